@@ -326,7 +326,7 @@ def meeting() -> Rows:
     value_at = lambda s: as_array(base) + s * as_array(change)
     measures = {
         "radius": lambda s: floquet.compute_spectral_radius(value_at(s)),
-        "jury": lambda s: floquet.jury_margins(value_at(s)),
+        "jury": lambda s: floquet.compute_jury_margins(value_at(s)),
     }
     derive = {name: jax.jit(jax.jacfwd(measure)) for name, measure in measures.items()}
     for kind, sign in (("real", 1), ("complex", -1)):

@@ -36,7 +36,7 @@ from experiments.shared.wheels import draw_wheels_near_gaits, make_wheels
 from experiments.speed import peers
 from experiments.work_precision.charts import COLOURS
 from vrw_jax import figures as plots
-from vrw_jax.batches.batch_steps import sort_wheels_by_work
+from vrw_jax.batches.batch_steps import order_wheels_by_work
 from vrw_jax.wheel import PARAMETER_NAMES, transitions
 
 LABELS = {
@@ -101,7 +101,7 @@ def by_peer(function, side_by_side=False):
         back = slice(None)
         if side_by_side:
             columns = [np.asarray(getattr(params, name)) for name in PARAMETER_NAMES]
-            order = sort_wheels_by_work(columns, states)
+            order = order_wheels_by_work(columns, states)
             params, states, back = make_wheels(rows[order]), states[order], np.argsort(order)
         landing = transitions.resolve_landing(params.symbols(), *np.asarray(states).T)
         starts = np.asarray(np.stack([landing.theta_after, landing.motion_after.dtheta], 1))

@@ -20,7 +20,7 @@ from experiments.shared.command import make_parser, parse_and_start_jax
 from experiments.shared.tables import DOCS, describe_run, format_markdown, replace_block
 from experiments.shared.wheels import draw_wheels_near_gaits, make_wheels
 from experiments.speed.engines_agree import draw_wheels
-from vrw_jax.batches.batch_steps import sort_wheels_by_work
+from vrw_jax.batches.batch_steps import order_wheels_by_work
 from vrw_jax.integrator import load_explicit_tableau
 from vrw_jax.models.batch_step import run_batch_phases
 from vrw_jax.wheel import PARAMETER_NAMES, make_wheel_from_parameters
@@ -94,7 +94,7 @@ def main() -> None:
         orders = (
             np.arange(len(rows)),
             np.argsort(own_values["damping"] / own_values["leg_mass"]),
-            sort_wheels_by_work(list(rows.T), states),
+            order_wheels_by_work(list(rows.T), states),
             np.argsort(steps[1], kind="stable"),
         )
         result.append((scene, *(f"{compute_group_steps(steps, order):.2f}" for order in orders)))

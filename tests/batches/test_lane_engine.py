@@ -153,7 +153,7 @@ def test_lanes_of_similar_cost_are_grouped():
     states = TABLE_1_SECTION_STATE * draw(0.95, 1.05, (n, 3))
     tried = np.asarray(vrw.step_batch(reference_values.make_wheels(vectors), states).solver_steps)
     waits = lambda order: tried[order].reshape(-1, 8).max(1).mean() / tried.mean() - 1.0
-    ours = waits(lane_batch.sort_wheels_by_work(list(vectors.T), states))
+    ours = waits(lane_batch.order_wheels_by_work(list(vectors.T), states))
     assert ours < 0.5 * waits(np.arange(n))
     assert ours < 0.8 * waits(np.argsort(vectors[:, NAMES.index("damping")]))
 
@@ -164,7 +164,7 @@ def test_invalid_wheels_have_a_position_in_that_order():
         np.tile(TABLE_1_SECTION_STATE, (5, 1)),
     )
     states[:, 1] = [1.6, 1e300, np.inf, -1.0, 0.0]
-    order = lane_batch.sort_wheels_by_work(list(vectors.T), states)
+    order = lane_batch.order_wheels_by_work(list(vectors.T), states)
     np.testing.assert_array_equal(np.sort(order), np.arange(5))
 
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 import vrw_jax as vrw
-from vrw_jax.branches.branch_location import continue_and_locate_points
+from vrw_jax.branches.branch_location import continue_and_locate_special_points
 from vrw_jax.branches.continuation import MapContinuation
-from vrw_jax.branches.jumps import find_jumps
+from vrw_jax.branches.jumps import find_state_jumps
 from vrw_jax.continuation import AbstractContinuationProblem, ArclengthOptions, NewtonStep
 
 TAN = float(np.tan(0.3))
@@ -36,7 +36,9 @@ def test_a_branch_passes_a_kink_at_which_no_step_is_short_enough(slope):
     """Its tangent turns there by 76 or 121 degrees; an option forbids more than 0.2 rad."""
     run = MapContinuation(Bent(slope), ArclengthOptions(), jnp.zeros(1), np.array([-1.0, 1.0]))
     begin = jnp.array([[-0.25]]), jnp.array([-0.5])
-    (strand,) = continue_and_locate_points(run, *begin, np.array([True]), lambda owner, point: None)
+    (strand,) = continue_and_locate_special_points(
+        run, *begin, np.array([True]), lambda owner, point: None
+    )
     p, x = np.asarray(strand.points.p), np.asarray(strand.points.z)[:, 0]
     assert p[[0, -1]].tolist() == [-1.0, 1.0]
     np.testing.assert_allclose(x, np.where(p < 0.0, 0.5 * p, slope * p), atol=1e-12)
@@ -120,11 +122,11 @@ def test_only_a_state_that_departs_from_both_tangents_jumps():
     angles = np.linspace(0.3, 2.9, 9)
     states, shares = np.cos(angles)[:, None], np.sin(angles)
     pairs = [(i, i + 1) for i in range(8)]
-    assert find_jumps(states, shares, np.cos(angles), pairs) == []
+    assert find_state_jumps(states, shares, np.cos(angles), pairs) == []
     across_fold = np.array([[0.1], [-0.1]]), np.array([0.995, 0.995]), np.array([0.1, -0.1])
-    assert find_jumps(*across_fold, [(0, 1)]) == []
+    assert find_state_jumps(*across_fold, [(0, 1)]) == []
     across_jump = np.array([[0.0], [0.1]]), np.array([0.0, 1e-4]), np.array([0.6, 0.6])
-    assert find_jumps(*across_jump, [(0, 1)]) == [(0, 1)]
+    assert find_state_jumps(*across_jump, [(0, 1)]) == [(0, 1)]
 
 
 @pytest.mark.slow

@@ -11,7 +11,7 @@ import pytest
 
 import vrw_jax as vrw
 from experiments.gaits.both_sides import judge_curve
-from vrw_jax.branches.branch_location import continue_and_locate_points
+from vrw_jax.branches.branch_location import continue_and_locate_special_points
 from vrw_jax.branches.continuation import MapContinuation
 from vrw_jax.branches.special_point_curves import continue_special_points
 from vrw_jax.continuation.arclength import ArclengthOptions, ContinuationStatus
@@ -20,7 +20,7 @@ from vrw_jax.continuation.test_functions import (
     TestFunctionCurve,
     TestFunctionNewtonStep,
     TestFunctionPoint,
-    offset_bifurcation_margins,
+    compute_offset_bifurcation_margins,
 )
 
 CURVE_OPTIONS = ArclengthOptions(max_points=400, max_ds=0.05)
@@ -54,10 +54,10 @@ def trace_curve(function, quantity, z, p, bounds, seconds, second):
     lead = lambda x: jnp.asarray(x, float)[None]
     start = TestFunctionPoint(lead(z), lead(share))
     run = MapContinuation(level, CURVE_OPTIONS, jnp.zeros(1), np.array(bounds))
-    (strand,) = continue_and_locate_points(
+    (strand,) = continue_and_locate_special_points(
         run, start, lead(p), np.array([True]), lambda owner, point: None
     )
-    second = level.second_parameter(jax.tree.map(jnp.asarray, strand.points.z))
+    second = level.compute_second_parameter(jax.tree.map(jnp.asarray, strand.points.z))
     return strand.points.p, np.asarray(second), strand
 
 
@@ -88,7 +88,7 @@ def find_fixed_point(a, b):
 
 
 def compute_jury_margin(place):
-    return lambda jacobian, x, p: offset_bifurcation_margins(jacobian)[place]
+    return lambda jacobian, x, p: compute_offset_bifurcation_margins(jacobian)[place]
 
 
 def test_period_doublings_of_henon_are_on_their_parabola():

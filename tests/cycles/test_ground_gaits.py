@@ -14,7 +14,11 @@ from vrw_jax import simd
 from vrw_jax.contact import batch_walks as ground_lanes
 from vrw_jax.contact import embed_section_states, step_batch_with_jacobian
 from vrw_jax.continuation.arclength import ArclengthOptions
-from vrw_jax.continuation.floquet import bifurcation_margins, floquet_multipliers, jury_margins
+from vrw_jax.continuation.floquet import (
+    compute_bifurcation_margins,
+    compute_jury_margins,
+    floquet_multipliers,
+)
 from vrw_jax.cycles import unilateral_finder as on_ground
 from vrw_jax.selection.ladder import ModelCode
 from vrw_jax.wheel import PARAMETER_NAMES
@@ -110,8 +114,8 @@ def test_bifurcations_of_larger_maps_are_those_of_the_small_map_inside():
     small = np.array([[0.4, 0.9, 0.1], [-0.7, 0.3, 0.2], [0.1, 0.0, -0.6]])
     large = np.zeros((7, 7))
     large[2:5, 2:5] = small
-    solution = bifurcation_margins(jnp.asarray(large))
-    np.testing.assert_allclose(solution, jury_margins(jnp.asarray(small))[:3], atol=1e-12)
+    solution = compute_bifurcation_margins(jnp.asarray(large))
+    np.testing.assert_allclose(solution, compute_jury_margins(jnp.asarray(small))[:3], atol=1e-12)
     three = np.asarray(floquet_multipliers(jnp.asarray(large)))[:3]
     exact = np.asarray(floquet_multipliers(jnp.asarray(small)))
     np.testing.assert_allclose(np.sort_complex(three), np.sort_complex(exact), atol=1e-12)
@@ -553,10 +557,10 @@ def test_batched_newton_steps_back_from_states_without_a_complete_step(monkeypat
     )
     a, begin = np.array([[0.25], [0.75], [-9.0]]), np.array([[1.9, 0.0], [1.5, 0.0], [0.0, 0.0]])
     solution = on_ground._find_contact_fixed_points(None, 1, vrw.StepOptions(), 1, a, begin, True)
-    assert solution.is_converged.tolist() == [True, True, False]  # the last has no fixed point
+    assert solution.is_gait_found.tolist() == [True, True, False]  # the last has no fixed point
     exact = 2.0 - 2.0 * np.sqrt(a[:2, 0])
-    np.testing.assert_allclose(solution.section_states[:2, 0], exact, atol=1e-12)
-    np.testing.assert_allclose(solution.residual[:2], 0.0, atol=1e-12)
+    np.testing.assert_allclose(solution.fixed_section_states[:2, 0], exact, atol=1e-12)
+    np.testing.assert_allclose(solution.newton_residuals[:2], 0.0, atol=1e-12)
     assert max(np.abs(x).max() for x in calls) > 3.0  # where it was sent back from
 
 
@@ -584,8 +588,8 @@ def test_batched_newton_finds_a_repeating_state_next_to_a_jump_of_the_map(monkey
     solution = on_ground._find_contact_fixed_points(
         None, 1, vrw.StepOptions(rtol=1e-10, atol=1e-10), 1, *given
     )
-    assert solution.is_converged[0]
-    assert solution.residual[0] < 1e-10
+    assert solution.is_gait_found[0]
+    assert solution.newton_residuals[0] < 1e-10
     assert abs(solution.section_states[0, 0] + 2.0) < 1e-10
 
 

@@ -40,9 +40,9 @@ def test_radius_differentiates_like_left_and_right_eigenvectors(size):
 def test_margins_are_positive_exactly_inside_the_circle(size):
     matrices = RANDOM_GENERATOR.normal(size=(2000, size, size)) * 0.8
     stable = np.abs(np.linalg.eigvals(matrices)).max(1) < 1.0
-    margins = np.asarray(floquet.jury_margins(jnp.asarray(matrices)))
+    margins = np.asarray(floquet.compute_jury_margins(jnp.asarray(matrices)))
     np.testing.assert_array_equal(np.all(margins > 0.0, axis=-1), stable)
-    smooth = np.asarray(floquet.stability_margin(jnp.asarray(matrices)))
+    smooth = np.asarray(floquet.compute_stability_margin(jnp.asarray(matrices)))
     assert np.all(smooth <= margins.min(-1) + 1e-14)
     assert np.all(smooth >= margins.min(-1) - np.log(4.0) / floquet.SMOOTH_MIN_SHARPNESS)
 
@@ -51,12 +51,12 @@ def test_the_margin_is_differentiable_at_equal_eigenvalues():
     defective = jnp.array([[0.5, 1.0], [0.0, 0.5]])
     assert bool(floquet.has_double_multiplier(defective))
     assert not bool(floquet.has_double_multiplier(jnp.diag(jnp.array([0.5, 0.4]))))
-    gradient = jax.grad(floquet.stability_margin)(defective)
+    gradient = jax.grad(floquet.compute_stability_margin)(defective)
     step = 1e-6
     direction = jnp.array([[0.3, -0.2], [0.7, 0.4]])
     slope = (
-        floquet.stability_margin(defective + step * direction)
-        - floquet.stability_margin(defective - step * direction)
+        floquet.compute_stability_margin(defective + step * direction)
+        - floquet.compute_stability_margin(defective - step * direction)
     ) / (2 * step)
     np.testing.assert_allclose(jnp.sum(gradient * direction), slope, rtol=1e-7)
     assert np.all(np.isfinite(jax.grad(floquet.compute_spectral_radius)(defective)))

@@ -40,7 +40,7 @@ def test_collocation_and_event_driven_steps_give_the_same_norms(sensitivity):
     )
     by_steps = compute_sensitivity_norms(response)
     # The states are taken at different instants of the step; the norm does not depend on that.
-    np.testing.assert_allclose(by_steps.norms, sensitivity.norm, rtol=1e-7, atol=1e-9)
+    np.testing.assert_allclose(by_steps.sensitivity_norms, sensitivity.norm, rtol=1e-7, atol=1e-9)
     np.testing.assert_allclose(
         by_steps.beginning_step_response, sensitivity.beginning_step, atol=1e-6
     )
@@ -141,7 +141,7 @@ def test_an_unstable_gait_has_an_infinite_norm():
     response = slope_response.SlopeResponse(
         jnp.diag(jnp.array([1.1, 0.2])), *jnp.ones((2, 2)), jnp.ones((1, 2)), *jnp.ones((2, 1))
     )
-    assert float(compute_sensitivity_norms(response).norms[0]) == np.inf
+    assert float(compute_sensitivity_norms(response).sensitivity_norms[0]) == np.inf
 
 
 @pytest.mark.parametrize(

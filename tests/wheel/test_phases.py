@@ -179,7 +179,7 @@ def test_resets_agree_with_the_collisions():
     following = (
         sequence.make_held_landing_sequence(PARAMS.n_legs)
         .phases[1]
-        .reset(constants, PhasePoint((), q, v))
+        .reset_map(constants, PhasePoint((), q, v))
     )
     np.testing.assert_array_equal(following.q, [q[0], hit.L1])
     np.testing.assert_array_equal(following.v, [hit.dtheta, hit.dL1])
@@ -221,7 +221,7 @@ def end_by_step_collocation():
     duration = jnp.asarray(0.2, float)  # of no weak type, as what comes back
     for _ in range(3):
         end = run(q, v, duration)
-        duration = end.duration
+        duration = end.phase_duration
     return end.q, end.v
 
 
@@ -230,11 +230,11 @@ def end_by_cycle_collocation():
     phase = sequence.make_held_landing_sequence(PARAMS.n_legs).phases[2]
     constants = sequence.compute_phase_constants(PARAMS.n_legs, *stack_parameters(PARAMS))
     _, q, v = make_state_at(2)
-    event = lambda theta: phase.event(constants, PhasePoint((), (theta, q[1]), v))
+    event = lambda theta: phase.end_event_function(constants, PhasePoint((), (theta, q[1]), v))
     theta = q[0]
     for _ in range(8):
         theta = theta - event(theta) / jax.grad(event)(theta)
-    assert phase.guards(constants, PhasePoint((), (theta, q[1]), v))[0] == event(theta)
+    assert phase.guards_function(constants, PhasePoint((), (theta, q[1]), v))[0] == event(theta)
     return (theta, q[1]), v
 
 

@@ -1,10 +1,10 @@
-"""Gait steps of batches of wheels: one function for several engines.
+"""Gait steps of batches of wheels: one function with a choice of engines.
 
-On a CPU the "lanes" engine is machine code for a few lanes at a time (`simd`). On a GPU the engine
-is an XLA program for very many lanes, and unfinished lanes run again in smaller batches. In both
-cases every lane runs the same code, and no data pass between lanes. The result of a batch element
-is therefore bitwise the same alone, in any batch and in any order. Wheels whose steps need similar
-work are placed side by side.
+On a CPU the engine "lanes" is machine code for a few lanes at a time (`simd`). On a GPU it is an
+XLA program for very many lanes, and unfinished lanes run again in smaller batches. Every lane runs
+the same code, and no data pass between lanes. The result of a batch element is therefore bitwise
+the same alone, in any batch and in any order. Wheels whose steps need similar work are placed side
+by side.
 """
 
 import dataclasses
@@ -64,16 +64,17 @@ from vrw_jax.wheel import (
     make_wheel_from_parameters,
 )
 
-BatchEngine = Literal["auto", "lanes", "diffrax", "collocation"]
-BATCH_ENGINE_NAMES: tuple[str, ...] = get_args(BatchEngine)
+BatchEngineName = Literal["auto", "lanes", "diffrax", "collocation"]
+BATCH_ENGINE_NAMES: tuple[str, ...] = get_args(BatchEngineName)
 
 PAPER_STEP_INPUT_NAMES = (START_INPUT_NAME, *PARAMETER_NAMES)
-"""Names of the inputs of a step of the paper's model with respect to which derivatives are
-available."""
+"""Names of the step inputs of the paper's model for which derivatives are available."""
 
 SLOPE_INPUT_INDEX = PARAMETER_NAMES.index("slope")
-"""Index of the slope among the inputs of a step, which are the parameters, the section state and
-the slope of the next line."""
+"""Index of the slope among the inputs of a step.
+
+The inputs are the parameters, the section state and the slope of the next line.
+"""
 NEXT_SLOPE_INPUT_INDEX = len(PARAMETER_NAMES) + 3
 """Index of the slope of the next line among the inputs of a step."""
 
@@ -86,29 +87,29 @@ def step_batch(
     *,
     model: AbstractWheel | None = None,
     options: StepOptions | None = None,
-    engine: BatchEngine = "auto",
+    engine: BatchEngineName = "auto",
     durations: Array | np.ndarray | None = None,
     derivatives: Sequence[str] = (),
 ) -> StepBatchResult:
     """Return the result of up to `n_steps` gait steps of many wheels, with derivatives if
     requested.
 
-    Engine "lanes" is the fast one, for the viscoelastic wheel and explicit solvers. "diffrax" maps
-    `model.advance` over the batch and accepts any solver. "auto" selects "lanes" if possible;
-    `StepBatchResult.engine` gives the selected engine. Both have the errors of `options`, which
-    apply to each solver step. The results of the two differ by some ten times the tolerance.
+    Engine "lanes" is the fastest engine, for the viscoelastic wheel and explicit solvers. "diffrax"
+    maps `model.advance` over the batch and accepts any solver. "auto" selects "lanes" if possible;
+    `StepBatchResult.engine` is the selected engine. `options` limits the error of each solver step
+    in both engines, whose results differ by about ten times the tolerance.
 
-    "auto" also replaces the named solver if the airborne leg is so stiff that another solver is
-    cheaper. `StepBatchResult.solver_index` gives the selected solver. Tsit5 is selected if
-    stability limits the steps. At the default options this is the case from c/m = 1,900 1/s; at a
-    tolerance of 1e-6, from 300 1/s. Kvaerno5 by "diffrax" is selected if Tsit5 failed,
-    or if explicit solvers need too many steps. At the default options this is the case from c/m =
-    4e5 1/s; at a tolerance of 1e-6, from 1.4e5 1/s.
+    "auto" also replaces the requested solver if the airborne leg is so stiff that another solver is
+    cheaper. `StepBatchResult.solver_index` identifies the selected solver. Tsit5 is selected if
+    stability limits the solver steps. At the default options this is the case from c/m = 1,900 1/s;
+    at a tolerance of 1e-6, from 300 1/s. Kvaerno5 in "diffrax" is selected if Tsit5 failed, or if
+    explicit solvers need too many steps. At the default options this is the case from c/m = 4e5
+    1/s; at a tolerance of 1e-6, from 1.4e5 1/s.
 
-    Derivatives include all steps and their events. They are zero for an element that fell, and are
-    not available by collocation. With unilateral contact (`UnilateralWheel`) the only engine is
-    "lanes"; friction is a scalar or an array over the batch. The function compiles itself once, so
-    that it cannot be called inside `jax.jit`.
+    Derivatives include all steps and their events. They are zero for a wheel that fell, and not
+    available by collocation. With unilateral contact (`UnilateralWheel`) the only engine is
+    "lanes"; friction is a scalar or an array over the batch. The function compiles its programs
+    itself, so it cannot be called inside `jax.jit`.
 
     On uneven ground the slope has the shape (elements, n_steps) or (elements, n_steps + 1), over
     the steps of each element as in `walk`. With unilateral contact, friction may have these shapes
@@ -121,7 +122,7 @@ def step_batch(
         model: model of the wheel; by default the paper's, `ViscoelasticWheel()`.
         options: numerical options of the steps.
         engine: "auto", "lanes", "diffrax" or "collocation", as above.
-        durations: durations of the phases, shape (elements, 3), s, for "collocation".
+        durations: for "collocation", expected durations of the phases, shape (elements, 3), s.
         derivatives: "section_state" and names of parameters; with unilateral contact "friction"
             too.
 
@@ -129,7 +130,7 @@ def step_batch(
         A `StepBatchResult`, for the last step of each element.
 
     Raises:
-        TypeError, ValueError: an invalid argument, described in one sentence.
+        TypeError, ValueError: if an argument is invalid; the message names the remedy.
 
     Examples:
         >>> params = vrw.WheelParams(damping=np.array([120.0, 150.0, 180.0]))
@@ -168,18 +169,18 @@ def step_batch(
     return (
         step_batch_with_contact(*step_arguments, derivative_names)
         if has_contact_kernel
-        else _step_batch_on_held_ground(*step_arguments, durations, derivative_names)
+        else _step_batch_without_contact(*step_arguments, durations, derivative_names)
     )
 
 
 def _check_derivative_names(
-    derivatives: Sequence[str], known_input_names: tuple[str, ...], engine: str
+    requested_derivatives: Sequence[str], known_input_names: tuple[str, ...], requested_engine: str
 ) -> list[str]:
     """Return the names of the requested derivatives as a list.
 
-    Raise a `ValueError` if a derivative is not available.
+    Raise ValueError if a derivative is not available.
     """
-    derivative_names = list(derivatives)
+    derivative_names = list(requested_derivatives)
     for derivative_name in derivative_names:
         if derivative_name not in known_input_names:
             raise ValueError(
@@ -187,9 +188,9 @@ def _check_derivative_names(
                 f"{', '.join(known_input_names)}: "
                 "give names of these."
             )
-    if derivative_names and engine == "collocation":
+    if derivative_names and requested_engine == "collocation":
         raise ValueError(
-            "derivatives are not available by collocation in batches: take "
+            "derivatives are given, but batches have none with engine 'collocation': take "
             "engine='lanes', or jax.jacfwd of vrw.return_map."
         )
     return derivative_names
@@ -202,10 +203,10 @@ def _check_parameter_shapes(
     options: StepOptions,
     n_steps: int,
 ) -> list[np.ndarray]:
-    """Return the parameters as arrays: a scalar, or one value per element, and for the slope one
-    value per step too.
+    """Return each parameter as a scalar or an array over the batch.
 
-    Raise a `ValueError` if the shapes of states and parameters do not fit.
+    The slope, and with unilateral contact the friction, may have a second axis over steps. Raise
+    ValueError if the shapes of states and parameters do not fit.
     """
     section_sizes = [3]
     if section_states.ndim != 2 or section_states.shape[1] != 3:
@@ -247,29 +248,31 @@ def _check_parameter_shapes(
     return [np.asarray(parameter_values, common_dtype) for parameter_values in parameter_columns]
 
 
-def _step_batch_on_held_ground(
+def _step_batch_without_contact(
     model: Any,
     parameter_columns: list[np.ndarray],
     section_states: np.ndarray,
     n_steps: int,
     options: StepOptions,
-    engine: str,
+    requested_engine: str,
     n_legs: int,
-    durations: Any,
+    phase_durations: Any,
     derivative_names: Sequence[str],
     selection_options: SolverSelectionOptions = SOLVER_SELECTION_OPTIONS,
 ) -> StepBatchResult:
-    """Return the result of `step_batch` for the paper's wheel, or for another model by diffrax."""
+    """Return the result of `step_batch` for a model without unilateral contact."""
     ground_slopes, stepwise_parameters = _split_slopes_by_step(
-        parameter_columns[SLOPE_INPUT_INDEX], n_steps, engine
+        parameter_columns[SLOPE_INPUT_INDEX], n_steps, requested_engine
     )
     parameter_columns = [
         ground_slopes[0] if i == SLOPE_INPUT_INDEX else x for i, x in enumerate(parameter_columns)
     ]
-    work_order = sort_wheels_by_work(parameter_columns, section_states)
-    parameter_rows = np.empty((len(parameter_columns), len(section_states)), section_states.dtype)
-    for lane_parameters, parameter_values in zip(parameter_rows, parameter_columns, strict=True):
-        lane_parameters[:] = (
+    work_order = order_wheels_by_work(parameter_columns, section_states)
+    parameter_matrix = np.empty((len(parameter_columns), len(section_states)), section_states.dtype)
+    for active_lane_parameters, parameter_values in zip(
+        parameter_matrix, parameter_columns, strict=True
+    ):
+        active_lane_parameters[:] = (
             parameter_values[work_order] if parameter_values.ndim else parameter_values
         )
     is_uneven = bool(stepwise_parameters)
@@ -280,63 +283,71 @@ def _step_batch_on_held_ground(
         PARAMETER_NAMES,
         stepwise_parameters,
     )
-    legs_and_inputs = n_legs, walk_batch.input_indices
+    engine_arguments = n_legs, walk_batch.input_indices
     engine_by_solver = {
-        SolverIndex.REQUESTED_SOLVER: _select_batch_engine(engine, model, options, *legs_and_inputs)
+        SolverIndex.REQUESTED_SOLVER: _select_batch_engine(
+            requested_engine, model, options, *engine_arguments
+        )
     }
     solver_indices = np.full(len(section_states), SolverIndex.REQUESTED_SOLVER, np.int32)
     solver_names: tuple[str, ...] = (options.solver,)
     engine_name = engine_by_solver[SolverIndex.REQUESTED_SOLVER].engine_name
-    if engine == "auto" and engine_name == "lanes":
+    if requested_engine == "auto" and engine_name == "lanes":
         solver_names = (
             options.solver,
             selection_options.stable_solver,
             selection_options.implicit_solver,
         )
-        tightened_options = options.with_derivative_tolerances() if derivative_names else options
+        stable_solver_options = (
+            options.with_derivative_tolerances() if derivative_names else options
+        )
         solver_indices = select_cheapest_solver(
-            parameter_rows, tightened_options, selection_options
+            parameter_matrix, stable_solver_options, selection_options
         )
     if np.any(solver_indices != SolverIndex.REQUESTED_SOLVER):
-        implicit_options = dataclasses.replace(options, solver=selection_options.implicit_solver)
-        stable_options = dataclasses.replace(options, solver=selection_options.stable_solver)
-        stable_options = stable_options.with_tightened_tolerances(
+        implicit_solver_options = dataclasses.replace(
+            options, solver=selection_options.implicit_solver
+        )
+        tightened_step_options = dataclasses.replace(
+            options, solver=selection_options.stable_solver
+        )
+        tightened_step_options = tightened_step_options.with_tightened_tolerances(
             selection_options.stable_solver_tightening_factor
         )
         engine_by_solver[SolverIndex.STABLE_SOLVER] = _select_batch_engine(
-            "lanes", model, stable_options, *legs_and_inputs
+            "lanes", model, tightened_step_options, *engine_arguments
         )
         engine_by_solver[SolverIndex.IMPLICIT_SOLVER] = _select_batch_engine(
-            "diffrax", model, implicit_options, *legs_and_inputs
+            "diffrax", model, implicit_solver_options, *engine_arguments
         )
-    if engine == "collocation":
-        engine_name = engine
-        if durations is None or np.shape(durations) != section_states.shape:
-            durations_shape = None if durations is None else np.shape(durations)
+    if requested_engine == "collocation":
+        engine_name = requested_engine
+        if phase_durations is None or np.shape(phase_durations) != section_states.shape:
+            durations_shape = None if phase_durations is None else np.shape(phase_durations)
             raise ValueError(
                 f"durations have shape {durations_shape}, but collocation needs those of DLS, "
                 "SLS-I and SLS-II to some per cent, shape (elements, 3): give those of a limit "
                 "cycle, or take 'lanes'."
             )
-        expected_durations = check_numpy_reals("durations", durations)
-        walk_batch.durations[:] = expected_durations.astype(parameter_rows.dtype).T.take(
+        expected_durations = check_numpy_reals("durations", phase_durations)
+        walk_batch.durations[:] = expected_durations.astype(parameter_matrix.dtype).T.take(
             work_order, -1
         )
     for k in range(n_steps):
-        active_lanes = walk_batch.find_active_lanes()
+        active_lanes = walk_batch.find_walking_lanes()
         if is_uneven:
-            parameter_rows[SLOPE_INPUT_INDEX] = ground_slopes[k]
-        if engine == "collocation" and len(active_lanes):
+            parameter_matrix[SLOPE_INPUT_INDEX] = ground_slopes[k]
+        if requested_engine == "collocation" and len(active_lanes):
             lane_selection = select_lanes(active_lanes, walk_batch)
             collocation_inputs = (
-                parameter_rows[:, lane_selection],
+                parameter_matrix[:, lane_selection],
                 walk_batch.section_state[:, lane_selection],
                 walk_batch.durations[:, lane_selection],
             )
             collocation_result = _step_lanes_by_collocation(
                 engine_by_solver[SolverIndex.REQUESTED_SOLVER], model, n_legs, *collocation_inputs
             )
-            walk_batch.record_lane_steps(active_lanes, *collocation_result)
+            walk_batch.store_lane_steps(active_lanes, *collocation_result)
             continue
         for engine_index, selected_engine in engine_by_solver.items():
             lane_indices = active_lanes[solver_indices[active_lanes] == engine_index]
@@ -344,37 +355,35 @@ def _step_batch_on_held_ground(
                 lane_selection = select_lanes(lane_indices, walk_batch)
                 next_slopes = (ground_slopes[k + 1][lane_selection],) if is_uneven else ()
                 step_values = selected_engine.take_lane_steps(
-                    parameter_rows[:, lane_selection],
+                    parameter_matrix[:, lane_selection],
                     walk_batch.section_state[:, lane_selection],
                     *next_slopes,
                 )
                 if engine_index == SolverIndex.STABLE_SOLVER:
                     # A phase may last longer than `select_cheapest_solver` assumes. The implicit
-                    # solver,
-                    # which is next, then repeats the step.
+                    # solver, which is next, then repeats the step.
                     has_solver_failed = step_values[2] == Outcome.SOLVER_FAILED
                     solver_indices[lane_indices[has_solver_failed]] = SolverIndex.IMPLICIT_SOLVER
                     lane_indices = lane_indices[~has_solver_failed]
                     step_values = tuple(
                         step_value[..., ~has_solver_failed] for step_value in step_values
                     )
-                walk_batch.record_lane_steps(
+                walk_batch.store_lane_steps(
                     lane_indices, step_values, np.zeros(len(lane_indices), bool)
                 )
     return walk_batch.make_batch_result(work_order, solver_indices, engine_name, solver_names)
 
 
 def _split_slopes_by_step(
-    element_slopes: np.ndarray, n_steps: int, engine: str
+    element_slopes: np.ndarray, n_steps: int, requested_engine: str
 ) -> tuple[Any, dict[str, StepwiseParameter]]:
-    """Return the slopes of the lines of all steps, and the role of the slope in the chain rule over
-    steps.
+    """Return the slopes of the lines of all steps, and the role of the slope in the chain rule.
 
-    On flat ground, return a list with one slope and an empty mapping.
+    On flat ground, return a list with one slope, and an empty mapping.
     """
     if element_slopes.ndim < 2:
         return [element_slopes], {}
-    if engine == "collocation":
+    if requested_engine == "collocation":
         raise ValueError(
             "engine is 'collocation', which takes one slope, but slope is an array over steps: "
             "take 'auto', 'lanes' or 'diffrax'."
@@ -387,18 +396,20 @@ def _split_slopes_by_step(
     return complete_slopes_over_steps(element_slopes, n_steps), {"slope": stepwise_slope}
 
 
-def sort_wheels_by_work(
+def order_wheels_by_work(
     parameter_columns: list[np.ndarray], section_states: np.ndarray
 ) -> np.ndarray:
-    """Return an order of the batch in which wheels whose steps need similar work are side by side.
+    """Return an order of the batch that places wheels with steps of similar work side by side.
 
-    A group of lanes takes as long as its slowest lane. Most of a step's work is in SLS-I. There,
-    stability limits the solver's steps by m/c. Leg 2 extends at the rate k (Ls - L)/c from its
+    A group of lanes takes as long as its slowest lane. Most work of a step belongs to SLS-I, in
+    which stability limits the solver steps by m/c. Leg 2 extends at the rate k (Ls - L)/c from its
     length at release. The exponents are rounded from a fit to numbers of solver steps, for wheels
     near their gaits and far from them (`python -m experiments.speed.straggler_steps`).
     """
     parameters_by_name = dict(zip(PARAMETER_NAMES, parameter_columns, strict=True))
-    get_float32_parameter = lambda name: np.asarray(parameters_by_name[name], np.float32)
+    get_float32_parameter = lambda parameter_name: np.asarray(
+        parameters_by_name[parameter_name], np.float32
+    )
     with np.errstate(all="ignore"):
         theta, dtheta = section_states.T[:2].astype(np.float32)
         locked_length, leg_mass = (
@@ -420,29 +431,35 @@ def sort_wheels_by_work(
 
 
 class _BatchEngine(NamedTuple):
-    """Engine that takes one gait step of any number of lanes. Its arrays are NumPy arrays with
-    lanes on the last axis.
+    """Engine that takes one gait step of any number of lanes. Arrays are NumPy arrays, lanes
+    last.
     """
 
     engine_name: str
     take_lane_steps: Callable[..., tuple[np.ndarray, ...]]
-    """Function of parameters, section states and, on uneven ground, slopes of the next lines. It
-    returns section state, durations, outcome, solver steps and, if requested, the Jacobian."""
+    """Function of parameters, section states and, on uneven ground, slopes of the next lines.
+
+    The function returns section states, durations, outcomes, numbers of solver steps and, if
+    derivatives are requested, Jacobians."""
 
 
 def _select_batch_engine(
-    engine: str, model: Any, options: StepOptions, n_legs: int, input_indices: tuple[int, ...]
+    requested_engine: str,
+    model: Any,
+    options: StepOptions,
+    n_legs: int,
+    input_indices: tuple[int, ...],
 ) -> _BatchEngine:
-    """Return the engine called `engine`, or the fastest possible engine if `engine` is "auto"."""
+    """Return the requested engine, or the fastest possible engine if "auto" is requested."""
     has_lane_kernel = (
         model.batch_kernel == "phases" and load_explicit_tableau(options.solver) is not None
     )
-    if engine in ("lanes", "collocation") and not has_lane_kernel:
+    if requested_engine in ("lanes", "collocation") and not has_lane_kernel:
         raise ValueError(
             f"the lane engine can't run {type(model).__name__} with {options.solver}: it supports "
             "the viscoelastic wheel and explicit Runge-Kutta solvers; take engine='diffrax'."
         )
-    if engine == "diffrax" or not has_lane_kernel:
+    if requested_engine == "diffrax" or not has_lane_kernel:
         step_by_diffrax = functools.partial(
             _step_lanes_by_diffrax, model, options.with_engine("diffrax"), n_legs, input_indices
         )
@@ -458,24 +475,27 @@ def _step_lanes_by_kernel(
     options: StepOptions,
     n_legs: int,
     input_indices: tuple[int, ...],
-    parameter_rows: np.ndarray,
+    parameter_matrix: np.ndarray,
     section_states: np.ndarray,
     *next_slopes: np.ndarray,
 ) -> tuple[np.ndarray, ...]:
-    """Return one gait step of all lanes by machine code or XLA; see
-    `_BatchEngine.take_lane_steps`.
+    """Return one gait step of all lanes by machine code or XLA.
+
+    The results are those of `_BatchEngine.take_lane_steps`.
     """
     option_leaves, options_structure = jax.tree.flatten(options)
-    scalar_arguments = [np.asarray(leaf, parameter_rows.dtype) for leaf in option_leaves]
-    tableau, n_parameters = load_explicit_tableau(options.solver), len(PARAMETER_NAMES)
-    assert tableau is not None  # `_select_batch_engine` has checked the solver.
+    scalar_arguments = [
+        np.asarray(option_leaf, parameter_matrix.dtype) for option_leaf in option_leaves
+    ]
+    solver_tableau, n_parameters = load_explicit_tableau(options.solver), len(PARAMETER_NAMES)
+    assert solver_tableau is not None  # `_select_batch_engine` has checked the solver.
 
     def step_lanes(
         scalar_arguments: Any, lane_inputs: Any, straggler_count: Array | None = None
     ) -> tuple:
-        current_options = jax.tree.unflatten(options_structure, scalar_arguments)
+        traced_options = jax.tree.unflatten(options_structure, scalar_arguments)
         if input_indices:
-            current_options = current_options.with_derivative_tolerances()
+            traced_options = traced_options.with_derivative_tolerances()
 
         def compute_step_outputs(*lane_inputs: Array) -> tuple:
             params = make_wheel_from_parameters(
@@ -483,7 +503,7 @@ def _step_lanes_by_kernel(
             )
             x = lane_inputs[n_parameters:NEXT_SLOPE_INPUT_INDEX]
             step_result = take_gait_step(
-                params, x, current_options, tableau, stop_at_lift_off, straggler_count
+                params, x, traced_options, solver_tableau, stop_at_lift_off, straggler_count
             )
             step_diagnostics = (
                 step_result.is_unfinished,
@@ -493,17 +513,17 @@ def _step_lanes_by_kernel(
             return jnp.stack([*step_result.section_state, *step_result.durations]), step_diagnostics
 
         if not input_indices:
-            step_values, diagnostics = compute_step_outputs(*lane_inputs)
-            return (*diagnostics, step_values)
+            step_values, step_diagnostics = compute_step_outputs(*lane_inputs)
+            return (*step_diagnostics, step_values)
         # With respect to all inputs, two columns follow from the units.
         needs_all_inputs = len(input_indices) == len(lane_inputs)
         compute_jacobian_of_columns = (
             complete_jacobian_columns if needs_all_inputs else compute_jacobian_columns
         )
-        jacobian, step_values, diagnostics = compute_jacobian_of_columns(
+        step_jacobian, step_values, step_diagnostics = compute_jacobian_of_columns(
             compute_step_outputs, lane_inputs, input_indices
         )
-        return (*diagnostics, step_values, jacobian)
+        return (*step_diagnostics, step_values, step_jacobian)
 
     cache_key = (
         "gait step",
@@ -517,26 +537,25 @@ def _step_lanes_by_kernel(
     register_limits = (
         simd.RegisterLimits(n_inputs) if input_indices else simd.DEFAULT_REGISTER_LIMITS
     )
-    lane_arrays = [*parameter_rows, *section_states, *next_slopes]
+    lane_arrays = [*parameter_matrix, *section_states, *next_slopes]
     kernel_results = run_compiled_lane_function(
         step_lanes, scalar_arguments, lane_arrays, cache_key, register_limits
     )
-    _, outcome, n_solver_steps, step_values, *jacobian = kernel_results
-    return step_values[:3], step_values[3:], outcome, n_solver_steps, *jacobian
+    _, outcomes, n_solver_steps, step_values, *step_jacobian = kernel_results
+    return step_values[:3], step_values[3:], outcomes, n_solver_steps, *step_jacobian
 
 
 def _step_lanes_by_collocation(
     lane_engine: _BatchEngine,
     model: Any,
     n_legs: int,
-    parameter_rows: np.ndarray,
+    parameter_matrix: np.ndarray,
     section_states: np.ndarray,
-    durations: np.ndarray,
+    expected_phase_durations: np.ndarray,
 ) -> tuple[tuple[np.ndarray, ...], np.ndarray]:
-    """Return one step of all lanes by collocation, and a flag for each lane that passed the checks
-    of collocation.
+    """Return one step of all lanes by collocation, and whether each lane passed its checks.
 
-    Lanes that failed a check are stepped by `lane_engine`. The results are those of
+    `lane_engine` repeats the step of lanes that failed a check. The results are those of
     `_BatchEngine.take_lane_steps`.
     """
     stop_at_lift_off, n_parameters = model.stop_at_lift_off, len(PARAMETER_NAMES)
@@ -548,19 +567,21 @@ def _step_lanes_by_collocation(
         x, expected_durations = tuple(lane_inputs[n_parameters:-3]), tuple(lane_inputs[-3:])
         collocation_step = take_collocation_step(params, x, expected_durations, stop_at_lift_off)
         is_unfinished = jnp.zeros_like(collocation_step.is_trusted)
-        step_values = jnp.stack([*collocation_step.section_state, *collocation_step.durations])
+        step_values = jnp.stack(
+            [*collocation_step.section_state, *collocation_step.phase_durations]
+        )
         return is_unfinished, collocation_step.is_trusted, step_values
 
     cache_key = ("gait step by collocation", n_legs, stop_at_lift_off)
     _, is_trusted, step_values = run_compiled_lane_function(
-        step_lanes, [], [*parameter_rows, *section_states, *durations], cache_key
+        step_lanes, [], [*parameter_matrix, *section_states, *expected_phase_durations], cache_key
     )
-    outcome, n_solver_steps = np.zeros((2, len(is_trusted)), np.int32)
-    collocated_values = step_values[:3], step_values[3:], outcome, n_solver_steps
+    outcomes, n_solver_steps = np.zeros((2, len(is_trusted)), np.int32)
+    collocated_values = step_values[:3], step_values[3:], outcomes, n_solver_steps
     untrusted_lanes = np.flatnonzero(~is_trusted)
     if len(untrusted_lanes) > 0:
         repeated_values = lane_engine.take_lane_steps(
-            parameter_rows[:, untrusted_lanes], section_states[:, untrusted_lanes]
+            parameter_matrix[:, untrusted_lanes], section_states[:, untrusted_lanes]
         )
         for collocated_value, repeated_value in zip(
             collocated_values, repeated_values, strict=True
@@ -574,79 +595,94 @@ def _step_lanes_by_diffrax(
     options: StepOptions,
     n_legs: int,
     input_indices: tuple[int, ...],
-    parameter_rows: np.ndarray,
+    parameter_matrix: np.ndarray,
     section_states: np.ndarray,
     *next_slopes: np.ndarray,
 ) -> tuple[np.ndarray, ...]:
-    """Return one step of all lanes by `model.advance` under `jax.vmap`; see
-    `_BatchEngine.take_lane_steps`.
+    """Return one step of all lanes by `model.advance` under `jax.vmap`.
+
+    The results are those of `_BatchEngine.take_lane_steps`.
     """
     convert_option_leaves = functools.partial(
-        jax.tree.map, lambda leaf: np.asarray(leaf, parameter_rows.dtype)
+        jax.tree.map, lambda option_leaf: np.asarray(option_leaf, parameter_matrix.dtype)
     )
     derivative_options = convert_option_leaves(options.with_derivative_tolerances())
     options = convert_option_leaves(options)
-    input_rows = np.concatenate(
+    step_input_matrix = np.concatenate(
         [
-            parameter_rows,
+            parameter_matrix,
             section_states,
             *(next_slope_values[None] for next_slope_values in next_slopes),
         ]
     ).T
 
-    def step_input_rows(
-        input_rows: np.ndarray, options: StepOptions, input_indices: tuple[int, ...]
+    def step_all_elements(
+        step_input_matrix: np.ndarray, options: StepOptions, input_indices: tuple[int, ...]
     ) -> Any:
-        step_row_block = functools.partial(
-            _step_rows_by_vmap, model, options, n_legs, input_indices
+        step_element_block = functools.partial(
+            _step_elements_by_vmap, model, options, n_legs, input_indices
         )
-        step_arrays = map_in_batches(step_row_block, (batch_sizes.DIFFRAX_BATCH_SIZE,), input_rows)
+        step_arrays = map_in_batches(
+            step_element_block, (batch_sizes.DIFFRAX_BATCH_SIZE,), step_input_matrix
+        )
         return jax.tree.map(lambda x: np.array(x).T, step_arrays)
 
-    def step_rows_with_jacobian(input_rows: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Return the step with derivatives, which are zero for elements without derivatives.
+    def step_elements_with_jacobian(step_input_matrix: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Return the step of all elements with derivatives, which are zero for elements without
+        any.
 
-        diffrax raises an error for the whole batch if the linear equations of an implicit solver's
-        derivative cannot be solved for one element. Bisection isolates that element.
+        diffrax raises an error for the whole batch if the implicit solver's linear equations for
+        the derivative of one element cannot be solved. Bisection isolates that element.
         """
         try:
-            step_arrays: tuple[np.ndarray, ...] = step_input_rows(
-                input_rows, options, input_indices
+            step_arrays: tuple[np.ndarray, ...] = step_all_elements(
+                step_input_matrix, options, input_indices
             )
         except eqx.EquinoxRuntimeError:
-            *step_values, n_solver_steps = step_input_rows(input_rows, derivative_options, ())
-            outcome = step_values[2]
-            jacobian = np.zeros((len(input_indices), 6, len(input_rows)), parameter_rows.dtype)
-            step_arrays = (*step_values, n_solver_steps, jacobian)
-            stepped_rows = np.flatnonzero(outcome == Outcome.STEPPED)
-            if len(stepped_rows) < len(input_rows):
-                row_index_parts = [stepped_rows]
-            elif len(input_rows) > 1:
-                row_index_parts = np.array_split(stepped_rows, 2)
+            *step_values, n_solver_steps = step_all_elements(
+                step_input_matrix, derivative_options, ()
+            )
+            outcomes = step_values[2]
+            step_jacobian = np.zeros(
+                (len(input_indices), 6, len(step_input_matrix)), parameter_matrix.dtype
+            )
+            step_arrays = (*step_values, n_solver_steps, step_jacobian)
+            stepped_elements = np.flatnonzero(outcomes == Outcome.STEPPED)
+            if len(stepped_elements) < len(step_input_matrix):
+                element_index_parts = [stepped_elements]
+            elif len(step_input_matrix) > 1:
+                element_index_parts = np.array_split(stepped_elements, 2)
             else:
-                row_index_parts, outcome[:] = [], Outcome.SOLVER_FAILED
-            for row_indices in (row_indices for row_indices in row_index_parts if len(row_indices)):
-                part_arrays = step_rows_with_jacobian(input_rows[row_indices])
-                for all_elements, part_elements in zip(step_arrays, part_arrays, strict=True):
-                    all_elements[..., row_indices] = part_elements
+                element_index_parts, outcomes[:] = [], Outcome.SOLVER_FAILED
+            for element_indices in (
+                element_indices for element_indices in element_index_parts if len(element_indices)
+            ):
+                partial_results = step_elements_with_jacobian(step_input_matrix[element_indices])
+                for full_result_array, partial_result_array in zip(
+                    step_arrays, partial_results, strict=True
+                ):
+                    full_result_array[..., element_indices] = partial_result_array
         return step_arrays
 
     return (
-        step_rows_with_jacobian(input_rows)
+        step_elements_with_jacobian(step_input_matrix)
         if input_indices
-        else step_input_rows(input_rows, options, ())
+        else step_all_elements(step_input_matrix, options, ())
     )
 
 
 @eqx.filter_jit
-def _step_rows_by_vmap(
+def _step_elements_by_vmap(
     model: AbstractWheel,
     options: StepOptions,
     n_legs: int,
     input_indices: tuple[int, ...],
-    input_rows: Array,
+    step_input_matrix: Array,
 ) -> tuple[Array, ...]:
-    """Return one step of each row of inputs, with its Jacobian if `input_indices` are given."""
+    """Return one step of each element, with its Jacobian if `input_indices` are given.
+
+    `step_input_matrix` contains the step inputs, shape (elements, inputs).
+    """
     n_parameters = len(PARAMETER_NAMES)
 
     def step_one_element(step_inputs: Array) -> tuple[Array, ...]:
@@ -671,13 +707,15 @@ def _step_rows_by_vmap(
                 step_result.outcome,
                 step_result.solver_steps,
             )
-        jacobian, step_result = jax.jacfwd(step_from_varied_inputs, has_aux=True)(varied_inputs)
+        step_jacobian, step_result = jax.jacfwd(step_from_varied_inputs, has_aux=True)(
+            varied_inputs
+        )
         step_values = (
             step_result.section_state,
             step_result.durations,
             step_result.outcome,
             step_result.solver_steps,
         )
-        return *step_values, jacobian
+        return *step_values, step_jacobian
 
-    return jax.vmap(step_one_element)(input_rows)
+    return jax.vmap(step_one_element)(step_input_matrix)

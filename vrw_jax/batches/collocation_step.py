@@ -1,16 +1,17 @@
-"""Gait steps of many wheels by collocation, in a fixed amount of work, near known gaits.
+"""Gait steps of many wheels by collocation with a fixed amount of work, near known gaits.
 
 The method is Gauss collocation of order 8 on a few graded mesh intervals. The unknowns are the
-accelerations at the four nodes of an interval. The airborne leg's fast mode, near c/m, forces an
-explicit method to small steps, but collocation needs no extra work for this mode. A fixed number of
-Newton iterations ("sweeps") with one Jacobian solves the node equations. In the eigenvectors of the
-Gauss rule the equations are two complex systems of the phase's size. In the last interval the
-duration is also corrected, towards the event.
+accelerations at the four nodes of an interval. The airborne leg's fast mode, whose rate is near
+c/m, forces explicit solvers to small steps, but costs collocation no additional work. A fixed
+number of Newton iterations ("sweeps") with one Jacobian solves the node equations. In the
+eigenvectors of the Gauss rule the equations separate into two complex systems of the phase's size.
+In the last interval the duration of the phase is corrected too, towards the event.
 
-All lanes do the same work. A fixed amount of work does not detect errors, so each phase returns
-three indicators of its accuracy. The first is the last corrections, and the second is the minimum
-of all guards. The third is the residual of the equations of motion at each interval's start, which
-is no node. A lane that fails a check of these indicators is stepped again by the adaptive engine.
+All lanes do the same work, which cannot adapt to errors. Each phase therefore returns three
+indicators of its accuracy. The first indicator is the size of the last corrections. The second
+indicator is the minimum of all guards. The third indicator is the residual of the equations of
+motion at the start of each interval, which is no node. The adaptive engine repeats the step of each
+lane that fails a check of these indicators.
 """
 
 import functools
@@ -33,9 +34,9 @@ from vrw_jax.collocation import (
     INTEGRATION_MATRIX,
     N_GAUSS_NODES,
     PhaseMesh,
-    differentiation_matrix,
-    integration_weights,
-    lagrange_weights,
+    build_differentiation_matrix,
+    compute_integration_weights,
+    compute_lagrange_weights,
 )
 from vrw_jax.models import PAPER_START_STATE, is_valid_start_state, replace_invalid_inputs
 from vrw_jax.numerics import Vector, evaluate_with_partials
@@ -53,107 +54,104 @@ _INTEGRATION_MATRIX_EIGENVALUES, _INTEGRATION_MATRIX_EIGENVECTORS = np.linalg.ei
     INTEGRATION_MATRIX
 )
 _UPPER_HALF_PLANE_INDICES = np.flatnonzero(_INTEGRATION_MATRIX_EIGENVALUES.imag > 0.0)
-GAUSS_EIGENVALUES = _INTEGRATION_MATRIX_EIGENVALUES[_UPPER_HALF_PLANE_INDICES]
-"""One eigenvalue of each conjugate pair of the Gauss rule's integration matrix."""
+INTEGRATION_MATRIX_EIGENVALUES = _INTEGRATION_MATRIX_EIGENVALUES[_UPPER_HALF_PLANE_INDICES]
+"""Eigenvalues of the Gauss rule's integration matrix, one of each complex conjugate pair."""
 EIGENVECTOR_PROJECTION_MATRIX = np.linalg.inv(_INTEGRATION_MATRIX_EIGENVECTORS)[
     _UPPER_HALF_PLANE_INDICES
 ]
-"""Matrix that projects node values onto the eigenvectors of `GAUSS_EIGENVALUES`, one row each."""
+"""Matrix that projects node values onto the eigenvectors of `INTEGRATION_MATRIX_EIGENVALUES`."""
 EIGENVECTOR_COLUMNS = _INTEGRATION_MATRIX_EIGENVECTORS[:, _UPPER_HALF_PLANE_INDICES]
-"""Eigenvectors of `GAUSS_EIGENVALUES`, as columns."""
+"""Eigenvectors of `INTEGRATION_MATRIX_EIGENVALUES`, as columns."""
 
-START_EXTRAPOLATION_WEIGHTS = lagrange_weights(0.0)
+START_EXTRAPOLATION_WEIGHTS = compute_lagrange_weights(0.0)
 """Weights that extrapolate node values to the start of a mesh interval."""
-MIDDLE_INTERPOLATION_WEIGHTS = lagrange_weights(0.5)
+MIDDLE_INTERPOLATION_WEIGHTS = compute_lagrange_weights(0.5)
 """Weights that interpolate node values to the middle of a mesh interval."""
-END_EXTRAPOLATION_WEIGHTS = lagrange_weights(1.0)
+END_EXTRAPOLATION_WEIGHTS = compute_lagrange_weights(1.0)
 """Weights that extrapolate node values to the end of a mesh interval."""
-MIDDLE_INTEGRATION_WEIGHTS = integration_weights(0.5)
-"""Weights that integrate node values once and twice from the start to the middle of an interval."""
-_DIFFERENTIATION_MATRIX = differentiation_matrix()
+MIDDLE_INTEGRATION_WEIGHTS = compute_integration_weights(0.5)
+"""Weights of node values in the single and double integral from the start to the middle of an
+interval."""
+_DIFFERENTIATION_MATRIX = build_differentiation_matrix()
 INTERVAL_STRETCH_WEIGHTS = GAUSS_NODES[:, None] * _DIFFERENTIATION_MATRIX
-"""Weights of the first derivative of the node values by the relative length of the mesh
-interval.
-"""
+"""First derivative of the node values with respect to the relative length of the mesh interval."""
 INTERVAL_STRETCH_CURVATURE_WEIGHTS = (
     0.5 * (GAUSS_NODES * GAUSS_NODES)[:, None] * (_DIFFERENTIATION_MATRIX @ _DIFFERENTIATION_MATRIX)
 )
-"""Weights of half of the second derivative of the node values by the relative length of the mesh
-interval."""
+"""Half of the second derivative of the node values with respect to the relative interval length."""
 
-COLLOCATION_PHASE_MESHES = PhaseMesh(4, 1.0), PhaseMesh(5, 4.0), PhaseMesh(2, 1.0)
+DEFAULT_COLLOCATION_PHASE_MESHES = PhaseMesh(4, 1.0), PhaseMesh(5, 4.0), PhaseMesh(2, 1.0)
 
 
 @dataclass(frozen=True)
 class CollocationStepOptions:
-    """Options of a step by collocation: amounts of work, and limits of the indicators of
-    accuracy.
-    """
+    """Options of a step by collocation: amounts of work, and limits of the accuracy indicators."""
 
-    phase_meshes: tuple[PhaseMesh, ...] = COLLOCATION_PHASE_MESHES
+    phase_meshes: tuple[PhaseMesh, ...] = DEFAULT_COLLOCATION_PHASE_MESHES
     """Meshes of DLS, SLS-I and SLS-II.
 
-    They are chosen because they are the cheapest of those tried with errors below 1e-8. The errors
-    are the 99th percentile over lanes near their gaits. The cost includes the lanes that the
-    adaptive engine repeats (experiments/speed/engine_benchmark.py)."""
+    The meshes are chosen as the cheapest tested meshes with errors below 1e-8, which is the 99th
+    percentile over lanes near their gaits. The cost includes the lanes that the adaptive engine
+    repeats (experiments/speed/engine_benchmark.py)."""
     n_sweeps_per_interval: int = 3
     """Number of Newton sweeps in each mesh interval except the last one of a phase."""
     n_duration_corrections: int = 2
     """Number of corrections of the duration in the last mesh interval."""
     n_sweeps_per_duration_correction: int = 2
-    """Number of Newton sweeps after each of these corrections."""
+    """Number of Newton sweeps after each correction of the duration."""
     max_expected_duration: float = 10.0
-    """Bound of the expected durations in the wheel's unit of time, chosen because no phase of a
+    """Largest accepted expected duration in the wheel's unit of time, chosen because no phase of a
     gait lasts that long."""
     max_rate_correction: float = 5e-8
-    """Largest accepted `CollocatedPhase.rate_correction`, in the wheel's units of rates."""
+    """Largest accepted `CollocatedPhaseEnd.estimated_rate_correction`, in the wheel's units."""
     max_duration_correction: float = 1e-5
-    """Largest accepted `CollocatedPhase.duration_correction`, in the wheel's unit of time.
+    """Largest accepted `CollocatedPhaseEnd.last_duration_correction`, in the wheel's unit of time.
 
-    The end is extrapolated by the last shift, with an error of half of its square times a rate."""
+    The state at the end is extrapolated by the last correction. The error is half the square of the
+    correction times the rate of an acceleration."""
     max_start_rate_errors: tuple[float, float, float] = (2e-3, 1.2e-1, 8e-5)
-    """Largest accepted `CollocatedPhase.start_rate_error` in DLS, SLS-I and SLS-II.
+    """Largest accepted `CollocatedPhaseEnd.largest_start_rate_error` in DLS, SLS-I and SLS-II.
 
-    The values are chosen because errors are at most the square of a mismatch. One in a hundred
-    lanes near its gait exceeds one of the limits."""
+    The limits are chosen because an error is at most the square of a mismatch. One in a hundred
+    lanes near their gaits exceeds a limit."""
 
 
 COLLOCATION_STEP_OPTIONS = CollocationStepOptions()
 
 
-class CollocatedPhase(NamedTuple):
-    """End of a phase by collocation, with indicators of its accuracy."""
+class CollocatedPhaseEnd(NamedTuple):
+    """State at the end of a phase by collocation, with indicators of the phase's accuracy."""
 
     q: Vector
     v: Vector
-    duration: Array  # s
-    rate_correction: Array  # estimated change of a rate by one more sweep, rad/s and m/s
-    duration_correction: Array  # last correction of the duration, s
-    start_rate_error: Array  # largest error of a rate at the start of an interval
-    lowest_guard: Array  # lowest guard at ends and middles; positive if valid
+    phase_duration: Array  # s
+    estimated_rate_correction: Array  # change of a rate by one more sweep, rad/s and m/s
+    last_duration_correction: Array  # of the duration, s
+    largest_start_rate_error: Array  # over the starts of all intervals
+    lowest_guard_value: Array  # at middles and ends of intervals; positive if valid
 
 
 NodeAccelerations = tuple[Vector, ...]
-"""Accelerations at the nodes of a mesh interval."""
+"""Accelerations at the nodes of a mesh interval, one vector per node."""
 
 
 class _NewtonSweepState(NamedTuple):
     """State of the Newton sweeps of one mesh interval."""
 
-    h: Array
+    interval_length: Array
     node_accelerations: NodeAccelerations
     rate_correction: Array
-    previous_rate_correction: Array  # correction of the previous sweep
+    previous_rate_correction: Array  # of the sweep before the last one
 
 
 class _SolvedMeshInterval(NamedTuple):
-    """Solution of one mesh interval."""
+    """Solution of the collocation equations in one mesh interval."""
 
     newton_sweep_state: _NewtonSweepState
-    end_state: tuple[Vector, Vector]
-    duration_correction: Array  # s
-    start_rate_error: Array
-    nonlinear_accelerations: NodeAccelerations  # part that the linearized equations omit
+    interval_end_state: tuple[Vector, Vector]
+    last_duration_correction: Array  # s
+    largest_start_rate_error: Array
+    nonlinear_accelerations: NodeAccelerations  # the part that the linearized equations omit
 
 
 def solve_phase_by_collocation(
@@ -163,15 +161,16 @@ def solve_phase_by_collocation(
     expected_duration: Array,
     phase_mesh: PhaseMesh,
     options: CollocationStepOptions = COLLOCATION_STEP_OPTIONS,
-) -> CollocatedPhase:
-    """Return the end of a phase that starts from (q, v), at the first guard near the expected
-    duration.
+) -> CollocatedPhaseEnd:
+    """Return the end of a phase that starts from (q, v).
+
+    The phase ends at its first guard, near the expected duration.
     """
-    interval_fractions, zero_scalars = (
+    interval_fractions, zero_indicators = (
         phase_mesh.interval_fractions,
         jnp.zeros_like(expected_duration),
     )
-    # The nonlinear part grows with the squared ratio of successive interval lengths.
+    # The nonlinear part scales with the squared ratio of successive interval lengths.
     nonlinear_growth_factor = float(interval_fractions[-1] / interval_fractions[0]) ** (
         2.0 / max(phase_mesh.n_intervals - 1, 1)
     )
@@ -187,21 +186,23 @@ def solve_phase_by_collocation(
             nonlinear_accelerations,
         ) = interval_carry
         h = interval_fraction * expected_duration
-        solved_interval = _solve_mesh_interval(phase, q, v, h, nonlinear_accelerations, options)
+        solved_mesh_interval = _solve_mesh_interval(
+            phase, q, v, h, nonlinear_accelerations, options
+        )
         interval_lowest_guard, end_guards = _find_lowest_guard(
-            phase, q, v, solved_interval, end_guards, 0
+            phase, q, v, solved_mesh_interval, end_guards, 0
         )
         interval_carry = (
-            *solved_interval.end_state,
+            *solved_mesh_interval.interval_end_state,
             jnp.maximum(
-                rate_correction, _estimate_next_correction(solved_interval.newton_sweep_state)
+                rate_correction, _estimate_next_correction(solved_mesh_interval.newton_sweep_state)
             ),
-            jnp.maximum(start_rate_error, solved_interval.start_rate_error),
+            jnp.maximum(start_rate_error, solved_mesh_interval.largest_start_rate_error),
             jnp.minimum(lowest_guard, interval_lowest_guard),
             end_guards,
             tuple(
                 tuple(nonlinear_growth_factor * x for x in node_acceleration)
-                for node_acceleration in solved_interval.nonlinear_accelerations
+                for node_acceleration in solved_mesh_interval.nonlinear_accelerations
             ),
         )
         return interval_carry, None
@@ -210,11 +211,11 @@ def solve_phase_by_collocation(
     interval_carry = (
         q,
         v,
-        zero_scalars,
-        zero_scalars,
-        zero_scalars + jnp.inf,
+        zero_indicators,
+        zero_indicators,
+        zero_indicators + jnp.inf,
         start_guards,
-        ((zero_scalars,) * len(q),) * N_GAUSS_NODES,
+        ((zero_indicators,) * len(q),) * N_GAUSS_NODES,
     )
     if len(interval_fractions) > 1:
         interval_carry, _ = lax.scan(
@@ -222,32 +223,41 @@ def solve_phase_by_collocation(
             interval_carry,
             jnp.asarray(interval_fractions[:-1], expected_duration.dtype),
         )
-    q, v, rate_correction, start_rate_error, lowest_guard, start_guards, nonlinear_accelerations = (
-        interval_carry
-    )
+    (
+        q,
+        v,
+        estimated_rate_correction,
+        largest_start_rate_error,
+        lowest_guard_value,
+        start_guards,
+        nonlinear_accelerations,
+    ) = interval_carry
     h = float(interval_fractions[-1]) * expected_duration
     last_interval = _solve_mesh_interval(
         phase, q, v, h, nonlinear_accelerations, options, ends_at_event=True
     )
     interval_lowest_guard, _ = _find_lowest_guard(phase, q, v, last_interval, start_guards, 1)
-    return CollocatedPhase(
-        *last_interval.end_state,
-        duration=float(1.0 - interval_fractions[-1]) * expected_duration
-        + last_interval.newton_sweep_state.h
-        + last_interval.duration_correction,
-        rate_correction=jnp.maximum(
-            rate_correction, _estimate_next_correction(last_interval.newton_sweep_state)
+    return CollocatedPhaseEnd(
+        *last_interval.interval_end_state,
+        phase_duration=float(1.0 - interval_fractions[-1]) * expected_duration
+        + last_interval.newton_sweep_state.interval_length
+        + last_interval.last_duration_correction,
+        estimated_rate_correction=jnp.maximum(
+            estimated_rate_correction, _estimate_next_correction(last_interval.newton_sweep_state)
         ),
-        duration_correction=jnp.abs(last_interval.duration_correction),
-        start_rate_error=jnp.maximum(start_rate_error, last_interval.start_rate_error),
-        lowest_guard=jnp.minimum(
-            jnp.minimum(lowest_guard, interval_lowest_guard), last_interval.newton_sweep_state.h
+        last_duration_correction=jnp.abs(last_interval.last_duration_correction),
+        largest_start_rate_error=jnp.maximum(
+            largest_start_rate_error, last_interval.largest_start_rate_error
+        ),
+        lowest_guard_value=jnp.minimum(
+            jnp.minimum(lowest_guard_value, interval_lowest_guard),
+            last_interval.newton_sweep_state.interval_length,
         ),
     )
 
 
 def _estimate_next_correction(newton_sweep_state: _NewtonSweepState) -> Array:
-    """Return the estimated correction of one more sweep, extrapolated from the last two sweeps."""
+    """Return the estimated correction by one more sweep, extrapolated from the last two sweeps."""
     correction_ratio = newton_sweep_state.rate_correction / jnp.maximum(
         newton_sweep_state.previous_rate_correction, 1e-300
     )
@@ -257,7 +267,7 @@ def _estimate_next_correction(newton_sweep_state: _NewtonSweepState) -> Array:
 def _sum_weighted_accelerations(
     node_weights: np.ndarray, node_accelerations: NodeAccelerations, coordinate_index: int
 ) -> Any:
-    """Return the weighted sum of one coordinate's accelerations over the nodes."""
+    """Return the weighted sum of one coordinate's accelerations over all nodes."""
     return sum(
         float(node_weight) * node_acceleration[coordinate_index]
         for node_weight, node_acceleration in zip(node_weights, node_accelerations, strict=True)
@@ -285,7 +295,7 @@ def _compute_interval_end_state(
 def _compute_node_state(
     node_index: int, q: Vector, v: Vector, h: Array, node_accelerations: NodeAccelerations
 ) -> tuple:
-    """Return coordinates and rates at a node of a mesh interval."""
+    """Return coordinates and rates at one node of a mesh interval."""
     n, node_fraction = range(len(q)), float(GAUSS_NODES[node_index])
     return (
         tuple(
@@ -319,10 +329,11 @@ def _solve_mesh_interval(
 ) -> _SolvedMeshInterval:
     """Return the solution of one mesh interval by Newton sweeps.
 
-    If the interval ends at an event, its length is also an unknown. The Jacobian is taken at the
-    middle of the interval, and each sweep gains some two digits. The sweeps start from the solution
-    of the equations linearized at the middle, plus `nonlinear_accelerations` of the previous
-    interval. If the length changes, the nodes move along the polynomial through their values.
+    If the interval ends at an event, its length is an additional unknown. The Jacobian is taken at
+    the middle of the interval, and each sweep gains about two digits. The sweeps start from the
+    solution of the equations linearized at the middle, plus the `nonlinear_accelerations` of the
+    previous interval. If the length changes, the node accelerations change along the polynomial
+    through their values.
     """
     n_dof = len(q)
     start_acceleration = phase.solve_acceleration(phase.compute_motion(q, v))[:n_dof]
@@ -340,7 +351,7 @@ def _solve_mesh_interval(
         _invert_stage_matrix(
             complex(gauss_eigenvalue), h, residual_by_q, residual_by_v, residual_by_a
         )
-        for gauss_eigenvalue in GAUSS_EIGENVALUES
+        for gauss_eigenvalue in INTEGRATION_MATRIX_EIGENVALUES
     ]
 
     def correct_from_projections(
@@ -368,14 +379,18 @@ def _solve_mesh_interval(
         node_residuals = []
         for node_index in range(N_GAUSS_NODES):
             Q, V = _compute_node_state(
-                node_index, q, v, newton_sweep_state.h, newton_sweep_state.node_accelerations
+                node_index,
+                q,
+                v,
+                newton_sweep_state.interval_length,
+                newton_sweep_state.node_accelerations,
             )
             node_residuals.append(
                 phase.compute_dynamics_residual(
                     phase.compute_motion(Q, V), newton_sweep_state.node_accelerations[node_index]
                 )
             )
-        # The sign of the projections is that of a correction.
+        # The projections have the sign of a correction.
         residual_projections = [
             [
                 (
@@ -391,10 +406,12 @@ def _solve_mesh_interval(
             for eigenvector_weights in EIGENVECTOR_PROJECTION_MATRIX
         ]
         node_accelerations, largest_rate_correction = correct_from_projections(
-            newton_sweep_state.node_accelerations, newton_sweep_state.h, residual_projections
+            newton_sweep_state.node_accelerations,
+            newton_sweep_state.interval_length,
+            residual_projections,
         )
         return _NewtonSweepState(
-            newton_sweep_state.h,
+            newton_sweep_state.interval_length,
             node_accelerations,
             largest_rate_correction,
             newton_sweep_state.rate_correction,
@@ -405,25 +422,30 @@ def _solve_mesh_interval(
         return phase.compute_end_guard(phase_instant), phase_instant.acceleration[: phase.n_dof]
 
     def compute_time_to_event(newton_sweep_state: _NewtonSweepState) -> Array:
-        """Return the time from the interval's end to the event, by Newton's method, s."""
+        """Return Newton's estimate of the time from the end of the interval to the event, s."""
         end_q, end_v = _compute_interval_end_state(
-            q, v, newton_sweep_state.h, newton_sweep_state.node_accelerations
+            q, v, newton_sweep_state.interval_length, newton_sweep_state.node_accelerations
         )
         _, end_acceleration = evaluate_event_guard(end_q, end_v)
         (guard_value, _), (guard_rate, _) = jax.jvp(
             evaluate_event_guard, (end_q, end_v), (end_v, end_acceleration)
         )
         time_to_event = -guard_value / jnp.where(guard_rate < 0.0, guard_rate, -jnp.inf)
-        return jnp.clip(time_to_event, -0.5 * newton_sweep_state.h, 0.5 * newton_sweep_state.h)
+        return jnp.clip(
+            time_to_event,
+            -0.5 * newton_sweep_state.interval_length,
+            0.5 * newton_sweep_state.interval_length,
+        )
 
     def correct_interval_duration(
         sweep_state_and_correction: tuple[_NewtonSweepState, Array], _: None
     ) -> tuple[tuple[_NewtonSweepState, Array], None]:
         newton_sweep_state, duration_correction = sweep_state_and_correction
         newton_sweep_state = newton_sweep_state._replace(
-            h=newton_sweep_state.h + duration_correction,
+            interval_length=newton_sweep_state.interval_length + duration_correction,
             node_accelerations=_stretch_node_accelerations(
-                newton_sweep_state.node_accelerations, duration_correction / newton_sweep_state.h
+                newton_sweep_state.node_accelerations,
+                duration_correction / newton_sweep_state.interval_length,
             ),
         )
         newton_sweep_state, _ = lax.scan(
@@ -468,10 +490,13 @@ def _solve_mesh_interval(
         )
         for d in coordinate_indices
     ]
-    start_rate_error = newton_sweep_state.h * functools.reduce(jnp.maximum, start_rate_errors)
-    # The end is extrapolated by the last shift, whose square is negligible.
+    start_rate_error = newton_sweep_state.interval_length * functools.reduce(
+        jnp.maximum, start_rate_errors
+    )
+    # The end state is extrapolated by the last correction of the duration, whose square is
+    # negligible.
     Q, V = _compute_interval_end_state(
-        q, v, newton_sweep_state.h, newton_sweep_state.node_accelerations
+        q, v, newton_sweep_state.interval_length, newton_sweep_state.node_accelerations
     )
     end_state = (
         tuple(Q[d] + duration_correction * V[d] for d in coordinate_indices),
@@ -495,13 +520,11 @@ def _solve_mesh_interval(
 
 def _add_node_accelerations(
     node_accelerations: NodeAccelerations,
-    other_accelerations: NodeAccelerations,
+    added_accelerations: NodeAccelerations,
     acceleration_factor: float,
 ) -> NodeAccelerations:
-    """Return the first accelerations plus `acceleration_factor` times the second ones, node by
-    node.
-    """
-    node_pairs = zip(node_accelerations, other_accelerations, strict=True)
+    """Return the first node accelerations plus `acceleration_factor` times the second ones."""
+    node_pairs = zip(node_accelerations, added_accelerations, strict=True)
     return tuple(
         tuple(x + acceleration_factor * y for x, y in zip(*node_pair, strict=True))
         for node_pair in node_pairs
@@ -511,7 +534,7 @@ def _add_node_accelerations(
 def _stretch_node_accelerations(
     node_accelerations: NodeAccelerations, relative_length_change: Array
 ) -> NodeAccelerations:
-    """Return the node accelerations of an interval whose length changes by a small fraction."""
+    """Return the node accelerations after a small relative change of the interval's length."""
     coordinate_indices = range(len(node_accelerations[0]))
     return tuple(
         tuple(
@@ -535,11 +558,12 @@ def _stretch_node_accelerations(
 
 
 def _linearize_dynamics_residual(phase: AbstractPhase, q: Vector, v: Vector, a: Vector) -> tuple:
-    """Return the residual, and the columns of its derivatives with respect to q, v and a."""
+    """Return the residual of the equations of motion, and its derivatives by q, v and a, as
+    columns."""
     n = len(q)
 
-    def evaluate_dynamics_residual(*arguments: Array) -> Vector:
-        q, v, a = (arguments[i * n : (i + 1) * n] for i in range(3))
+    def evaluate_dynamics_residual(*residual_arguments: Array) -> Vector:
+        q, v, a = (residual_arguments[i * n : (i + 1) * n] for i in range(3))
         return phase.compute_dynamics_residual(phase.compute_motion(q, v), a)
 
     dynamics_residual, partial_derivative_rows = evaluate_with_partials(
@@ -553,20 +577,20 @@ ComplexNumberPair = tuple[Array, Array]
 
 
 def _multiply_complex_pairs(x: ComplexNumberPair, y: ComplexNumberPair) -> ComplexNumberPair:
-    """Return the product of two complex numbers."""
+    """Return the product of two complex numbers, each a pair of real and imaginary part."""
     return x[0] * y[0] - x[1] * y[1], x[0] * y[1] + x[1] * y[0]
 
 
 def _subtract_complex_pairs(x: ComplexNumberPair, y: ComplexNumberPair) -> ComplexNumberPair:
-    """Return the difference of two complex numbers."""
+    """Return the difference of two complex numbers, each a pair of real and imaginary part."""
     return x[0] - y[0], x[1] - y[1]
 
 
 def _add_complex_pairs(complex_numbers: Sequence[ComplexNumberPair]) -> ComplexNumberPair:
-    """Return the sum of complex numbers."""
-    first_number, *other_numbers = complex_numbers
-    real_part, imaginary_part = first_number
-    for complex_number in other_numbers:
+    """Return the sum of complex numbers, each a pair of real and imaginary part."""
+    first_complex_number, *other_complex_numbers = complex_numbers
+    real_part, imaginary_part = first_complex_number
+    for complex_number in other_complex_numbers:
         real_part, imaginary_part = (
             real_part + complex_number[0],
             imaginary_part + complex_number[1],
@@ -575,15 +599,15 @@ def _add_complex_pairs(complex_numbers: Sequence[ComplexNumberPair]) -> ComplexN
 
 
 def _invert_stage_matrix(
-    eigenvalue: complex, h: Array, residual_by_q: Any, residual_by_v: Any, residual_by_a: Any
+    gauss_eigenvalue: complex, h: Array, residual_by_q: Any, residual_by_v: Any, residual_by_a: Any
 ) -> Any:
     """Return the inverse of the complex stage matrix A + h e V + (h e)^2 Q.
 
-    Here e is the eigenvalue. A, V and Q are the derivatives of the residual by accelerations, rates
-    and coordinates.
+    Here e is the eigenvalue, and A, V and Q are the derivatives of the residual with respect to
+    accelerations, rates and coordinates.
     """
-    n, squared_eigenvalue = len(residual_by_q), eigenvalue * eigenvalue
-    scaled_eigenvalue = (h * eigenvalue.real, h * eigenvalue.imag)
+    n, squared_eigenvalue = len(residual_by_q), gauss_eigenvalue * gauss_eigenvalue
+    scaled_eigenvalue = (h * gauss_eigenvalue.real, h * gauss_eigenvalue.imag)
     scaled_squared_eigenvalue = (h * h * squared_eigenvalue.real, h * h * squared_eigenvalue.imag)
     stage_matrix: list[list[ComplexNumberPair]] = [
         [
@@ -598,10 +622,15 @@ def _invert_stage_matrix(
         ]
         for i in range(n)
     ]
-    adjugate_matrix, determinant = _compute_adjugate_and_determinant(stage_matrix)
+    adjugate_matrix, stage_determinant = _compute_adjugate_and_determinant(stage_matrix)
 
-    squared_modulus = determinant[0] * determinant[0] + determinant[1] * determinant[1]
-    inverse_determinant = (determinant[0] / squared_modulus, -determinant[1] / squared_modulus)
+    squared_modulus = (
+        stage_determinant[0] * stage_determinant[0] + stage_determinant[1] * stage_determinant[1]
+    )
+    inverse_determinant = (
+        stage_determinant[0] / squared_modulus,
+        -stage_determinant[1] / squared_modulus,
+    )
     return [
         [_multiply_complex_pairs(inverse_determinant, matrix_entry) for matrix_entry in matrix_row]
         for matrix_row in adjugate_matrix
@@ -611,7 +640,7 @@ def _invert_stage_matrix(
 def _compute_adjugate_and_determinant(
     complex_matrix: list[list[ComplexNumberPair]],
 ) -> tuple[Any, ComplexNumberPair]:
-    """Return the adjugate and the determinant of a complex matrix of one to three rows."""
+    """Return the adjugate and the determinant of a complex matrix of size one to three."""
     n = len(complex_matrix)
     if n == 1:
         complex_one = (
@@ -647,11 +676,11 @@ def _compute_adjugate_and_determinant(
 def _project_linearized_residuals(
     middle_residual: Vector, residual_by_q: Any, residual_by_v: Any, v: Vector, a: Vector, h: Array
 ) -> list[list[ComplexNumberPair]]:
-    """Return the projections of the nodes' residuals onto all eigenvectors, with the sign of a
-    correction.
+    """Return the projections of the nodes' residuals onto all eigenvectors, with a correction's
+    sign.
 
-    The residuals are those of accelerations `a` in the equations linearized about the middle of the
-    interval.
+    The residuals are those of constant accelerations `a` in the equations that are linearized about
+    the middle of the interval.
     """
     n = range(len(v))
     multiply_by_columns = lambda derivative_columns, x: tuple(
@@ -695,9 +724,7 @@ def _correct_node_accelerations(
     eigenvector_corrections: list[list[ComplexNumberPair]],
     h: Array,
 ) -> tuple[NodeAccelerations, Array]:
-    """Return the corrected node accelerations, and the largest change of a rate that the correction
-    causes.
-    """
+    """Return the corrected node accelerations, and the largest resulting change of a rate."""
     corrected_accelerations, largest_acceleration_change = [], jnp.zeros_like(h)
     for node_index in range(N_GAUSS_NODES):
         corrected_node_acceleration = []
@@ -723,19 +750,20 @@ def _find_lowest_guard(
     phase: AbstractPhase,
     q: Vector,
     v: Vector,
-    solved_interval: _SolvedMeshInterval,
+    solved_mesh_interval: _SolvedMeshInterval,
     start_guards: Vector,
     n_event_guards: int,
 ) -> tuple[Array, Vector]:
-    """Return the smallest guard at the interval's middle and end, and all guards at the end.
+    """Return the lowest guard at the middle and end of an interval, and all guards at the end.
 
-    The smallest guard is -1 if a guard may be negative between start, middle and end. Between these
-    points, a guard may be lower by a quarter of its second difference.
+    Between start, middle and end a guard may be lower than at these points, by a quarter of its
+    second difference. If a guard may be negative there, the lowest guard is -1.
 
-    - `start_guards`: guards at the start;
-    - `n_event_guards`: 1 in the last interval, whose first guard is the event and zero at the end.
+    - `start_guards`: guards at the start of the interval;
+    - `n_event_guards`: 1 in the last interval, whose first guard is the event and zero at the end;
+      otherwise 0.
     """
-    newton_sweep_state, coordinate_indices = solved_interval.newton_sweep_state, range(len(q))
+    newton_sweep_state, coordinate_indices = solved_mesh_interval.newton_sweep_state, range(len(q))
     middle_acceleration = tuple(
         _sum_weighted_accelerations(
             MIDDLE_INTERPOLATION_WEIGHTS, newton_sweep_state.node_accelerations, i
@@ -757,17 +785,22 @@ def _find_lowest_guard(
     )
     interval_middle_state = (
         tuple(
-            q[i] + newton_sweep_state.h * (0.5 * v[i] + newton_sweep_state.h * position_integral[i])
+            q[i]
+            + newton_sweep_state.interval_length
+            * (0.5 * v[i] + newton_sweep_state.interval_length * position_integral[i])
             for i in coordinate_indices
         ),
-        tuple(v[i] + newton_sweep_state.h * velocity_integral[i] for i in coordinate_indices),
+        tuple(
+            v[i] + newton_sweep_state.interval_length * velocity_integral[i]
+            for i in coordinate_indices
+        ),
     )
     evaluate_phase_guards = lambda q, v, a: phase.compute_guards(
         PhaseInstant(phase, phase.compute_motion(q, v), a)
     )
     middle_guards = evaluate_phase_guards(*interval_middle_state, middle_acceleration)
-    end_guards = evaluate_phase_guards(*solved_interval.end_state, end_acceleration)
-    lowest_guard_of_all = jnp.full_like(newton_sweep_state.h, jnp.inf)
+    end_guards = evaluate_phase_guards(*solved_mesh_interval.interval_end_state, end_acceleration)
+    lowest_guard_of_all = jnp.full_like(newton_sweep_state.interval_length, jnp.inf)
     for i, (start_guard_value, middle_guard_value, end_guard_value) in enumerate(
         zip(start_guards, middle_guards, end_guards, strict=True)
     ):
@@ -785,11 +818,11 @@ def _find_lowest_guard(
 
 
 class CollocationStep(NamedTuple):
-    """Result of one gait step of a block of lanes, and whether each lane passes the checks."""
+    """Result of one gait step of a block of lanes."""
 
     section_state: Vector  # (theta-, dtheta-, dL1-), three arrays
-    durations: Vector  # of DLS, SLS-I, SLS-II, s
-    is_trusted: Bool[Array, " lanes"]
+    phase_durations: Vector  # of DLS, SLS-I, SLS-II, s
+    is_trusted: Bool[Array, " lanes"]  # whether the lane passes all checks
 
 
 def take_collocation_step(
@@ -799,13 +832,12 @@ def take_collocation_step(
     stop_at_lift_off: bool,
     options: CollocationStepOptions = COLLOCATION_STEP_OPTIONS,
 ) -> CollocationStep:
-    """Return one gait step of every lane, near the expected durations of DLS, SLS-I and
-    SLS-II (s).
+    """Return one gait step of every lane, near the expected durations of DLS, SLS-I and SLS-II (s).
 
-    It is computed in the wheel's units, in which the limits of `options` hold.
+    The step is computed in units of the wheel, to which the limits of `options` refer.
     """
-    is_valid_lane = is_valid_start_state(params, x)
-    params, x = replace_invalid_inputs(is_valid_lane, params, x, PAPER_START_STATE)
+    is_lane_valid = is_valid_start_state(params, x)
+    params, x = replace_invalid_inputs(is_lane_valid, params, x, PAPER_START_STATE)
     wheel_units = compute_wheel_units(params.symbols())
     state_units: tuple[Any, ...] = (1.0, wheel_units.rate_unit, wheel_units.velocity_unit)
     params = convert_to_wheel_units(params)
@@ -817,41 +849,47 @@ def take_collocation_step(
         (expected_duration > 0.0) & (expected_duration < options.max_expected_duration)
         for expected_duration in expected_durations
     ]
-    is_valid_lane = functools.reduce(operator.and_, has_valid_duration, is_valid_lane)
+    is_lane_valid = functools.reduce(operator.and_, has_valid_duration, is_lane_valid)
     expected_durations = tuple(
-        jnp.where(is_valid_lane, expected_duration, 0.1) for expected_duration in expected_durations
+        jnp.where(is_lane_valid, expected_duration, 0.1) for expected_duration in expected_durations
     )
     s = params.symbols()
     landing_result = transitions.resolve_landing(s, *x)
-    is_trusted = is_valid_lane & landing_result.is_rear_foot_planted
+    is_trusted = is_lane_valid & landing_result.is_rear_foot_planted
     wheel_angle, wheel_motion = landing_result.theta_after, landing_result.motion_after
-    phases = make_phases(s, landing_result.foot_distance, stop_at_lift_off)
+    step_phases = make_phases(s, landing_result.foot_distance, stop_at_lift_off)
     phase_durations = []
-    for phase, expected_duration, phase_mesh, max_start_rate_error in zip(
-        phases, expected_durations, options.phase_meshes, options.max_start_rate_errors, strict=True
+    for collocated_phase, expected_duration, phase_mesh, max_start_rate_error in zip(
+        step_phases,
+        expected_durations,
+        options.phase_meshes,
+        options.max_start_rate_errors,
+        strict=True,
     ):
-        phase_start_state = phase.select_coordinates(wheel_angle, wheel_motion)
+        phase_start_state = collocated_phase.select_coordinates(wheel_angle, wheel_motion)
         phase_end = solve_phase_by_collocation(
-            phase, *phase_start_state, expected_duration, phase_mesh, options
+            collocated_phase, *phase_start_state, expected_duration, phase_mesh, options
         )
         is_trusted = (
             is_trusted
-            & (phase_end.rate_correction <= options.max_rate_correction)
-            & (phase_end.duration_correction <= options.max_duration_correction)
-            & (phase_end.start_rate_error <= max_start_rate_error)
-            & (phase_end.lowest_guard > 0.0)
+            & (phase_end.estimated_rate_correction <= options.max_rate_correction)
+            & (phase_end.last_duration_correction <= options.max_duration_correction)
+            & (phase_end.largest_start_rate_error <= max_start_rate_error)
+            & (phase_end.lowest_guard_value > 0.0)
         )
         wheel_angle, wheel_motion = (
             phase_end.q[0],
-            phase.reset_motion(phase.compute_motion(phase_end.q, phase_end.v)),
+            collocated_phase.reset_motion(
+                collocated_phase.compute_motion(phase_end.q, phase_end.v)
+            ),
         )
-        phase_durations.append(phase_end.duration)
+        phase_durations.append(phase_end.phase_duration)
 
-    def convert_trusted_to_si(lane_arrays: Iterable[Array], units: Iterable[Any]) -> Vector:
-        """Return values of every lane in SI; zeros for lanes that are not trusted."""
+    def convert_trusted_to_si(lane_arrays: Iterable[Array], si_units: Iterable[Any]) -> Vector:
+        """Return the arrays in SI units, with zeros in lanes that are not trusted."""
         return tuple(
-            jnp.where(is_trusted, lane_array * unit, 0.0)
-            for lane_array, unit in zip(lane_arrays, units, strict=True)
+            jnp.where(is_trusted, lane_array * si_unit, 0.0)
+            for lane_array, si_unit in zip(lane_arrays, si_units, strict=True)
         )
 
     return CollocationStep(

@@ -1,4 +1,4 @@
-"""Steps of batches with unilateral contact, by machine code."""
+"""Gait steps of batches with unilateral contact, by machine code."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -19,13 +19,15 @@ from vrw_jax.wheel import PARAMETER_NAMES
 
 CONTACT_PARAMETER_NAMES = (*PARAMETER_NAMES, "friction")
 UNEVEN_GROUND_PARAMETER_NAMES = ("previous_friction", "tilt")
-"""Parameters that uneven ground adds: friction of the feet that landed earlier, and the angle by
-which the next line is steeper, rad."""
+"""Additional parameters of a step on uneven ground.
+
+They are the friction of the feet that landed earlier, and the increase of the slope from this line
+to the next line, rad.
+"""
 CONTACT_SLOPE_INDEX = CONTACT_PARAMETER_NAMES.index("slope")
 CONTACT_FRICTION_INDEX = CONTACT_PARAMETER_NAMES.index("friction")
 CONTACT_STEP_INPUT_NAMES = (START_INPUT_NAME, *CONTACT_PARAMETER_NAMES)
-"""Names of the inputs of a step with unilateral contact with respect to which derivatives are
-available."""
+"""Names of the inputs of a step with unilateral contact for which derivatives are available."""
 
 
 def step_batch_with_contact(
@@ -34,20 +36,20 @@ def step_batch_with_contact(
     section_states: np.ndarray,
     n_steps: int,
     options: StepOptions,
-    engine: str,
+    requested_engine: str,
     n_legs: int,
     derivative_names: Sequence[str],
 ) -> StepBatchResult:
     """Return the result of `step_batch` with unilateral contact.
 
-    Without derivatives, all steps of an element on flat ground are one walk of the kernel.
+    Without derivatives, all steps of an element on flat ground are one call of the kernel.
     """
     element_friction = np.asarray(model.friction, section_states.dtype)
     is_uneven = any(np.ndim(x) == 2 for x in (*parameter_columns, element_friction))
-    if engine not in ("auto", "lanes") or load_explicit_tableau(options.solver) is None:
+    if requested_engine not in ("auto", "lanes") or load_explicit_tableau(options.solver) is None:
         raise ValueError(
-            f"engine is {engine!r} and solver {options.solver}, but batches with contact need "
-            "'lanes' and an explicit Runge-Kutta solver: map vrw.walk over the wheels."
+            f"engine is {requested_engine!r} and solver {options.solver}, but batches with contact "
+            "need 'lanes' and an explicit Runge-Kutta solver: map vrw.walk over the wheels."
         )
     if np.ndim(model.restitution):
         raise ValueError(
@@ -61,23 +63,25 @@ def step_batch_with_contact(
         stepwise_ground.slopes_by_step[0] if i == CONTACT_SLOPE_INDEX else x
         for i, x in enumerate(parameter_columns)
     ]
-    parameter_rows = np.stack(
+    parameter_matrix = np.stack(
         [
             np.broadcast_to(x, len(section_states))
             for x in (*parameter_columns, stepwise_ground.friction_by_step[0])
         ]
     )
-    section_states = embed_section_states(parameter_rows, section_states, n_legs)
+    section_states = embed_section_states(parameter_matrix, section_states, n_legs)
     integer_zeros = np.zeros(len(section_states), np.int32)
     if not derivative_names and not is_uneven:
         kernel_walk_result = walk_batch(
-            parameter_rows, section_states, n_steps, model, options, n_legs
+            parameter_matrix, section_states, n_steps, model, options, n_legs
         )
-        x, durations, outcome, n_stepped, n_solver_steps, _ = map(np.asarray, kernel_walk_result)
+        x, phase_durations, outcomes, n_stepped, n_solver_steps, _ = map(
+            np.asarray, kernel_walk_result
+        )
         result_arrays = (
             x,
-            durations,
-            outcome,
+            phase_durations,
+            outcomes,
             n_stepped,
             n_solver_steps,
             integer_zeros > 0,
@@ -93,14 +97,16 @@ def step_batch_with_contact(
         section_states.T.copy(), derivative_names, parameter_names, stepwise_parameters
     )
     for k in range(n_steps):
-        active_lanes = active_walks.find_active_lanes()
+        active_lanes = active_walks.find_walking_lanes()
         if not len(active_lanes):
             break
-        parameter_rows = (
-            stepwise_ground.make_step_parameters(k, parameter_rows) if is_uneven else parameter_rows
+        parameter_matrix = (
+            stepwise_ground.make_step_parameters(k, parameter_matrix)
+            if is_uneven
+            else parameter_matrix
         )
         step_arguments = (
-            parameter_rows[:, active_lanes],
+            parameter_matrix[:, active_lanes],
             active_walks.section_state[:, active_lanes].T,
             model,
             options,
@@ -110,25 +116,27 @@ def step_batch_with_contact(
             kernel_walk_result = walk_batch(
                 step_arguments[0], step_arguments[1], 1, *step_arguments[2:]
             )
-            x, durations, outcome, _, n_solver_steps, _ = map(np.asarray, kernel_walk_result)
-            active_walks.record_lane_steps(
+            x, phase_durations, outcomes, _, n_solver_steps, _ = map(np.asarray, kernel_walk_result)
+            active_walks.store_lane_steps(
                 active_lanes,
-                (x.T, durations.T, outcome, n_solver_steps),
+                (x.T, phase_durations.T, outcomes, n_solver_steps),
                 integer_zeros[active_lanes] > 0,
             )
             continue
         contact_step_result, step_jacobian = step_batch_with_jacobian(
             *step_arguments, active_walks.input_indices
         )
-        full_jacobian = np.concatenate([step_jacobian.section_state, step_jacobian.durations], 1)
-        input_jacobian = full_jacobian[:, :, list(active_walks.input_indices)]
+        complete_step_jacobian = np.concatenate(
+            [step_jacobian.section_state, step_jacobian.durations], 1
+        )
+        input_jacobian = complete_step_jacobian[:, :, list(active_walks.input_indices)]
         step_values = (
             contact_step_result.section_state,
             contact_step_result.durations,
             contact_step_result.outcome,
             contact_step_result.solver_steps,
         )
-        active_walks.record_lane_steps(
+        active_walks.store_lane_steps(
             active_lanes,
             tuple(np.asarray(x).T for x in (*step_values, input_jacobian)),
             integer_zeros[active_lanes] > 0,
@@ -139,18 +147,18 @@ def step_batch_with_contact(
 
 
 class _StepwiseGround(NamedTuple):
-    """Slope and friction of the ground of each step."""
+    """Slope and friction of the ground for each step."""
 
     slopes_by_step: np.ndarray  # (n_steps + 1, elements), rad
     friction_by_step: np.ndarray  # (n_steps, elements)
-    n_given_slopes: int | None  # number of given slopes of an element; None without steps
+    n_given_slopes: int | None  # per element; None if slopes do not vary over steps
     n_given_frictions: int | None
 
     @classmethod
     def repeat_over_steps(
         cls, element_slopes: np.ndarray, element_friction: np.ndarray, n_elements: int, n_steps: int
     ) -> "_StepwiseGround":
-        """Return the ground, with scalars and arrays over the batch repeated for each step."""
+        """Return the ground of all steps, from values with or without axes over steps and batch."""
         n_given_values = (
             x.shape[1] if x.ndim == 2 else None for x in (element_slopes, element_friction)
         )
@@ -169,24 +177,29 @@ class _StepwiseGround(NamedTuple):
             *n_given_values,
         )
 
-    def make_step_parameters(self, k: int, parameter_rows: np.ndarray) -> np.ndarray:
-        """Return the parameters of step k, including `UNEVEN_GROUND_PARAMETER_NAMES`, shape
-        (parameters, elements)."""
-        parameter_rows = np.concatenate(
-            [parameter_rows[: len(CONTACT_PARAMETER_NAMES)], np.empty((2, parameter_rows.shape[1]))]
+    def make_step_parameters(self, k: int, parameter_matrix: np.ndarray) -> np.ndarray:
+        """Return the parameters of step k, shape (parameters, elements).
+
+        The last ones are `UNEVEN_GROUND_PARAMETER_NAMES`.
+        """
+        parameter_matrix = np.concatenate(
+            [
+                parameter_matrix[: len(CONTACT_PARAMETER_NAMES)],
+                np.empty((2, parameter_matrix.shape[1])),
+            ]
         )
-        parameter_rows[CONTACT_SLOPE_INDEX], parameter_rows[CONTACT_FRICTION_INDEX] = (
+        parameter_matrix[CONTACT_SLOPE_INDEX], parameter_matrix[CONTACT_FRICTION_INDEX] = (
             self.slopes_by_step[k],
             self.friction_by_step[k],
         )
-        parameter_rows[-2:] = (
+        parameter_matrix[-2:] = (
             self.friction_by_step[max(k - 1, 0)],
             self.slopes_by_step[k + 1] - self.slopes_by_step[k],
         )
-        return parameter_rows
+        return parameter_matrix
 
     def make_stepwise_parameters(self) -> dict[str, StepwiseParameter]:
-        """Return the roles of slopes and friction in the chain rule over steps, by name."""
+        """Return the roles of slope and friction in the chain rule over steps, by name."""
         previous_friction_index = len(CONTACT_PARAMETER_NAMES)
         tilt_index = previous_friction_index + 1
         n_given_slopes, n_given_frictions = self.n_given_slopes, self.n_given_frictions

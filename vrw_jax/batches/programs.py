@@ -1,4 +1,4 @@
-"""Compiled functions of lanes on numpy arrays: machine code, or XLA programs for blocks of
+"""Compiled functions of lanes for NumPy arrays: machine code, or XLA programs for blocks of
 lanes.
 """
 
@@ -14,14 +14,14 @@ from vrw_jax.numerics import batch_sizes
 from vrw_jax.runtime import compile_cached_lane_program
 
 STRAGGLER_COUNT_DIVISOR = 8
-"""Inverse fraction of running lanes below which an XLA program stops.
+"""Inverse of the fraction of running lanes below which an XLA program stops.
 
-The unfinished lanes of all blocks are then run again together. The value is chosen because a block
-with fewer running lanes wastes most of its work.
+The unfinished lanes of all blocks then run again together. The value is chosen because a block with
+fewer running lanes wastes most of its work.
 """
 
 _compiled_lane_programs: dict[Any, Callable] = {}
-"""Compiled functions of lanes by all settings on which their traces depend."""
+"""Compiled functions of lanes, by all settings on which their traces depend."""
 
 
 def run_compiled_lane_function(
@@ -31,12 +31,11 @@ def run_compiled_lane_function(
     cache_key: Any,
     register_limits: simd.RegisterLimits = simd.DEFAULT_REGISTER_LIMITS,
 ) -> list[np.ndarray]:
-    """Return the results of `lane_function(scalars, lanes, straggler_count)`, computed by compiled
-    code.
+    """Return the results of `lane_function(scalars, lanes, straggler_count)` by compiled code.
 
     The first result of `lane_function` marks unfinished lanes.
 
-    - `cache_key`: all settings on which `lane_function` depends, except its arguments.
+    - `cache_key`: all settings on which `lane_function` depends, besides its arguments.
     """
     lane_dtype, uses_machine_code = lane_arrays[0].dtype, simd.is_machine_code_available()
     block_size = batch_sizes.XLA_LANE_BATCH_SIZE
@@ -67,7 +66,7 @@ def _run_xla_program_by_blocks(
 ) -> list[np.ndarray]:
     """Return the results of an XLA program that runs for one block of lanes after another.
 
-    The unfinished lanes of all blocks are run again together.
+    The unfinished lanes of all blocks run again together.
     """
     result_arrays: list[np.ndarray] = []
     unfinished_lanes = np.arange(len(lane_arrays[0]))

@@ -1,4 +1,4 @@
-"""Selection of the cheapest solver for a wheel from the stiffness of its airborne leg."""
+"""Selection of the cheapest solver for each wheel, from the stiffness of its airborne leg."""
 
 import functools
 from dataclasses import dataclass
@@ -14,31 +14,32 @@ from vrw_jax.wheel import PARAMETER_NAMES
 class SolverIndex(IntEnum):
     """Index of a solver in `StepBatchResult.solver_names`."""
 
-    REQUESTED_SOLVER = 0  # solver of the step options
-    STABLE_SOLVER = 1  # explicit solver if stability limits the steps
-    IMPLICIT_SOLVER = 2  # solver for wheels that are too stiff for explicit solvers
+    REQUESTED_SOLVER = 0  # of the step options
+    STABLE_SOLVER = 1  # explicit, for steps that stability limits
+    IMPLICIT_SOLVER = 2  # for wheels that are too stiff for explicit solvers
 
 
 @dataclass(frozen=True)
 class SolverSelectionOptions:
-    """Solvers for stiff wheels, and the costs that `select_cheapest_solver` compares."""
+    """Solvers for stiff wheels, and the cost that `select_cheapest_solver` assumes."""
 
     stable_solver: SolverName = "Tsit5"
-    """Explicit solver for steps that are limited by stability.
+    """Explicit solver for steps that stability limits.
 
-    The value is chosen because of diffrax's solvers of order 5 and more it has the largest stable
-    step per evaluation. That step is 0.58 over the mode's rate, against 0.40 for Dopri8."""
+    Tsit5 is chosen because it has the largest stable step per evaluation among diffrax's solvers of
+    order 5 and more. That step is 0.58 over the mode's rate, and 0.40 for Dopri8."""
     stable_solver_tightening_factor: float = 4.0
     """Factor by which the tolerance of the stable solver is tightened.
 
-    The value is chosen because the tighter tolerance costs little. At tolerances of 1e-6 and below,
-    the error is then no larger than that of Dopri8."""
+    The factor is chosen because the tighter tolerance costs little, and because the error is then
+    at most that of Dopri8 at tolerances of 1e-6 and below.
+    """
     implicit_solver: SolverName = "Kvaerno5"
     """Solver for wheels that are too stiff for explicit solvers."""
     implicit_solver_cost_evaluations: float = 6e4
     """Cost of the implicit solver at a tolerance of 1e-6, in evaluations of an explicit solver.
 
-    The cost was measured (docs/verification/failures.md). It grows as the tolerance to the power of
+    The cost was measured (docs/verification/failures.md) and grows as the tolerance to the power of
     -0.17. The cost of explicit solvers at the limit of stability does not depend on the tolerance.
     """
 
@@ -47,31 +48,32 @@ SOLVER_SELECTION_OPTIONS = SolverSelectionOptions()
 
 
 def select_cheapest_solver(
-    parameter_rows: np.ndarray,
+    parameter_matrix: np.ndarray,
     options: StepOptions,
     selection_options: SolverSelectionOptions = SOLVER_SELECTION_OPTIONS,
 ) -> np.ndarray:
     """Return the `SolverIndex` of the cheapest solver for each lane.
 
-    If legs are light, the airborne leg's fast mode decays at the rate 1.03 c/m for some 0.67
-    sqrt(L0 / g), s. The step size times that rate must stay below an explicit solver's limit of
-    stability. Rejected steps add a tenth to the number of steps. The solver of `options` is kept if
-    accuracy requires more steps of the stable solver than stability. That number is about the
-    tolerance to the power of -1/5. A solver that would need more than `max_solver_steps` is
-    excluded.
+    If legs are light, the airborne leg's fast mode decays at the rate 1.03 c/m for about 0.67
+    sqrt(L0 / g), s. Stability limits the product of step size and decay rate. Rejected steps add a
+    tenth to the number of steps. The requested solver is kept if accuracy requires more steps of
+    the stable solver than stability does. For accuracy, that number is about the tolerance to the
+    power of -1/5. A solver that would need more than `max_solver_steps` is excluded.
 
-    - `parameter_rows`: parameters in the order of `PARAMETER_NAMES`, (9, lanes).
+    - `parameter_matrix`: parameters in the order of `PARAMETER_NAMES`, (9, lanes).
     """
-    damping, leg_mass, locked_length, gravity = (
-        parameter_rows[PARAMETER_NAMES.index(name)]
-        for name in ("damping", "leg_mass", "locked_length", "gravity")
+    leg_damping, leg_mass, locked_length, gravity_acceleration = (
+        parameter_matrix[PARAMETER_NAMES.index(parameter_name)]
+        for parameter_name in ("damping", "leg_mass", "locked_length", "gravity")
     )
     relative_tolerance = float(options.rtol)
     with np.errstate(all="ignore"):
-        n_decay_times = 1.03 * damping / leg_mass * 0.74 * np.sqrt(locked_length / gravity)
+        n_decay_times = (
+            1.03 * leg_damping / leg_mass * 0.74 * np.sqrt(locked_length / gravity_acceleration)
+        )
 
-        def estimate_solver_cost(solver: str) -> tuple[np.ndarray, np.ndarray]:
-            n_stages, stability_limit = _get_stages_and_stability_limit(solver)
+        def estimate_solver_cost(solver_name: str) -> tuple[np.ndarray, np.ndarray]:
+            n_stages, stability_limit = _get_stages_and_stability_limit(solver_name)
             n_solver_steps = n_decay_times / stability_limit
             return n_solver_steps, np.where(
                 n_solver_steps > options.max_solver_steps, np.inf, n_solver_steps * n_stages
@@ -95,11 +97,11 @@ def select_cheapest_solver(
 
 
 @functools.cache
-def _get_stages_and_stability_limit(solver: str) -> tuple[int, float]:
-    """Return the number of evaluations per step of an explicit solver, and its limit of stability.
+def _get_stages_and_stability_limit(solver_name: str) -> tuple[int, float]:
+    """Return an explicit solver's number of evaluations per step, and its limit of stability.
 
-    The limit is the largest stable step size times the decay rate.
+    The limit is the largest stable product of step size and decay rate.
     """
-    tableau = load_explicit_tableau(solver)
-    assert tableau is not None  # The caller has checked the solver.
-    return len(tableau.nodes) - 1, compute_real_stability_limit(tableau)
+    solver_tableau = load_explicit_tableau(solver_name)
+    assert solver_tableau is not None  # The caller has checked the solver.
+    return len(solver_tableau.nodes) - 1, compute_real_stability_limit(solver_tableau)

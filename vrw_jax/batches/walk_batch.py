@@ -1,4 +1,4 @@
-"""Results of batches of walks, and their derivatives with respect to starts and parameters."""
+"""Results of batches of walks, and derivatives with respect to their starts and parameters."""
 
 import itertools
 from collections.abc import Callable, Mapping, Sequence
@@ -19,9 +19,10 @@ from vrw_jax.wheel import Outcome
 
 
 class StepSensitivity(eqx.Module):
-    """Derivatives of the end of a walk with respect to its start or a parameter.
+    """Derivatives of the end of a walk with respect to one input, the start or a parameter.
 
-    The start, and a parameter that is an array over steps, have one more axis, the last one.
+    The derivatives have an additional last axis if the input is the start, or a parameter that
+    varies over steps.
     """
 
     section_state: Float[np.ndarray, "lanes section *start"]
@@ -29,22 +30,24 @@ class StepSensitivity(eqx.Module):
 
 
 class StepBatchResult(AbstractPrintable):
-    """Results of batches of walks for the last step of each element. The leading axis is the batch.
+    """Result of a batch of walks for the last step of each element, with the batch on the leading
+    axis.
 
-    Arrays are numpy arrays: the conversion of thousands of values to JAX takes as long as some
-    hundred steps.
+    Arrays are NumPy arrays, because a conversion of thousands of values to JAX takes as long as
+    some hundred steps.
 
     - `section_state`: state before the next touchdown; zeros if the step failed;
-    - `durations`: of DLS, SLS-I, SLS-II, s; with unilateral contact see its step;
-    - `outcome`: an Outcome. The walk ends at the first outcome that is not STEPPED;
+    - `durations`: durations of DLS, SLS-I and SLS-II, s; see `UnilateralWheel` for unilateral
+      contact;
+    - `outcome`: `Outcome` of the walk, which ends at the first outcome that is not STEPPED;
     - `n_stepped`: number of steps that ended in a touchdown;
-    - `solver_steps`: number of attempted solver steps, over all steps;
+    - `solver_steps`: number of attempted solver steps, summed over all gait steps;
     - `is_collocated`: whether the last step was computed by collocation, in a fixed amount of work;
-    - `solver_index`: index of the element's solver in `solver_names`; "auto" selects the solver by
+    - `solver_index`: index of the element's solver in `solver_names`, which "auto" selects by
       stiffness;
     - `engine`: "lanes", "diffrax" or "collocation";
-    - `solver_names`: names of solvers; the solver of the options is the first;
-    - `derivatives`: derivatives by the name of the requested input.
+    - `solver_names`: names of the solvers, of which the first is that of the options;
+    - `derivatives`: `StepSensitivity` by the name of the requested input.
 
     Examples:
         >>> params, states = vrw.WheelParams(damping=150.0), np.tile(vrw.paper_start(), (3, 1))
@@ -65,11 +68,11 @@ class StepBatchResult(AbstractPrintable):
 
     @property
     def ending(self) -> Any:
-        """Return how each walk ended, as an array of sentences."""
+        """Return one sentence on the end of each walk, as an array."""
         return describe_step_ending(self.outcome, Outcome)
 
     def summary_rows(self) -> list[LabelAndText]:
-        """Return the rows of the printed result as pairs of label and text."""
+        """Return labels and texts of the printed result."""
         n_by_solver = np.bincount(np.ravel(self.solver_index), minlength=len(self.solver_names))
         solver_texts = (
             f"{n_elements:,} by {solver_name}"
@@ -90,26 +93,31 @@ START_INPUT_NAME = "section_state"
 class StepwiseParameter(NamedTuple):
     """Role of a parameter in the steps of a walk, for the chain rule.
 
-    The parameter may be several inputs of one step, and its values may differ from step to step.
+    The parameter may determine several inputs of a step, and may vary from step to step.
     """
 
-    input_indices: tuple[int, ...]  # indices among the inputs of a step
-    n_stepwise_values: int | None  # number of values of one lane; None for a single number
+    input_indices: tuple[int, ...]  # among the inputs of a step
+    n_stepwise_values: int | None  # per lane; None for a single number
     list_chain_rule_terms: Callable[[int], tuple[tuple[int, int, float], ...]]
-    """Function from a step to its terms (position of the input, index of the value, derivative of
-    the input by the value)."""
+    """Function that maps the index of a step to the terms of the chain rule.
+
+    A term is (position of the input, index of the value, derivative of the input by the value)."""
 
 
-def complete_slopes_over_steps(slopes: np.ndarray, n_steps: int) -> np.ndarray:
+def complete_slopes_over_steps(given_slopes: np.ndarray, n_steps: int) -> np.ndarray:
     """Return the slopes of the lines of n steps, (n_steps + 1, lanes), rad.
 
-    If `slopes` has n entries per lane, the last slope is repeated.
+    If n slopes are given per lane, the last slope is repeated.
     """
-    return slopes.T if slopes.shape[1] > n_steps else np.concatenate([slopes.T, slopes.T[-1:]])
+    return (
+        given_slopes.T
+        if given_slopes.shape[1] > n_steps
+        else np.concatenate([given_slopes.T, given_slopes.T[-1:]])
+    )
 
 
 class WalkBatch:
-    """Batch of walks in progress, with lanes on the last axis of every array."""
+    """State of a batch of walks, with lanes on the last axis of every array."""
 
     def __init__(
         self,
@@ -118,13 +126,13 @@ class WalkBatch:
         step_parameter_names: tuple[str, ...],
         stepwise_parameters: Mapping[str, StepwiseParameter],
     ) -> None:
-        """Start the walks from `section_states`, (section, lanes).
+        """Start the walks from section states of shape (section, lanes).
 
-        - `derivative_names`: requested derivatives: `START_INPUT_NAME` and names of
+        - `derivative_names`: names of the requested derivatives, from `START_INPUT_NAME` and
           `step_parameter_names`;
-        - `step_parameter_names`: names of the first inputs of a step; the section state follows
-          them;
-        - `stepwise_parameters`: parameters that do not enter every step as one equal input.
+        - `step_parameter_names`: names of the first inputs of a step, which the section state
+          follows;
+        - `stepwise_parameters`: parameters that are not one equal input of every step.
         """
         state_size, n_lanes = section_states.shape
         self.section_state, self.durations = (
@@ -133,7 +141,7 @@ class WalkBatch:
         )
         self.outcome, self.n_stepped, self.solver_steps = np.zeros((3, n_lanes), np.int32)
         self.is_collocated = np.zeros(n_lanes, bool)
-        # The inputs of the Jacobian are the requested parameters, then the start.
+        # Axis 0 of the Jacobian contains the requested parameters, and then the start.
         self.derivative_names = derivative_names
         self.differentiated_parameter_names = [
             input_name for input_name in derivative_names if input_name != START_INPUT_NAME
@@ -161,15 +169,15 @@ class WalkBatch:
             stepwise_parameter.n_stepwise_values or 1
             for stepwise_parameter in self.differentiated_parameters
         ]
-        # This is the first row of each parameter in the Jacobian, and then that of the start.
+        # The first index of each parameter on axis 0 of the Jacobian, and then that of the start.
         self.first_jacobian_rows = np.cumsum([0, *n_rows_by_parameter])
         n_jacobian_rows = self.first_jacobian_rows[-1] + state_size if derivative_names else 0
         self.walk_jacobian = np.zeros(
             (n_jacobian_rows, state_size + 3, n_lanes), section_states.dtype
         )
 
-    def find_active_lanes(self) -> np.ndarray:
-        """Return the indices of the lanes whose walk continues."""
+    def find_walking_lanes(self) -> np.ndarray:
+        """Return the indices of the lanes whose walk has not ended."""
         return np.flatnonzero(self.outcome == Outcome.STEPPED)
 
     def make_batch_result(
@@ -179,7 +187,7 @@ class WalkBatch:
         engine: str,
         solver_names: tuple[str, ...],
     ) -> StepBatchResult:
-        """Return the result, with the lanes in the order before they were sorted by
+        """Return the result, with the lanes in their order before they were sorted by
         `lane_order`.
         """
         inverse_lane_order = np.empty_like(lane_order)
@@ -199,9 +207,7 @@ class WalkBatch:
         )
 
     def split_jacobian_by_input(self, inverse_lane_order: np.ndarray) -> dict[str, StepSensitivity]:
-        """Return the derivatives of the walk by the name of the input. The derivatives of failed
-        walks are zero.
-        """
+        """Return the derivatives of the walks by the name of the input, zero for failed walks."""
         if not self.derivative_names:
             return {}
         self.walk_jacobian[..., self.outcome != Outcome.STEPPED] = 0.0
@@ -212,7 +218,7 @@ class WalkBatch:
         jacobian_rows_by_name: dict[str, Any] = {
             START_INPUT_NAME: slice(self.first_jacobian_rows[-1], None)
         }
-        for input_name, stepwise_parameter, first_row in zip(
+        for input_name, stepwise_parameter, first_jacobian_row in zip(
             self.differentiated_parameter_names,
             self.differentiated_parameters,
             self.first_jacobian_rows[:-1],
@@ -220,9 +226,9 @@ class WalkBatch:
         ):
             n_stepwise_values = stepwise_parameter.n_stepwise_values
             jacobian_rows_by_name[input_name] = (
-                first_row
+                first_jacobian_row
                 if n_stepwise_values is None
-                else slice(first_row, first_row + n_stepwise_values)
+                else slice(first_jacobian_row, first_jacobian_row + n_stepwise_values)
             )
         jacobian_by_name = {
             input_name: ordered_jacobian[:, :, jacobian_rows_by_name[input_name]]
@@ -233,16 +239,18 @@ class WalkBatch:
             for input_name, x in jacobian_by_name.items()
         }
 
-    def record_lane_steps(
+    def store_lane_steps(
         self,
         lane_indices: np.ndarray,
         step_values: tuple[np.ndarray, ...],
         is_collocated: np.ndarray,
     ) -> None:
-        """Record one step of the lanes at `lane_indices`. The step values are state, durations,
-        outcome, solver steps and Jacobian.
+        """Store the results of one step of the lanes at `lane_indices`.
+
+        `step_values` contains section states, durations, outcomes, numbers of solver steps and,
+        with derivatives, Jacobians.
         """
-        section_state, durations, outcome, n_solver_steps, *step_jacobian = step_values
+        section_state, phase_durations, outcome, n_solver_steps, *step_jacobian = step_values
         lane_selection = select_lanes(lane_indices, self)
         if step_jacobian:
             self.walk_jacobian = _replace_lane_values(
@@ -251,17 +259,17 @@ class WalkBatch:
                 self._chain_walk_jacobian(lane_selection, *step_jacobian),
             )
         self.section_state = _replace_lane_values(self.section_state, lane_selection, section_state)
-        self.durations = _replace_lane_values(self.durations, lane_selection, durations)
+        self.durations = _replace_lane_values(self.durations, lane_selection, phase_durations)
         self.outcome = _replace_lane_values(self.outcome, lane_selection, outcome)
         self.is_collocated = _replace_lane_values(self.is_collocated, lane_selection, is_collocated)
         self.n_stepped[lane_selection] += outcome == Outcome.STEPPED
         self.solver_steps[lane_selection] += n_solver_steps
 
     def _chain_walk_jacobian(self, lane_selection: Any, step_jacobian: np.ndarray) -> np.ndarray:
-        """Return the Jacobian of the walk from the Jacobian of its last step, (inputs, outputs,
-        lanes).
+        """Return the Jacobian of the walk after the last step, (inputs, outputs, lanes).
 
-        Products are summed one by one, so that a lane's digits do not depend on the batch.
+        The products are summed one after another, so that a lane's digits do not depend on the
+        batch.
         """
         if not self.has_flat_ground:
             return self._chain_stepwise_jacobian(lane_selection, step_jacobian)
@@ -279,10 +287,10 @@ class WalkBatch:
     def _chain_stepwise_jacobian(
         self, lane_selection: Any, step_jacobian: np.ndarray
     ) -> np.ndarray:
-        """Return the Jacobian of the walk, with one row for each value of a parameter that varies
+        """Return the Jacobian of the walk, with one row per value of each parameter that varies
         over steps.
 
-        Values of later steps have no effect yet, and their rows are zero.
+        The derivatives by values of later steps are still zero.
         """
         state_size, first_start_row = len(self.section_state), self.first_jacobian_rows[-1]
         n_inputs = len(step_jacobian) - state_size
@@ -293,19 +301,21 @@ class WalkBatch:
             chained_jacobian[first_start_row:] = step_jacobian[n_inputs:]
         else:
             used_row_ranges = [
-                range(first_row, min(first_row + k + 1, end_row))
-                for first_row, end_row in itertools.pairwise(self.first_jacobian_rows)
+                range(first_jacobian_row, min(first_jacobian_row + k + 1, end_row))
+                for first_jacobian_row, end_row in itertools.pairwise(self.first_jacobian_rows)
             ]
-            used_rows = np.array(
+            used_jacobian_rows = np.array(
                 [*itertools.chain(*used_row_ranges), *range(first_start_row, len(chained_jacobian))]
             )
-            previous_jacobian = self.walk_jacobian[used_rows, :state_size][..., lane_selection]
-            chained_jacobian[used_rows] = sum(
+            previous_jacobian = self.walk_jacobian[used_jacobian_rows, :state_size][
+                ..., lane_selection
+            ]
+            chained_jacobian[used_jacobian_rows] = sum(
                 step_jacobian[n_inputs + i] * previous_jacobian[:, i, None]
                 for i in range(state_size)
             )
         first_input_row = 0
-        for stepwise_parameter, first_row in zip(
+        for stepwise_parameter, first_jacobian_row in zip(
             self.differentiated_parameters, self.first_jacobian_rows[:-1], strict=True
         ):
             for (
@@ -313,7 +323,7 @@ class WalkBatch:
                 value_index,
                 input_derivative,
             ) in stepwise_parameter.list_chain_rule_terms(k):
-                chained_jacobian[first_row + value_index] += (
+                chained_jacobian[first_jacobian_row + value_index] += (
                     input_derivative * step_jacobian[first_input_row + input_position]
                 )
             first_input_row += len(stepwise_parameter.input_indices)
@@ -321,19 +331,18 @@ class WalkBatch:
 
 
 def select_lanes(lane_indices: np.ndarray, walk_batch: WalkBatch) -> Any:
-    """Return an index of the lanes: a slice, which copies nothing, if `lane_indices` contain all
-    lanes.
-    """
+    """Return an index of the given lanes: a slice, which copies nothing, if all lanes are given."""
     return slice(None) if len(lane_indices) == len(walk_batch.outcome) else lane_indices
 
 
 def _replace_lane_values(
-    lane_values: np.ndarray, lane_selection: Any, new_values: np.ndarray
+    lane_values: np.ndarray, lane_selection: Any, new_lane_values: np.ndarray
 ) -> np.ndarray:
-    """Return the array with new values of the selected lanes; the array is changed in place unless
-    all lanes are selected.
+    """Return the array with new values of the selected lanes.
+
+    Unless all lanes are selected, the array is changed in place.
     """
     if isinstance(lane_selection, slice):
-        return new_values
-    lane_values[..., lane_selection] = new_values
+        return new_lane_values
+    lane_values[..., lane_selection] = new_lane_values
     return lane_values

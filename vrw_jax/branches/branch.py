@@ -1,4 +1,4 @@
-"""Results of a continuation: labeled branches with special points, and curves of special points."""
+"""Results of a continuation: branches with their special points, and curves of special points."""
 
 from __future__ import annotations
 
@@ -17,16 +17,17 @@ from vrw_jax.runtime import xarray as xr
 from vrw_jax.wheel import Outcome
 
 MAX_PRINTED_SPECIAL_POINTS = 20
-"""Largest number of special points that are printed. The value is chosen so that a branch fits on a
-screen."""
+"""Largest number of special points that are printed, chosen because a branch then fits on a
+screen.
+"""
 
 
 class FixedPoint(NamedTuple):
-    """Fixed point of a return map at one value of the parameter.
+    """Fixed point of a return map at one value of the continued parameter.
 
-    - `section_state`: coordinates of the point, shape (n,);
-    - `parameter`: value of the parameter;
-    - `jacobian`: Jacobian of the map, shape (n, n).
+    - `section_state`: fixed point, shape (n,);
+    - `parameter`: value of the continued parameter;
+    - `jacobian`: Jacobian of the return map, shape (n, n).
     """
 
     section_state: np.ndarray
@@ -35,24 +36,25 @@ class FixedPoint(NamedTuple):
 
     @property
     def multipliers(self) -> np.ndarray:
-        """Return the eigenvalues of the Jacobian, largest modulus first."""
+        """Return the Floquet multipliers, largest modulus first."""
         return np.asarray(floquet.floquet_multipliers(jnp.asarray(self.jacobian)))
 
     @property
     def spectral_radius(self) -> float:
-        """Return the largest modulus of a multiplier."""
+        """Return the largest modulus of the Floquet multipliers."""
         return float(np.max(np.abs(self.multipliers)))
 
 
 @dataclass(frozen=True, repr=False)
 class SpecialPoint:
-    """Bifurcation, border collision or end of a branch.
+    """Special point of a branch: a bifurcation, a border collision or an end.
 
     `kind` is "fold", "branch_point", "period_doubling", "neimark_sacker", "border_collision" (the
     indicator or margin `name` is zero), "order_of_contacts_changes" (the branch continues with a
     kink or a jump) or "lost" (the order of events changes, as `name` describes).
 
-    - `value`: value of the parameter at the special point;
+    - `name`: name of the bifurcation, or of the quantity that vanishes or changes its sign;
+    - `value`: value of the continued parameter at the special point;
     - `point`: fixed point beside the special point, on the side that belongs to the branch;
     - `ends_branch`: whether the branch ends at the special point;
     - `find_cycle`: function that finds the gait at the special point, for the property `cycle`;
@@ -75,7 +77,8 @@ class SpecialPoint:
 
     @functools.cached_property
     def cycle(self) -> Any:
-        """Return the `LimitCycle` at the special point, or for other models the `FixedPoint`."""
+        """Return the `LimitCycle` at the special point, or the `FixedPoint` beside it for other
+        models."""
         return self.point if self.find_cycle is None else self.find_cycle()
 
     def __str__(self) -> str:
@@ -92,14 +95,14 @@ class SpecialPoint:
 
 @dataclass(frozen=True, repr=False)
 class Branch:
-    """Gaits along one parameter and their special points, both in the order of the branch.
+    """Branch of gaits along one parameter, and its special points, in the order of the branch.
 
-    - `parameter`: name of the parameter;
+    - `parameter`: name of the continued parameter;
     - `dataset`: measures over the dimension `point`, with the parameter as coordinate. The
-      parameter reverses at folds;
+      parameter turns back at folds;
     - `special_points`: bifurcations, border collisions and ends;
-    - `ends`: reasons why the branch ends at its first and its last point;
-    - `outcome`: NO_CYCLE_FOUND or BAD_INPUT if there is no gait to start from.
+    - `ends`: reasons for the ends of the branch at its first and its last point;
+    - `outcome`: NO_CYCLE_FOUND or BAD_INPUT if there is no gait from which a branch starts.
 
     Examples:
         >>> logistic = lambda _, x, r: r * x * (1.0 - x)
@@ -116,22 +119,24 @@ class Branch:
 
     @property
     def values(self) -> np.ndarray:
-        """Return the value of the parameter at each point."""
+        """Return the value of the continued parameter at each point, shape (points,)."""
         return self.dataset[self.parameter].values
 
     @property
     def multipliers(self) -> np.ndarray:
-        """Return the complex multipliers, shape (point, n), largest modulus first."""
+        """Return the complex Floquet multipliers at each point, largest modulus first, shape
+        (points, n)."""
         return self.dataset.multiplier_real.values + 1j * self.dataset.multiplier_imag.values
 
     @property
     def stable(self) -> np.ndarray:
-        """Return whether the gait at each point is stable."""
+        """Return whether the gait at each point is stable, shape (points,)."""
         return self.dataset.spectral_radius.values < 1.0
 
     @property
     def ending(self) -> str:
-        """Return the reasons why the branch ends at its first and its last point, as one text."""
+        """Return the reasons for the ends of the branch at its first and its last point, as one
+        text."""
         if not self.values.size:
             return self.outcome.meaning
         return f"At the first point: {self.ends[0]} At the last point: {self.ends[1]}"
@@ -190,13 +195,15 @@ class Codim2Point:
 
 @dataclass(frozen=True, repr=False)
 class SpecialPointCurve:
-    """Curve of a special point in two parameters, with points in order along the dimension `point`.
+    """Curve of a special point in two parameters, with the points in order along the dimension
+    `point`.
 
     - `name`: name of the special point;
     - `parameters`: names of the two parameters;
     - `dataset`: durations, spectral radius and section state along the curve;
     - `codim2_points`: points at which the curve meets other special points;
-    - `ends`: reasons why the curve ends at its first and its last point, equal for a closed curve.
+    - `ends`: reasons for the ends of the curve at its first and its last point, equal for a closed
+      curve.
 
     Examples:
         >>> cycle = vrw.limit_cycle(vrw.WheelParams(damping=150.0))
@@ -213,22 +220,26 @@ class SpecialPointCurve:
 
     @property
     def values(self) -> np.ndarray:
-        """Return the values of the two parameters at each point, shape (point, 2)."""
+        """Return the values of both parameters at each point, shape (points, 2)."""
         return np.stack([self.dataset[name].values for name in self.parameters], -1)
 
     @property
     def ending(self) -> str:
-        """Return the reasons why the curve ends at its first and its last point, as one text."""
+        """Return the reasons for the ends of the curve at its first and its last point, as one
+        text."""
         return f"At the first point: {self.ends[0]} At the last point: {self.ends[1]}"
 
     def __str__(self) -> str:
-        first_name, second_name = self.parameters
+        first_parameter_name, second_parameter_name = self.parameters
         text_lines = [
-            f"Curve of {self.name} over {first_name} and {second_name}: {len(self.values)} points."
+            f"Curve of {self.name} over {first_parameter_name} and {second_parameter_name}: "
+            f"{len(self.values)} points."
         ]
         for end_index, end_reason in zip((0, -1), self.ends, strict=True):
-            first_value, second_value = self.values[end_index]
-            text_lines.append(f"  at ({first_value:.6g}, {second_value:.6g}): {end_reason}")
+            first_parameter_value, second_parameter_value = self.values[end_index]
+            text_lines.append(
+                f"  at ({first_parameter_value:.6g}, {second_parameter_value:.6g}): {end_reason}"
+            )
         return "\n".join(
             [*text_lines, *(f"    {codim2_point}" for codim2_point in self.codim2_points)]
         )

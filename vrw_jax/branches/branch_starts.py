@@ -1,4 +1,4 @@
-"""Starts of branches for each model: the first gaits and their wheels."""
+"""First gaits of branches, and the wheels and equations of their continuation, for each model."""
 
 import dataclasses
 from collections.abc import Callable
@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from vrw_jax.branches.branch_location import MakeCycleFinder
+from vrw_jax.branches.branch_location import CycleFinderFactory
 from vrw_jax.branches.continuation_problems import (
     AbstractGaitProblem,
     BranchWheel,
@@ -33,64 +33,69 @@ from vrw_jax.wheel import WheelParams
 
 
 class BranchRequest(NamedTuple):
-    """Request for the branches of a batch of wheels along one parameter."""
+    """Arguments of a continuation of the gaits of several wheels along one parameter."""
 
-    params: WheelParams  # parameters with one leading axis over wheels
+    params: WheelParams  # with one leading axis over wheels
     model: AbstractWheel
-    parameter_name: str  # name of the continued parameter
-    parameter_values: Array  # values of this parameter at the starts of the branches
+    parameter_name: str  # of the continued parameter
+    parameter_values: Array  # values of the continued parameter at the starts
     period_n: int
     cycle_options: CycleOptions | None
     step_options: StepOptions
-    measures_force_peaks: bool = False  # whether its points have the measures of the gait's force
+    measures_force_peaks: bool = False  # whether points have the measures of the gait's force
 
 
 class BranchStart(NamedTuple):
-    """Gaits, wheels and equations from which a continuation starts."""
+    """First gaits of branches, with the wheels and the equations of the continuation."""
 
-    problem: AbstractGaitProblem
+    continuation_problem: AbstractGaitProblem
     wheels: BranchWheel
     start_unknowns: Any
-    start_outcomes: np.ndarray  # outcomes of the first gaits
-    make_cycle_finder: MakeCycleFinder
+    start_outcomes: np.ndarray  # of the first gaits
+    make_cycle_finder: CycleFinderFactory
     start_cycles: Any = None  # the first gaits
-    # options with a finer mesh; None for a problem without a mesh
+    # None for a problem without a mesh
     finer_cycle_options: CycleOptions | None = None
 
 
 @dataclasses.dataclass(frozen=True)
 class LimitCycleFinder:
-    """Function without arguments that finds the gait at a special point; it can be pickled.
+    """Function without arguments that finds the gait at a special point. It can be pickled.
 
-    - `finder`, `model`: finder and model of the branch;
+    - `gait_finder`, `model`: finder and model of the branch's gaits;
     - `parameter_name`: name of the continued parameter;
     - `start_params`, `start_cycle`: wheel and gait at the start of the branch;
-    - `z`, `p`: solution and value of the parameter beside the special point.
+    - `solution_beside`, `parameter_value_beside`: collocation solution and value of the parameter
+      beside the special point.
     """
 
-    finder: Any
+    gait_finder: Any
     model: AbstractWheel
     parameter_name: str
     start_params: WheelParams
     start_cycle: LimitCycle
-    z: CollocationSolution
-    p: Any
+    solution_beside: CollocationSolution
+    parameter_value_beside: Any
 
     def __call__(self) -> LimitCycle:
-        """Return the gait at the special point."""
+        """Return the limit cycle at the special point."""
         params, guess_cycle = jax.device_put((self.start_params, self.start_cycle))
         collocation_state = guess_cycle.collocation_state._replace(
-            solution=jax.tree.map(jnp.asarray, self.z)
+            solution=jax.tree.map(jnp.asarray, self.solution_beside)
         )
         guess_cycle = dataclasses.replace(
-            guess_cycle, collocation_state=collocation_state, system=self.finder.system
+            guess_cycle,
+            collocation_state=collocation_state,
+            system=self.gait_finder.collocation_system,
         )
-        _, params = self.model.with_parameter(params, self.parameter_name, jnp.asarray(self.p))
-        cycle: LimitCycle = self.finder.find_cycle(params, guess_cycle)
+        _, params = self.model.with_parameter(
+            params, self.parameter_name, jnp.asarray(self.parameter_value_beside)
+        )
+        cycle: LimitCycle = self.gait_finder.find_cycle(params, guess_cycle)
         return cycle
 
 
-def start_branches_from_collocation(branch_request: BranchRequest, given_cycle: Any) -> BranchStart:
+def find_collocation_starts(branch_request: BranchRequest, given_cycle: Any) -> BranchStart:
     """Return the starts of branches from limit cycles by collocation, given or found.
 
     Without cycle options the mesh of the branch is not coarser than that of the limit cycles.
@@ -113,12 +118,12 @@ def start_branches_from_collocation(branch_request: BranchRequest, given_cycle: 
     if cycle_options is None:
         cycle_options = CycleOptions.tight()
         start_mesh = start_cycle.system.cycle_options.mesh_intervals
-        dls, sls1, sls2 = map(max, cycle_options.mesh_intervals, start_mesh)
-        cycle_options = dataclasses.replace(cycle_options, mesh_intervals=(dls, sls1, sls2))
+        dls, sls1_points, sls2 = map(max, cycle_options.mesh_intervals, start_mesh)
+        cycle_options = dataclasses.replace(cycle_options, mesh_intervals=(dls, sls1_points, sls2))
     gait_finder: Any = make_finder(
         branch_request.model, params.n_legs, period_n=period_n, cycle_options=cycle_options
     )
-    collocation_system = gait_finder.system
+    collocation_system = gait_finder.collocation_system
 
     def make_cycle_finder(wheel_index: int, branch_point: ContinuationPoint) -> LimitCycleFinder:
         start_cycle_of_wheel, start_params = select_tree_rows((start_cycle, params), wheel_index)
@@ -134,7 +139,7 @@ def start_branches_from_collocation(branch_request: BranchRequest, given_cycle: 
 
     return BranchStart(
         CollocationProblem(
-            system=collocation_system,
+            collocation_system=collocation_system,
             parameter_name=parameter_name,
             compute_additional_quantities=None,
             measures_force_peaks=branch_request.measures_force_peaks,
@@ -152,10 +157,10 @@ def start_branches_from_collocation(branch_request: BranchRequest, given_cycle: 
     )
 
 
-def start_branches_from_walks(branch_request: BranchRequest, given_cycle: Any) -> BranchStart:
-    """Return the starts of branches from fixed points of the model's step.
+def find_return_map_starts(branch_request: BranchRequest, given_cycle: Any) -> BranchStart:
+    """Return the starts of branches from fixed points of a model's return map.
 
-    The fixed points are given, or they are the last states of walks.
+    The fixed points are given, or they are found from the last states of walks.
     """
     params, model, step_options = (
         branch_request.params,
@@ -191,20 +196,18 @@ def start_branches_from_walks(branch_request: BranchRequest, given_cycle: Any) -
     )
 
 
-def start_branches_from_contact_gaits(
-    branch_request: BranchRequest, start_cycle: Any
-) -> BranchStart:
+def find_contact_gait_starts(branch_request: BranchRequest, start_cycle: Any) -> BranchStart:
     """Return the starts of branches from gaits with unilateral contact.
 
-    The gaits are given, or they are the slowest attracting gaits.
+    Without given gaits, each branch starts from the slowest attracting gait.
     """
     params, step_options = branch_request.params, branch_request.step_options
     model: Any = branch_request.model
     gait_finder: Any = make_finder(
         model, params.n_legs, step_options=step_options, period_n=branch_request.period_n
     )
-    if not gait_finder.is_multistable:  # This model has no batched engine.
-        return start_branches_from_walks(branch_request, start_cycle)
+    if not gait_finder.is_multistable:  # The model has no batched engine.
+        return find_return_map_starts(branch_request, start_cycle)
     wheels = BranchWheel(
         params,
         jnp.ones(
@@ -238,9 +241,9 @@ def start_branches_from_contact_gaits(
 
 
 START_FUNCTION_BY_METHOD: dict[GaitMethod, Callable[[BranchRequest, Any], BranchStart]] = {
-    GaitMethod.COLLOCATION: start_branches_from_collocation,
-    GaitMethod.CONTACT_WALKS: start_branches_from_contact_gaits,
-    GaitMethod.RETURN_MAP: start_branches_from_walks,
-    GaitMethod.SELECTION: start_branches_from_walks,
+    GaitMethod.COLLOCATION: find_collocation_starts,
+    GaitMethod.CONTACT_WALKS: find_contact_gait_starts,
+    GaitMethod.RETURN_MAP: find_return_map_starts,
+    GaitMethod.SELECTION: find_return_map_starts,
 }
-"""Function that returns the starts of branches, by the gait method of the model."""
+"""Function that returns the starts of branches, by the gait method of a model."""

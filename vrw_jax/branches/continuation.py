@@ -1,9 +1,8 @@
-"""Branches of gaits along one parameter, stable or unstable, with all special points on them
-located.
+"""Branches of stable and unstable gaits along one parameter, with all their special points.
 
-A special point is a bifurcation, or a border collision, at which an indicator or a margin is zero.
-Each is computed on the branch itself, with a new gait at every trial, so that it is as accurate as
-the gaits.
+A special point is a bifurcation, or a border collision, at which an indicator or a margin vanishes.
+During the search for a special point, the gait is computed anew at every trial. Special points are
+therefore as accurate as the gaits.
 """
 
 from __future__ import annotations
@@ -23,8 +22,8 @@ from vrw_jax.branches.branch_location import (
     ADMISSIBILITY_COLUMN,
     AbstractContinuation,
     BranchData,
-    PointQuantities,
-    continue_and_locate_points,
+    QuantitiesByName,
+    continue_and_locate_special_points,
 )
 from vrw_jax.branches.branch_starts import START_FUNCTION_BY_METHOD, BranchRequest
 from vrw_jax.branches.continuation_problems import FRICTION_SURPLUS_COLUMN_NAME, BranchWheel
@@ -79,28 +78,27 @@ BRANCH_ENDING_QUANTITIES = (
     "duration_sls1",
     "duration_sls2",
 )
-"""Quantities at whose zeros the order of events changes and the branch ends."""
+"""Names of the quantities at whose zeros the order of events changes and the branch ends."""
 
 SECOND_PEAK_RATE_NAME = "second_peak_rate"
-"""Name of the measure of the gait's force whose zero is the special point at which a second peak
-appears."""
+"""Name of the measure of the gait's force whose zero is the appearance of a second force peak."""
 
-DIFFERENTIATION_HINT = "differentiate vrw.limit_cycle"
-"""Advice in the error for a caller who differentiates a branch."""
+DIFFERENTIATION_ADVICE = "differentiate vrw.limit_cycle"
+"""Advice in the error message for a caller who differentiates a branch."""
 
 COARSE_MESH_END_NAME = Outcome.MESH_TOO_COARSE.name.lower()
-"""Name of an end at which the mesh is too coarse, so that the gaits do not repeat in a walk."""
+"""Name of the end of a branch at which the mesh is so coarse that gaits do not repeat in a walk."""
 
 
 @dataclass(frozen=True)
-class GaitBranchOptions:
-    """Options of the continuation of gaits.
+class GaitContinuationOptions:
+    """Numerical options of the continuation of gaits.
 
     - `max_measure_change_at_jump`: largest relative change of period and step length at a jump of
-      the section state within a branch, chosen because a change of the order of two impacts changes
-      both by 1e-4;
-    - `max_unrefined_mesh_error`: estimate of the mesh error above which a finer mesh is used;
-    - `max_mesh_refinements`: largest number of refinements of the mesh.
+      the section state within one branch. The value is chosen because a change of the order of two
+      impacts changes both by 1e-4;
+    - `max_unrefined_mesh_error`: estimated mesh error above which the mesh is refined;
+    - `max_mesh_refinements`: largest number of mesh refinements.
     """
 
     max_measure_change_at_jump: float = 0.01
@@ -108,24 +106,24 @@ class GaitBranchOptions:
     max_mesh_refinements: int = 3
 
 
-GAIT_BRANCH_OPTIONS = GaitBranchOptions()
-"""Options of all branches of gaits."""
+DEFAULT_GAIT_CONTINUATION_OPTIONS = GaitContinuationOptions()
+"""Default options of the continuation of gaits."""
 
 
 @dataclass(frozen=True)
 class GaitContinuation(AbstractContinuation):
-    """Continuation of gaits. A gait is admissible if its event-driven step repeats."""
+    """Continuation of gaits, which are admissible if their event-driven step repeats."""
 
     model: AbstractWheel
     step_options: StepOptions
     n_legs: int
-    gait_options: GaitBranchOptions = GAIT_BRANCH_OPTIONS
+    continuation_options: GaitContinuationOptions = DEFAULT_GAIT_CONTINUATION_OPTIONS
 
     branch_ending_quantities: ClassVar[tuple[str, ...]] = (
         *BRANCH_ENDING_QUANTITIES,
         FRICTION_SURPLUS_COLUMN_NAME,
     )
-    margin_names: ClassVar[tuple[str, ...]] = (
+    border_collision_quantities: ClassVar[tuple[str, ...]] = (
         *DOUBLE_SUPPORT_INDICATOR_NAMES,
         *MARGIN_MEASURES,
         SECOND_PEAK_RATE_NAME,
@@ -133,49 +131,49 @@ class GaitContinuation(AbstractContinuation):
     linear_margin_substitutes: ClassVar[Mapping[str, str]] = {
         "clearance_sls1": "takeoff_acceleration"
     }
-    """Names of margins that vanish as a cube, each with the quantity that vanishes linearly at the
-    same point. A foot that takes off less steeply descends less deeply, until it rises immediately.
-    A solver cannot resolve the shallowest descents, but the linear quantity changes its sign."""
+    """Names of margins that vanish as a cube, each with a quantity that vanishes linearly.
+
+    Both vanish at the same point. A foot that takes off less steeply descends less deeply, until it
+    rises immediately. A solver cannot resolve the shallowest descents, but the linear quantity
+    changes its sign."""
 
     def evaluate_point_quantities(
         self, wheels: BranchWheel, points: ContinuationPoint
-    ) -> PointQuantities:
-        """Return the table of measures.
-
-        A margin with one value per leg gets a column for each leg.
-        """
-        gait_problem: Any = self.problem
+    ) -> QuantitiesByName:
+        """Return the measures of the gaits by name, with one column per leg for each margin of the
+        legs."""
+        gait_problem: Any = self.continuation_problem
         measure_gaits = functools.partial(gait_problem.measure_gaits, self.model, self.step_options)
-        quantity_table = self.map_over_rows(
+        quantity_table = self.map_over_points(
             measure_gaits, batch_sizes.POINT_BATCH_SIZE, wheels, points
         )
-        for name, margin_measure in MARGIN_MEASURES.items():
-            if margin_measure.leg_dimension and name in quantity_table:
+        for measure_name, margin_measure in MARGIN_MEASURES.items():
+            if margin_measure.leg_dimension and measure_name in quantity_table:
                 leg_positions = enumerate(range(3, self.n_legs + 1))
                 quantity_table |= {
-                    f"{name}[{leg}]": quantity_table[name][:, leg_position]
-                    for leg_position, leg in leg_positions
+                    f"{measure_name}[{leg_number}]": quantity_table[measure_name][:, leg_position]
+                    for leg_position, leg_number in leg_positions
                 }
         return quantity_table
 
-    def are_points_admissible(self, table: PointQuantities) -> np.ndarray:
-        return (table["outcome"] == Outcome.STEPPED) & (
-            table["closure"] <= STATE_AGREEMENT_TOLERANCE
+    def are_points_admissible(self, quantity_table: QuantitiesByName) -> np.ndarray:
+        return (quantity_table["outcome"] == Outcome.STEPPED) & (
+            quantity_table["closure"] <= STATE_AGREEMENT_TOLERANCE
         )
 
     def is_same_gait(
-        self, table_before: PointQuantities, table_after: PointQuantities
+        self, table_before: QuantitiesByName, table_after: QuantitiesByName
     ) -> np.ndarray:
-        """Return whether period and step length are about equal before and after a jump, for each
-        point.
-        """
-        is_similar = super().is_same_gait(table_before, table_after)
-        for name in ("period", "step_length"):
-            max_measure_change = self.gait_options.max_measure_change_at_jump * np.abs(
-                table_before[name]
+        """Return whether period and step length are about equal before and after each jump."""
+        is_measure_similar = super().is_same_gait(table_before, table_after)
+        for measure_name in ("period", "step_length"):
+            max_measure_change = self.continuation_options.max_measure_change_at_jump * np.abs(
+                table_before[measure_name]
             )
-            is_similar &= np.abs(table_after[name] - table_before[name]) <= max_measure_change
-        return is_similar
+            is_measure_similar &= (
+                np.abs(table_after[measure_name] - table_before[measure_name]) <= max_measure_change
+            )
+        return is_measure_similar
 
     def describe_branch_end(self, end_name: str, parameter_value: float) -> str:
         if end_name != FRICTION_SURPLUS_COLUMN_NAME:
@@ -185,15 +183,16 @@ class GaitContinuation(AbstractContinuation):
             "with less no contact carries the weight along the slope, and no gait repeats."
         )
 
-    def name_branch_end(self, table: PointQuantities, row_index: int) -> str:
-        outcome = Outcome(int(table["outcome"][row_index]))
-        if outcome != Outcome.STEPPED:
-            return outcome.name.lower()
-        return COARSE_MESH_END_NAME if "mesh_error" in table else ADMISSIBILITY_COLUMN
+    def name_branch_end(self, quantity_table: QuantitiesByName, point_index: int) -> str:
+        step_outcome = Outcome(int(quantity_table["outcome"][point_index]))
+        if step_outcome != Outcome.STEPPED:
+            return step_outcome.name.lower()
+        return COARSE_MESH_END_NAME if "mesh_error" in quantity_table else ADMISSIBILITY_COLUMN
 
-    def is_mesh_limited(self, table: PointQuantities, end_names: tuple[str, ...]) -> bool:
+    def is_mesh_limited(self, quantity_table: QuantitiesByName, end_names: tuple[str, ...]) -> bool:
         return COARSE_MESH_END_NAME in end_names or bool(
-            np.max(table.get("mesh_error", 0.0)) > self.gait_options.max_unrefined_mesh_error
+            np.max(quantity_table.get("mesh_error", 0.0))
+            > self.continuation_options.max_unrefined_mesh_error
         )
 
 
@@ -213,28 +212,28 @@ def continue_branch(
 ) -> Branch:
     """Return the branch of limit cycles through `params` along a parameter within `bounds`.
 
-    The continuation starts from the limit cycle at `params`, or from `cycle`, found at the same
-    parameters. It leads in both directions, through folds, over stable and unstable gaits, to the
-    bounds or to the end of the branch. `Branch.ends` gives the reasons. A branch ends if the events
-    change their order, or if the mesh is too coarse (`mesh_too_coarse`). Without `cycle_options`
-    the mesh is first refined, up to eight times.
+    The continuation starts from the limit cycle at `params`, or from the given `cycle` of the same
+    parameters. The branch is continued in both directions, through folds, over stable and unstable
+    gaits, to the bounds or to its end. `Branch.ends` contains the reasons for both ends. A branch
+    ends if the events change their order, or if the mesh is too coarse (`mesh_too_coarse`). Without
+    `cycle_options` the mesh is first refined, up to eight times.
 
-    Each special point is located to 1e-9 in the parameter, unless the continuation step
-    (options.max_ds) hides it: two changes of sign within one step cancel. The gaits use the cycle
-    options, at least `CycleOptions.tight()` by default. Each is checked by one event-driven step,
-    which also gives indicators and margins.
+    Each special point is located to 1e-9 in the parameter. Two sign changes within one continuation
+    step (`options.max_ds`) cancel and are not found. The gaits use `cycle_options`, by default at
+    least `CycleOptions.tight()`. One event-driven step checks each gait, and determines its
+    indicators and margins.
 
     For other models the gaits are fixed points of their return map, as accurate as `step_options`.
-    With unilateral contact `name` may also be "friction". The start is then a `ReturnMapCycle` or,
-    without one, the end of a walk. If the order of contacts changes, the branch continues with a
-    kink or a jump, which is a special point. It ends if friction equals tan(slope). "auto" uses the
-    model that is selected for the start. A violated margin of the paper's model is a special point
-    with the name of the margin, beyond which unilateral contact is selected.
+    With unilateral contact `name` may also be "friction". The start is then a given
+    `ReturnMapCycle`, or the end of a walk. If the order of contacts changes, the branch continues
+    with a kink or a jump, which is a special point. The branch ends if friction equals tan(slope).
+    Model "auto" is the model that is selected for the start. A violated margin of the paper's model
+    is a special point with the name of the margin, beyond which unilateral contact is selected.
 
     Args:
         params: one wheel; its gait is on the branch.
-        name: name of the parameter.
-        bounds: range of the parameter.
+        name: name of the continued parameter.
+        bounds: lower and upper bound of the parameter.
         cycle: the gait at `params`, if it is known.
         period_n: number of steps after which the gaits repeat.
         model: the model; the paper's, `ViscoelasticWheel()`, by default.
@@ -246,7 +245,7 @@ def continue_branch(
             instant, is then the special point "second_peak_rate".
 
     Returns:
-        A `Branch`. If there is no gait to start from, its `outcome` is the reason.
+        A `Branch`. If there is no gait from which to start, `outcome` is the reason.
 
     Raises:
         TypeError, ValueError: if an argument is invalid; the message names the remedy.
@@ -260,7 +259,7 @@ def continue_branch(
     check_single_wheel(params, "use vrw.continue_branches for a batch")
     if cycle is not None:
         check_type("cycle", cycle, AbstractCycle, "give vrw.limit_cycle(params)")
-    require_untraced_arguments("vrw.continue_branch", DIFFERENTIATION_HINT, params, cycle)
+    require_untraced_arguments("vrw.continue_branch", DIFFERENTIATION_ADVICE, params, cycle)
     params_batch, cycle = jax.device_put(select_tree_rows((params, cycle), None))
     (branch,) = continue_branches(
         params_batch, name, bounds, cycle=cycle, period_n=period_n, options=options,
@@ -314,7 +313,7 @@ def continue_branches(
         >>> [round(branch.special_points[-1].value, 4) for branch in branches]
         [219.8477, 219.8477]
     """
-    require_untraced_arguments("vrw.continue_branch", DIFFERENTIATION_HINT, params, cycle)
+    require_untraced_arguments("vrw.continue_branch", DIFFERENTIATION_ADVICE, params, cycle)
     check_type("params", params, WheelParams, "write vrw.WheelParams(damping=..., slope=...)")
     model, step_options = (
         check_model(model),
@@ -341,38 +340,42 @@ def continue_branches(
         model, params.n_legs, cycle_options=cycle_options, step_options=step_options
     )
     gait_finder.search_options.check_tolerances(jnp.result_type(*jax.tree.leaves(params)))
-    batch_shape = np.broadcast_shapes(*(leaf.shape for leaf in jax.tree.leaves(params)))
+    batch_shape = np.broadcast_shapes(
+        *(parameter_values_of_field.shape for parameter_values_of_field in jax.tree.leaves(params))
+    )
     if len(batch_shape) != 1:
         raise ValueError(f"the wheels' batch has shape {batch_shape}, but it must have one axis.")
     (n_wheels,) = batch_shape
     if n_wheels == 0:
         return ()
     # The batch is padded to a power of two, because each size compiles programs.
-    padded_size = 1 << (n_wheels - 1).bit_length()
-    wheel_indices = np.minimum(np.arange(padded_size), n_wheels - 1)
-    pad_batch = lambda leaf: np.broadcast_to(np.asarray(leaf), batch_shape)[wheel_indices]
+    padded_batch_size = 1 << (n_wheels - 1).bit_length()
+    wheel_indices = np.minimum(np.arange(padded_batch_size), n_wheels - 1)
+    pad_batch = lambda parameter_values_of_field: np.broadcast_to(
+        np.asarray(parameter_values_of_field), batch_shape
+    )[wheel_indices]
     start_values = pad_batch(getattr(model if name == FRICTION_NAME else params, name))
     params, parameter_values = jax.device_put(
         (jax.tree.map(pad_batch, params), np.clip(start_values, lower_bound, upper_bound))
     )
-    if isinstance(cycle, AbstractCycle) and padded_size > n_wheels:
+    if isinstance(cycle, AbstractCycle) and padded_batch_size > n_wheels:
         cycle = jax.device_put(select_tree_rows(cycle, wheel_indices))
     if name != FRICTION_NAME:
         _, params = model.with_parameter(params, name, parameter_values)
     branch_request = BranchRequest(
         params, model, name, parameter_values, period_n, cycle_options, step_options, force_peaks
     )
-    outcomes, branch_data = _continue_gait_branches(
+    start_outcomes, branch_data = _continue_gait_branches(
         branch_request, cycle, options, np.array([lower_bound, upper_bound]), n_wheels
     )
     return tuple(
-        _label_gait_branch(
+        _make_labeled_gait_branch(
             branch_data[wheel_index],
             jax.device_put(select_tree_rows(params, wheel_index)),
             name,
             model,
             step_options,
-            int(outcomes[wheel_index]),
+            int(start_outcomes[wheel_index]),
         )
         for wheel_index in range(n_wheels)
     )
@@ -384,37 +387,38 @@ def _continue_gait_branches(
     arclength_options: ArclengthOptions,
     parameter_bounds: np.ndarray,
     n_wheels: int,
-    gait_options: GaitBranchOptions = GAIT_BRANCH_OPTIONS,
+    continuation_options: GaitContinuationOptions = DEFAULT_GAIT_CONTINUATION_OPTIONS,
 ) -> tuple[np.ndarray, list[BranchData | None]]:
-    """Return the outcomes of the starts, and the data of the branches from the first `n_wheels`
-    of them; the other starts pad the batch.
+    """Return the outcomes of the starts, and the data of the branches of the first `n_wheels`
+    wheels.
 
-    The mesh is that of the cycle options. Without options the mesh is as fine as the branches need.
+    Any further wheels only pad the batch. The mesh is that of the cycle options. Without cycle
+    options it is refined until it limits no branch.
     """
     can_refine_mesh = branch_request.cycle_options is None
-    for refinement_index in range(1 + gait_options.max_mesh_refinements):
+    for refinement_index in range(1 + continuation_options.max_mesh_refinements):
         branch_start = START_FUNCTION_BY_METHOD[branch_request.model.capabilities.gait_method](
             branch_request, start_cycle
         )
-        continuation = GaitContinuation(
-            branch_start.problem,
+        branch_continuation = GaitContinuation(
+            branch_start.continuation_problem,
             arclength_options,
             branch_start.wheels,
             parameter_bounds,
             branch_request.model,
             branch_request.step_options,
             branch_request.params.n_legs,
-            gait_options,
+            continuation_options,
         )
         has_start = branch_start.start_outcomes == Outcome.STEPPED
         has_start &= np.arange(len(has_start)) < n_wheels
         is_finest_mesh = (
             not can_refine_mesh
             or branch_start.finer_cycle_options is None
-            or refinement_index == gait_options.max_mesh_refinements
+            or refinement_index == continuation_options.max_mesh_refinements
         )
-        branch_data_by_wheel = continue_and_locate_points(
-            continuation,
+        branch_data_by_wheel = continue_and_locate_special_points(
+            branch_continuation,
             branch_start.start_unknowns,
             branch_request.parameter_values,
             has_start,
@@ -434,17 +438,17 @@ def _continue_gait_branches(
 
 
 MEASURES_OUTSIDE_BRANCHES = ("outcome", "solver_steps")
-"""Measures of the checking step that are not in the dataset of a branch."""
+"""Names of measures of the checking step that the dataset of a branch does not contain."""
 
 
 def _check_arclength_options(options: ArclengthOptions | None) -> ArclengthOptions:
-    """Return the options of a continuation, by default `ArclengthOptions()`."""
+    """Return the given options of a continuation, or `ArclengthOptions()` if there are none."""
     if options is not None:
         check_type("options", options, ArclengthOptions, "give vrw.ArclengthOptions()")
     return ArclengthOptions() if options is None else options
 
 
-def _label_gait_branch(
+def _make_labeled_gait_branch(
     branch_data: BranchData | None,
     params: WheelParams,
     parameter_name: str,
@@ -452,7 +456,7 @@ def _label_gait_branch(
     step_options: StepOptions,
     start_outcome: int,
 ) -> Branch:
-    """Return the labeled branch of one wheel; `start_outcome` is the outcome of its start."""
+    """Return the labeled branch of one wheel. `start_outcome` is the outcome of its start."""
     start_provenance = collect_provenance_attributes(params, model, step_options)
     start_provenance.pop(f"parameter_{parameter_name}", None)
     branch_attrs = {"title": f"Branch of limit cycles along {parameter_name}"} | start_provenance
@@ -495,9 +499,9 @@ def _label_gait_branch(
     if branch_data.quantity_table["section_state"].shape[-1] != len(component_names):
         leg_numbers = range(1, params.n_legs + 1)
         leg_names = [
-            f"{parameter_name}{leg}"
+            f"{parameter_name}{leg_number}"
             for parameter_name in ("L", "dL", "code")
-            for leg in leg_numbers
+            for leg_number in leg_numbers
         ]
         component_names = ["theta", "dtheta", "vx", "vz", *leg_names]
     branch_coordinates = {
@@ -507,24 +511,25 @@ def _label_gait_branch(
         "component": component_names,
         "leg": make_locked_leg_coordinate(params.n_legs),
     }
-    dataset = xr.Dataset(
-        branch_variables | _make_stability_variables(np.asarray(branch_data.points.jacobian)),
+    branch_dataset = xr.Dataset(
+        branch_variables
+        | _make_stability_variables(np.asarray(branch_data.points.return_map_jacobian)),
         branch_coordinates,
         branch_attrs,
     )
     return Branch(
         parameter_name,
-        dataset,
+        branch_dataset,
         branch_data.special_points,
         branch_data.end_reasons,
         Outcome.STEPPED,
     )
 
 
-def _make_stability_variables(jacobians: np.ndarray) -> dict[str, xr.Variable]:
-    """Return labeled variables of multipliers and stability measures along the branch."""
+def _make_stability_variables(return_map_jacobians: np.ndarray) -> dict[str, xr.Variable]:
+    """Return labeled variables of the multipliers and the stability measures along a branch."""
     multiplier_values = map_in_numpy_batches(
-        floquet_multipliers, (batch_sizes.POINT_BATCH_SIZE,), jacobians
+        floquet_multipliers, (batch_sizes.POINT_BATCH_SIZE,), return_map_jacobians
     )
     spectral_radius = np.max(np.abs(multiplier_values), -1)
     multiplier_parts = {
@@ -554,17 +559,19 @@ def _make_stability_variables(jacobians: np.ndarray) -> dict[str, xr.Variable]:
 
 
 class MapContinuation(AbstractContinuation):
-    """Continuation of the fixed points of any map."""
+    """Continuation of the fixed points of any map, all of which are admissible."""
 
-    def evaluate_point_quantities(self, wheels: Any, points: ContinuationPoint) -> PointQuantities:
+    def evaluate_point_quantities(self, wheels: Any, points: ContinuationPoint) -> QuantitiesByName:
         return {
-            "x": self.map_over_rows(
-                jax.vmap(self.problem.section_state), batch_sizes.POINT_BATCH_SIZE, points.z
+            "x": self.map_over_points(
+                jax.vmap(self.continuation_problem.section_state),
+                batch_sizes.POINT_BATCH_SIZE,
+                points.z,
             )
         }
 
-    def are_points_admissible(self, table: PointQuantities) -> np.ndarray:
-        return np.asarray(np.isfinite(table["x"]).all(-1))
+    def are_points_admissible(self, quantity_table: QuantitiesByName) -> np.ndarray:
+        return np.asarray(np.isfinite(quantity_table["x"]).all(-1))
 
 
 @with_default_jax_settings
@@ -578,16 +585,16 @@ def continue_map(
     name: str = "parameter",
     options: ArclengthOptions | None = None,
 ) -> Branch:
-    """Return the branch of fixed points of any map x -> `function(constants, x, p)` through (x, p).
+    """Return the branch of fixed points through (x, p) of a map x -> `function(constants, x, p)`.
 
-    The map must be differentiable in forward mode, and return NaN if it is undefined. Its
-    bifurcations are located as in `continue_branch`.
+    The map must be differentiable in forward mode, and return NaN if it is undefined. Bifurcations
+    are located as in `continue_branch`.
 
     Args:
-        function: `function(constants, x, p)`, which returns the shape of `x`.
+        function: `function(constants, x, p)`, which returns an array of the shape of `x`.
         x: a fixed point or a state near one, shape (n,).
         p: value of the parameter at `x`.
-        bounds: range of the parameter.
+        bounds: lower and upper bound of the parameter.
         constants: any pytree, passed to the function.
         name: name of the parameter in the result.
         options: `ArclengthOptions` of the branch.
@@ -614,14 +621,14 @@ def continue_map(
         )
     options, x = _check_arclength_options(options), check_reals("x", x)
     add_batch_axis = lambda tree: jax.tree.map(lambda a: jnp.asarray(a, float)[None], tree)
-    continuation = MapContinuation(
+    branch_continuation = MapContinuation(
         FixedPointProblem(function),
         options,
         add_batch_axis(constants),
         np.array([lower_bound, upper_bound]),
     )
-    (branch_data,) = continue_and_locate_points(
-        continuation,
+    (branch_data,) = continue_and_locate_special_points(
+        branch_continuation,
         add_batch_axis(x),
         add_batch_axis(p),
         np.array([True]),
@@ -632,7 +639,7 @@ def continue_map(
         return Branch(name, empty_dataset, (), ("", ""), Outcome.NO_CYCLE_FOUND)
     dataset = xr.Dataset(
         {"x": (("point", "component"), branch_data.quantity_table["x"])}
-        | _make_stability_variables(np.asarray(branch_data.points.jacobian)),
+        | _make_stability_variables(np.asarray(branch_data.points.return_map_jacobian)),
         {name: ("point", branch_data.points.p)},
         {"title": f"Branch of fixed points along {name}"},
     )

@@ -1,9 +1,9 @@
-"""Continuation problems of the wheel's gaits, and the measures at points of their branches.
+"""Continuation problems of gaits, and the measures of the gaits at points of their branches.
 
-`CollocationProblem` is the fastest one: it solves the collocation system of the paper's sequence of
-phases, with one linearized pass per Newton iteration. `GroundProblem` uses batched steps with
-unilateral contact. `ReturnMapProblem` works for every model: it iterates the model's step and
-differentiates it in forward mode.
+`CollocationProblem` is the fastest problem. It solves the collocation equations of the paper's
+sequence of phases, with one linearization per Newton iteration. `GroundProblem` uses batches of
+steps with unilateral contact. `ReturnMapProblem` applies to every model, whose step it iterates and
+differentiates in forward mode.
 """
 
 import abc
@@ -26,7 +26,7 @@ from vrw_jax.continuation import (
     ContinuationPoint,
     NewtonStep,
     ProblemUnknowns,
-    SectionVector,
+    SectionStateVector,
     arclength,
 )
 from vrw_jax.cycles import (
@@ -52,39 +52,43 @@ from vrw_jax.wheel import (
 )
 
 FRICTION_SURPLUS_COLUMN_NAME = "friction_above_slope"
-"""Name of the quantity that is the friction coefficient minus the smallest one with a gait, which
-is the tangent of the slope."""
+"""Name of the difference between the friction coefficient and the slope's tangent.
+
+The tangent is the smallest friction coefficient for which a gait exists.
+"""
 
 MIN_FRICTION_SURPLUS = 1e-9
-"""Smallest surplus of friction over the slope's tangent, as a fraction of the tangent. The value is
-chosen because at the tangent itself gaits of every speed repeat, up to the round-off of friction.
+"""Smallest admissible surplus of friction, as a fraction of the slope's tangent.
+
+The value is chosen because gaits of every speed repeat if friction equals the tangent, up to the
+round-off of friction.
 """
 
 
 class BranchWheel(NamedTuple):
-    """Wheel whose gaits are continued, at any value of the continued parameter."""
+    """Wheel whose gaits are continued. A problem replaces the continued parameter in `params`."""
 
     params: WheelParams
-    is_phase_active: Float[Array, "n n_phases"]  # 1 if the phase takes place in the cycle, else 0
+    is_phase_active: Float[Array, "n n_phases"]  # 1 if the phase occurs in the cycle, else 0
 
 
 class AbstractGaitProblem(AbstractContinuationProblem):
-    """Continuation problem of gaits of `n_steps` steps along a parameter of the wheel."""
+    """Continuation problem of gaits of `n_steps` steps along one parameter of the wheel."""
 
     parameter_name: eqx.AbstractVar[str]
 
     @property
     @abc.abstractmethod
     def n_steps(self) -> int:
-        """Return the number of steps after which the gait repeats."""
+        """Return the number of steps after which the gaits repeat."""
 
     @abc.abstractmethod
     def read_gait_state(
         self, wheel: BranchWheel, z: ProblemUnknowns, p: Scalar
     ) -> tuple[AnySectionState, dict[str, Array]]:
-        """Return the section state before the first landing, and continued quantities by name.
+        """Return the section state before the first landing, and the continued quantities by name.
 
-        Continued quantities are also defined beyond a special point.
+        A continued quantity is defined on both sides of a special point.
         """
 
     @eqx.filter_jit
@@ -95,7 +99,7 @@ class AbstractGaitProblem(AbstractContinuationProblem):
         wheels: BranchWheel,
         points: ContinuationPoint,
     ) -> dict[str, Array]:
-        """Return all measures of the gaits at many points by name, from event-driven steps."""
+        """Return the measures of the gaits at many points by name, from event-driven steps."""
 
         def measure_point(wheel: BranchWheel, z: Any, p: Array) -> dict[str, Array]:
             section_state, continued_quantities = self.read_gait_state(wheel, z, p)
@@ -109,45 +113,48 @@ class AbstractGaitProblem(AbstractContinuationProblem):
 
 
 class CollocationProblem(AbstractGaitProblem):
-    """Continuation problem of limit cycles by collocation, with a `CollocationSolution` z.
+    """Continuation problem of limit cycles by collocation; the unknowns z are a
+    `CollocationSolution`.
 
     Beyond the zero of an indicator the solution continues, but the event-driven step rejects it as
     a gait. `compute_additional_quantities` is a function of the phase points of the first step and
-    of z. With `measures_force_peaks` the points also have the measures of the gait's force.
+    of z. If `measures_force_peaks` is set, points also have the measures of the gait's force.
     """
 
-    system: CollocationSystem = eqx.field(static=True)
+    collocation_system: CollocationSystem = eqx.field(static=True)
     parameter_name: str = eqx.field(static=True)
     compute_additional_quantities: Callable | None = eqx.field(static=True)
     measures_force_peaks: bool = eqx.field(static=True, default=False)
 
     @property
     def n_steps(self) -> int:
-        return self.system.period_n
+        return self.collocation_system.period_n
 
     def _stack_parameters_at(self, wheel: BranchWheel, p: Scalar) -> Array:
-        """Return the wheel's parameters with the continued parameter at p."""
+        """Return the wheel's parameters as a vector, with the continued parameter equal to p."""
         return stack_parameters(
             eqx.tree_at(lambda w: getattr(w, self.parameter_name), wheel.params, p)
         )
 
     def linearize(self, wheel: BranchWheel, z: ProblemUnknowns, p: Scalar) -> NewtonStep:
         linearize_trial = make_trial_linearizer(
-            self.system, (PARAMETER_NAMES.index(self.parameter_name),)
+            self.collocation_system, (PARAMETER_NAMES.index(self.parameter_name),)
         )
-        correction, tangents, monodromy, *_ = linearize_trial(
+        newton_correction, parameter_tangents, monodromy_matrix, *_ = linearize_trial(
             self._stack_parameters_at(wheel, p), wheel.is_phase_active, z
         )
-        return NewtonStep(correction, jax.tree.map(lambda x: x[0], tangents), monodromy)
+        return NewtonStep(
+            newton_correction, jax.tree.map(lambda x: x[0], parameter_tangents), monodromy_matrix
+        )
 
-    def section_state(self, z: ProblemUnknowns) -> SectionVector:
+    def section_state(self, z: ProblemUnknowns) -> SectionStateVector:
         return z.section_state
 
-    def correction_norm(self, z: ProblemUnknowns, correction: ProblemUnknowns) -> Scalar:
-        return unbatch(compute_correction_norm)(z, correction)
+    def correction_norm(self, z: ProblemUnknowns, newton_correction: ProblemUnknowns) -> Scalar:
+        return unbatch(compute_correction_norm)(z, newton_correction)
 
     def is_admissible(self, wheel: BranchWheel, z: ProblemUnknowns, p: Scalar) -> Bool[Array, ""]:
-        """Return whether the durations are positive.
+        """Return whether all durations are positive.
 
         The event-driven step checks all other conditions.
         """
@@ -156,22 +163,29 @@ class CollocationProblem(AbstractGaitProblem):
     def read_gait_state(
         self, wheel: BranchWheel, z: ProblemUnknowns, p: Scalar
     ) -> tuple[AnySectionState, dict[str, Array]]:
-        """Return the section state, and quantities that continue beyond a special point, by name.
+        """Return the section state before the first landing, and the continued quantities by name.
 
-        The quantities are the shortest duration of each phase over the steps, s, and
-        `takeoff_acceleration`, m/s^2. The latter is the rear foot's acceleration at take-off, least
-        over the steps.
+        They are the shortest duration of each phase over the steps, s, and `takeoff_acceleration`,
+        the rear foot's lowest acceleration at take-off over the steps, m/s^2.
         """
         parameters = self._stack_parameters_at(wheel, p)
-        wheel_symbols = make_wheel_from_parameters(parameters, self.system.n_legs).symbols()
-        _, phase_points_by_step = self.system.evaluate_phase_points(parameters, z)
+        wheel_symbols = make_wheel_from_parameters(
+            parameters, self.collocation_system.n_legs
+        ).symbols()
+        _, phase_points_by_step = self.collocation_system.evaluate_phase_points(parameters, z)
         takeoff_accelerations = [
-            compute_takeoff_acceleration(wheel_symbols, sls1) for _, sls1, _ in phase_points_by_step
+            compute_takeoff_acceleration(wheel_symbols, sls1_points)
+            for _, sls1_points, _ in phase_points_by_step
         ]
-        last_end_point, min_durations = phase_points_by_step[-1][-1].end, jnp.min(z.durations, 0)
+        last_end_point, min_durations = (
+            phase_points_by_step[-1][-1].end_point,
+            jnp.min(z.durations, 0),
+        )
         solution_with_lane = jax.tree.map(lambda x: x[..., None], z)
         mesh_error = estimate_mesh_error(
-            self.system.phase_sequence, self.system.phase_meshes, solution_with_lane
+            self.collocation_system.phase_sequence,
+            self.collocation_system.phase_meshes,
+            solution_with_lane,
         )[0]
         continued_quantities = {
             "duration_dls": jnp.where(wheel.is_phase_active[0, 0] > 0.5, min_durations[0], jnp.nan),
@@ -185,36 +199,40 @@ class CollocationProblem(AbstractGaitProblem):
                 wheel_symbols, phase_points_by_step[0], z
             )
         if self.measures_force_peaks:
-            continued_quantities |= compute_force_peaks(self.system, parameters, z)
+            continued_quantities |= compute_force_peaks(self.collocation_system, parameters, z)
         return jnp.stack([last_end_point.q[0], *last_end_point.v]), continued_quantities
 
 
 ComputeGaitQuantities = Callable[[CollocationSystem, Array, Array, CollocationSolution], Array]
-"""Function of the system, parameters, `is_phase_active` and solution that returns quantities of
-collocated gaits over lanes."""
+"""Function that returns quantities of collocated gaits over lanes.
+
+Its arguments are the collocation system, the parameters, `is_phase_active` and the solution.
+"""
 
 
 def make_trial_linearizer(
-    system: CollocationSystem,
+    collocation_system: CollocationSystem,
     parameter_indices: tuple[int, ...],
     compute_quantities: ComputeGaitQuantities | None = None,
 ) -> Any:
-    """Return a function that linearizes one wheel's trial solution.
+    """Return a function that linearizes the collocation equations of one wheel at a trial solution.
 
-    Its arguments are (parameters, is_phase_active, solution), and `jax.vmap` can map it over
-    wheels. The function returns the correction, the tangents of the parameters and the monodromy
-    matrix. With `compute_quantities` it also returns these quantities, and their derivatives along
-    the correction and each tangent.
+    The arguments of the function are (parameters, is_phase_active, solution), and `jax.vmap` can
+    map it over wheels. It returns Newton's correction, the tangents with respect to the selected
+    parameters and the monodromy matrix. With `compute_quantities` it also returns the computed
+    quantities, and their derivatives along the correction and along each tangent.
     """
 
     def linearize_trial(parameters: Array, is_phase_active: Array, z: CollocationSolution) -> tuple:
         collocation_state = CollocationState(
-            z, is_phase_active, *init_search_flags(system, z.section_state)
+            z, is_phase_active, *init_search_flags(collocation_system, z.section_state)
         )
-        cycle_linearization = system.linearize_at(parameters, collocation_state, parameter_indices)
+        cycle_linearization = collocation_system.linearize_at(
+            parameters, collocation_state, parameter_indices
+        )
         newton_results = (
-            cycle_linearization.correction,
-            cycle_linearization.tangents,
+            cycle_linearization.newton_correction,
+            cycle_linearization.parameter_tangents,
             cycle_linearization.monodromy,
         )
         if compute_quantities is None:
@@ -227,14 +245,16 @@ def make_trial_linearizer(
         ]
         prepend_correction = lambda a, b: jnp.concatenate([a[None], b])
         solution_tangents = jax.tree.map(
-            prepend_correction, cycle_linearization.correction, cycle_linearization.tangents
+            prepend_correction,
+            cycle_linearization.newton_correction,
+            cycle_linearization.parameter_tangents,
         )
         tangent_directions = (
             jnp.broadcast_to(parameter_tangents, (len(parameter_tangents), *parameters.shape)),
             solution_tangents,
         )
         evaluate_quantities = lambda parameters, z: compute_quantities(
-            system, parameters, is_phase_active, z
+            collocation_system, parameters, is_phase_active, z
         )
         compute_quantity_tangent = lambda tangent_direction: jax.jvp(
             evaluate_quantities, (parameters, z), tangent_direction
@@ -252,7 +272,7 @@ def make_trial_linearizer(
     )
     cache_key = (
         "followed",
-        system,
+        collocation_system,
         parameter_indices,
         compute_quantities.__name__ if compute_quantities else "",
     )
@@ -264,9 +284,9 @@ def make_trial_linearizer(
 class AbstractReturnMapProblem(AbstractGaitProblem):
     """Continuation problem of fixed points of the return map over `period_n` steps.
 
-    z is the section state. Its last components are codes (see `AbstractWheel.n_continuous`), which
-    are those of the image in the last iteration. Newton's method ends only if the codes of state
-    and image are equal.
+    The unknowns z are the section state. Its last components are codes (see
+    `AbstractWheel.n_continuous`), which are copied from the image in every iteration. Newton's
+    method converges only if the codes of state and image are equal.
     """
 
     period_n: eqx.AbstractVar[int]
@@ -276,29 +296,34 @@ class AbstractReturnMapProblem(AbstractGaitProblem):
     def n_steps(self) -> int:
         return self.period_n
 
-    def section_state(self, z: ProblemUnknowns) -> SectionVector:
+    def section_state(self, z: ProblemUnknowns) -> SectionStateVector:
         return z[: self.n_coordinates]
 
-    def interpolate(
-        self, left: ProblemUnknowns, right: ProblemUnknowns, fraction: Scalar
+    def interpolate_unknowns(
+        self, left_point: ProblemUnknowns, right_point: ProblemUnknowns, location_fraction: Scalar
     ) -> ProblemUnknowns:
-        return interpolate_section_states(left, right, fraction, self.n_coordinates)
+        return interpolate_section_states(
+            left_point, right_point, location_fraction, self.n_coordinates
+        )
 
-    def is_smooth_between(self, left: ProblemUnknowns, right: ProblemUnknowns) -> Bool[Array, ""]:
-        """Return whether the codes of both points are equal."""
-        return jnp.all(left[self.n_coordinates :] == right[self.n_coordinates :])
+    def is_smooth_between(
+        self, left_point: ProblemUnknowns, right_point: ProblemUnknowns
+    ) -> Bool[Array, ""]:
+        """Return whether the codes of two neighboring points are equal."""
+        return jnp.all(left_point[self.n_coordinates :] == right_point[self.n_coordinates :])
 
     def read_gait_state(
         self, wheel: BranchWheel, z: ProblemUnknowns, p: Scalar
     ) -> tuple[AnySectionState, dict[str, Array]]:
-        """Return the section state without continued quantities, because all quantities are
-        measures of the step.
+        """Return the section state before the first landing, and no continued quantities.
+
+        All quantities are measures of the event-driven step.
         """
         return z, {}
 
 
 class ReturnMapProblem(AbstractReturnMapProblem):
-    """Continuation problem of a model whose steps JAX differentiates."""
+    """Continuation problem of the gaits of a model whose steps JAX differentiates."""
 
     model: AbstractWheel
     step_options: StepOptions
@@ -306,23 +331,21 @@ class ReturnMapProblem(AbstractReturnMapProblem):
     period_n: int = eqx.field(static=True)
     n_coordinates: int = eqx.field(static=True)
 
-    def _iterate_return_map(self, wheel: BranchWheel, z: Array, p: Scalar) -> Array:
-        """Return the section state after `period_n` steps; NaN if one of them fails."""
-        model, params = self.model.with_parameter(wheel.params, self.parameter_name, p)
-        for _ in range(self.period_n):
-            advance_result = model.advance(params, z, self.step_options)
-            z = jnp.where(
-                advance_result.outcome == Outcome.STEPPED, advance_result.section_state, jnp.nan
-            )
-        return z
-
     def linearize(self, wheel: BranchWheel, z: ProblemUnknowns, p: Scalar) -> NewtonStep:
-        return_map = lambda z, p: self._iterate_return_map(wheel, z, p)
-        return arclength.make_fixed_point_newton_step(return_map, z, p, self.n_coordinates)
+        def return_map(z: Array, p: Scalar) -> Array:
+            model, params = self.model.with_parameter(wheel.params, self.parameter_name, p)
+            for _ in range(self.period_n):
+                advance_result = model.advance(params, z, self.step_options)
+                z = jnp.where(
+                    advance_result.outcome == Outcome.STEPPED, advance_result.section_state, jnp.nan
+                )
+            return z
+
+        return arclength.compute_fixed_point_newton_step(return_map, z, p, self.n_coordinates)
 
 
 class GroundProblem(AbstractReturnMapProblem):
-    """Continuation problem with unilateral contact, by batches of steps."""
+    """Continuation problem of gaits with unilateral contact, by batches of steps."""
 
     model: UnilateralWheel
     step_options: StepOptions
@@ -335,7 +358,7 @@ class GroundProblem(AbstractReturnMapProblem):
     has_kinks: ClassVar[bool] = True
 
     def stack_parameter_values(self, wheels: BranchWheel, p: Array) -> Array:
-        """Return the parameter values of many wheels, with the continued parameter at p."""
+        """Return the parameter values of many wheels, with the continued parameter equal to p."""
 
         def select_values(wheel: BranchWheel, p: Array) -> Array:
             model, params = self.model.with_parameter(wheel.params, self.parameter_name, p)
@@ -344,12 +367,12 @@ class GroundProblem(AbstractReturnMapProblem):
         return jax.vmap(select_values)(wheels, p)
 
     def _make_period_map(self, wheels: BranchWheel, p: Array) -> PeriodMap:
-        """Return the map of many wheels over one period."""
+        """Return the return map of many wheels over one period."""
         parameter_values = np.asarray(self.stack_parameter_values(wheels, p))
         return PeriodMap(self.model, self.n_legs, self.period_n, parameter_values)
 
     def linearize(self, wheel: BranchWheel, z: ProblemUnknowns, p: Array) -> NewtonStep:
-        """Return the Newton steps of many wheels."""
+        """Return the Newton steps of many wheels at their trial points."""
         section_states, n_coordinates = np.asarray(z), self.n_coordinates
         is_continued_parameter = np.asarray(self.model.parameter_names) == self.parameter_name
         period_evaluation = self._make_period_map(wheel, p).evaluate_period(
@@ -366,12 +389,12 @@ class GroundProblem(AbstractReturnMapProblem):
         right_sides = np.concatenate(
             [period_defects[:, :n_coordinates, None], parameter_jacobian], -1
         )
-        linear_solutions = solve_linear_systems(
+        solved_columns = solve_linear_systems(
             np.eye(n_coordinates) - return_map_jacobian, right_sides
         )
         code_changes = period_defects[:, n_coordinates:]
-        newton_corrections = np.concatenate([linear_solutions[..., 0], code_changes], 1)
-        parameter_tangents = np.concatenate([linear_solutions[..., 1], 0.0 * code_changes], 1)
+        newton_corrections = np.concatenate([solved_columns[..., 0], code_changes], 1)
+        parameter_tangents = np.concatenate([solved_columns[..., 1], 0.0 * code_changes], 1)
         return NewtonStep(newton_corrections, parameter_tangents, jnp.asarray(return_map_jacobian))
 
     def measure_gaits(
@@ -384,7 +407,7 @@ class GroundProblem(AbstractReturnMapProblem):
         period_evaluation = self._make_period_map(wheels, points.p).evaluate_period(
             step_options, np.asarray(points.z), False, False
         )
-        additional_columns = {
+        additional_quantities = {
             "section_state": jnp.asarray(points.z),
             CONTACT_ORDER_COLUMN: compute_contact_order_numbers(
                 period_evaluation.period_steps, self.n_legs
@@ -394,15 +417,16 @@ class GroundProblem(AbstractReturnMapProblem):
             ),
         }
         return (
-            _combine_period_measures(period_evaluation.period_steps, points.z) | additional_columns
+            _combine_period_measures(period_evaluation.period_steps, points.z)
+            | additional_quantities
         )
 
     def _compute_friction_surplus(self, wheel: BranchWheel, p: Array) -> Array:
-        """Return the friction coefficient minus the smallest one with a gait.
+        """Return the friction coefficient minus the slope's tangent.
 
-        Over a period the ground's tangential impulse equals that of the weight along the slope.
-        Friction limits the tangential impulse to a multiple of the normal impulse, so no gait
-        repeats without a surplus.
+        Over a period, the ground's tangential impulse balances that of the weight along the slope.
+        The tangential impulse is at most the friction coefficient times the normal impulse, so no
+        gait repeats without a surplus.
         """
         model: Any
         model, params = self.model.with_parameter(wheel.params, self.parameter_name, p)
@@ -414,23 +438,23 @@ class GroundProblem(AbstractReturnMapProblem):
 
 
 def compute_contact_order_numbers(period_steps: Any, n_legs: int) -> np.ndarray:
-    """Return a number for each of many periods that identifies its order of contacts.
+    """Return a number for each period that identifies its order of contacts, shape (periods,).
 
-    The number is a checksum of the modes that occur, the counts of events and the final contact
-    modes.
+    The number is a checksum of the contact modes that occur, the counts of events and the final
+    contact modes.
     """
     has_mode_occurred = np.asarray(period_steps.mode_durations) > 0.0
     contact_codes = np.asarray(period_steps.section_state)[..., -n_legs:]
     event_counts = np.stack([np.asarray(period_steps.events), np.asarray(period_steps.impacts)], -1)
-    integer_arrays = [
+    integer_period_arrays = [
         x.reshape(len(x), -1).astype(np.int64)
         for x in (has_mode_occurred, contact_codes, event_counts)
     ]
-    order_numbers = [
+    contact_order_numbers = [
         zlib.crc32(period_integers.tobytes())
-        for period_integers in np.concatenate(integer_arrays, 1)
+        for period_integers in np.concatenate(integer_period_arrays, 1)
     ]
-    return np.array(order_numbers, float)
+    return np.array(contact_order_numbers, float)
 
 
 @jax.jit
@@ -438,7 +462,7 @@ def compute_contact_order_numbers(period_steps: Any, n_legs: int) -> np.ndarray:
 def _combine_period_measures(
     step_results: AbstractStep, section_states: AnySectionState
 ) -> dict[str, Array]:
-    """Return the measures of many periods that begin at the given section states."""
+    """Return the measures of many periods, whose first section states are given."""
     return combine_step_measures(
         step_results.section_state[-1],
         jax.vmap(lambda step_result: step_result.measures())(step_results),
@@ -449,7 +473,7 @@ def _combine_period_measures(
 def interpolate_section_states(
     left_state: Array, right_state: Array, state_fraction: Scalar, n_coordinates: int
 ) -> Array:
-    """Return a section state between two others, with the codes of the nearer one."""
+    """Return a section state between two section states, with the codes of the nearer one."""
     nearer_codes = jnp.where(state_fraction < 0.5, left_state, right_state)[n_coordinates:]
     return jnp.concatenate(
         [(left_state + state_fraction * (right_state - left_state))[:n_coordinates], nearer_codes]
@@ -463,11 +487,12 @@ def measure_gait(
     step_options: StepOptions,
     period_n: int,
 ) -> dict[str, Array]:
-    """Return all measures of one period of a gait from its section state, with `closure`.
+    """Return all measures of one period of a gait, which starts from its section state.
 
-    Indicators and margins are minima over the steps; durations and energies are sums. The section
-    state is that of the last step, the post-impact state that of the first step. `outcome` is that
-    of the first step that fails. `closure` is the change of the section state over the period.
+    Indicators and margins are minima over the steps, and durations and energies are sums. The
+    section state is that of the last step, and the post-impact state is that of the first step.
+    `outcome` is the first failure of a step, if any. `closure` is the largest change of the section
+    state over the period.
     """
 
     def measure_next_step(
@@ -483,9 +508,7 @@ def measure_gait(
 def combine_step_measures(
     end_state: AnySectionState, step_measures: dict[str, Array], section_state: AnySectionState
 ) -> dict[str, Array]:
-    """Return the result of `measure_gait` from the measures of each step and the final section
-    state.
-    """
+    """Return the result of `measure_gait` from the measures of each step and the end state."""
     period_measures = {}
     for measure_name, step_values in step_measures.items():
         if measure_name in MARGIN_MEASURES | STOPPER_MARGIN_MEASURES or measure_name.startswith(

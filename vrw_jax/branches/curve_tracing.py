@@ -1,7 +1,8 @@
-"""Continuation of special points as curves in two parameters, in batches, each curve once.
+"""Curves of special points in two parameters, traced in batches, each curve once.
 
-A special point is computed together with its gait, so that a point of a curve is as accurate as the
-gait. If a curve meets another special point, a new curve starts there.
+A special point and its gait are unknowns of the same equations, so that the points of a curve are
+as accurate as the gaits. If a curve meets another special point, a new curve is traced from the
+meeting point.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -17,12 +18,12 @@ from vrw_jax.branches.branch import Codim2Point, SpecialPoint, SpecialPointCurve
 from vrw_jax.branches.branch_location import (
     AbstractContinuation,
     BranchData,
-    PointQuantities,
-    continue_and_locate_points,
+    QuantitiesByName,
+    continue_and_locate_special_points,
 )
 from vrw_jax.branches.continuation import (
     BRANCH_ENDING_QUANTITIES,
-    GAIT_BRANCH_OPTIONS,
+    DEFAULT_GAIT_CONTINUATION_OPTIONS,
     GaitContinuation,
     continue_branches,
 )
@@ -57,24 +58,24 @@ from vrw_jax.runtime import xarray as xr
 from vrw_jax.wheel import Outcome, WheelParams, make_wheel_from_parameters
 
 RANGE_EDGE_COLUMN = "edge of the box"
-"""Name of the quantity that is zero if the second parameter is at an end of its range."""
+"""Name of the quantity that vanishes if the second parameter is at an end of its range."""
 
 DEFAULT_CURVE_OPTIONS = ArclengthOptions(initial_ds=5e-4)
-"""Default options of curves. The first step is short because some curves are short."""
+"""Default options of curves, with a short first continuation step because some curves are short."""
 
 
 @dataclass(frozen=True)
 class CurveTracingOptions:
-    """Options of the tracing of curves. Lengths are arc lengths of curves.
+    """Numerical options of the tracing of curves. Lengths are arc lengths.
 
-    - `same_curve_distance`: largest distance of a point from a curve that contains the point;
-    - `codim2_overrun_distance`: distance from a point of codimension two at which the continuation
-      of the other curve starts;
-    - `relative_codim2_tolerance`: tolerance of Newton's last step to a point of codimension two,
-      relative to the values of the parameters;
-    - `max_zero_dls_duration`: duration of double support that counts as zero, s. It is chosen above
-      round-off because the duration is ill-conditioned near zero;
-    - `dls_duration_guess`: first guess of a nonzero duration of double support, s.
+    - `same_curve_distance`: largest distance at which a point counts as a point of a curve;
+    - `codim2_overrun_distance`: distance beyond a point of codimension two at which the
+      continuation of the other curve starts;
+    - `relative_codim2_tolerance`: tolerance of Newton's last correction at a point of codimension
+      two, relative to the values of the parameters;
+    - `max_zero_dls_duration`: largest duration of double support that counts as zero, s. The value
+      is chosen above round-off because the duration is ill-conditioned near zero;
+    - `dls_duration_guess`: initial guess of a nonzero duration of double support, s.
     """
 
     same_curve_distance: float = 2e-3
@@ -84,47 +85,50 @@ class CurveTracingOptions:
     dls_duration_guess: float = 0.1
 
 
-CURVE_TRACING_OPTIONS = CurveTracingOptions()
-"""Options of the tracing of all curves."""
+DEFAULT_CURVE_TRACING_OPTIONS = CurveTracingOptions()
+"""Default options of the tracing of curves."""
 
 
 @dataclass(frozen=True)
 class CurveContinuation(AbstractContinuation):
-    """Continuation of special points.
+    """Continuation of special points as curves in two parameters.
 
-    Their quantities are those of gaits, except for the quantity that vanishes.
+    The quantities at its points are those of gaits, without the quantity that vanishes on the whole
+    curve.
     """
 
-    problem: TestFunctionCurve
-    second_parameter: str
-    special_point_names: tuple[str, ...]  # name of the special point of each wheel
-    gait_continuation: GaitContinuation  # continuation of gaits along the first parameter
+    continuation_problem: TestFunctionCurve
+    second_parameter_name: str
+    special_point_names: tuple[str, ...]  # of each wheel
+    gait_continuation: GaitContinuation  # along the first parameter
 
     branch_ending_quantities: ClassVar[tuple[str, ...]] = (
         *BRANCH_ENDING_QUANTITIES,
         RANGE_EDGE_COLUMN,
         INITIAL_FORCE_FALL_NAME,
     )
-    margin_names: ClassVar[tuple[str, ...]] = GaitContinuation.margin_names
+    border_collision_quantities: ClassVar[tuple[str, ...]] = (
+        GaitContinuation.border_collision_quantities
+    )
     linear_margin_substitutes: ClassVar[Mapping[str, str]] = LINEAR_MARGIN_SUBSTITUTES
 
     def evaluate_point_quantities(
         self, wheels: TestFunctionWheel, points: ContinuationPoint
-    ) -> PointQuantities:
+    ) -> QuantitiesByName:
         z, second_fractions = points.z
         (lower_bound, upper_bound), second_fractions = (
-            self.problem.bounds,
+            self.continuation_problem.second_parameter_bounds,
             np.asarray(second_fractions),
         )
         second_values = lower_bound + (upper_bound - lower_bound) * second_fractions
-        get_second_parameter = lambda params: getattr(params, self.second_parameter)
+        get_second_parameter = lambda params: getattr(params, self.second_parameter_name)
         gait_wheels = wheels.branch_wheel._replace(
             params=eqx.tree_at(get_second_parameter, wheels.branch_wheel.params, second_values)
         )
         quantity_table = self.gait_continuation.evaluate_point_quantities(
             gait_wheels, points._replace(z=z)
         )
-        # Without double support the rear foot's force must not be positive.
+        # Without double support, the rear foot's force must not be positive.
         rear_force_sign = np.where(wheels.branch_wheel.is_phase_active[:, 0, 0] > 0.5, 1.0, -1.0)
         curve_quantities = {
             "lambda_4_plus": rear_force_sign * quantity_table["lambda_4_plus"],
@@ -137,25 +141,30 @@ class CurveContinuation(AbstractContinuation):
         )
 
     def mask_undefined_quantities(
-        self, table: PointQuantities, wheel_indices: np.ndarray
-    ) -> PointQuantities:
-        """Return the table with NaN for quantities that are zero or undefined on a whole curve."""
+        self, quantity_table: QuantitiesByName, wheel_indices: np.ndarray
+    ) -> QuantitiesByName:
+        """Return the table with NaN for quantities that are zero or undefined on the whole
+        curve.
+        """
         point_names = np.array(self.special_point_names)[wheel_indices]
         is_dls_vanishing = point_names == DLS_VANISHING_NAME
         is_discontinuous = np.isin(point_names, (*DISCONTINUOUS_QUANTITIES, DLS_VANISHING_NAME))
         step_measure_names = {
-            name for name in table if name.partition("[")[0] in MARGIN_MEASURES
+            quantity_name
+            for quantity_name in quantity_table
+            if quantity_name.partition("[")[0] in MARGIN_MEASURES
         } - set(CONTINUED_QUANTITIES)
         is_undefined_by_name = {
-            name: point_names == name for name in {*self.special_point_names} & {*table}
+            quantity_name: point_names == quantity_name
+            for quantity_name in {*self.special_point_names} & {*quantity_table}
         }
         is_undefined_by_name |= {
-            substitute: point_names == name
-            for name, substitute in LINEAR_MARGIN_SUBSTITUTES.items()
+            substitute_name: point_names == quantity_name
+            for quantity_name, substitute_name in LINEAR_MARGIN_SUBSTITUTES.items()
         }
         is_undefined_by_name |= {
-            name: is_discontinuous | is_undefined_by_name.get(name, False)
-            for name in step_measure_names
+            quantity_name: is_discontinuous | is_undefined_by_name.get(quantity_name, False)
+            for quantity_name in step_measure_names
         }
         is_rear_force_undefined = (
             is_undefined_by_name.get("lambda_4_plus", False) | is_dls_vanishing
@@ -164,44 +173,54 @@ class CurveContinuation(AbstractContinuation):
             "lambda_4_plus": is_rear_force_undefined,
             INITIAL_FORCE_FALL_NAME: ~is_dls_vanishing,
         }
-        table = table | {
-            name: np.where(mask if table[name].ndim == 1 else mask[:, None], np.nan, table[name])
-            for name, mask in is_undefined_by_name.items()
+        quantity_table = quantity_table | {
+            quantity_name: np.where(
+                is_undefined_by_quantity
+                if quantity_table[quantity_name].ndim == 1
+                else is_undefined_by_quantity[:, None],
+                np.nan,
+                quantity_table[quantity_name],
+            )
+            for quantity_name, is_undefined_by_quantity in is_undefined_by_name.items()
         }
-        outcomes = np.where(is_discontinuous, Outcome.STEPPED, table["outcome"])
-        return table | {
-            "outcome": outcomes,
-            "closure": np.where(is_discontinuous, 0.0, table["closure"]),
+        step_outcomes = np.where(is_discontinuous, Outcome.STEPPED, quantity_table["outcome"])
+        return quantity_table | {
+            "outcome": step_outcomes,
+            "closure": np.where(is_discontinuous, 0.0, quantity_table["closure"]),
         }
 
-    def are_points_admissible(self, table: PointQuantities) -> np.ndarray:
+    def are_points_admissible(self, quantity_table: QuantitiesByName) -> np.ndarray:
         is_positive = np.all(
-            [~(table[name] <= 0.0) for name in self.branch_ending_quantities], axis=0
+            [
+                ~(quantity_table[quantity_name] <= 0.0)
+                for quantity_name in self.branch_ending_quantities
+            ],
+            axis=0,
         )
-        return is_positive & self.gait_continuation.are_points_admissible(table)
+        return is_positive & self.gait_continuation.are_points_admissible(quantity_table)
 
-    def is_mesh_limited(self, table: PointQuantities, end_names: tuple[str, ...]) -> bool:
-        return self.gait_continuation.is_mesh_limited(table, end_names)
+    def is_mesh_limited(self, quantity_table: QuantitiesByName, end_names: tuple[str, ...]) -> bool:
+        return self.gait_continuation.is_mesh_limited(quantity_table, end_names)
 
-    def name_branch_end(self, table: PointQuantities, row_index: int) -> str:
-        return self.gait_continuation.name_branch_end(table, row_index)
+    def name_branch_end(self, quantity_table: QuantitiesByName, point_index: int) -> str:
+        return self.gait_continuation.name_branch_end(quantity_table, point_index)
 
 
 class CurveSeed(NamedTuple):
-    """Point on or near a curve of special points, from which the curve is continued."""
+    """Point on or near a curve of special points, from which the curve is traced."""
 
     special_point_name: str
-    parameter_values: tuple[float, float]  # values of the two parameters
+    parameter_values: tuple[float, float]  # of the two parameters
     collocation_system: CollocationSystem
     branch_wheel: BranchWheel
     z: CollocationSolution
 
 
 class TracedCurve(NamedTuple):
-    """Traced curve, with seeds at the special points that it meets."""
+    """Traced curve of special points, with seeds at the other special points that it meets."""
 
     special_point_curve: SpecialPointCurve
-    # section states and both parameters as fractions of their ranges, (point, coordinate)
+    # section states and both parameters, as fractions of their ranges, (point, coordinate)
     scaled_vertices: np.ndarray
     meeting_seeds: tuple[CurveSeed, ...]
 
@@ -214,31 +233,35 @@ class CurveTracer(NamedTuple):
     model: ViscoelasticWheel
     arclength_options: ArclengthOptions
     step_options: StepOptions
-    report_stage_to: Callable[[str], None] | None = None
-    tracing_options: CurveTracingOptions = CURVE_TRACING_OPTIONS
+    stage_reporter: Callable[[str], None] | None = None
+    tracing_options: CurveTracingOptions = DEFAULT_CURVE_TRACING_OPTIONS
     measures_force_peaks: bool = False  # whether branches measure the peaks of the gait's force
 
-    def report_stage(self, stage: str) -> None:
-        """Call `report_stage_to`, if it is given, with a description of the next stage."""
-        if self.report_stage_to is not None:
-            self.report_stage_to(stage)
+    def report_stage(self, stage_description: str) -> None:
+        """Pass a description of the next stage to `stage_reporter`, if it is given."""
+        if self.stage_reporter is not None:
+            self.stage_reporter(stage_description)
 
-    def with_parameters(self, params: WheelParams, values: Mapping[str, float]) -> WheelParams:
-        """Return the wheel with other values of some parameters."""
-        for name, value in values.items():
-            params = self.model.with_parameter(params, name, jnp.asarray(value))[1]
+    def with_parameters(
+        self, params: WheelParams, parameter_values: Mapping[str, float]
+    ) -> WheelParams:
+        """Return the wheel with new values of the two parameters."""
+        for parameter_name, parameter_value in parameter_values.items():
+            params = self.model.with_parameter(
+                params, parameter_name, jnp.asarray(parameter_value)
+            )[1]
         return params
 
-    def compute_parameter_fractions(self, values: np.ndarray) -> np.ndarray:
-        """Return both parameters, on the last axis, as fractions of their ranges."""
-        return (values - self.parameter_ranges[:, 0]) / np.ptp(self.parameter_ranges, 1)
+    def compute_parameter_fractions(self, parameter_values: np.ndarray) -> np.ndarray:
+        """Return the two parameters, which are on the last axis, as fractions of their ranges."""
+        return (parameter_values - self.parameter_ranges[:, 0]) / np.ptp(self.parameter_ranges, 1)
 
     def find_seeds(
         self, parameter_index: int, params: WheelParams, start_cycles: LimitCycle | None = None
     ) -> list[CurveSeed]:
-        """Return seeds at the special points on branches of the wheels along one parameter.
+        """Return seeds at the special points of the wheels' branches along one parameter.
 
-        `start_cycles` contains the gaits of the wheels, or is None if they are unknown.
+        `start_cycles` are the gaits of the wheels, if they are known.
         """
         parameter_name, curve_seeds = self.parameter_names[parameter_index], []
         lower_bound, upper_bound = self.parameter_ranges[parameter_index]
@@ -259,25 +282,28 @@ class CurveTracer(NamedTuple):
 
     def _make_seed(self, special_point: SpecialPoint) -> CurveSeed:
         """Return the seed at a special point of a branch."""
-        cycle = special_point.cycle
-        params = make_wheel_from_parameters(cycle.parameters, cycle.system.n_legs)
-        first_value, second_value = (
-            float(getattr(params, special_point_name))
-            for special_point_name in self.parameter_names
+        limit_cycle = special_point.cycle
+        params = make_wheel_from_parameters(limit_cycle.parameters, limit_cycle.system.n_legs)
+        first_parameter_value, second_parameter_value = (
+            float(getattr(params, parameter_name)) for parameter_name in self.parameter_names
         )
-        branch_wheel = BranchWheel(params, cycle.collocation_state.is_phase_active)
-        z = cycle.collocation_state.solution
-        special_point_name = rename_special_point(
+        branch_wheel = BranchWheel(params, limit_cycle.collocation_state.is_phase_active)
+        z = limit_cycle.collocation_state.solution
+        special_point_name = choose_continued_special_point_name(
             special_point.name, branch_wheel, z, self.tracing_options
         )
         return CurveSeed(
-            special_point_name, (first_value, second_value), cycle.system, branch_wheel, z
+            special_point_name,
+            (first_parameter_value, second_parameter_value),
+            limit_cycle.system,
+            branch_wheel,
+            z,
         )
 
     def trace_curves(
         self, seeds: Sequence[CurveSeed], known_curves: Sequence[TracedCurve]
     ) -> list[TracedCurve]:
-        """Return the curves through all seeds that are on none of the known curves."""
+        """Return the curves through all seeds that lie on no known curve."""
         new_curves: list[TracedCurve] = []
         new_seeds = [
             seed
@@ -299,8 +325,7 @@ class CurveTracer(NamedTuple):
             ]
             while remaining_seeds:
                 batch_seeds: list[CurveSeed] = []
-                # A batch contains each name once, because other seeds of the name may be on its
-                # curve.
+                # A batch has one seed per name, because seeds of one name may lie on one curve.
                 for seed in remaining_seeds:
                     if (
                         seed.special_point_name
@@ -309,7 +334,7 @@ class CurveTracer(NamedTuple):
                     ):
                         batch_seeds.append(seed)
                 accepted_curves: list[TracedCurve] = []
-                for curve in self._trace_batch(quantity_group, batch_seeds):
+                for curve in self._trace_curves_of_batch(quantity_group, batch_seeds):
                     if not any(
                         self.are_same_curve(curve, other_curve)
                         for other_curve in (*known_curves, *new_curves, *accepted_curves)
@@ -324,107 +349,135 @@ class CurveTracer(NamedTuple):
                 ]
         return new_curves
 
-    def _is_on_curve(self, seed: CurveSeed, curve: TracedCurve) -> bool:
-        """Return whether a seed is on a curve of the same special point."""
+    def _is_on_curve(self, curve_seed: CurveSeed, traced_curve: TracedCurve) -> bool:
+        """Return whether a seed lies on a curve of the same special point."""
         seed_point = np.append(
-            seed.z.section_state, self.compute_parameter_fractions(np.array(seed.parameter_values))
+            curve_seed.z.section_state,
+            self.compute_parameter_fractions(np.array(curve_seed.parameter_values)),
         )
-        has_same_name = seed.special_point_name == curve.special_point_curve.name
-        max_distance = self.tracing_options.same_curve_distance
+        has_same_name = curve_seed.special_point_name == traced_curve.special_point_curve.name
+        max_curve_distance = self.tracing_options.same_curve_distance
         return has_same_name and bool(
-            compute_distances_to_polyline(seed_point[None], curve.scaled_vertices)[0] < max_distance
+            compute_distances_to_polyline(seed_point[None], traced_curve.scaled_vertices)[0]
+            < max_curve_distance
         )
 
-    def are_same_curve(self, curve: TracedCurve, other_curve: TracedCurve) -> bool:
-        """Return whether two curves have the same name, and all points of the first are on the
-        second.
-        """
-        has_same_name = curve.special_point_curve.name == other_curve.special_point_curve.name
-        max_distance = self.tracing_options.same_curve_distance
+    def are_same_curve(self, traced_curve: TracedCurve, other_curve: TracedCurve) -> bool:
+        """Return whether two curves have one name and all points of the first curve lie on the
+        second."""
+        has_same_name = (
+            traced_curve.special_point_curve.name == other_curve.special_point_curve.name
+        )
+        max_curve_distance = self.tracing_options.same_curve_distance
         return has_same_name and bool(
             np.max(
-                compute_distances_to_polyline(curve.scaled_vertices, other_curve.scaled_vertices)
+                compute_distances_to_polyline(
+                    traced_curve.scaled_vertices, other_curve.scaled_vertices
+                )
             )
-            < max_distance
+            < max_curve_distance
         )
 
-    def _trace_batch(
-        self, quantity_group: tuple[str, ...], seeds: list[CurveSeed]
+    def _trace_curves_of_batch(
+        self, quantity_group: tuple[str, ...], curve_seeds: list[CurveSeed]
     ) -> list[TracedCurve]:
-        """Return a curve through each seed that has one, on a sufficiently fine mesh."""
-        curves: list[TracedCurve] = []
-        special_point_names = ", ".join(sorted({seed.special_point_name for seed in seeds}))
+        """Return the curves through the seeds of one batch, on a sufficiently fine mesh.
+
+        A seed through which there is no curve is omitted.
+        """
+        traced_curves: list[TracedCurve] = []
+        special_point_names = ", ".join(
+            sorted({curve_seed.special_point_name for curve_seed in curve_seeds})
+        )
         self.report_stage(f"following special points: {special_point_names}")
-        max_mesh_refinements = GAIT_BRANCH_OPTIONS.max_mesh_refinements
+        max_mesh_refinements = DEFAULT_GAIT_CONTINUATION_OPTIONS.max_mesh_refinements
         for refinement_index in range(1 + max_mesh_refinements):
             is_finest_mesh = refinement_index == max_mesh_refinements
-            branches = self._continue_batch(quantity_group, seeds, is_finest_mesh)
+            data_and_systems = self._continue_curves_of_batch(
+                quantity_group, curve_seeds, is_finest_mesh
+            )
             mesh_limited_seeds = []
-            for seed, (branch_data, collocation_system) in zip(seeds, branches, strict=True):
+            for curve_seed, (branch_data, collocation_system) in zip(
+                curve_seeds, data_and_systems, strict=True
+            ):
                 if branch_data is not None and branch_data.is_mesh_limited and not is_finest_mesh:
                     options = collocation_system.cycle_options.refine_mesh()
                     mesh_limited_seeds.append(
                         self._transfer_seed(
-                            seed, collocation_system._replace(cycle_options=options)
+                            curve_seed, collocation_system._replace(cycle_options=options)
                         )
                     )
                 elif branch_data is not None:
-                    curves.append(
-                        self._label_traced(
-                            seed._replace(collocation_system=collocation_system), branch_data
+                    traced_curves.append(
+                        self._make_traced_curve(
+                            curve_seed._replace(collocation_system=collocation_system), branch_data
                         )
                     )
             if not mesh_limited_seeds:
                 break
-            seeds = mesh_limited_seeds
-        return curves
+            curve_seeds = mesh_limited_seeds
+        return traced_curves
 
     @staticmethod
-    def _transfer_seed(seed: CurveSeed, collocation_system: CollocationSystem) -> CurveSeed:
-        """Return the seed transferred to the mesh of `system`."""
-        if seed.collocation_system == collocation_system:
-            return seed
-        return seed._replace(
+    def _transfer_seed(curve_seed: CurveSeed, collocation_system: CollocationSystem) -> CurveSeed:
+        """Return the seed on the mesh of `collocation_system`."""
+        if curve_seed.collocation_system == collocation_system:
+            return curve_seed
+        return curve_seed._replace(
             collocation_system=collocation_system,
-            z=transfer_solution_to_mesh(seed.collocation_system, collocation_system, seed.z),
+            z=transfer_solution_to_mesh(
+                curve_seed.collocation_system, collocation_system, curve_seed.z
+            ),
         )
 
-    def _continue_batch(
-        self, quantity_group: tuple[str, ...], seeds: list[CurveSeed], is_finest_mesh: bool
+    def _continue_curves_of_batch(
+        self, quantity_group: tuple[str, ...], curve_seeds: list[CurveSeed], is_finest_mesh: bool
     ) -> list[tuple[BranchData | None, CollocationSystem]]:
-        """Return the data of a curve through each seed, and the collocation system of the data.
+        """Return the data of the curve through each seed, with the collocation system of that
+        curve.
 
-        The system has the finest mesh among the seeds.
+        The collocation system has the finest mesh of the seeds.
         """
         collocation_system = max(
-            (seed.collocation_system for seed in seeds),
+            (curve_seed.collocation_system for curve_seed in curve_seeds),
             key=lambda collocation_system: collocation_system.cycle_options.mesh_intervals,
         )
-        seeds = [self._transfer_seed(seed, collocation_system) for seed in seeds]
-        padded_seeds = [*seeds, *seeds[-1:] * (-len(seeds) % batch_sizes.CURVE_BATCH_SIZE)]
+        curve_seeds = [
+            self._transfer_seed(curve_seed, collocation_system) for curve_seed in curve_seeds
+        ]
+        padded_seeds = [
+            *curve_seeds,
+            *curve_seeds[-1:] * (-len(curve_seeds) % batch_sizes.CURVE_BATCH_SIZE),
+        ]
         test_function = GaitTestFunction(
             collocation_system, self.parameter_names, quantity_group, self.model, self.step_options
         )
-        stack_trees = lambda *trees: jax.tree.map(lambda *x: np.stack(x), *trees)
+        stack_trees = lambda *trees_of_seeds: jax.tree.map(lambda *x: np.stack(x), *trees_of_seeds)
         quantity_names = [
             select_test_quantity(
-                seed.special_point_name, bool(seed.branch_wheel.is_phase_active[0, 0] > 0.5)
+                curve_seed.special_point_name,
+                bool(curve_seed.branch_wheel.is_phase_active[0, 0] > 0.5),
             )
-            for seed in padded_seeds
+            for curve_seed in padded_seeds
         ]
-        quantity_indices = [jnp.asarray(quantity_group.index(name)) for name in quantity_names]
+        quantity_indices = [
+            jnp.asarray(quantity_group.index(quantity_name)) for quantity_name in quantity_names
+        ]
         test_function_arguments = stack_trees(
             *(
-                TestFunctionWheel(seed.branch_wheel, quantity_index)
-                for seed, quantity_index in zip(padded_seeds, quantity_indices, strict=True)
+                TestFunctionWheel(curve_seed.branch_wheel, quantity_index)
+                for curve_seed, quantity_index in zip(padded_seeds, quantity_indices, strict=True)
             )
         )
         lower_bound, upper_bound = map(float, self.parameter_ranges[1])
-        compute_second_fraction = lambda seed: jnp.asarray(
-            (seed.parameter_values[1] - lower_bound) / (upper_bound - lower_bound)
+        compute_second_fraction = lambda curve_seed: jnp.asarray(
+            (curve_seed.parameter_values[1] - lower_bound) / (upper_bound - lower_bound)
         )
         z = stack_trees(
-            *(TestFunctionPoint(seed.z, compute_second_fraction(seed)) for seed in padded_seeds)
+            *(
+                TestFunctionPoint(curve_seed.z, compute_second_fraction(curve_seed))
+                for curve_seed in padded_seeds
+            )
         )
         gait_continuation = GaitContinuation(
             test_function.gait_problem,
@@ -435,31 +488,32 @@ class CurveTracer(NamedTuple):
             self.step_options,
             collocation_system.n_legs,
         )
-        continuation = CurveContinuation(
+        branch_continuation = CurveContinuation(
             TestFunctionCurve(test_function, (lower_bound, upper_bound)),
             self.arclength_options,
             test_function_arguments,
             self.parameter_ranges[0],
             self.parameter_names[1],
-            tuple(seed.special_point_name for seed in padded_seeds),
+            tuple(curve_seed.special_point_name for curve_seed in padded_seeds),
             gait_continuation,
         )
-        first_values = jnp.asarray([seed.parameter_values[0] for seed in padded_seeds])
-        is_seed_requested = np.arange(len(padded_seeds)) < len(seeds)
-        branch_data_by_seed = continue_and_locate_points(
-            continuation,
+        first_values = jnp.asarray([curve_seed.parameter_values[0] for curve_seed in padded_seeds])
+        is_seed_requested = np.arange(len(padded_seeds)) < len(curve_seeds)
+        branch_data_by_seed = continue_and_locate_special_points(
+            branch_continuation,
             z,
             first_values,
             is_seed_requested,
             lambda wheel_index, point: lambda: point,
             is_finest_mesh,
         )
-        return [(branch, collocation_system) for branch in branch_data_by_seed[: len(seeds)]]
+        return [
+            (branch_data_of_seed, collocation_system)
+            for branch_data_of_seed in branch_data_by_seed[: len(curve_seeds)]
+        ]
 
-    def _label_traced(self, seed: CurveSeed, branch_data: BranchData) -> TracedCurve:
-        """Return the labeled curve from its data, with seeds at the special points that it
-        meets.
-        """
+    def _make_traced_curve(self, curve_seed: CurveSeed, branch_data: BranchData) -> TracedCurve:
+        """Return a labeled curve with seeds at the special points that it meets."""
         parameter_points = np.stack(
             [branch_data.points.p, branch_data.quantity_table["second"]], -1
         )
@@ -473,26 +527,32 @@ class CurveTracer(NamedTuple):
         for special_point in branch_data.special_points:
             if special_point.name == RANGE_EDGE_COLUMN:
                 continue
-            point_beside = special_point.cycle
+            point_beside_zero = special_point.cycle
             meeting_values = (
                 special_point.value,
                 float(
                     self.parameter_ranges[1, 0]
-                    + np.ptp(self.parameter_ranges[1]) * point_beside.z.fraction
+                    + np.ptp(self.parameter_ranges[1])
+                    * point_beside_zero.z.second_parameter_fraction
                 ),
             )
-            special_point_name = rename_special_point(
-                special_point.name, seed.branch_wheel, point_beside.z.z, self.tracing_options
+            special_point_name = choose_continued_special_point_name(
+                special_point.name,
+                curve_seed.branch_wheel,
+                point_beside_zero.z.z,
+                self.tracing_options,
             )
-            if {special_point_name, seed.special_point_name} == {
+            if {special_point_name, curve_seed.special_point_name} == {
                 "lambda_4_plus",
                 DLS_VANISHING_NAME,
             }:
-                meeting_values = self._locate_jump_onset(seed, point_beside.z.z, meeting_values)
+                meeting_values = self._locate_jump_onset(
+                    curve_seed, point_beside_zero.z.z, meeting_values
+                )
                 new_seeds.append(
                     self._seed_beyond_meeting(
                         special_point_name,
-                        seed,
+                        curve_seed,
                         scaled_vertices,
                         parameter_points,
                         branch_data.points.z.z,
@@ -505,48 +565,48 @@ class CurveTracer(NamedTuple):
                     end_reasons[1].replace(*text_replacement),
                 )
             elif can_continue_special_point(special_point_name):
-                seed_values = float(point_beside.p), meeting_values[1]
+                seed_values = float(point_beside_zero.p), meeting_values[1]
                 new_seeds.append(
                     CurveSeed(
                         special_point_name,
                         seed_values,
-                        seed.collocation_system,
-                        seed.branch_wheel,
-                        point_beside.z.z,
+                        curve_seed.collocation_system,
+                        curve_seed.branch_wheel,
+                        point_beside_zero.z.z,
                     )
                 )
             codim2_points.append(
                 Codim2Point(special_point_name, meeting_values, special_point.ends_branch)
             )
-        special_point_curve = self._label_curve(
-            seed, branch_data._replace(end_reasons=end_reasons), tuple(codim2_points)
+        special_point_curve = self._make_labeled_curve(
+            curve_seed, branch_data._replace(end_reasons=end_reasons), tuple(codim2_points)
         )
         return TracedCurve(special_point_curve, scaled_vertices, tuple(new_seeds))
 
     def _locate_jump_onset(
-        self, seed: CurveSeed, z: CollocationSolution, start_values: Any
+        self, curve_seed: CurveSeed, z: CollocationSolution, start_values: Any
     ) -> tuple[float, float]:
-        """Return both parameters at the onset of the jump, or `start_values` if the onset is not
-        found.
-        """
+        """Return both parameters at the onset of the jump, or `start_values` if it is not found."""
         test_function = GaitTestFunction(
-            seed.collocation_system,
+            curve_seed.collocation_system,
             self.parameter_names,
             CONTINUED_QUANTITIES,
             self.model,
             self.step_options,
         )
-        onset_values, last_change = locate_jump_onset(
-            test_function, seed.branch_wheel, jax.device_put(z), jnp.asarray(start_values)
+        onset_parameter_values, last_relative_change = locate_jump_onset(
+            test_function, curve_seed.branch_wheel, jax.device_put(z), jnp.asarray(start_values)
         )
-        is_onset_found = last_change < self.tracing_options.relative_codim2_tolerance
-        first_value, second_value = onset_values if is_onset_found else start_values
-        return float(first_value), float(second_value)
+        is_onset_found = last_relative_change < self.tracing_options.relative_codim2_tolerance
+        first_parameter_value, second_parameter_value = (
+            onset_parameter_values if is_onset_found else start_values
+        )
+        return float(first_parameter_value), float(second_parameter_value)
 
     def _seed_beyond_meeting(
         self,
         special_point_name: str,
-        seed: CurveSeed,
+        curve_seed: CurveSeed,
         scaled_vertices: np.ndarray,
         parameter_points: np.ndarray,
         z: CollocationSolution,
@@ -554,27 +614,29 @@ class CurveTracer(NamedTuple):
     ) -> CurveSeed:
         """Return a seed beyond the point at which the rear foot's force starts to rise or fall.
 
-        The force is zero along the curve. Both curves cross at that point and continue in the same
+        The force is zero along the curve. Two curves cross at that point and continue in the same
         direction. `meeting_values` are both parameters at the crossing.
         """
         starts_at_meeting = (
             abs(parameter_points[0] - meeting_values).max()
             < abs(parameter_points[-1] - meeting_values).max()
         )
-        order_sign = 1 if starts_at_meeting else -1
+        traversal_sign = 1 if starts_at_meeting else -1
         scaled_vertices, parameter_points = (
-            scaled_vertices[::order_sign],
-            parameter_points[::order_sign],
+            scaled_vertices[::traversal_sign],
+            parameter_points[::traversal_sign],
         )
-        z = jax.tree.map(lambda x: x[::order_sign], z)
+        z = jax.tree.map(lambda x: x[::traversal_sign], z)
         overrun_distance = self.tracing_options.codim2_overrun_distance
-        distances = np.linalg.norm(scaled_vertices - scaled_vertices[0], axis=1)
-        point_index = int(np.argmax(distances >= min(overrun_distance, distances[-1])))
+        distances_to_meeting = np.linalg.norm(scaled_vertices - scaled_vertices[0], axis=1)
+        point_index = int(
+            np.argmax(distances_to_meeting >= min(overrun_distance, distances_to_meeting[-1]))
+        )
         extrapolate_from_meeting = lambda x: (
-            x[0] + overrun_distance / distances[point_index] * (x[0] - x[point_index])
+            x[0] + overrun_distance / distances_to_meeting[point_index] * (x[0] - x[point_index])
         )
         z = jax.tree.map(lambda x: jnp.asarray(extrapolate_from_meeting(x)), z)
-        first_value, second_value = extrapolate_from_meeting(parameter_points)
+        first_parameter_value, second_parameter_value = extrapolate_from_meeting(parameter_points)
         dls_duration = (
             0.0
             if special_point_name == DLS_VANISHING_NAME
@@ -583,17 +645,19 @@ class CurveTracer(NamedTuple):
         z = z._replace(durations=z.durations.at[0, 0].set(dls_duration))
         return CurveSeed(
             special_point_name,
-            (first_value, second_value),
-            seed.collocation_system,
-            seed.branch_wheel,
+            (first_parameter_value, second_parameter_value),
+            curve_seed.collocation_system,
+            curve_seed.branch_wheel,
             z,
         )
 
-    def _label_curve(
-        self, seed: CurveSeed, branch_data: BranchData, codim2_points: tuple[Codim2Point, ...]
+    def _make_labeled_curve(
+        self, curve_seed: CurveSeed, branch_data: BranchData, codim2_points: tuple[Codim2Point, ...]
     ) -> SpecialPointCurve:
-        """Return the labeled curve from its data."""
-        spectral_radius = np.abs(np.linalg.eigvals(np.asarray(branch_data.points.jacobian))).max(-1)
+        """Return a labeled curve from the data of its continuation."""
+        spectral_radius = np.abs(
+            np.linalg.eigvals(np.asarray(branch_data.points.return_map_jacobian))
+        ).max(-1)
         quantity_table = branch_data.quantity_table | {"spectral_radius": spectral_radius}
         column_names = ("duration_dls", "duration_sls1", "duration_sls2", "spectral_radius")
         curve_variables: dict[str, Any] = {
@@ -608,52 +672,53 @@ class CurveTracer(NamedTuple):
         curve_variables["section_state"] = (("point", "component"), quantity_table["section_state"])
         parameter_values = np.asarray(branch_data.points.p), quantity_table["second"]
         curve_coordinates = {
-            parameter: ("point", value, make_measure_attributes(parameter))
-            for parameter, value in zip(self.parameter_names, parameter_values, strict=True)
+            parameter_name: ("point", parameter_value, make_measure_attributes(parameter_name))
+            for parameter_name, parameter_value in zip(
+                self.parameter_names, parameter_values, strict=True
+            )
         }
         start_wheel = collect_provenance_attributes(
-            seed.branch_wheel.params, self.model, self.step_options
+            curve_seed.branch_wheel.params, self.model, self.step_options
         )
-        title = {
-            "title": f"Curve of {seed.special_point_name} over {' and '.join(self.parameter_names)}"
-        }
-        dataset = xr.Dataset(curve_variables, curve_coordinates, title | start_wheel)
+        axes_text = " and ".join(self.parameter_names)
+        dataset_attrs = {"title": f"Curve of {curve_seed.special_point_name} over {axes_text}"}
+        curve_dataset = xr.Dataset(curve_variables, curve_coordinates, dataset_attrs | start_wheel)
         return SpecialPointCurve(
-            seed.special_point_name,
+            curve_seed.special_point_name,
             self.parameter_names,
-            dataset,
+            curve_dataset,
             codim2_points,
             branch_data.end_reasons,
         )
 
 
-def compute_distances_to_polyline(points: np.ndarray, vertices: np.ndarray) -> np.ndarray:
+def compute_distances_to_polyline(
+    query_points: np.ndarray, polyline_vertices: np.ndarray
+) -> np.ndarray:
     """Return the distance of each point from a polyline, shape (points,).
 
-    The vertices of the polyline are rows of `vertices`.
+    Each row of `polyline_vertices` is a vertex of the polyline.
     """
-    segment_starts, segment_vectors = vertices[:-1], np.diff(vertices, axis=0)
+    segment_starts, segment_vectors = polyline_vertices[:-1], np.diff(polyline_vertices, axis=0)
     squared_lengths = np.maximum(np.sum(segment_vectors**2, 1), 1e-300)
-    start_offsets = points[:, None] - segment_starts
+    offsets_from_segment_start = query_points[:, None] - segment_starts
     segment_fractions = np.clip(
-        np.sum(start_offsets * segment_vectors, 2) / squared_lengths, 0.0, 1.0
+        np.sum(offsets_from_segment_start * segment_vectors, 2) / squared_lengths, 0.0, 1.0
     )
     segment_distances = np.linalg.norm(
-        start_offsets - segment_fractions[..., None] * segment_vectors, axis=2
+        offsets_from_segment_start - segment_fractions[..., None] * segment_vectors, axis=2
     )
     return np.min(segment_distances, axis=1, initial=np.inf)
 
 
-def rename_special_point(
+def choose_continued_special_point_name(
     special_point_name: str,
     branch_wheel: BranchWheel,
     z: CollocationSolution,
-    tracing_options: CurveTracingOptions = CURVE_TRACING_OPTIONS,
+    tracing_options: CurveTracingOptions = DEFAULT_CURVE_TRACING_OPTIONS,
 ) -> str:
-    """Return the name under which a special point of a curve or branch is continued, given its
-    gait.
-    """
-    # A curve of folds need not turn back at its special points.
+    """Return the name under which a special point of a gait is continued as a curve."""
+    # A curve of folds may continue in one direction at its special points.
     if special_point_name == BRANCH_POINT_KIND:
         return "fold"
     if (
@@ -669,7 +734,7 @@ def rename_special_point(
 
 
 def can_continue_special_point(special_point_name: str) -> bool:
-    """Return whether `GaitTestFunction` can continue the special point of this name as a curve."""
+    """Return whether `GaitTestFunction` can continue the named special point as a curve."""
     continued_names = (
         *BIFURCATION_NAMES,
         *DISCONTINUOUS_QUANTITIES,

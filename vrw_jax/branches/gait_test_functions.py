@@ -1,7 +1,7 @@
-"""Test functions of collocated gaits over two parameters, whose zeros are special points.
+"""Test functions of collocated gaits in two parameters, whose zeros are special points.
 
-Trial solution, tangents, quantities and their derivatives are computed by one call of machine code.
-Margins that need an event-driven step are computed by steps.
+One call of machine code computes Newton's correction, the tangents, the quantities and their
+derivatives. Event-driven steps compute the margins that the collocation does not determine.
 """
 
 from collections.abc import Mapping
@@ -29,9 +29,9 @@ from vrw_jax.collocation import CollocationSolution, PhasePoints
 from vrw_jax.continuation import (
     BIFURCATION_NAMES,
     AbstractTestFunction,
-    SectionVector,
+    SectionStateVector,
     TestFunctionNewtonStep,
-    offset_bifurcation_margins,
+    compute_offset_bifurcation_margins,
 )
 from vrw_jax.cycles import (
     CollocationState,
@@ -55,25 +55,32 @@ from vrw_jax.wheel import (
 )
 
 LINEAR_MARGIN_SUBSTITUTES: Mapping[str, str] = GaitContinuation.linear_margin_substitutes
-"""Names of margins that vanish as a cube, each with the quantity that vanishes linearly at the same
+"""Names of margins that vanish as a cube, each with a quantity that vanishes linearly at that
 point."""
 
 DISCONTINUOUS_QUANTITIES = (*DOUBLE_SUPPORT_INDICATOR_NAMES, "duration_sls1", "duration_sls2")
-"""Quantities at whose zeros the step is discontinuous, so that measures of the step are not
-defined."""
+"""Names of the quantities at whose zeros the step is discontinuous, so that its measures are
+undefined."""
 
 DLS_VANISHING_NAME = "duration_dls"
-"""Name of the special point at which the duration of double support is zero. At this point the rear
-foot's force is zero and falls. At the zero of `lambda_4_plus` the force is zero and rises, and the
-step jumps."""
+"""Name of the special point at which the duration of double support vanishes.
+
+At that point the rear foot's force is zero and decreases. At the zero of `lambda_4_plus` the force
+is zero and increases, and the step jumps.
+"""
 
 INITIAL_FORCE_FALL_NAME = "fall of the rear foot's force at first"
-"""Name of a rate in N/s that is positive on the curve of `DLS_VANISHING_NAME`. The curve ends at
-the zero of the rate."""
+"""Name of the rate at which the rear foot's force first decreases, N/s.
+
+The rate is positive on the curve of `DLS_VANISHING_NAME`, which ends at the zero of the rate.
+"""
 
 MEAN_FORCE_FALL_NAME = "its mean fall in double support"
-"""Name of a rate in N/s that is zero on the curve of `lambda_4_plus`. On the curve of
-`DLS_VANISHING_NAME`, which otherwise satisfies the same equations, the rate is not zero."""
+"""Name of the mean rate at which the rear foot's force decreases in double support, N/s.
+
+The rate is zero on the curve of `lambda_4_plus`. It is not zero on the curve of
+`DLS_VANISHING_NAME`, which otherwise satisfies the same equations.
+"""
 
 CONTINUED_QUANTITIES = (
     *DISCONTINUOUS_QUANTITIES,
@@ -81,7 +88,9 @@ CONTINUED_QUANTITIES = (
     INITIAL_FORCE_FALL_NAME,
     MEAN_FORCE_FALL_NAME,
 )
-"""Quantities of the collocated gait itself, which are also defined beyond the special point."""
+"""Names of quantities of the collocated gait, which are defined on both sides of a special
+point.
+"""
 
 
 FORCE_QUANTITY_NAMES = (SECOND_PEAK_RATE_NAME,)
@@ -90,12 +99,12 @@ FORCE_QUANTITY_NAMES = (SECOND_PEAK_RATE_NAME,)
 
 @dataclass(frozen=True)
 class TestFunctionOptions:
-    """Options of the test functions of gaits.
+    """Numerical options of the test functions of gaits.
 
     - `n_codim2_iterations`: number of Newton iterations for a point of codimension two;
-    - `max_duration_roundoff`: round-off of a duration that is zero along a whole curve, s;
-    - `relative_difference_step`: finite difference of section state and relative parameters, for
-      derivatives of the quantities of a step.
+    - `max_duration_roundoff`: largest round-off of a duration that is zero along a whole curve, s;
+    - `relative_difference_step`: finite difference of the section state and the relative
+      parameters, for derivatives of the step's quantities.
     """
 
     n_codim2_iterations: int = 8
@@ -103,54 +112,64 @@ class TestFunctionOptions:
     relative_difference_step: float = 1e-6
 
 
-def select_test_quantity(name: str, has_double_support: bool) -> str:
-    """Return the name of the quantity whose zero is the special point.
+def select_test_quantity(special_point_name: str, has_double_support: bool) -> str:
+    """Return the name of the quantity whose zero is the named special point.
 
-    The name depends on whether the gait has double support.
+    The quantity depends on whether the gait has double support.
     """
-    if name == "lambda_4_plus" and has_double_support:
+    if special_point_name == "lambda_4_plus" and has_double_support:
         return MEAN_FORCE_FALL_NAME
     return (
-        "lambda_4_plus" if name == DLS_VANISHING_NAME else LINEAR_MARGIN_SUBSTITUTES.get(name, name)
+        "lambda_4_plus"
+        if special_point_name == DLS_VANISHING_NAME
+        else LINEAR_MARGIN_SUBSTITUTES.get(special_point_name, special_point_name)
     )
 
 
-def find_test_quantity_group(name: str, n_legs: int) -> tuple[str, ...]:
+def find_test_quantity_group(quantity_name: str, n_legs: int) -> tuple[str, ...]:
     """Return the names of the quantities that are evaluated together with that of a special
     point.
     """
-    leg_suffixes = [f"[{leg}]" for leg in range(3, n_legs + 1)]
+    leg_suffixes = [f"[{leg_number}]" for leg_number in range(3, n_legs + 1)]
     step_quantities = [
-        name + leg
-        for name, margin_name in MARGIN_MEASURES.items()
-        for leg in (leg_suffixes if margin_name.leg_dimension else [""])
+        quantity_name + leg_number
+        for quantity_name, margin_name in MARGIN_MEASURES.items()
+        for leg_number in (leg_suffixes if margin_name.leg_dimension else [""])
     ]
     quantity_groups = (
         BIFURCATION_NAMES,
         CONTINUED_QUANTITIES,
         FORCE_QUANTITY_NAMES,
-        tuple(name for name in step_quantities if name not in CONTINUED_QUANTITIES),
+        tuple(
+            quantity_name
+            for quantity_name in step_quantities
+            if quantity_name not in CONTINUED_QUANTITIES
+        ),
     )
     return next(
         quantity_group
         for quantity_group in quantity_groups
-        if select_test_quantity(name, True) in quantity_group
+        if select_test_quantity(quantity_name, True) in quantity_group
     )
 
 
 class TestFunctionWheel(NamedTuple):
-    """Wheel on a curve of special points, and the index of the quantity that vanishes on it."""
+    """Wheel on a curve of special points, and the index of the quantity that vanishes on the
+    curve.
+    """
 
     branch_wheel: BranchWheel
     quantity_index: Array
 
 
 class GaitTestFunction(AbstractTestFunction):
-    """Test function over two parameters: one of several quantities of collocated gaits."""
+    """Test function in two parameters: one quantity of a group of quantities of collocated
+    gaits.
+    """
 
-    system: CollocationSystem = eqx.field(static=True)
+    collocation_system: CollocationSystem = eqx.field(static=True)
     parameter_names: tuple[str, str] = eqx.field(static=True)
-    quantity_names: tuple[str, ...] = eqx.field(static=True)  # names of the quantities of one group
+    quantity_names: tuple[str, ...] = eqx.field(static=True)  # of one group of quantities
     model: ViscoelasticWheel
     step_options: StepOptions
     test_function_options: TestFunctionOptions = eqx.field(
@@ -161,24 +180,30 @@ class GaitTestFunction(AbstractTestFunction):
         self, wheel: TestFunctionWheel, z: CollocationSolution, p: Array
     ) -> TestFunctionNewtonStep:
         branch_wheel = wheel.branch_wheel
-        parameter_indices = tuple(PARAMETER_NAMES.index(name) for name in self.parameter_names)
+        parameter_indices = tuple(
+            PARAMETER_NAMES.index(parameter_name) for parameter_name in self.parameter_names
+        )
         linearize_trial = make_trial_linearizer(
-            self.system, parameter_indices, QUANTITY_FUNCTION_BY_GROUP.get(self.quantity_names)
+            self.collocation_system,
+            parameter_indices,
+            QUANTITY_FUNCTION_BY_GROUP.get(self.quantity_names),
         )
         trial_arguments = (
             stack_parameters(self.with_parameters(branch_wheel, p).params),
             branch_wheel.is_phase_active,
             z,
         )
-        correction, tangents, monodromy, *quantity_data = linearize_trial(*trial_arguments)
-        first_tangent, second_tangent = (
-            jax.tree.map(lambda x, i=i: x[i], tangents) for i in range(2)
+        newton_correction, tangents_by_parameter, monodromy_matrix, *quantity_data = (
+            linearize_trial(*trial_arguments)
+        )
+        tangent_by_first_parameter, tangent_by_second_parameter = (
+            jax.tree.map(lambda x, i=i: x[i], tangents_by_parameter) for i in range(2)
         )
         if quantity_data:
             quantity_values, parameter_gradients = quantity_data
             if self.quantity_names == BIFURCATION_NAMES:
                 apply_margin_jacobian = lambda quantity_tangent: jax.jvp(
-                    offset_bifurcation_margins, (quantity_values,), (quantity_tangent,)
+                    compute_offset_bifurcation_margins, (quantity_values,), (quantity_tangent,)
                 )
                 quantity_values, parameter_gradients = jax.vmap(
                     apply_margin_jacobian, out_axes=(None, 0)
@@ -188,57 +213,61 @@ class GaitTestFunction(AbstractTestFunction):
                 parameter_gradients[1:],
             )
         else:
-            quantity_values, parameter_gradients = self._differentiate_steps(
-                branch_wheel, z, p, correction, (first_tangent, second_tangent)
+            quantity_values, parameter_gradients = self._differentiate_step_quantities(
+                branch_wheel,
+                z,
+                p,
+                newton_correction,
+                (tangent_by_first_parameter, tangent_by_second_parameter),
             )
         return TestFunctionNewtonStep(
-            correction,
-            (first_tangent, second_tangent),
-            monodromy,
+            newton_correction,
+            (tangent_by_first_parameter, tangent_by_second_parameter),
+            monodromy_matrix,
             quantity_values[wheel.quantity_index],
             parameter_gradients[:, wheel.quantity_index],
         )
 
-    def _differentiate_steps(
+    def _differentiate_step_quantities(
         self,
         branch_wheel: BranchWheel,
         z: CollocationSolution,
         p: Array,
-        correction: CollocationSolution,
-        tangents: tuple,
+        newton_correction: CollocationSolution,
+        tangents_by_parameter: tuple,
     ) -> tuple[Array, Array]:
-        """Return the step's quantities of the corrected gait, and their derivatives by both
+        """Return the step's quantities at the corrected gait, and their derivatives by both
         parameters.
 
-        Newton's method needs the derivatives to a few digits. Finite differences of steps cost less
-        than derivatives of the step, and use the same machine code. Near a fold the tangents grow
-        without bound and become parallel, and so do the corrections. The differences are therefore
-        taken along an orthonormal basis, from the point of the tangents' plane that is nearest to
-        the trial.
+        Newton's method needs only a few digits of the derivatives. Finite differences of steps are
+        cheaper than derivatives of the step, and use the same machine code. Near a fold the
+        tangents and the correction grow without bound and become parallel. The differences are
+        therefore taken along an orthonormal basis, from the point of the tangents' plane that is
+        nearest to the trial.
         """
         scaled_tangents = jnp.stack(
             [
-                p[parameter_index] * self.section_state(tangent)
-                for parameter_index, tangent in enumerate(tangents)
+                p[parameter_index] * self.section_state(parameter_tangent)
+                for parameter_index, parameter_tangent in enumerate(tangents_by_parameter)
             ]
         )
         orthonormal_basis, triangular_factor = jnp.linalg.qr(
             jnp.concatenate([scaled_tangents, jnp.eye(2, dtype=p.dtype)], 1).T
         )
         basis_coefficients = p[:, None] * jnp.linalg.inv(triangular_factor)
-        correction_coordinates = orthonormal_basis[:-2].T @ self.section_state(correction)
+        correction_coordinates = orthonormal_basis[:-2].T @ self.section_state(newton_correction)
 
         def measure_at_offset(basis_offset: Array) -> Array:
             parameter_change = basis_coefficients @ (basis_offset - correction_coordinates)
-            displace_leaf = lambda x, correction_leaf, first_tangent, second_tangent: (
+            displace_leaf = lambda x, correction_array, first_array, second_array: (
                 x
-                + correction_leaf
-                + parameter_change[0] * first_tangent
-                + parameter_change[1] * second_tangent
+                + correction_array
+                + parameter_change[0] * first_array
+                + parameter_change[1] * second_array
             )
             return self.measure_step(
                 branch_wheel,
-                jax.tree.map(displace_leaf, z, correction, *tangents),
+                jax.tree.map(displace_leaf, z, newton_correction, *tangents_by_parameter),
                 p + parameter_change,
             )
 
@@ -255,17 +284,17 @@ class GaitTestFunction(AbstractTestFunction):
         ] + correction_coordinates @ quantity_gradients, parameter_gradient
 
     def with_parameters(self, branch_wheel: BranchWheel, p: Array) -> BranchWheel:
-        """Return the wheel with both parameters at p."""
+        """Return the wheel with both parameters equal to the components of p."""
         params = branch_wheel.params
-        for name, parameter_value in zip(self.parameter_names, p, strict=True):
-            params = self.model.with_parameter(params, name, parameter_value)[1]
+        for parameter_name, parameter_value in zip(self.parameter_names, p, strict=True):
+            params = self.model.with_parameter(params, parameter_name, parameter_value)[1]
         return branch_wheel._replace(params=params)
 
     @property
     def gait_problem(self) -> CollocationProblem:
-        """Return the continuation problem of the gaits along the first parameter alone."""
+        """Return the continuation problem of the gaits along the first parameter."""
         return CollocationProblem(
-            system=self.system,
+            collocation_system=self.collocation_system,
             parameter_name=self.parameter_names[0],
             compute_additional_quantities=_compute_continued_quantities,
         )
@@ -276,15 +305,15 @@ class GaitTestFunction(AbstractTestFunction):
         """
         params = self.with_parameters(branch_wheel, p).params
         if self.quantity_names == FORCE_QUANTITY_NAMES:
-            force_peaks = compute_force_peaks(self.system, stack_parameters(params), z)
-            return jnp.stack([force_peaks[name] for name in FORCE_QUANTITY_NAMES])
+            force_peaks = compute_force_peaks(self.collocation_system, stack_parameters(params), z)
+            return jnp.stack([force_peaks[quantity_name] for quantity_name in FORCE_QUANTITY_NAMES])
         section_state = self.gait_problem.read_gait_state(
             branch_wheel._replace(params=params), z, p[0]
         )[0]
         gait_measures = measure_gait(self.model, params, section_state, self.step_options, 1)
         measures_and_legs = [
-            (gait_measures[name.partition("[")[0]], name.partition("[")[2])
-            for name in self.quantity_names
+            (gait_measures[quantity_name.partition("[")[0]], quantity_name.partition("[")[2])
+            for quantity_name in self.quantity_names
         ]
         return jnp.stack(
             [
@@ -293,11 +322,13 @@ class GaitTestFunction(AbstractTestFunction):
             ]
         )
 
-    def section_state(self, z: CollocationSolution) -> SectionVector:
+    def section_state(self, z: CollocationSolution) -> SectionStateVector:
         return z.section_state
 
-    def correction_norm(self, z: CollocationSolution, correction: CollocationSolution) -> Scalar:
-        return unbatch(compute_correction_norm)(z, correction)
+    def correction_norm(
+        self, z: CollocationSolution, newton_correction: CollocationSolution
+    ) -> Scalar:
+        return unbatch(compute_correction_norm)(z, newton_correction)
 
     def is_admissible(self, wheel: TestFunctionWheel, z: CollocationSolution, p: Array) -> Array:
         is_nonnegative = z.durations > -self.test_function_options.max_duration_roundoff
@@ -308,42 +339,52 @@ class GaitTestFunction(AbstractTestFunction):
 def locate_jump_onset(
     test_function: GaitTestFunction, branch_wheel: BranchWheel, z: CollocationSolution, p: Array
 ) -> tuple[Array, Array]:
-    """Return the parameters at which `DLS_VANISHING_NAME` meets `lambda_4_plus`.
+    """Return both parameters at which `DLS_VANISHING_NAME` meets `lambda_4_plus`.
 
-    The second result is the last relative change of the parameters. The search starts from a gait
-    and parameters near that point. The equations of both curves are singular if double support has
-    zero duration. The equations of the same gait without double support are regular, and the rear
-    foot's force and its rate are both zero.
+    The second result is the last relative change of the parameters. The search starts from a nearby
+    gait and its parameters. If double support has zero duration, the equations of both curves are
+    singular. The search therefore uses the equations of the gait without double support, which are
+    regular, with zero rear-foot force and zero force rate.
     """
     branch_wheel = branch_wheel._replace(
         is_phase_active=branch_wheel.is_phase_active.at[0, 0].set(0.0)
     )
     z = z._replace(durations=z.durations.at[0, 0].set(0.0))
     quantity_indices = [
-        jnp.asarray(CONTINUED_QUANTITIES.index(name))
-        for name in ("lambda_4_plus", INITIAL_FORCE_FALL_NAME)
+        jnp.asarray(CONTINUED_QUANTITIES.index(quantity_name))
+        for quantity_name in ("lambda_4_plus", INITIAL_FORCE_FALL_NAME)
     ]
 
     def take_newton_step(solution_and_parameters: tuple, _: None) -> tuple[tuple, Array]:
         z, p = solution_and_parameters
-        force_step, force_fall_step = (
+        force_newton_step, force_fall_newton_step = (
             test_function.linearize(TestFunctionWheel(branch_wheel, quantity_index), z, p)
             for quantity_index in quantity_indices
         )
         quantity_gradients = jnp.stack(
-            [force_step.parameter_gradient, force_fall_step.parameter_gradient]
+            [force_newton_step.parameter_gradient, force_fall_newton_step.parameter_gradient]
         )
         parameter_change = -jnp.linalg.solve(
-            quantity_gradients, jnp.stack([force_step.value, force_fall_step.value])
+            quantity_gradients,
+            jnp.stack(
+                [force_newton_step.test_function_value, force_fall_newton_step.test_function_value]
+            ),
         )
-        displace_leaf = lambda x, correction_leaf, first_tangent, second_tangent: (
-            x
-            + correction_leaf
-            + parameter_change[0] * first_tangent
-            + parameter_change[1] * second_tangent
+        displace_leaf = (
+            lambda x, correction_array, tangent_by_first_parameter, tangent_by_second_parameter: (
+                x
+                + correction_array
+                + parameter_change[0] * tangent_by_first_parameter
+                + parameter_change[1] * tangent_by_second_parameter
+            )
         )
         return (
-            jax.tree.map(displace_leaf, z, force_step.correction, *force_step.tangents),
+            jax.tree.map(
+                displace_leaf,
+                z,
+                force_newton_step.newton_correction,
+                *force_newton_step.tangents_by_parameter,
+            ),
             p + parameter_change,
         ), parameter_change / p
 
@@ -357,11 +398,14 @@ def locate_jump_onset(
 
 
 def _stack_continued_quantities(
-    system: CollocationSystem, parameters: Array, is_phase_active: Array, z: CollocationSolution
+    collocation_system: CollocationSystem,
+    parameters: Array,
+    is_phase_active: Array,
+    z: CollocationSolution,
 ) -> Array:
-    """Return the `CONTINUED_QUANTITIES` of a collocated gait, in their order."""
-    wheel_symbols = make_wheel_from_parameters(parameters, system.n_legs).symbols()
-    (phase_points,) = system.evaluate_phase_points(parameters, z)[1]
+    """Return the values of `CONTINUED_QUANTITIES` for a collocated gait, in their order."""
+    wheel_symbols = make_wheel_from_parameters(parameters, collocation_system.n_legs).symbols()
+    (phase_points,) = collocation_system.evaluate_phase_points(parameters, z)[1]
     return jnp.stack(list(_compute_continued_quantities(wheel_symbols, phase_points, z).values()))
 
 
@@ -369,52 +413,59 @@ def _compute_continued_quantities(
     wheel_symbols: Symbols, phase_points: Any, z: CollocationSolution
 ) -> dict[str, Array]:
     """Return the `CONTINUED_QUANTITIES` of a step by name, from the points of its phases."""
-    dls, sls1, sls2 = phase_points
-    landing = transitions.resolve_landing(wheel_symbols, sls2.end.q[0], *sls2.end.v)
-    fore_force, rear_force = transitions.compute_landing_forces(wheel_symbols, landing)
-    dls_duration, *other_durations = z.durations[0]
-    landing_forces = landing.rear_impulse.normal, fore_force.normal, rear_force.normal
+    dls_points, sls1_points, sls2_points = phase_points
+    landing_result = transitions.resolve_landing(
+        wheel_symbols, sls2_points.end_point.q[0], *sls2_points.end_point.v
+    )
+    fore_force, rear_force = transitions.compute_landing_forces(wheel_symbols, landing_result)
+    dls_duration, *single_support_durations = z.durations[0]
+    landing_forces = landing_result.rear_impulse.normal, fore_force.normal, rear_force.normal
     quantity_values = (
         *landing_forces,
-        *other_durations,
-        compute_takeoff_acceleration(wheel_symbols, sls1),
-        *_compute_force_decrease_rates(wheel_symbols, dls, dls_duration),
+        *single_support_durations,
+        compute_takeoff_acceleration(wheel_symbols, sls1_points),
+        *_compute_force_decrease_rates(wheel_symbols, dls_points, dls_duration),
     )
     return dict(zip(CONTINUED_QUANTITIES, quantity_values, strict=True))
 
 
 def _compute_force_decrease_rates(
-    s: Symbols, dls: PhasePoints, dls_duration: Array
+    s: Symbols, dls_points: PhasePoints, dls_duration: Array
 ) -> tuple[Array, Array]:
     """Return the initial and the mean rate at which the rear foot's force decreases in DLS, N/s."""
-    dls_phase = make_phases(s, dls.start.held_constants[0], stop_at_lift_off=False)[0]
+    dls_phase = make_phases(s, dls_points.start_point.held_constants[0], stop_at_lift_off=False)[0]
 
     def make_instant(theta: Array, dtheta: Array) -> PhaseInstant:
         return PhaseInstant(dls_phase, dls_phase.compute_motion((theta,), (dtheta,)), None)
 
-    compute_rear_force = lambda *state: dls_phase.compute_end_guard(make_instant(*state))
-    start_state, end_state = (*dls.start.q, *dls.start.v), (*dls.end.q, *dls.end.v)
+    compute_rear_force = lambda *dls_state: dls_phase.compute_end_guard(make_instant(*dls_state))
+    start_state, end_state = (
+        (*dls_points.start_point.q, *dls_points.start_point.v),
+        (*dls_points.end_point.q, *dls_points.end_point.v),
+    )
     state_rates = start_state[1], make_instant(*start_state).acceleration.ddtheta
-    first_force, force_rate = jax.jvp(compute_rear_force, start_state, state_rates)
-    mean_decrease_rate = (first_force - compute_rear_force(*end_state)) / jnp.where(
+    initial_rear_force, force_rate = jax.jvp(compute_rear_force, start_state, state_rates)
+    mean_decrease_rate = (initial_rear_force - compute_rear_force(*end_state)) / jnp.where(
         dls_duration == 0.0, 1.0, dls_duration
     )
     return -force_rate, mean_decrease_rate
 
 
 def _compute_trial_monodromy(
-    system: CollocationSystem, parameters: Array, is_phase_active: Array, z: CollocationSolution
+    collocation_system: CollocationSystem,
+    parameters: Array,
+    is_phase_active: Array,
+    z: CollocationSolution,
 ) -> Array:
-    """Return the monodromy matrix of a trial solution."""
+    """Return the monodromy matrix at a trial solution."""
     collocation_state = CollocationState(
-        z, is_phase_active, *init_search_flags(system, z.section_state)
+        z, is_phase_active, *init_search_flags(collocation_system, z.section_state)
     )
-    return system.linearize_at(parameters, collocation_state).monodromy
+    return collocation_system.linearize_at(parameters, collocation_state).monodromy
 
 
 QUANTITY_FUNCTION_BY_GROUP = {
     CONTINUED_QUANTITIES: _stack_continued_quantities,
     BIFURCATION_NAMES: _compute_trial_monodromy,
 }
-"""Function that computes the quantities of a test function without an event-driven step, by the
-group of quantities."""
+"""Function that computes a group of quantities without an event-driven step, by the group."""

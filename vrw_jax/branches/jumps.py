@@ -1,7 +1,8 @@
-"""Branches whose section state jumps, as with unilateral contact if two impacts change order.
+"""Continuation of branches beyond jumps of the section state.
 
-The effects of two impacts do not commute. The gait beyond the change of their order therefore has
-another section state. No step along the branch leads to that gait, however short the step is.
+With unilateral contact, the section state jumps if two impacts change their order, because the
+effects of two impacts do not commute. No continuation step leads to the gait beyond the jump,
+however short the step is.
 """
 
 from collections.abc import Callable
@@ -17,16 +18,16 @@ from vrw_jax.numerics import select_tree_rows
 
 @dataclass(frozen=True)
 class JumpOptions:
-    """Options of the continuation beyond jumps of the section state.
+    """Numerical options of the continuation beyond jumps of the section state.
 
-    - `max_jumps_per_direction`: largest number of jumps beyond which one direction of a branch is
-      continued;
+    - `max_jumps_per_direction`: largest number of jumps in one direction of a branch;
     - `parameter_change_fractions`: changes of the parameter, as fractions of its range, after which
-      a gait beyond a jump is searched for. They are chosen because two impacts change their order
-      within a fraction of 1e-4 with unilateral contact;
-    - `min_steepness_factor`: factor by which the chord between two points is steeper than both
-      tangents at a jump. It is chosen because the slope of a chord is between those of the tangents
-      to some tenths if a continuation step turns by at most 0.2 rad, also at a kink.
+      a gait beyond a jump is searched for. The values are chosen because two impacts with
+      unilateral contact change their order within a fraction of 1e-4;
+    - `min_steepness_factor`: smallest ratio, at a jump, of the steepness of the chord between two
+      points to that of both tangents. The value is chosen because continuation steps turn by at
+      most 0.2 rad. The slope of a chord is then between those of the tangents to some tenths, even
+      at a kink.
     """
 
     max_jumps_per_direction: int = 20
@@ -36,48 +37,48 @@ class JumpOptions:
     min_steepness_factor: float = 5.0
 
 
-JUMP_OPTIONS = JumpOptions()
-"""Options of the continuation beyond jumps, for all branches."""
+DEFAULT_JUMP_OPTIONS = JumpOptions()
+"""Default options of the continuation beyond jumps."""
 
 
 def continue_beyond_jumps(
-    continuation: Any,
+    branch_continuation: Any,
     continue_branches: Callable[..., Any],
     wheels: Any,
     direction_results: ContinuationResult,
-    jump_options: JumpOptions = JUMP_OPTIONS,
+    jump_options: JumpOptions = DEFAULT_JUMP_OPTIONS,
 ) -> ContinuationResult:
-    """Return the results with the points beyond jumps at which the continuation stalled.
+    """Return the points of all branches, with the points beyond jumps at which branches stalled.
 
     The gait beyond a jump is searched for from the last gait, at the smallest change of the
-    parameter that leads to a similar gait. `continuation` is an `AbstractContinuation`, and
-    `continue_branches` continues its branches.
+    parameter that leads to a similar gait. `continue_branches` is the function that continues
+    branches of `branch_continuation`.
     """
     branch_indices, parameter_bounds = (
         np.arange(len(direction_results.n_points)),
-        np.asarray(continuation.parameter_bounds),
+        np.asarray(branch_continuation.parameter_bounds),
     )
     wheel_indices, has_search_failed = branch_indices // 2, np.zeros(len(branch_indices), bool)
     for _ in range(jump_options.max_jumps_per_direction):
-        n_points, status = (
+        n_points, branch_statuses = (
             np.asarray(direction_results.n_points),
             np.asarray(direction_results.status),
         )
-        is_stalled = status == int(ContinuationStatus.STEP_SIZE_UNDERFLOW)
-        is_stalled = is_stalled & (n_points > 1) & ~has_search_failed
-        if not is_stalled.any():
+        is_branch_stalled = branch_statuses == int(ContinuationStatus.STEP_SIZE_UNDERFLOW)
+        is_branch_stalled = is_branch_stalled & (n_points > 1) & ~has_search_failed
+        if not is_branch_stalled.any():
             break
         end_points = select_tree_rows(
             direction_results.points, (branch_indices, np.maximum(n_points - 1, 0))
         )
         direction_signs = np.sign(end_points.fraction_rate)
-        end_quantities = continuation.make_table(end_points, wheel_indices)
-        for change_fraction in jump_options.parameter_change_fractions:
-            parameter_values = end_points.p + direction_signs * change_fraction * (
+        end_quantities = branch_continuation.make_quantity_table(end_points, wheel_indices)
+        for parameter_change_fraction in jump_options.parameter_change_fractions:
+            parameter_values = end_points.p + direction_signs * parameter_change_fraction * (
                 parameter_bounds[1] - parameter_bounds[0]
             )
             is_requested = (
-                is_stalled
+                is_branch_stalled
                 & (parameter_values > parameter_bounds[0])
                 & (parameter_values < parameter_bounds[1])
             )
@@ -96,13 +97,13 @@ def continue_beyond_jumps(
             new_results = jax.tree.map(np.asarray, continue_branches(*continuation_arguments))
             first_points = select_tree_rows(new_results.points, (branch_indices, 0))
             is_gait_found = is_requested & (np.asarray(new_results.n_points) > 1)
-            first_quantities = continuation.make_table(first_points, wheel_indices)
-            is_gait_found = is_gait_found & continuation.is_same_gait(
+            first_quantities = branch_continuation.make_quantity_table(first_points, wheel_indices)
+            is_gait_found = is_gait_found & branch_continuation.is_same_gait(
                 end_quantities, first_quantities
             )
             direction_results = append_results(direction_results, new_results, is_gait_found)
-            is_stalled = is_stalled & ~is_gait_found
-        has_search_failed = has_search_failed | is_stalled
+            is_branch_stalled = is_branch_stalled & ~is_gait_found
+        has_search_failed = has_search_failed | is_branch_stalled
     return direction_results
 
 
@@ -131,17 +132,17 @@ def append_results(
     return ContinuationResult(appended_points, point_counts, branch_status, n_linearizations)
 
 
-def find_jumps(
+def find_state_jumps(
     section_states: np.ndarray,
     parameter_fractions: np.ndarray,
     fraction_rates: np.ndarray,
     point_pairs: list[tuple[int, int]],
-    jump_options: JumpOptions = JUMP_OPTIONS,
+    jump_options: JumpOptions = DEFAULT_JUMP_OPTIONS,
 ) -> list[tuple[int, int]]:
     """Return the pairs of points between which the section state jumps.
 
-    `parameter_fractions` are the parameter as a fraction of its range. `fraction_rates` are the
-    derivatives of these fractions with respect to the arc length.
+    `parameter_fractions` is the parameter as a fraction of its range, and `fraction_rates` is the
+    derivative of that fraction with respect to arc length.
     """
 
     def has_jump(left_index: int, right_index: int) -> bool:
@@ -153,11 +154,11 @@ def find_jumps(
         min_fraction_change = (
             min(abs(fraction_rates[left_index]), abs(fraction_rates[right_index])) * chord_length
         )
-        # Across a fold the rates differ in sign, and both points may have the same parameter.
+        # Across a fold the rates have opposite signs, and both parameters may be equal.
         has_one_direction = fraction_rates[left_index] * fraction_rates[right_index] > 0.0
         is_chord_steeper = (
             jump_options.min_steepness_factor * abs(fraction_change) < min_fraction_change
         )
         return bool(has_one_direction and is_chord_steeper)
 
-    return [pair for pair in point_pairs if has_jump(*pair)]
+    return [point_pair for point_pair in point_pairs if has_jump(*point_pair)]

@@ -23,7 +23,7 @@ DEFAULT_PARAMETER_BOUNDS: ParameterBounds = {
     "natural_length": (1.001, 1.06),
     "slope": (0.05, 0.5),
 }
-"""Default bounds of the parameters of a curve, for a wheel with legs of 1 m."""
+"""Default bounds of the parameters of a curve, for wheels with legs of 1 m."""
 
 
 def continue_special_point(
@@ -74,28 +74,28 @@ def continue_special_point(
 
 
 def _check_parameter_plane(parameters: Any, bounds: Any) -> tuple[tuple[str, str], np.ndarray]:
-    """Return the names of the two parameters and their ranges, shape (2, 2).
+    """Return the names of the two parameters, and their bounds as an array of shape (2, 2).
 
     Raise TypeError or ValueError if names or bounds are invalid.
     """
     check_type("bounds", bounds, (Mapping, type(None)), "write {'damping': (100.0, 200.0)}")
-    all_bounds = {**DEFAULT_PARAMETER_BOUNDS, **(bounds or {})}
+    bounds_by_parameter = {**DEFAULT_PARAMETER_BOUNDS, **(bounds or {})}
     parameter_names = check_names("parameters", parameters)
-    for name in all_bounds:
-        check_parameter_name(name, tuple(PARAMETER_DOMAINS), "parameter that has bounds")
-    for name in parameter_names:
-        check_parameter_name(name, tuple(all_bounds), "parameter with bounds")
+    for parameter_name in bounds_by_parameter:
+        check_parameter_name(parameter_name, tuple(PARAMETER_DOMAINS), "parameter that has bounds")
+    for parameter_name in parameter_names:
+        check_parameter_name(parameter_name, tuple(bounds_by_parameter), "parameter with bounds")
     if len(parameter_names) != 2 or len(set(parameter_names)) != 2:
         raise ValueError(
             f"parameters are {parameter_names}, but a curve needs two different ones: write "
             "('damping', 'slope')."
         )
     parameter_ranges = {
-        name: check_range(f"bounds[{name!r}]", bound_pair)
-        for name, bound_pair in all_bounds.items()
+        parameter_name: check_range(f"bounds[{parameter_name!r}]", bounds_of_parameter)
+        for parameter_name, bounds_of_parameter in bounds_by_parameter.items()
     }
     return (parameter_names[0], parameter_names[1]), np.array(
-        [parameter_ranges[name] for name in parameter_names], float
+        [parameter_ranges[parameter_name] for parameter_name in parameter_names], float
     )
 
 
@@ -109,13 +109,15 @@ def continue_special_points(
     options: ArclengthOptions | None = None,
     step_options: StepOptions | None = None,
 ) -> tuple[SpecialPointCurve, ...]:
-    """Return `continue_special_point` of several special points."""
+    """Return the curves of several special points over two parameters, as
+    `continue_special_point`.
+    """
     parameters, parameter_ranges = _check_parameter_plane(parameters, bounds)
-    first_parameter, second_parameter = parameters
+    first_parameter_name, second_parameter = parameters
     check_type("cycle", cycle, LimitCycle, "give vrw.limit_cycle(params)")
     if cycle.period_n != 1:
         raise ValueError(
-            f"the gait has {cycle.period_n} steps: a curve of special points takes one step."
+            f"the gait has {cycle.period_n} steps, but a curve needs a gait of one step: give one."
         )
     options = DEFAULT_CURVE_OPTIONS if options is None else options
     step_options = StepOptions.tight() if step_options is None else step_options
@@ -131,14 +133,17 @@ def continue_special_points(
     )
     params = make_wheel_from_parameters(cycle.parameters, cycle.system.n_legs)
     seeds_by_name: dict[str, CurveSeed] = {}
-    for parameter_index, parameter in enumerate(parameters):
+    for parameter_index, parameter_name in enumerate(parameters):
         if set(names) - set(seeds_by_name):
             curve_seeds = curve_tracer.find_seeds(
                 parameter_index, *select_tree_rows((params, cycle), None)
             )
-            start_value = float(getattr(params, parameter))
+            start_parameter_value = float(getattr(params, parameter_name))
             distance_order = np.argsort(
-                [-abs(seed.parameter_values[parameter_index] - start_value) for seed in curve_seeds]
+                [
+                    -abs(curve_seed.parameter_values[parameter_index] - start_parameter_value)
+                    for curve_seed in curve_seeds
+                ]
             )
             seeds_by_name = {
                 curve_seeds[seed_index].special_point_name: curve_seeds[seed_index]
@@ -147,19 +152,22 @@ def continue_special_points(
     missing_names = sorted(set(names) - set(seeds_by_name))
     if missing_names:
         raise ValueError(
-            f"no special point {missing_names[0]!r} on branches along {first_parameter} "
+            f"no special point {missing_names[0]!r} on branches along {first_parameter_name} "
             f"and {second_parameter} within their bounds, but "
             f"{', '.join(sorted(seeds_by_name)) or 'none'}: give a gait nearer to it, or wider "
             "bounds."
         )
     curves_by_name = {
         traced_curve.special_point_curve.name: traced_curve.special_point_curve
-        for traced_curve in curve_tracer.trace_curves([seeds_by_name[name] for name in names], ())
-    }
-    lost_names = sorted(set(names) - set(curves_by_name))
-    if lost_names:
-        raise ValueError(
-            f"special point {lost_names[0]} at "
-            f"{seeds_by_name[lost_names[0]].parameter_values[0]:.9g} can't be followed from there."
+        for traced_curve in curve_tracer.trace_curves(
+            [seeds_by_name[special_point_name] for special_point_name in names], ()
         )
-    return tuple(curves_by_name[name] for name in names)
+    }
+    untraced_names = sorted(set(names) - set(curves_by_name))
+    if untraced_names:
+        raise ValueError(
+            f"special point {untraced_names[0]} at "
+            f"{seeds_by_name[untraced_names[0]].parameter_values[0]:.9g} can't be continued: give "
+            "a gait nearer to the special point."
+        )
+    return tuple(curves_by_name[special_point_name] for special_point_name in names)

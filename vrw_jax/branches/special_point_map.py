@@ -1,7 +1,7 @@
 """Map of all special points of gaits over two parameters, checked against a scan.
 
-If a quantity has different signs at neighboring samples of a scan, a curve of special points runs
-between them. If that curve is not traced yet, it is found on branches through these samples.
+If a quantity has opposite signs at neighboring samples of a scan, a curve of special points lies
+between the samples. A curve that is not traced yet is found on branches through these samples.
 """
 
 from __future__ import annotations
@@ -35,15 +35,14 @@ from vrw_jax.wheel import Outcome, WheelParams
 
 @dataclass(frozen=True)
 class SpecialPointMapOptions:
-    """Options of the map of special points. Distances are in cells of the scan.
+    """Numerical options of the map of special points. Distances are in cells of the scan.
 
-    - `n_parallel_branches`: number of parallel branches along each parameter with which the map
+    - `n_parallel_branches`: number of parallel branches along each parameter, from which the map
       starts;
     - `n_meeting_rounds`: number of rounds in which special points on new curves are continued;
-    - `max_search_rounds`: largest number of rounds in which changes of sign are examined;
-    - `max_explained_distance`: largest distance of a change of sign from a curve that explains the
-      change;
-    - `min_examined_distance`: smallest distance between changes that are examined.
+    - `max_search_rounds`: largest number of rounds in which sign changes are examined;
+    - `max_explained_distance`: largest distance of a sign change from a curve that explains it;
+    - `min_examined_distance`: smallest distance between examined sign changes.
     """
 
     n_parallel_branches: int = 5
@@ -53,18 +52,17 @@ class SpecialPointMapOptions:
     min_examined_distance: float = 5.0
 
 
-SPECIAL_POINT_MAP_OPTIONS = SpecialPointMapOptions()
-"""Options of all maps of special points."""
+DEFAULT_SPECIAL_POINT_MAP_OPTIONS = SpecialPointMapOptions()
+"""Default options of the map of special points."""
 
 GAIT_CHANGE_NAME = "gait"
-"""Name of a change between a sample with a gait and a sample without one."""
+"""Name of the change between a sample with a gait and a sample without a gait."""
 
 STABILITY_CHANGE_NAME = "spectral_radius"
-"""Name of a change between a stable and an unstable gait."""
+"""Name of the change between a stable and an unstable gait."""
 
 SPECIAL_POINT_MEASURES = ("lambda_4_plus", STABILITY_CHANGE_NAME)
-"""Measures of a scan whose zeros indicate special points, in addition to the margins of every
-scan."""
+"""Measures of a scan whose zeros indicate special points, besides the margins."""
 
 EXPLAINING_CURVE_NAMES: Mapping[str, tuple[str, ...]] = {
     GAIT_CHANGE_NAME: (*BRANCH_ENDING_QUANTITIES, *BIFURCATION_NAMES),
@@ -72,16 +70,19 @@ EXPLAINING_CURVE_NAMES: Mapping[str, tuple[str, ...]] = {
     "lambda_4_plus": ("lambda_4_plus", DLS_VANISHING_NAME),
     **{exact: (name,) for name, exact in LINEAR_MARGIN_SUBSTITUTES.items()},
 }
-"""Names of the curves that explain a change of sign, if they are not the curve of the same name."""
+"""Names of the curves that explain a sign change, by the name of the quantity.
+
+By default the curve of the same name explains the change.
+"""
 
 
 class ScanSignChange(NamedTuple):
-    """Change of sign between two neighboring samples of a scan."""
+    """Sign change of a quantity between two neighboring samples of a scan."""
 
     quantity_name: str
     parameter_index: int
-    sample_indices: tuple[int, int]  # indices of the first sample, which has a gait
-    position_in_cells: tuple[float, float]  # position of the change in cells of the scan
+    sample_indices: tuple[int, int]  # of the first sample, which has a gait
+    position_in_cells: tuple[float, float]  # of the change, along both parameters
 
 
 @with_default_jax_settings
@@ -90,17 +91,19 @@ def trace_special_points(
     params: WheelParams,
     model: ViscoelasticWheel,
     on_stage: Callable[[str], None] | None = None,
-    map_options: SpecialPointMapOptions = SPECIAL_POINT_MAP_OPTIONS,
+    map_options: SpecialPointMapOptions = DEFAULT_SPECIAL_POINT_MAP_OPTIONS,
 ) -> tuple[tuple[SpecialPointCurve, ...], tuple[ScanSignChange, ...]]:
-    """Return all curves of special points over the parameters of a scan, and unexplained sign
-    changes.
+    """Return the curves of special points over a scan's parameters, and unexplained sign changes.
 
-    The scan contains `SPECIAL_POINT_MEASURES` and margins. A change of sign between two samples is
+    The scan contains `SPECIAL_POINT_MEASURES` and margins. A sign change between two samples is
     unexplained if no curve is near it. `on_stage` is called with a description of each stage.
     """
     parameter_names = tuple(map(str, scan_dataset.outcome.dims))
     parameter_ranges = np.array(
-        [(scan_dataset[name].values[0], scan_dataset[name].values[-1]) for name in parameter_names],
+        [
+            (scan_dataset[parameter_name].values[0], scan_dataset[parameter_name].values[-1])
+            for parameter_name in parameter_names
+        ],
         float,
     )
     curve_tracer = CurveTracer(
@@ -117,37 +120,39 @@ def trace_special_points(
     examined_changes: list[ScanSignChange] = []
     find_remaining_changes = lambda: find_unexplained_changes(
         sign_changes,
-        [curve.special_point_curve for curve in traced_curves],
+        [traced_curve.special_point_curve for traced_curve in traced_curves],
         scan_dataset,
         map_options,
     )
     for _ in range(map_options.max_search_rounds):
-        new_changes = _select_distant_changes(
+        new_sign_changes = _select_distant_changes(
             find_remaining_changes(), examined_changes, map_options
         )
-        if not new_changes:
+        if not new_sign_changes:
             break
-        examined_changes += new_changes
+        examined_changes += new_sign_changes
         curve_seeds = []
         for parameter_index in range(2):
-            changed_wheels = []
-            for sign_change in new_changes:
+            wheels_beside_change = []
+            for sign_change in new_sign_changes:
                 if sign_change.parameter_index == parameter_index:
                     parameter_sample_indices = zip(
                         curve_tracer.parameter_names, sign_change.sample_indices, strict=True
                     )
                     sample_parameters = {
-                        name: float(scan_dataset[name][change_index])
-                        for name, change_index in parameter_sample_indices
+                        parameter_name: float(scan_dataset[parameter_name][change_index])
+                        for parameter_name, change_index in parameter_sample_indices
                     }
-                    changed_wheels.append(curve_tracer.with_parameters(params, sample_parameters))
+                    wheels_beside_change.append(
+                        curve_tracer.with_parameters(params, sample_parameters)
+                    )
             curve_seeds += _find_seeds_in_batches(
-                curve_tracer, parameter_index, changed_wheels, map_options.n_parallel_branches
+                curve_tracer, parameter_index, wheels_beside_change, map_options.n_parallel_branches
             )
         traced_curves = _trace_curves_and_meetings(
             curve_tracer, curve_seeds, traced_curves, map_options
         )
-    return tuple(curve.special_point_curve for curve in traced_curves), tuple(
+    return tuple(traced_curve.special_point_curve for traced_curve in traced_curves), tuple(
         find_remaining_changes()
     )
 
@@ -158,43 +163,52 @@ def _trace_curves_and_meetings(
     traced_curves: list[TracedCurve],
     map_options: SpecialPointMapOptions,
 ) -> list[TracedCurve]:
-    """Return known curves, and curves through the seeds and through special points on new
-    curves.
-    """
+    """Return the known curves, with the curves through seeds and through special points on new
+    curves."""
     for _ in range(map_options.n_meeting_rounds):
         new_curves = curve_tracer.trace_curves(curve_seeds, traced_curves)
         known_curves = [
-            curve
-            for curve in traced_curves
-            if not any(curve_tracer.are_same_curve(curve, new_curve) for new_curve in new_curves)
+            traced_curve
+            for traced_curve in traced_curves
+            if not any(
+                curve_tracer.are_same_curve(traced_curve, new_curve) for new_curve in new_curves
+            )
         ]
         traced_curves = [*known_curves, *new_curves]
-        curve_seeds = [seed for curve in new_curves for seed in curve.meeting_seeds]
+        curve_seeds = [
+            curve_seed for traced_curve in new_curves for curve_seed in traced_curve.meeting_seeds
+        ]
     return traced_curves
 
 
 def find_seeds_on_parallel_lines(
     curve_tracer: CurveTracer,
     params: WheelParams,
-    map_options: SpecialPointMapOptions = SPECIAL_POINT_MAP_OPTIONS,
+    map_options: SpecialPointMapOptions = DEFAULT_SPECIAL_POINT_MAP_OPTIONS,
 ) -> list[CurveSeed]:
-    """Return seeds on branches that cross the middle line of each range at evenly spaced values."""
-    curve_seeds, midpoints, n_lines = (
+    """Return seeds on branches that start at evenly spaced values on the middle line of each
+    range.
+    """
+    curve_seeds, range_midpoints, n_lines = (
         [],
         curve_tracer.parameter_ranges.mean(1),
         map_options.n_parallel_branches,
     )
-    for parameter_index, name in enumerate(curve_tracer.parameter_names):
+    for parameter_index, parameter_name in enumerate(curve_tracer.parameter_names):
         lower_bound, upper_bound = curve_tracer.parameter_ranges[1 - parameter_index]
-        line_values = lower_bound + (np.arange(n_lines) + 0.5) / n_lines * (
+        line_parameter_values = lower_bound + (np.arange(n_lines) + 0.5) / n_lines * (
             upper_bound - lower_bound
         )
         other_parameter = curve_tracer.parameter_names[1 - parameter_index]
         line_wheels = [
             curve_tracer.with_parameters(
-                params, {name: midpoints[parameter_index], other_parameter: line_value}
+                params,
+                {
+                    parameter_name: range_midpoints[parameter_index],
+                    other_parameter: line_parameter_value,
+                },
             )
-            for line_value in line_values
+            for line_parameter_value in line_parameter_values
         ]
         curve_seeds += _find_seeds_in_batches(curve_tracer, parameter_index, line_wheels, n_lines)
     return curve_seeds
@@ -203,13 +217,13 @@ def find_seeds_on_parallel_lines(
 def _find_seeds_in_batches(
     curve_tracer: CurveTracer, parameter_index: int, wheels: list[WheelParams], batch_size: int
 ) -> list[CurveSeed]:
-    """Return seeds on branches that are continued in batches of one size.
+    """Return seeds on the wheels' branches, which are continued in batches of one size.
 
-    With one size, only one program is compiled.
+    A single size needs only one compiled program.
     """
     curve_seeds = []
-    for first_wheel in range(0, len(wheels), batch_size):
-        wheel_group = wheels[first_wheel : first_wheel + batch_size]
+    for first_wheel_index in range(0, len(wheels), batch_size):
+        wheel_group = wheels[first_wheel_index : first_wheel_index + batch_size]
         padded_wheels = [*wheel_group, *wheel_group[-1:] * (batch_size - len(wheel_group))]
         curve_seeds += curve_tracer.find_seeds(
             parameter_index, jax.tree.map(lambda *x: jnp.stack(x), *padded_wheels)
@@ -220,30 +234,35 @@ def _find_seeds_in_batches(
 def _collect_signed_quantities(
     scan_dataset: xr.Dataset, parameter_names: tuple[str, str]
 ) -> dict[str, np.ndarray]:
-    """Return the quantities whose signs may change, as arrays over the two parameters."""
+    """Return the quantities whose signs may change by name, as arrays over the two parameters."""
     signed_quantities = {
         "lambda_4_plus": scan_dataset.lambda_4_plus.transpose(*parameter_names).values
     }
     signed_quantities[STABILITY_CHANGE_NAME] = (
         1.0 - scan_dataset[STABILITY_CHANGE_NAME].transpose(*parameter_names).values
     )
-    for name in (name for name in MARGIN_MEASURES if name not in LINEAR_MARGIN_SUBSTITUTES):
-        measure_values = scan_dataset[name].transpose(*parameter_names, ...).values
-        leg_numbers = scan_dataset.leg.values if MARGIN_MEASURES[name].leg_dimension else []
+    for measure_name in (
+        measure_name
+        for measure_name in MARGIN_MEASURES
+        if measure_name not in LINEAR_MARGIN_SUBSTITUTES
+    ):
+        measure_values = scan_dataset[measure_name].transpose(*parameter_names, ...).values
+        leg_numbers = scan_dataset.leg.values if MARGIN_MEASURES[measure_name].leg_dimension else []
         signed_quantities |= {
-            f"{name}[{leg}]": measure_values[..., i] for i, leg in enumerate(leg_numbers)
+            f"{measure_name}[{leg_number}]": measure_values[..., i]
+            for i, leg_number in enumerate(leg_numbers)
         }
-        if not MARGIN_MEASURES[name].leg_dimension:
-            signed_quantities[name] = measure_values
+        if not MARGIN_MEASURES[measure_name].leg_dimension:
+            signed_quantities[measure_name] = measure_values
     return signed_quantities
 
 
 def find_sign_changes_in_scan(
     scan_dataset: xr.Dataset, parameter_names: tuple[str, str]
 ) -> list[ScanSignChange]:
-    """Return the changes of sign between all neighboring samples.
+    """Return the sign changes between all neighboring samples.
 
-    Changes of measures count only if both samples, or none, have double support.
+    Sign changes of measures count only if both samples or neither sample has double support.
     """
     outcome_codes = scan_dataset.outcome.transpose(*parameter_names).values
     has_gait, has_coarse_mesh = (
@@ -265,28 +284,32 @@ def find_sign_changes_in_scan(
         order_by_parameter = lambda a, b, parameter_index=parameter_index: (
             (a, b) if parameter_index == 0 else (b, a)
         )
-        first_found, second_found = get_neighbor_values(has_gait)
+        has_first_sample_gait, has_second_sample_gait = get_neighbor_values(has_gait)
         has_same_double_support = np.equal(
             *get_neighbor_values(signed_quantities["lambda_4_plus"] > 0.0)
         )
-        for name, quantity_values in signed_quantities.items():
+        for quantity_name, quantity_values in signed_quantities.items():
             first_values, second_values = get_neighbor_values(quantity_values)
             has_sign_change = first_values * second_values < 0.0
-            if name not in (GAIT_CHANGE_NAME, COARSE_MESH_END_NAME):
+            if quantity_name not in (GAIT_CHANGE_NAME, COARSE_MESH_END_NAME):
                 has_sign_change &= (
-                    first_found
-                    & second_found
-                    & (has_same_double_support | (name == "lambda_4_plus"))
+                    has_first_sample_gait
+                    & has_second_sample_gait
+                    & (has_same_double_support | (quantity_name == "lambda_4_plus"))
                 )
             for i, j in np.argwhere(has_sign_change):
-                zero_fraction = first_values[i, j] / (first_values[i, j] - second_values[i, j])
-                sample_indices = order_by_parameter(int(i if first_found[i, j] else i + 1), int(j))
+                zero_location_fraction = first_values[i, j] / (
+                    first_values[i, j] - second_values[i, j]
+                )
+                sample_indices = order_by_parameter(
+                    int(i if has_first_sample_gait[i, j] else i + 1), int(j)
+                )
                 sign_changes.append(
                     ScanSignChange(
-                        name,
+                        quantity_name,
                         parameter_index,
                         sample_indices,
-                        order_by_parameter(float(i + zero_fraction), float(j)),
+                        order_by_parameter(float(i + zero_location_fraction), float(j)),
                     )
                 )
     return sign_changes
@@ -296,25 +319,30 @@ def find_unexplained_changes(
     sign_changes: Sequence[ScanSignChange],
     special_point_curves: Sequence[SpecialPointCurve],
     scan_dataset: xr.Dataset,
-    map_options: SpecialPointMapOptions = SPECIAL_POINT_MAP_OPTIONS,
+    map_options: SpecialPointMapOptions = DEFAULT_SPECIAL_POINT_MAP_OPTIONS,
 ) -> list[ScanSignChange]:
-    """Return the changes that are near no curve that can explain them."""
-    remaining_changes = []
-    for name in sorted({sign_change.quantity_name for sign_change in sign_changes}):
-        named_changes = [
-            sign_change for sign_change in sign_changes if sign_change.quantity_name == name
+    """Return the sign changes that are not near any curve that explains them."""
+    unexplained_changes = []
+    for quantity_name in sorted({sign_change.quantity_name for sign_change in sign_changes}):
+        changes_of_quantity = [
+            sign_change
+            for sign_change in sign_changes
+            if sign_change.quantity_name == quantity_name
         ]
         explaining_curves = [
-            curve
-            for curve in special_point_curves
-            if curve.name in EXPLAINING_CURVE_NAMES.get(name, (name,))
+            special_point_curve
+            for special_point_curve in special_point_curves
+            if special_point_curve.name
+            in EXPLAINING_CURVE_NAMES.get(quantity_name, (quantity_name,))
         ]
         change_positions = np.array(
-            [sign_change.position_in_cells for sign_change in named_changes]
+            [sign_change.position_in_cells for sign_change in changes_of_quantity]
         )
-        curve_distances = np.full(len(named_changes), np.inf)
-        for curve in explaining_curves:
-            values_and_names = zip(curve.values.T, curve.parameters, strict=True)
+        curve_distances = np.full(len(changes_of_quantity), np.inf)
+        for special_point_curve in explaining_curves:
+            values_and_names = zip(
+                special_point_curve.values.T, special_point_curve.parameters, strict=True
+            )
             curve_positions = [
                 np.interp(
                     curve_parameter_values,
@@ -327,22 +355,26 @@ def find_unexplained_changes(
                 curve_distances,
                 compute_distances_to_polyline(change_positions, np.stack(curve_positions, -1)),
             )
-        remaining_changes += [
+        unexplained_changes += [
             sign_change
-            for sign_change, curve_distance in zip(named_changes, curve_distances, strict=True)
+            for sign_change, curve_distance in zip(
+                changes_of_quantity, curve_distances, strict=True
+            )
             if curve_distance > map_options.max_explained_distance
         ]
-    return remaining_changes
+    return unexplained_changes
 
 
 def _select_distant_changes(
-    remaining_changes: Sequence[ScanSignChange],
+    unexplained_changes: Sequence[ScanSignChange],
     examined_changes: Sequence[ScanSignChange],
     map_options: SpecialPointMapOptions,
 ) -> list[ScanSignChange]:
-    """Return changes of each name that are distant from each other and from the examined ones."""
+    """Return sign changes of each name that are distant from each other and from examined
+    changes.
+    """
     selected_changes: list[ScanSignChange] = []
-    for sign_change in remaining_changes:
+    for sign_change in unexplained_changes:
         changes_of_same_name = [
             other_change
             for other_change in (*examined_changes, *selected_changes)

@@ -366,7 +366,7 @@ def _print_limit_cycle(limit_cycle_result: "LimitCycle | ReturnMapCycle") -> Non
     """Print stability, period, speed and DLS fraction of a limit cycle."""
     import numpy as np
 
-    from vrw_jax.cycles import format_multipliers
+    from vrw_jax.cycles import format_floquet_multipliers
     from vrw_jax.wheel import Outcome
 
     if not bool(limit_cycle_result.found):
@@ -375,7 +375,7 @@ def _print_limit_cycle(limit_cycle_result: "LimitCycle | ReturnMapCycle") -> Non
             f"[bold]Limit cycle[/]  {search_outcome.name}: {search_outcome.meaning}"
         )
         return
-    spectral_radius, multipliers = format_multipliers(
+    spectral_radius, multipliers = format_floquet_multipliers(
         np.asarray(limit_cycle_result.monodromy_value)
     )
     stability_text = "stable" if spectral_radius < 1.0 else "unstable"

@@ -1,9 +1,9 @@
 """Gauss collocation of limit cycles, with the durations of the phases among the unknowns."""
 
 from vrw_jax.collocation.extrema import (
-    CollocatedPhase,
+    CollocatedPhaseMotion,
     PhaseExtrema,
-    find_extrema,
+    find_quantity_extrema,
 )
 from vrw_jax.collocation.gauss import (
     DOUBLE_END_WEIGHTS,
@@ -13,10 +13,10 @@ from vrw_jax.collocation.gauss import (
     INTEGRATION_MATRIX,
     N_GAUSS_NODES,
     PhaseMesh,
-    differentiation_matrix,
-    integration_weights,
-    lagrange_weights,
-    mesh_transfer_matrix,
+    build_differentiation_matrix,
+    build_mesh_transfer_matrix,
+    compute_integration_weights,
+    compute_lagrange_weights,
 )
 from vrw_jax.collocation.phase_collocation import (
     CollocationPhase,

@@ -1,10 +1,11 @@
-"""Smooth extrema of a quantity within a phase, located on its collocated motion.
+"""Smooth extrema of a quantity within one phase of a collocated cycle.
 
-Let F be a quantity of the state, and R and S its first and second time derivative. The extrema of R
-are zeros of S. Between two extrema R is monotone, so each change of sign of R is one extremum of F.
-Zeros are first located on a polynomial of F in each mesh interval. The state at a zero is then the
-end of one more interval of Gauss nodes, at which F, R and S are evaluated and the time is
-corrected. Extrema are therefore as accurate as the cycle.
+Let F be a quantity of the state, and let R and S be its first and second time derivatives. The
+extrema of R are zeros of S. Between two neighboring extrema R is monotone, so that each sign change
+of R is one extremum of F. The zeros are first located on a polynomial of F in each mesh interval.
+The state at a zero is then the end of an additional interval of Gauss nodes. F, R and S are
+evaluated at that state, and the time of the zero is corrected. The extrema are therefore as
+accurate as the cycle.
 """
 
 from collections.abc import Callable
@@ -25,358 +26,459 @@ from vrw_jax.collocation.gauss import (
     INTEGRATION_MATRIX,
     N_GAUSS_NODES,
     PhaseMesh,
-    integration_weights,
+    compute_integration_weights,
 )
 from vrw_jax.numerics import Scalar
 
 
 @dataclass(frozen=True)
-class ExtremumOptions:
-    """Options of the search for extrema in a phase."""
+class ExtremumSearchOptions:
+    """Numerical options of the search for extrema of a quantity F in a phase; R is its rate."""
 
-    n_samples: int = 8
-    """Samples of F in each mesh interval, chosen because their polynomial is then more accurate
-    than the motion between two nodes."""
-    max_rate_extrema: int = 6
-    """Largest number of extrema of R in a phase, chosen because phases of stiff, lightly damped
-    legs have at most five."""
-    n_bracket_zero_iterations: int = 12
-    """Iterations on the polynomials, chosen because the error is then that of the polynomials."""
+    n_samples_per_interval: int = 8
+    """Number of samples of F per mesh interval, chosen because the polynomial through the samples
+    is then more accurate than the motion between two nodes.
+    """
+    max_rate_extrema_per_phase: int = 6
+    """Largest number of extrema of R per phase, chosen because R has at most five extrema if legs
+    are stiff and lightly damped.
+    """
+    n_bracketing_iterations: int = 12
+    """Number of bracketing iterations on the polynomials, chosen because the error of a zero is
+    then that of the polynomials.
+    """
     n_time_corrections: int = 3
-    """Corrections of the time of an extremum, chosen because the error of 1e-4 of a mesh interval
-    shrinks by at least a factor of a hundred in each."""
-    n_newton_iterations: int = 3
-    """Newton iterations for a state, chosen because the polynomial is accurate to 1e-5 and
-    convergence is quadratic."""
+    """Number of corrections of the time of an extremum, chosen because each correction shrinks the
+    initial error of 1e-4 mesh intervals at least a hundredfold."""
+    n_state_newton_iterations: int = 3
+    """Number of Newton iterations for a state, chosen because the initial error is 1e-5 and
+    Newton's method converges quadratically.
+    """
 
 
-EXTREMUM_OPTIONS = ExtremumOptions()
+DEFAULT_EXTREMUM_SEARCH_OPTIONS = ExtremumSearchOptions()
+"""Default options of `find_quantity_extrema`."""
 
 
-class QuantityRates(NamedTuple):
-    """Quantity at a state, with its first and second time derivative."""
+class QuantityTimeDerivatives(NamedTuple):
+    """Value of a quantity at one state, with its first and second time derivatives."""
 
-    value: Scalar
-    rate: Scalar
-    second_rate: Scalar
+    quantity_value: Scalar
+    first_time_derivative: Scalar
+    second_time_derivative: Scalar
 
 
 class PhaseExtrema(NamedTuple):
-    """Extrema of a quantity in one phase in the order of time, and maxima of its rate.
+    """Extrema of a quantity F in one phase, and extrema of its rate, both in the order of time.
 
-    An array element without an extremum has false flags, and its other numbers are meaningless.
-    Times have no derivatives. First derivatives of values and rates need no derivatives of times,
-    because values and rates are stationary in time.
+    Arrays have a fixed length. An element that is no extremum has false flags, and its times and
+    values are meaningless. Times have no derivatives. The values have exact first derivatives
+    without derivatives of the times, because F is stationary in time at its extrema, as is its
+    rate.
     """
 
-    time: Float[Array, " pieces"]  # since the start of the phase, s
-    value: Float[Array, " pieces"]
-    is_maximum: Bool[Array, " pieces"]
-    is_minimum: Bool[Array, " pieces"]
-    rate_time: Float[Array, " rates"]  # of an extremum of the rate, s
-    rate: Float[Array, " rates"]  # at that time
-    is_maximum_of_rate: Bool[Array, " rates"]
+    extremum_times: Float[Array, " pieces"]  # since the start of the phase, s; for `value`
+    extremum_values: Float[Array, " pieces"]
+    is_quantity_maximum: Bool[Array, " pieces"]
+    is_quantity_minimum: Bool[Array, " pieces"]
+    rate_extremum_times: Float[Array, " rates"]  # since the start of the phase, s; for `rate`
+    rate_extremum_values: Float[Array, " rates"]  # rate of F at its extrema
+    is_rate_maximum: Bool[Array, " rates"]
 
 
-StateFunction = Callable[[Array, Array], Array]
+FunctionOfCoordinatesAndRates = Callable[[Array, Array], Array]
 """Function of coordinates and rates, each of shape (coordinates,)."""
 
 
-class CollocatedPhase(NamedTuple):
-    """Motion of one phase as polynomials, one for each mesh interval."""
+class CollocatedPhaseMotion(NamedTuple):
+    """Motion during one phase: states at the mesh boundaries and accelerations at the Gauss nodes.
 
-    times: Float[Array, " boundaries"]  # of the interval boundaries, s
-    q: Float[Array, "boundaries coordinates"]
-    v: Float[Array, "boundaries coordinates"]
-    accelerations: Float[Array, "intervals nodes coordinates"]
+    In each mesh interval the accelerations are a polynomial of time.
+    """
+
+    boundary_times: Float[Array, " boundaries"]  # of the interval boundaries, s
+    boundary_q: Float[Array, "boundaries coordinates"]
+    boundary_v: Float[Array, "boundaries coordinates"]
+    node_accelerations: Float[Array, "intervals nodes coordinates"]
 
     @classmethod
-    def from_nodes(
-        cls, mesh: PhaseMesh, q: Array, v: Array, duration: Scalar, accelerations: Array
-    ) -> "CollocatedPhase":
-        """Return the motion from the start of a phase, its duration and its accelerations."""
-        interval_lengths = jnp.asarray(mesh.interval_fractions, duration.dtype)[:, None] * duration
-        rate_steps, position_steps = (
-            jnp.einsum("n,ind->id", end_weights, accelerations)
+    def from_node_accelerations(
+        cls,
+        mesh: PhaseMesh,
+        start_q: Array,
+        start_v: Array,
+        phase_duration: Scalar,
+        node_accelerations: Array,
+    ) -> "CollocatedPhaseMotion":
+        """Return the motion that starts at the given state and has the given duration (s) and node
+        accelerations."""
+        interval_lengths = (
+            jnp.asarray(mesh.interval_fractions, phase_duration.dtype)[:, None] * phase_duration
+        )
+        rate_increments, position_increments = (
+            jnp.einsum("n,ind->id", end_weights, node_accelerations)
             for end_weights in (END_WEIGHTS, DOUBLE_END_WEIGHTS)
         )
-        accumulate_from_start = lambda start, interval_changes: jnp.concatenate(
-            [start[None], start + jnp.cumsum(interval_changes, axis=0)]
+        accumulate_increments = lambda start_value, interval_increments: jnp.concatenate(
+            [start_value[None], start_value + jnp.cumsum(interval_increments, axis=0)]
         )
-        rates = accumulate_from_start(v, interval_lengths * rate_steps)
-        positions = accumulate_from_start(
-            q, interval_lengths * rates[:-1] + interval_lengths * interval_lengths * position_steps
+        boundary_v = accumulate_increments(start_v, interval_lengths * rate_increments)
+        boundary_q = accumulate_increments(
+            start_q,
+            interval_lengths * boundary_v[:-1]
+            + interval_lengths * interval_lengths * position_increments,
         )
         return cls(
-            accumulate_from_start(jnp.zeros(1), interval_lengths)[:, 0],
-            positions,
-            rates,
-            accelerations,
+            accumulate_increments(jnp.zeros(1), interval_lengths)[:, 0],
+            boundary_q,
+            boundary_v,
+            node_accelerations,
         )
 
-    def find_interval_index(self, time: Scalar) -> Array:
-        """Return the index of the mesh interval that contains a time."""
-        last_index = len(self.times) - 2
-        return jnp.clip(jnp.searchsorted(self.times, time, side="right") - 1, 0, last_index)
-
-    def evaluate_states(self, location: float) -> tuple[Array, Array]:
-        """Return coordinates and rates at one location of every interval, in [0, 1]."""
-        interval_lengths = jnp.diff(self.times)[:, None]
-        rate_weights, position_weights = integration_weights(location)
-        rate_steps, position_steps = (
-            jnp.einsum("n,ind->id", node_weights, self.accelerations)
-            for node_weights in (rate_weights, position_weights)
+    def find_interval_at_time(self, time_in_phase: Scalar) -> Array:
+        """Return the index of the mesh interval that contains a time, in s since the start of the
+        phase."""
+        last_interval_index = len(self.boundary_times) - 2
+        return jnp.clip(
+            jnp.searchsorted(self.boundary_times, time_in_phase, side="right") - 1,
+            0,
+            last_interval_index,
         )
-        q, v = self.q[:-1], self.v[:-1]
-        return q + interval_lengths * (
-            location * v + interval_lengths * position_steps
-        ), v + interval_lengths * rate_steps
+
+    def evaluate_states_in_intervals(self, location_in_interval: float) -> tuple[Array, Array]:
+        """Return coordinates and rates at one relative location of every mesh interval.
+
+        `location_in_interval` is in [0, 1]. Both arrays have the shape (intervals, coordinates).
+        """
+        interval_lengths = jnp.diff(self.boundary_times)[:, None]
+        rate_node_weights, position_node_weights = compute_integration_weights(location_in_interval)
+        rate_increments, position_increments = (
+            jnp.einsum("n,ind->id", node_weights, self.node_accelerations)
+            for node_weights in (rate_node_weights, position_node_weights)
+        )
+        interval_start_q, interval_start_v = self.boundary_q[:-1], self.boundary_v[:-1]
+        return interval_start_q + interval_lengths * (
+            location_in_interval * interval_start_v + interval_lengths * position_increments
+        ), interval_start_v + interval_lengths * rate_increments
 
     def integrate_to_time(
-        self, time: Scalar, acceleration_of: StateFunction, n_iterations: int
+        self,
+        time_in_phase: Scalar,
+        compute_acceleration: FunctionOfCoordinatesAndRates,
+        n_newton_iterations: int,
     ) -> tuple[Array, Array]:
-        """Return coordinates and rates at a time, which is the end of one more interval.
+        """Return coordinates and rates at a time, in s since the start of the phase.
 
-        The additional interval begins at the mesh boundary before the time. Newton's method solves
-        for its accelerations. They have derivatives with respect to the motion but not to the time.
+        The time is the end of an additional mesh interval, which begins at the mesh boundary before
+        it. Newton's method solves for the node accelerations of that interval. The state has
+        derivatives with respect to the motion but not with respect to the time.
         """
-        interval_index = self.find_interval_index(time)
-        start_time, q, v = (
-            self.times[interval_index],
-            self.q[interval_index],
-            self.v[interval_index],
+        interval_index = self.find_interval_at_time(time_in_phase)
+        interval_start_time, interval_start_q, interval_start_v = (
+            self.boundary_times[interval_index],
+            self.boundary_q[interval_index],
+            self.boundary_v[interval_index],
         )
-        partial_length = lax.stop_gradient(time - start_time)
+        partial_interval_length = lax.stop_gradient(time_in_phase - interval_start_time)
 
-        def residual(accelerations: Array) -> Array:
-            node_accelerations = accelerations.reshape(N_GAUSS_NODES, -1)
-            node_q = q + partial_length * (
-                GAUSS_NODES[:, None] * v
-                + partial_length * (DOUBLE_INTEGRATION_MATRIX @ node_accelerations)
+        def compute_residual(flat_accelerations: Array) -> Array:
+            node_accelerations = flat_accelerations.reshape(N_GAUSS_NODES, -1)
+            node_q = interval_start_q + partial_interval_length * (
+                GAUSS_NODES[:, None] * interval_start_v
+                + partial_interval_length * (DOUBLE_INTEGRATION_MATRIX @ node_accelerations)
             )
-            node_v = v + partial_length * (INTEGRATION_MATRIX @ node_accelerations)
-            return (node_accelerations - jax.vmap(acceleration_of)(node_q, node_v)).ravel()
+            node_v = interval_start_v + partial_interval_length * (
+                INTEGRATION_MATRIX @ node_accelerations
+            )
+            return (node_accelerations - jax.vmap(compute_acceleration)(node_q, node_v)).ravel()
 
-        def refine(accelerations: Array, _: None) -> tuple[Array, None]:
+        def refine_accelerations(flat_accelerations: Array, _: None) -> tuple[Array, None]:
             # The tangents of the last iteration are exact because the Jacobian has none.
-            jacobian = lax.stop_gradient(jax.jacfwd(residual)(accelerations))
-            return accelerations - jnp.linalg.solve(jacobian, residual(accelerations)), None
+            residual_jacobian = lax.stop_gradient(jax.jacfwd(compute_residual)(flat_accelerations))
+            return flat_accelerations - jnp.linalg.solve(
+                residual_jacobian, compute_residual(flat_accelerations)
+            ), None
 
-        guessed_accelerations = lax.stop_gradient(self.accelerations[interval_index].ravel())
-        node_accelerations = lax.scan(refine, guessed_accelerations, length=n_iterations)[
-            0
-        ].reshape(N_GAUSS_NODES, -1)
-        return q + partial_length * (
-            v + partial_length * (DOUBLE_END_WEIGHTS @ node_accelerations)
-        ), v + partial_length * (END_WEIGHTS @ node_accelerations)
+        guessed_accelerations = lax.stop_gradient(self.node_accelerations[interval_index].ravel())
+        node_accelerations = lax.scan(
+            refine_accelerations, guessed_accelerations, length=n_newton_iterations
+        )[0].reshape(N_GAUSS_NODES, -1)
+        return interval_start_q + partial_interval_length * (
+            interval_start_v + partial_interval_length * (DOUBLE_END_WEIGHTS @ node_accelerations)
+        ), interval_start_v + partial_interval_length * (END_WEIGHTS @ node_accelerations)
 
 
-class _PiecewisePolynomial(NamedTuple):
-    """Quantity as a polynomial in each mesh interval, without derivatives."""
+class _PiecewiseQuantityPolynomial(NamedTuple):
+    """Quantity in one phase, as a polynomial of time in each mesh interval, without derivatives."""
 
-    times: Float[Array, " boundaries"]
-    coefficients: Float[Array, "intervals powers"]  # over the location in the interval
+    boundary_times: Float[Array, " boundaries"]
+    interval_coefficients: Float[Array, "intervals powers"]  # of powers of the location in [0, 1]
 
     @classmethod
-    def from_motion(
-        cls, motion: CollocatedPhase, quantity_of: StateFunction, n_samples: int
-    ) -> "_PiecewisePolynomial":
-        """Return the polynomials through `n_samples` values in each interval."""
-        sample_locations = _chebyshev_nodes(n_samples)
-        sampled_states = [motion.evaluate_states(location) for location in sample_locations]
-        q, v = (jnp.stack(state_parts, 1) for state_parts in zip(*sampled_states, strict=True))
-        sampled_values = jax.vmap(jax.vmap(quantity_of))(q, v)
-        interpolation_matrix = np.linalg.inv(sample_locations[:, None] ** np.arange(n_samples))
-        return lax.stop_gradient(cls(motion.times, sampled_values @ interpolation_matrix.T))
-
-    def evaluate_rate(self, evaluation_times: Array, derivative_order: int) -> Array:
-        """Return the time derivative of first or second order at many times."""
-        last_index = len(self.times) - 2
-        interval_indices = jnp.clip(
-            jnp.searchsorted(self.times, evaluation_times, side="right") - 1, 0, last_index
+    def interpolate_motion(
+        cls,
+        phase_motion: CollocatedPhaseMotion,
+        compute_quantity: FunctionOfCoordinatesAndRates,
+        n_samples_per_interval: int,
+    ) -> "_PiecewiseQuantityPolynomial":
+        """Return the polynomials through `n_samples_per_interval` values of the quantity in
+        each mesh interval.
+        """
+        chebyshev_angles = (
+            np.pi * (np.arange(n_samples_per_interval) + 0.5) / n_samples_per_interval
         )
-        interval_lengths = jnp.diff(self.times)[interval_indices]
+        sample_locations = 0.5 - 0.5 * np.cos(chebyshev_angles)
+        sampled_states = [
+            phase_motion.evaluate_states_in_intervals(sample_location)
+            for sample_location in sample_locations
+        ]
+        q, v = (
+            jnp.stack(states_by_location, 1)
+            for states_by_location in zip(*sampled_states, strict=True)
+        )
+        sampled_values = jax.vmap(jax.vmap(compute_quantity))(q, v)
+        interpolation_matrix = np.linalg.inv(
+            sample_locations[:, None] ** np.arange(n_samples_per_interval)
+        )
+        return lax.stop_gradient(
+            cls(phase_motion.boundary_times, sampled_values @ interpolation_matrix.T)
+        )
+
+    def evaluate_time_derivative(self, evaluation_times: Array, derivative_order: int) -> Array:
+        """Return the first or second time derivative of the quantity at each evaluation time."""
+        last_interval_index = len(self.boundary_times) - 2
+        interval_indices = jnp.clip(
+            jnp.searchsorted(self.boundary_times, evaluation_times, side="right") - 1,
+            0,
+            last_interval_index,
+        )
+        interval_lengths = jnp.diff(self.boundary_times)[interval_indices]
         interval_lengths = jnp.where(interval_lengths > 0.0, interval_lengths, 1.0)
-        interval_locations = (evaluation_times - self.times[interval_indices]) / interval_lengths
-        scaled_rates = jnp.zeros_like(evaluation_times)
-        for power in range(self.coefficients.shape[1] - 1, derivative_order - 1, -1):
-            factor = power if derivative_order == 1 else power * (power - 1)
-            scaled_rates = (
-                scaled_rates * interval_locations
-                + factor * self.coefficients[interval_indices, power]
+        locations_in_intervals = (
+            evaluation_times - self.boundary_times[interval_indices]
+        ) / interval_lengths
+        scaled_derivatives = jnp.zeros_like(evaluation_times)
+        for power in range(self.interval_coefficients.shape[1] - 1, derivative_order - 1, -1):
+            power_derivative_factor = power if derivative_order == 1 else power * (power - 1)
+            scaled_derivatives = (
+                scaled_derivatives * locations_in_intervals
+                + power_derivative_factor * self.interval_coefficients[interval_indices, power]
             )
-        return scaled_rates / interval_lengths**derivative_order
+        return scaled_derivatives / interval_lengths**derivative_order
 
     @property
-    def sample_times(self) -> Array:
-        """Return the times of many samples in order, both ends of the phase included."""
-        sample_fractions = np.linspace(0.0, 1.0, self.coefficients.shape[1], endpoint=False)
-        inner_times = self.times[:-1, None] + jnp.diff(self.times)[:, None] * sample_fractions
-        return jnp.append(inner_times.ravel(), self.times[-1])
+    def sample_times_in_phase(self) -> Array:
+        """Return increasing times in the phase, in s: several per interval, and both ends of the
+        phase."""
+        locations_in_interval = np.linspace(
+            0.0, 1.0, self.interval_coefficients.shape[1], endpoint=False
+        )
+        times_before_phase_end = (
+            self.boundary_times[:-1, None]
+            + jnp.diff(self.boundary_times)[:, None] * locations_in_interval
+        )
+        return jnp.append(times_before_phase_end.ravel(), self.boundary_times[-1])
 
 
-def _chebyshev_nodes(n: int) -> np.ndarray:
-    """Return the Chebyshev nodes on [0, 1]."""
-    return 0.5 - 0.5 * np.cos(np.pi * (np.arange(n) + 0.5) / n)
-
-
-def find_extrema(
-    collocated_phase: CollocatedPhase,
-    acceleration_of: StateFunction,
-    quantity_of: StateFunction,
-    extremum_options: ExtremumOptions = EXTREMUM_OPTIONS,
+def find_quantity_extrema(
+    phase_motion: CollocatedPhaseMotion,
+    compute_acceleration: FunctionOfCoordinatesAndRates,
+    compute_quantity: FunctionOfCoordinatesAndRates,
+    search_options: ExtremumSearchOptions = DEFAULT_EXTREMUM_SEARCH_OPTIONS,
 ) -> PhaseExtrema:
-    """Return the extrema of a quantity inside a phase, with first derivatives.
+    """Return the extrema of a quantity inside a phase, with exact first derivatives of their
+    values.
 
     Args:
-        collocated_phase: the collocated motion.
-        acceleration_of: accelerations, by the equations of motion.
-        quantity_of: the quantity.
-        extremum_options: options of the search.
+        phase_motion: motion during the phase.
+        compute_acceleration: function from coordinates and rates to the accelerations.
+        compute_quantity: function from coordinates and rates to the quantity, a scalar.
+        search_options: numerical options of the search.
     """
-    sampled_quantity = _PiecewisePolynomial.from_motion(
-        collocated_phase, quantity_of, extremum_options.n_samples
+    quantity_polynomial = _PiecewiseQuantityPolynomial.interpolate_motion(
+        phase_motion, compute_quantity, search_options.n_samples_per_interval
     )
-    duration, sample_times = sampled_quantity.times[-1], sampled_quantity.sample_times
-    sampled_second_rates = sampled_quantity.evaluate_rate(sample_times, 2)
-    last_index = len(sampled_second_rates) - 1
-    # Without another zero the bracket is the end of the phase.
-    has_zero = sampled_second_rates[:-1] * sampled_second_rates[1:] < 0.0
-    lower_indices = jnp.nonzero(
-        has_zero, size=extremum_options.max_rate_extrema, fill_value=last_index
+    phase_duration, sample_times_in_phase = (
+        quantity_polynomial.boundary_times[-1],
+        quantity_polynomial.sample_times_in_phase,
+    )
+    sampled_second_rates = quantity_polynomial.evaluate_time_derivative(sample_times_in_phase, 2)
+    last_sample_index = len(sampled_second_rates) - 1
+    # An unused bracket has zero length and lies at the end of the phase.
+    has_second_rate_zero = sampled_second_rates[:-1] * sampled_second_rates[1:] < 0.0
+    bracket_start_indices = jnp.nonzero(
+        has_second_rate_zero,
+        size=search_options.max_rate_extrema_per_phase,
+        fill_value=last_sample_index,
     )[0]
-    upper_indices = jnp.minimum(lower_indices + 1, last_index)
-    is_rate_extremum = lower_indices < last_index
+    bracket_end_indices = jnp.minimum(bracket_start_indices + 1, last_sample_index)
+    is_rate_extremum = bracket_start_indices < last_sample_index
     rate_extremum_times = _find_bracketed_zeros(
-        lambda t: sampled_quantity.evaluate_rate(t, 2),
-        (sample_times[lower_indices], sample_times[upper_indices]),
-        (sampled_second_rates[lower_indices], sampled_second_rates[upper_indices]),
-        extremum_options.n_bracket_zero_iterations,
+        lambda t: quantity_polynomial.evaluate_time_derivative(t, 2),
+        (sample_times_in_phase[bracket_start_indices], sample_times_in_phase[bracket_end_indices]),
+        (sampled_second_rates[bracket_start_indices], sampled_second_rates[bracket_end_indices]),
+        search_options.n_bracketing_iterations,
     )
-    bracket_length = sample_times[upper_indices] - sample_times[lower_indices]
+    bracket_lengths = (
+        sample_times_in_phase[bracket_end_indices] - sample_times_in_phase[bracket_start_indices]
+    )
     second_rate_slopes = (
-        sampled_second_rates[upper_indices] - sampled_second_rates[lower_indices]
-    ) / jnp.where(is_rate_extremum, bracket_length, 1.0)
-    phase_ends = jnp.stack([0.0 * duration, duration])
+        sampled_second_rates[bracket_end_indices] - sampled_second_rates[bracket_start_indices]
+    ) / jnp.where(is_rate_extremum, bracket_lengths, 1.0)
+    phase_start_and_end_times = jnp.stack([0.0 * phase_duration, phase_duration])
     rate_extremum_times = jnp.concatenate(
-        [phase_ends[:1], jnp.where(is_rate_extremum, rate_extremum_times, duration), phase_ends[1:]]
+        [
+            phase_start_and_end_times[:1],
+            jnp.where(is_rate_extremum, rate_extremum_times, phase_duration),
+            phase_start_and_end_times[1:],
+        ]
     )
-    inner_slice = slice(1, -1)
-    inverse_slopes = jnp.where(
+    rate_extrema_slice = slice(1, -1)
+    inverse_second_rate_slopes = jnp.where(
         is_rate_extremum, 1.0 / jnp.where(second_rate_slopes == 0.0, 1.0, second_rate_slopes), 0.0
     )
-    inverse_slopes = jnp.pad(inverse_slopes, 1)
+    inverse_second_rate_slopes = jnp.pad(inverse_second_rate_slopes, 1)
 
     def correct_times(
-        rates_to_time: Callable[[QuantityRates], Array], extremum_times: Array
+        compute_time_corrections: Callable[[QuantityTimeDerivatives], Array], extremum_times: Array
     ) -> tuple:
-        """Return corrected times, and the quantity with its rates there."""
+        """Return corrected times, and the quantity with its time derivatives at these times.
 
-        def evaluate(time: Array) -> QuantityRates:
-            n_iterations = extremum_options.n_newton_iterations
-            state_at_time = collocated_phase.integrate_to_time(time, acceleration_of, n_iterations)
-            return evaluate_quantity_rates(quantity_of, acceleration_of, *state_at_time)
+        `compute_time_corrections` returns the error of each time from the quantity's time
+        derivatives.
+        """
 
-        def iterate(loop_carry: tuple, _: None) -> tuple[tuple, None]:
-            corrected_times, quantity_rates = loop_carry
-            time_corrections = lax.stop_gradient(rates_to_time(quantity_rates))
-            corrected_times = jnp.clip(corrected_times - time_corrections, 0.0, duration)
-            return (corrected_times, jax.vmap(evaluate)(corrected_times)), None
+        def evaluate_at_time(time_in_phase: Array) -> QuantityTimeDerivatives:
+            n_newton_iterations = search_options.n_state_newton_iterations
+            state_at_time = phase_motion.integrate_to_time(
+                time_in_phase, compute_acceleration, n_newton_iterations
+            )
+            return evaluate_quantity_time_derivatives(
+                compute_quantity, compute_acceleration, *state_at_time
+            )
 
-        zero_rates = jnp.zeros_like(extremum_times)
-        loop_carry = extremum_times, QuantityRates(zero_rates, zero_rates, zero_rates)
-        return lax.scan(iterate, loop_carry, length=extremum_options.n_time_corrections)[0]
+        def correct_times_once(times_and_derivatives: tuple, _: None) -> tuple[tuple, None]:
+            corrected_times, time_derivatives = times_and_derivatives
+            time_corrections = lax.stop_gradient(compute_time_corrections(time_derivatives))
+            corrected_times = jnp.clip(corrected_times - time_corrections, 0.0, phase_duration)
+            return (corrected_times, jax.vmap(evaluate_at_time)(corrected_times)), None
 
-    rate_extremum_times, quantity_rates = correct_times(
-        lambda quantity_rates: quantity_rates.second_rate * inverse_slopes, rate_extremum_times
+        zero_derivatives = jnp.zeros_like(extremum_times)
+        initial_carry = (
+            extremum_times,
+            QuantityTimeDerivatives(zero_derivatives, zero_derivatives, zero_derivatives),
+        )
+        return lax.scan(
+            correct_times_once, initial_carry, length=search_options.n_time_corrections
+        )[0]
+
+    rate_extremum_times, derivatives_at_rate_extrema = correct_times(
+        lambda derivatives_at_rate_extrema: (
+            derivatives_at_rate_extrema.second_time_derivative * inverse_second_rate_slopes
+        ),
+        rate_extremum_times,
     )
-    rate_before, rate_after = quantity_rates.rate[:-1], quantity_rates.rate[1:]
-    has_extremum = (rate_before * rate_after < 0.0) & (duration > 0.0)
+    rate_before_extremum, rate_after_extremum = (
+        derivatives_at_rate_extrema.first_time_derivative[:-1],
+        derivatives_at_rate_extrema.first_time_derivative[1:],
+    )
+    has_extremum = (rate_before_extremum * rate_after_extremum < 0.0) & (phase_duration > 0.0)
     extremum_times = _find_bracketed_zeros(
-        lambda t: sampled_quantity.evaluate_rate(t, 1),
+        lambda t: quantity_polynomial.evaluate_time_derivative(t, 1),
         (rate_extremum_times[:-1], rate_extremum_times[1:]),
-        (rate_before, rate_after),
-        extremum_options.n_bracket_zero_iterations,
+        (rate_before_extremum, rate_after_extremum),
+        search_options.n_bracketing_iterations,
     )
-    newton_correction = lambda quantity_rates: jnp.where(
+    compute_newton_correction = lambda derivatives_at_rate_extrema: jnp.where(
         has_extremum,
-        quantity_rates.rate
-        / jnp.where(quantity_rates.second_rate == 0.0, 1.0, quantity_rates.second_rate),
+        derivatives_at_rate_extrema.first_time_derivative
+        / jnp.where(
+            derivatives_at_rate_extrema.second_time_derivative == 0.0,
+            1.0,
+            derivatives_at_rate_extrema.second_time_derivative,
+        ),
         0.0,
     )
-    extremum_times, rates_at_extrema = correct_times(newton_correction, extremum_times)
+    extremum_times, derivatives_at_extrema = correct_times(
+        compute_newton_correction, extremum_times
+    )
     return PhaseExtrema(
-        time=extremum_times,
-        value=rates_at_extrema.value,
-        is_maximum=has_extremum & (rate_before > 0.0),
-        is_minimum=has_extremum & (rate_before < 0.0),
-        rate_time=rate_extremum_times[inner_slice],
-        rate=quantity_rates.rate[inner_slice],
-        is_maximum_of_rate=is_rate_extremum & (second_rate_slopes < 0.0) & (duration > 0.0),
+        extremum_times=extremum_times,
+        extremum_values=derivatives_at_extrema.quantity_value,
+        is_quantity_maximum=has_extremum & (rate_before_extremum > 0.0),
+        is_quantity_minimum=has_extremum & (rate_before_extremum < 0.0),
+        rate_extremum_times=rate_extremum_times[rate_extrema_slice],
+        rate_extremum_values=derivatives_at_rate_extrema.first_time_derivative[rate_extrema_slice],
+        is_rate_maximum=is_rate_extremum & (second_rate_slopes < 0.0) & (phase_duration > 0.0),
     )
 
 
-def evaluate_quantity_rates(
-    quantity_of: StateFunction, acceleration_of: StateFunction, q: Array, v: Array
-) -> QuantityRates:
-    """Return a quantity and its first and second time derivative at a state."""
+def evaluate_quantity_time_derivatives(
+    compute_quantity: FunctionOfCoordinatesAndRates,
+    compute_acceleration: FunctionOfCoordinatesAndRates,
+    q: Array,
+    v: Array,
+) -> QuantityTimeDerivatives:
+    """Return a quantity at the state (q, v), with its first and second time derivatives."""
 
-    def with_rate(function: Callable, q: Array, v: Array) -> tuple:
-        return jax.jvp(function, (q, v), (v, acceleration_of(q, v)))
+    def compute_with_time_derivative(function_of_state: Callable, q: Array, v: Array) -> tuple:
+        return jax.jvp(function_of_state, (q, v), (v, compute_acceleration(q, v)))
 
-    value_and_rate = lambda q, v: with_rate(quantity_of, q, v)
-    (value, rate), (_, second_rate) = with_rate(value_and_rate, q, v)
-    return QuantityRates(value, rate, second_rate)
+    compute_quantity_and_rate = lambda q, v: compute_with_time_derivative(compute_quantity, q, v)
+    (quantity_value, first_time_derivative), (_, second_time_derivative) = (
+        compute_with_time_derivative(compute_quantity_and_rate, q, v)
+    )
+    return QuantityTimeDerivatives(quantity_value, first_time_derivative, second_time_derivative)
 
 
 def _find_bracketed_zeros(
     function: Callable[[Array], Array],
-    bracket: tuple[Array, Array],
+    bracket_end_points: tuple[Array, Array],
     bracket_values: tuple[Array, Array],
     n_iterations: int,
 ) -> Array:
-    """Return a zero of `function` in each bracket, without derivative.
+    """Return a zero of `function` in each bracket, without derivatives.
 
-    `bracket_values` are the values of the function at the ends of the brackets. If both values have
-    one sign, the result is the start of the bracket. The method is Chandrupatla's (Adv. Eng. Softw.
-    28, 145-149, 1997).
+    `bracket_values` are the values of `function` at the two ends of the brackets. If both values of
+    a bracket have the same sign, its start is returned. The method is Chandrupatla's (Adv. Eng.
+    Softw. 28, 145-149, 1997).
     """
-    bracket_starts, bracket_ends, start_values, end_values = lax.stop_gradient(
-        (*bracket, *bracket_values)
+    bracket_starts, bracket_ends, bracket_start_values, bracket_end_values = lax.stop_gradient(
+        (*bracket_end_points, *bracket_values)
     )
-    has_zero = start_values * end_values < 0.0
-    replace_zero_by_one = lambda x: jnp.where(x == 0.0, 1.0, x)
+    has_sign_change = bracket_start_values * bracket_end_values < 0.0
+    avoid_zero_division = lambda x: jnp.where(x == 0.0, 1.0, x)
 
-    def iterate(loop_carry: tuple, _: None) -> tuple[tuple, None]:
-        node_accelerations, fa, b, fb, c, fc, fraction = loop_carry
-        x = node_accelerations + fraction * (b - node_accelerations)
+    def shrink_brackets(loop_carry: tuple, _: None) -> tuple[tuple, None]:
+        a, fa, b, fb, c, fc, next_fraction = loop_carry
+        x = a + next_fraction * (b - a)
         fx = function(x)
         is_same_side = jnp.sign(fx) == jnp.sign(fa)
-        c, fc = jnp.where(is_same_side, node_accelerations, b), jnp.where(is_same_side, fa, fb)
-        b, fb = jnp.where(is_same_side, b, node_accelerations), jnp.where(is_same_side, fb, fa)
-        node_accelerations, fa = x, fx
-        xi = (node_accelerations - b) / replace_zero_by_one(c - b)
-        phi = (fa - fb) / replace_zero_by_one(fc - fb)
-        is_smooth = (phi * phi < xi) & ((1.0 - phi) * (1.0 - phi) < 1.0 - xi)
-        inverse_quadratic = fa / replace_zero_by_one(fb - fa) * fc / replace_zero_by_one(
+        c, fc = jnp.where(is_same_side, a, b), jnp.where(is_same_side, fa, fb)
+        b, fb = jnp.where(is_same_side, b, a), jnp.where(is_same_side, fb, fa)
+        a, fa = x, fx
+        xi = (a - b) / avoid_zero_division(c - b)
+        phi = (fa - fb) / avoid_zero_division(fc - fb)
+        is_interpolation_trusted = (phi * phi < xi) & ((1.0 - phi) * (1.0 - phi) < 1.0 - xi)
+        interpolated_fraction = fa / avoid_zero_division(fb - fa) * fc / avoid_zero_division(
             fb - fc
-        ) + (c - node_accelerations) / replace_zero_by_one(
-            b - node_accelerations
-        ) * fa / replace_zero_by_one(fc - fa) * fb / replace_zero_by_one(fc - fb)
-        fraction = jnp.where(is_smooth, jnp.clip(inverse_quadratic, 0.0, 1.0), 0.5)
-        fraction = jnp.where(fa == 0.0, 0.0, fraction)
-        return (node_accelerations, fa, b, fb, c, fc, fraction), None
+        ) + (c - a) / avoid_zero_division(b - a) * fa / avoid_zero_division(
+            fc - fa
+        ) * fb / avoid_zero_division(fc - fb)
+        next_fraction = jnp.where(
+            is_interpolation_trusted, jnp.clip(interpolated_fraction, 0.0, 1.0), 0.5
+        )
+        next_fraction = jnp.where(fa == 0.0, 0.0, next_fraction)
+        return (a, fa, b, fb, c, fc, next_fraction), None
 
-    loop_carry = (
+    initial_carry = (
         bracket_ends,
-        end_values,
+        bracket_end_values,
         bracket_starts,
-        start_values,
+        bracket_start_values,
         bracket_starts,
-        start_values,
+        bracket_start_values,
         jnp.full_like(bracket_starts, 0.5),
     )
-    node_accelerations, fa, b, fb, *_ = lax.scan(iterate, loop_carry, None, length=n_iterations)[0]
-    return jnp.where(
-        has_zero, jnp.where(jnp.abs(fa) <= jnp.abs(fb), node_accelerations, b), bracket_starts
-    )
+    a, fa, b, fb, *_ = lax.scan(shrink_brackets, initial_carry, None, length=n_iterations)[0]
+    return jnp.where(has_sign_change, jnp.where(jnp.abs(fa) <= jnp.abs(fb), a, b), bracket_starts)

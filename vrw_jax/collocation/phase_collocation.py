@@ -1,15 +1,17 @@
-"""Collocation of a limit cycle: all phases, their durations and the section state together.
+"""Collocation equations of a limit cycle, and their linearization.
 
-Each phase is divided into mesh intervals of four Gauss nodes (order 8). The unknowns are the
-section state, the durations of the phases and the accelerations at all nodes. Positions and rates
-are explicit functions of the unknowns. `linearize_cycle` visits each interval once and propagates a
-few tangents. They are the Newton correction, one tangent for each component of the section state,
-one for each requested parameter, and one for the duration of the current phase. The node equations
-of an interval are eliminated immediately, the duration of a phase at its event, and the section
-state when the cycle is closed. The monodromy matrix and the sensitivities of all unknowns to the
-parameters are therefore tangents of the same linearization.
+The unknowns of the cycle are the section state, the durations of all phases and the accelerations
+at all nodes. Each phase is divided into mesh intervals with four Gauss nodes (order 8). Positions
+and rates are explicit functions of the unknowns.
 
-Arrays have batch elements (independent wheels) on their last axis, and no code branches.
+`linearize_cycle` visits each mesh interval once and propagates a few tangents: the Newton
+correction, one tangent per component of the section state, one per requested parameter, and one for
+the duration of the current phase. The node equations are eliminated in each interval. The duration
+of a phase is eliminated at its event, and the section state when the cycle is closed. The monodromy
+matrix and the sensitivities of all unknowns are therefore tangents of one linearization.
+
+Arrays have batch elements (independent wheels) on their last axis, and the code has no branches
+that depend on values.
 """
 
 import functools
@@ -30,8 +32,8 @@ from vrw_jax.collocation.gauss import (
     INTEGRATION_MATRIX,
     N_GAUSS_NODES,
     PhaseMesh,
-    lagrange_weights,
-    phase_integration_matrices,
+    build_phase_integration_matrices,
+    compute_lagrange_weights,
 )
 from vrw_jax.numerics import (
     Elementwise,
@@ -49,11 +51,11 @@ from vrw_jax.numerics import (
 )
 
 PhaseConstants = tuple[Elementwise, ...]
-"""Constants of the equations of all phases, one array for each constant."""
+"""Constants of the equations of motion of all phases, one array per constant."""
 
 
 class PhasePoint(NamedTuple):
-    """State within a phase: the constants held since its start, coordinates and rates."""
+    """State within a phase: constants that are held since its start, coordinates and rates."""
 
     held_constants: Vector
     q: Vector
@@ -61,109 +63,117 @@ class PhasePoint(NamedTuple):
 
 
 class CollocationPhase(NamedTuple):
-    """One phase as functions that are elementwise over the batch.
+    """One phase, described by functions that are elementwise over the batch.
 
-    `residual` is the residual of the equations of motion at (constants, point, acceleration), which
-    is linear in the acceleration. The residual costs far less to differentiate than the solved
-    equations. The functions `event`, zero at the end, and `guards`, positive inside, take
-    (constants, point). `reset` maps the end of the phase to the start of the next phase, and the
-    end of the last phase to the section state (in `q`).
+    `residual_function` maps (constants, point, accelerations) to the residual of the equations of
+    motion. The residual is linear in the accelerations, and far cheaper to differentiate than the
+    solved equations. `end_event_function` maps (constants, point) to a scalar that is zero at the
+    end of the phase. `guards_function` maps (constants, point) to guards that are positive during
+    the phase. `reset_map` maps (constants, end point) to the start point of the next phase. The
+    reset of the last phase returns the section state as `q`.
     """
 
-    name: str
+    phase_name: str
     n_coordinates: int
-    residual: Callable[[PhaseConstants, PhasePoint, Vector], Vector]
-    event: Callable[[PhaseConstants, PhasePoint], Elementwise]
-    reset: Callable[[PhaseConstants, PhasePoint], PhasePoint]
-    guards: Callable[[PhaseConstants, PhasePoint], Vector]
+    residual_function: Callable[[PhaseConstants, PhasePoint, Vector], Vector]
+    end_event_function: Callable[[PhaseConstants, PhasePoint], Elementwise]
+    reset_map: Callable[[PhaseConstants, PhasePoint], PhasePoint]
+    guards_function: Callable[[PhaseConstants, PhasePoint], Vector]
     is_smooth: bool = True  # False if the first interval leaves a fast decaying mode unresolved
 
 
 class PhaseSequence(NamedTuple):
-    """The phases between two crossings of the section, which has `section_size` coordinates.
+    """Phases between two crossings of the section, which has `section_size` coordinates.
 
-    `start` maps the section state to the start of the first phase. `admissibility_margins` takes
-    the constants, the points of all phases and the flags of active phases. It returns the
-    quantities that must be positive in a gait.
+    `start_map` maps (constants, section state) to the start point of the first phase.
+    `margins_function` maps the constants, the points of all phases and the flags of active
+    phases to the margins, which are positive if the gait is admissible.
     """
 
     section_size: int
-    start: Callable[[PhaseConstants, Vector], PhasePoint]
+    start_map: Callable[[PhaseConstants, Vector], PhasePoint]
     phases: tuple[CollocationPhase, ...]
-    admissibility_margins: Callable[[PhaseConstants, "tuple[PhasePoints, ...]", Array], Vector]
+    margins_function: Callable[[PhaseConstants, "tuple[PhasePoints, ...]", Array], Vector]
 
 
 class CollocationSolution(NamedTuple):
-    """Unknowns of a cycle of n gait steps, with the batch on the last axis.
+    """Unknowns of a cycle of n gait steps, with batch elements on the last axis.
 
-    Each gait step runs the whole phase sequence.
+    Each gait step consists of all phases of the sequence.
     """
 
     section_state: LaneArray  # (section_size, batch), at the start of the first gait step
     durations: LaneArray  # (n, n_phases, batch), s
-    # for each phase, (n, n_intervals, N_GAUSS_NODES, n_coordinates, batch)
+    # one array per phase: (n, n_intervals, N_GAUSS_NODES, n_coordinates, batch)
     accelerations: tuple[LaneArray, ...]
 
 
 class CycleLinearization(NamedTuple):
-    """Results of the linearization of a cycle at a trial solution."""
+    """Newton correction, tangents and monodromy matrix of a cycle at a trial solution."""
 
-    correction: CollocationSolution  # correction of Newton's method
-    tangents: (
-        # derivatives with respect to each requested parameter, on a leading axis
+    newton_correction: CollocationSolution
+    parameter_tangents: (
+        # derivatives of the solution; requested parameters on a leading axis
         CollocationSolution
     )
-    # (n, 2 n_coordinates, batch): corrected coordinates and rates at each step's end
-    step_ends: LaneArray
-    # their derivatives with respect to each requested parameter, on a leading axis
+    # corrected coordinates and rates at the end of each gait step, (n, 2 n_coordinates, batch)
+    step_end_states: LaneArray
+    # derivatives of `step_ends`; requested parameters on a leading axis
     step_end_tangents: LaneArray
-    monodromy: LaneArray  # (row, column, batch): Jacobian of the return map on the section
+    monodromy: LaneArray  # Jacobian of the return map, (row, column, batch)
 
 
 class _LinearizationContext(NamedTuple):
-    """Inputs of a linearization, and the layout of its tangents.
+    """Inputs of a linearization, and the order of its tangents.
 
-    The order of the tangents is: the correction; one for each component of the section state; one
-    for each parameter in `parameter_indices`; and, within a phase, one for the duration of the
-    phase.
+    The first tangent is the Newton correction. The next tangents are those of the components of the
+    section state, and then those of the parameters in `parameter_indices`. Within a phase the last
+    tangent is that of the phase's duration.
     """
 
     section_size: int
     parameter_indices: tuple[int, ...]
     parameters: LaneArray
-    compute_constants: Callable[..., PhaseConstants]
-    constants: PhaseConstants
-    constants_tangents: tuple[
+    compute_phase_constants: Callable[..., PhaseConstants]
+    phase_constants: PhaseConstants
+    constant_tangents: tuple[
         LaneArray, ...
-    ]  # the tangents of each constant, with respect to the parameters only
+    ]  # of each constant, with respect to the requested parameters
     prevent_fusion: FusionBarrierFn
 
     @property
     def n_tangents(self) -> int:
-        """Return the number of tangents outside of a phase."""
+        """Return the number of tangents between phases, where no tangent belongs to a duration."""
         return 1 + self.section_size + len(self.parameter_indices)
 
     @property
-    def section_slice(self) -> slice:
-        """Return the slice of the tangents with respect to the section state."""
+    def section_tangent_slice(self) -> slice:
+        """Return the slice of the tangents that belong to the section state."""
         return slice(1, 1 + self.section_size)
 
-    def value_and_tangents(self, function: Callable, point: tuple, point_tangents: tuple) -> tuple:
-        """Return the value and the tangents of `function(*point, *constants)`."""
+    def evaluate_with_tangents(
+        self, function_of_point: Callable, point: tuple, point_tangents: tuple
+    ) -> tuple:
+        """Return the value of `function_of_point(*point, *phase_constants)` and its tangents."""
         if not self.parameter_indices:
             return evaluate_with_jvps(
-                lambda *point: function(*point, *self.constants), point, point_tangents
+                lambda *point: function_of_point(*point, *self.phase_constants),
+                point,
+                point_tangents,
             )
         n_trailing_axes = point_tangents[0].shape[0] - self.n_tangents
-        zero_tangents = (
-            (self.section_slice.stop, n_trailing_axes),
+        tangent_padding = (
+            (self.section_tangent_slice.stop, n_trailing_axes),
             *((0, 0),) * (self.parameters.ndim - 1),
         )
-        constants_tangents = (
-            jnp.pad(tangent, zero_tangents) for tangent in self.constants_tangents
+        padded_constant_tangents = (
+            jnp.pad(constant_tangent, tangent_padding)
+            for constant_tangent in self.constant_tangents
         )
         return evaluate_with_jvps(
-            function, (*point, *self.constants), (*point_tangents, *constants_tangents)
+            function_of_point,
+            (*point, *self.phase_constants),
+            (*point_tangents, *padded_constant_tangents),
         )
 
 
@@ -171,81 +181,91 @@ def _make_linearization_context(
     section_size: int,
     parameter_indices: tuple[int, ...],
     parameters: LaneArray,
-    compute_constants: Callable[..., PhaseConstants],
+    compute_phase_constants: Callable[..., PhaseConstants],
 ) -> _LinearizationContext:
-    """Return the context of a linearization, with the constants and their tangents."""
+    """Return the context of a linearization, with the phase constants and their tangents."""
     prevent_fusion = make_fusion_barrier(parameters)
-    dtype, lanes = parameters.dtype, parameters.shape[1:]
+    dtype, lane_shape = parameters.dtype, parameters.shape[1:]
     unit_parameter_tangents = np.eye(parameters.shape[0], dtype=dtype)[list(parameter_indices)]
     parameter_tangents = tuple(
-        jnp.broadcast_to(x[:, None], (len(parameter_indices), *lanes))
+        jnp.broadcast_to(x[:, None], (len(parameter_indices), *lane_shape))
         for x in unit_parameter_tangents.T
     )
     if parameter_indices:
-        constants, constants_tangents = evaluate_with_jvps(
-            compute_constants, tuple(parameters), parameter_tangents
+        phase_constants, constant_tangents = evaluate_with_jvps(
+            compute_phase_constants, tuple(parameters), parameter_tangents
         )
     else:
-        constants, constants_tangents = compute_constants(*parameters), ()
+        phase_constants, constant_tangents = compute_phase_constants(*parameters), ()
     return _LinearizationContext(
         section_size,
         parameter_indices,
         parameters,
-        compute_constants,
-        constants,
-        constants_tangents,
+        compute_phase_constants,
+        phase_constants,
+        constant_tangents,
         prevent_fusion,
     )
 
 
-def _stack_phase_point(point: PhasePoint, template: Array) -> tuple[Array, ...]:
-    """Return the parts of a point as arrays, some of which may be empty."""
-    empty = jnp.zeros((0, *template.shape[1:]), template.dtype)
-    return tuple(jnp.stack(components) if components else empty for components in point)
+def _stack_phase_point(phase_point: PhasePoint, template_array: Array) -> tuple[Array, ...]:
+    """Return held constants, coordinates and rates of a point as three arrays with a leading axis.
+
+    A part without components becomes an empty array with the trailing shape and type of
+    `template_array`.
+    """
+    empty_array = jnp.zeros((0, *template_array.shape[1:]), template_array.dtype)
+    return tuple(
+        jnp.stack(point_components) if point_components else empty_array
+        for point_components in phase_point
+    )
 
 
 class _PhaseTangentState(NamedTuple):
-    """State within a phase with its tangents, on a leading axis."""
+    """State within a phase, and its tangents, which have an additional leading axis."""
 
     held_constants: LaneArray
     q: LaneArray
     v: LaneArray
-    held_tangents: LaneArray
+    held_constant_tangents: LaneArray
     q_tangents: LaneArray
     v_tangents: LaneArray
 
 
 class _MeshInterval(NamedTuple):
-    """One mesh interval of a phase."""
+    """Length and node accelerations of one mesh interval of a phase."""
 
-    duration_fraction: Array  # length as a fraction of the phase's duration
+    length_fraction: Array  # fraction of the phase's duration
     h: LaneArray  # length, s
-    accelerations: LaneArray  # (node, coordinate, batch)
+    node_accelerations: LaneArray  # (node, coordinate, batch)
 
 
-def _make_unit_tangent(n_tangents: int, tangent_index: int, dtype: Any) -> np.ndarray:
-    """Return a unit vector over the tangents, with trailing axes for multiplication."""
-    return np.eye(n_tangents, dtype=dtype)[tangent_index][:, None, None, None]
+def _make_unit_tangent(n_tangents: int, tangent_index: int, float_dtype: Any) -> np.ndarray:
+    """Return a unit vector over the tangents, of shape (n_tangents, 1, 1, 1)."""
+    return np.eye(n_tangents, dtype=float_dtype)[tangent_index][:, None, None, None]
 
 
 def _evaluate_interval_nodes(
     tangent_state: _PhaseTangentState, mesh_interval: _MeshInterval
 ) -> tuple[Array, ...]:
-    """Return coordinates and rates at the nodes of an interval, and their tangents."""
-    duration_fraction, h, accelerations = mesh_interval
+    """Return coordinates and rates at the nodes of a mesh interval, and their tangents."""
+    length_fraction, h, node_accelerations = mesh_interval
     v, q_tangents, v_tangents = tangent_state.v, tangent_state.q_tangents, tangent_state.v_tangents
-    nodes = GAUSS_NODES.astype(h.dtype)[:, None, None]
-    duration_unit = _make_unit_tangent(q_tangents.shape[0], -1, h.dtype)
-    rate_increments = apply_matrix(INTEGRATION_MATRIX, accelerations)
-    position_increments = apply_matrix(DOUBLE_INTEGRATION_MATRIX, accelerations)
-    node_q = tangent_state.q + h * (nodes * v + h * position_increments)
+    gauss_node_column = GAUSS_NODES.astype(h.dtype)[:, None, None]
+    duration_unit_tangent = _make_unit_tangent(q_tangents.shape[0], -1, h.dtype)
+    rate_increments = apply_matrix(INTEGRATION_MATRIX, node_accelerations)
+    position_increments = apply_matrix(DOUBLE_INTEGRATION_MATRIX, node_accelerations)
+    node_q = tangent_state.q + h * (gauss_node_column * v + h * position_increments)
     node_v = v + h * rate_increments
     node_q_tangents = (
         q_tangents[:, None]
-        + (h * nodes) * v_tangents[:, None]
-        + duration_unit * (duration_fraction * (nodes * v + 2.0 * h * position_increments))
+        + (h * gauss_node_column) * v_tangents[:, None]
+        + duration_unit_tangent
+        * (length_fraction * (gauss_node_column * v + 2.0 * h * position_increments))
     )
-    node_v_tangents = v_tangents[:, None] + duration_unit * (duration_fraction * rate_increments)
+    node_v_tangents = v_tangents[:, None] + duration_unit_tangent * (
+        length_fraction * rate_increments
+    )
     return node_q, node_v, node_q_tangents, node_v_tangents
 
 
@@ -254,12 +274,12 @@ def _evaluate_interval_end(
     mesh_interval: _MeshInterval,
     acceleration_tangents: LaneArray,
 ) -> _PhaseTangentState:
-    """Return the state at the end of an interval from its accelerations and their tangents."""
-    duration_fraction, h, accelerations = mesh_interval
+    """Return the state and the tangents at the end of a mesh interval."""
+    length_fraction, h, node_accelerations = mesh_interval
     _, q, v, _, q_tangents, v_tangents = tangent_state
-    duration_unit = _make_unit_tangent(q_tangents.shape[0], -1, h.dtype)[:, 0]
-    rate_increment = sum_with_weights(END_WEIGHTS, accelerations)
-    position_increment = sum_with_weights(DOUBLE_END_WEIGHTS, accelerations)
+    duration_unit_tangent = _make_unit_tangent(q_tangents.shape[0], -1, h.dtype)[:, 0]
+    rate_increment = sum_with_weights(END_WEIGHTS, node_accelerations)
+    position_increment = sum_with_weights(DOUBLE_END_WEIGHTS, node_accelerations)
     rate_increment_tangents = sum_with_weights(END_WEIGHTS, acceleration_tangents).swapaxes(0, 1)
     position_increment_tangents = sum_with_weights(DOUBLE_END_WEIGHTS, acceleration_tangents)
     position_increment_tangents = position_increment_tangents.swapaxes(0, 1)
@@ -267,12 +287,12 @@ def _evaluate_interval_end(
         q_tangents
         + h * v_tangents
         + h * h * position_increment_tangents
-        + duration_unit * (duration_fraction * (v + 2.0 * h * position_increment))
+        + duration_unit_tangent * (length_fraction * (v + 2.0 * h * position_increment))
     )
     v_tangents = (
         v_tangents
         + h * rate_increment_tangents
-        + duration_unit * (duration_fraction * rate_increment)
+        + duration_unit_tangent * (length_fraction * rate_increment)
     )
     q, v = q + h * v + h * h * position_increment, v + h * rate_increment
     return tangent_state._replace(q=q, v=v, q_tangents=q_tangents, v_tangents=v_tangents)
@@ -284,13 +304,13 @@ def _linearize_residual(
     tangent_state: _PhaseTangentState,
     node_q: LaneArray,
     node_v: LaneArray,
-    accelerations: LaneArray,
+    node_accelerations: LaneArray,
 ) -> tuple[Array, Array, Any]:
-    """Return the residual of the equations at the nodes and its partial derivatives.
+    """Return the residual of the equations of motion at the nodes, and its partial derivatives.
 
-    The Jacobian, with axes (node, equation, argument, batch), is with respect to (q, v,
-    acceleration, held constants). The derivatives with respect to the parameters are separate, with
-    the parameters on a leading axis.
+    The Jacobian has the axes (node, equation, argument, batch). Its arguments are q, v, the
+    accelerations and the held constants. The derivatives with respect to the parameters are a
+    separate array with the parameters on the leading axis.
     """
     n_coordinates, n_held_constants = phase.n_coordinates, tangent_state.held_constants.shape[0]
 
@@ -299,16 +319,16 @@ def _linearize_residual(
         held_constants = arguments[3 * n_coordinates :][:n_held_constants]
         parameters = arguments[3 * n_coordinates :][n_held_constants:]
         constants = (
-            linearization_context.compute_constants(*parameters)
+            linearization_context.compute_phase_constants(*parameters)
             if linearization_context.parameter_indices
-            else linearization_context.constants
+            else linearization_context.phase_constants
         )
-        return phase.residual(constants, PhasePoint(held_constants, q, v), a)
+        return phase.residual_function(constants, PhasePoint(held_constants, q, v), a)
 
     residual_arguments = [
-        residual_argument[:, argument_offset]
-        for residual_argument in (node_q, node_v, accelerations)
-        for argument_offset in range(n_coordinates)
+        residual_argument[:, argument_index]
+        for residual_argument in (node_q, node_v, node_accelerations)
+        for argument_index in range(n_coordinates)
     ]
     residual_arguments += [
         jnp.broadcast_to(residual_argument, node_q[:, 0].shape)
@@ -320,13 +340,13 @@ def _linearize_residual(
             jnp.broadcast_to(residual_argument, node_q[:, 0].shape)
             for residual_argument in linearization_context.parameters
         ]
-    # The partial derivatives stay separate arrays at first, because each is a small kernel and
-    # stacking them is a copy.
+    # The partial derivatives are stacked only after they are computed, because each is a small
+    # kernel and stacking copies it.
     residual_value, partials_by_output = linearization_context.prevent_fusion(
         evaluate_with_partials(evaluate_residual, residual_arguments)
     )
     partials_by_argument = list(zip(*partials_by_output, strict=True))
-    jacobian = jnp.stack(
+    residual_jacobian = jnp.stack(
         [
             jnp.stack(partials_of_argument, 1)
             for partials_of_argument in partials_by_argument[:n_state_arguments]
@@ -334,13 +354,13 @@ def _linearize_residual(
         2,
     )
     parameter_partials = [
-        jnp.stack(partials_by_argument[n_state_arguments + argument_offset], 1)
-        for argument_offset in linearization_context.parameter_indices
+        jnp.stack(partials_by_argument[n_state_arguments + argument_index], 1)
+        for argument_index in linearization_context.parameter_indices
     ]
     return linearization_context.prevent_fusion(
         (
             jnp.stack(residual_value, 1),
-            jacobian,
+            residual_jacobian,
             jnp.stack(parameter_partials) if parameter_partials else (),
         )
     )
@@ -350,43 +370,48 @@ def _assemble_node_system(
     linearization_context: _LinearizationContext,
     tangent_state: _PhaseTangentState,
     h: LaneArray,
-    linearization: tuple,
+    linearized_residual: tuple,
     state_tangents: LaneArray,
 ) -> tuple[Array, Array]:
-    """Return the matrix and the right-hand sides of the equations for corrections of the
-    accelerations.
+    """Return matrix and right-hand sides of the equations for the node accelerations' tangents.
 
-    There is one right-hand side for each tangent.
+    There is one right-hand side per tangent.
     """
-    residual_value, jacobian, parameter_partials = linearization
-    n_tangents, n_coordinates, dtype = state_tangents.shape[0], residual_value.shape[1], h.dtype
+    residual_value, residual_jacobian, parameter_partials = linearized_residual
+    n_tangents, n_coordinates, float_dtype = (
+        state_tangents.shape[0],
+        residual_value.shape[1],
+        h.dtype,
+    )
     tangent_terms = [
-        jacobian[:, :, argument_index] * state_tangents[:, :, argument_index, None]
+        residual_jacobian[:, :, argument_index] * state_tangents[:, :, argument_index, None]
         for argument_index in range(2 * n_coordinates)
     ]
     tangent_terms += [
-        jacobian[:, :, 3 * n_coordinates + argument_index]
-        * tangent_state.held_tangents[:, argument_index, None, None]
+        residual_jacobian[:, :, 3 * n_coordinates + argument_index]
+        * tangent_state.held_constant_tangents[:, argument_index, None, None]
         for argument_index in range(tangent_state.held_constants.shape[0])
     ]
     right_hand_sides = sum(
-        tangent_terms, start=_make_unit_tangent(n_tangents, 0, dtype) * residual_value
+        tangent_terms, start=_make_unit_tangent(n_tangents, 0, float_dtype) * residual_value
     )
     if linearization_context.parameter_indices:
-        n_leading = linearization_context.n_tangents - len(linearization_context.parameter_indices)
-        right_hand_sides = right_hand_sides + jnp.pad(
-            parameter_partials, ((n_leading, 1), *((0, 0),) * 3)
+        n_other_tangents = linearization_context.n_tangents - len(
+            linearization_context.parameter_indices
         )
-    double_matrix, single_matrix = (
-        matrix.astype(dtype)[:, None, :, None, None]
-        for matrix in (DOUBLE_INTEGRATION_MATRIX, INTEGRATION_MATRIX)
+        right_hand_sides = right_hand_sides + jnp.pad(
+            parameter_partials, ((n_other_tangents, 1), *((0, 0),) * 3)
+        )
+    double_integration_matrix, integration_matrix = (
+        float64_matrix.astype(float_dtype)[:, None, :, None, None]
+        for float64_matrix in (DOUBLE_INTEGRATION_MATRIX, INTEGRATION_MATRIX)
     )
-    jacobian_q, jacobian_v, jacobian_a = (
-        jacobian[:, :, None, i * n_coordinates : (i + 1) * n_coordinates] for i in range(3)
+    residual_by_q, residual_by_v, residual_by_a = (
+        residual_jacobian[:, :, None, i * n_coordinates : (i + 1) * n_coordinates] for i in range(3)
     )
-    node_diagonal = np.eye(N_GAUSS_NODES, dtype=dtype)[:, None, :, None, None]
-    system_matrix = node_diagonal * jacobian_a + h * (
-        h * double_matrix * jacobian_q + single_matrix * jacobian_v
+    node_identity = np.eye(N_GAUSS_NODES, dtype=float_dtype)[:, None, :, None, None]
+    system_matrix = node_identity * residual_by_a + h * (
+        h * double_integration_matrix * residual_by_q + integration_matrix * residual_by_v
     )
     return system_matrix, -jnp.moveaxis(right_hand_sides, 0, 2)
 
@@ -394,42 +419,47 @@ def _assemble_node_system(
 def _linearize_phase(
     linearization_context: _LinearizationContext,
     phase: CollocationPhase,
-    mesh: PhaseMesh,
+    phase_mesh: PhaseMesh,
     tangent_state: _PhaseTangentState,
-    duration: LaneArray,
-    accelerations: LaneArray,
+    phase_duration: LaneArray,
+    phase_accelerations: LaneArray,
 ) -> tuple[_PhaseTangentState, LaneArray]:
-    """Return the state at the end of a phase, and the tangents of the phase's accelerations.
+    """Return the state at the end of a phase, and the tangents of the phase's node accelerations.
 
-    Within the phase there is one more tangent, the last one. It belongs to the duration of the
-    phase.
+    Within the phase, the last tangent belongs to the duration of the phase.
     """
     append_duration_tangent = lambda x: jnp.concatenate([x, jnp.zeros_like(x[:1])])
     tangent_state = tangent_state._replace(
-        held_tangents=append_duration_tangent(tangent_state.held_tangents),
+        held_constant_tangents=append_duration_tangent(tangent_state.held_constant_tangents),
         q_tangents=append_duration_tangent(tangent_state.q_tangents),
         v_tangents=append_duration_tangent(tangent_state.v_tangents),
     )
 
-    def linearize_interval(interval_state: tuple, interval_inputs: tuple) -> tuple[tuple, Array]:
-        accelerations, duration_fraction = interval_inputs
+    def linearize_interval(
+        start_field_values: tuple, interval_inputs: tuple
+    ) -> tuple[tuple, Array]:
+        node_accelerations, length_fraction = interval_inputs
         mesh_interval = _MeshInterval(
-            duration_fraction, duration_fraction * duration, accelerations
+            length_fraction, length_fraction * phase_duration, node_accelerations
         )
         start_state = tangent_state._replace(
-            **dict(zip(PROPAGATED_STATE_FIELDS, interval_state, strict=True))
+            **dict(zip(PROPAGATED_STATE_FIELDS, start_field_values, strict=True))
         )
         node_q, node_v, node_q_tangents, node_v_tangents = linearization_context.prevent_fusion(
             _evaluate_interval_nodes(start_state, mesh_interval)
         )
-        linearization = _linearize_residual(
-            linearization_context, phase, start_state, node_q, node_v, accelerations
+        linearized_residual = _linearize_residual(
+            linearization_context, phase, start_state, node_q, node_v, node_accelerations
         )
         # Axes: (tangent, node, argument, batch).
         state_tangents = jnp.concatenate([node_q_tangents, node_v_tangents], 2)
         node_system = linearization_context.prevent_fusion(
             _assemble_node_system(
-                linearization_context, start_state, mesh_interval.h, linearization, state_tangents
+                linearization_context,
+                start_state,
+                mesh_interval.h,
+                linearized_residual,
+                state_tangents,
             )
         )
         # Axes: (node, row, tangent, batch).
@@ -437,51 +467,59 @@ def _linearize_phase(
             solve_node_equations(*node_system, linearization_context.parameters)
         )
         end_state = _evaluate_interval_end(start_state, mesh_interval, acceleration_tangents)
-        next_state = tuple(getattr(end_state, name) for name in PROPAGATED_STATE_FIELDS)
-        return next_state, jnp.moveaxis(acceleration_tangents, 2, 0)
+        end_field_values = tuple(getattr(end_state, name) for name in PROPAGATED_STATE_FIELDS)
+        return end_field_values, jnp.moveaxis(acceleration_tangents, 2, 0)
 
-    start_state = tuple(getattr(tangent_state, name) for name in PROPAGATED_STATE_FIELDS)
-    interval_fractions = jnp.asarray(mesh.interval_fractions, duration.dtype)
-    end_state, acceleration_tangents = lax.scan(
-        linearize_interval, start_state, (accelerations, interval_fractions)
+    start_fields = tuple(getattr(tangent_state, name) for name in PROPAGATED_STATE_FIELDS)
+    length_fractions = jnp.asarray(phase_mesh.interval_fractions, phase_duration.dtype)
+    end_field_values, acceleration_tangents = lax.scan(
+        linearize_interval, start_fields, (phase_accelerations, length_fractions)
     )
-    end_fields = dict(zip(PROPAGATED_STATE_FIELDS, end_state, strict=True))
-    return tangent_state._replace(**end_fields), acceleration_tangents
+    end_values_by_field = dict(zip(PROPAGATED_STATE_FIELDS, end_field_values, strict=True))
+    return tangent_state._replace(**end_values_by_field), acceleration_tangents
 
 
 PROPAGATED_STATE_FIELDS = ("q", "v", "q_tangents", "v_tangents")
-"""Names of the fields of `_PhaseTangentState` that change within a phase."""
+"""Names of the fields of `_PhaseTangentState` that change during a phase."""
 
 
 def _eliminate_duration(
     linearization_context: _LinearizationContext,
     phase: CollocationPhase,
     tangent_state: _PhaseTangentState,
-    duration: LaneArray,
+    phase_duration: LaneArray,
     is_phase_active: Bool[Array, " lanes"],
 ) -> tuple[_PhaseTangentState, LaneArray, Callable[[Array], Array]]:
-    """Eliminate the duration of a phase by its event, and apply the reset.
+    """Eliminate the tangent of a phase's duration by the phase's event, and apply the reset.
 
-    Return the state of the next phase, the tangents of the duration, and the function that
-    eliminates the duration's tangent from other tangents. An inactive phase has duration zero.
+    Return the state at the start of the next phase, the tangents of the duration, and a function
+    that eliminates the tangent of the duration from other tangents. An inactive phase has duration
+    zero.
     """
 
     def evaluate_end(held_constants: Array, q: Array, v: Array, *constants: Array) -> tuple:
         point = PhasePoint(tuple(held_constants), tuple(q), tuple(v))
-        return phase.event(constants, point), _stack_phase_point(phase.reset(constants, point), q)
+        return phase.end_event_function(constants, point), _stack_phase_point(
+            phase.reset_map(constants, point), q
+        )
 
     end_point = tangent_state.held_constants, tangent_state.q, tangent_state.v
-    point_tangents = tangent_state.held_tangents, tangent_state.q_tangents, tangent_state.v_tangents
-    (event_value, next_point), (event_tangents, next_point_tangents) = (
-        linearization_context.value_and_tangents(evaluate_end, end_point, point_tangents)
+    point_tangents = (
+        tangent_state.held_constant_tangents,
+        tangent_state.q_tangents,
+        tangent_state.v_tangents,
     )
-    correction_unit, duration_unit = (
-        _make_unit_tangent(event_tangents.shape[0], i, duration.dtype)[:, 0, 0] for i in (0, -1)
+    (event_value, next_phase_point), (event_tangents, next_point_tangents) = (
+        linearization_context.evaluate_with_tangents(evaluate_end, end_point, point_tangents)
     )
-    event_value = jnp.where(is_phase_active, event_value, duration)
-    event_tangents = jnp.where(is_phase_active, event_tangents, duration_unit)
+    correction_unit_tangent, duration_unit_tangent = (
+        _make_unit_tangent(event_tangents.shape[0], i, phase_duration.dtype)[:, 0, 0]
+        for i in (0, -1)
+    )
+    event_value = jnp.where(is_phase_active, event_value, phase_duration)
+    event_tangents = jnp.where(is_phase_active, event_tangents, duration_unit_tangent)
     duration_tangents = (
-        -(event_tangents[:-1] + correction_unit[:-1] * event_value) / event_tangents[-1]
+        -(event_tangents[:-1] + correction_unit_tangent[:-1] * event_value) / event_tangents[-1]
     )
 
     def eliminate_duration(tangents: Array) -> Array:
@@ -491,7 +529,7 @@ def _eliminate_duration(
         return tangents[:-1] + duration_factor * tangents[-1:]
 
     next_state = _PhaseTangentState(
-        *next_point, *(eliminate_duration(x) for x in next_point_tangents)
+        *next_phase_point, *(eliminate_duration(x) for x in next_point_tangents)
     )
     return next_state, duration_tangents, eliminate_duration
 
@@ -503,35 +541,43 @@ def _linearize_gait_step(
     section_and_tangents: tuple,
     step_inputs: tuple,
 ) -> tuple:
-    """Propagate the section state and its tangents through one gait step, and return them."""
+    """Return the section state after one gait step with its tangents, and the outputs of the step.
+
+    The outputs are the state at the end of the step, its tangents, and the tangents of the phase
+    durations and of the node accelerations.
+    """
     section_state, section_tangents = section_and_tangents
-    durations, accelerations, is_phase_active = step_inputs
+    phase_durations, accelerations_by_phase, is_phase_active = step_inputs
 
     def evaluate_start(section_state: Array, *constants: Array) -> tuple:
         return _stack_phase_point(
-            phase_sequence.start(constants, tuple(section_state)), section_state
+            phase_sequence.start_map(constants, tuple(section_state)), section_state
         )
 
-    start_point, start_tangents = linearization_context.value_and_tangents(
+    start_point, start_tangents = linearization_context.evaluate_with_tangents(
         evaluate_start, (section_state,), (section_tangents,)
     )
     tangent_state = _PhaseTangentState(*start_point, *start_tangents)
     duration_tangents, acceleration_tangents = [], []
-    for i, phase in enumerate(phase_sequence.phases):
+    for i, collocation_phase in enumerate(phase_sequence.phases):
         tangent_state, phase_acceleration_tangents = _linearize_phase(
             linearization_context,
-            phase,
+            collocation_phase,
             phase_meshes[i],
             tangent_state,
-            durations[i],
-            accelerations[i],
+            phase_durations[i],
+            accelerations_by_phase[i],
         )
         phase_end_state = jnp.concatenate((tangent_state.q, tangent_state.v), -2)
         phase_end_tangents = jnp.concatenate(
             (tangent_state.q_tangents, tangent_state.v_tangents), -2
         )
         tangent_state, phase_duration_tangents, eliminate_duration = _eliminate_duration(
-            linearization_context, phase, tangent_state, durations[i], is_phase_active[i]
+            linearization_context,
+            collocation_phase,
+            tangent_state,
+            phase_durations[i],
+            is_phase_active[i],
         )
         duration_tangents.append(phase_duration_tangents)
         # Axes: (tangent, interval, node, row, batch).
@@ -539,7 +585,7 @@ def _linearize_gait_step(
             eliminate_duration(jnp.swapaxes(phase_acceleration_tangents, 0, 1))
         )
         tangent_state = linearization_context.prevent_fusion(tangent_state)
-    # The end state and its tangents are those of the last phase.
+    # After the loop, the end state and its tangents belong to the last phase.
     step_outputs = (
         phase_end_state,
         eliminate_duration(phase_end_tangents),
@@ -552,76 +598,82 @@ def _linearize_gait_step(
 def linearize_cycle(
     phase_sequence: PhaseSequence,
     phase_meshes: tuple[PhaseMesh, ...],
-    compute_constants: Callable[..., PhaseConstants],
+    compute_phase_constants: Callable[..., PhaseConstants],
     parameters: LaneArray,
-    solution: CollocationSolution,
+    trial_solution: CollocationSolution,
     is_phase_active: Bool[Array, "n n_phases lanes"],
     parameter_indices: tuple[int, ...] = (),
 ) -> CycleLinearization:
-    """Return Newton's correction, the monodromy matrix and the requested tangents at `solution`.
+    """Return the Newton correction, the monodromy matrix and the parameter tangents at
+    `trial_solution`.
 
-    `is_phase_active` marks the phases that take place. An inactive phase has duration zero and only
-    applies its reset.
+    An inactive phase, which `is_phase_active` marks as False, has duration zero and only applies
+    its reset.
     """
     linearization_context = _make_linearization_context(
-        phase_sequence.section_size, parameter_indices, parameters, compute_constants
+        phase_sequence.section_size, parameter_indices, parameters, compute_phase_constants
     )
-    section_state, dtype, n_tangents = (
-        solution.section_state,
+    section_state, float_dtype, n_tangents = (
+        trial_solution.section_state,
         parameters.dtype,
         linearization_context.n_tangents,
     )
-    section_units = np.eye(n_tangents, dtype=dtype)[:, linearization_context.section_slice, None]
+    section_unit_tangents = np.eye(n_tangents, dtype=float_dtype)[
+        :, linearization_context.section_tangent_slice, None
+    ]
     section_and_tangents = (
         section_state,
-        jnp.broadcast_to(section_units, (n_tangents, *section_state.shape)),
+        jnp.broadcast_to(section_unit_tangents, (n_tangents, *section_state.shape)),
     )
-    step_inputs = (solution.durations, solution.accelerations, is_phase_active)
-    linearize_step = functools.partial(
+    step_inputs = (trial_solution.durations, trial_solution.accelerations, is_phase_active)
+    linearize_one_step = functools.partial(
         _linearize_gait_step, linearization_context, phase_sequence, phase_meshes
     )
-    if solution.durations.shape[0] == 1:
-        (return_state, return_tangents), step_outputs = linearize_step(
+    if trial_solution.durations.shape[0] == 1:
+        (state_after_cycle, tangents_after_cycle), step_outputs = linearize_one_step(
             section_and_tangents, jax.tree.map(lambda x: x[0], step_inputs)
         )
         step_outputs = jax.tree.map(lambda x: x[None], step_outputs)
     else:
-        (return_state, return_tangents), step_outputs = lax.scan(
-            linearize_step, section_and_tangents, step_inputs
+        (state_after_cycle, tangents_after_cycle), step_outputs = lax.scan(
+            linearize_one_step, section_and_tangents, step_inputs
         )
 
-    monodromy = jnp.swapaxes(return_tangents[linearization_context.section_slice], 0, 1)
-    drop_section_tangents = lambda x: jnp.concatenate(
-        [x[:1], x[linearization_context.section_slice.stop :]]
+    monodromy = jnp.swapaxes(
+        tangents_after_cycle[linearization_context.section_tangent_slice], 0, 1
     )
-    correction_unit_vector = np.eye(n_tangents - linearization_context.section_size, dtype=dtype)[
-        0
-    ][:, None, None]
-    right_hand_sides = drop_section_tangents(return_tangents) + correction_unit_vector * (
-        return_state - section_state
+    drop_section_tangents = lambda x: jnp.concatenate(
+        [x[:1], x[linearization_context.section_tangent_slice.stop :]]
+    )
+    correction_unit_vector = np.eye(
+        n_tangents - linearization_context.section_size, dtype=float_dtype
+    )[0][:, None, None]
+    right_hand_sides = drop_section_tangents(tangents_after_cycle) + correction_unit_vector * (
+        state_after_cycle - section_state
     )
     closing_matrix = invert_small_matrices(
-        jnp.eye(linearization_context.section_size, dtype=dtype)[:, :, None] - monodromy
+        jnp.eye(linearization_context.section_size, dtype=float_dtype)[:, :, None] - monodromy
     )
     closed_section_tangents = jnp.swapaxes(
         contract_inner_axis(closing_matrix, jnp.swapaxes(right_hand_sides, 0, 1)), 0, 1
     )
 
-    def close_cycle(tangents: Array) -> Array:
-        """Return (tangent, n, ...) from (n, tangent, ...) without the tangents of the section
-        state.
+    def close_cycle(open_tangents: Array) -> Array:
+        """Return the tangents of the closed cycle, which do not depend on a given section state.
+
+        The axes (n, tangent, ...) of the argument become (tangent, n, ...).
         """
-        tangents = jnp.swapaxes(tangents, 0, 1)
-        shape = (-1, *(1,) * (tangents.ndim - 2), *section_state.shape[1:])
-        section_tangents = tangents[linearization_context.section_slice]
+        open_tangents = jnp.swapaxes(open_tangents, 0, 1)
+        broadcast_shape = (-1, *(1,) * (open_tangents.ndim - 2), *section_state.shape[1:])
+        section_tangents = open_tangents[linearization_context.section_tangent_slice]
         section_terms = [
-            closed_section_tangents[:, section_index].reshape(shape)
+            closed_section_tangents[:, section_index].reshape(broadcast_shape)
             * section_tangents[section_index]
             for section_index in range(len(section_state))
         ]
-        return drop_section_tangents(tangents) + sum(section_terms[1:], start=section_terms[0])
+        return drop_section_tangents(open_tangents) + sum(section_terms[1:], start=section_terms[0])
 
-    step_ends, *uncorrected_tangents = linearization_context.prevent_fusion(step_outputs)
+    step_end_states, *uncorrected_tangents = linearization_context.prevent_fusion(step_outputs)
     step_end_tangents, duration_tangents, acceleration_tangents = jax.tree.map(
         close_cycle, tuple(uncorrected_tangents)
     )
@@ -632,50 +684,50 @@ def linearize_cycle(
         )
     )
     return CycleLinearization(
-        correction=jax.tree.map(lambda x: x[0], solution_tangents),
-        tangents=jax.tree.map(lambda x: x[1:], solution_tangents),
-        step_ends=step_ends + step_end_tangents[0],
+        newton_correction=jax.tree.map(lambda x: x[0], solution_tangents),
+        parameter_tangents=jax.tree.map(lambda x: x[1:], solution_tangents),
+        step_end_states=step_end_states + step_end_tangents[0],
         step_end_tangents=step_end_tangents[1:],
         monodromy=monodromy,
     )
 
 
 class PhasePoints(NamedTuple):
-    """Points of one phase: its start, its end and all nodes (on a leading axis)."""
+    """Points of one phase: its start, all its nodes (on a leading axis) and its end."""
 
-    start: PhasePoint
-    nodes: PhasePoint
-    end: PhasePoint
+    start_point: PhasePoint
+    node_points: PhasePoint
+    end_point: PhasePoint
 
 
 def reconstruct_step(
     phase_sequence: PhaseSequence,
     phase_meshes: tuple[PhaseMesh, ...],
-    constants: PhaseConstants,
+    phase_constants: PhaseConstants,
     section_state: Vector,
-    durations: Array,
-    accelerations: tuple[Array, ...],
+    phase_durations: Array,
+    accelerations_by_phase: tuple[Array, ...],
 ) -> tuple[Vector, tuple[PhasePoints, ...]]:
-    """Return the section state after a gait step, and the points of its phases.
+    """Return the section state after a gait step, and the points of the step's phases.
 
-    Durations and accelerations of the step are known, so no equation is solved. Any trailing axes
-    are allowed.
+    The states follow from the given durations and node accelerations, and no equation is solved.
+    Arrays may have additional trailing axes.
     """
-    start_point = phase_sequence.start(constants, section_state)
+    start_point = phase_sequence.start_map(phase_constants, section_state)
     phase_points = []
-    for i, phase in enumerate(phase_sequence.phases):
+    for i, collocation_phase in enumerate(phase_sequence.phases):
         node_times, rate_matrix, position_matrix = (
-            weights.astype(durations.dtype)
-            for weights in phase_integration_matrices(phase_meshes[i])
+            float64_weights.astype(phase_durations.dtype)
+            for float64_weights in build_phase_integration_matrices(phase_meshes[i])
         )
-        phase_accelerations, duration = accelerations[i], durations[i]
+        phase_accelerations, phase_duration = accelerations_by_phase[i], phase_durations[i]
         phase_accelerations = phase_accelerations.reshape(-1, *phase_accelerations.shape[2:])
         q, v = jnp.stack(start_point.q), jnp.stack(start_point.v)
         node_times = node_times.reshape(-1, *(1,) * q.ndim)
-        node_q = q + duration * (
-            node_times * v + duration * jnp.tensordot(position_matrix, phase_accelerations, 1)
+        node_q = q + phase_duration * (
+            node_times * v + phase_duration * jnp.tensordot(position_matrix, phase_accelerations, 1)
         )
-        node_v = v + duration * jnp.tensordot(rate_matrix, phase_accelerations, 1)
+        node_v = v + phase_duration * jnp.tensordot(rate_matrix, phase_accelerations, 1)
         node_points = PhasePoint(
             start_point.held_constants,
             tuple(node_q[:-1].swapaxes(0, 1)),
@@ -683,7 +735,7 @@ def reconstruct_step(
         )
         end_point = PhasePoint(start_point.held_constants, tuple(node_q[-1]), tuple(node_v[-1]))
         phase_points.append(PhasePoints(start_point, node_points, end_point))
-        start_point = phase.reset(constants, end_point)
+        start_point = collocation_phase.reset_map(phase_constants, end_point)
     return start_point.q, tuple(phase_points)
 
 
@@ -693,27 +745,29 @@ def estimate_mesh_error(
     solution: CollocationSolution,
     error_per_jump: float = 0.05,
 ) -> LaneArray:
-    """Return an estimate of the discretization error of a cycle, in rad, m and fractions of the
-    period, (batch,).
+    """Return an estimate of the discretization error of a cycle, shape (batch,).
 
-    The accelerations of each interval are a separate polynomial. At an interval boundary the two
-    polynomials differ by their errors. That jump times the square of the longer interval is a
-    displacement, which is multiplied by `error_per_jump`. Phases with `is_smooth` False do not
-    count, because their error in one interval hardly affects the next phase.
+    The unit is rad for angles, m for lengths and the period for times. The accelerations are a
+    separate polynomial in each mesh interval. At a boundary, two polynomials differ by their
+    errors. The estimate is the largest such jump times the square of the longer interval, times
+    `error_per_jump`. Phases with `is_smooth` False do not count, because their error in one
+    interval hardly affects the next phase.
 
-    - `error_per_jump`: factor chosen because the estimate then bounds the error except for
-      round-off. It was tested with 346 random gaits of periods to 10 s on two meshes. For most of
-      them the estimate is far above the error.
+    - `error_per_jump`: dimensionless factor, chosen because the estimate then bounds the error
+      except for round-off in tests with random gaits of periods to 10 s. For most gaits the
+      estimate is far above the error.
     """
     largest_acceleration_jump = jnp.zeros(
         solution.section_state.shape[-1], solution.section_state.dtype
     )
-    for i, mesh in enumerate(phase_meshes):
-        if mesh.n_intervals == 1 or not phase_sequence.phases[i].is_smooth:
+    for i, phase_mesh in enumerate(phase_meshes):
+        if phase_mesh.n_intervals == 1 or not phase_sequence.phases[i].is_smooth:
             continue
         left_limits, right_limits = (
             jnp.tensordot(
-                jnp.asarray(lagrange_weights(interval_location), largest_acceleration_jump.dtype),
+                jnp.asarray(
+                    compute_lagrange_weights(interval_location), largest_acceleration_jump.dtype
+                ),
                 node_accelerations,
                 (0, 2),
             )
@@ -722,9 +776,11 @@ def estimate_mesh_error(
                 (0.0, solution.accelerations[i][:, 1:]),
             )
         )
-        max_fraction = np.maximum(mesh.interval_fractions[1:], mesh.interval_fractions[:-1])
+        longer_interval_fraction = np.maximum(
+            phase_mesh.interval_fractions[1:], phase_mesh.interval_fractions[:-1]
+        )
         longer_interval_length = (
-            max_fraction[:, None, None].astype(largest_acceleration_jump.dtype)
+            longer_interval_fraction[:, None, None].astype(largest_acceleration_jump.dtype)
             * solution.durations[:, None, None, i]
         )
         acceleration_jump = (

@@ -4,18 +4,18 @@ from vrw_jax.continuation import arclength, floquet
 from vrw_jax.continuation.arclength import (
     AbstractContinuationProblem,
     ArclengthOptions,
-    ConstraintPlane,
     ContinuationPoint,
     ContinuationResult,
     ContinuationStatus,
+    CorrectorPlane,
     FixedPointProblem,
     NewtonStep,
     ProblemUnknowns,
-    SectionVector,
+    SectionStateVector,
 )
 from vrw_jax.continuation.batched_continuation import (
-    continue_many_from,
-    solve_many_on_planes,
+    continue_branches_uncompiled,
+    solve_on_many_planes,
     solve_on_plane,
 )
 from vrw_jax.continuation.fixed_points import (
@@ -33,12 +33,12 @@ from vrw_jax.continuation.sign_changes import (
     evaluate_bifurcation_functions,
     find_sign_changes,
     has_unit_circle_pair,
-    locate_zeros,
+    locate_function_zeros,
 )
 from vrw_jax.continuation.test_functions import (
     AbstractTestFunction,
     TestFunctionCurve,
     TestFunctionNewtonStep,
     TestFunctionPoint,
-    offset_bifurcation_margins,
+    compute_offset_bifurcation_margins,
 )

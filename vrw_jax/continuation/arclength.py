@@ -1,8 +1,8 @@
 """Pseudo-arclength continuation of fixed points in one parameter, through folds.
 
-A problem is an `AbstractContinuationProblem`. It defines how Newton's method corrects the unknowns
-z at a parameter p, and how z changes with p. Many branches run concurrently, each with buffers of
-fixed size for its points. Lengths are measured in the section state and in the parameter as a
+An `AbstractContinuationProblem` defines Newton's correction of the unknowns z at a parameter p, and
+the derivative dz/dp. Many branches are continued concurrently, and each branch has a buffer of
+fixed size for its points. Arc length is measured in the section state and in the parameter as a
 fraction of its range.
 """
 
@@ -34,7 +34,7 @@ from vrw_jax.validation import (
 
 ProblemUnknowns = Any
 """Tree of float arrays that Newton's method corrects: the unknowns of a continuation problem."""
-SectionVector = Float[Array, " n"]
+SectionStateVector = Float[Array, " n"]
 
 
 @with_renamed_arguments(
@@ -46,19 +46,21 @@ SectionVector = Float[Array, " n"]
 )
 @dataclasses.dataclass(frozen=True)
 class ArclengthOptions:
-    """Numerical options of a continuation; each change compiles again.
+    """Numerical options of a continuation. Every change of an option compiles the continuation
+    again.
 
-    - `initial_ds`, `max_ds`, `min_ds`: continuation step along the branch, in the section state and
-      in the parameter as a fraction of its range;
-    - `max_points`: limit of points in each direction;
-    - `max_newton_iterations`: limit of Newton's iterations for one point;
-    - `tolerance`: limit of the norm of Newton's last correction;
-    - `max_turn_angle`: largest turn of the branch in one continuation step, rad;
-    - `kink_step_factor`: steps below this multiple of `min_ds` may pass a kink of the branch, at
-      any angle. It is chosen because three halvings then remain for failures of Newton's method
-      between two smooth pieces;
-    - `jacobian_reuse_fraction`: share of `tolerance` below which a correction converges without
-      another iteration. It is chosen because the Jacobian of the trial is then exact.
+    - `initial_ds`, `max_ds`, `min_ds`: first, largest and smallest continuation step, an arc length
+      in the section state and the fraction of the parameter's range;
+    - `max_points`: largest number of points in each direction;
+    - `max_newton_iterations`: largest number of Newton iterations for one point;
+    - `tolerance`: largest norm of Newton's last correction;
+    - `max_turn_angle`: largest angle between the tangents of neighboring points, rad;
+    - `kink_step_factor`: continuation steps below this multiple of `min_ds` may pass a kink of the
+      branch at any angle. The value is chosen because three halvings then remain for failures of
+      Newton's method between two smooth pieces;
+    - `jacobian_reuse_fraction`: if a correction is below this fraction of `tolerance`, the
+      iteration ends and the Jacobian of the trial is returned. The value is chosen because that
+      Jacobian is then exact.
 
     Examples:
         >>> vrw.ArclengthOptions(max_ds=0.05).max_points
@@ -89,77 +91,90 @@ class ArclengthOptions:
 
 
 class NewtonStep(NamedTuple):
-    """Correction and tangent of Newton's method at a trial point (z, p)."""
+    """Newton's correction and the tangent of the branch at a trial point (z, p)."""
 
-    correction: ProblemUnknowns  # correction of z at fixed p
-    tangent: ProblemUnknowns  # dz/dp, the tangent of the branch
-    jacobian: Float[Array, "n n"]  # Jacobian of the return map with respect to the section state
+    newton_correction: ProblemUnknowns  # of z at fixed p
+    branch_tangent: ProblemUnknowns  # dz/dp, the tangent of the branch
+    return_map_jacobian: Float[
+        Array, "n n"
+    ]  # Jacobian of the return map with respect to the section state
 
 
 class AbstractContinuationProblem(eqx.Module):
     """Base class of continuation problems.
 
-    The argument `args` of the methods is a tree with all inputs except z and p.
+    The argument `args` of each method is a pytree of all inputs except z and p.
     """
 
     is_traceable: ClassVar[bool] = True
-    """Whether `linearize` can be compiled into a loop. If not, `linearize` is called for a batch of
-    points from outside of compiled code."""
+    """Whether JAX can trace `linearize`. If not, `linearize` is called outside of compiled code,
+    for a batch of points.
+    """
 
     has_multipliers: ClassVar[bool] = True
-    """Whether the Jacobians are those of the equations that are continued."""
+    """Whether `NewtonStep.jacobian` is the Jacobian of the equations that are continued, so that
+    its eigenvalues show bifurcations of the branch.
+    """
 
     has_kinks: ClassVar[bool] = False
-    """Whether a branch may have kinks, at which its tangent jumps."""
+    """Whether branches may have kinks, at which the tangent jumps."""
 
     @abc.abstractmethod
     def linearize(self, args: Any, z: ProblemUnknowns, p: Scalar) -> NewtonStep:
-        """Return correction, tangent and Jacobian at (z, p); they are not finite if the map is
-        undefined.
-        """
+        """Return correction, tangent and Jacobian at (z, p), not finite if the map is undefined
+        there."""
 
     @abc.abstractmethod
-    def section_state(self, z: ProblemUnknowns) -> SectionVector:
-        """Return the section state, which is a part of z."""
+    def section_state(self, z: ProblemUnknowns) -> SectionStateVector:
+        """Return the section state, which is a part of the unknowns z."""
 
-    def interpolate(
-        self, left: ProblemUnknowns, right: ProblemUnknowns, fraction: Scalar
+    def interpolate_unknowns(
+        self, left_point: ProblemUnknowns, right_point: ProblemUnknowns, location_fraction: Scalar
     ) -> ProblemUnknowns:
-        """Return the initial guess of Newton's method at a fraction in [0, 1] between two
-        points.
-        """
-        return jax.tree.map(lambda a, b: a + fraction * (b - a), left, right)
+        """Return the unknowns at a fraction in [0, 1] of the way between two points of a branch.
 
-    def is_smooth_between(self, left: ProblemUnknowns, right: ProblemUnknowns) -> Bool[Array, ""]:
-        """Return whether no kink of the branch shows between two neighboring points."""
+        The result is the initial guess of Newton's method.
+        """
+        return jax.tree.map(lambda a, b: a + location_fraction * (b - a), left_point, right_point)
+
+    def is_smooth_between(
+        self, left_point: ProblemUnknowns, right_point: ProblemUnknowns
+    ) -> Bool[Array, ""]:
+        """Return whether the branch shows no kink between two neighboring points."""
         return jnp.asarray(True)
 
     def correction_norm(self, z: ProblemUnknowns, correction: ProblemUnknowns) -> Scalar:
-        """Return the norm of a correction, which is compared with the tolerance."""
+        """Return the norm of a Newton correction, which is compared with the tolerance."""
         return jnp.max(jnp.abs(correction))
 
     def is_admissible(self, args: Any, z: ProblemUnknowns, p: Scalar) -> Bool[Array, ""]:
-        """Return whether a converged z satisfies the conditions of its branch."""
+        """Return whether converged unknowns z satisfy the conditions of their branch."""
         return jnp.all(jnp.isfinite(z))
 
 
-def make_fixed_point_newton_step(
+def compute_fixed_point_newton_step(
     return_map: Callable[[Array, Scalar], Array], z: Array, p: Scalar, n_continuous: int
 ) -> NewtonStep:
-    """Return the Newton step of the equation `return_map(z, p)` = z.
+    """Return Newton's correction and the tangent for the equation `return_map(z, p)` = z.
 
-    The first `n_continuous` components of z are continuous. The others are codes, which are copied
-    from the image.
+    The first `n_continuous` components of z are continuous. The other components are codes, whose
+    corrections are the differences from their images.
     """
     continuous_map = lambda x, p: return_map(jnp.concatenate([x, z[n_continuous:]]), p)
-    image_point, jacobians = evaluate_with_jacobian(continuous_map, z[:n_continuous], p)
-    jacobian_z, jacobian_p = (jacobian[:n_continuous] for jacobian in jacobians)
-    map_defect = image_point - z
-    right_sides = jnp.stack([map_defect[:n_continuous], jacobian_p], -1)
-    solutions = jnp.linalg.solve(jnp.eye(n_continuous, dtype=z.dtype) - jacobian_z, right_sides)
-    code_changes = map_defect[n_continuous:]
-    tangent = jnp.concatenate([solutions[:, 1], jnp.zeros_like(code_changes)])
-    return NewtonStep(jnp.concatenate([solutions[:, 0], code_changes]), tangent, jacobian_z)
+    mapped_point, partial_jacobians = evaluate_with_jacobian(continuous_map, z[:n_continuous], p)
+    jacobian_by_z, jacobian_by_p = (
+        return_map_jacobian[:n_continuous] for return_map_jacobian in partial_jacobians
+    )
+    map_defect = mapped_point - z
+    right_hand_sides = jnp.stack([map_defect[:n_continuous], jacobian_by_p], -1)
+    solved_columns = jnp.linalg.solve(
+        jnp.eye(n_continuous, dtype=z.dtype) - jacobian_by_z, right_hand_sides
+    )
+    code_corrections = map_defect[n_continuous:]
+    branch_tangent = jnp.concatenate([solved_columns[:, 1], jnp.zeros_like(code_corrections)])
+    return NewtonStep(
+        jnp.concatenate([solved_columns[:, 0], code_corrections]), branch_tangent, jacobian_by_z
+    )
 
 
 class FixedPointProblem(AbstractContinuationProblem):
@@ -168,19 +183,21 @@ class FixedPointProblem(AbstractContinuationProblem):
     JAX differentiates the map in forward mode. The map returns NaN if it is not defined.
     """
 
-    function: Callable[[Any, SectionVector, Scalar], SectionVector] = eqx.field(static=True)
+    function: Callable[[Any, SectionStateVector, Scalar], SectionStateVector] = eqx.field(
+        static=True
+    )
 
     def linearize(self, args: Any, z: ProblemUnknowns, p: Scalar) -> NewtonStep:
-        return make_fixed_point_newton_step(
+        return compute_fixed_point_newton_step(
             lambda x, p: self.function(args, x, p), z, p, z.shape[0]
         )
 
-    def section_state(self, z: ProblemUnknowns) -> SectionVector:
+    def section_state(self, z: ProblemUnknowns) -> SectionStateVector:
         return z
 
 
 class ContinuationStatus(StatusCode):
-    """Reason why the continuation of a branch ended in one direction."""
+    """Reason for the end of a continuation in one direction."""
 
     RUNNING = 0, "The continuation was still running."
     RANGE_END_REACHED = 1, "The parameter's range ended."
@@ -192,19 +209,21 @@ class ContinuationStatus(StatusCode):
 
 
 class ContinuationPoint(NamedTuple):
-    """Point of a branch with the unit tangent of the branch."""
+    """Point of a branch, with the derivatives of the branch with respect to arc length."""
 
     z: ProblemUnknowns
     p: Scalar
-    tangent: ProblemUnknowns  # derivative of z with respect to arc length; () for stored points
-    # derivative of the parameter, as a fraction of its range, with respect to arc length
+    arclength_tangent: ProblemUnknowns  # dz/ds; () for stored points
+    # derivative of the parameter (as a fraction of its range) with respect to arc length
     fraction_rate: Scalar
-    jacobian: Float[Array, "n n"]
+    return_map_jacobian: Float[Array, "n n"]
     is_admissible: Bool[Array, ""]
 
 
 class ContinuationResult(NamedTuple):
-    """Points of branches in buffers of `max_points`, of which the first `n_points` are set."""
+    """Points of all branches, in buffers of `max_points`, of which the first `n_points` are
+    valid.
+    """
 
     points: ContinuationPoint
     n_points: Int[Array, " branches"]
@@ -212,24 +231,27 @@ class ContinuationResult(NamedTuple):
     n_linearizations: Int[Array, " branches"]  # number of calls of `linearize`
 
 
-class ConstraintPlane(NamedTuple):
-    """Plane that contains a given point and selects a point of a branch."""
+class CorrectorPlane(NamedTuple):
+    """Plane in which Newton's method solves for a point of a branch: a point and a normal vector.
 
-    section_state: SectionVector
-    fraction: Scalar
-    normal_section: SectionVector
-    normal_fraction: Scalar
+    Both have a part in the section state and a part in the fraction of the parameter's range.
+    """
+
+    plane_section_state: SectionStateVector
+    plane_fraction: Scalar
+    normal_section_part: SectionStateVector
+    normal_fraction_part: Scalar
 
 
 class CorrectorState(NamedTuple):
-    """State of the corrector after one Newton iteration."""
+    """State of the corrector after a Newton iteration."""
 
     z: ProblemUnknowns
-    fraction: Scalar
+    parameter_fraction: Scalar
     correction_norm: Scalar
-    # derivative of z with respect to the parameter as a fraction of its range
-    tangent: ProblemUnknowns
-    jacobian: Float[Array, "n n"]
+    # derivative of z with respect to the fraction of the parameter's range
+    fraction_tangent: ProblemUnknowns
+    return_map_jacobian: Float[Array, "n n"]
 
 
 def evaluate_newton_step_at_fraction(
@@ -237,11 +259,13 @@ def evaluate_newton_step_at_fraction(
     args: Any,
     parameter_bounds: Array,
     z: ProblemUnknowns,
-    fraction: Scalar,
+    parameter_fraction: Scalar,
 ) -> NewtonStep:
-    """Return the Newton step at a fraction of the parameter's range."""
+    """Return the Newton step at z and at a fraction of the parameter's range."""
     return problem.linearize(
-        args, z, parameter_bounds[0] + (parameter_bounds[1] - parameter_bounds[0]) * fraction
+        args,
+        z,
+        parameter_bounds[0] + (parameter_bounds[1] - parameter_bounds[0]) * parameter_fraction,
     )
 
 
@@ -249,34 +273,33 @@ def correct_trial_point(
     problem: AbstractContinuationProblem,
     newton_step: NewtonStep,
     parameter_bounds: Array,
-    constraint_plane: ConstraintPlane,
+    corrector_plane: CorrectorPlane,
     z: ProblemUnknowns,
-    fraction: Scalar,
+    parameter_fraction: Scalar,
 ) -> CorrectorState:
-    """Return the state after one Newton iteration.
-
-    The equations are those of the branch and of the constraint plane.
-    """
+    """Return the corrector state after one Newton iteration in the constraint plane."""
     parameter_range = parameter_bounds[1] - parameter_bounds[0]
-    tangent = jax.tree.map(
-        lambda section_state: parameter_range * section_state, newton_step.tangent
+    fraction_tangent = jax.tree.map(
+        lambda section_state: parameter_range * section_state, newton_step.branch_tangent
     )
-    section_state = problem.section_state(z) + problem.section_state(newton_step.correction)
-    plane_residual = constraint_plane.normal_section @ (
-        section_state - constraint_plane.section_state
-    ) + constraint_plane.normal_fraction * (fraction - constraint_plane.fraction)
+    section_state = problem.section_state(z) + problem.section_state(newton_step.newton_correction)
+    plane_residual = corrector_plane.normal_section_part @ (
+        section_state - corrector_plane.plane_section_state
+    ) + corrector_plane.normal_fraction_part * (parameter_fraction - corrector_plane.plane_fraction)
     d_fraction = -plane_residual / (
-        constraint_plane.normal_section @ problem.section_state(tangent)
-        + constraint_plane.normal_fraction
+        corrector_plane.normal_section_part @ problem.section_state(fraction_tangent)
+        + corrector_plane.normal_fraction_part
     )
-    dz = jax.tree.map(lambda a, b: a + d_fraction * b, newton_step.correction, tangent)
+    dz = jax.tree.map(
+        lambda a, b: a + d_fraction * b, newton_step.newton_correction, fraction_tangent
+    )
     correction_norm = jnp.maximum(problem.correction_norm(z, dz), jnp.abs(d_fraction))
     return CorrectorState(
         jax.tree.map(jnp.add, z, dz),
-        fraction + d_fraction,
+        parameter_fraction + d_fraction,
         correction_norm,
-        tangent,
-        newton_step.jacobian,
+        fraction_tangent,
+        newton_step.return_map_jacobian,
     )
 
 
@@ -285,36 +308,36 @@ def _compute_parameter_fraction(p: Array, parameter_bounds: Array) -> Array:
     return (p - parameter_bounds[0]) / (parameter_bounds[1] - parameter_bounds[0])
 
 
-def compute_parameter_from_fraction(fraction: Array, parameter_bounds: Array) -> Array:
-    """Return the parameter at a fraction of its range, exact at both ends of the range."""
-    p = parameter_bounds[0] + (parameter_bounds[1] - parameter_bounds[0]) * fraction
-    return jnp.where(fraction == 1.0, parameter_bounds[1], p)
+def compute_parameter_from_fraction(parameter_fraction: Array, parameter_bounds: Array) -> Array:
+    """Return the parameter at a fraction of its range, exactly the bounds at fractions 0 and 1."""
+    p = parameter_bounds[0] + (parameter_bounds[1] - parameter_bounds[0]) * parameter_fraction
+    return jnp.where(parameter_fraction == 1.0, parameter_bounds[1], p)
 
 
 class _TrialPoint(NamedTuple):
-    """Predicted point of a branch, with the plane on which Newton's method solves for the point."""
+    """Predicted point of a branch, and the plane in which Newton's method corrects it."""
 
-    plane: ConstraintPlane
+    corrector_plane: CorrectorPlane
     z: ProblemUnknowns
-    fraction: Scalar
-    length: Scalar  # predicted arc length from the last point
-    is_final: Bool[Array, ""]  # whether the point lies on the end of the range
+    parameter_fraction: Scalar
+    predicted_arc_length: Scalar  # from the last point of the branch
+    is_range_end: Bool[Array, ""]  # whether the plane is an end of the parameter's range
 
 
-def _predict_point(
+def _predict_trial_point(
     problem: AbstractContinuationProblem,
     previous_point: ContinuationPoint,
     current_point: ContinuationPoint,
-    has_two_points: Bool[Array, ""],
+    has_previous_point: Bool[Array, ""],
     ds: Scalar,
     parameter_bounds: Array,
 ) -> _TrialPoint:
-    """Return the predicted point: one continuation step along the tangent, or the nearer end of the
-    range.
+    """Return the trial point one continuation step ahead, or at the end of the range if that is
+    nearer.
 
-    With `has_two_points`, Newton's method starts on the cubic through the last two points with
-    their tangents. The cubic is nearer to the branch than the tangent by two orders, and saves one
-    of three iterations.
+    With `has_previous_point`, the prediction is the cubic polynomial through the last two points
+    and their tangents. Its error is two orders smaller than that of the tangent, which saves one of
+    three Newton iterations.
     """
     fraction = _compute_parameter_fraction(current_point.p, parameter_bounds)
     fraction_rate = current_point.fraction_rate
@@ -325,77 +348,84 @@ def _predict_point(
         jnp.inf,
         (range_end - fraction) / jnp.where(is_stationary, 1.0, fraction_rate),
     )
-    is_final = bound_distance <= ds
-    predicted_length = jnp.where(is_final, bound_distance, ds)
-    section_tangent = problem.section_state(current_point.tangent)
+    is_range_end = bound_distance <= ds
+    predicted_arc_length = jnp.where(is_range_end, bound_distance, ds)
+    section_tangent = problem.section_state(current_point.arclength_tangent)
     section_state = problem.section_state(current_point.z)
-    target_fraction = jnp.where(is_final, range_end, fraction + predicted_length * fraction_rate)
-    constraint_plane = ConstraintPlane(
-        section_state + predicted_length * section_tangent,
+    target_fraction = jnp.where(
+        is_range_end, range_end, fraction + predicted_arc_length * fraction_rate
+    )
+    corrector_plane = CorrectorPlane(
+        section_state + predicted_arc_length * section_tangent,
         target_fraction,
-        jnp.where(is_final, 0.0, section_tangent),
-        jnp.where(is_final, 1.0, fraction_rate),
+        jnp.where(is_range_end, 0.0, section_tangent),
+        jnp.where(is_range_end, 1.0, fraction_rate),
     )
     previous_fraction = _compute_parameter_fraction(previous_point.p, parameter_bounds)
     point_displacement = jnp.append(
         section_state - problem.section_state(previous_point.z), fraction - previous_fraction
     )
-    has_two_points = has_two_points & problem.is_smooth_between(previous_point.z, current_point.z)
-    # After a kink the two points are equal up to round-off.
-    has_two_points = has_two_points & (point_displacement @ point_displacement > (1e-9 * ds) ** 2)
-    chord_length = jnp.where(has_two_points, jnp.sqrt(point_displacement @ point_displacement), 1.0)
+    has_previous_point = has_previous_point & problem.is_smooth_between(
+        previous_point.z, current_point.z
+    )
+    # After a kink, the previous and the current point are equal up to round-off.
+    has_previous_point = has_previous_point & (
+        point_displacement @ point_displacement > (1e-9 * ds) ** 2
+    )
+    chord_length = jnp.where(
+        has_previous_point, jnp.sqrt(point_displacement @ point_displacement), 1.0
+    )
 
     def extrapolate(
         previous_value: Array, previous_rate: Array, current_value: Array, current_rate: Array
     ) -> Array:
         mean_rate = (current_value - previous_value) / chord_length
         cubic_coefficient = (current_rate - mean_rate) / chord_length + (
-            predicted_length + chord_length
+            predicted_arc_length + chord_length
         ) * (previous_rate + current_rate - 2.0 * mean_rate) / chord_length**2
         return (
             current_value
-            + predicted_length * current_rate
-            + jnp.where(has_two_points, predicted_length**2 * cubic_coefficient, 0.0)
+            + predicted_arc_length * current_rate
+            + jnp.where(has_previous_point, predicted_arc_length**2 * cubic_coefficient, 0.0)
         )
 
     z = jax.tree.map(
         extrapolate,
         previous_point.z,
-        previous_point.tangent,
+        previous_point.arclength_tangent,
         current_point.z,
-        current_point.tangent,
+        current_point.arclength_tangent,
     )
     fraction = jnp.where(
-        is_final,
+        is_range_end,
         range_end,
         extrapolate(previous_fraction, previous_point.fraction_rate, fraction, fraction_rate),
     )
-    return _TrialPoint(constraint_plane, z, fraction, predicted_length, is_final)
+    return _TrialPoint(corrector_plane, z, fraction, predicted_arc_length, is_range_end)
 
 
 class ContinuationState(NamedTuple):
-    """State of the continuation of one branch."""
+    """State of the continuation of one branch in one direction."""
 
     previous_point: ContinuationPoint
     current_point: ContinuationPoint
-    first_point: ContinuationPoint  # first point of the branch, if it exists
+    first_point: ContinuationPoint  # meaningless until a point is accepted
     ds: Scalar
-    trial: _TrialPoint
-    suspicion: BranchJumpSuspicion
-    iteration: Int[Array, ""]
+    trial_point: _TrialPoint
+    jump_suspicion: BranchJumpSuspicion
+    n_newton_iterations: Int[Array, ""]
     n_points: Int[Array, ""]
-    status: Int[Array, ""]
+    status_code: Int[Array, ""]
     n_linearizations: Int[Array, ""]
 
 
-class _TrialAssessment(NamedTuple):
-    """Assessment of a trial after one Newton iteration. If no flag is set, the iteration
-    continues.
-    """
+class _TrialVerdict(NamedTuple):
+    """Verdict on a trial point after one Newton iteration; without a flag, another iteration
+    follows."""
 
     is_accepted: Bool[Array, ""]
     has_failed: Bool[Array, ""]
-    # the trial is accepted, although the branch turns by more than `max_turn_angle`
+    # whether the trial is accepted despite a turn of more than `max_turn_angle`
     is_kink: Bool[Array, ""]
     fraction_rate: Scalar  # rate of the parameter in the direction of continuation
 
@@ -406,35 +436,37 @@ def _assess_trial(
     continuation_state: ContinuationState,
     corrector_state: CorrectorState,
     direction_sign: Scalar,
-) -> _TrialAssessment:
-    """Return whether a trial is accepted or has failed, and the rate of the parameter at the
-    trial.
-    """
+) -> _TrialVerdict:
+    """Return the verdict on a trial point after one Newton iteration."""
     current_point, trial_point, is_first_point = (
         continuation_state.current_point,
-        continuation_state.trial,
+        continuation_state.trial_point,
         continuation_state.n_points == 0,
     )
     trial_distance = jnp.maximum(
         jnp.max(
-            jnp.abs(problem.section_state(corrector_state.z) - trial_point.plane.section_state)
+            jnp.abs(
+                problem.section_state(corrector_state.z)
+                - trial_point.corrector_plane.plane_section_state
+            )
         ),
-        jnp.abs(corrector_state.fraction - trial_point.plane.fraction),
+        jnp.abs(corrector_state.parameter_fraction - trial_point.corrector_plane.plane_fraction),
     )
     is_valid = jnp.isfinite(corrector_state.correction_norm) & (
         is_first_point | (trial_distance <= continuation_state.ds)
     )
     is_converged = is_valid & (corrector_state.correction_norm < options.tolerance)
-    section_tangent = problem.section_state(corrector_state.tangent)
+    section_tangent = problem.section_state(corrector_state.fraction_tangent)
     tangent_alignment = (
-        problem.section_state(current_point.tangent) @ section_tangent + current_point.fraction_rate
+        problem.section_state(current_point.arclength_tangent) @ section_tangent
+        + current_point.fraction_rate
     )
     tangent_alignment = jnp.where(is_first_point, direction_sign, tangent_alignment)
     tangent_norm = jnp.sqrt(1.0 + section_tangent @ section_tangent)
     is_turn_small = is_first_point | (
         jnp.abs(tangent_alignment) >= tangent_norm * jnp.cos(options.max_turn_angle)
     )
-    # At a kink a branch turns by more than the limit, however short the step is.
+    # At a kink a branch turns by more than the limit, even if the continuation step is short.
     is_kink = (
         is_converged
         & ~is_turn_small
@@ -445,9 +477,9 @@ def _assess_trial(
     has_failed = ~is_accepted & (
         ~is_valid
         | is_converged
-        | (continuation_state.iteration + 1 >= options.max_newton_iterations)
+        | (continuation_state.n_newton_iterations + 1 >= options.max_newton_iterations)
     )
-    return _TrialAssessment(
+    return _TrialVerdict(
         is_accepted,
         has_failed,
         is_kink,
@@ -459,7 +491,7 @@ def _is_jump_suspicious(
     problem: AbstractContinuationProblem,
     options: ArclengthOptions,
     continuation_state: ContinuationState,
-    trial_assessment: _TrialAssessment,
+    trial_assessment: _TrialVerdict,
     new_point: ContinuationPoint,
 ) -> Bool[Array, ""]:
     """Return whether an accepted trial may lie on another branch, which a shorter step may
@@ -470,12 +502,12 @@ def _is_jump_suspicious(
     current_point = continuation_state.current_point
     has_turned_back = current_point.fraction_rate * new_point.fraction_rate < 0.0
     is_multiplier_change_explained_by_bifurcations = is_multiplier_change_explained(
-        current_point.jacobian, new_point.jacobian, has_turned_back
+        current_point.return_map_jacobian, new_point.return_map_jacobian, has_turned_back
     )
     can_be_suspicious = (
         trial_assessment.is_accepted
         & (continuation_state.n_points > 0)
-        & ~continuation_state.suspicion.is_resolved
+        & ~continuation_state.jump_suspicion.accepts_any_multipliers
         & new_point.is_admissible
     )
     return can_be_suspicious & ~is_multiplier_change_explained_by_bifurcations
@@ -484,23 +516,24 @@ def _is_jump_suspicious(
 def _choose_next_step_length(
     options: ArclengthOptions,
     continuation_state: ContinuationState,
-    trial_assessment: _TrialAssessment,
+    trial_assessment: _TrialVerdict,
 ) -> Scalar:
     """Return the length of the next continuation step.
 
-    The step grows after few Newton iterations, shrinks after many, and is halved after a failure.
+    The step is lengthened after few Newton iterations, shortened after many, and halved after a
+    failure.
     """
     has_converged_quickly, has_converged_slowly = (
-        continuation_state.iteration < 4,
-        continuation_state.iteration >= 6,
+        continuation_state.n_newton_iterations < 4,
+        continuation_state.n_newton_iterations >= 6,
     )
     growth_factor = jnp.where(has_converged_quickly, 1.4, jnp.where(has_converged_slowly, 0.6, 1.0))
     longer_ds = jnp.minimum(continuation_state.ds * growth_factor, options.max_ds)
     shorter_ds = jnp.where(
         trial_assessment.has_failed, 0.5 * continuation_state.ds, continuation_state.ds
     )
-    ds = jnp.where(trial_assessment.is_accepted, longer_ds, shorter_ds)
-    return jnp.where(continuation_state.n_points == 0, options.initial_ds, ds)
+    chosen_ds = jnp.where(trial_assessment.is_accepted, longer_ds, shorter_ds)
+    return jnp.where(continuation_state.n_points == 0, options.initial_ds, chosen_ds)
 
 
 def _is_curve_closed(
@@ -510,19 +543,19 @@ def _is_curve_closed(
     next_point: ContinuationPoint,
     parameter_bounds: Array,
 ) -> Bool[Array, ""]:
-    """Return whether the segment from one point to the next contains the branch's start."""
+    """Return whether the branch's start lies on the segment between two successive points."""
     stack_coordinates = lambda point: jnp.append(
         problem.section_state(point.z), _compute_parameter_fraction(point.p, parameter_bounds)
     )
     chord_vector = stack_coordinates(next_point) - stack_coordinates(current_point)
-    start_offset = stack_coordinates(start_point) - stack_coordinates(current_point)
+    offset_from_start = stack_coordinates(start_point) - stack_coordinates(current_point)
     squared_chord_length = chord_vector @ chord_vector
     chord_fraction = (
-        start_offset
+        offset_from_start
         @ chord_vector
         / jnp.where(squared_chord_length > 0.0, squared_chord_length, 1.0)
     )
-    start_distance = start_offset - chord_fraction * chord_vector
+    start_distance = offset_from_start - chord_fraction * chord_vector
     return (
         (chord_fraction >= 0.0)
         & (chord_fraction <= 1.0)
@@ -533,27 +566,28 @@ def _is_curve_closed(
 def _update_continuation_status(
     options: ArclengthOptions,
     continuation_state: ContinuationState,
-    trial_assessment: _TrialAssessment,
+    trial_assessment: _TrialVerdict,
     new_point: ContinuationPoint,
     ds: Scalar,
-    next_length: Scalar,
+    next_arc_length: Scalar,
     is_closed: Bool[Array, ""],
 ) -> Int[Array, ""]:
-    """Return the status of a branch after a trial.
+    """Return the `ContinuationStatus` of a branch after a trial.
 
-    `next_length` is the length of the next step.
+    `next_arc_length` is the arc length of the next continuation step.
     """
     is_accepted, has_failed = trial_assessment.is_accepted, trial_assessment.has_failed
-    n_points, status_by_reason = (
+    n_points, reasons_and_statuses = (
         continuation_state.n_points + is_accepted,
-        continuation_state.status,
+        continuation_state.status_code,
     )
-    for has_reason_occurred, status_code in (
+    for has_ending_reason_occurred, status_code in (
         (ds < options.min_ds, ContinuationStatus.STEP_SIZE_UNDERFLOW),
         (has_failed & (continuation_state.n_points == 0), ContinuationStatus.START_NOT_FOUND),
         (is_accepted & (n_points >= options.max_points), ContinuationStatus.MAX_POINTS_REACHED),
         (
-            is_accepted & (continuation_state.trial.is_final | (next_length <= 1e-12)),
+            is_accepted
+            & (continuation_state.trial_point.is_range_end | (next_arc_length <= 1e-12)),
             ContinuationStatus.RANGE_END_REACHED,
         ),
         (is_accepted & ~new_point.is_admissible, ContinuationStatus.POINT_NOT_ADMISSIBLE),
@@ -562,8 +596,10 @@ def _update_continuation_status(
             ContinuationStatus.CURVE_CLOSED,
         ),
     ):
-        status_by_reason = jnp.where(has_reason_occurred, int(status_code), status_by_reason)
-    return status_by_reason.astype(jnp.int32)
+        reasons_and_statuses = jnp.where(
+            has_ending_reason_occurred, int(status_code), reasons_and_statuses
+        )
+    return reasons_and_statuses.astype(jnp.int32)
 
 
 def _init_continuation_state(
@@ -574,43 +610,45 @@ def _init_continuation_state(
     p: Scalar,
     direction_sign: Scalar,
 ) -> ContinuationState:
-    """Return the initial state of one branch, whose first trial is the given point."""
-    x = problem.section_state(z)
-    n_section, float_dtype = x.shape[0], x.dtype
-    zero_length, zero_count, false_flag = (
+    """Return the initial state of one branch. Its first trial point is (z, p)."""
+    section_state = problem.section_state(z)
+    n_section, float_dtype = section_state.shape[0], section_state.dtype
+    zero_step_length, zero_count, false_flag = (
         jnp.zeros((), float_dtype),
         jnp.zeros((), jnp.int32),
         jnp.asarray(False),
     )
-    zero_tangent, fraction = (
+    make_zero_tangent, fraction = (
         jax.tree.map(jnp.zeros_like, z),
         _compute_parameter_fraction(p, parameter_bounds),
     )
-    point = ContinuationPoint(
+    initial_point = ContinuationPoint(
         z,
         p,
-        zero_tangent,
-        zero_length + direction_sign,
+        make_zero_tangent,
+        zero_step_length + direction_sign,
         jnp.zeros((n_section, n_section), float_dtype),
         false_flag,
     )
     trial_point = _TrialPoint(
-        ConstraintPlane(x, fraction, jnp.zeros_like(x), zero_length + 1.0),
+        CorrectorPlane(
+            section_state, fraction, jnp.zeros_like(section_state), zero_step_length + 1.0
+        ),
         z,
         fraction,
-        zero_length,
+        zero_step_length,
         false_flag,
     )
     running_status = zero_count + int(ContinuationStatus.RUNNING)
-    jump_suspicion, first_step = (
-        BranchJumpSuspicion(zero_length, false_flag),
-        zero_length + options.initial_ds,
+    jump_suspicion, initial_ds = (
+        BranchJumpSuspicion(zero_step_length, false_flag),
+        zero_step_length + options.initial_ds,
     )
     return ContinuationState(
-        point,
-        point,
-        point,
-        first_step,
+        initial_point,
+        initial_point,
+        initial_point,
+        initial_ds,
         trial_point,
         jump_suspicion,
         zero_count,
@@ -633,23 +671,25 @@ def init_branches(
     direction_signs: Array,
     is_branch_requested: Array,
 ) -> BranchBatch:
-    """Return the initial states of the branches and their empty buffers of points."""
+    """Return the initial states of branches, and empty buffers for their points."""
     continuation_states = jax.vmap(
         functools.partial(_init_continuation_state, problem, options, parameter_bounds)
     )(z, p, direction_signs)
     initial_status = jnp.where(
-        is_branch_requested, continuation_states.status, int(ContinuationStatus.START_NOT_FOUND)
+        is_branch_requested,
+        continuation_states.status_code,
+        int(ContinuationStatus.START_NOT_FOUND),
     )
-    continuation_states = continuation_states._replace(status=initial_status.astype(jnp.int32))
+    continuation_states = continuation_states._replace(status_code=initial_status.astype(jnp.int32))
     allocate_buffer = lambda x: jnp.zeros((x.shape[0], options.max_points, *x.shape[1:]), x.dtype)
     return continuation_states, jax.tree.map(
-        allocate_buffer, continuation_states.current_point._replace(tangent=())
+        allocate_buffer, continuation_states.current_point._replace(arclength_tangent=())
     )
 
 
 def are_branches_active(branch_batch: BranchBatch) -> Array:
-    """Return whether the continuation of each branch still runs."""
-    return branch_batch[0].status == int(ContinuationStatus.RUNNING)
+    """Return whether the continuation of each branch is still running."""
+    return branch_batch[0].status_code == int(ContinuationStatus.RUNNING)
 
 
 def iterate_branches(
@@ -662,9 +702,9 @@ def iterate_branches(
     branch_batch: BranchBatch,
     newton_steps: NewtonStep,
 ) -> BranchBatch:
-    """Linearize the trial of each branch once, store accepted points, and return the states.
+    """Return the branches after one Newton iteration of each trial, with accepted points stored.
 
-    The points of the branches are stored at the indices `buffer_indices` of the buffers.
+    Accepted points of branch i are stored in the buffer `buffer_indices[i]`.
     """
 
     def iterate_branch(
@@ -673,102 +713,110 @@ def iterate_branches(
         continuation_state: ContinuationState,
         newton_step: NewtonStep,
     ) -> tuple[ContinuationState, ContinuationPoint, Bool[Array, ""]]:
-        trial_point = continuation_state.trial
+        trial_point = continuation_state.trial_point
         corrector_state = correct_trial_point(
             problem,
             newton_step,
             parameter_bounds,
-            trial_point.plane,
+            trial_point.corrector_plane,
             trial_point.z,
-            trial_point.fraction,
+            trial_point.parameter_fraction,
         )
-        trial_assessment = _assess_trial(
+        trial_verdict = _assess_trial(
             problem, options, continuation_state, corrector_state, direction_sign
         )
-        p = compute_parameter_from_fraction(
-            jnp.where(trial_point.is_final, trial_point.plane.fraction, corrector_state.fraction),
+        accepted_p = compute_parameter_from_fraction(
+            jnp.where(
+                trial_point.is_range_end,
+                trial_point.corrector_plane.plane_fraction,
+                corrector_state.parameter_fraction,
+            ),
             parameter_bounds,
         )
-        is_admissible = problem.is_admissible(args, corrector_state.z, p)
-        tangent = jax.tree.map(
-            lambda x: trial_assessment.fraction_rate * x, corrector_state.tangent
+        is_admissible = problem.is_admissible(args, corrector_state.z, accepted_p)
+        arclength_tangent = jax.tree.map(
+            lambda x: trial_verdict.fraction_rate * x, corrector_state.fraction_tangent
         )
         new_point = ContinuationPoint(
             corrector_state.z,
-            p,
-            tangent,
-            trial_assessment.fraction_rate,
-            corrector_state.jacobian,
+            accepted_p,
+            arclength_tangent,
+            trial_verdict.fraction_rate,
+            corrector_state.return_map_jacobian,
             is_admissible,
         )
         is_suspicious = _is_jump_suspicious(
-            problem, options, continuation_state, trial_assessment, new_point
+            problem, options, continuation_state, trial_verdict, new_point
         )
-        trial_assessment = trial_assessment._replace(
-            is_accepted=trial_assessment.is_accepted & ~is_suspicious,
-            has_failed=trial_assessment.has_failed | is_suspicious,
+        trial_verdict = trial_verdict._replace(
+            is_accepted=trial_verdict.is_accepted & ~is_suspicious,
+            has_failed=trial_verdict.has_failed | is_suspicious,
         )
         current_point = select_tree_leaves(
-            trial_assessment.is_accepted, new_point, continuation_state.current_point
+            trial_verdict.is_accepted, new_point, continuation_state.current_point
         )
         first_point = select_tree_leaves(
-            trial_assessment.is_accepted & (continuation_state.n_points == 0),
+            trial_verdict.is_accepted & (continuation_state.n_points == 0),
             new_point,
             continuation_state.first_point,
         )
-        # The cubic of the prediction must not cross a kink.
+        # The cubic prediction must not cross a kink.
         previous_point = select_tree_leaves(
-            trial_assessment.is_kink, new_point, continuation_state.current_point
+            trial_verdict.is_kink, new_point, continuation_state.current_point
         )
         previous_point = select_tree_leaves(
-            trial_assessment.is_accepted, previous_point, continuation_state.previous_point
+            trial_verdict.is_accepted, previous_point, continuation_state.previous_point
         )
-        n_points = continuation_state.n_points + trial_assessment.is_accepted
-        ds = _choose_next_step_length(options, continuation_state, trial_assessment)
-        jump_suspicion = continuation_state.suspicion.record_trial(
+        n_points = continuation_state.n_points + trial_verdict.is_accepted
+        ds = _choose_next_step_length(options, continuation_state, trial_verdict)
+        jump_suspicion = continuation_state.jump_suspicion.update_after_trial(
             is_suspicious, continuation_state.ds
         )
-        jump_suspicion, ds = jump_suspicion.resolve(
-            trial_assessment.is_accepted, ds, options.min_ds
+        jump_suspicion, ds = jump_suspicion.choose_trial_ds(
+            trial_verdict.is_accepted, ds, options.min_ds
         )
-        next_trial_point = _predict_point(
+        next_trial_point = _predict_trial_point(
             problem, previous_point, current_point, n_points > 1, ds, parameter_bounds
         )
-        is_finished = trial_assessment.is_accepted | trial_assessment.has_failed
+        is_finished = trial_verdict.is_accepted | trial_verdict.has_failed
         next_trial_point = select_tree_leaves(
             is_finished,
             next_trial_point,
-            trial_point._replace(z=corrector_state.z, fraction=corrector_state.fraction),
+            trial_point._replace(
+                z=corrector_state.z, parameter_fraction=corrector_state.parameter_fraction
+            ),
         )
         is_closed = _is_curve_closed(
             problem, first_point, continuation_state.current_point, new_point, parameter_bounds
         )
-        status = _update_continuation_status(
+        next_status = _update_continuation_status(
             options,
             continuation_state,
-            trial_assessment,
+            trial_verdict,
             new_point,
             ds,
-            next_trial_point.length,
+            next_trial_point.predicted_arc_length,
             is_closed,
         )
-        iteration = jnp.where(is_finished, 0, continuation_state.iteration + 1)
-        next_counters = n_points, status, continuation_state.n_linearizations + 1
-        next_state = ContinuationState(
+        next_n_newton_iterations = jnp.where(
+            is_finished, 0, continuation_state.n_newton_iterations + 1
+        )
+        next_counters = n_points, next_status, continuation_state.n_linearizations + 1
+        next_continuation_state = ContinuationState(
             previous_point,
             current_point,
             first_point,
             ds,
             next_trial_point,
             jump_suspicion,
-            iteration,
+            next_n_newton_iterations,
             *next_counters,
         )
-        return next_state, new_point, trial_assessment.is_accepted
+        return next_continuation_state, new_point, trial_verdict.is_accepted
 
-    # Buffers are updated outside of `select_tree_leaves`, which would copy them in every iteration.
+    # Buffers are updated outside of `tree_where`, which would copy them in every iteration.
     continuation_state, branch_points = branch_batch
-    next_states, new_points, is_accepted = jax.vmap(iterate_branch)(
+    next_continuation_states, new_points, is_accepted = jax.vmap(iterate_branch)(
         args_by_branch, direction_signs, continuation_state, newton_steps
     )
     buffer_index = jnp.where(
@@ -779,19 +827,21 @@ def iterate_branches(
     write_point = lambda buffer, new_points: buffer.at[buffer_indices, buffer_index].set(
         new_points, mode="drop"
     )
-    branch_points = jax.tree.map(write_point, branch_points, new_points._replace(tangent=()))
+    branch_points = jax.tree.map(
+        write_point, branch_points, new_points._replace(arclength_tangent=())
+    )
     return jax.vmap(select_tree_leaves)(
-        are_branches_active(branch_batch), next_states, continuation_state
+        are_branches_active(branch_batch), next_continuation_states, continuation_state
     ), branch_points
 
 
 def make_continuation_result(branch_batch: BranchBatch) -> ContinuationResult:
-    """Return the result of a continuation from the states of its branches."""
+    """Return the points, their numbers and the statuses of all branches."""
     continuation_states, branch_points = branch_batch
     return ContinuationResult(
         branch_points,
         continuation_states.n_points,
-        continuation_states.status,
+        continuation_states.status_code,
         continuation_states.n_linearizations,
     )
 
@@ -807,21 +857,21 @@ def continue_from(
     direction_signs: Float[Array, "*branches"],
     is_branch_requested: Bool[Array, "*branches"] | None = None,
 ) -> ContinuationResult:
-    """Continue branches from the points near (z, p) in the given directions, and return all points.
+    """Continue branches from the points near (z, p), and return all points.
 
-    The parameter grows if the direction is 1 and shrinks if it is -1. The input is one branch, or
-    several with a leading axis, of which only the requested ones run. Each branch ends at the end
-    of the range, or with its first point that is not admissible, which is kept. Groups of branches
-    run concurrently with one linearization of each branch per iteration. When a branch ends, the
-    next branch starts.
+    A direction of 1 increases the parameter, and a direction of -1 decreases it. The input is one
+    branch, or several branches with a leading axis, of which only the requested ones run. A branch
+    ends at the end of the parameter's range, or with its first point that is not admissible; that
+    point is included. A group of branches runs concurrently, with one linearization per branch and
+    iteration. When a branch of the group ends, the next branch starts.
     """
     if p.ndim == 0:
-        add_axis = lambda tree: jax.tree.map(lambda x: x[None], tree)
+        add_branch_axis = lambda tree: jax.tree.map(lambda x: x[None], tree)
         result = continue_from(
             problem,
             options,
-            add_axis(args_by_branch),
-            add_axis(z),
+            add_branch_axis(args_by_branch),
+            add_branch_axis(z),
             p[None],
             parameter_bounds,
             direction_signs[None],
@@ -842,9 +892,9 @@ def continue_from(
 
         def advance_once(branch_batch: BranchBatch) -> BranchBatch:
             linearize_trial = lambda args, trial_point: evaluate_newton_step_at_fraction(
-                problem, args, parameter_bounds, trial_point.z, trial_point.fraction
+                problem, args, parameter_bounds, trial_point.z, trial_point.parameter_fraction
             )
-            newton_steps = jax.vmap(linearize_trial)(group_args, branch_batch[0].trial)
+            newton_steps = jax.vmap(linearize_trial)(group_args, branch_batch[0].trial_point)
             return iterate_branches(
                 problem,
                 options,

@@ -1,7 +1,8 @@
-"""Points of branches on constraint planes, and concurrent branches outside of compiled code.
+"""Points of branches on given planes, and continuation outside of compiled code.
 
-A map that is machine code for a batch of points is not traced. Its linearizations are called from
-outside of compiled code, and `arclength` performs the rest of each iteration.
+JAX cannot trace a map that is machine code for a batch of points. The linearizations of such a map
+are called outside of compiled code, and the functions of `arclength` perform the rest of each
+iteration.
 """
 
 import functools
@@ -17,9 +18,9 @@ from jaxtyping import Array, Bool, Float, Int
 from vrw_jax.continuation.arclength import (
     AbstractContinuationProblem,
     ArclengthOptions,
-    ConstraintPlane,
     ContinuationPoint,
     ContinuationResult,
+    CorrectorPlane,
     CorrectorState,
     NewtonStep,
     ProblemUnknowns,
@@ -34,100 +35,102 @@ from vrw_jax.continuation.arclength import (
 from vrw_jax.numerics import select_tree_leaves, select_tree_rows
 
 
-class PlaneSolveState(NamedTuple):
-    """State of Newton's method for a point of a branch on a plane."""
+class PlaneNewtonState(NamedTuple):
+    """State of Newton's method for the point at which a branch crosses a plane."""
 
-    corrector: CorrectorState
+    corrector_state: CorrectorState
     n_iterations: Int[Array, ""]
     n_converged: Int[Array, ""]
 
 
-def init_plane_solve_state(
-    z: ProblemUnknowns, constraint_plane: ConstraintPlane
-) -> PlaneSolveState:
-    """Return the initial state of Newton's method on a plane."""
-    n_section = constraint_plane.section_state.shape[0]
-    zero_tangent, zero_count = jax.tree.map(jnp.zeros_like, z), jnp.zeros((), jnp.int32)
-    zero_jacobian = jnp.zeros((n_section, n_section), constraint_plane.section_state.dtype)
+def init_plane_newton(z: ProblemUnknowns, corrector_plane: CorrectorPlane) -> PlaneNewtonState:
+    """Return the initial state of Newton's method in a plane, from the guess z."""
+    n_section = corrector_plane.plane_section_state.shape[0]
+    make_zero_tangent, zero_count = jax.tree.map(jnp.zeros_like, z), jnp.zeros((), jnp.int32)
+    zero_jacobian = jnp.zeros((n_section, n_section), corrector_plane.plane_section_state.dtype)
     initial_corrector = CorrectorState(
         z,
-        constraint_plane.fraction,
-        jnp.ones_like(constraint_plane.fraction),
-        zero_tangent,
+        corrector_plane.plane_fraction,
+        jnp.ones_like(corrector_plane.plane_fraction),
+        make_zero_tangent,
         zero_jacobian,
     )
-    return PlaneSolveState(initial_corrector, zero_count, zero_count)
+    return PlaneNewtonState(initial_corrector, zero_count, zero_count)
 
 
-def needs_newton_iteration(options: ArclengthOptions, plane_solve_state: PlaneSolveState) -> Array:
-    """Return whether Newton's method needs another iteration."""
+def needs_newton_iteration(
+    options: ArclengthOptions, plane_newton_state: PlaneNewtonState
+) -> Array:
+    """Return whether Newton's method in a plane needs another iteration."""
     return (
-        (plane_solve_state.n_converged < 2)
-        & (plane_solve_state.n_iterations < options.max_newton_iterations)
-        & jnp.isfinite(plane_solve_state.corrector.correction_norm)
+        (plane_newton_state.n_converged < 2)
+        & (plane_newton_state.n_iterations < options.max_newton_iterations)
+        & jnp.isfinite(plane_newton_state.corrector_state.correction_norm)
     )
 
 
-def iterate_plane_solve(
+def iterate_plane_newton(
     problem: AbstractContinuationProblem,
     options: ArclengthOptions,
     parameter_bounds: Array,
-    constraint_plane: ConstraintPlane,
-    plane_solve_state: PlaneSolveState,
+    corrector_plane: CorrectorPlane,
+    plane_newton_state: PlaneNewtonState,
     newton_step: NewtonStep,
-) -> PlaneSolveState:
-    """Return the state of a plane solve after one Newton iteration."""
-    corrector_state = plane_solve_state.corrector
+) -> PlaneNewtonState:
+    """Return the state of Newton's method in a plane after one more iteration."""
+    corrector_state = plane_newton_state.corrector_state
     next_corrector = correct_trial_point(
         problem,
         newton_step,
         parameter_bounds,
-        constraint_plane,
+        corrector_plane,
         corrector_state.z,
-        corrector_state.fraction,
+        corrector_state.parameter_fraction,
     )
-    # A trial that is not finite keeps its state, so that no NaN reaches other batch elements.
+    # If a trial is not finite, its state is kept, so that NaN cannot reach other batch elements.
     is_valid = jnp.isfinite(next_corrector.correction_norm)
     next_corrector = select_tree_leaves(is_valid, next_corrector, corrector_state)._replace(
         correction_norm=next_corrector.correction_norm
     )
-    # The last Jacobian is exact if the correction is negligible; then no other iteration follows.
+    # If the correction is negligible, the last Jacobian is exact and no other iteration follows.
     negligible_correction = options.jacobian_reuse_fraction * options.tolerance
     n_converged_before = jnp.where(next_corrector.correction_norm < negligible_correction, 2, 1)
     n_converged = jnp.where(
         next_corrector.correction_norm < options.tolerance,
-        plane_solve_state.n_converged + n_converged_before,
+        plane_newton_state.n_converged + n_converged_before,
         0,
     )
-    return PlaneSolveState(next_corrector, plane_solve_state.n_iterations + 1, n_converged)
+    return PlaneNewtonState(next_corrector, plane_newton_state.n_iterations + 1, n_converged)
 
 
-def make_plane_solve_point(
+def make_plane_newton_point(
     problem: AbstractContinuationProblem,
     args: Any,
     parameter_bounds: Array,
-    constraint_plane: ConstraintPlane,
-    plane_solve_state: PlaneSolveState,
+    corrector_plane: CorrectorPlane,
+    plane_newton_state: PlaneNewtonState,
 ) -> tuple[ContinuationPoint, Bool[Array, ""]]:
-    """Return the point of a plane solve, and whether Newton's method converged.
+    """Return the point of the branch in a plane, and whether Newton's method converged.
 
-    The rate of the parameter is that along the plane's normal.
+    `fraction_rate` of the point has the sign that belongs to the direction of the plane's normal.
     """
     corrector_state, p = (
-        plane_solve_state.corrector,
-        compute_parameter_from_fraction(plane_solve_state.corrector.fraction, parameter_bounds),
+        plane_newton_state.corrector_state,
+        compute_parameter_from_fraction(
+            plane_newton_state.corrector_state.parameter_fraction, parameter_bounds
+        ),
     )
     is_admissible = problem.is_admissible(args, corrector_state.z, p)
-    section_tangent = problem.section_state(corrector_state.tangent)
+    section_tangent = problem.section_state(corrector_state.fraction_tangent)
     normal_alignment = (
-        constraint_plane.normal_section @ section_tangent + constraint_plane.normal_fraction
+        corrector_plane.normal_section_part @ section_tangent + corrector_plane.normal_fraction_part
     )
     normal_direction = jnp.where(normal_alignment >= 0.0, 1.0, -1.0)
     fraction_rate = normal_direction / jnp.sqrt(1.0 + section_tangent @ section_tangent)
-    point = ContinuationPoint(
-        corrector_state.z, p, (), fraction_rate, corrector_state.jacobian, is_admissible
+    continuation_point = ContinuationPoint(
+        corrector_state.z, p, (), fraction_rate, corrector_state.return_map_jacobian, is_admissible
     )
-    return point, plane_solve_state.n_converged >= 1
+    return continuation_point, plane_newton_state.n_converged >= 1
 
 
 @eqx.filter_jit
@@ -136,38 +139,37 @@ def solve_on_plane(
     options: ArclengthOptions,
     args: Any,
     z: ProblemUnknowns,
-    constraint_plane: ConstraintPlane,
+    corrector_plane: CorrectorPlane,
     parameter_bounds: Float[Array, "2"],
 ) -> tuple[ContinuationPoint, Bool[Array, ""]]:
-    """Return the point of the branch on a plane, from z near it, and whether Newton's method
-    converged.
+    """Return the point at which a branch crosses a plane, and whether Newton's method converged.
 
-    After convergence Newton's method takes one more iteration unless its correction is negligible.
-    The Jacobian is then as accurate as the point.
+    Newton's method starts from z. After convergence another iteration follows, unless the last
+    correction is negligible. The Jacobian is therefore as accurate as the point.
     """
 
-    def iterate_once(plane_solve_state: PlaneSolveState) -> PlaneSolveState:
+    def iterate_once(plane_newton_state: PlaneNewtonState) -> PlaneNewtonState:
         newton_step = evaluate_newton_step_at_fraction(
             problem,
             args,
             parameter_bounds,
-            plane_solve_state.corrector.z,
-            plane_solve_state.corrector.fraction,
+            plane_newton_state.corrector_state.z,
+            plane_newton_state.corrector_state.parameter_fraction,
         )
-        return iterate_plane_solve(
-            problem, options, parameter_bounds, constraint_plane, plane_solve_state, newton_step
+        return iterate_plane_newton(
+            problem, options, parameter_bounds, corrector_plane, plane_newton_state, newton_step
         )
 
     needs_more_iterations = functools.partial(needs_newton_iteration, options)
-    plane_solve_state = lax.while_loop(
-        needs_more_iterations, iterate_once, init_plane_solve_state(z, constraint_plane)
+    plane_newton_state = lax.while_loop(
+        needs_more_iterations, iterate_once, init_plane_newton(z, corrector_plane)
     )
-    return make_plane_solve_point(
-        problem, args, parameter_bounds, constraint_plane, plane_solve_state
+    return make_plane_newton_point(
+        problem, args, parameter_bounds, corrector_plane, plane_newton_state
     )
 
 
-def continue_many_from(
+def continue_branches_uncompiled(
     problem: AbstractContinuationProblem,
     options: ArclengthOptions,
     args_by_branch: Any,
@@ -177,22 +179,22 @@ def continue_many_from(
     direction_signs: Float[Array, " branches"],
     is_branch_requested: Bool[Array, " branches"],
 ) -> ContinuationResult:
-    """Continue branches as `arclength.continue_from` does, outside of compiled code.
+    """Continue many branches outside of compiled code, and return all points.
 
-    Return all points.
+    The arguments and the result are those of `arclength.continue_from`.
     """
     branch_batch = init_branches(
         problem, options, z, p, parameter_bounds, direction_signs, is_branch_requested
     )
     buffer_indices = jnp.arange(len(p))
-    while np.any(is_unfinished := np.asarray(_is_active_jit(branch_batch))):
-        trial_point = branch_batch[0].trial
-        newton_steps = _linearize_selected(
+    while np.any(is_unfinished := np.asarray(_are_branches_active_jit(branch_batch))):
+        trial_point = branch_batch[0].trial_point
+        newton_steps = _linearize_selected_branches(
             problem,
             args_by_branch,
             parameter_bounds,
             trial_point.z,
-            trial_point.fraction,
+            trial_point.parameter_fraction,
             is_unfinished,
         )
         branch_batch = _iterate_branches_jit(
@@ -208,19 +210,19 @@ def continue_many_from(
     return make_continuation_result(branch_batch)
 
 
-def _linearize_selected(
+def _linearize_selected_branches(
     problem: AbstractContinuationProblem,
     args_by_branch: Any,
     parameter_bounds: Array,
     z: ProblemUnknowns,
-    fraction: Array,
+    parameter_fractions: Array,
     is_selected: Any,
 ) -> NewtonStep:
-    """Return the Newton steps of the selected branches, and NaN for the others."""
+    """Return the Newton steps of the selected branches, and NaN for other branches."""
     lower_bound, upper_bound = np.asarray(parameter_bounds)
-    p = lower_bound + (upper_bound - lower_bound) * np.asarray(fraction)
+    parameter_values = lower_bound + (upper_bound - lower_bound) * np.asarray(parameter_fractions)
     selected_steps = problem.linearize(
-        *jax.device_put(select_tree_rows((args_by_branch, z, p), is_selected))
+        *jax.device_put(select_tree_rows((args_by_branch, z, parameter_values), is_selected))
     )
     fill_with_nan = lambda selected_values: np.full(
         (len(is_selected), *selected_values.shape[1:]), np.nan
@@ -233,75 +235,84 @@ def _linearize_selected(
     return jax.device_put(all_steps)
 
 
-def solve_many_on_planes(
+def solve_on_many_planes(
     problem: AbstractContinuationProblem,
     options: ArclengthOptions,
     args_by_branch: Any,
     z: ProblemUnknowns,
-    constraint_planes: ConstraintPlane,
+    corrector_planes: CorrectorPlane,
     parameter_bounds: Float[Array, "2"],
 ) -> tuple[ContinuationPoint, Bool[Array, " many"]]:
-    """Return many points as `solve_on_plane` does. All arrays have a leading axis."""
-    plane_solve_states = _init_plane_solves(z, constraint_planes)
-    while np.any(is_unfinished := np.asarray(_needs_iteration_jit(options, plane_solve_states))):
-        newton_step = _linearize_selected(
+    """Return the points at which many branches cross planes, and whether Newton's method converged.
+
+    Every array has a leading axis over the branches; see `solve_on_plane`.
+    """
+    plane_newton_states = _init_plane_newton_jit(z, corrector_planes)
+    while np.any(
+        is_unfinished := np.asarray(_needs_newton_iteration_jit(options, plane_newton_states))
+    ):
+        newton_step = _linearize_selected_branches(
             problem,
             args_by_branch,
             parameter_bounds,
-            plane_solve_states.corrector.z,
-            plane_solve_states.corrector.fraction,
+            plane_newton_states.corrector_state.z,
+            plane_newton_states.corrector_state.parameter_fraction,
             is_unfinished,
         )
-        plane_solve_states = _iterate_unfinished_plane_solves(
-            problem, options, parameter_bounds, constraint_planes, plane_solve_states, newton_step
+        plane_newton_states = _iterate_unfinished_plane_newton(
+            problem, options, parameter_bounds, corrector_planes, plane_newton_states, newton_step
         )
-    return _make_plane_solve_points(
-        problem, args_by_branch, parameter_bounds, constraint_planes, plane_solve_states
+    return _make_plane_newton_points(
+        problem, args_by_branch, parameter_bounds, corrector_planes, plane_newton_states
     )
 
 
-_is_active_jit: Any = eqx.filter_jit(are_branches_active)
+_are_branches_active_jit: Any = eqx.filter_jit(are_branches_active)
 _iterate_branches_jit: Any = eqx.filter_jit(iterate_branches)
-_init_plane_solves: Any = eqx.filter_jit(jax.vmap(init_plane_solve_state))
-_needs_iteration_jit: Any = eqx.filter_jit(needs_newton_iteration)
+_init_plane_newton_jit: Any = eqx.filter_jit(jax.vmap(init_plane_newton))
+_needs_newton_iteration_jit: Any = eqx.filter_jit(needs_newton_iteration)
 
 
 @eqx.filter_jit
-def _make_plane_solve_points(
+def _make_plane_newton_points(
     problem: AbstractContinuationProblem,
     args_by_branch: Any,
     parameter_bounds: Array,
-    constraint_planes: ConstraintPlane,
-    plane_solve_states: PlaneSolveState,
+    corrector_planes: CorrectorPlane,
+    plane_newton_states: PlaneNewtonState,
 ) -> tuple[ContinuationPoint, Bool[Array, " many"]]:
-    """Return the points of many plane solves, and whether each solve converged."""
-    finish_one = lambda args, constraint_plane, plane_solve_state: make_plane_solve_point(
-        problem, args, parameter_bounds, constraint_plane, plane_solve_state
+    """Return the points of many branches in planes, and whether Newton's method converged."""
+    finish_plane_newton = lambda args, corrector_plane, plane_newton_state: make_plane_newton_point(
+        problem, args, parameter_bounds, corrector_plane, plane_newton_state
     )
-    return jax.vmap(finish_one)(args_by_branch, constraint_planes, plane_solve_states)
+    return jax.vmap(finish_plane_newton)(args_by_branch, corrector_planes, plane_newton_states)
 
 
 @eqx.filter_jit
-def _iterate_unfinished_plane_solves(
+def _iterate_unfinished_plane_newton(
     problem: AbstractContinuationProblem,
     options: Any,
     parameter_bounds: Array,
-    constraint_planes: ConstraintPlane,
-    plane_solve_states: PlaneSolveState,
+    corrector_planes: CorrectorPlane,
+    plane_newton_states: PlaneNewtonState,
     newton_steps: NewtonStep,
-) -> PlaneSolveState:
-    """Return the states of many plane solves, after one iteration of each unfinished one."""
+) -> PlaneNewtonState:
+    """Return the states of many plane solves, where each unfinished solve has made one
+    iteration.
+    """
 
-    def iterate_one(
-        constraint_plane: ConstraintPlane,
-        plane_solve_state: PlaneSolveState,
+    def iterate_if_unfinished(
+        corrector_plane: CorrectorPlane,
+        plane_newton_state: PlaneNewtonState,
         newton_step: NewtonStep,
-    ) -> PlaneSolveState:
-        next_state = iterate_plane_solve(
-            problem, options, parameter_bounds, constraint_plane, plane_solve_state, newton_step
+    ) -> PlaneNewtonState:
+        next_continuation_state = iterate_plane_newton(
+            problem, options, parameter_bounds, corrector_plane, plane_newton_state, newton_step
         )
         return select_tree_leaves(
-            needs_newton_iteration(options, plane_solve_state), next_state, plane_solve_state
+            needs_newton_iteration(options, plane_newton_state),
+            next_continuation_state,
+            plane_newton_state,
         )
 
-    return jax.vmap(iterate_one)(constraint_planes, plane_solve_states, newton_steps)
+    return jax.vmap(iterate_if_unfinished)(corrector_planes, plane_newton_states, newton_steps)

@@ -1,8 +1,8 @@
-"""Test by the multipliers whether two neighboring points are on one branch.
+"""Test by Floquet multipliers whether two neighboring points belong to one branch.
 
-A continuation step may pass several special points, or reach another branch nearby. Both change the
-number of multipliers outside the unit circle, or the sign of the determinant of Newton's equations
-along the branch. The sign of the determinant changes only at branch points.
+A continuation step may pass several special points, or reach a nearby branch. Both change the
+number of multipliers outside the unit circle, or the sign of the determinant of Newton's equations.
+Along a branch this sign changes only at branch points.
 """
 
 from typing import NamedTuple
@@ -15,7 +15,7 @@ from vrw_jax.continuation.floquet import (
     MAX_CLOSED_FORM_SIZE,
     MULTIPLIER_TOLERANCES,
     MultiplierTolerances,
-    bifurcation_margins,
+    compute_bifurcation_margins,
     floquet_multipliers,
 )
 from vrw_jax.numerics import Scalar
@@ -25,17 +25,19 @@ def is_multiplier_change_explained(
     jacobian_before: Float[Array, "n n"],
     jacobian_after: Float[Array, "n n"],
     has_turned_back: Bool[Array, ""],
-    tolerances: MultiplierTolerances = MULTIPLIER_TOLERANCES,
+    multiplier_tolerances: MultiplierTolerances = MULTIPLIER_TOLERANCES,
 ) -> Bool[Array, ""]:
     """Return whether bifurcations explain the change of the multipliers between two points.
 
-    `has_turned_back` states whether the parameter turns back between the points.
+    `has_turned_back` is whether the parameter changes its direction between the points.
     """
-    margins_before, margins_after = map(bifurcation_margins, (jacobian_before, jacobian_after))
+    margins_before, margins_after = map(
+        compute_bifurcation_margins, (jacobian_before, jacobian_after)
+    )
     has_margin_sign_change = margins_before * margins_after < 0.0
     crosses_other_branch = has_margin_sign_change[0] != has_turned_back
     if jacobian_before.shape[-1] > MAX_CLOSED_FORM_SIZE and jax.default_backend() != "cpu":
-        return ~crosses_other_branch  # Eigenvalues of larger matrices are computed on CPUs alone.
+        return ~crosses_other_branch  # JAX computes eigenvalues of larger matrices only on CPUs.
     n_explained_multipliers = has_margin_sign_change[0].astype(int) + has_margin_sign_change[1]
     n_explained_multipliers = n_explained_multipliers + (
         2 * has_margin_sign_change[2] if len(has_margin_sign_change) > 2 else 0
@@ -45,7 +47,10 @@ def is_multiplier_change_explained(
         """Return the least and the largest possible number of multipliers outside the unit
         circle.
         """
-        multiplier_moduli, tolerance = jnp.abs(floquet_multipliers(jacobian)), tolerances.on_circle
+        multiplier_moduli, tolerance = (
+            jnp.abs(floquet_multipliers(jacobian)),
+            multiplier_tolerances.unit_circle_distance,
+        )
         return jnp.sum(multiplier_moduli > 1.0 + tolerance), jnp.sum(
             multiplier_moduli > 1.0 - tolerance
         )
@@ -59,41 +64,44 @@ def is_multiplier_change_explained(
 
 
 class BranchJumpSuspicion(NamedTuple):
-    """Suspicion that the last step of a continuation left the branch.
+    """Suspicion that the last continuation step reached another branch, which shortens the next
+    steps.
 
-    The suspicion shortens the next steps.
-
-    - `suspicious_step`: length of the first suspicious step, 0 if there is none;
-    - `is_resolved`: whether no shorter step helped, so that the next step is accepted whatever its
-      multipliers are.
+    - `suspicious_ds`: length of the first suspicious continuation step, 0 if there is none;
+    - `accepts_any_multipliers`: whether shorter steps did not help, so that the next step is
+      accepted with any multipliers.
     """
 
-    suspicious_step: Scalar
-    is_resolved: Bool[Array, ""]
+    suspicious_ds: Scalar
+    accepts_any_multipliers: Bool[Array, ""]
 
-    def record_trial(
-        self, is_suspicious: Bool[Array, ""], trial_step: Scalar
+    def update_after_trial(
+        self, is_suspicious: Bool[Array, ""], trial_ds: Scalar
     ) -> "BranchJumpSuspicion":
-        """Return the suspicion after a trial of length `trial_step`."""
-        is_first_suspicion = is_suspicious & (self.suspicious_step == 0.0)
+        """Return the suspicion after a trial with a continuation step of length `trial_ds`."""
+        is_first_suspicion = is_suspicious & (self.suspicious_ds == 0.0)
         return self._replace(
-            suspicious_step=jnp.where(is_first_suspicion, trial_step, self.suspicious_step)
+            suspicious_ds=jnp.where(is_first_suspicion, trial_ds, self.suspicious_ds)
         )
 
-    def resolve(
-        self, is_accepted: Bool[Array, ""], proposed_step: Scalar, min_step: float
+    def choose_trial_ds(
+        self, is_accepted: Bool[Array, ""], proposed_ds: Scalar, min_ds: float
     ) -> tuple["BranchJumpSuspicion", Scalar]:
-        """Return the suspicion before the next trial, and the length of that trial's step.
+        """Return the suspicion before the next trial, and the length of the trial's continuation
+        step.
 
-        The length is `proposed_step`. If `proposed_step` is too short, the length is that of the
-        first suspicious step.
+        The length is `proposed_ds`, or `suspicious_ds` if `proposed_ds` is below `min_ds`.
         """
-        is_too_short = (self.suspicious_step > 0.0) & ~self.is_resolved & (proposed_step < min_step)
-        trial_step = jnp.where(is_too_short, self.suspicious_step, proposed_step)
-        has_passed_suspicious_step = is_accepted & (
-            self.is_resolved | (trial_step >= self.suspicious_step)
+        is_below_min_ds = (
+            (self.suspicious_ds > 0.0) & ~self.accepts_any_multipliers & (proposed_ds < min_ds)
         )
-        is_resolved = jnp.where(is_accepted, False, self.is_resolved | is_too_short)
+        trial_ds = jnp.where(is_below_min_ds, self.suspicious_ds, proposed_ds)
+        has_passed_suspicious_ds = is_accepted & (
+            self.accepts_any_multipliers | (trial_ds >= self.suspicious_ds)
+        )
+        accepts_any_multipliers = jnp.where(
+            is_accepted, False, self.accepts_any_multipliers | is_below_min_ds
+        )
         return BranchJumpSuspicion(
-            jnp.where(has_passed_suspicious_step, 0.0, self.suspicious_step), is_resolved
-        ), trial_step
+            jnp.where(has_passed_suspicious_ds, 0.0, self.suspicious_ds), accepts_any_multipliers
+        ), trial_ds

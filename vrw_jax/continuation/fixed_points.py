@@ -1,4 +1,4 @@
-"""Fixed points of any return map, by Newton's method on the section."""
+"""Fixed points of return maps by Newton's method on the section, for any system."""
 
 import functools
 from collections.abc import Callable
@@ -29,14 +29,15 @@ from vrw_jax.validation import (
 
 
 class FixedPointResult(NamedTuple):
-    """A fixed point of a map, and the map's Jacobian at it.
+    """Fixed point of a map, and the Jacobian of the map at that point.
 
-    - `x`: the point, shape (n,);
-    - `jacobian`: Jacobian of the map, or of its period_n-th iterate;
-    - `residual`: largest entry of map(x) - x;
+    - `x`: the fixed point, shape (n,);
+    - `jacobian`: Jacobian of the `period_n`-th iterate of the map, shape (n, n);
+    - `residual`: largest absolute component of map(x) - x;
     - `converged`: whether Newton's method converged;
-    - `n_iterations`: number of Newton's iterations;
-    - `termination`: how the simulation of a `ReturnMap` from `x` ended; None for any other map.
+    - `n_iterations`: number of Newton iterations;
+    - `termination`: `Termination` of the simulation of a `ReturnMap` from `x`; None for any other
+      map.
 
     Examples:
         >>> result = vrw.solve_fixed_point(lambda x: 0.5 * x + 1.0, jnp.zeros(1))
@@ -53,9 +54,8 @@ class FixedPointResult(NamedTuple):
 
     @property
     def ending(self) -> Any:
-        """Return a sentence about whether Newton's method converged; for a batch, an array of
-        sentences.
-        """
+        """Return a sentence on the convergence of Newton's method; for a batch, an array of
+        sentences."""
         return map_text_of_elements(_describe_newton_convergence, self.converged, self.n_iterations)
 
     def __repr__(self) -> str:
@@ -76,7 +76,7 @@ class FixedPointResult(NamedTuple):
 
 
 def _describe_newton_convergence(converged: bool, n_iterations: int) -> str:
-    """Return a sentence about the convergence to one fixed point."""
+    """Return a sentence on the convergence of Newton's method to one fixed point."""
     if converged:
         return f"Newton's method converged after {n_iterations} iterations."
     return (
@@ -86,8 +86,8 @@ def _describe_newton_convergence(converged: bool, n_iterations: int) -> str:
 
 
 MAX_NEWTON_ITERATIONS = 30
-"""Default limit of Newton's iterations. The value is chosen far above the number that a start near
-the fixed point needs."""
+"""Default limit of Newton iterations, chosen far above the number that is needed from a start near
+the fixed point."""
 
 
 @with_renamed_arguments(iterations="max_iterations")
@@ -101,18 +101,19 @@ def solve_fixed_point(
 ) -> FixedPointResult:
     """Return a fixed point of `function` applied `period_n` times, by Newton's method.
 
-    The result is differentiable with respect to everything that `function` closes over, by two
-    further iterations with derivatives: the point to third order, the Jacobian to first order. If a
-    start does not converge, it is returned unchanged, without derivative.
+    The result is differentiable with respect to all values that `function` closes over. Two further
+    iterations with derivatives give the point's derivatives to third order, and the Jacobian's to
+    first order. If Newton's method does not converge, the start is returned unchanged, without
+    derivatives.
 
     Args:
         function: map of a vector to a vector of its shape, differentiable in forward mode. For a
-            hybrid system it is a `ReturnMap`, which has no fixed point if its simulation ends
+            hybrid system the map is a `ReturnMap`, which has no fixed point if its simulation ends
             early.
         start: start of Newton's method, shape (n,).
         period_n: number of times that the map is applied.
-        tolerance: tolerance of Newton's last correction, in units of `start`.
-        max_iterations: limit of Newton's iterations.
+        tolerance: largest norm of Newton's last correction, in units of `start`.
+        max_iterations: largest number of Newton iterations.
 
     Returns:
         A `FixedPointResult`.
@@ -126,7 +127,7 @@ def solve_fixed_point(
         0.739085 True
     """
 
-    fixed_point = _check_and_solve(
+    fixed_point = _solve_checked_fixed_point(
         _run_newton_loop, function, start, period_n, tolerance, max_iterations
     )
     if isinstance(function, ReturnMap):
@@ -145,23 +146,23 @@ def solve_fixed_point_implicit(
 ) -> FixedPointResult:
     """Return a fixed point of a map whose second derivatives are expensive.
 
-    First derivatives of the point need only first derivatives of `function`, and second derivatives
-    need second ones. Derivatives of the Jacobian are NaN.
+    Derivatives of order n of the fixed point need only derivatives of order n of `function`.
+    Derivatives of the Jacobian are NaN.
     """
-    return _check_and_solve(
+    return _solve_checked_fixed_point(
         _run_newton_implicit, function, start, period_n, tolerance, MAX_NEWTON_ITERATIONS
     )
 
 
-def _check_and_solve(
-    run_newton: Callable[..., FixedPointResult],
+def _solve_checked_fixed_point(
+    newton_method: Callable[..., FixedPointResult],
     function: Callable[[Array], Array],
     start: Any,
     period_n: int,
     tolerance: float | Scalar,
     max_iterations: int,
 ) -> FixedPointResult:
-    """Check the arguments, and return the fixed point by the given form of Newton's method."""
+    """Return the fixed point by a given form of Newton's method, after checks of the arguments."""
     check_callable("function", function, "that maps a state to the next")
     start, period_n = check_reals("start", start), check_int("period_n", period_n)
     max_iterations = check_int("max_iterations", max_iterations)
@@ -177,37 +178,37 @@ def _check_and_solve(
     start = lax.stop_gradient(start)
     map_output = jax.eval_shape(function, start)
     if getattr(map_output, "shape", None) != start.shape:
-        map_description = getattr(map_output, "shape", type(map_output).__name__)
+        map_output_description = getattr(map_output, "shape", type(map_output).__name__)
         raise ValueError(
-            f"the map gives {map_description} for a start of shape {start.shape}, but it must give "
-            "an array of that shape: take a map of a state to the next state."
+            f"the map gives {map_output_description} for a start of shape {start.shape}, but it "
+            "must give an array of that shape: take a map of a state to the next state."
         )
     tolerance = lax.stop_gradient(jnp.asarray(tolerance, start.dtype))
-    map_and_iterations = (run_newton, function, period_n, max_iterations)
+    map_and_iterations = (newton_method, function, period_n, max_iterations)
     newton_arguments = start, tolerance
     uses_program_cache = isinstance(function, ReturnMap)
-    compiled_program = (
-        find_program(_solve_iterated_map, map_and_iterations, *newton_arguments)
+    solver_program = (
+        find_program(_find_fixed_point_of_iterate, map_and_iterations, *newton_arguments)
         if uses_program_cache
         else None
     )
-    return (compiled_program or functools.partial(_solve_iterated_map, map_and_iterations))(
+    return (solver_program or functools.partial(_find_fixed_point_of_iterate, map_and_iterations))(
         *newton_arguments
     )
 
 
-def _solve_iterated_map(
+def _find_fixed_point_of_iterate(
     map_and_iterations: tuple, start: Array, tolerance: Array
 ) -> FixedPointResult:
-    run_newton, function, period_n, iterations = map_and_iterations
+    newton_method, function, period_n, max_iterations = map_and_iterations
 
-    def iterate(x: Array) -> Array:
+    def apply_map_repeatedly(x: Array) -> Array:
         for _ in range(period_n):
             x = function(x)
         return x
 
-    converted_map, closed_over_values = jax.closure_convert(iterate, start)
-    return run_newton(converted_map, iterations, start, tolerance, *closed_over_values)
+    converted_map, closed_over_values = jax.closure_convert(apply_map_repeatedly, start)
+    return newton_method(converted_map, max_iterations, start, tolerance, *closed_over_values)
 
 
 ClosureConvertedMap = Callable[..., Array]
@@ -216,11 +217,11 @@ ClosureConvertedMap = Callable[..., Array]
 def _compute_newton_correction(
     converted_map: ClosureConvertedMap, x: Array, closed_over_values: tuple
 ) -> tuple[Array, Array, Array]:
-    """Return Newton's correction, the map's Jacobian, and the defect map(x) - x."""
-    image_point, jacobian = evaluate_with_jacobian(
+    """Return Newton's correction, the Jacobian of the map, and the defect map(x) - x."""
+    mapped_point, jacobian = evaluate_with_jacobian(
         lambda y: converted_map(y, *closed_over_values), x
     )
-    map_defect = image_point - x
+    map_defect = mapped_point - x
     return (
         jnp.linalg.solve(jnp.eye(x.size, dtype=x.dtype) - jacobian, map_defect),
         jacobian,
@@ -229,9 +230,8 @@ def _compute_newton_correction(
 
 
 N_DERIVATIVE_ITERATIONS = 2
-"""Number of iterations with derivatives, chosen because a single one gives only first
-derivatives of the point.
-"""
+"""Number of Newton iterations with derivatives, chosen because one iteration gives only first
+derivatives of the point."""
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0, 1))
@@ -242,9 +242,9 @@ def _run_newton_loop(
     tolerance: Array,
     *closed_over_values: Any,
 ) -> FixedPointResult:
-    """Return the fixed point by Newton's method in one loop.
+    """Return the fixed point by Newton's method in a single loop.
 
-    The loop compiles the map, often a large program, once.
+    A single loop compiles the map, which is often a large program, only once.
     """
 
     def is_newton_searching(correction_norm: Array, n_iterations: Array) -> Array:
@@ -302,7 +302,8 @@ def _run_newton_loop(
 def _run_newton_jvp(
     converted_map: ClosureConvertedMap, iterations: int, primals: tuple, tangents: tuple
 ) -> tuple[FixedPointResult, FixedPointResult]:
-    """Return the fixed point and its tangent, by iterations with derivatives from the point."""
+    """Return the fixed point and its tangent, by iterations with derivatives that start at the
+    point."""
     start, _, *closed_over_values = primals
     newton_result = _run_newton_loop(converted_map, iterations, *lax.stop_gradient(primals))
 
@@ -333,9 +334,8 @@ def _run_newton_implicit(
     tolerance: Array,
     *closed_over_values: Any,
 ) -> FixedPointResult:
-    """Return the fixed point by Newton's method, with the implicit function theorem as derivative
-    rule.
-    """
+    """Return the fixed point by Newton's method; its derivatives follow from the implicit function
+    theorem."""
     return _run_newton_loop(converted_map, iterations, start, tolerance, *closed_over_values)
 
 
@@ -346,7 +346,7 @@ def _run_newton_implicit_jvp(
 ) -> tuple[FixedPointResult, FixedPointResult]:
     """Return the fixed point and its tangent by the implicit function theorem.
 
-    The same rule differentiates the fixed point that the tangent contains.
+    The tangent depends on the fixed point, to which the same derivative rule applies.
     """
     newton_result = _run_newton_implicit(converted_map, iterations, *primals)
     closed_over_values, closed_over_tangents = tuple(primals[2:]), tuple(tangents[2:])

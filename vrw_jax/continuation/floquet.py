@@ -1,9 +1,9 @@
-"""Floquet multipliers of small real maps in closed form, differentiable and batched on any device.
+"""Floquet multipliers of small real matrices in closed form, differentiable and batched.
 
-Matrices are Jacobians of a return map, shape (..., n, n) with n = 1, 2 or 3. For larger matrices,
-LAPACK computes the multipliers, the spectral radius and the bifurcation margins on a CPU.
-Eigenvalues are not differentiable if two of them are equal. The Jury margins, which are polynomials
-of the matrix, are always differentiable.
+A matrix is the Jacobian of a return map, of shape (..., n, n) with n at most 3. For larger matrices
+LAPACK computes the multipliers, the spectral radius and the bifurcation margins on a CPU. An
+eigenvalue is not differentiable if it equals another one. The Jury margins are polynomials of the
+matrix and always differentiable.
 """
 
 import functools
@@ -16,44 +16,45 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Complex, Float
 
-RealMatrix = Float[Array, "... n n"]
+RealSquareMatrix = Float[Array, "... n n"]
 
 MAX_CLOSED_FORM_SIZE = 3
 """Size of the largest matrix whose characteristic polynomial is solved in closed form."""
 
 SMOOTH_MIN_SHARPNESS = 50.0
-"""Sharpness of the smooth minimum in `stability_margin`, chosen because the result is then at
-most log(4)/50 below the minimum.
+"""Sharpness of the smooth minimum in `compute_stability_margin`, chosen because the result is then
+at most log(4)/50 below the exact minimum.
 """
 
 
 @dataclass(frozen=True)
 class MultiplierTolerances:
-    """Distances within which multipliers count as equal, real or on the unit circle.
+    """Tolerances within which multipliers count as equal, as real, or as on the unit circle.
 
-    - `on_circle`: distance from modulus 1 within which a multiplier counts to either side. It is
-      chosen because multipliers of maps that preserve areas are on the circle up to round-off,
-      which is 1e-8 if two are equal;
-    - `located_on_circle`: largest distance from modulus 1 of the pair of a located Neimark-Sacker
-      bifurcation;
-    - `min_imaginary`: imaginary part below which multipliers on the unit circle count as real. It
-      is chosen because three equal real ones are computed with imaginary parts of 1e-5;
-    - `equal_moduli`: distance between moduli of ranks that cross the circle together, chosen as
-      `on_circle`.
+    - `unit_circle_distance`: largest distance from modulus 1 at which a multiplier counts to both
+      sides of the circle. The value is chosen because maps that preserve areas have multipliers on
+      the circle up to round-off, which is 1e-8 for two equal multipliers;
+    - `located_pair_circle_distance`: largest distance from modulus 1 of the pair at a located
+      Neimark-Sacker bifurcation;
+    - `min_imaginary_part`: imaginary part below which a multiplier on the unit circle counts as
+      real. The value is chosen because three equal real multipliers are computed with imaginary
+      parts of 1e-5;
+    - `equal_moduli_distance`: largest difference of two moduli that count as equal, chosen as
+      `unit_circle_distance`.
     """
 
-    on_circle: float = 1e-6
-    located_on_circle: float = 1e-4
-    min_imaginary: float = 1e-3
-    equal_moduli: float = 1e-6
+    unit_circle_distance: float = 1e-6
+    located_pair_circle_distance: float = 1e-4
+    min_imaginary_part: float = 1e-3
+    equal_moduli_distance: float = 1e-6
 
 
 MULTIPLIER_TOLERANCES = MultiplierTolerances()
-"""Tolerances of multipliers, for all continuations."""
+"""Tolerances of multipliers in all continuations."""
 
 
-def characteristic_polynomial(matrix: RealMatrix) -> tuple[Array, ...]:
-    """Return the coefficients (a_0, ..., a_{n-1}) of z^n + ... + a_1 z + a_0 = det(z - matrix)."""
+def compute_characteristic_polynomial(matrix: RealSquareMatrix) -> tuple[Array, ...]:
+    """Return the coefficients (a_0, ..., a_{n-1}) of det(z - matrix) = z^n + ... + a_1 z + a_0."""
     matrix_entries = lambda i, j: matrix[..., i, j]
     n = matrix.shape[-1]
     if matrix.shape[-2:] != (n, n) or n not in (1, 2, 3):
@@ -87,39 +88,42 @@ def characteristic_polynomial(matrix: RealMatrix) -> tuple[Array, ...]:
     )
 
 
-def _safe_square_root(x: Array) -> Array:
-    """Return the square root of max(x, 0), with derivative zero if x <= 0."""
+def _differentiable_square_root(x: Array) -> Array:
+    """Return the square root of max(x, 0), whose derivative is zero for x <= 0."""
     is_positive = x > 0.0
     return jnp.where(is_positive, jnp.sqrt(jnp.where(is_positive, x, 1.0)), 0.0)
 
 
 class _EigenvaluePair(NamedTuple):
-    """Two eigenvalues: mean ± real_offset if they are real, else mean ± i imaginary_offset."""
+    """Pair of eigenvalues: mean ± real_offset if they are real, mean ± i imaginary_offset
+    otherwise."""
 
-    mean: Array
+    pair_mean: Array
     real_offset: Array
     imaginary_offset: Array
 
     @property
     def modulus(self) -> Array:
-        """Return the modulus of both eigenvalues if they are complex."""
-        return _safe_square_root(
-            self.mean * self.mean + self.imaginary_offset * self.imaginary_offset
+        """Return the modulus of a complex pair."""
+        return _differentiable_square_root(
+            self.pair_mean * self.pair_mean + self.imaginary_offset * self.imaginary_offset
         )
 
 
 def _solve_quadratic_pair(a0: Array, a1: Array) -> _EigenvaluePair:
-    """Return the roots of z^2 + a1 z + a0."""
+    """Return the two roots of z^2 + a1 z + a0."""
     mean = -0.5 * a1
     discriminant = mean * mean - a0
-    return _EigenvaluePair(mean, _safe_square_root(discriminant), _safe_square_root(-discriminant))
+    return _EigenvaluePair(
+        mean, _differentiable_square_root(discriminant), _differentiable_square_root(-discriminant)
+    )
 
 
 def _solve_cubic_real_root(a0: Array, a1: Array, a2: Array) -> Array:
-    """Return the real root of z^3 + a2 z^2 + a1 z + a0 that is farthest from the others.
+    """Return the real root of z^3 + a2 z^2 + a1 z + a0 that is farthest from the other roots.
 
-    The root is computed without derivatives. Newton's method then makes it exact, with derivatives
-    up to order 3.
+    A closed form gives the root without derivatives. Newton's method then makes the root exact,
+    with derivatives up to order 3.
     """
     b0, b1, b2 = map(lax.stop_gradient, (a0, a1, a2))
     mean_root = -b2 / 3.0
@@ -129,15 +133,15 @@ def _solve_cubic_real_root(a0: Array, a1: Array, a2: Array) -> Array:
     has_three_real_roots = discriminant < 0.0
     # A single real root is the sum of two cube roots, computed without cancellation.
     larger_cube_root = jnp.cbrt(
-        -0.5 * q - jnp.where(q >= 0.0, 1.0, -1.0) * _safe_square_root(discriminant)
+        -0.5 * q - jnp.where(q >= 0.0, 1.0, -1.0) * _differentiable_square_root(discriminant)
     )
     unique_real_root = larger_cube_root - jnp.where(
         larger_cube_root == 0.0,
         0.0,
         p / (3.0 * jnp.where(larger_cube_root == 0, 1, larger_cube_root)),
     )
-    # Of three real roots, the extreme one on the isolated side is computed.
-    trigonometric_radius = 2.0 * _safe_square_root(-p / 3.0)
+    # If three roots are real, the extreme root on the isolated side is computed.
+    trigonometric_radius = 2.0 * _differentiable_square_root(-p / 3.0)
     root_cosine = -4.0 * q / jnp.where(trigonometric_radius == 0.0, 1.0, trigonometric_radius**3)
     extreme_root = trigonometric_radius * jnp.cos(
         jnp.arccos(jnp.clip(jnp.abs(root_cosine), 0.0, 1.0)) / 3.0
@@ -158,11 +162,12 @@ def _solve_cubic_real_root(a0: Array, a1: Array, a2: Array) -> Array:
     return z
 
 
-def _split_into_isolated_and_pair(matrix: RealMatrix) -> tuple[list[Array], _EigenvaluePair | None]:
-    """Return the isolated real eigenvalues of a small matrix, and the other two eigenvalues as a
-    pair.
-    """
-    coefficients = characteristic_polynomial(matrix)
+def _split_into_isolated_and_pair(
+    matrix: RealSquareMatrix,
+) -> tuple[list[Array], _EigenvaluePair | None]:
+    """Return the isolated real eigenvalues of a small matrix, and the remaining pair if there is
+    one."""
+    coefficients = compute_characteristic_polynomial(matrix)
     if len(coefficients) == 1:
         return [-coefficients[0]], None
     if len(coefficients) == 2:
@@ -176,12 +181,14 @@ def _split_into_isolated_and_pair(matrix: RealMatrix) -> tuple[list[Array], _Eig
 
 
 @jax.jit
-def floquet_multipliers(matrix: RealMatrix) -> Complex[Array, "... n"]:
-    """Return all eigenvalues, largest modulus first."""
+def floquet_multipliers(matrix: RealSquareMatrix) -> Complex[Array, "... n"]:
+    """Return all eigenvalues of a return map's Jacobian, the largest modulus first, shape (...,
+    n).
+    """
     if matrix.shape[-1] > MAX_CLOSED_FORM_SIZE:
         return _sort_eigenvalues_by_modulus(jnp.linalg.eigvals(matrix))
-    isolated_values, remaining_pair = _split_into_isolated_and_pair(matrix)
-    eigenvalues = [lax.complex(x, jnp.zeros_like(x)) for x in isolated_values]
+    isolated_eigenvalues, remaining_pair = _split_into_isolated_and_pair(matrix)
+    eigenvalues = [lax.complex(x, jnp.zeros_like(x)) for x in isolated_eigenvalues]
     if remaining_pair is not None:
         mean, real_offset, imaginary_offset = remaining_pair
         eigenvalues += [
@@ -191,24 +198,24 @@ def floquet_multipliers(matrix: RealMatrix) -> Complex[Array, "... n"]:
 
 
 def _sort_eigenvalues_by_modulus(eigenvalues: Array) -> Array:
-    """Return the eigenvalues sorted by modulus, the largest first."""
+    """Return the eigenvalues in the order of decreasing modulus."""
     eigenvalue_moduli = jnp.square(eigenvalues.real) + jnp.square(eigenvalues.imag)
     descending_order = jnp.argsort(-lax.stop_gradient(eigenvalue_moduli), axis=-1)
     return jnp.take_along_axis(eigenvalues, descending_order, -1)
 
 
 @jax.jit
-def compute_spectral_radius(matrix: RealMatrix) -> Float[Array, "..."]:
-    """Return the largest modulus of an eigenvalue.
+def compute_spectral_radius(matrix: RealSquareMatrix) -> Float[Array, "..."]:
+    """Return the largest modulus of the eigenvalues.
 
-    If two eigenvalues are equal, the derivative of the spectral radius is one-sided or zero.
+    If two eigenvalues are equal, the derivative is one-sided or zero.
     """
     if matrix.shape[-1] > MAX_CLOSED_FORM_SIZE:
         return jnp.abs(floquet_multipliers(matrix)[..., 0])
-    isolated_values, remaining_pair = _split_into_isolated_and_pair(matrix)
-    eigenvalue_moduli = [jnp.abs(x) for x in isolated_values]
+    isolated_eigenvalues, remaining_pair = _split_into_isolated_and_pair(matrix)
+    eigenvalue_moduli = [jnp.abs(x) for x in isolated_eigenvalues]
     if remaining_pair is not None:
-        max_real_modulus = jnp.abs(remaining_pair.mean) + remaining_pair.real_offset
+        max_real_modulus = jnp.abs(remaining_pair.pair_mean) + remaining_pair.real_offset
         eigenvalue_moduli.append(
             jnp.where(
                 remaining_pair.imaginary_offset > 0.0, remaining_pair.modulus, max_real_modulus
@@ -218,15 +225,14 @@ def compute_spectral_radius(matrix: RealMatrix) -> Float[Array, "..."]:
 
 
 @jax.jit
-def jury_margins(matrix: RealMatrix) -> Float[Array, "... n_margins"]:
-    """Return polynomials of the matrix that are all positive if and only if all multipliers are
-    stable.
+def compute_jury_margins(matrix: RealSquareMatrix) -> Float[Array, "... n_margins"]:
+    """Return the Jury margins, which are all positive if and only if all multipliers are stable.
 
-    The first vanishes at a fold (multiplier 1), the second at a period doubling (-1). The third,
-    for n > 1, vanishes if a pair crosses the unit circle. For n = 3 the fourth completes the
-    criterion.
+    The first margin vanishes at a fold (multiplier 1), and the second at a period doubling
+    (multiplier -1). For n > 1 the third margin vanishes if a pair crosses the unit circle. For n =
+    3 the fourth margin completes the criterion.
     """
-    polynomial_coefficients = characteristic_polynomial(matrix)
+    polynomial_coefficients = compute_characteristic_polynomial(matrix)
     if len(polynomial_coefficients) == 1:
         (a0,) = polynomial_coefficients
         return jnp.stack([1.0 + a0, 1.0 - a0], -1)
@@ -239,19 +245,23 @@ def jury_margins(matrix: RealMatrix) -> Float[Array, "... n_margins"]:
 
 
 @jax.jit
-def bifurcation_margins(matrix: RealMatrix) -> Float[Array, "... n_margins"]:
-    """Return the first three Jury margins (two for n = 1) of a matrix of any size.
+def compute_bifurcation_margins(matrix: RealSquareMatrix) -> Float[Array, "... n_margins"]:
+    """Return the margins to fold, period doubling and Neimark-Sacker bifurcation, for any matrix
+    size.
 
-    For large matrices they are det(1 - matrix), det(1 + matrix), and the product of 1 - z_i z_j
-    over all pairs of eigenvalues.
+    For small matrices these are the first Jury margins. For large matrices the margins are det(1 -
+    matrix), det(1 + matrix), and the product of 1 - z_i z_j over all pairs of eigenvalues. The
+    third margin is absent for n = 1.
     """
     n = matrix.shape[-1]
     if n <= MAX_CLOSED_FORM_SIZE:
-        return jury_margins(matrix)[..., :3]
+        return compute_jury_margins(matrix)[..., :3]
     identity, eigenvalues = jnp.eye(n, dtype=matrix.dtype), floquet_multipliers(matrix)
-    first_indices, second_indices = np.triu_indices(n, 1)
+    first_eigenvalue_indices, second_eigenvalue_indices = np.triu_indices(n, 1)
     eigenvalue_products = jnp.prod(
-        1.0 - eigenvalues[..., first_indices] * eigenvalues[..., second_indices], axis=-1
+        1.0
+        - eigenvalues[..., first_eigenvalue_indices] * eigenvalues[..., second_eigenvalue_indices],
+        axis=-1,
     ).real
     return jnp.stack(
         [jnp.linalg.det(identity - matrix), jnp.linalg.det(identity + matrix), eigenvalue_products],
@@ -260,38 +270,41 @@ def bifurcation_margins(matrix: RealMatrix) -> Float[Array, "... n_margins"]:
 
 
 @jax.jit
-def stability_margin(matrix: RealMatrix) -> Float[Array, "..."]:
-    """Return a smooth minimum of the Jury margins, which is never above the smallest one.
+def compute_stability_margin(matrix: RealSquareMatrix) -> Float[Array, "..."]:
+    """Return a smooth minimum of the Jury margins, which is at most their exact minimum.
 
-    A positive value means that the gait is stable.
+    A positive result implies that the gait is stable.
     """
-    jury_margin_values = SMOOTH_MIN_SHARPNESS * jury_margins(matrix)
-    lowest_margin = lax.stop_gradient(jnp.min(jury_margin_values, -1))
-    scaled_excess = jnp.sum(jnp.exp(lowest_margin[..., None] - jury_margin_values), -1)
-    return (lowest_margin - jnp.log(scaled_excess)) / SMOOTH_MIN_SHARPNESS
+    jury_margin_values = SMOOTH_MIN_SHARPNESS * compute_jury_margins(matrix)
+    lowest_jury_margin = lax.stop_gradient(jnp.min(jury_margin_values, -1))
+    scaled_excess = jnp.sum(jnp.exp(lowest_jury_margin[..., None] - jury_margin_values), -1)
+    return (lowest_jury_margin - jnp.log(scaled_excess)) / SMOOTH_MIN_SHARPNESS
 
 
 @jax.jit
-def has_double_multiplier(matrix: RealMatrix, tolerance: float = 1e-6) -> Bool[Array, "..."]:
-    """Return whether the two largest moduli agree within `tolerance`, so that the spectral radius
-    has a kink.
+def has_double_multiplier(
+    matrix: RealSquareMatrix, modulus_tolerance: float = 1e-6
+) -> Bool[Array, "..."]:
+    """Return whether the two largest moduli are equal within `modulus_tolerance`.
 
-    The moduli of a complex pair always agree and are smooth, so that a pair counts only if it is
-    about to become real.
+    The spectral radius then has a kink. A complex pair has equal moduli that are smooth, so a pair
+    counts only if it is about to become real.
     """
-    isolated_values, remaining_pair = _split_into_isolated_and_pair(matrix)
+    isolated_eigenvalues, remaining_pair = _split_into_isolated_and_pair(matrix)
     if remaining_pair is None:
         return jnp.zeros(matrix.shape[:-2], bool)
     mean, real_offset, imaginary_offset = remaining_pair
-    real_eigenvalues = [*isolated_values, mean + real_offset, mean - real_offset]
+    real_eigenvalues = [*isolated_eigenvalues, mean + real_offset, mean - real_offset]
     is_complex_pair = imaginary_offset > 0.0
     eigenvalue_moduli = jnp.sort(jnp.abs(jnp.stack(real_eigenvalues, -1)), -1)
-    has_equal_real_moduli = eigenvalue_moduli[..., -1] - eigenvalue_moduli[..., -2] <= tolerance
-    has_equal_moduli = jnp.where(
-        is_complex_pair, imaginary_offset <= tolerance, has_equal_real_moduli
+    has_equal_real_moduli = (
+        eigenvalue_moduli[..., -1] - eigenvalue_moduli[..., -2] <= modulus_tolerance
     )
-    for x in isolated_values:
+    has_equal_moduli = jnp.where(
+        is_complex_pair, imaginary_offset <= modulus_tolerance, has_equal_real_moduli
+    )
+    for x in isolated_eigenvalues:
         has_equal_moduli = has_equal_moduli | (
-            is_complex_pair & (jnp.abs(jnp.abs(x) - remaining_pair.modulus) <= tolerance)
+            is_complex_pair & (jnp.abs(jnp.abs(x) - remaining_pair.modulus) <= modulus_tolerance)
         )
     return has_equal_moduli

@@ -1,6 +1,6 @@
 """Sign changes of quantities along a branch, and their exact locations.
 
-All brackets are searched in one batch: each round has one evaluation, whatever their number.
+All brackets are searched in one batch, with one evaluation per round for all of them.
 """
 
 from collections.abc import Callable
@@ -13,38 +13,39 @@ import numpy as np
 from vrw_jax.continuation.floquet import (
     MULTIPLIER_TOLERANCES,
     MultiplierTolerances,
-    bifurcation_margins,
+    compute_bifurcation_margins,
     floquet_multipliers,
 )
 
 BIFURCATION_NAMES = ("fold", "period_doubling", "neimark_sacker")
-"""Names of the bifurcations: a multiplier is 1, one is -1, or a pair has modulus 1."""
+"""Names of the bifurcations, at which a multiplier is 1, a multiplier is -1, or a pair has modulus
+1."""
 
 
 @dataclass(frozen=True)
 class ZeroSearchOptions:
-    """Options of the search for zeros by `locate_zeros`.
+    """Numerical options of `locate_function_zeros`.
 
-    - `max_smooth_rounds`: limit of rounds to locate a smooth zero, after which an unresolved
-      bracket counts as a jump;
-    - `n_sections`: number of equal sections into which a bracket with a jump is divided per round.
+    - `max_smooth_rounds`: number of rounds after which an unresolved bracket counts as a jump;
+    - `n_sections_per_jump_bracket`: number of equal sections into which a round divides a bracket
+      with a jump.
     """
 
     max_smooth_rounds: int = 12
-    n_sections: int = 9
+    n_sections_per_jump_bracket: int = 9
 
 
 ZERO_SEARCH_OPTIONS = ZeroSearchOptions()
-"""Options of all searches for zeros."""
+"""Default options of `locate_function_zeros`."""
 
 
 def evaluate_bifurcation_functions(jacobians: np.ndarray) -> np.ndarray:
-    """Return the test functions of `BIFURCATION_NAMES` on the last axis.
+    """Return the values of the test functions of `BIFURCATION_NAMES`, shape (..., 3).
 
-    `jacobians` have the shape (..., n, n). A function is NaN if matrices of this size cannot have
-    its bifurcation.
+    `jacobians` has the shape (..., n, n). A value is NaN if matrices of size n cannot have the
+    bifurcation.
     """
-    bifurcation_margin_values = np.asarray(bifurcation_margins(jnp.asarray(jacobians)))
+    bifurcation_margin_values = np.asarray(compute_bifurcation_margins(jnp.asarray(jacobians)))
     bifurcation_values = np.full(
         (*bifurcation_margin_values.shape[:-1], len(BIFURCATION_NAMES)), np.nan
     )
@@ -54,32 +55,35 @@ def evaluate_bifurcation_functions(jacobians: np.ndarray) -> np.ndarray:
 
 
 def has_unit_circle_pair(
-    jacobian: np.ndarray, tolerances: MultiplierTolerances = MULTIPLIER_TOLERANCES
+    jacobian: np.ndarray, multiplier_tolerances: MultiplierTolerances = MULTIPLIER_TOLERANCES
 ) -> bool:
     """Return whether a complex pair of multipliers lies on the unit circle.
 
-    The product of two multipliers is also 1 if they are real and reciprocal, which is no
-    bifurcation.
+    The test function of the Neimark-Sacker bifurcation also vanishes for two real reciprocal
+    multipliers, which are no bifurcation.
     """
     multipliers = np.asarray(floquet_multipliers(jnp.asarray(jacobian)))
-    is_complex_pair = np.abs(multipliers.imag) > tolerances.min_imaginary
-    is_on_circle = np.abs(np.abs(multipliers) - 1.0) < tolerances.located_on_circle
+    is_complex_pair = np.abs(multipliers.imag) > multiplier_tolerances.min_imaginary_part
+    is_on_circle = (
+        np.abs(np.abs(multipliers) - 1.0) < multiplier_tolerances.located_pair_circle_distance
+    )
     return bool(np.any(is_on_circle & is_complex_pair))
 
 
 class QuantitySignChange(NamedTuple):
-    """A sign change of the quantity with index `quantity_index` between two points of a branch."""
+    """Sign change of one quantity between two points of a branch, given by three indices."""
 
-    left_index: int
-    right_index: int
+    left_point_index: int
+    right_point_index: int
     quantity_index: int
 
 
 def find_sign_changes(quantity_values: np.ndarray) -> list[QuantitySignChange]:
-    """Return the sign changes between neighboring points, from an array (point, quantity).
+    """Return the sign changes between neighboring points, from values of shape (points,
+    quantities).
 
-    NaN and zero have no sign. Two changes between neighboring points are not detected, so the
-    continuation step must be short enough.
+    NaN and zero have no sign. Two sign changes between neighboring points cancel and are not
+    detected.
     """
     quantity_signs = np.sign(np.nan_to_num(quantity_values))
     signed_points = np.argwhere(quantity_signs[:-1] * quantity_signs[1:] < 0.0)
@@ -90,28 +94,29 @@ def find_sign_changes(quantity_values: np.ndarray) -> list[QuantitySignChange]:
 
 
 class ZeroLocations(NamedTuple):
-    """Locations of sign changes in [0, 1], one per bracket."""
+    """Locations of zeros in [0, 1] and the brackets that enclose them, each of shape
+    (brackets,).
+    """
 
-    best_locations: np.ndarray  # location of the end with the smaller value
-    left_bracket_ends: np.ndarray  # end with the sign at location 0
-    right_bracket_ends: np.ndarray  # end with the sign at location 1
+    best_locations: np.ndarray  # bracket end with the smaller absolute value
+    left_bracket_ends: np.ndarray  # bracket end with the sign of location 0
+    right_bracket_ends: np.ndarray  # bracket end with the sign of location 1
 
 
-def locate_zeros(
+def locate_function_zeros(
     function: Callable[[np.ndarray, np.ndarray], np.ndarray],
     end_values: tuple[np.ndarray, np.ndarray],
     max_bracket_width: np.ndarray,
     options: ZeroSearchOptions = ZERO_SEARCH_OPTIONS,
 ) -> ZeroLocations:
-    """Return the locations of zeros of functions with opposite signs at 0 and 1, by Chandrupatla's
-    method.
+    """Return the zeros of functions that have opposite signs at 0 and 1, by Chandrupatla's method.
 
-    `function` takes locations and the indices of their brackets. `end_values` are the values of the
-    function at 0 and 1. A round uses inverse quadratic interpolation if it is reliable, and
-    otherwise bisection. A bracket in which the function jumps or stalls is divided into several
-    sections per round, so that a jump is located as reliably as a smooth zero. The search ends when
-    each bracket is narrower than `max_bracket_width`, or at an exact zero. A location where the
-    function is NaN counts to the side of 1.
+    `function` maps locations and the indices of their brackets to function values. `end_values` are
+    the function values at 0 and 1. A round uses inverse quadratic interpolation if it is reliable,
+    and bisection otherwise. A bracket in which the function jumps or stalls is divided into several
+    sections per round. A jump is therefore located as reliably as a smooth zero. The search ends
+    when every bracket is narrower than `max_bracket_width` or has an exact zero. A location at
+    which the function is NaN gets the sign of location 1.
     """
     values_at_zero, values_at_one = end_values
     # The rows are the newest location, the end with the other sign, and the location replaced by
@@ -121,7 +126,7 @@ def locate_zeros(
     is_sign_jump, n_rounds, n_sections = (
         np.zeros(len(max_bracket_width), bool),
         0,
-        options.n_sections,
+        options.n_sections_per_jump_bracket,
     )
     while len(
         unresolved_indices := np.flatnonzero(
@@ -135,8 +140,8 @@ def locate_zeros(
             function_values[:, smooth_brackets],
             max_bracket_width[smooth_brackets],
         )
-        lower_ends, upper_ends = np.sort(locations[:2, jump_brackets], 0)
-        section_ends = np.linspace(lower_ends, upper_ends, n_sections + 1, axis=-1)
+        bracket_lower_ends, bracket_upper_ends = np.sort(locations[:2, jump_brackets], 0)
+        section_ends = np.linspace(bracket_lower_ends, bracket_upper_ends, n_sections + 1, axis=-1)
         bracket_indices = np.concatenate(
             [smooth_brackets, np.repeat(jump_brackets, n_sections - 1)]
         )
@@ -164,7 +169,7 @@ def locate_zeros(
             proposal_values == 0.0
         ]
         is_left_side = np.sign(section_values) != np.sign(values_at_one[jump_brackets])[:, None]
-        # The last location on the side of 0 precedes the first one on the side of 1.
+        # The zero lies between the last location with the sign of 0 and the next location.
         last_left_index = np.sum(np.cumprod(is_left_side, 1), 1)
         locations[:2, jump_brackets] = section_ends[
             np.arange(len(jump_brackets)), np.stack([last_left_index, last_left_index + 1])
@@ -188,7 +193,7 @@ def locate_zeros(
 def _propose_zero_location(
     bracket_locations: np.ndarray, function_values: np.ndarray, max_bracket_width: np.ndarray
 ) -> np.ndarray:
-    """Return the next locations of Chandrupatla's method (1997, doi 10/d9zjj8)."""
+    """Return the next location in each bracket by Chandrupatla's method (1997, doi 10/d9zjj8)."""
     with np.errstate(divide="ignore", invalid="ignore"):
         location_ratio, value_ratio = (
             (bracket_locations[0] - bracket_locations[1])

@@ -1,8 +1,8 @@
-"""Curves in two parameters on which a test function of fixed points is zero, for `arclength`.
+"""Curves in two parameters on which a test function of fixed points is zero.
 
-The second parameter is added to the unknowns of Newton's method, and the test function to its
-equations. A curve is then a branch along the first parameter, which turns back as branches do at
-folds.
+Newton's method has the second parameter as an additional unknown, and the test function as an
+additional equation. A curve is then continued by `arclength` along the first parameter. It may turn
+back as a branch does at a fold.
 """
 
 import abc
@@ -17,47 +17,47 @@ from vrw_jax.continuation.arclength import (
     AbstractContinuationProblem,
     NewtonStep,
     ProblemUnknowns,
-    SectionVector,
+    SectionStateVector,
 )
-from vrw_jax.continuation.floquet import bifurcation_margins
+from vrw_jax.continuation.floquet import compute_bifurcation_margins
 from vrw_jax.numerics import Elementwise, Scalar
 
 ParameterPair = Float[Array, "2"]
-"""Values of the two parameters."""
+"""Values of the first and the second parameter."""
 
 
 class TestFunctionNewtonStep(NamedTuple):
-    """Newton step at a trial (z, p), and the test function whose zero is continued."""
+    """Newton step at a trial (z, p), and the test function whose zeros are continued."""
 
-    correction: ProblemUnknowns  # correction of z at fixed p
-    # dz/dp along the curve of fixed points, for both parameters
-    tangents: tuple[ProblemUnknowns, ProblemUnknowns]
-    jacobian: Float[Array, "n n"]  # Jacobian of the return map
-    value: Scalar  # value of the test function at the corrected z
-    # derivatives of the value with respect to p along the fixed points
+    newton_correction: ProblemUnknowns  # of z at fixed p
+    # derivatives dz/dp of the fixed point with respect to both parameters
+    tangents_by_parameter: tuple[ProblemUnknowns, ProblemUnknowns]
+    return_map_jacobian: Float[Array, "n n"]  # Jacobian of the return map
+    test_function_value: Scalar  # at the corrected z
+    # total derivatives of the test function with respect to both parameters
     parameter_gradient: ParameterPair
 
 
 class AbstractTestFunction(eqx.Module):
     """Base class of test functions of fixed points in two parameters.
 
-    `args` is a pytree with all other inputs.
+    The argument `args` of each method is a pytree of all inputs except z and p.
     """
 
     @abc.abstractmethod
     def linearize(self, args: Any, z: ProblemUnknowns, p: ParameterPair) -> TestFunctionNewtonStep:
-        """Return the Newton step; it is not finite if the map is undefined at (z, p)."""
+        """Return the Newton step at (z, p), not finite if the map is undefined there."""
 
     @abc.abstractmethod
-    def section_state(self, z: ProblemUnknowns) -> SectionVector:
-        """Return the section state, which is a part of z."""
+    def section_state(self, z: ProblemUnknowns) -> SectionStateVector:
+        """Return the section state, which is a part of the unknowns z."""
 
     def correction_norm(self, z: ProblemUnknowns, correction: ProblemUnknowns) -> Scalar:
-        """Return the norm of a correction, which is compared with the tolerance."""
+        """Return the norm of a Newton correction, which is compared with the tolerance."""
         return jnp.max(jnp.abs(correction))
 
     def is_admissible(self, args: Any, z: ProblemUnknowns, p: ParameterPair) -> Bool[Array, ""]:
-        """Return whether a converged z satisfies the conditions of its branch."""
+        """Return whether converged unknowns z satisfy the conditions of their branch."""
         return jnp.all(jnp.isfinite(self.section_state(z)))
 
 
@@ -65,76 +65,79 @@ class TestFunctionPoint(NamedTuple):
     """Unknowns of a point of the curve: those of the fixed point, and the second parameter."""
 
     z: ProblemUnknowns
-    fraction: Elementwise  # second parameter as a fraction of its range
+    second_parameter_fraction: Elementwise  # of the second parameter's range
 
 
 class TestFunctionCurve(AbstractContinuationProblem):
-    """Curve on which a test function is zero, continued along the first of its two parameters.
+    """Continuation problem of the curve on which a test function of two parameters is zero.
 
-    Arc lengths include the second parameter as a fraction of its range. The curve ends if this
-    fraction leaves [0, 1].
+    The curve is continued along the first parameter. Arc lengths include the second parameter as a
+    fraction of its range. The curve ends when this fraction leaves [0, 1].
     """
 
     test_function: AbstractTestFunction
-    bounds: tuple[float, float] = eqx.field(static=True)  # bounds of the second parameter
+    second_parameter_bounds: tuple[float, float] = eqx.field(static=True)  # lower and upper bound
 
     has_multipliers: ClassVar[bool] = False
 
-    def second_parameter(self, z: TestFunctionPoint) -> Elementwise:
+    def compute_second_parameter(self, z: TestFunctionPoint) -> Elementwise:
         """Return the second parameter at a point of the curve."""
-        lower_bound, upper_bound = self.bounds
-        return lower_bound + (upper_bound - lower_bound) * z.fraction
+        lower_bound, upper_bound = self.second_parameter_bounds
+        return lower_bound + (upper_bound - lower_bound) * z.second_parameter_fraction
 
     def linearize(self, args: Any, z: TestFunctionPoint, p: Scalar) -> NewtonStep:
-        parameter_range = self.bounds[1] - self.bounds[0]
+        parameter_range = self.second_parameter_bounds[1] - self.second_parameter_bounds[0]
         newton_step = self.test_function.linearize(
-            args, z.z, jnp.stack([p, self.second_parameter(z)])
+            args, z.z, jnp.stack([p, self.compute_second_parameter(z)])
         )
         derivative_by_first_parameter = newton_step.parameter_gradient[0]
         derivative_by_fraction = parameter_range * newton_step.parameter_gradient[1]
-        fraction_change = -newton_step.value / derivative_by_fraction
+        fraction_change = -newton_step.test_function_value / derivative_by_fraction
         fraction_tangent = -derivative_by_first_parameter / derivative_by_fraction
-        first_tangent, second_tangent = newton_step.tangents
+        first_tangent, second_tangent = newton_step.tangents_by_parameter
         add_second_tangent = lambda parameter_change: (
             lambda first_leaf, second_leaf: (
                 first_leaf + parameter_range * parameter_change * second_leaf
             )
         )
         correction = jax.tree.map(
-            add_second_tangent(fraction_change), newton_step.correction, second_tangent
+            add_second_tangent(fraction_change), newton_step.newton_correction, second_tangent
         )
         tangent = jax.tree.map(add_second_tangent(fraction_tangent), first_tangent, second_tangent)
-        # A zero multiplier is added for the fraction; it has no effect.
-        jacobian = jnp.pad(newton_step.jacobian, (0, 1))
+        # The fraction adds a multiplier of zero, which has no effect.
+        jacobian = jnp.pad(newton_step.return_map_jacobian, (0, 1))
         return NewtonStep(
             TestFunctionPoint(correction, fraction_change),
             TestFunctionPoint(tangent, fraction_tangent),
             jacobian,
         )
 
-    def section_state(self, z: TestFunctionPoint) -> SectionVector:
-        return jnp.append(self.test_function.section_state(z.z), z.fraction)
+    def section_state(self, z: TestFunctionPoint) -> SectionStateVector:
+        return jnp.append(self.test_function.section_state(z.z), z.second_parameter_fraction)
 
     def correction_norm(self, z: TestFunctionPoint, correction: TestFunctionPoint) -> Scalar:
         return jnp.maximum(
-            self.test_function.correction_norm(z.z, correction.z), jnp.abs(correction.fraction)
+            self.test_function.correction_norm(z.z, correction.z),
+            jnp.abs(correction.second_parameter_fraction),
         )
 
     def is_admissible(self, args: Any, z: TestFunctionPoint, p: Scalar) -> Bool[Array, ""]:
-        is_inside_parameter_range = (z.fraction >= 0.0) & (z.fraction <= 1.0)
+        is_inside_parameter_range = (z.second_parameter_fraction >= 0.0) & (
+            z.second_parameter_fraction <= 1.0
+        )
         return is_inside_parameter_range & self.test_function.is_admissible(
-            args, z.z, jnp.stack([p, self.second_parameter(z)])
+            args, z.z, jnp.stack([p, self.compute_second_parameter(z)])
         )
 
 
 JURY_MARGIN_OFFSET = 1e-6
 """Value of the fold's margin on the curve that represents the fold.
 
-It is chosen above zero because the equations are singular at the fold itself. The parameters turn
-at the fold, so their error is the square of this value.
+The value is above zero, because the equations are singular at the fold. It is small, because the
+error of the parameters is the square of the value.
 """
 
 
-def offset_bifurcation_margins(jacobian: Float[Array, "n n"]) -> Array:
-    """Return the bifurcation margins, each zero where one of `BIFURCATION_NAMES` occurs."""
-    return bifurcation_margins(jacobian).at[0].add(-JURY_MARGIN_OFFSET)
+def compute_offset_bifurcation_margins(jacobian: Float[Array, "n n"]) -> Array:
+    """Return the bifurcation margins, where that of the fold is reduced by `JURY_MARGIN_OFFSET`."""
+    return compute_bifurcation_margins(jacobian).at[0].add(-JURY_MARGIN_OFFSET)

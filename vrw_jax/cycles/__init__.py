@@ -1,4 +1,4 @@
-"""Limit cycles: finders, admissibility checks and derivatives for each model."""
+"""Limit cycles of each model: finders, admissibility checks and derivatives."""
 
 from vrw_jax.cycles import (
     collocation_search,
@@ -15,7 +15,7 @@ from vrw_jax.cycles.collocation_search import (
     compute_correction_norm,
     init_search_flags,
 )
-from vrw_jax.cycles.cycle import CYCLE_MEASURE_FUNCTIONS, AbstractCycle, format_multipliers
+from vrw_jax.cycles.cycle import CYCLE_MEASURE_FUNCTIONS, AbstractCycle, format_floquet_multipliers
 from vrw_jax.cycles.derivatives import compile_batch_function
 from vrw_jax.cycles.finder import (
     STATE_AGREEMENT_TOLERANCE,
@@ -28,7 +28,7 @@ from vrw_jax.cycles.finder import (
     is_same_branch,
 )
 from vrw_jax.cycles.finder_selection import (
-    CycleGuess,
+    UserCycleGuess,
     make_finder,
     resolve_finder,
     resolve_model,

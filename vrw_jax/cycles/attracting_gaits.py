@@ -1,4 +1,4 @@
-"""Attracting gaits of a wheel, found by walks from fixed starts and refined by Newton's method."""
+"""Attracting gaits of wheels, found by walks from fixed starts and refined by Newton's method."""
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -20,14 +20,14 @@ from vrw_jax.runtime import with_default_jax_settings
 from vrw_jax.wheel import Outcome, WheelParams
 
 DUPLICATE_GAIT_DISTANCE = 1e-5
-"""Distance of section states, in units of the wheel, below which two gaits are considered equal."""
+"""Distance of section states, in units of the wheel, below which two gaits count as equal."""
 
 
 def find_attracting_gaits(gait_finder: Any, parameter_values: Any) -> tuple[np.ndarray, Any]:
     """Return the attracting gaits of each wheel, slowest first.
 
-    Walks begin at WALK_STARTS. If none of them leads to a gait, walks also begin at
-    FALLBACK_WALK_STARTS. A wheel without an attracting gait gets one entry whose outcome is a
+    Walks begin at WALK_STARTS. For a wheel without a gait from these starts, walks also begin at
+    FALLBACK_WALK_STARTS. A wheel without an attracting gait has one cycle, whose outcome is a
     failure.
 
     Args:
@@ -36,27 +36,27 @@ def find_attracting_gaits(gait_finder: Any, parameter_values: Any) -> tuple[np.n
             `AbstractWheel.parameter_values`.
 
     Returns:
-        Index of the wheel of each gait, (gaits,), and a cycle with that leading axis.
+        Index of the wheel of each gait, (gaits,), and cycles with the leading axis (gaits,).
     """
     parameter_values = np.asarray(parameter_values)
-    gait_wheel_indices, gaits = _find_gaits_from_starts(
+    gait_wheel_indices, gaits_from_first_starts = _find_gaits_from_starts(
         gait_finder, parameter_values, compute_walk_starts
     )
-    is_gait_missing = np.asarray(gaits.outcome) != Outcome.STEPPED
+    is_gait_missing = np.asarray(gaits_from_first_starts.outcome) != Outcome.STEPPED
     missing_wheels = gait_wheel_indices[is_gait_missing]
     if not len(missing_wheels):
-        return gait_wheel_indices, gaits
+        return gait_wheel_indices, gaits_from_first_starts
     fallback_wheel_indices, fallback_gaits = _find_gaits_from_starts(
         gait_finder, parameter_values[missing_wheels], compute_fallback_walk_starts
     )
     is_fallback_found = np.asarray(fallback_gaits.outcome) == Outcome.STEPPED
-    found_wheels = missing_wheels[fallback_wheel_indices[is_fallback_found]]
-    keeps_first_gaits = ~np.isin(gait_wheel_indices, found_wheels)
+    wheels_with_gait = missing_wheels[fallback_wheel_indices[is_fallback_found]]
+    keeps_first_gaits = ~np.isin(gait_wheel_indices, wheels_with_gait)
     all_gaits = concatenate_tree_rows(
-        select_tree_rows(gaits, keeps_first_gaits),
+        select_tree_rows(gaits_from_first_starts, keeps_first_gaits),
         select_tree_rows(fallback_gaits, is_fallback_found),
     )
-    gait_wheel_indices = np.concatenate([gait_wheel_indices[keeps_first_gaits], found_wheels])
+    gait_wheel_indices = np.concatenate([gait_wheel_indices[keeps_first_gaits], wheels_with_gait])
     gait_order = np.argsort(gait_wheel_indices, kind="stable")
     return gait_wheel_indices[gait_order], jax.device_put(select_tree_rows(all_gaits, gait_order))
 
@@ -64,11 +64,12 @@ def find_attracting_gaits(gait_finder: Any, parameter_values: Any) -> tuple[np.n
 def _find_gaits_from_starts(
     gait_finder: Any,
     parameter_values: np.ndarray,
-    compute_starts: Callable[[WheelParams], np.ndarray],
+    compute_start_states: Callable[[WheelParams], np.ndarray],
 ) -> tuple[np.ndarray, Any]:
-    """Return the attracting gaits that walks from given starts reach, and the wheel of each gait.
+    """Return the index of the wheel of each attracting gait, and the gaits that walks reach.
 
-    The gaits of a wheel are ordered by speed, slowest first.
+    The walks begin at the states that `compute_start_states` returns. The gaits of a wheel are
+    ordered by speed, slowest first.
     """
     n_wheels = len(parameter_values)
     with ThreadPoolExecutor(1) as compile_thread:
@@ -76,17 +77,17 @@ def _find_gaits_from_starts(
             with_default_jax_settings(gait_finder.precompile_newton_programs), parameter_values[:1]
         )
         candidate_wheel_indices, walk_states, _ = walk_to_gaits(
-            gait_finder, parameter_values, compute_starts
+            gait_finder, parameter_values, compute_start_states
         )
     candidate_gaits = gait_finder.find_cycles_near(
         parameter_values[candidate_wheel_indices], walk_states
     )
-    # NumPy is used because JAX compiles each operation for every number of wheels.
+    # NumPy is used, because JAX would compile each operation for every number of wheels.
     is_attracting = np.abs(np.linalg.eigvals(candidate_gaits.monodromy_value)).max(-1) < 1.0
     is_gait_valid = (np.asarray(candidate_gaits.outcome) == Outcome.STEPPED) & is_attracting
     step_end_states = np.asarray(
         candidate_gaits.steps.section_state
-    )  # section states of every step
+    )  # section states at the ends of all steps
     sum_over_steps = lambda walk_states: (
         np.asarray(walk_states).reshape(len(candidate_wheel_indices), -1).sum(-1)
     )
@@ -99,7 +100,7 @@ def _find_gaits_from_starts(
     scaled_step_ends = (step_end_states / section_units[:, None])[
         :, :, : count_section_coordinates(gait_finder)
     ]
-    # A gait that repeats after fewer steps has a shorter period.
+    # A gait that repeats after fewer steps is a gait of a shorter period.
     distances_to_last_step = np.abs(scaled_step_ends[:, :-1] - scaled_step_ends[:, -1:]).max(-1)
     is_gait_valid &= ~(distances_to_last_step < DUPLICATE_GAIT_DISTANCE).any(1)
     selected_indices: list[int] = []
@@ -119,31 +120,36 @@ def _find_gaits_from_starts(
                 < DUPLICATE_GAIT_DISTANCE
                 for selected_index in selected_indices[n_selected_before:]
             )
-            if not any(step_match.any() for step_match in step_matches):
+            if not any(matching_step_flags.any() for matching_step_flags in step_matches):
                 selected_indices.append(int(candidate_index))
         selected_indices += (
             [] if len(selected_indices) > n_selected_before else [int(candidate_indices[0])]
         )
-    # A wheel without a valid candidate gets a cycle that is marked as not found, with zeros.
+    # The cycle of a wheel without a valid candidate contains zeros and counts as not found.
     selected_gaits = select_tree_rows(candidate_gaits, selected_indices)
     is_missing = ~is_gait_valid[selected_indices]
-    broadcast_mask = lambda leaf: is_missing.reshape(-1, *[1] * (leaf.ndim - 1))
+    broadcast_mask = lambda gait_array: is_missing.reshape(-1, *[1] * (gait_array.ndim - 1))
     masked_gaits = jax.tree.map(
-        lambda leaf: np.where(broadcast_mask(leaf), np.zeros_like(leaf), leaf), selected_gaits
+        lambda gait_array: np.where(
+            broadcast_mask(gait_array), np.zeros_like(gait_array), gait_array
+        ),
+        selected_gaits,
     )
     outcome_codes = np.where(
         selected_gaits.outcome == Outcome.STEPPED, Outcome.NO_CYCLE_FOUND, selected_gaits.outcome
     )
     outcome_codes = np.where(is_missing, outcome_codes, selected_gaits.outcome).astype(np.int32)
-    masked_gaits = eqx.tree_at(lambda gaits: gaits.outcome, masked_gaits, outcome_codes)
+    masked_gaits = eqx.tree_at(
+        lambda gaits_of_candidates: gaits_of_candidates.outcome, masked_gaits, outcome_codes
+    )
     return candidate_wheel_indices[selected_indices], jax.device_put(masked_gaits)
 
 
 def find_slow_gaits(gait_finder: Any, parameter_values: Any) -> Any:
     """Return for each wheel the gait that a walk from a slow start reaches.
 
-    If that walk reaches none, return the slowest attracting gait. For 1,200 random wheels, the
-    result is the slowest attracting gait of each.
+    If the walk reaches no gait, the slowest attracting gait is returned. For 1,200 random wheels,
+    both gaits are the same.
     """
     parameter_values = np.asarray(parameter_values)
     compute_slow_start = lambda params: compute_walk_starts(params)[:1]
@@ -164,5 +170,5 @@ def find_slow_gaits(gait_finder: Any, parameter_values: Any) -> Any:
 
 
 def find_slowest_gait_indices(gait_wheel_indices: np.ndarray, n_wheels: int) -> np.ndarray:
-    """Return the index of each wheel's slowest gait, which is its first one, shape (wheels,)."""
+    """Return the index of each wheel's first gait, which is its slowest one, shape (wheels,)."""
     return np.searchsorted(gait_wheel_indices, np.arange(n_wheels))

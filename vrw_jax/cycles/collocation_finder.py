@@ -1,4 +1,4 @@
-"""Finder of the paper's gaits, which solves one algebraic system and checks it by one step."""
+"""Finder of the paper's gaits by collocation, with a check by one event-driven step."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -14,23 +14,23 @@ from jaxtyping import Array
 from vrw_jax.cycles.collocation_search import (
     CollocationState,
     CollocationSystem,
-    predict_start_from_surface,
+    predict_start_from_gait_surface,
 )
 from vrw_jax.cycles.cycle import CYCLE_MEASURE_FUNCTIONS, AbstractCycle
 from vrw_jax.cycles.finder import (
     AbstractGaitFinder,
-    BranchPoint,
     Gait,
+    GaitBranchPoint,
     GaitMeasures,
     ParameterValues,
-    measure_on_cycle,
-    measure_on_gait,
+    compute_cycle_measures,
+    compute_gait_measures,
     move_derivative_axis_first,
 )
 from vrw_jax.cycles.limit_cycle_result import (
     LimitCycle,
-    guess_from_walk,
-    sample_walk,
+    guess_cycle_from_walk,
+    sample_walk_in_time,
     solve_limit_cycle,
     transfer_solution_to_mesh,
 )
@@ -57,9 +57,9 @@ from vrw_jax.wheel import (
 
 
 class CollocationFinder(AbstractGaitFinder):
-    """Finder of limit cycles that needs no start.
+    """Finder of the paper's limit cycles, which needs no start.
 
-    `period_n` applies to `find_cycle` alone.
+    `period_n` applies only to `find_cycle`.
     """
 
     model: ViscoelasticWheel
@@ -101,31 +101,35 @@ class CollocationFinder(AbstractGaitFinder):
         return self.cycle_options
 
     @property
-    def system(self) -> CollocationSystem:
-        """Return the collocation system that the search solves."""
+    def collocation_system(self) -> CollocationSystem:
+        """Return the collocation system of the search."""
         return CollocationSystem(
             self.n_legs, self.period_n, self.cycle_options, self.model.stop_at_lift_off
         )
 
     def with_finer_mesh(self) -> "CollocationFinder":
-        """Return this finder with a finer mesh of each phase."""
+        """Return a finder with a finer mesh of each phase."""
         return dataclasses.replace(self, cycle_options=self.cycle_options.refine_mesh())
 
     @classmethod
-    def read_measure(cls, name: str, cycle: AbstractCycle, step: AbstractStep) -> Array:
+    def read_measure(cls, measure_name: str, cycle: AbstractCycle, step: AbstractStep) -> Array:
         """Return a measure of a gait by name.
 
-        At a scuffing take-off the clearance in SLS-I would jump, so the clearance in SLS-II is
-        returned. Callers must check `takeoff_acceleration` too.
+        At a scuffing take-off the clearance in SLS-I jumps, and the clearance in SLS-II is returned
+        instead. Callers must therefore also check `takeoff_acceleration`.
         """
-        value = cycle.measure(name) if name in cls.cycle_measures else step.measures()[name]
-        if name == "clearance_sls1":
+        measure_value = (
+            cycle.measure(measure_name)
+            if measure_name in cls.cycle_measures
+            else step.measures()[measure_name]
+        )
+        if measure_name == "clearance_sls1":
             is_scuffing = cycle.measure("takeoff_acceleration") < 0.0
-            return jnp.where(is_scuffing, step.measures()["clearance_sls2"], value)
-        return value
+            return jnp.where(is_scuffing, step.measures()["clearance_sls2"], measure_value)
+        return measure_value
 
     def find_cycle(self, params: WheelParams, search_guess: Any = None) -> LimitCycle:
-        if isinstance(search_guess, LimitCycle) and search_guess.system == self.system:
+        if isinstance(search_guess, LimitCycle) and search_guess.system == self.collocation_system:
             search_guess = search_guess.collocation_state
         elif search_guess is not None and not isinstance(search_guess, CollocationState):
             section_state = (
@@ -133,29 +137,32 @@ class CollocationFinder(AbstractGaitFinder):
                 if isinstance(search_guess, AbstractCycle)
                 else search_guess
             )
-            params, state, _, _ = validate_arguments(params, section_state, None, None)
-            search_guess = self.guess_from_state(*lax.stop_gradient((params, state)))
+            params, collocation_state, _, _ = validate_arguments(params, section_state, None, None)
+            search_guess = self.guess_cycle_from_state(
+                *lax.stop_gradient((params, collocation_state))
+            )
         return dataclasses.replace(
-            solve_limit_cycle(params, self.system, search_guess), model=self.model
+            solve_limit_cycle(params, self.collocation_system, search_guess), model=self.model
         )
 
-    def guess_from_state(
+    def guess_cycle_from_state(
         self, params: WheelParams, section_state: SectionState
     ) -> CollocationState:
-        """Return a start of the search from a walk of `period_n` steps from a section state."""
-        walk_samples = sample_walk(self.model, params, section_state, self.period_n)
-        return guess_from_walk(self.system, params, walk_samples)
+        """Return the guess of a cycle from a walk of `period_n` steps that starts at a section
+        state."""
+        walk_samples = sample_walk_in_time(self.model, params, section_state, self.period_n)
+        return guess_cycle_from_walk(self.collocation_system, params, walk_samples)
 
     @eqx.filter_jit
-    def start_at_step(
+    def shift_first_step(
         self, first_step_index: int, params: WheelParams, collocation_state: CollocationState
     ) -> CollocationState:
-        """Return the same cycle with the step of the given index as the first one."""
+        """Return the same cycle with another step as its first step."""
         previous_end_state = collocation_state.step_end_states[first_step_index - 1]
-        landing = transitions.resolve_landing(
+        landing_result = transitions.resolve_landing(
             params.symbols(), previous_end_state[0], *previous_end_state[2:]
         )
-        solution, is_active, ends = jax.tree.map(
+        collocation_solution, is_active, step_ends = jax.tree.map(
             lambda x: jnp.roll(x, -first_step_index, 0),
             (
                 collocation_state.solution,
@@ -163,30 +170,34 @@ class CollocationFinder(AbstractGaitFinder):
                 collocation_state.step_end_states,
             ),
         )
-        section_state = jnp.stack([landing.theta_after, landing.motion_after.dtheta])
+        section_state = jnp.stack([landing_result.theta_after, landing_result.motion_after.dtheta])
         return collocation_state._replace(
-            solution=solution._replace(section_state=section_state),
+            solution=collocation_solution._replace(section_state=section_state),
             is_phase_active=is_active,
-            step_end_states=ends,
+            step_end_states=step_ends,
         )
 
-    def transfer_to_mesh(
-        self, system: CollocationSystem, collocation_state: CollocationState
+    def transfer_state_to_mesh(
+        self, source_system: CollocationSystem, collocation_state: CollocationState
     ) -> CollocationState:
-        """Return a start on this finder's mesh from a solution on the mesh of `system`."""
-        solution = transfer_solution_to_mesh(system, self.system, collocation_state.solution)
-        return collocation_state._replace(solution=solution)
+        """Return a collocation state on this finder's mesh, from a state on the mesh of
+        `source_system`.
+        """
+        transferred_solution = transfer_solution_to_mesh(
+            source_system, self.collocation_system, collocation_state.solution
+        )
+        return collocation_state._replace(solution=transferred_solution)
 
     @eqx.filter_jit
     def make_initial_guess(self, parameter_values: ParameterValues) -> CollocationState:
-        start = predict_start_from_surface(
-            self.system, parameter_values[:, None], jnp.ones((1,), bool)
+        predicted_start = predict_start_from_gait_surface(
+            self.collocation_system, parameter_values[:, None], jnp.ones((1,), bool)
         )
-        return jax.tree.map(lambda x: x[..., 0], start)
+        return jax.tree.map(lambda x: x[..., 0], predicted_start)
 
     def find_gait(self, parameter_values: ParameterValues, start_state: CollocationState) -> Gait:
         cycle, cycle_derivatives = compute_cycle_and_derivatives(
-            self.system, parameter_values, start_state
+            self.collocation_system, parameter_values, start_state
         )
         section_state, section_state_derivatives = (
             cycle.section_state,
@@ -208,38 +219,42 @@ class CollocationFinder(AbstractGaitFinder):
             cycle.monodromy_value,
         )
         return Gait(
-            cycle, step, cycle_derivatives, step_derivatives, BranchPoint(*branch_point_fields)
+            cycle, step, cycle_derivatives, step_derivatives, GaitBranchPoint(*branch_point_fields)
         )
 
     def measure_gait(
-        self, parameter_values: ParameterValues, guess: Any, measure_names: tuple[str, ...]
+        self, parameter_values: ParameterValues, cycle_guess: Any, measure_names: tuple[str, ...]
     ) -> GaitMeasures:
         if set(measure_names) <= set(self.cycle_measures):
-            return measure_on_cycle(self, parameter_values, guess, measure_names)
-        cycle: Any = None if guess is None else self.find_cycle_from_values(parameter_values, guess)
+            return compute_cycle_measures(self, parameter_values, cycle_guess, measure_names)
+        cycle: Any = (
+            None
+            if cycle_guess is None
+            else self.find_cycle_from_values(parameter_values, cycle_guess)
+        )
         start_state = (
             self.make_initial_guess(parameter_values) if cycle is None else cycle.collocation_state
         )
-        return measure_on_gait(
+        return compute_gait_measures(
             self.find_gait(parameter_values, start_state), type(self).read_measure, measure_names
         )
 
     def compute_slope_response(
         self, params: WheelParams, cycle: Any, measure_names: Sequence[str]
     ) -> SlopeResponse:
-        """Return the response of the step and its measures to the slopes of two lines.
+        """Return the response of the step and of its measures to the slopes of its two lines.
 
-        It is computed from the collocation if that determines the measures, else from the
-        event-driven step.
+        The response is computed from the collocation if that determines the measures, and from the
+        event-driven step otherwise.
         """
         if not set(measure_names) <= set(COLLOCATION_RESPONSE_MEASURES):
             return super().compute_slope_response(params, cycle, measure_names)
-        response: SlopeResponse = cycle.slope_response
-        return response.select_measures(
-            [COLLOCATION_RESPONSE_MEASURES.index(name) for name in measure_names]
+        slope_response: SlopeResponse = cycle.slope_response
+        return slope_response.select_measures(
+            [COLLOCATION_RESPONSE_MEASURES.index(measure_name) for measure_name in measure_names]
         )
 
-    def precompile(self, params: WheelParams) -> None:
+    def precompile_programs(self, params: WheelParams) -> None:
         parameter_values = stack_parameters(params)
         section_state = jnp.asarray(self.model.default_start(params), parameter_values.dtype)
         section_state_derivatives = jnp.zeros(
@@ -248,7 +263,7 @@ class CollocationFinder(AbstractGaitFinder):
         with ThreadPoolExecutor(2) as compile_pool:
             cycle_future = compile_pool.submit(
                 with_default_jax_settings(compute_cycle_and_derivatives),
-                self.system,
+                self.collocation_system,
                 parameter_values,
                 self.make_initial_guess(parameter_values),
             )
@@ -266,12 +281,16 @@ class CollocationFinder(AbstractGaitFinder):
 
 @eqx.filter_jit
 def compute_cycle_and_derivatives(
-    system: CollocationSystem, parameter_values: Array, guess: CollocationState
+    collocation_system: CollocationSystem, parameter_values: Array, cycle_guess: CollocationState
 ) -> tuple[LimitCycle, LimitCycle]:
-    """Return the cycle near `guess`, and its derivatives by all parameters on a leading axis."""
+    """Return the cycle near `cycle_guess`, and its derivatives by all parameters on a leading
+    axis.
+    """
 
     find_cycle = lambda parameter_values: solve_limit_cycle(
-        make_wheel_from_parameters(parameter_values, system.n_legs), system, guess
+        make_wheel_from_parameters(parameter_values, collocation_system.n_legs),
+        collocation_system,
+        cycle_guess,
     )
     cycle, parameter_jacobian = evaluate_with_jacobian(find_cycle, parameter_values)
     return cycle, move_derivative_axis_first(parameter_jacobian)
@@ -288,7 +307,7 @@ def compute_step_and_derivatives(
 ) -> tuple[StepResult, StepResult]:
     """Return one step, and its derivatives by all parameters along the branch of gaits.
 
-    `section_state_derivatives` are the derivatives of the step's section state by the parameters.
+    `section_state_derivatives` contains the derivatives of the section state by the parameters.
     """
 
     n_values = parameter_values.shape[0]

@@ -1,8 +1,8 @@
 """Search for limit cycles of many wheels by collocation and Newton's method.
 
-Newton's method on the collocation system also converges to solutions that are no gaits. A cycle
-therefore counts as found only if every sign that its sequence of phases assumes holds at all nodes.
-Wheels without a cycle after an attempt are gathered for the next attempt.
+Newton's method on the collocation system also converges to solutions that are not gaits. A cycle
+therefore counts as found only if all signs that its sequence of phases assumes hold at all nodes.
+After each attempt, the wheels without a cycle are gathered for the next attempt.
 """
 
 import functools
@@ -43,60 +43,59 @@ from vrw_jax.numerics import BatchFunction, LaneArray, Vector
 from vrw_jax.wheel import WheelParams, make_wheel_from_parameters, stack_parameters
 
 LaneParameters = Float[Array, "n_parameters lanes"]
-"""Float parameters of each lane, in the order of PARAMETER_NAMES."""
+"""Parameters of each lane as floats, in the order of PARAMETER_NAMES."""
 
 
 @dataclass(frozen=True)
 class CycleSearchLimits:
-    """Limits of the search for limit cycles that users do not set."""
+    """Limits of the search for limit cycles that are no options of the user."""
 
     end_guard_tolerance: float = 1e-6
-    """Largest depth below zero of a guard at the end of the phase that it ends, N, m or rad/s."""
+    """Largest negative value of the end guard at the end of its phase, N, m or rad/s."""
     max_accepted_mesh_error: float = 1e-5
-    """Estimate of the mesh error above which a solution does not count as found.
+    """Largest estimated mesh error of a solution that counts as found.
 
-    The value is chosen because the errors of some hundred random wheels are below it, most of them
-    by far."""
+    The value is chosen because the errors of some hundred random wheels are smaller, most of them
+    much smaller."""
     n_homotopy_segments: int = 16
     """Number of segments of the last homotopy.
 
-    If no root is found, the gait of Table 1 is continued on the line from Table 1's wheel to this
-    wheel. If the homotopy ends before this wheel, its last segment gives the reason."""
+    If no root is found, the gait of Table 1 is continued on the line from Table 1's wheel to the
+    searched wheel. If the homotopy ends on the way, its last segment determines the reason."""
     max_lanes_without_gathering: int = 16
-    """Largest number of lanes that are searched without gathering the lanes that need another
-    attempt."""
+    """Largest number of lanes for which the lanes that need another attempt are not gathered."""
 
 
 CYCLE_SEARCH_LIMITS = CycleSearchLimits()
 
 
 class CollocationSystem(NamedTuple):
-    """Problem of a search for limit cycles: the phases, the number of steps and the meshes."""
+    """Collocation system of a limit cycle: phases, number of steps and meshes."""
 
     n_legs: int
     period_n: int
     cycle_options: CycleOptions
-    stop_at_lift_off: bool = True  # whether the ground must push in an admissible gait
+    stop_at_lift_off: bool = True  # whether the normal force must be positive in an admissible gait
     search_limits: CycleSearchLimits = CYCLE_SEARCH_LIMITS
 
     @property
     def phase_sequence(self) -> PhaseSequence:
-        """Return the phases of one gait step as data for the collocation."""
+        """Return the phases of one gait step and their functions."""
         return make_held_landing_sequence(self.n_legs, self.stop_at_lift_off)
 
     @property
     def phase_meshes(self) -> tuple[PhaseMesh, ...]:
-        """Return the mesh of each phase in the order DLS, SLS-I, SLS-II."""
-        dls, sls1, sls2 = self.cycle_options.mesh_intervals
+        """Return the meshes of DLS, SLS-I and SLS-II."""
+        n_dls_intervals, n_sls1_intervals, n_sls2_intervals = self.cycle_options.mesh_intervals
         return (
-            PhaseMesh(dls, 1.0),
-            PhaseMesh(sls1, self.cycle_options.mesh_grading),
-            PhaseMesh(sls2, 1.0),
+            PhaseMesh(n_dls_intervals, 1.0),
+            PhaseMesh(n_sls1_intervals, self.cycle_options.mesh_grading),
+            PhaseMesh(n_sls2_intervals, 1.0),
         )
 
     @property
-    def compute_phase_constants(self) -> Callable:
-        """Return the function that computes the constants of the equations from the parameters."""
+    def phase_constants_function(self) -> Callable:
+        """Return the function from the parameters to the constants of the equations of motion."""
         return functools.partial(compute_phase_constants, self.n_legs)
 
     def linearize_at(
@@ -107,12 +106,12 @@ class CollocationSystem(NamedTuple):
     ) -> CycleLinearization:
         """Return the linearization of the collocation equations at a state.
 
-        It contains tangents with respect to the parameters of `parameter_indices`.
+        The result has tangents with respect to the parameters in `parameter_indices`.
         """
         return linearize_cycle(
             self.phase_sequence,
             self.phase_meshes,
-            self.compute_phase_constants,
+            self.phase_constants_function,
             parameters,
             collocation_state.solution,
             collocation_state.is_phase_active > 0.5,
@@ -120,42 +119,42 @@ class CollocationSystem(NamedTuple):
         )
 
     def evaluate_phase_points(
-        self, parameters: Array, solution: CollocationSolution
+        self, parameters: Array, collocation_solution: CollocationSolution
     ) -> tuple[Vector, list[tuple[PhasePoints, ...]]]:
         """Return the section state after the last step, and the points of all phases of each step.
 
         The arguments belong to one wheel or to several lanes.
         """
         phase_constants, section_state = (
-            self.compute_phase_constants(*parameters),
-            tuple(solution.section_state),
+            self.phase_constants_function(*parameters),
+            tuple(collocation_solution.section_state),
         )
         phase_points_of_steps = []
         for step_index in range(self.period_n):
-            durations, accelerations = jax.tree.map(
+            phase_durations, accelerations_by_phase = jax.tree.map(
                 lambda x, step_index=step_index: x[step_index],
-                (solution.durations, solution.accelerations),
+                (collocation_solution.durations, collocation_solution.accelerations),
             )
             section_state, phase_points = reconstruct_step(
                 self.phase_sequence,
                 self.phase_meshes,
                 phase_constants,
                 section_state,
-                durations,
-                accelerations,
+                phase_durations,
+                accelerations_by_phase,
             )
             phase_points_of_steps.append(phase_points)
         return section_state, phase_points_of_steps
 
 
 class CollocationState(NamedTuple):
-    """Solution of the collocation system with the data that select it, in floats with lanes
+    """Solution of the collocation system with the flags that select it, as floats with lanes
     last.
     """
 
     solution: CollocationSolution
     is_phase_active: LaneArray  # (n, n_phases, lanes): 1 if the phase takes place, else 0
-    # (lanes,): 1 for a limit cycle; 0 if there is none and other numbers replace the solution
+    # (lanes,): 1 for a limit cycle, 0 for a replacement of a missing cycle
     has_cycle: LaneArray
     # (lanes,): 1 + index in ADMISSIBILITY_CHECKS of the check that a root fails;
     # plus HOMOTOPY_OFFSET for a root of a wheel on the homotopy; a NewtonFailure; else 0
@@ -168,28 +167,29 @@ class CycleSearchResult(NamedTuple):
 
     collocation_state: CollocationState
     monodromy_matrix: LaneArray  # (row, column, lanes)
-    correction_norm: LaneArray  # of the last correction of Newton's method
-    n_newton_iterations: Int[Array, " lanes"]  # linearizations of the system
+    correction_norm: LaneArray  # of Newton's last correction
+    n_newton_iterations: Int[Array, " lanes"]  # number of linearizations of the system
 
 
 @functools.cache
 def register_export_types() -> None:
-    """Register this module's named tuples for exported traces on disk, once in a process."""
-    for state_class in (CollocationSolution, CollocationState, CycleSearchResult):
+    """Register the module's named tuples for the export of traces to disk, once per process."""
+    for namedtuple_class in (CollocationSolution, CollocationState, CycleSearchResult):
         export.register_namedtuple_serialization(
-            state_class, serialized_name=f"vrw_jax.{state_class.__name__}"
+            namedtuple_class, serialized_name=f"vrw_jax.{namedtuple_class.__name__}"
         )
 
 
-def predict_start_from_surface(
-    system: CollocationSystem, parameters: LaneParameters, has_dls: Array
+def predict_start_from_gait_surface(
+    collocation_system: CollocationSystem, parameters: LaneParameters, has_dls: Array
 ) -> CollocationState:
-    """Return the gait that the stored gait surface predicts, as a start of the search.
+    """Return the prediction of the stored gait surface as a start of the search.
 
-    Without DLS the duration of DLS is added to that of SLS-I.
+    Without DLS, the duration of SLS-I includes that of DLS.
     """
     predicted_solution = predict_gait(
-        make_wheel_from_parameters(parameters, system.n_legs), system.phase_meshes
+        make_wheel_from_parameters(parameters, collocation_system.n_legs),
+        collocation_system.phase_meshes,
     )
     dls_duration, sls1_duration, sls2_duration = predicted_solution.durations[0]
     phase_durations = jnp.stack(
@@ -200,31 +200,45 @@ def predict_start_from_surface(
         ]
     )
     start_state = make_start_state(
-        system, predicted_solution.section_state, phase_durations, has_dls
+        collocation_system, predicted_solution.section_state, phase_durations, has_dls
     )
-    accelerations = tuple(
-        jnp.broadcast_to(jnp.where(has_dls, acceleration, 0.0), acceleration_template.shape)
-        for acceleration, acceleration_template in zip(
+    accelerations_by_phase = tuple(
+        jnp.broadcast_to(
+            jnp.where(has_dls, predicted_accelerations, 0.0), acceleration_template.shape
+        )
+        for predicted_accelerations, acceleration_template in zip(
             predicted_solution.accelerations, start_state.solution.accelerations, strict=True
         )
     )
-    return start_state._replace(solution=start_state.solution._replace(accelerations=accelerations))
+    return start_state._replace(
+        solution=start_state.solution._replace(accelerations=accelerations_by_phase)
+    )
 
 
 def make_start_state(
-    system: CollocationSystem, section_state: Array, phase_durations: Array, has_dls: Array
+    collocation_system: CollocationSystem,
+    section_state: Array,
+    phase_durations: Array,
+    has_dls: Array,
 ) -> CollocationState:
-    """Return a start with zero accelerations, in which all steps have the same state and
-    durations.
-    """
-    period_n, n_phases = system.period_n, len(system.phase_sequence.phases)
+    """Return a start of the search with zero accelerations and the same state and durations in all
+    steps."""
+    period_n, n_phases = collocation_system.period_n, len(collocation_system.phase_sequence.phases)
     n_lanes = section_state.shape[-1]
-    accelerations = tuple(
+    zero_accelerations = tuple(
         jnp.zeros(
-            (period_n, mesh.n_intervals, N_GAUSS_NODES, phase.n_coordinates, n_lanes),
+            (
+                period_n,
+                phase_mesh.n_intervals,
+                N_GAUSS_NODES,
+                collocation_phase.n_coordinates,
+                n_lanes,
+            ),
             section_state.dtype,
         )
-        for phase, mesh in zip(system.phase_sequence.phases, system.phase_meshes, strict=True)
+        for collocation_phase, phase_mesh in zip(
+            collocation_system.phase_sequence.phases, collocation_system.phase_meshes, strict=True
+        )
     )
     is_dls_active = jnp.where(has_dls, 1.0, 0.0).astype(section_state.dtype)
     is_sls_active = jnp.ones((period_n, n_phases - 1, n_lanes), section_state.dtype)
@@ -232,119 +246,129 @@ def make_start_state(
         [jnp.broadcast_to(is_dls_active, (period_n, 1, n_lanes)), is_sls_active], 1
     )
     phase_durations = jnp.broadcast_to(phase_durations, (period_n, n_phases, n_lanes))
-    solution = CollocationSolution(section_state, phase_durations, accelerations)
-    return CollocationState(solution, is_phase_active, *init_search_flags(system, section_state))
+    collocation_solution = CollocationSolution(section_state, phase_durations, zero_accelerations)
+    return CollocationState(
+        collocation_solution, is_phase_active, *init_search_flags(collocation_system, section_state)
+    )
 
 
 def init_search_flags(
-    system: CollocationSystem, section_state: Array
+    collocation_system: CollocationSystem, section_state: Array
 ) -> tuple[Array, Array, Array]:
-    """Return initial values of `has_cycle`, `failed_check` and `step_end_states` for a start."""
+    """Return initial values of `has_cycle`, `failed_check` and `step_end_states`."""
     lane_shape, n_end_components = (
         section_state.shape[1:],
-        2 * system.phase_sequence.phases[-1].n_coordinates,
+        2 * collocation_system.phase_sequence.phases[-1].n_coordinates,
     )
-    make_zeros = lambda *shape: jnp.zeros((*shape, *lane_shape), section_state.dtype)
-    return make_zeros(), make_zeros(), make_zeros(system.period_n, n_end_components)
+    make_zeros = lambda *array_shape: jnp.zeros((*array_shape, *lane_shape), section_state.dtype)
+    return make_zeros(), make_zeros(), make_zeros(collocation_system.period_n, n_end_components)
 
 
-def reduce_all_but_lanes(
-    reduce_pair: Callable[[Array, Array], Array], lane_values: Array
+def reduce_over_non_lane_axes(
+    combine_two_arrays: Callable[[Array, Array], Array], lane_values: Array
 ) -> LaneArray:
-    """Return `lane_values` reduced by `reduce_pair` over all axes except the lanes.
+    """Return `lane_values` reduced by `combine_two_arrays` over all axes except that of the lanes.
 
-    The reduction combines halves, because XLA's reduction runs along the wrong axis.
+    The halves of the array are combined repeatedly, because XLA's reduction runs along the wrong
+    axis.
     """
     if simd.targets_machine_code():
-        machine_reduction = jnp.max if reduce_pair is jnp.maximum else jnp.min
+        machine_reduction = jnp.max if combine_two_arrays is jnp.maximum else jnp.min
         return machine_reduction(lane_values, axis=tuple(range(lane_values.ndim - 1)))
     lane_rows = lane_values.reshape(-1, lane_values.shape[-1])
     while lane_rows.shape[0] > 1:
-        half_length = lane_rows.shape[0] // 2
-        odd_row = lane_rows[2 * half_length :]
+        half_array_length = lane_rows.shape[0] // 2
+        unpaired_row = lane_rows[2 * half_array_length :]
         lane_rows = jnp.concatenate(
             [
-                reduce_pair(lane_rows[:half_length], lane_rows[half_length : 2 * half_length]),
-                odd_row,
+                combine_two_arrays(
+                    lane_rows[:half_array_length],
+                    lane_rows[half_array_length : 2 * half_array_length],
+                ),
+                unpaired_row,
             ]
         )
     return lane_rows[0]
 
 
 def compute_correction_norm(
-    solution: CollocationSolution, correction: CollocationSolution
+    collocation_solution: CollocationSolution, newton_correction: CollocationSolution
 ) -> LaneArray:
-    """Return the largest component of a correction.
+    """Return the norm of a Newton correction: its largest absolute component, shape (lanes,).
 
-    Accelerations are weighted by the square of the duration, which is their effect on positions.
+    Accelerations are multiplied by the square of the phase's duration, as in their effect on
+    positions.
     """
-    max_by_lane = functools.partial(reduce_all_but_lanes, jnp.maximum)
+    max_by_lane = functools.partial(reduce_over_non_lane_axes, jnp.maximum)
     correction_norm = jnp.maximum(
-        max_by_lane(jnp.abs(correction.section_state)),
-        max_by_lane(jnp.abs(correction.durations)),
+        max_by_lane(jnp.abs(newton_correction.section_state)),
+        max_by_lane(jnp.abs(newton_correction.durations)),
     )
-    for phase_index, acceleration_change in enumerate(correction.accelerations):
-        phase_duration = max_by_lane(jnp.abs(solution.durations[:, phase_index]))
+    for phase_index, acceleration_change in enumerate(newton_correction.accelerations):
+        phase_duration = max_by_lane(jnp.abs(collocation_solution.durations[:, phase_index]))
         correction_norm = jnp.maximum(
             correction_norm, max_by_lane(jnp.abs(acceleration_change)) * phase_duration**2
         )
     return correction_norm
 
 
-def _limit_correction(solution: CollocationSolution, correction: CollocationSolution) -> LaneArray:
-    """Return the largest fraction of a correction, at most 1, with limited changes.
+def _compute_correction_fraction(
+    collocation_solution: CollocationSolution, newton_correction: CollocationSolution
+) -> LaneArray:
+    """Return the largest fraction of a Newton correction, at most 1, whose changes are within
+    limits.
 
     The limits apply to the section state and the durations.
     """
-    step_time = jnp.sum(solution.durations, 1, keepdims=True)
+    step_time = jnp.sum(collocation_solution.durations, 1, keepdims=True)
     change_limits = jnp.concatenate(
         [
-            0.15 * jnp.abs(solution.section_state) + 0.05,
-            (0.25 * jnp.abs(solution.durations) + 0.02 * jnp.abs(step_time)).reshape(
-                -1, solution.section_state.shape[-1]
+            0.15 * jnp.abs(collocation_solution.section_state) + 0.05,
+            (0.25 * jnp.abs(collocation_solution.durations) + 0.02 * jnp.abs(step_time)).reshape(
+                -1, collocation_solution.section_state.shape[-1]
             ),
         ]
     )
     proposed_changes = jnp.concatenate(
         [
-            correction.section_state,
-            correction.durations.reshape(-1, solution.section_state.shape[-1]),
+            newton_correction.section_state,
+            newton_correction.durations.reshape(-1, collocation_solution.section_state.shape[-1]),
         ]
     )
     smallest_float = jnp.finfo(proposed_changes.dtype).tiny
-    step_fraction = reduce_all_but_lanes(
+    step_fraction = reduce_over_non_lane_axes(
         jnp.minimum, change_limits / jnp.maximum(jnp.abs(proposed_changes), smallest_float)
     )
     return jnp.minimum(1.0, step_fraction)
 
 
 def compute_state_tangents(
-    linearized_pass: CycleLinearization, collocation_state: CollocationState
+    cycle_linearization: CycleLinearization, collocation_state: CollocationState
 ) -> CollocationState:
-    """Return the tangents of a state from a linearization.
+    """Return the tangents of a collocation state from its linearization.
 
-    The data that select a solution have zero tangents.
+    The flags that select the solution have zero tangents.
     """
     make_zero_tangents = lambda x: jnp.zeros(
-        (linearized_pass.step_end_tangents.shape[0], *x.shape), x.dtype
+        (cycle_linearization.step_end_tangents.shape[0], *x.shape), x.dtype
     )
     has_cycle_tangents, failed_check_tangents = (
         make_zero_tangents(collocation_state.has_cycle),
         make_zero_tangents(collocation_state.failed_check),
     )
     return CollocationState(
-        linearized_pass.tangents,
+        cycle_linearization.parameter_tangents,
         make_zero_tangents(collocation_state.is_phase_active),
         has_cycle_tangents,
         failed_check_tangents,
-        linearized_pass.step_end_tangents,
+        cycle_linearization.step_end_tangents,
     )
 
 
 class _NewtonState(NamedTuple):
-    """State of the loop of Newton's method, for all lanes."""
+    """State of the loop of Newton's method for all lanes."""
 
-    iteration: Int[Array, ""]
+    iteration_index: Int[Array, ""]
     collocation_state: CollocationState
     monodromy_matrix: LaneArray
     correction_norm: LaneArray
@@ -354,7 +378,7 @@ class _NewtonState(NamedTuple):
 
 
 def run_newton_iterations(
-    system: CollocationSystem,
+    collocation_system: CollocationSystem,
     parameters: LaneParameters,
     start_state: CollocationState,
     initial_parameters: LaneParameters,
@@ -366,18 +390,18 @@ def run_newton_iterations(
 
     During the first `homotopy_steps` iterations the parameters move from `initial_parameters` to
     their final values. A lane stops when it converges, or when round-off keeps its corrections from
-    decreasing. Its result therefore does not depend on other lanes.
+    decreasing. The result of a lane therefore does not depend on other lanes.
     """
-    cycle_options = system.cycle_options
+    cycle_options = collocation_system.cycle_options
     machine_epsilon = float(jnp.finfo(parameters.dtype).eps)
     tight_tolerance, loose_tolerance = (
         max(cycle_options.tolerance, 1e3 * machine_epsilon),
         CycleOptions.tolerance,
     )
 
-    def newton_iteration(newton_state: _NewtonState) -> _NewtonState:
+    def run_newton_iteration(newton_state: _NewtonState) -> _NewtonState:
         homotopy_fraction = jnp.minimum(
-            1.0, (newton_state.iteration + 1) / jnp.maximum(homotopy_steps, 1)
+            1.0, (newton_state.iteration_index + 1) / jnp.maximum(homotopy_steps, 1)
         ).astype(parameters.dtype)
         is_at_target = homotopy_fraction >= 1.0
         current_parameters = jnp.where(
@@ -386,20 +410,22 @@ def run_newton_iterations(
             initial_parameters + homotopy_fraction * (parameters - initial_parameters),
         )
         collocation_solution = newton_state.collocation_state.solution
-        linearized_pass = system.linearize_at(current_parameters, newton_state.collocation_state)
-        correction = linearized_pass.correction
-        correction_norm = compute_correction_norm(collocation_solution, correction)
+        cycle_linearization = collocation_system.linearize_at(
+            current_parameters, newton_state.collocation_state
+        )
+        newton_correction = cycle_linearization.newton_correction
+        correction_norm = compute_correction_norm(collocation_solution, newton_correction)
         is_finite = jnp.isfinite(correction_norm)
-        step_fraction = _limit_correction(collocation_solution, correction)
+        step_fraction = _compute_correction_fraction(collocation_solution, newton_correction)
         is_lane_moving = newton_state.is_running & is_finite
         update_moving_lanes = lambda new_value, old_value: jnp.where(
             is_lane_moving, new_value, old_value
         )
 
-        def apply_correction(unknowns: Array, correction_values: Array) -> Array:
+        def apply_correction(unknowns: Array, newton_correction_values: Array) -> Array:
             return jnp.where(
                 is_lane_moving,
-                unknowns + step_fraction * jnp.where(is_lane_moving, correction_values, 0.0),
+                unknowns + step_fraction * jnp.where(is_lane_moving, newton_correction_values, 0.0),
                 unknowns,
             )
 
@@ -414,16 +440,16 @@ def run_newton_iterations(
         )
         is_converged = is_lane_moving & is_at_target & (correction_norm < newton_tolerance)
         collocation_state = newton_state.collocation_state._replace(
-            solution=jax.tree.map(apply_correction, collocation_solution, correction),
+            solution=jax.tree.map(apply_correction, collocation_solution, newton_correction),
             step_end_states=update_moving_lanes(
-                linearized_pass.step_ends, newton_state.collocation_state.step_end_states
+                cycle_linearization.step_end_states, newton_state.collocation_state.step_end_states
             ),
         )
         return _NewtonState(
-            iteration=newton_state.iteration + 1,
+            iteration_index=newton_state.iteration_index + 1,
             collocation_state=collocation_state,
             monodromy_matrix=update_moving_lanes(
-                linearized_pass.monodromy, newton_state.monodromy_matrix
+                cycle_linearization.monodromy, newton_state.monodromy_matrix
             ),
             correction_norm=update_moving_lanes(correction_norm, newton_state.correction_norm),
             is_converged=newton_state.is_converged | is_converged,
@@ -433,15 +459,15 @@ def run_newton_iterations(
 
     has_running_lanes = lambda newton_state: (
         jnp.any(newton_state.is_running)
-        & (newton_state.iteration < max_iterations + homotopy_steps)
+        & (newton_state.iteration_index < max_iterations + homotopy_steps)
     )
     section_size, float_dtype, n_lanes = (
-        system.phase_sequence.section_size,
+        collocation_system.phase_sequence.section_size,
         start_state.has_cycle.dtype,
         is_lane_requested.shape[-1],
     )
     first_newton_state = _NewtonState(
-        iteration=jnp.zeros((), jnp.int32),
+        iteration_index=jnp.zeros((), jnp.int32),
         collocation_state=start_state,
         monodromy_matrix=jnp.zeros((section_size, section_size, n_lanes), float_dtype),
         correction_norm=jnp.ones((n_lanes,), float_dtype),
@@ -449,8 +475,10 @@ def run_newton_iterations(
         is_running=is_lane_requested,
         n_newton_iterations=jnp.zeros((n_lanes,), jnp.int32),
     )
-    last_newton_state = lax.while_loop(has_running_lanes, newton_iteration, first_newton_state)
-    failed_check = find_first_failed_check(system, parameters, last_newton_state.collocation_state)
+    last_newton_state = lax.while_loop(has_running_lanes, run_newton_iteration, first_newton_state)
+    failed_check = find_first_failed_check(
+        collocation_system, parameters, last_newton_state.collocation_state
+    )
     has_cycle = (last_newton_state.is_converged & (failed_check == 0.0)).astype(parameters.dtype)
     failed_check = jnp.where(last_newton_state.is_converged, failed_check, 0.0)
     collocation_state = last_newton_state.collocation_state._replace(
@@ -464,70 +492,79 @@ def run_newton_iterations(
     )
 
 
-def _find_guard_minima(
-    phase: CollocationPhase, phase_constants: PhaseConstants, phase_points: PhasePoints
+def _compute_guard_minima(
+    collocation_phase: CollocationPhase, phase_constants: PhaseConstants, phase_points: PhasePoints
 ) -> Vector:
-    """Return each guard's minimum over the start and the nodes of a phase, computed in one loop."""
+    """Return the minimum of each guard over the start and the nodes of a phase.
+
+    A loop over the nodes computes the minima.
+    """
 
     def update_minimum(
         guard_minima: Vector, node_state: tuple[Array, Array]
     ) -> tuple[Vector, None]:
         q, v = node_state
-        node_guards = phase.guards(
-            phase_constants, PhasePoint(phase_points.nodes.held_constants, tuple(q), tuple(v))
+        node_guards = collocation_phase.guards_function(
+            phase_constants, PhasePoint(phase_points.node_points.held_constants, tuple(q), tuple(v))
         )
         return tuple(map(jnp.minimum, guard_minima, node_guards)), None
 
-    start_guards = phase.guards(phase_constants, phase_points.start)
-    node_states = jnp.stack(phase_points.nodes.q, 1), jnp.stack(phase_points.nodes.v, 1)
+    start_guards = collocation_phase.guards_function(phase_constants, phase_points.start_point)
+    node_states = jnp.stack(phase_points.node_points.q, 1), jnp.stack(phase_points.node_points.v, 1)
     return lax.scan(update_minimum, start_guards, node_states)[0]
 
 
 def find_first_failed_check(
-    system: CollocationSystem, parameters: LaneParameters, collocation_state: CollocationState
+    collocation_system: CollocationSystem,
+    parameters: LaneParameters,
+    collocation_state: CollocationState,
 ) -> LaneArray:
-    """Return the code of the first failed admissibility check of each lane, or 0 if all hold.
+    """Return the code of the first failed admissibility check of each lane, or 0 if no check fails.
 
-    The code is 1 + the index in ADMISSIBILITY_CHECKS. Durations, guards at all nodes and the
-    quantities checked at transitions must be positive.
+    The code is 1 + the index of the check in ADMISSIBILITY_CHECKS. Durations, guards at all nodes
+    and the margins at the transitions must be positive.
     """
-    phase_sequence = system.phase_sequence
-    phase_constants = system.compute_phase_constants(*parameters)
+    phase_sequence = collocation_system.phase_sequence
+    phase_constants = collocation_system.phase_constants_function(*parameters)
     collocation_solution = collocation_state.solution
 
     def check_step(loop_carry: tuple, step_inputs: tuple) -> tuple:
         section_state, failed_check = loop_carry
-        durations, accelerations, is_phase_active = step_inputs
+        phase_durations, accelerations_by_phase, is_phase_active = step_inputs
         is_phase_active = is_phase_active > 0.5
-        next_section, phase_points = reconstruct_step(
+        next_section_state, phase_points = reconstruct_step(
             phase_sequence,
-            system.phase_meshes,
+            collocation_system.phase_meshes,
             phase_constants,
             tuple(section_state),
-            durations,
-            accelerations,
+            phase_durations,
+            accelerations_by_phase,
         )
         is_check_satisfied: list[Array] = []
-        for phase_index, (phase, points_of_phase) in enumerate(
+        for phase_index, (collocation_phase, points_of_phase) in enumerate(
             zip(phase_sequence.phases, phase_points, strict=True)
         ):
             is_check_satisfied.append(
-                ~is_phase_active[phase_index] | (durations[phase_index] > 0.0)
+                ~is_phase_active[phase_index] | (phase_durations[phase_index] > 0.0)
             )
-            end_guards = phase.guards(phase_constants, points_of_phase.end)
-            for guard_minimum, end_guard in zip(
-                _find_guard_minima(phase, phase_constants, points_of_phase), end_guards, strict=True
+            guards_at_phase_end = collocation_phase.guards_function(
+                phase_constants, points_of_phase.end_point
+            )
+            for guard_minimum, end_guard_value in zip(
+                _compute_guard_minima(collocation_phase, phase_constants, points_of_phase),
+                guards_at_phase_end,
+                strict=True,
             ):
                 is_check_satisfied.append(
                     ~is_phase_active[phase_index]
                     | (
                         (guard_minimum > 0.0)
-                        & (end_guard > -system.search_limits.end_guard_tolerance)
+                        & (end_guard_value > -collocation_system.search_limits.end_guard_tolerance)
                     )
                 )
         is_check_satisfied += [
             admissibility_margin > 0.0
-            for admissibility_margin in phase_sequence.admissibility_margins(
+            for admissibility_margin in phase_sequence.margins_function(
                 phase_constants, phase_points, is_phase_active
             )
         ]
@@ -535,7 +572,7 @@ def find_first_failed_check(
             failed_check = jnp.where(
                 (failed_check == 0.0) & ~is_satisfied, 1.0 + check_index, failed_check
             )
-        return (jnp.stack(next_section), failed_check), None
+        return (jnp.stack(next_section_state), failed_check), None
 
     step_inputs = (
         collocation_solution.durations,
@@ -548,36 +585,42 @@ def find_first_failed_check(
     )
     (_, failed_check), _ = lax.scan(check_step, loop_carry, step_inputs)
     is_mesh_fine_enough = (
-        estimate_mesh_error(phase_sequence, system.phase_meshes, collocation_solution)
-        < system.search_limits.max_accepted_mesh_error
+        estimate_mesh_error(phase_sequence, collocation_system.phase_meshes, collocation_solution)
+        < collocation_system.search_limits.max_accepted_mesh_error
     )
     return jnp.where(
         (failed_check == 0.0) & ~is_mesh_fine_enough, float(MESH_CHECK_CODE), failed_check
     )
 
 
-def _has_attempt_name(attempt_index: Array, *names: str) -> Array:
-    """Return whether the attempt of the given index has one of the given names."""
+def _has_attempt_name(attempt_index: Array, *attempt_names: str) -> Array:
+    """Return whether the attempt with a given index has one of the given names."""
     return functools.reduce(
-        operator.or_, [attempt_index == SEARCH_ATTEMPTS.index(name) for name in names]
+        operator.or_,
+        [attempt_index == SEARCH_ATTEMPTS.index(attempt_name) for attempt_name in attempt_names],
     )
 
 
 def _run_search_attempt(
-    system: CollocationSystem,
+    collocation_system: CollocationSystem,
     attempt_index: Array,
     parameters: LaneParameters,
     search_result: CycleSearchResult,
-    guess: CollocationState | None,
+    search_guess: CollocationState | None,
 ) -> CycleSearchResult:
-    """Run one attempt on the lanes that are without a cycle, and return the merged result."""
-    cycle_options, n_segments = system.cycle_options, system.search_limits.n_homotopy_segments
-    table_1_values = stack_parameters(WheelParams(n_legs=system.n_legs)).astype(parameters.dtype)
+    """Run one attempt on the lanes without a cycle, and return the merged result."""
+    cycle_options, n_segments = (
+        collocation_system.cycle_options,
+        collocation_system.search_limits.n_homotopy_segments,
+    )
+    table_1_values = stack_parameters(WheelParams(n_legs=collocation_system.n_legs)).astype(
+        parameters.dtype
+    )
     max_iterations = dict.fromkeys(SEARCH_ATTEMPTS, cycle_options.max_newton_iterations) | {
         "guess": cycle_options.first_newton_iterations,
         "surface": cycle_options.first_newton_iterations,
     }
-    iteration_limits = [max_iterations[name] for name in SEARCH_ATTEMPTS] + [
+    iteration_limits = [max_iterations[attempt_name] for attempt_name in SEARCH_ATTEMPTS] + [
         cycle_options.max_newton_iterations
     ] * (2 * n_segments)
     segment_indices = [0] * len(SEARCH_ATTEMPTS) + [
@@ -587,8 +630,7 @@ def _run_search_attempt(
         attempt_index
     ]
     table_1_parameters = jnp.broadcast_to(table_1_values[:, None], parameters.shape)
-    # Each segment is tried twice. The first try starts from the previous wheel, the second without
-    # double support.
+    # Each segment has two tries: from the previous wheel's gait, and without double support.
     segment_number = select_by_attempt(segment_indices)
     is_second_try_by_attempt = [0] * len(SEARCH_ATTEMPTS) + [0, 1] * n_segments
     is_second_try = select_by_attempt(is_second_try_by_attempt) == 1
@@ -606,25 +648,25 @@ def _run_search_attempt(
         ~_has_attempt_name(attempt_index, "without DLS") & ~is_second_try, parameters.shape[-1:]
     )
     homotopy_steps = jnp.where(is_homotopy_attempt, cycle_options.homotopy_steps, 0)
-    start_state = predict_start_from_surface(system, start_parameters, has_dls)
-    continues_previous = _has_attempt_name(attempt_index, "guess, on", "surface, on") | (
+    start_state = predict_start_from_gait_surface(collocation_system, start_parameters, has_dls)
+    continues_previous_segment = _has_attempt_name(attempt_index, "guess, on", "surface, on") | (
         (segment_number > 1) & ~is_second_try
     )
     start_state = jax.tree.map(
         lambda surface_value, previous_value: jnp.where(
-            continues_previous, previous_value, surface_value
+            continues_previous_segment, previous_value, surface_value
         ),
         start_state,
         search_result.collocation_state,
     )
-    if guess is not None:
+    if search_guess is not None:
         is_guess_attempt = _has_attempt_name(attempt_index, "guess")
         start_state = jax.tree.map(
             lambda surface_value, guess_value: jnp.where(
                 is_guess_attempt, guess_value, surface_value
             ),
             start_state,
-            guess,
+            search_guess,
         )
     is_lane_pending = search_result.collocation_state.has_cycle < 0.5
     is_lane_pending &= ~is_segment_attempt | (
@@ -632,7 +674,7 @@ def _run_search_attempt(
         == jnp.where(is_second_try, float(HomotopyFailure.FIRST_TRY), 0.0)
     )
     attempt_result = run_newton_iterations(
-        system,
+        collocation_system,
         target_parameters,
         start_state,
         table_1_parameters,
@@ -640,7 +682,7 @@ def _run_search_attempt(
         select_by_attempt(iteration_limits),
         is_lane_pending,
     )
-    if system.period_n == 1:
+    if collocation_system.period_n == 1:
         # The result for a wheel on the homotopy may decide the search for the wheel at its end.
         collocation_state = attempt_result.collocation_state
         failure_code = jnp.where(
@@ -650,11 +692,15 @@ def _run_search_attempt(
         continues_homotopy = ~is_last_segment & (
             (has_cycle > 0.5) | (failed_check == MESH_CHECK_CODE)
         )
-        final_code = jnp.where(is_last_segment, failed_check, failed_check + HOMOTOPY_OFFSET)
-        check_code = jnp.where((has_cycle > 0.5) | (failed_check > 0.0), final_code, failure_code)
-        check_code = jnp.where(continues_homotopy, 0.0, check_code)
+        final_failed_check = jnp.where(
+            is_last_segment, failed_check, failed_check + HOMOTOPY_OFFSET
+        )
+        failed_check_code = jnp.where(
+            (has_cycle > 0.5) | (failed_check > 0.0), final_failed_check, failure_code
+        )
+        failed_check_code = jnp.where(continues_homotopy, 0.0, failed_check_code)
         homotopy_state = collocation_state._replace(
-            has_cycle=jnp.where(is_last_segment, has_cycle, 0.0), failed_check=check_code
+            has_cycle=jnp.where(is_last_segment, has_cycle, 0.0), failed_check=failed_check_code
         )
         collocation_state = jax.tree.map(
             lambda new_value, old_value: jnp.where(is_segment_attempt, new_value, old_value),
@@ -662,7 +708,7 @@ def _run_search_attempt(
             attempt_result.collocation_state,
         )
         attempt_result = attempt_result._replace(collocation_state=collocation_state)
-    merged_result = jax.tree.map(
+    merged_search_result = jax.tree.map(
         lambda new_value, old_value: jnp.where(is_lane_pending, new_value, old_value),
         attempt_result,
         search_result,
@@ -670,30 +716,32 @@ def _run_search_attempt(
     # The first inadmissible root is reported, unless a later one fails only the mesh check.
     failed_check_before, failed_check_after = (
         search_result.collocation_state.failed_check,
-        merged_result.collocation_state.failed_check,
+        merged_search_result.collocation_state.failed_check,
     )
     failed_check = jnp.where(
         (failed_check_before <= 0.0) | (failed_check_after == MESH_CHECK_CODE),
         failed_check_after,
         failed_check_before,
     )
-    failed_check = jnp.where(merged_result.collocation_state.has_cycle > 0.5, 0.0, failed_check)
-    collocation_state = merged_result.collocation_state._replace(failed_check=failed_check)
-    return merged_result._replace(
+    failed_check = jnp.where(
+        merged_search_result.collocation_state.has_cycle > 0.5, 0.0, failed_check
+    )
+    collocation_state = merged_search_result.collocation_state._replace(failed_check=failed_check)
+    return merged_search_result._replace(
         collocation_state=collocation_state,
         n_newton_iterations=search_result.n_newton_iterations + attempt_result.n_newton_iterations,
     )
 
 
 def run_search_attempts(
-    system: CollocationSystem,
+    collocation_system: CollocationSystem,
     parameters: LaneParameters,
     search_result: CycleSearchResult,
     attempt_index: Int[Array, ""],
     end_index: Int[Array, ""],
-    guess: CollocationState | None = None,
+    search_guess: CollocationState | None = None,
 ) -> CycleSearchResult:
-    """Run attempts on the lanes without a cycle, from `attempt_index` to before `end_index`.
+    """Run the attempts `attempt_index`, ..., `end_index` - 1 on the lanes without a cycle.
 
     Return the search result. The parameters must be in their domains.
     """
@@ -701,7 +749,7 @@ def run_search_attempts(
     def has_next_attempt(loop_carry: tuple[Array, CycleSearchResult]) -> Array:
         attempt_index, search_result = loop_carry
         return (attempt_index < end_index) & jnp.any(
-            _can_attempt_help(attempt_index, search_result)
+            _can_attempt_change_result(attempt_index, search_result)
         )
 
     def run_next_attempt(
@@ -709,14 +757,14 @@ def run_search_attempts(
     ) -> tuple[Array, CycleSearchResult]:
         attempt_index, search_result = loop_carry
         return attempt_index + 1, _run_search_attempt(
-            system, attempt_index, parameters, search_result, guess
+            collocation_system, attempt_index, parameters, search_result, search_guess
         )
 
     return lax.while_loop(has_next_attempt, run_next_attempt, (attempt_index, search_result))[1]
 
 
 def search_all_attempts(
-    system: CollocationSystem, run_attempts: BatchFunction, *parameters_and_guess: Any
+    collocation_system: CollocationSystem, run_attempts: BatchFunction, *parameters_and_guess: Any
 ) -> CycleSearchResult:
     """Return the search result of each lane after all attempts.
 
@@ -724,22 +772,22 @@ def search_all_attempts(
     without a cycle are therefore gathered before each stage.
 
     - `run_attempts`: batched form of `run_search_attempts`;
-    - `parameters_and_guess`: the parameters and, if given, a guess.
+    - `parameters_and_guess`: the parameters and, optionally, a guess.
     """
     parameters, n_lanes = parameters_and_guess[0], parameters_and_guess[0].shape[-1]
-    # With several steps, a repeated gait of one step would be continued, which decides nothing.
-    n_attempts = len(SEARCH_ATTEMPTS) + 2 * system.search_limits.n_homotopy_segments * (
-        system.period_n == 1
+    # With several steps, the homotopy would continue a gait of one step, which decides nothing.
+    n_attempts = len(SEARCH_ATTEMPTS) + 2 * collocation_system.search_limits.n_homotopy_segments * (
+        collocation_system.period_n == 1
     )
-    first_attempt = jnp.asarray(
+    first_attempt_index = jnp.asarray(
         SEARCH_ATTEMPTS.index("surface" if len(parameters_and_guess) == 1 else "guess"), jnp.int32
     )
-    search_result = init_search_result(system, parameters)
-    if n_lanes <= system.search_limits.max_lanes_without_gathering:
+    search_result = init_search_result(collocation_system, parameters)
+    if n_lanes <= collocation_system.search_limits.max_lanes_without_gathering:
         return run_attempts(
             parameters,
             search_result,
-            first_attempt,
+            first_attempt_index,
             jnp.asarray(n_attempts, jnp.int32),
             *parameters_and_guess[1:],
         )
@@ -747,41 +795,45 @@ def search_all_attempts(
     def has_next_stage(loop_carry: tuple) -> Array:
         attempt_index, _, search_result, _ = loop_carry
         return (attempt_index < n_attempts) & jnp.any(
-            _can_attempt_help(attempt_index, search_result)
+            _can_attempt_change_result(attempt_index, search_result)
         )
 
     def run_stage(loop_carry: tuple) -> tuple:
         attempt_index, lane_indices, *lane_arrays = loop_carry
         pending_first_order = jnp.argsort(
-            ~_can_attempt_help(attempt_index, lane_arrays[0]), stable=True
+            ~_can_attempt_change_result(attempt_index, lane_arrays[0]), stable=True
         )
         lane_indices, search_result, parameters_and_guess = jax.tree.map(
             lambda x: x[..., pending_first_order], (lane_indices, *lane_arrays)
         )
-        end_attempt = jnp.where(attempt_index < len(SEARCH_ATTEMPTS), attempt_index + 1, n_attempts)
+        end_attempt_index = jnp.where(
+            attempt_index < len(SEARCH_ATTEMPTS), attempt_index + 1, n_attempts
+        )
         return (
-            end_attempt,
+            end_attempt_index,
             lane_indices,
             run_attempts(
                 parameters_and_guess[0],
                 search_result,
                 attempt_index,
-                end_attempt,
+                end_attempt_index,
                 *parameters_and_guess[1:],
             ),
             parameters_and_guess,
         )
 
-    first_carry = first_attempt, jnp.arange(n_lanes), search_result, parameters_and_guess
-    _, lane_indices, gathered_result, _ = lax.while_loop(has_next_stage, run_stage, first_carry)
+    initial_carry = first_attempt_index, jnp.arange(n_lanes), search_result, parameters_and_guess
+    _, lane_indices, gathered_search_result, _ = lax.while_loop(
+        has_next_stage, run_stage, initial_carry
+    )
     original_order = jnp.argsort(lane_indices)
-    return jax.tree.map(lambda x: x[..., original_order], gathered_result)
+    return jax.tree.map(lambda x: x[..., original_order], gathered_search_result)
 
 
-def _can_attempt_help(
+def _can_attempt_change_result(
     attempt_index: Int[Array, ""], search_result: CycleSearchResult
 ) -> Bool[Array, " lanes"]:
-    """Return whether an attempt can still change the result of each lane."""
+    """Return for each lane whether an attempt can still change its result."""
     is_lane_decided = (search_result.collocation_state.failed_check > 0.0) | (
         search_result.collocation_state.failed_check == HomotopyFailure.BOTH_TRIES
     )
@@ -790,13 +842,20 @@ def _can_attempt_help(
     )
 
 
-def init_search_result(system: CollocationSystem, parameters: LaneParameters) -> CycleSearchResult:
+def init_search_result(
+    collocation_system: CollocationSystem, parameters: LaneParameters
+) -> CycleSearchResult:
     """Return the search result before the first attempt."""
-    section_size, n_phases = system.phase_sequence.section_size, len(system.phase_sequence.phases)
-    make_zeros = lambda *shape: jnp.zeros((*shape, parameters.shape[-1]), parameters.dtype)
+    section_size, n_phases = (
+        collocation_system.phase_sequence.section_size,
+        len(collocation_system.phase_sequence.phases),
+    )
+    make_zeros = lambda *array_shape: jnp.zeros(
+        (*array_shape, parameters.shape[-1]), parameters.dtype
+    )
     return CycleSearchResult(
         make_start_state(
-            system, make_zeros(section_size), make_zeros(n_phases), make_zeros() > 0.0
+            collocation_system, make_zeros(section_size), make_zeros(n_phases), make_zeros() > 0.0
         ),
         make_zeros(section_size, section_size),
         make_zeros() + jnp.inf,
@@ -805,10 +864,10 @@ def init_search_result(system: CollocationSystem, parameters: LaneParameters) ->
 
 
 MESH_CHECK_CODE = len(ADMISSIBILITY_CHECKS)
-"""Value of `CollocationState.failed_check` for a root that the mesh does not resolve."""
+"""Value of `CollocationState.failed_check` for a root with a too coarse mesh."""
 
 HOMOTOPY_OFFSET = float(len(ADMISSIBILITY_CHECKS))
-"""Offset in `CollocationState.failed_check` of a check that a wheel on the homotopy fails."""
+"""Offset of `CollocationState.failed_check` for a check that a wheel on the homotopy fails."""
 
 
 class HomotopyFailure(IntEnum):
@@ -819,7 +878,10 @@ class HomotopyFailure(IntEnum):
 
 
 SEARCH_ATTEMPTS = ("guess", "guess, on", "surface", "surface, on", "homotopy", "without DLS")
-"""Names of the attempts in their order. The first two start from the guess, if any, the next two
-from the gait that the stored surface predicts. A homotopy from Table 1 follows, then a cycle
-without double support. The attempts "guess" and "surface" have few iterations, so that a batch can
-gather the lanes that need more in separate blocks."""
+"""Names of the attempts in their order.
+
+The first two attempts start from the guess, if there is one. The next two start from the gait that
+the stored surface predicts. A homotopy from Table 1 follows, and then a cycle without double
+support. The attempts "guess" and "surface" have few iterations, so that the lanes of a batch that
+need more are gathered in separate blocks.
+"""

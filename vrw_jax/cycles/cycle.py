@@ -1,4 +1,4 @@
-"""Interface of limit cycles, independent of the model and of the search method."""
+"""Interface of limit cycles of all models and search methods."""
 
 import abc
 import dataclasses
@@ -26,26 +26,29 @@ from vrw_jax.validation import check_choice
 from vrw_jax.wheel import Outcome, WheelParams
 
 SAME_STATE_RELATIVE_TOLERANCE = 1e-7
-"""Relative distance below which two section states of a cycle are equal. The value is chosen
-because it is ten times the allowed difference of two computations of a gait
-(`finder.STATE_AGREEMENT_TOLERANCE`)."""
+"""Relative distance below which two section states of a cycle count as equal.
+
+The value is chosen as ten times the allowed difference between two computations of a gait
+(`finder.STATE_AGREEMENT_TOLERANCE`).
+"""
 
 
 class AbstractCycle(AbstractPrintable):
-    """Gait that repeats after `period_n` steps; under vmap every field has the batch axis first.
+    """Gait that repeats after `period_n` steps. Under vmap, the batch axis of every field comes
+    first.
 
-    If no gait is found, `outcome` gives the reason. All other numbers and their derivatives are
-    then zero. The axis over steps is absent if `period_n` is 1.
+    If no gait is found, `outcome` is the reason, and all other fields and their derivatives are
+    zero. For `period_n` 1, arrays have no axis over the steps.
     """
 
-    # state before touchdown, a fixed point of `period_n` return maps
+    # before touchdown; fixed point of `period_n` return maps
     section_state: eqx.AbstractVar[Array]
     post_impact: eqx.AbstractVar[Float[Array, "2"]]  # (theta, dtheta) after the first landing
-    # durations of the phases, s, double support first
+    # of the phases, s, double support first
     durations: eqx.AbstractVar[Float[Array, "*n 3"]]
-    step_length: eqx.AbstractVar[Float[Array, "*n"]]  # distance between the feet at the landing, m
-    monodromy_value: eqx.AbstractVar[Array]  # monodromy matrix, without derivatives
-    outcome: eqx.AbstractVar[Int[Array, ""]]  # Outcome.STEPPED or the failure
+    step_length: eqx.AbstractVar[Float[Array, "*n"]]  # distance between the feet at each landing, m
+    monodromy_value: eqx.AbstractVar[Array]  # the monodromy matrix without derivatives
+    outcome: eqx.AbstractVar[Int[Array, ""]]  # Outcome.STEPPED or a failure
 
     @property
     @abc.abstractmethod
@@ -55,25 +58,24 @@ class AbstractCycle(AbstractPrintable):
     @property
     @abc.abstractmethod
     def monodromy(self) -> Array:
-        """Return the Jacobian of the return map, which is itself differentiable."""
+        """Return the monodromy matrix, the differentiable Jacobian of the return map."""
 
     @property
     @abc.abstractmethod
     def warm_start(self) -> Any:
-        """Return the start of a search for the gait of a neighboring wheel."""
+        """Return a start of the search for the gait of a similar wheel."""
 
     @property
     @abc.abstractmethod
     def step_ends(self) -> Array:
-        """Return the section state at the end of each step; the last axes are steps and
-        coordinates.
-        """
+        """Return the section state at the end of each step; the last two axes are steps and
+        coordinates."""
 
     @property
     def minimal_period(self) -> Int[Array, "..."]:
-        """Return the fewest steps after which the gait repeats; 0 if there is no gait.
+        """Return the fewest steps after which the gait repeats, or 0 if there is no gait.
 
-        The number divides `period_n`: a gait of one step also repeats after two steps.
+        The result divides `period_n`: a gait that repeats after one step also repeats after two.
         """
         step_ends, period_n = self.step_ends, self.period_n
         largest_coordinate = jnp.max(jnp.abs(step_ends), (-2, -1))
@@ -97,12 +99,12 @@ class AbstractCycle(AbstractPrintable):
         return jnp.where(self.found, minimal_period, 0)
 
     def replace_missing_gaits_by_nan(self, params: WheelParams) -> Any:
-        """Return the cycle with NaN in place of zeros if no gait was found.
+        """Return the cycle with NaN instead of zeros if no gait was found.
 
-        Derivatives by `params` are then NaN too.
+        Derivatives with respect to `params` are then also NaN.
         """
         nan_without_gait = jnp.where(self.found, 0.0, jnp.nan)
-        # The parameters are included, so that derivatives are NaN too.
+        # The weight contains the parameters, so that derivatives are also NaN.
         nan_weight = 1.0 + nan_without_gait * sum(jax.tree.leaves(params))
 
         def apply_nan_weight(x: Array) -> Array:
@@ -114,18 +116,18 @@ class AbstractCycle(AbstractPrintable):
         }
         return dataclasses.replace(self, **weighted_fields)
 
-    def _zero_without_gait(self, gait_value: Array) -> Array:
-        """Return `gait_value`, or zero if no gait was found.
+    def _zero_without_gait(self, value_of_gait: Array) -> Array:
+        """Return `value_of_gait`, or zero if no gait was found.
 
-        After `replace_missing_gaits_by_nan` the result is NaN, also in derivatives.
+        After `replace_missing_gaits_by_nan` the result and its derivatives are NaN instead of zero.
         """
-        # The derivative of this zero is zero.
-        return jnp.where(self.found, gait_value, 0.0 * self.monodromy_value[..., 0, 0])
+        # The derivative of the zero is also zero.
+        return jnp.where(self.found, value_of_gait, 0.0 * self.monodromy_value[..., 0, 0])
 
     def reduce_over_steps(
         self, step_values: Array, reduce_values: Callable[[Array, int], Array]
     ) -> Array:
-        """Return one value for the whole cycle from the values of its steps on the last axis."""
+        """Return one value per cycle from the values of its steps, which are on the last axis."""
         return reduce_values(step_values, -1) if self.period_n > 1 else step_values
 
     @property
@@ -135,12 +137,12 @@ class AbstractCycle(AbstractPrintable):
 
     @property
     def ending(self) -> Any:
-        """Return a sentence about how the search ended; for a batch, an array of sentences."""
+        """Return a sentence on the end of the search; for a batch, an array of sentences."""
         return describe_step_ending(self.outcome, Outcome)
 
     @property
     def why(self) -> Any:
-        """Return the reason why no gait was found, which is the sentence of `ending`."""
+        """Return the sentence of `ending`, which is the reason if no gait was found."""
         return self.ending
 
     @property
@@ -150,27 +152,27 @@ class AbstractCycle(AbstractPrintable):
 
     @property
     def dls_fraction(self) -> Array:
-        """Return the fraction of the period in double support."""
-        dls, period = self.reduce_over_steps(self.durations[..., 0], jnp.sum), self.period
-        return dls / jnp.where(period > 0.0, period, 1.0)
+        """Return the fraction of the period that is double support."""
+        dls_duration, period = self.reduce_over_steps(self.durations[..., 0], jnp.sum), self.period
+        return dls_duration / jnp.where(period > 0.0, period, 1.0)
 
     @property
     def speed(self) -> Array:
-        """Return the mean speed, the distance of a cycle over its period, m/s."""
-        distance, period = self.reduce_over_steps(self.step_length, jnp.sum), self.period
-        return distance / jnp.where(period > 0.0, period, 1.0)
+        """Return the mean speed of the cycle: its distance over its period, m/s."""
+        cycle_distance, period = self.reduce_over_steps(self.step_length, jnp.sum), self.period
+        return cycle_distance / jnp.where(period > 0.0, period, 1.0)
 
     @property
     def multipliers(self) -> Complex[Array, "... n"]:
         """Return the Floquet multipliers, largest modulus first.
 
-        They are differentiable for sections of at most three coordinates.
+        The multipliers are differentiable for sections of at most three coordinates.
         """
         return floquet.floquet_multipliers(self.monodromy)
 
     @property
     def spectral_radius(self) -> Array:
-        """Return the largest modulus of a Floquet multiplier; the gait is stable below 1."""
+        """Return the largest modulus of the Floquet multipliers, below 1 for stable gaits."""
         return floquet.compute_spectral_radius(self.monodromy)
 
     @property
@@ -180,29 +182,30 @@ class AbstractCycle(AbstractPrintable):
 
     @property
     def spectral_margin(self) -> Array:
-        """Return 1 minus the spectral radius, which is positive for stable gaits of every model."""
+        """Return 1 minus the spectral radius, positive for stable gaits of every model."""
         return self._zero_without_gait(1.0 - self.spectral_radius)
 
     @property
     def stability_margin(self) -> Array:
-        """Return the smooth minimum of the Jury margins, which is positive for stable gaits.
+        """Return the smooth minimum of the Jury margins, positive only for stable gaits.
 
-        See `floquet.stability_margin`. It is defined for sections of at most three coordinates,
-        which excludes unilateral contact.
+        See `floquet.compute_stability_margin`. The margin is defined for sections of at most three
+        coordinates, and therefore not for unilateral contact.
         """
-        return self._zero_without_gait(floquet.stability_margin(self.monodromy))
+        return self._zero_without_gait(floquet.compute_stability_margin(self.monodromy))
 
     @property
     def condition_number(self) -> Array:
-        """Return the condition number of I - monodromy, the factor by which the cycle amplifies a
-        disturbance.
+        """Return the condition number of I - monodromy.
+
+        The cycle amplifies a disturbance by this factor.
         """
         newton_matrix = jnp.eye(self.monodromy_value.shape[-1]) - self.monodromy_value
         return self._zero_without_gait(jnp.linalg.cond(newton_matrix))
 
     @with_default_jax_settings
     def measure(self, measure_name: str) -> Array:
-        """Return a measure of the cycle by its name in `CYCLE_MEASURE_FUNCTIONS`; batch axes come
+        """Return a measure of the cycle by its name in `CYCLE_MEASURE_FUNCTIONS`, with batch axes
         first.
 
         Durations are sums over the cycle's steps, and indicators are minima over the steps.
@@ -211,18 +214,22 @@ class AbstractCycle(AbstractPrintable):
             check_choice("the measure", measure_name, tuple(CYCLE_MEASURE_FUNCTIONS))
         ](self)
 
-    def measures(self, names: Iterable[str]) -> dict[str, Array]:
-        """Return several measures by name. Measures that are not named are not traced."""
-        return {name: self.measure(name) for name in names}
+    def measures(self, measure_names: Iterable[str]) -> dict[str, Array]:
+        """Return the named measures by name; only these measures are traced."""
+        return {measure_name: self.measure(measure_name) for measure_name in measure_names}
 
     def summary_rows(self) -> list[LabelAndText]:
-        """Return labels and texts of the printed cycle; for a batch, the number of found cycles."""
+        """Return labels and texts of the printed cycle; for a batch, of the number of found
+        cycles.
+        """
         outcome_codes = np.asarray(self.outcome)
         if outcome_codes.ndim:
             return [("wheels", format_outcome_counts(outcome_codes, Outcome))]
         if outcome_codes != Outcome.STEPPED:
             return [("outcome", f"{Outcome(int(outcome_codes)).name}: {self.why}")]
-        spectral_radius, multipliers_text = format_multipliers(np.asarray(self.monodromy_value))
+        spectral_radius, multipliers_text = format_floquet_multipliers(
+            np.asarray(self.monodromy_value)
+        )
         period_text = f"{self.period_n} steps" if self.period_n > 1 else "one step"
         if (minimal_period := int(self.minimal_period)) < self.period_n:
             period_text += f"; its minimal period is {minimal_period}"
@@ -239,26 +246,30 @@ class AbstractCycle(AbstractPrintable):
 
     @abc.abstractmethod
     def model_summary_rows(self) -> list[LabelAndText]:
-        """Return the labels and texts that only this model's cycles print."""
+        """Return labels and texts that are printed only for cycles of this model."""
 
 
-def format_multipliers(monodromy_matrix: np.ndarray) -> tuple[float, str]:
-    """Return the spectral radius, and a text of the multipliers, largest first.
+def format_floquet_multipliers(monodromy_matrix: np.ndarray) -> tuple[float, str]:
+    """Return the spectral radius, and a text of the Floquet multipliers, largest modulus first.
 
     Multipliers that are zero to five digits are only counted.
     """
-    multipliers = sorted(np.linalg.eigvals(monodromy_matrix), key=abs, reverse=True)
-    shown_multipliers = [multiplier for multiplier in multipliers if abs(multiplier) >= 5e-6]
+    floquet_multipliers = sorted(np.linalg.eigvals(monodromy_matrix), key=abs, reverse=True)
+    shown_multipliers = [
+        floquet_multiplier
+        for floquet_multiplier in floquet_multipliers
+        if abs(floquet_multiplier) >= 5e-6
+    ]
     remainder_text = (
-        f"{len(multipliers) - len(shown_multipliers)} below 5e-6"
-        if len(shown_multipliers) < len(multipliers)
+        f"{len(floquet_multipliers) - len(shown_multipliers)} below 5e-6"
+        if len(shown_multipliers) < len(floquet_multipliers)
         else ""
     )
     multiplier_texts = [
-        f"{multiplier:.5f}" if multiplier.imag else f"{multiplier.real:.5f}"
-        for multiplier in shown_multipliers
+        f"{floquet_multiplier:.5f}" if floquet_multiplier.imag else f"{floquet_multiplier.real:.5f}"
+        for floquet_multiplier in shown_multipliers
     ]
-    return float(np.abs(multipliers[0])), ", ".join(
+    return float(np.abs(floquet_multipliers[0])), ", ".join(
         [*multiplier_texts, *([remainder_text] if remainder_text else [])]
     )
 
@@ -272,34 +283,32 @@ FIELDS_ZERO_WITHOUT_GAIT = (
     "steps",
     "monodromy_value",
 )
-"""Names of the fields of a cycle that are zero if no gait was found."""
+"""Names of the fields of a cycle that are zero if no gait is found."""
 
 
-def _make_property_reader(name: str) -> Callable[[AbstractCycle], Array]:
-    """Return the function that reads the property `name` of a cycle."""
-    return lambda cycle: getattr(cycle, name)
+def _make_property_reader(property_name: str) -> Callable[[AbstractCycle], Array]:
+    """Return a function that reads the named property of a cycle."""
+    return lambda cycle: getattr(cycle, property_name)
 
 
 def _make_duration_reader(phase_index: int) -> Callable[[AbstractCycle], Array]:
-    """Return the function that reads the duration of a phase, s, from a cycle."""
+    """Return a function that reads the duration of a phase, summed over the steps of a cycle, s."""
     return lambda cycle: cycle.reduce_over_steps(cycle.durations[..., phase_index], jnp.sum)
 
 
-def _make_indicator_reader(name: str) -> Callable[[Any], Array]:
-    """Return the function that reads an indicator of double support from a cycle."""
-    return lambda cycle: cycle.reduce_over_steps(getattr(cycle.indicators, name), jnp.min)
+def _make_indicator_reader(indicator_name: str) -> Callable[[Any], Array]:
+    """Return a function that reads a double-support indicator of a cycle."""
+    return lambda cycle: cycle.reduce_over_steps(getattr(cycle.indicators, indicator_name), jnp.min)
 
 
-def _make_sensitivity_reader(name: str) -> Callable[[Any], Array]:
-    """Return the function that reads the gait sensitivity norm of the measure `name` from a
-    cycle.
-    """
-    return lambda cycle: cycle.gait_sensitivity(name)
+def _make_sensitivity_reader(measure_name: str) -> Callable[[Any], Array]:
+    """Return a function that reads the gait sensitivity norm of a measure of a cycle."""
+    return lambda cycle: cycle.gait_sensitivity(measure_name)
 
 
-def _make_force_peak_reader(name: str) -> Callable[[Any], Array]:
-    """Return the function that reads the force-peak measure `name` from a cycle."""
-    return lambda cycle: cycle.force_peaks[name]
+def _make_force_peak_reader(measure_name: str) -> Callable[[Any], Array]:
+    """Return a function that reads a force-peak measure of a cycle."""
+    return lambda cycle: cycle.force_peaks[measure_name]
 
 
 CYCLE_MEASURE_FUNCTIONS: dict[str, Callable[[AbstractCycle], Array]] = {
@@ -327,6 +336,8 @@ CYCLE_MEASURE_FUNCTIONS: dict[str, Callable[[AbstractCycle], Array]] = {
     "gait_sensitivity_speed": _make_sensitivity_reader("speed"),
     **{name: _make_force_peak_reader(name) for name in FORCE_PEAK_MEASURES},
 }
-"""Functions of a cycle by the name of the measure. Derivatives of the stability measures are second
-derivatives of the motion. They need one more compiled program than other derivatives, and take
-twice the time to run."""
+"""Functions from a cycle to a measure, by the name of the measure.
+
+Derivatives of the stability measures are second derivatives of the motion. They need an additional
+compiled program, and take twice as long as derivatives of other measures.
+"""

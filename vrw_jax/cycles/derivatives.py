@@ -1,8 +1,8 @@
-"""Derivatives of limit cycles by the implicit function theorem, to any order and in any mode.
+"""Derivatives of limit cycles by the implicit function theorem, of any order and in any mode.
 
 First derivatives are the tangents of the linearization at the cycle. Second derivatives are
-derivatives of that linearization, of its tangents and of the monodromy matrix. They are taken along
-the tangents of the cycle, one parameter after another. On a CPU, both orders are machine code.
+derivatives of the linearization, of its tangents and of the monodromy matrix along the tangents of
+the cycle, one parameter after another. On a CPU, both orders are machine code.
 """
 
 import functools
@@ -47,31 +47,35 @@ from vrw_jax.wheel import PARAMETER_DOMAINS, PARAMETER_NAMES, compute_symbols, c
 
 
 def _compute_collocation_tangents(
-    system: CollocationSystem, parameters: LaneParameters, collocation_state: CollocationState
+    collocation_system: CollocationSystem,
+    parameters: LaneParameters,
+    collocation_state: CollocationState,
 ) -> CollocationState:
-    """Return the derivatives of the state by the parameters on a leading axis, for each lane.
+    """Return the derivatives of the collocation state by the parameters, on a leading axis.
 
-    They are zero in lanes without a cycle.
+    The derivatives are zero in lanes without a cycle.
     """
-    linearized_pass = system.linearize_at(
+    cycle_linearization = collocation_system.linearize_at(
         parameters, collocation_state, tuple(range(parameters.shape[0]))
     )
     return _zero_without_cycle(
-        collocation_state, compute_state_tangents(linearized_pass, collocation_state)
+        collocation_state, compute_state_tangents(cycle_linearization, collocation_state)
     )
 
 
 def _compute_masked_monodromy(
-    system: CollocationSystem, parameters: LaneParameters, collocation_state: CollocationState
+    collocation_system: CollocationSystem,
+    parameters: LaneParameters,
+    collocation_state: CollocationState,
 ) -> Array:
-    """Return the monodromy matrix of each lane, which is zero in lanes without a cycle."""
+    """Return the monodromy matrix of each lane, zero in lanes without a cycle."""
     return _zero_without_cycle(
-        collocation_state, system.linearize_at(parameters, collocation_state).monodromy
+        collocation_state, collocation_system.linearize_at(parameters, collocation_state).monodromy
     )
 
 
 def _compute_monodromy_tangents(
-    system: CollocationSystem,
+    collocation_system: CollocationSystem,
     parameters: LaneParameters,
     solution_and_tangents: tuple[CollocationState, CollocationState],
 ) -> Array:
@@ -79,68 +83,81 @@ def _compute_monodromy_tangents(
     axis.
 
     The directions are computed one after another, so that the compiled code is as short as for one
-    direction. Three of the nine derivatives follow from a change of units. For the unit of mass,
-    the direction increases both masses by the same factor and leaves the forces unchanged.
+    direction. Three of the nine derivatives follow from changes of units. A change of the unit of
+    mass scales both masses by one factor, so that only the orthogonal direction of the two masses
+    is computed.
 
     - `solution_and_tangents`: the solution z and its derivatives dz/dp.
     """
     collocation_state, state_tangents = solution_and_tangents
-    hub_index, leg_index = (PARAMETER_NAMES.index(name) for name in ("hub_mass", "leg_mass"))
-    total_mass = parameters[hub_index] + parameters[leg_index]
-    hub_share, leg_share = parameters[hub_index] / total_mass, parameters[leg_index] / total_mass
-    plain_indices = [
+    hub_mass_index, leg_mass_index = (
+        PARAMETER_NAMES.index(parameter_name) for parameter_name in ("hub_mass", "leg_mass")
+    )
+    total_mass = parameters[hub_mass_index] + parameters[leg_mass_index]
+    hub_mass_share, leg_mass_share = (
+        parameters[hub_mass_index] / total_mass,
+        parameters[leg_mass_index] / total_mass,
+    )
+    unscaled_parameter_indices = [
         i
         for i in range(len(parameters))
-        if i not in (hub_index, leg_index, *scales.UNIT_SCALING_BY_PARAMETER_INDEX)
+        if i not in (hub_mass_index, leg_mass_index, *scales.UNIT_SCALING_BY_PARAMETER_INDEX)
     ]
     unit_weights, zero_weights = jnp.ones_like(total_mass), jnp.zeros_like(total_mass)
-    first_indices = jnp.asarray([*plain_indices, leg_index])
-    second_indices = jnp.asarray([*plain_indices, hub_index])
+    first_parameter_indices = jnp.asarray([*unscaled_parameter_indices, leg_mass_index])
+    second_parameter_indices = jnp.asarray([*unscaled_parameter_indices, hub_mass_index])
     direction_weights = (
-        jnp.stack([unit_weights] * len(plain_indices) + [hub_share]),
-        jnp.stack([zero_weights] * len(plain_indices) + [-leg_share]),
+        jnp.stack([unit_weights] * len(unscaled_parameter_indices) + [hub_mass_share]),
+        jnp.stack([zero_weights] * len(unscaled_parameter_indices) + [-leg_mass_share]),
     )
-    identity = jnp.eye(len(parameters), dtype=parameters.dtype)[..., None]
-    parameter_tangents = jnp.broadcast_to(identity, (len(parameters), *parameters.shape))
+    identity_matrix = jnp.eye(len(parameters), dtype=parameters.dtype)[..., None]
+    parameter_tangents = jnp.broadcast_to(identity_matrix, (len(parameters), *parameters.shape))
 
     def monodromy_tangent(indices_and_weights: tuple) -> tuple[Array, Array]:
-        first_index, second_index, first_weight, second_weight = indices_and_weights
-        select_tangent = lambda x, first_index: lax.dynamic_index_in_dim(
-            x, first_index, keepdims=False
+        (
+            first_parameter_index,
+            second_parameter_index,
+            first_direction_weight,
+            second_direction_weight,
+        ) = indices_and_weights
+        select_tangent = lambda x, first_parameter_index: lax.dynamic_index_in_dim(
+            x, first_parameter_index, keepdims=False
         )
         indices_and_weights = jax.tree.map(
             lambda x: (
-                first_weight * select_tangent(x, first_index)
-                + second_weight * select_tangent(x, second_index)
+                first_direction_weight * select_tangent(x, first_parameter_index)
+                + second_direction_weight * select_tangent(x, second_parameter_index)
             ),
             (parameter_tangents, state_tangents),
         )
         return jax.jvp(
-            functools.partial(_compute_masked_monodromy, system),
+            functools.partial(_compute_masked_monodromy, collocation_system),
             (parameters, collocation_state),
             indices_and_weights,
         )
 
     monodromy_matrices, monodromy_tangents = lax.map(
-        monodromy_tangent, (first_indices, second_indices, *direction_weights)
+        monodromy_tangent, (first_parameter_indices, second_parameter_indices, *direction_weights)
     )
-    tangent_by_parameter = dict(zip(plain_indices, monodromy_tangents[:-1], strict=True))
+    tangent_by_parameter = dict(
+        zip(unscaled_parameter_indices, monodromy_tangents[:-1], strict=True)
+    )
     mass_scale_tangent = (
         scales.MASS_UNIT_SCALING.subtract_known_columns(
             jnp.zeros_like(monodromy_tangents[0]), tuple(parameters), tangent_by_parameter
         )
         / total_mass
     )
-    squared_direction_norm = hub_share * hub_share + leg_share * leg_share
-    tangent_by_parameter[hub_index] = (
-        hub_share * mass_scale_tangent - leg_share * monodromy_tangents[-1]
+    squared_direction_norm = hub_mass_share * hub_mass_share + leg_mass_share * leg_mass_share
+    tangent_by_parameter[hub_mass_index] = (
+        hub_mass_share * mass_scale_tangent - leg_mass_share * monodromy_tangents[-1]
     ) / squared_direction_norm
-    tangent_by_parameter[leg_index] = (
-        leg_share * mass_scale_tangent + hub_share * monodromy_tangents[-1]
+    tangent_by_parameter[leg_mass_index] = (
+        leg_mass_share * mass_scale_tangent + hub_mass_share * monodromy_tangents[-1]
     ) / squared_direction_norm
     time_scale_tangent = (
         jnp.asarray([[0, 1], [-1, 0]])[..., None] * monodromy_matrices[0]
-    )  # derivative of the monodromy matrix by the logarithm of the time unit
+    )  # by the logarithm of the time unit
     time_scale_tangents = {
         i: time_scale_tangent
         if unit_scale is scales.TIME_UNIT_SCALING
@@ -153,85 +170,96 @@ def _compute_monodromy_tangents(
     return jnp.stack([tangent_by_parameter[i] for i in range(len(parameters))])
 
 
-def _zero_without_cycle(collocation_state: CollocationState, tree: Any) -> Any:
+def _zero_without_cycle(collocation_state: CollocationState, tree_over_lanes: Any) -> Any:
     """Return the tree with zeros in the lanes without a cycle."""
-    return jax.tree.map(lambda x: jnp.where(collocation_state.has_cycle > 0.5, x, 0.0), tree)
+    return jax.tree.map(
+        lambda x: jnp.where(collocation_state.has_cycle > 0.5, x, 0.0), tree_over_lanes
+    )
 
 
 def compile_batch_function(
-    function: BatchFunction, make_output_template: Callable, cache_key: tuple, batch_size: int
+    function_of_element: BatchFunction,
+    make_output_template: Callable,
+    cache_key: tuple,
+    batch_size: int,
 ) -> BatchFunction:
     """Return a batch function compiled in its fastest form.
 
-    The fastest form is machine code on a CPU, else XLA in blocks of `batch_size` lanes.
+    The fastest form is machine code on a CPU, and XLA in blocks of `batch_size` lanes otherwise.
     """
     if simd.is_machine_code_available():
-        return compile_cached_lane_function(function, make_output_template, cache_key)
+        return compile_cached_lane_function(function_of_element, make_output_template, cache_key)
     register_export_types()
-    return call_through_saved_trace(apply_in_blocks(function, batch_size), cache_key)
+    return call_through_saved_trace(apply_in_blocks(function_of_element, batch_size), cache_key)
 
 
 def _make_derivative_compiler(
-    function_name: str, make_output_templates: tuple[Callable, ...], system: CollocationSystem
+    function_name: str,
+    make_output_templates: tuple[Callable, ...],
+    collocation_system: CollocationSystem,
 ) -> ExecutionWrapper:
     """Return a function that compiles a batch function for a given order of derivatives.
 
-    Orders with an output template use `compile_batch_function`, higher orders XLA.
+    Orders with an output template use `compile_batch_function`, and higher orders use XLA.
     """
-    batch_size = system.cycle_options.batch_size
+    batch_size = collocation_system.cycle_options.batch_size
 
-    def compile_function(function: BatchFunction, derivative_order: int) -> BatchFunction:
+    def compile_function(
+        function_of_element: BatchFunction, derivative_order: int
+    ) -> BatchFunction:
         if derivative_order < len(make_output_templates):
             return compile_batch_function(
-                function,
+                function_of_element,
                 make_output_templates[derivative_order],
-                (function_name, derivative_order, system),
+                (function_name, derivative_order, collocation_system),
                 batch_size,
             )
-        return apply_in_blocks(function, batch_size)
+        return apply_in_blocks(function_of_element, batch_size)
 
     return compile_function
 
 
-def _make_tangent_function(system: CollocationSystem) -> Callable:
+def _make_tangent_function(collocation_system: CollocationSystem) -> Callable:
     """Return `_compute_collocation_tangents` of one wheel as a differentiable function."""
     make_output_templates = (
         (lambda parameters, collocation_state: collocation_state),
         (lambda parameters, solution_and_tangents: solution_and_tangents[0]),
     )
-    compile_function = _make_derivative_compiler("columns", make_output_templates, system)
+    compile_function = _make_derivative_compiler(
+        "columns", make_output_templates, collocation_system
+    )
     compute_tangents = with_implicit_derivative(
-        functools.partial(_compute_collocation_tangents, system),
-        lambda *inputs: compute_tangents(*inputs),
+        functools.partial(_compute_collocation_tangents, collocation_system),
+        lambda *primal_arrays: compute_tangents(*primal_arrays),
         compile_function,
     )
     return compute_tangents
 
 
 def _search_in_scaled_units(
-    system: CollocationSystem,
+    collocation_system: CollocationSystem,
     run_attempts: BatchFunction,
     parameters: LaneParameters,
     *si_guess: CollocationState,
 ) -> CycleSearchResult:
     """Return the result of `search_all_attempts` in SI units.
 
-    The search uses units of length and time of the wheel. The section state is (theta, dtheta)
-    after a landing. Step ends are (theta, L1) and their rates. Mass is not converted, because no
+    The search uses the wheel's units of length and time. The section state is (theta, dtheta) after
+    a landing, and the step ends are (theta, L1) and their rates. Mass is not converted, because no
     unknown contains it.
     """
-    wheel_units = compute_wheel_units(compute_symbols(system.n_legs, *parameters))._replace(
-        mass_unit=1.0
-    )
+    wheel_units = compute_wheel_units(
+        compute_symbols(collocation_system.n_legs, *parameters)
+    )._replace(mass_unit=1.0)
     angle_unit, time_unit = jnp.ones_like(wheel_units.time_unit), wheel_units.time_unit
     position_units = jnp.stack([angle_unit, wheel_units.length_unit, wheel_units.length_unit])
     section_units = jnp.stack([angle_unit, 1.0 / time_unit])
-    end_units = jnp.concatenate([position_units[:2], position_units[:2] / time_unit])
+    step_end_units = jnp.concatenate([position_units[:2], position_units[:2] / time_unit])
 
     def convert_units(
         collocation_state: CollocationState, apply_unit: Callable[[Array, Array], Array]
     ) -> CollocationState:
-        """Return the state with each number converted by `apply_unit(number, unit)`."""
+        """Return the state, each number of which is converted by `apply_unit(number, unit)`."""
         collocation_solution = collocation_state.solution
         accelerations = tuple(
             apply_unit(x, position_units[: x.shape[-2]] / (time_unit * time_unit))
@@ -244,10 +272,10 @@ def _search_in_scaled_units(
         )
         return collocation_state._replace(
             solution=collocation_solution,
-            step_end_states=apply_unit(collocation_state.step_end_states, end_units),
+            step_end_states=apply_unit(collocation_state.step_end_states, step_end_units),
         )
 
-    scaled_guess = tuple(convert_units(state, operator.truediv) for state in si_guess)
+    scaled_guess = tuple(convert_units(scaled_state, operator.truediv) for scaled_state in si_guess)
     parameter_units = [
         wheel_units.compute_unit_in_si(parameter_domain.unit)
         for parameter_domain in PARAMETER_DOMAINS.values()
@@ -257,7 +285,7 @@ def _search_in_scaled_units(
         for parameter_value, parameter_unit in zip(parameters, parameter_units, strict=True)
     ]
     search_result = search_all_attempts(
-        system, run_attempts, jnp.stack(scaled_parameters), *scaled_guess
+        collocation_system, run_attempts, jnp.stack(scaled_parameters), *scaled_guess
     )
     monodromy_matrix = section_units[:, None] * search_result.monodromy_matrix / section_units
     return search_result._replace(
@@ -267,39 +295,47 @@ def _search_in_scaled_units(
 
 
 def solve_cycle_with_derivatives(
-    system: CollocationSystem, parameters: Array, guess: CollocationState | None
+    collocation_system: CollocationSystem, parameters: Array, search_guess: CollocationState | None
 ) -> tuple[CollocationState, tuple]:
-    """Return the cycle of one wheel and the diagnostics of the search.
+    """Return the collocation state of one wheel's cycle, and diagnostics of the search.
 
-    The cycle is differentiable with respect to the parameters. The guess has no derivative.
+    The state is differentiable with respect to the parameters. The guess has no derivatives.
     """
-    search_function = functools.partial(run_search_attempts, system)
-    make_output_template = lambda parameters, start, *_: start
+    search_function = functools.partial(run_search_attempts, collocation_system)
+    make_output_template = lambda parameters, search_start, *_: search_start
     batched_search = compile_batch_function(
-        search_function, make_output_template, ("search", system), system.cycle_options.batch_size
+        search_function,
+        make_output_template,
+        ("search", collocation_system),
+        collocation_system.cycle_options.batch_size,
     )
-    search_one_wheel = unbatch(functools.partial(_search_in_scaled_units, system, batched_search))
-    compute_tangents = _make_tangent_function(system)
+    search_one_wheel = unbatch(
+        functools.partial(_search_in_scaled_units, collocation_system, batched_search)
+    )
+    compute_tangents = _make_tangent_function(collocation_system)
 
     @jax.custom_jvp
     def solve_with_rule(
-        parameters: Array, *guess: CollocationState
+        parameters: Array, *search_guess: CollocationState
     ) -> tuple[CollocationState, tuple]:
-        collocation_state, *diagnostics = search_one_wheel(parameters, *guess)
-        return collocation_state, tuple(diagnostics)
+        collocation_state, *search_diagnostics = search_one_wheel(parameters, *search_guess)
+        return collocation_state, tuple(search_diagnostics)
 
     @solve_with_rule.defjvp
     @with_default_jax_settings
     def jvp_rule(primals: tuple, tangents: tuple) -> tuple:
-        collocation_state, diagnostics = solve_with_rule(*primals)
-        tangent = apply_jacobian(compute_tangents(primals[0], collocation_state), tangents[0])
-        return (collocation_state, diagnostics), (tangent, make_zero_tangent(diagnostics))
+        collocation_state, search_diagnostics = solve_with_rule(*primals)
+        state_tangent = apply_jacobian(compute_tangents(primals[0], collocation_state), tangents[0])
+        return (collocation_state, search_diagnostics), (
+            state_tangent,
+            make_zero_tangent(search_diagnostics),
+        )
 
-    return solve_with_rule(parameters, *(() if guess is None else (guess,)))
+    return solve_with_rule(parameters, *(() if search_guess is None else (search_guess,)))
 
 
 def attach_monodromy_derivatives(
-    system: CollocationSystem,
+    collocation_system: CollocationSystem,
     monodromy_value: Array,
     parameters: Array,
     collocation_state: CollocationState,
@@ -307,13 +343,13 @@ def attach_monodromy_derivatives(
     """Return `monodromy_value` with the derivatives of the monodromy matrix along the branch."""
     make_output_template = lambda parameters, solution_and_tangents: parameters
     compile_function = _make_derivative_compiler(
-        "monodromy", (make_output_template, make_output_template), system
+        "monodromy", (make_output_template, make_output_template), collocation_system
     )
-    compute_monodromy = functools.partial(_compute_masked_monodromy, system)
-    compute_monodromy_tangents = functools.partial(_compute_monodromy_tangents, system)
+    compute_monodromy = functools.partial(_compute_masked_monodromy, collocation_system)
+    compute_monodromy_tangents = functools.partial(_compute_monodromy_tangents, collocation_system)
     compute_parameter_jacobian = make_implicit_jacobian(
         compute_monodromy,
-        _make_tangent_function(system),
+        _make_tangent_function(collocation_system),
         compile_function,
         make_jacobian=compute_monodromy_tangents,
     )

@@ -1,4 +1,6 @@
-"""Interface of gait finders, each of which finds, checks and differentiates one model's gaits."""
+"""Interface of gait finders, each of which finds, checks and differentiates the gaits of a
+model.
+"""
 
 import abc
 from collections.abc import Callable, Sequence
@@ -19,42 +21,44 @@ from vrw_jax.numerics import StepOptions, evaluate_with_jacobian, select_tree_ro
 from vrw_jax.wheel import Outcome, WheelParams
 
 STATE_AGREEMENT_TOLERANCE = 1e-8
-"""Largest distance, rad, rad/s and m/s, between a cycle's section state and the state after the
-event-driven step. The two computations are independent. At the default options the errors of both
-are a tenth of this limit, for steps of up to some 1.5 s."""
+"""Largest accepted change of the section state of a cycle over its event-driven step.
+
+The unit is rad, rad/s and m/s. Collocation and event-driven step are independent. At the default
+options, each of them has a tenth of this error for steps of up to about 1.5 s.
+"""
 
 ParameterValues = Float[Array, " n_values"]
-"""Values of the parameters `AbstractWheel.parameter_names`, in that order."""
+"""Values of the parameters in `AbstractWheel.parameter_names`, in that order."""
 
 
-class BranchPoint(NamedTuple):
+class GaitBranchPoint(NamedTuple):
     """Gait as a point of a branch, with the data that `is_same_branch` compares."""
 
     gait_coordinates: Any  # section state and durations
-    # derivatives of the coordinates, with a leading axis over the model's parameters
+    # with a leading axis over the model's parameters
     coordinate_derivatives: Any
-    is_phase_active: Any  # which phases take place, constant along a branch
-    return_map_jacobian: Any  # Jacobian of the return map
+    is_phase_active: Any  # whether each phase occurs; constant along a branch
+    return_map_jacobian: Any  # with respect to the section state
 
 
 class Gait(eqx.Module):
     """Gait that repeats after one step, with its event-driven step and the derivatives of both.
 
-    Derivatives are taken along the branch of gaits and have a leading axis over the parameters. In
-    a batch of gaits, the batch axis comes first.
+    The derivatives are taken along the branch of gaits, and have a leading axis over the
+    parameters. In a batch of gaits, the batch axis comes first.
     """
 
     cycle: AbstractCycle
-    step: AbstractStep  # event-driven step from the cycle's section state
+    step: AbstractStep  # event-driven, from the cycle's section state
     cycle_derivatives: AbstractCycle
     step_derivatives: AbstractStep
-    branch_point: BranchPoint
+    branch_point: GaitBranchPoint
 
     @property
     def outcome(self) -> np.ndarray:
-        """Return the cycle's outcome, or the failure of the step from the cycle's state.
+        """Return the outcome of the cycle, or the failure of the step from its section state.
 
-        A step that ends at another state is a failure.
+        The step also fails if it ends at another section state.
         """
         cycle, step = self.cycle, self.step
         return confirm_outcome_by_step(
@@ -63,19 +67,23 @@ class Gait(eqx.Module):
 
 
 def is_same_branch(
-    first_point: BranchPoint, second_point: BranchPoint, parameter_change: np.ndarray
+    first_gait_point: GaitBranchPoint,
+    second_gait_point: GaitBranchPoint,
+    parameter_change: np.ndarray,
 ) -> bool:
     """Return whether a branch connects two gaits whose parameters differ by `parameter_change`.
 
-    The mean of the tangents at both gaits must predict most of the distance between the gaits. The
-    same phases must take place, and no multiplier may have crossed 1.
+    The mean of the tangents at both gaits must predict most of their distance. The same phases must
+    occur in both gaits, and no multiplier may have crossed 1.
     """
-    first_point, second_point = select_tree_rows((first_point, second_point), ...)
+    first_gait_point, second_gait_point = select_tree_rows(
+        (first_gait_point, second_gait_point), ...
+    )
     predicted_change = parameter_change @ (
-        0.5 * (first_point.coordinate_derivatives + second_point.coordinate_derivatives)
+        0.5 * (first_gait_point.coordinate_derivatives + second_gait_point.coordinate_derivatives)
     )
     prediction_error = np.linalg.norm(
-        second_point.gait_coordinates - first_point.gait_coordinates - predicted_change
+        second_gait_point.gait_coordinates - first_gait_point.gait_coordinates - predicted_change
     )
     if prediction_error > 0.5 * np.linalg.norm(predicted_change) + 1e-6:
         return False
@@ -83,8 +91,8 @@ def is_same_branch(
         np.eye(len(branch_point.return_map_jacobian)) - branch_point.return_map_jacobian
     )
     return bool(
-        np.array_equal(first_point.is_phase_active, second_point.is_phase_active)
-        and fold_test_function(first_point) * fold_test_function(second_point) > 0.0
+        np.array_equal(first_gait_point.is_phase_active, second_gait_point.is_phase_active)
+        and fold_test_function(first_gait_point) * fold_test_function(second_gait_point) > 0.0
     )
 
 
@@ -93,7 +101,7 @@ def confirm_outcome_by_step(
 ) -> np.ndarray:
     """Return the outcomes of cycles, each confirmed by an event-driven step.
 
-    The step begins at `section_states` and ends at `end_states`, which must be the same.
+    A step confirms its cycle if its start in `section_states` equals its end in `end_states`.
     """
     ends_at_same_state = (
         np.max(np.abs(np.asarray(end_states) - np.asarray(section_states)), axis=-1)
@@ -109,28 +117,27 @@ def confirm_outcome_by_step(
 
 
 class AbstractGaitFinder(eqx.Module):
-    """Finder of the gaits of one model.
+    """Base class of gait finders, each for one model.
 
-    Higher packages use only this interface. `make_finder` selects the class.
+    Packages above `cycles` use only this interface. `make_finder` selects the class.
     """
 
     model: eqx.AbstractVar[AbstractWheel]
     n_legs: eqx.AbstractVar[int]
     step_options: eqx.AbstractVar[StepOptions]
-    options_type: eqx.AbstractClassVar[type]  # type of the options that `limit_cycle` accepts
-    # names of the measures that need only the cycle
+    options_type: eqx.AbstractClassVar[type]  # of the options that `limit_cycle` accepts
+    # names of measures that depend only on the cycle
     cycle_measures: eqx.AbstractClassVar[tuple[str, ...]]
     differentiable_measures: eqx.AbstractClassVar[tuple[str, ...]]
-    """Names of the scalar measures that have derivatives along the branch."""
-    # names of the measures returned by default
+    """Names of scalar measures with derivatives along the branch."""
+    # names of measures that are returned by default
     default_measures: eqx.AbstractClassVar[tuple[str, ...]]
-    # names of all measures, including those with one value per leg
+    # names of all measures, including measures with one value per leg
     readable_measures: eqx.AbstractClassVar[tuple[str, ...]]
-    # whether a search works without a start near the gait
+    # whether the search needs no start near the gait
     supports_cold_start: eqx.AbstractClassVar[bool]
     is_multistable: ClassVar[bool] = False
-    """Whether several gaits of a wheel may attract. If so, walks from several starts distinguish
-    these gaits."""
+    """Whether several gaits of a wheel may attract, which walks from several starts distinguish."""
 
     @classmethod
     @abc.abstractmethod
@@ -142,7 +149,7 @@ class AbstractGaitFinder(eqx.Module):
         period_n: int,
         cycle_options: CycleOptions,
     ) -> "AbstractGaitFinder":
-        """Return the finder with the options of its step, and of its search if it has any."""
+        """Return a finder with the options of its steps and, if it has any, of its search."""
 
     @property
     def search_options(self) -> Any:
@@ -150,88 +157,91 @@ class AbstractGaitFinder(eqx.Module):
         return self.step_options
 
     @abc.abstractmethod
-    def find_cycle(self, params: WheelParams, guess: Any = None) -> AbstractCycle:
-        """Return the cycle of one wheel near `guess`.
+    def find_cycle(self, params: WheelParams, cycle_guess: Any = None) -> AbstractCycle:
+        """Return the cycle of one wheel near `cycle_guess`.
 
-        The guess is a neighbor's `warm_start`, a section state or None.
+        The guess is the `warm_start` of a similar wheel's cycle, a section state or None.
         """
 
-    def find_cycles(self, params: WheelParams, guess: Any = None) -> Any:
-        """Return the cycles of a batch of wheels; every array has a leading axis over wheels."""
-        return jax.vmap(self.find_cycle)(params, guess)
+    def find_cycles(self, params: WheelParams, cycle_guess: Any = None) -> Any:
+        """Return the cycles of a batch of wheels, with a leading axis over wheels."""
+        return jax.vmap(self.find_cycle)(params, cycle_guess)
 
     @abc.abstractmethod
     def make_initial_guess(self, parameter_values: ParameterValues) -> Any:
-        """Return the start of a search for a wheel without a known neighbor."""
+        """Return a start of the search for a wheel without a known similar wheel."""
 
     def make_initial_guesses(self, parameter_values: Float[Array, "lanes n_values"]) -> Any:
-        """Return `make_initial_guess` of a batch of wheels."""
+        """Return starts of the search for a batch of wheels."""
         return jax.vmap(self.make_initial_guess)(parameter_values)
 
     @abc.abstractmethod
-    def find_gait(self, parameter_values: ParameterValues, guess: Any) -> Gait:
-        """Return the gait near `guess` with its derivatives.
+    def find_gait(self, parameter_values: ParameterValues, cycle_guess: Any) -> Gait:
+        """Return the gait near `cycle_guess` with its derivatives, by compiled programs."""
 
-        The large programs are compiled once.
-        """
-
-    def find_gaits(self, parameter_values: Float[Array, "lanes n_values"], guess: Any) -> Gait:
-        """Return `find_gait` of a batch of wheels; every array has a leading axis over wheels."""
-        return eqx.filter_vmap(self.find_gait)(parameter_values, guess)
+    def find_gaits(
+        self, parameter_values: Float[Array, "lanes n_values"], cycle_guess: Any
+    ) -> Gait:
+        """Return the gaits of a batch of wheels with their derivatives, with a leading axis over
+        wheels."""
+        return eqx.filter_vmap(self.find_gait)(parameter_values, cycle_guess)
 
     @abc.abstractmethod
-    def precompile(self, params: WheelParams) -> None:
-        """Compile the programs that `find_gait` needs, in parallel if possible."""
+    def precompile_programs(self, params: WheelParams) -> None:
+        """Compile the programs of `find_gait`, in parallel if possible."""
 
     def take_step(self, params: WheelParams, section_state: Array) -> AbstractStep:
-        """Return one step of the model from a section state.
-
-        The step runs in a program that is already compiled.
+        """Return one event-driven step from a section state, by a program that is already
+        compiled.
         """
-        step: AbstractStep = self.model.take_step(params, section_state, self.step_options)
-        return step
+        event_driven_step: AbstractStep = self.model.take_step(
+            params, section_state, self.step_options
+        )
+        return event_driven_step
 
     def find_cycle_from_values(
-        self, parameter_values: ParameterValues, guess: Any = None
+        self, parameter_values: ParameterValues, cycle_guess: Any = None
     ) -> AbstractCycle:
-        """Return `find_cycle` as a function of the model's parameter values."""
+        """Return the cycle near `cycle_guess` of the wheel with the given parameter values."""
         model, params = self.model.from_values(parameter_values, self.n_legs)
-        return eqx.tree_at(lambda finder: finder.model, self, model).find_cycle(params, guess)
+        return eqx.tree_at(lambda gait_finder: gait_finder.model, self, model).find_cycle(
+            params, cycle_guess
+        )
 
     def measure_gait(
-        self, parameter_values: ParameterValues, guess: Any, measure_names: tuple[str, ...]
+        self, parameter_values: ParameterValues, cycle_guess: Any, measure_names: tuple[str, ...]
     ) -> "GaitMeasures":
-        """Return the requested measures of the gait near `guess` with their derivatives.
+        """Return the named measures of the gait near `cycle_guess`, with their derivatives.
 
-        `measure_names` are some of `differentiable_measures`. Derivatives of stability measures are
-        second derivatives of the motion.
+        `measure_names` is a selection of `differentiable_measures`. Derivatives of stability
+        measures are second derivatives of the motion.
         """
-        return measure_on_cycle(self, parameter_values, guess, measure_names)
+        return compute_cycle_measures(self, parameter_values, cycle_guess, measure_names)
 
     def compute_slope_response(
         self, params: WheelParams, cycle: Any, measure_names: Sequence[str]
     ) -> SlopeResponse:
-        """Return the linear response of the cycle's step and of measures to the slopes of its two
-        lines.
-        """
+        """Return the linear response of the cycle's step and measures to the slopes of its two
+        lines."""
         return _compute_step_slope_response(
             self.model, params, cycle.section_state, tuple(measure_names), self.step_options
         )
 
     @classmethod
-    def read_measure(cls, name: str, cycle: AbstractCycle, step: AbstractStep) -> Array:
-        """Return a measure of a gait by name.
-
-        Margins of the locked legs have one value for each leg.
-        """
-        return cycle.measure(name) if name in cls.cycle_measures else step.measures()[name]
+    def read_measure(cls, measure_name: str, cycle: AbstractCycle, step: AbstractStep) -> Array:
+        """Return a measure of a gait by name; margins of locked legs have one value per leg."""
+        return (
+            cycle.measure(measure_name)
+            if measure_name in cls.cycle_measures
+            else step.measures()[measure_name]
+        )
 
 
 _compute_step_slope_response = eqx.filter_jit(compute_step_slope_response)
 
 
 class GaitMeasures(NamedTuple):
-    """Measures of a gait with their derivatives with respect to the model's parameter values."""
+    """Measures of a gait, with their derivatives by the model's parameter values."""
 
     measure_values: Float[Array, " n_names"]
     parameter_jacobian: Float[Array, "n_names n_values"]
@@ -239,82 +249,96 @@ class GaitMeasures(NamedTuple):
 
 
 @eqx.filter_jit
-def measure_on_cycle(
-    finder: AbstractGaitFinder,
+def compute_cycle_measures(
+    gait_finder: AbstractGaitFinder,
     parameter_values: ParameterValues,
-    guess: Any,
+    cycle_guess: Any,
     measure_names: tuple[str, ...],
 ) -> GaitMeasures:
-    """Return measures that need only the cycle, with their derivatives."""
+    """Return measures that depend only on the cycle, with their derivatives."""
 
-    def measures_and_outcome(parameter_values: ParameterValues) -> tuple[Array, Array]:
-        cycle = finder.find_cycle_from_values(parameter_values, guess)
+    def compute_measures_and_outcome(parameter_values: ParameterValues) -> tuple[Array, Array]:
+        cycle = gait_finder.find_cycle_from_values(parameter_values, cycle_guess)
         return jnp.stack(list(cycle.measures(measure_names).values())), cycle.outcome
 
-    (measure_values, outcome), (parameter_jacobian, _) = evaluate_with_jacobian(
-        measures_and_outcome, parameter_values
+    (measure_values, cycle_outcome), (parameter_jacobian, _) = evaluate_with_jacobian(
+        compute_measures_and_outcome, parameter_values
     )
-    return GaitMeasures(measure_values, parameter_jacobian, outcome)
+    return GaitMeasures(measure_values, parameter_jacobian, cycle_outcome)
 
 
-def move_derivative_axis_first(derivatives: Any) -> Any:
-    """Return a tree whose last axis, over the model's parameters, is moved to the front."""
-    return jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), derivatives)
+def move_derivative_axis_first(derivative_tree: Any) -> Any:
+    """Return a tree with the last axis, over the model's parameters, moved to the front."""
+    return jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), derivative_tree)
 
 
 def compute_value_and_tangents(
-    function: Callable, primals: tuple, tangents: tuple
+    function: Callable, input_values: tuple, input_tangents: tuple
 ) -> tuple[Any, Any]:
-    """Return the value of a function at `primals`, and its JVP along each of the `tangents`.
+    """Return the value of a function at `input_values`, and its JVP along each of the
+    `input_tangents`.
 
-    Tangents have a leading axis.
+    The tangents have a leading axis.
     """
-    float_primals, other_leaves = eqx.partition(primals, eqx.is_inexact_array)
-    float_tangents = eqx.filter(tangents, eqx.is_inexact_array)
-    evaluate = lambda all_floats: function(*eqx.combine(all_floats, other_leaves))
+    float_primals, non_float_inputs = eqx.partition(input_values, eqx.is_inexact_array)
+    float_tangents = eqx.filter(input_tangents, eqx.is_inexact_array)
+    evaluate_at_floats = lambda all_float_inputs: function(
+        *eqx.combine(all_float_inputs, non_float_inputs)
+    )
     tangents_of_value = jax.vmap(
-        lambda tangent: jax.jvp(evaluate, (float_primals,), (tangent,))[1]
+        lambda float_tangent: jax.jvp(evaluate_at_floats, (float_primals,), (float_tangent,))[1]
     )(float_tangents)
-    return evaluate(float_primals), tangents_of_value
+    return evaluate_at_floats(float_primals), tangents_of_value
 
 
 @eqx.filter_jit
-def evaluate_on_gait(function: Callable, gait: Gait) -> tuple[Any, Any]:
-    """Return `function(cycle, step)` of one gait and its derivatives along the branch, compiled."""
+def evaluate_on_gait(function_of_cycle_and_step: Callable, gait: Gait) -> tuple[Any, Any]:
+    """Return `function_of_cycle_and_step(cycle, step)` of one gait and its derivatives along
+    the branch.
+    """
     return compute_value_and_tangents(
-        function, (gait.cycle, gait.step), (gait.cycle_derivatives, gait.step_derivatives)
+        function_of_cycle_and_step,
+        (gait.cycle, gait.step),
+        (gait.cycle_derivatives, gait.step_derivatives),
     )
 
 
 @eqx.filter_jit
-def evaluate_on_gaits(function: Callable, gait: Gait) -> tuple[Any, Any]:
-    """Return `evaluate_on_gait` of a batch of gaits."""
-    arguments = (gait.cycle, gait.step), (gait.cycle_derivatives, gait.step_derivatives)
+def evaluate_on_gaits(function_of_cycle_and_step: Callable, gait: Gait) -> tuple[Any, Any]:
+    """Return `function_of_cycle_and_step(cycle, step)` of each gait of a batch, and its derivatives
+    along the branches.
+    """
+    cycles_and_steps = (gait.cycle, gait.step), (gait.cycle_derivatives, gait.step_derivatives)
     return eqx.filter_vmap(
-        lambda arguments, tangents: compute_value_and_tangents(function, arguments, tangents)
-    )(*arguments)
+        lambda cycles_and_steps, tangents: compute_value_and_tangents(
+            function_of_cycle_and_step, cycles_and_steps, tangents
+        )
+    )(*cycles_and_steps)
 
 
 @dataclass(frozen=True)
 class MeasureReader:
-    """Function of cycle and step that returns several measures by name."""
+    """Function from cycle and step to the named measures."""
 
     read_measure: Callable[[str, AbstractCycle, AbstractStep], Array]
     measure_names: tuple[str, ...]
 
     def __call__(self, cycle: AbstractCycle, step: AbstractStep) -> dict[str, Array]:
-        return {name: self.read_measure(name, cycle, step) for name in self.measure_names}
+        return {
+            measure_name: self.read_measure(measure_name, cycle, step)
+            for measure_name in self.measure_names
+        }
 
 
-def measure_on_gait(
+def compute_gait_measures(
     gait: Gait, read_measure: Callable, measure_names: tuple[str, ...]
 ) -> GaitMeasures:
-    """Return measures of a gait from its stored derivatives."""
+    """Return measures of a gait with derivatives, from the gait's stored derivatives."""
     measure_values, measure_tangents = evaluate_on_gait(
         MeasureReader(read_measure, measure_names), gait
     )
     stack_measures = lambda parameter_values: jnp.stack(
-        [parameter_values[name] for name in measure_names], -1
+        [parameter_values[measure_name] for measure_name in measure_names], -1
     )
     return GaitMeasures(
         stack_measures(measure_values), stack_measures(measure_tangents).T, gait.cycle.outcome

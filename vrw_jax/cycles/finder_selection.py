@@ -1,4 +1,4 @@
-"""Selection of the gait finder for a model, and checks of the arguments of a search."""
+"""Selection of the gait finder of a model, and checks of the arguments of a search."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -29,16 +29,16 @@ from vrw_jax.simulation import (
 from vrw_jax.validation import check_type, has_traced_leaf
 from vrw_jax.wheel import WheelParams
 
-CycleGuess = LimitCycle | ReturnMapCycle | Array | np.ndarray | Sequence[float]
-"""Guess of a user: a neighbor's cycle, or a section state near the gait."""
+UserCycleGuess = LimitCycle | ReturnMapCycle | Array | np.ndarray | Sequence[float]
+"""Guess of a user: a similar wheel's cycle, or a section state near the gait."""
 
-FINDER_CLASSES: dict[GaitMethod, type[AbstractGaitFinder]] = {
+FINDER_CLASS_BY_METHOD: dict[GaitMethod, type[AbstractGaitFinder]] = {
     GaitMethod.COLLOCATION: CollocationFinder,
     GaitMethod.CONTACT_WALKS: UnilateralFinder,
     GaitMethod.RETURN_MAP: ReturnMapFinder,
     GaitMethod.SELECTION: ReturnMapFinder,
 }
-"""Class of the gait finder by the gait method of a model."""
+"""Class of the gait finder, by the gait method of a model."""
 
 
 def make_finder(
@@ -49,23 +49,24 @@ def make_finder(
     cycle_options: CycleOptions | None = None,
     step_options: StepOptions | None = None,
 ) -> AbstractGaitFinder:
-    """Return the finder that finds, checks and differentiates the gaits of this model."""
+    """Return the finder of the gaits of a model."""
     if cycle_options is not None:
         check_type("cycle_options", cycle_options, CycleOptions, "give vrw.CycleOptions()")
     resolved_model = check_model(model)
-    make_finder_from_options = FINDER_CLASSES[resolved_model.capabilities.gait_method].from_options
+    make_finder_from_options = FINDER_CLASS_BY_METHOD[
+        resolved_model.capabilities.gait_method
+    ].from_options
     return make_finder_from_options(
         resolved_model, n_legs, check_step_options(step_options), period_n,
         CycleOptions() if cycle_options is None else cycle_options)  # fmt: skip
 
 
 def resolve_model(params: WheelParams, model: ModelLike | None) -> ModelLike | None:
-    """Return the model of this wheel's gait.
+    """Return the model of a wheel's gait.
 
-    For the ladder, it is the lowest model whose margins are met. The paper's gait is tried first.
-    If it is not found or violates a margin on its ground, the upper model is returned. Any other
-    model is returned unchanged. The ladder is returned unchanged if the parameters have no concrete
-    values.
+    For the ladder, this is the lowest model whose margins are met. The paper's gait is tried first.
+    If it is not found or violates a margin on its ground, the upper model is returned. If the
+    parameters have no concrete values, the ladder is returned unchanged, as is any other model.
     """
     return resolve_model_with_reason(params, model)[0]
 
@@ -73,7 +74,7 @@ def resolve_model(params: WheelParams, model: ModelLike | None) -> ModelLike | N
 def resolve_model_with_reason(
     params: WheelParams, model: ModelLike | None
 ) -> tuple[ModelLike | None, str | None]:
-    """Return `resolve_model` and, for the ladder, the reason in one sentence."""
+    """Return the model of a wheel's gait and, for the ladder, the reason in one sentence."""
     selected_model: Any = check_model(model)
     if selected_model.fallback_model is selected_model or not isinstance(params, WheelParams):
         return model, None
@@ -87,14 +88,14 @@ def resolve_model_with_reason(
     return model_choice.model, model_choice.why
 
 
-def check_guess(guess: Any) -> Any:
-    """Return a user's guess: a cycle, a `CollocationState` or a finite section state.
+def check_cycle_guess(cycle_guess: Any) -> Any:
+    """Return a user's guess as a cycle, a `CollocationState` or a finite section state.
 
     Raise ValueError if the section state is not finite.
     """
-    if guess is None or isinstance(guess, AbstractCycle | CollocationState):
-        return guess
-    section_state = check_section_state(guess, "guess")
+    if cycle_guess is None or isinstance(cycle_guess, AbstractCycle | CollocationState):
+        return cycle_guess
+    section_state = check_section_state(cycle_guess, "guess")
     if not has_traced_leaf(section_state) and not np.isfinite(section_state).all():
         raise ValueError(
             f"guess is {format_numbers(section_state)}, but a search can begin at finite numbers "
@@ -109,7 +110,7 @@ def resolve_finder(
     options: CycleOptions | StepOptions | None,
     period_n: int = 1,
 ) -> AbstractGaitFinder:
-    """Return the finder for a model and options, after checks of the arguments.
+    """Return the finder of a model and options, after checks of the arguments.
 
     Raise TypeError or ValueError if the arguments do not fit the model.
     """
@@ -133,7 +134,7 @@ def resolve_finder(
                 "its return map: give the vrw.StepOptions of its step."
             )
         raise TypeError(
-            "options is an Options, but the paper's wheel is solved by collocation: "
+            "options is a StepOptions, but the paper's wheel is solved by collocation: "
             "give vrw.CycleOptions(), or CycleOptions.tight()."
         )
     gait_finder.search_options.check_tolerances(jnp.result_type(*jax.tree.leaves(params)))

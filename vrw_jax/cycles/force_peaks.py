@@ -11,7 +11,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from vrw_jax.collocation import CollocatedPhase, CollocationSolution, PhaseExtrema, find_extrema
+from vrw_jax.collocation import (
+    CollocatedPhaseMotion,
+    CollocationSolution,
+    PhaseExtrema,
+    find_quantity_extrema,
+)
 from vrw_jax.cycles.collocation_search import CollocationSystem
 from vrw_jax.numerics import Scalar
 from vrw_jax.wheel import (
@@ -35,17 +40,17 @@ def compute_force_peaks(
     )
     for step_index, phase_points in enumerate(phase_points_by_step):
         phases = make_phases(
-            wheel_symbols, phase_points[0].start.held_constants[0], stop_at_lift_off=False
+            wheel_symbols, phase_points[0].start_point.held_constants[0], stop_at_lift_off=False
         )
         phase_durations = solution.durations[step_index]
         fore_force_extrema, total_force_extrema = [], []
         for phase_index, (phase, points_of_phase) in enumerate(
             zip(phases, phase_points, strict=True)
         ):
-            collocated_phase = CollocatedPhase.from_nodes(
+            collocated_phase = CollocatedPhaseMotion.from_node_accelerations(
                 system.phase_meshes[phase_index],
-                jnp.stack(points_of_phase.start.q),
-                jnp.stack(points_of_phase.start.v),
+                jnp.stack(points_of_phase.start_point.q),
+                jnp.stack(points_of_phase.start_point.v),
                 phase_durations[phase_index],
                 solution.accelerations[phase_index][step_index],
             )
@@ -59,10 +64,10 @@ def compute_force_peaks(
                 else fore_force_extrema[-1]
             )
         fore_peaks, total_peaks = (
-            _summarize_force_extrema(extrema, phase_durations)
-            for extrema in (fore_force_extrema, total_force_extrema)
+            _summarize_force_extrema(force_extrema, phase_durations)
+            for force_extrema in (fore_force_extrema, total_force_extrema)
         )
-        end_point = phase_points[-1].end
+        end_point = phase_points[-1].end_point
         landing = transitions.resolve_landing(wheel_symbols, end_point.q[0], *end_point.v)
         peaks_by_step.append(
             {
@@ -81,7 +86,7 @@ def compute_force_peaks(
 
 
 def _find_force_extrema(
-    phase: AbstractPhase, collocated_phase: CollocatedPhase, with_rear_foot: bool
+    phase: AbstractPhase, collocated_phase: CollocatedPhaseMotion, with_rear_foot: bool
 ) -> PhaseExtrema:
     """Return the extrema of the normal force on the fore foot, or on both feet, in a phase."""
 
@@ -97,7 +102,7 @@ def _find_force_extrema(
             normal_force = normal_force + phase_instant.rear_force.normal
         return normal_force
 
-    return find_extrema(collocated_phase, evaluate_acceleration, evaluate_normal_force)
+    return find_quantity_extrema(collocated_phase, evaluate_acceleration, evaluate_normal_force)
 
 
 class _ForcePeaks(NamedTuple):
@@ -116,29 +121,40 @@ def _summarize_force_extrema(
     phase_start_times = jnp.cumsum(phase_durations) - phase_durations
     shifted_extrema = [
         step_extrema._replace(
-            time=step_extrema.time + start, rate_time=step_extrema.rate_time + start
+            extremum_times=step_extrema.extremum_times + start,
+            rate_extremum_times=step_extrema.rate_extremum_times + start,
         )
         for step_extrema, start in zip(extrema_of_phases, phase_start_times, strict=True)
     ]
     step_extrema = jax.tree.map(lambda *phase_parts: jnp.concatenate(phase_parts), *shifted_extrema)
-    peak_forces = jnp.where(step_extrema.is_maximum, step_extrema.value, -jnp.inf)
+    peak_forces = jnp.where(
+        step_extrema.is_quantity_maximum, step_extrema.extremum_values, -jnp.inf
+    )
     extremum_indices = jnp.arange(len(peak_forces))
     find_highest_peak = lambda extremum_mask: jnp.max(
         jnp.where(extremum_mask, peak_forces, -jnp.inf), axis=1
     )
     highest_peak_before = find_highest_peak(extremum_indices < extremum_indices[:, None])
     highest_peak_after = find_highest_peak(extremum_indices > extremum_indices[:, None])
-    lower_peak = jnp.minimum(highest_peak_before, highest_peak_after)
-    is_force_trough = step_extrema.is_minimum & jnp.isfinite(lower_peak)
+    lower_neighbor_peak = jnp.minimum(highest_peak_before, highest_peak_after)
+    is_force_trough = step_extrema.is_quantity_minimum & jnp.isfinite(lower_neighbor_peak)
     trough_depths = jnp.where(
-        is_force_trough, jnp.where(is_force_trough, lower_peak, 0.0) - step_extrema.value, 0.0
+        is_force_trough,
+        jnp.where(is_force_trough, lower_neighbor_peak, 0.0) - step_extrema.extremum_values,
+        0.0,
     )
-    first_peak_time = jnp.min(jnp.where(step_extrema.is_maximum, step_extrema.time, jnp.inf))
-    is_later_maximum = step_extrema.is_maximum_of_rate & (step_extrema.rate_time > first_peak_time)
-    largest_force_rate = jnp.max(jnp.where(is_later_maximum, step_extrema.rate, -jnp.inf))
+    first_peak_time = jnp.min(
+        jnp.where(step_extrema.is_quantity_maximum, step_extrema.extremum_times, jnp.inf)
+    )
+    is_later_maximum = step_extrema.is_rate_maximum & (
+        step_extrema.rate_extremum_times > first_peak_time
+    )
+    largest_force_rate = jnp.max(
+        jnp.where(is_later_maximum, step_extrema.rate_extremum_values, -jnp.inf)
+    )
     return _ForcePeaks(
-        n_peaks=jnp.sum(step_extrema.is_maximum).astype(phase_durations.dtype),
-        peak_force=jnp.where(jnp.any(step_extrema.is_maximum), jnp.max(peak_forces), 0.0),
+        n_peaks=jnp.sum(step_extrema.is_quantity_maximum).astype(phase_durations.dtype),
+        peak_force=jnp.where(jnp.any(step_extrema.is_quantity_maximum), jnp.max(peak_forces), 0.0),
         trough_depth=jnp.max(trough_depths),
         second_peak_rate=jnp.where(jnp.any(is_later_maximum), largest_force_rate, jnp.nan),
     )

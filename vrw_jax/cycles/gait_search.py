@@ -1,9 +1,9 @@
-"""Limit cycles by a search and, if it fails, by searches on finer meshes or from walks.
+"""Search for limit cycles, with finer meshes and walks as fallbacks.
 
-The search (`cycles`) starts from predicted gaits of the paper's parameter ranges, on a mesh that
-suits them. If it fails, batches of walks (`batches`) begin at starts that scale with the wheel. A
-walk that continues is the start of another search. If the mesh is too coarse, it is refined. These
-fallbacks depend on concrete values, so under a `jit` or `vmap` of the caller only the search runs.
+The search of `collocation_search` starts from predicted gaits of the paper's parameter ranges, on a
+mesh that suits them. If it fails, batches of walks (`batches`) begin at starts that scale with the
+wheel. A walk that settles is the start of another search. If the mesh is too coarse, it is refined.
+These fallbacks depend on concrete values, so only the search runs under a caller's `jit` or `vmap`.
 """
 
 import functools
@@ -21,7 +21,12 @@ from vrw_jax.cycles.attracting_gaits import find_attracting_gaits, find_slowest_
 from vrw_jax.cycles.collocation_finder import CollocationFinder
 from vrw_jax.cycles.collocation_search import CollocationState
 from vrw_jax.cycles.finder import AbstractGaitFinder
-from vrw_jax.cycles.finder_selection import CycleGuess, check_guess, resolve_finder, resolve_model
+from vrw_jax.cycles.finder_selection import (
+    UserCycleGuess,
+    check_cycle_guess,
+    resolve_finder,
+    resolve_model,
+)
 from vrw_jax.cycles.gait_walks import (
     GAIT_WALK_OPTIONS,
     compute_fallback_walk_starts,
@@ -52,40 +57,42 @@ RETRY_OUTCOMES = (
     Outcome.BRANCH_ENDS_BEFORE_TARGET,
     Outcome.MESH_TOO_COARSE,
 )
-"""Outcomes of a search that may have missed a gait."""
+"""Outcomes of a search that may have missed an existing gait."""
 
 
 @dataclass(frozen=True)
 class SearchFallbackOptions:
-    """Options of finer meshes, which are fallbacks of the search for gaits of the paper's model."""
+    """Options of the finer meshes that are fallbacks of the search for the paper's gaits."""
 
     max_unrefined_mesh_error: float = 1e-7
-    """Estimate of the mesh error above which a finer mesh is used.
+    """Estimated mesh error above which a finer mesh is used.
 
-    The value is chosen because the actual errors are a hundredth of the estimate."""
+    The value is chosen because actual errors are a hundredth of the estimate."""
     max_mesh_refinements: int = 3
     """Largest number of times that the number of mesh intervals is doubled."""
 
 
 SEARCH_FALLBACK_OPTIONS = SearchFallbackOptions()
 
-FailureFill = Literal["zeros", "nan"]
-FAILURE_FILLS: tuple[str, ...] = get_args(FailureFill)
+FailureFillName = Literal["zeros", "nan"]
+FAILURE_FILLS: tuple[str, ...] = get_args(FailureFillName)
 
 GaitChoice = Literal["slowest", "fastest"] | int
-"""Choice among the attracting gaits of a wheel by speed: the slowest, the fastest, or an index in
-their list, slowest first."""
+"""Choice among the attracting gaits of a wheel: the slowest, the fastest, or an index by speed.
+
+Index 0 is the slowest gait.
+"""
 
 
 @overload
 def limit_cycle(
     params: WheelParams,
     *,
-    guess: CycleGuess | None = None,
+    guess: UserCycleGuess | None = None,
     period_n: int = 1,
     model: None = None,
     options: CycleOptions | StepOptions | None = None,
-    on_failure: FailureFill = "zeros",
+    on_failure: FailureFillName = "zeros",
     which: GaitChoice = "slowest",
 ) -> LimitCycle: ...
 
@@ -94,11 +101,11 @@ def limit_cycle(
 def limit_cycle(
     params: WheelParams,
     *,
-    guess: CycleGuess | None = None,
+    guess: UserCycleGuess | None = None,
     period_n: int = 1,
     model: ModelLike,
     options: CycleOptions | StepOptions | None = None,
-    on_failure: FailureFill = "zeros",
+    on_failure: FailureFillName = "zeros",
     which: GaitChoice = "slowest",
 ) -> LimitCycle | ReturnMapCycle: ...
 
@@ -108,11 +115,11 @@ def limit_cycle(
 def limit_cycle(
     params: WheelParams,
     *,
-    guess: CycleGuess | None = None,
+    guess: UserCycleGuess | None = None,
     period_n: int = 1,
     model: ModelLike | None = None,
     options: CycleOptions | StepOptions | None = None,
-    on_failure: FailureFill = "zeros",
+    on_failure: FailureFillName = "zeros",
     which: GaitChoice = "slowest",
 ) -> LimitCycle | ReturnMapCycle:
     """Return the limit cycle of this wheel: the gait that repeats after `period_n` steps.
@@ -173,7 +180,7 @@ def limit_cycle(
             "many beside the gait of one step: give guess=, a section state near it."
         )
     cycle: Any = _search_with_fallbacks(
-        gait_finder, params, check_guess(guess), options is None, which
+        gait_finder, params, check_cycle_guess(guess), options is None, which
     )
     return cycle.replace_missing_gaits_by_nan(params) if returns_nan else cycle
 
@@ -229,7 +236,7 @@ def limit_cycles(
         missing_cycle = limit_cycles(
             invalid_params, period_n=period_n, model=model, options=options, which=which
         )
-        return _take_rows_on_device(missing_cycle, slice(0, 0))
+        return _take_wheels_on_device(missing_cycle, slice(0, 0))
     if has_traced_leaf(params):
         params = jax.tree.map(lambda x: jnp.broadcast_to(x, batch_shape), params)
         single_params = jax.tree.map(lambda x: x[0], params)
@@ -253,9 +260,9 @@ def parse_gait_choice(which: GaitChoice) -> int:
     return int(which)
 
 
-def _find_chosen_gaits(gait_finder: Any, params: WheelParams, which: GaitChoice) -> Any:
-    """Return the attracting gait that `which` selects for each wheel."""
-    n_wheels, gait_rank = params.damping.shape[0], parse_gait_choice(which)
+def _find_chosen_gaits(gait_finder: Any, params: WheelParams, gait_choice: GaitChoice) -> Any:
+    """Return the attracting gait of each wheel that `gait_choice` selects."""
+    n_wheels, gait_rank = params.damping.shape[0], parse_gait_choice(gait_choice)
     gait_wheel_indices, attracting_gaits = find_attracting_gaits(
         gait_finder, gait_finder.model.parameter_rows(params)
     )
@@ -266,18 +273,22 @@ def _find_chosen_gaits(gait_finder: Any, params: WheelParams, which: GaitChoice)
     if len(insufficient_gait_counts):
         n_available_gaits = int(insufficient_gait_counts[0])
         raise ValueError(
-            f"which is {which}, but {n_available_gaits} gait{'s' * (n_available_gaits > 1)} of "
-            f"this wheel attract{'s' * (n_available_gaits == 1)}: "
+            f"which is {gait_choice}, but {n_available_gaits} gait{'s' * (n_available_gaits > 1)} "
+            f"of this wheel attract{'s' * (n_available_gaits == 1)}: "
             "vrw.limit_cycles(params, model=...) returns them."
         )
-    return _take_rows_on_device(
+    return _take_wheels_on_device(
         attracting_gaits,
         find_slowest_gait_indices(gait_wheel_indices, n_wheels) + gait_rank % n_gaits_per_wheel,
     )
 
 
 def _search_with_fallbacks(
-    gait_finder: Any, params: WheelParams, guess: Any, can_refine_mesh: bool, which: GaitChoice
+    gait_finder: Any,
+    params: WheelParams,
+    cycle_guess: Any,
+    can_refine_mesh: bool,
+    gait_choice: GaitChoice,
 ) -> Any:
     """Return the cycle of one wheel or of a batch, by the search and all fallbacks."""
     is_batch = params.damping.ndim > 0
@@ -286,28 +297,34 @@ def _search_with_fallbacks(
         has_traced_leaf(params_without_tangents),
         not has_traced_leaf(params),
     )
-    if gait_finder.is_multistable and guess is None and not has_no_values:
+    if gait_finder.is_multistable and cycle_guess is None and not has_no_values:
         cycle = _find_chosen_gaits(
             gait_finder,
             params_without_tangents
             if is_batch
-            else _take_rows_on_device(params_without_tangents, None),
-            which,
+            else _take_wheels_on_device(params_without_tangents, None),
+            gait_choice,
         )
-        cycle = cycle if is_batch else _take_rows_on_device(cycle, 0)
-        return cycle if is_concrete else _run_search(gait_finder, params, cycle.section_state)
-    cycle = _run_search(gait_finder, params, guess)
-    params_and_cycle = lax.stop_gradient((params, cycle))  # Differentiated arrays have values, too.
+        cycle = cycle if is_batch else _take_wheels_on_device(cycle, 0)
+        return (
+            cycle
+            if is_concrete
+            else _search_without_fallbacks(gait_finder, params, cycle.section_state)
+        )
+    cycle = _search_without_fallbacks(gait_finder, params, cycle_guess)
+    params_and_cycle = lax.stop_gradient(
+        (params, cycle)
+    )  # Arrays that are differentiated have values too.
     if not gait_finder.supports_cold_start or has_traced_leaf(params_and_cycle):
         return cycle
     if not is_batch:
-        params_and_cycle = _take_rows_on_device(params_and_cycle, None)
+        params_and_cycle = _take_wheels_on_device(params_and_cycle, None)
     section_state = None
-    if guess is not None:
-        if isinstance(guess, CollocationState):
-            guess_state = guess.step_end_states[-1][jnp.array([0, 2, 3])]
+    if cycle_guess is not None:
+        if isinstance(cycle_guess, CollocationState):
+            guess_state = cycle_guess.step_end_states[-1][jnp.array([0, 2, 3])]
         else:
-            guess_state = getattr(guess, "section_state", guess)
+            guess_state = getattr(cycle_guess, "section_state", cycle_guess)
         section_state = np.asarray(lax.stop_gradient(guess_state))[None]
     finder_and_starts = _find_fallback_starts(
         gait_finder, *params_and_cycle, section_state, can_refine_mesh
@@ -330,22 +347,22 @@ def _search_with_fallbacks(
             params_and_cycle[0],
             collocation_state,
         )  # a compiled program
-        retried_cycle = retried_cycle if is_batch else _take_rows_on_device(retried_cycle, 0)
+        retried_cycle = retried_cycle if is_batch else _take_wheels_on_device(retried_cycle, 0)
     else:
-        retried_cycle = _run_search(
+        retried_cycle = _search_without_fallbacks(
             gait_finder,
             params,
             jax.device_put(collocation_state)
             if is_batch
-            else _take_rows_on_device(collocation_state, 0),
+            else _take_wheels_on_device(collocation_state, 0),
         )
-    return _keep_first_reason(cycle, retried_cycle)
+    return _keep_first_failure_reason(cycle, retried_cycle)
 
 
-def _keep_first_reason(cycle: LimitCycle, retried_cycle: LimitCycle) -> LimitCycle:
-    """Return the cycles of the retry, with the reason of the first search where no gait exists.
+def _keep_first_failure_reason(cycle: LimitCycle, retried_cycle: LimitCycle) -> LimitCycle:
+    """Return the cycles of the retry, with the reason of the first search if no gait exists.
 
-    All functions therefore report the same reason, with or without fallbacks, and in any batch.
+    All functions therefore report the same reason, with or without fallbacks and in any batch.
     """
     get_failure_reason = lambda cycle: (cycle.outcome, cycle.collocation_state.failed_check)
     first_failure_reason, last_failure_reason = (
@@ -369,66 +386,64 @@ def _keep_first_reason(cycle: LimitCycle, retried_cycle: LimitCycle) -> LimitCyc
     return eqx.tree_at(get_failure_reason, retried_cycle, tuple(failure_reason))
 
 
-def _run_search(finder: AbstractGaitFinder, params: WheelParams, guess: Any) -> Any:
+def _search_without_fallbacks(
+    gait_finder: AbstractGaitFinder, params: WheelParams, cycle_guess: Any
+) -> Any:
     """Return the cycle of one wheel, or the cycles of a batch, without fallbacks."""
     if not params.damping.ndim:
-        return finder.find_cycle(params, guess)
-    if guess is not None or has_traced_leaf(params):
-        return finder.find_cycles(params, guess)
-    return map_in_batches(finder.find_cycles, batch_sizes.GAIT_BATCH_SIZES, params)
+        return gait_finder.find_cycle(params, cycle_guess)
+    if cycle_guess is not None or has_traced_leaf(params):
+        return gait_finder.find_cycles(params, cycle_guess)
+    return map_in_batches(gait_finder.find_cycles, batch_sizes.GAIT_BATCH_SIZES, params)
 
 
-def _take_rows_on_device(tree: Any, row_indices: Any) -> Any:
-    """Return rows of a tree on the device.
+def _take_wheels_on_device(tree_over_wheels: Any, wheel_indices: Any) -> Any:
+    """Return the selected wheels of a tree as arrays on the device.
 
-    NumPy selects the rows, because JAX would compile a program for each shape.
+    NumPy selects the wheels, because JAX would compile a program for each shape.
     """
-    return jax.device_put(select_tree_rows(tree, row_indices))
+    return jax.device_put(select_tree_rows(tree_over_wheels, wheel_indices))
 
 
-def _stack_concrete_parameters(params: WheelParams) -> np.ndarray:
-    """Return `stack_parameters` of a batch, computed by NumPy.
+def _replace_wheels(
+    tree_over_wheels: Any, wheel_indices: np.ndarray, tree_of_new_wheels: Any
+) -> Any:
+    """Return a tree of arrays in which `tree_of_new_wheels` replaces the selected wheels."""
 
-    JAX would compile a program for each number of wheels.
-    """
-    return np.stack([np.asarray(getattr(params, name)) for name in PARAMETER_NAMES])
+    def replace_leaf_rows(array_over_wheels: Any, array_of_new_wheels: Any) -> np.ndarray:
+        array_over_wheels = np.array(array_over_wheels)
+        array_over_wheels[wheel_indices] = array_of_new_wheels
+        return array_over_wheels
 
-
-def _replace_rows(tree: Any, row_indices: np.ndarray, new_rows_tree: Any) -> Any:
-    """Return a tree of arrays with the given rows replaced by `new_rows_tree`."""
-
-    def replace_leaf_rows(leaf: Any, new_rows: Any) -> np.ndarray:
-        leaf = np.array(leaf)
-        leaf[row_indices] = new_rows
-        return leaf
-
-    return jax.tree.map(replace_leaf_rows, tree, new_rows_tree)
+    return jax.tree.map(replace_leaf_rows, tree_over_wheels, tree_of_new_wheels)
 
 
 def _find_walk_end_states(
-    finder: CollocationFinder,
+    gait_finder: CollocationFinder,
     params: WheelParams,
     needs_walk: np.ndarray,
     guess_states: np.ndarray | None,
 ) -> np.ndarray:
-    """Return, for each wheel that needs a walk, the end of the walk with the smallest period
-    defect.
+    """Return for each wheel the end of its walk with the smallest period defect.
 
     The ends are section states, shape (wheels, 3). They are NaN if no walk of the wheel nearly
-    repeats. A guess that nearly repeats replaces the walks of its wheel. Wheels too stiff for
-    explicit solvers do not walk, because the walks of one such wheel would take minutes with an
-    implicit solver.
+    repeats, and for wheels that need no walk. A guess that nearly repeats replaces the walks of its
+    wheel. Wheels that are too stiff for explicit solvers do not walk, because the walks of one such
+    wheel would take minutes with an implicit solver.
     """
-    parameter_rows = _stack_concrete_parameters(params)
-    solver_indices = select_cheapest_solver(parameter_rows, StepOptions())
+    # NumPy is used, because JAX would compile a program for each number of wheels.
+    parameter_matrix = np.stack([np.asarray(getattr(params, name)) for name in PARAMETER_NAMES])
+    solver_indices = select_cheapest_solver(parameter_matrix, StepOptions())
     is_solver_explicit = solver_indices != SolverIndex.IMPLICIT_SOLVER
     unsettled_wheels = np.flatnonzero(needs_walk & is_solver_explicit)
-    parameter_values, walk_end_states = parameter_rows.T, np.full((len(needs_walk), 3), np.nan)
+    parameter_values, walk_end_states = parameter_matrix.T, np.full((len(needs_walk), 3), np.nan)
     smallest_period_defects = np.full(len(needs_walk), GAIT_WALK_OPTIONS.max_newton_start_defect)
     if guess_states is not None:
         guess_section_states = guess_states[unsettled_wheels]
         is_guess_usable = (
-            measure_period_defects(finder, parameter_values[unsettled_wheels], guess_section_states)
+            measure_period_defects(
+                gait_finder, parameter_values[unsettled_wheels], guess_section_states
+            )
             < GAIT_WALK_OPTIONS.max_newton_start_defect
         )
         walk_end_states[unsettled_wheels[is_guess_usable]] = guess_section_states[is_guess_usable]
@@ -436,7 +451,7 @@ def _find_walk_end_states(
     for compute_starts in (compute_walk_starts, compute_fallback_walk_starts):
         if not len(unsettled_wheels):
             break
-        walk_ends = walk_to_gaits(finder, parameter_values[unsettled_wheels], compute_starts)
+        walk_ends = walk_to_gaits(gait_finder, parameter_values[unsettled_wheels], compute_starts)
         for wheel_index, walk_end_state, period_defect in zip(
             unsettled_wheels[walk_ends.wheel_indices], *walk_ends[1:], strict=True
         ):
@@ -459,9 +474,9 @@ def _make_search_starts(
     has_known_state: np.ndarray,
     walk_end_states: np.ndarray,
 ) -> CollocationState:
-    """Return starts of searches: known states, else states from walks, else predictions.
+    """Return starts of searches: known states, otherwise states from walks, otherwise predictions.
 
-    The predictions are those of the gait surface.
+    The gait surface determines the predictions.
     """
     start_states = map_in_batches(
         lambda batch_params: gait_finder.make_initial_guesses(stack_parameters(batch_params).T),
@@ -470,19 +485,19 @@ def _make_search_starts(
     )
     wheels_with_walk = np.flatnonzero(np.isfinite(walk_end_states[:, 0]) & ~has_known_state)
     if len(wheels_with_walk):
-        guess_from_state = jax.vmap(gait_finder.guess_from_state)
-        start_states = _replace_rows(
+        guess_from_state = jax.vmap(gait_finder.guess_cycle_from_state)
+        start_states = _replace_wheels(
             start_states,
             wheels_with_walk,
             map_in_batches(
                 guess_from_state,
                 batch_sizes.GAIT_BATCH_SIZES,
-                _take_rows_on_device(params, wheels_with_walk),
+                _take_wheels_on_device(params, wheels_with_walk),
                 walk_end_states[wheels_with_walk],
             ),
         )
-    return _replace_rows(
-        start_states, has_known_state, _take_rows_on_device(collocation_state, has_known_state)
+    return _replace_wheels(
+        start_states, has_known_state, _take_wheels_on_device(collocation_state, has_known_state)
     )
 
 
@@ -494,11 +509,10 @@ def _find_fallback_starts(
     can_refine_mesh: bool,
     fallback_options: SearchFallbackOptions = SEARCH_FALLBACK_OPTIONS,
 ) -> tuple[CollocationFinder, CollocationState] | None:
-    """Return a finder and starts from which it finds more gaits of a batch, or None if it finds
-    none.
+    """Return a finder and starts from which it finds more gaits of a batch, or None.
 
-    `guess_states` are the section states of guesses, shape (wheels, 3). `can_refine_mesh` allows a
-    finer mesh.
+    `guess_states` contains the section states of guesses, shape (wheels, 3). A finer mesh is used
+    only if `can_refine_mesh` is set.
     """
     search_outcomes = np.asarray(cycle.outcome)
     mesh_errors = map_in_batches(
@@ -520,7 +534,9 @@ def _find_fallback_starts(
         if refinement_index:
             coarser_finder, gait_finder = gait_finder, gait_finder.with_finer_mesh()
             transfer_solution = jax.vmap(
-                functools.partial(gait_finder.transfer_to_mesh, coarser_finder.system)
+                functools.partial(
+                    gait_finder.transfer_state_to_mesh, coarser_finder.collocation_system
+                )
             )
             collocation_state = map_in_batches(
                 transfer_solution, batch_sizes.GAIT_BATCH_SIZES, collocation_state
@@ -535,11 +551,11 @@ def _find_fallback_starts(
         retried_wheels = np.flatnonzero(needs_better_gait & is_retry_promising)
         if not len(retried_wheels):
             continue
-        retried_params = _take_rows_on_device(params, retried_wheels)
+        retried_params = _take_wheels_on_device(params, retried_wheels)
         start_states = _make_search_starts(
             gait_finder,
             retried_params,
-            _take_rows_on_device(collocation_state, retried_wheels),
+            _take_wheels_on_device(collocation_state, retried_wheels),
             has_known_state[retried_wheels],
             walk_end_states[retried_wheels],
         )
@@ -552,10 +568,10 @@ def _find_fallback_starts(
                 lambda cycle: cycle.mesh_error, batch_sizes.GAIT_BATCH_SIZES, retried_cycle
             )
         )
-        collocation_state = _replace_rows(
+        collocation_state = _replace_wheels(
             collocation_state,
             retried_wheels[is_gait_found],
-            _take_rows_on_device(retried_cycle.collocation_state, is_gait_found),
+            _take_wheels_on_device(retried_cycle.collocation_state, is_gait_found),
         )
         if is_gait_found.any():
             best_finder_and_starts = gait_finder, collocation_state
@@ -575,70 +591,74 @@ def _find_fallback_starts(
     return best_finder_and_starts
 
 
-def retry_from_walks(finder: Any, params: WheelParams, search_result: LimitCycle) -> LimitCycle:
-    """Return the search's result, completed by cycles from walks on the same mesh.
+def retry_from_walks(
+    gait_finder: Any, params: WheelParams, search_result: LimitCycle
+) -> LimitCycle:
+    """Return the search result, completed by cycles from walks on the same mesh.
 
     Only wheels without a cycle are searched again.
     """
     finder_and_starts = _find_fallback_starts(
-        finder, params, search_result, None, can_refine_mesh=False
+        gait_finder, params, search_result, None, can_refine_mesh=False
     )
     if finder_and_starts is None:
         return search_result
     retried_cycle = map_in_batches(
-        finder.find_cycles, batch_sizes.GAIT_BATCH_SIZES, params, finder_and_starts[1]
+        gait_finder.find_cycles, batch_sizes.GAIT_BATCH_SIZES, params, finder_and_starts[1]
     )
-    return _keep_first_reason(search_result, retried_cycle)
+    return _keep_first_failure_reason(search_result, retried_cycle)
 
 
 def _retry_from_other_steps(
-    finder: CollocationFinder, params: WheelParams, cycle: LimitCycle, section_states: np.ndarray
+    gait_finder: CollocationFinder,
+    params: WheelParams,
+    cycle: LimitCycle,
+    section_states: np.ndarray,
 ) -> tuple[CollocationFinder, CollocationState] | None:
-    """Return a finder and the same orbits, found with another step as the first one.
+    """Return a finder and the same gaits, found with another step as the first step.
 
-    Return None if no orbit is found. A guess contains the accelerations of all steps, whose errors
-    accumulate. A step without double support is the most sensitive one. As the first or last step
-    it may make the guess fail.
+    If no gait is found, None is returned. A guess contains the accelerations of all steps, whose
+    errors accumulate. A step without double support is the most sensitive step, which as the first
+    or last step may make the search fail.
     """
     missing_wheels = np.flatnonzero(np.isin(np.asarray(cycle.outcome), RETRY_OUTCOMES))
     if not len(missing_wheels):
         return None
-    missing_params = _take_rows_on_device(params, missing_wheels)
+    missing_params = _take_wheels_on_device(params, missing_wheels)
     section_states = np.array(section_states[missing_wheels])
     best_finder_and_starts = None
     collocation_state = cycle.collocation_state
-    for _ in range(1, finder.period_n):
+    for _ in range(1, gait_finder.period_n):
         section_states = np.asarray(
-            step_batch(missing_params, section_states, model=finder.model).section_state
+            step_batch(missing_params, section_states, model=gait_finder.model).section_state
         )
         retried_cycle = map_in_batches(
-            finder.find_cycles, batch_sizes.GAIT_BATCH_SIZES, missing_params, section_states
+            gait_finder.find_cycles, batch_sizes.GAIT_BATCH_SIZES, missing_params, section_states
         )
-        found_positions = np.flatnonzero(
+        positions_of_found_gaits = np.flatnonzero(
             np.asarray(retried_cycle.found)
             & (np.asarray(collocation_state.has_cycle)[missing_wheels] < 0.5)
         )
-        if len(found_positions):
-            collocation_state = _replace_rows(
+        if len(positions_of_found_gaits):
+            collocation_state = _replace_wheels(
                 collocation_state,
-                missing_wheels[found_positions],
-                _take_rows_on_device(retried_cycle.collocation_state, found_positions),
+                missing_wheels[positions_of_found_gaits],
+                _take_wheels_on_device(retried_cycle.collocation_state, positions_of_found_gaits),
             )
-            best_finder_and_starts = finder, collocation_state
+            best_finder_and_starts = gait_finder, collocation_state
     return best_finder_and_starts
 
 
 def _align_first_step(
-    finder: CollocationFinder,
+    gait_finder: CollocationFinder,
     params: WheelParams,
     cycle: LimitCycle,
     start_section_states: np.ndarray,
     finder_and_starts: tuple[CollocationFinder, CollocationState] | None,
 ) -> tuple[CollocationFinder, CollocationState] | None:
-    """Return a finder and the same orbits, with the step nearest to `start_section_states`
-    first.
-    """
-    finder, collocation_state = finder_and_starts or (finder, cycle.collocation_state)
+    """Return a finder and the same gaits, whose first step starts nearest to
+    `start_section_states`."""
+    gait_finder, collocation_state = finder_and_starts or (gait_finder, cycle.collocation_state)
     end_states = np.asarray(collocation_state.step_end_states)[:, :, [0, 2, 3]]
     distances_to_start = np.abs(np.roll(end_states, 1, axis=1) - start_section_states[:, None]).max(
         -1
@@ -646,17 +666,17 @@ def _align_first_step(
     distances_to_start = np.where(
         np.asarray(collocation_state.has_cycle)[:, None] > 0.5, distances_to_start, 0.0
     )
-    for step_index in range(1, finder.period_n):
+    for step_index in range(1, gait_finder.period_n):
         shifted_wheels = np.flatnonzero(np.argmin(distances_to_start, 1) == step_index)
         if len(shifted_wheels):
-            start_at_step = jax.vmap(functools.partial(finder.start_at_step, step_index))
-            collocation_state = _replace_rows(
+            start_at_step = jax.vmap(functools.partial(gait_finder.shift_first_step, step_index))
+            collocation_state = _replace_wheels(
                 collocation_state,
                 shifted_wheels,
                 start_at_step(
-                    _take_rows_on_device(params, shifted_wheels),
-                    _take_rows_on_device(collocation_state, shifted_wheels),
+                    _take_wheels_on_device(params, shifted_wheels),
+                    _take_wheels_on_device(collocation_state, shifted_wheels),
                 ),
             )
-            finder_and_starts = finder, collocation_state
+            finder_and_starts = gait_finder, collocation_state
     return finder_and_starts

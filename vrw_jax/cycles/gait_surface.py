@@ -1,11 +1,10 @@
-"""Prediction of gaits by a cubic polynomial that is fitted to the gaits of many wheels.
+"""Prediction of gaits by cubic polynomials that were fitted to the gaits of many wheels.
 
 The prediction is the start of every search. Lengths are in L0, times in sqrt(L0 / g) and masses in
-the total mass, so that wheels of any size are covered. The polynomial surface was fitted by
-experiments/gaits/fit_surface.py to the gaits that a continuation from Table 1 reaches. The fit uses
-Table 1's mass ratio, center of mass and eight legs, for which it is accurate to about 1 %.
-Parameters of other wheels are clipped to the range of the fit, and the prediction is the start of a
-homotopy.
+the total mass, so that wheels of any size are covered. `experiments/gaits/fit_surface.py` fitted
+the surface to gaits that a continuation from Table 1 reaches. For Table 1's mass ratio, center of
+mass and eight legs, which the fit uses, the prediction is accurate to about 1 %. For other wheels,
+the parameters are clipped to the range of the fit, and the prediction is the start of a homotopy.
 """
 
 import functools
@@ -17,21 +16,26 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from vrw_jax.collocation import N_GAUSS_NODES, CollocationSolution, PhaseMesh, mesh_transfer_matrix
+from vrw_jax.collocation import (
+    N_GAUSS_NODES,
+    CollocationSolution,
+    PhaseMesh,
+    build_mesh_transfer_matrix,
+)
 from vrw_jax.numerics import Elementwise
 from vrw_jax.wheel import PAPER_PHASES, WheelParams
 
 GAIT_SURFACE_MESHES = (PhaseMesh(2, 1.0), PhaseMesh(4, 2.0), PhaseMesh(1, 1.0))
-"""Meshes of the surface's accelerations for DLS, SLS-I and SLS-II."""
+"""Meshes of the predicted accelerations in DLS, SLS-I and SLS-II."""
 GAIT_SURFACE_DEGREE = 3
 """Degree of the polynomials whose coefficients are stored."""
 
 
 class GaitSurface(NamedTuple):
-    """Polynomial coefficients of the gait surface, shape (monomials, unknowns), and coordinate
-    ranges.
+    """Polynomial coefficients of the gait surface, (monomials, unknowns), and ranges of its
+    coordinates.
 
-    The coordinates are centered.
+    The polynomials are functions of the centered coordinates.
     """
 
     centre: np.ndarray
@@ -43,7 +47,7 @@ class GaitSurface(NamedTuple):
 
 @functools.cache
 def load_gait_surface() -> GaitSurface:
-    """Return the surface that is stored beside this file."""
+    """Return the gait surface from the file beside this module."""
     surface_file = importlib.resources.files(__package__) / "surface.npz"
     with surface_file.open("rb") as surface_stream, np.load(surface_stream) as stored_arrays:
         return GaitSurface(**{name: stored_arrays[name] for name in GaitSurface._fields})
@@ -55,9 +59,10 @@ def compute_time_unit(params: WheelParams) -> Elementwise:
 
 
 def compute_surface_coordinates(params: WheelParams) -> tuple[Elementwise, ...]:
-    """Return the dimensionless coordinates of the surface.
+    """Return the dimensionless coordinates of the gait surface.
 
-    They are the root of damping, stiffness, natural length and slope.
+    The coordinates depend on the square root of the damping, on stiffness, natural length and
+    slope.
     """
     total_mass = params.hub_mass + params.n_legs * params.leg_mass
     leg_length, gravity = params.locked_length, params.gravity
@@ -70,7 +75,9 @@ def compute_surface_coordinates(params: WheelParams) -> tuple[Elementwise, ...]:
 
 
 def evaluate_monomials(centered_coordinates: tuple[Elementwise, ...]) -> list[Elementwise]:
-    """Return all monomials of the coordinates up to the surface's degree, the constant first."""
+    """Return all monomials of the coordinates up to the degree of the surface, the constant
+    first.
+    """
     constant_monomial = jnp.ones_like(centered_coordinates[0])
     return [
         functools.reduce(operator.mul, monomial_factors, constant_monomial)
@@ -81,17 +88,17 @@ def evaluate_monomials(centered_coordinates: tuple[Elementwise, ...]) -> list[El
     ]
 
 
-def predict_gait(params: WheelParams, meshes: tuple[PhaseMesh, ...]) -> CollocationSolution:
+def predict_gait(params: WheelParams, phase_meshes: tuple[PhaseMesh, ...]) -> CollocationSolution:
     """Return the predicted section state, durations and accelerations of each lane.
 
-    The accelerations belong to the nodes of `meshes`. Lanes are the last axis.
+    The accelerations belong to the nodes of `phase_meshes`. Lanes are on the last axis.
     """
     gait_surface = load_gait_surface()
-    # Python floats preserve the dtype of the parameters.
-    coordinate_ranges = (coordinate.tolist() for coordinate in gait_surface[:4])
+    # With Python floats, the dtype of the parameters is kept.
+    coordinate_ranges = (surface_coordinate.tolist() for surface_coordinate in gait_surface[:4])
     centered_coordinates = tuple(
-        (jnp.clip(coordinate, lower, upper) - center) / half_range
-        for coordinate, center, half_range, lower, upper in zip(
+        (jnp.clip(surface_coordinate, lower_bound, upper_bound) - center) / half_range
+        for surface_coordinate, center, half_range, lower_bound, upper_bound in zip(
             compute_surface_coordinates(params), *coordinate_ranges, strict=True
         )
     )
@@ -102,25 +109,29 @@ def predict_gait(params: WheelParams, meshes: tuple[PhaseMesh, ...]) -> Collocat
     time_scale = compute_time_unit(params)
     section_state = jnp.stack([predicted_values[0], predicted_values[1] / time_scale])
     phase_durations = predicted_values[None, 2:5] * time_scale
-    accelerations, value_index = [], 5
-    for phase, surface_mesh, mesh in zip(PAPER_PHASES, GAIT_SURFACE_MESHES, meshes, strict=True):
-        n_coordinates = phase.n_dof
+    accelerations_by_phase, value_index = [], 5
+    for phase_index, surface_mesh, phase_mesh in zip(
+        PAPER_PHASES, GAIT_SURFACE_MESHES, phase_meshes, strict=True
+    ):
+        n_coordinates = phase_index.n_dof
         n_values = surface_mesh.n_intervals * N_GAUSS_NODES * n_coordinates
         surface_accelerations = predicted_values[value_index : value_index + n_values].reshape(
             -1, n_coordinates, *monomials.shape[1:]
         )
         value_index += n_values
-        transfer_matrix = jnp.asarray(mesh_transfer_matrix(surface_mesh, mesh), monomials.dtype)
-        # The accelerations are those of (theta, L1, L2).
+        transfer_matrix = jnp.asarray(
+            build_mesh_transfer_matrix(surface_mesh, phase_mesh), monomials.dtype
+        )
+        # The coordinates are (theta, L1, L2).
         angle_scale = 1.0 / time_scale**2
         length_scale = params.locked_length / time_scale**2
         acceleration_units = jnp.stack([angle_scale, length_scale, length_scale][:n_coordinates])
         phase_accelerations = (
             jnp.tensordot(transfer_matrix, surface_accelerations, 1) * acceleration_units
         )
-        accelerations.append(
+        accelerations_by_phase.append(
             phase_accelerations.reshape(
-                1, mesh.n_intervals, N_GAUSS_NODES, *phase_accelerations.shape[1:]
+                1, phase_mesh.n_intervals, N_GAUSS_NODES, *phase_accelerations.shape[1:]
             )
         )
-    return CollocationSolution(section_state, phase_durations, tuple(accelerations))
+    return CollocationSolution(section_state, phase_durations, tuple(accelerations_by_phase))

@@ -17,50 +17,56 @@ from vrw_jax.wheel import PARAMETER_NAMES, Outcome, WheelParams, compute_wheel_u
 
 @dataclass(frozen=True)
 class GaitWalkOptions:
-    """Options of the walks toward attracting gaits.
+    """Numerical options of the walks toward attracting gaits.
 
-    All distances compare section states in units of the wheel.
+    Distances are those of section states in units of the wheel.
     """
 
     steps_by_round: tuple[int, ...] = (8, 12, 30, 50, 100)
-    """Numbers of steps toward a gait, one for each round. After a round, settled walks stop and
-    walks to the same gait are merged."""
+    """Number of steps in each round.
+
+    After a round, settled walks stop, and walks to the same gait are merged."""
     walk_step_tolerance: float = 1e-8
-    """Tolerance of the Tsit5 steps toward a gait, which is independent of the tolerance of the
-    gait."""
+    """Tolerance of the Tsit5 steps of walks, which is independent of the tolerance of the gait."""
     max_settled_defect: float = 1e-3
-    """Largest distance between the state of a settled walk and its state one period earlier."""
+    """Largest distance between states of a settled walk that are one period apart."""
     max_newton_start_defect: float = 0.1
-    """Largest distance between states one period apart of an unsettled walk from which Newton's
+    """Largest distance between states of an unsettled walk, one period apart, from which Newton's
     method starts."""
     walk_merge_distance: float = 0.02
-    """Distance up to which two walks are considered to reach the same gait."""
+    """Largest distance between the ends of two walks that count as walks to the same gait."""
 
 
 GAIT_WALK_OPTIONS = GaitWalkOptions()
 
 WALK_STARTS = ((1.0, 0.45), (1.0, 0.7), (1.0, 1.0), (0.5, 1.0), (0.0, 1.0))
-"""Starts of walks. The first number is the static contraction of Leg 1 at touchdown, as a fraction.
-The second is the rate of the hub as a fraction of the rigid rolling gait's rate. Of 4,800 random
-wheels with 5 to 16 legs, 1,240 walk from one of these starts or from a grid of 78 starts. From
-these starts alone, 1,175 wheels walk (ranges: experiments/gaits/off_the_box.py)."""
+"""Starts of walks, each given by a contraction and a rate.
+
+The first number is the static contraction of Leg 1 at touchdown, as a fraction. The second number
+is the rate of the hub, as a fraction of the rigid rolling gait's rate. Of 4,800 random wheels with
+5 to 16 legs, 1,240 wheels walk from one of these starts or from a grid of 78 starts. From these
+starts alone, 1,175 wheels walk (ranges: experiments/gaits/off_the_box.py).
+"""
 
 FALLBACK_WALK_STARTS = (
     (0.002, 0.4), (0.002, 0.3), (0.002, 0.5), (0.5, 1.1), (0.2, 0.4), (0.2, 1.1), (0.2, 0.8),
     (0.35, 1.0), (0.35, 1.1), (0.43, 1.6), (0.4, 1.35), (0.46, 1.6), (0.43, 1.35),
 )  # fmt: skip
-"""Starts of walks that are tried if none of WALK_STARTS leads to a gait. The first number is Leg
-1's angle to the slope's normal at touchdown, as a fraction of the angle between legs. The second
-number is the rate, as in WALK_STARTS. The first nine starts reach 65 wheels that WALK_STARTS miss.
-With many legs, gaits roll from double support into double support, with an angle near 0. The last
-four starts are chosen because some gaits of few legs are only reached from large angles and high
-rates. Of 442 wheels with 5 to 7 legs that walk from one of these starts or from a grid of 30, the
-last four starts reach 18 wheels that other starts miss."""
+"""Starts of walks for wheels that reach no gait from WALK_STARTS, each given by an angle and a
+rate.
+
+The first number is Leg 1's angle to the slope's normal at touchdown, as a fraction of the angle
+between legs. The second number is the rate, as in WALK_STARTS. The first nine starts reach 65
+wheels that WALK_STARTS miss. With many legs, gaits roll from double support into double support,
+with an angle near 0. The last four starts are chosen because some gaits with few legs are reached
+only from large angles and high rates. Of 442 wheels with 5 to 7 legs that walk from one of these
+starts or from a grid of 30, the last four starts reach 18 wheels that other starts miss.
+"""
 
 
 def compute_walk_starts(params: WheelParams) -> np.ndarray:
     """Return the section states of WALK_STARTS for each wheel, shape (starts, wheels, 3)."""
-    numpy_params, sin, cos = (
+    numpy_params, slope_sine, slope_cosine = (
         _convert_params_to_numpy(params),
         math.sin(params.leg_angle),
         math.cos(params.leg_angle),
@@ -74,22 +80,24 @@ def compute_walk_starts(params: WheelParams) -> np.ndarray:
         numpy_params.natural_length - normal_weight / numpy_params.stiffness
     ) / numpy_params.locked_length
     leg_lengths = [
-        np.clip(1.0 + contraction_share * (static_length_ratio - 1.0), cos + 0.02, 1.0)
+        np.clip(1.0 + contraction_share * (static_length_ratio - 1.0), slope_cosine + 0.02, 1.0)
         for contraction_share, _ in WALK_STARTS
     ]
-    touchdown_angles = [np.arctan((length - cos) / sin) for length in leg_lengths]
+    touchdown_angles = [
+        np.arctan((leg_length - slope_cosine) / slope_sine) for leg_length in leg_lengths
+    ]
     return _make_section_states(
         params, touchdown_angles, [rate_share for _, rate_share in WALK_STARTS]
     )
 
 
 def compute_fallback_walk_starts(params: WheelParams) -> np.ndarray:
-    """Return the section states of FALLBACK_WALK_STARTS for each wheel, shape (starts,
-    wheels, 3).
+    """Return the section states of FALLBACK_WALK_STARTS for each wheel, shape (starts, wheels,
+    3).
     """
     touchdown_angles = [
-        np.full(np.shape(params.slope), angle_share * params.leg_angle)
-        for angle_share, _ in FALLBACK_WALK_STARTS
+        np.full(np.shape(params.slope), touchdown_angle_share * params.leg_angle)
+        for touchdown_angle_share, _ in FALLBACK_WALK_STARTS
     ]
     return _make_section_states(
         params, touchdown_angles, [rate_share for _, rate_share in FALLBACK_WALK_STARTS]
@@ -99,7 +107,7 @@ def compute_fallback_walk_starts(params: WheelParams) -> np.ndarray:
 def _convert_params_to_numpy(params: WheelParams) -> Any:
     """Return the parameters as NumPy arrays.
 
-    JAX would compile each operation on its arrays for every number of wheels.
+    JAX would compile each operation for every number of wheels.
     """
     return SimpleNamespace(**{name: np.asarray(getattr(params, name)) for name in PARAMETER_NAMES})
 
@@ -109,7 +117,7 @@ def _make_section_states(
 ) -> np.ndarray:
     """Return section states with the given touchdown angles, rad, shape (starts, wheels, 3).
 
-    Hub rates are given as fractions of the rate of the rigid rolling gait.
+    The rates of the hub are given as fractions of the rigid rolling gait's rate.
     """
     numpy_params, leg_angle = _convert_params_to_numpy(params), params.leg_angle
     rigid_leg_rate = np.sqrt(
@@ -140,14 +148,13 @@ def stack_section_units(model: Any, parameter_values: np.ndarray, n_legs: int) -
 
 
 def count_section_coordinates(gait_finder: Any) -> int:
-    """Return the number of continuous components of a section state; the other components are
-    codes.
-    """
+    """Return the number of continuous components of a section state. The other components are
+    codes."""
     return int(gait_finder.model.n_continuous(WheelParams(n_legs=gait_finder.n_legs)))
 
 
 class DistinctWalkEnds(NamedTuple):
-    """Distinct ends of walks, in the order of the wheels. Each wheel has at least one end."""
+    """Distinct ends of walks in the order of the wheels, at least one for each wheel."""
 
     wheel_indices: np.ndarray  # (ends,)
     section_states: np.ndarray  # (ends, section)
@@ -157,23 +164,25 @@ class DistinctWalkEnds(NamedTuple):
 def walk_to_gaits(
     gait_finder: Any,
     parameter_values: np.ndarray,
-    compute_starts: Callable[[WheelParams], np.ndarray],
+    compute_start_states: Callable[[WheelParams], np.ndarray],
     walk_options: GaitWalkOptions = GAIT_WALK_OPTIONS,
 ) -> DistinctWalkEnds:
     """Return the distinct ends of the walks of each wheel.
 
-    Of walks that reach the same state, the one with the smallest period defect is returned. A walk
-    that fails ends at the state of its last round, which may be near a repelling gait. If no walk
-    of a wheel nearly repeats, the end of its first walk is returned.
+    Of several walks that reach the same state, the walk with the smallest period defect is kept. A
+    walk that fails ends at the state of its last round, which may be near a repelling gait. If no
+    walk of a wheel nearly repeats, the end of its first walk is returned.
 
     Args:
         gait_finder: finder of gaits, whose model takes the steps.
         parameter_values: values of each wheel, (wheels, n_values); see
             `AbstractWheel.parameter_values`.
-        compute_starts: function that returns section states of shape (starts, wheels, 3).
-        walk_options: options of the walks.
+        compute_start_states: function from wheels to section states of shape (starts, wheels, 3).
+        walk_options: numerical options of the walks.
     """
-    start_section_states = compute_starts(_split_parameter_values(gait_finder, parameter_values)[1])
+    start_section_states = compute_start_states(
+        _split_parameter_values(gait_finder, parameter_values)[1]
+    )
     n_wheels, n_coordinates = len(parameter_values), count_section_coordinates(gait_finder)
     walk_wheel_indices = np.tile(np.arange(n_wheels), len(start_section_states))
     values_by_walk, section_states = (
@@ -241,7 +250,7 @@ def measure_period_defects(
 ) -> np.ndarray:
     """Return the largest change of each section state over one period, shape (wheels,).
 
-    Changes are in units of the wheel. A change is infinite if a step fails.
+    Changes are in units of the wheel, and infinite if a step fails.
     """
     end_states, period_outcomes = _walk_wheels(
         gait_finder, parameter_values, section_states, gait_finder.period_n, walk_options
@@ -264,7 +273,7 @@ def _walk_wheels(
     step_options = StepOptions(
         solver="Tsit5", rtol=walk_options.walk_step_tolerance, atol=walk_options.walk_step_tolerance
     )
-    # The implicit solver of the stiffest wheels would take minutes for a walk.
+    # For the stiffest wheels, the implicit solver would take minutes per walk.
     walk_result = step_batch(
         params, section_states, n_steps, model=model, options=step_options, engine="lanes"
     )
@@ -274,9 +283,7 @@ def _walk_wheels(
 def _split_parameter_values(
     gait_finder: Any, parameter_values: np.ndarray
 ) -> tuple[Any, WheelParams]:
-    """Return the model and the wheels of given parameter values, whose first axis is over
-    wheels.
-    """
+    """Return the model and the wheels with the given parameter values, (wheels, n_values)."""
     model, params = gait_finder.model.from_values(
         tuple(jax.device_put(list(parameter_values.T))), gait_finder.n_legs
     )
@@ -290,12 +297,11 @@ def _find_duplicate_walks(
     max_settled_defect: float,
     walk_options: GaitWalkOptions,
 ) -> np.ndarray:
-    """Return which walks reach the same state as another walk of the same wheel with a smaller
-    defect.
+    """Return whether another walk of the same wheel reaches the same state with a smaller defect.
 
     Two states are the same if their distance is within `walk_merge_distance`. If the other walk has
-    settled to within `max_settled_defect`, three times the defect of the first walk is allowed if
-    that is larger. Axes are starts, wheels and, for states, coordinates.
+    settled to within `max_settled_defect`, a distance of three times the first walk's defect is
+    also allowed. The axes are starts, wheels and, for states, coordinates.
     """
     scaled_walk_states, period_defects = (
         scaled_walk_states.reshape(-1, n_wheels, scaled_walk_states.shape[-1]),
@@ -303,13 +309,14 @@ def _find_duplicate_walks(
     )
     start_indices = np.arange(len(scaled_walk_states))[:, None]
     is_walk_duplicate = np.zeros(period_defects.shape, bool)
-    for other_start in range(len(scaled_walk_states)):
-        has_smaller_defect = (period_defects[other_start] < period_defects) | (
-            (period_defects[other_start] == period_defects) & (other_start < start_indices)
+    for other_start_index in range(len(scaled_walk_states)):
+        has_smaller_defect = (period_defects[other_start_index] < period_defects) | (
+            (period_defects[other_start_index] == period_defects)
+            & (other_start_index < start_indices)
         )
-        state_distances = np.abs(scaled_walk_states - scaled_walk_states[other_start]).max(-1)
+        state_distances = np.abs(scaled_walk_states - scaled_walk_states[other_start_index]).max(-1)
         is_same_state = state_distances <= np.where(
-            period_defects[other_start] < max_settled_defect,
+            period_defects[other_start_index] < max_settled_defect,
             np.maximum(walk_options.walk_merge_distance, 3.0 * period_defects),
             walk_options.walk_merge_distance,
         )

@@ -1,5 +1,5 @@
-"""Margins that searches along gaits of the paper's model keep positive, with default least
-values.
+"""Margins that searches along gaits of the paper's model keep positive, and their default
+limits.
 """
 
 from collections.abc import Mapping
@@ -12,12 +12,14 @@ from vrw_jax.validation import check_type
 from vrw_jax.wheel import Motion, Symbols, WheelParams, dynamics
 
 
-def compute_takeoff_acceleration(s: Symbols, sls1: PhasePoints) -> Elementwise:
-    """Return the rear foot's acceleration at the start of SLS-I of a gait, m/s^2.
+def compute_takeoff_acceleration(s: Symbols, sls1_points: PhasePoints) -> Elementwise:
+    """Return the rear foot's acceleration at the start of SLS-I, m/s^2.
 
-    See `dynamics.takeoff_acceleration`.
+    See `dynamics.compute_takeoff_acceleration`.
     """
-    return dynamics.compute_takeoff_acceleration(s, Motion.from_angle(*sls1.start.q, *sls1.start.v))
+    return dynamics.compute_takeoff_acceleration(
+        s, Motion.from_angle(*sls1_points.start_point.q, *sls1_points.start_point.v)
+    )
 
 
 KEPT_MARGIN_NAMES: tuple[str, ...] = (
@@ -33,26 +35,25 @@ KEPT_MARGIN_NAMES: tuple[str, ...] = (
     "lambda_2_plus",
     "lambda_4_plus",
 )
-"""Names of the margins on forces, clearances and indicators that gaits of the paper's model can
-keep."""
+"""Names of the margins on forces, clearances and indicators that can be kept positive."""
 
 DEFAULT_MARGIN_SHARE = 1e-3
-"""Default least value of a margin, as a fraction of the wheel's weight, leg length or gravity."""
+"""Default lower limit of a margin, as a fraction of the wheel's weight, leg length or gravity."""
 
 
 @with_default_jax_settings
 def default_margins(params: WheelParams) -> Mapping[str, float]:
-    """Return least values of `KEPT_MARGIN_NAMES`: a thousandth of each unit's natural scale on this
-    wheel.
+    """Return lower limits of the margins in `KEPT_MARGIN_NAMES`.
 
-    The values are not zero because a search needs a distance from the limits. At lambda_4_plus = 0,
-    for example, the gait itself ends.
+    Each limit is a thousandth of the margin's natural scale for this wheel. The limits are above
+    zero, because a search needs a distance from the boundary. At lambda_4_plus = 0, for example,
+    the gaits end.
 
     Args:
         params: one wheel.
 
     Returns:
-        Least values by name of the measure, each in the measure's unit.
+        Lower limits by the name of the margin, each in the unit of the margin.
 
     Raises:
         TypeError, ValueError: if an argument is invalid; the message names the remedy.
@@ -63,15 +64,16 @@ def default_margins(params: WheelParams) -> Mapping[str, float]:
     """
     check_type("params", params, WheelParams, "write vrw.WheelParams(damping=..., slope=...)")
     params.require_single_wheel("take one after the other")
-    mass = float(params.hub_mass + params.n_legs * params.leg_mass)
-    length, gravity = float(params.locked_length), float(params.gravity)
+    total_mass = float(params.hub_mass + params.n_legs * params.leg_mass)
+    leg_length, gravity_acceleration = float(params.locked_length), float(params.gravity)
     unit_scales = {
-        "N": mass * gravity,
-        "m": length,
-        "m/s^2": gravity,
-        "N s": mass * (gravity * length) ** 0.5,
+        "N": total_mass * gravity_acceleration,
+        "m": leg_length,
+        "m/s^2": gravity_acceleration,
+        "N s": total_mass * (gravity_acceleration * leg_length) ** 0.5,
         "1": 1.0,
     }
     return {
-        name: DEFAULT_MARGIN_SHARE * unit_scales[MEASURES[name].unit] for name in KEPT_MARGIN_NAMES
+        margin_name: DEFAULT_MARGIN_SHARE * unit_scales[MEASURES[margin_name].unit]
+        for margin_name in KEPT_MARGIN_NAMES
     }

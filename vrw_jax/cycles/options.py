@@ -24,15 +24,16 @@ from vrw_jax.validation import (
 )
 @dataclasses.dataclass(frozen=True)
 class CycleOptions:
-    """Numerical options of `limit_cycle`; each change compiles the search again.
+    """Numerical options of `limit_cycle`. Every change of an option compiles the search again.
 
-    The defaults reach 1e-9 relative in values and 1e-8 in first derivatives.
+    The defaults reach relative errors of 1e-9 in values and 1e-8 in first derivatives.
 
     - `mesh_intervals`: numbers of mesh intervals, of order 8, in DLS, SLS-I and SLS-II;
-    - `mesh_grading`: ratio of the lengths of the last and the first mesh interval in SLS-I;
-    - `tolerance`: tolerance of Newton's last correction, in the wheel's own units;
-    - `max_newton_iterations`: limit of Newton iterations in one attempt;
-    - `first_newton_iterations`: number after which a batch collects the wheels that need more;
+    - `mesh_grading`: ratio of the last to the first mesh interval in SLS-I;
+    - `tolerance`: largest norm of Newton's last correction, in units of the wheel;
+    - `max_newton_iterations`: largest number of Newton iterations in one attempt;
+    - `first_newton_iterations`: number of iterations after which a batch gathers the wheels that
+      need more;
     - `homotopy_steps`: number of steps of a homotopy from Table 1, used if the first attempt fails;
     - `batch_size`: number of wheels that are solved together.
 
@@ -50,15 +51,19 @@ class CycleOptions:
     batch_size: int = 64
 
     def __post_init__(self) -> None:
-        for name in (
+        for option_name in (
             "max_newton_iterations",
             "first_newton_iterations",
             "homotopy_steps",
             "batch_size",
         ):
-            object.__setattr__(self, name, check_int(name, getattr(self, name)))
-        for name in ("mesh_grading", "tolerance"):
-            object.__setattr__(self, name, check_positive(name, getattr(self, name)))
+            object.__setattr__(
+                self, option_name, check_int(option_name, getattr(self, option_name))
+            )
+        for option_name in ("mesh_grading", "tolerance"):
+            object.__setattr__(
+                self, option_name, check_positive(option_name, getattr(self, option_name))
+            )
         if not isinstance(self.mesh_intervals, tuple | list) or len(self.mesh_intervals) != 3:
             raise ValueError(
                 f"mesh_intervals is {format_value(self.mesh_intervals)}, but it counts the "
@@ -73,9 +78,9 @@ class CycleOptions:
         object.__setattr__(self, "mesh_intervals", mesh_intervals)
 
     def check_tolerances(self, parameter_dtype: np.dtype) -> None:
-        """Raise a ValueError for a tolerance that the number format cannot resolve.
+        """Raise ValueError if the number format cannot resolve the tolerance.
 
-        The parameters of a wheel in 64 bits count as 32 bits if `jax_enable_x64` is off, as in JAX.
+        As in JAX, 64-bit parameters of a wheel count as 32-bit numbers if `jax_enable_x64` is off.
         """
         jax_dtype = jax.dtypes.canonicalize_dtype(parameter_dtype)
         if self.tolerance < jnp.finfo(jax_dtype).eps:
@@ -90,9 +95,16 @@ class CycleOptions:
             )
 
     def refine_mesh(self) -> "CycleOptions":
-        """Return the options with about twice as many mesh intervals."""
-        dls, sls1, sls2 = self.mesh_intervals
-        return dataclasses.replace(self, mesh_intervals=(2 * dls, 2 * sls1, max(2 * sls2, sls1)))
+        """Return options with about twice as many mesh intervals."""
+        n_dls_intervals, n_sls1_intervals, n_sls2_intervals = self.mesh_intervals
+        return dataclasses.replace(
+            self,
+            mesh_intervals=(
+                2 * n_dls_intervals,
+                2 * n_sls1_intervals,
+                max(2 * n_sls2_intervals, n_sls1_intervals),
+            ),
+        )
 
     @classmethod
     def tight(cls) -> "CycleOptions":

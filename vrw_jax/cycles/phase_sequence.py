@@ -1,9 +1,9 @@
-"""The paper's phases as data for the collocation: dynamics, end events and resets.
+"""Phases of the paper's model as functions for the collocation: dynamics, end events and resets.
 
 `make_held_landing_sequence` uses the plane section (theta+, dtheta+) just after an impact that ends
-with both feet on the ground. Its double support may be absent; then the rear foot lifts immediately
-(case B3). An impact that throws the rear foot off (case A3) leaves that plane, so the search does
-not find such gaits.
+with both feet on the ground. If double support is absent, the rear foot lifts immediately (case
+B3). An impact at which the rear foot leaves the ground (case A3) is not in that plane, so the
+search does not find such gaits.
 """
 
 import functools
@@ -34,17 +34,19 @@ from vrw_jax.wheel import (
 )
 
 N_LANE_SYMBOLS = 12
-"""Number of fields of `Symbols` that vary between lanes. The other fields follow from the number of
-legs."""
+"""Number of fields of `Symbols` that vary between lanes.
+
+The other fields follow from the number of legs.
+"""
 
 
 def compute_phase_constants(n_legs: int, *parameters: Elementwise) -> PhaseConstants:
-    """Return the combinations of parameters that all formulas need.
+    """Return the combinations of parameters that the formulas of all phases contain.
 
-    The arguments are the parameters in their order.
+    The arguments are the parameters in the order of PARAMETER_NAMES.
     """
-    symbols: tuple[Any, ...] = compute_symbols(n_legs, *parameters)
-    return symbols[:N_LANE_SYMBOLS]
+    wheel_symbols: tuple[Any, ...] = compute_symbols(n_legs, *parameters)
+    return wheel_symbols[:N_LANE_SYMBOLS]
 
 
 def _restore_symbols(n_legs: int, phase_constants: PhaseConstants) -> Symbols:
@@ -61,7 +63,7 @@ def _restore_symbols(n_legs: int, phase_constants: PhaseConstants) -> Symbols:
 
 
 def _has_line_turn(phase_constants: PhaseConstants) -> bool:
-    """Return whether the last constant is an angle, rad, by which the next line is steeper."""
+    """Return whether the constants contain the angle, rad, by which the next line is steeper."""
     return len(phase_constants) > N_LANE_SYMBOLS
 
 
@@ -72,31 +74,31 @@ def _make_collocation_phase(
     phase_class = PAPER_PHASES[phase_index]
 
     def evaluate_phase(
-        phase_constants: PhaseConstants, point: PhasePoint
+        phase_constants: PhaseConstants, phase_point: PhasePoint
     ) -> tuple[AbstractPhase, Motion]:
         line_turn = (
             compute_sine_cosine(phase_constants[N_LANE_SYMBOLS])
             if _has_line_turn(phase_constants)
             else ()
         )
-        phase = phase_class(
-            _restore_symbols(n_legs, phase_constants), point.held_constants, True, line_turn
+        wheel_phase = phase_class(
+            _restore_symbols(n_legs, phase_constants), phase_point.held_constants, True, line_turn
         )
-        return phase, phase.compute_motion(point.q, point.v)
+        return wheel_phase, wheel_phase.compute_motion(phase_point.q, phase_point.v)
 
-    def residual(
-        phase_constants: PhaseConstants, point: PhasePoint, acceleration: Vector
+    def evaluate_residual(
+        phase_constants: PhaseConstants, phase_point: PhasePoint, phase_acceleration: Vector
     ) -> Vector:
-        phase, motion = evaluate_phase(phase_constants, point)
-        return phase.compute_dynamics_residual(motion, acceleration)
+        wheel_phase, wheel_motion = evaluate_phase(phase_constants, phase_point)
+        return wheel_phase.compute_dynamics_residual(wheel_motion, phase_acceleration)
 
-    def end_event(phase_constants: PhaseConstants, point: PhasePoint) -> Elementwise:
-        phase, motion = evaluate_phase(phase_constants, point)
-        return phase.compute_end_guard(PhaseInstant(phase, motion, None))
+    def evaluate_end_event(phase_constants: PhaseConstants, phase_point: PhasePoint) -> Elementwise:
+        wheel_phase, wheel_motion = evaluate_phase(phase_constants, phase_point)
+        return wheel_phase.compute_end_guard(PhaseInstant(wheel_phase, wheel_motion, None))
 
-    def guards(phase_constants: PhaseConstants, point: PhasePoint) -> Vector:
-        phase, motion = evaluate_phase(phase_constants, point)
-        guard_values = phase.compute_guards(PhaseInstant(phase, motion, None))
+    def evaluate_guards(phase_constants: PhaseConstants, phase_point: PhasePoint) -> Vector:
+        wheel_phase, wheel_motion = evaluate_phase(phase_constants, phase_point)
+        guard_values = wheel_phase.compute_guards(PhaseInstant(wheel_phase, wheel_motion, None))
         # Every guard keeps its index in ADMISSIBILITY_CHECKS, even if it is not checked.
         return (
             guard_values
@@ -104,17 +106,17 @@ def _make_collocation_phase(
             else (*guard_values[:-1], jnp.ones_like(guard_values[-1]))
         )
 
-    def reset_to_next_phase(phase_constants: PhaseConstants, point: PhasePoint) -> PhasePoint:
-        phase, motion = evaluate_phase(phase_constants, point)
+    def reset_to_next_phase(phase_constants: PhaseConstants, phase_point: PhasePoint) -> PhasePoint:
+        wheel_phase, wheel_motion = evaluate_phase(phase_constants, phase_point)
         return PhasePoint(
             (),
             *PAPER_PHASES[phase_index + 1].select_coordinates(
-                point.q[0], phase.reset_motion(motion)
+                phase_point.q[0], wheel_phase.reset_motion(wheel_motion)
             ),
         )
 
-    def reset_to_section(phase_constants: PhaseConstants, point: PhasePoint) -> PhasePoint:
-        (theta, _), (dtheta, dL1) = point.q, point.v
+    def reset_to_section(phase_constants: PhaseConstants, phase_point: PhasePoint) -> PhasePoint:
+        (theta, _), (dtheta, dL1) = phase_point.q, phase_point.v
         s = _restore_symbols(n_legs, phase_constants)
         theta = (
             theta - phase_constants[N_LANE_SYMBOLS] if _has_line_turn(phase_constants) else theta
@@ -125,22 +127,23 @@ def _make_collocation_phase(
     return CollocationPhase(
         phase_class.name,
         phase_class.n_dof,
-        residual,
-        end_event,
+        evaluate_residual,
+        evaluate_end_event,
         reset_function,
-        guards,
+        evaluate_guards,
         is_smooth=not phase_class.has_stiff_start,
     )
 
 
-def _admissibility_checks() -> tuple[str, ...]:
-    """Return the checks of all phases and transitions, each as a phrase."""
+def _list_admissibility_checks() -> tuple[str, ...]:
+    """Return a phrase for each check of the phases and their transitions."""
     check_phrases: list[str] = []
     for phase_class in PAPER_PHASES:
         failure_outcomes = (*phase_class.guard_outcomes[1:], *SHARED_FAILURE_OUTCOMES)
         check_phrases += [f"{phase_class.name} lasts", f"{phase_class.name} ends only once"]
         check_phrases += [
-            f"no {outcome.name} in {phase_class.name}" for outcome in failure_outcomes
+            f"no {failure_outcome.name} in {phase_class.name}"
+            for failure_outcome in failure_outcomes
         ]
     return (
         *check_phrases,
@@ -150,23 +153,26 @@ def _admissibility_checks() -> tuple[str, ...]:
     )
 
 
-ADMISSIBILITY_CHECKS = (*_admissibility_checks(), "mesh")
-"""Assumptions about a gait, in the order of the checks. The duration and the guards of each phase
-come first. The checks at the transitions between phases and the resolution of the mesh follow."""
+ADMISSIBILITY_CHECKS = (*_list_admissibility_checks(), "mesh")
+"""Assumptions about a gait, in the order of their checks.
+
+The first checks are the duration and the guards of each phase. The transitions between phases and
+the resolution of the mesh follow.
+"""
 
 
 @functools.cache
 def make_held_landing_sequence(n_legs: int, stop_at_lift_off: bool = True) -> PhaseSequence:
     """Return DLS, SLS-I and SLS-II on the plane section (theta+, dtheta+) after the impact."""
-    phases = tuple(
+    collocation_phases = tuple(
         _make_collocation_phase(n_legs, stop_at_lift_off, phase_index)
         for phase_index in range(len(PAPER_PHASES))
     )
 
     def make_start_point(phase_constants: PhaseConstants, section_state: Vector) -> PhasePoint:
         s = _restore_symbols(n_legs, phase_constants)
-        sin, cos = compute_sine_cosine(section_state[0])
-        foot_distance = s.L0 * s.sin_alpha / rotate_to_rear_leg(s, sin, cos).cos
+        sine, cosine = compute_sine_cosine(section_state[0])
+        foot_distance = s.L0 * s.sin_alpha / rotate_to_rear_leg(s, sine, cosine).cos
         return PhasePoint((foot_distance,), section_state[:1], section_state[1:])
 
     def evaluate_transition_margins(
@@ -174,16 +180,18 @@ def make_held_landing_sequence(n_legs: int, stop_at_lift_off: bool = True) -> Ph
         phase_points: tuple[PhasePoints, ...],
         is_phase_active: Array,
     ) -> Vector:
-        dls, sls1, sls2 = phase_points
-        lift_off_guard = phases[0].event(phase_constants, dls.start)
-        (theta, _), (dtheta, dL1) = sls2.end.q, sls2.end.v
-        landing = transitions.resolve_landing(
+        dls_points, sls1_points, sls2_points = phase_points
+        lift_off_guard = collocation_phases[0].end_event_function(
+            phase_constants, dls_points.start_point
+        )
+        (theta, _), (dtheta, dL1) = sls2_points.end_point.q, sls2_points.end_point.v
+        landing_result = transitions.resolve_landing(
             _restore_symbols(n_legs, phase_constants), theta, dtheta, dL1
         )
         return (
             jnp.where(is_phase_active[0], lift_off_guard, -lift_off_guard),
-            landing.rear_impulse.normal,
-            sls1.end.v[2],
+            landing_result.rear_impulse.normal,
+            sls1_points.end_point.v[2],
         )
 
-    return PhaseSequence(2, make_start_point, phases, evaluate_transition_margins)
+    return PhaseSequence(2, make_start_point, collocation_phases, evaluate_transition_margins)

@@ -1,7 +1,7 @@
 """Gaits of any model, found by Newton's method on its return map from a start near the gait.
 
-The paper's model has a faster method (see `collocation_finder`). This module uses only the
-interface of the models.
+Only the interface of models is used. For the paper's model, `collocation_finder` is a faster
+method.
 """
 
 from typing import Any, ClassVar
@@ -15,13 +15,13 @@ from vrw_jax.continuation import FixedPointResult, solve_fixed_point, solve_fixe
 from vrw_jax.cycles.cycle import CYCLE_MEASURE_FUNCTIONS, AbstractCycle
 from vrw_jax.cycles.finder import (
     AbstractGaitFinder,
-    BranchPoint,
     Gait,
+    GaitBranchPoint,
     GaitMeasures,
     ParameterValues,
+    compute_cycle_measures,
+    compute_gait_measures,
     compute_value_and_tangents,
-    measure_on_cycle,
-    measure_on_gait,
     move_derivative_axis_first,
 )
 from vrw_jax.cycles.options import CycleOptions
@@ -38,31 +38,30 @@ from vrw_jax.simulation import validate_arguments, walk_toward_gait
 from vrw_jax.wheel import Outcome, WheelParams, compute_wheel_units
 
 MIN_NEWTON_TOLERANCE = 1e-12
-"""Smallest tolerance of Newton's last correction. The tolerance is also at least that of the
-step."""
+"""Smallest tolerance of Newton's last correction, which is at least the tolerance of the step."""
 
 
 def compute_newton_tolerance(options: StepOptions) -> Scalar:
-    """Return the tolerance of Newton's last correction for these step options."""
+    """Return the tolerance of Newton's last correction for the given step options."""
     return jnp.maximum(MIN_NEWTON_TOLERANCE, options.rtol)
 
 
 class ReturnMapCycle(AbstractCycle):
-    """Gait that repeats after `period_n` steps, a fixed point of the return map; batched under
-    vmap.
+    """Gait that repeats after `period_n` steps, as a fixed point of a model's return map.
 
-    It is differentiable in the parameters by the implicit function theorem, to second order. If no
-    gait is found, `outcome` gives the reason and every other number is zero.
+    Under vmap, the batch axis of fields comes first. The cycle is differentiable in the parameters
+    by the implicit function theorem, to second order. If no gait is found, `outcome` is the reason,
+    and all other fields are zero.
 
     - `section_state`: fixed point of `period_n` return maps;
     - `post_impact`: (theta, dtheta) after the first landing, rad, rad/s;
     - `durations`: durations that the model's step returns, s; (n, 3) for period_n = n > 1;
     - `step_length`: distance between the feet at the landing, m;
-    - `steps`: the model's step results, with an axis over the steps of one cycle;
+    - `steps`: step results of the model, with an axis over the steps of one cycle;
     - `monodromy_value`: Jacobian of the return map;
     - `outcome`: Outcome.STEPPED, or the reason of the failure;
-    - `residual`: largest entry of map(x) - x, in the wheel's own units;
-    - `n_iterations`: number of iterations of Newton's method.
+    - `residual`: largest absolute component of map(x) - x, in units of the wheel;
+    - `n_iterations`: number of Newton iterations.
 
     Examples:
         >>> wheel = vrw.RigidWheel(held_landing=True)
@@ -85,16 +84,19 @@ class ReturnMapCycle(AbstractCycle):
     def period_n(self) -> int:
         return self.steps.durations.shape[self.outcome.ndim]
 
-    def _drop_single_step_axis(self, tree: Any) -> Any:
-        """Return the tree without the axis over steps if there is only one step."""
+    def _drop_single_step_axis(self, tree_over_steps: Any) -> Any:
+        """Return the tree without its axis over the steps if there is only one step."""
         step_axis, is_single_step = self.outcome.ndim, self.period_n == 1
         return jax.tree.map(
-            lambda leaf: jnp.squeeze(leaf, step_axis) if is_single_step else leaf, tree
+            lambda array_over_steps: (
+                jnp.squeeze(array_over_steps, step_axis) if is_single_step else array_over_steps
+            ),
+            tree_over_steps,
         )
 
     @property
     def indicators(self) -> Any:
-        """Return the indicators of each landing."""
+        """Return the indicators of double support at each landing."""
         return self._drop_single_step_axis(self.steps.indicators)
 
     @property
@@ -127,11 +129,11 @@ def find_return_map_cycle(
     period_n: int,
     uses_implicit_jvp: bool,
 ) -> ReturnMapCycle:
-    """Return the cycle of a wheel, found by Newton's method on the model's return map.
+    """Return the cycle of a wheel by Newton's method on the model's return map.
 
-    `uses_implicit_jvp` selects `solve_fixed_point_implicit`, because second derivatives of a step
-    are expensive with unilateral contact. The search then uses the same step as the result, so that
-    only one program is compiled.
+    With `uses_implicit_jvp`, `solve_fixed_point_implicit` is used, because second derivatives of a
+    step with unilateral contact are expensive. The search then uses the same step as the result, so
+    that only one program is compiled.
     """
     evaluate_step, find_fixed_point = (
         (model.take_step, solve_fixed_point_implicit)
@@ -159,18 +161,22 @@ def find_return_map_cycle(
         step_results.append(model.take_step(params, section_state, options))
         section_state = step_results[-1].section_state
     return make_return_map_cycle(
-        params, fixed_point, jax.tree.map(lambda *leaves: jnp.stack(leaves), *step_results)
+        params,
+        fixed_point,
+        jax.tree.map(lambda *stacked_arrays: jnp.stack(stacked_arrays), *step_results),
     )
 
 
 def make_return_map_cycle(
     params: WheelParams, fixed_point: FixedPointResult, cycle_steps: Any
 ) -> ReturnMapCycle:
-    """Return the cycle of a fixed point whose steps have a leading axis."""
-    # A step that fails returns zeros, which Newton's method may take for a fixed point.
+    """Return the cycle of a fixed point, from its steps with a leading axis."""
+    # A failed step returns zeros, to which Newton's method may converge.
     is_gait_valid = fixed_point.converged & jnp.all(cycle_steps.outcome == Outcome.STEPPED)
     failure_outcome = jnp.where(params.is_in_domain(), Outcome.NO_CYCLE_FOUND, Outcome.BAD_INPUT)
-    zero_without_gait = lambda leaf: jnp.where(is_gait_valid, leaf, jnp.zeros_like(leaf))
+    zero_without_gait = lambda array_over_steps: jnp.where(
+        is_gait_valid, array_over_steps, jnp.zeros_like(array_over_steps)
+    )
     cycle_steps = jax.tree.map(zero_without_gait, cycle_steps)
     return ReturnMapCycle(
         zero_without_gait(fixed_point.x),
@@ -184,18 +190,18 @@ def make_return_map_cycle(
 
 
 def summarize_cycle_steps(cycle_steps: Any) -> tuple[Array, Array, Array]:
-    """Return post-impact state, durations, s, and step lengths, m, of a cycle from its steps.
+    """Return post-impact state, durations, s, and step lengths, m, of a cycle.
 
-    The steps have a leading axis.
+    The steps of the cycle have a leading axis.
     """
-    durations, step_lengths = cycle_steps.durations, cycle_steps.step_length
-    if len(durations) == 1:
-        durations, step_lengths = durations[0], step_lengths[0]
-    return cycle_steps.post_impact[0], durations, step_lengths
+    phase_durations, step_lengths = cycle_steps.durations, cycle_steps.step_length
+    if len(phase_durations) == 1:
+        phase_durations, step_lengths = phase_durations[0], step_lengths[0]
+    return cycle_steps.post_impact[0], phase_durations, step_lengths
 
 
 class AbstractReturnMapFinder(AbstractGaitFinder):
-    """Finder of gaits as fixed points of `period_n` steps of the model."""
+    """Finder of gaits as fixed points of the return map over `period_n` steps."""
 
     model: AbstractWheel
     n_legs: int = eqx.field(static=True)
@@ -216,21 +222,21 @@ class AbstractReturnMapFinder(AbstractGaitFinder):
     ) -> "AbstractReturnMapFinder":
         return cls(model, n_legs, step_options, period_n)
 
-    def find_cycle(self, params: WheelParams, guess: Any = None) -> ReturnMapCycle:
-        arguments = prepare_search(self, params, guess)
-        return find_return_map_cycle(*arguments, self.period_n, uses_implicit_jvp=False)
+    def find_cycle(self, params: WheelParams, cycle_guess: Any = None) -> ReturnMapCycle:
+        search_arguments = prepare_search(self, params, cycle_guess)
+        return find_return_map_cycle(*search_arguments, self.period_n, uses_implicit_jvp=False)
 
     def make_initial_guess(self, parameter_values: ParameterValues) -> Array:
-        """Return the last section state of a walk from the model's start."""
+        """Return the last section state of a walk from the model's default start."""
         model, params = self.model.from_values(parameter_values, self.n_legs)
         return walk_toward_gait(model, params, self.step_options).steps.section_state[-1]
 
-    def precompile(self, params: WheelParams) -> None:
+    def precompile_programs(self, params: WheelParams) -> None:
         self.find_gait(self.model.parameter_values(params), self.model.default_start(params))
 
 
 class ReturnMapFinder(AbstractReturnMapFinder):
-    """Finder of the gaits of any model, with the derivatives of Newton's method."""
+    """Finder of the gaits of any model, whose derivatives are those of Newton's method."""
 
     cycle_measures: ClassVar[tuple[str, ...]] = tuple(
         measure_name
@@ -256,12 +262,14 @@ class ReturnMapFinder(AbstractReturnMapFinder):
     readable_measures: ClassVar[tuple[str, ...]] = differentiable_measures
 
     def measure_gait(
-        self, parameter_values: ParameterValues, guess: Any, measure_names: tuple[str, ...]
+        self, parameter_values: ParameterValues, cycle_guess: Any, measure_names: tuple[str, ...]
     ) -> GaitMeasures:
         if set(measure_names) <= set(self.cycle_measures):
-            return measure_on_cycle(self, parameter_values, guess, measure_names)
-        start_state = self.make_initial_guess(parameter_values) if guess is None else guess
-        return measure_on_gait(
+            return compute_cycle_measures(self, parameter_values, cycle_guess, measure_names)
+        start_state = (
+            self.make_initial_guess(parameter_values) if cycle_guess is None else cycle_guess
+        )
+        return compute_gait_measures(
             self.find_gait(parameter_values, start_state), type(self).read_measure, measure_names
         )
 
@@ -280,10 +288,12 @@ class ReturnMapFinder(AbstractReturnMapFinder):
 
 
 def prepare_search(
-    gait_finder: AbstractReturnMapFinder, params: WheelParams, guess: Any
+    gait_finder: AbstractReturnMapFinder, params: WheelParams, cycle_guess: Any
 ) -> tuple[WheelParams, Array, AbstractWheel, StepOptions]:
-    """Return wheel, section state, model and options of a search near `guess`."""
-    guess_state = guess.section_state if isinstance(guess, AbstractCycle) else guess
+    """Return wheel, section state, model and options of a search near `cycle_guess`."""
+    guess_state = (
+        cycle_guess.section_state if isinstance(cycle_guess, AbstractCycle) else cycle_guess
+    )
     section_state = gait_finder.model.default_start(params) if guess_state is None else guess_state
     return validate_arguments(params, section_state, gait_finder.model, gait_finder.step_options)
 
@@ -292,27 +302,27 @@ def make_return_map_gait(
     model: AbstractWheel,
     n_legs: int,
     cycle: Any,
-    step: Any,
+    event_driven_step: Any,
     cycle_derivatives: Any,
     step_derivatives: Any,
 ) -> Gait:
     """Return a gait with the data that identify its branch.
 
-    The active phases do not identify the branch, because with unilateral contact the order of
-    events may change along a branch.
+    The active phases do not identify a branch, because with unilateral contact the order of events
+    may change along a branch.
     """
     n_coordinates = model.n_continuous(WheelParams(n_legs=n_legs))
-    gait_coordinates = lambda cycle, step: jnp.concatenate(
-        [cycle.section_state[:n_coordinates], step.durations]
+    gait_coordinates = lambda cycle, event_driven_step: jnp.concatenate(
+        [cycle.section_state[:n_coordinates], event_driven_step.durations]
     )
     coordinates_and_derivatives = compute_value_and_tangents(
-        gait_coordinates, (cycle, step), (cycle_derivatives, step_derivatives)
+        gait_coordinates, (cycle, event_driven_step), (cycle_derivatives, step_derivatives)
     )
     return_map_jacobian = cycle.monodromy_value[:n_coordinates, :n_coordinates]
     return Gait(
         cycle,
-        step,
+        event_driven_step,
         cycle_derivatives,
         step_derivatives,
-        BranchPoint(*coordinates_and_derivatives, jnp.ones(1), return_map_jacobian),
+        GaitBranchPoint(*coordinates_and_derivatives, jnp.ones(1), return_map_jacobian),
     )

@@ -1,4 +1,4 @@
-"""Sensitivities of every measure of a gait to every parameter, as a labeled table."""
+"""Sensitivities of the measures of a gait to all parameters, as a labeled table."""
 
 from __future__ import annotations
 
@@ -6,7 +6,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from vrw_jax.cycles.finder_selection import CycleGuess, check_guess, resolve_finder, resolve_model
+from vrw_jax.cycles.finder_selection import (
+    UserCycleGuess,
+    check_cycle_guess,
+    resolve_finder,
+    resolve_model,
+)
 from vrw_jax.cycles.options import CycleOptions
 from vrw_jax.measures import MEASURES
 from vrw_jax.numerics import StepOptions
@@ -22,20 +27,21 @@ def sensitivities(
     params: WheelParams,
     *,
     measures: Sequence[str] | None = None,
-    guess: CycleGuess | None = None,
+    guess: UserCycleGuess | None = None,
     model: ModelLike | None = None,
     options: CycleOptions | StepOptions | None = None,
 ) -> xr.Dataset:
-    """Return d(measure)/d(parameter) of one gait, with elasticities and the values of the measures.
+    """Return the derivatives of measures of one gait by all parameters, with elasticities and
+    values.
 
-    An elasticity is the relative change of the measure per relative change of the parameter. It is
-    NaN where the measure is zero. Leaving out the stability measures saves most of the compile
-    time. With unilateral contact, friction is a parameter too. With model "auto", `attrs` names the
-    model that was selected for the gait.
+    An elasticity is the relative change of a measure per relative change of a parameter. It is NaN
+    if the measure is zero. Without the stability measures, most of the compile time is saved. With
+    unilateral contact, friction is a parameter too. With model "auto", `attrs` contains the name of
+    the model that was selected for the gait.
 
     Args:
         params: the wheel.
-        measures: names of measures; by default all that the model's gait has.
+        measures: names of measures; by default all measures of the model's gait.
         guess: as in `limit_cycle`.
         model: the model; the paper's, `ViscoelasticWheel()`, by default.
         options: as in `limit_cycle`.
@@ -66,28 +72,42 @@ def sensitivities(
             f"{', '.join(gait_finder.differentiable_measures)}: choose among these."
         )
     parameter_values = gait_finder.model.parameter_values(params)
-    gait_measures = gait_finder.measure_gait(parameter_values, check_guess(guess), measure_names)
+    gait_measures = gait_finder.measure_gait(
+        parameter_values, check_cycle_guess(guess), measure_names
+    )
     if int(gait_measures.outcome) != Outcome.STEPPED:
         failure_outcome = Outcome(int(gait_measures.outcome))
         raise ValueError(f"there is no gait to differentiate: {failure_outcome.meaning}")
-    derivatives, measure_values = (
+    measure_derivatives, measure_values = (
         np.asarray(gait_measures.parameter_jacobian),
         np.asarray(gait_measures.measure_values),
     )
     with np.errstate(divide="ignore", invalid="ignore"):
-        elasticities = derivatives * np.asarray(parameter_values) / measure_values[:, None]
+        measure_elasticities = (
+            measure_derivatives * np.asarray(parameter_values) / measure_values[:, None]
+        )
     table_axes, parameter_names = ("measure", "parameter"), gait_finder.model.parameter_names
     return xr.Dataset(
         {
             "value": ("measure", measure_values),
-            "derivative": (table_axes, derivatives, {"long_name": "d(measure)/d(parameter)"}),
+            "derivative": (
+                table_axes,
+                measure_derivatives,
+                {"long_name": "d(measure)/d(parameter)"},
+            ),
             "elasticity": (
                 table_axes,
-                np.where(np.isfinite(elasticities), elasticities, np.nan),
+                np.where(np.isfinite(measure_elasticities), measure_elasticities, np.nan),
                 {"long_name": "relative change of measure per relative change of parameter"},
             ),
-            "measure_unit": ("measure", [MEASURES[name].unit for name in measure_names]),
-            "parameter_unit": ("parameter", [MEASURES[name].unit for name in parameter_names]),
+            "measure_unit": (
+                "measure",
+                [MEASURES[measure_name].unit for measure_name in measure_names],
+            ),
+            "parameter_unit": (
+                "parameter",
+                [MEASURES[measure_name].unit for measure_name in parameter_names],
+            ),
             "parameter_value": ("parameter", np.asarray(parameter_values)),
         },
         coords={"measure": list(measure_names), "parameter": list(parameter_names)},

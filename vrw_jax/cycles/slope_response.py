@@ -1,7 +1,7 @@
 """Linear response of a gait's step to the slopes of uneven ground, and the gait sensitivity norm.
 
 The norm is that of Hobbelen and Wisse, "A disturbance rejection measure for limit cycle walkers:
-the gait sensitivity norm" (2007), with its sum over all later steps in closed form.
+the gait sensitivity norm" (2007). Its sum over all later steps has a closed form.
 """
 
 import functools
@@ -23,15 +23,18 @@ from vrw_jax.numerics import ForwardFunction, StepOptions, enable_all_ad_modes
 from vrw_jax.wheel import PARAMETER_NAMES, WheelParams
 
 N_CHORD_ITERATIONS = 3
-"""Number of Newton iterations with one Jacobian. The value is chosen because each iteration makes
-derivatives of one more order exact. A gradient of the norm needs the second order."""
+"""Number of Newton iterations with one Jacobian.
+
+Each iteration makes the derivatives of one more order exact. The value is chosen because a gradient
+of the norm needs derivatives of second order.
+"""
 
 
 class SlopeResponse(NamedTuple):
     """Derivatives of a step's end state and measures by its start and the slopes of its two lines.
 
-    With x[k] the start of step k and e[k] the deviation of the slope of line k, x[k+1] = A x[k] +
-    B1 e[k] + B0 e[k+1] and y[k] = C x[k] + D1 e[k] + D0 e[k+1].
+    Let x[k] be the start of step k, y[k] its measures, and e[k] the deviation of the slope of line
+    k. Then x[k+1] = A x[k] + B1 e[k] + B0 e[k+1] and y[k] = C x[k] + D1 e[k] + D0 e[k+1].
     """
 
     A: Float[Array, "n n"]
@@ -42,12 +45,10 @@ class SlopeResponse(NamedTuple):
     D0: Float[Array, " n_measures"]
 
     @classmethod
-    def from_jacobian(cls, jacobian: Array, n_states: int) -> "SlopeResponse":
-        """Return the response from the Jacobian of (end state, measures).
-
-        The Jacobian is taken with respect to (start, slope, next slope).
-        """
-        end_state_rows, measure_rows = jacobian[:n_states], jacobian[n_states:]
+    def from_jacobian(cls, step_jacobian: Array, n_states: int) -> "SlopeResponse":
+        """Return the response from the Jacobian of (end state, measures) by (start, slope, next
+        slope)."""
+        end_state_rows, measure_rows = step_jacobian[:n_states], step_jacobian[n_states:]
         return cls(
             end_state_rows[:, :n_states],
             end_state_rows[:, n_states],
@@ -58,33 +59,35 @@ class SlopeResponse(NamedTuple):
         )
 
     def select_measures(self, measure_indices: Sequence[int]) -> "SlopeResponse":
-        """Return the response with the measures of the given indices."""
-        index_array = jnp.asarray(measure_indices)
+        """Return the response of the selected measures."""
+        measure_index_array = jnp.asarray(measure_indices)
         return self._replace(
-            C=self.C[index_array], D1=self.D1[index_array], D0=self.D0[index_array]
+            C=self.C[measure_index_array],
+            D1=self.D1[measure_index_array],
+            D0=self.D0[measure_index_array],
         )
 
 
 class SensitivityNormParts(NamedTuple):
-    """Sensitivity norm of each measure and its parts, in the measure's unit per rad.
+    """Gait sensitivity norm of each measure and its three parts, in the measure's unit per rad.
 
-    The squares of the parts add up to the square of the norm. The parts are responses to the
-    deviation of one line. Two parts, with sign, belong to the step that ends on the line and the
-    step that begins on it. The third part belongs to all later steps together.
+    The squares of the parts sum to the square of the norm. A part is the response to the deviation
+    of one line. The first two parts have a sign and belong to the steps that end and begin on that
+    line. The third part belongs to all later steps.
     """
 
-    norms: Float[Array, " n_measures"]
+    sensitivity_norms: Float[Array, " n_measures"]
     ending_step_response: Float[Array, " n_measures"]
     beginning_step_response: Float[Array, " n_measures"]
     later_steps_response: Float[Array, " n_measures"]
 
 
 def compute_sensitivity_norms(slope_response: SlopeResponse) -> SensitivityNormParts:
-    """Return the standard deviation of each measure divided by that of independent slopes.
+    """Return the ratio of each measure's standard deviation to that of independent slopes.
 
-    The response to one line is D0, then C B0 + D1, then C A^j b with b = A B0 + B1. The squares of
-    C A^j b sum to C P C^T, where P solves the discrete Lyapunov equation P = A P A^T + b b^T. The
-    norm is infinite for a gait that is not stable.
+    The responses to the deviation of one line are D0, then C B0 + D1, then C A^j b with b = A B0 +
+    B1. The squares of C A^j b sum to C P C^T, where P solves the discrete Lyapunov equation P = A P
+    A^T + b b^T. The norm is infinite if the gait is not stable.
     """
     A, B1, B0, C, D1, D0 = slope_response
     n = len(A)
@@ -94,40 +97,45 @@ def compute_sensitivity_norms(slope_response: SlopeResponse) -> SensitivityNormP
     lyapunov_matrix = jnp.eye(n * n, dtype=A.dtype) - jnp.kron(A, A)
     approximate_inverse = invert_by_elimination(lax.stop_gradient(lyapunov_matrix))
     forcing_vector = jnp.outer(b, b).ravel()
-    covariance = approximate_inverse @ forcing_vector
+    response_covariance = approximate_inverse @ forcing_vector
     for _ in range(N_CHORD_ITERATIONS):
-        covariance = covariance - approximate_inverse @ (
-            lyapunov_matrix @ covariance - forcing_vector
+        response_covariance = response_covariance - approximate_inverse @ (
+            lyapunov_matrix @ response_covariance - forcing_vector
         )
-    P = covariance.reshape(n, n)
-    later_squared = jnp.einsum("mi,ij,mj->m", C, P, C)
+    P = response_covariance.reshape(n, n)
+    later_steps_squared = jnp.einsum("mi,ij,mj->m", C, P, C)
     beginning_step_response = C @ B0 + D1
-    sensitivity_norm = _safe_square_root(D0**2 + beginning_step_response**2 + later_squared)
-    infinite_if_unstable = lambda value: jnp.where(is_stable, value, jnp.inf)
+    sensitivity_norm = _safe_square_root(D0**2 + beginning_step_response**2 + later_steps_squared)
+    infinite_if_unstable = lambda sensitivity: jnp.where(is_stable, sensitivity, jnp.inf)
     return SensitivityNormParts(
         infinite_if_unstable(sensitivity_norm),
         D0,
         beginning_step_response,
-        infinite_if_unstable(_safe_square_root(later_squared)),
+        infinite_if_unstable(_safe_square_root(later_steps_squared)),
     )
 
 
-def invert_by_elimination(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
+def invert_by_elimination(square_matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
     """Return the inverse of a matrix by Gauss-Jordan elimination with row exchanges.
 
     LAPACK's batched solver uses threads of the pool on which XLA runs the program. Two such
-    programs at a time, as in a scan on two cores, block each other for ever (jaxlib 0.10).
+    programs at a time, as in a scan on two cores, block each other (jaxlib 0.10).
     """
-    n = len(matrix)
-    augmented_matrix = jnp.concatenate([matrix, jnp.eye(n, dtype=matrix.dtype)], axis=1)
+    n = len(square_matrix)
+    augmented_matrix = jnp.concatenate(
+        [square_matrix, jnp.eye(n, dtype=square_matrix.dtype)], axis=1
+    )
 
     def eliminate_column(column_index: Array, augmented_matrix: Array) -> Array:
         pivot_candidates = jnp.where(
             jnp.arange(n) >= column_index, jnp.abs(augmented_matrix[:, column_index]), -1.0
         )
         pivot_row_index = jnp.argmax(pivot_candidates)
-        pivot_row, replaced_row = augmented_matrix[pivot_row_index], augmented_matrix[column_index]
-        augmented_matrix = augmented_matrix.at[pivot_row_index].set(replaced_row)
+        pivot_row, row_at_pivot_position = (
+            augmented_matrix[pivot_row_index],
+            augmented_matrix[column_index],
+        )
+        augmented_matrix = augmented_matrix.at[pivot_row_index].set(row_at_pivot_position)
         pivot_row = pivot_row / pivot_row[column_index]
         eliminated_matrix = augmented_matrix - augmented_matrix[:, column_index, None] * pivot_row
         return eliminated_matrix.at[column_index].set(pivot_row)
@@ -136,7 +144,7 @@ def invert_by_elimination(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
 
 
 def _safe_square_root(squared_value: Array) -> Array:
-    """Return the square root, with a zero derivative at zero and for negative round-off."""
+    """Return the square root of max(squared_value, 0), whose derivative at zero is zero."""
     is_positive = squared_value > 0.0
     return jnp.where(is_positive, jnp.sqrt(jnp.where(is_positive, squared_value, 1.0)), 0.0)
 
@@ -148,12 +156,12 @@ def compute_step_slope_response(
     measure_names: Sequence[str],
     options: StepOptions,
 ) -> SlopeResponse:
-    """Return the response of a model's event-driven step from the section state of its gait.
+    """Return the slope response of a model's event-driven step from the section state of its gait.
 
-    Components of the section state that are codes do not vary.
+    The components of the section state that are codes do not vary.
     """
     n_states = model.n_continuous(params)
-    state_codes = section_state[n_states:]
+    section_state_codes = section_state[n_states:]
 
     def evaluate_step(state_and_slopes: Array) -> Array:
         line_slopes: Any = model.split_ground(
@@ -163,10 +171,12 @@ def compute_step_slope_response(
             params, tuple(line_values[0] for line_values in line_slopes)
         )
         gait_step = step_model.take_step(
-            step_params, jnp.concatenate([state_and_slopes[:n_states], state_codes]), options
+            step_params,
+            jnp.concatenate([state_and_slopes[:n_states], section_state_codes]),
+            options,
         )
         step_measures = gait_step.measures()
-        measure_values = [jnp.ravel(step_measures[name]) for name in measure_names]
+        measure_values = [jnp.ravel(step_measures[measure_name]) for measure_name in measure_names]
         return jnp.concatenate([gait_step.section_state[:n_states], *measure_values])
 
     state_and_slopes = jnp.concatenate(
@@ -184,15 +194,15 @@ COLLOCATION_RESPONSE_MEASURES = (
     "duration_sls1",
     "duration_sls2",
 )
-"""Measures of a step that its durations and its first landing determine."""
+"""Measures of a step that follow from its durations and its first landing."""
 
 
 def compute_collocation_slope_response(
-    system: CollocationSystem, parameters: Array, collocation_state: CollocationState
+    collocation_system: CollocationSystem, parameters: Array, collocation_state: CollocationState
 ) -> SlopeResponse:
-    """Return the response of the paper's step to slopes, from its collocation.
+    """Return the slope response of the paper's step, from its collocation.
 
-    Its measures are `COLLOCATION_RESPONSE_MEASURES`. The state is (theta+, dtheta+) just after a
+    The measures are `COLLOCATION_RESPONSE_MEASURES`. The state is (theta+, dtheta+) just after a
     landing, in the frame of the line under both feet. The response is differentiable along the
     branch of gaits in every mode, up to second order.
     """
@@ -206,19 +216,19 @@ def compute_collocation_slope_response(
             *(phase_accelerations[0] for phase_accelerations in collocation_solution.accelerations),
         )
     )
-    compute_response = _make_collocation_response_function(system)
+    compute_response = _make_collocation_response_function(collocation_system)
     return compute_response(
         parameters, collocation_solution.section_state, lax.stop_gradient(is_active), *gait_unknowns
     )[0]
 
 
 @functools.cache
-def _make_collocation_response_function(system: CollocationSystem) -> ForwardFunction:
-    """Return the function that computes the slope response of a collocated step.
+def _make_collocation_response_function(collocation_system: CollocationSystem) -> ForwardFunction:
+    """Return a function that computes the slope response of a collocated step.
 
-    Its arguments are parameters, section state and the solution of the step. Newton's method gives
-    durations and accelerations for other starts and slopes. It uses the Jacobian of the gait's
-    step.
+    The arguments of the function are the parameters, the section state and the solution of the
+    step. Newton's method with the Jacobian of the gait's step determines durations and
+    accelerations for other starts and slopes.
     """
     slope_index = PARAMETER_NAMES.index("slope")
 
@@ -233,12 +243,12 @@ def _make_collocation_response_function(system: CollocationSystem) -> ForwardFun
             durations, *accelerations = unflatten_unknowns(unknown_vector)
             line_parameters = parameters.at[slope_index].set(state_and_slopes[2])
             phase_constants = (
-                *system.compute_phase_constants(*line_parameters),
+                *collocation_system.phase_constants_function(*line_parameters),
                 state_and_slopes[3] - state_and_slopes[2],
             )
             end_section_state, phase_points = reconstruct_step(
-                system.phase_sequence,
-                system.phase_meshes,
+                collocation_system.phase_sequence,
+                collocation_system.phase_meshes,
                 phase_constants,
                 tuple(state_and_slopes[:2]),
                 durations,
@@ -255,16 +265,18 @@ def _make_collocation_response_function(system: CollocationSystem) -> ForwardFun
             )
             residual_parts: list[Array] = []
             for phase_index, (phase, points_of_phase) in enumerate(
-                zip(system.phase_sequence.phases, phase_points, strict=True)
+                zip(collocation_system.phase_sequence.phases, phase_points, strict=True)
             ):
                 node_accelerations = accelerations[phase_index].reshape(-1, phase.n_coordinates).T
-                residual_parts += phase.residual(
-                    phase_constants, points_of_phase.nodes, tuple(node_accelerations)
+                residual_parts += phase.residual_function(
+                    phase_constants, points_of_phase.node_points, tuple(node_accelerations)
                 )
-                event_value = phase.event(phase_constants, points_of_phase.end)
+                end_event_value = phase.end_event_function(
+                    phase_constants, points_of_phase.end_point
+                )
                 residual_parts.append(
                     jnp.where(
-                        is_phase_active[phase_index] > 0.5, event_value, durations[phase_index]
+                        is_phase_active[phase_index] > 0.5, end_event_value, durations[phase_index]
                     )[None]
                 )
             return jnp.concatenate(residual_parts)
@@ -290,7 +302,7 @@ def _make_collocation_response_function(system: CollocationSystem) -> ForwardFun
             )
             durations, (step_length,) = (
                 unflatten_unknowns(unknown_vector)[0],
-                phase_points[0].start.held_constants,
+                phase_points[0].start_point.held_constants,
             )
             period = jnp.sum(durations)
             measure_values = (

@@ -1,8 +1,7 @@
-"""Gaits with unilateral contact, found by Newton's method on batches of steps and their
-derivatives.
+"""Gaits with unilateral contact, found by Newton's method on batches of steps.
 
-All tangents of a step are computed together with its motion in the same machine code. Many wheels
-are therefore searched together, and no large program is compiled for the derivatives.
+The machine code of a step also computes its tangents. Many wheels are therefore searched together,
+and no large program is compiled for the derivatives.
 """
 
 import functools
@@ -24,7 +23,7 @@ from vrw_jax.cycles.finder import (
     Gait,
     GaitMeasures,
     ParameterValues,
-    measure_on_gait,
+    compute_gait_measures,
     move_derivative_axis_first,
 )
 from vrw_jax.cycles.gait_walks import stack_section_units
@@ -49,18 +48,18 @@ from vrw_jax.wheel import Outcome, WheelParams
 
 @dataclass(frozen=True)
 class ContactNewtonOptions:
-    """Options of Newton's method on the return map with unilateral contact."""
+    """Numerical options of Newton's method on the return map with unilateral contact."""
 
     max_iterations: int = 15
     """Largest number of Newton iterations."""
     max_halvings: int = 6
-    """Largest number of halvings of a correction if no step completes after it."""
+    """Largest number of halvings of a correction after which no step completes."""
     far_step_tolerance: float = 1e-6
-    """Tolerance of the steps far from a gait."""
+    """Tolerance of steps that start far from a gait."""
     max_near_correction: float = 1e-4
-    """Size of a correction below which a state is near a gait, rad, rad/s, m/s."""
+    """Correction below which a state counts as near a gait, rad, rad/s, m/s."""
     clear_convergence_fraction: float = 0.01
-    """Fraction of the tolerance below which a correction is accepted without a second one."""
+    """Fraction of the tolerance below which one correction suffices for convergence."""
 
 
 CONTACT_NEWTON_OPTIONS = ContactNewtonOptions()
@@ -91,12 +90,12 @@ class UnilateralFinder(AbstractReturnMapFinder):
     ) -> AbstractReturnMapFinder:
         return cls(model, n_legs, step_options, period_n)
 
-    def find_cycle(self, params: WheelParams, guess: Any = None) -> ReturnMapCycle:
-        """Return the cycle, computed by the batched engine if all inputs are concrete.
+    def find_cycle(self, params: WheelParams, cycle_guess: Any = None) -> ReturnMapCycle:
+        """Return the cycle, by the batched engine if all inputs are concrete.
 
-        With traced inputs, derivatives of the single step are used.
+        With traced inputs, the derivatives of the single step are used.
         """
-        params, section_state, model, options = prepare_search(self, params, guess)
+        params, section_state, model, options = prepare_search(self, params, cycle_guess)
         if has_traced_leaf(params, section_state, model):
             return find_return_map_cycle(
                 params, section_state, model, options, self.period_n, uses_implicit_jvp=True
@@ -106,11 +105,11 @@ class UnilateralFinder(AbstractReturnMapFinder):
             self.find_cycles_near(model.parameter_values(params)[None], section_state[None]),
         )
 
-    def find_cycles(self, params: WheelParams, guess: Any = None) -> Any:
-        if has_traced_leaf(params, guess):
-            return eqx.filter_vmap(self.find_cycle)(params, guess)
+    def find_cycles(self, params: WheelParams, cycle_guess: Any = None) -> Any:
+        if has_traced_leaf(params, cycle_guess):
+            return eqx.filter_vmap(self.find_cycle)(params, cycle_guess)
         parameter_values = jax.vmap(self.model.parameter_values)(params)
-        section_states = getattr(guess, "section_state", guess)
+        section_states = getattr(cycle_guess, "section_state", cycle_guess)
         if section_states is None:
             section_states = jax.vmap(self.model.default_start)(params)
         else:
@@ -134,23 +133,22 @@ class UnilateralFinder(AbstractReturnMapFinder):
         return _remove_batch_axis(self.make_initial_guesses(_add_batch_axis(parameter_values)))
 
     def make_initial_guesses(self, parameter_values: Array) -> Array:
-        """Return the section state of a slow attracting gait for each wheel, NaN if there is
-        none.
-        """
-        gaits = find_slow_gaits(self, parameter_values)
-        is_found = np.asarray(gaits.outcome) == Outcome.STEPPED
-        return jax.device_put(np.where(is_found[:, None], gaits.section_state, np.nan))
+        """Return the section state of a slow attracting gait of each wheel, or NaN if there is
+        none."""
+        slow_gaits = find_slow_gaits(self, parameter_values)
+        is_found = np.asarray(slow_gaits.outcome) == Outcome.STEPPED
+        return jax.device_put(np.where(is_found[:, None], slow_gaits.section_state, np.nan))
 
-    def find_gait(self, parameter_values: ParameterValues, guess: Array) -> Gait:
+    def find_gait(self, parameter_values: ParameterValues, cycle_guess: Array) -> Gait:
         return _remove_batch_axis(
-            self.find_gaits(_add_batch_axis(parameter_values), _add_batch_axis(guess))
+            self.find_gaits(_add_batch_axis(parameter_values), _add_batch_axis(cycle_guess))
         )
 
-    def find_gaits(self, parameter_values: Array, guess: Any) -> Gait:
+    def find_gaits(self, parameter_values: Array, cycle_guess: Any) -> Gait:
         return self._solve_and_evaluate(
             _make_contact_gait,
             parameter_values,
-            getattr(guess, "section_state", guess),
+            getattr(cycle_guess, "section_state", cycle_guess),
             with_parameter_derivatives=True,
         )
 
@@ -161,7 +159,7 @@ class UnilateralFinder(AbstractReturnMapFinder):
         section_states: Any,
         with_parameter_derivatives: bool,
     ) -> Any:
-        """Return `evaluate_fixed_point` of the fixed point of each wheel."""
+        """Return the values of `evaluate_fixed_point` at the fixed points of all wheels."""
         newton_arguments = (
             np.asarray(parameter_values),
             np.asarray(section_states),
@@ -178,9 +176,12 @@ class UnilateralFinder(AbstractReturnMapFinder):
         )
 
     def take_step(self, params: WheelParams, section_state: Array) -> AbstractStep:
-        value_columns, model = np.asarray(self.model.parameter_values(params))[:, None], self.model
+        parameter_value_columns, model = (
+            np.asarray(self.model.parameter_values(params))[:, None],
+            self.model,
+        )
         step_arguments = (
-            value_columns,
+            parameter_value_columns,
             np.asarray(section_state)[None],
             model,
             self.step_options,
@@ -189,18 +190,21 @@ class UnilateralFinder(AbstractReturnMapFinder):
         return _remove_batch_axis(step_batch_with_jacobian(*step_arguments, ())[0])
 
     def measure_gait(
-        self, parameter_values: ParameterValues, guess: Any, measure_names: tuple[str, ...]
+        self, parameter_values: ParameterValues, cycle_guess: Any, measure_names: tuple[str, ...]
     ) -> GaitMeasures:
-        """Return measures and derivatives, as in the base class, from one Jacobian of the step."""
+        """Return the named measures of a gait with their derivatives, from one Jacobian of the
+        step."""
         model, params = self.model.from_values(
             tuple(jax.device_put(list(np.asarray(parameter_values)))), self.n_legs
         )
-        start_state = guess.section_state if isinstance(guess, AbstractCycle) else guess
+        start_state = (
+            cycle_guess.section_state if isinstance(cycle_guess, AbstractCycle) else cycle_guess
+        )
         start_state = (
             self.make_initial_guess(parameter_values) if start_state is None else start_state
         )
         _, section_state, _, _ = validate_arguments(params, start_state, model, self.step_options)
-        return measure_on_gait(
+        return compute_gait_measures(
             self.find_gait(parameter_values, section_state), type(self).read_measure, measure_names
         )
 
@@ -213,24 +217,25 @@ def _add_batch_axis(x: Array) -> Array:
     return jax.device_put(np.asarray(x)[None])
 
 
-def _remove_batch_axis(tree: Any) -> Any:
-    """Return the first element of every leaf, the inverse of `_add_batch_axis`."""
-    return jax.device_put(select_tree_rows(tree, 0))
+def _remove_batch_axis(batched_tree: Any) -> Any:
+    """Return the first element of every array, which inverts `_add_batch_axis`."""
+    return jax.device_put(select_tree_rows(batched_tree, 0))
 
 
 class _ContactFixedPoints(NamedTuple):
-    """Fixed points that Newton's method found, for many wheels with a leading axis."""
+    """Fixed points of the return maps of many wheels, with a leading axis over wheels."""
 
-    section_states: Any  # section state
-    steps: Any  # steps from that state, (period_n, ...)
-    step_jacobians: Any  # derivatives of the steps with respect to values and section state
-    residual: Any
-    is_converged: Any
-    n_iterations: Any
+    fixed_section_states: Any
+    period_steps: Any  # steps from the fixed point, (period_n, ...)
+    step_jacobians: Any  # by parameter values and section state
+    newton_residuals: Any
+    is_gait_found: Any
+    n_newton_iterations: Any
 
 
 class PeriodMap(NamedTuple):
-    """Map over one period of each wheel, evaluated by the batched engine outside of `jax.jit`."""
+    """Map of section states over one period for many wheels, by the batched engine outside
+    `jax.jit`."""
 
     model: Any
     n_legs: int
@@ -243,7 +248,7 @@ class PeriodMap(NamedTuple):
         return stack_section_units(self.model, self.parameter_values, self.n_legs)
 
     def select_wheels(self, wheel_indices: np.ndarray) -> "PeriodMap":
-        """Return the map of the wheels of given indices."""
+        """Return the map of the selected wheels."""
         return self._replace(parameter_values=self.parameter_values[wheel_indices])
 
     def evaluate_period(
@@ -253,9 +258,9 @@ class PeriodMap(NamedTuple):
         is_value_differentiated: Any = True,
         is_start_differentiated: bool = True,
     ) -> "PeriodEvaluation":
-        """Return the period from given section states, with derivatives.
+        """Return the steps of one period from the given section states, with derivatives.
 
-        Derivatives are taken with respect to the selected parameter values and the section states.
+        The derivatives are those by the selected parameter values and by the section states.
         """
         steps_and_jacobians, (n_values, n_section) = (
             [],
@@ -288,12 +293,12 @@ class PeriodMap(NamedTuple):
             step_jacobian = np.asarray(step_result_jacobians.section_state)
             input_jacobian = step_jacobian[:, :, n_values:] @ input_jacobian
             input_jacobian[:, :, :n_values] += step_jacobian[:, :, :n_values]
-        steps, stacked_jacobians = (
-            jax.tree.map(lambda *leaves: np.stack(leaves, 1), *stacked_pair)
+        period_steps, stacked_jacobians = (
+            jax.tree.map(lambda *stacked_arrays: np.stack(stacked_arrays, 1), *stacked_pair)
             for stacked_pair in zip(*steps_and_jacobians, strict=True)
         )
         return PeriodEvaluation(
-            steps,
+            period_steps,
             stacked_jacobians,
             section_states,
             input_jacobian[:, :, :n_values],
@@ -303,7 +308,7 @@ class PeriodMap(NamedTuple):
 
 
 class PeriodEvaluation(NamedTuple):
-    """Steps of one period, their Jacobians, the end states and which periods are complete."""
+    """Steps of one period with their Jacobians, the end states, and flags of complete periods."""
 
     period_steps: Any
     step_jacobians: Any
@@ -315,7 +320,7 @@ class PeriodEvaluation(NamedTuple):
     def compute_newton_correction(
         self, section_states: np.ndarray, return_map_jacobian: np.ndarray
     ) -> np.ndarray:
-        """Return Newton's correction of the section states; zeros if a period is not complete."""
+        """Return Newton's correction of the section states, zero if a period is not complete."""
         newton_correction, is_complete = np.zeros_like(section_states), self.is_complete
         newton_matrix = np.eye(section_states.shape[1]) - return_map_jacobian[is_complete]
         newton_correction[is_complete] = solve_linear_systems(
@@ -324,17 +329,14 @@ class PeriodEvaluation(NamedTuple):
         return newton_correction
 
 
-def solve_linear_systems(matrices: np.ndarray, right_sides: np.ndarray) -> np.ndarray:
-    """Return the solutions of many linear systems.
-
-    A singular system gives NaN instead of an error for all systems.
-    """
+def solve_linear_systems(system_matrices: np.ndarray, right_sides: np.ndarray) -> np.ndarray:
+    """Return the solutions of many linear systems, NaN for a singular system."""
     try:
-        return np.linalg.solve(matrices, right_sides)
+        return np.linalg.solve(system_matrices, right_sides)
     except np.linalg.LinAlgError:
-        is_matrix_regular = np.abs(np.linalg.det(matrices)) > 0.0
+        is_matrix_regular = np.abs(np.linalg.det(system_matrices)) > 0.0
         regular_matrices = np.where(
-            is_matrix_regular[:, None, None], matrices, np.eye(matrices.shape[-1])
+            is_matrix_regular[:, None, None], system_matrices, np.eye(system_matrices.shape[-1])
         )
         return np.where(
             is_matrix_regular[:, None, None], np.linalg.solve(regular_matrices, right_sides), np.nan
@@ -353,26 +355,27 @@ def _find_contact_fixed_points(
 ) -> _ContactFixedPoints:
     """Return the fixed points near `start_states`.
 
-    Codes at the end of a section state are those of its image. The iteration uses loose steps until
-    corrections are small. Then a step at the tolerance of `step_options` is taken with the same
-    Jacobian. One more step, with all derivatives, yields the gait. If loose steps move away from a
-    state that an exact step hardly changes, all steps are exact.
+    The codes at the end of a section state are copied from its image. Newton's method first uses
+    steps of loose tolerance, until corrections are small. It then takes a step at the tolerance of
+    `step_options` with the same Jacobian. The gait is evaluated by one more step, with all
+    derivatives. If loose steps move away from a state that an exact step hardly changes, all steps
+    are exact.
     """
     period_map = PeriodMap(model, n_legs, period_n, parameter_values)
-    loose_tolerances = [
-        np.maximum(tolerance, newton_options.far_step_tolerance)
-        for tolerance in (step_options.rtol, step_options.atol)
+    loose_step_tolerances = [
+        np.maximum(newton_tolerance, newton_options.far_step_tolerance)
+        for newton_tolerance in (step_options.rtol, step_options.atol)
     ]
     loose_step_options = eqx.tree_at(
         lambda step_options: (step_options.rtol, step_options.atol),
         step_options,
-        jax.device_put(loose_tolerances),
+        jax.device_put(loose_step_tolerances),
     )
-    tolerance, is_every_wheel = (
+    newton_tolerance, is_every_wheel = (
         float(compute_newton_tolerance(step_options)),
         np.ones(len(parameter_values), bool),
     )
-    loose_solution, return_map_jacobian = _run_contact_newton(
+    loose_fixed_points, return_map_jacobian = _run_contact_newton(
         period_map,
         loose_step_options,
         start_states,
@@ -381,11 +384,13 @@ def _find_contact_fixed_points(
         is_every_wheel,
         newton_options,
     )
-    is_near_gait = loose_solution.is_converged
-    section_states = np.where(is_near_gait[:, None], loose_solution.section_states, start_states)
+    is_near_gait = loose_fixed_points.is_gait_found
+    section_states = np.where(
+        is_near_gait[:, None], loose_fixed_points.fixed_section_states, start_states
+    )
     section_units = period_map.section_units
-    exact_evaluation = period_map.evaluate_period(step_options, section_states, False, False)
-    newton_correction = exact_evaluation.compute_newton_correction(
+    exact_period_evaluation = period_map.evaluate_period(step_options, section_states, False, False)
+    newton_correction = exact_period_evaluation.compute_newton_correction(
         section_states, return_map_jacobian
     )
     section_states[is_near_gait] += newton_correction[is_near_gait] * (
@@ -393,24 +398,26 @@ def _find_contact_fixed_points(
         < newton_options.max_near_correction
     )
     is_near_gait = is_near_gait | (
-        exact_evaluation.is_complete
+        exact_period_evaluation.is_complete
         & (
-            np.abs((exact_evaluation.end_states - section_states) / section_units).max(-1)
+            np.abs((exact_period_evaluation.end_states - section_states) / section_units).max(-1)
             < newton_options.max_near_correction
         )
     )
-    exact_solution, _ = _run_contact_newton(
+    exact_fixed_points, _ = _run_contact_newton(
         period_map,
         step_options,
         section_states,
         with_parameter_derivatives,
-        tolerance,
+        newton_tolerance,
         is_near_gait,
         newton_options,
         stops_at_small_correction=False,
     )
-    return exact_solution._replace(
-        n_iterations=loose_solution.n_iterations + 1 + exact_solution.n_iterations
+    return exact_fixed_points._replace(
+        n_newton_iterations=loose_fixed_points.n_newton_iterations
+        + 1
+        + exact_fixed_points.n_newton_iterations
     )
 
 
@@ -420,17 +427,17 @@ def _run_contact_newton(
     start_states: np.ndarray,
     with_parameter_derivatives: bool,
     newton_tolerance: float,
-    is_requested: np.ndarray,
+    is_wheel_requested: np.ndarray,
     newton_options: ContactNewtonOptions,
     stops_at_small_correction: bool = True,
 ) -> tuple[_ContactFixedPoints, np.ndarray]:
     """Run Newton's method on the requested wheels until corrections are small.
 
     Return the fixed points and the Jacobians of the return map. A correction after which no period
-    completes is halved. A small correction ends the iteration if `stops_at_small_correction` is
-    set. Otherwise another evaluation follows, which gives the gait at the corrected state. Then a
-    small correction must occur twice in succession, because the map may jump between two states if
-    a foot grazes the ground.
+    completes is halved. With `stops_at_small_correction`, a single small correction ends the
+    iteration. Otherwise the gait is evaluated again at the corrected state. Two small corrections
+    in succession are then needed, because the map may jump between two states if a foot grazes the
+    ground.
     """
     n_wheels, n_legs = len(start_states), period_map.n_legs
     section_states, last_section_states, section_units = (
@@ -440,7 +447,7 @@ def _run_contact_newton(
     )
     newton_residuals, n_iterations = np.full(n_wheels, np.inf), np.zeros(n_wheels, np.int32)
     had_small_correction, is_gait_found, n_halvings = (
-        np.zeros(n_wheels, dtype) for dtype in (bool, bool, int)
+        np.zeros(n_wheels, float_dtype) for float_dtype in (bool, bool, int)
     )
     return_map_jacobian = np.zeros((n_wheels, start_states.shape[1], start_states.shape[1]))
     active_wheels, stored_steps_and_jacobians = np.arange(n_wheels), None
@@ -452,12 +459,12 @@ def _run_contact_newton(
             stored_steps_and_jacobians = jax.tree.map(
                 np.array, (period_evaluation.period_steps, period_evaluation.step_jacobians)
             )
-        for stored_leaf, new_leaf in zip(
+        for stored_array, new_array in zip(
             jax.tree.leaves(stored_steps_and_jacobians),
             jax.tree.leaves(period_evaluation[:2]),
             strict=True,
         ):
-            stored_leaf[active_wheels] = new_leaf
+            stored_array[active_wheels] = new_array
         newton_correction = period_evaluation.compute_newton_correction(
             section_states[active_wheels], period_evaluation.return_map_jacobian
         )
@@ -491,13 +498,13 @@ def _run_contact_newton(
         )
         n_halvings[failed_wheels] += 1
         section_states[failed_wheels, -n_legs:] = last_section_states[failed_wheels, -n_legs:]
-        is_gait_found[active_wheels] = is_requested[active_wheels] & (
+        is_gait_found[active_wheels] = is_wheel_requested[active_wheels] & (
             had_small_correction[active_wheels] if stops_at_small_correction else is_wheel_done
         )
         has_wheel_failed = (
             (n_halvings > newton_options.max_halvings)
             | (n_iterations > newton_options.max_iterations)
-            | ~is_requested
+            | ~is_wheel_requested
         )
         active_wheels = active_wheels[
             ~is_gait_found[active_wheels] & ~has_wheel_failed[active_wheels]
@@ -523,7 +530,7 @@ def _evaluate_over_wheels(
     parameter_values: Array,
     fixed_points: _ContactFixedPoints,
 ) -> Any:
-    """Return `evaluate_fixed_point` of each wheel, compiled for the batch."""
+    """Return the values of `evaluate_fixed_point` for all wheels, by a program for the batch."""
     return eqx.filter_vmap(
         lambda parameter_values, fixed_points: evaluate_fixed_point(
             model, n_legs, parameter_values, fixed_points
@@ -531,10 +538,12 @@ def _evaluate_over_wheels(
     )(parameter_values, fixed_points)
 
 
-def _multiply_step_jacobians(fixed_points: _ContactFixedPoints, n_values: int) -> Array:
-    """Return the Jacobian of the return map over one period."""
+def _compute_return_map_jacobian_of_steps(
+    fixed_points: _ContactFixedPoints, n_values: int
+) -> Array:
+    """Return the Jacobian of the return map over one period, a product of step Jacobians."""
     return_map_jacobian = jnp.eye(
-        fixed_points.section_states.shape[0], dtype=fixed_points.section_states.dtype
+        fixed_points.fixed_section_states.shape[0], dtype=fixed_points.fixed_section_states.dtype
     )
     for step_jacobian in fixed_points.step_jacobians.section_state:
         return_map_jacobian = step_jacobian[:, n_values:] @ return_map_jacobian
@@ -544,48 +553,56 @@ def _multiply_step_jacobians(fixed_points: _ContactFixedPoints, n_values: int) -
 def _make_contact_cycle(
     model: AbstractWheel, n_legs: int, parameter_values: Array, fixed_points: _ContactFixedPoints
 ) -> ReturnMapCycle:
-    """Return the cycle of a fixed point."""
-    newton_diagnostics = fixed_points.residual, fixed_points.is_converged, fixed_points.n_iterations
+    """Return the cycle at a fixed point."""
+    newton_diagnostics = (
+        fixed_points.newton_residuals,
+        fixed_points.is_gait_found,
+        fixed_points.n_newton_iterations,
+    )
     params = model.from_values(parameter_values, n_legs)[1]
     fixed_point = FixedPointResult(
-        fixed_points.section_states,
-        _multiply_step_jacobians(fixed_points, len(parameter_values)),
+        fixed_points.fixed_section_states,
+        _compute_return_map_jacobian_of_steps(fixed_points, len(parameter_values)),
         *newton_diagnostics,
     )
-    return make_return_map_cycle(params, fixed_point, fixed_points.steps)
+    return make_return_map_cycle(params, fixed_point, fixed_points.period_steps)
 
 
 def _make_contact_gait(
     model: AbstractWheel, n_legs: int, parameter_values: Array, fixed_points: _ContactFixedPoints
 ) -> Gait:
-    """Return the gait of a fixed point, with derivatives by the implicit function theorem."""
+    """Return the gait at a fixed point, with derivatives by the implicit function theorem."""
     n_values = parameter_values.shape[0]
-    identity = jnp.eye(
-        fixed_points.section_states.shape[0], dtype=fixed_points.section_states.dtype
+    identity_matrix = jnp.eye(
+        fixed_points.fixed_section_states.shape[0], dtype=fixed_points.fixed_section_states.dtype
     )
-    parameter_jacobian = jnp.zeros((len(identity), n_values), identity.dtype)
-    return_map_jacobian = _multiply_step_jacobians(fixed_points, n_values)
+    parameter_jacobian = jnp.zeros((len(identity_matrix), n_values), identity_matrix.dtype)
+    return_map_jacobian = _compute_return_map_jacobian_of_steps(fixed_points, n_values)
     for step_jacobian in fixed_points.step_jacobians.section_state:
         parameter_jacobian = (
             step_jacobian[:, :n_values] + step_jacobian[:, n_values:] @ parameter_jacobian
         )
-    newton_matrix = jnp.where(fixed_points.is_converged, identity - return_map_jacobian, identity)
+    newton_matrix = jnp.where(
+        fixed_points.is_gait_found, identity_matrix - return_map_jacobian, identity_matrix
+    )
     section_state_derivatives = jnp.linalg.solve(newton_matrix, parameter_jacobian)
 
     state_derivatives, derivatives_by_step = section_state_derivatives, []
     for step_index in range(len(fixed_points.step_jacobians.section_state)):
         input_tangents = jnp.concatenate(
-            [jnp.eye(n_values, dtype=identity.dtype), state_derivatives]
+            [jnp.eye(n_values, dtype=identity_matrix.dtype), state_derivatives]
         )
         step_tangents = jax.tree.map(
-            lambda leaf, step_index=step_index, input_tangents=input_tangents: (
-                leaf[step_index] @ input_tangents
+            lambda array_over_steps, step_index=step_index, input_tangents=input_tangents: (
+                array_over_steps[step_index] @ input_tangents
             ),
             fixed_points.step_jacobians,
         )
         derivatives_by_step.append(move_derivative_axis_first(step_tangents))
         state_derivatives = step_tangents.section_state
-    step_derivatives = jax.tree.map(lambda *leaves: jnp.stack(leaves, 1), *derivatives_by_step)
+    step_derivatives = jax.tree.map(
+        lambda *stacked_arrays: jnp.stack(stacked_arrays, 1), *derivatives_by_step
+    )
 
     cycle = _make_contact_cycle(model, n_legs, parameter_values, fixed_points)
     # The derivative of the Jacobian is unknown, so measures of the Jacobian are not in
@@ -603,8 +620,12 @@ def _make_contact_gait(
             *jax.vmap(summarize_cycle_steps)(step_derivatives),
         ),
     )
-    first_step = jax.tree.map(lambda leaf: leaf[0], fixed_points.steps)
-    first_step_derivatives = jax.tree.map(lambda leaf: leaf[:, 0], step_derivatives)
+    first_step = jax.tree.map(
+        lambda array_over_steps: array_over_steps[0], fixed_points.period_steps
+    )
+    first_step_derivatives = jax.tree.map(
+        lambda array_over_steps: array_over_steps[:, 0], step_derivatives
+    )
     return make_return_map_gait(
         model, n_legs, cycle, first_step, cycle_derivatives, first_step_derivatives
     )

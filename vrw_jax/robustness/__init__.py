@@ -1,4 +1,4 @@
-"""Robustness of gaits: uneven ground, first passage, basins of attraction, disturbances."""
+"""Robustness of gaits: uneven ground, first passage, basins of attraction and disturbances."""
 
 from vrw_jax.robustness.basin_share import BasinShare, basin_share
 from vrw_jax.robustness.branch_basins import measure_basins

@@ -1,4 +1,4 @@
-"""Share of a box of starts from which a wheel reaches its gait."""
+"""Share of the starts in a box from which a wheel reaches its gait."""
 
 from collections.abc import Mapping
 from typing import Any, Literal, NamedTuple, get_args
@@ -11,29 +11,31 @@ from vrw_jax.cycles import AbstractCycle
 from vrw_jax.measures import POST_LANDING_COMPONENT_NAMES, PRE_TOUCHDOWN_COMPONENT_NAMES
 from vrw_jax.numerics import StepOptions
 from vrw_jax.printing import AbstractPrintable, LabelAndText
-from vrw_jax.robustness.gait_arrival import StableGait, walk_to_gait
+from vrw_jax.robustness.gait_arrival import StableGait, walk_until_on_gait
 from vrw_jax.runtime import with_default_jax_settings
 from vrw_jax.simulation import ModelLike, invert_landing_map
 from vrw_jax.validation import check_choice, check_int, check_range, check_real, check_type
 from vrw_jax.wheel import Outcome, WheelParams
 
-StartSampling = Literal["sobol", "random"]
+StartSamplingName = Literal["sobol", "random"]
 StartBox = Mapping[str, float | tuple[float, float]]
-"""Bounds (lower, upper) of each component of a start, by its name. A single number fixes the
-component."""
+"""Bounds (lower, upper) of each component of a start, by the name of the component.
+
+A single number fixes the component.
+"""
 
 
 class BasinShare(AbstractPrintable):
-    """Share of a box of starts from which a wheel ends up on its gait.
+    """Share of the starts in a box from which a wheel arrives at its gait.
 
     - `share`: share of the starts whose walk arrives at the gait;
     - `share_error`: standard error of `share` for independent starts;
-    - `walking_share`: share of the starts that still walk after 1, 2, ... steps, on the gait or
-      not, shape (max_steps,);
+    - `walking_share`: share of the starts whose walk continues after 1, 2, ... steps, on the gait
+      or not, shape (max_steps,);
     - `walking_share_error`: standard errors of `walking_share`, shape (max_steps,);
-    - `elsewhere_share`: share of the starts that walk `max_steps` steps and do not arrive at the
+    - `elsewhere_share`: share of the starts whose walk of `max_steps` steps does not arrive at the
       gait;
-    - `failure_shares`: share of the starts by the name of the outcome that ends their walk;
+    - `failure_shares`: share of the starts whose walk fails, by the name of the outcome;
     - `n_starts`: number of starts.
 
     Examples:
@@ -56,7 +58,7 @@ class BasinShare(AbstractPrintable):
     n_starts: int = eqx.field(static=True)
 
     def summary_rows(self) -> list[LabelAndText]:
-        """Return the label and the text of each share, with its standard error."""
+        """Return labels and texts of the shares, with their standard errors."""
         n = len(self.walking_share)
         final_walking_share, final_walking_share_error = (
             self.walking_share[-1],
@@ -69,7 +71,10 @@ class BasinShare(AbstractPrintable):
                 f"{final_walking_share:.4f} (standard error {final_walking_share_error:.4f})",
             ),
         ]
-        text_rows += [(name, f"{share:.4f}") for name, share in self.failure_shares.items()]
+        text_rows += [
+            (outcome_name, f"{failure_share:.4f}")
+            for outcome_name, failure_share in self.failure_shares.items()
+        ]
         return [*text_rows, ("starts", f"{self.n_starts:,}")]
 
 
@@ -83,7 +88,7 @@ def basin_share(
     options: StepOptions | None = None,
     n_starts: int = 4096,
     max_steps: int = 200,
-    sampling: StartSampling = "sobol",
+    sampling: StartSamplingName = "sobol",
     seed: int = 0,
 ) -> BasinShare:
     """Return the share of a box of starts from which the wheel ends up on its gait.
@@ -124,7 +129,7 @@ def basin_share(
         0.75
     """
     n_starts, max_steps = check_int("n_starts", n_starts), check_int("max_steps", max_steps)
-    check_choice("sampling", sampling, get_args(StartSampling))
+    check_choice("sampling", sampling, get_args(StartSamplingName))
     seed, box_bounds = check_int("seed", seed, 0), parse_start_box(box)
     stable_gait = StableGait.from_cycle("vrw.basin_share", params, model, cycle, options)
     return compute_basin_share(stable_gait, box_bounds, n_starts, max_steps, sampling, seed)
@@ -143,34 +148,37 @@ def compute_basin_share(
     box_bounds: StartBoxBounds,
     n_starts: int,
     max_steps: int,
-    sampling: str = "sobol",
+    sampling_name: str = "sobol",
     seed: int = 0,
 ) -> BasinShare:
-    """Return the `BasinShare` of a stable gait for validated arguments of `basin_share`."""
+    """Return the `BasinShare` of a stable gait, for validated arguments of `basin_share`."""
     n_components = len(box_bounds.component_names)
     random_generator = np.random.default_rng(seed)
-    if sampling == "random":
-        unit_points = random_generator.random((n_starts, n_components))
+    if sampling_name == "random":
+        unit_cube_points = random_generator.random((n_starts, n_components))
     else:
         from scipy.stats import qmc  # This import is slow.
 
         sobol_sampler = qmc.Sobol(n_components, rng=random_generator)
-        unit_points = sobol_sampler.random_base2((n_starts - 1).bit_length())[:n_starts]
-    starts = (
-        box_bounds.lower_bounds + (box_bounds.upper_bounds - box_bounds.lower_bounds) * unit_points
+        unit_cube_points = sobol_sampler.random_base2((n_starts - 1).bit_length())[:n_starts]
+    start_states = (
+        box_bounds.lower_bounds
+        + (box_bounds.upper_bounds - box_bounds.lower_bounds) * unit_cube_points
     )
     if box_bounds.component_names == POST_LANDING_COMPONENT_NAMES:
-        starts = invert_landing_map(stable_gait.params, starts)
-    is_start_reachable = np.isfinite(starts).all(-1)
+        start_states = invert_landing_map(stable_gait.params, start_states)
+    is_start_reachable = np.isfinite(start_states).all(-1)
     is_on_gait, n_steps_walked = np.zeros(n_starts, bool), np.zeros(n_starts, int)
     walk_outcomes = np.full(n_starts, int(Outcome.BAD_INPUT))
     if is_start_reachable.any():
-        arrival_result = walk_to_gait(stable_gait, starts[is_start_reachable], max_steps)
+        arrival_result = walk_until_on_gait(
+            stable_gait, start_states[is_start_reachable], max_steps
+        )
         is_on_gait[is_start_reachable], walk_outcomes[is_start_reachable] = (
             arrival_result.is_on_gait,
-            arrival_result.outcome,
+            arrival_result.walk_outcomes,
         )
-        n_steps_walked[is_start_reachable] = arrival_result.n_stepped
+        n_steps_walked[is_start_reachable] = arrival_result.n_steps_walked
     n_steps_walked[is_on_gait] = max_steps
     walking_share = np.mean(n_steps_walked[:, None] >= np.arange(1, max_steps + 1), 0)
     share_by_failure = {
@@ -185,23 +193,28 @@ def compute_basin_share(
         walking_share=walking_share,
         walking_share_error=compute_share_error(walking_share, n_starts),
         elsewhere_share=float(np.mean((walk_outcomes == Outcome.STEPPED) & ~is_on_gait)),
-        failure_shares={name: value for name, value in share_by_failure.items() if value > 0.0},
+        failure_shares={
+            outcome_name: outcome_share
+            for outcome_name, outcome_share in share_by_failure.items()
+            if outcome_share > 0.0
+        },
         n_starts=n_starts,
     )
 
 
-def compute_share_error(share: Any, n_draws: int) -> Any:
+def compute_share_error(sampled_share: Any, n_draws: int) -> Any:
     """Return the standard error of a share of `n_draws` independent draws, or of an array of
     shares.
 
-    One draw on either side is added (Laplace's rule of succession), so that the error is positive.
+    One draw with each result is added (Laplace's rule of succession), so that the error is
+    positive.
     """
-    smoothed_share = (share * n_draws + 1.0) / (n_draws + 2.0)
+    smoothed_share = (sampled_share * n_draws + 1.0) / (n_draws + 2.0)
     return (smoothed_share * (1.0 - smoothed_share) / n_draws) ** 0.5
 
 
 def parse_start_box(box: StartBox) -> StartBoxBounds:
-    """Return the names and bounds of the components of the starts.
+    """Return the names and bounds of the components of starts in a box.
 
     Raise TypeError if the box is not a mapping. Raise ValueError unless the box bounds all
     components of one kind of start.
@@ -217,12 +230,12 @@ def parse_start_box(box: StartBox) -> StartBoxBounds:
             f"{', '.join(POST_LANDING_COMPONENT_NAMES)}: give "
             "each a number or two bounds."
         )
-    is_fixed_value = lambda value: np.ndim(value) == 0
-    component_bounds = [
+    is_fixed_value = lambda box_entry: np.ndim(box_entry) == 0
+    bounds_of_component = [
         (check_real(component_name, box[component_name]),) * 2
         if is_fixed_value(box[component_name])
         else check_range(component_name, box[component_name])
         for component_name in component_names
     ]
-    lower_bounds, upper_bounds = np.array(component_bounds).T
+    lower_bounds, upper_bounds = np.array(bounds_of_component).T
     return StartBoxBounds(component_names, lower_bounds, upper_bounds)

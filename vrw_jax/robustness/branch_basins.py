@@ -25,7 +25,7 @@ BASIN_VARIABLE_ATTRS = {
     "smallest_disturbance": ("rad/s", "smallest change of dtheta that leaves the basin"),
     "smallest_disturbance_error": ("rad/s", "error of that change"),
 }
-"""Unit and meaning of each variable of the dataset that `measure_basins` returns."""
+"""Unit and meaning of each variable in the dataset that `measure_basins` returns."""
 
 
 @with_default_jax_settings
@@ -89,7 +89,7 @@ def measure_basins(
     )
     values_by_variable: dict[str, np.ndarray] = {}
 
-    def record_value(variable_name: str, result_index: int, variable_value: float) -> None:
+    def store_value(variable_name: str, result_index: int, variable_value: float) -> None:
         values_by_variable.setdefault(variable_name, np.full(len(point_indices), np.nan))[
             result_index
         ] = variable_value
@@ -100,17 +100,17 @@ def measure_basins(
         stable_gait = _load_branch_gait(branch, int(point_index), checked_model, checked_options)
         if box_bounds is not None:
             basin_share_result = compute_basin_share(stable_gait, box_bounds, n_starts, max_steps)
-            record_value("basin_share", result_index, basin_share_result.share)
-            record_value("basin_share_error", result_index, basin_share_result.share_error)
+            store_value("basin_share", result_index, basin_share_result.share)
+            store_value("basin_share_error", result_index, basin_share_result.share_error)
         if checked_model.capabilities.begins_within_step:
             disturbance_result = compute_smallest_disturbance(stable_gait, None, max_steps)
-            record_value("smallest_disturbance", result_index, disturbance_result.size)
-            record_value("smallest_disturbance_error", result_index, disturbance_result.size_error)
-    make_attrs = lambda parameter_name: dict(
+            store_value("smallest_disturbance", result_index, disturbance_result.size)
+            store_value("smallest_disturbance_error", result_index, disturbance_result.size_error)
+    make_variable_attrs = lambda parameter_name: dict(
         zip(("units", "long_name"), BASIN_VARIABLE_ATTRS[parameter_name], strict=True)
     )
     basin_variables = {
-        parameter_name: xr.Variable("point", variable_values, make_attrs(parameter_name))
+        parameter_name: xr.Variable("point", variable_values, make_variable_attrs(parameter_name))
         for parameter_name, variable_values in values_by_variable.items()
     }
     parameter_name = branch.parameter
@@ -119,8 +119,8 @@ def measure_basins(
             "point", branch.values[point_indices], make_measure_attributes(parameter_name)
         )
     }
-    title_attr = {"title": f"Basins of the gaits along {parameter_name}"}
-    return xr.Dataset(basin_variables, branch_coordinates, branch_attrs | title_attr)
+    title_attrs = {"title": f"Basins of the gaits along {parameter_name}"}
+    return xr.Dataset(basin_variables, branch_coordinates, branch_attrs | title_attrs)
 
 
 def _load_branch_gait(
@@ -128,7 +128,7 @@ def _load_branch_gait(
 ) -> StableGait:
     """Return the gait of one step at a point of a branch.
 
-    Raise ValueError unless the gait repeats after one step.
+    Raise ValueError if the gait does not repeat after one step.
     """
     branch_attrs, float_dtype = branch.dataset.attrs, branch.dataset.attrs["dtype"]
     parameter_values = {

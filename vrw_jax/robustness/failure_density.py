@@ -1,8 +1,8 @@
-"""Gaussian mixtures fitted to rare failures of walks, for importance sampling.
+"""Gaussian mixtures that are fitted to rare failures of walks, for importance sampling.
 
-The fit is the cross-entropy method (Rubinstein and Kroese 2004). The standard deviation of the
-slopes is multiplied by an inflation so large that failures are frequent. A mixture is then fitted
-to the failures, and the inflation decreases to 1 in stages.
+The method is the cross-entropy method (Rubinstein and Kroese 2004). An inflation multiplies the
+standard deviation of the slopes, so that failures are frequent. A mixture is then fitted to the
+failures, and the inflation decreases to 1 in stages.
 """
 
 from collections.abc import Callable
@@ -10,52 +10,68 @@ from dataclasses import dataclass
 
 import numpy as np
 
-RunDeviationWalks = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
-"""Function that runs one walk for each standardized sequence of slopes, shape (walks, lines). It
-returns two boolean arrays of shape (walks,): whether a walk fails in its last step, and whether a
-walk fails in any step."""
+DeviationWalkFunction = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
+"""Function that runs one walk for each sequence of standardized slopes, shape (walks, lines).
+
+The function returns two boolean arrays of shape (walks,): whether a walk fails in its last step,
+and whether it fails in any step.
+"""
 
 
 @dataclass(frozen=True)
 class FailureDensityOptions:
-    """Options of the Gaussian mixture that is fitted to failing walks."""
+    """Numerical options of the Gaussian mixture that is fitted to failing walks."""
 
     max_walks_per_stage: int = 6144
-    """Largest number of walks of each stage. The value is chosen because fits to fewer walks vary
-    by tens of per cent."""
+    """Largest number of walks per stage.
+
+    The value is chosen because fits to fewer walks vary by tens of per cent."""
     n_gaussians: int = 4
-    """Number of Gaussians of a fit. The value is chosen because the paper's wheel fails in two
-    ways, and each failing region is curved."""
+    """Number of Gaussians in a mixture.
+
+    The value is chosen because the paper's wheel fails in two ways, each in a curved region of
+    slopes."""
     nominal_walk_fraction: float = 0.1
-    """Fraction of walks that are drawn from the nominal density of the slopes. Its inverse bounds
-    all likelihood ratios. These walks also find frequent failures that the fit missed."""
+    """Fraction of walks that are drawn from the nominal density of the slopes.
+
+    The inverse of the fraction bounds all likelihood ratios. The nominal walks also find frequent
+    failures that the fit missed."""
     wide_walk_fraction: float = 0.2
-    """Fraction of walks that are drawn from the fitted Gaussians with larger standard deviations.
-    These walks bound the likelihood ratios where failures extend beyond the fit."""
+    """Fraction of walks that are drawn from the fitted Gaussians with wider standard deviations.
+
+    The wide walks bound the likelihood ratios of failures outside the fitted Gaussians."""
     widening_factor: float = 1.7
-    """Factor of the standard deviations of the wide Gaussians."""
+    """Factor by which the standard deviations of the wide Gaussians exceed those of the fit."""
     n_uninflated_fits: int = 2
-    """Number of fits without inflation. The value is chosen because the second fit uses failures
-    that the first one produces."""
+    """Number of fits without inflation.
+
+    The value is chosen because the second fit uses failures that the first fit produces."""
     min_failure_fraction: float = 0.15
-    """Fraction of failing walks at which the slopes are inflated enough. The value is chosen
-    because about a third of failing walks fail in their last step."""
+    """Smallest fraction of failing walks at which the inflation of the slopes suffices.
+
+    The value is chosen because about a third of the failing walks fail in their last step."""
     slope_inflation_factor: float = 1.3
-    """Factor between successive inflations of the slopes' standard deviation."""
+    """Ratio of successive inflations of the slopes' standard deviation."""
     max_slope_inflation: float = 20.0
-    """Largest inflation of the slopes' standard deviation. The value is chosen because failures
-    that need more inflation have probabilities below 1e-80."""
-    effective_samples_per_dimension: float = 60.0
-    """Smallest effective number of failures per dimension at the next, smaller inflation. The value
-    is chosen because each Gaussian in five dimensions has 20 parameters."""
+    """Largest inflation of the slopes' standard deviation.
+
+    The value is chosen because failures that need a larger inflation have probabilities below
+    1e-80."""
+    min_effective_failures_per_dimension: float = 60.0
+    """Smallest effective number of failures per dimension at the next, smaller inflation.
+
+    The value is chosen because each Gaussian in five dimensions has 20 parameters."""
     min_gaussian_variance: float = 0.02
-    """Variance that is added to each Gaussian in every direction. It bounds the likelihood ratios
-    if failures are few."""
+    """Variance that is added to each Gaussian in every direction.
+
+    The variance bounds the likelihood ratios if failures are few."""
     n_em_iterations: int = 25
-    """Number of iterations of expectation maximization. The value is chosen because later
-    iterations change the variance of the likelihood ratios by less than 5 %."""
+    """Number of iterations of expectation maximization.
+
+    The value is chosen because later iterations change the variance of the likelihood ratios by
+    less than 5 %."""
     n_em_samples: int = 2000
-    """Number of failures that are drawn by weight for each fit."""
+    """Number of failures that are resampled by weight for each fit."""
 
 
 FAILURE_DENSITY_OPTIONS = FailureDensityOptions()
@@ -63,7 +79,7 @@ FAILURE_DENSITY_OPTIONS = FailureDensityOptions()
 
 @dataclass(frozen=True)
 class GaussianMixture:
-    """Mixture of Gaussians over standardized slope deviations."""
+    """Mixture of Gaussians over standardized deviations of slopes."""
 
     component_weights: np.ndarray  # (components,), sum 1
     component_means: np.ndarray  # (components, dimensions)
@@ -74,31 +90,31 @@ class GaussianMixture:
     def make_isotropic_gaussian(
         cls, n_dimensions: int, standard_deviation: float
     ) -> "GaussianMixture":
-        """Return one Gaussian of mean zero with the same standard deviation in all directions."""
+        """Return a mixture of one Gaussian with mean zero and the same standard deviation in all
+        directions."""
         return cls(
             np.ones(1), np.zeros((1, n_dimensions)), standard_deviation * np.eye(n_dimensions)[None]
         )
 
-    def add_component(
-        self, other_mixture: "GaussianMixture", other_weight: float
+    def add_mixture(
+        self, added_mixture: "GaussianMixture", added_weight: float
     ) -> "GaussianMixture":
-        """Return the mixture of this mixture and `other_mixture`, which has the total weight
-        `other_weight`.
-        """
+        """Return the weighted sum of this mixture and `added_mixture`, whose weight is
+        `added_weight`."""
         return GaussianMixture(
             np.concatenate(
                 [
-                    (1.0 - other_weight) * self.component_weights,
-                    other_weight * other_mixture.component_weights,
+                    (1.0 - added_weight) * self.component_weights,
+                    added_weight * added_mixture.component_weights,
                 ]
             ),
-            np.concatenate([self.component_means, other_mixture.component_means]),
+            np.concatenate([self.component_means, added_mixture.component_means]),
             np.concatenate(
-                [self.covariance_cholesky_factors, other_mixture.covariance_cholesky_factors]
+                [self.covariance_cholesky_factors, added_mixture.covariance_cholesky_factors]
             ),
         )
 
-    def widen(self, deviation_factor: float) -> "GaussianMixture":
+    def widen_gaussians(self, deviation_factor: float) -> "GaussianMixture":
         """Return the mixture with all standard deviations multiplied by `deviation_factor`."""
         return GaussianMixture(
             self.component_weights,
@@ -107,9 +123,8 @@ class GaussianMixture:
         )
 
     def compute_component_log_densities(self, slope_deviations: np.ndarray) -> np.ndarray:
-        """Return the logarithm of the weighted density of each Gaussian, shape (components,
-        samples).
-        """
+        """Return the logarithm of each weighted Gaussian at each sample, shape (components,
+        samples)."""
         log_densities = []
         for component_weight, component_mean, covariance_cholesky_factor in zip(
             self.component_weights,
@@ -160,7 +175,7 @@ def fit_gaussian_mixture(
     random_generator: np.random.Generator,
     density_options: FailureDensityOptions,
 ) -> GaussianMixture:
-    """Return a Gaussian mixture fitted to samples by expectation maximization.
+    """Return a Gaussian mixture that is fitted to samples by expectation maximization.
 
     The initial means are samples far from each other (Arthur and Vassilvitskii 2007).
 
@@ -185,15 +200,19 @@ def fit_gaussian_mixture(
                 ],
             ]
         )
-    covariance = np.cov(slope_deviations.T).reshape(n_dimensions, n_dimensions) + covariance_floor
-    cholesky_factors = np.tile(np.linalg.cholesky(covariance), (len(component_means), 1, 1))
+    weighted_covariance = (
+        np.cov(slope_deviations.T).reshape(n_dimensions, n_dimensions) + covariance_floor
+    )
+    cholesky_factors = np.tile(
+        np.linalg.cholesky(weighted_covariance), (len(component_means), 1, 1)
+    )
     gaussian_mixture = GaussianMixture(
         np.full(len(component_means), 1.0 / len(component_means)), component_means, cholesky_factors
     )
     for _ in range(density_options.n_em_iterations):
         log_densities = gaussian_mixture.compute_component_log_densities(slope_deviations)
         membership_probabilities = np.exp(log_densities - np.logaddexp.reduce(log_densities, 0))
-        # One more sample prevents an empty Gaussian.
+        # The additional sample prevents an empty Gaussian.
         effective_component_sizes = np.sum(membership_probabilities, 1) + 1.0
         component_means = (
             membership_probabilities @ slope_deviations + gaussian_mixture.component_means
@@ -203,10 +222,10 @@ def fit_gaussian_mixture(
             zip(membership_probabilities, component_means, strict=True)
         ):
             centered_deviations = slope_deviations - component_mean
-            covariance = (
+            weighted_covariance = (
                 component_membership * centered_deviations.T
             ) @ centered_deviations / effective_component_sizes[component_index] + covariance_floor
-            cholesky_factors[component_index] = np.linalg.cholesky(covariance)
+            cholesky_factors[component_index] = np.linalg.cholesky(weighted_covariance)
         gaussian_mixture = GaussianMixture(
             effective_component_sizes / np.sum(effective_component_sizes),
             component_means,
@@ -216,15 +235,15 @@ def fit_gaussian_mixture(
 
 
 def fit_failure_density(
-    run_walks: RunDeviationWalks,
+    run_walks: DeviationWalkFunction,
     n_dimensions: int,
     random_generator: np.random.Generator,
     density_options: FailureDensityOptions = FAILURE_DENSITY_OPTIONS,
 ) -> GaussianMixture | None:
-    """Return a density of slopes on which walks often fail in their last step.
+    """Return a density of slopes for which walks often fail in their last step.
 
-    The slopes are standardized: the nominal density is standard normal. The returned mixture
-    contains a fraction of the nominal density. Return None if no walk failed.
+    The slopes are standardized, so that their nominal density is standard normal. The returned
+    mixture contains a fraction of the nominal density. The result is None if no walk fails.
     """
     nominal_density = GaussianMixture.make_isotropic_gaussian(n_dimensions, 1.0)
     slope_inflation = 1.0
@@ -245,7 +264,7 @@ def fit_failure_density(
             return None
         failing_deviations = slope_deviations[has_failed_last]
         log_proposal_density = proposal_density.compute_log_density(failing_deviations)
-        next_slope_inflation, failure_weights = _lower_slope_inflation(
+        next_slope_inflation, failure_weights = _find_next_slope_inflation(
             failing_deviations, log_proposal_density, slope_inflation, density_options
         )
         resampled_indices = random_generator.choice(
@@ -254,17 +273,17 @@ def fit_failure_density(
         fitted_mixture = fit_gaussian_mixture(
             failing_deviations[resampled_indices], random_generator, density_options
         )
-        wide_mixture = fitted_mixture.widen(density_options.widening_factor)
-        fitted_mixture = fitted_mixture.add_component(
+        wide_mixture = fitted_mixture.widen_gaussians(density_options.widening_factor)
+        fitted_mixture = fitted_mixture.add_mixture(
             wide_mixture, density_options.wide_walk_fraction
         )
         n_finished_fits += slope_inflation == 1.0
         if n_finished_fits == density_options.n_uninflated_fits:
-            return fitted_mixture.add_component(
+            return fitted_mixture.add_mixture(
                 nominal_density, density_options.nominal_walk_fraction
             )
         slope_inflation = next_slope_inflation
-        proposal_density = fitted_mixture.add_component(
+        proposal_density = fitted_mixture.add_mixture(
             GaussianMixture.make_isotropic_gaussian(n_dimensions, slope_inflation),
             density_options.nominal_walk_fraction,
         )
@@ -274,14 +293,15 @@ def fit_failure_density(
         has_failed_last, _ = run_walks(slope_deviations)
 
 
-def _lower_slope_inflation(
+def _find_next_slope_inflation(
     failing_deviations: np.ndarray,
     log_proposal_density: np.ndarray,
     slope_inflation: float,
     density_options: FailureDensityOptions,
 ) -> tuple[float, np.ndarray]:
-    """Return the smallest inflation at which enough failures have weight, and the weights of the
-    failures at that inflation.
+    """Return the next inflation, and the weights of the failures at that inflation.
+
+    The next inflation is the smallest one at which enough failures have weight.
     """
 
     def compute_weights(target_inflation: float) -> np.ndarray:
@@ -294,7 +314,7 @@ def _lower_slope_inflation(
         return normalized_weights
 
     min_effective_samples = min(
-        density_options.effective_samples_per_dimension * failing_deviations.shape[1],
+        density_options.min_effective_failures_per_dimension * failing_deviations.shape[1],
         0.3 * len(failing_deviations),
     )
     has_enough_samples = lambda failure_weights: (
@@ -302,11 +322,11 @@ def _lower_slope_inflation(
     )
     next_slope_inflation = slope_inflation
     while next_slope_inflation > 1.0:
-        candidate_slope_inflation = max(next_slope_inflation / 1.05, 1.0)
+        candidate_inflation = max(next_slope_inflation / 1.05, 1.0)
         if (
-            not has_enough_samples(compute_weights(candidate_slope_inflation))
+            not has_enough_samples(compute_weights(candidate_inflation))
             and next_slope_inflation < slope_inflation
         ):
             break
-        next_slope_inflation = candidate_slope_inflation
+        next_slope_inflation = candidate_inflation
     return next_slope_inflation, compute_weights(next_slope_inflation)

@@ -239,27 +239,33 @@ def _differentiate_passage(
     params, slope_sd = primals
     require_untraced_arguments("vrw.first_passage", SAMPLED_TRACING_REMEDY, params, slope_sd)
     params_tangent, slope_sd_tangent = tangents
-    tangent_by_name = {name: getattr(params_tangent, name) for name in PARAMETER_NAMES}
+    tangent_by_name = {
+        parameter_name: getattr(params_tangent, parameter_name)
+        for parameter_name in PARAMETER_NAMES
+    }
     tangent_by_name["slope_sd"] = slope_sd_tangent
     tangent_by_name = {
-        name: tangent
-        for name, tangent in tangent_by_name.items()
-        if not isinstance(tangent, SymbolicZero)
+        parameter_name: parameter_tangent
+        for parameter_name, parameter_tangent in tangent_by_name.items()
+        if not isinstance(parameter_tangent, SymbolicZero)
     }
-    passage, gradient = estimate_passage(
+    sampled_passage, derivative_by_name = estimate_passage(
         params, float(slope_sd), differentiated_names=tuple(tangent_by_name)
     )
-    relative_tangent = sum(gradient[name] * tangent for name, tangent in tangent_by_name.items())
+    relative_tangent = sum(
+        derivative_by_name[parameter_name] * parameter_tangent
+        for parameter_name, parameter_tangent in tangent_by_name.items()
+    )
     passage_tangent = eqx.tree_at(
         lambda p: (p.mean_steps, p.mean_steps_from_gait, p.failure_probability),
-        make_zero_tangent(passage),
+        make_zero_tangent(sampled_passage),
         (
-            passage.mean_steps * relative_tangent,
-            passage.mean_steps_from_gait * relative_tangent,
-            -passage.failure_probability * relative_tangent,
+            sampled_passage.mean_steps * relative_tangent,
+            sampled_passage.mean_steps_from_gait * relative_tangent,
+            -sampled_passage.failure_probability * relative_tangent,
         ),
     )
-    return passage, passage_tangent
+    return sampled_passage, passage_tangent
 
 
 def _solve_passage_by_quadrature(
@@ -287,8 +293,8 @@ def _solve_passage_by_quadrature(
     while True:
         fine_passage = solve_rigid_passage(params, slope_sd, model, n_nodes)
         mean_steps_estimates = [
-            1.0 / passage.survival_analysis.failure_probability
-            for passage in (coarse_passage, fine_passage)
+            1.0 / rigid_passage_result.survival_analysis.failure_probability
+            for rigid_passage_result in (coarse_passage, fine_passage)
         ]
         mean_steps_error = lax.stop_gradient(
             jnp.abs(mean_steps_estimates[1] - mean_steps_estimates[0])
@@ -355,9 +361,9 @@ def _estimate_passage_by_sampling(
             f"slope_sd is {slope_sd:g} rad, with which hardly any step of this wheel succeeds: "
             "give a smaller one."
         ) from error
-    gradient = {}
+    derivative_by_name = {}
     if differentiated_names:
-        gradient = differentiate_log_mean_steps(
+        derivative_by_name = differentiate_log_mean_steps(
             walker_groups, sampled_passage.walk_density, differentiated_names
         )
     failure_probability = sampled_passage.failure_probability
@@ -369,8 +375,8 @@ def _estimate_passage_by_sampling(
     if not np.isfinite(sampled_passage.relative_error):
         passage_status = PassageStatus.UNKNOWN_ERROR
     passage_status = passage_status if failure_probability else PassageStatus.NO_FAILURE
-    to_float_array = lambda values: jnp.asarray(values, params.damping.dtype)
-    passage = FirstPassage(
+    to_float_array = lambda float_values: jnp.asarray(float_values, params.damping.dtype)
+    first_passage_result = FirstPassage(
         mean_steps=to_float_array(mean_steps),
         mean_steps_from_gait=to_float_array(sampled_passage.mean_steps_from_gait),
         failure_probability=to_float_array(failure_probability),
@@ -390,4 +396,4 @@ def _estimate_passage_by_sampling(
         end_names=tuple(sampled_passage.fraction_by_outcome),
         n_steps=sampled_passage.n_sampled_steps,
     )
-    return passage, gradient
+    return first_passage_result, derivative_by_name

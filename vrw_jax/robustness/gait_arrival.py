@@ -1,4 +1,4 @@
-"""Walks from many starts of one wheel, each until it is on a stable gait or fails."""
+"""Walks of one wheel from many starts, until each walk arrives at a stable gait or fails."""
 
 import functools
 from dataclasses import dataclass
@@ -19,26 +19,26 @@ from vrw_jax.wheel import Outcome, WheelParams, compute_wheel_units
 
 @dataclass(frozen=True)
 class ArrivalOptions:
-    """Options of the test whether a walk has arrived at a gait."""
+    """Numerical options of the test whether a walk has arrived at a gait."""
 
     max_gait_distance: float = 1e-6
-    """Largest difference between a section state and one of the gait, in units of the wheel.
+    """Largest distance of a section state from the gait at which the walk has arrived.
 
-    The value is chosen because it is far above the errors of a step and of a gait, and far below
-    the distances of most gaits from the borders of their basins."""
+    Distances are in units of the wheel. The value is chosen far above the errors of a step and of a
+    gait, and far below the distances of most gaits from the boundaries of their basins."""
     steps_per_arrival_test: int = 10
-    """Number of steps between two tests, chosen because tests after fewer steps cost many calls."""
+    """Number of steps between two tests, chosen because more frequent tests need many calls."""
 
 
 ARRIVAL_OPTIONS = ArrivalOptions()
 
 
 class StableGait(NamedTuple):
-    """Stable gait of one wheel, together with the wheel, the model and the options of its steps."""
+    """Stable gait of one wheel, with the wheel, the model and the options of its steps."""
 
     params: WheelParams
     model: AbstractWheel
-    options: StepOptions
+    step_options: StepOptions
     section_states: np.ndarray  # before the landing of each step, (period_n, m)
 
     @classmethod
@@ -50,7 +50,7 @@ class StableGait(NamedTuple):
         cycle: AbstractCycle | None,
         options: StepOptions | None,
     ) -> "StableGait":
-        """Return the gait of `cycle`, or by default that of `limit_cycle`.
+        """Return the gait of `cycle`, or of `limit_cycle` by default.
 
         Raise TypeError or ValueError if an argument is invalid or the gait is not stable. Messages
         contain `caller_name`, the name of the public function.
@@ -95,7 +95,7 @@ class StableGait(NamedTuple):
     def is_on_gait(
         self, section_states: np.ndarray, arrival_options: ArrivalOptions = ARRIVAL_OPTIONS
     ) -> np.ndarray:
-        """Return whether each section state agrees with one of the gait's, shape (states,)."""
+        """Return whether each section state equals a section state of the gait, shape (states,)."""
         state_units = self.model.section_units(
             compute_wheel_units(self.params.symbols()), self.params.n_legs
         )
@@ -107,20 +107,20 @@ class StableGait(NamedTuple):
 
 
 class ArrivalWalkResult(NamedTuple):
-    """Outcomes of walks towards a gait, with a leading axis over starts."""
+    """Result of walks toward a gait, with a leading axis over starts."""
 
     is_on_gait: np.ndarray
-    outcome: np.ndarray  # an Outcome, STEPPED if the walk continues
-    n_stepped: np.ndarray  # steps until the arrival at the gait, the failure or max_steps
+    walk_outcomes: np.ndarray  # `Outcome` of each walk, STEPPED if the walk continues
+    n_steps_walked: np.ndarray  # to the arrival at the gait, the failure or the limit
 
 
-def walk_to_gait(
+def walk_until_on_gait(
     stable_gait: StableGait,
     start_states: np.ndarray,
     max_steps: int,
     arrival_options: ArrivalOptions = ARRIVAL_OPTIONS,
 ) -> ArrivalWalkResult:
-    """Return the result of a walk of at most `max_steps` steps from each section state."""
+    """Return the result of a walk of at most `max_steps` steps from each start."""
     n_starts = len(start_states)
     is_on_gait, walk_outcomes = np.zeros(n_starts, bool), np.full(n_starts, int(Outcome.STEPPED))
     n_steps_by_walk = np.zeros(n_starts, int)
@@ -136,7 +136,7 @@ def walk_to_gait(
             section_states[walking_indices],
             n_steps_to_test,
             model=stable_gait.model,
-            options=stable_gait.options,
+            options=stable_gait.step_options,
         )
         section_states[walking_indices], walk_outcomes[walking_indices] = (
             walk_results.section_state,

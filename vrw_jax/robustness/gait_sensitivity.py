@@ -1,6 +1,4 @@
-"""Gait sensitivity norm, which is the variation of a measure of a gait on slightly uneven
-ground.
-"""
+"""Gait sensitivity norm: the variation of a gait's measures on slightly uneven ground."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -10,8 +8,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from vrw_jax.cycles import (
-    CycleGuess,
     CycleOptions,
+    UserCycleGuess,
     compute_sensitivity_norms,
     limit_cycle,
     resolve_finder,
@@ -31,23 +29,22 @@ class GaitSensitivity(AbstractPrintable):
 
     The norm is the standard deviation of a measure in a long walk over independent slopes, divided
     by the standard deviation of the slopes, in the limit of small deviations. The norm is infinite
-    if the gait is not stable. The squares of `ending_step`, `beginning_step` and `later_steps` add
-    up to the square of the norm.
+    if the gait is not stable. The squares of `ending_step`, `beginning_step` and `later_steps` sum
+    to the square of the norm.
 
     - `norm`: norms in the order of `measures`;
-    - `ending_step`: signed response to a line of the step that ends on this line;
-    - `beginning_step`: signed response to a line of the step that begins on this line;
+    - `ending_step`: signed response of the step that ends on a line to the slope of that line;
+    - `beginning_step`: signed response of the step that begins on a line to the slope of that line;
     - `later_steps`: root of the sum of the squared responses of all later steps;
     - `spectral_radius`: spectral radius of the gait's return map;
-    - `outcome`: Outcome.STEPPED, or the reason why there is no gait; all numbers are then zero;
+    - `outcome`: Outcome.STEPPED, or the reason why there is no gait; all other numbers are then
+      zero;
     - `measures`: names of the measures.
 
-    Examples:
-        >>> print(vrw.gait_sensitivity(vrw.WheelParams(), ["period"]))
-        GaitSensitivity
-          step period T: 3.50861 s per rad (step that ends on a line: 0.566241, step that begins on it: -2.78338, later steps: 2.05973)
-          spectral radius of the gait: 0.32862
-    """  # noqa: E501
+    Examples: >>> print(vrw.gait_sensitivity(vrw.WheelParams(), ["period"])) GaitSensitivity step
+    period T: 3.50861 s per rad (step that ends on a line: 0.566241, step that begins on it:
+    -2.78338, later steps: 2.05973) spectral radius of the gait: 0.32862
+    """
 
     norm: Float[Array, " n_measures"]
     ending_step: Float[Array, " n_measures"]
@@ -59,7 +56,7 @@ class GaitSensitivity(AbstractPrintable):
 
     @property
     def ending(self) -> str:
-        """Return a sentence about whether the norms are finite, with the reason."""
+        """Return a sentence on whether the norms are finite, with the reason."""
         if self.outcome != Outcome.STEPPED:
             return describe_step_ending(self.outcome, Outcome)
         if self.spectral_radius < 1.0:
@@ -67,13 +64,13 @@ class GaitSensitivity(AbstractPrintable):
         return "The gait is not stable: deviations grow from step to step, and no norm is finite."
 
     def summary_rows(self) -> list[LabelAndText]:
-        """Return label and text of each measure, with the parts of its norm."""
+        """Return labels and texts of the norms of all measures, with their parts."""
         if self.outcome != Outcome.STEPPED:
             return [("outcome", self.ending)]
         text_rows = []
         for measure_index, measure_name in enumerate(self.measures):
-            measure = MEASURES[measure_name]
-            sensitivity_unit = f"{measure.display_unit} per rad".strip()
+            measure_definition = MEASURES[measure_name]
+            sensitivity_unit = f"{measure_definition.display_unit} per rad".strip()
             norm_parts_text = (
                 f"step that ends on a line: {float(self.ending_step[measure_index]):.6g}, "
                 f"step that begins on it: {float(self.beginning_step[measure_index]):.6g}, "
@@ -81,7 +78,7 @@ class GaitSensitivity(AbstractPrintable):
             )
             text_rows.append(
                 (
-                    measure.label_with_symbol,
+                    measure_definition.label_with_symbol,
                     f"{float(self.norm[measure_index]):.6g} {sensitivity_unit} ({norm_parts_text})",
                 )
             )
@@ -94,7 +91,7 @@ def gait_sensitivity(
     measures: str | Sequence[str],
     *,
     model: ModelLike | None = None,
-    guess: CycleGuess | None = None,
+    guess: UserCycleGuess | None = None,
     options: CycleOptions | StepOptions | None = None,
 ) -> GaitSensitivity:
     """Return the gait sensitivity norm of each measure of a step.
@@ -156,11 +153,11 @@ def gait_sensitivity(
     sensitivity_norms = compute_sensitivity_norms(
         cycle_finder.compute_slope_response(params, limit_cycle_result, measure_names)
     )
-    zero_without_gait = lambda value: jnp.where(
-        limit_cycle_result.outcome == Outcome.STEPPED, value, 0.0
+    zero_without_gait = lambda sensitivity_or_zero: jnp.where(
+        limit_cycle_result.outcome == Outcome.STEPPED, sensitivity_or_zero, 0.0
     )
     return GaitSensitivity(
-        norm=zero_without_gait(sensitivity_norms.norms),
+        norm=zero_without_gait(sensitivity_norms.sensitivity_norms),
         ending_step=zero_without_gait(sensitivity_norms.ending_step_response),
         beginning_step=zero_without_gait(sensitivity_norms.beginning_step_response),
         later_steps=zero_without_gait(sensitivity_norms.later_steps_response),

@@ -1,8 +1,8 @@
-"""First passage of the rigid wheel by quadrature of a kernel in closed form.
+"""First passage of the rigid wheel by quadrature, with a kernel in closed form.
 
-The state is one number: the squared angular rate with the stance leg vertical. The slope of the
-next line and this rate determine the next rate. So the probability density of the slope gives the
-kernel.
+The state is one number, the squared angular rate with the stance leg vertical. This rate and the
+slope of the next line determine the next rate. The probability density of the slopes therefore
+determines the kernel.
 """
 
 import functools
@@ -24,23 +24,26 @@ from vrw_jax.robustness.survival import (
 from vrw_jax.wheel import WheelParams
 
 MAX_SLOPE_STANDARD_DEVIATIONS = 10.0
-"""Largest deviation of a slope from its mean, in standard deviations. It bounds the states. The
-value is chosen because steeper lines have a probability of 1e-23."""
+"""Largest deviation of a slope from its mean, in standard deviations.
+
+The limit bounds the states. The value is chosen because larger deviations have a probability of
+1e-23.
+"""
 
 
 class RigidPassage(NamedTuple):
-    """First passage of the rigid wheel, computed with one set of quadrature nodes."""
+    """First passage of the rigid wheel, computed with a given number of quadrature nodes."""
 
     survival_analysis: SurvivalAnalysis
     mean_steps_from_gait: Scalar
-    squared_rate_nodes: Float[Array, " n"]  # squared rate with the stance leg vertical, 1/s^2
+    squared_rate_nodes: Float[Array, " n"]  # squared rates with the stance leg vertical, 1/s^2
 
 
 @functools.partial(jax.jit, static_argnums=(2, 3))
 def solve_rigid_passage(
     params: WheelParams, slope_sd: Scalar, rigid_model: Any, n_nodes: int
 ) -> RigidPassage:
-    """Return the first passage by Gauss-Legendre quadrature at `n_nodes` squared rates.
+    """Return the first passage by Gauss-Legendre quadrature with `n_nodes` nodes.
 
     - `slope_sd`: standard deviation of the slopes, rad.
     """
@@ -54,7 +57,8 @@ def solve_rigid_passage(
     node_weights = 0.5 * largest_squared_rate * legendre_weights
 
     def evaluate_kernel_row(squared_rate: Array) -> tuple[Array, Array]:
-        """Return the row of the survival operator at x, and the probability of failure."""
+        """Return the row of the survival operator at a squared rate, and the probability of failure
+        there."""
         compute_slope_cosine = lambda next_squared_rate: (
             (next_squared_rate - vertical_rate_map.compute_slope_independent_part(squared_rate))
             / vertical_rate_map.slope_amplitude

@@ -28,7 +28,7 @@ from vrw_jax.wheel import Outcome, WheelParams
 
 @dataclass(frozen=True)
 class PassageSamplingOptions:
-    """Options of first-passage times from sampled walks."""
+    """Numerical options of first-passage times from sampled walks."""
 
     n_walker_groups: int = 32
     """Number of independent groups of walkers. The value is chosen because the quantile for 99 % of
@@ -90,14 +90,14 @@ leaves two degrees of freedom."""
 
 
 class ExtinctGroupError(ValueError):
-    """Error that is raised if no walker of a group survives a step."""
+    """Error that is raised if all walkers of a group fail in the same step."""
 
 
 class SampledPassage(NamedTuple):
-    """First-passage times of a model, estimated from samples."""
+    """First-passage times of a model, estimated by sampled walks."""
 
     failure_probability: float  # of one step from the quasi-stationary distribution
-    relative_error: float  # half a confidence interval, plus the start's effect; inf if unknown
+    relative_error: float  # of the mean; half a confidence interval plus the start's effect
     mean_steps_from_gait: float
     kappa_2: float
     quasi_stationary_states: np.ndarray  # with the slope as last component, (n, components)
@@ -124,23 +124,27 @@ class WalkerGroups:
         self.params, self.model, self.step_options = params, model, step_options
         self.mean_slope, self.slope_sd, self.random = float(params.slope), slope_sd, generator
         self.n_groups, self.n_continuous = options.n_walker_groups, int(model.n_continuous(params))
-        group_size = -(-n_walkers // self.n_groups)
-        self.states = self.gait_states = np.tile(section_state, (self.n_groups * group_size, 1))
+        walkers_per_group = -(-n_walkers // self.n_groups)
+        self.states = self.gait_states = np.tile(
+            section_state, (self.n_groups * walkers_per_group, 1)
+        )
         self.slopes = np.full(len(self.states), self.mean_slope)
         self.n_steps = 0
         self.weight_by_outcome: dict[int, float] = {}
 
     def run_walks(self, slope_deviations: np.ndarray) -> StepBatchResult:
-        """Return walks from the states of the walkers over lines of given slopes.
+        """Return the results of walks that begin at the states of the walkers, over given slopes.
 
-        Walk i starts at walker i modulo the number of walkers.
+        Walk i begins at walker i modulo the number of walkers.
 
         - `slope_deviations`: standardized deviations of the slopes, shape (walks, lines).
         """
         landing_slopes = self.mean_slope + self.slope_sd * slope_deviations
         walker_indices = np.arange(len(slope_deviations)) % len(self.states)
         line_slopes = np.concatenate([self.slopes[walker_indices, None], landing_slopes], 1)
-        wheels_on_lines = eqx.tree_at(lambda wheel: wheel.slope, self.params, line_slopes)
+        wheels_on_lines = eqx.tree_at(
+            lambda wheel_params: wheel_params.slope, self.params, line_slopes
+        )
         walk_results = step_batch(
             wheels_on_lines,
             self.states[walker_indices],
@@ -153,7 +157,7 @@ class WalkerGroups:
         )
         return walk_results
 
-    def record_failures(self, walk_outcomes: np.ndarray, walk_weights: np.ndarray) -> None:
+    def add_failure_weights(self, walk_outcomes: np.ndarray, walk_weights: np.ndarray) -> None:
         """Add the weights of failed walks to the total weight of each outcome."""
         for outcome_code in np.unique(walk_outcomes[walk_weights > 0.0]):
             outcome_weight = float(np.sum(walk_weights[walk_outcomes == outcome_code]))
@@ -162,28 +166,28 @@ class WalkerGroups:
             )
 
     def restart_at_gait(self) -> None:
-        """Set all walkers to the gait, on lines of the mean slope."""
+        """Move all walkers to the gait, on lines of the mean slope."""
         self.states, self.slopes = self.gait_states, np.full(len(self.gait_states), self.mean_slope)
 
-    def get_states_with_slopes(self) -> np.ndarray:
+    def stack_states_and_slopes(self) -> np.ndarray:
         """Return section states with the slope as last component, shape (walkers, components).
 
-        A section state and the slope of its line determine the distribution of the next ones
-        (Markov property).
+        By the Markov property, a section state and the slope of its line determine the distribution
+        of later states.
         """
         return np.concatenate([self.states, self.slopes[:, None]], 1)
 
     def step_and_replace_failures(self) -> tuple[np.ndarray, np.ndarray]:
-        """Take one step of every walker, and replace walkers that fail by copies of others.
+        """Take one step of every walker, and replace walkers that fail by copies of other walkers.
 
         Return whether each walker survived, and the standardized deviations of the slopes on which
-        walkers landed. Raise `ExtinctGroupError` if no walker of a group survived.
+        the walkers landed. Raise `ExtinctGroupError` if no walker of a group survived.
         """
         n_walkers = len(self.states)
         slope_deviations = self.random.standard_normal((n_walkers, 1))
         walk_results = self.run_walks(slope_deviations)
         is_alive: np.ndarray = walk_results.outcome == Outcome.STEPPED
-        self.record_failures(walk_results.outcome, (~is_alive).astype(float))
+        self.add_failure_weights(walk_results.outcome, (~is_alive).astype(float))
         source_walkers = np.arange(n_walkers).reshape(self.n_groups, -1)
         for group_walkers, is_group_alive in zip(
             source_walkers, is_alive.reshape(source_walkers.shape), strict=True
@@ -205,18 +209,19 @@ def sample_passage(
     max_steps: int,
     sampling_options: PassageSamplingOptions = PASSAGE_SAMPLING_OPTIONS,
 ) -> SampledPassage:
-    """Return first-passage times from walks of groups of walkers, until the error is within
-    tolerance.
+    """Return first-passage times from walks of groups of walkers.
+
+    Walks are sampled until the error is within the tolerance.
 
     Args:
         walker_groups: groups of walkers at the gait.
-        spectral_radius: of the gait.
-        relative_tolerance: relative error at which the walks end.
+        spectral_radius: spectral radius of the gait.
+        relative_tolerance: relative error at which the sampling ends.
         max_steps: number of steps after which no further walks begin.
-        sampling_options: options of the sampling.
+        sampling_options: numerical options of the sampling.
 
     Raises:
-        ExtinctGroupError: no walker of a group survived a step.
+        ExtinctGroupError: if no walker of a group survives a step.
     """
     from scipy import stats  # This import is slow.
 
@@ -242,10 +247,10 @@ def sample_passage(
     walker_groups.restart_at_gait()
     step_transitions = []
     for _ in range(n_forgetting_steps):
-        states_before = walker_groups.get_states_with_slopes()
+        states_before = walker_groups.stack_states_and_slopes()
         is_alive, slope_deviations = walker_groups.step_and_replace_failures()
         step_transitions.append(
-            (states_before, is_alive, slope_deviations, walker_groups.get_states_with_slopes())
+            (states_before, is_alive, slope_deviations, walker_groups.stack_states_and_slopes())
         )
     kappa_2 = _estimate_kappa_2(
         step_transitions[-sampling_options.n_kappa_2_steps :], walker_groups.n_continuous
@@ -260,15 +265,17 @@ def sample_passage(
         _estimate_failure_probability,
         walker_groups,
         student_t_quantile=student_t_quantile,
-        start_effect=(max(kappa_2, spectral_radius), n_forgetting_steps - 1),
+        start_effect_decay=(max(kappa_2, spectral_radius), n_forgetting_steps - 1),
         relative_tolerance=relative_tolerance,
         max_steps=max_steps,
         sampling_options=sampling_options,
     )
     count_failures = lambda: (~walker_groups.step_and_replace_failures()[0]).astype(float)
     failure_probability, relative_error = 0.0, np.inf
-    is_counted = n_biased_lines * np.mean(~is_alive) > sampling_options.min_failures_for_counting
-    if not is_counted:
+    are_failures_counted = (
+        n_biased_lines * np.mean(~is_alive) > sampling_options.min_failures_for_counting
+    )
+    if not are_failures_counted:
         failure_density = _fit_density_of_failures(walker_groups, n_biased_lines)
         if failure_density is not None:
             walk_density = failure_density
@@ -280,11 +287,11 @@ def sample_passage(
             ):
                 relative_error = np.inf
         n_expected_failures = failure_probability * (max_steps - walker_groups.n_steps)
-        is_counted = (
+        are_failures_counted = (
             not np.isfinite(relative_error)
             and n_expected_failures > sampling_options.min_effective_failures
         )
-    if is_counted:
+    if are_failures_counted:
         walker_groups.weight_by_outcome.clear()
         failure_probability, relative_error = estimate_probability(count_failures, 1)
     mean_steps_from_gait = np.inf
@@ -298,7 +305,7 @@ def sample_passage(
         relative_error=relative_error,
         mean_steps_from_gait=mean_steps_from_gait,
         kappa_2=kappa_2,
-        quasi_stationary_states=walker_groups.get_states_with_slopes(),
+        quasi_stationary_states=walker_groups.stack_states_and_slopes(),
         fraction_by_outcome={
             Outcome(outcome_code).name: outcome_weight / total_weight
             for outcome_code, outcome_weight in sorted(
@@ -313,39 +320,40 @@ def sample_passage(
 
 def _estimate_failure_probability(
     walker_groups: WalkerGroups,
-    sample_failure_weights: Callable[[], np.ndarray],
+    failure_weight_sampler: Callable[[], np.ndarray],
     n_lines: int,
     *,
     student_t_quantile: float,
-    start_effect: tuple[float, int],
+    start_effect_decay: tuple[float, int],
     relative_tolerance: float,
     max_steps: int,
     sampling_options: PassageSamplingOptions,
 ) -> tuple[float, float]:
     """Return the failure probability of a step, and its relative error.
 
-    Rounds of all walkers are repeated until the relative error is within tolerance. The error is
-    infinite if a few walks dominate the probability.
+    Rounds of all walkers are repeated until the relative error is within the tolerance. The error
+    is infinite if a few walks dominate the probability.
 
-    - `sample_failure_weights`: function that returns the weight of each walk of a round, which is 0
+    - `failure_weight_sampler`: function that returns the weight of each walk of a round, which is 0
       unless the walk fails in its last step;
-    - `n_lines`: number of lines of a walk;
-    - `start_effect`: factor per step of the start's effect, and number of steps before the walks.
+    - `n_lines`: number of lines of each walk;
+    - `start_effect_decay`: factor per step of the start's effect, and number of steps before the
+      walks.
     """
     group_weight_sums, n_rounds = np.zeros(walker_groups.n_groups), 0
-    weight_sum, squared_weight_sum, n_failing_walks = 0.0, 0.0, 0
+    failure_weight_sum, squared_weight_sum, n_failing_walks = 0.0, 0.0, 0
     failure_probability, relative_error = 0.0, np.inf
-    remaining_start_effect = start_effect[0] ** (start_effect[1] + n_lines)
+    remaining_start_effect = start_effect_decay[0] ** (start_effect_decay[1] + n_lines)
     while n_rounds < sampling_options.min_sampling_rounds or (
         relative_error > relative_tolerance and walker_groups.n_steps < max_steps
     ):
-        failure_weights = sample_failure_weights()
+        failure_weights = failure_weight_sampler()
         group_weight_sums += failure_weights.reshape(walker_groups.n_groups, -1).mean(1)
-        weight_sum += float(np.sum(failure_weights))
+        failure_weight_sum += float(np.sum(failure_weights))
         squared_weight_sum += float(np.sum(failure_weights**2))
         n_failing_walks += int(np.sum(failure_weights > 0.0))
         n_rounds += 1
-        if weight_sum == 0.0:
+        if failure_weight_sum == 0.0:
             continue
         last_step_failure_probability = float(np.mean(group_weight_sums)) / n_rounds
         failure_probability, error_amplification = _solve_failure_probability(
@@ -361,7 +369,7 @@ def _estimate_failure_probability(
             / last_step_failure_probability
         )
         relative_error = float(sampling_error + remaining_start_effect)
-        n_effective_failures = weight_sum**2 / squared_weight_sum
+        n_effective_failures = failure_weight_sum**2 / squared_weight_sum
         if n_effective_failures < sampling_options.min_effective_failures:
             relative_error = np.inf
         min_effective_fraction = sampling_options.min_effective_failure_fraction
@@ -379,7 +387,7 @@ def _estimate_survival_from_gait(
     relative_tolerance: float,
     sampling_options: PassageSamplingOptions,
 ) -> np.ndarray:
-    """Return the fractions of walks from the gait that survive 0, 1, ... `n_steps` steps.
+    """Return the fractions of walks from the gait that survive 0, 1, ..., `n_steps` steps.
 
     Rounds of all walkers are repeated until the last fraction has the relative standard error
     `relative_tolerance`.
@@ -399,8 +407,9 @@ def _estimate_survival_from_gait(
 
 
 def _fit_density_of_failures(walker_groups: WalkerGroups, n_lines: int) -> GaussianMixture | None:
-    """Return a density of slope deviations on which walks over `n_lines` lines often fail in their
-    last step; return None if no walk fails.
+    """Return a density of slope deviations for which walks often fail in their last step.
+
+    The walks have `n_lines` lines. The result is None if no walk fails.
     """
 
     def find_failures(slope_deviations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -456,9 +465,9 @@ def run_biased_walks(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Run one walk from every walker, over lines whose slope deviations are drawn from a density.
 
-    Return the slope deviations, shape (walkers, lines), and a weight of each walk. The weight is
-    the likelihood ratio if the walk fails in its last step, and 0 otherwise. The mean of the
-    weights is the probability of such a failure.
+    Return the slope deviations, shape (walkers, lines), and the weight of each walk. The weight is
+    the likelihood ratio if the walk fails in its last step, and 0 otherwise. The mean weight is the
+    probability of a failure in the last step.
     """
     n_lines = walk_density.component_means.shape[1]
     slope_deviations = walk_density.draw_samples(len(walker_groups.states), walker_groups.random)
@@ -472,7 +481,7 @@ def run_biased_walks(
         - walk_density.compute_log_density(slope_deviations)
     )
     failure_weights = np.where(has_failed_last, likelihood_ratios, 0.0)
-    walker_groups.record_failures(walk_results.outcome, failure_weights)
+    walker_groups.add_failure_weights(walk_results.outcome, failure_weights)
     return slope_deviations, failure_weights
 
 
@@ -481,10 +490,10 @@ def _solve_failure_probability(
 ) -> tuple[float, float]:
     """Return the failure probability p of a step, and the amplification of its relative error.
 
-    Each step from the quasi-stationary distribution fails with probability p. So a walk fails in
-    the last of `n_biased_lines` steps with probability p (1 - p)^(n_biased_lines - 1), which is
-    `last_step_failure_probability`. The amplification is the relative error of p divided by that of
-    this probability.
+    Each step from the quasi-stationary distribution fails with probability p. A walk therefore
+    fails in the last of `n_biased_lines` steps with probability p (1 - p)^(n_biased_lines - 1),
+    which is `last_step_failure_probability`. The amplification is the ratio of the relative errors
+    of p and of that probability.
     """
     p = last_step_failure_probability
     if n_biased_lines == 1:
@@ -510,12 +519,14 @@ def _estimate_kappa_2(
     states_before, is_alive, landing_deviations, states_after = (
         np.concatenate(transition_parts) for transition_parts in zip(*step_transitions, strict=True)
     )
-    state_center = states_before.mean(0)
+    mean_state = states_before.mean(0)
     coordinate_indices = [
         i for i in (*range(n_continuous), states_before.shape[1] - 1) if np.ptp(states_before[:, i])
     ]
-    state_scale = states_before[:, coordinate_indices].std(0)
-    standardize_states = lambda states: (states - state_center)[:, coordinate_indices] / state_scale
+    standardizing_scales = states_before[:, coordinate_indices].std(0)
+    standardize_states = lambda states: (
+        (states - mean_state)[:, coordinate_indices] / standardizing_scales
+    )
     _, singular_values, principal_directions = np.linalg.svd(
         standardize_states(states_before), full_matrices=False
     )
@@ -525,29 +536,34 @@ def _estimate_kappa_2(
         * np.sqrt(len(states_before))
         / singular_values[is_direction_resolved, None]
     )
-    first_indices, second_indices = np.triu_indices(len(principal_directions))
+    first_coordinate_indices, second_coordinate_indices = np.triu_indices(len(principal_directions))
 
     def evaluate_features(states: np.ndarray) -> np.ndarray:
         z = standardize_states(states) @ principal_directions.T
         return np.concatenate(
-            [np.ones((len(z), 1)), z, z[:, first_indices] * z[:, second_indices]], 1
+            [
+                np.ones((len(z), 1)),
+                z,
+                z[:, first_coordinate_indices] * z[:, second_coordinate_indices],
+            ],
+            1,
         )
 
-    next_features, quadratic_features = (
+    features_after_step, features_before_step = (
         np.where(is_alive[:, None], evaluate_features(states_after), 0.0),
         evaluate_features(states_before),
     )
-    linear_features = quadratic_features[:, : 1 + len(principal_directions)]
+    linear_features = features_before_step[:, : 1 + len(principal_directions)]
     hermite_polynomials = landing_deviations[:, None], landing_deviations[:, None] ** 2 - 1.0
-    regression_inputs = np.concatenate(
+    regressor_matrix = np.concatenate(
         [
-            quadratic_features,
+            features_before_step,
             *(linear_features * hermite_polynomial for hermite_polynomial in hermite_polynomials),
         ],
         1,
     )
-    regression_coefficients = np.linalg.lstsq(regression_inputs, next_features, rcond=None)[0]
+    regression_coefficients = np.linalg.lstsq(regressor_matrix, features_after_step, rcond=None)[0]
     eigenvalue_moduli = np.sort(
-        np.abs(np.linalg.eigvals(regression_coefficients[: quadratic_features.shape[1]]))
+        np.abs(np.linalg.eigvals(regression_coefficients[: features_before_step.shape[1]]))
     )
     return float(eigenvalue_moduli[-2])

@@ -1,4 +1,4 @@
-"""Smallest disturbance within a step that takes a wheel out of the basin of its gait."""
+"""Smallest disturbance within a step after which a wheel leaves the basin of its gait."""
 
 import functools
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ from vrw_jax.cycles import AbstractCycle
 from vrw_jax.models import AbstractWheel, AdvanceResult
 from vrw_jax.numerics import StepOptions, batch_sizes, map_in_batches
 from vrw_jax.printing import AbstractPrintable, LabelAndText
-from vrw_jax.robustness.gait_arrival import StableGait, walk_to_gait
+from vrw_jax.robustness.gait_arrival import StableGait, walk_until_on_gait
 from vrw_jax.runtime import with_default_jax_settings
 from vrw_jax.simulation import ModelLike
 from vrw_jax.validation import check_int, check_positive
@@ -29,32 +29,36 @@ ANGULAR_VELOCITY_INDEX = 3
 
 @dataclass(frozen=True)
 class DisturbanceSearchOptions:
-    """Options of the search for the smallest disturbance, over the instants of a step and the
-    sizes.
+    """Numerical options of the search for the smallest disturbance.
+
+    The search is over the instants of a step and over the sizes of the disturbance.
     """
 
     sample_strides: tuple[int, ...] = (512, 64, 8, 1)
-    """Distances of the instants of each pass, in samples of a phase, coarse to fine.
+    """Distance between neighboring instants in each pass, in samples of a phase.
 
     The values are chosen because each pass then covers two intervals of the previous pass, and the
     last pass resolves a ten-thousandth of a phase."""
     n_pass_intervals: int = 16
     """Number of intervals between the instants of a pass."""
     n_grid_sizes: int = 24
-    """Number of sizes in the first grid. The search may miss an interval of sizes that leave the
-    basin if it is narrower than the grid spacing."""
+    """Number of sizes in the first grid.
+
+    An interval of sizes that leave the basin may be missed if the grid spacing exceeds the width of
+    the interval."""
     n_bisection_sizes: int = 8
-    """Number of sizes that divide a bracket, chosen because one batch then gains a digit."""
+    """Number of sizes that divide a bracket, chosen because each batch then gains one digit."""
     final_size_tolerance: float = 1e-8
-    """Width of a bracket in the last pass, relative to the size, chosen because this is the error
-    of steps."""
+    """Width of a bracket in the last pass, relative to the size, chosen as the relative error of a
+    step."""
     early_size_tolerance: float = 1e-5
-    """Width of a bracket in all earlier passes, relative to the size. The value is chosen because
-    sizes at neighboring instants differ by more."""
+    """Width of a bracket in all earlier passes, relative to the size.
+
+    The value is chosen because sizes at neighboring instants differ by more than the width."""
 
     @property
     def n_phase_samples(self) -> int:
-        """Return the number of samples of a phase, both ends included."""
+        """Return the number of samples per phase, both ends included."""
         return self.n_pass_intervals * self.sample_strides[0] + 1
 
 
@@ -97,7 +101,7 @@ class SmallestDisturbance(AbstractPrintable):
 
     @property
     def ending(self) -> str:
-        """Return a sentence about the end of a walk after a slightly larger disturbance."""
+        """Return a sentence on the end of a walk after a slightly larger disturbance."""
         if not np.isfinite(self.size):
             return "No disturbance of the tried sizes leaves the basin."
         if self.outcome == Outcome.STEPPED:
@@ -165,29 +169,29 @@ def smallest_disturbance(
         0.275 rad/s at 0.25 s
     """
     max_steps = check_int("max_steps", max_steps)
-    gait = StableGait.from_cycle("vrw.smallest_disturbance", params, model, cycle, options)
-    if not gait.model.capabilities.begins_within_step:
+    stable_gait = StableGait.from_cycle("vrw.smallest_disturbance", params, model, cycle, options)
+    if not stable_gait.model.capabilities.begins_within_step:
         raise ValueError(
-            f"{type(gait.model).__name__} cannot begin within a step, so that disturbances within "
-            "a step are not available: take ViscoelasticWheel() or RigidWheel(), or disturb starts "
-            "by vrw.basin_share."
+            f"{type(stable_gait.model).__name__} cannot begin within a step, so that disturbances "
+            "within a step are not available: take ViscoelasticWheel() or RigidWheel(), or disturb "
+            "starts by vrw.basin_share."
         )
-    if len(gait.section_states) > 1:
+    if len(stable_gait.section_states) > 1:
         raise ValueError(
-            f"cycle repeats after {len(gait.section_states)} steps, but disturbances are those of "
-            "gaits of one step: give a cycle with period_n=1."
+            f"cycle repeats after {len(stable_gait.section_states)} steps, but disturbances are "
+            "those of gaits of one step: give a cycle with period_n=1."
         )
     max_size = None if max_size is None else check_positive("max_size", max_size)
-    return compute_smallest_disturbance(gait, max_size, max_steps)
+    return compute_smallest_disturbance(stable_gait, max_size, max_steps)
 
 
 class _GaitStep(NamedTuple):
-    """Samples of the step of a gait, with axes over phases and samples."""
+    """Samples of one step of a gait, with axes over phases and samples."""
 
     sample_times: np.ndarray  # after the landing, s, (phase, sample)
     sample_states: np.ndarray  # (theta, L1, L2) and their rates, (phase, sample, 6)
-    occurred_phases: tuple[int, ...]  # indices of the phases that take place
-    foot_distance: Array  # distance between both feet in double support, m
+    indices_of_occurring_phases: tuple[int, ...]  # indices of the phases with a duration above zero
+    foot_distance: Array  # between the feet in double support, m
 
 
 def compute_smallest_disturbance(
@@ -196,15 +200,17 @@ def compute_smallest_disturbance(
     max_steps: int,
     search_options: DisturbanceSearchOptions = DISTURBANCE_SEARCH_OPTIONS,
 ) -> SmallestDisturbance:
-    """Return the `SmallestDisturbance` of a gait of one step for validated arguments."""
+    """Return the `SmallestDisturbance` of a gait of one step, for validated arguments."""
     params, model, options, section_states = stable_gait
     start_state = jnp.asarray(section_states[0])
-    trajectory = model.sample_step(params, start_state, options, search_options.n_phase_samples)
+    step_trajectory = model.sample_step(
+        params, start_state, options, search_options.n_phase_samples
+    )
     foot_distance = jnp.asarray(model.take_step(params, start_state, options).step_length)
     gait_step = _GaitStep(
-        np.asarray(trajectory.time),
-        np.asarray(trajectory.state),
-        tuple(int(i) for i in np.flatnonzero(np.asarray(trajectory.durations) > 0.0)),
+        np.asarray(step_trajectory.time),
+        np.asarray(step_trajectory.state),
+        tuple(int(i) for i in np.flatnonzero(np.asarray(step_trajectory.durations) > 0.0)),
         foot_distance,
     )
     if max_size is None:
@@ -213,7 +219,9 @@ def compute_smallest_disturbance(
 
 
 class _DirectedInstants(NamedTuple):
-    """Instants of a step, each with a direction of the disturbance, as arrays of one axis."""
+    """Instants of a step, each with the direction of a disturbance, as arrays of shape
+    (instants,).
+    """
 
     phase_indices: np.ndarray
     sample_indices: np.ndarray
@@ -221,11 +229,11 @@ class _DirectedInstants(NamedTuple):
 
 
 class _ExitSizeBrackets(NamedTuple):
-    """Bracket of the smallest size that leaves the basin, for each instant and direction."""
+    """Brackets of the smallest size that leaves the basin, for each instant and direction."""
 
     lower_sizes: np.ndarray  # rad/s
     upper_sizes: np.ndarray  # rad/s, infinite if no tried size leaves the basin
-    exit_outcomes: np.ndarray  # Outcome of the walk after a disturbance of the upper size
+    exit_outcomes: np.ndarray  # `Outcome` after a disturbance of the upper size
 
     @property
     def middle_sizes(self) -> np.ndarray:
@@ -240,28 +248,32 @@ def _search_disturbance_instants(
     max_steps: int,
     search_options: DisturbanceSearchOptions,
 ) -> SmallestDisturbance:
-    """Return the smallest disturbance over all instants, by passes with finer and finer
+    """Return the smallest disturbance over all instants, by passes with increasingly fine
     instants.
     """
     phase_directions = [
-        (phase_index, direction)
-        for phase_index in gait_step.occurred_phases
-        for direction in DISTURBANCE_SIGNS
+        (phase_index, disturbance_sign)
+        for phase_index in gait_step.indices_of_occurring_phases
+        for disturbance_sign in DISTURBANCE_SIGNS
     ]
     window_centers = dict.fromkeys(phase_directions, search_options.n_phase_samples // 2)
     half_intervals = search_options.n_pass_intervals // 2
-    first_pass_result = best_candidate = None
+    first_pass_result = best_instant_index = None
     for sample_stride in search_options.sample_strides:
         sample_offsets = sample_stride * np.arange(-half_intervals, half_intervals + 1)
         sample_windows = [
-            np.clip(window_centers[key] + sample_offsets, 0, search_options.n_phase_samples - 1)
-            for key in phase_directions
+            np.clip(
+                window_centers[phase_and_direction] + sample_offsets,
+                0,
+                search_options.n_phase_samples - 1,
+            )
+            for phase_and_direction in phase_directions
         ]
         n_instants = len(sample_offsets)
         directed_instants = _DirectedInstants(
             np.repeat([phase_index for phase_index, _ in phase_directions], n_instants),
             np.concatenate(sample_windows),
-            np.repeat([direction for _, direction in phase_directions], n_instants),
+            np.repeat([disturbance_sign for _, disturbance_sign in phase_directions], n_instants),
         )
         is_last_pass = sample_stride == search_options.sample_strides[-1]
         size_tolerance = (
@@ -281,45 +293,53 @@ def _search_disturbance_instants(
         exit_sizes = exit_brackets.middle_sizes.reshape(len(phase_directions), n_instants)
         best_instant_indices = exit_sizes.argmin(1)
         window_centers = {
-            key: sample_windows[i][best_instant_indices[i]]
-            for i, key in enumerate(phase_directions)
+            phase_and_direction: sample_windows[i][best_instant_indices[i]]
+            for i, phase_and_direction in enumerate(phase_directions)
         }
         first_pass_result = first_pass_result or (directed_instants, exit_brackets)
-        best_candidate = int(exit_brackets.middle_sizes.argmin())
+        best_instant_index = int(exit_brackets.middle_sizes.argmin())
     assert first_pass_result is not None
-    assert best_candidate is not None
+    assert best_instant_index is not None
     smallest_size, phase_index = (
-        float(exit_brackets.middle_sizes[best_candidate]),
-        int(directed_instants.phase_indices[best_candidate]),
+        float(exit_brackets.middle_sizes[best_instant_index]),
+        int(directed_instants.phase_indices[best_instant_index]),
     )
     size_error = 0.0
     if np.isfinite(smallest_size):
         size_error = float(
-            exit_brackets.upper_sizes[best_candidate] - exit_brackets.lower_sizes[best_candidate]
+            exit_brackets.upper_sizes[best_instant_index]
+            - exit_brackets.lower_sizes[best_instant_index]
         )
-        if directed_instants.sample_indices[best_candidate] not in (
+        if directed_instants.sample_indices[best_instant_index] not in (
             0,
             search_options.n_phase_samples - 1,
         ):
             # Sizes at the neighboring instants of the last pass bound the change between two
             # instants.
-            key_index, instant_index = divmod(best_candidate, n_instants)
-            neighbor_sizes = exit_sizes[key_index, max(instant_index - 1, 0) : instant_index + 2]
+            phase_direction_index, instant_index = divmod(best_instant_index, n_instants)
+            neighbor_sizes = exit_sizes[
+                phase_direction_index, max(instant_index - 1, 0) : instant_index + 2
+            ]
             size_error += float(np.max(neighbor_sizes[np.isfinite(neighbor_sizes)]) - smallest_size)
     is_backward_disturbance = first_pass_result[0].disturbance_signs < 0.0
     profile_phase_indices, profile_sample_indices = (
-        indices[is_backward_disturbance]
-        for indices in (first_pass_result[0].phase_indices, first_pass_result[0].sample_indices)
+        sample_indices_of_pass[is_backward_disturbance]
+        for sample_indices_of_pass in (
+            first_pass_result[0].phase_indices,
+            first_pass_result[0].sample_indices,
+        )
     )
     return SmallestDisturbance(
         size=smallest_size,
         size_error=size_error,
-        direction=int(directed_instants.disturbance_signs[best_candidate]),
+        direction=int(directed_instants.disturbance_signs[best_instant_index]),
         time=float(
-            gait_step.sample_times[phase_index, directed_instants.sample_indices[best_candidate]]
+            gait_step.sample_times[
+                phase_index, directed_instants.sample_indices[best_instant_index]
+            ]
         ),
         phase_index=phase_index,
-        outcome=np.asarray(exit_brackets.exit_outcomes[best_candidate]),
+        outcome=np.asarray(exit_brackets.exit_outcomes[best_instant_index]),
         profile_times=gait_step.sample_times[profile_phase_indices, profile_sample_indices],
         profile_phase_indices=profile_phase_indices,
         backward_sizes=first_pass_result[1].middle_sizes[is_backward_disturbance],
@@ -344,41 +364,46 @@ def _bracket_exit_sizes(
     lower_sizes, upper_sizes = np.zeros(n_directed_instants), np.full(n_directed_instants, np.inf)
     exit_outcomes = np.full(n_directed_instants, int(Outcome.STEPPED))
     size_fractions = np.arange(1, search_options.n_grid_sizes + 1) / search_options.n_grid_sizes
-    open_indices, tried_sizes = (
+    unresolved_instant_indices, tried_sizes = (
         np.arange(n_directed_instants),
         np.tile(max_size * size_fractions, (n_directed_instants, 1)),
     )
-    while len(open_indices):
-        open_instants = _DirectedInstants(
-            *(instant_values[open_indices] for instant_values in directed_instants)
+    while len(unresolved_instant_indices):
+        unresolved_instants = _DirectedInstants(
+            *(instant_values[unresolved_instant_indices] for instant_values in directed_instants)
         )
         leaves_basin, walk_outcomes = _walk_after_disturbance(
-            stable_gait, gait_step, open_instants, tried_sizes, max_steps
+            stable_gait, gait_step, unresolved_instants, tried_sizes, max_steps
         )
-        has_exit, first_exit_index = leaves_basin.any(1), leaves_basin.argmax(1)
-        row_indices = np.arange(len(open_indices))
-        last_inside_index = np.where(has_exit, first_exit_index, tried_sizes.shape[1]) - 1
+        has_exit_size, first_exit_index = leaves_basin.any(1), leaves_basin.argmax(1)
+        row_indices = np.arange(len(unresolved_instant_indices))
+        last_inside_index = np.where(has_exit_size, first_exit_index, tried_sizes.shape[1]) - 1
         largest_inside_size = np.where(
             last_inside_index >= 0,
             tried_sizes[row_indices, last_inside_index],
-            lower_sizes[open_indices],
+            lower_sizes[unresolved_instant_indices],
         )
-        upper_sizes[open_indices] = np.where(
-            has_exit, tried_sizes[row_indices, first_exit_index], upper_sizes[open_indices]
+        upper_sizes[unresolved_instant_indices] = np.where(
+            has_exit_size,
+            tried_sizes[row_indices, first_exit_index],
+            upper_sizes[unresolved_instant_indices],
         )
-        exit_outcomes[open_indices] = np.where(
-            has_exit, walk_outcomes[row_indices, first_exit_index], exit_outcomes[open_indices]
+        exit_outcomes[unresolved_instant_indices] = np.where(
+            has_exit_size,
+            walk_outcomes[row_indices, first_exit_index],
+            exit_outcomes[unresolved_instant_indices],
         )
-        lower_sizes[open_indices] = np.where(
-            np.isfinite(upper_sizes[open_indices]), largest_inside_size, max_size
+        lower_sizes[unresolved_instant_indices] = np.where(
+            np.isfinite(upper_sizes[unresolved_instant_indices]), largest_inside_size, max_size
         )
         bracket_width = np.where(np.isfinite(upper_sizes), upper_sizes - lower_sizes, 0.0)
-        open_indices = np.flatnonzero(bracket_width > size_tolerance * upper_sizes)
+        unresolved_instant_indices = np.flatnonzero(bracket_width > size_tolerance * upper_sizes)
         bracket_fractions = np.arange(1, search_options.n_bisection_sizes + 1) / (
             search_options.n_bisection_sizes + 1.0
         )
         tried_sizes = (
-            lower_sizes[open_indices, None] + bracket_width[open_indices, None] * bracket_fractions
+            lower_sizes[unresolved_instant_indices, None]
+            + bracket_width[unresolved_instant_indices, None] * bracket_fractions
         )
     return _ExitSizeBrackets(
         np.where(np.isfinite(upper_sizes), lower_sizes, np.inf), upper_sizes, exit_outcomes
@@ -392,9 +417,8 @@ def _walk_after_disturbance(
     disturbance_sizes: np.ndarray,
     max_steps: int,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return whether each disturbed walk leaves the basin, and its Outcome, both (instants,
-    sizes).
-    """
+    """Return whether each disturbed walk leaves the basin, and its `Outcome`, both (instants,
+    sizes)."""
     n_sizes = disturbance_sizes.shape[1]
     disturbed_states = np.repeat(
         gait_step.sample_states[directed_instants.phase_indices, directed_instants.sample_indices],
@@ -412,7 +436,7 @@ def _walk_after_disturbance(
         finish_batch = functools.partial(
             _finish_disturbed_steps,
             stable_gait.model,
-            stable_gait.options,
+            stable_gait.step_options,
             stable_gait.params,
             int(phase_index),
             gait_step.foot_distance,
@@ -425,9 +449,9 @@ def _walk_after_disturbance(
     leaves_basin = np.ones(len(phase_indices), bool)
     has_stepped = np.flatnonzero(walk_outcomes == Outcome.STEPPED)
     if len(has_stepped):
-        arrival_result = walk_to_gait(stable_gait, section_states[has_stepped], max_steps)
+        arrival_result = walk_until_on_gait(stable_gait, section_states[has_stepped], max_steps)
         walk_outcomes[has_stepped], leaves_basin[has_stepped] = (
-            arrival_result.outcome,
+            arrival_result.walk_outcomes,
             ~arrival_result.is_on_gait,
         )
     return leaves_basin.reshape(disturbance_sizes.shape), walk_outcomes.reshape(
@@ -444,7 +468,7 @@ def _finish_disturbed_steps(
     foot_distance: Array,
     phase_states: Array,
 ) -> AdvanceResult:
-    """Return the result of the rest of the step from each state within a phase."""
+    """Return the result of the rest of a step from each state within a phase."""
     finish_step = lambda phase_state: model.finish_step(
         params, phase_index, foot_distance, phase_state, options
     )

@@ -1,8 +1,8 @@
 """Leading eigenvalues of a survival operator, and mean first-passage times.
 
-The operator K is given by a matrix: (K f)(i) is the mean of f over the states after one step from
-state i, where failures count as 0. F(i) is the probability that this step fails: K 1 = 1 - F.
-The source is Byl and Tedrake, "Metastable walking machines" (2009).
+The operator K is a matrix: (K f)(i) is the mean of f over the states after one step from state i,
+and failures count as 0. F(i) is the probability that this step fails, so that K 1 = 1 - F. The
+source is Byl and Tedrake, "Metastable walking machines" (2009).
 """
 
 from typing import NamedTuple
@@ -14,8 +14,7 @@ from jaxtyping import Array, Float
 from vrw_jax.numerics import Scalar
 
 MAX_POWER_ITERATIONS = 5000
-"""Largest number of power iterations, chosen because this number suffices for kappa_2 up to 0.99
-kappa_1."""
+"""Largest number of power iterations, chosen because it suffices for kappa_2 up to 0.99 kappa_1."""
 
 POWER_ITERATION_TOLERANCE = 1e-15
 """Relative change of an eigenvector at which power iteration ends, chosen near round-off."""
@@ -36,8 +35,8 @@ def analyze_survival_operator(
     """Return the leading eigenvalues and eigenvectors of a survival operator.
 
     Let q be the quasi-stationary distribution and u the right eigenvector, with q.1 = q.u = 1. The
-    failure probability is q.F. Its first derivatives are those of q.(F - K (u - 1)) with q and u
-    held fixed.
+    failure probability is q.F. Its first derivatives are those of q.(F - K (u - 1)) with constant q
+    and u.
     """
     K = lax.stop_gradient(survival_matrix)
     quasi_stationary_weights = _compute_leading_eigenvector(K.T)
@@ -53,31 +52,34 @@ def analyze_survival_operator(
     )
 
 
-def _compute_leading_eigenvector(matrix: Array) -> Array:
-    """Return the leading eigenvector of a matrix, scaled to a sum of 1.
+def _compute_leading_eigenvector(nonnegative_matrix: Array) -> Array:
+    """Return the leading eigenvector of a nonnegative matrix, scaled to a sum of 1.
 
-    The method is power iteration. Its sums have only positive terms and no cancellation, so that
+    The method is power iteration. Its sums contain only positive terms and no cancellation, so that
     small components are relatively accurate.
     """
 
     def has_not_converged(loop_state: tuple) -> Array:
-        iteration, _, relative_change = loop_state
-        return (iteration < MAX_POWER_ITERATIONS) & (relative_change > POWER_ITERATION_TOLERANCE)
-
-    def apply_matrix(loop_state: tuple) -> tuple:
-        iteration, vector, _ = loop_state
-        next_vector = matrix @ vector
-        next_vector = next_vector / jnp.sum(next_vector)
-        return (
-            iteration + 1,
-            next_vector,
-            jnp.max(jnp.abs(next_vector - vector)) / jnp.max(jnp.abs(next_vector)),
+        iteration_index, _, eigenvector_change = loop_state
+        return (iteration_index < MAX_POWER_ITERATIONS) & (
+            eigenvector_change > POWER_ITERATION_TOLERANCE
         )
 
-    n = matrix.shape[0]
-    initial_vector = jnp.full(n, 1.0 / n, matrix.dtype)
+    def apply_matrix(loop_state: tuple) -> tuple:
+        iteration_index, normalized_vector, _ = loop_state
+        next_eigenvector = nonnegative_matrix @ normalized_vector
+        next_eigenvector = next_eigenvector / jnp.sum(next_eigenvector)
+        return (
+            iteration_index + 1,
+            next_eigenvector,
+            jnp.max(jnp.abs(next_eigenvector - normalized_vector))
+            / jnp.max(jnp.abs(next_eigenvector)),
+        )
+
+    n = nonnegative_matrix.shape[0]
+    initial_vector = jnp.full(n, 1.0 / n, nonnegative_matrix.dtype)
     return lax.while_loop(
-        has_not_converged, apply_matrix, (0, initial_vector, jnp.ones((), matrix.dtype))
+        has_not_converged, apply_matrix, (0, initial_vector, jnp.ones((), nonnegative_matrix.dtype))
     )[1]
 
 

@@ -180,7 +180,7 @@ def tune(
         cycle_options=cycle_options,
     )
     exploration_result = tune_problem.explore_starts(n_starts, seed) if n_starts > 1 else None
-    tune_problem.gait_finder.precompile(params)
+    tune_problem.gait_finder.precompile_programs(params)
     start_trial = tune_problem.evaluate_start(
         tune_problem.normalized_start
         if exploration_result is None
