@@ -303,9 +303,9 @@ def _emit_llvm_finiteness_test(
     x: LlvmValue,
 ) -> LlvmValue:
     """Emit the test whether the float `x` is finite, and return its truth value."""
-    magnitude = _emit_llvm_intrinsic_call(value_emitter, "fabs", x)
+    absolute_value = _emit_llvm_intrinsic_call(value_emitter, "fabs", x)
     return value_emitter.builder.fcmp_ordered(
-        "<", magnitude, value_emitter.make_llvm_constant(magnitude.type, np.inf)
+        "<", absolute_value, value_emitter.make_llvm_constant(absolute_value.type, np.inf)
     )
 
 

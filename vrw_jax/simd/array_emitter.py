@@ -60,8 +60,10 @@ DEFAULT_REGISTER_LIMITS = RegisterLimits()
 
 
 class PrimitiveCall(NamedTuple):
-    """One equation of a trace with one result: a primitive, its parameters, and the shapes and
-    types of its operands and its result."""
+    """Equation of a trace with one result.
+
+    The fields are the primitive, its parameters, and the shapes and types of operands and result.
+    """
 
     primitive_name: str
     primitive_params: dict[str, Any]
@@ -209,17 +211,17 @@ class ArrayEmitter:
         """
 
         def emit_nested_index_loops(
-            partial_index: EntryIndex, loop_carry: Sequence[LlvmValue]
+            outer_index: EntryIndex, loop_carry: Sequence[LlvmValue]
         ) -> Sequence[LlvmValue]:
-            if len(partial_index) == len(index_shape):
-                return emit_body(partial_index, list(loop_carry))
-            if index_shape[len(partial_index)] == 1:
-                return emit_nested_index_loops((*partial_index, 0), loop_carry)
+            if len(outer_index) == len(index_shape):
+                return emit_body(outer_index, list(loop_carry))
+            if index_shape[len(outer_index)] == 1:
+                return emit_nested_index_loops((*outer_index, 0), loop_carry)
             emit_inner_loop = lambda i, loop_carry: emit_nested_index_loops(
-                (*partial_index, i), loop_carry
+                (*outer_index, i), loop_carry
             )
             return self.emit_counted_loop(
-                index_shape[len(partial_index)], emit_inner_loop, loop_carry
+                index_shape[len(outer_index)], emit_inner_loop, loop_carry
             )
 
         return list(emit_nested_index_loops((), loop_carry))
@@ -326,12 +328,12 @@ class ArrayEmitter:
         return MemoryArray(self, array.shape, llvm_element_type, llvm_table)
 
     def emit_elementwise_array(
-        self, call: PrimitiveCall, operand_arrays: Sequence[LlvmArray]
+        self, primitive_call: PrimitiveCall, operand_arrays: Sequence[LlvmArray]
     ) -> LlvmArray:
         """Emit an elementwise primitive for arrays of values, and return the array of its
         results.
         """
-        primitive_name, primitive_params, operand_avals, result_aval = call
+        primitive_name, primitive_params, operand_avals, result_aval = primitive_call
         result_shape, operand_dtype = get_shape_without_lanes(result_aval), operand_avals[0].dtype
         if not result_shape and all(
             isinstance(x, np.ndarray) and not x.shape for x in operand_arrays
@@ -392,7 +394,7 @@ class ArrayEmitter:
     def reshape_if_needed(
         self, array: LlvmArray, new_shape: tuple[int, ...], needs_reshape: bool
     ) -> LlvmArray:
-        """Return the array reshaped to `new_shape` if `needs_reshape`, else the array itself."""
+        """Return the array, reshaped to `new_shape` if `needs_reshape` is true."""
         return self.reshape_array(array, new_shape) if needs_reshape else array
 
     def broadcast_array(
@@ -412,9 +414,10 @@ class ArrayEmitter:
             return np.broadcast_to(array.reshape(expanded_shape), broadcast_shape)
 
         def get_broadcast_entry(broadcast_index: EntryIndex) -> LlvmValue:
-            pairs = zip(axis_positions, axis_lengths, strict=True)
+            positions_and_lengths = zip(axis_positions, axis_lengths, strict=True)
             return self.get_array_entry(
-                array, tuple(0 if n == 1 else broadcast_index[axis] for axis, n in pairs)
+                array,
+                tuple(0 if n == 1 else broadcast_index[axis] for axis, n in positions_and_lengths),
             )
 
         return LazyArray(broadcast_shape, array.entry_type, get_broadcast_entry)
@@ -499,8 +502,10 @@ class ArrayEmitter:
         return tuple(add_axis_indices(i, j) for i, j in zip(entry_index, offset_index, strict=True))
 
     def make_llvm_zero(self, entry_type: ir.Type) -> LlvmValue:
-        """Return the LLVM value zero from which a sum starts; this zero is not dropped as a known
-        constant is."""
+        """Return the LLVM value zero from which a sum starts.
+
+        Unlike a known constant zero, this zero is not omitted from the sum.
+        """
         llvm_element_type = (
             entry_type.element if isinstance(entry_type, ir.VectorType) else entry_type
         )
@@ -557,7 +562,8 @@ def get_llvm_number_type(aval: Any) -> ir.Type:
 
 
 _LLVM_TYPE_BY_DTYPE = {
-    np.dtype(name): kind for name, kind in LLVM_NUMBER_TYPES.items()
+    np.dtype(dtype_name): llvm_number_type
+    for dtype_name, llvm_number_type in LLVM_NUMBER_TYPES.items()
 }  # The names of dtypes are slow to compute.
 
 
@@ -571,7 +577,10 @@ def make_entry_array(array_shape: tuple[int, ...], llvm_entries: Sequence[LlvmVa
 def split_into_entry_arrays(
     flat_entries: Sequence[LlvmValue], avals: Sequence[Any]
 ) -> list[LlvmArray]:
-    """Return the arrays whose entries `ArrayEmitter.flatten_array_entries` put into one list."""
+    """Return the arrays whose entries are in the list `flat_entries`.
+
+    This is the inverse of `ArrayEmitter.flatten_array_entries`.
+    """
     entry_arrays: list[LlvmArray] = []
     first_entry = 0
     for aval in avals:

@@ -33,7 +33,7 @@ from vrw_jax.simd.machine import (
 
 @runtime_checkable
 class CodeStore(Protocol):
-    """Store of code between processes: an object or a module with these two functions."""
+    """Store of machine code for several processes: an object or a module with two functions."""
 
     def load_bytes(self, record_name: str) -> bytes | None:
         """Return the bytes saved under `record_name`, or None if no undamaged record has that
@@ -45,8 +45,9 @@ class CodeStore(Protocol):
 
 
 class MachineCode(NamedTuple):
-    """The machine code of a function over lanes, whose compilation may still run in the
-    background.
+    """Machine code of a function over lanes.
+
+    The compilation of the code may still run in the background.
     """
 
     code_name: str  # digest of the text that LLVM compiles; JAX programs call the code by it
@@ -68,8 +69,9 @@ def get_machine_code(
     code_store: CodeStore | None,
     register_limits: RegisterLimits,
 ) -> MachineCode:
-    """Return the machine code of a function, from this process, from `code_store`, or newly
-    compiled.
+    """Return the machine code of a function.
+
+    The code is that of this process or of `code_store`. Code that neither contains is compiled.
 
     `argument_shapes` are the shapes of the arguments, and the code computes `group_width` lanes at
     a time. `trace_key` identifies everything else on which the trace depends.
@@ -197,8 +199,7 @@ traced for several batch sizes share the code."""
 def _pause_garbage_collection() -> Iterator[None]:
     """Return a context in which garbage collection is disabled.
 
-    Collections would take a sixth of the tracing time, because a trace creates many objects that
-    persist.
+    Collections take a sixth of the tracing time, because a trace creates many objects that persist.
     """
     was_collection_enabled = gc.isenabled()
     gc.disable()

@@ -146,10 +146,14 @@ def emit_stacked_array(
 
 
 def emit_unstacked_arrays(
-    lowering: JaxprLowering, equation: Any, operands: list[LlvmArray]
+    jaxpr_lowering: JaxprLowering, equation: Any, operands: list[LlvmArray]
 ) -> list[LlvmArray]:
     """Return the arrays, all of one shape, into which an array is split along an axis."""
-    (array,), split_axis, array_emitter = operands, equation.params["axis"], lowering.array_emitter
+    (array,), split_axis, array_emitter = (
+        operands,
+        equation.params["axis"],
+        jaxpr_lowering.array_emitter,
+    )
     if split_axis == len(array.shape):
         raise make_lane_mixing_error("unstack")
 

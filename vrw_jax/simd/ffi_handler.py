@@ -55,7 +55,8 @@ def add_ffi_handler(
     llvm_handler.attributes.add("nounwind")
     builder = ir.IRBuilder(llvm_handler.append_basic_block("entry"))
     extension_basic_block, metadata_basic_block, execute_basic_block = (
-        llvm_handler.append_basic_block(name) for name in ("extension", "metadata", "execute")
+        llvm_handler.append_basic_block(block_name)
+        for block_name in ("extension", "metadata", "execute")
     )
     ffi_call_frame, llvm_null_pointer = llvm_handler.args[0], ir.Constant(llvm_pointer_type, None)
 

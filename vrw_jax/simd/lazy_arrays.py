@@ -36,7 +36,7 @@ class LazyArray:
 
 
 class UninitializedArray(LazyArray):
-    """A large array whose entries are never read before they are overwritten."""
+    """Large array whose entries are overwritten before they are read."""
 
 
 class PendingArrayUpdate(LazyArray):

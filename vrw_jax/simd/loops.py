@@ -1,4 +1,4 @@
-"""Lowering of JAX loops to LLVM: carried arrays are kept in registers or, if large, in memory."""
+"""Lowering of JAX loops to LLVM: small carried arrays are in registers, large ones in memory."""
 
 import math
 from collections.abc import Sequence

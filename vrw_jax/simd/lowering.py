@@ -1,4 +1,4 @@
-"""Lowering of JAX traces to LLVM: each equation of a trace in turn, and calls of other traces."""
+"""Lowering of JAX traces to LLVM: equations one after another, and calls of other traces."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -197,10 +197,9 @@ class JaxprLowering:
 
 
 def _find_overwriting_equations(jaxpr: Any) -> dict[Any, int | None]:
-    """Return, for each variable, the index of the equation that may overwrite the variable's
-    memory, or None.
+    """Return the index of the equation that may overwrite the memory of each variable, or None.
 
-    The equation is the last one that reads the variable, if all earlier readers are loops. A loop
+    This is the last equation that reads the variable, if all earlier readers are loops. A loop
     reads nothing after its end.
     """
     overwriting_equations: dict[Any, int | None] = {}

@@ -34,7 +34,7 @@ ELF_SECTION_LAYOUT = struct.Struct("<IIQQQQIIQQ")
 
 
 class ElfSectionType(IntEnum):
-    """Types of ELF sections that the check of an object file distinguishes."""
+    """Code of the type of an ELF section, as the check of an object file distinguishes them."""
 
     ELF_STRING_TABLE = 3
     ELF_ZERO_FILLED_MEMORY = 8  # memory for which the file contains no bytes
@@ -54,9 +54,7 @@ def describe_processor() -> tuple[str, str, str]:
 
 
 def describe_compilation() -> str:
-    """Return a text that identifies everything, except LLVM's input, on which object code
-    depends.
-    """
+    """Return a text that identifies all that object code depends on, except LLVM's input."""
     return repr(
         (llvm.llvm_version_info, describe_processor(), LLVM_OPTIMIZATION_LEVEL, LLVM_PASS_NAMES)
     )

@@ -65,19 +65,17 @@ def is_machine_code_available() -> bool:
 
 @functools.cache
 def _can_xla_call_machine_code() -> bool:
-    """Return whether XLA can call a small test program of machine code and gets the correct
-    result.
-    """
+    """Return whether XLA can call a small test program of machine code with a correct result."""
     increment_program = compile_lane_function(
         lambda x: x + 1.0, lambda x: x, "interface check", None
     )
     with jax.ensure_compile_time_eval():
         try:
-            test_results = jax.jit(increment_program)(jnp.arange(3.0))
+            test_program_results = jax.jit(increment_program)(jnp.arange(3.0))
         except Exception as call_error:  # XLA and LLVM may raise any exception.
             fallback.disable_machine_code(call_error)
             return False
-        if test_results.tolist() != [1.0, 2.0, 3.0]:
+        if test_program_results.tolist() != [1.0, 2.0, 3.0]:
             fallback.disable_machine_code("XLA calls it in another way")
             return False
     return True
@@ -229,7 +227,7 @@ def compile_lane_function(
 
 
 def _reraise_on_tested_release(compilation_error: Exception) -> None:
-    """Raise the error on a tested release of JAX; on any other release, use XLA from now on."""
+    """Raise the error on a tested release of JAX. On any other release, disable machine code."""
     if fallback.is_tested_jax_release():
         raise compilation_error
     fallback.disable_machine_code(compilation_error)

@@ -1,6 +1,4 @@
-"""Rules of primitives that reduce arrays along axes. Over lanes only `any` and `all` are
-possible.
-"""
+"""Rules of primitives that reduce arrays along axes. Only `any` and `all` reduce over lanes."""
 
 import functools
 import math
@@ -40,14 +38,14 @@ def emit_cumulative_sum(
         array_emitter.value_emitter, "add", {}, result_dtype, result_dtype, (x, y)
     )
     partial_sums = np.empty_like(summed_terms)
-    for position, i in enumerate(summation_order):
+    for summation_position, i in enumerate(summation_order):
         sum_and_term_pairs = zip(
-            partial_sums[summation_order[position - 1], ...].ravel(),
+            partial_sums[summation_order[summation_position - 1], ...].ravel(),
             summed_terms[i, ...].ravel(),
             strict=True,
         )
         partial_sum_entries = [
-            emit_sum(*sum_and_term) if position else sum_and_term[1]
+            emit_sum(*sum_and_term) if summation_position else sum_and_term[1]
             for sum_and_term in sum_and_term_pairs
         ]
         partial_sums[i, ...] = make_entry_array(summed_terms.shape[1:], partial_sum_entries)

@@ -1,5 +1,5 @@
-"""The table `PRIMITIVE_RULES`, which contains the lowering rule of each JAX primitive. A new
-primitive needs one more entry.
+"""Table `PRIMITIVE_RULES` of the lowering rules of JAX primitives. A new primitive needs one more
+entry.
 """
 
 import math

@@ -109,8 +109,8 @@ class ValueEmitter:
         return self.emit_value_once(("spread", id(scalar_value)), emit_equal_lanes)
 
     def emit_value_once(self, value_key: tuple, create_llvm_value: Callable[[], Any]) -> Any:
-        """Return the value stored under `value_key`. On the first call `create_llvm_value` creates
-        the value.
+        """Return the value stored under `value_key`, which `create_llvm_value` creates on the first
+        call.
 
         An object that a key identifies by `id` must live as long as this emitter.
         """
@@ -142,7 +142,7 @@ class ValueEmitter:
 
     @contextlib.contextmanager
     def discard_inner_values(self) -> Iterator[None]:
-        """Return a context. At its end, the values computed within the context are discarded."""
+        """Return a context at whose end the values computed within it are discarded."""
         outer_keys, self.recent_value_keys = self.recent_value_keys, []
         yield
         for key in self.recent_value_keys:
