@@ -34,7 +34,9 @@ def with_damping(
     s = params.symbols()
     power = lambda y: dynamics.compute_damping_power(s, phase.unpack_motion(y))
     field = lambda y: jnp.append(phase.vector_field(y[:-1]), power(y[:-1]))
-    watched = MonitoredFunctions(lambda y: phase.guards.evaluate(y[:-1]), phase.guards.n_guards)
+    watched = MonitoredFunctions(
+        lambda y: phase.guards.evaluate_monitored(y[:-1]), phase.guards.n_guards
+    )
     zero = 0.0 * start[:1]
     end = integrate_phase(
         field, watched, jnp.concatenate([start, zero]), jnp.asarray(True), options

@@ -20,7 +20,7 @@ import vrw_jax as vrw
 from experiments.shared.command import make_parser, parse_and_start_jax
 from experiments.shared.tables import FIGURES, read_column, read_table, write_table
 from vrw_jax import figures as plots
-from vrw_jax.contact import foot_heights, leg_directions, unpack_state
+from vrw_jax.contact import compute_foot_heights, compute_leg_directions, unpack_state
 
 NO_SLIP, FINITE_FRICTION = math.inf, 0.7
 GAIT_RANGE = (8.0, 215.0)
@@ -156,8 +156,8 @@ def draw(chosen: list[int], labels: tuple, friction: tuple, damping: tuple, x: n
         s, force_axis, height_axis = params.symbols(), axes[0, column], axes[1, column]
         heights = jax.vmap(
             jax.vmap(
-                lambda y, s=s: foot_heights(
-                    unpack_state(y)[0], leg_directions(s, unpack_state(y)[0].theta)
+                lambda y, s=s: compute_foot_heights(
+                    unpack_state(y)[0], compute_leg_directions(s, unpack_state(y)[0].theta)
                 )
             )
         )(trace.state)

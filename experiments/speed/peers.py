@@ -323,11 +323,12 @@ class ByHand:
     def __init__(self, solver):
         tableau, created = load_explicit_tableau(solver), Path(tempfile.mkdtemp())
         parts = {
-            "PLACES": tableau.nodes, "ONCE": tableau.matrix, "TWICE": tableau.matrix_squared,
-            "ERROR_ONCE": tableau.b_error, "ERROR_TWICE": tableau.b_error_position,
+            "PLACES": tableau.stage_nodes, "ONCE": tableau.stage_matrix,
+            "TWICE": tableau.squared_stage_matrix,
+            "ERROR_ONCE": tableau.rate_error_weights, "ERROR_TWICE": tableau.position_error_weights,
         }  # fmt: skip
-        lines = [f"static constexpr int S = {len(tableau.nodes)};"]
-        lines.append(f"static constexpr float EXPONENT = {-0.5 / tableau.order};")
+        lines = [f"static constexpr int S = {len(tableau.stage_nodes)};"]
+        lines.append(f"static constexpr float EXPONENT = {-0.5 / tableau.convergence_order};")
         for name, values in parts.items():
             shape = "".join(f"[{n}]" for n in values.shape)
             numbers = str(values.tolist()).replace("[", "{").replace("]", "}")

@@ -14,10 +14,10 @@ from jaxtyping import Array
 
 from vrw_jax import simd
 from vrw_jax.contact import UnilateralWheel
-from vrw_jax.contact.batch_integrator import N_ACCUMULATOR_ROWS, IntervalPoint, motion_from_point
+from vrw_jax.contact.batch_integrator import N_ACCUMULATOR_ROWS, IntervalPoint, unpack_motion
 from vrw_jax.contact.contact_state import ContactState
-from vrw_jax.contact.mechanics import kinetic_energy, potential_energy
-from vrw_jax.contact.section import embed_section_state, full_section_size
+from vrw_jax.contact.mechanics import compute_kinetic_energy, compute_potential_energy
+from vrw_jax.contact.section import compute_full_section_size, embed_section_state
 from vrw_jax.contact.single_step import sample_interval
 from vrw_jax.contact.walk_kernel import BatchWalkSettings, init_lane_states, process_and_integrate
 from vrw_jax.integrator import load_explicit_tableau, sample_batch_phase
@@ -151,7 +151,7 @@ def _on_ground(wheel: Callable[[Array], WheelParams], n_legs: int) -> dict[str, 
     The state of the walk is a column of numbers, which include flags and codes.
     """
     model, tableau = UnilateralWheel(), load_explicit_tableau(SOLVER)
-    size, n = full_section_size(n_legs), 3 + n_legs
+    size, n = compute_full_section_size(n_legs), 3 + n_legs
 
     def on(tolerance: Array) -> BatchWalkSettings:
         rules = (
@@ -194,16 +194,16 @@ def _on_ground(wheel: Callable[[Array], WheelParams], n_legs: int) -> dict[str, 
         past, after = process_and_integrate(
             walk, columns(parameters, friction), _rebuild_tree(lane, form), waits_for_events=True
         )
-        (q, v, _), stance = past.interval.point, past.interval.contact_state
-        codes = [stance.contact_modes.astype(float), stance.locked.astype(float)]
-        step = walk.compute_result(after, None)
+        (q, v, _), stance = past.interval_state.interval_point, past.interval_state.contact_state
+        codes = [stance.contact_modes.astype(float), stance.is_locked.astype(float)]
+        step = walk.compute_step_result(after, None)
         result = (
             step.durations, step.step_length, step.post_impact, step.slip, step.energy_impacts,
             step.energy_damping, step.energy_friction,
             *(getattr(step.margins, name) for name in STOPPER_MARGIN_MEASURES),
         )  # fmt: skip
-        stretch = jnp.concatenate([q, v, *codes, after.interval.time[None]])
-        return _flat(after), stretch, _flat((step.section_state, *result)), after.outcome
+        stretch = jnp.concatenate([q, v, *codes, after.interval_state.time_since_event[None]])
+        return _flat(after), stretch, _flat((step.section_state, *result)), after.walk_outcome
 
     def between(tolerance: Array, friction: Array, parameters: Array, stretch: Array) -> tuple:
         """Return samples of the motion between two events.
@@ -217,14 +217,19 @@ def _on_ground(wheel: Callable[[Array], WheelParams], n_legs: int) -> dict[str, 
         stance = ContactState(contact, locked, none, none, none)
         flow = walk.make_dynamics(columns(parameters, friction), stance)
         blank = jnp.zeros((N_ACCUMULATOR_ROWS, *q.shape[1:]), q.dtype)
-        motion = motion_from_point(IntervalPoint(q, v, q))
-        rows = sample_interval(flow, motion, blank, stretch[-1], SAMPLES, walk.options, tableau)
+        motion = unpack_motion(IntervalPoint(q, v, q))
+        rows = sample_interval(
+            flow, motion, blank, stretch[-1], SAMPLES, walk.step_options, tableau
+        )
 
         def row(current_value: Array) -> Array:
-            motion = motion_from_point(
+            motion = unpack_motion(
                 IntervalPoint(current_value[:n], current_value[n : 2 * n], current_value)
             )
-            energies = kinetic_energy(flow.s, motion), *potential_energy(flow.s, motion)
+            energies = (
+                compute_kinetic_energy(flow.s, motion),
+                *compute_potential_energy(flow.s, motion),
+            )
             return jnp.concatenate(
                 [
                     current_value[:n],
@@ -248,7 +253,7 @@ def ground_rows(n_legs: int) -> dict[str, int]:
     onward = _on_ground(lambda p: make_wheel_from_parameters(tuple(p), n_legs), n_legs)[
         "ground_onward"
     ]
-    return {"section": full_section_size(n_legs), "lane": onward.section}
+    return {"section": compute_full_section_size(n_legs), "lane": onward.section}
 
 
 def _size(form: Any) -> int:

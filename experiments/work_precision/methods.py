@@ -51,7 +51,7 @@ class Method(NamedTuple):
 def stages(solver: str) -> int:
     """Return the evaluations per tried step, 0 for implicit solvers, which report none."""
     tableau = load_explicit_tableau(solver)
-    return 0 if tableau is None else len(tableau.nodes) - 1
+    return 0 if tableau is None else len(tableau.stage_nodes) - 1
 
 
 def by_library(engine: str, solver: str, dtype: type = np.float64) -> Callable:
@@ -135,7 +135,8 @@ def by_diffeqsolve(solver: diffrax.AbstractAdaptiveSolver, fixed: bool) -> Calla
             solver, 0.0, 20.0, setting if fixed else 5e-3, y,
             stepsize_controller=controller,
             event=diffrax.Event(
-                lambda t, y, args, **_: phase.guards.values(y)[0], root_finder, direction=False
+                lambda t, y, args, **_: phase.guards.evaluate_monitored(y)[0],
+                root_finder, direction=False,
             ),
             max_steps=20_000, throw=False,
         )  # fmt: skip

@@ -24,7 +24,7 @@ from vrw_jax.integrator.tableaus import (
     StageState,
     compute_real_stability_limit,
     load_explicit_tableau,
-    rk_step,
+    take_rk_step,
 )
 from vrw_jax.numerics import batch_sizes
 from vrw_jax.numerics.trigonometry import compute_sine_cosine
@@ -264,7 +264,7 @@ def test_a_solver_step_has_the_order_of_its_tableau(name, order):
         q, v = (jnp.ones(1),), (jnp.full(1, 0.5),)
         place = StageState(q, v, evaluate(q, v))
         for _ in range(n):
-            place = rk_step(tableau, evaluate, place, jnp.full(1, 1.0 / n)).end
+            place = take_rk_step(tableau, evaluate, place, jnp.full(1, 1.0 / n)).end_state
         return np.concatenate([*place.q, *place.v])
 
     exact = end(160)
@@ -461,7 +461,7 @@ def test_for_stiff_wheels_the_solver_choice_saves_work_without_losing_accuracy()
     evaluations = lambda result: (
         np.asarray(result.solver_steps)
         * [
-            len(load_explicit_tableau(result.solver_names[i]).nodes) - 1
+            len(load_explicit_tableau(result.solver_names[i]).stage_nodes) - 1
             for i in result.solver_index
         ]
     )

@@ -11,17 +11,17 @@ from reference_code import moreau_jean
 import vrw_jax as vrw
 from vrw_jax.contact.contact_modes import (
     ALL_MODES_MASK,
-    AllowedModes,
+    AllowedContactModes,
     ContactMode,
-    SignTolerances,
+    ContactSignTolerances,
     choose_combination,
     solve_combination,
 )
 from vrw_jax.contact.mechanics import (
     WheelMotion,
-    find_slots,
-    free_acceleration,
-    free_velocity,
+    compute_free_acceleration,
+    compute_free_velocity,
+    find_contact_slots,
     make_inverse_inertia,
 )
 
@@ -115,25 +115,32 @@ def select_contacts(q, v, at_stopper, locked, friction, moving):
     """Return the library's choice: modes, held stoppers, rates of hub and slots' lengths,
     solutions."""
     s = vrw.WheelParams().symbols()
-    slots = find_slots(jnp.arange(8) < 2)
+    slots = find_contact_slots(jnp.arange(8) < 2)
     motion = WheelMotion(*q[:3], *v[:3], q[3:], v[3:])
     resting = motion._replace(dL=jnp.where(locked & moving, 0.0, motion.dL))
     hub = make_inverse_inertia(s, motion, slots, locked)
-    levels = free_acceleration(s, resting, slots, hub), free_velocity(s, motion, slots, hub)
+    levels = (
+        compute_free_acceleration(s, resting, slots, hub),
+        compute_free_velocity(s, motion, slots, hub),
+    )
     free = jax.tree.map(lambda a, b: jnp.where(moving, a, b), *levels)
     none = jnp.zeros(2, jnp.int32)
-    allowed = AllowedModes(
-        allowed_modes=none + ALL_MODES_MASK,
+    allowed = AllowedContactModes(
+        allowed_slot_modes=none + ALL_MODES_MASK,
         can_hold_stopper=at_stopper,
         has_fixed_mode=none > 0,
-        untested_modes=none,
-        is_open_untested=~at_stopper,
+        untested_slot_modes=none,
+        is_open_stopper_untested=~at_stopper,
     )
-    small = SignTolerances(jnp.asarray(1e-12), jnp.asarray(1e-12))  # no case is near a border
+    small = ContactSignTolerances(
+        jnp.asarray(1e-12), jnp.asarray(1e-12)
+    )  # no case is near a border
     choice = choose_combination(s, hub, free, allowed, friction, small, True)
-    measured = solve_combination(s, hub, free, choice.slot_modes, choice.is_held, friction)
-    rates = jnp.stack([*measured.hub_vector, *measured.length_motion])
-    return choice.slot_modes, choice.is_held, rates, choice.n_solutions
+    measured = solve_combination(
+        s, hub, free, choice.slot_modes, choice.is_stopper_holding, friction
+    )
+    rates = jnp.stack([*measured.hub_motion, *measured.length_motion])
+    return choice.slot_modes, choice.is_stopper_holding, rates, choice.n_solutions
 
 
 @pytest.mark.parametrize("moving", [False, True], ids=["impulses", "forces"])

@@ -10,12 +10,12 @@ from scipy.integrate import solve_ivp
 
 import vrw_jax as vrw
 from vrw_jax.contact.batch_integrator import (
-    INTERVAL_OPTIONS,
+    EVENT_SEARCH_OPTIONS,
     EventBracket,
     _find_earliest_root,
     _find_earliest_secant_root,
 )
-from vrw_jax.contact.mechanics import leg_directions
+from vrw_jax.contact.mechanics import compute_leg_directions
 
 N_WHEELS, N_STEPS = 128, 60
 HIGH_FRICTION, INFINITE_FRICTION = np.linspace(1.0, 3.0, N_WHEELS), np.full(N_WHEELS, math.inf)
@@ -87,7 +87,8 @@ def test_the_painleve_paradox_occurs_at_the_singularity_of_another_code():
         assert int(step.outcome) == vrw.Outcome.PAINLEVE_PARADOX
         # It ends where no more is left than `march.SINGULAR` says, of what falls by 0.8 a second.
         left_over = (
-            INTERVAL_OPTIONS.painleve_atol + INTERVAL_OPTIONS.painleve_rtol_factor * tolerance
+            EVENT_SEARCH_OPTIONS.painleve_atol
+            + EVENT_SEARCH_OPTIONS.painleve_rtol_factor * tolerance
         ) / 0.8
         assert abs(step.durations.sum() - (time - 1e-6 / slope)) < 1.1 * left_over
 
@@ -95,7 +96,10 @@ def test_the_painleve_paradox_occurs_at_the_singularity_of_another_code():
 def test_leg_directions_are_accurate_after_any_number_of_turns():
     s = vrw.WheelParams().symbols()
     for theta in np.linspace(-20.0, 20.0, 41):
-        legs, angles = leg_directions(s, jnp.asarray(theta)), theta + s.alpha * np.arange(s.n)
+        legs, angles = (
+            compute_leg_directions(s, jnp.asarray(theta)),
+            theta + s.alpha * np.arange(s.n),
+        )
         np.testing.assert_allclose(legs.sin, np.sin(angles), atol=1e-14)
         np.testing.assert_allclose(legs.cos, np.cos(angles), atol=1e-14)
 

@@ -12,7 +12,7 @@ import vrw_jax as vrw
 from vrw_jax.contact.contact_modes import ContactMode
 from vrw_jax.contact.contact_state import ContactState, make_guard_layout
 from vrw_jax.contact.impacts import ContactLaw, classify_event, resolve_event
-from vrw_jax.contact.mechanics import WheelMotion, kinetic_energy, potential_energy
+from vrw_jax.contact.mechanics import WheelMotion, compute_kinetic_energy, compute_potential_energy
 from vrw_jax.contact.section import unpack_section_state
 
 START = (0.1, 1.6, -0.1)
@@ -73,7 +73,7 @@ def test_a_stopper_impact_releases_legs_whose_stoppers_would_have_to_pull(stoppe
     np.testing.assert_allclose(joined_values, expected, atol=1e-12)
     thrown_values = np.asarray(solution.dL) < -1e-3
     assert thrown_values.any()
-    assert not np.any(thrown_values & np.asarray(change.contact_state.locked))
+    assert not np.any(thrown_values & np.asarray(change.contact_state.is_locked))
     assert float(change.stopper_impulse) >= -1e-12
     assert float(change.energy_lost) > 0.0
 
@@ -89,7 +89,9 @@ def test_at_a_high_rest_speed_one_sided_stoppers_act_as_two_sided_ones(stopper_i
 def test_no_stopper_pulls_and_energy_losses_are_reported_by_cause(friction, damping):
     params, wheel = vrw.WheelParams(damping=damping), make_model(friction)
     s = params.symbols()
-    total = lambda motion: float(kinetic_energy(s, motion) + sum(potential_energy(s, motion)))
+    total = lambda motion: float(
+        compute_kinetic_energy(s, motion) + sum(compute_potential_energy(s, motion))
+    )
     x = wheel.embed_section(params, jnp.asarray(START))
     for _ in range(3):
         step = vrw.step(params, x, model=wheel, options=TIGHT_OPTIONS)

@@ -10,7 +10,7 @@ import vrw_jax as vrw
 from vrw_jax.contact.contact_modes import ContactMode
 from vrw_jax.contact.contact_state import ContactState, make_guard_layout
 from vrw_jax.contact.impacts import ContactLaw, classify_event, project_motion, resolve_event
-from vrw_jax.contact.mechanics import WheelMotion, kinetic_energy, leg_directions
+from vrw_jax.contact.mechanics import WheelMotion, compute_kinetic_energy, compute_leg_directions
 
 N_IMPACTS, RNG_SEED = 400, 3
 START = (0.1, 1.6, -0.1)
@@ -35,9 +35,9 @@ def random_impacts():
         motion = project_motion(s, motion, stance.contact_modes, locked)
         law = ContactLaw(s, friction, False, False, jnp.asarray(1e-6), restitution)
         change = resolve_event(law, motion, stance, event)
-        legs = leg_directions(s, theta)
+        legs = compute_leg_directions(s, theta)
         speed = lambda at: (at.vz - at.dL * legs.cos + at.L * at.dtheta * legs.sin)[0]
-        energies = kinetic_energy(s, motion), kinetic_energy(s, change.motion)
+        energies = compute_kinetic_energy(s, motion), compute_kinetic_energy(s, change.motion)
         within = jnp.max(motion.L) <= s.L0  # no leg is longer than its stopper lets it be
         return speed(motion), speed(change.motion), *energies, within & (change.n_solutions > 0)
 

@@ -14,24 +14,24 @@ from scipy.optimize import brentq
 import vrw_jax as vrw
 from vrw_jax.contact.contact_modes import ContactMode
 from vrw_jax.contact.contact_state import (
-    Accumulators,
     ContactState,
-    airborne_stopper_force,
+    LossAccumulators,
+    compute_airborne_stopper_force,
     compute_forces,
     compute_guard_values,
+    evaluate_vector_field,
     make_guard_layout,
     make_mode_dynamics,
     pack_state,
     unpack_state,
-    vector_field,
 )
 from vrw_jax.contact.impacts import ContactLaw, classify_event, resolve_event
 from vrw_jax.contact.mechanics import (
     WheelMotion,
-    foot_heights,
-    kinetic_energy,
-    leg_directions,
-    potential_energy,
+    compute_foot_heights,
+    compute_kinetic_energy,
+    compute_leg_directions,
+    compute_potential_energy,
 )
 from vrw_jax.contact.section import unpack_section_state
 from vrw_jax.hybrid.minima import MonitoredFunctions
@@ -78,7 +78,9 @@ def iterate_phases(params, trace):
 
 def compute_total_energy(s, motion):
     return np.asarray(
-        jax.vmap(lambda m: kinetic_energy(s, m) + sum(potential_energy(s, m)))(motion)
+        jax.vmap(lambda m: compute_kinetic_energy(s, m) + sum(compute_potential_energy(s, m)))(
+            motion
+        )
     )
 
 
@@ -105,8 +107,8 @@ def test_feet_stay_above_the_slope_and_contacts_only_push(scene_traces):
     for params, _, trace in scene_traces.values():
         s = params.symbols()
         for k, motion, _ in iterate_phases(params, trace):
-            legs = jax.vmap(leg_directions, (None, 0))(s, motion.theta)
-            heights = jax.vmap(foot_heights)(motion, legs)
+            legs = jax.vmap(compute_leg_directions, (None, 0))(s, motion.theta)
+            heights = jax.vmap(compute_foot_heights)(motion, legs)
             assert float(jnp.min(heights)) >= -1e-9
             assert float(jnp.min(trace.normal[k])) >= -1e-9
 
@@ -114,7 +116,7 @@ def test_feet_stay_above_the_slope_and_contacts_only_push(scene_traces):
 def test_friction_lies_in_coulombs_cone_and_opposes_slip(scene_traces):
     for params, friction, trace in scene_traces.values():
         for k, motion, _ in iterate_phases(params, trace):
-            legs = jax.vmap(leg_directions, (None, 0))(params.symbols(), motion.theta)
+            legs = jax.vmap(compute_leg_directions, (None, 0))(params.symbols(), motion.theta)
             speed = motion.vx[:, None] - motion.dL * legs.sin
             speed = speed - motion.L * motion.dtheta[:, None] * legs.cos
             tangential, normal = trace.tangential[k], trace.normal[k]
@@ -146,7 +148,7 @@ def test_energy_lost_in_a_step_is_reported_by_cause(scene_traces):
     s = params.symbols()
     wheel = vrw.UnilateralWheel(friction=friction)
     before, _ = unpack_section_state(s, wheel.embed_section(params, jnp.asarray(START)))
-    begin = float(kinetic_energy(s, before) + sum(potential_energy(s, before)))
+    begin = float(compute_kinetic_energy(s, before) + sum(compute_potential_energy(s, before)))
     *_, (_, motion, _) = iterate_phases(params, trace)
     step = compute_step(friction)
     lost_values = step.energy_impacts + step.energy_damping + step.energy_friction
@@ -238,7 +240,11 @@ def test_at_friction_below_one_every_event_has_exactly_one_solution(friction):
 
 def make_contact_law(s, friction):
     return ContactLaw(
-        s, jnp.asarray(friction), is_one_sided=False, counts_solutions=True, rest_speed=1e-6
+        s,
+        jnp.asarray(friction),
+        has_one_sided_stoppers=False,
+        counts_all_solutions=True,
+        rest_speed=1e-6,
     )
 
 
@@ -266,13 +272,15 @@ def test_a_wheel_on_two_stiff_legs_slides_like_a_block():
         False,
         make_contact_state((ContactMode.SLIP_DOWN, ContactMode.SLIP_DOWN), [True] * 8),
     )
-    solution = compute_forces(flow, make_resting_motion(-math.pi / 8, vx=jnp.asarray(0.1))).solution
+    solution = compute_forces(
+        flow, make_resting_motion(-math.pi / 8, vx=jnp.asarray(0.1))
+    ).force_solution
     g, slope = 9.81, 0.30
     tangential_part = g * (math.sin(slope) - friction * math.cos(slope))
     np.testing.assert_allclose(
-        jnp.stack(solution.hub_vector), [tangential_part, 0.0, 0.0], atol=1e-12
+        jnp.stack(solution.hub_motion), [tangential_part, 0.0, 0.0], atol=1e-12
     )
-    assert abs(float(sum(solution.normal)) - 18.0 * g * math.cos(slope)) < 1e-10
+    assert abs(float(sum(solution.normal_forces)) - 18.0 * g * math.cos(slope)) < 1e-10
 
 
 def test_a_wheel_in_the_air_falls_freely():
@@ -286,9 +294,13 @@ def test_a_wheel_in_the_air_falls_freely():
     motion = make_resting_motion(-0.3, z=jnp.asarray(2.0), dtheta=jnp.asarray(3.0))
     current_value = compute_forces(flow, motion)
     expected = [9.81 * math.sin(0.3), -9.81 * math.cos(0.3), 0.0]
-    np.testing.assert_allclose(jnp.stack(current_value.solution.hub_vector), expected, atol=1e-12)
+    np.testing.assert_allclose(
+        jnp.stack(current_value.force_solution.hub_motion), expected, atol=1e-12
+    )
     # Preload and spin press each leg on its stopper: 500 * 0.02 + 0.7 * 3^2 N.
-    np.testing.assert_allclose(airborne_stopper_force(flow, current_value), 10.0 + 6.3, atol=1e-12)
+    np.testing.assert_allclose(
+        compute_airborne_stopper_force(flow, current_value), 10.0 + 6.3, atol=1e-12
+    )
 
 
 def test_a_vertical_leg_lands_with_its_own_mass_alone():
@@ -302,7 +314,7 @@ def test_a_vertical_leg_lands_with_its_own_mass_alone():
     assert abs(float(change.energy_lost) - 0.5 * speed**2) < 1e-12
     assert abs(float(change.motion.vz) + speed) < 1e-12
     assert abs(float(change.motion.dL[0]) + speed) < 1e-12
-    assert not bool(change.contact_state.locked[0])
+    assert not bool(change.contact_state.is_locked[0])
 
 
 def test_a_single_leg_bounces_as_a_damped_oscillator():
@@ -332,11 +344,11 @@ def test_a_single_leg_bounces_as_a_damped_oscillator():
         False,
         make_contact_state((ContactMode.STICK, ContactMode.OFF), [False] + [True] * 7),
     )
-    lift = make_guard_layout(8, False).liftoff
+    lift = make_guard_layout(8, False).first_liftoff_guard
     watched = MonitoredFunctions(lambda y: compute_guard_values(flow, y)[lift : lift + 1], 1)
-    start = pack_state(motion, Accumulators(zero, zero, zero, zero))
+    start = pack_state(motion, LossAccumulators(zero, zero, zero, zero))
     end = integrate_phase(
-        partial(vector_field, flow), watched, start, jnp.asarray(True), TIGHT_OPTIONS
+        partial(evaluate_vector_field, flow), watched, start, jnp.asarray(True), TIGHT_OPTIONS
     )
     landed, tally = unpack_state(end.state)
     assert abs(float(end.duration) - time) < 1e-8

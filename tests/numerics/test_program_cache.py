@@ -23,7 +23,7 @@ from vrw_jax.hybrid import (
 from vrw_jax.hybrid.program_cache import (
     MAX_CACHED_PROGRAMS,
     _program_by_key,
-    call_compiled,
+    call_compiled_program,
     find_program,
 )
 
@@ -143,9 +143,9 @@ def test_a_program_for_another_shape_has_the_constants_of_its_own_functions():
     """The first function has another constant by then, and an equal one is traced for a vector."""
     scale, table = lambda static, x: static() * x, np.array([2.0])
     make_function = lambda own_table: lambda: own_table[0]
-    assert call_compiled(scale, make_function(table), 1.0) == 2.0
+    assert call_compiled_program(scale, make_function(table), 1.0) == 2.0
     table[0] = 3.0
-    scaled = call_compiled(scale, make_function(np.array([2.0])), jnp.ones(2))
+    scaled = call_compiled_program(scale, make_function(np.array([2.0])), jnp.ones(2))
     assert scaled.tolist() == [2.0, 2.0]
 
 

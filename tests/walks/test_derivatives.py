@@ -73,7 +73,7 @@ def test_the_saltation_formula_agrees(forward_jacobian):
     def through(phase, y, duration):
         ending = lambda y: (flow(phase.vector_field, y, duration),) * 2
         matrix, end = jax.jacfwd(ending, has_aux=True)(y)
-        gradient = jax.grad(lambda y: phase.guards.evaluate(y)[0])(end)
+        gradient = jax.grad(lambda y: phase.guards.evaluate_monitored(y)[0])(end)
         f = phase.vector_field(end)
         return end, matrix - jnp.outer(f, gradient @ matrix) / (gradient @ f)
 
@@ -92,7 +92,9 @@ def test_the_saltation_formula_agrees(forward_jacobian):
         first, second, third = flows(distance)
         with_distance = first._replace(
             vector_field=lambda y: jnp.append(flows(y[2])[0].vector_field(y[:2]), 0.0),
-            guards=first.guards._replace(evaluate=lambda y: flows(y[2])[0].guards.evaluate(y[:2])),
+            guards=first.guards._replace(
+                evaluate_monitored=lambda y: flows(y[2])[0].guards.evaluate_monitored(y[:2])
+            ),
         )
 
         def lifted(y):

@@ -10,7 +10,7 @@ from reference_code import complementarity, uneven_ground
 from reference_code.five_coordinates import TABLE_1
 
 import vrw_jax as vrw
-from vrw_jax.contact.mechanics import find_slots, slot_friction
+from vrw_jax.contact.mechanics import find_contact_slots, select_slot_friction
 from vrw_jax.contact.section import pack_section_state, unpack_section_state
 from vrw_jax.wheel import PARAMETER_NAMES
 
@@ -196,9 +196,12 @@ def test_each_foot_keeps_the_friction_of_its_landing():
     np.testing.assert_allclose(friction, FRICTIONS)
     np.testing.assert_allclose(others, (0.7, 0.7, 0.5, 0.9))
     np.testing.assert_allclose(tilt, (0.03, -0.06, 0.04, 0.0), atol=1e-15)
-    both_values, rear = find_slots(jnp.arange(8) < 2), find_slots(jnp.arange(8) == 1)
-    assert [float(x) for x in slot_friction((0.7, 0.5), both_values)] == [0.7, 0.5]
-    assert [float(x) for x in slot_friction((0.7, 0.5), rear)] == [0.5, 0.5]
+    both_values, rear = (
+        find_contact_slots(jnp.arange(8) < 2),
+        find_contact_slots(jnp.arange(8) == 1),
+    )
+    assert [float(x) for x in select_slot_friction((0.7, 0.5), both_values)] == [0.7, 0.5]
+    assert [float(x) for x in select_slot_friction((0.7, 0.5), rear)] == [0.5, 0.5]
 
 
 def test_a_landing_on_a_steeper_line_is_the_same_motion_in_another_frame():

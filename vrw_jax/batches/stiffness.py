@@ -104,4 +104,4 @@ def _get_stages_and_stability_limit(solver_name: str) -> tuple[int, float]:
     """
     solver_tableau = load_explicit_tableau(solver_name)
     assert solver_tableau is not None  # The caller has checked the solver.
-    return len(solver_tableau.nodes) - 1, compute_real_stability_limit(solver_tableau)
+    return len(solver_tableau.stage_nodes) - 1, compute_real_stability_limit(solver_tableau)

@@ -7,12 +7,12 @@ from vrw_jax.contact.batch_walks import embed_section_states, step_batch_with_ja
 from vrw_jax.contact.contact_modes import ContactMode
 from vrw_jax.contact.contact_state import PackedState, unpack_state
 from vrw_jax.contact.mechanics import (
-    foot_heights,
-    foot_positions,
-    kinetic_energy,
-    leg_directions,
-    potential_energy,
+    compute_foot_heights,
+    compute_foot_positions,
+    compute_kinetic_energy,
+    compute_leg_directions,
+    compute_potential_energy,
 )
 from vrw_jax.contact.section import LOCKED_CODE_OFFSET, FullState, embed_section_state
-from vrw_jax.contact.step_record import UnilateralStep, min_bounce_height
+from vrw_jax.contact.step_record import UnilateralStep, compute_min_bounce_height
 from vrw_jax.contact.unilateral_wheel import UnilateralTrajectory, UnilateralWheel

@@ -23,14 +23,19 @@ from vrw_jax.contact.contact_state import (
     ContactQuantities,
     ContactState,
     ModeDynamics,
-    accumulator_rates,
     collect_contact_quantities,
+    compute_accumulator_rates,
     compute_forces,
     compute_guard_scales,
     compute_state_units,
     evaluate_guards,
 )
-from vrw_jax.contact.mechanics import WheelMotion, leg_directions, opaque_one, prevent_fusion
+from vrw_jax.contact.mechanics import (
+    WheelMotion,
+    compute_leg_directions,
+    make_opaque_one,
+    prevent_fusion,
+)
 from vrw_jax.hybrid import GUARD_ROUNDOFF_IN_EPS
 from vrw_jax.integrator import (
     ButcherTableau,
@@ -41,7 +46,7 @@ from vrw_jax.integrator import (
 from vrw_jax.numerics import StepOptions, select_tree_leaves
 from vrw_jax.wheel import Outcome, Symbols, compute_wheel_units
 
-N_CONTACT_ROWS = 9
+N_CONTACT_QUANTITY_ROWS = 9
 """Number of dynamics rows that hold the contact quantities of the guards. They follow the
 accelerations. Stopper forces of legs in the air follow if stoppers are one-sided, then
 `N_ACCUMULATOR_ROWS` rows if these are requested."""
@@ -57,10 +62,10 @@ class LaneStatus(IntEnum):
 
 
 @dataclass(frozen=True)
-class IntervalOptions:
+class EventSearchOptions:
     """Options of the search for events with unilateral contact, and of the loop over lanes."""
 
-    max_wait_attempts: int = 8
+    max_attempts_with_waiting_lane: int = 8
     """Number of attempted solver steps after which a lane at an event ends the loop for all lanes.
     """
     painleve_atol: float = 1e-8
@@ -77,7 +82,7 @@ class IntervalOptions:
     if a guard is below zero for a short time."""
     min_iterations_of_initiating_guard: int = 15
     """Number of event iterations after which an initiating guard can be the event."""
-    max_roundoff_fall_time: float = 1e-3
+    max_roundoff_fall_duration: float = 1e-3
     """Time in which a guard that counts as falling falls by its own round-off. The value is in the
     wheel's unit of time: seconds for a wheel of Table 1's size."""
     event_time_tolerance_factor: float = 30.0
@@ -87,11 +92,14 @@ class IntervalOptions:
     correction."""
 
 
-INTERVAL_OPTIONS = IntervalOptions()
+EVENT_SEARCH_OPTIONS = EventSearchOptions()
 
 
 class IntervalPoint(NamedTuple):
-    """Coordinates (hub x, z, theta, lengths), rates and dynamics rows of all lanes at one time."""
+    """Coordinates, rates and dynamics rows of all lanes at one time.
+
+    The coordinates are the hub position x and z, the angle theta and the leg lengths.
+    """
 
     q: Array  # (3 + n, lanes)
     v: Array
@@ -99,45 +107,60 @@ class IntervalPoint(NamedTuple):
 
 
 class EventBracket(NamedTuple):
-    """Bracket of the earliest event inside a step, and the last attempt of the search."""
+    """Bracket of the earliest event inside a solver step, and the last attempt of the search."""
 
-    is_active: Array
-    is_crossing: Array  # whether a guard crosses zero in the bracket, (guards, lanes)
-    low_h: Array  # bracket of the event, s from the start of the step
-    high_h: Array
+    is_search_active: Array
+    is_guard_crossing: Array  # whether a guard crosses zero in the bracket, (guards, lanes)
+    low_step_size: Array  # bracket of the event, s from the start of the step
+    high_step_size: Array
     time_tolerance: Array  # s
     n_iterations: Array
-    previous_h: Array  # size of the previous attempt, s
+    previous_step_size: Array  # size of the previous attempt, s
     guard_values: Array  # at the end of the previous attempt, (guards, lanes)
 
 
 class IntervalState(NamedTuple):
-    """State of all lanes between two of their events."""
+    """State of all lanes in the interval between two events of each lane."""
 
-    point: IntervalPoint
+    interval_point: IntervalPoint
     contact_state: ContactState
     guard_values: Array  # at the point, (guards, lanes)
     guard_offset: Array  # initial value of an initiating guard, minus round-off; else 0
     # integrals since the last event, (N_ACCUMULATOR_ROWS, lanes)
     interval_accumulators: Array | None
     h: Array  # of the next attempt, s
-    time: Array  # since the last event, s
+    time_since_event: Array  # since the last event, s
     event_bracket: EventBracket
-    status: Array  # `LaneStatus` or `Outcome`
-    triggered_guard: Array  # index of the guard that has triggered
+    lane_status: Array  # `LaneStatus` or `Outcome`
+    triggered_guard_index: Array  # index of the guard that has triggered
     n_solver_steps: Array  # number of attempts since the last event
 
 
-def motion_from_point(point: IntervalPoint) -> WheelMotion:
-    """Return the motion at a point of an interval."""
-    x, z, theta, L = point.q[0], point.q[1], point.q[2], point.q[3:]
-    return WheelMotion(x, z, theta, point.v[0], point.v[1], point.v[2], L, point.v[3:])
+def unpack_motion(interval_point: IntervalPoint) -> WheelMotion:
+    """Return coordinates and rates of the wheel at a point of an interval."""
+    x = interval_point.q[0]
+    z = interval_point.q[1]
+    theta = interval_point.q[2]
+    L = interval_point.q[3:]
+    return WheelMotion(
+        x,
+        z,
+        theta,
+        interval_point.v[0],
+        interval_point.v[1],
+        interval_point.v[2],
+        L,
+        interval_point.v[3:],
+    )
 
 
-def make_point(dynamics: ModeDynamics, motion: WheelMotion) -> IntervalPoint:
-    """Return the point of a motion, with its dynamics rows: the inverse of `motion_from_point`."""
+def make_interval_point(mode_dynamics: ModeDynamics, motion: WheelMotion) -> IntervalPoint:
+    """Return the interval point of a motion, with its dynamics rows.
+
+    This is the inverse of `unpack_motion`.
+    """
     q, v = pack_coordinates(motion)
-    return IntervalPoint(q, v, evaluate_dynamics(dynamics, q, v))
+    return IntervalPoint(q, v, evaluate_dynamics(mode_dynamics, q, v))
 
 
 def pack_coordinates(motion: WheelMotion) -> tuple[Array, Array]:
@@ -146,82 +169,109 @@ def pack_coordinates(motion: WheelMotion) -> tuple[Array, Array]:
     return q, jnp.concatenate([jnp.stack([motion.vx, motion.vz, motion.dtheta]), motion.dL])
 
 
-def evaluate_dynamics(dynamics: ModeDynamics, q: Array, v: Array) -> Array:
+def evaluate_dynamics(mode_dynamics: ModeDynamics, q: Array, v: Array) -> Array:
     """Return the dynamics rows: accelerations, contact quantities, and accumulator rates if
     requested.
 
     The axes are (rows, lanes). Leg directions are not among the contact quantities.
     """
-    motion = motion_from_point(IntervalPoint(q, v, q))
-    forces = compute_forces(dynamics, motion)
-    quantities = collect_contact_quantities(dynamics, forces)
+    motion = unpack_motion(IntervalPoint(q, v, q))
+    contact_forces = compute_forces(mode_dynamics, motion)
+    contact_quantities = collect_contact_quantities(mode_dynamics, contact_forces)
     contact_rows = [
-        *quantities.normal,
-        *quantities.tangential,
-        *quantities.stopper,
-        *quantities.slip_speed,
-        quantities.painleve_determinant,
+        *contact_quantities.normal_forces,
+        *contact_quantities.tangential_forces,
+        *contact_quantities.stopper_forces,
+        *contact_quantities.slip_speeds,
+        contact_quantities.painleve_determinant,
     ]
-    optional_rows = [] if quantities.airborne_stopper is None else [quantities.airborne_stopper]
-    if dynamics.has_accumulators:
-        accumulators = accumulator_rates(dynamics, motion, forces)
+    optional_dynamics_rows = (
+        []
+        if contact_quantities.airborne_stopper_forces is None
+        else [contact_quantities.airborne_stopper_forces]
+    )
+    if mode_dynamics.has_accumulators:
+        accumulators = compute_accumulator_rates(mode_dynamics, motion, contact_forces)
         accumulator_rows = (
             accumulators.damping_loss,
             accumulators.friction_loss,
             accumulators.slip_length,
         )
-        optional_rows.append(jnp.stack(prevent_fusion(accumulator_rows, opaque_one(motion))))
+        optional_dynamics_rows.append(
+            jnp.stack(prevent_fusion(accumulator_rows, make_opaque_one(motion)))
+        )
     return jnp.concatenate(
         [
-            jnp.stack(forces.solution.hub_vector),
-            forces.solution.length_motion,
+            jnp.stack(contact_forces.force_solution.hub_motion),
+            contact_forces.force_solution.length_motion,
             jnp.stack(contact_rows),
-            *optional_rows,
+            *optional_dynamics_rows,
         ]
     )
 
 
-def evaluate_guards_at_point(dynamics: ModeDynamics, point: IntervalPoint) -> Array:
-    """Return all guards in the order of `GuardLayout`, (guards, lanes).
+def evaluate_guards_at_point(mode_dynamics: ModeDynamics, interval_point: IntervalPoint) -> Array:
+    """Return the values of all guards in the order of `GuardLayout`, (guards, lanes).
 
-    The point is after the start of the contact state, so that all guards are evaluated.
+    The point is after the start of the contact state, so that no guard has a placeholder value.
     """
-    motion = motion_from_point(point)
-    contact_rows = point.dynamics_rows[len(point.q) :]
-    n1, n2, t1, t2, s1, s2, x1, x2, painleve_determinant = contact_rows[:N_CONTACT_ROWS]
+    motion = unpack_motion(interval_point)
+    contact_rows = interval_point.dynamics_rows[len(interval_point.q) :]
+    (
+        first_normal_force,
+        second_normal_force,
+        first_tangential_force,
+        second_tangential_force,
+        first_stopper_force,
+        second_stopper_force,
+        first_slip_speed,
+        second_slip_speed,
+        painleve_determinant,
+    ) = contact_rows[:N_CONTACT_QUANTITY_ROWS]
     airborne_stopper = (
-        contact_rows[N_CONTACT_ROWS : N_CONTACT_ROWS + dynamics.s.n]
-        if dynamics.is_one_sided
+        contact_rows[N_CONTACT_QUANTITY_ROWS : N_CONTACT_QUANTITY_ROWS + mode_dynamics.s.n]
+        if mode_dynamics.has_one_sided_stoppers
         else None
     )
-    directions, slot_pairs = (
-        leg_directions(dynamics.s, motion.theta),
-        ((n1, n2), (t1, t2), (s1, s2), (x1, x2)),
+    leg_directions = compute_leg_directions(mode_dynamics.s, motion.theta)
+    slot_pairs = (
+        (first_normal_force, second_normal_force),
+        (first_tangential_force, second_tangential_force),
+        (first_stopper_force, second_stopper_force),
+        (first_slip_speed, second_slip_speed),
     )
-    quantities = ContactQuantities(directions, *slot_pairs, painleve_determinant, airborne_stopper)
-    is_after_start = jnp.ones(point.q.shape[-1:], bool)
-    return jnp.concatenate(evaluate_guards(dynamics, motion, quantities, is_after_start))
+    contact_quantities = ContactQuantities(
+        leg_directions, *slot_pairs, painleve_determinant, airborne_stopper
+    )
+    is_after_start = jnp.ones(interval_point.q.shape[-1:], bool)
+    return jnp.concatenate(
+        evaluate_guards(mode_dynamics, motion, contact_quantities, is_after_start)
+    )
 
 
-def compute_guard_rates(dynamics: ModeDynamics, point: IntervalPoint) -> Array:
-    """Return the time derivatives of the guards along the motion, (guards, lanes)."""
+def compute_guard_rates(mode_dynamics: ModeDynamics, interval_point: IntervalPoint) -> Array:
+    """Return the time derivatives of all guards along the motion, (guards, lanes)."""
 
-    def evaluate_guards_at(q: Array, v: Array) -> Array:
+    def evaluate_guards_of_coordinates(q: Array, v: Array) -> Array:
         return evaluate_guards_at_point(
-            dynamics, IntervalPoint(q, v, evaluate_dynamics(dynamics, q, v))
+            mode_dynamics, IntervalPoint(q, v, evaluate_dynamics(mode_dynamics, q, v))
         )
 
     return jax.jvp(
-        evaluate_guards_at, (point.q, point.v), (point.v, point.dynamics_rows[: len(point.q)])
+        evaluate_guards_of_coordinates,
+        (interval_point.q, interval_point.v),
+        (interval_point.v, interval_point.dynamics_rows[: len(interval_point.q)]),
     )[1]
 
 
-def find_initiating_guards(dynamics: ModeDynamics) -> Array:
+def find_initiating_guards(mode_dynamics: ModeDynamics) -> Array:
     """Return whether each guard is the initiating guard of the contact state, (guards, lanes)."""
-    contact_state = dynamics.contact_state
-    has_just_slid = dynamics.contact_slots.gather_flags(contact_state.has_just_slid)
+    contact_state = mode_dynamics.contact_state
+    has_just_slid = mode_dynamics.contact_slots.gather_slot_flags(contact_state.has_just_slid)
     no_slot_flags = jnp.zeros((2, contact_state.contact_modes.shape[-1]), bool)
-    airborne_release_flags = [contact_state.locked & False] if dynamics.is_one_sided else []
+    airborne_release_flags = (
+        [contact_state.is_locked & False] if mode_dynamics.has_one_sided_stoppers else []
+    )
     return jnp.concatenate(
         [
             contact_state.has_just_lifted,
@@ -239,64 +289,72 @@ def find_initiating_guards(dynamics: ModeDynamics) -> Array:
 
 @eqx.filter_jit  # This function is traced once for all call sites.
 def init_interval(
-    dynamics: ModeDynamics,
+    mode_dynamics: ModeDynamics,
     motion: WheelMotion,
     h: Array,
-    interval_options: IntervalOptions = INTERVAL_OPTIONS,
+    search_options: EventSearchOptions = EVENT_SEARCH_OPTIONS,
 ) -> IntervalState:
-    """Return the lanes at the start of a contact state.
+    """Return the states of the lanes at the start of a contact state.
 
-    A lane is at an event again if one of its guards falls immediately.
+    The status of a lane is `LaneStatus.EVENT` if one of its guards falls immediately.
 
-    - `h`: size of the first attempt in the wheel's unit of time.
+    - `h`: size of the first solver step, in the wheel's unit of time.
     """
-    start_point, is_initiating = make_point(dynamics, motion), find_initiating_guards(dynamics)
-    guard_values, guard_rates = (
-        evaluate_guards_at_point(dynamics, start_point),
-        compute_guard_rates(dynamics, start_point),
-    )
+    start_point = make_interval_point(mode_dynamics, motion)
+    is_initiating = find_initiating_guards(mode_dynamics)
+    guard_values = evaluate_guards_at_point(mode_dynamics, start_point)
+    guard_rates = compute_guard_rates(mode_dynamics, start_point)
     # The guard of a contact released from rest is within round-off for 1e-8 s and longer. A guard
     # that rises from below zero has no event before it falls. Several events at one time leave
     # several such guards.
-    roundoff = compute_guard_scales(dynamics) * (
+    guard_roundoff = compute_guard_scales(mode_dynamics) * (
         GUARD_ROUNDOFF_IN_EPS * jnp.finfo(guard_values.dtype).eps
     )
-    time_unit = compute_wheel_units(dynamics.s).time_unit
-    min_guard_rate = -roundoff / (interval_options.max_roundoff_fall_time * time_unit)
-    is_initiating = is_initiating | ((guard_values <= roundoff) & (guard_rates > min_guard_rate))
-    is_triggered = ~is_initiating & (
+    time_unit = compute_wheel_units(mode_dynamics.s).time_unit
+    min_initiating_guard_rate = -guard_roundoff / (
+        search_options.max_roundoff_fall_duration * time_unit
+    )
+    is_initiating = is_initiating | (
+        (guard_values <= guard_roundoff) & (guard_rates > min_initiating_guard_rate)
+    )
+    is_guard_triggered = ~is_initiating & (
         (guard_values < 0.0) | ((guard_values == 0.0) & (guard_rates <= 0.0))
     )
-    triggered_guard = jnp.zeros(is_triggered.shape[1:], jnp.int32)
-    for guard_index in reversed(range(len(is_triggered))):
-        triggered_guard = jnp.where(is_triggered[guard_index], guard_index, triggered_guard)
-    guard_offset = jnp.where(is_initiating, guard_values - 2.0 * roundoff, 0.0)
-    float_zeros, int_zeros = jnp.zeros_like(motion.x), jnp.zeros(motion.x.shape, jnp.int32)
+    triggered_guard_index = jnp.zeros(is_guard_triggered.shape[1:], jnp.int32)
+    for guard_index in reversed(range(len(is_guard_triggered))):
+        triggered_guard_index = jnp.where(
+            is_guard_triggered[guard_index], guard_index, triggered_guard_index
+        )
+    guard_offset = jnp.where(is_initiating, guard_values - 2.0 * guard_roundoff, 0.0)
+    float_zero_lanes = jnp.zeros_like(motion.x)
+    int_zero_lanes = jnp.zeros(motion.x.shape, jnp.int32)
     return IntervalState(
-        point=start_point,
-        contact_state=dynamics.contact_state,
+        interval_point=start_point,
+        contact_state=mode_dynamics.contact_state,
         guard_values=guard_values - guard_offset,
         guard_offset=guard_offset,
-        interval_accumulators=jnp.zeros((N_ACCUMULATOR_ROWS, *float_zeros.shape), float_zeros.dtype)
-        if dynamics.has_accumulators
+        interval_accumulators=jnp.zeros(
+            (N_ACCUMULATOR_ROWS, *float_zero_lanes.shape), float_zero_lanes.dtype
+        )
+        if mode_dynamics.has_accumulators
         else None,
-        h=float_zeros + h * time_unit,
-        time=float_zeros,
+        h=float_zero_lanes + h * time_unit,
+        time_since_event=float_zero_lanes,
         event_bracket=EventBracket(
-            int_zeros > 0,
+            int_zero_lanes > 0,
             jnp.zeros_like(is_initiating),
-            float_zeros,
-            float_zeros,
-            float_zeros,
-            int_zeros,
-            float_zeros,
+            float_zero_lanes,
+            float_zero_lanes,
+            float_zero_lanes,
+            int_zero_lanes,
+            float_zero_lanes,
             guard_values,
         ),
-        status=jnp.where(
-            jnp.any(is_triggered, axis=0), LaneStatus.EVENT, LaneStatus.RUNNING
+        lane_status=jnp.where(
+            jnp.any(is_guard_triggered, axis=0), LaneStatus.EVENT, LaneStatus.RUNNING
         ).astype(jnp.int32),
-        triggered_guard=triggered_guard,
-        n_solver_steps=int_zeros,
+        triggered_guard_index=triggered_guard_index,
+        n_solver_steps=int_zero_lanes,
     )
 
 
@@ -312,32 +370,30 @@ def integrate_interval(
     options: StepOptions,
     tableau: ButcherTableau,
 ) -> IntervalState:
-    """Return the lanes integrated until none is running.
+    """Return the states of the lanes, integrated until each lane is at an event or has failed.
 
-    After `max_wait_attempts` attempts, the loop ends as soon as a lane with an unfinished walk is
-    at an event.
+    After `max_attempts_with_waiting_lane` solver steps, the loop ends as soon as a lane with an
+    unfinished walk is at an event.
 
     - `input_columns`: parameters, friction and uneven ground, (columns, lanes).
     """
-    dynamics = dynamics_fn(input_columns)
-    guard_scales, options = (
-        compute_guard_scales(dynamics),
-        compute_wheel_units(dynamics.s).scale_times_to_seconds(options),
-    )
+    mode_dynamics = dynamics_fn(input_columns)
+    guard_scales = compute_guard_scales(mode_dynamics)
+    options = compute_wheel_units(mode_dynamics.s).scale_times_to_seconds(options)
 
-    def try_step(state: IntervalState) -> IntervalState:
-        return integrator_step(
-            state,
-            attempt_solver_step(dynamics, tableau, options, state),
+    def try_solver_step(lane_states: IntervalState) -> IntervalState:
+        return advance_running_lanes(
+            lane_states,
+            attempt_solver_step(mode_dynamics, tableau, options, lane_states),
             guard_scales,
             tableau,
             options,
         )
 
     return iterate_until_stopped(
-        lambda state: state.status == LaneStatus.RUNNING,
+        lambda lane_states: lane_states.lane_status == LaneStatus.RUNNING,
         has_unfinished_walk,
-        try_step,
+        try_solver_step,
         initial_state,
     )
 
@@ -347,89 +403,104 @@ def iterate_until_stopped(
     has_unfinished_walk: Array,
     advance_state: Callable,
     initial_state: Any,
-    max_wait_attempts: int = INTERVAL_OPTIONS.max_wait_attempts,
+    max_attempts_with_waiting_lane: int = EVENT_SEARCH_OPTIONS.max_attempts_with_waiting_lane,
 ) -> Any:
-    """Return the state after `advance_state` has been applied until no lane is running.
+    """Return the loop state after `advance_state` has been applied until no lane is running.
 
-    After `max_wait_attempts` attempts, the loop ends as soon as a lane with an unfinished walk has
-    stopped.
+    After `max_attempts_with_waiting_lane` applications, the loop ends as soon as a lane with an
+    unfinished walk has stopped.
     """
 
     def should_continue(loop_state: tuple) -> Array:
-        lane_state, n_attempts = loop_state
-        is_active = is_running(lane_state)
-        has_stopped = jnp.any(has_unfinished_walk & ~is_active)
-        return jnp.any(is_active) & ((n_attempts < max_wait_attempts) | ~has_stopped)
+        lane_states, n_attempts = loop_state
+        is_search_active = is_running(lane_states)
+        has_stopped = jnp.any(has_unfinished_walk & ~is_search_active)
+        return jnp.any(is_search_active) & (
+            (n_attempts < max_attempts_with_waiting_lane) | ~has_stopped
+        )
 
-    n_initial = jnp.zeros((), jnp.int32)
-    advance_loop = lambda loop_state: (advance_state(loop_state[0]), loop_state[1] + 1)
-    return lax.while_loop(should_continue, advance_loop, (initial_state, n_initial))[0]
+    initial_attempt_count = jnp.zeros((), jnp.int32)
+    advance_loop_state = lambda loop_state: (advance_state(loop_state[0]), loop_state[1] + 1)
+    return lax.while_loop(
+        should_continue, advance_loop_state, (initial_state, initial_attempt_count)
+    )[0]
 
 
 class AttemptedSolverStep(NamedTuple):
-    """Result of one attempted solver step of every lane."""
+    """Result of one solver step of every lane, before the step is accepted or rejected."""
 
     end_point: IntervalPoint
-    squared_error: Array  # mean square of the error over the tolerance
+    mean_squared_error: Array  # mean square of the error over the tolerance
     guard_values: Array  # at the end of the step, (guards, lanes)
-    parabola_curvature: Array  # of the parabola through each guard, (guards, lanes)
-    parabola_linear_term: Array
-    minimum_fraction: Array  # fraction of the step to a negative guard minimum, else 1
+    guard_parabola_curvature: Array  # of the parabola through each guard, (guards, lanes)
+    guard_parabola_linear_term: Array
+    guard_minimum_fraction: Array  # fraction of the step to a negative guard minimum, else 1
     accumulator_increments: Array | None  # increment of `IntervalState.interval_accumulators`
 
 
 def compute_stage_state(
     tableau: ButcherTableau, i: Array | int, q: Array, v: Array, stage_rows: Array, h: Array
 ) -> tuple[Array, Array]:
-    """Return coordinates and rates at stage i, from the accelerations of the earlier stages.
+    """Return coordinates and rates at Runge-Kutta stage `i`, (3 + n, lanes) each.
+
+    They follow from the accelerations of the earlier stages.
 
     - `h`: step size, s.
     """
-    a, b, node = (
-        jnp.asarray(x)[i] for x in (tableau.matrix, tableau.matrix_squared, tableau.nodes)
+    a, b, stage_node = (
+        jnp.asarray(x)[i]
+        for x in (tableau.stage_matrix, tableau.squared_stage_matrix, tableau.stage_nodes)
     )
-    n, n_previous = len(q), len(tableau.nodes) - 1
-    rate_increment = sum(a[j] * stage_rows[j, :n] for j in range(n_previous))
-    coordinate_increment = sum(b[j] * stage_rows[j, :n] for j in range(n_previous))
-    return q + h * (node * v + h * coordinate_increment), v + h * rate_increment
+    n, n_previous_stages = len(q), len(tableau.stage_nodes) - 1
+    rate_increment = sum(a[j] * stage_rows[j, :n] for j in range(n_previous_stages))
+    coordinate_increment = sum(b[j] * stage_rows[j, :n] for j in range(n_previous_stages))
+    return q + h * (stage_node * v + h * coordinate_increment), v + h * rate_increment
 
 
 def attempt_solver_step(
-    dynamics: ModeDynamics, tableau: ButcherTableau, options: StepOptions, state: IntervalState
+    mode_dynamics: ModeDynamics,
+    tableau: ButcherTableau,
+    options: StepOptions,
+    lane_states: IntervalState,
 ) -> AttemptedSolverStep:
-    """Return one attempted step of every lane."""
-    h, start_point, last_stage = state.h, state.point, len(tableau.nodes) - 1
+    """Return the result of one attempted solver step of every lane."""
+    h = lane_states.h
+    start_point = lane_states.interval_point
+    last_stage = len(tableau.stage_nodes) - 1
 
     def evaluate_stage_dynamics(i: Array, stage_rows: Array) -> Array:
         stage_row = evaluate_dynamics(
-            dynamics, *compute_stage_state(tableau, i, start_point.q, start_point.v, stage_rows, h)
+            mode_dynamics,
+            *compute_stage_state(tableau, i, start_point.q, start_point.v, stage_rows, h),
         )
         return lax.dynamic_update_index_in_dim(stage_rows, stage_row, i, 0)
 
     later_stage_rows = jnp.zeros((last_stage, *start_point.dynamics_rows.shape), h.dtype)
     stage_rows = jnp.concatenate([start_point.dynamics_rows[None], later_stage_rows])
     stage_rows = lax.fori_loop(1, last_stage + 1, evaluate_stage_dynamics, stage_rows)
-    return complete_solver_step(dynamics, tableau, options, state, stage_rows)
+    return complete_solver_step(mode_dynamics, tableau, options, lane_states, stage_rows)
 
 
 def complete_solver_step(
-    dynamics: ModeDynamics,
+    mode_dynamics: ModeDynamics,
     tableau: ButcherTableau,
     options: StepOptions,
-    state: IntervalState,
+    lane_states: IntervalState,
     stage_rows: Array,
 ) -> AttemptedSolverStep:
-    """Return the attempted step whose dynamics rows at all stages are `stage_rows`."""
-    h, start_point, last_stage = state.h, state.point, len(tableau.nodes) - 1
+    """Return the result of a solver step, given the dynamics rows `stage_rows` at all stages."""
+    h = lane_states.h
+    start_point = lane_states.interval_point
+    last_stage = len(tableau.stage_nodes) - 1
     n = len(start_point.q)
     end_point = IntervalPoint(
         *compute_stage_state(tableau, last_stage, start_point.q, start_point.v, stage_rows, h),
         stage_rows[last_stage],
     )
     accumulator_increments = None
-    if dynamics.has_accumulators:
+    if mode_dynamics.has_accumulators:
         accumulator_increments = h * sum(
-            tableau.matrix[last_stage][j] * stage_rows[j, -N_ACCUMULATOR_ROWS:]
+            tableau.stage_matrix[last_stage][j] * stage_rows[j, -N_ACCUMULATOR_ROWS:]
             for j in range(last_stage)
         )
     inner_stage_points = {
@@ -437,218 +508,283 @@ def complete_solver_step(
             *compute_stage_state(tableau, i, start_point.q, start_point.v, stage_rows, h),
             stage_rows[i],
         )
-        for i in tableau.guard_stages
+        for i in tableau.guard_stage_indices
     }
     guard_points = *inner_stage_points.values(), end_point
     *inner_guard_values, end_guard_values = (
-        evaluate_guards_at_point(dynamics, guard_point) - state.guard_offset
+        evaluate_guards_at_point(mode_dynamics, guard_point) - lane_states.guard_offset
         for guard_point in guard_points
     )
     sum_stages = lambda weights: sum(
         float(w) * stage_rows[j, :n] for j, w in enumerate(weights) if w != 0.0
     )
-    error_estimates = h * h * sum_stages(tableau.b_error_position), h * sum_stages(tableau.b_error)
-    squared_error = _compute_squared_error(
-        dynamics.s, options, error_estimates, start_point, guard_points[-1], end_guard_values
+    error_estimates = (
+        h * h * sum_stages(tableau.position_error_weights),
+        h * sum_stages(tableau.rate_error_weights),
+    )
+    mean_squared_error = _compute_squared_error(
+        mode_dynamics.s, options, error_estimates, start_point, guard_points[-1], end_guard_values
     )
     middle_guard_values = (
-        inner_guard_values[tableau.guard_stages.index(tableau.middle_stage)]
+        inner_guard_values[tableau.guard_stage_indices.index(tableau.middle_stage_index)]
         if inner_guard_values
-        else state.guard_values
+        else lane_states.guard_values
     )
     parabola_terms = fit_guard_parabola(
-        tableau, state.guard_values, middle_guard_values, end_guard_values
+        tableau, lane_states.guard_values, middle_guard_values, end_guard_values
     )
-    minimum_fraction = _find_earliest_minimum(
-        tableau, [state.guard_values, *inner_guard_values, end_guard_values], _is_initiating(state)
+    guard_minimum_fraction = _find_earliest_minimum(
+        tableau,
+        [lane_states.guard_values, *inner_guard_values, end_guard_values],
+        _flag_initiating_guards(lane_states),
     )
     return AttemptedSolverStep(
         end_point,
-        squared_error,
+        mean_squared_error,
         end_guard_values,
         *parabola_terms,
-        minimum_fraction,
+        guard_minimum_fraction,
         accumulator_increments,
     )
 
 
-def is_at_singularity(
-    value_before: Array,
-    value_after: Array,
+def is_at_painleve_singularity(
+    determinant_before: Array,
+    determinant_after: Array,
     options: StepOptions,
-    interval_options: IntervalOptions = INTERVAL_OPTIONS,
+    search_options: EventSearchOptions = EVENT_SEARCH_OPTIONS,
 ) -> Array:
-    """Return whether a determinant vanishes between two times, which is Painlevé's singularity.
+    """Return whether a contact determinant vanishes between two times.
 
-    - `value_before`, `value_after`: the determinant at the two times.
+    The motion is then at Painlevé's singularity.
+
+    - `determinant_before`, `determinant_after`: determinant at the two times.
     """
-    atol, rtol_factor = interval_options.painleve_atol, interval_options.painleve_rtol_factor
-    is_zero = jnp.abs(value_after) <= atol + rtol_factor * options.rtol
-    return (value_before * value_after <= 0.0) | is_zero
+    painleve_atol = search_options.painleve_atol
+    painleve_rtol_factor = search_options.painleve_rtol_factor
+    is_near_zero = jnp.abs(determinant_after) <= painleve_atol + painleve_rtol_factor * options.rtol
+    return (determinant_before * determinant_after <= 0.0) | is_near_zero
 
 
-def integrator_step(
-    state: IntervalState,
-    attempt: AttemptedSolverStep,
+def advance_running_lanes(
+    lane_states: IntervalState,
+    attempted_step: AttemptedSolverStep,
     guard_scales: Array,
     tableau: ButcherTableau,
     options: StepOptions,
-    interval_options: IntervalOptions = INTERVAL_OPTIONS,
+    search_options: EventSearchOptions = EVENT_SEARCH_OPTIONS,
 ) -> IntervalState:
-    """Return the lanes after one attempted solver step.
+    """Return the states of the lanes after one attempted solver step.
 
-    A lane accepts the step, repeats the step with another size, or stops at an event.
+    Each running lane accepts the step, repeats the step with another size, or stops at an event.
     """
-    start_point, h, event_bracket, end_point = (
-        state.point,
-        state.h,
-        state.event_bracket,
-        attempt.end_point,
+    start_point = lane_states.interval_point
+    h = lane_states.h
+    event_bracket = lane_states.event_bracket
+    end_point = attempted_step.end_point
+    is_running = lane_states.lane_status == LaneStatus.RUNNING
+    is_step_accurate = (
+        is_running & ~event_bracket.is_search_active & (attempted_step.mean_squared_error <= 1.0)
     )
-    is_running = state.status == LaneStatus.RUNNING
-    is_accurate = is_running & ~event_bracket.is_active & (attempt.squared_error <= 1.0)
-    needs_retry = (
-        is_accurate
-        & (attempt.minimum_fraction < 1.0)
-        & (state.time + h * attempt.minimum_fraction > state.time)
+    must_retry_step = (
+        is_step_accurate
+        & (attempted_step.guard_minimum_fraction < 1.0)
+        & (
+            lane_states.time_since_event + h * attempted_step.guard_minimum_fraction
+            > lane_states.time_since_event
+        )
     )
-    has_crossed = is_accurate & ~needs_retry & jnp.any(attempt.guard_values <= 0.0, axis=0)
-    is_accepted = is_accurate & ~needs_retry & ~has_crossed
-    next_bracket, event = _search_event(
-        state, attempt, has_crossed, guard_scales, options, interval_options
+    has_guard_crossed = (
+        is_step_accurate & ~must_retry_step & jnp.any(attempted_step.guard_values <= 0.0, axis=0)
     )
-    has_reached_event = event.has_reached_event
+    is_accepted = is_step_accurate & ~must_retry_step & ~has_guard_crossed
+    next_bracket, located_event = _iterate_event_search(
+        lane_states, attempted_step, has_guard_crossed, guard_scales, options, search_options
+    )
+    has_reached_event = located_event.has_reached_event
     step_size_ratio = jnp.where(
-        needs_retry,
-        attempt.minimum_fraction,
-        compute_step_size_factor(tableau, attempt.squared_error, h.dtype),
+        must_retry_step,
+        attempted_step.guard_minimum_fraction,
+        compute_step_size_factor(tableau, attempted_step.mean_squared_error, h.dtype),
     )
     # The last step ends exactly at the time limit.
-    time_limit = options.max_phase_time
-    end_time = jnp.where(is_accepted & (h == time_limit - state.time), time_limit, state.time + h)
-    reached_time = jnp.where(is_accepted, end_time, state.time)
-    next_integration_h = jnp.minimum(h * step_size_ratio, time_limit - reached_time)
-    next_h = jnp.where(event_bracket.is_active | has_crossed, event.next_h, next_integration_h)
+    latest_event_time = options.max_phase_time
+    end_time = jnp.where(
+        is_accepted & (h == latest_event_time - lane_states.time_since_event),
+        latest_event_time,
+        lane_states.time_since_event + h,
+    )
+    reached_time = jnp.where(is_accepted, end_time, lane_states.time_since_event)
+    next_integration_h = jnp.minimum(h * step_size_ratio, latest_event_time - reached_time)
+    next_step_size = jnp.where(
+        event_bracket.is_search_active | has_guard_crossed,
+        located_event.next_step_size,
+        next_integration_h,
+    )
 
-    time_shift = jnp.where(has_reached_event, event.time_shift, 0.0)
+    event_time_shift = jnp.where(has_reached_event, located_event.event_time_shift, 0.0)
     end_point = IntervalPoint(
-        end_point.q + time_shift * end_point.v,
-        end_point.v + time_shift * end_point.dynamics_rows[: len(end_point.q)],
+        end_point.q + event_time_shift * end_point.v,
+        end_point.v + event_time_shift * end_point.dynamics_rows[: len(end_point.q)],
         end_point.dynamics_rows,
     )
     is_state_updated = is_accepted | has_reached_event
-    interval_accumulators = state.interval_accumulators
-    if interval_accumulators is not None and attempt.accumulator_increments is not None:
+    interval_accumulators = lane_states.interval_accumulators
+    if interval_accumulators is not None and attempted_step.accumulator_increments is not None:
         interval_accumulators = interval_accumulators + jnp.where(
-            is_state_updated, attempt.accumulator_increments, 0.0
+            is_state_updated, attempted_step.accumulator_increments, 0.0
         )
-    time = jnp.where(is_state_updated, end_time + time_shift, state.time)
-    is_past_time_limit = is_accepted & (time >= time_limit)
-    is_past_time_limit = is_past_time_limit | (has_reached_event & (time > time_limit))
-    has_failed = (next_bracket.n_iterations >= options.max_event_iterations) | (
-        state.n_solver_steps + 1 >= options.max_solver_steps
+    time = jnp.where(is_state_updated, end_time + event_time_shift, lane_states.time_since_event)
+    is_past_time_limit = is_accepted & (time >= latest_event_time)
+    is_past_time_limit = is_past_time_limit | (has_reached_event & (time > latest_event_time))
+    has_step_failed = (next_bracket.n_iterations >= options.max_event_iterations) | (
+        lane_states.n_solver_steps + 1 >= options.max_solver_steps
     )
-    has_failed = has_failed | (~event_bracket.is_active & (state.time + next_h == state.time))
-    determinant_row = len(start_point.q) + N_CONTACT_ROWS - 1
-    determinant_before = start_point.dynamics_rows[determinant_row]
-    determinant_after = end_point.dynamics_rows[determinant_row]
-    status = jnp.where(has_failed, Outcome.SOLVER_FAILED, LaneStatus.RUNNING)
-    status = jnp.where(has_reached_event, LaneStatus.EVENT, status)
-    status = jnp.where(is_past_time_limit, Outcome.NO_TOUCHDOWN_IN_TIME, status)
-    is_singular = is_state_updated & is_at_singularity(
-        determinant_before, determinant_after, options, interval_options
+    has_step_failed = has_step_failed | (
+        ~event_bracket.is_search_active
+        & (lane_states.time_since_event + next_step_size == lane_states.time_since_event)
     )
-    status = jnp.where(is_singular, Outcome.PAINLEVE_PARADOX, status)
-    return state._replace(
-        point=select_tree_leaves(is_state_updated, end_point, start_point),
-        guard_values=jnp.where(is_accepted, attempt.guard_values, state.guard_values),
+    painleve_determinant_row = len(start_point.q) + N_CONTACT_QUANTITY_ROWS - 1
+    determinant_before = start_point.dynamics_rows[painleve_determinant_row]
+    determinant_after = end_point.dynamics_rows[painleve_determinant_row]
+    lane_status = jnp.where(has_step_failed, Outcome.SOLVER_FAILED, LaneStatus.RUNNING)
+    lane_status = jnp.where(has_reached_event, LaneStatus.EVENT, lane_status)
+    lane_status = jnp.where(is_past_time_limit, Outcome.NO_TOUCHDOWN_IN_TIME, lane_status)
+    is_at_singularity = is_state_updated & is_at_painleve_singularity(
+        determinant_before, determinant_after, options, search_options
+    )
+    lane_status = jnp.where(is_at_singularity, Outcome.PAINLEVE_PARADOX, lane_status)
+    return lane_states._replace(
+        interval_point=select_tree_leaves(is_state_updated, end_point, start_point),
+        guard_values=jnp.where(is_accepted, attempted_step.guard_values, lane_states.guard_values),
         interval_accumulators=interval_accumulators,
-        h=jnp.where(is_running, next_h, h),
-        time=time,
+        h=jnp.where(is_running, next_step_size, h),
+        time_since_event=time,
         event_bracket=select_tree_leaves(is_running, next_bracket, event_bracket),
-        status=jnp.where(is_running, status, state.status).astype(jnp.int32),
-        triggered_guard=jnp.where(has_reached_event, event.guard, state.triggered_guard),
-        n_solver_steps=state.n_solver_steps + is_running,
+        lane_status=jnp.where(is_running, lane_status, lane_states.lane_status).astype(jnp.int32),
+        triggered_guard_index=jnp.where(
+            has_reached_event, located_event.guard_index, lane_states.triggered_guard_index
+        ),
+        n_solver_steps=lane_states.n_solver_steps + is_running,
     )
 
 
 class _LocatedEvent(NamedTuple):
-    """Result of one iteration of the search for the earliest event inside a step."""
+    """Result of one iteration of the search for the earliest event inside a solver step."""
 
-    next_h: Array  # step size of the next attempt, s
-    time_shift: Array  # correction from this step size to that of the event, s
+    next_step_size: Array  # step size of the next attempt, s
+    event_time_shift: Array  # correction from this step size to that of the event, s
     has_reached_event: Array  # whether the event is within tolerance
-    guard: Array
+    guard_index: Array
 
 
-def _search_event(
-    state: IntervalState,
-    attempt: AttemptedSolverStep,
-    has_crossed: Array,
+def _iterate_event_search(
+    lane_states: IntervalState,
+    attempted_step: AttemptedSolverStep,
+    has_guard_crossed: Array,
     guard_scales: Array,
     options: StepOptions,
-    interval_options: IntervalOptions,
+    search_options: EventSearchOptions,
 ) -> tuple[EventBracket, _LocatedEvent]:
-    """Return the bracket after one more iteration, and the event if the iteration has located one.
+    """Return the event bracket after one more iteration, and the event that has been located.
 
-    The proposed step size is a zero of the guards' parabolas or secants.
+    The next step size is the earliest zero of the guards' parabolas or secants.
     """
-    h, bracket = state.h, state.event_bracket
-    is_below_zero = attempt.guard_values <= 0.0
-    is_crossing = jnp.where(bracket.is_active, bracket.is_crossing | is_below_zero, is_below_zero)
-    parabolas = state.guard_values, attempt.parabola_linear_term, attempt.parabola_curvature
-    root_fraction, guard = _find_earliest_root(*parabolas, is_crossing, _is_initiating(state))
-    secant_h, secant_guard = _find_earliest_secant_root(
-        bracket, attempt.guard_values, h, is_crossing
+    h, event_bracket = lane_states.h, lane_states.event_bracket
+    is_guard_negative = attempted_step.guard_values <= 0.0
+    is_guard_crossing = jnp.where(
+        event_bracket.is_search_active,
+        event_bracket.is_guard_crossing | is_guard_negative,
+        is_guard_negative,
     )
-    uses_secant = bracket.is_active & (
-        bracket.n_iterations >= interval_options.n_parabola_iterations
+    parabolas = (
+        lane_states.guard_values,
+        attempted_step.guard_parabola_linear_term,
+        attempted_step.guard_parabola_curvature,
     )
-    proposed_h = jnp.where(uses_secant, secant_h, h * root_fraction)
-    guard = jnp.where(uses_secant, secant_guard, guard)
-    is_past_crossing = jnp.any(is_crossing & is_below_zero, axis=0)
-    low_h = jnp.where(bracket.is_active & ~is_past_crossing, h, bracket.low_h)
-    high_h = jnp.where(bracket.is_active & is_past_crossing, h, bracket.high_h)
-    low_h, high_h = jnp.where(has_crossed, 0.0, low_h), jnp.where(has_crossed, h, high_h)
-    time_resolution = 1e3 * jnp.finfo(h.dtype).eps * (state.time + h)
+    root_fraction, guard_index = _find_earliest_root(
+        *parabolas, is_guard_crossing, _flag_initiating_guards(lane_states)
+    )
+    secant_step_size, secant_guard = _find_earliest_secant_root(
+        event_bracket, attempted_step.guard_values, h, is_guard_crossing
+    )
+    uses_secant_step = event_bracket.is_search_active & (
+        event_bracket.n_iterations >= search_options.n_parabola_iterations
+    )
+    proposed_step_size = jnp.where(uses_secant_step, secant_step_size, h * root_fraction)
+    guard_index = jnp.where(uses_secant_step, secant_guard, guard_index)
+    is_past_event = jnp.any(is_guard_crossing & is_guard_negative, axis=0)
+    low_step_size = jnp.where(
+        event_bracket.is_search_active & ~is_past_event, h, event_bracket.low_step_size
+    )
+    high_step_size = jnp.where(
+        event_bracket.is_search_active & is_past_event, h, event_bracket.high_step_size
+    )
+    low_step_size = jnp.where(has_guard_crossed, 0.0, low_step_size)
+    high_step_size = jnp.where(has_guard_crossed, h, high_step_size)
+    time_resolution = 1e3 * jnp.finfo(h.dtype).eps * (lane_states.time_since_event + h)
     time_tolerance = jnp.maximum(
-        interval_options.event_time_tolerance_factor * options.rtol * h, time_resolution
+        search_options.event_time_tolerance_factor * options.rtol * h, time_resolution
     )
-    time_tolerance = jnp.where(bracket.is_active, bracket.time_tolerance, time_tolerance)
-    is_in_bracket = (proposed_h >= low_h - time_tolerance) & (proposed_h <= high_h + time_tolerance)
+    time_tolerance = jnp.where(
+        event_bracket.is_search_active, event_bracket.time_tolerance, time_tolerance
+    )
+    is_step_in_bracket = (proposed_step_size >= low_step_size - time_tolerance) & (
+        proposed_step_size <= high_step_size + time_tolerance
+    )
     # If a guard is below zero for microseconds only, round-off moves proposals out of the bracket.
     # The bracket is then bisected.
-    needs_bisection = ~is_in_bracket | (uses_secant & ((bracket.n_iterations & 3) == 3))
-    # An initiating guard falls again soon, or not at all.
-    bisection_h = jnp.where(
-        (low_h == 0.0) & jnp.isinf(proposed_h), 0.125 * high_h, 0.5 * (low_h + high_h)
+    needs_bisection = ~is_step_in_bracket | (
+        uses_secant_step & ((event_bracket.n_iterations & 3) == 3)
     )
-    next_h = jnp.where(needs_bisection, bisection_h, proposed_h)
-    time_shift = next_h - h
+    # An initiating guard falls again soon, or not at all.
+    bisection_step_size = jnp.where(
+        (low_step_size == 0.0) & jnp.isinf(proposed_step_size),
+        0.125 * high_step_size,
+        0.5 * (low_step_size + high_step_size),
+    )
+    next_step_size = jnp.where(needs_bisection, bisection_step_size, proposed_step_size)
+    event_time_shift = next_step_size - h
     # If a guard is within its round-off, no other step size is better than this one.
-    lowest_guard, lowest_value = _find_lowest_guard(
-        attempt.guard_values / guard_scales, is_crossing
+    lowest_guard, lowest_guard_value = _find_lowest_guard(
+        attempted_step.guard_values / guard_scales, is_guard_crossing
     )
     # An initiating guard is within twice its round-off. Without another event, the guard is the
     # event.
     guard_roundoff = (
         GUARD_ROUNDOFF_IN_EPS
         * jnp.where(
-            bracket.n_iterations < interval_options.min_iterations_of_initiating_guard, 1.0, 3.0
+            event_bracket.n_iterations < search_options.min_iterations_of_initiating_guard,
+            1.0,
+            3.0,
         )
         * jnp.finfo(h.dtype).eps
     )
-    is_guard_within_roundoff = bracket.is_active & (jnp.abs(lowest_value) <= guard_roundoff)
-    time_shift = jnp.where(is_guard_within_roundoff, 0.0, time_shift)
-    guard = jnp.where(is_guard_within_roundoff, lowest_guard, guard)
-    is_within_tolerance = bracket.is_active & (jnp.abs(time_shift) <= time_tolerance)
-    n_iterations = jnp.where(bracket.is_active, bracket.n_iterations + 1, 0)
-    is_active = (bracket.is_active | has_crossed) & ~is_within_tolerance
+    is_guard_within_roundoff = event_bracket.is_search_active & (
+        jnp.abs(lowest_guard_value) <= guard_roundoff
+    )
+    event_time_shift = jnp.where(is_guard_within_roundoff, 0.0, event_time_shift)
+    guard_index = jnp.where(is_guard_within_roundoff, lowest_guard, guard_index)
+    is_within_tolerance = event_bracket.is_search_active & (
+        jnp.abs(event_time_shift) <= time_tolerance
+    )
+    n_iterations = jnp.where(event_bracket.is_search_active, event_bracket.n_iterations + 1, 0)
+    is_search_active = (event_bracket.is_search_active | has_guard_crossed) & ~is_within_tolerance
     next_bracket = EventBracket(
-        is_active, is_crossing, low_h, high_h, time_tolerance, n_iterations, h, attempt.guard_values
+        is_search_active,
+        is_guard_crossing,
+        low_step_size,
+        high_step_size,
+        time_tolerance,
+        n_iterations,
+        h,
+        attempted_step.guard_values,
     )
     return next_bracket, _LocatedEvent(
-        next_h, time_shift, is_within_tolerance & (state.status == LaneStatus.RUNNING), guard
+        next_step_size,
+        event_time_shift,
+        is_within_tolerance & (lane_states.lane_status == LaneStatus.RUNNING),
+        guard_index,
     )
 
 
@@ -660,117 +796,152 @@ def _compute_squared_error(
     end_point: IntervalPoint,
     guard_values: Array,
 ) -> Array:
-    """Return the mean square of the error over its tolerance; infinite for a step that is not
-    finite.
+    """Return the mean square of the error of a solver step, relative to its tolerance.
+
+    The result is infinite for a step whose end is not finite.
     """
-    total_error = 0.0 * jnp.sum(guard_values, axis=0)
-    units = compute_state_units(s)
-    for error, a, b, coordinate_unit in zip(
-        error_estimates, start_point[:2], end_point[:2], units, strict=True
+    squared_error_sum = 0.0 * jnp.sum(guard_values, axis=0)
+    state_units = compute_state_units(s)
+    for error_rows, a, b, coordinate_unit in zip(
+        error_estimates, start_point[:2], end_point[:2], state_units, strict=True
     ):
-        tolerance = options.atol * coordinate_unit + options.rtol * jnp.maximum(
+        error_tolerance = options.atol * coordinate_unit + options.rtol * jnp.maximum(
             jnp.abs(a), jnp.abs(b)
         )
-        total_error = total_error + jnp.sum(jnp.square(error / tolerance), axis=0)
-    return jnp.where(jnp.isfinite(total_error), total_error / (2 * start_point.q.shape[0]), jnp.inf)
+        squared_error_sum = squared_error_sum + jnp.sum(
+            jnp.square(error_rows / error_tolerance), axis=0
+        )
+    return jnp.where(
+        jnp.isfinite(squared_error_sum), squared_error_sum / (2 * start_point.q.shape[0]), jnp.inf
+    )
 
 
-def _is_initiating(state: IntervalState) -> Array:
-    """Return whether each guard is an initiating guard and the lane is at the start of its
-    interval.
+def _flag_initiating_guards(lane_states: IntervalState) -> Array:
+    """Return whether each guard is an initiating guard of a lane at the start of its interval.
+
+    The axes are (guards, lanes).
     """
-    return (state.time == 0.0) & (state.guard_offset != 0.0)
+    return (lane_states.time_since_event == 0.0) & (lane_states.guard_offset != 0.0)
 
 
 def _find_earliest_minimum(
     tableau: ButcherTableau, guard_values: list[Array], is_initiating: Array
 ) -> Array:
-    """Return the fraction of the step to the earliest negative minimum of a guard; 1 without such a
-    minimum.
+    """Return the fraction of the step to the earliest negative minimum of a guard.
 
-    A guard that is positive at both ends of a step may be negative between them: see
-    `integrator.find_guard_minimum`. Initiating guards are not considered.
+    The result is 1 without such a minimum. A guard that is positive at both ends of a step may be
+    negative between them: see `integrator.find_guard_minimum`. Initiating guards are excluded.
     """
-    has_minimum, minimum_fraction = find_guard_minimum(tableau, guard_values)
+    has_guard_minimum, guard_minimum_fraction = find_guard_minimum(tableau, guard_values)
     return jnp.min(
-        jnp.where(has_minimum & (guard_values[0] > 0.0) & ~is_initiating, minimum_fraction, 1.0),
+        jnp.where(
+            has_guard_minimum & (guard_values[0] > 0.0) & ~is_initiating,
+            guard_minimum_fraction,
+            1.0,
+        ),
         axis=0,
     )
 
 
-def _find_lowest_guard(guard_values: Array, is_crossing: Array) -> tuple[Array, Array]:
-    """Return the index of the lowest guard that crosses zero, and its value; infinite if none
-    crosses.
+def _find_lowest_guard(guard_values: Array, is_guard_crossing: Array) -> tuple[Array, Array]:
+    """Return the index and the value of the lowest guard that crosses zero.
+
+    The value is infinite if no guard crosses zero.
     """
-    lowest_value, guard = (
-        jnp.full_like(guard_values[0], jnp.inf),
-        jnp.zeros(guard_values.shape[1:], jnp.int32),
-    )
+    lowest_guard_value = jnp.full_like(guard_values[0], jnp.inf)
+    lowest_guard = jnp.zeros(guard_values.shape[1:], jnp.int32)
     for guard_index in range(len(guard_values)):
-        is_lower = is_crossing[guard_index] & (guard_values[guard_index] < lowest_value)
-        lowest_value = jnp.where(is_lower, guard_values[guard_index], lowest_value)
-        guard = jnp.where(is_lower, guard_index, guard)
-    return guard, lowest_value
+        is_guard_lower = is_guard_crossing[guard_index] & (
+            guard_values[guard_index] < lowest_guard_value
+        )
+        lowest_guard_value = jnp.where(
+            is_guard_lower, guard_values[guard_index], lowest_guard_value
+        )
+        lowest_guard = jnp.where(is_guard_lower, guard_index, lowest_guard)
+    return lowest_guard, lowest_guard_value
 
 
 def _find_earliest_secant_root(
-    bracket: EventBracket, guard_values: Array, h: Array, is_crossing: Array
+    event_bracket: EventBracket, guard_values: Array, h: Array, is_guard_crossing: Array
 ) -> tuple[Array, Array]:
-    """Return the step size (s) at the earliest zero of the crossing guards' secants, and the
-    guard's index.
+    """Return the step size (s) to the earliest zero of the crossing guards' secants, and the index
+    of that guard.
 
-    The secants go through the last two attempts, because their ends are as accurate as the
-    integration and inner stages are not. The step size is infinite if no guard falls. It is minus
-    infinity if a guard is below zero and does not fall, because the guard fell earlier.
+    The secants go through the ends of the last two attempts, which are more accurate than inner
+    stages. The step size is infinite if no guard falls. The step size is minus infinity if a guard
+    is negative and does not fall, because this guard fell earlier.
     """
-    secant_slope = (guard_values - bracket.guard_values) / jnp.where(
-        h == bracket.previous_h, jnp.inf, h - bracket.previous_h
+    guard_secant_rate = (guard_values - event_bracket.guard_values) / jnp.where(
+        h == event_bracket.previous_step_size, jnp.inf, h - event_bracket.previous_step_size
     )
-    earliest_h, guard = jnp.full_like(h, jnp.inf), jnp.zeros(h.shape, jnp.int32)
+    earliest_step_size, earliest_guard = jnp.full_like(h, jnp.inf), jnp.zeros(h.shape, jnp.int32)
     for guard_index in range(len(guard_values)):
-        is_falling = is_crossing[guard_index] & (secant_slope[guard_index] < 0.0)
-        root_h = h - guard_values[guard_index] / jnp.where(
-            is_falling, secant_slope[guard_index], 1.0
+        is_guard_falling = is_guard_crossing[guard_index] & (guard_secant_rate[guard_index] < 0.0)
+        root_step_size = h - guard_values[guard_index] / jnp.where(
+            is_guard_falling, guard_secant_rate[guard_index], 1.0
         )
-        is_already_below = (
-            is_crossing[guard_index] & ~is_falling & (guard_values[guard_index] < 0.0)
+        is_already_negative = (
+            is_guard_crossing[guard_index] & ~is_guard_falling & (guard_values[guard_index] < 0.0)
         )
-        root_h = jnp.where(is_already_below, -jnp.inf, root_h)
-        is_earlier = (is_falling | is_already_below) & (root_h < earliest_h)
-        earliest_h = jnp.where(is_earlier, root_h, earliest_h)
-        guard = jnp.where(is_earlier, guard_index, guard)
-    return earliest_h, guard
+        root_step_size = jnp.where(is_already_negative, -jnp.inf, root_step_size)
+        is_root_earlier = (is_guard_falling | is_already_negative) & (
+            root_step_size < earliest_step_size
+        )
+        earliest_step_size = jnp.where(is_root_earlier, root_step_size, earliest_step_size)
+        earliest_guard = jnp.where(is_root_earlier, guard_index, earliest_guard)
+    return earliest_step_size, earliest_guard
 
 
 def _find_earliest_root(
-    g0: Array, linear_term: Array, curvature: Array, is_crossing: Array, is_initiating: Array
+    start_guard_values: Array,
+    parabola_linear_term: Array,
+    parabola_curvature: Array,
+    is_guard_crossing: Array,
+    is_initiating: Array,
 ) -> tuple[Array, Array]:
     """Return the earliest zero of the crossing guards' parabolas, as a fraction of the step, and
-    the guard's index.
+    the index of that guard.
 
-    The zero is infinite if no parabola falls ahead. An initiating guard rises first: if its
-    parabola falls at once, the step is too long for parabolas. The zero is minus infinity if such a
-    parabola ends below zero.
+    The fraction is infinite if no parabola falls to zero in the step. An initiating guard rises
+    first. If its parabola falls at once, the step is too long for parabolas. The fraction is minus
+    infinity if such a parabola ends below zero.
     """
-    discriminant = linear_term * linear_term - 4.0 * curvature * g0
-    sqrt_discriminant = jnp.sqrt(jnp.maximum(discriminant, 0.0))
-    is_falling = linear_term < 0.0
-    numerator = jnp.where(is_falling, 2.0 * g0, -linear_term - sqrt_discriminant)
-    denominator = jnp.where(is_falling, sqrt_discriminant - linear_term, 2.0 * curvature)
-    root_fraction = numerator / jnp.where(denominator == 0.0, 1.0, denominator)
-    has_root = is_crossing & (discriminant >= 0.0) & (denominator != 0.0) & (root_fraction > 0.0)
-    has_root = has_root & ~(is_initiating & is_falling)
-    is_already_below = is_crossing & ~has_root & (g0 + linear_term + curvature < 0.0)
-    root_fraction, has_root = (
-        jnp.where(is_already_below, -jnp.inf, root_fraction),
-        has_root | is_already_below,
+    discriminant = (
+        parabola_linear_term * parabola_linear_term - 4.0 * parabola_curvature * start_guard_values
     )
+    sqrt_discriminant = jnp.sqrt(jnp.maximum(discriminant, 0.0))
+    is_guard_falling = parabola_linear_term < 0.0
+    root_numerator = jnp.where(
+        is_guard_falling, 2.0 * start_guard_values, -parabola_linear_term - sqrt_discriminant
+    )
+    root_denominator = jnp.where(
+        is_guard_falling, sqrt_discriminant - parabola_linear_term, 2.0 * parabola_curvature
+    )
+    root_fraction = root_numerator / jnp.where(root_denominator == 0.0, 1.0, root_denominator)
+    has_guard_root = (
+        is_guard_crossing
+        & (discriminant >= 0.0)
+        & (root_denominator != 0.0)
+        & (root_fraction > 0.0)
+    )
+    has_guard_root = has_guard_root & ~(is_initiating & is_guard_falling)
+    is_already_negative = (
+        is_guard_crossing
+        & ~has_guard_root
+        & (start_guard_values + parabola_linear_term + parabola_curvature < 0.0)
+    )
+    root_fraction = jnp.where(is_already_negative, -jnp.inf, root_fraction)
+    has_guard_root = has_guard_root | is_already_negative
     earliest_fraction = jnp.full_like(root_fraction[0], jnp.inf)
-    guard = jnp.zeros(root_fraction.shape[-1:], jnp.int32)
+    earliest_guard = jnp.zeros(root_fraction.shape[-1:], jnp.int32)
     for guard_index in reversed(range(len(root_fraction))):
-        guard = jnp.where(is_crossing[guard_index], guard_index, guard)
+        earliest_guard = jnp.where(is_guard_crossing[guard_index], guard_index, earliest_guard)
     for guard_index in range(len(root_fraction)):
-        is_earlier = has_root[guard_index] & (root_fraction[guard_index] < earliest_fraction)
-        earliest_fraction = jnp.where(is_earlier, root_fraction[guard_index], earliest_fraction)
-        guard = jnp.where(is_earlier, guard_index, guard)
-    return earliest_fraction, guard
+        is_root_earlier = has_guard_root[guard_index] & (
+            root_fraction[guard_index] < earliest_fraction
+        )
+        earliest_fraction = jnp.where(
+            is_root_earlier, root_fraction[guard_index], earliest_fraction
+        )
+        earliest_guard = jnp.where(is_root_earlier, guard_index, earliest_guard)
+    return earliest_fraction, earliest_guard

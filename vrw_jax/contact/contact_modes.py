@@ -54,14 +54,14 @@ PAPER_RULE_SENTINEL = -np.inf
 """Value of friction that selects the paper's rule instead of the limit of large friction."""
 
 
-class ContactSolution(NamedTuple):
+class SlotForceSolution(NamedTuple):
     """Forces (N) and resulting accelerations, or impulses (N s) and velocities after them."""
 
-    tangential: SlotPair  # on each slot's foot, downhill positive
-    normal: SlotPair  # pushing positive
-    stopper: SlotPair  # of the stopper of each slot's leg, pushing positive
-    pull: SlotPair  # force of stopper and foot along u on the leg's mass
-    hub_vector: HubVector
+    tangential_forces: SlotPair  # on each slot's foot, downhill positive
+    normal_forces: SlotPair  # pushing positive
+    stopper_forces: SlotPair  # of the stopper of each slot's leg, pushing positive
+    leg_pull_forces: SlotPair  # force of stopper and foot along u on the leg's mass
+    hub_motion: HubVector
     length_motion: SlotPair  # of the length of each slot's leg
     foot_motion_x: SlotPair  # of each slot's foot
     foot_motion_z: SlotPair
@@ -88,31 +88,40 @@ def _make_matrix(entry_fn: Any) -> Matrix2x2:
 
 
 def _make_pair(entry_fn: Any) -> SlotPair:
-    """Return the pair of the entries `entry_fn(0)` and `entry_fn(1)`."""
+    """Return the pair (`entry_fn(0)`, `entry_fn(1)`), with one entry for each slot."""
     return entry_fn(0), entry_fn(1)
 
 
-def map_friction(function: Callable[[Any], Any], friction: Friction) -> Any:
-    """Return `function` applied to the friction of all feet, or to that of each slot's foot."""
-    is_pair = isinstance(friction, tuple)
-    return (function(friction[0]), function(friction[1])) if is_pair else function(friction)
+def map_friction(friction_function: Callable[[Any], Any], friction: Friction) -> Any:
+    """Return a function of the friction coefficient of all feet, or of each slot's foot."""
+    is_friction_pair = isinstance(friction, tuple)
+    return (
+        (friction_function(friction[0]), friction_function(friction[1]))
+        if is_friction_pair
+        else friction_function(friction)
+    )
 
 
-def _friction_of_slot(i: int, friction: Any) -> Any:
-    """Return the friction of slot i, from a pair or a common number."""
+def _get_slot_friction(i: int, friction: Any) -> Any:
+    """Return the friction coefficient of slot `i`, from a pair or a common number."""
     return friction[i] if isinstance(friction, tuple) else friction
 
 
-def finite_friction(friction: Friction) -> Any:
-    """Return Coulomb's coefficient of friction; 0 if friction is infinite.
+def replace_infinite_friction(friction: Friction) -> Any:
+    """Return Coulomb's coefficient of friction, with 0 in place of infinity.
 
     A foot that slides under infinite friction receives no friction by Coulomb's law.
     """
-    return map_friction(lambda value: jnp.where(jnp.isfinite(value), value, 0.0), friction)
+    return map_friction(
+        lambda coefficient_value: jnp.where(
+            jnp.isfinite(coefficient_value), coefficient_value, 0.0
+        ),
+        friction,
+    )
 
 
 class _FootEquations(NamedTuple):
-    """Equations of a combination at each slot's foot.
+    """Coefficients of the contact equations at each slot's foot, for a combination of modes.
 
     The unknown c is the transverse force for a sticking foot. For a sliding foot, c is the normal
     force, or the friction force in the limit of infinite friction. An unloaded foot has c = 0.
@@ -122,23 +131,25 @@ class _FootEquations(NamedTuple):
     is_loaded: SlotPair
     unit_force_transverse: SlotPair  # transverse force for c = 1
     unit_force_radial: SlotPair  # force along the leg for c = 1; 0 for a sticking foot
-    weight_transverse: SlotPair  # weight of the foot's transverse motion in the condition
-    weight_radial: SlotPair  # weight of the force on the leg's mass in the condition
+    condition_weight_transverse: SlotPair  # weight of the foot's transverse motion in the condition
+    condition_weight_radial: SlotPair  # weight of the force on the leg's mass in the condition
 
 
 def _make_foot_equations(
-    s: Symbols, inertia: ContactInverseInertia, slot_modes: Array, friction: Friction
+    s: Symbols, inverse_inertia: ContactInverseInertia, slot_modes: Array, friction: Friction
 ) -> _FootEquations:
-    """Return the equations at both slots' feet for these contact modes and friction
-    coefficients.
-    """
-    sin, cos = inertia.sin, inertia.cos
+    """Return the coefficients of the contact equations at both slots' feet."""
+    sin, cos = inverse_inertia.sin, inverse_inertia.cos
     sliding_coefficient = map_friction(
-        lambda value: jnp.where(value == jnp.inf, 1.0, jnp.where(jnp.isfinite(value), value, 0.0)),
+        lambda coefficient_value: jnp.where(
+            coefficient_value == jnp.inf,
+            1.0,
+            jnp.where(jnp.isfinite(coefficient_value), coefficient_value, 0.0),
+        ),
         friction,
     )
     normal_force_factor = map_friction(
-        lambda value: jnp.where(value == jnp.inf, 0.0, 1.0), friction
+        lambda coefficient_value: jnp.where(coefficient_value == jnp.inf, 0.0, 1.0), friction
     )
     is_sticking = _make_pair(lambda i: slot_modes[i] == ContactMode.STICK)
     is_sliding = _make_pair(
@@ -147,8 +158,8 @@ def _make_foot_equations(
     friction_factor = _make_pair(
         lambda i: jnp.where(
             slot_modes[i] == ContactMode.SLIP_DOWN,
-            -_friction_of_slot(i, sliding_coefficient),
-            _friction_of_slot(i, sliding_coefficient),
+            -_get_slot_friction(i, sliding_coefficient),
+            _get_slot_friction(i, sliding_coefficient),
         )
     )
     select_by_mode = lambda i, sticking_value, sliding_value: jnp.where(
@@ -161,69 +172,73 @@ def _make_foot_equations(
             lambda i: select_by_mode(
                 i,
                 1.0,
-                friction_factor[i] * cos[i] - _friction_of_slot(i, normal_force_factor) * sin[i],
+                friction_factor[i] * cos[i] - _get_slot_friction(i, normal_force_factor) * sin[i],
             )
         ),
         unit_force_radial=_make_pair(
             lambda i: select_by_mode(
                 i,
                 0.0,
-                friction_factor[i] * sin[i] + _friction_of_slot(i, normal_force_factor) * cos[i],
+                friction_factor[i] * sin[i] + _get_slot_friction(i, normal_force_factor) * cos[i],
             )
         ),
-        weight_transverse=_make_pair(lambda i: select_by_mode(i, 1.0, -sin[i])),
-        weight_radial=_make_pair(lambda i: select_by_mode(i, 0.0, cos[i] * (1.0 / s.m))),
+        condition_weight_transverse=_make_pair(lambda i: select_by_mode(i, 1.0, -sin[i])),
+        condition_weight_radial=_make_pair(lambda i: select_by_mode(i, 0.0, cos[i] * (1.0 / s.m))),
     )
 
 
-def _identity_entry(i: int, j: int) -> float:
+def _get_identity_entry(i: int, j: int) -> float:
     """Return the entry (i, j) of the identity matrix."""
     return 1.0 if i == j else 0.0
 
 
 def _eliminate_stoppers(
     s: Symbols,
-    inertia: ContactInverseInertia,
+    inverse_inertia: ContactInverseInertia,
     free_motion: FreeMotion,
-    is_held: Array,
+    is_stopper_holding: Array,
     foot_equations: _FootEquations,
     unit_divisor: Array,
 ) -> tuple[SlotPair, Matrix2x2]:
-    """Return the stopper forces without foot forces, and their change for c = 1 of each foot.
+    """Return the stopper forces without foot forces, and their change for c = 1 at each foot.
 
-    The second result has the indices [foot][stopper]. The forces solve N s = p + P c, in which the
-    row of an open stopper is s = 0. So the system is always regular.
+    The second result has the indices [foot][stopper]. The stopper forces s solve N s = p + P c. The
+    row of an open stopper is s = 0, so that the system is always regular.
     """
-    sin, cos, inverse_leg_mass = inertia.sin, inertia.cos, 1.0 / s.m
-    H = ((inertia.H[0], inertia.H[1]), (inertia.H[2], inertia.H[3]))
-    K = ((inertia.K[0], inertia.K[1]), inertia.K[1:])
-    compliance = _make_pair(
+    sin, cos, inverse_leg_mass = inverse_inertia.sin, inverse_inertia.cos, 1.0 / s.m
+    H = ((inverse_inertia.H[0], inverse_inertia.H[1]), (inverse_inertia.H[2], inverse_inertia.H[3]))
+    K = ((inverse_inertia.K[0], inverse_inertia.K[1]), inverse_inertia.K[1:])
+    leg_compliance = _make_pair(
         lambda i: jnp.where(foot_equations.is_sticking[i], 0.0, inverse_leg_mass)
     )
     N = _make_matrix(
         lambda i, j: jnp.where(
-            is_held[i], K[i][j] + _identity_entry(i, j) * compliance[i], _identity_entry(i, j)
+            is_stopper_holding[i],
+            K[i][j] + _get_identity_entry(i, j) * leg_compliance[i],
+            _get_identity_entry(i, j),
         )
     )
-    outward_motion = _make_pair(
+    outward_leg_motion = _make_pair(
         lambda i: (
-            sin[i] * free_motion.hub_vector[0]
-            + cos[i] * free_motion.hub_vector[1]
+            sin[i] * free_motion.hub_motion[0]
+            + cos[i] * free_motion.hub_motion[1]
             + free_motion.slot_leg_motion[i]
         )
     )
     free_length_motion = _make_pair(
         lambda i: (
-            outward_motion[i]
+            outward_leg_motion[i]
             + jnp.where(foot_equations.is_sticking[i], free_motion.foot_radial_motion[i], 0.0)
         )
     )
-    p = _make_pair(lambda i: jnp.where(is_held[i], free_length_motion[i], 0.0))
+    p = _make_pair(lambda i: jnp.where(is_stopper_holding[i], free_length_motion[i], 0.0))
     foot_effect_on_stopper = lambda i, j: (
         H[i][j] * foot_equations.unit_force_transverse[j]
-        - _identity_entry(i, j) * foot_equations.unit_force_radial[i] * inverse_leg_mass
+        - _get_identity_entry(i, j) * foot_equations.unit_force_radial[i] * inverse_leg_mass
     )
-    P = _make_matrix(lambda i, j: jnp.where(is_held[i], foot_effect_on_stopper(i, j), 0.0))
+    P = _make_matrix(
+        lambda i, j: jnp.where(is_stopper_holding[i], foot_effect_on_stopper(i, j), 0.0)
+    )
     p, P, N = prevent_fusion((p, P, N), unit_divisor)
     return prevent_fusion(
         (_solve_2x2(N, p), _make_pair(lambda j: _solve_2x2(N, (P[0][j], P[1][j])))), unit_divisor
@@ -238,40 +253,43 @@ determinant. This is the ratio of Table 1's wheel, chosen because `painleve_atol
 
 def _solve_feet(
     s: Symbols,
-    inertia: ContactInverseInertia,
+    inverse_inertia: ContactInverseInertia,
     free_motion: FreeMotion,
     foot_equations: _FootEquations,
     stopper_without_feet: SlotPair,
     stopper_response: Matrix2x2,
     unit_divisor: Array,
 ) -> tuple[SlotPair, SlotPair, SlotPair, Any]:
-    """Return the forces of stoppers, of feet transverse to and along their legs, and the
-    determinant.
+    """Return the stopper forces, the foot forces and the determinant of the foot equations.
 
-    The stopper forces of `_eliminate_stoppers` are inserted into the equations of the feet.
+    The foot forces are transverse to the legs, then along the legs. The stopper forces of
+    `_eliminate_stoppers` are inserted into the equations of the feet.
     """
-    weight_transverse = foot_equations.weight_transverse
-    weight_radial = foot_equations.weight_radial
+    condition_weight_transverse = foot_equations.condition_weight_transverse
+    condition_weight_radial = foot_equations.condition_weight_radial
     unit_force_transverse = foot_equations.unit_force_transverse
     unit_force_radial = foot_equations.unit_force_radial
-    G = ((inertia.G[0], inertia.G[1]), inertia.G[1:])
-    H = ((inertia.H[0], inertia.H[1]), (inertia.H[2], inertia.H[3]))
+    G = ((inverse_inertia.G[0], inverse_inertia.G[1]), inverse_inertia.G[1:])
+    H = ((inverse_inertia.H[0], inverse_inertia.H[1]), (inverse_inertia.H[2], inverse_inertia.H[3]))
     R = _make_matrix(
-        lambda i, k: _identity_entry(i, k) * weight_radial[i] - weight_transverse[i] * H[k][i]
+        lambda i, k: (
+            _get_identity_entry(i, k) * condition_weight_radial[i]
+            - condition_weight_transverse[i] * H[k][i]
+        )
     )
     C = _make_matrix(
         lambda i, j: (
-            weight_transverse[i] * G[i][j] * unit_force_transverse[j]
-            + _identity_entry(i, j) * weight_radial[i] * unit_force_radial[i]
+            condition_weight_transverse[i] * G[i][j] * unit_force_transverse[j]
+            + _get_identity_entry(i, j) * condition_weight_radial[i] * unit_force_radial[i]
             + R[i][0] * stopper_response[j][0]
             + R[i][1] * stopper_response[j][1]
-            + _identity_entry(i, j) * jnp.where(foot_equations.is_loaded[i], 0.0, 1.0)
+            + _get_identity_entry(i, j) * jnp.where(foot_equations.is_loaded[i], 0.0, 1.0)
         )
     )
     right_hand_side = _make_pair(
         lambda i: (
-            -weight_transverse[i] * free_motion.foot_transverse_motion[i]
-            - weight_radial[i] * s.m * free_motion.foot_radial_motion[i]
+            -condition_weight_transverse[i] * free_motion.foot_transverse_motion[i]
+            - condition_weight_radial[i] * s.m * free_motion.foot_radial_motion[i]
         )
     )
     c = _solve_2x2(
@@ -316,71 +334,79 @@ def _solve_feet(
 @eqx.filter_jit  # This function is traced once for all call sites.
 def solve_combination(
     s: Symbols,
-    inertia: ContactInverseInertia,
+    inverse_inertia: ContactInverseInertia,
     free_motion: FreeMotion,
     slot_modes: Array,
-    is_held: Array,
+    is_stopper_holding: Array,
     friction: Friction,
-) -> ContactSolution:
-    """Return the solution of one combination of contact modes and stoppers of the two slots.
+) -> SlotForceSolution:
+    """Return forces and motion for one combination of contact modes and stoppers of the two slots.
 
-    - `slot_modes`, `is_held`: contact mode and stopper of each slot, shape (2, ...).
+    - `slot_modes`: contact mode of each slot's foot, shape (2, ...);
+    - `is_stopper_holding`: whether the stopper of each slot's leg holds the leg, shape (2, ...).
 
-    A sticking foot is at rest, a sliding foot keeps its height with friction against the slip, and
-    a held leg keeps its length. The stoppers are eliminated first.
+    A sticking foot is at rest. A sliding foot keeps its height, with friction against the slip. A
+    held leg keeps its length. The stoppers are eliminated first.
     """
-    sin, cos, inverse_leg_mass = inertia.sin, inertia.cos, 1.0 / s.m
-    unit_divisor = 1.0 + 0.0 * lax.stop_gradient(free_motion.hub_vector[2])
-    foot_equations = _make_foot_equations(s, inertia, slot_modes, friction)
+    sin, cos, inverse_leg_mass = inverse_inertia.sin, inverse_inertia.cos, 1.0 / s.m
+    unit_divisor = 1.0 + 0.0 * lax.stop_gradient(free_motion.hub_motion[2])
+    foot_equations = _make_foot_equations(s, inverse_inertia, slot_modes, friction)
     stopper_system = _eliminate_stoppers(
-        s, inertia, free_motion, is_held, foot_equations, unit_divisor
+        s, inverse_inertia, free_motion, is_stopper_holding, foot_equations, unit_divisor
     )
     stopper_force, foot_force_transverse, foot_force_radial, painleve_determinant = _solve_feet(
-        s, inertia, free_motion, foot_equations, *stopper_system, unit_divisor
+        s, inverse_inertia, free_motion, foot_equations, *stopper_system, unit_divisor
     )
-    pull = _make_pair(lambda i: foot_force_radial[i] + stopper_force[i])
-    z, y = inertia.response_transverse, inertia.response_radial
-    hub_with_feet = [
-        free_motion.hub_vector[k]
-        + z[0][k] * foot_force_transverse[0]
-        + z[1][k] * foot_force_transverse[1]
+    leg_pull_forces = _make_pair(lambda i: foot_force_radial[i] + stopper_force[i])
+    hub_response_transverse = inverse_inertia.hub_response_transverse
+    hub_response_radial = inverse_inertia.hub_response_radial
+    hub_motion_with_feet = [
+        free_motion.hub_motion[k]
+        + hub_response_transverse[0][k] * foot_force_transverse[0]
+        + hub_response_transverse[1][k] * foot_force_transverse[1]
         for k in range(3)
     ]
-    vx, vz, omega = (
-        hub_with_feet[k] - y[0][k] * stopper_force[0] - y[1][k] * stopper_force[1] for k in range(3)
+    vx, vz, hub_motion_theta = (
+        hub_motion_with_feet[k]
+        - hub_response_radial[0][k] * stopper_force[0]
+        - hub_response_radial[1][k] * stopper_force[1]
+        for k in range(3)
     )
-    dx, dz, domega = (
-        vx - free_motion.hub_vector[0],
-        vz - free_motion.hub_vector[1],
-        omega - free_motion.hub_vector[2],
-    )
+    hub_change_x = vx - free_motion.hub_motion[0]
+    hub_change_z = vz - free_motion.hub_motion[1]
+    hub_change_theta = hub_motion_theta - free_motion.hub_motion[2]
     foot_transverse = _make_pair(
         lambda i: (
-            cos[i] * dx
-            - sin[i] * dz
-            - inertia.L[i] * domega
+            cos[i] * hub_change_x
+            - sin[i] * hub_change_z
+            - inverse_inertia.L[i] * hub_change_theta
             + free_motion.foot_transverse_motion[i]
         )
     )
     foot_radial = _make_pair(
-        lambda i: free_motion.foot_radial_motion[i] + pull[i] * inverse_leg_mass
+        lambda i: free_motion.foot_radial_motion[i] + leg_pull_forces[i] * inverse_leg_mass
     )
     free_length_motion = _make_pair(
         lambda i: (
-            sin[i] * vx + cos[i] * vz + free_motion.slot_leg_motion[i] - pull[i] * inverse_leg_mass
+            sin[i] * vx
+            + cos[i] * vz
+            + free_motion.slot_leg_motion[i]
+            - leg_pull_forces[i] * inverse_leg_mass
         )
     )
-    return ContactSolution(
-        tangential=_make_pair(
+    return SlotForceSolution(
+        tangential_forces=_make_pair(
             lambda i: foot_force_transverse[i] * cos[i] + foot_force_radial[i] * sin[i]
         ),
-        normal=_make_pair(
+        normal_forces=_make_pair(
             lambda i: foot_force_radial[i] * cos[i] - foot_force_transverse[i] * sin[i]
         ),
-        stopper=stopper_force,
-        pull=pull,
-        hub_vector=(vx, vz, omega),
-        length_motion=_make_pair(lambda i: jnp.where(is_held[i], 0.0, free_length_motion[i])),
+        stopper_forces=stopper_force,
+        leg_pull_forces=leg_pull_forces,
+        hub_motion=(vx, vz, hub_motion_theta),
+        length_motion=_make_pair(
+            lambda i: jnp.where(is_stopper_holding[i], 0.0, free_length_motion[i])
+        ),
         foot_motion_x=_make_pair(lambda i: foot_transverse[i] * cos[i] + foot_radial[i] * sin[i]),
         foot_motion_z=_make_pair(lambda i: foot_radial[i] * cos[i] - foot_transverse[i] * sin[i]),
         painleve_determinant=painleve_determinant,
@@ -388,30 +414,30 @@ def solve_combination(
 
 
 def _enumerate_combinations() -> tuple[np.ndarray, np.ndarray]:
-    """Return all combinations of modes and of stoppers, two arrays of shape (63, 2).
+    """Return the contact modes and the held stoppers of all combinations, of shape (63, 2) each.
 
-    Combinations with the most sticking feet come first, then those with the most sliding feet. Two
-    sticking feet on two held legs are excluded: they constrain the hub twice, so that their forces
-    are not determined.
+    Combinations with the most sticking feet come first, then combinations with the most sliding
+    feet. Two sticking feet on two held legs are excluded, because they constrain the hub twice and
+    their forces are not determined.
     """
-    mode_rank = {
+    mode_priority = {
         ContactMode.STICK: 0,
         ContactMode.SLIP_DOWN: 1,
         ContactMode.SLIP_UP: 1,
         ContactMode.OFF: 2,
     }
     combinations = [
-        (slot_modes, is_held)
+        (slot_modes, is_stopper_holding)
         for slot_modes in itertools.product(
             (ContactMode.STICK, ContactMode.SLIP_DOWN, ContactMode.SLIP_UP, ContactMode.OFF),
             repeat=2,
         )
-        for is_held in itertools.product((False, True), repeat=2)
-        if not (slot_modes == (ContactMode.STICK, ContactMode.STICK) and all(is_held))
+        for is_stopper_holding in itertools.product((False, True), repeat=2)
+        if not (slot_modes == (ContactMode.STICK, ContactMode.STICK) and all(is_stopper_holding))
     ]
     combinations.sort(
         key=lambda combination: (
-            sum(mode_rank[mode] for mode in combination[0]),
+            sum(mode_priority[mode] for mode in combination[0]),
             sum(combination[1]),
         )
     )
@@ -423,13 +449,16 @@ CONTACT_MODE_TABLE, HELD_STOPPER_TABLE = _enumerate_combinations()
 the same shape and marks the held stoppers."""
 PAPER_RULE_ORDER = np.argsort(
     [
-        sum({ContactMode.STICK: 0, ContactMode.OFF: 2}.get(ContactMode(mode), 5) for mode in modes)
-        for modes in CONTACT_MODE_TABLE
+        sum(
+            {ContactMode.STICK: 0, ContactMode.OFF: 2}.get(ContactMode(mode), 5)
+            for mode in slot_modes
+        )
+        for slot_modes in CONTACT_MODE_TABLE
     ],
     kind="stable",
 )
 """Order of the combinations by the paper's rule, in which sliding comes last."""
-N_CONCURRENT_COMBINATIONS = 8
+N_COMBINATIONS_PER_ITERATION = 8
 """Number of combinations that XLA solves together, chosen because most events allow no more.
 Machine code solves combinations one after the other."""
 ALL_MODES_MASK = sum(1 << mode for mode in ContactMode)
@@ -439,62 +468,67 @@ CombinationMask = tuple[Any, Any]
 """Set of combinations, one bit each in two 32-bit integers."""
 
 
-class _OrderedTable(NamedTuple):
-    """Table of combinations in one order, as masks of combinations with a common mode or
-    stopper.
-    """
+class _OrderedCombinationTable(NamedTuple):
+    """Combinations in one order, as bit masks of the combinations with a common mode or stopper."""
 
-    mode_masks: list[list[CombinationMask]]  # indexed by slot and mode
-    held_masks: list[CombinationMask]  # indexed by slot
+    masks_by_slot_mode: list[list[CombinationMask]]  # indexed by slot and mode
+    masks_by_held_stopper: list[CombinationMask]  # indexed by slot
 
     @classmethod
-    def from_indices(cls, indices: np.ndarray) -> "_OrderedTable":
-        """Return the table whose combinations are in the order of these indices."""
+    def from_indices(cls, indices: np.ndarray) -> "_OrderedCombinationTable":
+        """Return the table of the combinations in the order `indices`."""
 
         def pack_bits(is_member: np.ndarray) -> CombinationMask:
-            masks = np.packbits(np.append(is_member, False), bitorder="little").view("<i4")
-            return masks[0], masks[1]
+            combination_masks = np.packbits(np.append(is_member, False), bitorder="little").view(
+                "<i4"
+            )
+            return combination_masks[0], combination_masks[1]
 
-        slot_modes, is_held = CONTACT_MODE_TABLE[indices].T, HELD_STOPPER_TABLE[indices].T
+        slot_modes = CONTACT_MODE_TABLE[indices].T
+        is_stopper_holding = HELD_STOPPER_TABLE[indices].T
         mode_masks = [
             [pack_bits(slot_values == mode) for mode in ContactMode] for slot_values in slot_modes
         ]
-        return cls(mode_masks, [pack_bits(slot_values) for slot_values in is_held])
+        return cls(mode_masks, [pack_bits(slot_values) for slot_values in is_stopper_holding])
 
 
-_ORDERED_TABLES = (
-    _OrderedTable.from_indices(PAPER_RULE_ORDER),
-    _OrderedTable.from_indices(np.arange(len(CONTACT_MODE_TABLE))),
+_COMBINATION_TABLES = (
+    _OrderedCombinationTable.from_indices(PAPER_RULE_ORDER),
+    _OrderedCombinationTable.from_indices(np.arange(len(CONTACT_MODE_TABLE))),
 )
 
 
-class AllowedModes(NamedTuple):
-    """Allowed modes and stoppers at an event, and conditions that need no test.
+class AllowedContactModes(NamedTuple):
+    """Contact modes and stoppers that are allowed at an event, and conditions that need no test.
 
-    Sets of modes have one bit per mode.
+    A set of modes is an integer with one bit per mode.
     """
 
-    allowed_modes: Int[Array, "2 ..."]  # set of allowed modes of each slot's foot
+    allowed_slot_modes: Int[Array, "2 ..."]  # set of allowed modes of each slot's foot
     can_hold_stopper: Bool[Array, "2 ..."]  # whether the stopper may hold, not only be open
     has_fixed_mode: Bool[Array, "2 ..."]  # whether the foot keeps its mode for any force
-    untested_modes: Int[Array, "2 ..."]  # set of modes that need no test
-    is_open_untested: Bool[Array, "2 ..."]  # whether an open stopper needs no test
+    untested_slot_modes: Int[Array, "2 ..."]  # set of modes that need no test
+    is_open_stopper_untested: Bool[Array, "2 ..."]  # whether an open stopper needs no test
 
-    def select_allowed(self, ordered_table: _OrderedTable) -> CombinationMask:
-        """Return the mask of the allowed combinations of the table."""
+    def mask_allowed_combinations(self, ordered_table: _OrderedCombinationTable) -> CombinationMask:
+        """Return the bit mask of those combinations of the table that are allowed."""
 
         def combine_masks(mask_index: int) -> Array:
-            allowed_mask = jnp.full_like(self.allowed_modes[0], -1, jnp.int32)
+            allowed_mask = jnp.full_like(self.allowed_slot_modes[0], -1, jnp.int32)
             for i in range(2):
-                masks_by_mode = enumerate(ordered_table.mode_masks[i])
+                masks_by_mode = enumerate(ordered_table.masks_by_slot_mode[i])
                 slot_mode_masks = [
                     jnp.where(
-                        contains_mode(self.allowed_modes[i], mode), combination_mask[mask_index], 0
+                        is_mode_in_set(self.allowed_slot_modes[i], mode),
+                        combination_mask[mask_index],
+                        0,
                     )
                     for mode, combination_mask in masks_by_mode
                 ]
                 stopper_mask = jnp.where(
-                    self.can_hold_stopper[i], -1, ~ordered_table.held_masks[i][mask_index]
+                    self.can_hold_stopper[i],
+                    -1,
+                    ~ordered_table.masks_by_held_stopper[i][mask_index],
                 )
                 allowed_mask = (
                     allowed_mask
@@ -511,125 +545,139 @@ class AllowedModes(NamedTuple):
         return combine_masks(0), combine_masks(1)
 
 
-def contains_mode(mode_set: Array, mode: Array | int) -> Bool[Array, "..."]:
-    """Return whether a set of modes contains a mode."""
-    return ((mode_set >> mode) & 1) > 0
+def is_mode_in_set(allowed_mode_set: Array, mode: Array | int) -> Bool[Array, "..."]:
+    """Return whether a set of modes, with one bit per mode, contains a mode."""
+    return ((allowed_mode_set >> mode) & 1) > 0
 
 
-class ChosenCombination(NamedTuple):
-    """Combination of contact modes and stoppers that an event selects."""
+class ChosenModeCombination(NamedTuple):
+    """Combination of contact modes and stoppers that is chosen at an event."""
 
     slot_modes: Int[Array, "2 ..."]
-    is_held: Bool[Array, "2 ..."]
-    violation: Elementwise  # largest sign violation in `SignTolerances`; 0 if admissible
+    is_stopper_holding: Bool[Array, "2 ..."]
+    # largest sign violation in `ContactSignTolerances`; 0 if admissible
+    sign_violation: Elementwise
     n_solutions: Int[Array, "..."]  # at least 1 if the violation is small
 
 
-class SignTolerances(NamedTuple):
-    """Units of sign violations, within which round-off decides the sign."""
+class ContactSignTolerances(NamedTuple):
+    """Forces and motions below which round-off decides the sign.
+
+    They are the units of sign violations.
+    """
 
     force_tolerance: Elementwise  # N, or N s in an impact
     motion_tolerance: Elementwise  # m/s^2, or m/s
 
 
 MAX_VIOLATION = 1e3
-"""Largest accepted violation, in units of `SignTolerances`, if no combination has all signs
+"""Largest accepted violation, in units of `ContactSignTolerances`, if no combination has all signs
 correct."""
 
 
 class _EnumerationState(NamedTuple):
-    """State of the enumeration of the table."""
+    """State of the loop over the combinations of a table."""
 
-    remaining_mask: CombinationMask  # allowed combinations that are not yet examined
+    untested_combination_mask: CombinationMask  # allowed combinations that are not yet examined
     best_combination: CombinationMask  # first admissible combination, else the least violating one
-    violation: Elementwise
+    lowest_violation: Elementwise
     n_solutions: Int[Array, "..."]
 
 
 def _evaluate_violation(
     s: Symbols,
-    inertia: ContactInverseInertia,
+    inverse_inertia: ContactInverseInertia,
     free_motion: FreeMotion,
     friction: Friction,
-    allowed_modes: AllowedModes,
-    tolerances: SignTolerances,
+    allowed_modes: AllowedContactModes,
+    tolerances: ContactSignTolerances,
     slot_modes: Array,
-    is_held: Array,
+    is_stopper_holding: Array,
 ) -> Array:
-    """Return the largest sign violation of a combination, in units of `tolerances`."""
-    is_infinite = map_friction(lambda coefficient_value: ~jnp.isfinite(coefficient_value), friction)
+    """Return the largest sign violation of a combination, as a multiple of its tolerance."""
+    is_friction_infinite = map_friction(
+        lambda coefficient_value: ~jnp.isfinite(coefficient_value), friction
+    )
     uses_friction_limit = map_friction(
         lambda coefficient_value: coefficient_value == jnp.inf, friction
     )
-    coefficient = finite_friction(friction)
-    solution = solve_combination(s, inertia, free_motion, slot_modes, is_held, friction)
-    max_violation, holds_along_slope = jnp.zeros_like(solution.hub_vector[0]), []
+    coefficient = replace_infinite_friction(friction)
+    solution = solve_combination(
+        s, inverse_inertia, free_motion, slot_modes, is_stopper_holding, friction
+    )
+    max_violation, holds_along_slope = jnp.zeros_like(solution.hub_motion[0]), []
     for i in range(2):
         mode = slot_modes[i]
         holds_along_slope.append(
-            is_held[i]
+            is_stopper_holding[i]
             & (mode != ContactMode.OFF)
-            & ((mode == ContactMode.STICK) | _friction_of_slot(i, uses_friction_limit))
+            & ((mode == ContactMode.STICK) | _get_slot_friction(i, uses_friction_limit))
         )
-        zero_if = lambda is_untested, coefficient_value: jnp.where(
+        zero_if_untested = lambda is_untested, coefficient_value: jnp.where(
             is_untested, 0.0, coefficient_value
         )
-        is_untested = contains_mode(allowed_modes.untested_modes[i], mode)
-        t, n, x, z = (
+        is_untested = is_mode_in_set(allowed_modes.untested_slot_modes[i], mode)
+        tangential_force, normal_force, foot_motion_x, foot_motion_z = (
             slot_pair[i]
             for slot_pair in (
-                solution.tangential,
-                solution.normal,
+                solution.tangential_forces,
+                solution.normal_forces,
                 solution.foot_motion_x,
                 solution.foot_motion_z,
             )
         )
-        pull_violation = -n / tolerances.force_tolerance
-        cone_violation = zero_if(
-            _friction_of_slot(i, is_infinite),
-            jnp.abs(t) - _friction_of_slot(i, coefficient) * n,
+        pull_violation = -normal_force / tolerances.force_tolerance
+        cone_violation = zero_if_untested(
+            _get_slot_friction(i, is_friction_infinite),
+            jnp.abs(tangential_force) - _get_slot_friction(i, coefficient) * normal_force,
         )
-        stick_violation = zero_if(
+        stick_violation = zero_if_untested(
             is_untested, jnp.maximum(pull_violation, cone_violation / tolerances.force_tolerance)
         )
         slip_violation = (
-            jnp.where(mode == ContactMode.SLIP_DOWN, -x, x) / tolerances.motion_tolerance
+            jnp.where(mode == ContactMode.SLIP_DOWN, -foot_motion_x, foot_motion_x)
+            / tolerances.motion_tolerance
         )
         friction_violation = (
-            jnp.where(mode == ContactMode.SLIP_DOWN, t, -t) / tolerances.force_tolerance
+            jnp.where(mode == ContactMode.SLIP_DOWN, tangential_force, -tangential_force)
+            / tolerances.force_tolerance
         )
         slide_violation = jnp.maximum(
             jnp.where(
-                _friction_of_slot(i, uses_friction_limit), friction_violation, pull_violation
+                _get_slot_friction(i, uses_friction_limit), friction_violation, pull_violation
             ),
-            zero_if(is_untested, slip_violation),
+            zero_if_untested(is_untested, slip_violation),
         )
         loaded_violation = jnp.where(mode == ContactMode.STICK, stick_violation, slide_violation)
         foot_violation = jnp.where(
             mode == ContactMode.OFF,
-            zero_if(is_untested, -z / tolerances.motion_tolerance),
+            zero_if_untested(is_untested, -foot_motion_z / tolerances.motion_tolerance),
             loaded_violation,
         )
-        open_violation = zero_if(
-            allowed_modes.is_open_untested[i],
+        open_violation = zero_if_untested(
+            allowed_modes.is_open_stopper_untested[i],
             solution.length_motion[i] / tolerances.motion_tolerance,
         )
         stopper_violation = jnp.where(
-            is_held[i], -solution.stopper[i] / tolerances.force_tolerance, open_violation
+            is_stopper_holding[i],
+            -solution.stopper_forces[i] / tolerances.force_tolerance,
+            open_violation,
         )
         max_violation = jnp.maximum(
             max_violation,
             jnp.maximum(
-                zero_if(allowed_modes.has_fixed_mode[i], foot_violation), stopper_violation
+                zero_if_untested(allowed_modes.has_fixed_mode[i], foot_violation), stopper_violation
             ),
         )
-        max_violation = jnp.where(jnp.isfinite(n) & jnp.isfinite(t), max_violation, jnp.inf)
+        max_violation = jnp.where(
+            jnp.isfinite(normal_force) & jnp.isfinite(tangential_force), max_violation, jnp.inf
+        )
     # If both legs are held and both feet resist motion along the slope, the hub is rigid. The
     # tangential forces of the feet are then not separately determined.
     return jnp.where(holds_along_slope[0] & holds_along_slope[1], jnp.inf, max_violation)
 
 
-def _least_violating(
+def _find_least_violating(
     evaluate_combination: Callable[[CombinationMask], Array], combinations: list[CombinationMask]
 ) -> tuple[CombinationMask, Array, Array]:
     """Return the first of the least violating combinations, its violation, and the number of
@@ -639,65 +687,93 @@ def _least_violating(
     would duplicate the code of `evaluate_combination` for each use.
     """
     if len(combinations) == 1:
-        violation = evaluate_combination(combinations[0])
-        return combinations[0], violation, violation == 0.0
-    first_masks, second_masks = (jnp.stack(masks) for masks in zip(*combinations, strict=True))
+        sign_violation = evaluate_combination(combinations[0])
+        return combinations[0], sign_violation, sign_violation == 0.0
+    first_masks, second_masks = (
+        jnp.stack(combination_masks) for combination_masks in zip(*combinations, strict=True)
+    )
     violations = jax.vmap(evaluate_combination)((first_masks, second_masks))
     combination_indices = lax.broadcasted_iota(jnp.int32, violations.shape, 0)
 
-    def pick_better(a: tuple, b: tuple) -> tuple:
-        a_is_better = (a[0] < b[0]) | ((a[0] == b[0]) & (a[1] < b[1]))
-        return jnp.where(a_is_better, a[0], b[0]), jnp.where(a_is_better, a[1], b[1]), a[2] + b[2]
+    def pick_less_violating(a: tuple, b: tuple) -> tuple:
+        is_first_better = (a[0] < b[0]) | ((a[0] == b[0]) & (a[1] < b[1]))
+        return (
+            jnp.where(is_first_better, a[0], b[0]),
+            jnp.where(is_first_better, a[1], b[1]),
+            a[2] + b[2],
+        )
 
-    initial_minimum = np.array(np.inf, violations.dtype), np.int32(len(combinations)), np.int32(0)
-    operands = violations, combination_indices, (violations == 0.0).astype(jnp.int32)
-    violation, best_index, n_admissible = lax.reduce(operands, initial_minimum, pick_better, (0,))
-    select_mask = lambda masks: jnp.sum(
-        jnp.where(best_index == combination_indices, masks, 0), axis=0, dtype=jnp.int32
+    initial_lowest_violation = (
+        np.array(np.inf, violations.dtype),
+        np.int32(len(combinations)),
+        np.int32(0),
     )
-    return (select_mask(first_masks), select_mask(second_masks)), violation, n_admissible
+    reduction_operands = violations, combination_indices, (violations == 0.0).astype(jnp.int32)
+    sign_violation, least_violating_index, n_admissible = lax.reduce(
+        reduction_operands, initial_lowest_violation, pick_less_violating, (0,)
+    )
+    select_combinations = lambda combination_masks: jnp.sum(
+        jnp.where(least_violating_index == combination_indices, combination_masks, 0),
+        axis=0,
+        dtype=jnp.int32,
+    )
+    return (
+        (select_combinations(first_masks), select_combinations(second_masks)),
+        sign_violation,
+        n_admissible,
+    )
 
 
 def choose_combination(
     s: Symbols,
-    inertia: ContactInverseInertia,
+    inverse_inertia: ContactInverseInertia,
     free_motion: FreeMotion,
-    allowed_modes: AllowedModes,
+    allowed_modes: AllowedContactModes,
     friction: Friction,
-    tolerances: SignTolerances,
+    tolerances: ContactSignTolerances,
     counts_all_solutions: bool,
-) -> ChosenCombination:
-    """Return the first admissible combination of the table; `n_solutions` is 0 if there is none.
+) -> ChosenModeCombination:
+    """Return the first admissible combination of the table, with the number of solutions.
 
-    - `counts_all_solutions`: whether all admissible combinations are counted; otherwise the search
-      ends at the first.
+    - `counts_all_solutions`: whether all admissible combinations are counted. Otherwise the search
+      ends at the first admissible combination.
 
-    Without an admissible combination, the least violating one is returned. That combination counts
-    as a solution if its violation is at most `MAX_VIOLATION`: round-off may close or open two
-    contacts.
+    Without an admissible combination, the least violating combination is returned. It counts as a
+    solution if its violation is at most `MAX_VIOLATION`, because round-off may close or open two
+    contacts. Otherwise the number of solutions is 0.
     """
     evaluate_modes = functools.partial(
         _evaluate_violation,
-        *lax.stop_gradient((s, inertia, free_motion, friction)),
+        *lax.stop_gradient((s, inverse_inertia, free_motion, friction)),
         allowed_modes,
         lax.stop_gradient(tolerances),
     )
-    uses_paper_rule = map_friction(lambda value: value == PAPER_RULE_SENTINEL, friction)
+    uses_paper_rule = map_friction(
+        lambda coefficient_value: coefficient_value == PAPER_RULE_SENTINEL, friction
+    )
     if isinstance(uses_paper_rule, tuple):
         uses_paper_rule = uses_paper_rule[0] & uses_paper_rule[1]
     ordered_table = jax.tree.map(
         lambda paper_mask, limit_mask: jnp.where(uses_paper_rule, paper_mask, limit_mask),
-        *_ORDERED_TABLES,
+        *_COMBINATION_TABLES,
     )
 
     def decode_combination(combination: CombinationMask) -> tuple[Array, Array]:
-        is_in_mask = lambda mask: ((combination[0] & mask[0]) | (combination[1] & mask[1])) != 0
+        is_combination_in_mask = lambda mask: (
+            ((combination[0] & mask[0]) | (combination[1] & mask[1])) != 0
+        )
         slot_modes = [
-            sum(jnp.where(is_in_mask(masks_by_mode[mode]), mode, 0) for mode in range(1, 4))
-            for masks_by_mode in ordered_table.mode_masks
+            sum(
+                jnp.where(is_combination_in_mask(masks_by_mode[mode]), mode, 0)
+                for mode in range(1, 4)
+            )
+            for masks_by_mode in ordered_table.masks_by_slot_mode
         ]
         return jnp.stack(slot_modes).astype(jnp.int32), jnp.stack(
-            [is_in_mask(masks_by_mode) for masks_by_mode in ordered_table.held_masks]
+            [
+                is_combination_in_mask(masks_by_mode)
+                for masks_by_mode in ordered_table.masks_by_held_stopper
+            ]
         )
 
     def evaluate_combination(combination: CombinationMask) -> Array:
@@ -707,22 +783,29 @@ def choose_combination(
             jnp.inf,
         )
 
-    def is_unfinished(state: _EnumerationState) -> Array:
-        return ((state.remaining_mask[0] | state.remaining_mask[1]) != 0) & (
-            counts_all_solutions | (state.n_solutions == 0)
-        )
-
-    def evaluate_next_combinations(state: _EnumerationState) -> _EnumerationState:
-        """Return the state after evaluation of the next few allowed combinations."""
-        (remaining_mask, best_combination, lowest_violation, n_solutions), combinations = state, []
-        for _ in range(1 if simd.targets_machine_code() else N_CONCURRENT_COMBINATIONS):
-            combination = (
-                remaining_mask[0] & -remaining_mask[0],
-                jnp.where(remaining_mask[0] == 0, remaining_mask[1] & -remaining_mask[1], 0),
+    def is_unfinished(enumeration_state: _EnumerationState) -> Array:
+        return (
+            (
+                enumeration_state.untested_combination_mask[0]
+                | enumeration_state.untested_combination_mask[1]
             )
-            remaining_mask = remaining_mask[0] ^ combination[0], remaining_mask[1] ^ combination[1]
+            != 0
+        ) & (counts_all_solutions | (enumeration_state.n_solutions == 0))
+
+    def evaluate_next_combinations(enumeration_state: _EnumerationState) -> _EnumerationState:
+        """Return the enumeration state after the next few allowed combinations are evaluated."""
+        (untested_mask, best_combination, lowest_violation, n_solutions), combinations = (
+            enumeration_state,
+            [],
+        )
+        for _ in range(1 if simd.targets_machine_code() else N_COMBINATIONS_PER_ITERATION):
+            combination = (
+                untested_mask[0] & -untested_mask[0],
+                jnp.where(untested_mask[0] == 0, untested_mask[1] & -untested_mask[1], 0),
+            )
+            untested_mask = untested_mask[0] ^ combination[0], untested_mask[1] ^ combination[1]
             combinations.append(combination)
-        combination, combination_violation, n_admissible = _least_violating(
+        combination, combination_violation, n_admissible = _find_least_violating(
             evaluate_combination, combinations
         )
         best_combination, lowest_violation = select_tree_leaves(
@@ -732,86 +815,90 @@ def choose_combination(
         )
         n_solutions = n_solutions + n_admissible
         return select_tree_leaves(
-            is_unfinished(state),
-            _EnumerationState(remaining_mask, best_combination, lowest_violation, n_solutions),
-            state,
+            is_unfinished(enumeration_state),
+            _EnumerationState(untested_mask, best_combination, lowest_violation, n_solutions),
+            enumeration_state,
         )
 
-    remaining_mask = allowed_modes.select_allowed(ordered_table)
-    infinite_violation = jnp.full_like(lax.stop_gradient(free_motion.hub_vector[2]), jnp.inf)
+    untested_mask = allowed_modes.mask_allowed_combinations(ordered_table)
+    infinite_violation = jnp.full_like(lax.stop_gradient(free_motion.hub_motion[2]), jnp.inf)
     initial_state = _EnumerationState(
-        remaining_mask,
-        (0 * remaining_mask[0] + 1, 0 * remaining_mask[1]),
+        untested_mask,
+        (0 * untested_mask[0] + 1, 0 * untested_mask[1]),
         infinite_violation,
-        0 * remaining_mask[0],
+        0 * untested_mask[0],
     )
-    state = lax.while_loop(
-        lambda state: jnp.any(is_unfinished(state)), evaluate_next_combinations, initial_state
+    enumeration_state = lax.while_loop(
+        lambda enumeration_state: jnp.any(is_unfinished(enumeration_state)),
+        evaluate_next_combinations,
+        initial_state,
     )
     n_solutions = jnp.maximum(
-        state.n_solutions, (state.violation <= MAX_VIOLATION).astype(jnp.int32)
+        enumeration_state.n_solutions,
+        (enumeration_state.lowest_violation <= MAX_VIOLATION).astype(jnp.int32),
     )
-    return ChosenCombination(
-        *decode_combination(state.best_combination), state.violation, n_solutions
+    return ChosenModeCombination(
+        *decode_combination(enumeration_state.best_combination),
+        enumeration_state.lowest_violation,
+        n_solutions,
     )
 
 
 def is_release_consistent(
     s: Symbols,
-    inertia: ContactInverseInertia,
+    inverse_inertia: ContactInverseInertia,
     free_motion: FreeMotion,
     slot_state: tuple[Array, Array],
     friction: Friction,
     is_second_slot: Bool[Array, "..."],
     release_direction: Int[Array, "..."],
 ) -> Bool[Array, "..."]:
-    """Return whether a slot's foot, just released from its mode, would move in the direction of
-    release.
+    """Return whether a foot that is released from its contact mode moves in the release direction.
 
     - `slot_state`: contact modes and stoppers of both slots;
     - `is_second_slot`: whether the foot is that of the second slot;
     - `release_direction`: 0 off the ground, 1 downhill, -1 uphill.
 
     The margin of the mode must grow with the acceleration in that direction. If the margin shrinks,
-    the next mode would end at once, and the forces jump instead (Painlevé).
+    the next mode ends at once, and the forces jump (Painlevé).
     """
-    slot_modes, is_held = slot_state
-    slot_weights = jnp.stack([~is_second_slot, is_second_slot]).astype(inertia.sin[0].dtype)
+    slot_modes, is_stopper_holding = slot_state
+    slot_weights = jnp.stack([~is_second_slot, is_second_slot]).astype(inverse_inertia.sin[0].dtype)
     sin, cos = (
         slot_weights[0] * slot_pair[0] + slot_weights[1] * slot_pair[1]
-        for slot_pair in (inertia.sin, inertia.cos)
+        for slot_pair in (inverse_inertia.sin, inverse_inertia.cos)
     )
     is_liftoff = release_direction == 0
-    e, u = (
-        jnp.where(is_liftoff, -sin, release_direction * cos),
-        jnp.where(is_liftoff, cos, release_direction * sin),
-    )
+    e = jnp.where(is_liftoff, -sin, release_direction * cos)
+    u = jnp.where(is_liftoff, cos, release_direction * sin)
     acceleration_unit = compute_wheel_units(s).acceleration_unit
-    shift_pair = lambda slot_pair, shift: (
-        slot_pair[0] - acceleration_unit * shift * slot_weights[0],
-        slot_pair[1] - acceleration_unit * shift * slot_weights[1],
+    shift_slot_pair = lambda slot_pair, slot_shift: (
+        slot_pair[0] - acceleration_unit * slot_shift * slot_weights[0],
+        slot_pair[1] - acceleration_unit * slot_shift * slot_weights[1],
     )
-    displaced_motion = free_motion._replace(
-        foot_transverse_motion=shift_pair(free_motion.foot_transverse_motion, e),
-        foot_radial_motion=shift_pair(free_motion.foot_radial_motion, u),
+    shifted_free_motion = free_motion._replace(
+        foot_transverse_motion=shift_slot_pair(free_motion.foot_transverse_motion, e),
+        foot_radial_motion=shift_slot_pair(free_motion.foot_radial_motion, u),
     )
     slot_friction = (
         jnp.where(is_second_slot, friction[1], friction[0])
         if isinstance(friction, tuple)
         else friction
     )
-    coefficient = finite_friction(slot_friction)
-    uses_friction_limit, mode = (
-        slot_friction == jnp.inf,
-        jnp.where(is_second_slot, slot_modes[1], slot_modes[0]),
-    )
+    coefficient = replace_infinite_friction(slot_friction)
+    uses_friction_limit = slot_friction == jnp.inf
+    mode = jnp.where(is_second_slot, slot_modes[1], slot_modes[0])
     slides_down = mode == ContactMode.SLIP_DOWN
     is_sliding = slides_down | (mode == ContactMode.SLIP_UP)
 
-    def mode_margin(assumed_motion: FreeMotion) -> Array:
-        solution = solve_combination(s, inertia, assumed_motion, slot_modes, is_held, friction)
-        normal = jnp.where(is_second_slot, solution.normal[1], solution.normal[0])
-        tangential = jnp.where(is_second_slot, solution.tangential[1], solution.tangential[0])
+    def compute_mode_margin(assumed_motion: FreeMotion) -> Array:
+        solution = solve_combination(
+            s, inverse_inertia, assumed_motion, slot_modes, is_stopper_holding, friction
+        )
+        normal = jnp.where(is_second_slot, solution.normal_forces[1], solution.normal_forces[0])
+        tangential = jnp.where(
+            is_second_slot, solution.tangential_forces[1], solution.tangential_forces[0]
+        )
         supporting_force = jnp.where(
             uses_friction_limit & is_sliding,
             jnp.where(slides_down, -tangential, tangential),
@@ -823,4 +910,4 @@ def is_release_consistent(
             coefficient * normal + release_direction * tangential,
         )
 
-    return mode_margin(displaced_motion) > mode_margin(free_motion)
+    return compute_mode_margin(shifted_free_motion) > compute_mode_margin(free_motion)

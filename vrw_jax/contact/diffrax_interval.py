@@ -15,28 +15,28 @@ from jaxtyping import Array, Float
 
 from vrw_jax.contact.batch_integrator import (
     N_ACCUMULATOR_ROWS,
-    N_CONTACT_ROWS,
+    N_CONTACT_QUANTITY_ROWS,
     IntervalPoint,
     IntervalState,
     LaneStatus,
     evaluate_dynamics,
-    is_at_singularity,
-    motion_from_point,
+    is_at_painleve_singularity,
     pack_coordinates,
+    unpack_motion,
 )
 from vrw_jax.contact.contact_state import (
-    Accumulators,
     ContactState,
+    LossAccumulators,
     ModeDynamics,
     PackedState,
     compute_forces,
     compute_guard_scales,
     compute_guard_values,
     compute_packed_units,
+    evaluate_vector_field,
     make_guard_layout,
     pack_state,
     unpack_state,
-    vector_field,
 )
 from vrw_jax.contact.mechanics import WheelMotion, stop_gradients
 from vrw_jax.hybrid import MonitoredFunctions, integrate_in_units, sample_in_units
@@ -47,28 +47,30 @@ ROLLING_INDEX = 2
 """Index of the rolling rate among the rates (hub x, z, theta, lengths)."""
 
 
-def init_diffrax_interval(dynamics: ModeDynamics, motion: WheelMotion) -> IntervalState:
-    """Return the lane at the start of a contact state.
+def init_diffrax_interval(mode_dynamics: ModeDynamics, motion: WheelMotion) -> IntervalState:
+    """Return the state of a single lane at the start of a contact state.
 
-    The accelerations are infinite, because only those at the end of the interval are used. The
-    fields of the batch integrator's search for events are None.
+    The accelerations are infinite, because only the accelerations at the end of the interval are
+    used. The fields for the event search of the batch integrator are None.
     """
     q, v = pack_coordinates(motion)
-    n_rows = len(q) + N_CONTACT_ROWS
-    int_zeros = jnp.zeros(motion.x.shape, jnp.int32)
-    search_field: Any = None
+    n_dynamics_rows = len(q) + N_CONTACT_QUANTITY_ROWS
+    int_zero_lanes = jnp.zeros(motion.x.shape, jnp.int32)
+    no_search_field: Any = None
     return IntervalState(
-        point=IntervalPoint(q, v, jnp.full((n_rows, *motion.x.shape), jnp.inf, q.dtype)),
-        contact_state=dynamics.contact_state,
-        guard_values=search_field,
-        guard_offset=search_field,
+        interval_point=IntervalPoint(
+            q, v, jnp.full((n_dynamics_rows, *motion.x.shape), jnp.inf, q.dtype)
+        ),
+        contact_state=mode_dynamics.contact_state,
+        guard_values=no_search_field,
+        guard_offset=no_search_field,
         interval_accumulators=jnp.zeros((N_ACCUMULATOR_ROWS, *motion.x.shape), q.dtype),
-        h=search_field,
-        time=jnp.zeros_like(motion.x),
-        event_bracket=search_field,
-        status=int_zeros + LaneStatus.RUNNING,
-        triggered_guard=int_zeros,
-        n_solver_steps=int_zeros,
+        h=no_search_field,
+        time_since_event=jnp.zeros_like(motion.x),
+        event_bracket=no_search_field,
+        lane_status=int_zero_lanes + LaneStatus.RUNNING,
+        triggered_guard_index=int_zero_lanes,
+        n_solver_steps=int_zero_lanes,
     )
 
 
@@ -78,83 +80,103 @@ def integrate_by_diffrax(
     interval: IntervalState,
     options: StepOptions,
 ) -> IntervalState:
-    """Return a running lane at its next event or failure; any other lane is unchanged.
+    """Return the state of a running lane at its next event or failure.
 
-    All arrays have one lane on their last axis.
+    The state of any other lane is returned unchanged. All arrays have one lane on their last axis.
     """
     input_columns, interval, options = jax.tree.map(
         lambda x: x[..., 0], (input_columns, interval, options)
     )
-    dynamics = make_dynamics(input_columns, interval.contact_state)._replace(has_accumulators=False)
-    is_running = interval.status == LaneStatus.RUNNING
-    assert interval.interval_accumulators is not None
-    start_accumulators = Accumulators(
-        jnp.zeros_like(interval.time), *interval.interval_accumulators
+    mode_dynamics = make_dynamics(input_columns, interval.contact_state)._replace(
+        has_accumulators=False
     )
-    layout = make_guard_layout(dynamics.s.n, dynamics.is_one_sided)
-    q, v = interval.point[:2]
-    start_rows = evaluate_dynamics(*stop_gradients((dynamics, q, v)))
+    is_running = interval.lane_status == LaneStatus.RUNNING
+    assert interval.interval_accumulators is not None
+    start_accumulators = LossAccumulators(
+        jnp.zeros_like(interval.time_since_event), *interval.interval_accumulators
+    )
+    guard_layout = make_guard_layout(mode_dynamics.s.n, mode_dynamics.has_one_sided_stoppers)
+    q, v = interval.interval_point[:2]
+    start_rows = evaluate_dynamics(*stop_gradients((mode_dynamics, q, v)))
     # As in `init_interval`, a wheel that an event leaves rolling backward continues if it
     # accelerates forward. The guard is then the rise of the rate.
-    rate, acceleration = lax.stop_gradient(v[ROLLING_INDEX]), start_rows[ROLLING_INDEX]
-    guard_offset = jnp.zeros(layout.n_guards, q.dtype)
-    guard_offset = guard_offset.at[layout.rolling_rate].set(
-        jnp.where((rate < 0.0) & (acceleration > 0.0), rate, 0.0)
+    end_rates, end_acceleration = lax.stop_gradient(v[ROLLING_INDEX]), start_rows[ROLLING_INDEX]
+    guard_offset = jnp.zeros(guard_layout.n_guards, q.dtype)
+    guard_offset = guard_offset.at[guard_layout.rolling_rate_guard].set(
+        jnp.where((end_rates < 0.0) & (end_acceleration > 0.0), end_rates, 0.0)
     )
-    end = integrate_in_units(
-        partial(vector_field, dynamics),
+    end_result = integrate_in_units(
+        partial(evaluate_vector_field, mode_dynamics),
         MonitoredFunctions(
-            lambda state: compute_guard_values(dynamics, state) - guard_offset,
-            layout.n_guards,
-            guard_scales=compute_guard_scales(dynamics),
+            lambda packed_state: compute_guard_values(mode_dynamics, packed_state) - guard_offset,
+            guard_layout.n_guards,
+            guard_scales=compute_guard_scales(mode_dynamics),
         ),
-        pack_state(motion_from_point(interval.point), start_accumulators),
+        pack_state(unpack_motion(interval.interval_point), start_accumulators),
         is_running,
         options,
-        compute_packed_units(dynamics.s),
-        compute_wheel_units(dynamics.s).time_unit,
+        compute_packed_units(mode_dynamics.s),
+        compute_wheel_units(mode_dynamics.s).time_unit,
     )
-    end_motion, end_accumulators = unpack_state(end.state)
+    end_motion, end_accumulators = unpack_state(end_result.state)
     q, v = pack_coordinates(end_motion)
-    end_rows = evaluate_dynamics(*stop_gradients((dynamics, q, v)))
+    end_rows = evaluate_dynamics(*stop_gradients((mode_dynamics, q, v)))
     # At the singularity, forces change sign without passing through zero.
-    n_rows = len(q) + N_CONTACT_ROWS
-    is_singular = is_at_singularity(start_rows[n_rows - 1], end_rows[n_rows - 1], options)
-    failure = jnp.where(end.timed_out, Outcome.NO_TOUCHDOWN_IN_TIME, Outcome.SOLVER_FAILED)
-    status = jnp.where(end.guard >= 0, LaneStatus.EVENT, failure)
-    status = jnp.where(is_singular, Outcome.PAINLEVE_PARADOX, status)
-    dynamics_rows = jnp.where(is_running, end_rows[:n_rows], interval.point.dynamics_rows)
+    n_dynamics_rows = len(q) + N_CONTACT_QUANTITY_ROWS
+    is_singular = is_at_painleve_singularity(
+        start_rows[n_dynamics_rows - 1], end_rows[n_dynamics_rows - 1], options
+    )
+    failure_outcome = jnp.where(
+        end_result.timed_out, Outcome.NO_TOUCHDOWN_IN_TIME, Outcome.SOLVER_FAILED
+    )
+    lane_status = jnp.where(end_result.guard >= 0, LaneStatus.EVENT, failure_outcome)
+    lane_status = jnp.where(is_singular, Outcome.PAINLEVE_PARADOX, lane_status)
+    dynamics_rows = jnp.where(
+        is_running, end_rows[:n_dynamics_rows], interval.interval_point.dynamics_rows
+    )
     interval = interval._replace(
-        point=IntervalPoint(q, v, dynamics_rows),
+        interval_point=IntervalPoint(q, v, dynamics_rows),
         interval_accumulators=jnp.stack(end_accumulators[1:]),
-        time=jnp.where(is_running, end.duration, interval.time),
-        status=jnp.where(is_running, status, interval.status).astype(jnp.int32),
-        triggered_guard=jnp.where(is_running, end.guard, interval.triggered_guard),
-        n_solver_steps=jnp.where(is_running, end.solver_steps, interval.n_solver_steps),
+        time_since_event=jnp.where(is_running, end_result.duration, interval.time_since_event),
+        lane_status=jnp.where(is_running, lane_status, interval.lane_status).astype(jnp.int32),
+        triggered_guard_index=jnp.where(
+            is_running, end_result.guard, interval.triggered_guard_index
+        ),
+        n_solver_steps=jnp.where(is_running, end_result.solver_steps, interval.n_solver_steps),
     )
     return jax.tree.map(lambda x: x[..., None], interval)
 
 
 def sample_by_diffrax(
-    dynamics: ModeDynamics,
-    start: PackedState,
+    mode_dynamics: ModeDynamics,
+    start_state: PackedState,
     duration: Array,
     n_samples: int,
     options: StepOptions,
 ) -> tuple[Float[Array, "n dim"], Float[Array, "n legs"], Float[Array, "n legs"]]:
-    """Return the states of an interval at equal times, and tangential and normal forces on all
-    feet, N.
+    """Return packed states at equally spaced times of an interval, and tangential and normal forces
+    on all feet, N.
 
     - `duration`: length of the interval, s.
     """
 
-    def compute_foot_forces(state: PackedState) -> tuple[Array, Array]:
-        solution = compute_forces(dynamics, unpack_state(state)[0]).solution
-        scatter = dynamics.contact_slots.scatter
-        return scatter(solution.tangential), scatter(solution.normal)
+    def compute_foot_forces(packed_state: PackedState) -> tuple[Array, Array]:
+        force_solution = compute_forces(mode_dynamics, unpack_state(packed_state)[0]).force_solution
+        scatter_to_legs = mode_dynamics.contact_slots.scatter_to_legs
+        return scatter_to_legs(force_solution.tangential_forces), scatter_to_legs(
+            force_solution.normal_forces
+        )
 
-    units = compute_packed_units(dynamics.s), compute_wheel_units(dynamics.s).time_unit
-    states = sample_in_units(
-        partial(vector_field, dynamics), start, duration, n_samples, options, *units
+    wheel_units = (
+        compute_packed_units(mode_dynamics.s),
+        compute_wheel_units(mode_dynamics.s).time_unit,
     )
-    return states, *jax.vmap(compute_foot_forces)(states)
+    packed_states = sample_in_units(
+        partial(evaluate_vector_field, mode_dynamics),
+        start_state,
+        duration,
+        n_samples,
+        options,
+        *wheel_units,
+    )
+    return packed_states, *jax.vmap(compute_foot_forces)(packed_states)

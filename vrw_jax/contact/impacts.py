@@ -18,19 +18,19 @@ from vrw_jax.contact.contact_modes import (
     ALL_MODES_MASK,
     MAX_VIOLATION,
     PAPER_RULE_SENTINEL,
-    AllowedModes,
-    ChosenCombination,
+    AllowedContactModes,
+    ChosenModeCombination,
     ContactMode,
+    ContactSignTolerances,
     Friction,
-    SignTolerances,
     choose_combination,
     is_release_consistent,
 )
-from vrw_jax.contact.contact_state import ContactState, GuardLayout, stack_friction
+from vrw_jax.contact.contact_state import ContactState, GuardLayout, stack_slot_friction
 from vrw_jax.contact.dynamics_jvp import (
     ContactConfiguration,
-    ForceSolution,
-    solve_configuration,
+    WheelForceSolution,
+    solve_contact_configuration,
     solve_contact_forces,
     solve_impact,
 )
@@ -41,78 +41,82 @@ from vrw_jax.contact.mechanics import (
     LegArray,
     SlotPair,
     WheelMotion,
-    find_slots,
-    foot_heights,
-    foot_speeds,
-    foot_velocity,
-    free_acceleration,
-    free_velocity,
-    kinetic_energy,
-    leg_directions,
+    compute_foot_heights,
+    compute_foot_velocities,
+    compute_free_acceleration,
+    compute_free_velocity,
+    compute_kinetic_energy,
+    compute_leg_directions,
+    compute_slot_foot_velocity,
+    find_contact_slots,
     make_inverse_inertia,
-    slot_friction,
+    select_slot_friction,
     stop_gradients,
 )
 from vrw_jax.numerics import Elementwise, run_if_any, select_tree_leaves
 from vrw_jax.wheel import Symbols
 
 
-class Event(NamedTuple):
-    """Kind of an event. One flag is set, for one leg or slot."""
+class ContactEvent(NamedTuple):
+    """Kind of an event, as flags of legs and slots. One flag of one leg or slot is true."""
 
-    lands: Bool[Array, "n_legs ..."]  # whether the foot meets the ground
-    meets_stopper: Bool[Array, "n_legs ..."]  # whether the leg meets its stopper
-    leaves_stopper: Bool[Array, "n_legs ..."]  # whether the stopper force in the air vanishes
-    lifts_off: Bool[Array, "2 ..."]  # whether the normal force of the slot vanishes
-    slides_up: Bool[Array, "2 ..."]  # whether the slot's foot begins to slide uphill
-    slides_down: Bool[Array, "2 ..."]
-    stops_sliding: Bool[Array, "2 ..."]  # whether the slot's foot stops sliding
-    releases_stopper: Bool[Array, "2 ..."]  # whether the stopper force of the slot's leg vanishes
+    is_foot_landing: Bool[Array, "n_legs ..."]  # whether the foot meets the ground
+    is_leg_meeting_stopper: Bool[Array, "n_legs ..."]  # whether the leg meets its stopper
+    # whether the stopper force of a leg in the air vanishes
+    is_leg_leaving_stopper: Bool[Array, "n_legs ..."]
+    is_foot_lifting_off: Bool[Array, "2 ..."]  # whether the normal force of the slot vanishes
+    is_starting_to_slide_up: Bool[Array, "2 ..."]  # whether the slot's foot begins to slide uphill
+    is_starting_to_slide_down: Bool[Array, "2 ..."]
+    is_stopping_to_slide: Bool[Array, "2 ..."]  # whether the slot's foot stops sliding
+    # whether the stopper force of the slot's leg vanishes
+    is_releasing_stopper: Bool[Array, "2 ..."]
 
     @property
     def is_impact(self) -> Bool[Array, "..."]:
         """Return whether velocities jump at the event."""
-        return jnp.any(self.lands, axis=0) | jnp.any(self.meets_stopper, axis=0)
+        return jnp.any(self.is_foot_landing, axis=0) | jnp.any(self.is_leg_meeting_stopper, axis=0)
 
 
-def _leg_indices(n: int, reference: Array) -> np.ndarray:
-    """Return 0 ... n - 1 on the first axis, with as many further axes as `reference`."""
-    return np.arange(n, dtype=np.int32).reshape(-1, *(1,) * jnp.ndim(reference))
+def _make_leg_indices(n_legs: int, axes_reference: Array) -> np.ndarray:
+    """Return the leg indices 0 ... n - 1 on the first of as many axes as `axes_reference` has, and
+    one more.
+    """
+    return np.arange(n_legs, dtype=np.int32).reshape(-1, *(1,) * jnp.ndim(axes_reference))
 
 
-def classify_event(guard_layout: GuardLayout, guard: Int[Array, "..."]) -> Event:
-    """Return the event of a guard, from the guard's index in `layout`."""
-    n = guard_layout.n_legs
+def classify_event(guard_layout: GuardLayout, guard_index: Int[Array, "..."]) -> ContactEvent:
+    """Return the event that the zero of a guard causes, given the index of the guard."""
+    n_legs = guard_layout.n_legs
     select_flags = lambda first_index, n_guards: (
-        guard == first_index + _leg_indices(n_guards, guard)
+        guard_index == first_index + _make_leg_indices(n_guards, guard_index)
     )
-    leaves_stopper = (
-        select_flags(guard_layout.airborne_release, n)
-        if guard_layout.n_guards > guard_layout.airborne_release
-        else select_flags(guard_layout.landing, n) & False
+    is_leg_leaving_stopper = (
+        select_flags(guard_layout.first_airborne_release_guard, n_legs)
+        if guard_layout.n_guards > guard_layout.first_airborne_release_guard
+        else select_flags(guard_layout.first_landing_guard, n_legs) & False
     )
-    return Event(
-        lands=select_flags(guard_layout.landing, n),
-        meets_stopper=select_flags(guard_layout.stopper, n),
-        leaves_stopper=leaves_stopper,
-        lifts_off=select_flags(guard_layout.liftoff, 2),
-        slides_up=select_flags(guard_layout.slip_up, 2),
-        slides_down=select_flags(guard_layout.slip_down, 2),
-        stops_sliding=select_flags(guard_layout.slip_end, 2),
-        releases_stopper=select_flags(guard_layout.stopper_release, 2),
+    return ContactEvent(
+        is_foot_landing=select_flags(guard_layout.first_landing_guard, n_legs),
+        is_leg_meeting_stopper=select_flags(guard_layout.first_stopper_guard, n_legs),
+        is_leg_leaving_stopper=is_leg_leaving_stopper,
+        is_foot_lifting_off=select_flags(guard_layout.first_liftoff_guard, 2),
+        is_starting_to_slide_up=select_flags(guard_layout.first_slip_up_guard, 2),
+        is_starting_to_slide_down=select_flags(guard_layout.first_slip_down_guard, 2),
+        is_stopping_to_slide=select_flags(guard_layout.first_slip_end_guard, 2),
+        is_releasing_stopper=select_flags(guard_layout.first_stopper_release_guard, 2),
     )
 
 
 class ContactLaw(NamedTuple):
-    """Wheel, ground and contact options of all events of a walk."""
+    """Parameters of wheel and ground, and options of contact, for all events of a walk."""
 
     s: Symbols
     friction: Friction  # of all feet; or of the last landed foot and of the others
-    is_one_sided: bool  # whether stoppers of legs in the air only push
-    counts_solutions: bool  # whether all admissible solutions are counted
+    has_one_sided_stoppers: bool  # whether stoppers of legs in the air only push
+    counts_all_solutions: bool  # whether all admissible solutions are counted
     rest_speed: Elementwise  # speed below which a contact is at rest after an impact, m/s
     restitution: Elementwise | None = None  # Newton's coefficient of the feet
-    tilt: Elementwise | None = None  # angle by which the next line is steeper, rad
+    next_line_tilt: Elementwise | None = None  # angle by which the next line is steeper, rad
 
 
 @dataclass(frozen=True)
@@ -133,17 +137,21 @@ class StopperPivotOptions:
 STOPPER_PIVOT_OPTIONS = StopperPivotOptions()
 
 
-class _LevelSolution(NamedTuple):
-    """Solution at velocity or acceleration level for an assumed set of held legs in the air."""
+class _KinematicLevelSolution(NamedTuple):
+    """Solution for an assumed set of held legs in the air, at the level of velocities or of
+    accelerations.
+    """
 
-    chosen_combination: ChosenCombination
-    solution: ForceSolution
-    stopper_push: LegArray  # force or impulse of the stoppers, N or N s
-    outward_motion: LegArray  # of the leg lengths, m/s^2 or m/s
-    motion: WheelMotion  # motion after the impact
+    chosen_combination: ChosenModeCombination
+    force_solution: WheelForceSolution
+    stopper_forces: LegArray  # force or impulse of the stoppers, N or N s
+    outward_leg_motion: LegArray  # of the leg lengths, m/s^2 or m/s
+    motion_after_impact: WheelMotion  # motion after the impact
 
 
-_LevelSolver = Callable[[ContactLaw, WheelMotion, Array, ChosenCombination | None], _LevelSolution]
+_LevelSolver = Callable[
+    [ContactLaw, WheelMotion, Array, ChosenModeCombination | None], _KinematicLevelSolution
+]
 """Function of contact law, motion, held legs in the air and, if known, the chosen combination."""
 
 
@@ -152,70 +160,72 @@ def _solve_stopper_lcp(
     contact_law: ContactLaw,
     motion: WheelMotion,
     is_at_stopper: Array,
-    is_tested: Array,
-    tolerances: SignTolerances,
+    is_stopper_tested: Array,
+    tolerances: ContactSignTolerances,
     pivot_options: StopperPivotOptions = STOPPER_PIVOT_OPTIONS,
-) -> tuple[_LevelSolution, Array]:
-    """Return the solution for the legs in the air that are held, and whether each leg is held.
+) -> tuple[_KinematicLevelSolution, Array]:
+    """Return the solution with complementary stopper forces, and whether each leg is held.
 
-    Legs `is_at_stopper` that are `is_tested` are held if their stopper pushes; otherwise they move
-    inwards. Pivots first switch all legs of the wrong sign together. Later pivots switch only the
-    last of these legs, which prevents cycles. This is principal pivoting, which is finite if no
-    friction couples the legs (Murty 1974, Kostreva 1978). If pivoting fails, all combinations are
-    enumerated. The least violating solution is returned. That solution is admissible if its
-    violation is at most `MAX_VIOLATION`.
+    A tested leg at its stopper is held if the stopper pushes, or moves inwards otherwise. The first
+    pivots switch all legs of the wrong sign together. Later pivots switch only the last of these
+    legs, which prevents cycles. This is principal pivoting, which is finite if no friction couples
+    the legs (Murty 1974, Kostreva 1978). If pivoting fails, all combinations are enumerated. The
+    solution with the smallest violation is returned. This solution is admissible if its violation
+    is at most `MAX_VIOLATION`.
     """
     constant_inputs = stop_gradients((contact_law, motion))
-    tested_rank = jnp.cumsum(is_tested.astype(jnp.int32), axis=0) - 1
+    tested_leg_rank = jnp.cumsum(is_stopper_tested.astype(jnp.int32), axis=0) - 1
     n_combinations = 1 << jnp.minimum(
-        jnp.sum(is_tested, axis=0, dtype=jnp.int32), pivot_options.max_enumerated_legs
+        jnp.sum(is_stopper_tested, axis=0, dtype=jnp.int32), pivot_options.max_enumerated_legs
     )
-    leg_index = _leg_indices(len(is_at_stopper), n_combinations)
+    leg_index = _make_leg_indices(len(is_at_stopper), n_combinations)
 
-    def is_unfinished(state: tuple) -> Array:
-        _, combination_code, n_attempts, best_solution = state
+    def is_unfinished(pivot_state: tuple) -> Array:
+        _, combination_code, n_attempts, best_solution = pivot_state
         return (n_attempts == 0) | ((best_solution[0] > 1.0) & (combination_code < n_combinations))
 
-    def pivot(state: tuple) -> tuple:
-        is_held, combination_code, n_attempts, best_solution = state
-        level_solution = solve_level(constant_inputs[0], constant_inputs[1], is_held, None)
-        violation = jnp.where(
-            is_held,
-            -level_solution.stopper_push / tolerances.force_tolerance,
-            level_solution.outward_motion / tolerances.motion_tolerance,
+    def pivot_legs(pivot_state: tuple) -> tuple:
+        is_stopper_holding, combination_code, n_attempts, best_solution = pivot_state
+        level_solution = solve_level(
+            constant_inputs[0], constant_inputs[1], is_stopper_holding, None
         )
-        violation = jnp.where(is_tested, lax.stop_gradient(violation), 0.0)
-        is_violated = violation > 1.0
+        sign_violation = jnp.where(
+            is_stopper_holding,
+            -level_solution.stopper_forces / tolerances.force_tolerance,
+            level_solution.outward_leg_motion / tolerances.motion_tolerance,
+        )
+        sign_violation = jnp.where(is_stopper_tested, lax.stop_gradient(sign_violation), 0.0)
+        has_wrong_sign = sign_violation > 1.0
         max_violation = jnp.maximum(
-            jnp.max(violation, axis=0), level_solution.chosen_combination.violation
+            jnp.max(sign_violation, axis=0), level_solution.chosen_combination.sign_violation
         )
         best_solution = select_tree_leaves(
             max_violation < best_solution[0],
-            (max_violation, is_held, level_solution.chosen_combination),
+            (max_violation, is_stopper_holding, level_solution.chosen_combination),
             best_solution,
         )
-        is_last_violated = leg_index == jnp.max(jnp.where(is_violated, leg_index, -1), axis=0)
-        switched_legs = is_held ^ jnp.where(
-            n_attempts < pivot_options.max_block_pivots, is_violated, is_last_violated
+        is_last_wrong_leg = leg_index == jnp.max(jnp.where(has_wrong_sign, leg_index, -1), axis=0)
+        switched_legs = is_stopper_holding ^ jnp.where(
+            n_attempts < pivot_options.max_block_pivots, has_wrong_sign, is_last_wrong_leg
         )
         is_pivoting = (
             (combination_code < 0)
-            & jnp.any(is_violated, axis=0)
+            & jnp.any(has_wrong_sign, axis=0)
             & (n_attempts < pivot_options.max_block_pivots + pivot_options.max_single_pivots)
         )
         combination_code = jnp.where(is_pivoting, combination_code, combination_code + 1)
         enumerated_legs = jnp.where(
-            is_tested, ((combination_code >> tested_rank) & 1) == 1, is_at_stopper
+            is_stopper_tested, ((combination_code >> tested_leg_rank) & 1) == 1, is_at_stopper
         )
         return select_tree_leaves(
-            is_unfinished(state),
+            is_unfinished(pivot_state),
             (
                 jnp.where(is_pivoting, switched_legs, enumerated_legs),
                 combination_code,
                 n_attempts + 1,
                 best_solution,
             ),
-            state,
+            pivot_state,
         )
 
     int_zeros = jnp.zeros_like(n_combinations)
@@ -228,18 +238,22 @@ def _solve_stopper_lcp(
         (
             infinite_violation,
             is_at_stopper,
-            ChosenCombination(slot_zeros, slot_zeros > 0, infinite_violation, int_zeros),
+            ChosenModeCombination(slot_zeros, slot_zeros > 0, infinite_violation, int_zeros),
         ),
     )
-    final_state = lax.while_loop(lambda state: jnp.any(is_unfinished(state)), pivot, initial_state)
-    max_violation, is_held, chosen_combination = final_state[3]
+    final_state = lax.while_loop(
+        lambda pivot_state: jnp.any(is_unfinished(pivot_state)), pivot_legs, initial_state
+    )
+    max_violation, is_stopper_holding, chosen_combination = final_state[3]
     chosen_combination = chosen_combination._replace(
         n_solutions=jnp.where(max_violation <= MAX_VIOLATION, chosen_combination.n_solutions, 0)
     )
-    return solve_level(contact_law, motion, is_held, chosen_combination), is_held
+    return solve_level(
+        contact_law, motion, is_stopper_holding, chosen_combination
+    ), is_stopper_holding
 
 
-class EventResult(NamedTuple):
+class ContactEventResult(NamedTuple):
     """Motion and contact state after an event, with impulses and lost energy."""
 
     motion: WheelMotion
@@ -249,42 +263,50 @@ class EventResult(NamedTuple):
     tangential_impulse: SlotPair
     stopper_impulse: Elementwise  # minimum over airborne locked legs, N s; inf without impact
     n_solutions: Int[Array, "..."]  # number of admissible combinations: minimum of both levels
-    is_paradox: Bool[Array, "..."]  # whether no forces can continue the motion
-    most_solutions: Int[Array, "..."]
+    is_painleve_paradox: Bool[Array, "..."]  # whether no forces can continue the motion
+    max_n_solutions: Int[Array, "..."]
     has_third_foot: Bool[Array, "..."]  # whether a third foot would have to be loaded
 
 
-def _motion_after_impact(motion: WheelMotion, solution: ForceSolution) -> WheelMotion:
-    """Return the motion with the velocities of an impact's solution."""
-    vx, vz, dtheta = solution.hub_vector
-    return motion._replace(vx=vx, vz=vz, dtheta=dtheta, dL=solution.length_motion)
+def _apply_impact_velocities(
+    motion: WheelMotion, force_solution: WheelForceSolution
+) -> WheelMotion:
+    """Return the motion with its velocities replaced by those after an impact."""
+    vx, vz, dtheta = force_solution.hub_motion
+    return motion._replace(vx=vx, vz=vz, dtheta=dtheta, dL=force_solution.length_motion)
 
 
 def _apply_restitution(
     contact_law: ContactLaw,
     motion: WheelMotion,
     contact_slots: ContactSlots,
-    inertia: ContactInverseInertia,
+    inverse_inertia: ContactInverseInertia,
     free_motion: FreeMotion,
 ) -> FreeMotion:
-    """Return the velocities without impulses, changed by the rebound of striking feet by Newton's
-    law.
+    """Return the velocities without impulses, corrected for the rebound of striking feet by
+    Newton's law.
     """
     if contact_law.restitution is None:
         return free_motion
     rebound_speeds = [
-        contact_law.restitution * z for z in foot_velocity(motion, contact_slots, inertia).z
+        contact_law.restitution * foot_speed
+        for foot_speed in compute_slot_foot_velocity(
+            motion, contact_slots, inverse_inertia
+        ).normal_to_slope
     ]
     # A foot whose rebound is slower than the rest speed is at rest.
-    rebound_speeds = [jnp.where(z < -contact_law.rest_speed, z, 0.0) for z in rebound_speeds]
+    rebound_speeds = [
+        jnp.where(foot_speed < -contact_law.rest_speed, foot_speed, 0.0)
+        for foot_speed in rebound_speeds
+    ]
     return free_motion._replace(
         foot_transverse_motion=(
-            free_motion.foot_transverse_motion[0] - inertia.sin[0] * rebound_speeds[0],
-            free_motion.foot_transverse_motion[1] - inertia.sin[1] * rebound_speeds[1],
+            free_motion.foot_transverse_motion[0] - inverse_inertia.sin[0] * rebound_speeds[0],
+            free_motion.foot_transverse_motion[1] - inverse_inertia.sin[1] * rebound_speeds[1],
         ),
         foot_radial_motion=(
-            free_motion.foot_radial_motion[0] + inertia.cos[0] * rebound_speeds[0],
-            free_motion.foot_radial_motion[1] + inertia.cos[1] * rebound_speeds[1],
+            free_motion.foot_radial_motion[0] + inverse_inertia.cos[0] * rebound_speeds[0],
+            free_motion.foot_radial_motion[1] + inverse_inertia.cos[1] * rebound_speeds[1],
         ),
     )
 
@@ -292,87 +314,98 @@ def _apply_restitution(
 def _limit_energy_gain(
     contact_law: ContactLaw,
     motion: WheelMotion,
-    newton_solution: _LevelSolution,
-    inelastic_solution: _LevelSolution,
-) -> _LevelSolution:
-    """Return the part of Newton's rebound that energy allows.
+    newton_solution: _KinematicLevelSolution,
+    inelastic_solution: _KinematicLevelSolution,
+) -> _KinematicLevelSolution:
+    """Return the impact with the largest part of Newton's rebound that does not increase energy.
 
-    With Coulomb's friction, Newton's law can create energy (Kane 1984). Along the line from the
-    inelastic impact to Newton's, energy is a quadratic function. The inelastic impact never creates
-    energy. The result is the largest part of the rebound without an energy gain. Impulses stay in
-    the cone of friction, because the cone is convex.
+    With Coulomb's friction, Newton's law can increase the energy (Kane 1984). The inelastic impact
+    never increases the energy. The energy is a quadratic function along the line from the inelastic
+    impact to Newton's impact. Impulses stay in the cone of friction, because the cone is convex.
     """
-    compute_energy = lambda motion_state: kinetic_energy(contact_law.s, motion_state)
-    energy_inelastic, energy_newton = (
-        compute_energy(inelastic_solution.motion),
-        compute_energy(newton_solution.motion),
-    )
+    compute_energy = lambda motion_state: compute_kinetic_energy(contact_law.s, motion_state)
+    energy_inelastic = compute_energy(inelastic_solution.motion_after_impact)
+    energy_newton = compute_energy(newton_solution.motion_after_impact)
     energy_midpoint = compute_energy(
-        jax.tree.map(lambda a, b: 0.5 * (a + b), inelastic_solution.motion, newton_solution.motion)
+        jax.tree.map(
+            lambda a, b: 0.5 * (a + b),
+            inelastic_solution.motion_after_impact,
+            newton_solution.motion_after_impact,
+        )
     )
     parabola_curvature = 2.0 * (energy_inelastic - 2.0 * energy_midpoint + energy_newton)
     parabola_linear_term = 4.0 * energy_midpoint - 3.0 * energy_inelastic - energy_newton
-    allowed_gain = jnp.maximum(compute_energy(motion) - energy_inelastic, 0.0)
-    has_gain = energy_newton > compute_energy(motion)
+    allowed_energy_gain = jnp.maximum(compute_energy(motion) - energy_inelastic, 0.0)
+    has_energy_gain = energy_newton > compute_energy(motion)
     sqrt_discriminant = jnp.sqrt(
         jnp.where(
-            has_gain,
-            parabola_linear_term * parabola_linear_term + 4.0 * parabola_curvature * allowed_gain,
+            has_energy_gain,
+            parabola_linear_term * parabola_linear_term
+            + 4.0 * parabola_curvature * allowed_energy_gain,
             1.0,
         )
     )
     rebound_fraction = jnp.where(
-        has_gain,
-        2.0 * allowed_gain / jnp.where(has_gain, parabola_linear_term + sqrt_discriminant, 1.0),
+        has_energy_gain,
+        2.0
+        * allowed_energy_gain
+        / jnp.where(has_energy_gain, parabola_linear_term + sqrt_discriminant, 1.0),
         1.0,
     )
-    interpolate = lambda a, b: jnp.where(has_gain, a + rebound_fraction * (b - a), b)
-    return _LevelSolution(
+    interpolate_rebound = lambda a, b: jnp.where(has_energy_gain, a + rebound_fraction * (b - a), b)
+    return _KinematicLevelSolution(
         newton_solution.chosen_combination,
-        *jax.tree.map(interpolate, inelastic_solution[1:], newton_solution[1:]),
+        *jax.tree.map(interpolate_rebound, inelastic_solution[1:], newton_solution[1:]),
     )
 
 
 def _solve_velocity_level(
-    contact_law: ContactLaw, motion: WheelMotion, contact_state: ContactState, event: Event
-) -> tuple[_LevelSolution, ContactSlots, Bool[Array, "n ..."]]:
-    """Return the solution of a simultaneous inelastic impact, with Coulomb's law for impulses.
+    contact_law: ContactLaw,
+    motion: WheelMotion,
+    contact_state: ContactState,
+    contact_event: ContactEvent,
+) -> tuple[_KinematicLevelSolution, ContactSlots, Bool[Array, "n ..."]]:
+    """Return the solution of an impact of all striking contacts at once, with Coulomb's law for
+    impulses.
 
-    The result is (solution, slots, held legs in the air). With one-sided stoppers, held legs are
-    those whose stoppers need not pull. The paper's rule keeps resting feet planted when a leg meets
-    its stopper.
+    The result is (solution, slots, held legs in the air). With one-sided stoppers, a leg is held if
+    its stopper need not pull. By the paper's rule, resting feet stay at rest when a leg meets its
+    stopper.
     """
-    s, contact_slots = (
-        contact_law.s,
-        find_slots((contact_state.contact_modes != ContactMode.OFF) | event.lands),
+    s = contact_law.s
+    contact_slots = find_contact_slots(
+        (contact_state.contact_modes != ContactMode.OFF) | contact_event.is_foot_landing
     )
-    friction = slot_friction(contact_law.friction, contact_slots)
-    is_at_stopper = contact_state.locked | event.meets_stopper
+    friction = select_slot_friction(contact_law.friction, contact_slots)
+    is_at_stopper = contact_state.is_locked | contact_event.is_leg_meeting_stopper
     is_loaded = jnp.stack(
-        [jnp.any(contact_slots.first_mask, axis=0), jnp.any(contact_slots.second_mask, axis=0)]
+        [
+            jnp.any(contact_slots.first_slot_mask, axis=0),
+            jnp.any(contact_slots.second_slot_mask, axis=0),
+        ]
     )
-    slot_locked = contact_slots.gather_flags(is_at_stopper)
-    slot_modes = contact_slots.gather_codes(contact_state.contact_modes)
-    is_landing = jnp.any(event.lands, axis=0)
-    is_planted = (
+    is_slot_locked = contact_slots.gather_slot_flags(is_at_stopper)
+    slot_modes = contact_slots.gather_slot_codes(contact_state.contact_modes)
+    is_landing = jnp.any(contact_event.is_foot_landing, axis=0)
+    is_kept_at_rest = (
         (slot_modes == ContactMode.STICK)
         & ~is_landing
-        & (stack_friction(friction) == PAPER_RULE_SENTINEL)
+        & (stack_slot_friction(friction) == PAPER_RULE_SENTINEL)
     )
     allowed_slot_modes = jnp.where(is_loaded, ALL_MODES_MASK, 1 << ContactMode.OFF).astype(
         jnp.int32
     )
-    allowed_slot_modes = jnp.where(is_planted, 1 << slot_modes, allowed_slot_modes)
-    allowed = AllowedModes(
-        allowed_modes=jnp.where(
-            event.is_impact, allowed_slot_modes, 0
+    allowed_slot_modes = jnp.where(is_kept_at_rest, 1 << slot_modes, allowed_slot_modes)
+    allowed_contact_modes = AllowedContactModes(
+        allowed_slot_modes=jnp.where(
+            contact_event.is_impact, allowed_slot_modes, 0
         ),  # Without an impact, no mode is examined.
-        can_hold_stopper=slot_locked,
-        has_fixed_mode=is_planted,
-        untested_modes=jnp.where(is_loaded, 0, 1 << ContactMode.OFF).astype(jnp.int32),
-        is_open_untested=~slot_locked,
+        can_hold_stopper=is_slot_locked,
+        has_fixed_mode=is_kept_at_rest,
+        untested_slot_modes=jnp.where(is_loaded, 0, 1 << ContactMode.OFF).astype(jnp.int32),
+        is_open_stopper_untested=~is_slot_locked,
     )
-    tolerances = SignTolerances(
+    tolerances = ContactSignTolerances(
         s.m * contact_law.rest_speed / MAX_VIOLATION, contact_law.rest_speed / MAX_VIOLATION
     )
 
@@ -380,91 +413,103 @@ def _solve_velocity_level(
         contact_law: ContactLaw,
         motion: WheelMotion,
         is_airborne_locked: Array,
-        chosen_combination: ChosenCombination | None,
-    ) -> _LevelSolution:
-        s, friction = contact_law.s, slot_friction(contact_law.friction, contact_slots)
-        directions = leg_directions(s, motion.theta)
-        inertia = make_inverse_inertia(s, motion, contact_slots, is_airborne_locked)
-        free_motion = free_velocity(s, motion, contact_slots, inertia)
+        chosen_combination: ChosenModeCombination | None,
+    ) -> _KinematicLevelSolution:
+        s, friction = contact_law.s, select_slot_friction(contact_law.friction, contact_slots)
+        leg_directions = compute_leg_directions(s, motion.theta)
+        inverse_inertia = make_inverse_inertia(s, motion, contact_slots, is_airborne_locked)
+        free_motion = compute_free_velocity(s, motion, contact_slots, inverse_inertia)
         rebound_motion = _apply_restitution(
-            contact_law, motion, contact_slots, inertia, free_motion
+            contact_law, motion, contact_slots, inverse_inertia, free_motion
         )
         if chosen_combination is None:
             chosen_combination = choose_combination(
                 s,
-                inertia,
+                inverse_inertia,
                 rebound_motion,
-                allowed,
+                allowed_contact_modes,
                 friction,
                 tolerances,
-                contact_law.counts_solutions,
+                contact_law.counts_all_solutions,
             )
-        configuration = ContactConfiguration(
+        contact_configuration = ContactConfiguration(
             s,
             motion,
             friction,
             contact_slots,
             chosen_combination.slot_modes,
-            chosen_combination.is_held,
+            chosen_combination.is_stopper_holding,
             is_airborne_locked,
         )
-        solution = (
-            solve_impact(configuration)
+        force_solution = (
+            solve_impact(contact_configuration)
             if contact_law.restitution is None
-            else solve_configuration(configuration, inertia, rebound_motion)
+            else solve_contact_configuration(contact_configuration, inverse_inertia, rebound_motion)
         )
-        motion_after = _motion_after_impact(motion, solution)
-        jump_x, jump_z = motion_after.vx - motion.vx, motion_after.vz - motion.vz
-        impulse = s.m * (directions.sin * jump_x + directions.cos * jump_z + motion.dL)
-        return _LevelSolution(chosen_combination, solution, impulse, motion_after.dL, motion_after)
+        motion_after = _apply_impact_velocities(motion, force_solution)
+        hub_jump_x, hub_jump_z = motion_after.vx - motion.vx, motion_after.vz - motion.vz
+        contact_impulse = s.m * (
+            leg_directions.sin * hub_jump_x + leg_directions.cos * hub_jump_z + motion.dL
+        )
+        return _KinematicLevelSolution(
+            chosen_combination, force_solution, contact_impulse, motion_after.dL, motion_after
+        )
 
-    is_airborne_locked = is_at_stopper & ~contact_slots.is_filled
-    if not contact_law.is_one_sided:
+    is_airborne_locked = is_at_stopper & ~contact_slots.is_in_slot
+    if not contact_law.has_one_sided_stoppers:
         return (
             solve_level(contact_law, motion, is_airborne_locked, None),
             contact_slots,
             is_airborne_locked,
         )
-    is_tested = is_airborne_locked & event.is_impact
+    is_stopper_tested = is_airborne_locked & contact_event.is_impact
     level_solution, is_held_airborne = _solve_stopper_lcp(
-        solve_level, contact_law, motion, is_airborne_locked, is_tested, tolerances
+        solve_level, contact_law, motion, is_airborne_locked, is_stopper_tested, tolerances
     )
     return level_solution, contact_slots, is_held_airborne
 
 
-def _following_modes(
-    event: Event, slot_modes: Array, is_consistent: Array, follows_paper_rule: Array
+def _list_following_modes(
+    contact_event: ContactEvent, slot_modes: Array, is_consistent: Array, follows_paper_rule: Array
 ) -> tuple[Int[Array, "2 ..."], Int[Array, "2 ..."]]:
-    """Return the modes that may follow an event in each slot, and those that need no test, as bits.
+    """Return the modes that may follow an event in each slot, and the modes that need no test.
 
-    - `is_consistent`: whether the next mode of a slot's foot has the direction of release (see
+    Both are sets of modes, with one bit per mode.
+
+    - `is_consistent`: whether the released foot of a slot moves in the release direction (see
       `is_release_consistent`).
     """
-    current_bit, off_bit = 1 << slot_modes, 1 << ContactMode.OFF
+    current_mode_bit, off_mode_bit = 1 << slot_modes, 1 << ContactMode.OFF
     possible_modes = jnp.where(
-        slot_modes == ContactMode.STICK, ALL_MODES_MASK, current_bit | off_bit
+        slot_modes == ContactMode.STICK, ALL_MODES_MASK, current_mode_bit | off_mode_bit
     )
-    reversed_bit = jnp.where(
+    reversed_mode_bit = jnp.where(
         slot_modes == ContactMode.SLIP_DOWN, 1 << ContactMode.SLIP_UP, 1 << ContactMode.SLIP_DOWN
     )
     possible_modes = jnp.where(
-        event.stops_sliding, 1 << ContactMode.STICK | off_bit | reversed_bit, possible_modes
+        contact_event.is_stopping_to_slide,
+        1 << ContactMode.STICK | off_mode_bit | reversed_mode_bit,
+        possible_modes,
     )
     untested_modes = jnp.where(
-        (slot_modes == ContactMode.STICK) | event.stops_sliding, 0, current_bit
+        (slot_modes == ContactMode.STICK) | contact_event.is_stopping_to_slide, 0, current_mode_bit
     )
     for event_flags, following_mode, ended_mode in (
-        (event.lifts_off, off_bit, current_bit),
-        (event.slides_up, 1 << ContactMode.SLIP_UP, 1 << ContactMode.STICK),
-        (event.slides_down, 1 << ContactMode.SLIP_DOWN, 1 << ContactMode.STICK),
+        (contact_event.is_foot_lifting_off, off_mode_bit, current_mode_bit),
+        (contact_event.is_starting_to_slide_up, 1 << ContactMode.SLIP_UP, 1 << ContactMode.STICK),
+        (
+            contact_event.is_starting_to_slide_down,
+            1 << ContactMode.SLIP_DOWN,
+            1 << ContactMode.STICK,
+        ),
     ):
-        tested_bits = (
+        tested_mode_bits = (
             ALL_MODES_MASK
             & ~ended_mode
             & jnp.where(is_consistent | follows_paper_rule, ALL_MODES_MASK, ~following_mode)
         )
         possible_modes = jnp.where(
-            event_flags, jnp.where(is_consistent, following_mode, tested_bits), possible_modes
+            event_flags, jnp.where(is_consistent, following_mode, tested_mode_bits), possible_modes
         )
         untested_modes = jnp.where(
             event_flags, jnp.where(is_consistent, following_mode, 0), untested_modes
@@ -482,81 +527,100 @@ def _solve_acceleration_level(
     motion: WheelMotion,
     contact_modes: Int[Array, "n ..."],
     is_at_stopper: Array,
-    event: Event,
-) -> tuple[ChosenCombination, ContactSlots, Array, Bool[Array, "n ..."]]:
-    """Return the contact modes and stoppers of the following motion, at the acceleration level.
+    contact_event: ContactEvent,
+) -> tuple[ChosenModeCombination, ContactSlots, Array, Bool[Array, "n ..."]]:
+    """Return the contact modes and stoppers of the motion after an event.
 
-    The result is (combination, slots, feet that were at rest, held legs in the air). The contact
-    that an event has just ended is not tested again: its force is zero up to round-off. The contact
-    is followed by the mode of its release, if that is consistent (see `is_release_consistent`). The
-    result has no derivatives.
+    They follow from the accelerations. The result is (combination, slots, feet that were at rest,
+    held legs in the air), without derivatives. The contact that the event has ended is not tested
+    again, because its force is zero up to round-off. This contact gets the mode of its release if
+    that mode is consistent (see `is_release_consistent`).
     """
     contact_law, motion = stop_gradients((contact_law, motion))
-    s, contact_slots = contact_law.s, find_slots(contact_modes != ContactMode.OFF)
-    friction = slot_friction(contact_law.friction, contact_slots)
-    slot_modes, slot_locked = (
-        contact_slots.gather_codes(contact_modes),
-        contact_slots.gather_flags(is_at_stopper),
-    )
-    was_resting = (slot_modes == ContactMode.STICK) | event.stops_sliding
+    s, contact_slots = contact_law.s, find_contact_slots(contact_modes != ContactMode.OFF)
+    friction = select_slot_friction(contact_law.friction, contact_slots)
+    slot_modes = contact_slots.gather_slot_codes(contact_modes)
+    is_slot_locked = contact_slots.gather_slot_flags(is_at_stopper)
+    was_resting = (slot_modes == ContactMode.STICK) | contact_event.is_stopping_to_slide
     # When such a foot is released, its tangential force jumps to zero.
     follows_paper_rule = (slot_modes == ContactMode.STICK) & (
-        stack_friction(friction) == PAPER_RULE_SENTINEL
+        stack_slot_friction(friction) == PAPER_RULE_SENTINEL
     )
-    slides_up, slides_down = event.slides_up, event.slides_down
-    is_second = (event.lifts_off | slides_up | slides_down)[1]
-    any_slot = lambda event_flags: jnp.any(event_flags, axis=0).astype(jnp.int32)
-    release_direction = any_slot(slides_down) - any_slot(slides_up)
-    may_leave_stopper = ~slot_locked | event.releases_stopper
-    tolerances = SignTolerances(FORCE_ROUNDOFF_FRACTION * s.Mt * s.g, FORCE_ROUNDOFF_FRACTION * s.g)
+    is_starting_to_slide_up = contact_event.is_starting_to_slide_up
+    is_starting_to_slide_down = contact_event.is_starting_to_slide_down
+    is_second_slot = (
+        contact_event.is_foot_lifting_off | is_starting_to_slide_up | is_starting_to_slide_down
+    )[1]
+    is_in_any_slot = lambda event_flags: jnp.any(event_flags, axis=0).astype(jnp.int32)
+    release_direction = is_in_any_slot(is_starting_to_slide_down) - is_in_any_slot(
+        is_starting_to_slide_up
+    )
+    may_leave_stopper = ~is_slot_locked | contact_event.is_releasing_stopper
+    tolerances = ContactSignTolerances(
+        FORCE_ROUNDOFF_FRACTION * s.Mt * s.g, FORCE_ROUNDOFF_FRACTION * s.g
+    )
 
     def solve_level(
         contact_law: ContactLaw,
         motion: WheelMotion,
         is_airborne_locked: Array,
-        chosen_combination: ChosenCombination | None,
-    ) -> _LevelSolution:
-        inertia = make_inverse_inertia(s, motion, contact_slots, is_airborne_locked)
-        free_motion = free_acceleration(s, motion, contact_slots, inertia)
+        chosen_combination: ChosenModeCombination | None,
+    ) -> _KinematicLevelSolution:
+        inverse_inertia = make_inverse_inertia(s, motion, contact_slots, is_airborne_locked)
+        free_motion = compute_free_acceleration(s, motion, contact_slots, inverse_inertia)
         if chosen_combination is None:
             is_consistent = is_release_consistent(
                 s,
-                inertia,
+                inverse_inertia,
                 free_motion,
-                (slot_modes, slot_locked),
+                (slot_modes, is_slot_locked),
                 friction,
-                is_second,
+                is_second_slot,
                 release_direction,
             )
-            possible_modes, untested = _following_modes(
-                event, slot_modes, is_consistent & ~follows_paper_rule, follows_paper_rule
+            possible_modes, untested_slot_modes = _list_following_modes(
+                contact_event, slot_modes, is_consistent & ~follows_paper_rule, follows_paper_rule
             )
-            allowed = AllowedModes(
-                possible_modes, ~may_leave_stopper, was_resting & False, untested, may_leave_stopper
+            allowed_contact_modes = AllowedContactModes(
+                possible_modes,
+                ~may_leave_stopper,
+                was_resting & False,
+                untested_slot_modes,
+                may_leave_stopper,
             )
             chosen_combination = choose_combination(
-                s, inertia, free_motion, allowed, friction, tolerances, contact_law.counts_solutions
+                s,
+                inverse_inertia,
+                free_motion,
+                allowed_contact_modes,
+                friction,
+                tolerances,
+                contact_law.counts_all_solutions,
             )
-        configuration = ContactConfiguration(
+        contact_configuration = ContactConfiguration(
             s,
             motion,
             friction,
             contact_slots,
             chosen_combination.slot_modes,
-            chosen_combination.is_held,
+            chosen_combination.is_stopper_holding,
             is_airborne_locked,
         )
-        solution = solve_configuration(configuration, inertia, free_motion)
-        ax, az, _ = solution.hub_vector
-        outward = (
-            free_motion.leg_motion
-            + inertia.leg_directions.sin * ax
-            + inertia.leg_directions.cos * az
+        force_solution = solve_contact_configuration(
+            contact_configuration, inverse_inertia, free_motion
         )
-        return _LevelSolution(chosen_combination, solution, s.m * outward, outward, motion)
+        hub_acceleration_x, hub_acceleration_z, _ = force_solution.hub_motion
+        outward_leg_motion = (
+            free_motion.leg_motion
+            + inverse_inertia.leg_directions.sin * hub_acceleration_x
+            + inverse_inertia.leg_directions.cos * hub_acceleration_z
+        )
+        return _KinematicLevelSolution(
+            chosen_combination, force_solution, s.m * outward_leg_motion, outward_leg_motion, motion
+        )
 
-    is_airborne_locked = is_at_stopper & ~contact_slots.is_filled
-    if not contact_law.is_one_sided:
+    is_airborne_locked = is_at_stopper & ~contact_slots.is_in_slot
+    if not contact_law.has_one_sided_stoppers:
         return (
             solve_level(contact_law, motion, is_airborne_locked, None).chosen_combination,
             contact_slots,
@@ -569,194 +633,234 @@ def _solve_acceleration_level(
     return level_solution.chosen_combination, contact_slots, was_resting, is_held_airborne
 
 
-def _bring_to_rest(
+def _bring_slow_contacts_to_rest(
     contact_law: ContactLaw,
     motion: WheelMotion,
     contact_slots: ContactSlots,
     contact_modes: Array,
     is_at_stopper: Array,
-    was_locked: Array,
+    was_at_stopper: Array,
 ) -> tuple[WheelMotion, Array, Array]:
-    """Return the motion after an impact, the modes of the touching feet, and whether legs are on
-    stoppers.
+    """Return the motion after an impact with slow contacts at rest, the modes of the touching feet,
+    and whether each leg is on its stopper.
 
-    A contact slower than `ContactLaw.rest_speed` after the impact is brought to rest. Otherwise the
-    contact would return after a bounce too small to resolve, and separate again at a lower speed,
-    without end. The forces decide the contacts of the following motion.
+    A contact slower than `ContactLaw.rest_speed` after the impact is brought to rest. Otherwise its
+    bounces would be too small to resolve, and their number would have no bound. The forces
+    determine the contacts of the following motion.
 
-    - `was_locked`: legs that were at their stoppers.
+    - `was_at_stopper`: whether each leg was on its stopper before the impact.
     """
-    directions = leg_directions(contact_law.s, motion.theta)
-    tangential_speed, normal_speed = foot_speeds(motion, directions)
-    stays_loaded = contact_slots.is_filled & (normal_speed < contact_law.rest_speed)
-    slip_mode = jnp.where(tangential_speed > 0.0, ContactMode.SLIP_DOWN, ContactMode.SLIP_UP)
-    rest_modes = jnp.where(
-        jnp.abs(tangential_speed) < contact_law.rest_speed, ContactMode.STICK, slip_mode
+    leg_directions = compute_leg_directions(contact_law.s, motion.theta)
+    tangential_speed, normal_speed = compute_foot_velocities(motion, leg_directions)
+    stays_in_contact = contact_slots.is_in_slot & (normal_speed < contact_law.rest_speed)
+    mode_against_slip = jnp.where(
+        tangential_speed > 0.0, ContactMode.SLIP_DOWN, ContactMode.SLIP_UP
     )
-    rest_modes = jnp.where(
-        stays_loaded,
-        jnp.where(contact_modes == ContactMode.STICK, ContactMode.STICK, rest_modes),
+    modes_after_rest = jnp.where(
+        jnp.abs(tangential_speed) < contact_law.rest_speed, ContactMode.STICK, mode_against_slip
+    )
+    modes_after_rest = jnp.where(
+        stays_in_contact,
+        jnp.where(contact_modes == ContactMode.STICK, ContactMode.STICK, modes_after_rest),
         ContactMode.OFF,
     )
-    is_locked = is_at_stopper | (was_locked & (jnp.abs(motion.dL) < contact_law.rest_speed))
-    has_changed = jnp.any((rest_modes != contact_modes) | (is_locked != is_at_stopper), axis=0)
+    is_locked = is_at_stopper | (was_at_stopper & (jnp.abs(motion.dL) < contact_law.rest_speed))
+    has_contact_changed = jnp.any(
+        (modes_after_rest != contact_modes) | (is_locked != is_at_stopper), axis=0
+    )
     s, frozen_motion, friction = stop_gradients((contact_law.s, motion, contact_law.friction))
 
     def find_reversed_slip(_: Array) -> Array:
-        """Return the feet whose slip would be reversed by the projection. These feet also come to
+        """Return whether the projection reverses the slip of each foot. Such a foot also comes to
         rest.
         """
-        speed_after, _ = foot_speeds(
-            project_motion(s, frozen_motion, rest_modes, is_locked, friction), directions
+        slip_speed_after, _ = compute_foot_velocities(
+            project_motion(s, frozen_motion, modes_after_rest, is_locked, friction), leg_directions
         )
-        return ((rest_modes == ContactMode.SLIP_DOWN) & (speed_after < 0.0)) | (
-            (rest_modes == ContactMode.SLIP_UP) & (speed_after > 0.0)
+        return ((modes_after_rest == ContactMode.SLIP_DOWN) & (slip_speed_after < 0.0)) | (
+            (modes_after_rest == ContactMode.SLIP_UP) & (slip_speed_after > 0.0)
         )
 
-    is_slip_reversed = has_changed & run_if_any(
-        jnp.any(has_changed), find_reversed_slip, is_locked & False
+    is_slip_reversed = has_contact_changed & run_if_any(
+        jnp.any(has_contact_changed), find_reversed_slip, is_locked & False
     )
-    rest_modes = jnp.where(is_slip_reversed, ContactMode.STICK, rest_modes)
+    modes_after_rest = jnp.where(is_slip_reversed, ContactMode.STICK, modes_after_rest)
     return (
         select_tree_leaves(
-            has_changed,
-            project_motion(contact_law.s, motion, rest_modes, is_locked, contact_law.friction),
+            has_contact_changed,
+            project_motion(
+                contact_law.s, motion, modes_after_rest, is_locked, contact_law.friction
+            ),
             motion,
         ),
-        rest_modes,
+        modes_after_rest,
         is_locked,
     )
 
 
-def _merge_touching(
-    contact_law: ContactLaw, motion: WheelMotion, contact_state: ContactState, event: Event
-) -> Event:
-    """Return the event extended to all contacts that touch, whether or not their guards are zero.
+def _merge_touching_contacts(
+    contact_law: ContactLaw,
+    motion: WheelMotion,
+    contact_state: ContactState,
+    contact_event: ContactEvent,
+) -> ContactEvent:
+    """Return the event with all contacts that touch, including those whose guards are not zero.
 
     A contact touches if its distance is below the smallest resolved bounce and it does not
-    separate. If such contacts were resolved one by one, they would push each other off forever.
+    separate. If such contacts were resolved one after another, each impact would cause the next one
+    without end.
     """
-    s, directions = contact_law.s, leg_directions(contact_law.s, motion.theta)
+    s, leg_directions = contact_law.s, compute_leg_directions(contact_law.s, motion.theta)
     bounce_height = contact_law.rest_speed**2 / (2.0 * s.g)
-    heights = foot_heights(motion, directions, contact_law.tilt)
-    is_touching = (heights <= bounce_height) & (
-        foot_speeds(motion, directions)[1] <= contact_law.rest_speed
+    foot_heights = compute_foot_heights(motion, leg_directions, contact_law.next_line_tilt)
+    is_touching = (foot_heights <= bounce_height) & (
+        compute_foot_velocities(motion, leg_directions)[1] <= contact_law.rest_speed
     )
-    lands = event.lands | (
-        is_touching & (contact_state.contact_modes == ContactMode.OFF) & event.is_impact
+    is_foot_landing = contact_event.is_foot_landing | (
+        is_touching & (contact_state.contact_modes == ContactMode.OFF) & contact_event.is_impact
     )
-    fits_slots = (
-        jnp.sum(lands | (contact_state.contact_modes != ContactMode.OFF), axis=0, dtype=jnp.int32)
+    fits_two_slots = (
+        jnp.sum(
+            is_foot_landing | (contact_state.contact_modes != ContactMode.OFF),
+            axis=0,
+            dtype=jnp.int32,
+        )
         <= 2
     )
-    is_extended = (bounce_height >= s.L0 - motion.L) & (motion.dL >= -contact_law.rest_speed)
-    meets_stopper = event.meets_stopper | (is_extended & ~contact_state.locked & event.is_impact)
-    return event._replace(
-        lands=jnp.where(fits_slots, lands, event.lands), meets_stopper=meets_stopper
+    has_more_contacts = (bounce_height >= s.L0 - motion.L) & (motion.dL >= -contact_law.rest_speed)
+    is_leg_meeting_stopper = contact_event.is_leg_meeting_stopper | (
+        has_more_contacts & ~contact_state.is_locked & contact_event.is_impact
+    )
+    return contact_event._replace(
+        is_foot_landing=jnp.where(fits_two_slots, is_foot_landing, contact_event.is_foot_landing),
+        is_leg_meeting_stopper=is_leg_meeting_stopper,
     )
 
 
-def _liftoff_to_slip(
-    contact_law: ContactLaw, motion: WheelMotion, contact_state: ContactState, event: Event
-) -> Event:
-    """Return the event with lift-off replaced by slip, in the limit of large friction.
+def _replace_liftoff_by_slip(
+    contact_law: ContactLaw,
+    motion: WheelMotion,
+    contact_state: ContactState,
+    contact_event: ContactEvent,
+) -> ContactEvent:
+    """Return the event with lift-off replaced by sliding, in the limit of large friction.
 
     A resting foot whose normal force vanishes begins to slide against the direction of its
     tangential force.
     """
     contact_law, motion = stop_gradients((contact_law, motion))
-    contact_slots = find_slots(contact_state.contact_modes != ContactMode.OFF)
-    friction, slot_modes = (
-        slot_friction(contact_law.friction, contact_slots),
-        contact_slots.gather_codes(contact_state.contact_modes),
-    )
-    begins_slip = (
-        event.lifts_off & (slot_modes == ContactMode.STICK) & (stack_friction(friction) == jnp.inf)
+    contact_slots = find_contact_slots(contact_state.contact_modes != ContactMode.OFF)
+    friction = select_slot_friction(contact_law.friction, contact_slots)
+    slot_modes = contact_slots.gather_slot_codes(contact_state.contact_modes)
+    is_starting_to_slide = (
+        contact_event.is_foot_lifting_off
+        & (slot_modes == ContactMode.STICK)
+        & (stack_slot_friction(friction) == jnp.inf)
     )
     slot_state = (
         contact_slots,
         slot_modes,
-        contact_slots.gather_flags(contact_state.locked),
-        contact_state.locked & ~contact_slots.is_filled,
+        contact_slots.gather_slot_flags(contact_state.is_locked),
+        contact_state.is_locked & ~contact_slots.is_in_slot,
     )
     tangential_forces = lambda _: (
         solve_contact_forces(
             ContactConfiguration(contact_law.s, motion, friction, *slot_state)
-        ).tangential
+        ).tangential_forces
     )
-    zeros = jnp.zeros_like(motion.theta), jnp.zeros_like(motion.theta)
-    is_uphill = jnp.stack(run_if_any(jnp.any(begins_slip), tangential_forces, zeros)) > 0.0
-    return event._replace(
-        lifts_off=event.lifts_off & ~begins_slip,
-        slides_up=event.slides_up | (begins_slip & is_uphill),
-        slides_down=event.slides_down | (begins_slip & ~is_uphill),
+    zero_slot_flags = jnp.zeros_like(motion.theta), jnp.zeros_like(motion.theta)
+    is_force_uphill = (
+        jnp.stack(run_if_any(jnp.any(is_starting_to_slide), tangential_forces, zero_slot_flags))
+        > 0.0
+    )
+    return contact_event._replace(
+        is_foot_lifting_off=contact_event.is_foot_lifting_off & ~is_starting_to_slide,
+        is_starting_to_slide_up=contact_event.is_starting_to_slide_up
+        | (is_starting_to_slide & is_force_uphill),
+        is_starting_to_slide_down=contact_event.is_starting_to_slide_down
+        | (is_starting_to_slide & ~is_force_uphill),
     )
 
 
 def resolve_event(
-    contact_law: ContactLaw, motion: WheelMotion, contact_state: ContactState, event: Event
-) -> EventResult:
-    """Return motion, contact state, impulses and lost energy after an event."""
-    event = _merge_touching(
+    contact_law: ContactLaw,
+    motion: WheelMotion,
+    contact_state: ContactState,
+    contact_event: ContactEvent,
+) -> ContactEventResult:
+    """Return motion and contact state after an event, with its impulses and lost energy."""
+    contact_event = _merge_touching_contacts(
         contact_law,
         motion,
         contact_state,
-        _liftoff_to_slip(contact_law, motion, contact_state, event),
+        _replace_liftoff_by_slip(contact_law, motion, contact_state, contact_event),
     )
-    s, is_impact = contact_law.s, event.is_impact
-    was_touching = (contact_state.contact_modes != ContactMode.OFF) | event.lands
-    was_locked = (contact_state.locked | event.meets_stopper) & ~event.leaves_stopper
-    velocity_solution, contact_slots, is_held = _solve_velocity_level(
-        contact_law, motion, contact_state, event
+    s, is_impact = contact_law.s, contact_event.is_impact
+    was_touching = (contact_state.contact_modes != ContactMode.OFF) | contact_event.is_foot_landing
+    was_at_stopper = (
+        contact_state.is_locked | contact_event.is_leg_meeting_stopper
+    ) & ~contact_event.is_leg_leaving_stopper
+    velocity_solution, contact_slots, is_stopper_holding = _solve_velocity_level(
+        contact_law, motion, contact_state, contact_event
     )
     if contact_law.restitution is not None:
         inelastic_solution = _solve_velocity_level(
-            contact_law._replace(restitution=None), motion, contact_state, event
+            contact_law._replace(restitution=None), motion, contact_state, contact_event
         )[0]
         velocity_solution = _limit_energy_gain(
             contact_law, motion, velocity_solution, inelastic_solution
         )
-    impact_modes = contact_slots.scatter(velocity_solution.chosen_combination.slot_modes).astype(
-        jnp.int32
-    )
-    stays_locked = jnp.where(
-        contact_slots.is_filled,
-        contact_slots.scatter(velocity_solution.chosen_combination.is_held) > 0,
-        was_locked & is_held,
+    impact_modes = contact_slots.scatter_to_legs(
+        velocity_solution.chosen_combination.slot_modes
+    ).astype(jnp.int32)
+    stays_at_stopper = jnp.where(
+        contact_slots.is_in_slot,
+        contact_slots.scatter_to_legs(velocity_solution.chosen_combination.is_stopper_holding) > 0,
+        was_at_stopper & is_stopper_holding,
     )
     if contact_law.restitution is not None:  # Only a part of the impulse may act.
-        stays_locked = stays_locked & (
-            jnp.abs(velocity_solution.motion.dL) < contact_law.rest_speed
+        stays_at_stopper = stays_at_stopper & (
+            jnp.abs(velocity_solution.motion_after_impact.dL) < contact_law.rest_speed
         )
-    rest_result = _bring_to_rest(
-        contact_law, velocity_solution.motion, contact_slots, impact_modes, stays_locked, was_locked
+    slow_contact_result = _bring_slow_contacts_to_rest(
+        contact_law,
+        velocity_solution.motion_after_impact,
+        contact_slots,
+        impact_modes,
+        stays_at_stopper,
+        was_at_stopper,
     )
     motion_after, contact_modes, is_at_stopper = select_tree_leaves(
-        is_impact, rest_result, (motion, contact_state.contact_modes, was_locked)
+        is_impact, slow_contact_result, (motion, contact_state.contact_modes, was_at_stopper)
     )
-    directions = leg_directions(s, motion.theta)
-    has_no_slot = was_touching & ~contact_slots.is_filled
-    energy_lost = kinetic_energy(s, motion) - kinetic_energy(s, motion_after)
-    stopper_impulse = jnp.where(is_held, velocity_solution.stopper_push, jnp.inf)
+    leg_directions = compute_leg_directions(s, motion.theta)
+    is_without_slot = was_touching & ~contact_slots.is_in_slot
+    energy_lost = compute_kinetic_energy(s, motion) - compute_kinetic_energy(s, motion_after)
+    stopper_impulse = jnp.where(is_stopper_holding, velocity_solution.stopper_forces, jnp.inf)
 
-    acceleration_solution, contact_slots, was_resting, is_held = _solve_acceleration_level(
-        contact_law, motion_after, contact_modes, is_at_stopper, event
+    acceleration_solution, contact_slots, was_resting, is_stopper_holding = (
+        _solve_acceleration_level(
+            contact_law, motion_after, contact_modes, is_at_stopper, contact_event
+        )
     )
-    contact_modes = contact_slots.scatter(acceleration_solution.slot_modes).astype(jnp.int32)
+    contact_modes = contact_slots.scatter_to_legs(acceleration_solution.slot_modes).astype(
+        jnp.int32
+    )
     is_locked = jnp.where(
-        contact_slots.is_filled,
-        contact_slots.scatter(acceleration_solution.is_held) > 0,
-        is_at_stopper & is_held,
+        contact_slots.is_in_slot,
+        contact_slots.scatter_to_legs(acceleration_solution.is_stopper_holding) > 0,
+        is_at_stopper & is_stopper_holding,
     )
     is_sliding = (acceleration_solution.slot_modes == ContactMode.SLIP_DOWN) | (
         acceleration_solution.slot_modes == ContactMode.SLIP_UP
     )
     contact_state = ContactState(
         contact_modes=contact_modes,
-        locked=is_locked,
+        is_locked=is_locked,
         has_just_lifted=was_touching & (contact_modes == ContactMode.OFF),
-        has_just_unlocked=(contact_state.locked | event.meets_stopper) & ~is_locked,
-        has_just_slid=contact_slots.scatter(is_sliding & was_resting) > 0,
+        has_just_unlocked=(contact_state.is_locked | contact_event.is_leg_meeting_stopper)
+        & ~is_locked,
+        has_just_slid=contact_slots.scatter_to_legs(is_sliding & was_resting) > 0,
     )
     n_impact_solutions = velocity_solution.chosen_combination.n_solutions
     n_force_solutions = acceleration_solution.n_solutions
@@ -764,25 +868,26 @@ def resolve_event(
         jnp.where(is_impact, slot_pair[0], 0.0),
         jnp.where(is_impact, slot_pair[1], 0.0),
     )
-    return EventResult(
+    return ContactEventResult(
         motion=motion_after._replace(
             L=jnp.where(is_locked, s.L0, motion_after.L),
             dL=jnp.where(is_locked, 0.0, motion_after.dL),
         ),
         contact_state=contact_state,
         energy_lost=jnp.where(is_impact, energy_lost, 0.0),
-        normal_impulse=zero_without_impact(velocity_solution.solution.normal),
-        tangential_impulse=zero_without_impact(velocity_solution.solution.tangential),
+        normal_impulse=zero_without_impact(velocity_solution.force_solution.normal_forces),
+        tangential_impulse=zero_without_impact(velocity_solution.force_solution.tangential_forces),
         stopper_impulse=jnp.where(is_impact, jnp.min(stopper_impulse, axis=0), jnp.inf),
         n_solutions=jnp.where(
             is_impact, jnp.minimum(n_impact_solutions, n_force_solutions), n_force_solutions
         ),
-        is_paradox=(n_force_solutions == 0) & ((n_impact_solutions > 0) | ~is_impact),
-        most_solutions=jnp.where(
+        is_painleve_paradox=(n_force_solutions == 0) & ((n_impact_solutions > 0) | ~is_impact),
+        max_n_solutions=jnp.where(
             is_impact, jnp.maximum(n_impact_solutions, n_force_solutions), n_force_solutions
         ),
         has_third_foot=jnp.any(
-            has_no_slot & (foot_speeds(motion_after, directions)[1] < 0.0), axis=0
+            is_without_slot & (compute_foot_velocities(motion_after, leg_directions)[1] < 0.0),
+            axis=0,
         )
         & is_impact,
     )
@@ -795,33 +900,41 @@ def project_motion(
     is_locked: Bool[Array, "n ..."],
     friction: Any = None,
 ) -> WheelMotion:
-    """Return the motion projected onto its contacts: loaded feet on the slope, sticking feet at
-    rest.
+    """Return the motion projected onto its contacts.
 
-    Bilateral, frictionless impulses project the velocities. A motion that already satisfies its
-    contacts is unchanged up to round-off.
+    After the projection, loaded feet are on the slope and sticking feet are at rest. Bilateral
+    impulses without friction project the velocities. A motion that satisfies the contacts is
+    returned unchanged up to round-off.
 
-    - `friction`: coefficient of sliding feet during the projection; None means 0.
+    - `friction`: friction coefficient of sliding feet in the projection; None means 0.
     """
-    directions = leg_directions(s, motion.theta)
+    leg_directions = compute_leg_directions(s, motion.theta)
     L = jnp.where(
-        (contact_modes != ContactMode.OFF) & ~is_locked, motion.z / directions.cos, motion.L
+        (contact_modes != ContactMode.OFF) & ~is_locked, motion.z / leg_directions.cos, motion.L
     )
     motion = motion._replace(L=jnp.where(is_locked, s.L0, L))
-    contact_slots = find_slots(contact_modes != ContactMode.OFF)
-    is_airborne_locked = is_locked & ~contact_slots.is_filled
-    slot_modes, is_held = (
-        contact_slots.gather_codes(contact_modes),
-        contact_slots.gather_flags(is_locked),
-    )
+    contact_slots = find_contact_slots(contact_modes != ContactMode.OFF)
+    is_airborne_locked = is_locked & ~contact_slots.is_in_slot
+    slot_modes = contact_slots.gather_slot_codes(contact_modes)
+    is_stopper_holding = contact_slots.gather_slot_flags(is_locked)
     # Two resting feet on two held legs would constrain the hub twice.
-    is_overdetermined = jnp.all((slot_modes == ContactMode.STICK) & is_held, axis=0)
-    is_held = jnp.stack([is_held[0], is_held[1] & ~is_overdetermined])
+    is_overdetermined = jnp.all((slot_modes == ContactMode.STICK) & is_stopper_holding, axis=0)
+    is_stopper_holding = jnp.stack(
+        [is_stopper_holding[0], is_stopper_holding[1] & ~is_overdetermined]
+    )
     slot_coefficients = (
-        jnp.zeros_like(motion.theta) if friction is None else slot_friction(friction, contact_slots)
+        jnp.zeros_like(motion.theta)
+        if friction is None
+        else select_slot_friction(friction, contact_slots)
     )
-    configuration = ContactConfiguration(
-        s, motion, slot_coefficients, contact_slots, slot_modes, is_held, is_airborne_locked
+    contact_configuration = ContactConfiguration(
+        s,
+        motion,
+        slot_coefficients,
+        contact_slots,
+        slot_modes,
+        is_stopper_holding,
+        is_airborne_locked,
     )
-    projected_motion = _motion_after_impact(motion, solve_impact(configuration))
+    projected_motion = _apply_impact_velocities(motion, solve_impact(contact_configuration))
     return projected_motion._replace(dL=jnp.where(is_locked, 0.0, projected_motion.dL))

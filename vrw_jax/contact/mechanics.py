@@ -50,41 +50,43 @@ class LegDirections(NamedTuple):
     cos: LegArray
 
 
-def leg_directions(s: Symbols, theta: Elementwise) -> LegDirections:
+def compute_leg_directions(s: Symbols, theta: Elementwise) -> LegDirections:
     """Return the directions of all legs at the angle `theta` (rad) of Leg 1.
 
-    The angle may have any number of turns.
+    The angle may be of any size, with any number of turns.
     """
     leg_angles = (s.alpha * np.arange(s.n)).reshape(-1, *(1,) * jnp.ndim(theta))
     half_turns = lax.stop_gradient(jnp.floor(theta / math.pi + 0.5))
-    is_odd = half_turns - 2.0 * jnp.floor(0.5 * half_turns)
-    sin, cos = (x - 2.0 * is_odd * x for x in compute_sine_cosine(theta - math.pi * half_turns))
+    is_half_turn_odd = half_turns - 2.0 * jnp.floor(0.5 * half_turns)
+    sin, cos = (
+        x - 2.0 * is_half_turn_odd * x for x in compute_sine_cosine(theta - math.pi * half_turns)
+    )
     sin_leg, cos_leg = np.sin(leg_angles), np.cos(leg_angles)
     return LegDirections(sin * cos_leg + cos * sin_leg, cos * cos_leg - sin * sin_leg)
 
 
-def sum_over_legs(values: Array) -> Array:
-    """Return the sum over the legs, which are on the first axis."""
-    return jnp.sum(values, axis=0)
+def sum_over_legs(leg_quantities: Array) -> Array:
+    """Return the sum of a quantity over the legs, which are on the first axis."""
+    return jnp.sum(leg_quantities, axis=0)
 
 
 def prevent_fusion(tree: Any, unit_divisor: Array) -> Any:
     """Return the tree with every float divided by `unit_divisor`, which is 1 at run time.
 
-    Fusions of XLA on a CPU repeat chains of cheap operations for each use, which multiplies their
-    number by a hundred here. A division is computed only once.
+    Fusions of XLA on a CPU repeat chains of cheap operations for each use. Here the repetitions
+    multiply the number of operations by a hundred. XLA computes a division only once.
     """
-    is_float = lambda leaf: jnp.issubdtype(jnp.result_type(leaf), jnp.floating)
-    return jax.tree.map(lambda leaf: leaf / unit_divisor if is_float(leaf) else leaf, tree)
+    is_float_array = lambda leaf: jnp.issubdtype(jnp.result_type(leaf), jnp.floating)
+    return jax.tree.map(lambda leaf: leaf / unit_divisor if is_float_array(leaf) else leaf, tree)
 
 
-def opaque_one(motion: "WheelMotion") -> Array:
-    """Return 1 as an array that no compiler can simplify."""
+def make_opaque_one(motion: "WheelMotion") -> Array:
+    """Return ones in the shape of `theta` that no compiler can simplify."""
     return lax.stop_gradient(1.0 + 0.0 * motion.theta)
 
 
 def stop_gradients(tree: Any) -> Any:
-    """Return the tree with its floats constant for differentiation."""
+    """Return the tree with its float arrays excluded from differentiation."""
     float_leaves, other_leaves = eqx.partition(tree, eqx.is_inexact_array)
     return eqx.combine(lax.stop_gradient(float_leaves), other_leaves)
 
@@ -95,64 +97,70 @@ class ContactSlots(NamedTuple):
     The mask of an empty slot is False for all legs.
     """
 
-    first_mask: Bool[Array, "n_legs ..."]
-    second_mask: Bool[Array, "n_legs ..."]
+    first_slot_mask: Bool[Array, "n_legs ..."]
+    second_slot_mask: Bool[Array, "n_legs ..."]
 
     @property
-    def is_filled(self) -> Bool[Array, "n_legs ..."]:
-        """Return whether each leg occupies one of the two contact slots, (n_legs, ...)."""
-        return self.first_mask | self.second_mask
+    def is_in_slot(self) -> Bool[Array, "n_legs ..."]:
+        """Return whether each leg is in one of the two contact slots, (n_legs, ...)."""
+        return self.first_slot_mask | self.second_slot_mask
 
-    def gather_codes(self, values: Array) -> Int[Array, "2 ..."]:
-        """Return the entries of an integer per leg for both slots, as one array (2, ...).
+    def gather_slot_codes(self, leg_quantities: Array) -> Int[Array, "2 ..."]:
+        """Return the integers of both slots' legs, (2, ...), given an integer of each leg.
 
-        The entry of an empty slot is 0.
+        The integer of an empty slot is 0.
         """
-        return jnp.stack(self.gather(values))
+        return jnp.stack(self.gather_slot_pair(leg_quantities))
 
-    def gather_flags(self, values: Array) -> Bool[Array, "2 ..."]:
-        """Return the entries of a flag per leg for both slots, as one array (2, ...).
+    def gather_slot_flags(self, leg_quantities: Array) -> Bool[Array, "2 ..."]:
+        """Return the flags of both slots' legs, (2, ...), given a flag of each leg.
 
-        The entry of an empty slot is False.
+        The flag of an empty slot is False.
         """
-        return self.gather_codes(values.astype(jnp.int32)) > 0
+        return self.gather_slot_codes(leg_quantities.astype(jnp.int32)) > 0
 
-    def gather(self, values: Array) -> SlotPair:
-        """Return the entries of a quantity per leg for both slots; 0 for an empty slot."""
-        zeros = jnp.zeros_like(values)
+    def gather_slot_pair(self, leg_quantities: Array) -> SlotPair:
+        """Return a quantity of both slots' legs, given the quantity of each leg; 0 for an empty
+        slot.
+        """
+        zero_slot_values = jnp.zeros_like(leg_quantities)
         return (
-            sum_over_legs(jnp.where(self.first_mask, values, zeros)),
-            sum_over_legs(jnp.where(self.second_mask, values, zeros)),
+            sum_over_legs(jnp.where(self.first_slot_mask, leg_quantities, zero_slot_values)),
+            sum_over_legs(jnp.where(self.second_slot_mask, leg_quantities, zero_slot_values)),
         )
 
-    def scatter(self, slot_pair: Any) -> LegArray:
-        """Return a quantity per leg from that of both slots; 0 for legs in no slot.
+    def scatter_to_legs(self, slot_pair: Any) -> LegArray:
+        """Return a quantity of each leg, given that of both slots' legs; 0 for legs in no slot.
 
-        This is the inverse of `gather`.
+        This is the inverse of `gather_slot_pair`.
         """
-        return jnp.where(self.first_mask, slot_pair[0], 0.0) + jnp.where(
-            self.second_mask, slot_pair[1], 0.0
+        return jnp.where(self.first_slot_mask, slot_pair[0], 0.0) + jnp.where(
+            self.second_slot_mask, slot_pair[1], 0.0
         )
 
 
-def find_slots(is_touching: Bool[Array, "n_legs ..."]) -> ContactSlots:
+def find_contact_slots(is_foot_touching: Bool[Array, "n_legs ..."]) -> ContactSlots:
     """Return the contact slots of the first two legs whose feet touch the ground."""
-    touching_rank = jnp.cumsum(is_touching.astype(jnp.int32), axis=0)
-    return ContactSlots(is_touching & (touching_rank == 1), is_touching & (touching_rank == 2))
+    touching_leg_rank = jnp.cumsum(is_foot_touching.astype(jnp.int32), axis=0)
+    return ContactSlots(
+        is_foot_touching & (touching_leg_rank == 1), is_foot_touching & (touching_leg_rank == 2)
+    )
 
 
-def slot_friction(
+def select_slot_friction(
     friction: Elementwise | SlotPair, contact_slots: ContactSlots
 ) -> Elementwise | SlotPair:
     """Return the friction coefficient of the foot in each contact slot, or the common coefficient.
 
-    A pair `friction` holds the coefficient of the foot that landed last, Leg 1's, and that of all
-    others. A single number is the coefficient of all feet.
+    A pair `friction` contains the coefficient of the foot of Leg 1, which landed last, and that of
+    all other feet. A single number is the coefficient of all feet.
     """
     if not isinstance(friction, tuple):
         return friction
-    last_friction, other_friction = friction
-    return jnp.where(contact_slots.first_mask[0], last_friction, other_friction), other_friction
+    last_landed_friction, other_friction = friction
+    return jnp.where(
+        contact_slots.first_slot_mask[0], last_landed_friction, other_friction
+    ), other_friction
 
 
 class ContactInverseInertia(NamedTuple):
@@ -164,51 +172,63 @@ class ContactInverseInertia(NamedTuple):
     sin: SlotPair
     cos: SlotPair
     L: SlotPair
-    response_transverse: tuple[HubVector, HubVector]  # of the hub to a unit transverse force
-    response_radial: tuple[HubVector, HubVector]  # of the hub to a unit stopper force
+    hub_response_transverse: tuple[HubVector, HubVector]  # of the hub to a unit transverse force
+    hub_response_radial: tuple[HubVector, HubVector]  # of the hub to a unit stopper force
     G: tuple[Any, Any, Any]  # 11, 12, 22: of feet to transverse forces
     H: tuple[Any, Any, Any, Any]  # 11, 12, 21, 22: of feet to stopper forces
     K: tuple[Any, Any, Any]  # 11, 12, 22: of legs to stopper forces
 
 
-def apply_inverse(inverse_inertia: tuple[Any, ...], generalized_force: HubVector) -> HubVector:
+def multiply_by_inverse_inertia(
+    inverse_inertia: tuple[Any, ...], generalized_force: HubVector
+) -> HubVector:
     """Return the product of the symmetric inverse inertia and a vector."""
-    xx, xz, xt, zz, zt, tt = inverse_inertia
+    inverse_xx, inverse_xz, inverse_xt, inverse_zz, inverse_zt, inverse_tt = inverse_inertia
     return (
-        xx * generalized_force[0] + xz * generalized_force[1] + xt * generalized_force[2],
-        xz * generalized_force[0] + zz * generalized_force[1] + zt * generalized_force[2],
-        xt * generalized_force[0] + zt * generalized_force[1] + tt * generalized_force[2],
+        inverse_xx * generalized_force[0]
+        + inverse_xz * generalized_force[1]
+        + inverse_xt * generalized_force[2],
+        inverse_xz * generalized_force[0]
+        + inverse_zz * generalized_force[1]
+        + inverse_zt * generalized_force[2],
+        inverse_xt * generalized_force[0]
+        + inverse_zt * generalized_force[1]
+        + inverse_tt * generalized_force[2],
     )
 
 
 def _invert_inertia(
-    s: Symbols, directions: LegDirections, b: LegArray, is_released: Array
+    s: Symbols, leg_directions: LegDirections, b: LegArray, is_released: Array
 ) -> tuple[Any, ...]:
-    """Return the inverse of the hub's 3 x 3 inertia after elimination of the released legs.
+    """Return the inverse of the hub's 3 x 3 inertia matrix without the released legs.
 
     The entries are xx, xz, x theta, zz, z theta, theta theta.
     """
-    sin = jnp.where(is_released, directions.sin, 0.0)
-    cos = jnp.where(is_released, directions.cos, 0.0)
-    xx = s.Mt - s.m * sum_over_legs(sin * sin)
-    xz = -s.m * sum_over_legs(sin * cos)
-    zz = s.Mt - s.m * sum_over_legs(cos * cos)
-    xt = -s.m * sum_over_legs(b * directions.cos)
-    zt = s.m * sum_over_legs(b * directions.sin)
-    tt = s.m * sum_over_legs(b * b)
-    c_xx, c_xz, c_xt = zz * tt - zt * zt, xt * zt - xz * tt, xz * zt - zz * xt
-    inverse_determinant = 1.0 / (xx * c_xx + xz * c_xz + xt * c_xt)
+    sin = jnp.where(is_released, leg_directions.sin, 0.0)
+    cos = jnp.where(is_released, leg_directions.cos, 0.0)
+    inertia_xx = s.Mt - s.m * sum_over_legs(sin * sin)
+    inertia_xz = -s.m * sum_over_legs(sin * cos)
+    inertia_zz = s.Mt - s.m * sum_over_legs(cos * cos)
+    inertia_xt = -s.m * sum_over_legs(b * leg_directions.cos)
+    inertia_zt = s.m * sum_over_legs(b * leg_directions.sin)
+    inertia_tt = s.m * sum_over_legs(b * b)
+    cofactor_xx = inertia_zz * inertia_tt - inertia_zt * inertia_zt
+    cofactor_xz = inertia_xt * inertia_zt - inertia_xz * inertia_tt
+    cofactor_xt = inertia_xz * inertia_zt - inertia_zz * inertia_xt
+    inverse_determinant = 1.0 / (
+        inertia_xx * cofactor_xx + inertia_xz * cofactor_xz + inertia_xt * cofactor_xt
+    )
     return (
-        c_xx * inverse_determinant,
-        c_xz * inverse_determinant,
-        c_xt * inverse_determinant,
-        (xx * tt - xt * xt) * inverse_determinant,
-        (xz * xt - xx * zt) * inverse_determinant,
-        (xx * zz - xz * xz) * inverse_determinant,
+        cofactor_xx * inverse_determinant,
+        cofactor_xz * inverse_determinant,
+        cofactor_xt * inverse_determinant,
+        (inertia_xx * inertia_tt - inertia_xt * inertia_xt) * inverse_determinant,
+        (inertia_xz * inertia_xt - inertia_xx * inertia_zt) * inverse_determinant,
+        (inertia_xx * inertia_zz - inertia_xz * inertia_xz) * inverse_determinant,
     )
 
 
-class Posture(NamedTuple):
+class WheelPosture(NamedTuple):
     """Directions of all legs, and directions and lengths of the slots' legs."""
 
     leg_directions: LegDirections
@@ -217,14 +237,16 @@ class Posture(NamedTuple):
     L: SlotPair
 
 
-def make_posture(s: Symbols, motion: WheelMotion, contact_slots: ContactSlots) -> Posture:
+def make_wheel_posture(
+    s: Symbols, motion: WheelMotion, contact_slots: ContactSlots
+) -> WheelPosture:
     """Return the directions of all legs, and the directions and lengths of the slots' legs."""
-    directions = leg_directions(s, motion.theta)
-    return Posture(
-        directions,
-        contact_slots.gather(directions.sin),
-        contact_slots.gather(directions.cos),
-        contact_slots.gather(motion.L),
+    leg_directions = compute_leg_directions(s, motion.theta)
+    return WheelPosture(
+        leg_directions,
+        contact_slots.gather_slot_pair(leg_directions.sin),
+        contact_slots.gather_slot_pair(leg_directions.cos),
+        contact_slots.gather_slot_pair(motion.L),
     )
 
 
@@ -235,96 +257,119 @@ def make_inverse_inertia(
 
     - `is_airborne_locked`: whether a leg is in the air on its stopper.
     """
-    directions, sin, cos, L = make_posture(s, motion, contact_slots)
-    is_released = contact_slots.is_filled | ~is_airborne_locked
-    inverse_inertia = _invert_inertia(s, directions, motion.L - s.a, is_released)
+    leg_directions, sin, cos, L = make_wheel_posture(s, motion, contact_slots)
+    is_released = contact_slots.is_in_slot | ~is_airborne_locked
+    inverse_inertia = _invert_inertia(s, leg_directions, motion.L - s.a, is_released)
     e = [(cos[i], -sin[i], -L[i]) for i in range(2)]
     u = [(sin[i], cos[i], jnp.zeros_like(sin[i])) for i in range(2)]
-    z = (apply_inverse(inverse_inertia, e[0]), apply_inverse(inverse_inertia, e[1]))
-    y = (apply_inverse(inverse_inertia, u[0]), apply_inverse(inverse_inertia, u[1]))
-    dot = lambda a, b: a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-    plane_dot = lambda a, b: a[0] * b[0] + a[1] * b[1]
+    z = (
+        multiply_by_inverse_inertia(inverse_inertia, e[0]),
+        multiply_by_inverse_inertia(inverse_inertia, e[1]),
+    )
+    y = (
+        multiply_by_inverse_inertia(inverse_inertia, u[0]),
+        multiply_by_inverse_inertia(inverse_inertia, u[1]),
+    )
+    multiply_hub_vectors = lambda a, b: a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+    multiply_plane_vectors = lambda a, b: a[0] * b[0] + a[1] * b[1]
     return ContactInverseInertia(
-        directions,
+        leg_directions,
         is_released,
         inverse_inertia,
         sin,
         cos,
         L,
-        response_transverse=z,
-        response_radial=y,
-        G=(dot(e[0], z[0]), dot(e[0], z[1]), dot(e[1], z[1])),
-        H=(
-            plane_dot(u[0], z[0]),
-            plane_dot(u[0], z[1]),
-            plane_dot(u[1], z[0]),
-            plane_dot(u[1], z[1]),
+        hub_response_transverse=z,
+        hub_response_radial=y,
+        G=(
+            multiply_hub_vectors(e[0], z[0]),
+            multiply_hub_vectors(e[0], z[1]),
+            multiply_hub_vectors(e[1], z[1]),
         ),
-        K=(plane_dot(u[0], y[0]), plane_dot(u[0], y[1]), plane_dot(u[1], y[1])),
+        H=(
+            multiply_plane_vectors(u[0], z[0]),
+            multiply_plane_vectors(u[0], z[1]),
+            multiply_plane_vectors(u[1], z[0]),
+            multiply_plane_vectors(u[1], z[1]),
+        ),
+        K=(
+            multiply_plane_vectors(u[0], y[0]),
+            multiply_plane_vectors(u[0], y[1]),
+            multiply_plane_vectors(u[1], y[1]),
+        ),
     )
 
 
 class FreeMotion(NamedTuple):
-    """Motion without contact forces: accelerations, or velocities in an impact."""
+    """Accelerations without contact forces, or velocities after an impact without impulses."""
 
-    hub_vector: HubVector
+    hub_motion: HubVector
     leg_motion: LegArray  # of a released leg's length, minus the part u . hub
     slot_leg_motion: SlotPair  # the same for the slots' legs
     foot_transverse_motion: SlotPair  # of the slots' feet, transverse to the leg
     foot_radial_motion: SlotPair  # of the slots' feet, along the leg
 
 
-def free_leg_motion(s: Symbols, motion: WheelMotion, directions: LegDirections) -> LegArray:
-    """Return the acceleration of each leg's length without contact force, m/s^2.
+def compute_free_leg_acceleration(
+    s: Symbols, motion: WheelMotion, leg_directions: LegDirections
+) -> LegArray:
+    """Return the acceleration of each leg's length without contact forces, m/s^2.
 
-    The hub's acceleration along the leg is not included.
+    The acceleration of the hub along the leg is not included.
     """
-    gx, gz = s.g * s.sin_phi, -s.g * s.cos_phi
+    gravity_x, gravity_z = s.g * s.sin_phi, -s.g * s.cos_phi
     centrifugal_acceleration = (motion.L - s.a) * motion.dtheta * motion.dtheta
     spring_force = s.k * (s.Ls - motion.L) - s.c * motion.dL
     return (
-        centrifugal_acceleration - (directions.sin * gx + directions.cos * gz) + spring_force / s.m
+        centrifugal_acceleration
+        - (leg_directions.sin * gravity_x + leg_directions.cos * gravity_z)
+        + spring_force / s.m
     )
 
 
-def free_acceleration(
-    s: Symbols, motion: WheelMotion, contact_slots: ContactSlots, inertia: ContactInverseInertia
+def compute_free_acceleration(
+    s: Symbols,
+    motion: WheelMotion,
+    contact_slots: ContactSlots,
+    inverse_inertia: ContactInverseInertia,
 ) -> FreeMotion:
     """Return the accelerations due to gravity, springs, dampers and rotation alone.
 
     The slots' feet and stoppers exert no force.
     """
-    sin, cos = inertia.leg_directions
+    sin, cos = inverse_inertia.leg_directions
     b, dtheta = motion.L - s.a, motion.dtheta
-    gx, gz = s.g * s.sin_phi, -s.g * s.cos_phi
-    centrifugal_acceleration, leg_acceleration = (
-        b * dtheta * dtheta,
-        free_leg_motion(s, motion, inertia.leg_directions),
-    )
+    gravity_x, gravity_z = s.g * s.sin_phi, -s.g * s.cos_phi
+    centrifugal_acceleration = b * dtheta * dtheta
+    leg_acceleration = compute_free_leg_acceleration(s, motion, inverse_inertia.leg_directions)
     coriolis_acceleration = 2.0 * motion.dL * dtheta
     radial_acceleration = (
-        jnp.where(inertia.is_released, leg_acceleration, 0.0) - centrifugal_acceleration
+        jnp.where(inverse_inertia.is_released, leg_acceleration, 0.0) - centrifugal_acceleration
     )
-    force_x = s.Mt * gx + s.m * sum_over_legs(
+    hub_force_x = s.Mt * gravity_x + s.m * sum_over_legs(
         radial_acceleration * sin + coriolis_acceleration * cos
     )
-    force_z = s.Mt * gz + s.m * sum_over_legs(
+    hub_force_z = s.Mt * gravity_z + s.m * sum_over_legs(
         radial_acceleration * cos - coriolis_acceleration * sin
     )
-    torque = -s.m * sum_over_legs(b * (coriolis_acceleration + cos * gx - sin * gz))
-    hub_acceleration = apply_inverse(inertia.inverse_inertia, (force_x, force_z, torque))
-    slot_coriolis, slot_leg_acceleration = (
-        contact_slots.gather(coriolis_acceleration),
-        contact_slots.gather(leg_acceleration),
+    hub_torque = -s.m * sum_over_legs(
+        b * (coriolis_acceleration + cos * gravity_x - sin * gravity_z)
     )
+    hub_acceleration = multiply_by_inverse_inertia(
+        inverse_inertia.inverse_inertia, (hub_force_x, hub_force_z, hub_torque)
+    )
+    slot_coriolis = contact_slots.gather_slot_pair(coriolis_acceleration)
+    slot_leg_acceleration = contact_slots.gather_slot_pair(leg_acceleration)
     foot_transverse = [
-        inertia.cos[i] * hub_acceleration[0]
-        - inertia.sin[i] * hub_acceleration[1]
-        - inertia.L[i] * hub_acceleration[2]
+        inverse_inertia.cos[i] * hub_acceleration[0]
+        - inverse_inertia.sin[i] * hub_acceleration[1]
+        - inverse_inertia.L[i] * hub_acceleration[2]
         - slot_coriolis[i]
         for i in range(2)
     ]
-    foot_radial = [inertia.L[i] * dtheta * dtheta - slot_leg_acceleration[i] for i in range(2)]
+    foot_radial = [
+        inverse_inertia.L[i] * dtheta * dtheta - slot_leg_acceleration[i] for i in range(2)
+    ]
     return FreeMotion(
         hub_acceleration,
         leg_acceleration,
@@ -334,30 +379,39 @@ def free_acceleration(
     )
 
 
-def free_velocity(
-    s: Symbols, motion: WheelMotion, contact_slots: ContactSlots, inertia: ContactInverseInertia
+def compute_free_velocity(
+    s: Symbols,
+    motion: WheelMotion,
+    contact_slots: ContactSlots,
+    inverse_inertia: ContactInverseInertia,
 ) -> FreeMotion:
     """Return the velocities after an impact without impulses at feet or slots' stoppers.
 
-    An airborne leg on its stopper whose length still changes meets the stopper, inelastically.
+    An airborne leg at its stopper whose length changes strikes the stopper inelastically.
     """
-    sin, cos = inertia.leg_directions
+    sin, cos = inverse_inertia.leg_directions
     b, dtheta = motion.L - s.a, motion.dtheta
     hub_outward = sin * motion.vx + cos * motion.vz
-    leg_velocity = jnp.where(inertia.is_released, motion.dL - hub_outward, 0.0)
+    leg_velocity = jnp.where(inverse_inertia.is_released, motion.dL - hub_outward, 0.0)
     radial_velocity = leg_velocity - motion.dL
     transverse_velocity = b * dtheta
-    px = s.Mt * motion.vx + s.m * sum_over_legs(radial_velocity * sin - transverse_velocity * cos)
-    pz = s.Mt * motion.vz + s.m * sum_over_legs(radial_velocity * cos + transverse_velocity * sin)
+    momentum_x = s.Mt * motion.vx + s.m * sum_over_legs(
+        radial_velocity * sin - transverse_velocity * cos
+    )
+    momentum_z = s.Mt * motion.vz + s.m * sum_over_legs(
+        radial_velocity * cos + transverse_velocity * sin
+    )
     angular_momentum = -s.m * sum_over_legs(
         b * (cos * motion.vx - sin * motion.vz - transverse_velocity)
     )
-    hub_velocity = apply_inverse(inertia.inverse_inertia, (px, pz, angular_momentum))
-    slot_leg_velocity = contact_slots.gather(leg_velocity)
+    hub_velocity = multiply_by_inverse_inertia(
+        inverse_inertia.inverse_inertia, (momentum_x, momentum_z, angular_momentum)
+    )
+    slot_leg_velocity = contact_slots.gather_slot_pair(leg_velocity)
     foot_transverse = [
-        inertia.cos[i] * hub_velocity[0]
-        - inertia.sin[i] * hub_velocity[1]
-        - inertia.L[i] * hub_velocity[2]
+        inverse_inertia.cos[i] * hub_velocity[0]
+        - inverse_inertia.sin[i] * hub_velocity[1]
+        - inverse_inertia.L[i] * hub_velocity[2]
         for i in range(2)
     ]
     return FreeMotion(
@@ -369,18 +423,18 @@ def free_velocity(
     )
 
 
-class FootVelocity(NamedTuple):
+class SlotFootVelocity(NamedTuple):
     """Velocity of the slots' feet along the slope and normal to the slope, m/s."""
 
-    x: SlotPair
-    z: SlotPair
+    along_slope: SlotPair
+    normal_to_slope: SlotPair
 
 
-def foot_velocity(
-    motion: WheelMotion, contact_slots: ContactSlots, posture: ContactInverseInertia | Posture
-) -> FootVelocity:
+def compute_slot_foot_velocity(
+    motion: WheelMotion, contact_slots: ContactSlots, posture: ContactInverseInertia | WheelPosture
+) -> SlotFootVelocity:
     """Return the velocity of the slots' feet along the slope and normal to the slope, m/s."""
-    dL = contact_slots.gather(motion.dL)
+    dL = contact_slots.gather_slot_pair(motion.dL)
     x = [
         motion.vx - dL[i] * posture.sin[i] - posture.L[i] * motion.dtheta * posture.cos[i]
         for i in range(2)
@@ -389,63 +443,69 @@ def foot_velocity(
         motion.vz - dL[i] * posture.cos[i] + posture.L[i] * motion.dtheta * posture.sin[i]
         for i in range(2)
     ]
-    return FootVelocity((x[0], x[1]), (z[0], z[1]))
+    return SlotFootVelocity((x[0], x[1]), (z[0], z[1]))
 
 
-def foot_heights(
-    motion: WheelMotion, directions: LegDirections, tilt: Elementwise | None = None
+def compute_foot_heights(
+    motion: WheelMotion, leg_directions: LegDirections, next_line_tilt: Elementwise | None = None
 ) -> LegArray:
     """Return the height of every foot above the slope, m.
 
-    - `tilt`: angle by which the next line is steeper, rad. The height of the foremost foot is then
-      that above the next line, which begins under the foot of Leg 1.
+    - `next_line_tilt`: angle by which the next line is steeper, rad. The height of the foremost
+      foot is measured from the next line, which begins under the foot of Leg 1.
     """
-    heights = motion.z - motion.L * directions.cos
-    if tilt is None:
-        return heights
-    downhill_positions = foot_positions(motion, directions)
+    foot_heights = motion.z - motion.L * leg_directions.cos
+    if next_line_tilt is None:
+        return foot_heights
+    downhill_positions = compute_foot_positions(motion, leg_directions)
     foremost_distance = downhill_positions[-1] - downhill_positions[0]
-    foremost_height = heights[-1] * jnp.cos(tilt) + foremost_distance * jnp.sin(tilt)
-    return jnp.concatenate([heights[:-1], foremost_height[None]])
+    foremost_height = foot_heights[-1] * jnp.cos(next_line_tilt) + foremost_distance * jnp.sin(
+        next_line_tilt
+    )
+    return jnp.concatenate([foot_heights[:-1], foremost_height[None]])
 
 
-def foot_speeds(motion: WheelMotion, directions: LegDirections) -> tuple[LegArray, LegArray]:
+def compute_foot_velocities(
+    motion: WheelMotion, leg_directions: LegDirections
+) -> tuple[LegArray, LegArray]:
     """Return the velocity of every foot along the slope and normal to the slope, m/s."""
     transverse_velocity = motion.L * motion.dtheta
-    tangential_speed = motion.vx - motion.dL * directions.sin - transverse_velocity * directions.cos
+    tangential_speed = (
+        motion.vx - motion.dL * leg_directions.sin - transverse_velocity * leg_directions.cos
+    )
     return (
         tangential_speed,
-        motion.vz - motion.dL * directions.cos + transverse_velocity * directions.sin,
+        motion.vz - motion.dL * leg_directions.cos + transverse_velocity * leg_directions.sin,
     )
 
 
-def foot_positions(motion: WheelMotion, directions: LegDirections) -> LegArray:
+def compute_foot_positions(motion: WheelMotion, leg_directions: LegDirections) -> LegArray:
     """Return the downhill position of every foot, m."""
-    return motion.x - motion.L * directions.sin
+    return motion.x - motion.L * leg_directions.sin
 
 
-def landing_position(n: int, motion: WheelMotion) -> Elementwise:
+def compute_landing_position(n_legs: int, motion: WheelMotion) -> Elementwise:
     """Return the downhill position of the foremost of `n` feet, m."""
-    foremost_angle = motion.theta + (n - 1) * 2.0 * math.pi / n
-    return motion.x - motion.L[n - 1] * jnp.sin(foremost_angle)
+    foremost_angle = motion.theta + (n_legs - 1) * 2.0 * math.pi / n_legs
+    return motion.x - motion.L[n_legs - 1] * jnp.sin(foremost_angle)
 
 
-def kinetic_energy(s: Symbols, motion: WheelMotion) -> Elementwise:
+def compute_kinetic_energy(s: Symbols, motion: WheelMotion) -> Elementwise:
     """Return the kinetic energy of the hub and all leg masses, J."""
-    directions = leg_directions(s, motion.theta)
+    leg_directions = compute_leg_directions(s, motion.theta)
     transverse_velocity = (motion.L - s.a) * motion.dtheta
-    x = motion.vx - motion.dL * directions.sin - transverse_velocity * directions.cos
-    z = motion.vz - motion.dL * directions.cos + transverse_velocity * directions.sin
+    x = motion.vx - motion.dL * leg_directions.sin - transverse_velocity * leg_directions.cos
+    z = motion.vz - motion.dL * leg_directions.cos + transverse_velocity * leg_directions.sin
     hub_mass = s.Mt - s.n * s.m
     return 0.5 * (hub_mass * (motion.vx**2 + motion.vz**2) + s.m * sum_over_legs(x * x + z * z))
 
 
-def potential_energy(s: Symbols, motion: WheelMotion) -> SlotPair:
+def compute_potential_energy(s: Symbols, motion: WheelMotion) -> SlotPair:
     """Return the gravitational energy relative to the origin, and the elastic energy of all
     springs, J.
     """
-    directions = leg_directions(s, motion.theta)
-    x = s.Mt * motion.x - s.m * sum_over_legs((motion.L - s.a) * directions.sin)
-    z = s.Mt * motion.z - s.m * sum_over_legs((motion.L - s.a) * directions.cos)
+    leg_directions = compute_leg_directions(s, motion.theta)
+    x = s.Mt * motion.x - s.m * sum_over_legs((motion.L - s.a) * leg_directions.sin)
+    z = s.Mt * motion.z - s.m * sum_over_legs((motion.L - s.a) * leg_directions.cos)
     elastic_energy = 0.5 * s.k * sum_over_legs((motion.L - s.Ls) ** 2)
     return s.g * (z * s.cos_phi - x * s.sin_phi), elastic_energy

@@ -1,11 +1,12 @@
-"""Full section state of the unilateral model as one vector, and conversions to and from motions."""
+"""Full section state of the unilateral model as one vector, and its conversion to and from
+motions."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from vrw_jax.contact.contact_modes import ContactMode
 from vrw_jax.contact.contact_state import ContactState
-from vrw_jax.contact.mechanics import WheelMotion, leg_directions
+from vrw_jax.contact.mechanics import WheelMotion, compute_leg_directions
 from vrw_jax.models import (
     PAPER_START_STATE,
     is_valid_slope,
@@ -27,27 +28,37 @@ LOCKED_CODE_OFFSET = 4
 """Number that the code of a leg on its stopper exceeds the contact mode of its foot by."""
 
 
-def full_section_size(n: int) -> int:
+def compute_full_section_size(n_legs: int) -> int:
     """Return the number of entries of a full section state of a wheel with `n` legs."""
-    return 4 + 3 * n
+    return 4 + 3 * n_legs
 
 
-def compute_section_units(units: WheelUnits, n: int) -> list[Elementwise]:
+def compute_section_units(wheel_units: WheelUnits, n_legs: int) -> list[Elementwise]:
     """Return the wheel's unit of each entry of a full section state, as a list.
 
     Angles and codes have the unit 1.
     """
-    angle_unit = units.length_unit / units.length_unit
-    hub_units = [angle_unit, units.rate_unit, units.velocity_unit, units.velocity_unit]
-    return [*hub_units, *[units.length_unit] * n, *[units.velocity_unit] * n, *[angle_unit] * n]
+    angle_unit = wheel_units.length_unit / wheel_units.length_unit
+    hub_units = [
+        angle_unit,
+        wheel_units.rate_unit,
+        wheel_units.velocity_unit,
+        wheel_units.velocity_unit,
+    ]
+    return [
+        *hub_units,
+        *[wheel_units.length_unit] * n_legs,
+        *[wheel_units.velocity_unit] * n_legs,
+        *[angle_unit] * n_legs,
+    ]
 
 
-def embed_section_state(s: Symbols, x: Float[Array, "3 ..."]) -> FullState:
-    """Return the full section state of the paper's state `x`, (theta-, dtheta-, dL1-).
+def embed_section_state(s: Symbols, paper_state: Float[Array, "3 ..."]) -> FullState:
+    """Return the full section state of the paper's section state, (theta-, dtheta-, dL1-).
 
     Leg 1 is at rest on the ground, and all other legs are in the air on their stoppers.
     """
-    theta, dtheta, dL1 = x
+    theta, dtheta, dL1 = paper_state
     sin, cos, L1 = jnp.sin(theta), jnp.cos(theta), compute_length_at_touchdown(s, theta)
     is_leg_1 = (jnp.arange(s.n) == 0).reshape(-1, *(1,) * theta.ndim)
     vx, vz = dL1 * sin + L1 * dtheta * cos, dL1 * cos - L1 * dtheta * sin
@@ -66,30 +77,34 @@ def embed_section_state(s: Symbols, x: Float[Array, "3 ..."]) -> FullState:
 
 
 def replace_invalid_start(
-    params: WheelParams, friction: Elementwise, x: FullState, tilt: Elementwise | None = None
+    params: WheelParams,
+    friction: Elementwise,
+    section_state: FullState,
+    next_line_tilt: Elementwise | None = None,
 ) -> tuple[Bool[Array, "..."], WheelParams, Elementwise, FullState]:
     """Return whether a step can start from this input, and the input with invalid elements
     replaced.
 
-    Invalid elements are replaced by the start of Table 1's wheel with a friction of 1. The result
-    is (is_valid, parameters, friction, section state).
+    An invalid element is replaced by the start of Table 1's wheel on ground with a friction
+    coefficient of 1. The result is (is_valid, parameters, friction, section state).
 
     - `friction`: coefficient of the ground, invalid if negative;
-    - `tilt`: angle by which the next line is steeper, rad. On such uneven ground, feet may be below
-      the line that continues the one of the last foothold.
+    - `next_line_tilt`: angle by which the next line is steeper, rad. On such uneven ground, feet
+      may be below the line that continues the one of the last foothold.
     """
-    safe_state = embed_section_state(
-        WheelParams(n_legs=params.n_legs).symbols(), jnp.asarray(PAPER_START_STATE, x.dtype)
+    valid_state = embed_section_state(
+        WheelParams(n_legs=params.n_legs).symbols(),
+        jnp.asarray(PAPER_START_STATE, section_state.dtype),
     )
-    safe_column = safe_state.reshape(-1, *(1,) * (x.ndim - 1))
-    is_valid = is_valid_start_state(params, x) & (friction >= 0.0)
+    valid_column = valid_state.reshape(-1, *(1,) * (section_state.ndim - 1))
+    is_valid = is_valid_start_state(params, section_state) & (friction >= 0.0)
     is_valid = is_valid & (
-        is_valid_slope(params.slope + tilt)
-        if tilt is not None
-        else _is_consistent_posture(params.symbols(), x)
+        is_valid_slope(params.slope + next_line_tilt)
+        if next_line_tilt is not None
+        else _has_consistent_posture(params.symbols(), section_state)
     )
-    params, x = replace_invalid_inputs(is_valid, params, x, safe_column)
-    return is_valid, params, jnp.where(is_valid, friction, 1.0), x
+    params, section_state = replace_invalid_inputs(is_valid, params, section_state, valid_column)
+    return is_valid, params, jnp.where(is_valid, friction, 1.0), section_state
 
 
 PENETRATION_TOLERANCE = 1e-3
@@ -98,46 +113,43 @@ the errors of integration and of Newton's method, and small enough for the first
 it."""
 
 
-def _unpack_posture(
-    s: Symbols, x: FullState
+def _unpack_leg_posture(
+    s: Symbols, section_state: FullState
 ) -> tuple[Elementwise, tuple, Array, Array, Array, Array]:
-    """Return angle (rad), hub position, lengths (m), length rates (m/s), contact modes and stopper
-    flags.
+    """Return angle (rad), hub position (m), leg lengths (m), their rates (m/s), contact modes and
+    stopper flags of a section state.
 
-    Leg labels are those of the starting step. The landing foot is the origin, and the lengths of
+    The legs are numbered as in the step that starts. The landing foot is the origin. Lengths of
     loaded legs are replaced so that their feet are on the slope.
     """
-    n = s.n
-    theta = x[0] - s.alpha
-    leg_values = (x[4 + i * n : 4 + (i + 1) * n] for i in range(3))
+    n_legs = s.n
+    theta = section_state[0] - s.alpha
+    leg_entries = (section_state[4 + i * n_legs : 4 + (i + 1) * n_legs] for i in range(3))
     L, dL, contact_codes = (
-        jnp.concatenate([values_by_leg[-1:], values_by_leg[:-1]]) for values_by_leg in leg_values
+        jnp.concatenate([entries_by_leg[-1:], entries_by_leg[:-1]])
+        for entries_by_leg in leg_entries
     )
     contact_codes = jnp.floor(contact_codes + 0.5).astype(jnp.int32)
-    contact_modes, is_locked = (
-        contact_codes & (LOCKED_CODE_OFFSET - 1),
-        contact_codes >= LOCKED_CODE_OFFSET,
-    )
+    contact_modes = contact_codes & (LOCKED_CODE_OFFSET - 1)
+    is_locked = contact_codes >= LOCKED_CODE_OFFSET
     L = jnp.where(is_locked, s.L0, L)
-    directions = leg_directions(s, theta)
-    hub_position = L[0] * directions.sin[0], L[0] * directions.cos[0]
+    leg_directions = compute_leg_directions(s, theta)
+    hub_position = L[0] * leg_directions.sin[0], L[0] * leg_directions.cos[0]
     L = jnp.where(
-        (contact_modes != ContactMode.OFF) & ~is_locked, hub_position[1] / directions.cos, L
+        (contact_modes != ContactMode.OFF) & ~is_locked, hub_position[1] / leg_directions.cos, L
     )
     return theta, hub_position, L, dL, contact_modes, is_locked
 
 
-def _is_consistent_posture(s: Symbols, x: FullState) -> Bool[Array, "..."]:
+def _has_consistent_posture(s: Symbols, section_state: FullState) -> Bool[Array, "..."]:
     """Return whether the feet and leg lengths of a section state are consistent with the ground.
 
     No foot is below the ground, loaded feet are on the ground, and no leg is longer than its
     stopper allows. The tolerance is `PENETRATION_TOLERANCE`.
     """
-    theta, (_, z), L, _, contact_modes, _ = _unpack_posture(s, x)
-    foot_height, height_tolerance = (
-        z - L * leg_directions(s, theta).cos,
-        PENETRATION_TOLERANCE * s.L0,
-    )
+    theta, (_, z), L, _, contact_modes, _ = _unpack_leg_posture(s, section_state)
+    foot_height = z - L * compute_leg_directions(s, theta).cos
+    height_tolerance = PENETRATION_TOLERANCE * s.L0
     is_contact_consistent = (contact_modes == ContactMode.OFF) | (foot_height <= height_tolerance)
     return jnp.all(
         (foot_height >= -height_tolerance) & is_contact_consistent & (height_tolerance >= L - s.L0),
@@ -145,33 +157,33 @@ def _is_consistent_posture(s: Symbols, x: FullState) -> Bool[Array, "..."]:
     )
 
 
-def unpack_section_state(s: Symbols, x: FullState) -> tuple[WheelMotion, ContactState]:
+def unpack_section_state(s: Symbols, section_state: FullState) -> tuple[WheelMotion, ContactState]:
     """Return the motion and the contact state just before the landing that starts a step.
 
-    Leg labels are those of the starting step, and the landing foot is the origin. Loaded feet are
-    placed on the slope, so every vector near a section state is valid. The landing brings sticking
-    feet to rest.
+    The legs are numbered as in the step that starts, and the landing foot is the origin. Loaded
+    feet are placed on the slope, so that every vector near a section state is valid. The landing
+    brings sticking feet to rest.
     """
-    theta, (hub_x, hub_z), L, dL, contact_modes, is_locked = _unpack_posture(s, x)
-    dtheta, vx, vz = x[1], x[2], x[3]
+    theta, (hub_x, hub_z), L, dL, contact_modes, is_locked = _unpack_leg_posture(s, section_state)
+    dtheta, vx, vz = section_state[1], section_state[2], section_state[3]
     motion = WheelMotion(hub_x, hub_z, theta, vx, vz, dtheta, L, dL)
     no_leg_flags = is_locked & False
     return motion, ContactState(contact_modes, is_locked, no_leg_flags, no_leg_flags, no_leg_flags)
 
 
 def pack_section_state(
-    motion: WheelMotion, contact_state: ContactState, tilt: Elementwise | None = None
+    motion: WheelMotion, contact_state: ContactState, next_line_tilt: Elementwise | None = None
 ) -> FullState:
     """Return the section state of a motion just before the next landing, in the frame of that
     landing's line.
 
-    - `tilt`: angle by which that line is steeper, rad; None on flat ground.
+    - `next_line_tilt`: angle by which that line is steeper, rad; None on flat ground.
     """
-    contact_codes = contact_state.contact_modes + LOCKED_CODE_OFFSET * contact_state.locked
+    contact_codes = contact_state.contact_modes + LOCKED_CODE_OFFSET * contact_state.is_locked
     theta, vx, vz = motion.theta, motion.vx, motion.vz
-    if tilt is not None:
-        sin, cos = jnp.sin(tilt), jnp.cos(tilt)
-        theta, vx, vz = theta - tilt, vx * cos - vz * sin, vz * cos + vx * sin
+    if next_line_tilt is not None:
+        sin, cos = jnp.sin(next_line_tilt), jnp.cos(next_line_tilt)
+        theta, vx, vz = theta - next_line_tilt, vx * cos - vz * sin, vz * cos + vx * sin
     return jnp.concatenate(
         [
             jnp.stack([theta, motion.dtheta, vx, vz]),

@@ -21,18 +21,18 @@ from vrw_jax.contact.batch_integrator import (
     IntervalPoint,
     attempt_solver_step,
     init_interval,
-    motion_from_point,
+    unpack_motion,
 )
 from vrw_jax.contact.contact_modes import ContactMode
 from vrw_jax.contact.contact_state import (
-    Accumulators,
     ContactState,
+    LossAccumulators,
     ModeDynamics,
     pack_state,
     unpack_state,
 )
 from vrw_jax.contact.diffrax_interval import sample_by_diffrax
-from vrw_jax.contact.mechanics import WheelMotion, find_slots
+from vrw_jax.contact.mechanics import WheelMotion, find_contact_slots
 from vrw_jax.contact.walk_kernel import (
     STATUS_UNFINISHED,
     BatchWalkResult,
@@ -52,29 +52,34 @@ from vrw_jax.wheel import stack_parameters
 
 
 class ContactStepConfig(NamedTuple):
-    """Static configuration of a step, and the functions of its array leaves."""
+    """Static configuration of a contact step, and functions of the leaves of its arguments."""
 
-    argument_structure: Any  # tree structure of (wheel, params, x, options)
+    argument_tree_structure: Any  # tree structure of (wheel, params, x, options)
     is_detailed: bool
     uses_diffrax: bool = False  # whether diffrax replaces the batch kernel
     engine_name: str = "lanes"  # name of the engine in the results
 
     def tighten_tolerances(self, leaves: tuple[Array, ...]) -> tuple[Array, ...]:
-        """Return the leaves with the tolerances of derivatives."""
-        *settings, options = jax.tree.unflatten(self.argument_structure, leaves)
-        return tuple(jax.tree.leaves((*settings, options.with_derivative_tolerances())))
+        """Return the argument leaves with the tighter solver tolerances of derivatives."""
+        *traced_settings, options = jax.tree.unflatten(self.argument_tree_structure, leaves)
+        return tuple(jax.tree.leaves((*traced_settings, options.with_derivative_tolerances())))
 
-    def compile_function(
-        self, function: Callable, make_template: Callable, key: tuple[Any, ...]
+    def compile_lane_function(
+        self, lane_function: Callable, make_template: Callable, program_name: tuple[Any, ...]
     ) -> Callable:
-        """Return a function over lanes as a function of one wheel."""
+        """Return a compiled function of one wheel, given a function over lanes."""
+
+        def evaluate_one_lane(*arrays: Any) -> Any:
+            lane_outputs = lane_function(*jax.tree.map(lambda x: jnp.asarray(x)[..., None], arrays))
+            return jax.tree.map(lambda x: x[..., 0], lane_outputs)
+
         if self.uses_diffrax:
-            return _add_lane_axis(function)
-        return unbatch(compile_cached_lane_function(function, make_template, key))
+            return evaluate_one_lane
+        return unbatch(compile_cached_lane_function(lane_function, make_template, program_name))
 
     def unpack_leaves(self, leaves: tuple[Array, ...]) -> tuple[Array, Array, Any]:
-        """Return the lanes' input columns and section states, and (wheel, params, options)."""
-        wheel, params, x, options = jax.tree.unflatten(self.argument_structure, leaves)
+        """Return input columns and section states of the lanes, and (wheel, params, options)."""
+        wheel, params, x, options = jax.tree.unflatten(self.argument_tree_structure, leaves)
         uneven_columns = () if wheel.uneven is None else wheel.uneven
         restitution = () if wheel.restitution is None else (wheel.restitution.astype(x.dtype),)
         input_columns = jnp.stack(
@@ -99,16 +104,18 @@ class ContactStepConfig(NamedTuple):
         )
 
     def make_template(self, *leaves: Array) -> tuple:
-        """Return zero arrays in the structure and shapes of `compute_outputs` for one wheel."""
+        """Return zeros in the structure and shapes of the results of `compute_outputs` for one
+        wheel.
+        """
         params = self.unpack_leaves(leaves)[2][1]
         return _partition_result(
             make_result_template(params.n_legs, leaves[0].dtype, self.is_detailed)
         )
 
     def compute_outputs(self, *leaves: Array) -> tuple:
-        """Return the results of a step over lanes, split into floats and other arrays.
+        """Return the results of one step of all lanes, split into float arrays and other arrays.
 
-        The leaves have the lanes on their last axis.
+        The argument leaves have the lanes on their last axis.
         """
         input_columns, x, step_settings = self.unpack_leaves(leaves)
         return _partition_result(
@@ -116,15 +123,23 @@ class ContactStepConfig(NamedTuple):
         )
 
     def compute_tangents(self, leaves: tuple[Array, ...], tangents: tuple[Array, ...]) -> tuple:
-        """Return the tangents of the result's floats, the floats, and the other arrays.
+        """Return the tangents of the float results of a step, the float results, and the other
+        results.
 
-        Each lane has one tangent of its leaves.
+        Each lane has one tangent of its argument leaves.
         """
         input_columns, x, step_settings = self.unpack_leaves(leaves)
-        d_columns, d_x = (tangent_rows[None] for tangent_rows in self.unpack_leaves(tangents)[:2])
+        input_column_tangents, section_state_tangents = (
+            tangent_rows[None] for tangent_rows in self.unpack_leaves(tangents)[:2]
+        )
         n_tangents = jnp.ones_like(input_columns[0], jnp.int32)
         walk_result, result_tangents = walk_with_tangents(
-            self.make_walk_settings(step_settings), input_columns, x, d_columns, d_x, n_tangents
+            self.make_walk_settings(step_settings),
+            input_columns,
+            x,
+            input_column_tangents,
+            section_state_tangents,
+            n_tangents,
         )
         result_tangents = jax.tree.map(lambda leaf: leaf[0], result_tangents)
         return _partition_result(walk_result._replace(step_result=result_tangents))[
@@ -132,20 +147,10 @@ class ContactStepConfig(NamedTuple):
         ], *_partition_result(walk_result)
 
 
-def _add_lane_axis(function: Callable) -> Callable:
-    """Return a function over lanes as a function of arrays without the axis of lanes."""
-
-    def evaluate_one_lane(*arrays: Any) -> Any:
-        outputs = function(*jax.tree.map(lambda x: jnp.asarray(x)[..., None], arrays))
-        return jax.tree.map(lambda x: x[..., 0], outputs)
-
-    return evaluate_one_lane
-
-
 def _partition_result(walk_result: BatchWalkResult) -> tuple[Any, Any]:
-    """Return the results of a step, split into floats and other arrays.
+    """Return the results of a step, split into float arrays and other arrays.
 
-    A detailed walk gives all results of the step. Any other walk gives section state, durations,
+    A detailed walk has all results of the step. Any other walk has section state, durations,
     outcome and number of solver steps.
     """
     step_result = walk_result.step_result
@@ -159,37 +164,47 @@ def _partition_result(walk_result: BatchWalkResult) -> tuple[Any, Any]:
     return eqx.partition(step_result, eqx.is_inexact_array)
 
 
-def build_contact_step_function(config: ContactStepConfig) -> ForwardFunction:
+def build_contact_step_function(step_config: ContactStepConfig) -> ForwardFunction:
     """Return a function from the leaves of (wheel, params, x, options) to the results of a step.
 
-    The results are split into floats and other arrays. The function is a forward rule from which
-    all AD modes are built.
+    The results are split into float arrays and other arrays. All AD modes are built from this
+    function.
     """
-    cache_key = "step with unilateral contact", str(config.argument_structure), config.is_detailed
-    return config.compile_function(config.compute_outputs, config.make_template, cache_key)
+    cache_key = (
+        "step with unilateral contact",
+        str(step_config.argument_tree_structure),
+        step_config.is_detailed,
+    )
+    return step_config.compile_lane_function(
+        step_config.compute_outputs, step_config.make_template, cache_key
+    )
 
 
 def build_contact_step_jacobian(
-    config: ContactStepConfig, input_indices: tuple[int, ...]
+    step_config: ContactStepConfig, input_indices: tuple[int, ...]
 ) -> ForwardFunction:
-    """Return a function that computes the Jacobian of the step of `build_contact_step_function`.
+    """Return a function from the leaves of a step's arguments to its Jacobian and results.
 
     The function returns (Jacobian with respect to the leaves at `input_indices`, float results) and
-    the other results.
+    the other results of the step of `build_contact_step_function`.
     """
 
     def make_template(leaves: tuple[Array, ...], _tangents: tuple[Array, ...]) -> tuple:
-        float_outputs, other_outputs = config.make_template(*leaves)
+        float_outputs, other_outputs = step_config.make_template(*leaves)
         return float_outputs, float_outputs, other_outputs
 
-    structure_name = str(config.argument_structure)
-    cache_key = "step with unilateral contact along directions", structure_name, config.is_detailed
+    structure_name = str(step_config.argument_tree_structure)
+    cache_key = (
+        "step with unilateral contact along directions",
+        structure_name,
+        step_config.is_detailed,
+    )
     compute_tangents = unbatch(
-        compile_cached_lane_function(config.compute_tangents, make_template, cache_key)
+        compile_cached_lane_function(step_config.compute_tangents, make_template, cache_key)
     )
 
     def evaluate_jacobian(*leaves: Array) -> tuple:
-        leaves = config.tighten_tolerances(leaves)
+        leaves = step_config.tighten_tolerances(leaves)
         unit_tangents = np.eye(sum(np.size(leaves[i]) for i in input_indices))
         tangents, leaf_offset = [jnp.zeros_like(leaf) for leaf in leaves], 0
         for i in input_indices:
@@ -213,27 +228,27 @@ def build_contact_step_jacobian(
 
 
 class IntervalLog(NamedTuple):
-    """Start state and duration of each interval of a step, between two events."""
+    """Start state and duration of each interval of a step; an interval is between two events."""
 
-    state: Array  # start of each interval, see `contact_state.PackedState`, (intervals, dim)
-    contact: Array  # contact mode of every foot, (intervals, legs)
-    locked: Array
-    duration: Array  # s
+    start_states: Array  # start of each interval, see `contact_state.PackedState`, (intervals, dim)
+    contact_modes: Array  # contact mode of every foot, (intervals, legs)
+    is_locked: Array
+    durations: Array  # s
 
 
 class SampledIntervals(NamedTuple):
-    """Intervals of a step, each sampled at equal times with both ends."""
+    """Intervals of a step, each with samples at equally spaced times from start to end."""
 
-    log: IntervalLog
-    summary: StepSummary
-    outcome: Array
-    state: Array  # `contact_state.PackedState`, (intervals, samples, dim)
-    tangential: Array  # force on every foot, N, (intervals, samples, legs)
-    normal: Array
+    interval_log: IntervalLog
+    step_summary: StepSummary
+    step_outcome: Array
+    sampled_states: Array  # `contact_state.PackedState`, (intervals, samples, dim)
+    tangential_forces: Array  # force on every foot, N, (intervals, samples, legs)
+    normal_forces: Array
 
 
 def sample_interval(
-    dynamics: ModeDynamics,
+    mode_dynamics: ModeDynamics,
     motion: WheelMotion,
     initial_accumulators: Array,
     duration: Array,
@@ -241,28 +256,31 @@ def sample_interval(
     options: StepOptions,
     tableau: ButcherTableau,
 ) -> Array:
-    """Return samples of one interval at equal times, both ends included, with axes (sample, row,
-    lanes).
+    """Return samples of one interval at equally spaced times, with the axes (sample, row, lanes).
 
-    The rows are coordinates, rates, accumulators that start at `initial_accumulators`, and normal
-    and tangential forces of the slots.
+    The first and the last sample are at the ends of the interval. The rows are coordinates, rates,
+    loss accumulators, normal forces and tangential forces of the slots. The accumulators start at
+    `initial_accumulators`.
 
     - `duration`: length of the interval, s.
     """
-    initial_interval = init_interval(dynamics, motion, options.dt0)
+    initial_interval = init_interval(mode_dynamics, motion, options.dt0)
 
     def take_sample_step(
         sample_state: tuple[IntervalPoint, Array], step_size: Array
     ) -> tuple[tuple[IntervalPoint, Array], Array]:
         start_point, accumulators = sample_state
-        attempt = attempt_solver_step(
-            dynamics, tableau, options, initial_interval._replace(point=start_point, h=step_size)
+        attempted_step = attempt_solver_step(
+            mode_dynamics,
+            tableau,
+            options,
+            initial_interval._replace(interval_point=start_point, h=step_size),
         )
-        assert attempt.accumulator_increments is not None
+        assert attempted_step.accumulator_increments is not None
         return (
-            attempt.end_point,
-            accumulators + attempt.accumulator_increments,
-        ), attempt.squared_error
+            attempted_step.end_point,
+            accumulators + attempted_step.accumulator_increments,
+        ), attempted_step.mean_squared_error
 
     def pack_sample(sample_state: tuple[IntervalPoint, Array]) -> Array:
         (q, v, dynamics_rows), accumulators = sample_state
@@ -271,7 +289,7 @@ def sample_interval(
     return sample_at_equal_times(
         take_sample_step,
         pack_sample,
-        (initial_interval.point, initial_accumulators),
+        (initial_interval.interval_point, initial_accumulators),
         tableau,
         duration,
         n_samples,
@@ -281,142 +299,173 @@ def sample_interval(
 
 @functools.cache
 def build_contact_step_sampler(
-    config: ContactStepConfig, n_samples: int
+    step_config: ContactStepConfig, n_samples: int
 ) -> Callable[..., SampledIntervals]:
     """Return a function from the leaves of (wheel, params, x, options) to the sampled motion of a
     step.
 
     The function has no derivatives.
     """
-    argument_structure, cache_key = config.argument_structure, str(config.argument_structure)
+    argument_tree_structure = step_config.argument_tree_structure
+    cache_key = str(step_config.argument_tree_structure)
 
-    def begin_lane(*leaves: Array) -> Any:
-        input_columns, x, step_settings = config.unpack_leaves(leaves)
-        return init_lane_states(config.make_walk_settings(step_settings), input_columns, x)[1]
+    def init_lane_state(*leaves: Array) -> Any:
+        input_columns, x, step_settings = step_config.unpack_leaves(leaves)
+        return init_lane_states(step_config.make_walk_settings(step_settings), input_columns, x)[1]
 
     def advance_to_event(leaves: tuple[Array, ...], lane_state: Any) -> tuple[Any, IntervalLog]:
-        input_columns, x, step_settings = config.unpack_leaves(leaves)
-        walk_settings = config.make_walk_settings(step_settings)
+        input_columns, x, step_settings = step_config.unpack_leaves(leaves)
+        walk_settings = step_config.make_walk_settings(step_settings)
         state_after_event, lane_state = process_and_integrate(
             walk_settings,
-            walk_settings.replace_invalid(input_columns, x)[0],
+            walk_settings.replace_invalid_lanes(input_columns, x)[0],
             lane_state,
             waits_for_events=True,
         )
-        assert state_after_event.step_accumulators is not None
-        (point, contact_state), zero_time = (
-            (state_after_event.interval.point, state_after_event.interval.contact_state),
-            jnp.zeros_like(lane_state.interval.time),
+        assert state_after_event.step_loss_accumulators is not None
+        (interval_point, contact_state), zero_time = (
+            (
+                state_after_event.interval_state.interval_point,
+                state_after_event.interval_state.contact_state,
+            ),
+            jnp.zeros_like(lane_state.interval_state.time_since_event),
         )
-        state = pack_state(
-            motion_from_point(point), Accumulators(zero_time, *state_after_event.step_accumulators)
+        start_state = pack_state(
+            unpack_motion(interval_point),
+            LossAccumulators(zero_time, *state_after_event.step_loss_accumulators),
         )
         return lane_state, IntervalLog(
-            state, contact_state.contact_modes, contact_state.locked, lane_state.interval.time
+            start_state,
+            contact_state.contact_modes,
+            contact_state.is_locked,
+            lane_state.interval_state.time_since_event,
         )
 
     def make_logged_dynamics(
-        leaves: tuple[Array, ...], log: IntervalLog
+        leaves: tuple[Array, ...], interval_log: IntervalLog
     ) -> tuple[BatchWalkSettings, ModeDynamics]:
-        input_columns, x, step_settings = config.unpack_leaves(leaves)
-        walk_settings, no_leg_flags = config.make_walk_settings(step_settings), log.locked & False
+        input_columns, x, step_settings = step_config.unpack_leaves(leaves)
+        walk_settings = step_config.make_walk_settings(step_settings)
+        no_leg_flags = interval_log.is_locked & False
         contact_state = ContactState(
-            log.contact, log.locked, no_leg_flags, no_leg_flags, no_leg_flags
+            interval_log.contact_modes,
+            interval_log.is_locked,
+            no_leg_flags,
+            no_leg_flags,
+            no_leg_flags,
         )
         return walk_settings, walk_settings.make_dynamics(
-            walk_settings.replace_invalid(input_columns, x)[0], contact_state
+            walk_settings.replace_invalid_lanes(input_columns, x)[0], contact_state
         )
 
-    def sample_with_diffrax(leaves: tuple[Array, ...], log: IntervalLog) -> tuple:
-        walk_settings, dynamics = make_logged_dynamics(leaves, log)
+    def sample_with_diffrax(leaves: tuple[Array, ...], interval_log: IntervalLog) -> tuple:
+        walk_settings, mode_dynamics = make_logged_dynamics(leaves, interval_log)
         return sample_by_diffrax(
-            dynamics, log.state, log.duration, n_samples, walk_settings.options
+            mode_dynamics,
+            interval_log.start_states,
+            interval_log.durations,
+            n_samples,
+            walk_settings.step_options,
         )
 
-    def sample_intervals(leaves: tuple[Array, ...], log: IntervalLog) -> Array:
-        walk_settings, dynamics = make_logged_dynamics(leaves, log)
-        motion, accumulators = unpack_state(log.state)
+    def sample_intervals(leaves: tuple[Array, ...], interval_log: IntervalLog) -> Array:
+        walk_settings, mode_dynamics = make_logged_dynamics(leaves, interval_log)
+        motion, accumulators = unpack_state(interval_log.start_states)
         assert walk_settings.tableau is not None
         sampling_arguments = (
             jnp.stack(accumulators[1:]),
-            log.duration,
+            interval_log.durations,
             n_samples,
-            walk_settings.options,
+            walk_settings.step_options,
             walk_settings.tableau,
         )
-        return sample_interval(dynamics, motion, *sampling_arguments)
+        return sample_interval(mode_dynamics, motion, *sampling_arguments)
 
     def sample_whole_step(*leaves: Array) -> SampledIntervals:
-        wheel, params, *_ = jax.tree.unflatten(argument_structure, leaves)
+        wheel, params, *_ = jax.tree.unflatten(argument_tree_structure, leaves)
         initial_state = compiled_start(*leaves)
         log_template = jax.eval_shape(compiled_advance, leaves, initial_state)[1]
-        allocate = lambda leaf: jnp.zeros((wheel.max_events, *leaf.shape), leaf.dtype)
+        allocate_log_array = lambda leaf: jnp.zeros((wheel.max_events, *leaf.shape), leaf.dtype)
 
-        def record_interval_end(state: tuple) -> tuple:
-            previous_state, interval_log = state
+        def record_interval_end(loop_state: tuple) -> tuple:
+            previous_state, interval_log = loop_state
             lane_state, interval_entry = compiled_advance(leaves, previous_state)
-            entry_index = previous_state.counters.n_events
+            entry_index = previous_state.step_counters.n_events
             entry_index = jnp.where(
-                lane_state.counters.n_events > entry_index, entry_index, wheel.max_events
+                lane_state.step_counters.n_events > entry_index, entry_index, wheel.max_events
             )
-            write_entry = lambda log_leaf, entry_leaf: log_leaf.at[entry_index].set(
+            write_log_entry = lambda log_leaf, entry_leaf: log_leaf.at[entry_index].set(
                 entry_leaf, mode="drop"
             )
-            return lane_state, jax.tree.map(write_entry, interval_log, interval_entry)
+            return lane_state, jax.tree.map(write_log_entry, interval_log, interval_entry)
 
         should_continue = lambda state: make_opaque_condition(
-            state[0].outcome == STATUS_UNFINISHED, state[0].counters.n_events
+            state[0].walk_outcome == STATUS_UNFINISHED, state[0].step_counters.n_events
         )
         lane_state, interval_log = lax.while_loop(
             should_continue,
             record_interval_end,
-            (initial_state, jax.tree.map(allocate, log_template)),
+            (initial_state, jax.tree.map(allocate_log_array, log_template)),
         )
         final_state = (
-            motion_from_point(lane_state.interval.point),
-            lane_state.interval.contact_state,
+            unpack_motion(lane_state.interval_state.interval_point),
+            lane_state.interval_state.contact_state,
         )
-        input_columns, _, step_settings = config.unpack_leaves(leaves)
-        walk_settings = config.make_walk_settings(step_settings)
-        summary = walk_settings.summarize_step(
-            final_state, lane_state.counters, lane_state.outcome, walk_settings.tilt(input_columns)
+        input_columns, _, step_settings = step_config.unpack_leaves(leaves)
+        walk_settings = step_config.make_walk_settings(step_settings)
+        step_summary = walk_settings.summarize_step(
+            final_state,
+            lane_state.step_counters,
+            lane_state.walk_outcome,
+            walk_settings.extract_next_line_tilt(input_columns),
         )
-        if config.uses_diffrax:
-            samples = lax.map(lambda log: sample_with_diffrax(leaves, log), interval_log)
+        if step_config.uses_diffrax:
+            interval_samples = lax.map(
+                lambda interval_log: sample_with_diffrax(leaves, interval_log), interval_log
+            )
         else:
-            sample_rows = jax.vmap(lambda log: compiled_sampling(leaves, log))(interval_log)
-            samples = _unpack_sample_rows(params.n_legs, interval_log, sample_rows)
-        return SampledIntervals(interval_log, summary, lane_state.outcome, *samples)
+            sample_rows = jax.vmap(lambda interval_log: compiled_sampling(leaves, interval_log))(
+                interval_log
+            )
+            interval_samples = _unpack_sample_rows(params.n_legs, interval_log, sample_rows)
+        return SampledIntervals(
+            interval_log, step_summary, lane_state.walk_outcome, *interval_samples
+        )
 
-    compiled_start = config.compile_function(
-        begin_lane, begin_lane, ("start with unilateral contact", cache_key)
+    compiled_start = step_config.compile_lane_function(
+        init_lane_state, init_lane_state, ("start with unilateral contact", cache_key)
     )
-    make_template = lambda leaves, lane: (lane, IntervalLog(*(lane.interval.time,) * 4))
-    compiled_advance = config.compile_function(
+    make_template = lambda leaves, lane_state: (
+        lane_state,
+        IntervalLog(*(lane_state.interval_state.time_since_event,) * 4),
+    )
+    compiled_advance = step_config.compile_lane_function(
         advance_to_event, make_template, ("to the next event", cache_key)
     )
     compiled_sampling = unbatch(
         compile_cached_lane_function(
             sample_intervals,
-            lambda leaves, log: log.duration,
+            lambda leaves, interval_log: interval_log.durations,
             ("samples with unilateral contact", cache_key, n_samples),
         )
     )
     return jax.jit(sample_whole_step)
 
 
-def _unpack_sample_rows(n: int, log: IntervalLog, sample_rows: Array) -> tuple[Array, Array, Array]:
-    """Return the rows of `sample_interval` as packed states, and tangential and normal forces of
-    all legs.
+def _unpack_sample_rows(
+    n_legs: int, interval_log: IntervalLog, sample_rows: Array
+) -> tuple[Array, Array, Array]:
+    """Return packed states, tangential forces (N) and normal forces (N) of all legs, given the rows
+    of `sample_interval`.
 
-    The axes are (intervals, samples, entries), with forces in N.
+    The axes are (intervals, samples, entries).
     """
-    n_samples, n_coordinates = sample_rows.shape[1], 3 + n
-    time_since_event = jnp.linspace(0.0, 1.0, n_samples) * log.duration[:, None]
-    q, v, accumulators, forces = jnp.split(
+    n_samples, n_coordinates = sample_rows.shape[1], 3 + n_legs
+    time_since_event = jnp.linspace(0.0, 1.0, n_samples) * interval_log.durations[:, None]
+    q, v, accumulators, slot_forces = jnp.split(
         sample_rows, (n_coordinates, 2 * n_coordinates, 2 * n_coordinates + 3), -1
     )
-    state_parts = [
+    packed_state_parts = [
         q[..., :3],
         v[..., :3],
         q[..., 3:],
@@ -424,9 +473,15 @@ def _unpack_sample_rows(n: int, log: IntervalLog, sample_rows: Array) -> tuple[A
         time_since_event[..., None],
         accumulators,
     ]
-    contact_slots = jax.vmap(lambda contact: find_slots(contact != ContactMode.OFF))(log.contact)
+    contact_slots = jax.vmap(
+        lambda contact_modes: find_contact_slots(contact_modes != ContactMode.OFF)
+    )(interval_log.contact_modes)
     scatter_to_legs = jax.vmap(
-        jax.vmap(lambda contact_slots, slot_pair: contact_slots.scatter(slot_pair), (None, 0))
+        jax.vmap(
+            lambda contact_slots, slot_pair: contact_slots.scatter_to_legs(slot_pair), (None, 0)
+        )
     )
-    normal, tangential = (scatter_to_legs(contact_slots, forces[..., i : i + 2]) for i in (0, 2))
-    return jnp.concatenate(state_parts, -1), tangential, normal
+    normal_forces, tangential_forces = (
+        scatter_to_legs(contact_slots, slot_forces[..., i : i + 2]) for i in (0, 2)
+    )
+    return jnp.concatenate(packed_state_parts, -1), tangential_forces, normal_forces

@@ -15,16 +15,16 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from vrw_jax.contact.contact_modes import PAPER_RULE_SENTINEL, ContactMode, Friction
-from vrw_jax.contact.contact_state import Accumulators, ContactState, GuardLayout
+from vrw_jax.contact.contact_state import ContactState, GuardLayout, LossAccumulators
 from vrw_jax.contact.impacts import (
+    ContactEvent,
+    ContactEventResult,
     ContactLaw,
-    Event,
-    EventResult,
     classify_event,
     project_motion,
     resolve_event,
 )
-from vrw_jax.contact.mechanics import WheelMotion, landing_position
+from vrw_jax.contact.mechanics import WheelMotion, compute_landing_position
 from vrw_jax.contact.section import FullState, pack_section_state
 from vrw_jax.models import AbstractContactStep
 from vrw_jax.numerics import Elementwise, StepOptions, select_tree_leaves
@@ -32,15 +32,15 @@ from vrw_jax.wheel import Outcome, Symbols, replace_rest_outcome
 
 
 @dataclass(frozen=True)
-class RestOptions:
-    """Options that decide when a foot that bounces ever less comes to rest."""
+class BounceRestOptions:
+    """Options of the bounce height and number of events at which a bouncing foot comes to rest."""
 
-    bounce_height_per_atol: float = 1e-2
+    min_bounce_height_per_atol: float = 1e-2
     """Smallest height of a bounce that a step resolves, as a fraction of the absolute tolerance."""
-    bounce_height_eps: float = 4e2
+    min_bounce_height_in_eps: float = 4e2
     """Smallest height of a resolved bounce in units of round-off of a leg's length: 1e-13 m in
     float64."""
-    n_events_before_ramp: int = 100
+    n_events_before_rest_speed_ramp: int = 100
     """Number of events of a step after which each event raises the rest speed by its initial value.
 
     A quarter of the allowed events replaces this number if that is more. It is chosen because walks
@@ -48,19 +48,19 @@ class RestOptions:
     last bounce is as large as a tolerance of 1e-6 leaves from the first."""
 
 
-REST_OPTIONS = RestOptions()
+BOUNCE_REST_OPTIONS = BounceRestOptions()
 
 
-def min_bounce_height(
-    L0: Elementwise, options: StepOptions, rest_options: RestOptions = REST_OPTIONS
+def compute_min_bounce_height(
+    L0: Elementwise, options: StepOptions, rest_options: BounceRestOptions = BOUNCE_REST_OPTIONS
 ) -> Array:
     """Return the smallest height of a foot's bounce that a step resolves, m.
 
     - `L0`: leg length, m;
     - `options`: options whose absolute tolerance determines the height.
     """
-    roundoff_height = rest_options.bounce_height_eps * jnp.finfo(L0.dtype).eps
-    return jnp.maximum(rest_options.bounce_height_per_atol * options.atol, roundoff_height) * L0
+    roundoff_height = rest_options.min_bounce_height_in_eps * jnp.finfo(L0.dtype).eps
+    return jnp.maximum(rest_options.min_bounce_height_per_atol * options.atol, roundoff_height) * L0
 
 
 def apply_friction_rule(friction: Elementwise, uses_paper_rule: bool) -> Elementwise:
@@ -76,20 +76,28 @@ def make_contact_law(
     s: Symbols,
     friction: Friction,
     options: StepOptions,
-    is_one_sided: bool,
-    counts_solutions: bool,
+    has_one_sided_stoppers: bool,
+    counts_all_solutions: bool,
     restitution: Elementwise | None = None,
-    tilt: Elementwise | None = None,
+    next_line_tilt: Elementwise | None = None,
 ) -> ContactLaw:
     """Return the contact law of a walk.
 
     The rest speed is the landing speed after the smallest resolved bounce.
 
-    - `counts_solutions`: whether all admissible solutions of an event are counted;
-    - `tilt`: angle by which the next line is steeper, rad.
+    - `counts_all_solutions`: whether all admissible solutions of an event are counted;
+    - `next_line_tilt`: angle by which the next line is steeper, rad.
     """
-    rest_speed = jnp.sqrt(2.0 * s.g * min_bounce_height(s.L0, options))
-    return ContactLaw(s, friction, is_one_sided, counts_solutions, rest_speed, restitution, tilt)
+    rest_speed = jnp.sqrt(2.0 * s.g * compute_min_bounce_height(s.L0, options))
+    return ContactLaw(
+        s,
+        friction,
+        has_one_sided_stoppers,
+        counts_all_solutions,
+        rest_speed,
+        restitution,
+        next_line_tilt,
+    )
 
 
 def process_event(
@@ -97,33 +105,37 @@ def process_event(
     guard_layout: GuardLayout,
     motion: WheelMotion,
     contact_state: ContactState,
-    guard: Int[Array, "..."],
+    guard_index: Int[Array, "..."],
     n_events: Int[Array, "..."],
     max_events: int,
-    rest_options: RestOptions = REST_OPTIONS,
-) -> tuple[EventResult, Event, Int[Array, "..."]]:
-    """Return the result of a guard's event, the event, and the outcome (STEPPED if the event was
-    resolved).
+    rest_options: BounceRestOptions = BOUNCE_REST_OPTIONS,
+) -> tuple[ContactEventResult, ContactEvent, Int[Array, "..."]]:
+    """Return the result of an event, its kind, and its outcome (STEPPED if it was resolved).
 
-    - `n_events`: number of earlier events in this step, of at most `max_events`.
+    - `guard_index`: index of the guard whose zero is the event;
+
+    - `n_events`: number of earlier events in this step;
+    - `max_events`: largest number of events of a step.
 
     The motion is projected onto its contacts first, because the integrator's error moves feet off
     them. A foot that lifts off rises from the slope like the third power of time. Without the
     projection, the foot would land again immediately.
     """
-    ramp_start = max(rest_options.n_events_before_ramp, max_events // 4)
+    first_ramp_event = max(rest_options.n_events_before_rest_speed_ramp, max_events // 4)
     contact_law = contact_law._replace(
-        rest_speed=contact_law.rest_speed * (1 + jnp.maximum(n_events - ramp_start, 0))
+        rest_speed=contact_law.rest_speed * (1 + jnp.maximum(n_events - first_ramp_event, 0))
     )
     motion = project_motion(
-        contact_law.s, motion, contact_state.contact_modes, contact_state.locked
+        contact_law.s, motion, contact_state.contact_modes, contact_state.is_locked
     )
-    event = classify_event(guard_layout, guard)
-    result = resolve_event(contact_law, motion, contact_state, event)
-    outcome = jnp.where(result.n_solutions > 0, Outcome.STEPPED, Outcome.NO_ADMISSIBLE_CONTACT)
-    outcome = jnp.where(result.is_paradox, Outcome.PAINLEVE_PARADOX, outcome)
-    outcome = jnp.where(result.has_third_foot, Outcome.THREE_FEET_LOADED, outcome)
-    return result, event, outcome.astype(jnp.int32)
+    contact_event = classify_event(guard_layout, guard_index)
+    event_result = resolve_event(contact_law, motion, contact_state, contact_event)
+    outcome = jnp.where(
+        event_result.n_solutions > 0, Outcome.STEPPED, Outcome.NO_ADMISSIBLE_CONTACT
+    )
+    outcome = jnp.where(event_result.is_painleve_paradox, Outcome.PAINLEVE_PARADOX, outcome)
+    outcome = jnp.where(event_result.has_third_foot, Outcome.THREE_FEET_LOADED, outcome)
+    return event_result, contact_event, outcome.astype(jnp.int32)
 
 
 class UnilateralMargins(eqx.Module):
@@ -137,64 +149,68 @@ class UnilateralMargins(eqx.Module):
 
 
 class StepCounters(NamedTuple):
-    """Numbers of events and solver steps of a step, and durations by the number of loaded feet."""
+    """Numbers of events and solver steps of a gait step, and durations by number of loaded feet."""
 
     n_events: Int[Array, "..."]  # number of changes of contacts and stoppers
     durations: Float[Array, "3 ..."]  # with two loaded feet, with one, with none, s
     n_solver_steps: Int[Array, "..."]  # number of attempted solver steps
 
 
-def init_counters(template: Array) -> StepCounters:
-    """Return the counters at the start of a step, zeros in the shape and dtype of `template`."""
-    int_zeros = jnp.zeros(template.shape, jnp.int32)
-    return StepCounters(int_zeros, jnp.zeros((3, *template.shape), template.dtype), int_zeros)
+def init_step_counters(lane_template: Array) -> StepCounters:
+    """Return step counters of zero, in the shape and dtype of `lane_template`."""
+    int_zeros = jnp.zeros(lane_template.shape, jnp.int32)
+    return StepCounters(
+        int_zeros, jnp.zeros((3, *lane_template.shape), lane_template.dtype), int_zeros
+    )
 
 
-def add_interval(
-    counters: StepCounters,
+def count_interval(
+    step_counters: StepCounters,
     contact_state: ContactState,
     duration: Elementwise,
     n_solver_steps: Array,
 ) -> StepCounters:
-    """Return the counters after one more interval in this contact state.
+    """Return the step counters after one more interval in this contact state.
 
     - `duration`: length of the interval, s.
     """
-    n_loaded = jnp.sum(contact_state.contact_modes != ContactMode.OFF, axis=0)
-    is_foot_count = jnp.stack([n_loaded == n_feet for n_feet in (2, 1, 0)])
-    durations = counters.durations + jnp.where(is_foot_count, duration, 0.0)
-    return counters._replace(
-        durations=durations, n_solver_steps=counters.n_solver_steps + n_solver_steps
+    n_loaded_feet = jnp.sum(contact_state.contact_modes != ContactMode.OFF, axis=0)
+    has_foot_count = jnp.stack([n_loaded_feet == n_feet for n_feet in (2, 1, 0)])
+    durations = step_counters.durations + jnp.where(has_foot_count, duration, 0.0)
+    return step_counters._replace(
+        durations=durations, n_solver_steps=step_counters.n_solver_steps + n_solver_steps
     )
 
 
 def determine_interval_outcome(
-    counters: StepCounters,
+    step_counters: StepCounters,
     guard_layout: GuardLayout,
     has_reached_event: Array,
-    guard: Array,
+    guard_index: Array,
     has_landed: Array,
     failure_outcome: Array,
     is_resting: Array,
     max_events: int,
 ) -> Int[Array, "..."]:
-    """Return the outcome after an interval, STEPPED if the walk continues or the foremost foot
-    `has_landed`.
+    """Return the outcome after an interval, STEPPED if the walk continues or the foremost foot has
+    landed.
 
-    If the interval did not end at an event, the result is `failure_outcome`. If the wheel
-    `is_resting`, CAME_TO_REST replaces either.
+    If the interval did not end at an event, the result is `failure_outcome`. If the wheel is at
+    rest, the result is CAME_TO_REST.
     """
-    outcome = jnp.where(counters.n_events >= max_events, Outcome.TOO_MANY_EVENTS, Outcome.STEPPED)
-    outcome = jnp.where(guard == guard_layout.rolling_rate, Outcome.FELL_BACK, outcome)
-    outcome = jnp.where(guard == guard_layout.collapse, Outcome.COLLAPSED, outcome)
+    outcome = jnp.where(
+        step_counters.n_events >= max_events, Outcome.TOO_MANY_EVENTS, Outcome.STEPPED
+    )
+    outcome = jnp.where(guard_index == guard_layout.rolling_rate_guard, Outcome.FELL_BACK, outcome)
+    outcome = jnp.where(guard_index == guard_layout.collapse_guard, Outcome.COLLAPSED, outcome)
     outcome = jnp.where(
         has_reached_event, jnp.where(has_landed, Outcome.STEPPED, outcome), failure_outcome
     )
     return replace_rest_outcome(outcome, is_resting)
 
 
-class StepDetails(NamedTuple):
-    """Detailed results of a step, named as in `UnilateralStep`."""
+class UnilateralStepDetails(NamedTuple):
+    """Detailed results of a step, under the names of the fields of `UnilateralStep`."""
 
     post_impact: Float[Array, "2 ..."]
     mode_durations: Float[Array, "4 4 ..."]
@@ -207,11 +223,11 @@ class StepDetails(NamedTuple):
     most_solutions: Int[Array, "..."]
 
 
-def init_details(dtype: jnp.dtype) -> StepDetails:
-    """Return the details of one wheel at the start of a step."""
+def init_step_details(dtype: jnp.dtype) -> UnilateralStepDetails:
+    """Return the step details of one wheel at the start of a step, without a lane axis."""
     float_zero, int_zero = jnp.zeros((), dtype), jnp.zeros((), jnp.int32)
     zero_pair = jnp.zeros((2,), dtype)
-    return StepDetails(
+    return UnilateralStepDetails(
         post_impact=zero_pair,
         mode_durations=jnp.zeros((4, 4), dtype),
         landing_normal=zero_pair,
@@ -225,83 +241,94 @@ def init_details(dtype: jnp.dtype) -> StepDetails:
 
 
 def record_event(
-    details: StepDetails, is_first: Array, result: EventResult, event: Event
-) -> StepDetails:
-    """Return the details after one more event.
+    step_details: UnilateralStepDetails,
+    is_first_event: Array,
+    event_result: ContactEventResult,
+    contact_event: ContactEvent,
+) -> UnilateralStepDetails:
+    """Return the step details after one more event.
 
-    - `is_first`: whether the event is the first of the step.
+    - `is_first_event`: whether the event is the first of the step.
     """
-    opening_values = (
-        jnp.stack([result.motion.theta, result.motion.dtheta]),
-        jnp.stack(result.normal_impulse),
-        jnp.stack(result.tangential_impulse),
+    opening_quantities = (
+        jnp.stack([event_result.motion.theta, event_result.motion.dtheta]),
+        jnp.stack(event_result.normal_impulse),
+        jnp.stack(event_result.tangential_impulse),
     )
-    previous_values = details.post_impact, details.landing_normal, details.landing_tangential
-    post_impact, normal, tangential = select_tree_leaves(is_first, opening_values, previous_values)
-    stopper_impulse = jnp.minimum(details.margins.stopper_impulse, result.stopper_impulse)
-    return details._replace(
+    previous_quantities = (
+        step_details.post_impact,
+        step_details.landing_normal,
+        step_details.landing_tangential,
+    )
+    post_impact, landing_normal, landing_tangential = select_tree_leaves(
+        is_first_event, opening_quantities, previous_quantities
+    )
+    stopper_impulse = jnp.minimum(
+        step_details.margins.stopper_impulse, event_result.stopper_impulse
+    )
+    return step_details._replace(
         post_impact=post_impact,
-        landing_normal=normal,
-        landing_tangential=tangential,
-        energy_impacts=details.energy_impacts + result.energy_lost,
-        margins=UnilateralMargins(details.margins.stopper_force, stopper_impulse),
-        impacts=details.impacts + event.is_impact,
-        fewest_solutions=jnp.minimum(details.fewest_solutions, result.n_solutions),
-        most_solutions=jnp.maximum(details.most_solutions, result.most_solutions),
+        landing_normal=landing_normal,
+        landing_tangential=landing_tangential,
+        energy_impacts=step_details.energy_impacts + event_result.energy_lost,
+        margins=UnilateralMargins(step_details.margins.stopper_force, stopper_impulse),
+        impacts=step_details.impacts + contact_event.is_impact,
+        fewest_solutions=jnp.minimum(step_details.fewest_solutions, event_result.n_solutions),
+        most_solutions=jnp.maximum(step_details.most_solutions, event_result.max_n_solutions),
     )
 
 
 def record_interval(
-    details: StepDetails,
+    step_details: UnilateralStepDetails,
     slot_modes: Int[Array, "2 ..."],
     duration: Elementwise,
     stopper_force: Elementwise,
-) -> StepDetails:
-    """Return the details after one more interval.
+) -> UnilateralStepDetails:
+    """Return the step details after one more interval.
 
-    The interval adds to the durations of the slots' contact modes. The stopper force of legs in the
-    air is the minimum over the ends of all intervals.
+    The duration is added to the duration of the slots' contact modes. The stopper force is the
+    minimum over legs in the air at the ends of all intervals.
 
     - `slot_modes`: contact mode of each slot's foot;
     - `duration`: length of the interval, s;
-    - `stopper_force`: minimum at the ends of this interval, N.
+    - `stopper_force`: minimum over legs in the air at the ends of this interval, N.
     """
     mode_codes = np.arange(4).reshape(-1, *(1,) * jnp.ndim(stopper_force))
     first_mode_indicator, second_mode_indicator = (
         (mode_codes == slot_modes[i]).astype(jnp.result_type(stopper_force)) for i in range(2)
     )
-    stopper_force = jnp.minimum(details.margins.stopper_force, stopper_force)
-    return details._replace(
-        mode_durations=details.mode_durations
+    stopper_force = jnp.minimum(step_details.margins.stopper_force, stopper_force)
+    return step_details._replace(
+        mode_durations=step_details.mode_durations
         + first_mode_indicator[:, None] * second_mode_indicator[None, :] * duration,
-        margins=UnilateralMargins(stopper_force, details.margins.stopper_impulse),
+        margins=UnilateralMargins(stopper_force, step_details.margins.stopper_impulse),
     )
 
 
 class UnilateralStep(AbstractContactStep):
-    """One step, from the landing of the foremost foot to the next. Batched under vmap.
+    """One step with unilateral contact, from a landing of the foremost foot to the next landing.
 
     Fields of a step whose outcome is not STEPPED are finite and describe the partial motion; its
     `section_state` is all zeros, which is not a valid section state.
 
-    - `section_state`: just before the next landing;
+    - `section_state`: section state just before the next landing;
     - `post_impact`: (theta, dtheta) just after the opening landing, rad, rad/s;
-    - `durations`: with two feet loaded, with one, with none, s;
-    - `mode_durations`: by mode of the first and second loaded foot, s;
-    - `step_length`: between the places of the two landings, m;
-    - `landing_normal`: normal impulses of the opening landing, N s;
-    - `landing_tangential`: tangential ones; fore and rear foot;
-    - `energy_impacts`: lost in impacts, J;
-    - `energy_damping`: lost in the dampers, J;
-    - `energy_friction`: lost by sliding between impacts, J;
+    - `durations`: durations with two loaded feet, with one, with none, s;
+    - `mode_durations`: durations by the contact modes of the first and second loaded foot, s;
+    - `step_length`: distance between the places of the two landings, m;
+    - `landing_normal`: normal impulses of fore and rear foot at the opening landing, N s;
+    - `landing_tangential`: tangential impulses of both feet at the opening landing, N s;
+    - `energy_impacts`: energy lost in impacts, J;
+    - `energy_damping`: energy lost in the dampers, J;
+    - `energy_friction`: energy lost by sliding between impacts, J;
     - `slip`: path length of sliding feet, m;
     - `events`: number of changes of contacts and stoppers;
     - `impacts`: number of events in which velocities jumped;
-    - `fewest_solutions`, `most_solutions`: numbers of admissible combinations at an event: 1 if
-      well posed;
-    - `margins`: of the assumptions of this model;
+    - `fewest_solutions`, `most_solutions`: smallest and largest number of admissible combinations
+      at an event; both are 1 if all events are well posed;
+    - `margins`: margins of the bilateral stoppers;
     - `outcome`: an Outcome;
-    - `solver_steps`: attempted solver steps;
+    - `solver_steps`: number of attempted solver steps;
     - `engine`: name of the engine, see `StepOptions`.
 
     Examples:
@@ -334,55 +361,55 @@ class UnilateralStep(AbstractContactStep):
     def model_measures(self) -> dict[str, Array]:
         """Return the measures of contact steps and the stopper margins, by name."""
         return AbstractContactStep.model_measures(self) | {
-            field.name: getattr(self.margins, field.name)
-            for field in dataclasses.fields(self.margins)
+            margin_field.name: getattr(self.margins, margin_field.name)
+            for margin_field in dataclasses.fields(self.margins)
         }
 
 
-def final_section_state(
+def make_final_section_state(
     motion: WheelMotion,
     contact_state: ContactState,
     outcome: Array,
-    tilt: Elementwise | None = None,
+    next_line_tilt: Elementwise | None = None,
 ) -> FullState:
     """Return the section state at the end of a step, or zeros if the step failed."""
-    x = pack_section_state(motion, contact_state, tilt)
-    return jnp.where(outcome == Outcome.STEPPED, x, jnp.zeros_like(x))
+    section_state = pack_section_state(motion, contact_state, next_line_tilt)
+    return jnp.where(outcome == Outcome.STEPPED, section_state, jnp.zeros_like(section_state))
 
 
 def make_unilateral_step(
     motion: WheelMotion,
     contact_state: ContactState,
-    accumulators: Accumulators,
-    counters: StepCounters,
-    details: StepDetails,
+    accumulators: LossAccumulators,
+    step_counters: StepCounters,
+    step_details: UnilateralStepDetails,
     outcome: Array,
-    engine: str,
-    tilt: Elementwise | None = None,
+    engine_name: str,
+    next_line_tilt: Elementwise | None = None,
 ) -> UnilateralStep:
-    """Return the results of a step from its final state and its records.
+    """Return the results of a step, given its final state and its records.
 
-    - `engine`: name of the engine that took the step;
-    - `tilt`: angle by which the next line is steeper, rad.
+    - `engine_name`: name of the engine that took the step;
+    - `next_line_tilt`: angle by which the next line is steeper, rad.
     """
-    landing_place = landing_position(motion.L.shape[0], motion)
+    landing_place = compute_landing_position(motion.L.shape[0], motion)
     replace_nonfinite = lambda record_value: jnp.where(
         jnp.isfinite(record_value), record_value, 0.0
     )
-    details = details._replace(
-        margins=jax.tree.map(replace_nonfinite, details.margins),
-        fewest_solutions=jnp.where(counters.n_events > 0, details.fewest_solutions, 0),
+    step_details = step_details._replace(
+        margins=jax.tree.map(replace_nonfinite, step_details.margins),
+        fewest_solutions=jnp.where(step_counters.n_events > 0, step_details.fewest_solutions, 0),
     )
     return UnilateralStep(
-        section_state=final_section_state(motion, contact_state, outcome, tilt),
-        durations=counters.durations,
+        section_state=make_final_section_state(motion, contact_state, outcome, next_line_tilt),
+        durations=step_counters.durations,
         step_length=jnp.where(outcome == Outcome.STEPPED, landing_place, 0.0),
         energy_damping=accumulators.damping_loss,
         energy_friction=accumulators.friction_loss,
         slip=accumulators.slip_length,
-        events=counters.n_events,
+        events=step_counters.n_events,
         outcome=outcome,
-        solver_steps=counters.n_solver_steps,
-        engine=engine,
-        **details._asdict(),
+        solver_steps=step_counters.n_solver_steps,
+        engine=engine_name,
+        **step_details._asdict(),
     )

@@ -19,32 +19,32 @@ from vrw_jax.contact.contact_modes import solve_combination
 from vrw_jax.contact.contact_state import (
     ContactForces,
     ModeDynamics,
-    accumulator_rates,
+    compute_accumulator_rates,
     compute_forces,
 )
 from vrw_jax.contact.dynamics_jvp import (
     ContactConfiguration,
-    ForceSolution,
     ResidualTangent,
-    TotalTangent,
-    free_motion_tangent,
-    motion_equation_tangents,
-    residual_jvp,
+    SummedResidualTangent,
+    WheelForceSolution,
+    compute_free_motion_tangent,
+    compute_motion_equation_tangents,
+    compute_residual_tangent,
     solve_forces_with_free_motion,
-    sum_residual,
+    sum_residual_tangent,
 )
 from vrw_jax.contact.mechanics import (
     ContactInverseInertia,
     ContactSlots,
-    FootVelocity,
     FreeMotion,
     HubVector,
     LegArray,
     LegDirections,
+    SlotFootVelocity,
     SlotPair,
     WheelMotion,
-    foot_velocity,
-    make_posture,
+    compute_slot_foot_velocity,
+    make_wheel_posture,
     sum_over_legs,
 )
 from vrw_jax.numerics import run_if_any
@@ -62,8 +62,8 @@ _INPUT_NAMES = (
     "friction_before",
 )  # on uneven ground
 PARAMETER_GROUPS = [
-    tuple(map(_INPUT_NAMES.index, names))
-    for names in (
+    tuple(map(_INPUT_NAMES.index, group_names))
+    for group_names in (
         _MASS_PARAMETERS,
         _SPRING_PARAMETERS,
         ("slope", "gravity"),
@@ -77,120 +77,133 @@ CoordinateTangentFn = Callable[[slice], tuple[Array, Array]]
 """Function that returns the tangents of some coordinates and of their rates at a point."""
 
 
-class UnitResponse(NamedTuple):
-    """Response to a unit input, with constant forces and accelerations."""
+class UnitInputResponse(NamedTuple):
+    """Tangent of the contact equations by a unit input, at constant forces and accelerations."""
 
-    leg_lengths: LegArray  # acceleration of each leg's length
-    total_tangent: TotalTangent
-    foot_speed: SlotPair  # speed of the slots' feet along the slope
-    damping: Array  # W
+    leg_length_residual: LegArray  # acceleration of each leg's length
+    summed_residual_tangent: SummedResidualTangent
+    foot_speed_tangent: SlotPair  # speed of the slots' feet along the slope
+    damping_loss_rate: Array  # W
 
 
-class _UnitLengthResponse(NamedTuple):
-    """Response to a unit length of each leg, or to a unit length rate.
+class _UnitLegLengthResponse(NamedTuple):
+    """Tangent of the contact equations by a unit length of each leg, or by a unit length rate.
 
-    - `slot_responses`: of lengths, of feet transverse to and along their legs, and of foot speeds.
+    - `slot_responses`: responses of the slots' lengths, of the feet's motions transverse to and
+      along their legs, and of the foot speeds.
     """
 
-    leg_lengths: LegArray  # acceleration of the leg's length
-    hub_vector: tuple[LegArray, LegArray, LegArray]
+    leg_length_residual: LegArray  # acceleration of the leg's length
+    hub_residual: tuple[LegArray, LegArray, LegArray]
     slot_responses: tuple[SlotPair, SlotPair, SlotPair, SlotPair]
 
 
-class _LengthResponse(NamedTuple):
-    """Response to lengths and length rates of some legs along a tangent."""
+class _LegLengthResponse(NamedTuple):
+    """Tangent of the contact equations by lengths and length rates of a group of legs."""
 
-    hub_vector: HubVector
-    slot_length: SlotPair  # length of the slots' legs
-    slot_length_rate: SlotPair
-    damping: Array
+    hub_residual: HubVector
+    slot_length_residual: SlotPair  # length of the slots' legs
+    slot_length_rate_residual: SlotPair
+    damping_loss_rate: Array
 
 
-class _PointLinearization(NamedTuple):
-    """Linearization of the dynamics at one point."""
+class _DynamicsLinearization(NamedTuple):
+    """Linearization of the wheel's dynamics at one motion."""
 
     dynamics: ModeDynamics
     motion: WheelMotion
     configuration: ContactConfiguration
     inertia: ContactInverseInertia
     free_motion: FreeMotion
-    solution: ForceSolution
+    force_solution: WheelForceSolution
     zero_tangent: ContactConfiguration  # zero tangent of the configuration's floats
 
     @classmethod
-    def from_motion(cls, dynamics: ModeDynamics, motion: WheelMotion) -> "_PointLinearization":
-        """Return the linearization at this motion."""
-        configuration = dynamics.configure(motion)
-        force_solution = solve_forces_with_free_motion(configuration)
-        float_leaves = eqx.filter(configuration, eqx.is_inexact_array)
+    def from_motion(
+        cls, mode_dynamics: ModeDynamics, motion: WheelMotion
+    ) -> "_DynamicsLinearization":
+        """Return the linearization of the dynamics at this motion."""
+        contact_configuration = mode_dynamics.configure_contacts(motion)
+        force_solution = solve_forces_with_free_motion(contact_configuration)
+        float_leaves = eqx.filter(contact_configuration, eqx.is_inexact_array)
         zero_tangent = jax.tree.map(jnp.zeros_like, float_leaves)
-        return cls(dynamics, motion, configuration, *force_solution, zero_tangent)
+        return cls(mode_dynamics, motion, contact_configuration, *force_solution, zero_tangent)
 
-    def make_leg_residual(
+    def make_leg_residual_function(
         self, leg_slice: slice
     ) -> Callable[[ContactConfiguration], tuple[ResidualTangent, ContactSlots]]:
-        """Return a function of a tangent to the residual's tangent for some legs, and to the slots
-        of these legs.
+        """Return a function from a tangent to the residual tangent of the legs in `leg_slice`, and
+        to the slots of these legs.
         """
         static_leaves = eqx.filter(self.configuration, eqx.is_inexact_array, inverse=True)
-        configuration = _restrict_legs(self.configuration, leg_slice)
-        directions = LegDirections(*(leg_row[leg_slice] for leg_row in self.inertia.leg_directions))
-        hub = self.inertia._replace(
-            leg_directions=directions, is_released=self.inertia.is_released[leg_slice]
+        contact_configuration = _restrict_configuration_to_legs(self.configuration, leg_slice)
+        leg_directions = LegDirections(
+            *(leg_row[leg_slice] for leg_row in self.inertia.leg_directions)
         )
-        solution = self.solution._replace(length_motion=self.solution.length_motion[leg_slice])
+        hub_motion = self.inertia._replace(
+            leg_directions=leg_directions, is_released=self.inertia.is_released[leg_slice]
+        )
+        slot_solution = self.force_solution._replace(
+            length_motion=self.force_solution.length_motion[leg_slice]
+        )
 
         @jax.jit  # The residual is traced once.
         def compute_residual(tangent: ContactConfiguration) -> ResidualTangent:
             residual_arguments = (
-                configuration,
-                _restrict_legs(eqx.combine(tangent, static_leaves), leg_slice),
-                hub,
-                solution,
+                contact_configuration,
+                _restrict_configuration_to_legs(eqx.combine(tangent, static_leaves), leg_slice),
+                hub_motion,
+                slot_solution,
             )
-            return residual_jvp(*residual_arguments, *motion_equation_tangents(*residual_arguments))
+            return compute_residual_tangent(
+                *residual_arguments, *compute_motion_equation_tangents(*residual_arguments)
+            )
 
-        return lambda tangent: (compute_residual(tangent), configuration.contact_slots)
+        return lambda tangent: (compute_residual(tangent), contact_configuration.contact_slots)
 
-    def foot_speed_tangent(self, tangent: WheelMotion) -> SlotPair:
-        """Return the tangent of the slots' foot speeds along the slope."""
+    def compute_foot_speed_tangent(self, tangent: WheelMotion) -> SlotPair:
+        """Return the tangent of the foot speeds along the slope of both slots, m/s."""
         s, contact_slots = self.dynamics.s, self.dynamics.contact_slots
         compute_speeds = lambda motion: (
-            foot_velocity(motion, contact_slots, make_posture(s, motion, contact_slots)).x
+            compute_slot_foot_velocity(
+                motion, contact_slots, make_wheel_posture(s, motion, contact_slots)
+            ).along_slope
         )
         return jax.jvp(compute_speeds, (self.motion,), (tangent,))[1]
 
-    def linearize_along(
+    def compute_motion_residual(
         self,
         motion: WheelMotion,
         leg_residual: Callable[[ContactConfiguration], tuple[ResidualTangent, ContactSlots]],
     ) -> tuple:
-        """Return residual tangent, slots and foot speeds of some legs along a tangent of the
+        """Return residual tangent, slots and foot speeds of a group of legs along a tangent of the
         motion.
         """
-        return *leg_residual(self.zero_tangent._replace(motion=motion)), self.foot_speed_tangent(
-            motion
-        )
+        return *leg_residual(
+            self.zero_tangent._replace(motion=motion)
+        ), self.compute_foot_speed_tangent(motion)
 
     def compute_unit_length_responses(
         self, leg_slice: slice
-    ) -> tuple[_UnitLengthResponse, _UnitLengthResponse]:
-        """Return the responses to unit lengths of some legs, and to unit length rates."""
-        leg_residual = self.make_leg_residual(leg_slice)
+    ) -> tuple[_UnitLegLengthResponse, _UnitLegLengthResponse]:
+        """Return the responses to unit lengths of the legs in `leg_slice`, and to unit length
+        rates.
+        """
+        leg_residual = self.make_leg_residual_function(leg_slice)
 
-        def respond_to_coordinate(coordinate_name: str) -> _UnitLengthResponse:
+        def respond_to_coordinate(coordinate_name: str) -> _UnitLegLengthResponse:
             leg_row = getattr(self.zero_tangent.motion, coordinate_name)
             unit_tangent = jnp.stack(
                 [x + float(i in range(len(leg_row))[leg_slice]) for i, x in enumerate(leg_row)]
             )
-            residual, contact_slots, foot_speed = self.linearize_along(
+            residual, contact_slots, foot_speed = self.compute_motion_residual(
                 self.zero_tangent.motion._replace(**{coordinate_name: unit_tangent}), leg_residual
             )
-            return _UnitLengthResponse(
-                residual.leg_lengths,
-                residual.hub_by_leg,
+            return _UnitLegLengthResponse(
+                residual.leg_length_residual,
+                residual.hub_residual_by_leg,
                 (
-                    contact_slots.gather(residual.leg_lengths),
+                    contact_slots.gather_slot_pair(residual.leg_length_residual),
                     residual.foot_transverse_motion,
                     residual.foot_radial_motion,
                     foot_speed,
@@ -200,49 +213,57 @@ class _PointLinearization(NamedTuple):
         return respond_to_coordinate("L"), respond_to_coordinate("dL")
 
     def linearize_solution(self) -> Callable[[FreeMotion], tuple[HubVector, SlotPair, SlotPair]]:
-        """Return the tangent map from free motion to hub acceleration, pulls and tangential
-        forces.
+        """Return the linear map from tangents of the free motion to tangents of hub acceleration,
+        leg pull forces and tangential forces.
         """
         s, friction = self.configuration.s, self.configuration.friction
-        slot_modes, is_held = self.configuration.slot_modes, self.configuration.is_held
+        slot_modes, is_held = self.configuration.slot_modes, self.configuration.is_stopper_holding
 
         def solve_forces(free_motion: FreeMotion) -> tuple[HubVector, SlotPair, SlotPair]:
-            solution = solve_combination(
+            slot_solution = solve_combination(
                 s, self.inertia, free_motion, slot_modes, is_held, friction
             )
-            return solution.hub_vector, solution.pull, solution.tangential
+            return (
+                slot_solution.hub_motion,
+                slot_solution.leg_pull_forces,
+                slot_solution.tangential_forces,
+            )
 
         return jax.linearize(solve_forces, self.free_motion)[1]
 
 
-def _restrict_legs(configuration: ContactConfiguration, leg_slice: slice) -> ContactConfiguration:
-    """Return the configuration restricted to some legs."""
-    motion, contact_slots = configuration.motion, configuration.contact_slots
-    return configuration._replace(
+def _restrict_configuration_to_legs(
+    contact_configuration: ContactConfiguration, leg_slice: slice
+) -> ContactConfiguration:
+    """Return the contact configuration of the legs in `leg_slice` alone."""
+    motion, contact_slots = contact_configuration.motion, contact_configuration.contact_slots
+    return contact_configuration._replace(
         motion=motion._replace(L=motion.L[leg_slice], dL=motion.dL[leg_slice]),
         contact_slots=ContactSlots(
-            contact_slots.first_mask[leg_slice], contact_slots.second_mask[leg_slice]
+            contact_slots.first_slot_mask[leg_slice], contact_slots.second_slot_mask[leg_slice]
         ),
-        is_airborne_locked=configuration.is_airborne_locked[leg_slice],
+        is_airborne_locked=contact_configuration.is_airborne_locked[leg_slice],
     )
 
 
 class TangentBasis(NamedTuple):
-    """Quantities at a point that are common to all tangents.
+    """Responses to unit coordinates at one motion, which are common to all tangents.
 
-    - `all_leg_residual`: function to the residual of all legs along any tangent;
-    - `length_responses`: those of the first legs, and those of the others;
-    - `slot_responses`: sum of both for the slots.
+    - `compute_all_leg_residual`: function from a tangent to the residual tangent of all legs;
+    - `length_responses`: responses to lengths and length rates of the first legs and of the others;
+    - `slot_responses`: sums of the slot responses of both groups of legs.
     """
 
-    linearization: _PointLinearization
+    linearization: _DynamicsLinearization
     forces: ContactForces
-    solve_tangent: Callable[[FreeMotion], tuple[HubVector, SlotPair, SlotPair]]
-    all_leg_residual: Callable[[ContactConfiguration], tuple[ResidualTangent, ContactSlots]]
-    angle_responses: tuple[UnitResponse, UnitResponse]  # response to the angle, and to its rate
+    map_free_motion_tangent: Callable[[FreeMotion], tuple[HubVector, SlotPair, SlotPair]]
+    compute_all_leg_residual: Callable[[ContactConfiguration], tuple[ResidualTangent, ContactSlots]]
+    angle_responses: tuple[
+        UnitInputResponse, UnitInputResponse
+    ]  # response to the angle, and to its rate
     length_responses: tuple[
-        tuple[_UnitLengthResponse, _UnitLengthResponse],
-        tuple[_UnitLengthResponse, _UnitLengthResponse],
+        tuple[_UnitLegLengthResponse, _UnitLegLengthResponse],
+        tuple[_UnitLegLengthResponse, _UnitLegLengthResponse],
     ]
     slot_responses: tuple[tuple[SlotPair, SlotPair, SlotPair, SlotPair], ...]
     damping_response: LegArray  # damping power for a unit rate of each leg, W
@@ -250,20 +271,18 @@ class TangentBasis(NamedTuple):
 
     @classmethod
     def from_motion(
-        cls, dynamics: ModeDynamics, motion: WheelMotion, has_later_moving_legs: Array
+        cls, mode_dynamics: ModeDynamics, motion: WheelMotion, has_later_moving_legs: Array
     ) -> "TangentBasis":
-        """Return the basis at this motion.
+        """Return the tangent basis at this motion.
 
         - `has_later_moving_legs`: whether legs after the first `N_MOVING_LEGS` move.
         """
-        linearization = _PointLinearization.from_motion(dynamics, motion)
-        forces = compute_forces(dynamics, motion)
-        all_leg_residual = linearization.make_leg_residual(slice(None))
-        first_responses, n = (
-            linearization.compute_unit_length_responses(_LEG_GROUP_SLICES[0]),
-            len(motion.L),
-        )
-        make_zeros = lambda foot_velocity_x: jnp.zeros(
+        linearization = _DynamicsLinearization.from_motion(mode_dynamics, motion)
+        contact_forces = compute_forces(mode_dynamics, motion)
+        compute_all_leg_residual = linearization.make_leg_residual_function(slice(None))
+        first_responses = linearization.compute_unit_length_responses(_LEG_GROUP_SLICES[0])
+        n = len(motion.L)
+        make_zero_coordinates = lambda foot_velocity_x: jnp.zeros(
             (n - N_MOVING_LEGS, *foot_velocity_x.shape[1:])
             if foot_velocity_x.ndim > 1
             else foot_velocity_x.shape,
@@ -272,35 +291,41 @@ class TangentBasis(NamedTuple):
         other_responses = run_if_any(
             has_later_moving_legs,
             lambda _: linearization.compute_unit_length_responses(_LEG_GROUP_SLICES[1]),
-            jax.tree.map(make_zeros, first_responses),
+            jax.tree.map(make_zero_coordinates, first_responses),
         )
 
         def compute_slip_rates(x: SlotPair, tangential: SlotPair) -> Array:
-            solution = forces.solution._replace(tangential=tangential)
-            rates = accumulator_rates(
-                dynamics,
+            slot_solution = contact_forces.force_solution._replace(tangential_forces=tangential)
+            rates = compute_accumulator_rates(
+                mode_dynamics,
                 motion,
-                forces._replace(solution=solution, foot_velocity=FootVelocity(x, x)),
+                contact_forces._replace(
+                    force_solution=slot_solution, foot_velocity=SlotFootVelocity(x, x)
+                ),
             )
             return jnp.stack([rates.friction_loss, rates.slip_length])
 
         compute_damping = lambda dL: (
-            accumulator_rates(dynamics, motion._replace(dL=dL), forces).damping_loss
+            compute_accumulator_rates(
+                mode_dynamics, motion._replace(dL=dL), contact_forces
+            ).damping_loss
         )
         (damping_response,) = jax.vjp(compute_damping, motion.dL)[1](jnp.ones_like(motion.theta))
         _, slip_tangent = jax.linearize(
-            compute_slip_rates, forces.foot_velocity.x, forces.solution.tangential
+            compute_slip_rates,
+            contact_forces.foot_velocity.along_slope,
+            contact_forces.force_solution.tangential_forces,
         )
         unit_tangent = jnp.ones_like(motion.theta)
 
-        def respond_to_angle(coordinate_name: str) -> UnitResponse:
-            residual, contact_slots, foot_speed = linearization.linearize_along(
+        def respond_to_angle(coordinate_name: str) -> UnitInputResponse:
+            residual, contact_slots, foot_speed = linearization.compute_motion_residual(
                 linearization.zero_tangent.motion._replace(**{coordinate_name: unit_tangent}),
-                all_leg_residual,
+                compute_all_leg_residual,
             )
-            return UnitResponse(
-                residual.leg_lengths,
-                sum_residual(contact_slots, residual),
+            return UnitInputResponse(
+                residual.leg_length_residual,
+                sum_residual_tangent(contact_slots, residual),
                 foot_speed,
                 jnp.zeros_like(unit_tangent),
             )
@@ -308,15 +333,19 @@ class TangentBasis(NamedTuple):
         angle_responses = respond_to_angle("theta"), respond_to_angle("dtheta")
         slot_responses = [
             jax.tree.map(
-                operator.add, *(foot_velocity_x.slot_responses for foot_velocity_x in responses)
+                operator.add,
+                *(
+                    foot_velocity_x.slot_responses
+                    for foot_velocity_x in angle_responses_by_coordinate
+                ),
             )
-            for responses in zip(first_responses, other_responses, strict=True)
+            for angle_responses_by_coordinate in zip(first_responses, other_responses, strict=True)
         ]
         return cls(
             linearization,
-            forces,
+            contact_forces,
             linearization.linearize_solution(),
-            all_leg_residual,
+            compute_all_leg_residual,
             angle_responses,
             (first_responses, other_responses),
             tuple(slot_responses),
@@ -326,15 +355,15 @@ class TangentBasis(NamedTuple):
 
     def compute_column_response(
         self, dynamics_fn: DynamicsFn, input_columns: Array, input_tangent: Array
-    ) -> UnitResponse:
-        """Return the response to a tangent of the input columns."""
+    ) -> UnitInputResponse:
+        """Return the response of the contact equations to a tangent of the input columns."""
         linearization, zero_response = self.linearization, self.make_zero_response()
 
         def configure_columns(input_columns: Array) -> tuple[ContactConfiguration, Array]:
-            dynamics = dynamics_fn(input_columns)
-            rates = accumulator_rates(dynamics, linearization.motion, self.forces)
+            mode_dynamics = dynamics_fn(input_columns)
+            rates = compute_accumulator_rates(mode_dynamics, linearization.motion, self.forces)
             return eqx.filter(
-                dynamics.configure(linearization.motion), eqx.is_inexact_array
+                mode_dynamics.configure_contacts(linearization.motion), eqx.is_inexact_array
             ), rates.damping_loss
 
         _, column_pushforward = jax.linearize(configure_columns, input_columns)
@@ -349,48 +378,51 @@ class TangentBasis(NamedTuple):
             )
 
             def add_response(
-                total_response: UnitResponse, group_tangent: Array = group_tangent
-            ) -> UnitResponse:
-                configuration, damping_tangent = column_pushforward(group_tangent)
-                residual, contact_slots = self.all_leg_residual(configuration)
-                response = UnitResponse(
-                    residual.leg_lengths,
-                    sum_residual(contact_slots, residual),
-                    zero_response.foot_speed,
+                total_response: UnitInputResponse, group_tangent: Array = group_tangent
+            ) -> UnitInputResponse:
+                contact_configuration, damping_tangent = column_pushforward(group_tangent)
+                residual, contact_slots = self.compute_all_leg_residual(contact_configuration)
+                unit_response = UnitInputResponse(
+                    residual.leg_length_residual,
+                    sum_residual_tangent(contact_slots, residual),
+                    zero_response.foot_speed_tangent,
                     damping_tangent,
                 )
-                return jax.tree.map(operator.add, total_response, response)
+                return jax.tree.map(operator.add, total_response, unit_response)
 
             has_tangent = jnp.any(jnp.stack([input_tangent[i] != 0.0 for i in input_indices]))
             total_response = run_if_any(has_tangent, add_response, total_response)
         return total_response
 
-    def make_zero_response(self) -> UnitResponse:
-        """Return the zero response."""
+    def make_zero_response(self) -> UnitInputResponse:
+        """Return the response to a zero tangent of the input columns."""
         return jax.tree.map(jnp.zeros_like, self.angle_responses[0])
 
     def propagate_tangent(
         self,
         coordinate_tangent_fn: CoordinateTangentFn,
-        column_response: UnitResponse,
+        column_response: UnitInputResponse,
         has_later_moving_legs: Array,
     ) -> Array:
-        """Return the tangent of accelerations and, if requested, accumulators, along one direction.
+        """Return the tangent of the dynamics rows along one direction.
 
-        - `coordinate_tangent_fn`: function to the tangents of some coordinates and rates;
+        The dynamics rows are accelerations and, if requested, rates of the loss accumulators.
+
+        - `coordinate_tangent_fn`: function from a slice of coordinates to the tangents of these
+          coordinates and of their rates;
         - `column_response`: response to the direction's input columns.
         """
         q, v = coordinate_tangent_fn(slice(0, 3 + N_MOVING_LEGS))
         theta, dtheta, first_length_tangents = q[2], v[2], (q[3:], v[3:])
         later_length_tangents = lambda: coordinate_tangent_fn(slice(3 + N_MOVING_LEGS, None))
-        add_trees = lambda first_tree, second_tree: jax.tree.map(
+        add_tangent_trees = lambda first_tree, second_tree: jax.tree.map(
             operator.add, first_tree, second_tree
         )
-        length_response = self._propagate_lengths(0, *first_length_tangents)
+        length_response = self._respond_to_leg_lengths(0, *first_length_tangents)
         length_response = run_if_any(
             has_later_moving_legs,
-            lambda _: add_trees(
-                length_response, self._propagate_lengths(1, *later_length_tangents())
+            lambda _: add_tangent_trees(
+                length_response, self._respond_to_leg_lengths(1, *later_length_tangents())
             ),
             length_response,
         )
@@ -399,83 +431,93 @@ class TangentBasis(NamedTuple):
             jax.tree.map(combine_responses, *slot_rows)
             for slot_rows in zip(*self.angle_responses, column_response, strict=True)
         ][1:]
-        total_tangent, foot_speed, damping_tangent = combined_responses
+        summed_residual, foot_speed, damping_tangent = combined_responses
         slot_rows = (
-            total_tangent.slot_lengths,
-            total_tangent.foot_transverse_motion,
-            total_tangent.foot_radial_motion,
+            summed_residual.slot_length_residual,
+            summed_residual.foot_transverse_motion,
+            summed_residual.foot_radial_motion,
             foot_speed,
         )
         slot_lengths, foot_transverse, foot_radial, foot_speed = (
             tuple(
                 a[i]
-                + b[i] * length_response.slot_length[i]
-                + c[i] * length_response.slot_length_rate[i]
+                + b[i] * length_response.slot_length_residual[i]
+                + c[i] * length_response.slot_length_rate_residual[i]
                 for i in range(2)
             )
             for a, b, c in zip(slot_rows, *self.slot_responses, strict=True)
         )
-        hub_tangent = tuple(map(operator.add, total_tangent.hub_vector, length_response.hub_vector))
-        total_tangent = TotalTangent(
-            hub_tangent, slot_lengths, foot_transverse, foot_radial, total_tangent.friction_force
+        hub_motion_tangent = tuple(
+            map(operator.add, summed_residual.hub_residual, length_response.hub_residual)
         )
-        free_tangent = free_motion_tangent(
-            self.linearization.inertia, jnp.zeros_like(self.linearization.motion.L), total_tangent
+        summed_residual = SummedResidualTangent(
+            hub_motion_tangent,
+            slot_lengths,
+            foot_transverse,
+            foot_radial,
+            summed_residual.friction_force,
         )
-        hub_tangent, pull_tangent, tangential_tangent = self.solve_tangent(free_tangent)
-        propagate_legs = lambda group_index, *length_tangents: self._propagate_legs(
-            group_index,
-            hub_tangent,
-            pull_tangent,
-            combine_responses,
-            column_response.leg_lengths,
-            *length_tangents,
+        free_motion_tangents = compute_free_motion_tangent(
+            self.linearization.inertia, jnp.zeros_like(self.linearization.motion.L), summed_residual
         )
-        zero_legs = jnp.zeros(
+        hub_motion_tangent, leg_pull_tangent, tangential_force_tangent = (
+            self.map_free_motion_tangent(free_motion_tangents)
+        )
+        propagate_leg_group = lambda group_index, *length_tangents: (
+            self._propagate_leg_accelerations(
+                group_index,
+                hub_motion_tangent,
+                leg_pull_tangent,
+                combine_responses,
+                column_response.leg_length_residual,
+                *length_tangents,
+            )
+        )
+        zero_leg_accelerations = jnp.zeros(
             (len(self.damping_response) - N_MOVING_LEGS, *theta.shape), theta.dtype
         )
         row_tangents = [
-            jnp.stack(hub_tangent),
-            propagate_legs(0, *first_length_tangents),
+            jnp.stack(hub_motion_tangent),
+            propagate_leg_group(0, *first_length_tangents),
             run_if_any(
                 has_later_moving_legs,
-                lambda _: propagate_legs(1, *later_length_tangents()),
-                zero_legs,
+                lambda _: propagate_leg_group(1, *later_length_tangents()),
+                zero_leg_accelerations,
             ),
         ]
         if self.linearization.dynamics.has_accumulators:
             foot_speed = foot_speed[0] + v[0], foot_speed[1] + v[0]
-            tangential_tangent = tuple(
-                map(operator.add, tangential_tangent, total_tangent.friction_force)
+            tangential_force_tangent = tuple(
+                map(operator.add, tangential_force_tangent, summed_residual.friction_force)
             )
             row_tangents += [
-                (damping_tangent + length_response.damping)[None],
-                self.slip_tangent(foot_speed, tangential_tangent),
+                (damping_tangent + length_response.damping_loss_rate)[None],
+                self.slip_tangent(foot_speed, tangential_force_tangent),
             ]
         return jnp.concatenate(row_tangents)
 
-    def _propagate_lengths(self, group_index: int, L: Any, dL: Any) -> _LengthResponse:
-        """Return the response to lengths and length rates of one group of legs."""
+    def _respond_to_leg_lengths(self, group_index: int, L: Any, dL: Any) -> _LegLengthResponse:
+        """Return the response to tangents of lengths and length rates of one group of legs."""
         length_response, rate_response = self.length_responses[group_index]
         leg_slice = _LEG_GROUP_SLICES[group_index]
         sum_response = lambda a, b: sum_over_legs(a * L + b * dL)
-        x, z, rotation = map(sum_response, length_response.hub_vector, rate_response.hub_vector)
+        x, z, rotation = map(sum_response, length_response.hub_residual, rate_response.hub_residual)
         contact_slots = self.linearization.dynamics.contact_slots
         group_slots = ContactSlots(
-            contact_slots.first_mask[leg_slice], contact_slots.second_mask[leg_slice]
+            contact_slots.first_slot_mask[leg_slice], contact_slots.second_slot_mask[leg_slice]
         )
-        return _LengthResponse(
+        return _LegLengthResponse(
             (x, z, rotation),
-            group_slots.gather(L),
-            group_slots.gather(dL),
+            group_slots.gather_slot_pair(L),
+            group_slots.gather_slot_pair(dL),
             sum_over_legs(self.damping_response[leg_slice] * dL),
         )
 
-    def _propagate_legs(
+    def _propagate_leg_accelerations(
         self,
         group_index: int,
-        hub_tangent: HubVector,
-        pull_tangent: SlotPair,
+        hub_motion_tangent: HubVector,
+        leg_pull_tangent: SlotPair,
         combine_responses: Callable,
         column_leg_response: Any,
         L: Any,
@@ -488,20 +530,27 @@ class TangentBasis(NamedTuple):
             self.linearization,
         )
         angle_response = combine_responses(
-            *(response.leg_lengths[leg_slice] for response in self.angle_responses),
+            *(
+                unit_response.leg_length_residual[leg_slice]
+                for unit_response in self.angle_responses
+            ),
             column_leg_response[leg_slice],
         )
-        configuration = _restrict_legs(linearization.configuration, leg_slice)
+        contact_configuration = _restrict_configuration_to_legs(
+            linearization.configuration, leg_slice
+        )
         sin, cos = (leg_row[leg_slice] for leg_row in linearization.inertia.leg_directions)
         outward_motion = (
             angle_response
-            + length_response.leg_lengths * L
-            + rate_response.leg_lengths * dL
-            + sin * hub_tangent[0]
-            + cos * hub_tangent[1]
+            + length_response.leg_length_residual * L
+            + rate_response.leg_length_residual * dL
+            + sin * hub_motion_tangent[0]
+            + cos * hub_motion_tangent[1]
         )
         outward_motion = (
-            outward_motion - configuration.contact_slots.scatter(pull_tangent) / configuration.s.m
+            outward_motion
+            - contact_configuration.contact_slots.scatter_to_legs(leg_pull_tangent)
+            / contact_configuration.s.m
         )
         return jnp.where(
             linearization.configuration.has_fixed_length[leg_slice], 0.0, outward_motion

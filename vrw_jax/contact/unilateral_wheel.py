@@ -1,4 +1,4 @@
-"""Unilateral model: one-sided contacts with Coulomb friction, in any order of events."""
+"""Model of the wheel with unilateral contact and Coulomb friction, for any order of events."""
 
 import dataclasses
 import functools
@@ -12,9 +12,9 @@ from jaxtyping import Array, Bool, Float, Int
 
 from vrw_jax.contact.section import (
     FullState,
+    compute_full_section_size,
     compute_section_units,
     embed_section_state,
-    full_section_size,
 )
 from vrw_jax.contact.single_step import (
     ContactStepConfig,
@@ -83,16 +83,16 @@ class UnilateralTrajectory(eqx.Module):
 
 
 class UnevenGround(NamedTuple):
-    """Quantities of a step on uneven ground, besides the slope and friction of its landing."""
+    """Friction of earlier feet and tilt of the next line, for a step on uneven ground."""
 
     friction: Scalar  # friction coefficient of the feet that landed earlier
     tilt: Scalar  # angle by which the next line is steeper, rad
 
 
 def _convert_restitution(value: Any) -> Array | None:
-    """Return Newton's coefficient of restitution as an array; None means 0.
+    """Return Newton's coefficient of restitution as an array, or None for None, which means 0.
 
-    Raises `ValueError` for a number outside [0, 1].
+    Raise ValueError for a number outside [0, 1].
     """
     if value is None or (isinstance(value, float | int) and value == 0):
         return None
@@ -108,8 +108,10 @@ def _convert_restitution(value: Any) -> Array | None:
 
 @with_renamed_arguments(infinite="infinite_friction_rule")
 class UnilateralWheel(AbstractWheel):
-    """Model of the wheel whose feet push on the ground and slide by Coulomb's law; no leg has a
-    fixed role.
+    """Model of the wheel with unilateral contact: feet push on the ground and slide by Coulomb's
+    law.
+
+    The order of events is free, and every leg may land, slide or lift off.
 
     - `friction`: coefficient of the ground, `inf` for feet that never slide;
     - `max_events`: largest number of events of one step. After a quarter of them (at least 100),
@@ -192,10 +194,10 @@ class UnilateralWheel(AbstractWheel):
         )
 
     def section_size(self, params: WheelParams) -> int:
-        return full_section_size(params.n_legs)
+        return compute_full_section_size(params.n_legs)
 
     def n_continuous(self, params: WheelParams) -> int:
-        return full_section_size(params.n_legs) - params.n_legs
+        return compute_full_section_size(params.n_legs) - params.n_legs
 
     def section_units(self, units: WheelUnits, n_legs: int) -> list[Elementwise]:
         return compute_section_units(units, n_legs)
@@ -204,7 +206,7 @@ class UnilateralWheel(AbstractWheel):
         """Return the full section state of `x`, which may be the paper's (theta-, dtheta-,
         dL1-).
         """
-        return _embed_compiled(params, x) if x.shape == (3,) else x
+        return _embed_section_compiled(params, x) if x.shape == (3,) else x
 
     def split_ground(self, params: WheelParams, n_steps: int) -> StepGroundValues | None:
         """Return the ground of each step, or None on flat ground of one friction.
@@ -215,9 +217,9 @@ class UnilateralWheel(AbstractWheel):
         slope, friction = params.slope, self.friction
         if slope.ndim == friction.ndim == 0:
             return None
-        is_flat = slope.ndim == 0
+        is_flat_ground = slope.ndim == 0
         line_slopes = (
-            jnp.full(n_steps + 1, slope) if is_flat else complete_line_slopes(slope, n_steps)
+            jnp.full(n_steps + 1, slope) if is_flat_ground else complete_line_slopes(slope, n_steps)
         )
         if friction.ndim:
             check_stepwise_shape(FRICTION_NAME, friction, n_steps)
@@ -235,8 +237,8 @@ class UnilateralWheel(AbstractWheel):
         return model, eqx.tree_at(lambda wheel: wheel.slope, params, slope)
 
     def advance(self, params: WheelParams, x: FullState, options: StepOptions) -> AdvanceResult:
-        outputs, engine = self._compute_step(params, x, options, is_detailed=False)
-        section_state, durations, outcome, solver_steps = outputs
+        step_outputs, engine = self._compute_step(params, x, options, is_detailed=False)
+        section_state, durations, outcome, solver_steps = step_outputs
         return AdvanceResult(section_state, durations, outcome, solver_steps, engine=engine)
 
     def take_step(self, params: WheelParams, x: FullState, options: StepOptions) -> UnilateralStep:
@@ -263,31 +265,32 @@ class UnilateralWheel(AbstractWheel):
     ) -> UnilateralTrajectory:
         leaves, argument_structure = self._flatten_arguments(params, x, options)
         config = ContactStepConfig(argument_structure, True, not can_use_batch_kernel(options))
-        samples = build_contact_step_sampler(config, n_samples)(*leaves)
-        interval_log, step_summary = samples.log, samples.summary
-        start_times = jnp.concatenate([jnp.zeros((1,)), jnp.cumsum(interval_log.duration)[:-1]])
+        sampled_intervals = build_contact_step_sampler(config, n_samples)(*leaves)
+        interval_log, step_summary = sampled_intervals.interval_log, sampled_intervals.step_summary
+        start_times = jnp.concatenate([jnp.zeros((1,)), jnp.cumsum(interval_log.durations)[:-1]])
         return UnilateralTrajectory(
             time=start_times[:, None]
-            + jnp.linspace(0.0, 1.0, n_samples) * interval_log.duration[:, None],
-            state=samples.state,
-            contact=interval_log.contact,
-            locked=interval_log.locked,
-            tangential=samples.tangential,
-            normal=samples.normal,
-            duration=interval_log.duration,
+            + jnp.linspace(0.0, 1.0, n_samples) * interval_log.durations[:, None],
+            state=sampled_intervals.sampled_states,
+            contact=interval_log.contact_modes,
+            locked=interval_log.is_locked,
+            tangential=sampled_intervals.tangential_forces,
+            normal=sampled_intervals.normal_forces,
+            duration=interval_log.durations,
             section_state=step_summary.section_state,
             step_length=step_summary.step_length,
-            outcome=samples.outcome,
+            outcome=sampled_intervals.step_outcome,
         )
 
 
-_embed_compiled = jax.jit(lambda params, x: embed_section_state(params.symbols(), x))
+_embed_section_compiled = jax.jit(lambda params, x: embed_section_state(params.symbols(), x))
 
 
 @functools.cache
 def _compile_step(argument_structure: Any, is_detailed: bool, engine: str) -> ForwardFunction:
-    """Return the step over the leaves of (wheel, params, x, options), differentiable in any
-    mode.
+    """Return the step as a function of the leaves of (wheel, params, x, options).
+
+    The function is differentiable in every AD mode.
     """
 
     diffrax_config = ContactStepConfig(argument_structure, is_detailed, True, engine)

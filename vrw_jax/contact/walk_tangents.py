@@ -23,13 +23,13 @@ from vrw_jax.contact.batch_integrator import (
     IntervalPoint,
     IntervalState,
     LaneStatus,
+    advance_running_lanes,
     complete_solver_step,
     compute_stage_state,
     evaluate_dynamics,
     evaluate_guards_at_point,
-    integrator_step,
     iterate_until_stopped,
-    motion_from_point,
+    unpack_motion,
 )
 from vrw_jax.contact.contact_modes import ContactMode
 from vrw_jax.contact.contact_state import ContactState, ModeDynamics, compute_guard_scales
@@ -53,26 +53,26 @@ class _IntervalTangent(NamedTuple):
     v: Array
     interval_accumulators: Array | None
     dynamics_rows: Array  # tangents of accelerations and, if requested, accumulator rates
-    time: Array  # tangent of the time, s
+    time_since_event: Array  # tangent of the time, s
 
 
-class _Tangent(NamedTuple):
-    """Tangent of the whole state of a lane."""
+class _LaneTangent(NamedTuple):
+    """Tangent of the differentiable state of a lane."""
 
-    interval: _IntervalTangent
+    interval_tangent: _IntervalTangent
     other_tangents: DifferentiableLaneState  # tangents of what is not in the interval
 
     @classmethod
     def from_lane_tangents(
         cls, lane_tangents: DifferentiableLaneState, dynamics_rows: Array
-    ) -> "_Tangent":
-        """Return the tangent made of these lane tangents and tangents of dynamics rows."""
-        accumulators, interval_accumulators = lane_tangents.accumulators
+    ) -> "_LaneTangent":
+        """Return the lane tangent, given tangents of the lane state and of the dynamics rows."""
+        accumulators, interval_accumulators = lane_tangents.loss_accumulators
         other_tangents: Any = lane_tangents._asdict() | {
             "q": None,
             "v": None,
-            "accumulators": (accumulators, None),
-            "time": None,
+            "loss_accumulators": (accumulators, None),
+            "time_since_event": None,
         }
         return cls(
             _IntervalTangent(
@@ -80,31 +80,32 @@ class _Tangent(NamedTuple):
                 lane_tangents.v,
                 interval_accumulators,
                 dynamics_rows,
-                lane_tangents.time,
+                lane_tangents.time_since_event,
             ),
             DifferentiableLaneState(**other_tangents),
         )
 
     def to_lane_tangents(self) -> DifferentiableLaneState:
         """Return the tangent of the differentiable lane state."""
-        q, v, interval_accumulators, _, time = self.interval
+        q, v, interval_accumulators, _, time = self.interval_tangent
         return self.other_tangents._replace(
             q=q,
             v=v,
-            accumulators=(self.other_tangents.accumulators[0], interval_accumulators),
-            time=time,
+            loss_accumulators=(self.other_tangents.loss_accumulators[0], interval_accumulators),
+            time_since_event=time,
         )
 
 
 class TangentBatch(NamedTuple):
-    """Tangents of each lane: arrays have the tangents on the first axis and lanes on the last."""
+    """Tangents of all lanes, with the tangents on the first axis and the lanes on the last axis."""
 
     n_tangents: Array  # number of tangents of each lane
     n_column_tangents: Array  # number of leading tangents whose columns may vary
     column_tangents: Array
-    tangent_rows: Array  # all numbers of a `_Tangent`, see `_pack_rows`, (tangents, rows, lanes)
+    # all numbers of a `_LaneTangent`, see `_pack_rows`, (tangents, rows, lanes)
+    tangent_rows: Array
 
-    def allocate(self, n_rows: int) -> Array:
+    def allocate_rows(self, n_rows: int) -> Array:
         """Return uninitialized rows of all tangents, (tangents, n_rows, lanes)."""
         return lax.empty(
             (len(self.column_tangents), n_rows, *self.n_tangents.shape), self.column_tangents.dtype
@@ -112,20 +113,22 @@ class TangentBatch(NamedTuple):
 
     def map_tangents(
         self,
-        function: Callable[[Array, Array], Any],
+        row_function: Callable[[Array, Array], Any],
         tangent_rows: Array,
         first_row: Array | int = 0,
     ) -> Array:
-        """Return the rows of all tangents, with those from `first_row` on replaced by the
-        function's results.
+        """Return the tangent rows, in which results of a function replace the rows from `first_row`
+        on.
 
-        - `function`: maps the index of a tangent and its rows to the new rows, as a tree.
+        - `row_function`: function from the index of a tangent and its rows to a tree of new rows.
         """
         should_continue = lambda state: jnp.any(state[0] < self.n_tangents)
 
         def update_tangent(state: tuple[Array, Array]) -> tuple[Array, Array]:
             k, tangent_rows = state
-            new_rows = _pack_rows(function(k, lax.dynamic_index_in_dim(tangent_rows, k, 0, False)))
+            new_rows = _pack_rows(
+                row_function(k, lax.dynamic_index_in_dim(tangent_rows, k, 0, False))
+            )
             # Stacking row by row keeps the rows in registers.
             new_rows = jnp.stack([new_rows[i] for i in range(len(new_rows))])
             start_indices = k, jnp.int32(first_row), jnp.int32(0)
@@ -136,73 +139,90 @@ class TangentBatch(NamedTuple):
         )[1]
 
 
-def _pack_rows(tree: Any) -> Array:
-    """Return all numbers of a tree in one array (rows, lanes)."""
-    return jnp.concatenate([x.reshape(-1, x.shape[-1]) for x in jax.tree.leaves(tree)])
+def _pack_rows(array_tree: Any) -> Array:
+    """Return all arrays of a tree, concatenated to one array (rows, lanes)."""
+    return jnp.concatenate(
+        [
+            section_state.reshape(-1, section_state.shape[-1])
+            for section_state in jax.tree.leaves(array_tree)
+        ]
+    )
 
 
-def _unpack_rows(rows: Array, template: Any) -> Any:
-    """Return rows as a tree of the template's structure: the inverse of `_pack_rows`."""
-    leaves, structure = jax.tree.flatten(template)
+def _unpack_rows(tangent_rows: Array, tangent_template: Any) -> Any:
+    """Return the rows as a tree with the structure of `tangent_template`.
+
+    This is the inverse of `_pack_rows`.
+    """
+    leaves, structure = jax.tree.flatten(tangent_template)
     arrays, row_offset = [], 0
     for leaf in leaves:
         n_leaf_rows = math.prod(leaf.shape[:-1])
-        leaf_rows = rows[..., row_offset : row_offset + n_leaf_rows, :]
-        arrays.append(leaf_rows.reshape(*rows.shape[:-2], *leaf.shape))
+        leaf_rows = tangent_rows[..., row_offset : row_offset + n_leaf_rows, :]
+        arrays.append(leaf_rows.reshape(*tangent_rows.shape[:-2], *leaf.shape))
         row_offset += n_leaf_rows
     return jax.tree.unflatten(structure, arrays)
 
 
-def _unpack_tangent(tangent_rows: Array, k: Array, template: Any) -> Any:
-    """Return tangent k as a tree of the template's structure."""
-    return _unpack_rows(lax.dynamic_index_in_dim(tangent_rows, k, 0, False), template)
+def _unpack_tangent(tangent_rows: Array, k: Array, tangent_template: Any) -> Any:
+    """Return the tangent with index `k` as a tree with the structure of `tangent_template`."""
+    return _unpack_rows(lax.dynamic_index_in_dim(tangent_rows, k, 0, False), tangent_template)
 
 
 def walk_with_tangents(
     walk_settings: BatchWalkSettings,
     input_columns: Array,
-    x: Array,
-    d_columns: Array,
-    d_x: Array,
+    section_state: Array,
+    input_column_tangents: Array,
+    section_state_tangents: Array,
     n_tangents: Array,
 ) -> tuple[BatchWalkResult, Any]:
-    """Return the result of `run_walks`, and the tangents of its floats for each lane.
+    """Return the result of `run_walks`, and the tangents of its float arrays.
 
-    Tangents are the first axis of `d_columns`, `d_x` and the returned tangents. Each lane has
-    `n_tangents` of them.
+    The tangents are on the first axis of `input_column_tangents`, `section_state_tangents` and the
+    result. A lane uses the first `n_tangents` of them.
     """
     tableau = walk_settings.tableau
     assert tableau is not None  # diffrax differentiates in another way.
-    input_columns, x, is_valid = walk_settings.replace_invalid(input_columns, x)
-    count_rows = lambda tree: len(_pack_rows(tree))
+    input_columns, section_state, is_valid = walk_settings.replace_invalid_lanes(
+        input_columns, section_state
+    )
+    count_rows = lambda array_tree: len(_pack_rows(array_tree))
 
-    def begin_walk(input_columns: Array, x: Array) -> tuple[DifferentiableLaneState, LaneState]:
-        lane_state = walk_settings.deactivate_invalid(
-            walk_settings.begin_walk(input_columns, x), is_valid
+    def begin_walk(
+        input_columns: Array, section_state: Array
+    ) -> tuple[DifferentiableLaneState, LaneState]:
+        lane_state = walk_settings.deactivate_invalid_lanes(
+            walk_settings.begin_walk(input_columns, section_state), is_valid
         )
         return lane_state.get_differentiable(), lane_state
 
     lane_tangents, pushforward, lane_state = jax.linearize(
-        begin_walk, input_columns, x, has_aux=True
+        begin_walk, input_columns, section_state, has_aux=True
     )
     dynamics_rows = jnp.zeros(
         (len(lane_tangents.q) + N_ACCUMULATOR_ROWS * walk_settings.is_detailed, *n_tangents.shape),
-        x.dtype,
+        section_state.dtype,
     )
-    tangent_template = _Tangent.from_lane_tangents(lane_tangents, dynamics_rows)
+    tangent_template = _LaneTangent.from_lane_tangents(lane_tangents, dynamics_rows)
     n_column_tangents = jnp.zeros_like(n_tangents)
-    for k in range(len(d_columns)):
+    for k in range(len(input_column_tangents)):
         n_column_tangents = jnp.where(
-            jnp.any(d_columns[k] != 0.0, axis=0), k + 1, n_column_tangents
+            jnp.any(input_column_tangents[k] != 0.0, axis=0), k + 1, n_column_tangents
         )
-    tangents = TangentBatch(n_tangents, n_column_tangents, d_columns, d_columns)
-    make_start_tangent = lambda k, _: _Tangent.from_lane_tangents(
-        pushforward(_unpack_tangent(d_columns, k, input_columns), _unpack_tangent(d_x, k, x)),
+    tangents = TangentBatch(
+        n_tangents, n_column_tangents, input_column_tangents, input_column_tangents
+    )
+    make_start_tangent = lambda k, _: _LaneTangent.from_lane_tangents(
+        pushforward(
+            _unpack_tangent(input_column_tangents, k, input_columns),
+            _unpack_tangent(section_state_tangents, k, section_state),
+        ),
         dynamics_rows,
     )
     tangents = tangents._replace(
         tangent_rows=tangents.map_tangents(
-            make_start_tangent, tangents.allocate(count_rows(tangent_template))
+            make_start_tangent, tangents.allocate_rows(count_rows(tangent_template))
         )
     )
 
@@ -223,63 +243,75 @@ def walk_with_tangents(
             process_events_from, input_columns, lane_state.get_differentiable(), has_aux=True
         )
 
-        def push_through_event(k: Array, tangent_row: Array) -> _Tangent:
+        def push_through_event(k: Array, tangent_row: Array) -> _LaneTangent:
             tangent = _unpack_rows(tangent_row, tangent_template)
-            return _Tangent.from_lane_tangents(
+            return _LaneTangent.from_lane_tangents(
                 pushforward(
-                    _unpack_tangent(d_columns, k, input_columns), tangent.to_lane_tangents()
+                    _unpack_tangent(input_column_tangents, k, input_columns),
+                    tangent.to_lane_tangents(),
                 ),
-                tangent.interval.dynamics_rows,
+                tangent.interval_tangent.dynamics_rows,
             )
 
         tangents = tangents._replace(
             tangent_rows=tangents.map_tangents(push_through_event, tangents.tangent_rows)
         )
-        is_unfinished = next_state.outcome == STATUS_UNFINISHED
-        dynamics_fn = lambda c: walk_settings.make_dynamics(c, next_state.interval.contact_state)
+        is_unfinished = next_state.walk_outcome == STATUS_UNFINISHED
+        dynamics_fn = lambda c: walk_settings.make_dynamics(
+            c, next_state.interval_state.contact_state
+        )
         integration_arguments = (
             dynamics_fn,
             input_columns,
-            next_state.interval,
+            next_state.interval_state,
             tangents,
-            tangent_template.interval,
+            tangent_template.interval_tangent,
             is_unfinished,
-            walk_settings.options,
+            walk_settings.step_options,
             tableau,
         )
-        interval, tangent_rows = _integrate_with_tangents(*integration_arguments)
-        return next_state._replace(interval=interval), tangents._replace(tangent_rows=tangent_rows)
+        interval_state, tangent_rows = _integrate_with_tangents(*integration_arguments)
+        return next_state._replace(interval_state=interval_state), tangents._replace(
+            tangent_rows=tangent_rows
+        )
 
-    should_continue = lambda state: jnp.any(state[0].outcome == STATUS_UNFINISHED)
+    should_continue = lambda state: jnp.any(state[0].walk_outcome == STATUS_UNFINISHED)
     lane_state, tangents = lax.while_loop(
         should_continue, process_and_integrate, (lane_state, tangents)
     )
 
-    def partition_result(
-        differentiable: DifferentiableLaneState, tilt: Array | None
+    def partition_step_result(
+        differentiable: DifferentiableLaneState, next_line_tilt: Array | None
     ) -> tuple[Any, Any]:
         return eqx.partition(
-            walk_settings.compute_result(lane_state.replace_differentiable(differentiable), tilt),
+            walk_settings.compute_step_result(
+                lane_state.replace_differentiable(differentiable), next_line_tilt
+            ),
             eqx.is_inexact_array,
         )
 
     float_leaves, pushforward, other_leaves = jax.linearize(
-        partition_result,
+        partition_step_result,
         lane_state.get_differentiable(),
-        walk_settings.tilt(input_columns),
+        walk_settings.extract_next_line_tilt(input_columns),
         has_aux=True,
     )
-    tilt_tangent = lambda k: walk_settings.tilt(_unpack_tangent(d_columns, k, input_columns))
+    tilt_tangent = lambda k: walk_settings.extract_next_line_tilt(
+        _unpack_tangent(input_column_tangents, k, input_columns)
+    )
     push_result_tangent = lambda k, _: pushforward(
         _unpack_tangent(tangents.tangent_rows, k, tangent_template).to_lane_tangents(),
         tilt_tangent(k),
     )
     result_tangents = tangents.map_tangents(
-        push_result_tangent, tangents.allocate(count_rows(float_leaves))
+        push_result_tangent, tangents.allocate_rows(count_rows(float_leaves))
     )
     step_result = eqx.combine(float_leaves, other_leaves)
     walk_result = BatchWalkResult(
-        step_result, lane_state.outcome, lane_state.n_stepped, lane_state.counters.n_solver_steps
+        step_result,
+        lane_state.walk_outcome,
+        lane_state.n_stepped,
+        lane_state.step_counters.n_solver_steps,
     )
     return walk_result, _unpack_rows(result_tangents, float_leaves)
 
@@ -294,33 +326,40 @@ def _integrate_with_tangents(
     options: StepOptions,
     tableau: ButcherTableau,
 ) -> tuple[IntervalState, Array]:
-    """Return the result of `integrate_interval`, and the tangent rows at the event."""
-    dynamics = dynamics_fn(input_columns)
-    guard_scales, last_stage = compute_guard_scales(dynamics), len(tableau.nodes) - 1
-    options = compute_wheel_units(dynamics.s).scale_times_to_seconds(options)
+    """Return the result of `integrate_interval`, and the tangent rows at its end."""
+    mode_dynamics = dynamics_fn(input_columns)
+    guard_scales, last_stage = compute_guard_scales(mode_dynamics), len(tableau.stage_nodes) - 1
+    options = compute_wheel_units(mode_dynamics.s).scale_times_to_seconds(options)
     has_later_moving_legs = _has_later_moving_legs(
         tangents, tangent_template, initial_state.contact_state
     )
-    max_stable_h = _max_stable_step(dynamics, tableau)
+    max_stable_step_size = _compute_max_stable_step_size(mode_dynamics, tableau)
 
-    def try_step(state: tuple[IntervalState, Array]) -> tuple[IntervalState, Array]:
-        interval, tangent_rows = state
+    def try_solver_step(state: tuple[IntervalState, Array]) -> tuple[IntervalState, Array]:
+        interval_state, tangent_rows = state
         h = jnp.where(
-            interval.event_bracket.is_active, interval.h, jnp.minimum(interval.h, max_stable_h)
+            interval_state.event_bracket.is_search_active,
+            interval_state.h,
+            jnp.minimum(interval_state.h, max_stable_step_size),
         )
-        interval = interval._replace(h=h)
+        interval_state = interval_state._replace(h=h)
         stage_rows, stage_row_tangents = _evaluate_stages(
             dynamics_fn,
             input_columns,
-            interval,
+            interval_state,
             tangents._replace(tangent_rows=tangent_rows),
             tangent_template,
             tableau,
             has_later_moving_legs,
         )
-        attempt = complete_solver_step(dynamics, tableau, options, interval, stage_rows)
-        next_interval = integrator_step(interval, attempt, guard_scales, tableau, options)
-        is_state_updated, n = next_interval.time != interval.time, len(interval.point.q)
+        attempted_step = complete_solver_step(
+            mode_dynamics, tableau, options, interval_state, stage_rows
+        )
+        next_interval = advance_running_lanes(
+            interval_state, attempted_step, guard_scales, tableau, options
+        )
+        is_state_updated = next_interval.time_since_event != interval_state.time_since_event
+        n = len(interval_state.interval_point.q)
 
         def propagate_to_end(k: Array, tangent_row: Array) -> _IntervalTangent:
             start_tangent = _unpack_rows(tangent_row, tangent_template)
@@ -333,7 +372,7 @@ def _integrate_with_tangents(
                 start_tangent.q[leg_slice],
                 start_tangent.v[leg_slice],
                 stage_tangents[:, :n][:, leg_slice],
-                interval.h,
+                interval_state.h,
             )
             first_coordinates = slice(0, 3 + N_MOVING_LEGS)
             other_coordinates = slice(3 + N_MOVING_LEGS, None)
@@ -353,12 +392,16 @@ def _integrate_with_tangents(
             q, v = map(jnp.concatenate, end_coordinates)
             interval_accumulators = start_tangent.interval_accumulators
             if interval_accumulators is not None:
-                weights = tableau.matrix[last_stage]
-                interval_accumulators = interval_accumulators + interval.h * sum(
+                weights = tableau.stage_matrix[last_stage]
+                interval_accumulators = interval_accumulators + interval_state.h * sum(
                     weights[j] * stage_tangents[j, n:] for j in range(last_stage)
                 )
             end_tangent = _IntervalTangent(
-                q, v, interval_accumulators, stage_tangents[last_stage], start_tangent.time
+                q,
+                v,
+                interval_accumulators,
+                stage_tangents[last_stage],
+                start_tangent.time_since_event,
             )
             return select_tree_leaves(
                 is_state_updated,
@@ -368,13 +411,13 @@ def _integrate_with_tangents(
 
         return next_interval, tangents.map_tangents(propagate_to_end, tangent_rows)
 
-    is_running = lambda state: state[0].status == LaneStatus.RUNNING
-    interval, tangent_rows = iterate_until_stopped(
-        is_running, has_unfinished_walk, try_step, (initial_state, tangents.tangent_rows)
+    is_running = lambda state: state[0].lane_status == LaneStatus.RUNNING
+    interval_state, tangent_rows = iterate_until_stopped(
+        is_running, has_unfinished_walk, try_solver_step, (initial_state, tangents.tangent_rows)
     )
-    return interval, tangents.map_tangents(
-        _shift_to_event(
-            dynamics_fn, input_columns, initial_state, interval, tangents, tangent_template
+    return interval_state, tangents.map_tangents(
+        _make_event_shift(
+            dynamics_fn, input_columns, initial_state, interval_state, tangents, tangent_template
         ),
         tangent_rows,
     )
@@ -383,30 +426,34 @@ def _integrate_with_tangents(
 def _evaluate_stages(
     dynamics_fn: DynamicsFn,
     input_columns: Array,
-    interval: IntervalState,
+    interval_state: IntervalState,
     tangents: TangentBatch,
     tangent_template: _IntervalTangent,
     tableau: ButcherTableau,
     has_later_moving_legs: Array,
 ) -> tuple[Array, Array]:
-    """Return the dynamics rows at the stages of a step, and the tangents of these rows.
+    """Return the dynamics rows at all stages of a solver step, and the tangents of these rows.
 
     The tangents are computed one after another.
     """
-    point, h = interval.point, interval.h
-    n_dynamics_rows, last_stage = len(tangent_template.dynamics_rows), len(tableau.nodes) - 1
-    is_at_interval_start = (interval.status == LaneStatus.RUNNING) & (interval.time == 0.0)
+    interval_point, h = interval_state.interval_point, interval_state.h
+    n_dynamics_rows, last_stage = len(tangent_template.dynamics_rows), len(tableau.stage_nodes) - 1
+    is_at_interval_start = (interval_state.lane_status == LaneStatus.RUNNING) & (
+        interval_state.time_since_event == 0.0
+    )
 
     def evaluate_stage_with_tangents(
         state: tuple[Array, Array, Array],
     ) -> tuple[Array, Array, Array]:
         i, stage_rows, stage_row_tangents = state
 
-        stage_coordinates = compute_stage_state(tableau, i, point.q, point.v, stage_rows, h)
-        dynamics = dynamics_fn(input_columns)
+        stage_coordinates = compute_stage_state(
+            tableau, i, interval_point.q, interval_point.v, stage_rows, h
+        )
+        mode_dynamics = dynamics_fn(input_columns)
         tangent_basis = TangentBasis.from_motion(
-            dynamics,
-            motion_from_point(IntervalPoint(*stage_coordinates, stage_coordinates[0])),
+            mode_dynamics,
+            unpack_motion(IntervalPoint(*stage_coordinates, stage_coordinates[0])),
             has_later_moving_legs,
         )
         zero_response = tangent_basis.make_zero_response()
@@ -414,7 +461,7 @@ def _evaluate_stages(
             dynamics_fn, input_columns, _unpack_tangent(tangents.column_tangents, k, input_columns)
         )
         column_responses = tangents._replace(n_tangents=tangents.n_column_tangents).map_tangents(
-            compute_column_response, tangents.allocate(len(_pack_rows(zero_response)))
+            compute_column_response, tangents.allocate_rows(len(_pack_rows(zero_response)))
         )
 
         def propagate_tangent(k: Array, known_rows: Array) -> Array:
@@ -436,7 +483,9 @@ def _evaluate_stages(
             )
 
         stage_row = jnp.where(
-            i > 0, evaluate_dynamics(dynamics, *stage_coordinates), point.dynamics_rows
+            i > 0,
+            evaluate_dynamics(mode_dynamics, *stage_coordinates),
+            interval_point.dynamics_rows,
         )
         stage_rows = lax.dynamic_update_index_in_dim(stage_rows, stage_row, i, 0)
         return (
@@ -445,11 +494,11 @@ def _evaluate_stages(
             tangents.map_tangents(propagate_tangent, stage_row_tangents, i * n_dynamics_rows),
         )
 
-    later_stage_rows = jnp.zeros((last_stage, *point.dynamics_rows.shape), h.dtype)
-    stage_rows = jnp.concatenate([point.dynamics_rows[None], later_stage_rows])
+    later_stage_rows = jnp.zeros((last_stage, *interval_point.dynamics_rows.shape), h.dtype)
+    stage_rows = jnp.concatenate([interval_point.dynamics_rows[None], later_stage_rows])
     stage_row_tangents = tangents.map_tangents(
         lambda k, _: _unpack_tangent(tangents.tangent_rows, k, tangent_template).dynamics_rows,
-        tangents.allocate((last_stage + 1) * n_dynamics_rows),
+        tangents.allocate_rows((last_stage + 1) * n_dynamics_rows),
     )
     # The first stage is the last stage of the previous step, except after an event.
     first_stage = jnp.where(jnp.any(is_at_interval_start), 0, 1).astype(jnp.int32)
@@ -467,13 +516,17 @@ def _propagate_stage_coordinates(
     h: Array,
     leg_slice: slice,
 ) -> tuple[Array, Array]:
-    """Return the tangent of `compute_stage_state` for some coordinates, from the earlier stages."""
-    flat_matrices = [
-        jnp.asarray(np.reshape(x, -1)) for x in (tableau.matrix, tableau.matrix_squared)
-    ]
-    n_stages, node = len(tableau.matrix[0]), jnp.asarray(tableau.nodes)[i]
+    """Return the tangents of coordinates and rates at stage `i`, for the coordinates `leg_slice`.
 
-    def add_stage(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+    This is the tangent of `compute_stage_state`.
+    """
+    flat_matrices = [
+        jnp.asarray(np.reshape(section_state, -1))
+        for section_state in (tableau.stage_matrix, tableau.squared_stage_matrix)
+    ]
+    n_stages, stage_node = len(tableau.stage_matrix[0]), jnp.asarray(tableau.stage_nodes)[i]
+
+    def add_stage_increment(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         j, rate_increment, coordinate_increment = state
         a, b = (
             lax.dynamic_index_in_dim(flat_matrix, i * n_stages + j, 0, False)
@@ -487,33 +540,36 @@ def _propagate_stage_coordinates(
     q, v = tangent.q[leg_slice], tangent.v[leg_slice]
     initial_state = jnp.zeros((), jnp.int32), jnp.zeros_like(q), jnp.zeros_like(q)
     _, rate_increment, coordinate_increment = lax.while_loop(
-        lambda state: state[0] < i, add_stage, initial_state
+        lambda state: state[0] < i, add_stage_increment, initial_state
     )
-    return q + h * (node * v + h * coordinate_increment), v + h * rate_increment
+    return q + h * (stage_node * v + h * coordinate_increment), v + h * rate_increment
 
 
-def _max_stable_step(
-    dynamics: ModeDynamics, tableau: ButcherTableau, safety_factor: float = 0.85
+def _compute_max_stable_step_size(
+    mode_dynamics: ModeDynamics, tableau: ButcherTableau, stability_safety_factor: float = 0.85
 ) -> Array:
-    """Return the step size above which tangents of a swinging leg grow, times a safety factor, s.
+    """Return the largest step size for which tangents of a swinging leg do not grow, s.
 
     The damper of such a leg stops the leg within m / c. Step-size control is based on the motion
     alone, in which the leg may be almost at rest.
     """
     has_swing_leg = jnp.any(
-        ~dynamics.contact_state.locked & (dynamics.contact_state.contact_modes == ContactMode.OFF),
+        ~mode_dynamics.contact_state.is_locked
+        & (mode_dynamics.contact_state.contact_modes == ContactMode.OFF),
         axis=0,
     )
-    step_factor = safety_factor * compute_real_stability_limit(tableau)
-    return jnp.where(has_swing_leg, step_factor * dynamics.s.m / dynamics.s.c, jnp.inf)
+    stable_step_factor = stability_safety_factor * compute_real_stability_limit(tableau)
+    return jnp.where(
+        has_swing_leg, stable_step_factor * mode_dynamics.s.m / mode_dynamics.s.c, jnp.inf
+    )
 
 
 def _has_later_moving_legs(
     tangents: TangentBatch, tangent_template: _IntervalTangent, contact_state: ContactState
 ) -> Array:
-    """Return whether any leg after the first ones moves, in any lane and along any tangent."""
+    """Return whether a leg after the first `N_MOVING_LEGS` moves, in any lane and tangent."""
 
-    def check_tangent(state: tuple[Array, Array]) -> tuple[Array, Array]:
+    def update_moving_leg_flag(state: tuple[Array, Array]) -> tuple[Array, Array]:
         k, has_moving_leg = state
         tangent = _unpack_tangent(tangents.tangent_rows, k, tangent_template)
         length_tangents = jnp.concatenate(
@@ -521,46 +577,51 @@ def _has_later_moving_legs(
         )
         return k + 1, has_moving_leg | jnp.any(length_tangents != 0.0, axis=0)
 
-    initial_state = jnp.zeros((), jnp.int32), jnp.any(~contact_state.locked[N_MOVING_LEGS:], axis=0)
+    initial_state = (
+        jnp.zeros((), jnp.int32),
+        jnp.any(~contact_state.is_locked[N_MOVING_LEGS:], axis=0),
+    )
     should_continue = lambda state: jnp.any(state[0] < tangents.n_tangents)
-    return jnp.any(lax.while_loop(should_continue, check_tangent, initial_state)[1])
+    return jnp.any(lax.while_loop(should_continue, update_moving_leg_flag, initial_state)[1])
 
 
-def _shift_to_event(
+def _make_event_shift(
     dynamics_fn: DynamicsFn,
     input_columns: Array,
     initial_state: IntervalState,
-    interval: IntervalState,
+    interval_state: IntervalState,
     tangents: TangentBatch,
     tangent_template: _IntervalTangent,
 ) -> Callable[[Array, Array], _IntervalTangent]:
-    """Return a function that shifts tangents by the tangent of the event time."""
-    point, n = interval.point, len(interval.point.q)
+    """Return a function that adds the effect of the event time's tangent to a lane's tangent."""
+    interval_point, n = interval_state.interval_point, len(interval_state.interval_point.q)
 
     def compute_guards(input_columns: Array, q: Array, v: Array) -> Array:
-        dynamics = dynamics_fn(input_columns)
+        mode_dynamics = dynamics_fn(input_columns)
         return evaluate_guards_at_point(
-            dynamics, IntervalPoint(q, v, evaluate_dynamics(dynamics, q, v))
+            mode_dynamics, IntervalPoint(q, v, evaluate_dynamics(mode_dynamics, q, v))
         )
 
-    _, guard_pushforward = jax.linearize(compute_guards, input_columns, point.q, point.v)
-    guard_rates = guard_pushforward(jnp.zeros_like(input_columns), point.v, point.dynamics_rows[:n])
-    has_reached_event = (initial_state.status == LaneStatus.RUNNING) & (
-        interval.status == LaneStatus.EVENT
+    _, guard_pushforward = jax.linearize(
+        compute_guards, input_columns, interval_point.q, interval_point.v
+    )
+    guard_rates = guard_pushforward(
+        jnp.zeros_like(input_columns), interval_point.v, interval_point.dynamics_rows[:n]
+    )
+    has_reached_event = (initial_state.lane_status == LaneStatus.RUNNING) & (
+        interval_state.lane_status == LaneStatus.EVENT
     )
 
     def shift_tangent(k: Array, tangent_row: Array) -> _IntervalTangent:
-        tangent, time_tangent = (
-            _unpack_rows(tangent_row, tangent_template),
-            jnp.zeros_like(interval.time),
-        )
+        tangent = _unpack_rows(tangent_row, tangent_template)
+        time_tangent = jnp.zeros_like(interval_state.time_since_event)
         guard_tangents = guard_pushforward(
             _unpack_tangent(tangents.column_tangents, k, input_columns), tangent.q, tangent.v
         )
         for guard_index in range(len(guard_tangents)):
             is_at_guard = (
                 has_reached_event
-                & (interval.triggered_guard == guard_index)
+                & (interval_state.triggered_guard_index == guard_index)
                 & (guard_rates[guard_index] < 0.0)
             )
             time_tangent = jnp.where(
@@ -572,14 +633,15 @@ def _shift_to_event(
         interval_accumulators = tangent.interval_accumulators
         if interval_accumulators is not None:
             interval_accumulators = (
-                interval_accumulators + time_tangent * point.dynamics_rows[-N_ACCUMULATOR_ROWS:]
+                interval_accumulators
+                + time_tangent * interval_point.dynamics_rows[-N_ACCUMULATOR_ROWS:]
             )
         return _IntervalTangent(
-            q=tangent.q + time_tangent * point.v,
-            v=tangent.v + time_tangent * point.dynamics_rows[:n],
+            q=tangent.q + time_tangent * interval_point.v,
+            v=tangent.v + time_tangent * interval_point.dynamics_rows[:n],
             interval_accumulators=interval_accumulators,
             dynamics_rows=tangent.dynamics_rows,
-            time=time_tangent,
+            time_since_event=time_tangent,
         )
 
     return shift_tangent

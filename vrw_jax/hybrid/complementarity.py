@@ -30,7 +30,7 @@ class LCPStatus(StatusCode):
 
 
 class LCPSolutions(NamedTuple):
-    """Solutions of an LCP: forces z >= 0 and gaps w = matrix z + free_gap >= 0 with z w = 0."""
+    """Solutions of an LCP: forces z >= 0 and gaps w = matrix z + free_gap >= 0 with z . w = 0."""
 
     # forces of the solution with most closed contacts; NaN if there is none
     force: Float[Array, " n"]
@@ -46,13 +46,17 @@ def enumerate_lcp_solutions(
     """Return all solutions of an LCP with a square matrix, symmetric or not.
 
     `matrix` has the shape (n, n) and `free_gap` the shape (n,). Signs are accurate to `tolerance`
-    times the largest number of the problem. Combinations that differ only by contacts without force
-    count once. The result is differentiable as long as the same solution exists.
+    times the largest number of the problem. Solutions with the same forces count once. The result
+    is differentiable as long as the same solution exists.
     """
     free_gap = jnp.asarray(free_gap, float)
     matrix = jnp.asarray(matrix, free_gap.dtype)
-    n = free_gap.size
-    if free_gap.ndim != 1 or matrix.shape != (n, n) or not 0 < n <= MAX_LCP_CONTACTS:
+    n_contacts = free_gap.size
+    if (
+        free_gap.ndim != 1
+        or matrix.shape != (n_contacts, n_contacts)
+        or not 0 < n_contacts <= MAX_LCP_CONTACTS
+    ):
         raise ValueError(
             f"matrix has shape {matrix.shape} and free_gap {free_gap.shape}, but they must be (n, "
             f"n) and "
@@ -62,20 +66,26 @@ def enumerate_lcp_solutions(
         raise ValueError(
             "matrix or free_gap contains a number that is not finite: give finite numbers."
         )
-    max_entry = jnp.max(jnp.abs(matrix))
-    entry_scale = jnp.where(max_entry > 0.0, max_entry, 1.0)
-    free_gap, matrix = free_gap / entry_scale, matrix / entry_scale
+    largest_matrix_entry = jnp.max(jnp.abs(matrix))
+    matrix_scale = jnp.where(largest_matrix_entry > 0.0, largest_matrix_entry, 1.0)
+    free_gap, matrix = free_gap / matrix_scale, matrix / matrix_scale
     # Combinations with more closed contacts come first.
-    is_closed = np.array(list(itertools.product((True, False), repeat=n)))
+    is_closed = np.array(list(itertools.product((True, False), repeat=n_contacts)))
     is_closed = is_closed[np.argsort(-is_closed.sum(1), kind="stable")]
 
     def solve_combination(is_closed: Array) -> tuple[Array, Array]:
-        closed_pair = is_closed[:, None] & is_closed[None]
-        linear_system = jnp.where(closed_pair, matrix, jnp.eye(n, dtype=free_gap.dtype))
-        is_singular = jnp.abs(jnp.linalg.det(linear_system)) <= tolerance
-        linear_system = jnp.where(is_singular, jnp.eye(n, dtype=free_gap.dtype), linear_system)
+        is_pair_closed = is_closed[:, None] & is_closed[None]
+        closed_contact_matrix = jnp.where(
+            is_pair_closed, matrix, jnp.eye(n_contacts, dtype=free_gap.dtype)
+        )
+        is_singular = jnp.abs(jnp.linalg.det(closed_contact_matrix)) <= tolerance
+        closed_contact_matrix = jnp.where(
+            is_singular, jnp.eye(n_contacts, dtype=free_gap.dtype), closed_contact_matrix
+        )
         contact_forces = jnp.where(
-            is_closed, jnp.linalg.solve(linear_system, jnp.where(is_closed, -free_gap, 0.0)), 0.0
+            is_closed,
+            jnp.linalg.solve(closed_contact_matrix, jnp.where(is_closed, -free_gap, 0.0)),
+            0.0,
         )
         contact_gaps = jnp.where(is_closed, 0.0, matrix @ contact_forces + free_gap)
         are_forces_nonnegative = jnp.all(
@@ -103,7 +113,7 @@ def enumerate_lcp_solutions(
     )
     return LCPSolutions(
         contact_forces,
-        entry_scale * (matrix @ contact_forces + free_gap),
+        matrix_scale * (matrix @ contact_forces + free_gap),
         solution_status,
         is_solution,
         candidate_forces,

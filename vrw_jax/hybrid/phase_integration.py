@@ -29,8 +29,8 @@ from vrw_jax.hybrid.minima import (
     advance_minimum_refinement,
     find_guards_met_at_start,
     is_guard_at_roundoff,
-    make_empty_minimum,
-    select_by_mask,
+    make_empty_interior_minimum,
+    select_entry_by_mask,
     update_interior_minimum,
 )
 from vrw_jax.numerics import (
@@ -53,7 +53,7 @@ VectorField = Callable[[StateArray], StateArray]
 
 
 class PhaseEnd(NamedTuple):
-    """End of a phase: state, duration, the guard that ended the phase, and failure flags."""
+    """End of a phase: state, duration, index of the triggered guard, and failure flags."""
 
     state: StateArray
     duration: Scalar  # duration of the phase, s
@@ -65,7 +65,7 @@ class PhaseEnd(NamedTuple):
 
 
 class StepPurpose(IntEnum):
-    """Purpose of the next solver step."""
+    """Code of the purpose of the next solver step."""
 
     START = 0  # A step of length zero evaluates the start.
     INTEGRATION = 1
@@ -76,24 +76,22 @@ class StepPurpose(IntEnum):
 
 @dataclass(frozen=True)
 class EventSearchOptions:
-    """Options of the search for an event within a solver step, and of the growth of steps before
-    it.
-    """
+    """Options of the search for an event inside a solver step, and of the growth of steps."""
 
     max_step_growth: float = 2.0
     """Largest ratio of the lengths of successive solver steps. The error estimate of a step far
     shorter than needed is round-off, and a length derived from that estimate would grow without
     bound. A batch element would then differ from the same element alone by 1e-12. The value is
     chosen to avoid this difference, which is more than a hundred times the element's round-off."""
-    n_confirmations: int = 3
+    n_required_confirmations: int = 3
     """Number of tries at the located event that must confirm the event's time. The value is chosen
     because the first try makes the event's time accurate to first order in its derivatives and the
     second to third order. The last try evaluates the state at the event."""
-    max_confirmed_change: float = 1e-4
+    max_confirmed_length_change: float = 1e-4
     """Largest change of the event's time by a try that confirms it, as a fraction of the phase's
     duration. The value is chosen because Newton's method squares the change in each of the next two
     tries, to 1e-16 in the last try."""
-    min_stalled_ratio: float = 0.9
+    min_stalled_change_ratio: float = 0.9
     """Ratio of successive changes of the event's time above which the change is round-off. The
     value is chosen because Newton's method at least halves changes, and reduces them to two thirds
     at a triple root."""
@@ -103,84 +101,84 @@ EVENT_SEARCH_OPTIONS = EventSearchOptions()
 
 
 class _EventSearch(NamedTuple):
-    """State of Newton's search for the earliest event inside a step that brackets one."""
+    """State of Newton's search for the earliest event inside a solver step."""
 
-    is_crossing: Bool[Array, " n_guards"]
-    lower_bound: Scalar  # bracket of the event, s from the step's start
-    upper_bound: Scalar
+    is_guard_crossing: Bool[Array, " n_guards"]
+    lower_length_bound: Scalar  # bracket of the event, s from the step's start
+    upper_length_bound: Scalar
     time_tolerance: Scalar  # tolerance of the event's time, s
     n_iterations: Int[Array, ""]
-    n_confirmed: Int[Array, ""]  # number of tries that confirmed the event's time
-    change: Scalar  # change of the event's time by the last try, s
+    n_confirmed_proposals: Int[Array, ""]  # number of tries that confirmed the event's time
+    last_length_change: Scalar  # change of the event's time by the last try, s
 
 
 class _PhaseState(NamedTuple):
     """State of the loop that integrates a phase."""
 
-    purpose: Int[Array, ""]  # a StepPurpose
+    step_purpose: Int[Array, ""]  # a StepPurpose
     accepted_step: AcceptedPhaseStep  # the last accepted step
-    next_length: Scalar  # length of the next step to try, s
+    next_step_length: Scalar  # length of the next step to try, s
     controller_state: Any
-    search: _EventSearch
-    minimum: InteriorMinimum
-    refinement: MinimumRefinement
-    guard: Int[Array, ""]
-    timed_out: Bool[Array, ""]
-    gave_up: Bool[Array, ""]
+    event_search: _EventSearch
+    interior_minimum: InteriorMinimum
+    minimum_refinement: MinimumRefinement
+    triggered_guard: Int[Array, ""]
+    has_timed_out: Bool[Array, ""]
+    has_given_up: Bool[Array, ""]
     n_tried_steps: Int[Array, ""]
 
 
 class _SolverStepper(NamedTuple):
-    """A diffrax solver with its step-size controller, as a function that advances a state by a
-    step.
-    """
+    """Pair of a diffrax solver and a step-size controller, for single steps of one vector field."""
 
     vector_field: VectorField
-    solver: diffrax.AbstractAdaptiveSolver
-    controller: diffrax.PIDController
-    term: diffrax.ODETerm
+    diffrax_solver: diffrax.AbstractAdaptiveSolver
+    step_size_controller: diffrax.PIDController
+    ode_term: diffrax.ODETerm
 
-    def init_states(self, state: StateArray, options: StepOptions) -> tuple[Any, Any]:
-        """Return diffrax's solver state and controller state at the start of a phase."""
+    def init_solver_and_controller(
+        self, state: StateArray, options: StepOptions
+    ) -> tuple[Any, Any]:
+        """Return the initial states of diffrax's solver and step-size controller."""
         zero_time = jnp.zeros((), state.dtype)
-        _, controller_state = self.controller.init(
-            self.term,
+        _, controller_state = self.step_size_controller.init(
+            self.ode_term,
             zero_time,
             options.dt0,
             lax.stop_gradient(state),
             options.dt0,
             None,
             lambda terms, t, y, args: terms.vf(t, y, args),
-            self.solver.error_order(self.term),
+            self.diffrax_solver.error_order(self.ode_term),
         )
         return self.init_solver_state(state, options), controller_state
 
     def init_solver_state(self, state: StateArray, options: StepOptions) -> Any:
-        """Return the solver's internal state at a state of the system."""
+        """Return the internal state of diffrax's solver at a state of the system."""
         zero_time = jnp.zeros((), state.dtype)
-        return self.solver.init(self.term, zero_time, options.dt0, state, None)
+        return self.diffrax_solver.init(self.ode_term, zero_time, options.dt0, state, None)
 
-    def advance_state(
+    def take_solver_step(
         self, state: StateArray, solver_state: Any, length: Scalar
     ) -> tuple[StateArray, StateArray, Any]:
-        """Return the state after a step of `length`, its error estimate, and the solver's internal
-        state.
+        """Return the state after a step of `length`, s, its error estimate, and the internal state
+        of the solver.
         """
         zero_time = jnp.zeros_like(length)
-        end_state, error_estimate, _, solver_state, solver_result = self.solver.step(
-            self.term, zero_time, length, state, None, solver_state, jnp.asarray(False)
+        end_state, error_estimate, _, solver_state, solver_result = self.diffrax_solver.step(
+            self.ode_term, zero_time, length, state, None, solver_state, jnp.asarray(False)
         )
         if error_estimate is None:
             raise ValueError(
-                f"{type(self.solver).__name__} gives no error estimate, but the step size is "
-                "controlled by one: take 'Dopri8', 'Tsit5' or 'Kvaerno5'."
+                f"{type(self.diffrax_solver).__name__} gives no error estimate, but the step size "
+                "is controlled by one: take 'Dopri8', 'Tsit5' or 'Kvaerno5'."
             )
         error_estimate = jnp.where(
             solver_result == diffrax.RESULTS.successful, error_estimate, jnp.inf
         )
         return end_state, error_estimate, solver_state
 
-    def control_step(
+    def control_step_size(
         self,
         start_state: StateArray,
         end_state: StateArray,
@@ -188,24 +186,24 @@ class _SolverStepper(NamedTuple):
         length: Scalar,
         controller_state: Any,
     ) -> tuple[Bool[Array, ""], Scalar, Any]:
-        """Return whether the step's error is within tolerance, the next length, and the
-        controller's state.
+        """Return whether the error of a step is within tolerance, the length of the next step, s,
+        and the state of the controller.
 
-        No result is differentiated, because derivatives are those of the steps taken.
+        The results have no derivatives, because derivatives are those of the steps that were taken.
         """
         start_state, end_state, error_estimate = lax.stop_gradient(
             (start_state, end_state, error_estimate)
         )
         is_finite = jnp.all(jnp.isfinite(end_state))
         is_within_tolerance, next_start, next_end, _, controller_state, _ = (
-            self.controller.adapt_step_size(
+            self.step_size_controller.adapt_step_size(
                 jnp.zeros_like(length),
                 length,
                 start_state,
                 jnp.where(is_finite, end_state, start_state),
                 None,
                 jnp.where(is_finite, error_estimate, jnp.inf),
-                self.solver.error_order(self.term),  # type: ignore[arg-type]
+                self.diffrax_solver.error_order(self.ode_term),  # type: ignore[arg-type]
                 controller_state,
             )
         )
@@ -218,36 +216,37 @@ class _SolverStepper(NamedTuple):
 
 def make_solver(name: str, options: StepOptions) -> diffrax.AbstractAdaptiveSolver:
     """Return the diffrax solver with this name, configured for forward-mode derivatives."""
-    solver_class = getattr(diffrax, name, None)
+    diffrax_solver_class = getattr(diffrax, name, None)
     if not (
-        isinstance(solver_class, type) and issubclass(solver_class, diffrax.AbstractAdaptiveSolver)
+        isinstance(diffrax_solver_class, type)
+        and issubclass(diffrax_solver_class, diffrax.AbstractAdaptiveSolver)
     ):
         raise ValueError(
             f"solver is {name!r}, but it must name a diffrax solver with an error estimate: "
             "take 'Dopri8', 'Tsit5', 'Dopri5', 'Kvaerno3' or 'Kvaerno5'."
         )
-    field_names = getattr(solver_class, "__dataclass_fields__", {})
+    field_names = getattr(diffrax_solver_class, "__dataclass_fields__", {})
     solver_arguments: dict[str, Any] = {}
     if "scan_kind" in field_names:
         solver_arguments["scan_kind"] = "lax"
     if "root_finder" in field_names:
         tolerances: dict[str, Any] = {"rtol": options.rtol, "atol": options.atol}
         solver_arguments["root_finder"] = diffrax.VeryChord(**tolerances)
-    return solver_class(**solver_arguments)
+    return diffrax_solver_class(**solver_arguments)
 
 
 def _make_stepper(field: VectorField, options: StepOptions, max_growth: float) -> _SolverStepper:
-    """Return the solver and controller of the options for a vector field.
+    """Return a solver and a step-size controller for a vector field, as given by the options.
 
-    `max_growth` limits the ratio of successive step lengths.
+    `max_growth` is the largest ratio of successive step lengths.
     """
     return _SolverStepper(
         vector_field=field,
-        solver=make_solver(options.solver, options),
-        controller=diffrax.PIDController(
+        diffrax_solver=make_solver(options.solver, options),
+        step_size_controller=diffrax.PIDController(
             rtol=options.rtol, atol=options.atol, factormax=max_growth
         ),
-        term=diffrax.ODETerm(lambda t, y, args: field(y)),
+        ode_term=diffrax.ODETerm(lambda t, y, args: field(y)),
     )
 
 
@@ -259,176 +258,198 @@ def integrate_phase(
     options: StepOptions,
     event_options: EventSearchOptions = EVENT_SEARCH_OPTIONS,
 ) -> PhaseEnd:
-    """Integrate `field` from `start` until the earliest guard reaches zero from above, and return
-    the end.
+    """Return the end of the phase that begins at `start` and ends at the first zero of a guard.
 
     A guard that is negative at the start, or zero and not rising, ends the phase immediately with
     duration 0. A guard that is zero and rising does not end the phase. If a guard falls through
-    zero at the start, the event time has a derivative: minus the guard's derivative with respect to
-    the start over the guard's rate.
+    zero at the start, the event time has a derivative. It is minus the guard's derivative with
+    respect to the start, divided by the guard's rate.
 
-    A guard that is negative only inside a step is found: if the cubic through values and rates may
-    be negative, the step is repeated up to the cubic's minimum. Of two guards that are zero at the
-    same time, the first in the list ends the phase. If `is_active` is False, nothing is integrated.
-    Errors are those of the solver at the tolerances of `options`.
+    A guard may be negative only inside a step. If the cubic through its values and rates may be
+    negative, the step is repeated up to the minimum of the cubic. Of two guards that are zero at
+    the same time, the first in the list ends the phase. If `is_active` is False, nothing is
+    integrated. Errors are those of the solver at the tolerances of `options`.
     """
     solver_stepper = _make_stepper(field, options, event_options.max_step_growth)
     phase_context = _PhaseContext(solver_stepper, monitored_functions, options, event_options)
     phase_state = lax.while_loop(
         lambda phase_state: make_opaque_condition(
-            phase_state.purpose != StepPurpose.DONE, phase_state.n_tried_steps
+            phase_state.step_purpose != StepPurpose.DONE, phase_state.n_tried_steps
         ),
         functools.partial(_advance_phase_state, phase_context),
         _init_phase_state(phase_context, start, is_active),
     )
     minima = jnp.minimum(
-        phase_state.refinement.lowest_values,
-        phase_state.accepted_step.values[monitored_functions.n_guards :],
+        phase_state.minimum_refinement.lowest_margin_values,
+        phase_state.accepted_step.monitored_values[monitored_functions.n_guards :],
     )
     return PhaseEnd(
         state=phase_state.accepted_step.state,
-        duration=phase_state.accepted_step.time,
-        guard=phase_state.guard,
-        timed_out=phase_state.timed_out,
-        gave_up=phase_state.gave_up,
+        duration=phase_state.accepted_step.end_time,
+        guard=phase_state.triggered_guard,
+        timed_out=phase_state.has_timed_out,
+        gave_up=phase_state.has_given_up,
         solver_steps=phase_state.n_tried_steps,
         minima=minima,
     )
 
 
 class _PhaseContext(NamedTuple):
-    """Arguments of a phase's loop that do not change."""
+    """Arguments of the integration loop that are constant during a phase."""
 
-    stepper: _SolverStepper
+    solver_stepper: _SolverStepper
     monitored_functions: MonitoredFunctions
-    options: StepOptions
+    step_options: StepOptions
     event_options: EventSearchOptions
 
 
 def _init_phase_state(
     phase_context: _PhaseContext, start_state: StateArray, is_active: Bool[Array, ""]
 ) -> _PhaseState:
-    """Return the state of the loop before the first step.
+    """Return the state of the integration loop before the first step.
 
-    Every number that the loop will batch or perturb is batched or perturbed from the start.
-    Otherwise JAX would trace the loop again for each round in which these properties spread.
+    All numbers that the loop will batch or differentiate are batched or differentiated from the
+    start. Otherwise JAX would trace the loop again whenever one more number becomes batched or
+    differentiated.
     """
     solver_stepper, monitored_functions, options, _ = phase_context
     zero_time = 0.0 * start_state[0]
     zero_count = jnp.where(is_active, 0, 0).astype(jnp.int32)
     zero_values = (
         jnp.zeros(
-            jax.eval_shape(monitored_functions.evaluate, start_state).shape, start_state.dtype
+            jax.eval_shape(monitored_functions.evaluate_monitored, start_state).shape,
+            start_state.dtype,
         )
         + zero_time
     )
-    false_flag = is_active & False
-    zero_number = lax.stop_gradient(zero_time)
-    solver_state, controller_state = solver_stepper.init_states(start_state, options)
-    is_crossing = jnp.zeros((monitored_functions.n_guards,), bool) | false_flag
+    false_array = is_active & False
+    float_zero = lax.stop_gradient(zero_time)
+    solver_state, controller_state = solver_stepper.init_solver_and_controller(start_state, options)
+    is_guard_crossing = jnp.zeros((monitored_functions.n_guards,), bool) | false_array
     return _PhaseState(
-        purpose=jnp.where(is_active, StepPurpose.START, StepPurpose.DONE).astype(jnp.int32),
+        step_purpose=jnp.where(is_active, StepPurpose.START, StepPurpose.DONE).astype(jnp.int32),
         accepted_step=AcceptedPhaseStep(
             zero_time, start_state, solver_state, zero_values, zero_values
         ),
-        next_length=zero_time,  # The first step has length zero and evaluates the start.
-        controller_state=jax.tree.map(lambda x: x + zero_number, controller_state),
-        search=_EventSearch(
-            is_crossing,
-            zero_number,
-            zero_number,
-            zero_number,
+        next_step_length=zero_time,  # The first step has length zero and evaluates the start.
+        controller_state=jax.tree.map(lambda x: x + float_zero, controller_state),
+        event_search=_EventSearch(
+            is_guard_crossing,
+            float_zero,
+            float_zero,
+            float_zero,
             zero_count,
             zero_count,
-            zero_number,
+            float_zero,
         ),
-        minimum=make_empty_minimum(monitored_functions, start_state),
-        refinement=MinimumRefinement(
+        interior_minimum=make_empty_interior_minimum(monitored_functions, start_state),
+        minimum_refinement=MinimumRefinement(
             zero_count,
             zero_count,
-            zero_number,
-            zero_number,
+            float_zero,
+            float_zero,
             zero_values[monitored_functions.n_guards :] + jnp.inf,
         ),
-        guard=zero_count - 1,
-        timed_out=false_flag,
-        gave_up=false_flag,
+        triggered_guard=zero_count - 1,
+        has_timed_out=false_array,
+        has_given_up=false_array,
         n_tried_steps=zero_count,
     )
 
 
-def _advance_phase_state(context: _PhaseContext, phase_state: _PhaseState) -> _PhaseState:
-    """Take one solver step, update the searches for the event and for minima, and return the loop's
-    state.
+def _advance_phase_state(phase_context: _PhaseContext, phase_state: _PhaseState) -> _PhaseState:
+    """Return the loop state after one solver step, with updated searches for the event and for
+    minima.
     """
-    _, monitored_functions, options, event_options = context
-    n_guards, event_search = monitored_functions.n_guards, phase_state.search
-    previous_step, length = phase_state.accepted_step, phase_state.next_length
-    is_starting = phase_state.purpose == StepPurpose.START
-    is_searching = phase_state.purpose == StepPurpose.EVENT_SEARCH
-    accepted_step, error_estimate = _try_solver_step(context, phase_state)
-    guard_values, guard_rates = accepted_step.values[:n_guards], accepted_step.rates[:n_guards]
-    ends_phase, is_falling = find_guards_met_at_start(
+    _, monitored_functions, options, event_options = phase_context
+    n_guards, event_search = monitored_functions.n_guards, phase_state.event_search
+    previous_step, length = phase_state.accepted_step, phase_state.next_step_length
+    is_starting = phase_state.step_purpose == StepPurpose.START
+    is_searching_event = phase_state.step_purpose == StepPurpose.EVENT_SEARCH
+    accepted_step, error_estimate = _try_solver_step(phase_context, phase_state)
+    guard_values = accepted_step.monitored_values[:n_guards]
+    guard_rates = accepted_step.monitored_rates[:n_guards]
+    ends_phase, is_guard_falling = find_guards_met_at_start(
         monitored_functions, guard_values, guard_rates
     )
     first_met_guard = jnp.argmax(ends_phase).astype(jnp.int32)
     # An event at time zero is searched for like any other, because its time depends on the start.
-    begins_search_at_start = is_starting & is_falling[first_met_guard]
-    has_immediate_event = is_starting & jnp.any(ends_phase) & ~is_falling[first_met_guard]
-    step_assessment = _assess_solver_step(context, phase_state, accepted_step, error_estimate)
+    begins_search_at_start = is_starting & is_guard_falling[first_met_guard]
+    has_immediate_event = is_starting & jnp.any(ends_phase) & ~is_guard_falling[first_met_guard]
+    step_assessment = _assess_solver_step(phase_context, phase_state, accepted_step, error_estimate)
     event_proposal = _propose_event_time(event_search, guard_values, guard_rates, length)
     # A try confirms the event if it changes the event's time by little compared with the step. For
     # an event much earlier than the step's end, the change is also compared with the time since the
     # phase began. The comparison is skipped if the change is only the guard's round-off.
-    constant_proposal, constant_length, start_time = lax.stop_gradient(
-        (event_proposal.length, length, previous_step.time)
+    proposed_length_value, constant_length, start_time = lax.stop_gradient(
+        (event_proposal.proposed_step_length, length, previous_step.end_time)
     )
-    event_time_change = jnp.abs(constant_proposal - constant_length)
-    is_small_change = event_time_change <= event_options.max_confirmed_change * (
-        start_time + constant_proposal
+    event_time_change = jnp.abs(proposed_length_value - constant_length)
+    is_length_change_small = event_time_change <= event_options.max_confirmed_length_change * (
+        start_time + proposed_length_value
     )
-    is_search_stalled = event_time_change >= event_options.min_stalled_ratio * event_search.change
+    is_search_stalled = (
+        event_time_change
+        >= event_options.min_stalled_change_ratio * event_search.last_length_change
+    )
     is_event_confirmed = (event_time_change <= event_search.time_tolerance) & (
-        is_small_change | is_search_stalled
+        is_length_change_small | is_search_stalled
     )
-    is_at_zero, lowest_guard = is_guard_at_roundoff(
-        monitored_functions, event_search.is_crossing, guard_values
+    is_guard_at_zero, lowest_guard = is_guard_at_roundoff(
+        monitored_functions, event_search.is_guard_crossing, guard_values
     )
     event_proposal = event_proposal._replace(
-        guard=jnp.where(is_at_zero, lowest_guard, event_proposal.guard)
+        proposing_guard=jnp.where(is_guard_at_zero, lowest_guard, event_proposal.proposing_guard)
     )
-    n_confirmed = event_search.n_confirmed + (is_searching & (is_event_confirmed | is_at_zero))
-    has_arrived = is_searching & (n_confirmed >= event_options.n_confirmations)
+    n_confirmed_proposals = event_search.n_confirmed_proposals + (
+        is_searching_event & (is_event_confirmed | is_guard_at_zero)
+    )
+    is_at_event = is_searching_event & (
+        n_confirmed_proposals >= event_options.n_required_confirmations
+    )
 
-    timed_out = step_assessment.is_accepted & (accepted_step.time >= options.max_phase_time)
-    timed_out = timed_out | (has_arrived & (accepted_step.time > options.max_phase_time))
-    is_stuck = step_assessment.is_stuck | (
-        is_searching & ~has_arrived & (event_search.n_iterations >= options.max_event_iterations)
+    has_timed_out = step_assessment.is_accepted & (accepted_step.end_time >= options.max_phase_time)
+    has_timed_out = has_timed_out | (
+        is_at_event & (accepted_step.end_time > options.max_phase_time)
     )
-    is_phase_end = has_immediate_event | has_arrived | timed_out | is_stuck
-    begins_event_search = step_assessment.has_crossed | begins_search_at_start
-    purpose = jnp.where(is_starting, StepPurpose.INTEGRATION, phase_state.purpose)
-    purpose = jnp.where(begins_event_search, StepPurpose.EVENT_SEARCH, purpose)
-    purpose = jnp.where(is_phase_end, StepPurpose.DONE, purpose).astype(jnp.int32)
-    following_length = jnp.where(
-        begins_search_at_start, 0.0, lax.stop_gradient(step_assessment.following_length)
+    is_step_too_short = step_assessment.is_step_too_short | (
+        is_searching_event
+        & ~is_at_event
+        & (event_search.n_iterations >= options.max_event_iterations)
     )
-    following_length = jnp.where(is_searching, event_proposal.length, following_length)
-    is_crossing = jnp.where(
-        step_assessment.has_crossed, step_assessment.is_crossing, event_search.is_crossing
+    is_phase_end = has_immediate_event | is_at_event | has_timed_out | is_step_too_short
+    begins_event_search = step_assessment.has_guard_crossed | begins_search_at_start
+    step_purpose = jnp.where(is_starting, StepPurpose.INTEGRATION, phase_state.step_purpose)
+    step_purpose = jnp.where(begins_event_search, StepPurpose.EVENT_SEARCH, step_purpose)
+    step_purpose = jnp.where(is_phase_end, StepPurpose.DONE, step_purpose).astype(jnp.int32)
+    following_step_length = jnp.where(
+        begins_search_at_start, 0.0, lax.stop_gradient(step_assessment.following_step_length)
+    )
+    following_step_length = jnp.where(
+        is_searching_event, event_proposal.proposed_step_length, following_step_length
+    )
+    is_guard_crossing = jnp.where(
+        step_assessment.has_guard_crossed,
+        step_assessment.is_guard_crossing,
+        event_search.is_guard_crossing,
     )
     is_first_met_guard = begins_search_at_start & (jnp.arange(n_guards) == first_met_guard)
-    is_counted = (step_assessment.is_accepted & ~is_starting) | has_arrived
-    minimum = update_interior_minimum(
-        monitored_functions, phase_state.minimum, previous_step, accepted_step, length, is_counted
+    counts_at_start = (step_assessment.is_accepted & ~is_starting) | is_at_event
+    interior_minimum = update_interior_minimum(
+        monitored_functions,
+        phase_state.interior_minimum,
+        previous_step,
+        accepted_step,
+        length,
+        counts_at_start,
     )
-    minimum_refinement = phase_state.refinement
+    minimum_refinement = phase_state.minimum_refinement
     if monitored_functions.includes_start:
-        was_refining = phase_state.purpose == StepPurpose.REFINEMENT
+        was_refining = phase_state.step_purpose == StepPurpose.REFINEMENT
         minimum_refinement, is_refining, length_to_minimum = advance_minimum_refinement(
             minimum_refinement,
             monitored_functions,
-            minimum,
+            interior_minimum,
             accepted_step,
             length,
             was_refining,
@@ -436,77 +457,88 @@ def _advance_phase_state(context: _PhaseContext, phase_state: _PhaseState) -> _P
             is_phase_end,
             options.max_margin_search_iterations,
         )
-        purpose = jnp.where(was_refining, StepPurpose.DONE, purpose)
-        purpose = jnp.where(is_refining, StepPurpose.REFINEMENT, purpose)
-        following_length = jnp.where(is_refining, length_to_minimum, following_length)
+        step_purpose = jnp.where(was_refining, StepPurpose.DONE, step_purpose)
+        step_purpose = jnp.where(is_refining, StepPurpose.REFINEMENT, step_purpose)
+        following_step_length = jnp.where(is_refining, length_to_minimum, following_step_length)
     return _PhaseState(
-        purpose=purpose,
+        step_purpose=step_purpose,
         accepted_step=select_tree_leaves(
-            step_assessment.is_accepted | has_arrived, accepted_step, previous_step
+            step_assessment.is_accepted | is_at_event, accepted_step, previous_step
         ),
-        next_length=following_length,
+        next_step_length=following_step_length,
         controller_state=step_assessment.controller_state,
-        search=_EventSearch(
-            is_crossing=jnp.where(begins_search_at_start, is_first_met_guard, is_crossing),
-            lower_bound=jnp.where(begins_event_search, 0.0, event_proposal.lower_bound),
-            upper_bound=jnp.where(
-                begins_event_search, lax.stop_gradient(length), event_proposal.upper_bound
+        event_search=_EventSearch(
+            is_guard_crossing=jnp.where(
+                begins_search_at_start, is_first_met_guard, is_guard_crossing
+            ),
+            lower_length_bound=jnp.where(
+                begins_event_search, 0.0, event_proposal.lower_length_bound
+            ),
+            upper_length_bound=jnp.where(
+                begins_event_search, lax.stop_gradient(length), event_proposal.upper_length_bound
             ),
             time_tolerance=jnp.where(
-                step_assessment.has_crossed,
+                step_assessment.has_guard_crossed,
                 step_assessment.time_tolerance,
                 event_search.time_tolerance,
             ),
-            n_iterations=event_search.n_iterations + is_searching,
-            n_confirmed=n_confirmed,
-            change=jnp.where(begins_event_search, jnp.inf, event_time_change),
+            n_iterations=event_search.n_iterations + is_searching_event,
+            n_confirmed_proposals=n_confirmed_proposals,
+            last_length_change=jnp.where(begins_event_search, jnp.inf, event_time_change),
         ),
-        minimum=minimum,
-        refinement=minimum_refinement,
-        guard=jnp.where(
+        interior_minimum=interior_minimum,
+        minimum_refinement=minimum_refinement,
+        triggered_guard=jnp.where(
             has_immediate_event,
             first_met_guard,
-            jnp.where(has_arrived & ~timed_out, event_proposal.guard, phase_state.guard),
+            jnp.where(
+                is_at_event & ~has_timed_out,
+                event_proposal.proposing_guard,
+                phase_state.triggered_guard,
+            ),
         ),
-        timed_out=timed_out | phase_state.timed_out,
-        gave_up=is_stuck | phase_state.gave_up,
+        has_timed_out=has_timed_out | phase_state.has_timed_out,
+        has_given_up=is_step_too_short | phase_state.has_given_up,
         n_tried_steps=step_assessment.n_tried_steps,
     )
 
 
 def _try_solver_step(
-    context: _PhaseContext, phase_state: _PhaseState
+    phase_context: _PhaseContext, phase_state: _PhaseState
 ) -> tuple[AcceptedPhaseStep, Array]:
-    """Return the end of the step to try, the monitored functions at its end, and its error
+    """Return the end of one tried solver step, with the monitored functions there, and the error
     estimate.
 
-    One call of the solver and of the monitored functions serves every purpose, so that the code is
-    compiled once.
+    The same call of solver and monitored functions is used for every purpose of a step, so that
+    this code is compiled once.
     """
-    stepper, monitored_functions, options, _ = context
+    solver_stepper, monitored_functions, options, _ = phase_context
     start_state = phase_state.accepted_step.state, phase_state.accepted_step.solver_state
     if monitored_functions.includes_start:
-        minimum_start = select_by_mask(
-            phase_state.refinement.margin_index, phase_state.minimum.start_state
+        minimum_start = select_entry_by_mask(
+            phase_state.minimum_refinement.margin_index, phase_state.interior_minimum.start_state
         )
-        restarts_at_minimum = minimum_start, stepper.init_solver_state(minimum_start, options)
+        starts_at_minimum_step = (
+            minimum_start,
+            solver_stepper.init_solver_state(minimum_start, options),
+        )
         start_state = select_tree_leaves(
-            phase_state.purpose == StepPurpose.REFINEMENT, restarts_at_minimum, start_state
+            phase_state.step_purpose == StepPurpose.REFINEMENT, starts_at_minimum_step, start_state
         )
-    end_state, error_estimate, solver_state = stepper.advance_state(
-        *start_state, phase_state.next_length
+    end_state, error_estimate, solver_state = solver_stepper.take_solver_step(
+        *start_state, phase_state.next_step_length
     )
     monitored_values, monitored_rates = jax.jvp(
-        monitored_functions.evaluate, (end_state,), (stepper.vector_field(end_state),)
+        monitored_functions.evaluate_monitored,
+        (end_state,),
+        (solver_stepper.vector_field(end_state),),
     )
     error_estimate = jnp.where(jnp.all(jnp.isfinite(monitored_values)), error_estimate, jnp.inf)
     time_limit = lax.stop_gradient(options.max_phase_time)
-    start_time, is_integrating = (
-        phase_state.accepted_step.time,
-        phase_state.purpose == StepPurpose.INTEGRATION,
-    )
-    is_last_step = is_integrating & (phase_state.next_length >= time_limit - start_time)
-    end_time = jnp.where(is_last_step, time_limit, start_time + phase_state.next_length)
+    start_time = phase_state.accepted_step.end_time
+    is_integrating = phase_state.step_purpose == StepPurpose.INTEGRATION
+    is_last_step = is_integrating & (phase_state.next_step_length >= time_limit - start_time)
+    end_time = jnp.where(is_last_step, time_limit, start_time + phase_state.next_step_length)
     return AcceptedPhaseStep(
         end_time, end_state, solver_state, monitored_values, monitored_rates
     ), error_estimate
@@ -516,75 +548,80 @@ class _StepAssessment(NamedTuple):
     """Result of the examination of a tried solver step."""
 
     is_accepted: Bool[Array, ""]  # whether the step is accepted; the start is
-    has_crossed: Bool[Array, ""]  # whether the step brackets an event
-    is_crossing: Bool[Array, " n_guards"]  # guards that are not positive at the step's end
-    is_stuck: Bool[Array, ""]
-    following_length: Scalar  # length of the next step, s
+    has_guard_crossed: Bool[Array, ""]  # whether the step brackets an event
+    is_guard_crossing: Bool[Array, " n_guards"]  # guards that are not positive at the step's end
+    is_step_too_short: Bool[Array, ""]
+    following_step_length: Scalar  # length of the next step, s
     time_tolerance: Scalar  # tolerance of the event's time, s
     controller_state: Any
     n_tried_steps: Int[Array, ""]
 
 
 def _assess_solver_step(
-    context: _PhaseContext,
+    phase_context: _PhaseContext,
     phase_state: _PhaseState,
     tried_step: AcceptedPhaseStep,
     error_estimate: Array,
 ) -> _StepAssessment:
-    """Return whether the step is accepted, whether a guard crosses zero, and the next length.
+    """Return whether the tried step is accepted, whether a guard crosses zero, and the next length.
 
-    A guard may cross zero at the end of the step or inside it.
+    A guard may cross zero at the end of the step or inside the step.
     """
-    stepper, monitored_functions, options, _ = context
-    n_guards, previous_step, length = (
-        monitored_functions.n_guards,
-        phase_state.accepted_step,
-        phase_state.next_length,
-    )
-    is_starting = phase_state.purpose == StepPurpose.START
-    is_integrating = phase_state.purpose == StepPurpose.INTEGRATION
-    nominal_length = jnp.where(is_starting, options.dt0, length)
-    is_within_tolerance, next_length, controller_state = stepper.control_step(
+    solver_stepper, monitored_functions, options, _ = phase_context
+    n_guards = monitored_functions.n_guards
+    previous_step = phase_state.accepted_step
+    length = phase_state.next_step_length
+    is_starting = phase_state.step_purpose == StepPurpose.START
+    is_integrating = phase_state.step_purpose == StepPurpose.INTEGRATION
+    uninterrupted_step_length = jnp.where(is_starting, options.dt0, length)
+    is_within_tolerance, next_step_length, controller_state = solver_stepper.control_step_size(
         previous_step.state,
         tried_step.state,
         error_estimate,
-        nominal_length,
+        uninterrupted_step_length,
         phase_state.controller_state,
     )
     is_within_tolerance = is_within_tolerance & is_integrating
-    is_crossing = tried_step.values[:n_guards] <= 0.0
+    is_guard_crossing = tried_step.monitored_values[:n_guards] <= 0.0
     minimum_fractions, may_have_minimum = _find_guard_minima(
-        previous_step, tried_step.values, tried_step.rates, length, n_guards
+        previous_step, tried_step.monitored_values, tried_step.monitored_rates, length, n_guards
     )
     length_to_minimum = length * jnp.min(
-        jnp.where(may_have_minimum & ~is_crossing, minimum_fractions, 1.0)
+        jnp.where(may_have_minimum & ~is_guard_crossing, minimum_fractions, 1.0)
     )
-    must_retry = is_within_tolerance & (length_to_minimum < length)
-    has_crossed = is_within_tolerance & jnp.any(is_crossing) & ~must_retry
-    n_tried_steps = phase_state.n_tried_steps + (phase_state.purpose != StepPurpose.REFINEMENT)
-    cannot_continue = (n_tried_steps >= options.max_solver_steps) | (
-        previous_step.time + next_length == previous_step.time
+    must_shorten_step = is_within_tolerance & (length_to_minimum < length)
+    has_guard_crossed = is_within_tolerance & jnp.any(is_guard_crossing) & ~must_shorten_step
+    n_tried_steps = phase_state.n_tried_steps + (phase_state.step_purpose != StepPurpose.REFINEMENT)
+    has_step_failed = (n_tried_steps >= options.max_solver_steps) | (
+        previous_step.end_time + next_step_length == previous_step.end_time
     )
-    following_length = jnp.where(is_starting, options.dt0, next_length)
-    following_length = jnp.where(must_retry, length_to_minimum, following_length)
-    is_accepted = is_starting | (is_within_tolerance & ~has_crossed & ~must_retry)
-    end_time = jnp.where(is_accepted, tried_step.time, previous_step.time)
+    following_step_length = jnp.where(is_starting, options.dt0, next_step_length)
+    following_step_length = jnp.where(must_shorten_step, length_to_minimum, following_step_length)
+    is_accepted = is_starting | (is_within_tolerance & ~has_guard_crossed & ~must_shorten_step)
+    end_time = jnp.where(is_accepted, tried_step.end_time, previous_step.end_time)
     # The last step ends at the time limit.
-    time_left = lax.stop_gradient(options.max_phase_time - end_time)
-    following_length = jnp.minimum(following_length, time_left)
+    remaining_phase_time = lax.stop_gradient(options.max_phase_time - end_time)
+    following_step_length = jnp.minimum(following_step_length, remaining_phase_time)
     event_length_guess = _guess_event_length(
-        previous_step, tried_step.values, tried_step.rates, length, n_guards, is_crossing
+        previous_step,
+        tried_step.monitored_values,
+        tried_step.monitored_rates,
+        length,
+        n_guards,
+        is_guard_crossing,
     )
-    time_resolution = 1e3 * jnp.finfo(length.dtype).eps * tried_step.time
+    time_resolution = 1e3 * jnp.finfo(length.dtype).eps * tried_step.end_time
     return _StepAssessment(
         is_accepted=is_accepted,
-        has_crossed=has_crossed,
-        is_crossing=is_crossing,
-        is_stuck=is_integrating & ~has_crossed & cannot_continue,
-        following_length=jnp.where(has_crossed, event_length_guess, following_length),
+        has_guard_crossed=has_guard_crossed,
+        is_guard_crossing=is_guard_crossing,
+        is_step_too_short=is_integrating & ~has_guard_crossed & has_step_failed,
+        following_step_length=jnp.where(
+            has_guard_crossed, event_length_guess, following_step_length
+        ),
         time_tolerance=lax.stop_gradient(jnp.maximum(options.rtol * length, time_resolution)),
         controller_state=select_tree_leaves(
-            is_integrating & ~must_retry, controller_state, phase_state.controller_state
+            is_integrating & ~must_shorten_step, controller_state, phase_state.controller_state
         ),
         n_tried_steps=n_tried_steps,
     )
@@ -597,24 +634,37 @@ def _find_guard_minima(
     length: Scalar,
     n_guards: int,
 ) -> tuple[Array, Array]:
-    """Return, for each guard, the fraction of the step to its minimum, and whether it may be
+    """Return the fraction of the step to each guard's minimum, and whether each guard may be
     negative.
 
-    The cubic through values and rates does not fall below the least of its Bernstein coefficients,
-    so a guard with positive coefficients stays positive. Otherwise the step is repeated up to the
-    cubic's minimum, at most nine tenths of the step. Shorter steps have coefficients closer to the
-    guard, until these are positive or a step ends where the guard is negative.
+    The cubic through values and rates is nowhere below the smallest of its Bernstein coefficients,
+    so that a guard with positive coefficients stays positive. Otherwise the step is repeated up to
+    the minimum of the cubic, at most nine tenths of the step. In shorter steps, the coefficients
+    are closer to the guard. The repetition ends when the coefficients are positive or the guard is
+    negative at the end of a step.
     """
-    v0, r0, v1, r1 = lax.stop_gradient(
-        (previous_step.values, previous_step.rates, guard_values, guard_rates)
+    start_guards, start_rates, end_guards, end_rates = lax.stop_gradient(
+        (previous_step.monitored_values, previous_step.monitored_rates, guard_values, guard_rates)
     )
-    v0, r0, v1, r1 = v0[:n_guards], r0[:n_guards], v1[:n_guards], r1[:n_guards]
+    start_guards = start_guards[:n_guards]
+    start_rates = start_rates[:n_guards]
+    end_guards = end_guards[:n_guards]
+    end_rates = end_rates[:n_guards]
     length = lax.stop_gradient(length)
-    first_coefficient, second_coefficient = v0 + r0 * length / 3.0, v1 - r1 * length / 3.0
-    minimum_fractions = jnp.clip(find_cubic_minimum(v0, r0 * length, v1, r1 * length)[0], 0.1, 0.9)
-    advances_time = previous_step.time + minimum_fractions * length > previous_step.time
-    may_be_negative = (jnp.minimum(first_coefficient, second_coefficient) <= 0.0) & (r1 >= 0.0)
-    return minimum_fractions, may_be_negative & advances_time
+    first_bernstein_coefficient = start_guards + start_rates * length / 3.0
+    second_bernstein_coefficient = end_guards - end_rates * length / 3.0
+    minimum_fractions = jnp.clip(
+        find_cubic_minimum(start_guards, start_rates * length, end_guards, end_rates * length)[0],
+        0.1,
+        0.9,
+    )
+    does_step_advance_time = (
+        previous_step.end_time + minimum_fractions * length > previous_step.end_time
+    )
+    may_be_negative = (
+        jnp.minimum(first_bernstein_coefficient, second_bernstein_coefficient) <= 0.0
+    ) & (end_rates >= 0.0)
+    return minimum_fractions, may_be_negative & does_step_advance_time
 
 
 def _guess_event_length(
@@ -623,115 +673,141 @@ def _guess_event_length(
     guard_rates: Array,
     length: Scalar,
     n_guards: int,
-    is_crossing: Array,
+    is_guard_crossing: Array,
 ) -> Scalar:
     """Return the time from the step's start to the earliest zero of the crossing guards' cubics, s.
 
-    The zero is found by the secant, then by Newton's method.
+    The zero is located by the secant, then by Newton's method.
     """
-    v0, r0, v1, r1 = lax.stop_gradient(
-        (previous_step.values, previous_step.rates * length, guard_values, guard_rates * length)
+    start_guards, start_rates, end_guards, end_rates = lax.stop_gradient(
+        (
+            previous_step.monitored_values,
+            previous_step.monitored_rates * length,
+            guard_values,
+            guard_rates * length,
+        )
     )
-    v0, r0, v1, r1 = v0[:n_guards], r0[:n_guards], v1[:n_guards], r1[:n_guards]
-    guard_decrease = jnp.where(is_crossing & (v0 > v1), v0 - v1, 1.0)
-    zero_fraction = jnp.where(is_crossing, jnp.clip(v0 / guard_decrease, 0.0, 1.0), 1.0)
+    start_guards = start_guards[:n_guards]
+    start_rates = start_rates[:n_guards]
+    end_guards = end_guards[:n_guards]
+    end_rates = end_rates[:n_guards]
+    guard_decrease = jnp.where(
+        is_guard_crossing & (start_guards > end_guards), start_guards - end_guards, 1.0
+    )
+    zero_fraction = jnp.where(
+        is_guard_crossing, jnp.clip(start_guards / guard_decrease, 0.0, 1.0), 1.0
+    )
     # A guard that rises from zero, or from round-off above it, has its other zero where the cubic
     # divided by x vanishes.
-    linear_coefficient, quadratic_coefficient = 3.0 * v1 - 2.0 * r0 - r1, r0 - 2.0 * v1 + r1
+    linear_coefficient = 3.0 * end_guards - 2.0 * start_rates - end_rates
+    quadratic_coefficient = start_rates - 2.0 * end_guards + end_rates
     root_denominator = (
         jnp.sqrt(
             jnp.maximum(
-                linear_coefficient * linear_coefficient - 4.0 * r0 * quadratic_coefficient, 0.0
+                linear_coefficient * linear_coefficient - 4.0 * start_rates * quadratic_coefficient,
+                0.0,
             )
         )
         - linear_coefficient
     )
-    other_root = jnp.clip(
-        2.0 * r0 / jnp.where(root_denominator > 0.0, root_denominator, 1.0), 0.0, 1.0
+    other_parabola_zero = jnp.clip(
+        2.0 * start_rates / jnp.where(root_denominator > 0.0, root_denominator, 1.0), 0.0, 1.0
     )
-    cubic_rate = lambda zero_fraction: (
-        6.0 * zero_fraction * (zero_fraction - 1.0) * (v0 - v1)
-        + (1.0 - zero_fraction) * (1.0 - 3.0 * zero_fraction) * r0
-        + zero_fraction * (3.0 * zero_fraction - 2.0) * r1
+    cubic_rate_function = lambda zero_fraction: (
+        6.0 * zero_fraction * (zero_fraction - 1.0) * (start_guards - end_guards)
+        + (1.0 - zero_fraction) * (1.0 - 3.0 * zero_fraction) * start_rates
+        + zero_fraction * (3.0 * zero_fraction - 2.0) * end_rates
     )
-    rises_from_zero = is_crossing & (r0 > 0.0) & ((v0 == 0.0) | (cubic_rate(zero_fraction) >= 0.0))
-    zero_fraction = jnp.where(rises_from_zero, other_root, zero_fraction)
+    does_guard_rise_from_zero = (
+        is_guard_crossing
+        & (start_rates > 0.0)
+        & ((start_guards == 0.0) | (cubic_rate_function(zero_fraction) >= 0.0))
+    )
+    zero_fraction = jnp.where(does_guard_rise_from_zero, other_parabola_zero, zero_fraction)
     for _ in range(3):
-        is_falling = (cubic_rate_value := cubic_rate(zero_fraction)) < 0.0
-        fraction_change = evaluate_cubic(zero_fraction, v0, r0, v1, r1) / jnp.where(
-            is_falling, cubic_rate_value, 1.0
-        )
+        is_guard_falling = (cubic_rate_value := cubic_rate_function(zero_fraction)) < 0.0
+        fraction_change = evaluate_cubic(
+            zero_fraction, start_guards, start_rates, end_guards, end_rates
+        ) / jnp.where(is_guard_falling, cubic_rate_value, 1.0)
         zero_fraction = jnp.where(
-            is_crossing & is_falling,
+            is_guard_crossing & is_guard_falling,
             jnp.clip(zero_fraction - fraction_change, 0.0, 1.0),
             zero_fraction,
         )
-    return lax.stop_gradient(length) * jnp.min(jnp.where(is_crossing, zero_fraction, 1.0))
+    return lax.stop_gradient(length) * jnp.min(jnp.where(is_guard_crossing, zero_fraction, 1.0))
 
 
 class _EventProposal(NamedTuple):
-    """Newton's next proposal for an event's time, and the remaining bracket, s from the step's
-    start.
+    """Next proposal of Newton's method for the time of an event, and the remaining bracket, s from
+    the step's start.
     """
 
-    length: Scalar
-    guard: Int[Array, ""]
-    lower_bound: Scalar
-    upper_bound: Scalar
+    proposed_step_length: Scalar
+    proposing_guard: Int[Array, ""]
+    lower_length_bound: Scalar
+    upper_length_bound: Scalar
 
 
 def _propose_event_time(
     event_search: _EventSearch, guard_values: Array, guard_rates: Array, length: Scalar
 ) -> _EventProposal:
-    """Return the earliest of the event times that the crossing guards propose.
+    """Return the earliest of the event times that Newton's method proposes for the crossing guards.
 
     Bisection keeps the proposal inside the shrinking bracket. The proposal carries derivatives:
     after k proposals in the quadratic regime, derivatives are accurate to order 2^k - 1.
     """
-    is_falling = event_search.is_crossing & (guard_rates < 0.0)
-    time_change = -guard_values / jnp.where(is_falling, guard_rates, -1.0)
+    is_guard_falling = event_search.is_guard_crossing & (guard_rates < 0.0)
+    time_to_zero = -guard_values / jnp.where(is_guard_falling, guard_rates, -1.0)
     # A guard that rises below zero has crossed at an unknown earlier time.
-    time_of_missed_event = jnp.where(
-        event_search.is_crossing & (guard_values < 0.0), -jnp.inf, jnp.inf
+    missed_event_time = jnp.where(
+        event_search.is_guard_crossing & (guard_values < 0.0), -jnp.inf, jnp.inf
     )
-    proposed_lengths = jnp.where(is_falling, length + time_change, time_of_missed_event)
+    proposed_step_lengths = jnp.where(is_guard_falling, length + time_to_zero, missed_event_time)
     # If no crossing guard falls here, the lowest of the crossing guards is taken.
-    lowest_guard = jnp.argmin(jnp.where(event_search.is_crossing, guard_values, jnp.inf))
+    lowest_guard = jnp.argmin(jnp.where(event_search.is_guard_crossing, guard_values, jnp.inf))
     guard = jnp.where(
-        jnp.any(proposed_lengths < jnp.inf), jnp.argmin(proposed_lengths), lowest_guard
+        jnp.any(proposed_step_lengths < jnp.inf), jnp.argmin(proposed_step_lengths), lowest_guard
     ).astype(jnp.int32)
     # This happens at the start of the step.
-    is_rising = (guard_values == 0.0) & (guard_rates > 0.0)
-    is_before_event = jnp.all(
-        jnp.where(event_search.is_crossing, (guard_values > 0.0) | is_rising, True)
+    is_guard_rising = (guard_values == 0.0) & (guard_rates > 0.0)
+    is_step_before_event = jnp.all(
+        jnp.where(event_search.is_guard_crossing, (guard_values > 0.0) | is_guard_rising, True)
     )
-    lower_bound = jnp.where(is_before_event, lax.stop_gradient(length), event_search.lower_bound)
-    upper_bound = jnp.where(is_before_event, event_search.upper_bound, lax.stop_gradient(length))
-    earliest_proposal = proposed_lengths[guard]
+    lower_length_bound = jnp.where(
+        is_step_before_event, lax.stop_gradient(length), event_search.lower_length_bound
+    )
+    upper_length_bound = jnp.where(
+        is_step_before_event, event_search.upper_length_bound, lax.stop_gradient(length)
+    )
+    earliest_proposed_length = proposed_step_lengths[guard]
     # A proposal within round-off of a collapsed bracket counts as inside.
-    is_proposal_inside = (earliest_proposal >= lower_bound - event_search.time_tolerance) & (
-        earliest_proposal <= upper_bound + event_search.time_tolerance
-    )
+    is_proposal_inside = (
+        earliest_proposed_length >= lower_length_bound - event_search.time_tolerance
+    ) & (earliest_proposed_length <= upper_length_bound + event_search.time_tolerance)
     # If round-off moves Newton's proposal out of the bracket, its derivative is still valid.
-    finite_proposal = jnp.where(jnp.isfinite(earliest_proposal), earliest_proposal, 0.0)
-    bisected_length = 0.5 * (lower_bound + upper_bound) + (
-        finite_proposal - lax.stop_gradient(finite_proposal)
+    finite_proposed_length = jnp.where(
+        jnp.isfinite(earliest_proposed_length), earliest_proposed_length, 0.0
     )
-    next_length = jnp.where(is_proposal_inside, finite_proposal, bisected_length)
-    return _EventProposal(next_length, guard, lower_bound, upper_bound)
+    bisected_step_length = 0.5 * (lower_length_bound + upper_length_bound) + (
+        finite_proposed_length - lax.stop_gradient(finite_proposed_length)
+    )
+    next_step_length = jnp.where(is_proposal_inside, finite_proposed_length, bisected_step_length)
+    return _EventProposal(next_step_length, guard, lower_length_bound, upper_length_bound)
 
 
 def sample_phase(
     field: VectorField, start: StateArray, duration: Scalar, n_samples: int, options: StepOptions
 ) -> Float[Array, "n_samples dim"]:
-    """Return the states at `n_samples` equal times of a phase, both ends included, at solver
-    accuracy.
+    """Return the states at `n_samples` equally spaced times of a phase, at the accuracy of the
+    solver.
+
+    The first and the last sample are at the ends of the phase.
     """
-    stepper = _make_stepper(field, options, EVENT_SEARCH_OPTIONS.max_step_growth)
+    solver_stepper = _make_stepper(field, options, EVENT_SEARCH_OPTIONS.max_step_growth)
     sample_interval = duration / (n_samples - 1)
 
     def integrate_to_next(state: StateArray, _sample: None) -> tuple[StateArray, StateArray]:
-        next_state = _integrate_sample_interval(stepper, state, sample_interval, options)
+        next_state = _integrate_sample_interval(solver_stepper, state, sample_interval, options)
         return next_state, next_state
 
     _, states = lax.scan(integrate_to_next, start, None, length=n_samples - 1)
@@ -739,34 +815,38 @@ def sample_phase(
 
 
 def _integrate_sample_interval(
-    solver_stepper: _SolverStepper, state: StateArray, interval: Scalar, options: StepOptions
+    solver_stepper: _SolverStepper,
+    state: StateArray,
+    sampled_duration: Scalar,
+    options: StepOptions,
 ) -> StateArray:
-    """Return the state after the time `interval`, s, by adaptive steps of which the last ends
-    exactly.
+    """Return the state after the time `sampled_duration`, s, integrated by adaptive steps.
+
+    The last step ends exactly at this time.
     """
 
-    def advance_interval(loop_carry: tuple) -> tuple:
+    def take_interval_step(loop_carry: tuple) -> tuple:
         time, state, solver_state, length, controller_state, n_tried_steps = loop_carry
-        step_length = jnp.minimum(length, interval - time)
-        end_state, error_estimate, end_solver_state = solver_stepper.advance_state(
+        step_length = jnp.minimum(length, sampled_duration - time)
+        end_state, error_estimate, end_solver_state = solver_stepper.take_solver_step(
             state, solver_state, step_length
         )
-        is_within_tolerance, next_length, controller_state = solver_stepper.control_step(
+        is_within_tolerance, next_step_length, controller_state = solver_stepper.control_step_size(
             state, end_state, error_estimate, step_length, controller_state
         )
-        is_last_step = is_within_tolerance & (step_length >= interval - time)
+        is_last_step = is_within_tolerance & (step_length >= sampled_duration - time)
         time = jnp.where(
-            is_last_step, interval, jnp.where(is_within_tolerance, time + step_length, time)
+            is_last_step, sampled_duration, jnp.where(is_within_tolerance, time + step_length, time)
         )
         state, solver_state = select_tree_leaves(
             is_within_tolerance, (end_state, end_solver_state), (state, solver_state)
         )
-        return time, state, solver_state, next_length, controller_state, n_tried_steps + 1
+        return time, state, solver_state, next_step_length, controller_state, n_tried_steps + 1
 
-    needs_step = lambda c: (c[0] < interval) & (c[-1] < options.max_solver_steps)
+    needs_step = lambda c: (c[0] < sampled_duration) & (c[-1] < options.max_solver_steps)
     zero_count = jnp.zeros((), jnp.int32)
-    solver_state, controller_state = solver_stepper.init_states(state, options)
-    zero_time = jnp.zeros_like(interval)
+    solver_state, controller_state = solver_stepper.init_solver_and_controller(state, options)
+    zero_time = jnp.zeros_like(sampled_duration)
     loop_carry = (
         zero_time,
         state,
@@ -775,4 +855,4 @@ def _integrate_sample_interval(
         controller_state,
         zero_count,
     )
-    return lax.while_loop(needs_step, advance_interval, loop_carry)[1]
+    return lax.while_loop(needs_step, take_interval_step, loop_carry)[1]

@@ -35,28 +35,32 @@ users do not change them while a process runs."""
 _program_by_key: OrderedDict[Hashable, Callable] = OrderedDict()
 
 
-class _NoKeyError(Exception):
-    """Error for a function that refers to a traced value, or to an object that can change
-    unnoticed.
+class _UncacheableFunctionError(Exception):
+    """Error for a function without a key, which refers to a traced value or to an object that can
+    change unnoticed.
     """
 
 
 @dataclasses.dataclass(frozen=True)
 class _IdentityKey:
-    """Key of an object that is compared by identity. The key contains the object, so its address
-    stays in use.
+    """Key of an object that is compared by identity.
+
+    The key contains the object, so that its address is not reused.
     """
 
-    content: Any
+    identified_object: Any
 
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _IdentityKey) and self.content is other.content
+    def __eq__(self, other_key: object) -> bool:
+        return (
+            isinstance(other_key, _IdentityKey)
+            and self.identified_object is other_key.identified_object
+        )
 
     def __hash__(self) -> int:
-        return id(self.content)
+        return id(self.identified_object)
 
 
-def call_compiled(function: Callable, constants: Any, *arguments: Any) -> Any:
+def call_compiled_program(function: Callable, constants: Any, *arguments: Any) -> Any:
     """Return `function(constants, *arguments)`, computed by one compiled program for equal
     `constants`.
 
@@ -74,8 +78,8 @@ def find_program(function: Callable, constants: Any, *arguments: Any) -> Callabl
     """Return the compiled program for equal `constants` and arguments of these types, or None if no
     key exists.
 
-    The types of the arguments belong to the key. Each program is therefore traced once, while
-    `constants` has the values from which the key was made.
+    The key contains the types of the arguments. Each program is therefore traced once, when
+    `constants` has the values from which the key is made.
     """
     if is_inside_jit():
         return None
@@ -83,7 +87,7 @@ def find_program(function: Callable, constants: Any, *arguments: Any) -> Callabl
     try:
         argument_type_keys = tree_structure, tuple(map(jax.typeof, leaves))
         program_key = (function, argument_type_keys, _make_key(constants, frozenset()))
-    except _NoKeyError:
+    except _UncacheableFunctionError:
         return None
     if program_key not in _program_by_key:
         _program_by_key[program_key] = jax.jit(functools.partial(function, constants))
@@ -94,13 +98,13 @@ def find_program(function: Callable, constants: Any, *arguments: Any) -> Callabl
 
 
 def _make_key(keyed_value: Any, enclosing_ids: frozenset) -> Hashable:
-    """Return a key that is equal for two values only if both lead to the same program.
+    """Return the key of a value. Equal keys belong to values that lead to the same program.
 
-    `enclosing_ids` are the identities of the objects that contain the value; a reference to one of
-    them raises an error.
+    - `enclosing_ids`: identities of the objects that contain the value. A reference to one of them
+      raises `_UncacheableFunctionError`.
     """
     if isinstance(keyed_value, jax.core.Tracer) or id(keyed_value) in enclosing_ids:
-        raise _NoKeyError
+        raise _UncacheableFunctionError
     make_inner_key = lambda x: _make_key(x, enclosing_ids | {id(keyed_value)})
     value_type = type(keyed_value)
     if keyed_value is None or isinstance(
@@ -113,7 +117,7 @@ def _make_key(keyed_value: Any, enclosing_ids: frozenset) -> Hashable:
         return value_type, keyed_value.weak_type, make_inner_key(np.asarray(keyed_value))
     if isinstance(keyed_value, np.ndarray | np.generic):
         if keyed_value.dtype == object:
-            raise _NoKeyError
+            raise _UncacheableFunctionError
         return (
             value_type,
             keyed_value.shape,
@@ -124,7 +128,8 @@ def _make_key(keyed_value: Any, enclosing_ids: frozenset) -> Hashable:
         return value_type, tuple(map(make_inner_key, keyed_value))
     if isinstance(keyed_value, dict):
         return value_type, tuple(
-            (make_inner_key(dict_key), make_inner_key(x)) for dict_key, x in keyed_value.items()
+            (make_inner_key(dictionary_key), make_inner_key(x))
+            for dictionary_key, x in keyed_value.items()
         )
     if isinstance(keyed_value, types.FunctionType):
         return value_type, _make_function_key(keyed_value, enclosing_ids | {id(keyed_value)})
@@ -135,8 +140,8 @@ def _make_key(keyed_value: Any, enclosing_ids: frozenset) -> Hashable:
     ):
         return _IdentityKey(keyed_value)
     if isinstance(keyed_value, functools.partial):
-        partial_parts = (keyed_value.func, keyed_value.args, keyed_value.keywords)
-        return value_type, tuple(map(make_inner_key, partial_parts))
+        partial_function_parts = (keyed_value.func, keyed_value.args, keyed_value.keywords)
+        return value_type, tuple(map(make_inner_key, partial_function_parts))
     if isinstance(keyed_value, types.MethodType):
         return (
             value_type,
@@ -149,12 +154,14 @@ def _make_key(keyed_value: Any, enclosing_ids: frozenset) -> Hashable:
         keyed_value.__module__
     ):
         return _IdentityKey(keyed_value), make_inner_key(keyed_value.__wrapped__)
-    fixed_types = (types.BuiltinFunctionType, jax.Array, np.ufunc, np.dtype)
-    if isinstance(keyed_value, fixed_types) or value_type.__module__.startswith(("jax", "numpy")):
+    immutable_types = (types.BuiltinFunctionType, jax.Array, np.ufunc, np.dtype)
+    if isinstance(keyed_value, immutable_types) or value_type.__module__.startswith(
+        ("jax", "numpy")
+    ):
         return _IdentityKey(keyed_value)
     if dataclasses.is_dataclass(keyed_value):
         return make_inner_key(value_type), make_inner_key(vars(keyed_value))
-    raise _NoKeyError
+    raise _UncacheableFunctionError
 
 
 def _is_in_unchanging_package(module_name: str | None) -> bool:
@@ -163,8 +170,8 @@ def _is_in_unchanging_package(module_name: str | None) -> bool:
 
 
 def _make_class_key(value_type: type, enclosing_ids: frozenset) -> Hashable:
-    """Return the key of a class, with the keys of its methods and constants if a user defines
-    it.
+    """Return the key of a class. The key of a user's class contains those of its methods and
+    constants.
     """
     if _is_in_unchanging_package(value_type.__module__):
         return _IdentityKey(value_type)
@@ -193,14 +200,15 @@ def _make_function_key(function: types.FunctionType, enclosing_ids: frozenset) -
             closure_cell.cell_contents for closure_cell in function.__closure__ or ()
         )
     except ValueError:  # A cell of the closure has no value yet.
-        raise _NoKeyError from None
-    bound_values = (cell_values, function.__defaults__, function.__kwdefaults__)
-    return function.__code__, global_keys, _make_key(bound_values, enclosing_ids)
+        raise _UncacheableFunctionError from None
+    bound_argument_values = (cell_values, function.__defaults__, function.__kwdefaults__)
+    return function.__code__, global_keys, _make_key(bound_argument_values, enclosing_ids)
 
 
-def _make_scope_key(scope: dict, names: set[str], enclosing_ids: frozenset) -> Hashable:
-    """Return the names of a scope's objects and their keys; names of a module are followed into
-    the module.
+def _make_scope_key(objects_by_name: dict, names: set[str], enclosing_ids: frozenset) -> Hashable:
+    """Return the keys of the objects with these names, together with the names.
+
+    A module is replaced by its objects with these names.
     """
 
     def make_entry_key(value: Any) -> Hashable:
@@ -210,7 +218,11 @@ def _make_scope_key(scope: dict, names: set[str], enclosing_ids: frozenset) -> H
             return _IdentityKey(value)
         return _IdentityKey(value), _make_scope_key(vars(value), names, enclosing_ids | {id(value)})
 
-    return tuple((name, make_entry_key(scope[name])) for name in sorted(names) if name in scope)
+    return tuple(
+        (name, make_entry_key(objects_by_name[name]))
+        for name in sorted(names)
+        if name in objects_by_name
+    )
 
 
 def _iterate_code_objects(code_object: types.CodeType) -> Iterator[types.CodeType]:

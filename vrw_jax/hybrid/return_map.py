@@ -1,4 +1,4 @@
-"""Return maps of hybrid simulations, which carry the termination of each simulation."""
+"""Return maps of hybrid systems, with the termination of each simulation."""
 
 import dataclasses
 from collections.abc import Callable, Sequence
@@ -17,12 +17,12 @@ class ReturnMap:
     """Map from section coordinates to the section coordinates after `events` events of a
     simulation.
 
-    The map is NaN if the simulation ends early, so that no method takes its last state for a
-    return. `solve_fixed_point` reports the termination with the fixed point.
+    The map is NaN if the simulation ends early, so that its last state is not used as a return.
+    `solve_fixed_point` returns the termination with the fixed point.
 
     - `modes`: modes of the system, as in `simulate_hybrid`;
-    - `embed`: function that returns the state for section coordinates, where the simulation begins;
-    - `project`: function that returns the section coordinates of a state after the last event;
+    - `embed`: function from section coordinates to the state in which the simulation begins;
+    - `project`: function from the state after the last event to its section coordinates;
     - `events`: number of events of one return;
     - `mode`: index of the mode in which the simulation begins;
     - `options`: options of the simulation.
@@ -51,8 +51,9 @@ class ReturnMap:
         ).astype(section_coordinates.dtype)
 
     def find_termination(self, x: Float[Array, " n"], period_n: int = 1) -> Int[Array, ""]:
-        """Return the `Termination` of the first of `period_n` returns that ends early; else that
-        of the last.
+        """Return the `Termination` of the first of `period_n` returns that ends early.
+
+        If no return ends early, the result is the termination of the last return.
         """
         x = lax.stop_gradient(x)
         termination = jnp.full((), int(Termination.MAX_EVENTS_REACHED), jnp.int32)

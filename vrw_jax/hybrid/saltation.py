@@ -1,6 +1,5 @@
-"""Determinant of the flow's Jacobian through modes and events.
-
-It follows from Liouville's formula and from saltation matrices.
+"""Determinant of the flow's Jacobian through modes and events, by Liouville's formula and saltation
+matrices.
 """
 
 from collections.abc import Callable, Sequence
@@ -12,8 +11,8 @@ from jax.typing import ArrayLike
 from jaxtyping import Array
 
 from vrw_jax.hybrid.phase_integration import sample_phase
-from vrw_jax.hybrid.program_cache import call_compiled
-from vrw_jax.hybrid.simulation import Guard, HybridSolution, Mode, normalize_modes
+from vrw_jax.hybrid.program_cache import call_compiled_program
+from vrw_jax.hybrid.simulation import Guard, HybridSolution, Mode, convert_modes_to_tuple
 from vrw_jax.numerics import Scalar, StepOptions, forbid_reverse_mode
 from vrw_jax.validation import check_reals
 
@@ -27,10 +26,11 @@ def flow_jacobian_determinant(
     """Return the determinant of the final state's Jacobian with respect to `start`, after the last
     event.
 
-    It is the exponential of the field's divergence integrated along each mode (Liouville), times
-    the determinant of each event's saltation matrix (R. I. Leine and H. Nijmeijer, Dynamics and
-    Bifurcations of Non-Smooth Mechanical Systems, 2004, section 7). For an orbit that is periodic
-    after these events, it is the product of all multipliers, including the 1 along the orbit. A
+    Each mode contributes the exponential of the integrated divergence of its field (Liouville).
+    Each event contributes the determinant of its saltation matrix (R. I. Leine and H. Nijmeijer,
+    Dynamics and Bifurcations of Non-Smooth Mechanical Systems, 2004, section 7). For an orbit that
+    is periodic after these events, the result is the product of all multipliers, including the
+    multiplier 1 along the orbit. A
     return map's Jacobian loses the digits of that product if a guard is grazed, because its entries
     grow as one over the guard's rate.
 
@@ -38,9 +38,11 @@ def flow_jacobian_determinant(
     mode.
     """
     options = StepOptions() if options is None else options
-    modes, start = normalize_modes(modes), check_reals("start", start)
-    determinant = call_compiled(_multiply_event_determinants, modes, start, solution, options)
-    return forbid_reverse_mode("flow_jacobian_determinant", determinant)
+    modes, start = convert_modes_to_tuple(modes), check_reals("start", start)
+    flow_determinant = call_compiled_program(
+        _multiply_event_determinants, modes, start, solution, options
+    )
+    return forbid_reverse_mode("flow_jacobian_determinant", flow_determinant)
 
 
 def _multiply_event_determinants(
@@ -59,27 +61,29 @@ def _multiply_event_determinants(
     next_modes = jnp.where(event_indices == solution.n_events - 1, solution.mode, next_modes)
     vector_fields = [mode.field for mode in modes]
 
-    def multiply_event(determinant: Array, event_data: tuple) -> tuple[Array, None]:
+    def multiply_event_determinant(
+        flow_determinant: Array, event_data: tuple
+    ) -> tuple[Array, None]:
         (
             event_index,
             start_state,
-            state_before,
-            state_after,
+            state_before_event,
+            state_after_event,
             mode_duration,
-            factor_index,
+            event_factor_index,
             next_mode,
         ) = event_data
-        next_flow = lax.switch(next_mode, vector_fields, state_after)
-        event_determinant = lax.switch(
-            factor_index,
+        field_after_event = lax.switch(next_mode, vector_fields, state_after_event)
+        event_factor = lax.switch(
+            event_factor_index,
             event_determinant_functions,
             start_state,
-            state_before,
-            next_flow,
+            state_before_event,
+            field_after_event,
             mode_duration,
         )
-        return determinant * jnp.where(
-            event_index < solution.n_events, event_determinant, 1.0
+        return flow_determinant * jnp.where(
+            event_index < solution.n_events, event_factor, 1.0
         ), None
 
     event_data_by_event = (
@@ -87,35 +91,35 @@ def _multiply_event_determinants(
         first_guards[solution.modes] + solution.guards,
         next_modes,
     )  # fmt: skip
-    return lax.scan(multiply_event, jnp.ones((), start.dtype), event_data_by_event)[0]
+    return lax.scan(multiply_event_determinant, jnp.ones((), start.dtype), event_data_by_event)[0]
 
 
 def _make_event_determinant_function(mode: Mode, guard: Guard, options: StepOptions) -> Callable:
-    """Return the function that computes the determinant's factor of one mode and of the guard that
-    ends it.
+    """Return a function that computes the factor of the determinant for one mode and the guard that
+    ends the mode.
     """
 
-    def flow_with_divergence(z: Array) -> Array:
+    def evaluate_flow_and_divergence(z: Array) -> Array:
         y = z[:-2]
         divergence = jnp.trace(jax.jacfwd(mode.field)(y))
         return jnp.concatenate([mode.field(y), jnp.stack([divergence, jnp.ones_like(divergence)])])
 
-    def evaluate_factor(
-        start: Array, state_before: Array, next_flow: Array, duration: Array
+    def evaluate_determinant_factor(
+        start: Array, state_before_event: Array, field_after_event: Array, mode_duration: Array
     ) -> Array:
         end_state = sample_phase(
-            flow_with_divergence, jnp.append(start, jnp.zeros(2)), duration, 2, options
+            evaluate_flow_and_divergence, jnp.append(start, jnp.zeros(2)), mode_duration, 2, options
         )[-1]
         # Otherwise the solver steps were exhausted.
-        is_end_reached = jnp.abs(end_state[-1] - duration) <= 1e-9 * duration
-        reset_jacobian = jax.jacfwd(guard.reset)(state_before)
-        guard_gradient = jax.jacfwd(guard.value)(state_before)
-        flow_before = mode.field(state_before)
+        has_reached_end = jnp.abs(end_state[-1] - mode_duration) <= 1e-9 * mode_duration
+        reset_jacobian = jax.jacfwd(guard.reset)(state_before_event)
+        guard_gradient = jax.jacfwd(guard.value)(state_before_event)
+        field_before_event = mode.field(state_before_event)
         saltation_matrix = reset_jacobian + jnp.outer(
-            next_flow - reset_jacobian @ flow_before, guard_gradient
-        ) / (guard_gradient @ flow_before)
+            field_after_event - reset_jacobian @ field_before_event, guard_gradient
+        ) / (guard_gradient @ field_before_event)
         return jnp.where(
-            is_end_reached, jnp.exp(end_state[-2]) * jnp.linalg.det(saltation_matrix), jnp.nan
+            has_reached_end, jnp.exp(end_state[-2]) * jnp.linalg.det(saltation_matrix), jnp.nan
         )
 
-    return evaluate_factor
+    return evaluate_determinant_factor

@@ -1,7 +1,4 @@
-"""Integration of phases in units of the system.
-
-Tolerances, the first step and the time limit of `StepOptions` then hold in these units.
-"""
+"""Integration of phases in units of the system, in which the options of the solver are given."""
 
 from jax import lax
 from jaxtyping import Array, Bool, Float
@@ -22,14 +19,15 @@ def integrate_in_units(
 ) -> PhaseEnd:
     """Return the result of `integrate_phase` in SI, integrated in other units.
 
-    `state_units` are the unit of each coordinate of the state, and `time_unit` is in s. All other
-    arguments but `options` are in SI, guards and margins too.
+    `state_units` are the units of the state's coordinates, and `time_unit` is in s. The tolerances,
+    the first step and the time limit of `options` are in these units. All other arguments are in
+    SI, including guards and margins.
     """
     state_units, time_unit = lax.stop_gradient((state_units, time_unit))
-    evaluate_in_si = lambda y: monitored_functions.evaluate(y * state_units)
+    evaluate_in_si = lambda y: monitored_functions.evaluate_monitored(y * state_units)
     phase_end = integrate_phase(
         _make_scaled_field(field, state_units, time_unit),
-        monitored_functions._replace(evaluate=evaluate_in_si),
+        monitored_functions._replace(evaluate_monitored=evaluate_in_si),
         start / state_units,
         active,
         options,
@@ -48,8 +46,9 @@ def sample_in_units(
     state_units: StateArray,
     time_unit: Scalar,
 ) -> Float[Array, "n_samples dim"]:
-    """Return the states of `sample_phase` in SI, integrated in other units, see
-    `integrate_in_units`.
+    """Return the states of `sample_phase` in SI, integrated in other units.
+
+    The arguments are those of `integrate_in_units`.
     """
     state_units, time_unit = lax.stop_gradient((state_units, time_unit))
     scaled_field = _make_scaled_field(field, state_units, time_unit)

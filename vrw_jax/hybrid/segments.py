@@ -1,9 +1,9 @@
 """Multipliers of a periodic orbit from its segments, without the product of their Jacobians.
 
-A product of matrices keeps growing directions and loses decaying ones: beside a multiplier of 1,
-one of 1e-20 has no correct digit. Orthogonal iteration around the period makes every factor
-triangular instead (a periodic Schur form). A multiplier is then a product of diagonal elements,
-each of which is accurate.
+In a product of matrices, growing directions stay accurate and decaying directions do not. If one
+multiplier is 1 and another 1e-20, the product has no correct digit of the small multiplier.
+Orthogonal iteration around the period makes every factor triangular instead (a periodic Schur
+form). A multiplier is then a product of diagonal entries, each of which is accurate.
 """
 
 from collections.abc import Sequence
@@ -17,7 +17,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from vrw_jax.hybrid.phase_integration import VectorField, sample_phase
-from vrw_jax.hybrid.program_cache import call_compiled
+from vrw_jax.hybrid.program_cache import call_compiled_program
 from vrw_jax.numerics import Scalar, StepOptions, forbid_reverse_mode
 
 
@@ -42,11 +42,11 @@ def segment_maps(
     """Return the flow of `field` over `duration`, s, in `n_segments` segments, with the Jacobian of
     each segment.
 
-    The Jacobians are with respect to the first `n_directions` coordinates, by default all.
-    Derivatives take part in the step-size control. Each tangent is stored as a direction of about
-    constant length and the logarithm of its growth, so that decaying directions keep their digits.
-    A segment is NaN if its solver steps are exhausted. If a coordinate is a clock, it follows the
-    others and is no direction.
+    The Jacobians are with respect to the first `n_directions` coordinates, by default all. The
+    step-size control includes the errors of derivatives. Each tangent is stored as a direction of
+    about constant length and the logarithm of its growth, so that decaying directions stay
+    accurate. A segment is NaN if its solver steps are exhausted. A coordinate that is a clock comes
+    after all other coordinates and is not a direction.
     """
     start = jnp.asarray(start, float)
     output_shape = jax.eval_shape(field, start)
@@ -65,7 +65,7 @@ def segment_maps(
         )
     constants = (field, n_segments, n_tangents)
     duration = jnp.asarray(duration, start.dtype)
-    segments = call_compiled(_integrate_flow_segments, constants, start, duration, options)
+    segments = call_compiled_program(_integrate_flow_segments, constants, start, duration, options)
     return forbid_reverse_mode("segment_maps", segments)
 
 
@@ -76,25 +76,25 @@ def _integrate_flow_segments(
     n_coordinates, n_state_and_tangents = start.size, start.size * (1 + n_tangents)
     segment_duration = duration / n_segments
 
-    def flow_with_tangents(z: Array) -> Array:
-        y, tangents = (
-            z[:n_coordinates],
-            z[n_coordinates:n_state_and_tangents].reshape(n_tangents, n_coordinates),
-        )
+    def evaluate_flow_and_tangents(z: Array) -> Array:
+        y = z[:n_coordinates]
+        tangents = z[n_coordinates:n_state_and_tangents].reshape(n_tangents, n_coordinates)
         jvp_of_field = lambda tangent: jax.jvp(field, (y,), (tangent,))[1]
         tangent_rates = jax.vmap(jvp_of_field)(tangents)
-        growth_rates = jnp.sum(tangents * tangent_rates, axis=1) / jnp.sum(
+        tangent_growth_rates = jnp.sum(tangents * tangent_rates, axis=1) / jnp.sum(
             tangents * tangents, axis=1
         )
-        normalized_rates = tangent_rates - growth_rates[:, None] * tangents
-        unit_rates = jax.vmap(jvp_of_field)(jnp.eye(n_tangents, n_coordinates, dtype=z.dtype))
+        normalized_rates = tangent_rates - tangent_growth_rates[:, None] * tangents
+        unit_direction_rates = jax.vmap(jvp_of_field)(
+            jnp.eye(n_tangents, n_coordinates, dtype=z.dtype)
+        )
         clock_rate = jnp.ones_like(y[:1])
         return jnp.concatenate(
             [
                 field(y),
                 normalized_rates.ravel(),
-                growth_rates,
-                jnp.trace(unit_rates)[None],
+                tangent_growth_rates,
+                jnp.trace(unit_direction_rates)[None],
                 clock_rate,
             ]
         )
@@ -103,14 +103,18 @@ def _integrate_flow_segments(
         start_state = jnp.concatenate(
             [state, jnp.eye(n_tangents, n_coordinates).ravel(), jnp.zeros(n_tangents + 2)]
         )
-        end_state = sample_phase(flow_with_tangents, start_state, segment_duration, 2, options)[-1]
+        end_state = sample_phase(
+            evaluate_flow_and_tangents, start_state, segment_duration, 2, options
+        )[-1]
         # Otherwise the solver steps were exhausted.
-        is_reached = jnp.abs(end_state[-1] - segment_duration) <= 1e-9 * segment_duration
+        is_segment_completed = jnp.abs(end_state[-1] - segment_duration) <= 1e-9 * segment_duration
         tangents = end_state[n_coordinates:n_state_and_tangents].reshape(n_tangents, n_coordinates)
-        growth_factors = jnp.exp(
+        tangent_growth_factors = jnp.exp(
             end_state[n_state_and_tangents : n_state_and_tangents + n_tangents]
         )
-        jacobian = jnp.where(is_reached, tangents[:, :n_tangents].T * growth_factors, jnp.nan)
+        jacobian = jnp.where(
+            is_segment_completed, tangents[:, :n_tangents].T * tangent_growth_factors, jnp.nan
+        )
         return end_state[:n_coordinates], (end_state[:n_coordinates], jacobian, end_state[-2])
 
     _, (end_states, jacobians, divergences) = lax.scan(
@@ -139,11 +143,11 @@ Closer moduli stay together in one block, whose product loses few digits.
 def product_multipliers(
     jacobians: ArrayLike | Sequence, accuracy: float = 1e-6, tolerance: float = 1e-15
 ) -> ProductMultipliers:
-    """Return the eigenvalues of jacobians[-1] @ ... @ jacobians[0], and whether each has the
-    relative `accuracy`.
+    """Return the eigenvalues of jacobians[-1] @ ... @ jacobians[0], and whether each eigenvalue has
+    the relative `accuracy`.
 
-    `jacobians` has the shape (n_segments, n, n), and `tolerance` is the error of each relative to
-    its norm. The function accepts concrete matrices only.
+    `jacobians` has the shape (n_segments, n, n), and `tolerance` is the error of a Jacobian
+    relative to its norm. The function accepts concrete matrices only.
     """
     jacobians = np.asarray(jacobians, float)
     if jacobians.ndim != 3 or jacobians.shape[1] != jacobians.shape[2] or not jacobians.size:
@@ -153,36 +157,39 @@ def product_multipliers(
             "maps contains a number that is not finite: the flow left its domain, or its steps "
             "were exhausted; take more segments, or raise StepOptions.max_solver_steps."
         )
-    n = jacobians.shape[1]
+    n_coordinates = jacobians.shape[1]
     orthonormal_basis = np.eye(jacobians.shape[1])
     closing_matrix = np.eye(jacobians.shape[1])
     triangular_factors = np.zeros_like(jacobians)
     for _ in range(N_SCHUR_SWEEPS):
-        next_basis = orthonormal_basis
-        for i, jacobian in enumerate(jacobians):
-            next_basis, triangular_factors[i] = np.linalg.qr(jacobian @ next_basis)
-        closing_matrix, orthonormal_basis = orthonormal_basis.T @ next_basis, next_basis
-        has_coupling = np.abs(np.tril(closing_matrix, -1)) > 1e-14
-        if not has_coupling.any():
+        next_orthonormal_basis = orthonormal_basis
+        for factor_index, jacobian in enumerate(jacobians):
+            next_orthonormal_basis, triangular_factors[factor_index] = np.linalg.qr(
+                jacobian @ next_orthonormal_basis
+            )
+        closing_matrix = orthonormal_basis.T @ next_orthonormal_basis
+        orthonormal_basis = next_orthonormal_basis
+        has_subdiagonal_entry = np.abs(np.tril(closing_matrix, -1)) > 1e-14
+        if not has_subdiagonal_entry.any():
             break
     diagonal_blocks, block_start = [], 0
-    for block_end in range(1, n + 1):
-        if not has_coupling[block_end:, :block_end].any():
+    for block_end in range(1, n_coordinates + 1):
+        if not has_subdiagonal_entry[block_end:, :block_end].any():
             diagonal_blocks.append(slice(block_start, block_end))
             block_start = block_end
-    triangle_norms = np.linalg.norm(jacobians, axis=(1, 2))
+    triangular_factor_norms = np.linalg.norm(jacobians, axis=(1, 2))
     block_results = [
         _compute_block_multipliers(
-            triangular_factors, closing_matrix, diagonal_block, triangle_norms, tolerance
+            triangular_factors, closing_matrix, diagonal_block, triangular_factor_norms, tolerance
         )
         for diagonal_block in diagonal_blocks
     ]
-    multipliers, logarithms, relative_error = (
+    block_multipliers, logarithms, relative_error = (
         np.concatenate(x) for x in zip(*block_results, strict=True)
     )
     is_known = relative_error <= accuracy
     descending_order = np.argsort(-logarithms, kind="stable")
-    known_values = np.where(is_known, multipliers, np.nan)
+    known_values = np.where(is_known, block_multipliers, np.nan)
     return ProductMultipliers(
         known_values[descending_order],
         logarithms[descending_order],
@@ -195,32 +202,35 @@ def _compute_block_multipliers(
     triangular_factors: np.ndarray,
     closing_matrix: np.ndarray,
     block_slice: slice,
-    norms: np.ndarray,
+    jacobian_norms: np.ndarray,
     tolerance: float,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the multipliers of one diagonal block, the logarithms of their moduli, and relative
     errors.
     """
-    diagonal_blocks, block_size = (
-        triangular_factors[:, block_slice, block_slice],
-        block_slice.stop - block_slice.start,
-    )
+    diagonal_blocks = triangular_factors[:, block_slice, block_slice]
+    block_size = block_slice.stop - block_slice.start
     diagonal = np.abs(np.diagonal(diagonal_blocks, axis1=1, axis2=2))
     with np.errstate(divide="ignore", invalid="ignore"):
         log_diagonal = np.log(diagonal)
-        error_amplification = np.where(diagonal > 0.0, norms[:, None] / diagonal, 0.0)
+        error_amplification = np.where(diagonal > 0.0, jacobian_norms[:, None] / diagonal, 0.0)
         relative_error = tolerance * np.max(np.sum(error_amplification, axis=0))
         scaled_product = np.eye(block_size)
-        log_scale = 0.0
-        log_spread = np.ptp(np.sum(log_diagonal, axis=0)) if block_size > 1 else 0.0
+        log_block_scale = 0.0
+        log_diagonal_spread = np.ptp(np.sum(log_diagonal, axis=0)) if block_size > 1 else 0.0
         for scaled_block in diagonal_blocks:
             scaled_product = scaled_block @ scaled_product
-            max_entry = np.max(np.abs(scaled_product)) or 1.0
-            scaled_product, log_scale = scaled_product / max_entry, log_scale + np.log(max_entry)
+            largest_block_entry = np.max(np.abs(scaled_product)) or 1.0
+            scaled_product = scaled_product / largest_block_entry
+            log_block_scale = log_block_scale + np.log(largest_block_entry)
         values = np.linalg.eigvals(closing_matrix[block_slice, block_slice] @ scaled_product)
-        logarithms = np.log(np.abs(values)) + log_scale
+        logarithms = np.log(np.abs(values)) + log_block_scale
         if block_size == 1:
             logarithms = np.sum(log_diagonal, axis=0)
         multiplier_phases = np.where(values == 0.0, 1.0, values / np.abs(values))
-        multipliers = multiplier_phases * np.exp(logarithms)
-    return multipliers, logarithms, np.full(block_size, relative_error * np.exp(log_spread))
+        block_multipliers = multiplier_phases * np.exp(logarithms)
+    return (
+        block_multipliers,
+        logarithms,
+        np.full(block_size, relative_error * np.exp(log_diagonal_spread)),
+    )

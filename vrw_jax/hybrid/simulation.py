@@ -1,10 +1,10 @@
-"""Simulation of hybrid systems: any vector fields, the guards that end modes, and the resets.
+"""Simulation of hybrid systems, which consist of modes, guards and resets.
 
     ball = Mode(lambda y: jnp.stack([y[1], -9.81 + 0.0 * y[1]]), (Guard(height, bounce),))
     simulate_hybrid((ball,), start, events=10)
 
-A mode whose functions have wrong shapes raises a ValueError. A failure during the simulation is
-reported as a code, `Termination`, and the result contains all earlier events.
+A mode whose functions have wrong shapes raises a ValueError. If the simulation fails, the result
+has a code of `Termination` and contains all earlier events.
 """
 
 from collections.abc import Callable, Sequence
@@ -19,7 +19,7 @@ from jaxtyping import Array, Float, Int
 
 from vrw_jax.hybrid.minima import MonitoredFunctions, StateArray
 from vrw_jax.hybrid.phase_integration import PhaseEnd, VectorField, integrate_phase
-from vrw_jax.hybrid.program_cache import call_compiled
+from vrw_jax.hybrid.program_cache import call_compiled_program
 from vrw_jax.numerics import (
     Scalar,
     StatusCode,
@@ -37,10 +37,10 @@ times, states before and states after then take 2.4 GB."""
 
 
 class Guard(NamedTuple):
-    """Function `value` of the state, positive inside its mode, that ends the mode when it falls to
-    zero.
+    """Guard function `value` with the reset and the next mode of its event.
 
-    Then `reset` is applied to the state, and the mode with the index `target_mode` begins.
+    The function `value` of the state is positive inside its mode. The mode ends when `value` falls
+    to zero. Then `reset` is applied to the state, and the mode with the index `target_mode` begins.
     """
 
     value: Callable[[StateArray], Scalar]
@@ -49,10 +49,10 @@ class Guard(NamedTuple):
 
 
 class Mode(NamedTuple):
-    """An autonomous vector field, shape (dim,) to (dim,), and its guards.
+    """Autonomous vector field, from shape (dim,) to (dim,), and the guards that end the mode.
 
-    A single guard may be given without a tuple. A field that depends on time has time as a
-    coordinate.
+    A single guard may be given without a tuple. If the field depends on time, time is one of its
+    coordinates.
     """
 
     field: VectorField
@@ -85,7 +85,10 @@ STATUS_RUNNING_CODE = -1
 
 
 class HybridSolution(NamedTuple):
-    """Events of a simulation in order of time; entries after the first `n_events` are zero."""
+    """Events of a simulation in order of time, and its end.
+
+    Entries after the first `n_events` events are zero.
+    """
 
     times: Float[Array, " events"]
     time_tolerance: Float[Array, " events"]
@@ -122,23 +125,23 @@ def simulate_hybrid(
 ) -> HybridSolution:
     """Return the simulation of `modes` from `start` through at most `events` events.
 
-    `mode` is the index of the first mode. Events are located by `integrate_phase`: the earliest
-    first, at the integrator's accuracy, with derivatives of event times and states. At the start of
-    a mode, a guard counts as zero if its time of zero is within round-off. A guard that is zero
-    with a zero rate there ends the mode only if it will not rise.
+    `mode` is the index of the first mode. `integrate_phase` locates the earliest event of each mode
+    at the accuracy of the integrator, with derivatives of its time and state. At the start of a
+    mode, a guard counts as zero if its time of zero is within round-off. A guard that is zero with
+    a zero rate there ends the mode only if it will not rise.
 
-    The transforms `jax.jit`, `jax.jacfwd` and `jax.vmap` apply, reverse mode does not. One mode, or
-    the only guard of a mode, may be given without a tuple. Outside of `jax.jit` equal modes are
-    compiled once: functions with equal code and equal constants share a program.
+    The transforms `jax.jit`, `jax.jacfwd` and `jax.vmap` are supported; reverse mode is not. A
+    single mode, and the only guard of a mode, may be given without a tuple. Outside of `jax.jit`,
+    functions with equal code and equal constants share a compiled program.
     """
     options = StepOptions() if options is None else options
     check_type("options", options, StepOptions, "give vrw.StepOptions()")
     start, events = check_reals("start", start), check_int("events", events)
-    modes = normalize_modes(modes)
+    modes = convert_modes_to_tuple(modes)
     _check_simulation_arguments(modes, start, events, mode)
     options.check_tolerances(start.dtype)
     mode_index = jnp.asarray(mode, jnp.int32)
-    solution = call_compiled(_simulate_modes, (modes, events), options, start, mode_index)
+    solution = call_compiled_program(_simulate_modes, (modes, events), options, start, mode_index)
     return forbid_reverse_mode("simulate_hybrid", solution)
 
 
@@ -152,9 +155,10 @@ def time_errors(
     looser tolerances.
 
     The simulation is repeated with tolerances that are ten and a hundred times as large. The change
-    of each event's time is divided by its `time_tolerance`. The estimate of an event is twice the
-    largest of these ratios so far, at least 1, times its `time_tolerance`. The estimate is not
-    below the sum of the round-off of all states and of the time.
+    of each event's time is divided by the `time_tolerance` of that event. The estimate of an event
+    is twice the largest ratio of this and all earlier events, at least 1, times its
+    `time_tolerance`. The estimate is not below the sum of the round-off of all states and of the
+    time.
 
     Unlike `time_tolerance`, the estimate contains errors of steps that add up and errors of earlier
     events. It also contains errors that an implicit solver's own estimate omits in a stiff field.
@@ -162,15 +166,15 @@ def time_errors(
     does not reach. It is measured, not proved. `options` are those of the simulation.
     """
     options = StepOptions() if options is None else options
-    modes = normalize_modes(modes)
+    modes = convert_modes_to_tuple(modes)
     start, solution = lax.stop_gradient((check_reals("start", start), solution))
-    return call_compiled(_estimate_time_errors, modes, start, solution, options)
+    return call_compiled_program(_estimate_time_errors, modes, start, solution, options)
 
 
 def _estimate_time_errors(
     modes: tuple[Mode, ...], start: Array, solution: HybridSolution, options: StepOptions
 ) -> Float[Array, " events"]:
-    """Return `time_errors` for modes that are tuples."""
+    """Return the result of `time_errors` for modes that are given as tuples."""
     event_indices = jnp.arange(len(solution.times))
 
     def compute_time_change(tolerance_factor: Array) -> Array:
@@ -195,7 +199,7 @@ def _estimate_time_errors(
     changes_at_tenfold_tolerance, changes_at_hundredfold_tolerance = lax.stop_gradient(
         lax.map(compute_time_change, jnp.asarray([0.1, 0.01], start.dtype))
     )
-    max_change = (
+    largest_time_change = (
         jnp.maximum(
             changes_at_tenfold_tolerance,
             jnp.where(
@@ -204,13 +208,17 @@ def _estimate_time_errors(
         )
         / solution.time_tolerance
     )
-    max_change = lax.cummax(jnp.where(jnp.isnan(max_change), jnp.inf, jnp.maximum(max_change, 1.0)))
-    time_errors = jnp.maximum(2.0 * max_change * solution.time_tolerance, accumulated_roundoff)
+    largest_time_change = lax.cummax(
+        jnp.where(jnp.isnan(largest_time_change), jnp.inf, jnp.maximum(largest_time_change, 1.0))
+    )
+    time_errors = jnp.maximum(
+        2.0 * largest_time_change * solution.time_tolerance, accumulated_roundoff
+    )
     return jnp.where(event_indices < solution.n_events, time_errors, 0.0)
 
 
-def normalize_modes(modes: Sequence[Mode] | Mode) -> tuple[Mode, ...]:
-    """Return the modes as a tuple whose guards are tuples.
+def convert_modes_to_tuple(modes: Sequence[Mode] | Mode) -> tuple[Mode, ...]:
+    """Return the modes as a tuple, with the guards of each mode as a tuple.
 
     A single mode or guard may be given without a tuple.
     """
@@ -231,7 +239,7 @@ def normalize_modes(modes: Sequence[Mode] | Mode) -> tuple[Mode, ...]:
 def _check_simulation_arguments(
     modes: tuple[Mode, ...], start: Array, events: int, mode: int
 ) -> None:
-    """Raise a ValueError unless start, events, mode and all functions of the modes fit together."""
+    """Raise a ValueError if start, events, mode and the functions of the modes do not agree."""
     if start.ndim != 1 or not start.size:
         raise ValueError(f"start has shape {start.shape}, but a state is one row of numbers.")
     if not isinstance(start, jax.core.Tracer) and not np.all(np.isfinite(start)):
@@ -278,12 +286,12 @@ def _check_output_shape(name: str, function: Callable, start: Array, shape: tupl
 def _integrate_mode(
     mode: Mode, state: Array, time: Array, options: StepOptions
 ) -> tuple[PhaseEnd, Array]:
-    """Return the end of a mode, and whether a guard is violated at its start."""
+    """Return the end of a mode, and whether a guard is violated at the start of the mode."""
     guard_rates = lambda y: jax.jvp(mode.guard_values, (y,), (mode.field(y),))[1]
     guard_values = mode.guard_values(state)
-    guard_rate_values, guard_curvatures = jax.jvp(guard_rates, (state,), (mode.field(state),))
-    guard_values, guard_rate_values, guard_curvatures = lax.stop_gradient(
-        (guard_values, guard_rate_values, guard_curvatures)
+    guard_rate_values, second_guard_rates = jax.jvp(guard_rates, (state,), (mode.field(state),))
+    guard_values, guard_rate_values, second_guard_rates = lax.stop_gradient(
+        (guard_values, guard_rate_values, second_guard_rates)
     )
     time_after_first_step = lax.stop_gradient(time + options.dt0)
     time_resolution = 1e3 * jnp.finfo(state.dtype).eps * time_after_first_step
@@ -294,7 +302,9 @@ def _integrate_mode(
     )
     # For a guard at rest the second derivative decides: the guard does not end the mode if it will
     # rise.
-    will_guard_rise = (guard_values == 0.0) & (guard_rate_values == 0.0) & (guard_curvatures > 0.0)
+    will_guard_rise = (
+        (guard_values == 0.0) & (guard_rate_values == 0.0) & (second_guard_rates > 0.0)
+    )
     guard_offset = jnp.where(will_guard_rise, jnp.finfo(state.dtype).tiny, guard_offset)
     is_guard_zero = (guard_values <= 0.0) & is_guard_near_zero & ~will_guard_rise
     monitored_functions = MonitoredFunctions(
@@ -310,7 +320,7 @@ def _integrate_mode(
 def _compute_event_time_errors(
     mode: Mode, phase_end: PhaseEnd, options: StepOptions
 ) -> tuple[Array, Array]:
-    """Return the errors of the event time, s, due to the tolerance and the round-off of the state.
+    """Return two errors of the event time, s: due to the tolerance and to round-off of the state.
 
     The errors are large if the guard is grazed.
     """
@@ -318,31 +328,31 @@ def _compute_event_time_errors(
     guard_gradient = jax.jacfwd(mode.guard_values)(state)[jnp.maximum(phase_end.guard, 0)]
     state_roundoff = jnp.finfo(state.dtype).eps * jnp.abs(state)
     state_tolerance = options.atol + options.rtol * jnp.abs(state)
-    rate = jnp.abs(guard_gradient @ mode.field(state))
+    guard_rate = jnp.abs(guard_gradient @ mode.field(state))
     time_scales = [
-        jnp.abs(guard_gradient) @ state_error / rate
-        for state_error in (state_tolerance, state_roundoff)
+        jnp.abs(guard_gradient) @ state_error_bound / guard_rate
+        for state_error_bound in (state_tolerance, state_roundoff)
     ]
     return lax.stop_gradient((time_scales[0], time_scales[1]))
 
 
 def _add_with_roundoff(first_time: Scalar, second_time: Scalar) -> tuple[Scalar, Scalar]:
     """Return the rounded sum of two times and its rounding error (D. E. Knuth's two-sum)."""
-    rounded_sum = first_time + second_time
-    added_duration = rounded_sum - first_time
-    return rounded_sum, (first_time - (rounded_sum - added_duration)) + (
-        second_time - added_duration
+    rounded_time_sum = first_time + second_time
+    effective_duration = rounded_time_sum - first_time
+    return rounded_time_sum, (first_time - (rounded_time_sum - effective_duration)) + (
+        second_time - effective_duration
     )
 
 
 def _simulate_modes(
     modes_and_events: tuple[tuple[Mode, ...], int], options: StepOptions, start: Array, mode: Array
 ) -> HybridSolution:
-    """Return the simulation. `modes_and_events` contains the modes and the number of events."""
+    """Return the simulation. `modes_and_events` is a pair of modes and largest number of events."""
     modes, events = modes_and_events
 
     def make_mode_branch(mode_index: int) -> Callable:
-        def run_mode(state: Array, time: Array) -> tuple:
+        def run_numbered_mode(state: Array, time: Array) -> tuple:
             phase_end, is_guard_violated = _integrate_mode(modes[mode_index], state, time, options)
             time_scales = _compute_event_time_errors(modes[mode_index], phase_end, options)
             guards, guard = modes[mode_index].guards, jnp.maximum(phase_end.guard, 0)
@@ -351,20 +361,20 @@ def _simulate_modes(
             next_mode = jnp.asarray(next_modes, jnp.int32)[guard]
             return phase_end, is_guard_violated, time_scales, next_state, next_mode
 
-        return run_mode
+        return run_numbered_mode
 
     mode_branches = [make_mode_branch(mode_index) for mode_index in range(len(modes))]
     # The n - 1 guards between n bodies that meet in one point have up to n (n - 1) / 2 events.
-    max_simultaneous = sum(len(mode.guards) ** 2 for mode in modes)
+    max_simultaneous_events = sum(len(mode.guards) ** 2 for mode in modes)
 
-    def advance_event(loop_carry: tuple) -> tuple:
-        solution, n_events_without_progress, time_remainder = loop_carry
+    def simulate_next_event(loop_carry: tuple) -> tuple:
+        solution, n_events_without_progress, time_roundoff_remainder = loop_carry
         phase_end, is_guard_violated, time_scales, next_state, next_mode = lax.switch(
             solution.mode, mode_branches, solution.state, solution.time
         )
         has_event = ~is_guard_violated & (phase_end.guard >= 0)
-        time, time_remainder = _add_with_roundoff(
-            solution.time, phase_end.duration + time_remainder
+        time, time_roundoff_remainder = _add_with_roundoff(
+            solution.time, phase_end.duration + time_roundoff_remainder
         )
         n_events_without_progress = jnp.where(
             time > solution.time, 0, n_events_without_progress + 1
@@ -376,7 +386,7 @@ def _simulate_modes(
             STATUS_RUNNING_CODE,
         )
         termination = jnp.where(
-            n_events_without_progress > max_simultaneous, int(Termination.ZENO), termination
+            n_events_without_progress > max_simultaneous_events, int(Termination.ZENO), termination
         )
         failure_code = jnp.where(
             phase_end.timed_out,
@@ -412,24 +422,24 @@ def _simulate_modes(
                 termination=termination.astype(jnp.int32),
             ),
             n_events_without_progress,
-            time_remainder,
+            time_roundoff_remainder,
         )
 
-    zero_count, traced_zero = jnp.zeros((), jnp.int32), 0.0 * start[0]
-    zero_states, zero_indices = (
-        jnp.zeros((events, start.size)) + traced_zero,
-        jnp.zeros((events,), jnp.int32),
-    )
-    zero_times = jnp.zeros(events) + traced_zero
-    constant_zeros = lax.stop_gradient(zero_times)
+    zero_count, int_zero = jnp.zeros((), jnp.int32), 0.0 * start[0]
+    zero_states = jnp.zeros((events, start.size)) + int_zero
+    zero_indices = jnp.zeros((events,), jnp.int32)
+    zero_times = jnp.zeros(events) + int_zero
+    constant_zero_states = lax.stop_gradient(zero_times)
     initial_solution = HybridSolution(
-        times=zero_times, time_tolerance=constant_zeros, time_roundoff=constant_zeros,
+        times=zero_times, time_tolerance=constant_zero_states, time_roundoff=constant_zero_states,
         states_before=zero_states, states_after=zero_states,
-        modes=zero_indices, guards=zero_indices, n_events=zero_count, time=traced_zero, state=start,
+        modes=zero_indices, guards=zero_indices, n_events=zero_count, time=int_zero, state=start,
         mode=zero_count + mode,
         solver_steps=zero_count, termination=zero_count + STATUS_RUNNING_CODE,
     )  # fmt: skip
     is_running = lambda carry: make_opaque_condition(
         carry[0].termination == STATUS_RUNNING_CODE, carry[0].n_events
     )
-    return lax.while_loop(is_running, advance_event, (initial_solution, zero_count, traced_zero))[0]
+    return lax.while_loop(
+        is_running, simulate_next_event, (initial_solution, zero_count, int_zero)
+    )[0]

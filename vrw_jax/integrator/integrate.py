@@ -35,7 +35,7 @@ from vrw_jax.integrator.tableaus import (
     TakeStep,
     compute_step_size_factor,
     find_earliest_guard_minimum_fraction,
-    rk_step,
+    take_rk_step,
 )
 from vrw_jax.integrator.tangents import (
     ImplicitDynamics,
@@ -49,16 +49,16 @@ from vrw_jax.simd import mark_noinline
 
 
 class BatchPhase(NamedTuple):
-    """Phase as functions that are elementwise over the batch.
+    """Functions of a phase, which are elementwise over the batch.
 
-    `evaluate` returns the accelerations of a state. The `guards` are positive inside the phase, and
-    an event is a zero crossed from above. The earliest event ends the phase. Of two events at the
-    same time, the first guard in the list ends the phase.
+    `evaluate_acceleration` returns the accelerations at a state. The guards are positive inside the
+    phase, and an event is the fall of a guard through zero. The earliest event ends the phase. Of
+    two events at the same time, the first guard in the list ends the phase.
     """
 
-    evaluate: EvaluateAcceleration
-    guards: Callable[[StageState], Vector]
-    margins: MarginFunctions | None = None  # margins whose minima are computed
+    evaluate_acceleration: EvaluateAcceleration
+    evaluate_guards: Callable[[StageState], Vector]
+    margin_functions: MarginFunctions | None = None  # margins whose minima are computed
     # equations of motion in implicit form, for derivatives
     implicit_dynamics: ImplicitDynamics | None = None
     is_noinline: bool = False
@@ -69,7 +69,7 @@ class BatchPhase(NamedTuple):
 
 
 class BatchPhaseEnd(NamedTuple):
-    """End of a phase, for each batch element."""
+    """End of a phase: state, duration, guard and failure flags of each batch element."""
 
     state: StageState
     duration: Array  # s
@@ -83,26 +83,28 @@ class BatchPhaseEnd(NamedTuple):
 
 
 class _IntegratorState(NamedTuple):
-    """State of the integration loop, for each batch element."""
+    """State of the integration loop of each batch element."""
 
     state: StageState
     guard_values: Vector  # guards at the state
-    dt: Array
-    time: Array
-    status: Array  # an IntegrationStatus, after the last tried step
+    next_step_length: Array
+    elapsed_time: Array
+    integration_status: Array  # an IntegrationStatus, after the last tried step
     crossing_bits: Array  # bit i is set if guard i crosses in that step
-    middle_values: Vector  # guards at the middle stage of the crossing step
-    end_values: Vector
+    middle_guard_values: Vector  # guards at the middle stage of the crossing step
+    end_guard_values: Vector
     n_tried_steps: Array
     # number of iterations after which half of the batch had ended
-    iterations_until_half_ended: Array
+    n_iterations_until_half_ended: Array
     n_iterations: Array
-    minima: MinimaState | None
-    tangents: Array | None  # tangents of the state, (directions, components, batch), see `tangents`
+    minima_state: MinimaState | None
+    state_tangents: (
+        Array | None
+    )  # tangents of the state, (directions, components, batch), see `tangents`
 
 
 class IntegrationStatus(IntEnum):
-    """Status of a batch element in the integration."""
+    """Status code of a batch element in the integration."""
 
     RUNNING = 0
     TIMED_OUT = 1
@@ -132,14 +134,14 @@ def integrate_batch_phase(
     options: StepOptions,
     straggler_count: Array | None = None,
 ) -> BatchPhaseEnd:
-    """Integrate a phase from (q, v), and return its end for each batch element.
+    """Return the end of a phase that begins at positions `q` and rates `v`, for each batch element.
 
     Each active element is integrated to its earliest event. Errors are those of
-    `hybrid.integrate_phase`. In a large batch, as on a GPU, the last `straggler_count` elements are
-    cut off if they take `STRAGGLER_ITERATION_FACTOR` times as many iterations as half of the batch.
-    They are marked unfinished, and the caller integrates them again together with other stragglers.
-    The result is differentiable with respect to `constants`, `held_constants`, `q` and `v`, see
-    `tangents`.
+    `hybrid.integrate_phase`. Stragglers are the last `straggler_count` elements of a large batch
+    that take `STRAGGLER_ITERATION_FACTOR` times as many iterations as half of the batch. Their
+    integration stops unfinished, and the caller integrates them again together with other
+    stragglers. The result is differentiable with respect to `constants`, `held_constants`, `q` and
+    `v`, see `tangents`.
     """
     integrate_with_rule = jax.custom_jvp(
         lambda *arguments: _integrate_to_event(make_phase, tableau, None, *arguments).phase_end
@@ -147,13 +149,15 @@ def integrate_batch_phase(
 
     @integrate_with_rule.defjvp
     @with_default_jax_settings
-    def integrate_jvp(primals: tuple, tangents: tuple) -> tuple[BatchPhaseEnd, BatchPhaseEnd]:
+    def compute_integration_jvp(
+        primals: tuple, state_tangents: tuple
+    ) -> tuple[BatchPhaseEnd, BatchPhaseEnd]:
         def make_implicit_dynamics(*constants: Any) -> ImplicitDynamics:
             implicit_dynamics = make_phase(*constants).implicit_dynamics
             assert implicit_dynamics is not None
             return implicit_dynamics
 
-        def evaluate_with_tangents(
+        def integrate_with_tangents(
             primals: tuple, directions: tuple
         ) -> tuple[BatchPhaseEnd, tuple]:
             constants_tangents, held_constants, q, v = directions
@@ -167,7 +171,7 @@ def integrate_batch_phase(
             )
 
         phase_end, (q, v, event_time_tangent, minima_tangents) = apply_batched_jvp_rule(
-            evaluate_with_tangents, primals, tangents[:4]
+            integrate_with_tangents, primals, state_tangents[:4]
         )
         zero_phase_end = make_zero_tangent(phase_end)
         state_tangent = zero_phase_end.state._replace(q=q, v=v)
@@ -181,13 +185,13 @@ def integrate_batch_phase(
 
 
 class _PhaseRun(NamedTuple):
-    """End of a phase with the intermediate results that its tangents require."""
+    """End of a phase, with the intermediate results that the tangents of the end require."""
 
     step_function: TakeStep
-    start: StageState
+    start_state: StageState
     phase_end: BatchPhaseEnd
     integrator_state: _IntegratorState
-    minima: MinimaState | None
+    minima_state: MinimaState | None
     minima_result: MinimaResult | None
 
 
@@ -197,21 +201,24 @@ def _compute_phase_end_jvp(
     phase_tangents: PhaseTangents,
     phase_run: _PhaseRun,
 ) -> tuple[Vector, Vector, Array, Array | None]:
-    """Return the tangents of a phase's end for tangents of its start and constants.
+    """Return the tangents of a phase's end along tangents of its start and constants.
 
-    The tangents belong to positions, rates, duration and minima of the margins. Directions are the
-    first axis.
+    The result contains tangents of positions, rates, duration and minima of the margins. The
+    directions are on the first axis.
     """
-    step_function, start, phase_end, integrator_state, minima, minima_result = phase_run
-    n, has_crossed = len(start.q), integrator_state.status == IntegrationStatus.CROSSED
-    last_length = jnp.where(has_crossed, phase_end.duration - integrator_state.time, 0.0)
+    step_function, start_state, phase_end, integrator_state, minima_state, minima_result = phase_run
+    n = len(start_state.q)
+    has_guard_crossed = integrator_state.integration_status == IntegrationStatus.CROSSED
+    last_length = jnp.where(
+        has_guard_crossed, phase_end.duration - integrator_state.elapsed_time, 0.0
+    )
     rk_step = step_function(integrator_state.state, last_length)
-    assert integrator_state.tangents is not None
-    end_state_tangents = phase_tangents.propagate(
-        tableau, rk_step.stage_states, integrator_state.tangents, last_length
+    assert integrator_state.state_tangents is not None
+    end_state_tangents = phase_tangents.propagate_to_step_end(
+        tableau, rk_step.stage_states, integrator_state.state_tangents, last_length
     )
 
-    end_state, stacked_tangents = rk_step.end, tuple(jnp.moveaxis(end_state_tangents, 1, 0))
+    end_state, stacked_tangents = rk_step.end_state, tuple(jnp.moveaxis(end_state_tangents, 1, 0))
     event_time_tangent = _compute_event_time_jvp(
         make_phase, phase_tangents, end_state, end_state_tangents, integrator_state, phase_end.guard
     )
@@ -221,21 +228,21 @@ def _compute_phase_end_jvp(
         for x, y in zip(stacked_tangents[: 2 * n], motion_rates, strict=True)
     )
     minima_tangents = None
-    if minima is not None and minima_result is not None:
+    if minima_state is not None and minima_result is not None:
 
         def make_margins(*constants: Any) -> tuple[MarginFunctions, EvaluateAcceleration]:
             phase = make_phase(*constants)
-            assert phase.margins is not None
-            return phase.margins, phase.evaluate
+            assert phase.margin_functions is not None
+            return phase.margin_functions, phase.evaluate_acceleration
 
-        phase_ends = start, phase_end.state
+        phase_ends = start_state, phase_end.state
         end_tangents = jnp.stack([*state_tangents, *stacked_tangents[2 * n :]], 1)
         minima_tangents = compute_minima_jvp(
             make_margins,
             step_function,
             tableau,
             phase_tangents,
-            minima,
+            minima_state,
             minima_result,
             phase_ends,
             end_tangents,
@@ -247,28 +254,31 @@ def _compute_event_time_jvp(
     make_phase: MakeBatchPhase,
     phase_tangents: PhaseTangents,
     end_state: StageState,
-    tangents: Array,
+    state_tangents: Array,
     integrator_state: _IntegratorState,
     event_guard: Array,
 ) -> Array:
     """Return the tangent of the event's time, s.
 
-    It follows from the condition that the guard vanishes along the perturbed motion.
+    The tangent follows from the condition that the guard is zero at the event of the perturbed
+    motion.
     """
 
     def evaluate_guards(constants: Any, held_constants: Vector, q: Vector, v: Vector) -> Vector:
         phase = make_phase(constants, held_constants)
-        return phase.guards(StageState(q, v, phase.evaluate(q, v)))
+        return phase.evaluate_guards(StageState(q, v, phase.evaluate_acceleration(q, v)))
 
     phase = make_phase(phase_tangents.constants, phase_tangents.held_constants)
-    _, guard_rates = evaluate_with_rates(phase.guards, phase.evaluate, end_state)
-    guard_tangents = phase_tangents.evaluate_tangents(evaluate_guards, end_state, tangents)
-    has_crossed = integrator_state.status == IntegrationStatus.CROSSED
-    time_tangent = jnp.zeros_like(integrator_state.dt)
+    _, guard_rates = evaluate_with_rates(
+        phase.evaluate_guards, phase.evaluate_acceleration, end_state
+    )
+    guard_tangents = phase_tangents.evaluate_tangents(evaluate_guards, end_state, state_tangents)
+    has_guard_crossed = integrator_state.integration_status == IntegrationStatus.CROSSED
+    time_tangent = jnp.zeros_like(integrator_state.next_step_length)
     for guard_number, (guard_rate, guard_tangent) in enumerate(
         zip(guard_rates, guard_tangents, strict=True)
     ):
-        is_event_guard = has_crossed & (event_guard == guard_number) & (guard_rate < 0.0)
+        is_event_guard = has_guard_crossed & (event_guard == guard_number) & (guard_rate < 0.0)
         time_tangent = jnp.where(
             is_event_guard,
             -guard_tangent / jnp.where(is_event_guard, guard_rate, -1.0),
@@ -290,12 +300,14 @@ def _integrate_to_event(
     options: StepOptions,
     straggler_count: Array | None,
 ) -> _PhaseRun:
-    """Integrate a phase, locate its event and the minima of its margins, and return all results."""
+    """Return the end of a phase, its event and minima, with all intermediate results."""
     phase = make_phase(constants, held_constants)
     phase = _wrap_each_phase_function(phase, mark_noinline if phase.is_noinline else jax.jit)
     step_function = _make_step_function(phase, tableau)
-    start_state = StageState(q, v, phase.evaluate(q, v))
-    guard_values, guard_rates = evaluate_with_rates(phase.guards, phase.evaluate, start_state)
+    start_state = StageState(q, v, phase.evaluate_acceleration(q, v))
+    guard_values, guard_rates = evaluate_with_rates(
+        phase.evaluate_guards, phase.evaluate_acceleration, start_state
+    )
     is_guard_met_at_start = tuple(
         (guard_value < 0.0) | ((guard_value == 0.0) & (guard_rate <= 0.0))
         for guard_value, guard_rate in zip(guard_values, guard_rates, strict=True)
@@ -318,78 +330,96 @@ def _integrate_to_event(
         straggler_count,
         phase_tangents,
     )
-    has_crossed = integrator_state.status == IntegrationStatus.CROSSED
-    if phase.margins is not None or phase_tangents is not None:
+    has_guard_crossed = integrator_state.integration_status == IntegrationStatus.CROSSED
+    if phase.margin_functions is not None or phase_tangents is not None:
         # The functions are called, not inlined, because the program is already long.
         phase = _wrap_each_phase_function(phase, mark_noinline)
         step_function = _make_step_function(phase, tableau)
     crossing_step = CrossingStep(
         *integrator_state[:2],
-        integrator_state.middle_values,
-        integrator_state.end_values,
-        integrator_state.dt,
+        integrator_state.middle_guard_values,
+        integrator_state.end_guard_values,
+        integrator_state.next_step_length,
         integrator_state.crossing_bits,
-        has_crossed,
+        has_guard_crossed,
     )
     event_search = locate_event(
-        phase.guards, phase.evaluate, step_function, tableau, crossing_step, options
+        phase.evaluate_guards,
+        phase.evaluate_acceleration,
+        step_function,
+        tableau,
+        crossing_step,
+        options,
     )
-    is_event_unresolved = has_crossed & event_search.is_unresolved
-    duration = integrator_state.time + jnp.where(has_crossed, event_search.length, 0.0)
-    end_state = select_tree_leaves(has_crossed, event_search.end, integrator_state.state)
-    minima, minima_result = integrator_state.minima, None
-    if phase.margins is not None and minima is not None:
-        margin_arguments = phase.margins, phase.evaluate
+    is_event_unresolved = has_guard_crossed & event_search.is_unresolved
+    duration = integrator_state.elapsed_time + jnp.where(
+        has_guard_crossed, event_search.event_step_length, 0.0
+    )
+    end_state = select_tree_leaves(
+        has_guard_crossed, event_search.end_state, integrator_state.state
+    )
+    minima_state, minima_result = integrator_state.minima_state, None
+    if phase.margin_functions is not None and minima_state is not None:
+        margin_arguments = phase.margin_functions, phase.evaluate_acceleration
         accepted_step = AcceptedStep(
             integrator_state.state,
             end_state,
-            event_search.length,
-            has_crossed,
-            integrator_state.tangents,
+            event_search.event_step_length,
+            has_guard_crossed,
+            integrator_state.state_tangents,
         )
-        minima = update_minima_state(*margin_arguments, minima, accepted_step)
-        start_margins = jnp.stack(phase.margins.evaluate_margins(start_state))
+        minima_state = update_minima_state(*margin_arguments, minima_state, accepted_step)
+        start_margins = jnp.stack(phase.margin_functions.evaluate_margins(start_state))
         minima_result = refine_minima(
-            phase.margins, step_function, phase.evaluate, minima, start_margins, options
+            phase.margin_functions,
+            step_function,
+            phase.evaluate_acceleration,
+            minima_state,
+            start_margins,
+            options,
         )
-    is_straggler = has_crossed & ~event_search.is_unresolved & (duration > options.max_phase_time)
+    is_straggler = (
+        has_guard_crossed & ~event_search.is_unresolved & (duration > options.max_phase_time)
+    )
     event_guard = jnp.where(
         is_active & (start_guard >= 0),
         start_guard,
-        jnp.where(has_crossed, event_search.guard, -1),
+        jnp.where(has_guard_crossed, event_search.guard_index, -1),
     )
     phase_end = BatchPhaseEnd(
         state=end_state,
         duration=duration,
         guard=jnp.where(is_event_unresolved | is_straggler, -1, event_guard),
-        timed_out=(integrator_state.status == IntegrationStatus.TIMED_OUT) | is_straggler,
-        is_unfinished=integrator_state.status == IntegrationStatus.RUNNING,
+        timed_out=(integrator_state.integration_status == IntegrationStatus.TIMED_OUT)
+        | is_straggler,
+        is_unfinished=integrator_state.integration_status == IntegrationStatus.RUNNING,
         n_tried_steps=integrator_state.n_tried_steps
-        + jnp.where(has_crossed, event_search.n_tried_steps, 0),
-        next_dt=integrator_state.dt,
+        + jnp.where(has_guard_crossed, event_search.n_tried_steps, 0),
+        next_dt=integrator_state.next_step_length,
         minima=None if minima_result is None else minima_result.phase_minima,
     )
-    return _PhaseRun(step_function, start_state, phase_end, integrator_state, minima, minima_result)
+    return _PhaseRun(
+        step_function, start_state, phase_end, integrator_state, minima_state, minima_result
+    )
 
 
 def _make_step_function(phase: BatchPhase, tableau: ButcherTableau) -> TakeStep:
-    """Return the phase's Runge-Kutta step as a function of state and length.
+    """Return a function of state and length that takes a Runge-Kutta step of the phase.
 
     The function is traced once for all its calls.
     """
-    return jax.jit(lambda state, h: rk_step(tableau, phase.evaluate, state, h))
+    return jax.jit(lambda state, h: take_rk_step(tableau, phase.evaluate_acceleration, state, h))
 
 
 def _wrap_each_phase_function(phase: BatchPhase, wrap_function: Callable) -> BatchPhase:
-    """Return the phase with each function wrapped by `wrap_function`.
-
-    Each function is then traced once for all its calls.
-    """
-    margins = phase.margins
+    """Return a copy of the phase with all its functions wrapped by `wrap_function`."""
+    margins = phase.margin_functions
     if margins is not None:
         margins = margins._replace(evaluate_margins=wrap_function(margins.evaluate_margins))
     return phase._replace(
-        evaluate=wrap_function(phase.evaluate), guards=wrap_function(phase.guards), margins=margins
+        evaluate_acceleration=wrap_function(phase.evaluate_acceleration),
+        evaluate_guards=wrap_function(phase.evaluate_guards),
+        margin_functions=margins,
     )
 
 
@@ -397,7 +427,7 @@ def _integrate_until_crossing(
     phase: BatchPhase,
     step_function: TakeStep,
     tableau: ButcherTableau,
-    start: StageState,
+    start_state: StageState,
     guard_values: Vector,
     is_started: Array,
     initial_dt: Array,
@@ -405,20 +435,22 @@ def _integrate_until_crossing(
     straggler_count: Array | None,
     phase_tangents: PhaseTangents | None,
 ) -> _IntegratorState:
-    """Take adaptive steps until each element has crossed a guard, reached the time limit or failed.
+    """Return the loop state after adaptive steps until no batch element is running.
 
-    Return the state of the loop.
+    An element stops when a guard crosses zero, at the time limit, or when it fails.
     """
 
     def take_one_step(integrator_state: _IntegratorState) -> _IntegratorState:
-        rk_step = step_function(integrator_state.state, integrator_state.dt)
-        stage_values = [phase.guards(rk_step.stage_states[i]) for i in tableau.guard_stages]
-        end_values = phase.guards(rk_step.end)
+        rk_step = step_function(integrator_state.state, integrator_state.next_step_length)
+        stage_values = [
+            phase.evaluate_guards(rk_step.stage_states[i]) for i in tableau.guard_stage_indices
+        ]
+        end_guard_values = phase.evaluate_guards(rk_step.end_state)
         squared_error = _compute_mean_squared_error(
-            rk_step, integrator_state.state, end_values, options, phase.state_units
+            rk_step, integrator_state.state, end_guard_values, options, phase.state_units
         )
         guard_minimum_fraction = find_earliest_guard_minimum_fraction(
-            tableau, [integrator_state.guard_values, *stage_values, end_values]
+            tableau, [integrator_state.guard_values, *stage_values, end_guard_values]
         )
         is_within_tolerance = squared_error <= 1.0
         # A step inside which a guard may be negative is repeated up to the guard's minimum.
@@ -428,96 +460,105 @@ def _integrate_until_crossing(
             tableau, squared_error, guard_minimum_fraction.dtype
         )
         length_factor = jnp.where(may_cross_inside, guard_minimum_fraction, controller_factor)
-        status, crossing_bits, is_accepted, time, length = _classify_step(
-            options, integrator_state, length_factor, is_rejected, end_values
+        integration_status, crossing_bits, is_accepted, elapsed_time, next_step_length = (
+            _classify_step(options, integrator_state, length_factor, is_rejected, end_guard_values)
         )
         state, guard_values = select_tree_leaves(
             is_accepted,
-            (rk_step.end, end_values),
+            (rk_step.end_state, end_guard_values),
             (integrator_state.state, integrator_state.guard_values),
         )
-        was_running = integrator_state.status == IntegrationStatus.RUNNING
-        middle_values = (
-            stage_values[tableau.guard_stages.index(tableau.middle_stage)]
+        was_element_running = integrator_state.integration_status == IntegrationStatus.RUNNING
+        middle_guard_values = (
+            stage_values[tableau.guard_stage_indices.index(tableau.middle_stage_index)]
             if stage_values
             else integrator_state.guard_values
         )
-        new_middle_values, new_end_values = select_tree_leaves(
-            was_running,
-            (middle_values, end_values),
-            (integrator_state.middle_values, integrator_state.end_values),
+        new_middle_guard_values, new_end_guard_values = select_tree_leaves(
+            was_element_running,
+            (middle_guard_values, end_guard_values),
+            (integrator_state.middle_guard_values, integrator_state.end_guard_values),
         )
-        minima, tangents = integrator_state.minima, integrator_state.tangents
-        iterations_until_half_ended = integrator_state.iterations_until_half_ended
-        if phase.margins is not None and minima is not None:
-            margin_arguments = phase.margins, phase.evaluate
+        minima_state = integrator_state.minima_state
+        state_tangents = integrator_state.state_tangents
+        n_iterations_until_half_ended = integrator_state.n_iterations_until_half_ended
+        if phase.margin_functions is not None and minima_state is not None:
+            margin_arguments = phase.margin_functions, phase.evaluate_acceleration
             accepted_step = AcceptedStep(
                 integrator_state.state,
-                rk_step.end,
-                integrator_state.dt,
+                rk_step.end_state,
+                integrator_state.next_step_length,
                 is_accepted,
-                integrator_state.tangents,
+                integrator_state.state_tangents,
             )
-            minima = update_minima_state(*margin_arguments, minima, accepted_step)
-        if phase_tangents is not None and tangents is not None:
-            tangents = phase_tangents.propagate_if_accepted(
-                tableau, rk_step.stage_states, tangents, integrator_state.dt, is_accepted
+            minima_state = update_minima_state(*margin_arguments, minima_state, accepted_step)
+        if phase_tangents is not None and state_tangents is not None:
+            state_tangents = phase_tangents.propagate_if_accepted(
+                tableau,
+                rk_step.stage_states,
+                state_tangents,
+                integrator_state.next_step_length,
+                is_accepted,
             )
         if straggler_count is not None:
-            n_running = jnp.sum(status == IntegrationStatus.RUNNING, dtype=jnp.int32)
-            iterations_until_half_ended = jnp.where(
-                2 * n_running > status.size,
+            n_running_elements = jnp.sum(
+                integration_status == IntegrationStatus.RUNNING, dtype=jnp.int32
+            )
+            n_iterations_until_half_ended = jnp.where(
+                2 * n_running_elements > integration_status.size,
                 integrator_state.n_iterations + 1,
-                iterations_until_half_ended,
+                n_iterations_until_half_ended,
             )
         return _IntegratorState(
             state=state,
             guard_values=guard_values,
-            dt=length,
-            time=time,
-            status=status,
+            next_step_length=next_step_length,
+            elapsed_time=elapsed_time,
+            integration_status=integration_status,
             crossing_bits=crossing_bits,
-            middle_values=new_middle_values,
-            end_values=new_end_values,
-            n_tried_steps=integrator_state.n_tried_steps + was_running,
-            iterations_until_half_ended=iterations_until_half_ended,
+            middle_guard_values=new_middle_guard_values,
+            end_guard_values=new_end_guard_values,
+            n_tried_steps=integrator_state.n_tried_steps + was_element_running,
+            n_iterations_until_half_ended=n_iterations_until_half_ended,
             n_iterations=integrator_state.n_iterations + 1,
-            minima=minima,
-            tangents=tangents,
+            minima_state=minima_state,
+            state_tangents=state_tangents,
         )
 
     def needs_more_steps(integrator_state: _IntegratorState) -> Array:
-        """Return whether enough elements are running to continue the loop."""
-        is_running = integrator_state.status == IntegrationStatus.RUNNING
+        """Return whether the loop continues, which depends on the number of running elements."""
+        is_running = integrator_state.integration_status == IntegrationStatus.RUNNING
         if straggler_count is None:
             return jnp.any(is_running)
-        n_running = jnp.sum(is_running, dtype=jnp.int32)
+        n_running_elements = jnp.sum(is_running, dtype=jnp.int32)
         max_iterations = (
-            STRAGGLER_ITERATION_FACTOR * integrator_state.iterations_until_half_ended + 8
+            STRAGGLER_ITERATION_FACTOR * integrator_state.n_iterations_until_half_ended + 8
         )
         exceeds_iteration_limit = integrator_state.n_iterations > max_iterations
-        return (n_running > 0) & ~((n_running <= straggler_count) & exceeds_iteration_limit)
+        return (n_running_elements > 0) & ~(
+            (n_running_elements <= straggler_count) & exceeds_iteration_limit
+        )
 
-    initial_minima = phase.margins and init_minima_state(
-        phase.margins, phase.evaluate, start, phase_tangents
+    initial_minima = phase.margin_functions and init_minima_state(
+        phase.margin_functions, phase.evaluate_acceleration, start_state, phase_tangents
     )
     zero_counts, zero_count = jnp.zeros(initial_dt.shape, jnp.int32), jnp.zeros((), jnp.int32)
     initial_state = _IntegratorState(
-        state=start,
+        state=start_state,
         guard_values=guard_values,
-        dt=initial_dt,
-        time=jnp.zeros_like(initial_dt),
-        status=jnp.where(is_started, IntegrationStatus.RUNNING, IntegrationStatus.IDLE).astype(
-            jnp.int32
-        ),
+        next_step_length=initial_dt,
+        elapsed_time=jnp.zeros_like(initial_dt),
+        integration_status=jnp.where(
+            is_started, IntegrationStatus.RUNNING, IntegrationStatus.IDLE
+        ).astype(jnp.int32),
         crossing_bits=zero_counts,
-        middle_values=guard_values,
-        end_values=guard_values,
+        middle_guard_values=guard_values,
+        end_guard_values=guard_values,
         n_tried_steps=zero_counts,
-        iterations_until_half_ended=zero_count,
+        n_iterations_until_half_ended=zero_count,
         n_iterations=zero_count,
-        minima=initial_minima,
-        tangents=None if phase_tangents is None else phase_tangents.start_tangents,
+        minima_state=initial_minima,
+        state_tangents=None if phase_tangents is None else phase_tangents.start_tangents,
     )
     return lax.while_loop(needs_more_steps, take_one_step, initial_state)
 
@@ -527,74 +568,79 @@ def _classify_step(
     integrator_state: _IntegratorState,
     length_factor: Array,
     is_rejected: Array,
-    end_values: Vector,
+    end_guard_values: Vector,
 ) -> tuple[Array, Array, Array, Array, Array]:
-    """Return status, bits of crossing guards, acceptance, time and next step length of each
+    """Return status, bits of crossing guards, acceptance, time (s) and next step length (s) of each
     element.
 
-    A guard's minimum so close to the start that the time would not advance does not delay the
-    element. The last step ends at the time limit.
+    A step is not rejected for a minimum of a guard so close to its start that the time would not
+    advance. The last step ends at the time limit.
     """
-    is_running = integrator_state.status == IntegrationStatus.RUNNING
+    is_running = integrator_state.integration_status == IntegrationStatus.RUNNING
     is_valid_step = is_running & ~is_rejected
     crossing_bits = jnp.zeros_like(integrator_state.crossing_bits)
-    for guard_number, end_value in enumerate(end_values):
-        crossing_bits = crossing_bits | jnp.where(end_value <= 0.0, 1 << guard_number, 0)
-    has_crossed = is_valid_step & (crossing_bits > 0)
-    is_accepted = is_valid_step & ~has_crossed
-    dt, elapsed_time, time_limit = (
-        integrator_state.dt,
-        integrator_state.time,
-        options.max_phase_time,
+    for guard_number, end_guard_value in enumerate(end_guard_values):
+        crossing_bits = crossing_bits | jnp.where(end_guard_value <= 0.0, 1 << guard_number, 0)
+    has_guard_crossed = is_valid_step & (crossing_bits > 0)
+    is_accepted = is_valid_step & ~has_guard_crossed
+    step_length = integrator_state.next_step_length
+    elapsed_time = integrator_state.elapsed_time
+    time_limit = options.max_phase_time
+    end_time = jnp.where(
+        step_length == time_limit - elapsed_time, time_limit, elapsed_time + step_length
     )
-    end_time = jnp.where(dt == time_limit - elapsed_time, time_limit, elapsed_time + dt)
     elapsed_time = jnp.where(is_accepted, end_time, elapsed_time)
-    next_length = jnp.minimum(dt * length_factor, time_limit - elapsed_time)
+    next_step_length_limit = jnp.minimum(step_length * length_factor, time_limit - elapsed_time)
     has_timed_out = is_accepted & (elapsed_time >= time_limit)
-    is_stuck = (integrator_state.n_tried_steps + 1 >= options.max_solver_steps) | (
-        elapsed_time + next_length == elapsed_time
+    is_step_too_short = (integrator_state.n_tried_steps + 1 >= options.max_solver_steps) | (
+        elapsed_time + next_step_length_limit == elapsed_time
     )
-    status = jnp.where(is_stuck, IntegrationStatus.FAILED, IntegrationStatus.RUNNING)
-    status = jnp.where(
+    integration_status = jnp.where(
+        is_step_too_short, IntegrationStatus.FAILED, IntegrationStatus.RUNNING
+    )
+    integration_status = jnp.where(
         has_timed_out,
         IntegrationStatus.TIMED_OUT,
-        jnp.where(has_crossed, IntegrationStatus.CROSSED, status),
+        jnp.where(has_guard_crossed, IntegrationStatus.CROSSED, integration_status),
     )
     return (
-        jnp.where(is_running, status, integrator_state.status).astype(jnp.int32),
+        jnp.where(is_running, integration_status, integrator_state.integration_status).astype(
+            jnp.int32
+        ),
         jnp.where(is_running, crossing_bits, integrator_state.crossing_bits),
         is_accepted,
         elapsed_time,
-        jnp.where(is_running & ~has_crossed, next_length, dt),
+        jnp.where(is_running & ~has_guard_crossed, next_step_length_limit, step_length),
     )
 
 
 def _compute_mean_squared_error(
     rk_step: RKStep,
-    start: StageState,
-    guard_weights: Vector,
+    start_state: StageState,
+    weighted_guards: Vector,
     options: StepOptions,
     state_units: Vector | None,
 ) -> Array:
-    """Return the mean square of the step's error over its tolerance; infinity if the step is not
-    finite.
+    """Return the mean square of the error of a step, relative to its tolerance.
 
-    The mean is computed in float32, because an error estimate needs no more precision.
+    The result is infinite for a step whose end is not finite. The mean is computed in float32,
+    because an error estimate needs no higher precision.
     """
-    start_numbers, end_numbers = (*start.q, *start.v), (*rk_step.end.q, *rk_step.end.v)
-    to_float32 = lambda x: x.astype(jnp.float32)
+    start_numbers = (*start_state.q, *start_state.v)
+    end_numbers = (*rk_step.end_state.q, *rk_step.end_state.v)
+    convert_to_float32 = lambda x: x.astype(jnp.float32)
     sum_of_squares: Any = 0.0
     units_of_state: Any = (1.0,) * len(start_numbers) if state_units is None else state_units
-    for coordinate_error, start_value, end_value, state_unit in zip(
-        rk_step.error, start_numbers, end_numbers, units_of_state, strict=True
+    for coordinate_error, start_coordinate, end_coordinate, state_unit in zip(
+        rk_step.error_estimate, start_numbers, end_numbers, units_of_state, strict=True
     ):
         error_tolerance = options.atol * state_unit + options.rtol * jnp.maximum(
-            jnp.abs(start_value), jnp.abs(end_value)
+            jnp.abs(start_coordinate), jnp.abs(end_coordinate)
         )
-        error_ratio = to_float32(coordinate_error) / to_float32(error_tolerance)
-        sum_of_squares = sum_of_squares + error_ratio * error_ratio
-    for coordinate_value in guard_weights:
-        sum_of_squares = sum_of_squares + to_float32(0.0 * coordinate_value)
+        relative_error = convert_to_float32(coordinate_error) / convert_to_float32(error_tolerance)
+        sum_of_squares = sum_of_squares + relative_error * relative_error
+    for coordinate_value in weighted_guards:
+        sum_of_squares = sum_of_squares + convert_to_float32(0.0 * coordinate_value)
     return jnp.where(jnp.isfinite(sum_of_squares), sum_of_squares / len(start_numbers), jnp.inf)
 
 
@@ -607,50 +653,53 @@ def sample_batch_phase(
     n_samples: int,
     options: StepOptions,
 ) -> Array:
-    """Return positions, then rates, at `n_samples` equal times of a phase, both ends included.
+    """Return positions and rates at `n_samples` equally spaced times of a phase.
 
-    The shape is (samples, 2 coordinates, batch).
+    The first and the last sample are at the ends of the phase. The positions come before the rates
+    in the shape (samples, 2 coordinates, batch).
     """
 
-    def step_function(state: StageState, length: Array) -> tuple[StageState, Array]:
-        step = rk_step(tableau, phase.evaluate, state, length)
-        return step.end, _compute_mean_squared_error(step, state, (), options, phase.state_units)
+    def step_function(state: StageState, step_length: Array) -> tuple[StageState, Array]:
+        sampled_step = take_rk_step(tableau, phase.evaluate_acceleration, state, step_length)
+        return sampled_step.end_state, _compute_mean_squared_error(
+            sampled_step, state, (), options, phase.state_units
+        )
 
     pack_sample = lambda phase_state: jnp.stack([*phase_state.q, *phase_state.v])
-    start = StageState(q, v, phase.evaluate(q, v))
+    start_state = StageState(q, v, phase.evaluate_acceleration(q, v))
     return sample_at_equal_times(
-        step_function, pack_sample, start, tableau, duration, n_samples, options
+        step_function, pack_sample, start_state, tableau, duration, n_samples, options
     )
 
 
 def sample_at_equal_times(
     step_function: Callable[[Any, Array], tuple[Any, Array]],
     pack_sample: Callable[[Any], Array],
-    start: Any,
+    start_state: Any,
     tableau: ButcherTableau,
     duration: Array,
     n_samples: int,
     options: StepOptions,
 ) -> Array:
-    """Return `pack_sample` of the states at `n_samples` equal times, ends included, on the first
-    axis.
+    """Return samples at `n_samples` equally spaced times from the start to the end of `duration`.
 
-    `step_function(state, length)` returns the end of a step, and the square of its error over its
-    tolerance.
+    - `step_function`: function of state and step length that returns the end of a step, and the
+      square of its error over its tolerance;
+    - `pack_sample`: function from a state to a sample. The samples are on the first axis.
     """
     zero_count = jnp.zeros((), jnp.int32)
 
     def take_sample_step(loop_carry: tuple) -> tuple:
         sample_state, h, time_left, n_tried_steps = loop_carry
-        length = jnp.minimum(h, time_left)
-        step_end, squared_error = step_function(sample_state, length)
-        length_factor = compute_step_size_factor(tableau, squared_error, length.dtype)
+        taken_length = jnp.minimum(h, time_left)
+        step_end, squared_error = step_function(sample_state, taken_length)
+        length_factor = compute_step_size_factor(tableau, squared_error, taken_length.dtype)
         is_within_tolerance = squared_error <= 1.0
         # A step that was shortened to end at a sample does not reduce the next step's length.
         h = jnp.where(
-            is_within_tolerance & (length < h),
-            jnp.maximum(h, length * length_factor),
-            length * length_factor,
+            is_within_tolerance & (taken_length < h),
+            jnp.maximum(h, taken_length * length_factor),
+            taken_length * length_factor,
         )
         is_running = time_left > 0.0
         return (
@@ -658,7 +707,7 @@ def sample_at_equal_times(
             jnp.where(is_running, h, loop_carry[1]),
             jnp.where(
                 is_running & is_within_tolerance,
-                jnp.where(length == time_left, 0.0, time_left - length),
+                jnp.where(taken_length == time_left, 0.0, time_left - taken_length),
                 time_left,
             ),
             n_tried_steps + 1,
@@ -668,10 +717,10 @@ def sample_at_equal_times(
         needs_step = lambda loop_carry: (
             jnp.any(loop_carry[2] > 0.0) & (loop_carry[3] < options.max_solver_steps)
         )
-        initial_carry = (*loop_carry, duration / (n_samples - 1), zero_count)
-        sample_state, h, _, _ = lax.while_loop(needs_step, take_sample_step, initial_carry)
+        initial_loop_carry = (*loop_carry, duration / (n_samples - 1), zero_count)
+        sample_state, h, _, _ = lax.while_loop(needs_step, take_sample_step, initial_loop_carry)
         return (sample_state, h), pack_sample(sample_state)
 
-    initial_carry = start, options.dt0 + jnp.zeros_like(duration)
-    later_samples = lax.scan(integrate_to_next, initial_carry, None, length=n_samples - 1)[1]
-    return jnp.concatenate([pack_sample(start)[None], later_samples])
+    initial_loop_carry = start_state, options.dt0 + jnp.zeros_like(duration)
+    later_samples = lax.scan(integrate_to_next, initial_loop_carry, None, length=n_samples - 1)[1]
+    return jnp.concatenate([pack_sample(start_state)[None], later_samples])

@@ -27,7 +27,7 @@ from vrw_jax.numerics import (
 
 
 class MarginFunctions(NamedTuple):
-    """Margins whose minima are computed, as a function of the state."""
+    """Function that evaluates the margins whose minima are computed, and its options."""
 
     evaluate_margins: Callable[[StageState], Vector]
     # whether the margin at the phase's start counts, see `hybrid.MonitoredFunctions`
@@ -35,18 +35,20 @@ class MarginFunctions(NamedTuple):
 
 
 class MinimaState(NamedTuple):
-    """Margins at the present state, and the step that contains the lowest minimum of each margin so
+    """Margins at the present state, and the solver step with the lowest minimum of each margin so
     far.
     """
 
-    values: Array  # margins at the present state, (margins, batch)
-    rates: Array
-    lowest_values: Array  # lowest interior minimum, (margins, batch); infinity if there is none
+    margin_values: Array  # margins at the present state, (margins, batch)
+    margin_rates: Array
+    lowest_margin_values: (
+        Array  # lowest interior minimum, (margins, batch); infinity if there is none
+    )
     start_q: Array  # positions at the start of that step, (margins, coordinates, batch)
     start_v: Array
     step_length: Array  # length of that step, (margins, batch), s
-    minimum_offset: Array  # time from the step's start to the minimum, s
-    start_rates: Array  # rates of the margins at the step's start
+    time_to_minimum: Array  # time from the step's start to the minimum, s
+    start_margin_rates: Array  # rates of the margins at the step's start
     # tangents of that start, (margins, directions, components, batch)
     start_tangents: Array | None = None
 
@@ -56,10 +58,8 @@ def evaluate_with_rates(
     evaluate_acceleration: EvaluateAcceleration,
     motion_state: StageState,
 ) -> tuple[Vector, Vector]:
-    """Return the values of `evaluate_functions` at a state, and their time derivatives along the
-    motion.
-    """
-    n = len(motion_state.q)
+    """Return functions of the state at a state, and their time derivatives along the motion."""
+    n_coordinates = len(motion_state.q)
 
     def evaluate_along_motion(q: Vector, v: Vector) -> Vector:
         return evaluate_functions(StageState(q, v, evaluate_acceleration(q, v)))
@@ -67,25 +67,26 @@ def evaluate_with_rates(
     return jax.jvp(
         evaluate_along_motion,
         (motion_state.q, motion_state.v),
-        (motion_state.v, motion_state.acceleration.acceleration[:n]),
+        (motion_state.v, motion_state.acceleration.acceleration[:n_coordinates]),
     )
 
 
 def init_minima_state(
-    margins: MarginFunctions,
+    margin_functions: MarginFunctions,
     evaluate_acceleration: EvaluateAcceleration,
     start_state: StageState,
     phase_tangents: PhaseTangents | None,
 ) -> MinimaState:
-    """Return the state of the search for minima before the first step.
+    """Return the state of the search for minima before the first solver step.
 
     A margin that is zero at the start by construction has no negative rate at the start except
     round-off. A negative rate therefore counts as zero.
     """
     margin_values, margin_rates = map(
-        jnp.stack, evaluate_with_rates(margins.evaluate_margins, evaluate_acceleration, start_state)
+        jnp.stack,
+        evaluate_with_rates(margin_functions.evaluate_margins, evaluate_acceleration, start_state),
     )
-    includes_start = jnp.asarray(margins.includes_start)[:, None]
+    includes_start = jnp.asarray(margin_functions.includes_start)[:, None]
     infinite_minima = jnp.zeros_like(margin_values)
     zero_starts = jnp.zeros(
         (len(margin_values), len(start_state.q), margin_values.shape[-1]), margin_values.dtype
@@ -110,35 +111,41 @@ def init_minima_state(
 
 
 class AcceptedStep(NamedTuple):
-    """Solver step, and the batch elements that accepted it."""
+    """Solver step of all batch elements, and whether each element has accepted it."""
 
-    start: StageState
-    end: StageState
-    length: Array
+    start_state: StageState
+    end_state: StageState
+    step_length: Array
     is_accepted: Array
     start_tangents: Array | None  # tangents of the step's start
 
 
 def update_minima_state(
-    margins: MarginFunctions,
+    margin_functions: MarginFunctions,
     evaluate_acceleration: EvaluateAcceleration,
     minima_state: MinimaState,
     accepted_step: AcceptedStep,
 ) -> MinimaState:
-    """Return the minima, updated with the minima inside an accepted step."""
-    step_start, step_end, length, is_accepted, _ = accepted_step
+    """Return the search for minima, updated with the minima inside an accepted step."""
+    step_start, step_end, step_length, is_accepted, _ = accepted_step
     margin_values, margin_rates = map(
-        jnp.stack, evaluate_with_rates(margins.evaluate_margins, evaluate_acceleration, step_end)
+        jnp.stack,
+        evaluate_with_rates(margin_functions.evaluate_margins, evaluate_acceleration, step_end),
     )
     minimum_location, minimum_value = find_cubic_minimum(
-        minima_state.values, minima_state.rates * length, margin_values, margin_rates * length
+        minima_state.margin_values,
+        minima_state.margin_rates * step_length,
+        margin_values,
+        margin_rates * step_length,
     )
     minimum_value = jnp.where(
-        jnp.isfinite(minimum_value), minimum_value, jnp.minimum(minima_state.values, margin_values)
+        jnp.isfinite(minimum_value),
+        minimum_value,
+        jnp.minimum(minima_state.margin_values, margin_values),
     )
-    has_interior_minimum = (minima_state.rates < 0.0) & (margin_rates >= 0.0)
+    has_interior_minimum = (minima_state.margin_rates < 0.0) & (margin_rates >= 0.0)
     is_minimum_lower = (
-        is_accepted & has_interior_minimum & (minimum_value < minima_state.lowest_values)
+        is_accepted & has_interior_minimum & (minimum_value < minima_state.lowest_margin_values)
     )
     replace_if_lower = lambda new_value, old_value: jnp.where(
         is_minimum_lower, new_value, old_value
@@ -152,14 +159,18 @@ def update_minima_state(
             is_minimum_lower[:, None, None], accepted_step.start_tangents[None], start_tangents
         )
     return MinimaState(
-        values=jnp.where(is_accepted, margin_values, minima_state.values),
-        rates=jnp.where(is_accepted, margin_rates, minima_state.rates),
-        lowest_values=replace_if_lower(minimum_value, minima_state.lowest_values),
+        margin_values=jnp.where(is_accepted, margin_values, minima_state.margin_values),
+        margin_rates=jnp.where(is_accepted, margin_rates, minima_state.margin_rates),
+        lowest_margin_values=replace_if_lower(minimum_value, minima_state.lowest_margin_values),
         start_q=replace_start_if_lower(step_start.q, minima_state.start_q),
         start_v=replace_start_if_lower(step_start.v, minima_state.start_v),
-        step_length=replace_if_lower(length, minima_state.step_length),
-        minimum_offset=replace_if_lower(minimum_location * length, minima_state.minimum_offset),
-        start_rates=replace_if_lower(minima_state.rates, minima_state.start_rates),
+        step_length=replace_if_lower(step_length, minima_state.step_length),
+        time_to_minimum=replace_if_lower(
+            minimum_location * step_length, minima_state.time_to_minimum
+        ),
+        start_margin_rates=replace_if_lower(
+            minima_state.margin_rates, minima_state.start_margin_rates
+        ),
         start_tangents=start_tangents,
     )
 
@@ -173,87 +184,94 @@ class MinimaResult(NamedTuple):
 
 
 class _MinimumSearch(NamedTuple):
-    """State of the secant iteration for the minimum of one margin, for each batch element."""
+    """State of the secant iteration for the minimum of one margin in each batch element."""
 
-    length: Array  # length of the next try, s
-    best_length: Array  # length with the smallest rate so far, s
-    best_rate: Array
-    value: Array
+    step_length: Array  # length of the next try, s
+    best_step_length: Array  # length with the smallest rate so far, s
+    best_margin_rate: Array
+    margin_value: Array
     is_unresolved: Array
     n_iterations: Array
 
 
 def refine_minima(
-    margins: MarginFunctions,
+    margin_functions: MarginFunctions,
     step_function: TakeStep,
     evaluate_acceleration: EvaluateAcceleration,
     minima_state: MinimaState,
     start_values: Array,
     options: StepOptions,
 ) -> MinimaResult:
-    """Return the minima of the margins over the phase.
+    """Return the minima of the margins over the phase, refined by secant steps.
 
     `start_values` are the margins at the start of the phase. Each minimum takes at most
     `max_margin_search_iterations` secant steps. Each secant step begins at the start of the solver
     step that contains the minimum.
     """
 
-    def refine_margin(_: None, margin_inputs: tuple) -> tuple[None, tuple[Array, Array]]:
+    def refine_margin_minimum(_: None, margin_inputs: tuple) -> tuple[None, tuple[Array, Array]]:
         margin_index, minima_state_of_margin = margin_inputs
         q, v = tuple(minima_state_of_margin.start_q), tuple(minima_state_of_margin.start_v)
-        minimum_start = StageState(q, v, evaluate_acceleration(q, v))
+        minimum_step_start = StageState(q, v, evaluate_acceleration(q, v))
 
-        def selected_margin(state: StageState) -> Array:
-            is_selected = jnp.arange(len(margins.includes_start)) == margin_index
+        def evaluate_selected_margin(state: StageState) -> Array:
+            is_selected = jnp.arange(len(margin_functions.includes_start)) == margin_index
             return jnp.sum(
-                jnp.where(is_selected[:, None], jnp.stack(margins.evaluate_margins(state)), 0.0), 0
+                jnp.where(
+                    is_selected[:, None], jnp.stack(margin_functions.evaluate_margins(state)), 0.0
+                ),
+                0,
             )
 
-        def improve(minimum_search: _MinimumSearch) -> _MinimumSearch:
-            step_end = step_function(minimum_start, minimum_search.length).end
+        def improve_minimum_search(minimum_search: _MinimumSearch) -> _MinimumSearch:
+            step_end = step_function(minimum_step_start, minimum_search.step_length).end_state
             (margin_value,), (margin_rate,) = evaluate_with_rates(
-                lambda state: (selected_margin(state),), evaluate_acceleration, step_end
+                lambda state: (evaluate_selected_margin(state),), evaluate_acceleration, step_end
             )
-            length_change = minimum_search.length - minimum_search.best_length
-            rate_derivative = (margin_rate - minimum_search.best_rate) / jnp.where(
+            length_change = minimum_search.step_length - minimum_search.best_step_length
+            margin_rate_slope = (margin_rate - minimum_search.best_margin_rate) / jnp.where(
                 length_change == 0.0, 1.0, length_change
             )
-            is_secant_usable = (length_change != 0.0) & (rate_derivative > 0.0)
+            is_secant_usable = (length_change != 0.0) & (margin_rate_slope > 0.0)
             length_correction = jnp.where(
                 is_secant_usable,
-                -margin_rate / jnp.where(is_secant_usable, rate_derivative, 1.0),
+                -margin_rate / jnp.where(is_secant_usable, margin_rate_slope, 1.0),
                 0.0,
             )
-            length = jnp.clip(
-                minimum_search.length + length_correction, 0.0, minima_state_of_margin.step_length
+            step_length = jnp.clip(
+                minimum_search.step_length + length_correction,
+                0.0,
+                minima_state_of_margin.step_length,
             )
-            has_converged = (
-                jnp.abs(length - minimum_search.length)
+            has_secant_converged = (
+                jnp.abs(step_length - minimum_search.step_length)
                 <= MINIMUM_LOCATION_TOLERANCE * minima_state_of_margin.step_length
             )
-            has_smaller_rate = jnp.abs(margin_rate) < jnp.abs(minimum_search.best_rate)
+            has_smaller_rate = jnp.abs(margin_rate) < jnp.abs(minimum_search.best_margin_rate)
             improved_search = _MinimumSearch(
-                length=length,
-                best_length=jnp.where(
-                    has_smaller_rate, minimum_search.length, minimum_search.best_length
+                step_length=step_length,
+                best_step_length=jnp.where(
+                    has_smaller_rate, minimum_search.step_length, minimum_search.best_step_length
                 ),
-                best_rate=jnp.where(has_smaller_rate, margin_rate, minimum_search.best_rate),
-                value=margin_value,
-                is_unresolved=minimum_search.is_unresolved & ~has_converged,
+                best_margin_rate=jnp.where(
+                    has_smaller_rate, margin_rate, minimum_search.best_margin_rate
+                ),
+                margin_value=margin_value,
+                is_unresolved=minimum_search.is_unresolved & ~has_secant_converged,
                 n_iterations=minimum_search.n_iterations,
             )
             return select_tree_leaves(
                 minimum_search.is_unresolved, improved_search, minimum_search
             )._replace(n_iterations=minimum_search.n_iterations + 1)
 
-        has_minimum = jnp.isfinite(minima_state_of_margin.lowest_values)
-        zero_length = jnp.zeros_like(minima_state_of_margin.step_length)
+        has_minimum = jnp.isfinite(minima_state_of_margin.lowest_margin_values)
+        zero_step_length = jnp.zeros_like(minima_state_of_margin.step_length)
         n_iterations = jnp.zeros((), jnp.int32)
         minimum_search = _MinimumSearch(
-            minima_state_of_margin.minimum_offset,
-            zero_length,
-            minima_state_of_margin.start_rates,
-            zero_length + jnp.inf,
+            minima_state_of_margin.time_to_minimum,
+            zero_step_length,
+            minima_state_of_margin.start_margin_rates,
+            zero_step_length + jnp.inf,
             has_minimum,
             n_iterations,
         )
@@ -261,14 +279,16 @@ def refine_minima(
             jnp.any(minimum_search.is_unresolved)
             & (minimum_search.n_iterations < options.max_margin_search_iterations)
         )
-        final_search = lax.while_loop(needs_iteration, improve, minimum_search)
-        return None, (final_search.value, final_search.length)
+        final_search = lax.while_loop(needs_iteration, improve_minimum_search, minimum_search)
+        return None, (final_search.margin_value, final_search.step_length)
 
-    includes_start = np.asarray(margins.includes_start)[:, None]
-    end_minima = jnp.minimum(jnp.where(includes_start, start_values, jnp.inf), minima_state.values)
+    includes_start = np.asarray(margin_functions.includes_start)[:, None]
+    end_minima = jnp.minimum(
+        jnp.where(includes_start, start_values, jnp.inf), minima_state.margin_values
+    )
     margin_indices = jnp.arange(len(includes_start), dtype=jnp.int32)
     interior_minima, minimum_length = lax.scan(
-        refine_margin, None, (margin_indices, minima_state._replace(start_tangents=None))
+        refine_margin_minimum, None, (margin_indices, minima_state._replace(start_tangents=None))
     )[1]
     return MinimaResult(jnp.minimum(interior_minima, end_minima), interior_minima, minimum_length)
 
@@ -285,32 +305,36 @@ def compute_minima_jvp(
 ) -> Array:
     """Return the tangents of the minima, an array (directions, margins, batch).
 
-    They are tangents of the margins at fixed times of the minima, because the shift of a minimum
-    has no first-order effect. `phase_ends` are the start and the end of the phase, and
-    `end_tangents` the tangents of the end state.
+    The tangents are those of the margins at fixed times, because the shift of a minimum has no
+    first-order effect. `phase_ends` are the start and the end of the phase, and `end_tangents` are
+    the tangents of the end state.
     """
-    margins, evaluate_acceleration = make_margins(
+    margin_functions, evaluate_acceleration = make_margins(
         phase_tangents.constants, phase_tangents.held_constants
     )
 
     def evaluate_margins(constants: Any, held_constants: Vector, q: Vector, v: Vector) -> Array:
-        margin_functions, acceleration_of = make_margins(constants, held_constants)
-        return jnp.stack(margin_functions.evaluate_margins(StageState(q, v, acceleration_of(q, v))))
+        margin_functions, evaluate_acceleration_at = make_margins(constants, held_constants)
+        return jnp.stack(
+            margin_functions.evaluate_margins(StageState(q, v, evaluate_acceleration_at(q, v)))
+        )
 
     compute_margin_tangents = functools.partial(phase_tangents.evaluate_tangents, evaluate_margins)
 
     def compute_margin_tangent(_: None, margin_inputs: tuple) -> tuple[None, Array]:
-        margin_index, minima_state_of_margin, length = margin_inputs
+        margin_index, minima_state_of_margin, step_length = margin_inputs
         q, v = tuple(minima_state_of_margin.start_q), tuple(minima_state_of_margin.start_v)
-        minimum_start = StageState(q, v, evaluate_acceleration(q, v))
-        rk_step = step_function(minimum_start, length)
-        state_tangents = phase_tangents.propagate(
-            tableau, rk_step.stage_states, minima_state_of_margin.start_tangents, length
+        minimum_step_start = StageState(q, v, evaluate_acceleration(q, v))
+        rk_step = step_function(minimum_step_start, step_length)
+        state_tangents = phase_tangents.propagate_to_step_end(
+            tableau, rk_step.stage_states, minima_state_of_margin.start_tangents, step_length
         )
-        is_selected = jnp.arange(len(margins.includes_start)) == margin_index
+        is_selected = jnp.arange(len(margin_functions.includes_start)) == margin_index
         return None, jnp.sum(
             jnp.where(
-                is_selected[:, None], compute_margin_tangents(rk_step.end, state_tangents), 0.0
+                is_selected[:, None],
+                compute_margin_tangents(rk_step.end_state, state_tangents),
+                0.0,
             ),
             1,
         )
@@ -328,7 +352,9 @@ def compute_minima_jvp(
     start_tangents = compute_margin_tangents(phase_ends[0], phase_tangents.start_tangents)
     end_margin_tangents = compute_margin_tangents(phase_ends[1], end_tangents)
     end_minima_tangents = jnp.where(
-        minima_state.values <= minima_result.phase_minima, end_margin_tangents, start_tangents
+        minima_state.margin_values <= minima_result.phase_minima,
+        end_margin_tangents,
+        start_tangents,
     )
     return jnp.where(
         minima_result.interior_minima <= minima_result.phase_minima,

@@ -26,26 +26,26 @@ from vrw_jax.numerics import Vector, run_if_any
 
 
 class ButcherTableau(NamedTuple):
-    """Explicit Runge-Kutta method whose last stage is the end of the step and the first stage of
-    the next.
+    """Tableau of an explicit Runge-Kutta method whose last stage is the first stage of the next
+    step.
     """
 
-    order: int
-    nodes: np.ndarray  # Butcher's c: times of the stages, in step lengths
-    matrix: np.ndarray  # Butcher's A: from accelerations to rates
-    matrix_squared: np.ndarray  # A squared: from accelerations to positions
-    b_error: np.ndarray
-    b_error_position: np.ndarray
-    middle_stage: int
+    convergence_order: int
+    stage_nodes: np.ndarray  # Butcher's c: times of the stages, in step lengths
+    stage_matrix: np.ndarray  # Butcher's A: from accelerations to rates
+    squared_stage_matrix: np.ndarray  # A squared: from accelerations to positions
+    rate_error_weights: np.ndarray
+    position_error_weights: np.ndarray
+    middle_stage_index: int
     """Index of a stage well inside the step, at which the parabolas through guards are fitted."""
-    guard_stages: tuple[int, ...]
+    guard_stage_indices: tuple[int, ...]
     """Indices of the stages at which guards are sampled to find minima inside a step. They are
     separated from each other and from both ends.
     """
     bernstein_matrix: np.ndarray
     """Matrix from guard values to the inner Bernstein coefficients of the polynomial through
     them. The polynomial does not fall below its least coefficient. The values are those at the
-    start, at `guard_stages` and at the end.
+    start, at `guard_stage_indices` and at the end.
     """
 
     def __eq__(self, other: object) -> bool:
@@ -57,36 +57,46 @@ class ButcherTableau(NamedTuple):
 
 @functools.cache
 def load_explicit_tableau(solver_name: str) -> ButcherTableau | None:
-    """Return diffrax's tableau of the given name; None if the method is not an explicit Runge-Kutta
-    method.
+    """Return diffrax's tableau of the given name, or None for a method that is not an explicit
+    Runge-Kutta method.
 
-    The numbers are stored beside this file, because loading diffrax takes a fifth of a cached
-    start.
+    The numbers are stored in a file beside this module, because the import of diffrax takes a fifth
+    of the time of a start with cached programs.
     """
     tableaus = json.loads(Path(__file__).with_name("tableaus.json").read_text(encoding="utf-8"))
     if solver_name not in tableaus:
         return None
     tableau_entry = tableaus[solver_name]
-    n, has_step_end_stage = len(tableau_entry["b_sol"]), tableau_entry["ssal"]
-    matrix = np.zeros((n + (not has_step_end_stage), n + (not has_step_end_stage)))
+    n_stages, has_step_end_stage = len(tableau_entry["b_sol"]), tableau_entry["ssal"]
+    stage_matrix = np.zeros(
+        (n_stages + (not has_step_end_stage), n_stages + (not has_step_end_stage))
+    )
     for i, matrix_row in enumerate(tableau_entry["a_lower"]):
-        matrix[i + 1, : i + 1] = matrix_row
-    b_error = np.zeros(len(matrix))
-    b_error[:n] = tableau_entry["b_error"]
+        stage_matrix[i + 1, : i + 1] = matrix_row
+    rate_error_weights = np.zeros(len(stage_matrix))
+    rate_error_weights[:n_stages] = tableau_entry["b_error"]
     if not has_step_end_stage:
-        matrix[n, :n] = tableau_entry["b_sol"]
-    nodes = matrix.sum(axis=1)
-    guard_stages = _choose_guard_stages(nodes)
+        stage_matrix[n_stages, :n_stages] = tableau_entry["b_sol"]
+    stage_nodes = stage_matrix.sum(axis=1)
+    guard_stage_indices = _choose_guard_stages(stage_nodes)
+    guard_nodes = np.array([0.0, *stage_nodes[list(guard_stage_indices)], 1.0])
+    degree = len(guard_nodes) - 1
+    bernstein_basis = [
+        math.comb(degree, i) * guard_nodes**i * (1.0 - guard_nodes) ** (degree - i)
+        for i in range(degree + 1)
+    ]
     return ButcherTableau(
-        order=tableau_entry["order"],
-        nodes=nodes,
-        matrix=matrix,
-        matrix_squared=_set_roundoff_to_zero(matrix @ matrix),
-        b_error=b_error,
-        b_error_position=_set_roundoff_to_zero(b_error @ matrix),
-        middle_stage=min(guard_stages, key=lambda i: abs(nodes[i] - 0.45), default=0),
-        guard_stages=guard_stages,
-        bernstein_matrix=_make_bernstein_matrix(np.array([0.0, *nodes[list(guard_stages)], 1.0])),
+        convergence_order=tableau_entry["order"],
+        stage_nodes=stage_nodes,
+        stage_matrix=stage_matrix,
+        squared_stage_matrix=_set_roundoff_to_zero(stage_matrix @ stage_matrix),
+        rate_error_weights=rate_error_weights,
+        position_error_weights=_set_roundoff_to_zero(rate_error_weights @ stage_matrix),
+        middle_stage_index=min(
+            guard_stage_indices, key=lambda i: abs(stage_nodes[i] - 0.45), default=0
+        ),
+        guard_stage_indices=guard_stage_indices,
+        bernstein_matrix=np.linalg.inv(np.stack(bernstein_basis, 1))[1:-1],
     )
 
 
@@ -98,44 +108,39 @@ or before the end is the hardest to detect.
 """
 
 
-def _choose_guard_stages(nodes: np.ndarray) -> tuple[int, ...]:
+def _choose_guard_stages(stage_nodes: np.ndarray) -> tuple[int, ...]:
     """Return the indices of the stages nearest to GUARD_STAGE_NODES.
 
     Of several stages at one node the last stage is returned, because it is the most accurate.
     """
-    last_stage = {
+    last_stage_at_node = {
         round(float(target_stage_node), 3): i
-        for i, target_stage_node in enumerate(nodes)
+        for i, target_stage_node in enumerate(stage_nodes)
         if 0.05 < target_stage_node < 0.95
     }
     nearest_nodes = {
         min(
             (abs(target_stage_node - target_node), target_stage_node)
-            for target_stage_node in last_stage
+            for target_stage_node in last_stage_at_node
         )[1]
         for target_node in GUARD_STAGE_NODES
-        if last_stage
+        if last_stage_at_node
     }
-    return tuple(last_stage[target_stage_node] for target_stage_node in sorted(nearest_nodes))
-
-
-def _make_bernstein_matrix(nodes: np.ndarray) -> np.ndarray:
-    """Return the matrix from a polynomial's values at `nodes` in [0, 1] to its inner Bernstein
-    coefficients.
-    """
-    n = len(nodes) - 1
-    bernstein_basis = [math.comb(n, i) * nodes**i * (1.0 - nodes) ** (n - i) for i in range(n + 1)]
-    return np.linalg.inv(np.stack(bernstein_basis, 1))[1:-1]
+    return tuple(
+        last_stage_at_node[target_stage_node] for target_stage_node in sorted(nearest_nodes)
+    )
 
 
 def fit_guard_parabola(
     tableau: ButcherTableau, start_value: Array, middle_value: Array, end_value: Array
 ) -> tuple[Array, Array]:
-    """Return curvature and start rate of the parabola through a guard's values, in step lengths.
+    """Return the quadratic and the linear coefficient of the parabola through three values of a
+    guard.
 
-    `middle_value` is the guard at the stage `middle_stage`.
+    The parabola is a function of the fraction of the step. `middle_value` is the guard at the stage
+    `middle_stage_index`.
     """
-    middle_node = float(tableau.nodes[tableau.middle_stage])
+    middle_node = float(tableau.stage_nodes[tableau.middle_stage_index])
     curvature = (end_value - start_value - (middle_value - start_value) / middle_node) / (
         1.0 - middle_node
     )
@@ -147,12 +152,12 @@ def _compute_bernstein_coefficients(
 ) -> list[Array]:
     """Return a guard's Bernstein coefficients except the last one.
 
-    The guard is positive if all coefficients are positive. `guard_values` are the guard's values at
-    the start, at the `guard_stages`, and at the end.
+    The guard is positive if all coefficients are positive. `guard_values` are the values of the
+    guard at the start, at the stages `guard_stage_indices`, and at the end.
     """
     return [
         guard_values[0],
-        *(_weighted_sum(matrix_row, guard_values) for matrix_row in tableau.bernstein_matrix),
+        *(_sum_weighted_terms(matrix_row, guard_values) for matrix_row in tableau.bernstein_matrix),
     ]
 
 
@@ -169,21 +174,28 @@ def find_guard_minimum(tableau: ButcherTableau, guard_values: list[Array]) -> tu
     minimum.
 
     The fraction of the step is the node of the lowest Bernstein coefficient. A guard that only
-    decreases has no minimum. `guard_values` are the guard's values at the start, at the
-    `guard_stages`, and at the end.
+    decreases has no minimum. `guard_values` are the values of the guard at the start, at the stages
+    `guard_stage_indices`, and at the end.
     """
-    min_coefficient, *inner_coefficients = _compute_bernstein_coefficients(tableau, guard_values)
-    minimum_fraction = jnp.zeros_like(min_coefficient)
+    min_bernstein_coefficient, *inner_coefficients = _compute_bernstein_coefficients(
+        tableau, guard_values
+    )
+    minimum_fraction = jnp.zeros_like(min_bernstein_coefficient)
     for i, inner_coefficient in enumerate(inner_coefficients):
         minimum_fraction = jnp.where(
-            inner_coefficient < min_coefficient, (i + 1) / len(guard_values[1:]), minimum_fraction
+            inner_coefficient < min_bernstein_coefficient,
+            (i + 1) / len(guard_values[1:]),
+            minimum_fraction,
         )
-        min_coefficient = jnp.minimum(inner_coefficient, min_coefficient)
-    is_rising = inner_coefficients[-1] < guard_values[-1]
+        min_bernstein_coefficient = jnp.minimum(inner_coefficient, min_bernstein_coefficient)
+    has_guard_risen = inner_coefficients[-1] < guard_values[-1]
     for preceding_coefficient, following_coefficient in itertools.pairwise(guard_values):
-        is_rising = is_rising | (preceding_coefficient < following_coefficient)
+        has_guard_risen = has_guard_risen | (preceding_coefficient < following_coefficient)
     has_guard_minimum = (
-        (min_coefficient <= 0.0) & (minimum_fraction > 0.0) & is_rising & (guard_values[-1] > 0.0)
+        (min_bernstein_coefficient <= 0.0)
+        & (minimum_fraction > 0.0)
+        & has_guard_risen
+        & (guard_values[-1] > 0.0)
     )
     return has_guard_minimum, minimum_fraction
 
@@ -194,8 +206,8 @@ def find_earliest_guard_minimum_fraction(
     """Return the fraction of the step to the earliest minimum at which some guard may be negative.
 
     The result is 1 if there is no such minimum. `guard_values` are the guards at the start, at the
-    `guard_stages` and at the end. The minimum is located only if some batch element of the group
-    may have one.
+    stages `guard_stage_indices`, and at the end. The minimum is located only if some batch element
+    may have a minimum.
     """
     values_by_guard = [list(guard_values) for guard_values in zip(*guard_values, strict=True)]
     may_cross_inside = functools.reduce(
@@ -242,12 +254,12 @@ def compute_step_size_factor(
     float_dtype: Any,
     step_size_controller: StepSizeController = STEP_SIZE_CONTROLLER,
 ) -> Array:
-    """Return the ratio of the next step's length to the present length.
+    """Return the ratio of the length of the next step to that of the present step.
 
     `squared_error` is the mean square of the step's error over its tolerance.
     """
     error_power = jnp.exp(
-        jnp.log(jnp.clip(squared_error, 1e-20, 1e20)) * (-0.5 / tableau.order)
+        jnp.log(jnp.clip(squared_error, 1e-20, 1e20)) * (-0.5 / tableau.convergence_order)
     ).astype(float_dtype)
     return jnp.clip(
         step_size_controller.safety_factor * error_power,
@@ -257,7 +269,7 @@ def compute_step_size_factor(
 
 
 def _set_roundoff_to_zero(x: np.ndarray) -> np.ndarray:
-    """Return the matrix with zeros in place of numbers that are only round-off."""
+    """Return the matrix with zeros in place of entries that are round-off."""
     return np.where(np.abs(x) < 1e-14 * np.max(np.abs(x)), 0.0, x)
 
 
@@ -270,21 +282,19 @@ class StageAccelerations(NamedTuple):
 
 
 def compute_real_stability_limit(tableau: ButcherTableau) -> float:
-    """Return the largest z with |R(-z)| <= 1, where R is the method's stability function.
+    """Return the largest z with |R(-z)| <= 1, where R is the stability function of the method.
 
-    A mode that decays at the rate r allows steps up to z / r.
+    For a motion that decays at the rate r, the largest stable step is z / r.
     """
-    z, stage_values, stability_polynomial = (
-        np.linspace(0.01, 20.0, 2000),
-        np.ones(len(tableau.nodes)),
-        1.0,
-    )
+    z = np.linspace(0.01, 20.0, 2000)
+    stage_values = np.ones(len(tableau.stage_nodes))
+    stability_polynomial = 1.0
     # R is the polynomial 1 - z w (1 - z A + ...).
     for matrix_power in range(1, len(stage_values) + 1):
         stability_polynomial = stability_polynomial + (-z) ** matrix_power * (
-            tableau.matrix[-1] @ stage_values
+            tableau.stage_matrix[-1] @ stage_values
         )
-        stage_values = tableau.matrix @ stage_values
+        stage_values = tableau.stage_matrix @ stage_values
     return float(z[np.argmax(np.abs(stability_polynomial) > 1.0 + 1e-12)])
 
 
@@ -297,10 +307,10 @@ class StageState(NamedTuple):
 
 
 class RKStep(NamedTuple):
-    """Runge-Kutta step: its end, the error estimate, and its stages."""
+    """Result of a Runge-Kutta step: state at the end, error estimate, and states of all stages."""
 
-    end: StageState
-    error: Vector  # error estimates of the positions, then of the rates
+    end_state: StageState
+    error_estimate: Vector  # error estimates of the positions, then of the rates
     stage_states: list[StageState]  # the start first, the end last
 
 
@@ -308,19 +318,17 @@ EvaluateAcceleration = Callable[[Vector, Vector], StageAccelerations]
 TakeStep = Callable[[StageState, Array], RKStep]
 
 
-def rk_step(
+def take_rk_step(
     tableau: ButcherTableau,
     evaluate_acceleration: EvaluateAcceleration,
     start_state: StageState,
     h: Array,
     with_error: bool = True,
 ) -> RKStep:
-    """Return end, error estimate and stages of one Runge-Kutta step of length `h`, s, from a
-    state.
-    """
+    """Return end state, error estimate and stages of one Runge-Kutta step of length `h`, s."""
     n = len(start_state.q)
     stage_states, stage_accelerations = [start_state], [start_state.acceleration.acceleration[:n]]
-    for i in range(1, len(tableau.nodes)):
+    for i in range(1, len(tableau.stage_nodes)):
         q, v = evaluate_stage(tableau, i, start_state.q, start_state.v, stage_accelerations, h)
         stage_acceleration = evaluate_acceleration(q, v)
         stage_states.append(StageState(q, v, stage_acceleration))
@@ -333,11 +341,11 @@ def rk_step(
             for coordinate in range(n)
         ]
         position_errors = [
-            h * h * _weighted_sum(tableau.b_error_position, accelerations)
+            h * h * _sum_weighted_terms(tableau.position_error_weights, accelerations)
             for accelerations in accelerations_by_coordinate
         ]
         rate_errors = [
-            h * _weighted_sum(tableau.b_error, accelerations)
+            h * _sum_weighted_terms(tableau.rate_error_weights, accelerations)
             for accelerations in accelerations_by_coordinate
         ]
         error_estimate = (*position_errors, *rate_errors)
@@ -348,28 +356,30 @@ def rk_step(
 def evaluate_stage(
     tableau: ButcherTableau,
     stage_index: int,
-    q0: Vector,
-    v0: Vector,
+    start_positions: Vector,
+    start_rates: Vector,
     stage_accelerations: list[Vector],
     h: Array,
 ) -> tuple[Vector, Vector]:
-    """Return positions and rates of the stage `stage_index` from the accelerations of the earlier
+    """Return positions and rates at the stage `stage_index`, given the accelerations of the earlier
     stages.
     """
     stage_positions, stage_rates = [], []
-    for coordinate in range(len(q0)):
+    for coordinate in range(len(start_positions)):
         coordinate_accelerations = [
             stage_acceleration[coordinate] for stage_acceleration in stage_accelerations
         ]
-        twice_integrated_acceleration = _weighted_sum(
-            tableau.matrix_squared[stage_index], coordinate_accelerations
+        twice_integrated_acceleration = _sum_weighted_terms(
+            tableau.squared_stage_matrix[stage_index], coordinate_accelerations
         )
-        integrated_acceleration = _weighted_sum(
-            tableau.matrix[stage_index], coordinate_accelerations
+        integrated_acceleration = _sum_weighted_terms(
+            tableau.stage_matrix[stage_index], coordinate_accelerations
         )
-        displacement_at_constant_rate = float(tableau.nodes[stage_index]) * v0[coordinate]
+        displacement_at_constant_rate = (
+            float(tableau.stage_nodes[stage_index]) * start_rates[coordinate]
+        )
         stage_positions.append(
-            q0[coordinate]
+            start_positions[coordinate]
             + h
             * (
                 displacement_at_constant_rate
@@ -377,16 +387,16 @@ def evaluate_stage(
                 else displacement_at_constant_rate + h * twice_integrated_acceleration
             )
         )
-        stage_rates.append(v0[coordinate] + h * integrated_acceleration)
+        stage_rates.append(start_rates[coordinate] + h * integrated_acceleration)
     return tuple(stage_positions), tuple(stage_rates)
 
 
-def _weighted_sum(weights: np.ndarray, summands: list[Array]) -> Any:
-    """Return the sum of `weights` times `summands`; None if all weights vanish.
+def _sum_weighted_terms(weights: np.ndarray, summed_terms: list[Array]) -> Any:
+    """Return the sum of `weights` times `summed_terms`, or None if all weights are zero.
 
-    Functions of `lax` form the sum, because they are traced in a third of the time of Python's
-    operators. Half of a step's operations are such sums.
+    The sum uses functions of `lax`, which are traced in a third of the time of Python's operators.
+    Half of the operations of a step are such sums.
     """
-    weights_and_terms = zip(weights, summands, strict=False)
+    weights_and_terms = zip(weights, summed_terms, strict=False)
     weighted_terms = [lax.mul(x.dtype.type(w), x) for w, x in weights_and_terms if w != 0.0]
     return functools.reduce(lax.add, weighted_terms) if weighted_terms else None

@@ -1,13 +1,13 @@
-"""Tangents of a phase's end by its start and the constants of its equations, for a batch.
+"""Tangents of the end of a phase along tangents of its start and of its constants, for a batch.
 
 Each Runge-Kutta step is repeated for the linearized equations, for all requested directions. The
-Jacobians at the stages are the same for all directions and computed once; each direction then costs
-some hundred products. Step sizes and the iterations of an event search are not differentiated. The
-derivative is that of the discrete flow with the step lengths that were taken, and of the time at
-which the guard vanishes.
+Jacobians at the stages are the same for all directions and are computed once. Each direction then
+costs some hundred products. Step sizes and iterations of the event search are not differentiated.
+The derivative is that of the discrete flow with the step lengths that were taken, and of the time
+at which the guard vanishes.
 
-`jax.vmap` around a derivative supplies its directions. This module makes them the first axis of
-arrays, so that loops are traced once, not again for the vmap.
+Directions come from `jax.vmap` around a derivative. This module makes the directions the first axis
+of arrays, so that loops are traced once and not again for the vmap.
 """
 
 import functools
@@ -34,12 +34,12 @@ from vrw_jax.runtime import with_default_jax_settings
 
 
 class ImplicitDynamics(NamedTuple):
-    """Equations of motion near a state with known accelerations, in implicit form."""
+    """Implicit form of the equations of motion, near a state with known accelerations."""
 
-    residual: Callable[[StageState], Vector]
+    evaluate_residual: Callable[[StageState], Vector]
     """Function that returns the left side minus the right side of the equations at the state's
     accelerations."""
-    solve: Callable[[StageState, Vector], Vector]
+    solve_for_accelerations: Callable[[StageState, Vector], Vector]
     """Function that returns the accelerations for which the left side equals the given values."""
 
 
@@ -54,17 +54,15 @@ as the start of a phase.
 def apply_batched_jvp_rule(
     evaluate_rule: Callable[[Any, Any], tuple[Any, Any]], primals: Any, tangents: Any
 ) -> tuple[Any, Any]:
-    """Return (values, tangents) of a JVP rule from a function that takes all directions together.
+    """Return the (values, tangents) of a JVP rule that computes all directions of a vmap together.
 
-    `primals` and `tangents` are the arguments of the rule. `evaluate_rule` takes tangents with the
-    axis of directions first. The length of the axis is 1 if all directions agree. `evaluate_rule`
-    returns the values, and tangents in the same form.
+    `primals` and `tangents` are the arguments of the rule. The tangents of `evaluate_rule` have the
+    directions on the first axis, whose length is 1 if all directions agree. `evaluate_rule` returns
+    the values, and their tangents in the same form.
     """
     leaves, tree_structure = jax.tree.flatten((primals, tangents))
-    n_primal_leaves, n_directions = (
-        len(jax.tree.leaves(primals)),
-        len(_count_vmapped_directions(tangents)),
-    )
+    n_primal_leaves = len(jax.tree.leaves(primals))
+    n_directions = len(_count_vmapped_directions(tangents))
     if n_directions == 0:
         rule_values, output_tangents = evaluate_rule(
             primals, jax.tree.map(lambda x: x[None], tangents)
@@ -91,8 +89,8 @@ def apply_batched_jvp_rule(
             lambda x: jnp.broadcast_to(x, (n_directions, *x.shape[1:])), output_tangents
         )
         flat_results, output_structure = jax.tree.flatten((rule_values, output_tangents))
-        n_values = len(jax.tree.leaves(rule_values))
-        return flat_results, [None] * n_values + [0] * (len(flat_results) - n_values)
+        n_rule_values = len(jax.tree.leaves(rule_values))
+        return flat_results, [None] * n_rule_values + [0] * (len(flat_results) - n_rule_values)
 
     flat_results = _HOIST_OUT_OF_VMAP_PRIMITIVE.bind(*leaves, mapped=evaluate_batched)
     return jax.tree.unflatten(output_structure, flat_results)
@@ -124,43 +122,44 @@ loops again.
 
 
 def _map_sequentially(evaluate_direction: Callable[[Any], Any], directions: Any) -> Any:
-    """Return the function of each direction, computed in a loop so that a direction stays in
+    """Return a function evaluated for each direction in a loop, so that a direction stays in
     registers.
     """
     leaves, tree_structure = jax.tree.flatten(directions)
     has_several_directions = [len(x) > 1 for x in leaves]
 
-    def evaluate_one(varying_leaves: list[Array]) -> Any:
+    def evaluate_selected_direction(varying_leaves: list[Array]) -> Any:
         remaining_leaves = iter(varying_leaves)
         leaves_and_flags = zip(leaves, has_several_directions, strict=True)
         return evaluate_direction(
             jax.tree.unflatten(
                 tree_structure,
                 [
-                    next(remaining_leaves) if has_several else x[0]
-                    for x, has_several in leaves_and_flags
+                    next(remaining_leaves) if has_direction_axis else x[0]
+                    for x, has_direction_axis in leaves_and_flags
                 ],
             )
         )
 
     if not any(has_several_directions):
-        return jax.tree.map(lambda x: x[None], evaluate_one([]))
+        return jax.tree.map(lambda x: x[None], evaluate_selected_direction([]))
     return lax.map(
-        evaluate_one, [x for x, n in zip(leaves, has_several_directions, strict=True) if n]
+        evaluate_selected_direction,
+        [x for x, n in zip(leaves, has_several_directions, strict=True) if n],
     )
 
 
 def stack_directions(directions: Vector) -> Array:
-    """Return tangents of several numbers stacked as an array (directions, numbers, batch)."""
+    """Return the tangents of several numbers as one array (directions, numbers, batch)."""
     return jnp.stack(jnp.broadcast_arrays(*directions), 1)
 
 
 class StageJacobians(NamedTuple):
-    """Jacobians of the accelerations at the stages of a step."""
+    """Jacobians of the accelerations at the stages of a Runge-Kutta step."""
 
     # (stages, coordinates, components, batch): with respect to positions, rates, then held
     # constants
-    state_jacobian: Array
+    state_jacobians: Array
     # tangents due to the constants, (stages, directions, coordinates, batch)
     constants_tangents: Array
 
@@ -171,22 +170,21 @@ def _compute_stage_jacobians(
     constants: Any,
     constants_directions: Any,
     held_constants: Vector,
-    stages: list[StageState],
+    stage_states: list[StageState],
 ) -> StageJacobians:
     """Return the Jacobians of the accelerations at all stages of a step except the last."""
 
     def linearize_stage(packed_state: Array) -> tuple[Array, Array]:
-        stage_state, implicit_dynamics = (
-            _unpack_state(packed_state),
-            make_dynamics(constants, held_constants),
-        )
+        stage_state = _unpack_state(packed_state)
+        implicit_dynamics = make_dynamics(constants, held_constants)
         implicit_dynamics = ImplicitDynamics(
-            jax.jit(implicit_dynamics.residual), jax.jit(implicit_dynamics.solve)
+            jax.jit(implicit_dynamics.evaluate_residual),
+            jax.jit(implicit_dynamics.solve_for_accelerations),
         )
         n = len(stage_state.q)
         evaluate_residual = lambda constants, held_constants: make_dynamics(
             constants, held_constants
-        ).residual(stage_state)
+        ).evaluate_residual(stage_state)
         compute_acceleration_along = lambda *tangent: _solve_acceleration(
             implicit_dynamics, stage_state, jax.jvp(evaluate_residual, *tangent)[1]
         )
@@ -212,13 +210,13 @@ def _compute_stage_jacobians(
         )
 
     return StageJacobians(
-        *lax.map(linearize_stage, jnp.stack([_pack_state(state) for state in stages[:-1]]))
+        *lax.map(linearize_stage, jnp.stack([_pack_state(state) for state in stage_states[:-1]]))
     )
 
 
 def _map_unrolled(evaluate_direction: Callable[[Any], Array], directions: Any) -> Array:
-    """Return the function of each direction without a loop, so that the compiler removes known
-    zeros.
+    """Return a function evaluated for each direction without a loop, so that the compiler removes
+    known zeros.
     """
     leaves, tree_structure = jax.tree.flatten(directions)
     if all(len(x) == 1 for x in leaves):
@@ -231,65 +229,83 @@ def _map_unrolled(evaluate_direction: Callable[[Any], Array], directions: Any) -
 
 
 def _pack_state(state: StageState) -> Array:
-    """Return a state as one array (components, batch)."""
+    """Return the components of a state as one array (components, batch)."""
     n = len(state.q)
     sin, cos, acceleration = state.acceleration
     return jnp.stack([*state.q, *state.v, sin, cos, *acceleration[:n]])
 
 
 def _unpack_state(packed_state: Array) -> StageState:
-    """Return the state from its array, the inverse of `_pack_state`."""
+    """Return the state whose components are in one array. This is the inverse of `_pack_state`."""
     n = (len(packed_state) - 2) // 3
-    components = tuple(packed_state)
+    state_components = tuple(packed_state)
     acceleration = StageAccelerations(
-        components[2 * n], components[2 * n + 1], components[2 * n + 2 :]
+        state_components[2 * n], state_components[2 * n + 1], state_components[2 * n + 2 :]
     )
-    return StageState(components[:n], components[n : 2 * n], acceleration)
+    return StageState(state_components[:n], state_components[n : 2 * n], acceleration)
 
 
-def _make_unit_vectors(template: Vector) -> list[Vector]:
-    """Return the unit vectors of the space of `template`, each with the same component arrays."""
-    n = len(template)
-    return [tuple(jnp.full_like(template[j], float(i == j)) for j in range(n)) for i in range(n)]
+def _make_unit_vectors(template_state: Vector) -> list[Vector]:
+    """Return the unit vectors of the coordinates of `template_state`, in its structure."""
+    n = len(template_state)
+    return [
+        tuple(jnp.full_like(template_state[j], float(i == j)) for j in range(n)) for i in range(n)
+    ]
 
 
 def _compute_acceleration_tangent(
-    dynamics: ImplicitDynamics, state: StageState, dq: Vector, dv: Vector
+    implicit_dynamics: ImplicitDynamics,
+    state: StageState,
+    position_tangent: Vector,
+    rate_tangent: Vector,
 ) -> Vector:
-    """Return the tangent of the accelerations along a direction (dq, dv) of positions and rates."""
+    """Return the tangent of the accelerations along tangents of positions and rates."""
     sin, cos, acceleration = state.acceleration
     zero_accelerations = tuple(jnp.zeros_like(x) for x in acceleration)
     state_tangent = StageState(
-        dq, dv, StageAccelerations(cos * dq[0], -sin * dq[0], zero_accelerations)
+        position_tangent,
+        rate_tangent,
+        StageAccelerations(
+            cos * position_tangent[0], -sin * position_tangent[0], zero_accelerations
+        ),
     )
-    _, residual_tangent = jax.jvp(dynamics.residual, (state,), (state_tangent,))
-    return tuple(_solve_acceleration(dynamics, state, residual_tangent))
+    _, residual_tangent = jax.jvp(implicit_dynamics.evaluate_residual, (state,), (state_tangent,))
+    return tuple(_solve_acceleration(implicit_dynamics, state, residual_tangent))
 
 
 def _solve_acceleration(
-    dynamics: ImplicitDynamics, state: StageState, residual_tangent: Vector
+    implicit_dynamics: ImplicitDynamics, state: StageState, residual_tangent: Vector
 ) -> Array:
-    """Return the tangent of the accelerations for a tangent of the residual, by the implicit
-    function theorem.
+    """Return the tangent of the accelerations that cancels a tangent of the residual.
+
+    This is the implicit function theorem.
     """
-    return -jnp.stack(dynamics.solve(state, residual_tangent))
+    return -jnp.stack(implicit_dynamics.solve_for_accelerations(state, residual_tangent))
 
 
 @functools.partial(jax.jit, static_argnums=0)  # The function is traced once for all its calls.
 def _propagate_tangents(
     tableau: ButcherTableau, stage_jacobians: StageJacobians, start_tangents: Array, h: Array
 ) -> Array:
-    """Return tangents (positions, rates, held constants) propagated from a step's start to its
-    end.
+    """Return the tangents of positions, rates and held constants at the end of a step, given those
+    at its start.
     """
-    state_jacobian, n = stage_jacobians.state_jacobian, stage_jacobians.state_jacobian.shape[1]
+    state_jacobian, n = stage_jacobians.state_jacobians, stage_jacobians.state_jacobians.shape[1]
 
     def propagate_direction(tangent_direction: tuple[Array, Array]) -> Array:
         constants_tangent, start = tangent_direction
-        q0, v0, held_tangents = tuple(start[:n]), tuple(start[n : 2 * n]), tuple(start[2 * n :])
+        start_position_tangents = tuple(start[:n])
+        start_rate_tangents = tuple(start[n : 2 * n])
+        held_tangents = tuple(start[2 * n :])
         stage_tangents: list[Vector] = []
-        for i in range(len(tableau.nodes) - 1):
-            q, v = evaluate_stage(tableau, i, q0, v0, stage_tangents, h) if i else (q0, v0)
+        for i in range(len(tableau.stage_nodes) - 1):
+            q, v = (
+                evaluate_stage(
+                    tableau, i, start_position_tangents, start_rate_tangents, stage_tangents, h
+                )
+                if i
+                else (start_position_tangents, start_rate_tangents)
+            )
             state_tangents = (*q, *v, *held_tangents)
             acceleration_terms = [
                 [
@@ -304,7 +320,14 @@ def _propagate_tangents(
                     for weighted_terms in acceleration_terms
                 )
             )
-        q, v = evaluate_stage(tableau, len(tableau.nodes) - 1, q0, v0, stage_tangents, h)
+        q, v = evaluate_stage(
+            tableau,
+            len(tableau.stage_nodes) - 1,
+            start_position_tangents,
+            start_rate_tangents,
+            stage_tangents,
+            h,
+        )
         return jnp.stack([*q, *v, *held_tangents])
 
     return _map_sequentially(
@@ -314,7 +337,7 @@ def _propagate_tangents(
 
 
 def compute_each_jvp(function: Callable[..., Any], primals: tuple, directions: tuple) -> Any:
-    """Return `jax.jvp` along each of the directions, without the value.
+    """Return the tangents of a function's result along all directions, by `jax.jvp`.
 
     The program is as short as for one direction.
     """
@@ -322,7 +345,7 @@ def compute_each_jvp(function: Callable[..., Any], primals: tuple, directions: t
 
 
 def with_batched_jvp(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Return `function` of trees, with derivatives by its floats from `compute_each_jvp`."""
+    """Return `function`, with derivatives with respect to its floats by `compute_each_jvp`."""
 
     def call_with_batched_jvp(*arguments: Any) -> Any:
         float_arguments, other_arguments = eqx.partition(arguments, eqx.is_inexact_array)
@@ -336,7 +359,7 @@ def with_batched_jvp(function: Callable[..., Any]) -> Callable[..., Any]:
 
         @differentiable_function.defjvp
         @with_default_jax_settings
-        def batched_jvp(primals: tuple, tangent: tuple) -> tuple:
+        def evaluate_jvp_of_floats(primals: tuple, tangent: tuple) -> tuple:
             evaluate_with_tangents = lambda primals, directions: (
                 evaluate_combined(*primals),
                 compute_each_jvp(evaluate_floats, primals, directions),
@@ -352,9 +375,7 @@ def with_batched_jvp(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 class PhaseTangents(NamedTuple):
-    """Tangent directions of a phase: of its constants, of its start and of the constants held since
-    then.
-    """
+    """Tangents of the constants, of the start state and of the held constants of a phase."""
 
     make_dynamics: ImplicitDynamicsFn
     constants: Any
@@ -363,46 +384,56 @@ class PhaseTangents(NamedTuple):
     # tangents of positions, rates, held constants, (directions, components, batch)
     start_tangents: Array
 
-    def propagate(
-        self, tableau: ButcherTableau, stages: list[StageState], start_tangents: Array, h: Array
+    def propagate_to_step_end(
+        self,
+        tableau: ButcherTableau,
+        stage_states: list[StageState],
+        start_tangents: Array,
+        h: Array,
     ) -> Array:
-        """Return the tangents at a step's start, propagated to its end."""
+        """Return the tangents at the end of a step, given those at its start."""
         stage_jacobians = _compute_stage_jacobians(
-            self.make_dynamics, self.constants, self.constants_tangents, self.held_constants, stages
+            self.make_dynamics,
+            self.constants,
+            self.constants_tangents,
+            self.held_constants,
+            stage_states,
         )
         return _propagate_tangents(tableau, stage_jacobians, start_tangents, h)
 
     def propagate_if_accepted(
         self,
         tableau: ButcherTableau,
-        stages: list[StageState],
+        stage_states: list[StageState],
         start_tangents: Array,
         h: Array,
         is_accepted: Array,
     ) -> Array:
-        """Return the tangents after a step in batch elements that accepted it, and unchanged in
-        others.
+        """Return the tangents after a step in batch elements that accept it, and the start tangents
+        in all other elements.
 
-        A group without accepted steps skips the computation.
+        The computation is skipped if no element accepts the step.
         """
 
-        def propagate_accepted(start_tangents: Array) -> Array:
+        def propagate_accepted_tangents(start_tangents: Array) -> Array:
             return jnp.where(
-                is_accepted, self.propagate(tableau, stages, start_tangents, h), start_tangents
+                is_accepted,
+                self.propagate_to_step_end(tableau, stage_states, start_tangents, h),
+                start_tangents,
             )
 
-        return run_if_any(jnp.any(is_accepted), propagate_accepted, start_tangents)
+        return run_if_any(jnp.any(is_accepted), propagate_accepted_tangents, start_tangents)
 
     def evaluate_tangents(
-        self, evaluate: Callable[..., Any], state: StageState, directions: Array
+        self, evaluate_function: Callable[..., Any], state: StageState, directions: Array
     ) -> Any:
-        """Return the tangents of `evaluate(constants, held_constants, q, v)` at a state, for all
-        directions.
+        """Return the tangents of `evaluate_function(constants, held_constants, q, v)` at a state,
+        for all directions.
         """
         n, direction_components = len(state.q), tuple(jnp.moveaxis(directions, 1, 0))
         primals = self.constants, self.held_constants, state.q, state.v
         return compute_each_jvp(
-            evaluate,
+            evaluate_function,
             primals,
             (
                 self.constants_tangents,

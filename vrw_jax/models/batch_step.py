@@ -243,7 +243,7 @@ def _make_phase_runner(
             dt0 = engine_carry.next_dt
             if phase.has_stiff_start:
                 rooted_tolerance = jnp.exp(
-                    jnp.log(options.rtol.astype(jnp.float32)) / tableau.order
+                    jnp.log(options.rtol.astype(jnp.float32)) / tableau.convergence_order
                 )
                 transient_dt_in_transient_times = (
                     stiff_start_options.max_first_step_in_transient_times

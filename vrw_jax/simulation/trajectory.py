@@ -20,11 +20,11 @@ from jaxtyping import Array
 from vrw_jax.contact import (
     PackedState,
     UnilateralTrajectory,
-    foot_heights,
-    foot_positions,
-    kinetic_energy,
-    leg_directions,
-    potential_energy,
+    compute_foot_heights,
+    compute_foot_positions,
+    compute_kinetic_energy,
+    compute_leg_directions,
+    compute_potential_energy,
     unpack_state,
 )
 from vrw_jax.measures import (
@@ -464,20 +464,20 @@ def _compute_contact_columns(
     def compute_state_quantities(y: PackedState) -> dict[str, Array]:
         """Return positions (m), rates and energies (J) of one state by column name."""
         wheel_motion, _ = unpack_state(y)
-        leg_directions_of_state = leg_directions(s, wheel_motion.theta)
-        gravitational_energy, elastic_energy = potential_energy(s, wheel_motion)
+        leg_directions_of_state = compute_leg_directions(s, wheel_motion.theta)
+        gravitational_energy, elastic_energy = compute_potential_energy(s, wheel_motion)
         return {
             "hub_x": wheel_motion.x,
             "hub_z": wheel_motion.z,
             "theta": wheel_motion.theta,
             "dtheta": wheel_motion.dtheta,
-            "kinetic_energy": kinetic_energy(s, wheel_motion),
+            "kinetic_energy": compute_kinetic_energy(s, wheel_motion),
             "gravitational_energy": gravitational_energy,
             "elastic_energy": elastic_energy,
             "length": wheel_motion.L,
             "length_rate": wheel_motion.dL,
-            "foot_x": foot_positions(wheel_motion, leg_directions_of_state),
-            "foot_z": foot_heights(wheel_motion, leg_directions_of_state),
+            "foot_x": compute_foot_positions(wheel_motion, leg_directions_of_state),
+            "foot_z": compute_foot_heights(wheel_motion, leg_directions_of_state),
         }
 
     state_columns = jax.vmap(jax.vmap(compute_state_quantities))(trajectory.state)

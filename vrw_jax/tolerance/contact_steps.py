@@ -10,8 +10,8 @@ import numpy as np
 from vrw_jax.contact import (
     LOCKED_CODE_OFFSET,
     UnilateralWheel,
+    compute_min_bounce_height,
     embed_section_states,
-    min_bounce_height,
     step_batch_with_jacobian,
     walk_batch,
 )
@@ -181,7 +181,7 @@ class ContactWheelBatch:
             PARAMETER_NAMES.index(parameter_name)
         ]
         # A scalar is used because JAX would compile a program for each batch size.
-        relative_bounce_height = float(min_bounce_height(jnp.ones(()), self.step_options))
+        relative_bounce_height = float(compute_min_bounce_height(jnp.ones(()), self.step_options))
         bounce_height = relative_bounce_height * select_parameter("locked_length")
         return np.sqrt(8.0 * bounce_height / select_parameter("gravity"))[wheel_indices]
 
