@@ -137,7 +137,7 @@ def measure_batch_time() -> dict[str, float]:
         cycle = vrw.limit_cycle(p)
         return cycle.section_state, cycle.residual, cycle.multipliers
 
-    def from_neighbour(p: vrw.WheelParams, guess: vrw.LimitCycle) -> tuple:
+    def from_neighbor(p: vrw.WheelParams, guess: vrw.LimitCycle) -> tuple:
         cycle = vrw.limit_cycle(p, guess=guess)
         return cycle.section_state, cycle.residual, cycle.multipliers
 
@@ -160,8 +160,8 @@ def measure_batch_time() -> dict[str, float]:
     }
     table = {
         "from the default guess, with multipliers": (jax.jit(jax.vmap(residuals)), params),
-        "from a neighbour 0.1 % away, with multipliers": (
-            jax.jit(jax.vmap(from_neighbour)), params, near,
+        "from a neighbor 0.1 % away, with multipliers": (
+            jax.jit(jax.vmap(from_neighbor)), params, near,
         ),
         "with nine first derivatives of everything": (jax.jit(jax.vmap(differentiated)), vectors),
         **{name: (jax.jit(jax.vmap(function)), vectors) for name, function in derived.items()},
