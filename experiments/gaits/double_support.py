@@ -109,7 +109,8 @@ class StudySize:
     - `n_lives`: number of gaits with a mean number of steps on random slopes;
     - `n_contact`: number of gaits that are compared with unilateral contact;
     - `n_rows`: number of rows of the Sobol' indices;
-    - `front_levels`: least DLS fractions of the fronts.
+    - `front_levels`: least DLS fractions of the fronts;
+    - `n_front_starts`: number of searches for each of them.
     """
 
     n_wheels: int = 62
@@ -117,6 +118,7 @@ class StudySize:
     n_contact: int = 8
     n_rows: int = 128
     front_levels: tuple[float, ...] = (0.1, 0.25, 0.4, 0.55, 0.7)
+    n_front_starts: int = 6
 
 
 LIFE_SLOPE_SD = 0.01
@@ -441,29 +443,50 @@ FRONTS = {
 
 
 def compute_fronts(rows: Sequence[Row], size: StudySize) -> list[Row]:
-    """Return the gaits of least energy per metre for each least DLS fraction."""
-    starts = [
+    """Return the gait of least energy per metre for each front and each least DLS fraction.
+
+    Searches start from the random wheels of least energy that satisfy the DLS fraction, or else
+    have the most double support. The result is the best gait at the end of a search.
+    """
+    wheels = [
         row for row in select_compliant(rows) if row["comparison"] == f"speed {EQUAL_SPEED:g} m/s"
     ]
     lines: list[Row] = []
     for front, constraints in FRONTS.items():
         for level in size.front_levels:
-            reaching = [row for row in starts if float(row["dls_fraction"]) >= level]
-            best = min(reaching or starts, key=lambda row: float(row["energy_per_meter"]))
-            tuned = vrw.tune(
-                make_wheel(best), compute_energy_gain, list(BOX), BOX,
-                {"speed": EQUAL_SPEED, "dls_fraction": level} | constraints,
-                cycle_options=CYCLE_OPTIONS, max_evaluations=60, tolerance=1e-4,
-            )  # fmt: skip
-            values = {name: float(getattr(tuned.params, name)) for name in BOX}
-            cycle = tuned.cycle
-            values |= {"dls_fraction": float(cycle.dls_fraction), "speed": float(cycle.speed),
-                       "energy_per_meter": -tuned.value,
-                       "spectral_radius": float(cycle.spectral_radius)}  # fmt: skip
+
+            def rank_start(row: Row, level: float = level) -> tuple[float, float]:
+                missing = max(level - float(row["dls_fraction"]), 0.0)
+                return missing, float(row["energy_per_meter"])
+
+            ends = []
+            for row in sorted(wheels, key=rank_start)[: size.n_front_starts]:
+                try:
+                    tuned = vrw.tune(
+                        make_wheel(row), compute_energy_gain, list(BOX), BOX,
+                        {"speed": EQUAL_SPEED, "dls_fraction": level} | constraints,
+                        cycle_options=CYCLE_OPTIONS, max_evaluations=60, tolerance=1e-4,
+                    )  # fmt: skip
+                except ValueError as error:  # the single search found no gait of this wheel
+                    print(error, flush=True)
+                else:
+                    ends.append(tuned)
+            satisfying = [
+                tuned for tuned in ends
+                if float(tuned.cycle.speed) > EQUAL_SPEED - SPEED_TOLERANCE
+                and float(tuned.cycle.dls_fraction) > level - SPEED_TOLERANCE
+            ]  # fmt: skip
+            best = max(satisfying or ends, key=lambda tuned: tuned.value)
+            values = {name: float(getattr(best.params, name)) for name in BOX}
+            values |= {"dls_fraction": float(best.cycle.dls_fraction),
+                       "speed": float(best.cycle.speed), "energy_per_meter": -best.value,
+                       "spectral_radius": float(best.cycle.spectral_radius)}  # fmt: skip
+            n_converged = sum(tuned.status.name == "CONVERGED" for tuned in ends)
             lines.append(
-                {"front": front, "least_dls_fraction": f"{level:g}", "status": tuned.status.name}
-                | {name: f"{value:.4g}" for name, value in values.items()}
-            )
+                {"front": front, "least_dls_fraction": f"{level:g}",
+                 "converged_searches": f"{n_converged} of {len(ends)}", "status": best.status.name}
+                | {name: f"{value:.6g}" for name, value in values.items()}
+            )  # fmt: skip
             print(lines[-1], flush=True)
     return lines
 
