@@ -157,7 +157,7 @@ def unpack_motion(interval_point: IntervalPoint) -> WheelMotion:
 def make_interval_point(mode_dynamics: ModeDynamics, motion: WheelMotion) -> IntervalPoint:
     """Return the interval point of a motion, with its dynamics rows.
 
-    This is the inverse of `unpack_motion`.
+    The function is the inverse of `unpack_motion`.
     """
     q, v = pack_coordinates(motion)
     return IntervalPoint(q, v, evaluate_dynamics(mode_dynamics, q, v))
@@ -443,7 +443,7 @@ def compute_stage_state(
 ) -> tuple[Array, Array]:
     """Return coordinates and rates at Runge-Kutta stage `i`, (3 + n, lanes) each.
 
-    They follow from the accelerations of the earlier stages.
+    Both follow from the accelerations of the earlier stages.
 
     - `h`: step size, s.
     """

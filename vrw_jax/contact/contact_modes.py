@@ -561,9 +561,9 @@ class ChosenModeCombination(NamedTuple):
 
 
 class ContactSignTolerances(NamedTuple):
-    """Forces and motions below which round-off decides the sign.
+    """Tolerances of forces and motions, below which round-off decides the sign.
 
-    They are the units of sign violations.
+    A sign violation is measured in these tolerances.
     """
 
     force_tolerance: Elementwise  # N, or N s in an impact
@@ -738,9 +738,9 @@ def choose_combination(
     - `counts_all_solutions`: whether all admissible combinations are counted. Otherwise the search
       ends at the first admissible combination.
 
-    Without an admissible combination, the least violating combination is returned. It counts as a
-    solution if its violation is at most `MAX_VIOLATION`, because round-off may close or open two
-    contacts. Otherwise the number of solutions is 0.
+    Without an admissible combination, the least violating combination is returned. This combination
+    counts as a solution if its violation is at most `MAX_VIOLATION`, because round-off may close or
+    open two contacts. Otherwise the number of solutions is 0.
     """
     evaluate_modes = functools.partial(
         _evaluate_violation,

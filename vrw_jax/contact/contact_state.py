@@ -66,7 +66,7 @@ def pack_state(motion: WheelMotion, accumulators: LossAccumulators) -> PackedSta
 def unpack_state(packed_state: PackedState) -> tuple[WheelMotion, LossAccumulators]:
     """Return motion and loss accumulators of a packed state.
 
-    This is the inverse of `pack_state`.
+    The function is the inverse of `pack_state`.
     """
     n_legs = (packed_state.shape[0] - 10) // 2
     L = packed_state[6 : 6 + n_legs]
@@ -132,7 +132,7 @@ def make_mode_dynamics(
 ) -> ModeDynamics:
     """Return the dynamics of the wheel in this contact state.
 
-    - `friction`: friction coefficient of all feet, or those of the foot that landed last and of the
+    - `friction`: friction coefficient of all feet, or a pair for the foot that landed last and the
       other feet;
     - `tilt`: angle by which the next line is steeper, rad.
     """
@@ -222,7 +222,8 @@ def compute_accumulator_rates(
 ) -> LossAccumulators:
     """Return the time derivatives of the loss accumulators.
 
-    They are 1 for the time, the losses by damping and sliding in W, and the slip speed in m/s.
+    The derivatives are 1 for the time, the powers lost by damping and sliding in W, and the slip
+    speed in m/s.
     """
     slip_signs = compute_slip_signs(mode_dynamics.slot_modes)
     slip_speeds = [slip_signs[i] * contact_forces.foot_velocity.along_slope[i] for i in range(2)]
@@ -358,9 +359,9 @@ def evaluate_guards(
 
     - `is_after_start`: whether the time is after the start of the contact state.
 
-    The event that starts a contact state may leave a guard at zero. This is the guard of a foot
-    that lifts off, of a leg that leaves its stopper, or of a foot that starts to slide. The value
-    of that guard at the start is replaced by 1.
+    The event that starts a contact state may leave a guard at zero: the guard of a foot that lifts
+    off, of a leg that leaves its stopper, or of a foot that starts to slide. The value of that
+    guard at the start is replaced by 1.
     """
     s, contact_state = mode_dynamics.s, mode_dynamics.contact_state
     unit_guards = jnp.ones_like(motion.L)

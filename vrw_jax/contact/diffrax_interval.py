@@ -1,7 +1,7 @@
 """Integration of a single wheel between two events by diffrax.
 
 diffrax replaces `batch_integrator` in the event loop of `walk_kernel`. Its search for events is
-independent, so that it is a reference for the batch kernel. It also has implicit solvers.
+independent, so that it is a reference for the batch kernel. diffrax also has implicit solvers.
 """
 
 from collections.abc import Callable

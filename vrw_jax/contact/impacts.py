@@ -168,10 +168,10 @@ def _solve_stopper_lcp(
 
     A tested leg at its stopper is held if the stopper pushes, or moves inwards otherwise. The first
     pivots switch all legs of the wrong sign together. Later pivots switch only the last of these
-    legs, which prevents cycles. This is principal pivoting, which is finite if no friction couples
-    the legs (Murty 1974, Kostreva 1978). If pivoting fails, all combinations are enumerated. The
-    solution with the smallest violation is returned. This solution is admissible if its violation
-    is at most `MAX_VIOLATION`.
+    legs, which prevents cycles. The method is principal pivoting, which is finite if no friction
+    couples the legs (Murty 1974, Kostreva 1978). If pivoting fails, all combinations are
+    enumerated. The solution with the smallest violation is returned. This solution is admissible if
+    its violation is at most `MAX_VIOLATION`.
     """
     constant_inputs = stop_gradients((contact_law, motion))
     tested_leg_rank = jnp.cumsum(is_stopper_tested.astype(jnp.int32), axis=0) - 1
@@ -271,7 +271,7 @@ class ContactEventResult(NamedTuple):
 def _apply_impact_velocities(
     motion: WheelMotion, force_solution: WheelForceSolution
 ) -> WheelMotion:
-    """Return the motion with its velocities replaced by those after an impact."""
+    """Return the motion with the velocities after an impact."""
     vx, vz, dtheta = force_solution.hub_motion
     return motion._replace(vx=vx, vz=vz, dtheta=dtheta, dL=force_solution.length_motion)
 
@@ -531,10 +531,10 @@ def _solve_acceleration_level(
 ) -> tuple[ChosenModeCombination, ContactSlots, Array, Bool[Array, "n ..."]]:
     """Return the contact modes and stoppers of the motion after an event.
 
-    They follow from the accelerations. The result is (combination, slots, feet that were at rest,
-    held legs in the air), without derivatives. The contact that the event has ended is not tested
-    again, because its force is zero up to round-off. This contact gets the mode of its release if
-    that mode is consistent (see `is_release_consistent`).
+    Contact modes and stoppers follow from the accelerations. The result is (combination, slots,
+    feet that were at rest, held legs in the air), without derivatives. The contact that the event
+    has ended is not tested again, because its force is zero up to round-off. This contact gets the
+    mode of its release if that mode is consistent (see `is_release_consistent`).
     """
     contact_law, motion = stop_gradients((contact_law, motion))
     s, contact_slots = contact_law.s, find_contact_slots(contact_modes != ContactMode.OFF)

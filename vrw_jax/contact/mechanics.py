@@ -132,7 +132,7 @@ class ContactSlots(NamedTuple):
     def scatter_to_legs(self, slot_pair: Any) -> LegArray:
         """Return a quantity of each leg, given that of both slots' legs; 0 for legs in no slot.
 
-        This is the inverse of `gather_slot_pair`.
+        The function is the inverse of `gather_slot_pair`.
         """
         return jnp.where(self.first_slot_mask, slot_pair[0], 0.0) + jnp.where(
             self.second_slot_mask, slot_pair[1], 0.0

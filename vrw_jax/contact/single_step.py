@@ -123,8 +123,7 @@ class ContactStepConfig(NamedTuple):
         )
 
     def compute_tangents(self, leaves: tuple[Array, ...], tangents: tuple[Array, ...]) -> tuple:
-        """Return the tangents of the float results of a step, the float results, and the other
-        results.
+        """Return (tangents of the float results, float results, other results) of a step.
 
         Each lane has one tangent of its argument leaves.
         """

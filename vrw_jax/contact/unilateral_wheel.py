@@ -114,8 +114,8 @@ class UnilateralWheel(AbstractWheel):
     The order of events is free, and every leg may land, slide or lift off.
 
     - `friction`: coefficient of the ground, `inf` for feet that never slide;
-    - `max_events`: largest number of events of one step. After a quarter of them (at least 100),
-      the rest speed grows with each event;
+    - `max_events`: largest number of events of one step. The rest speed grows with each event after
+      a quarter of this number, or after 100 events if that is more;
     - `stoppers`: with "bilateral", a leg in the air that has met its stopper stays there until its
       foot is loaded. With "one-sided", the leg leaves as soon as the stopper would have to pull;
     - `restitution`: ratio of a striking foot's speeds after and before the impact, as far as energy

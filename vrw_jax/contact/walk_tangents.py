@@ -152,7 +152,7 @@ def _pack_rows(array_tree: Any) -> Array:
 def _unpack_rows(tangent_rows: Array, tangent_template: Any) -> Any:
     """Return the rows as a tree with the structure of `tangent_template`.
 
-    This is the inverse of `_pack_rows`.
+    The function is the inverse of `_pack_rows`.
     """
     leaves, structure = jax.tree.flatten(tangent_template)
     arrays, row_offset = [], 0
@@ -180,7 +180,7 @@ def walk_with_tangents(
     """Return the result of `run_walks`, and the tangents of its float arrays.
 
     The tangents are on the first axis of `input_column_tangents`, `section_state_tangents` and the
-    result. A lane uses the first `n_tangents` of them.
+    result. A lane has `n_tangents` tangents, which come first.
     """
     tableau = walk_settings.tableau
     assert tableau is not None  # diffrax differentiates in another way.
@@ -518,7 +518,7 @@ def _propagate_stage_coordinates(
 ) -> tuple[Array, Array]:
     """Return the tangents of coordinates and rates at stage `i`, for the coordinates `leg_slice`.
 
-    This is the tangent of `compute_stage_state`.
+    The result is the tangent of that of `compute_stage_state`.
     """
     flat_matrices = [
         jnp.asarray(np.reshape(section_state, -1))

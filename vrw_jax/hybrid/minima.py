@@ -120,7 +120,7 @@ class InteriorMinimum(NamedTuple):
 class MinimumRefinement(NamedTuple):
     """State of the secant iterations that refine the minima after the integration.
 
-    The iterations are on the rate of one margin after the other.
+    Each iteration is on the rate of one margin, and the margins follow one another.
     """
 
     margin_index: Int[Array, ""]

@@ -189,7 +189,7 @@ class _SolverStepper(NamedTuple):
         """Return whether the error of a step is within tolerance, the length of the next step, s,
         and the state of the controller.
 
-        The results have no derivatives, because derivatives are those of the steps that were taken.
+        The results have no derivatives, because only the steps that were taken are differentiated.
         """
         start_state, end_state, error_estimate = lax.stop_gradient(
             (start_state, end_state, error_estimate)
@@ -262,8 +262,8 @@ def integrate_phase(
 
     A guard that is negative at the start, or zero and not rising, ends the phase immediately with
     duration 0. A guard that is zero and rising does not end the phase. If a guard falls through
-    zero at the start, the event time has a derivative. It is minus the guard's derivative with
-    respect to the start, divided by the guard's rate.
+    zero at the start, the event time has a derivative. This derivative is minus the guard's
+    derivative with respect to the start, divided by the guard's rate.
 
     A guard may be negative only inside a step. If the cubic through its values and rates may be
     negative, the step is repeated up to the minimum of the cubic. Of two guards that are zero at

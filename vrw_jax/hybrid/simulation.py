@@ -161,9 +161,10 @@ def time_errors(
     time.
 
     Unlike `time_tolerance`, the estimate contains errors of steps that add up and errors of earlier
-    events. It also contains errors that an implicit solver's own estimate omits in a stiff field.
-    The estimate is infinite from the first event that the simulation at ten times the tolerance
-    does not reach. It is measured, not proved. `options` are those of the simulation.
+    events. The estimate also contains errors that an implicit solver's own estimate omits in a
+    stiff field. The estimate is infinite from the first event that the simulation at ten times the
+    tolerance does not reach. The estimate is measured and has no proof. `options` are those of the
+    simulation.
     """
     options = StepOptions() if options is None else options
     modes = convert_modes_to_tuple(modes)

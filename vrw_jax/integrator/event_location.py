@@ -322,8 +322,8 @@ def _find_parabola_zero(
 ) -> Array:
     """Return the zero of the parabola through three values of a guard, as a fraction of the step.
 
-    The values are those at the start, at the middle stage and at the end. The zero is located by
-    the secant, then by Newton's method.
+    The three values are at the start, at the middle stage and at the end of the step. The zero is
+    located by the secant, then by Newton's method.
     """
     curvature, linear_rate = fit_guard_parabola(
         tableau, start_guard_value, middle_guard_value, end_guard_value

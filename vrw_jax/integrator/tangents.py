@@ -236,7 +236,7 @@ def _pack_state(state: StageState) -> Array:
 
 
 def _unpack_state(packed_state: Array) -> StageState:
-    """Return the state whose components are in one array. This is the inverse of `_pack_state`."""
+    """Return the state whose components are in one array, the inverse of `_pack_state`."""
     n = (len(packed_state) - 2) // 3
     state_components = tuple(packed_state)
     acceleration = StageAccelerations(
@@ -278,7 +278,7 @@ def _solve_acceleration(
 ) -> Array:
     """Return the tangent of the accelerations that cancels a tangent of the residual.
 
-    This is the implicit function theorem.
+    The result follows from the implicit function theorem.
     """
     return -jnp.stack(implicit_dynamics.solve_for_accelerations(state, residual_tangent))
 
@@ -287,8 +287,8 @@ def _solve_acceleration(
 def _propagate_tangents(
     tableau: ButcherTableau, stage_jacobians: StageJacobians, start_tangents: Array, h: Array
 ) -> Array:
-    """Return the tangents of positions, rates and held constants at the end of a step, given those
-    at its start.
+    """Return the tangents of positions, rates and held constants at the end of a step, given the
+    tangents at its start.
     """
     state_jacobian, n = stage_jacobians.state_jacobians, stage_jacobians.state_jacobians.shape[1]
 
@@ -391,7 +391,7 @@ class PhaseTangents(NamedTuple):
         start_tangents: Array,
         h: Array,
     ) -> Array:
-        """Return the tangents at the end of a step, given those at its start."""
+        """Return the tangents at the end of a step, given the tangents at its start."""
         stage_jacobians = _compute_stage_jacobians(
             self.make_dynamics,
             self.constants,

@@ -74,7 +74,7 @@ def get_machine_code(
     The code is that of this process or of `code_store`. Code that neither contains is compiled.
 
     `argument_shapes` are the shapes of the arguments, and the code computes `group_width` lanes at
-    a time. `trace_key` identifies everything else on which the trace depends.
+    a time. `trace_key` identifies all other inputs of the trace.
     """
     index_key = (
         trace_key,

@@ -199,7 +199,7 @@ class JaxprLowering:
 def _find_overwriting_equations(jaxpr: Any) -> dict[Any, int | None]:
     """Return the index of the equation that may overwrite the memory of each variable, or None.
 
-    This is the last equation that reads the variable, if all earlier readers are loops. A loop
+    The equation is the last one that reads the variable, if all earlier readers are loops. A loop
     reads nothing after its end.
     """
     overwriting_equations: dict[Any, int | None] = {}

@@ -3,11 +3,11 @@
 The values of the lower model are known for all wheels, and only the difference from unilateral
 contact is sampled (M. B. Giles, Acta Numerica 24, 2015; B. Peherstorfer, K. Willcox and M.
 Gunzburger, SIAM Review 60, 2018). A pilot sample of wheels determines the weight of the control
-variate, the control that is worth its cost, and the number of further wheels. The pilot's wheels
-count as known, and the others are drawn from the remaining wheels. No estimate is therefore applied
-to the numbers from which it was computed, and the mean is unbiased. If some wheels have no gait,
-the mean is a ratio of sums over all wheels. Its bias is then of the order of one over the number of
-sampled wheels.
+variate, the control that is worth its cost, and the number of further wheels. The measures of the
+pilot's wheels count as known, and further wheels are drawn from the remaining wheels. No estimate
+is therefore applied to the numbers from which it was computed, and the mean is unbiased. If some
+wheels have no gait, the mean is a ratio of sums over all wheels. Its bias is then of the order of
+one over the number of sampled wheels.
 """
 
 import math

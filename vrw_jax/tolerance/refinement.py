@@ -1,9 +1,10 @@
 """Refinement of gaits with unilateral contact by Newton's method, with bounds of their errors.
 
 One step with unilateral contact from a state x gives the defect r = P(x) - x. Multiplied by the
-inverse of I - DP, it is Newton's correction d. The gait's quantities are near those of this step
-plus their change along d. The exact Jacobian of one step serves several corrections (chord
-iteration). The Jacobian is computed again if corrections contract slowly or the legs' codes change.
+inverse of I - DP, it is Newton's correction d. The gait's quantities are those of this step plus
+their change along d, to first order. The exact Jacobian of one step serves several corrections
+(chord iteration). The Jacobian is computed again if corrections contract slowly or the legs' codes
+change.
 """
 
 import dataclasses
@@ -36,9 +37,10 @@ class RefinementOptions:
       linearization is unknown beyond this length;
     - `stall_length_in_tolerances`: length of a correction, in tolerances of the step, below which
       corrections that contract slowly are at the level of the integrator's errors;
-    - `error_safety_factor`: bound of the remaining error over the effect of the last correction. It
-      is also the bound of the numerical error over the difference between steps at two tolerances.
-      It is chosen because a factor of four was too small for 4 of 10,365 results;
+    - `error_safety_factor`: bound of the remaining error over the effect of the last correction.
+      The same factor is the bound of the numerical error over the difference between steps at two
+      tolerances. The factor is chosen because a factor of four was too small for 4 of 10,365
+      results;
     - `step_error_in_tolerances`: bound of the error of a step, in tolerances of its solver steps,
       chosen because 99 of 100 errors are within a third of this bound;
     - `n_presumed_missed_contacts`: number of shortest contacts of a foot that a step may miss or

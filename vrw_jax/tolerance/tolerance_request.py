@@ -1,11 +1,11 @@
 """Measures to within a tolerance, from the simplest model whose error can be bounded.
 
 The lower model's gait takes one step with unilateral contact. The defect, propagated to the measure
-by the lower model's derivatives, is that model's error to second order. This is a dual-weighted
-residual (R. Becker and R. Rannacher, Acta Numerica 10, 2001) with the next model in place of the
-finer mesh. If the error is within the tolerance, the lower model's value is returned. Otherwise
-Newton's method leads from the end of that step to the gait with unilateral contact. If that gait is
-far from the lower model's, a walk leads to another gait.
+by the lower model's derivatives, is that model's error to second order. The estimate is a
+dual-weighted residual (R. Becker and R. Rannacher, Acta Numerica 10, 2001) with the next model in
+place of the finer mesh. If the error is within the tolerance, the lower model's value is returned.
+Otherwise Newton's method leads from the end of that step to the gait with unilateral contact. If
+that gait is far from the lower model's, a walk leads to another gait.
 """
 
 import time
@@ -57,8 +57,8 @@ class MeasureRequestOptions:
       chosen because the first two starts lead 100 of 232 wheels to a gait, and the other starts
       lead no other wheel to a gait;
     - `max_gait_distance_ratio`: largest distance from the lower gait to the gait that continues it,
-      in lengths of the first correction. It is chosen because corrections that are halved each time
-      have a sum of twice the first correction.
+      in lengths of the first correction. The ratio is chosen because the sum of corrections that
+      are halved each time is twice the first correction.
     """
 
     error_safety_factor: float = 4.0
@@ -195,7 +195,7 @@ GAIT_RESULT_NAMES = ("values", "errors", "model_errors", "numerical_errors", "st
 
 
 class _MeasureRequest:
-    """Request for measures of a batch of wheels, with the results that are known so far."""
+    """Request for measures of a batch of wheels, with an array of each result."""
 
     def __init__(
         self,
