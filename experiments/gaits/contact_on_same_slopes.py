@@ -22,13 +22,13 @@ DATA = tables.FIGURES / "contact_on_same_slopes.csv"
 SLOPE_SDS = (0.01, 0.015, 0.02)
 """Standard deviations of the slopes, rad."""
 N_WALKS, N_STEPS = 256, 50
-MODELS = {
-    "paper's model": vrw.ViscoelasticWheel(),
-    "infinite friction": vrw.UnilateralWheel(friction=np.inf),
-    "friction 1.3": vrw.UnilateralWheel(friction=1.3),
-    "friction 0.8": vrw.UnilateralWheel(friction=0.8),
+FRICTION_BY_LABEL = {
+    "paper's model": None,
+    "infinite friction": np.inf,
+    "friction 1.3": 1.3,
+    "friction 0.8": 0.8,
 }
-"""Models by their labels in the table."""
+"""Friction coefficients by their labels in the table; None is the paper's model."""
 
 
 def count_steps(params: vrw.WheelParams, line_slopes: np.ndarray, model: Any) -> np.ndarray:
@@ -57,7 +57,8 @@ def main() -> None:
             (N_WALKS, N_STEPS + 1)
         )
         line_slopes[:, 0] = float(params.slope)
-        for label, model in MODELS.items():
+        for label, friction in FRICTION_BY_LABEL.items():
+            model = None if friction is None else vrw.UnilateralWheel(friction=friction)
             print(f"slope_sd {slope_sd:g} rad, {label}:")
             n_steps = count_steps(params, line_slopes, model)
             rows.append(
@@ -75,7 +76,7 @@ def main() -> None:
         [slope_sd, *(f"{100 * int(row['n_complete_walks']) / N_WALKS:.0f} %" for row in group)]
         for slope_sd, group in group_by_slope_sd.items()
     ]
-    header = ["standard deviation, rad", *MODELS]
+    header = ["standard deviation, rad", *FRICTION_BY_LABEL]
     source = tables.describe_run("experiments.gaits.contact_on_same_slopes")
     tables.replace_block(PAGE, "same slopes", tables.format_markdown(header, lines), source)
 
