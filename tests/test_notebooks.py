@@ -21,7 +21,7 @@ MAX_NOTEBOOK_BYTES = 400_000
 def test_there_are_notebooks():
     assert {path.stem for path in NOTEBOOKS} >= {
         "branch", "force_peaks", "ground", "identification", "sensitivities", "tolerances",
-        "tuning",
+        "tuning", "uneven_ground",
     }  # fmt: skip
 
 
