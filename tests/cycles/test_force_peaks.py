@@ -177,4 +177,4 @@ def test_a_scan_of_peaks_has_those_of_each_gait(tmp_path):
         cycle = vrw.limit_cycle(vrw.WheelParams(damping=damping), options=options)
         for name, value in cycle.measures(names).items():
             np.testing.assert_allclose(scan[name].values[i], value, rtol=1e-9, err_msg=name)
-    assert scan.peak_force.variable_attributes["units"] == "N"
+    assert scan.peak_force.attrs["units"] == "N"

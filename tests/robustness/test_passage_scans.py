@@ -20,7 +20,7 @@ def test_a_scan_contains_the_life_of_each_wheel_with_a_gait() -> None:
     assert float(data.mean_steps_error[0]) == float(passage.error)
     assert float(data.failure_probability[0]) == float(passage.failure_probability)
     assert np.isnan(data.mean_steps[1])
-    assert data.mean_steps.variable_attributes["long_name"] == "mean number of steps until failure"
+    assert data.mean_steps.attrs["long_name"] == "mean number of steps until failure"
 
 
 def test_an_interrupted_scan_of_lives_continues_with_the_same_numbers(tmp_path: Path) -> None:

@@ -32,7 +32,7 @@ def test_a_scan_to_a_tolerance_has_value_error_and_model(tmp_path: Path) -> None
     assert np.array_equal(
         full_values.speed_error.values[values_here], measured.error["speed"][measured.found]
     )
-    meanings = full_values.rung.variable_attributes["flag_meanings"].split()
+    meanings = full_values.rung.attrs["flag_meanings"].split()
     names = {"RigidWheel": "rigid", "ViscoelasticWheel": "viscoelastic"}
     own_values = [
         names.get(meanings[i], "unilateral") for i in full_values.rung.values[values_here]

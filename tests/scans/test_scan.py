@@ -61,7 +61,7 @@ def test_a_stored_scan_opens_with_xarray_alone(tmp_path: Path) -> None:
     run_plan(make_plan(), tmp_path / "s.zarr", evaluate=evaluate_arithmetically)
     single_result = xr.open_zarr(tmp_path / "s.zarr", consolidated=False, chunks=None)
     assert single_result.speed.dims == ("damping", "slope")
-    assert single_result.speed.variable_attributes["units"] == "m/s"
+    assert single_result.speed.attrs["units"] == "m/s"
     np.testing.assert_array_equal(single_result.damping, SMALL_GRID.values_by_parameter["damping"])
 
 
@@ -315,8 +315,8 @@ def test_every_variable_is_described() -> None:
     ):
         assert scan_result[name].attrs["units"]
         assert scan_result[name].attrs["long_name"]
-    assert len(scan_result.outcome.variable_attributes["flag_values"]) == len(Outcome)
-    assert scan_result.outcome.variable_attributes["flag_meanings"].split()[0] == "STEPPED"
+    assert len(scan_result.outcome.attrs["flag_values"]) == len(Outcome)
+    assert scan_result.outcome.attrs["flag_meanings"].split()[0] == "STEPPED"
     assert json.loads(scan_result.attrs["scan"])["wheel"]["stiffness"] == 500.0
     assert "jax" in json.loads(scan_result.attrs["provenance"])["versions"]
 

@@ -223,9 +223,9 @@ def test_functions_of_cycle_and_step_are_objectives_like_names():
 def test_the_path_is_a_labelled_dataset_and_the_result_prints_itself(max_dls_result, tmp_path):
     assert_netcdf_round_trip(max_dls_result.path, tmp_path)
     path = max_dls_result.path
-    assert path.damping.variable_attributes["units"] == "N s/m"
+    assert path.damping.attrs["units"] == "N s/m"
     assert path.sizes["evaluation"] == max_dls_result.n_evaluations
-    assert path.variable_attributes["ending"] == "CONVERGED"
+    assert path.attrs["ending"] == "CONVERGED"
     assert "takeoff_acceleration" in repr(max_dls_result)
     assert "<table>" in max_dls_result._repr_html_()
 

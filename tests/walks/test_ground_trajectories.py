@@ -113,9 +113,7 @@ def test_forces_match_the_contact_mode(sampled_walk: xr.Dataset) -> None:
     assert sliding.any()
     cone = sampled_walk.tangential.values + 0.7 * sampled_walk.normal.values
     np.testing.assert_allclose(cone[sliding], 0.0, atol=1e-9)
-    assert (
-        sampled_walk.contact.variable_attributes["flag_meanings"].split()[2] == "sliding_downhill"
-    )
+    assert sampled_walk.contact.attrs["flag_meanings"].split()[2] == "sliding_downhill"
     np.testing.assert_allclose(
         sampled_walk.length.values[sampled_walk.on_stopper.values], 1.0, atol=1e-12
     )

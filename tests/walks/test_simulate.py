@@ -51,7 +51,7 @@ def test_every_variable_has_unit_long_name_and_symbol(sampled_walk: xr.Dataset) 
         assert variable.attrs["units"] == MEASURES[str(name)].unit
         assert variable.attrs["long_name"]
         assert variable.attrs["symbol"]
-    assert sampled_walk.phase.variable_attributes["flag_meanings"] == "DLS SLS-I SLS-II"
+    assert sampled_walk.phase.attrs["flag_meanings"] == "DLS SLS-I SLS-II"
 
 
 def test_a_trajectory_records_its_provenance(sampled_walk: xr.Dataset, tmp_path: Path) -> None:

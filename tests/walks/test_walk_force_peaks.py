@@ -21,7 +21,7 @@ def test_peaks_of_a_sampled_step_are_those_of_its_gait():
     assert peaks.sizes["step"] == 2
     for name, value in cycle.measures(SAMPLED_FORCE_PEAK_MEASURES).items():
         np.testing.assert_allclose(peaks[name], value, rtol=1e-7, err_msg=name)
-    assert peaks.n_force_peaks.variable_attributes["units"] == "1"
+    assert peaks.n_force_peaks.attrs["units"] == "1"
     np.testing.assert_array_equal(peaks.is_maximum, [True, False, True] * 2)
     np.testing.assert_array_equal(peaks.force_step, [0, 0, 0, 1, 1, 1])
 

@@ -188,8 +188,7 @@ def require_dataset_variables(
     missing_names = [
         variable_name
         for variable_name in needed_names
-        if variable_name not in dataset.variables
-        and variable_name not in dataset.variable_attributes
+        if variable_name not in dataset.variables and variable_name not in dataset.attrs
     ]
     if missing_names:
         raise ValueError(

@@ -100,9 +100,7 @@ def _draw_objective_path(axes: Axes, path_dataset: xr.Dataset) -> None:
                 linestyle=":",
                 label=legend_text,
             )
-    axes.set_ylabel(
-        format_axis_label(path_dataset.objective.variable_attributes["long_name"], "{name}")
-    )
+    axes.set_ylabel(format_axis_label(path_dataset.objective.attrs["long_name"], "{name}"))
     axes.legend(loc="best", fontsize=7.0)
 
 
