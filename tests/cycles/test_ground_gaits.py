@@ -590,7 +590,7 @@ def test_batched_newton_finds_a_repeating_state_next_to_a_jump_of_the_map(monkey
     )
     assert solution.is_gait_found[0]
     assert solution.newton_residuals[0] < 1e-10
-    assert abs(solution.section_states[0, 0] + 2.0) < 1e-10
+    assert abs(solution.fixed_section_states[0, 0] + 2.0) < 1e-10
 
 
 def test_a_singular_linear_system_does_not_affect_the_others():
