@@ -108,16 +108,17 @@ def test_the_papers_wheel_lasts_as_long_as_an_independent_code_counts(slope_sd, 
     assert "FirstPassage" in repr(passage)
 
 
-def count_failure_share(params, slope_sd, n_walkers, n_steps):
-    """Return failures per step of the paper's wheel, and their standard error, without bias."""
+def count_failure_share(params, slope_sd, n_walkers, n_steps, model=None):
+    """Return failures per step, their standard error, and the number of counted steps."""
     random, mean = np.random.default_rng(5), float(params.slope)
-    start = np.tile(np.asarray(vrw.limit_cycle(params).section_state), (n_walkers, 1))
+    gait = vrw.limit_cycle(params, model=model)
+    start = np.tile(np.asarray(gait.section_state), (n_walkers, 1))
     states, slopes, ages = start, np.full(n_walkers, mean), np.zeros(n_walkers, int)
     n_failures, n_counted = 0, 0
     for _ in range(n_steps):
         next_slopes = mean + slope_sd * random.standard_normal(n_walkers)
         wheels = eqx.tree_at(lambda p: p.slope, params, np.stack([slopes, next_slopes], 1))
-        result = vrw.step_batch(wheels, states)
+        result = vrw.step_batch(wheels, states, model=model)
         is_alive, is_old = result.outcome == 0, ages >= 12
         n_failures, n_counted = n_failures + np.sum(~is_alive & is_old), n_counted + np.sum(is_old)
         states = np.where(is_alive[:, None], result.section_state, start)
@@ -141,6 +142,13 @@ def test_samples_agree_with_a_million_counted_steps(slope_sd, damping):
     passage = vrw.first_passage(params, slope_sd, tol=0.01)
     error = float(passage.error / passage.mean_steps) * share + 2.58 * standard_error
     assert abs(float(passage.failure_probability) - share) < error
+
+
+def test_loose_tolerances_cause_no_failures_with_unilateral_contact():
+    """At tolerances of 1e-6, 22 of 512 walks of 40 steps end with a Painlevé paradox."""
+    params, model = vrw.WheelParams(), vrw.UnilateralWheel(friction=np.inf)
+    passage = vrw.first_passage(params, 0.02, model=model, n_walkers=256, tol=0.1, max_steps=50_000)
+    assert float(passage.mean_steps) > 1e5  # 98 at tolerances of 1e-6
 
 
 def test_a_life_of_millions_of_steps_depends_on_no_choice_of_the_sampling():

@@ -33,8 +33,10 @@ MAX_QUADRATURE_NODES = 3200
 """Largest number of quadrature nodes, chosen because a matrix of this size takes 80 MB."""
 
 SAMPLED_STEP_TOLERANCE = 1e-6
-"""Tolerance of sampled steps. The value is chosen because the error of an event time is then small:
-a ten-thousandth of the standard deviation that random slopes cause."""
+"""Tolerance of sampled steps without unilateral contact. The value is chosen because the error of
+an event time is then a ten-thousandth of the standard deviation that random slopes cause. With
+unilateral contact and infinite friction, one step in a thousand would end with a spurious Painlevé
+paradox at this tolerance."""
 
 SAMPLED_TRACING_REMEDY = "take jax.grad of a function that is not compiled"
 """Remedy for a sampled computation inside `jit` or `vmap`."""
@@ -166,7 +168,8 @@ def first_passage(
         params: the wheel, whose slope is the mean slope.
         slope_sd: standard deviation of the slopes, rad.
         model: the model; the paper's, `ViscoelasticWheel()`, by default.
-        options: numerical choices of sampled steps; by default rtol and atol are 1e-6.
+        options: numerical choices of sampled steps; by default rtol and atol are 1e-6, and those of
+            `StepOptions()` with unilateral contact.
         seed: of the random slopes.
         n_nodes: number of nodes of the quadrature; doubled until `tol` is met.
         n_walkers: number of walks side by side.
@@ -199,7 +202,9 @@ def first_passage(
     require_untraced_arguments(
         "vrw.first_passage", "differentiate by the wheel only", resolved_model
     )
-    if options is None:
+    if options is None and resolved_model.reports_contacts:
+        options = StepOptions()
+    elif options is None:
         options = StepOptions(rtol=SAMPLED_STEP_TOLERANCE, atol=SAMPLED_STEP_TOLERANCE)
     estimate_passage = functools.partial(
         _estimate_passage_by_sampling,
