@@ -1,6 +1,7 @@
-"""The paper's step in batches: one source for machine code and GPUs, values and derivatives.
+"""The paper's step in batches: one source for machine code and GPUs, for steps and their
+derivatives.
 
-The phases are those of the diffrax engine. Each array holds one quantity of all wheels.
+The phases are those of the diffrax engine. Each array contains one quantity of all wheels.
 `build_step_function` returns a function of one wheel that `jax.vmap` maps onto lanes, for use in
 JAX programs.
 """
@@ -109,9 +110,9 @@ class _PhaseCarry(NamedTuple):
 def make_batch_phase(
     phase: AbstractPhase, records_margins: bool, is_compiled_separately: bool = False
 ) -> BatchPhase:
-    """Return a phase in the form that the batched integrator takes.
+    """Return the functions of a phase in the form that the batched integrator requires.
 
-    - `records_margins`: whether margins are evaluated in addition to guards.
+    - `records_margins`: whether the integrator also evaluates margins.
     """
 
     def evaluate_acceleration(q: Vector, v: Vector) -> StageAccelerations:
@@ -163,6 +164,7 @@ def take_gait_step(
 ) -> BatchAdvanceResult:
     """Return the minimal results of one gait step of every lane, from touchdown to touchdown.
 
+    - `x`: section state of each lane;
     - `straggler_count`: see `integrate_batch_phase`.
     """
     phase_sequence = run_batch_phases(
@@ -287,10 +289,10 @@ def _make_phase_runner(
 
 
 def can_use_batch_kernel(options: StepOptions) -> bool:
-    """Return whether the batch kernel can take the step, which needs machine code and an explicit
-    solver.
+    """Return whether the batch kernel can take the step.
 
-    Raise a `ValueError` if the options require the batch kernel and it is not available.
+    The batch kernel needs machine code and an explicit solver. Raise a `ValueError` if the options
+    require the batch kernel and it is not available.
     """
     is_explicit = load_explicit_tableau(options.solver) is not None
     if options.engine == "lanes" and not (is_explicit and simd.is_machine_code_available()):
@@ -302,7 +304,7 @@ def can_use_batch_kernel(options: StepOptions) -> bool:
 
 
 class _StepTraceConfig(NamedTuple):
-    """Settings on which the trace of a batched step depends, besides its arrays."""
+    """Settings on which the trace of a batched step depends, besides the shapes of its arrays."""
 
     argument_structure: Any  # tree structure of (params, x, options)
     stop_at_lift_off: bool
@@ -310,7 +312,7 @@ class _StepTraceConfig(NamedTuple):
 
     @property
     def cache_key(self) -> tuple:
-        """Return the key of the trace in caches, compared by `repr`."""
+        """Return the key of the trace in caches, which compare keys by `repr`."""
         return str(self.argument_structure), self.stop_at_lift_off, self.friction
 
     def run_phases_of_lanes(
@@ -318,7 +320,7 @@ class _StepTraceConfig(NamedTuple):
     ) -> tuple[PhaseSequenceResult, ButcherTableau, StepOptions]:
         """Return the results of all phases of the lanes, the tableau and the options.
 
-        The leaves have the lanes on their last axis.
+        The argument leaves have the lanes on their last axis.
         """
         params, x, options = jax.tree.unflatten(self.argument_structure, argument_leaves)
         tableau = load_explicit_tableau(options.solver)
@@ -344,9 +346,7 @@ class _StepTraceConfig(NamedTuple):
         return eqx.partition(step_result, eqx.is_inexact_array)
 
     def make_output_template(self, *argument_leaves: Array) -> tuple:
-        """Return arrays with the structure of the results of `compute_step_outputs` for one
-        wheel.
-        """
+        """Return arrays in the structure of the results of `compute_step_outputs` for one wheel."""
         x = argument_leaves[0]
         int_zeros = jnp.zeros_like(x, jnp.int32)
         two_rows, three_rows = (jnp.broadcast_to(x, (n, *x.shape)) for n in (2, 3))
@@ -370,7 +370,7 @@ class _StepTraceConfig(NamedTuple):
 
 
 def _fill_all_fields(record_type: Any, x: Array) -> Any:
-    """Return a record of the class `record_type` with `x` in all fields."""
+    """Return a record of the class `record_type` whose fields all contain `x`."""
     return record_type(*(x for _ in dataclasses.fields(record_type)))
 
 
@@ -379,8 +379,8 @@ def build_step_function(
 ) -> ForwardFunction:
     """Return a function from the leaves of (params, x, options) to the results of a step.
 
-    The results are split into floats and other arrays. The function is a forward rule from which
-    all AD modes are built.
+    The results are split into floats and other arrays. All modes of automatic differentiation are
+    derived from the returned function.
     """
     trace_config = _StepTraceConfig(argument_structure, stop_at_lift_off, friction)
     cache_key = ("gait step", *trace_config.cache_key)
@@ -394,10 +394,10 @@ def build_step_function(
 def build_step_finisher(
     argument_structure: Any, phase_index: int, stop_at_lift_off: bool
 ) -> BatchFunction:
-    """Return a function from the leaves of (params, distance, state, options) to the results of
-    `finish_step`.
+    """Return a function from the leaves of (params, foot distance, state, options) to the end of a
+    step.
 
-    The results are split into floats and other arrays.
+    The function evaluates `finish_step`. Its results are split into floats and other arrays.
     """
 
     def compute_finish_outputs(*argument_leaves: Array) -> tuple:
@@ -427,8 +427,9 @@ def build_step_finisher(
 def build_step_sampler(
     argument_structure: Any, stop_at_lift_off: bool, n_samples: int
 ) -> BatchFunction:
-    """Return a function from the leaves of (params, x, options) to samples at equal times of each
-    phase.
+    """Return a function from the leaves of (params, x, options) to samples of a step.
+
+    The samples are at equal time intervals in each phase.
     """
     trace_config = _StepTraceConfig(argument_structure, stop_at_lift_off, None)
 
@@ -482,8 +483,8 @@ def build_step_jacobian(
 ) -> ForwardFunction:
     """Return a function that computes the Jacobian of the step of `build_step_function`.
 
-    That function returns the Jacobian with respect to the leaves at `input_indices`, the float
-    results, and the other results.
+    The returned function gives (Jacobian with respect to the leaves at `input_indices`, float
+    results) and the other results.
     """
     trace_config = _StepTraceConfig(argument_structure, stop_at_lift_off, friction)
 
@@ -530,7 +531,7 @@ def build_step_jacobian(
 def split_jacobian_by_leaf(
     jacobian_columns: Any, argument_leaves: Sequence[Array], input_indices: Sequence[int]
 ) -> tuple:
-    """Return a Jacobian as one tree for each selected leaf.
+    """Return a Jacobian as one tree of derivatives for each selected leaf.
 
     The leading axis of `jacobian_columns` runs over all entries of the selected leaves.
     """
@@ -557,11 +558,11 @@ registers.
 def compute_jacobian_columns(
     batch_function: BatchFunction, argument_leaves: Sequence[Array], input_indices: Sequence[int]
 ) -> tuple:
-    """Return the Jacobian columns of `batch_function(*argument_leaves)`, its float results and its
-    other results.
+    """Return the Jacobian columns, the float results and the other results of `batch_function`.
 
-    The columns are those of the leaves at `input_indices`, on the leading axis. The function
-    returns floats over lanes and auxiliary outputs.
+    The columns are derivatives with respect to the entries of the leaves at `input_indices`, on the
+    leading axis. `batch_function(*argument_leaves)` returns floats over lanes and auxiliary
+    outputs.
     """
 
     def evaluate_at_selected_leaves(*varied_leaves: Array) -> tuple:
@@ -583,8 +584,7 @@ def compute_jacobian_columns(
 def _make_unit_tangents(selected_leaves: Sequence[Array]) -> list[Array]:
     """Return the unit vectors of all entries of the leaves, split by leaf, on the leading axis.
 
-    The ones and zeros of each number are separate constants, so that machine code omits products
-    with zeros.
+    Each zero and each one is a separate constant, so that machine code omits products with zeros.
     """
     entries_per_leaf = [int(np.prod(selected_leaf.shape[:-1])) for selected_leaf in selected_leaves]
     unit_vectors, leaf_tangents, entry_offset = np.eye(sum(entries_per_leaf)), [], 0

@@ -1,6 +1,4 @@
-"""Features of the library for each model. Each model declares its features, and packages read
-them.
-"""
+"""Features of the library that each model declares, and that other packages read."""
 
 import enum
 from dataclasses import dataclass

@@ -27,7 +27,8 @@ StepGroundValues = tuple[Array, ...]
 
 
 class AbstractWheel(eqx.Module):
-    """Model of the wheel. Models are final; the rest of the library uses only this interface.
+    """Model of the wheel. Model classes are final, and the rest of the library uses only this
+    interface.
 
     `advance` and `take_step` compile themselves, once for each structure of their arguments.
 
@@ -62,14 +63,15 @@ class AbstractWheel(eqx.Module):
 
     @property
     def fallback_model(self) -> "AbstractWheel":
-        """Return the model that is valid for any start.
+        """Return the model that can take a step from any start.
 
-        For a ladder this is its most general model, and for any other model the model itself.
+        For a ladder of models this is the most general model, and for any other model the model
+        itself.
         """
         return self
 
     def parameter_values(self, params: WheelParams) -> Float[Array, " n_values"]:
-        """Return the values of `parameter_names` for one wheel on the ground of this model."""
+        """Return the numbers of `parameter_names` for one wheel on the ground of this model."""
         parameter_values_list = [
             getattr(self if parameter_name == FRICTION_NAME else params, parameter_name)
             for parameter_name in self.parameter_names
@@ -82,7 +84,7 @@ class AbstractWheel(eqx.Module):
         )
 
     def parameter_rows(self, params: WheelParams) -> Float[np.ndarray, "wheels n_values"]:
-        """Return `parameter_values` of each wheel of a batch, by numpy.
+        """Return the numbers of `parameter_names` of each wheel of a batch, by NumPy.
 
         JAX would compile a program for each batch size.
         """
@@ -95,9 +97,9 @@ class AbstractWheel(eqx.Module):
     def from_values(
         self, parameter_values: Array | tuple[Array, ...], n_legs: int
     ) -> tuple["AbstractWheel", WheelParams]:
-        """Return model and wheel with the given values of `parameter_names`.
+        """Return model and wheel with the given numbers of `parameter_names`, which may be tracers.
 
-        This is the inverse of `parameter_values`, also for tracers.
+        The function is the inverse of `parameter_values`.
         """
         n = len(PARAMETER_NAMES)
         model_with_friction = self
@@ -110,9 +112,8 @@ class AbstractWheel(eqx.Module):
     def with_parameter(
         self, params: WheelParams, parameter_name: str, parameter_value: Elementwise
     ) -> tuple["AbstractWheel", WheelParams]:
-        """Return model and wheel with another value of one of `parameter_names`.
-
-        The value may be a tracer.
+        """Return model and wheel with a new value of the parameter `parameter_name`, which may be a
+        tracer.
         """
         if parameter_name == FRICTION_NAME:
             return eqx.tree_at(lambda ground: ground.friction, self, parameter_value), params
@@ -122,26 +123,27 @@ class AbstractWheel(eqx.Module):
 
     @abc.abstractmethod
     def advance(self, params: WheelParams, x: SectionState, options: StepOptions) -> AdvanceResult:
-        """Return the minimal results of one step.
+        """Return the minimal results of one step from the section state `x`.
 
         The results are differentiable in any mode, to any order.
         """
 
     @abc.abstractmethod
     def take_step(self, params: WheelParams, x: SectionState, options: StepOptions) -> Any:
-        """Return all results of one step: indicators, margins and energies.
+        """Return all results of one step from the section state `x`: indicators, margins and
+        energies.
 
-        The type is `StepResult`, or its counterpart for the model. The results are differentiable
-        in any mode.
+        The type is `StepResult`, or the step type of the model. The results are differentiable in
+        any mode.
         """
 
     @abc.abstractmethod
     def sample_step(
         self, params: WheelParams, x: SectionState, options: StepOptions, n_samples: int
     ) -> Any:
-        """Return the motion of the step at `n_samples` times of each phase.
+        """Return the motion of a step at `n_samples` times of each phase.
 
-        The type is `Trajectory`, or its counterpart for the model.
+        The type is `Trajectory`, or the trajectory type of the model.
         """
 
     def finish_step(
@@ -167,8 +169,8 @@ class AbstractWheel(eqx.Module):
         """Return a section state from which a walk can start."""
 
     def split_ground(self, params: WheelParams, n_steps: int) -> StepGroundValues | None:
-        """Return the ground of each step if slope or friction are arrays over steps, otherwise
-        None.
+        """Return the ground of each step, or None if neither slope nor friction is an array over
+        steps.
         """
         if jnp.ndim(params.slope) == 0:
             return None
@@ -178,8 +180,9 @@ class AbstractWheel(eqx.Module):
     def with_ground(
         self, params: WheelParams, step_ground: StepGroundValues
     ) -> tuple["AbstractWheel", WheelParams]:
-        """Return model and wheel on the ground of one step, which is the slopes of two lines, see
-        `split_slopes`.
+        """Return model and wheel on the ground of one step, which has the slopes of two lines.
+
+        See `split_slopes`.
         """
         return self, eqx.tree_at(lambda wheel: wheel.slope, params, step_ground[0])
 
@@ -199,7 +202,7 @@ class AbstractWheel(eqx.Module):
         return [units.length_unit / units.length_unit, units.rate_unit, units.velocity_unit]
 
     def embed_section(self, params: WheelParams, x: Array) -> Array:
-        """Return the section state of this model for `x`, which may be the paper's three
-        numbers.
+        """Return the section state of this model for `x`, which may be a section state of the
+        paper's model.
         """
         return x

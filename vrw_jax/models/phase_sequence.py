@@ -1,8 +1,8 @@
 """The paper's step from landing to landing, for any engine that integrates its phases.
 
-An engine provides a `PhaseRunner`, which integrates one phase to its end. This module determines
-the phases that take place, their starts, the end of the step and its results. All functions work
-elementwise, for one wheel or a batch.
+An engine provides a `PhaseRunner`, which integrates one phase to its end. This module selects the
+phases that take place, and computes their starts, the end of the step and its results. All
+functions work elementwise, for one wheel or a batch.
 """
 
 import functools
@@ -56,7 +56,7 @@ failed. This state is never integrated."""
 
 
 class PhaseResult(NamedTuple):
-    """End of a phase. It equals the start if the phase was not active."""
+    """State and time at the end of a phase. For an inactive phase, the end equals the start."""
 
     q: Vector
     v: Vector
@@ -74,7 +74,7 @@ the previous phase."""
 
 
 class PhaseSequenceResult(NamedTuple):
-    """Starts and ends of all phases of a step, and its outcome."""
+    """Starts and ends of all phases of a step, and the outcome of the step."""
 
     s: Symbols
     landing: Landing
@@ -94,13 +94,14 @@ def run_step_phases(
     stop_at_lift_off: bool,
     evaluate_landing: Callable[..., Landing] = transitions.resolve_landing,
 ) -> PhaseSequenceResult:
-    """Return the result of all phases of one step from the section state `x`, given entry by entry.
+    """Return the result of all phases of one step.
 
     The motion is in the frame of the line under both feet in double support. On uneven ground (see
     `split_slopes`), the touchdown and the section state at the end refer to the next line.
 
-    - `integrate_phase`: engine that integrates a phase;
-    - `evaluate_landing`: function of the landing with which the step begins.
+    - `integrate_phase`: function of the engine that integrates one phase;
+    - `x`: section state, given entry by entry;
+    - `evaluate_landing`: function that computes the landing with which the step begins.
     """
     params, is_valid_step, next_line_tilt = select_stance_line_and_tilt(params, x)
     params, x = replace_invalid_inputs(is_valid_step, params, x, PAPER_START_STATE)
@@ -123,7 +124,7 @@ def run_step_phases(
 
 
 class _RemainingPhases(NamedTuple):
-    """Starts and ends of the remaining phases of a step; see `PhaseSequenceResult`."""
+    """Starts and ends of the remaining phases of a step. See `PhaseSequenceResult`."""
 
     phase_starts: tuple[tuple[Vector, Vector], ...]
     phase_ends: tuple[PhaseResult, ...]
@@ -140,11 +141,10 @@ def _run_remaining_phases(
     is_phase_active: Array,
     options: StepOptions,
 ) -> _RemainingPhases:
-    """Return the results of the remaining phases of a step, from a motion in the first of these
-    phases.
+    """Return the results of the remaining phases of a step, from a motion in the first of them.
 
     - `is_valid_step`: whether a step takes place;
-    - `is_phase_active`: whether the first of the phases takes place.
+    - `is_phase_active`: whether the first of the remaining phases takes place.
     """
     step_outcome = jnp.where(
         is_valid_step, jnp.int32(Outcome.STEPPED), jnp.int32(Outcome.BAD_INPUT)
@@ -209,8 +209,8 @@ def finish_step(
 
     - `phase_index`: index of the phase in the step;
     - `foot_distance`: distance between both feet in the double support of the step, m;
-    - `phase_state`: (theta, L1, L2) and their rates; entries that follow from others in the phase
-      are ignored.
+    - `phase_state`: (theta, L1, L2) and their rates. Entries that follow from other entries in the
+      phase are ignored.
     """
     bounded_inputs = [
         jnp.abs(input_value) < MAX_SI_VALUE for input_value in (*phase_state, foot_distance)
@@ -265,7 +265,7 @@ def get_next_section_state(phase_sequence: PhaseSequenceResult) -> Vector:
 
 
 def make_advance_result(phase_sequence: PhaseSequenceResult, engine: str) -> AdvanceResult:
-    """Return the minimal results of a step; the section state is zero if the step failed."""
+    """Return the minimal results of a step. The section state is zero if the step failed."""
     theta, dtheta, dL1 = get_next_section_state(phase_sequence)
     has_stepped = phase_sequence.outcome == Outcome.STEPPED
     solver_steps = [phase_end.n_solver_steps for phase_end in phase_sequence.phase_ends]
@@ -349,7 +349,7 @@ def make_step_result(
 def make_trajectory(
     phase_sequence: PhaseSequenceResult, phase_samples: Sequence[Array]
 ) -> Trajectory:
-    """Return the trajectory of a step from samples at equal times of each phase.
+    """Return the trajectory of a step from samples at equal time intervals in each phase.
 
     - `phase_samples`: samples of each phase, with axes (sample, coordinates and rates, ...).
     """
@@ -408,7 +408,7 @@ def _make_step_margins(
     stopper_hit: transitions.StopperCollision,
     friction: Elementwise | float,
 ) -> Margins:
-    """Return the margins of the step.
+    """Return the margins of a step.
 
     - `rear_force`: force on the rear foot just after the landing, N;
     - `liftoff_motion`: motion at the end of double support;
@@ -430,8 +430,8 @@ def _make_step_margins(
     ]
 
     def find_lowest_margin(margin_name: str, *phase_indices: int) -> Array:
-        """Return the minimum of a margin over those of the phases that happened, or 0 if none
-        happened.
+        """Return the minimum of a margin over those of the given phases that took place, otherwise
+        0.
         """
         lowest_value: Any = jnp.inf
         for phase_index in phase_indices:

@@ -1,4 +1,4 @@
-"""Rigid model: all legs are rigid, so a step has a closed form and nothing is integrated."""
+"""Rigid model: all legs are rigid, so a step has a closed form without numerical integration."""
 
 from dataclasses import dataclass
 from functools import partial
@@ -122,7 +122,7 @@ class RigidWheel(AbstractWheel):
         )
 
     def _compute_landing_rate_ratio(self, s: Symbols) -> Elementwise:
-        """Return the ratio of the angular rates after and before the landing."""
+        """Return the ratio of the angular rate after the landing to the angular rate before it."""
         foot_inertia = _compute_foot_inertia(s)
         if not self.held_landing:
             return (s.Mt * s.L0**2 * s.cos_alpha + _compute_hub_inertia(s)) / foot_inertia
@@ -139,8 +139,8 @@ class RigidWheel(AbstractWheel):
         )
 
     def make_vertical_rate_map(self, params: WheelParams) -> "VerticalRateMap":
-        """Return the map from the squared rate at the vertical of one stance leg to that at the
-        vertical of the next.
+        """Return the map of the squared angular rate from one stance leg at the vertical to the
+        next.
         """
         s = params.symbols()
         half_angle, doubled_gravity_stiffness = 0.5 * s.alpha, 2.0 * _compute_gravity_stiffness(s)
@@ -246,7 +246,9 @@ class RigidWheel(AbstractWheel):
         state: Float[Array, " 6"],
         options: StepOptions,
     ) -> AdvanceResult:
-        """Return the end of the step from theta and its rate; other arguments have no effect."""
+        """Return the end of the step from theta and its rate. The other entries of the state have
+        no effect.
+        """
         wheel_angle, angular_rate = state[0], state[3]
         s, half_angle = params.symbols(), jnp.asarray(0.5 * params.leg_angle, wheel_angle.dtype)
         rolling_motion = RollingMotion(s, params.slope, angular_rate, given_first_angle=wheel_angle)
@@ -285,10 +287,10 @@ class RigidWheel(AbstractWheel):
         rolling_motion: "RollingMotion",
         friction: Elementwise,
     ) -> tuple:
-        """Return the impulse at the rear foot (N s), the friction margins of both feet, and the
-        stopper impulses (N s).
+        """Return the rear impulse (N s), the friction margins and the stopper impulses (N s) of a
+        landing.
 
-        The friction margins are those of fore and rear foot, and the stopper impulses those of legs
+        The friction margins are those of fore and rear foot. The stopper impulses are those of legs
         3..n.
         """
         zero = jnp.zeros_like(x[1])
@@ -350,12 +352,11 @@ class RigidWheel(AbstractWheel):
 
 
 class VerticalRateMap(NamedTuple):
-    """Map x' = r (x + G (1 - cos(h + slope))) - G (1 - cos(h - slope)) at the slope of the next
-    line.
+    """Map of the squared rate x at the vertical of one stance leg to that of the next leg, 1/s^2.
 
-    Here x is the squared rate with the stance leg vertical, 1/s^2. The wheel falls back if x' < 0,
-    for a slope below h. As a function of the slope, x' = offset(x) + amplitude cos(slope -
-    slope_of_maximum).
+    The map is x' = r (x + G (1 - cos(h + slope))) - G (1 - cos(h - slope)) at the slope of the next
+    line. The wheel falls back if x' < 0, for a slope below h. As a function of the slope, x' =
+    offset(x) + amplitude cos(slope - slope_of_maximum).
     """
 
     retained_fraction: Elementwise  # r, retained fraction of the squared rate in a landing
@@ -370,7 +371,7 @@ class VerticalRateMap(NamedTuple):
 
     @property
     def slope_of_maximum(self) -> Elementwise:
-        """Return the slope at which x' is largest, rad. At smaller slopes, x' grows with the
+        """Return the slope at which x' is largest, rad. Below this slope, x' grows with the
         slope.
         """
         cosine_coefficient, sine_coefficient = self._cosine_and_sine_coefficients
@@ -391,13 +392,15 @@ class VerticalRateMap(NamedTuple):
         )
 
     def compute_fixed_point(self, slope: Elementwise) -> Elementwise:
-        """Return the x that repeats on lines of this slope (rad), 1/s^2."""
+        """Return the squared rate x that the map reproduces on lines of the given slope (rad),
+        1/s^2.
+        """
         periodic_part = self.slope_amplitude * jnp.cos(slope - self.slope_of_maximum)
         return periodic_part / (1.0 - self.retained_fraction) - self.doubled_gravity_stiffness
 
 
 class RollingMotion(eqx.Module):
-    """Rolling over one foot from a first angle at a given rate, by conservation of energy."""
+    """Rolling over one foot from a first angle at a given rate, with conserved energy."""
 
     s: Symbols
     phi: Elementwise  # slope, rad
@@ -415,8 +418,9 @@ class RollingMotion(eqx.Module):
         return self.given_first_angle
 
     def compute_squared_rate(self, theta: Elementwise) -> Elementwise:
-        """Return the square of dtheta at theta, rad^2/s^2. It is negative if the wheel does not
-        reach theta.
+        """Return the square of dtheta at theta, rad^2/s^2.
+
+        The square is negative if the wheel does not reach theta.
         """
         s = self.s
         height_drop = _compute_cosine_from_vertical(
@@ -428,7 +432,7 @@ class RollingMotion(eqx.Module):
         """Return the time from the first angle to theta, s, by Carlson's R_F.
 
         Let t be sin^2 of half the angle from the vertical. The rate is the square root of a linear
-        function of t. So the time is the complete cubic form of the elliptic integral.
+        function of t. Therefore the time is the complete cubic form of the elliptic integral.
         """
         s = self.s
         kappa = 2.0 * _compute_gravity_stiffness(s)
@@ -463,7 +467,7 @@ class RollingMotion(eqx.Module):
         return time_to_end + time_to_vertical
 
     def compute_motion_at_angle(self, theta: Elementwise) -> Motion:
-        """Return the motion at theta. Its rate is zero if the wheel does not reach theta."""
+        """Return the motion at theta, with rate zero if the wheel does not reach theta."""
         zero = 0.0 * theta
         squared_rate = self.compute_squared_rate(theta)
         is_moving = squared_rate > 0.0
@@ -472,7 +476,9 @@ class RollingMotion(eqx.Module):
         return Motion.from_angle(theta, leg_length, leg_length, angular_rate, zero, zero)
 
     def compute_acceleration_at_angle(self, theta: Elementwise) -> dynamics.Acceleration:
-        """Return the angular acceleration under gravity, rad/s^2, with legs of constant length."""
+        """Return the angular acceleration due to gravity at theta, rad/s^2, with legs of constant
+        length.
+        """
         zero = 0.0 * theta
         sin_p = jnp.sin(theta) * self.s.cos_phi + jnp.cos(theta) * self.s.sin_phi
         return dynamics.Acceleration(_compute_gravity_stiffness(self.s) * sin_p, zero, zero)
@@ -486,7 +492,7 @@ class RollingMotion(eqx.Module):
     def compute_stopper_force_at_angle(
         self, theta: Elementwise, legs: range
     ) -> Float[Array, "n ..."]:
-        """Return the forces of the stoppers of `legs` at theta, N."""
+        """Return the forces of the stoppers of the legs `legs` at theta, N."""
         return dynamics.compute_stopper_force(
             self.s,
             self.compute_motion_at_angle(theta),
@@ -495,8 +501,9 @@ class RollingMotion(eqx.Module):
         )
 
     def evaluate_states_at_angles(self, theta: Elementwise) -> tuple[Array, Array, Array]:
-        """Return coordinates with rates, forces of both feet (N) and energies (J) at theta, on the
-        first axis.
+        """Return coordinates with rates, forces of both feet (N) and energies (J) at theta.
+
+        The quantities are on the first axis of each array.
         """
         wheel_motion, foot_force, zero = (
             self.compute_motion_at_angle(theta),
@@ -521,7 +528,7 @@ class RollingMotion(eqx.Module):
         )
 
     def evaluate_margins_at_angles(self, theta: Array) -> Array:
-        """Return each margin at its angle, margin i at `theta[i]`.
+        """Return one margin at each angle: margin i at `theta[i]`.
 
         The margins are the normal force (N), minus the required friction, and the stopper forces of
         legs 2..n (N).
@@ -540,10 +547,11 @@ class RollingMotion(eqx.Module):
     def find_margin_minima(
         self, search_options: MarginMinimumSearchOptions = MARGIN_MINIMUM_SEARCH_OPTIONS
     ) -> Array:
-        """Return the minima of `evaluate_margins_at_angles` from landing to landing, to round-off.
+        """Return the minimum of each margin of `evaluate_margins_at_angles` from landing to
+        landing.
 
-        Each minimum is found by repeated zooming. The error of a minimum is the square of the
-        remaining error of its angle.
+        The minima are accurate to round-off. Each minimum is found by repeated zooming, and its
+        error is proportional to the square of the error of its angle.
         """
         half_angle = jnp.asarray(0.5 * self.s.alpha, self.initial_rate.dtype)
         end_angle = half_angle if self.end_angle is None else self.end_angle
@@ -599,7 +607,7 @@ def _compute_foot_inertia(s: Symbols) -> Elementwise:
 def _compute_gravity_stiffness(s: Symbols) -> Elementwise:
     """Return Mt g L0 over the inertia about the foot, 1/s^2.
 
-    The value is g/l for a rimless wheel without leg masses.
+    The quotient is g/l for a rimless wheel without leg masses.
     """
     return s.Mt * s.g * s.L0 / _compute_foot_inertia(s)
 
@@ -619,7 +627,7 @@ def _compute_rolling_time(
 
     The half-angles are given by their squares. The time is the integral of dt / sqrt(t (1 - t)
     (min_rate_squared + 2 kappa t)) over t = sin^2. Its closed form is 2 R_F (DLMF 19.29.4). The
-    result is zero if both ends coincide.
+    time is zero if both half-angles are equal.
     """
     is_nonempty = end_angle_squared > begin_angle_squared
     lower_squared = jnp.where(is_nonempty, begin_angle_squared, 0.0)

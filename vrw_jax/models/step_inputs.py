@@ -30,8 +30,9 @@ SectionStateEntries = Float[Array, "section ..."] | tuple[Array, ...]
 
 
 def is_valid_start_state(params: WheelParams, x: SectionStateEntries) -> Array:
-    """Return whether parameters and start are finite, in their domains and rolling forward. NaN
-    gives False.
+    """Return whether parameters and start are finite, in their domains and rolling forward.
+
+    NaN gives False.
     """
     wheel_angle, angular_rate = x[0], x[1]
     is_upright = (jnp.abs(wheel_angle) < 0.5 * jnp.pi) & (
@@ -49,9 +50,9 @@ def replace_invalid_inputs(
     x: SectionStateEntries,
     fallback_state: Any,
 ) -> tuple[WheelParams, Any]:
-    """Return parameters and start, with Table 1 and `fallback_state` in place of invalid input.
+    """Return parameters and start, with Table 1 and `fallback_state` in place of invalid inputs.
 
-    The replacement prevents NaN in the step and its derivatives.
+    The replacement prevents NaN in the step and in its derivatives.
     """
     return jax.tree.map(
         lambda given_value, safe_value: jnp.where(
@@ -72,7 +73,7 @@ def complete_line_slopes(slope: Array, n_steps: int) -> Array:
 
 
 def check_stepwise_shape(quantity_name: str, stepwise_values: Array, n_steps: int) -> None:
-    """Raise a `ValueError` unless an array has n or n + 1 values for n steps."""
+    """Raise a `ValueError` if an array does not have n or n + 1 entries for n steps."""
     if jnp.shape(stepwise_values) not in ((n_steps,), (n_steps + 1,)):
         steps_text = "a step" if n_steps == 1 else f"a walk of {n_steps} steps"
         raise ValueError(
@@ -97,15 +98,15 @@ def split_slopes(params: WheelParams) -> tuple[WheelParams, Elementwise | None]:
 
 
 def is_valid_slope(slope: Elementwise) -> Array:
-    """Return whether a slope (rad) lies in the domain of slopes. NaN gives False."""
+    """Return whether a slope (rad) lies in its domain. NaN gives False."""
     return jnp.asarray(PARAMETER_DOMAINS["slope"].contains_value(slope))
 
 
 def select_stance_line_and_tilt(
     params: WheelParams, x: SectionStateEntries
 ) -> tuple[WheelParams, Array, Elementwise | None]:
-    """Return the wheel on the line under both feet, whether a step may start, and the tilt of the
-    next line.
+    """Return the wheel on the line under both feet, whether a step may start, and the next line's
+    tilt.
 
     The tilt is the angle by which the next line is steeper than the present line, rad. On flat
     ground it is None.

@@ -1,4 +1,4 @@
-"""Results of one step: measures, margins and energies, with the common part of all models."""
+"""Results of one step: measures, margins and energies, and the part that all models share."""
 
 import abc
 from collections.abc import Mapping
@@ -25,20 +25,20 @@ MeasureValue = Float[Array, "..."]
 
 
 class AbstractMeasureGroup(AbstractPrintable):
-    """Group of measures, in which each field is one of `measures.MEASURES`."""
+    """Group of measures. Each field is one of `measures.MEASURES`."""
 
     measure_names: eqx.AbstractClassVar[Mapping[str, str]]
     """Names in `measures.MEASURES` of the fields that have another name there."""
 
     def measures(self) -> dict[str, Array]:
-        """Return the fields by their names in `measures.MEASURES`."""
+        """Return the measures of the group by their names in `measures.MEASURES`."""
         return {
             self.measure_names.get(field_name, field_name): field_value
             for field_name, field_value in vars(self).items()
         }
 
     def summary_rows(self) -> list[LabelAndText]:
-        """Return label and printed value of each measure."""
+        """Return label and printed number of each measure."""
         measure_items = self.measures().items()
         return [
             (
@@ -70,10 +70,11 @@ class DoubleSupportIndicators(AbstractMeasureGroup):
 
 
 class EnergyLoss(AbstractMeasureGroup):
-    """Mechanical energy lost in the step, J; each part is positive for a loss.
+    """Mechanical energy lost in the step, J. A loss is positive.
 
-    - `landing`, `stopper`: in the two collisions;
-    - `damping`: in the legs' dampers.
+    - `landing`: energy lost in the landing;
+    - `stopper`: energy lost in the collision of Leg 2 with its stopper;
+    - `damping`: energy lost in the legs' dampers.
 
     Examples:
         >>> step = vrw.step(vrw.WheelParams(damping=150.0), vrw.paper_start())
@@ -91,15 +92,15 @@ class EnergyLoss(AbstractMeasureGroup):
 
 
 class Margins(AbstractMeasureGroup):
-    """Margins of the viscoelastic model's assumptions over one step: negative if violated.
+    """Margins of the viscoelastic model's assumptions over one step, negative if violated.
 
     Margins do not affect the motion. Forces and lengths are minima over the step, accurate to the
-    integrator's tolerance. A quantity may be zero by construction at the start of a phase: for a
-    foot that leaves the ground, or for Leg 1 landing on its stopper. The quantity then counts from
-    its first later minimum on. Friction margins are the model's `friction` minus the required
-    coefficient. The rear foot's margin is taken just after landing, because it grows without bound
-    as the foot unloads. A phase that did not happen does not count. A step that did not begin has
-    zero margins.
+    integrator's tolerance. A quantity may be zero by construction at the start of a phase, for
+    example the height of a foot that leaves the ground. The minimum is then taken from the first
+    later local minimum on. Friction margins are the model's `friction` minus the required
+    coefficient. The friction margin of the rear foot is that just after landing, because the
+    required coefficient grows without bound as the foot unloads. Phases that did not take place are
+    ignored. A step that did not begin has zero margins.
 
     - `fore_foot_force`: lambda_2, N;
     - `takeoff_acceleration`: acceleration of foot 2 normal to the slope at the start of SLS-I,
@@ -144,9 +145,7 @@ class Margins(AbstractMeasureGroup):
 
 
 class AbstractStep(AbstractPrintable):
-    """Results of one step that every model reports. Under `vmap` each field gains the axis of the
-    batch.
-    """
+    """Results of one step that every model reports. Under `vmap` each field has a batch axis."""
 
     section_state: eqx.AbstractVar[Array]  # just before the next touchdown
     post_impact: eqx.AbstractVar[Float[Array, "2 ..."]]  # (theta, dtheta), rad, rad/s
@@ -157,7 +156,9 @@ class AbstractStep(AbstractPrintable):
 
     @property
     def ending(self) -> Any:
-        """Return how the step ended, as a sentence; a batch has an array of sentences."""
+        """Return a sentence that describes how the step ended, or an array of sentences for a
+        batch.
+        """
         return describe_step_ending(self.outcome, Outcome)
 
     @property
@@ -167,13 +168,15 @@ class AbstractStep(AbstractPrintable):
 
     @property
     def dls_fraction(self) -> Array:
-        """Return the fraction of the step with two loaded feet; 0 for a step of zero duration."""
+        """Return the fraction of the step with two loaded feet, or 0 for a step of zero
+        duration.
+        """
         period = self.period
         return self.durations[..., 0] / jnp.where(period > 0.0, period, 1.0)
 
     @property
     def speed(self) -> Array:
-        """Return the step length over the duration, m/s; 0 for a step of zero duration."""
+        """Return the step length divided by the duration, m/s, or 0 for a step of zero duration."""
         period = self.period
         return jnp.where(period > 0.0, self.step_length / jnp.where(period > 0.0, period, 1.0), 0.0)
 
@@ -198,7 +201,9 @@ class AbstractStep(AbstractPrintable):
         return shared_measures | self.model_measures()
 
     def summary_rows(self) -> list[LabelAndText]:
-        """Return labels and texts: measures, then margins with whether their assumptions hold."""
+        """Return labels and texts of all measures, and of each margin with a verdict on its
+        sign.
+        """
         step_outcome, measure_values = np.asarray(self.outcome), self.measures()
         if step_outcome.ndim:
             return [("steps", format_outcome_counts(step_outcome, Outcome))]
@@ -222,10 +227,10 @@ class AbstractStep(AbstractPrintable):
         return text_rows
 
     def model_selection(self) -> dict[str, Array]:
-        """Return the code of the model that took the step and the code of the reason, by the names
-        of the dataset variables.
+        """Return the codes of the selected model and of the reason, by the names of the dataset
+        variables.
 
-        The result is empty for a model that does not select another model.
+        The dictionary is empty for a model that does not select another model.
         """
         return {}
 
@@ -235,8 +240,8 @@ class AbstractStep(AbstractPrintable):
 
 
 class AbstractContactStep(AbstractStep):
-    """Step with contacts in any order. The `durations` are those with two, one and no loaded feet,
-    s.
+    """Step with contacts in any order, whose `durations` are those with two, one and no loaded
+    feet, s.
     """
 
     energy_impacts: eqx.AbstractVar[MeasureValue]  # lost in impacts, J
@@ -256,10 +261,10 @@ class AbstractContactStep(AbstractStep):
 
 
 class StepResult(AbstractStep):
-    """One step from touchdown to touchdown. Batched under vmap: every field gains the axis.
+    """One step from touchdown to touchdown. Under `vmap` each field has a batch axis.
 
-    Fields of a step whose outcome is not STEPPED are finite and describe the partial motion; its
-    `section_state` is all zeros, which is not a valid section state.
+    If the outcome is not STEPPED, the fields are finite and describe the partial motion. The
+    `section_state` then consists of zeros, which is not a valid section state.
 
     - `section_state`: just before the next touchdown;
     - `post_impact`: (theta, dtheta) just after the opening landing, rad, rad/s;
@@ -288,7 +293,7 @@ class StepResult(AbstractStep):
     engine: str = eqx.field(static=True, default="")
 
     def model_measures(self) -> dict[str, Array]:
-        """Return the measures that only steps of the paper's phases have, by name."""
+        """Return the measures, by name, that only steps with the paper's phases have."""
         """Return the measures of contact steps by name."""
         return {
             "duration_sls1": self.durations[..., 1],
@@ -301,7 +306,9 @@ class StepResult(AbstractStep):
 
 
 class AdvanceResult(eqx.Module):
-    """Minimal results of a step: the input of the next step, and the outcome."""
+    """Minimal results of a step: the section state from which the next step starts, and the
+    outcome.
+    """
 
     section_state: AnySectionState
     durations: Float[Array, "3 ..."]  # of DLS, SLS-I, SLS-II, s
@@ -313,11 +320,12 @@ class AdvanceResult(eqx.Module):
 
 
 class Trajectory(eqx.Module):
-    """States of one step at samples of each phase, both ends included, with forces and energies.
+    """States of one step at samples of each phase, with forces and energies.
 
-    The axes are phase (DLS, SLS-I, SLS-II) and sample. A phase that did not happen has duration 0
-    and repeats its start. Coordinates use the leg labels of this step, and the foot of Leg 1 is the
-    origin. The last three fields are those of the `AdvanceResult`.
+    The axes are phase (DLS, SLS-I, SLS-II) and sample. The samples of a phase include both ends. A
+    phase that did not take place has duration 0 and repeats its start. Coordinates use the leg
+    labels of this step, and the foot of Leg 1 is the origin. The last three fields are those of the
+    `AdvanceResult`.
     """
 
     time: Float[Array, "3 n ..."]  # time since the landing, s

@@ -1,11 +1,11 @@
 """Derivatives that follow from the units of length, time and mass by Euler's theorem.
 
-In other units of length, time and mass every gait is the same. So every output of a step or a cycle
-is a homogeneous function of the wheel and the start. By Euler's theorem, each unit gives one column
-of the Jacobian from the other columns. The Jacobian of a step obtains two columns in this way. The
-unit of mass would give a third column, but no mass is always large enough to divide by. The column
-of a light leg would lose its digits. The columns of the Jacobian of a cycle are more expensive.
-There, the direction in which both masses grow also follows from the unit of mass.
+Gaits do not depend on the units of length, time and mass. Every output of a step or a cycle is
+therefore a homogeneous function of the wheel and the start. By Euler's theorem, each unit gives one
+column of the Jacobian from the other columns. The Jacobian of a step obtains two columns in this
+way. The unit of mass would give a third column, but no mass is always large enough as a divisor:
+the column of a light leg would lose its digits. The columns of the Jacobian of a cycle are more
+expensive. For a cycle, the direction in which both masses grow also follows from the unit of mass.
 """
 
 from collections.abc import Mapping, Sequence
@@ -38,8 +38,8 @@ class UnitScalingPowers(NamedTuple):
         """Return `scaled_output` minus each known column times its input and the power of this
         input.
 
-        `scaled_output` is the output times its power. By Euler's theorem, the result is the sum of
-        such products over the unknown columns.
+        `scaled_output` is the output times its power. By Euler's theorem, the difference is the sum
+        of the same products over the unknown columns.
         """
         for i, known_column in known_columns.items():
             if self.input_powers[i]:
@@ -51,7 +51,8 @@ class UnitScalingPowers(NamedTuple):
 
 def _make_unit_scaling(unit_index: int) -> UnitScalingPowers:
     """Return the powers of one unit in inputs and outputs. The index is 0 for length, 1 for time
-    and 2 for mass."""
+    and 2 for mass.
+    """
     input_and_output_powers = (
         tuple(UNIT_POWERS[unit_name][unit_index] for unit_name in unit_names)
         for unit_names in (_STEP_INPUT_UNITS, (*_SECTION_STATE_UNITS, "s", "s", "s"))
@@ -75,8 +76,9 @@ def complete_jacobian_by_scaling(
     known_columns: Mapping[int, Array],
     scaled_outputs: Mapping[int, Array],
 ) -> dict[int, Array]:
-    """Return all columns of a Jacobian. The columns of `UNIT_SCALING_BY_PARAMETER_INDEX` follow
-    from Euler's theorem.
+    """Return all columns of a Jacobian by the index of their input.
+
+    The columns of `UNIT_SCALING_BY_PARAMETER_INDEX` follow from Euler's theorem.
 
     - `known_columns`: all other columns, by the index of the input;
     - `scaled_outputs`: outputs times their powers, by the index of the parameter.
@@ -95,9 +97,9 @@ def complete_jacobian_by_scaling(
 def complete_jacobian_columns(
     batch_function: BatchFunction, step_inputs: Sequence[Array], input_indices: Sequence[int]
 ) -> tuple:
-    """Return `compute_jacobian_columns` of section state and durations with respect to all inputs.
+    """Return the Jacobian columns of section state and durations with respect to all inputs.
 
-    Two columns follow from the other columns by scaling.
+    `compute_jacobian_columns` gives all columns except two, which follow by scaling.
 
     - `step_inputs`: parameters, then the start, then on uneven ground the slope of the next line;
     - `input_indices`: indices of all inputs, in the order of the returned columns.

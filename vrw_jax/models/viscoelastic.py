@@ -53,7 +53,7 @@ from vrw_jax.wheel import (
 
 
 class DiffraxPhaseFunctions(NamedTuple):
-    """Functions of a phase for the diffrax integrator, of the state y = (q, v) as one vector."""
+    """Functions of a phase for the diffrax integrator, whose state y = (q, v) is one vector."""
 
     unpack_motion: Callable[[StateArray], Motion]
     vector_field: VectorField
@@ -63,7 +63,7 @@ class DiffraxPhaseFunctions(NamedTuple):
 def make_diffrax_phase(phase: AbstractPhase, records_margins: bool) -> DiffraxPhaseFunctions:
     """Return the functions of a phase that the diffrax integrator calls.
 
-    - `records_margins`: whether margins are evaluated in addition to guards.
+    - `records_margins`: whether the integrator also evaluates margins.
     """
 
     def unpack_motion(y: StateArray) -> Motion:
@@ -95,8 +95,8 @@ def make_diffrax_phase(phase: AbstractPhase, records_margins: bool) -> DiffraxPh
 
 
 class ViscoelasticWheel(AbstractWheel):
-    """Model of the paper: fixed leg roles, no slip, no scuffing; margins are measured, not
-    enforced.
+    """Model of the paper: fixed leg roles, no slip, no scuffing, and margins without effect on
+    motion.
 
     - `friction`: coefficient of the ground, which enters the friction margins but not the motion;
     - `stop_at_lift_off`: whether a step ends if the ground would have to pull on Leg 1, since the
@@ -139,7 +139,7 @@ class ViscoelasticWheel(AbstractWheel):
     def _compute_step(
         self, params: WheelParams, x: SectionState, options: StepOptions, is_detailed: bool
     ) -> Any:
-        """Return the results of a step, computed by the compiled function."""
+        """Return the results of a step, computed by the compiled function of the step."""
         argument_leaves, argument_structure = jax.tree.flatten((params, x, options))
         return eqx.combine(
             *_compile_step_function(self, argument_structure, is_detailed)(*argument_leaves)
@@ -162,7 +162,7 @@ class ViscoelasticWheel(AbstractWheel):
     def _sample_with_diffrax(
         self, argument_structure: Any, n_samples: int, *argument_leaves: Array
     ) -> Trajectory:
-        """Return the samples of a step, integrated by diffrax."""
+        """Return samples of a step that diffrax integrates."""
         params, x, options = jax.tree.unflatten(argument_structure, argument_leaves)
         phase_sequence, phase_samples = (
             self._run_phases(params, x, options, records_margins=False),
@@ -195,7 +195,7 @@ class ViscoelasticWheel(AbstractWheel):
     def _run_phases(
         self, params: WheelParams, x: SectionState, options: StepOptions, records_margins: bool
     ) -> PhaseSequenceResult:
-        """Return the result of all phases of a step, integrated by diffrax."""
+        """Return the result of all phases of a step that diffrax integrates."""
         integrate_phase = _make_diffrax_phase_runner(options, records_margins)
         return run_step_phases(integrate_phase, params, tuple(x), options, self.stop_at_lift_off)
 
@@ -256,8 +256,9 @@ def _make_diffrax_phase_runner(options: StepOptions, records_margins: bool) -> P
 def _compile_step_function(
     model: ViscoelasticWheel, argument_structure: Any, is_detailed: bool
 ) -> ForwardFunction:
-    """Return the function of a step over the leaves of (params, x, options), differentiable in any
-    mode.
+    """Return the compiled function of a step, differentiable in any mode.
+
+    Its arguments are the leaves of (params, x, options).
     """
 
     static_options = jax.tree.unflatten(argument_structure, [0.0] * argument_structure.num_leaves)[
@@ -269,7 +270,7 @@ def _compile_step_function(
         """Return the results of a step by diffrax, split into floats and other arrays.
 
         If the batch kernel is the engine, this function computes only derivatives of derivatives,
-        under the name of that engine.
+        and the results have the name of the batch kernel's engine.
         """
         params, x, options = jax.tree.unflatten(argument_structure, argument_leaves)
         options = options.with_derivative_tolerances() if tightens_tolerances else options

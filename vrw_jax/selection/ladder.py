@@ -1,8 +1,8 @@
 """Wheel that takes each step by the simplest model whose assumptions hold ("ladder" of models).
 
 The viscoelastic model takes the step and measures its margins. If a margin is violated, the
-unilateral model takes the step again. Under `vmap` the selection is made per batch element. An
-element for which the viscoelastic model holds costs no work in the unilateral model. The rigid
+unilateral model takes the step again. Under `vmap` a model is selected for each batch element.
+Elements for which the viscoelastic model is valid cost no work in the unilateral model. The rigid
 model is never selected, because its assumption of rigid legs fails for every finite stiffness.
 """
 
@@ -97,12 +97,11 @@ MODEL_SELECTION_ATTRIBUTES: dict[str, dict[str, object]] = {
 
 
 class ModelChoice(AbstractPrintable):
-    """Selection of a model for one step, and its reason. Batched under vmap: every field gains the
-    axis.
+    """Selected model of one step, and the reason. Under `vmap` each field has a batch axis.
 
     - `model_code`: a `ModelCode`, VISCOELASTIC or UNILATERAL;
-    - `reason_code`: 0 if the viscoelastic model holds. If a margin is violated, the code is 1 + the
-      index of the first such margin in `MODEL_SELECTION_MARGINS`. If a leg other than Leg 1 is
+    - `reason_code`: 0 if the viscoelastic model is valid. If a margin is violated, the code is 1 +
+      the index of the first such margin in `MODEL_SELECTION_MARGINS`. If a leg other than Leg 1 is
       loaded or off its stopper at the start, the code is `START_NOT_EMBEDDABLE_REASON_CODE`. If the
       viscoelastic step does not reach a touchdown, the code is minus the outcome;
     - `margins`: margins of `MODEL_SELECTION_MARGINS`, negative if violated;
@@ -120,7 +119,7 @@ class ModelChoice(AbstractPrintable):
     friction: Scalar
 
     def summary_rows(self) -> list[LabelAndText]:
-        """Return label and text of model, explanation and margins."""
+        """Return label and text of the model, of the reason and of the margins."""
         reason_codes = np.asarray(self.reason_code)
         if reason_codes.ndim:
             n_paper_wheels = int(np.sum(reason_codes == 0))
@@ -154,7 +153,9 @@ class ModelChoice(AbstractPrintable):
 
     @property
     def why(self) -> Any:
-        """Return the reason of the selection as one sentence; a batch has an array of sentences."""
+        """Return a sentence with the reason of the selection, or an array of sentences for a
+        batch.
+        """
         return map_text_of_elements(describe_selection_reason, self.reason_code)
 
 
@@ -173,11 +174,12 @@ def describe_selection_reason(reason_code: int) -> str:
 def find_selection_reason(
     step_measures: Mapping[str, Any], friction_difference: Any
 ) -> tuple[Array, Array]:
-    """Return `ModelChoice.reason_code` of viscoelastic steps, and the steps' margins on the last
-    axis.
+    """Return `ModelChoice.reason_code` of viscoelastic steps, and the margins of the steps.
+
+    The margins are on the last axis, and include the effect of `friction_difference`.
 
     - `step_measures`: measures and outcomes of the steps;
-    - `friction_difference`: friction of the ground minus the friction assumed by `step_measures`.
+    - `friction_difference`: friction of the ground minus the friction in `step_measures`.
     """
     selection_margins = [
         step_measures[margin_name] + (friction_difference if "friction" in margin_name else 0.0)
@@ -192,7 +194,7 @@ def find_selection_reason(
 
 
 class LadderStep(AbstractContactStep):
-    """One step by the simplest valid model, in the same form for both. Batched under vmap.
+    """One step by the simplest valid model. Under `vmap` each field has a batch axis.
 
     - `choice`: the chosen model, and the reason;
     - `section_state`: just before the next landing; zeros if there was none;
@@ -263,7 +265,7 @@ class LadderWheel(AbstractWheel):
 
     @property
     def unilateral_model(self) -> UnilateralWheel:
-        """Return the model of the steps for which the viscoelastic model does not hold."""
+        """Return the model that takes the steps for which the viscoelastic model is not valid."""
         return UnilateralWheel(friction=self.friction)
 
     @property
@@ -388,9 +390,9 @@ class LadderWheel(AbstractWheel):
 def _embed_paper_result(
     uses_paper_model: Array, params: WheelParams, paper_result: StepResult
 ) -> FullState:
-    """Return the full section state of a viscoelastic step.
+    """Return the full section state after a viscoelastic step.
 
-    If the viscoelastic model is not used, return the state of Table 1's start.
+    If the viscoelastic model is not valid, return the state of Table 1's start.
     """
     fallback_state = jnp.asarray(PAPER_START_STATE, paper_result.section_state.dtype)
     params, x = replace_invalid_inputs(
@@ -400,7 +402,9 @@ def _embed_paper_result(
 
 
 def _sort_durations_by_loaded_feet(paper_result: StepResult) -> Float[Array, "3"]:
-    """Return the durations with two loaded feet, with one and with none, s."""
+    """Return the durations of a viscoelastic step with two loaded feet, with one and with none,
+    s.
+    """
     double_support, *single_support = paper_result.durations
     return jnp.stack(
         [double_support, single_support[0] + single_support[1], jnp.zeros_like(double_support)]
@@ -408,7 +412,7 @@ def _sort_durations_by_loaded_feet(paper_result: StepResult) -> Float[Array, "3"
 
 
 def raise_if_ladder(model: object, use_description: str) -> None:
-    """Raise a `TypeError` for a ladder if a model with smoothly varying gaits is required.
+    """Raise a `TypeError` for a ladder of models if a model whose gaits vary smoothly is required.
 
     - `use_description`: use of the model in the message, such as "tuned".
     """

@@ -1,4 +1,4 @@
-"""Registry of models: a new model is added to this list and nowhere else."""
+"""Registry of models. A new model is added to its list and nowhere else."""
 
 from vrw_jax.contact import UnilateralWheel
 from vrw_jax.models import AbstractWheel, RigidWheel, ViscoelasticWheel
@@ -28,11 +28,10 @@ def find_model_class(config_name: str) -> type[AbstractWheel]:
 def list_model_config_names(
     command: str | None = None, parameter: str | None = None
 ) -> tuple[str, ...]:
-    """Return the names of models in a configuration, restricted to models that satisfy the given
-    conditions.
+    """Return the configuration names of the models that satisfy the given conditions.
 
     - `command`: command that must accept the model;
-    - `parameter`: parameter on which the model's motion must depend.
+    - `parameter_name`: parameter on which the model's motion must depend.
     """
     return tuple(
         model_class.capabilities.config_name
@@ -43,8 +42,10 @@ def list_model_config_names(
 
 
 def describe_accepted_models(command: str | None = None, parameter: str | None = None) -> str:
-    """Return the models of `list_model_config_names` as a caller writes them, such as
-    `vrw.RigidWheel() or "auto"`."""
+    """Return the models of `list_model_config_names` as a caller writes them.
+
+    An example is `vrw.RigidWheel() or "auto"`.
+    """
     model_expressions = [
         f'"{config_name}"'
         if config_name == "auto"

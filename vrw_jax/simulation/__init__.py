@@ -1,4 +1,4 @@
-"""Simulation of one step, a walk, a trajectory, attractors and basins."""
+"""Simulation of single steps, walks, trajectories, attractors and basins."""
 
 from vrw_jax.simulation.basins import basin, invert_landing_map
 from vrw_jax.simulation.force_peaks import SAMPLED_FORCE_PEAK_MEASURES, force_peaks

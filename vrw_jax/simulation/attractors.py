@@ -1,7 +1,7 @@
-"""Attractors: many starts, each walked until its motion is periodic or the wheel falls.
+"""Attractors: walks from many starts, until the motion is periodic or the wheel falls.
 
-Starts may belong to different wheels. Starts that are undecided after a round are gathered for the
-next round, so that long transients cost little.
+Starts may belong to different wheels. Only the walks without a decision after a round continue in
+the next round, so that long transients cost little.
 """
 
 import functools
@@ -61,9 +61,7 @@ class PeriodicWalkEnds(NamedTuple):
 def _walk_round_of_block(
     model: AbstractWheel, options: StepOptions, n_steps: int, params: WheelParams, x: Array
 ) -> tuple[Array, Array]:
-    """Return section states and outcomes of one round of steps from a block of starts, shape
-    (starts, steps, ...).
-    """
+    """Return section states and outcomes of one round of steps, shape (starts, steps, ...)."""
     walk_one_round = lambda params, x: walk(params, x, n_steps, model=model, options=options)
     batch_walks = jax.vmap(walk_one_round)(params, x)
     return batch_walks.steps.section_state, batch_walks.steps.outcome
@@ -72,17 +70,17 @@ def _walk_round_of_block(
 def _walk_round_with_contact(
     model: Any, options: StepOptions, n_steps: int, params: WheelParams, x: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return section states and outcomes of one round of steps with unilateral contact, shape
-    (starts, steps, ...).
+    """Return section states and outcomes of one round of steps with unilateral contact.
 
-    The batch kernel takes the steps, for any number of starts.
+    The arrays have the shape (starts, steps, ...). The batch kernel takes the steps, for any number
+    of starts.
     """
     n_legs, parameter_rows = params.n_legs, np.asarray(jax.vmap(model.parameter_values)(params)).T
     x = embed_section_states(parameter_rows, np.asarray(x), n_legs)
     states_by_step, outcomes_by_step = list[np.ndarray](), list[np.ndarray]()
     for _ in range(n_steps):
         x, _, step_outcomes, *_ = walk_batch(parameter_rows, x, 1, model, options, n_legs)
-        # A wheel that fell has no section state, so its outcome is kept.
+        # A wheel that fell has no section state, so its outcome does not change.
         step_outcomes = (
             step_outcomes
             if not outcomes_by_step
@@ -172,8 +170,8 @@ def walk_until_periodic(
 def _detect_walk_periods(
     state_history: np.ndarray, max_period: int, periodicity_tolerance: float
 ) -> np.ndarray:
-    """Return the shortest period of each walk, in steps, that its last two periods confirm; 0 if
-    there is none.
+    """Return the shortest period of each walk, in steps, that its last two periods confirm,
+    otherwise 0.
 
     - `state_history`: section states, (starts, steps, m).
     """
@@ -189,7 +187,7 @@ def _detect_walk_periods(
 
 
 class DistinctOrbits(NamedTuple):
-    """Distinct orbits of many starts, ordered by decreasing number of starts."""
+    """Distinct orbits that walks from many starts reach, ordered by decreasing number of starts."""
 
     orbit_indices: np.ndarray  # index of the orbit of each start; -1 without an orbit
     orbit_states: list[np.ndarray]  # section states of each orbit, (period, m)
@@ -198,7 +196,7 @@ class DistinctOrbits(NamedTuple):
 def find_distinct_orbits(
     walk_ends: PeriodicWalkEnds, attractor_options: AttractorOptions = DEFAULT_ATTRACTOR_OPTIONS
 ) -> DistinctOrbits:
-    """Return the distinct orbits of the walks.
+    """Return the distinct orbits that the walks reach.
 
     Two orbits are compared state by state, beginning with the state of lowest dtheta-.
     """
@@ -227,7 +225,7 @@ def find_distinct_orbits(
 def _measure_steps_of_block(
     model: AbstractWheel, options: StepOptions, params: WheelParams, x: Array
 ) -> dict[str, Array]:
-    """Return all measures of one step from each start of a block."""
+    """Return all measures of one step from each start of a block, by name."""
     return jax.vmap(lambda p, x: model.take_step(p, x, options).measures())(params, x)
 
 

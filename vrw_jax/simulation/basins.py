@@ -1,6 +1,4 @@
-"""Basins of attraction: for each start of a grid, the gait that a walk reaches, or the outcome of
-its failure.
-"""
+"""Basins of attraction: the gait or the failure that a walk from each start of a grid reaches."""
 
 from __future__ import annotations
 
@@ -59,7 +57,7 @@ def basin(
     max_steps: int = 200,
     max_period: int = 16,
 ) -> xr.Dataset:
-    """Return where a walk from each start of `grid` ends, as a labelled dataset.
+    """Return the orbit or the failure that a walk from each start of `grid` reaches, as a dataset.
 
     `grid` names all components of a start before touchdown, such as {"theta_touchdown": 0.09,
     "dtheta_touchdown": np.linspace(1.0, 2.5, 60), "dL1_touchdown": np.linspace(-0.5, 0.2, 60)}, or
@@ -67,13 +65,13 @@ def basin(
     of the result, in this order. The variables over these axes are
 
     - `attractor`: index of the orbit that the walk reaches within `max_steps`, or -1;
-    - `outcome`: STEPPED, or how the wheel fell; BAD_INPUT if no landing leads to the start;
+    - `outcome`: STEPPED, or the code of the failure; BAD_INPUT if no landing leads to the start;
     - `steps`: number of steps until the walk stays within 1e-3 of the orbit, or until the fall.
 
     The orbits are in `orbit_state` over (attractor_index, orbit_step), ordered by decreasing number
-    of starts. Each has an `orbit_period` in steps, a DLS fraction and, for the paper's model, its
-    least margins. With unilateral contact, section states are full states. "auto" means unilateral
-    contact, which is valid for all starts.
+    of starts. The dataset has an `orbit_period` in steps, a DLS fraction and, for the paper's
+    model, the minimum margins of each orbit. With unilateral contact, section states are full
+    states. "auto" means unilateral contact, which is valid for all starts.
 
     Args:
         params: the wheel.
@@ -172,8 +170,8 @@ def basin(
 def _parse_start_grid(grid: StartGrid) -> dict[str, np.ndarray]:
     """Return the values of each component of a start as an array with one axis.
 
-    Raise a `ValueError` unless the grid contains all components of one kind, each a number or an
-    axis of numbers.
+    Raise a `ValueError` if the grid does not contain all components of one kind, each as a number
+    or as an axis of numbers.
     """
     check_type("grid", grid, Mapping, "write {'theta_touchdown': 0.09, 'dtheta_touchdown': ...}")
     for component_names in (PRE_TOUCHDOWN_COMPONENT_NAMES, POST_LANDING_COMPONENT_NAMES):
@@ -204,10 +202,10 @@ def _parse_start_grid(grid: StartGrid) -> dict[str, np.ndarray]:
 
 
 def invert_landing_map(params: WheelParams, post_landing_states: np.ndarray) -> np.ndarray:
-    """Return section states with dL1- = 0 whose landing leads to (theta+, dtheta+), or NaN if there
-    is none.
+    """Return section states with dL1- = 0 whose landing leads to (theta+, dtheta+).
 
-    With dL1- = 0, the angular rates before and after the landing are proportional.
+    A row is NaN if no such section state exists. With dL1- = 0, the angular rates before and after
+    the landing are proportional.
     """
     s = params.symbols()
 
@@ -276,8 +274,9 @@ def _make_orbit_variables(
 
 
 def compute_walk_end_fractions(basins: xr.Dataset) -> dict[str, float]:
-    """Return the fraction of starts for each kind of end: "attractor 0", ..., "unsettled", or the
-    name of an outcome.
+    """Return the fraction of starts for each end of a walk, by name.
+
+    The names are "attractor 0", ..., "unsettled", and the names of outcomes.
     """
     attractor_indices = basins.attractor.values.ravel()
     outcome_codes = basins.outcome.values.ravel()

@@ -1,4 +1,4 @@
-"""Peaks of the ground's normal force in each step of a sampled walk, of any model."""
+"""Peaks of the ground's normal force in each step of a sampled walk, for any model."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ class ForcePeakOptions:
     """Degree of the spline through the samples of an interval, chosen because its error with the
     default number of samples is that of the solver."""
     min_extremum_height_fraction: float = 1e-7
-    """Least rise and fall beside an extremum, as a fraction of the largest force. It is chosen
-    above the errors of the solver, which would be extrema of a force that is constant."""
+    """Smallest rise and fall beside an extremum, as a fraction of the largest force, chosen because
+    errors of the solver would otherwise be extrema of a constant force."""
 
 
 FORCE_PEAK_OPTIONS = ForcePeakOptions()
@@ -36,9 +36,9 @@ def force_peaks(walk: xr.Dataset) -> xr.Dataset:
     """Return the peaks of the normal force in each step of a walk that `vrw.simulate` returned.
 
     A peak is a smooth maximum of the force on the fore foot, Leg 1, between two events. Impacts and
-    changes of phase or contact are no peaks. Peaks are located on a spline of degree 7 through the
-    samples of each interval. For gaits of the paper's model `LimitCycle.measure` gives the same
-    measures without samples, with derivatives.
+    changes of phase or contact are not peaks. Peaks are located on a spline of degree 7 through the
+    samples of each interval. For gaits of the paper's model, `LimitCycle.measure` returns the same
+    measures without samples, and with derivatives.
 
     Args:
         walk: a trajectory with at least 9 samples per phase.
@@ -139,7 +139,10 @@ class _ForceExtrema(NamedTuple):
 def _find_force_extrema(
     sample_times: np.ndarray, sampled_forces: np.ndarray, interval_indices: list[np.ndarray]
 ) -> _ForceExtrema:
-    """Return the extrema of a force between the events of one step."""
+    """Return the extrema of a force between the events of one step.
+
+    - `interval_indices`: sample indices of each interval between two events.
+    """
     from scipy.interpolate import PPoly, make_interp_spline  # This import is slow.
 
     times_by_interval, forces_by_interval, maximum_flags, rate_maximum_times, rate_maxima = (
@@ -208,7 +211,7 @@ def _find_force_extrema(
 def _summarize_force_extrema(
     fore_extrema: _ForceExtrema, total_extrema: _ForceExtrema
 ) -> dict[str, Any]:
-    """Return the force measures of one step, from the extrema of its fore force and its total
+    """Return the force measures of one step from the extrema of its fore force and of its total
     force.
     """
     trough_depth = 0.0

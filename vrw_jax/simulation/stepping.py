@@ -60,7 +60,7 @@ def paper_start() -> SectionState:
 
 
 def check_model(model: ModelLike | None, allows_arrays: bool = False) -> AbstractWheel:
-    """Return the model of an argument: the paper's model for None, and a `LadderWheel` for "auto".
+    """Return the paper's model for None, a `LadderWheel` for "auto", and otherwise the given model.
 
     Raise a `TypeError` if the argument is no model. Raise a `ValueError` if its friction is an
     array although `allows_arrays` is False.
@@ -87,7 +87,7 @@ _make_default_model = functools.cache(ViscoelasticWheel)
 
 
 def check_single_wheel(params: Any, remedy: str) -> None:
-    """Raise a `TypeError` or a `ValueError` unless `params` is a single wheel.
+    """Raise a `TypeError` or a `ValueError` if `params` is not a single wheel.
 
     - `remedy`: end of the error message.
     """
@@ -96,7 +96,7 @@ def check_single_wheel(params: Any, remedy: str) -> None:
 
 
 def check_step_options(options: StepOptions | None) -> StepOptions:
-    """Return the options of steps, by default `StepOptions()`.
+    """Return the given options of steps, or `StepOptions()` for None.
 
     Raise a `TypeError` if the argument has another type.
     """
@@ -112,8 +112,9 @@ def check_step_options(options: StepOptions | None) -> StepOptions:
 
 @functools.cache
 def _make_default_step_options(dtype: np.dtype) -> StepOptions:
-    """Return the default options for a floating type. They are made once, and are concrete even
-    inside `jit`.
+    """Return the default options for a floating type.
+
+    They are made once, and are concrete even inside `jit`.
     """
     with jax.ensure_compile_time_eval():
         return StepOptions()
@@ -122,9 +123,7 @@ def _make_default_step_options(dtype: np.dtype) -> StepOptions:
 def check_section_state(
     x: Any, argument_description: str = "the section state", convert_state: Callable = check_reals
 ) -> Any:
-    """Return the section state, converted by `convert_state`. Raise an error if the argument is no
-    section state.
-    """
+    """Return the section state as an array, made by `convert_state`, or raise an error."""
     return convert_state(
         argument_description,
         x,
@@ -225,9 +224,9 @@ def step(
 ) -> StepResult | UnilateralStep | LadderStep:
     """Return one step from touchdown to touchdown, with indicators, margins and energies.
 
-    The `outcome` of the result describes how the step ended; a fall raises no error. Errors of
-    values and first derivatives are below 1e-9 at the default options and below 1e-12 at
-    `StepOptions.tight()`.
+    The `outcome` of the step describes how the step ended. A fall raises no error. Errors of the
+    results and their first derivatives are below 1e-9 with the default options, and below 1e-12
+    with `StepOptions.tight()`.
 
     Args:
         params: the wheel.
@@ -319,7 +318,7 @@ class Walk(AbstractPrintable):
 
     @property
     def outcome(self) -> Array:
-        """Return the outcome of the walk: that of the first failed step, or STEPPED."""
+        """Return the outcome of the first failed step, or STEPPED if no step failed."""
         last_index = self.steps.outcome.shape[-1] - 1
         return jnp.take_along_axis(
             self.steps.outcome, jnp.minimum(self.n_stepped, last_index)[..., None], axis=-1
@@ -327,11 +326,13 @@ class Walk(AbstractPrintable):
 
     @property
     def ending(self) -> Any:
-        """Return how the walk ended, as a sentence; a batch has an array of sentences."""
+        """Return a sentence that describes how the walk ended, or an array of sentences for a
+        batch.
+        """
         return describe_step_ending(self.outcome, Outcome)
 
     def summary_rows(self) -> list[LabelAndText]:
-        """Return labels and texts of outcome, steps, start, last state and time."""
+        """Return labels and texts of outcome, number of steps, start, last state and time."""
         walk_outcome = np.asarray(self.outcome)
         if walk_outcome.ndim:
             return [("walks", format_outcome_counts(walk_outcome, Outcome))]
@@ -354,11 +355,12 @@ def _walk_by_scan(
     n_steps: int,
     stepwise_ground: StepGroundValues | None,
 ) -> Walk:
-    """Return a walk of `n_steps` steps; the steps after a failure repeat its outcome."""
+    """Return a walk of `n_steps` steps. The steps after a failure repeat its outcome."""
 
     def advance_one_step(state_and_outcome: tuple, step_ground: StepGroundValues | None) -> tuple:
-        """Return the state and the outcome after one step, and the results of this step. No step is
-        taken after a failure.
+        """Return the state and the outcome after one step, and the results of the step.
+
+        After a failure no step is taken.
         """
         x, outcome = state_and_outcome
         is_unfinished = outcome == Outcome.STEPPED
@@ -395,7 +397,7 @@ def walk(
     options: StepOptions | None = None,
     engine: EngineName = "auto",
 ) -> Walk:
-    """Return a walk of `n_steps` steps; the steps after a failure repeat its outcome.
+    """Return a walk of `n_steps` steps. The steps after a failure repeat its outcome.
 
     On uneven ground `params.slope` is an array over steps. The ground then consists of straight
     lines of these slopes, which join the footholds. In the double support of step k both feet are
@@ -443,7 +445,7 @@ def split_stepwise_ground(
 ) -> tuple[AbstractWheel, Any, StepGroundValues | None]:
     """Return model and wheel on the ground of the first step, and the ground of each step.
 
-    On flat ground, return None as the ground, and model and wheel unchanged.
+    On flat ground, model and wheel are unchanged and the third result is None.
     """
     checked_model = check_model(model, allows_arrays=True)
     if not isinstance(params, WheelParams):

@@ -1,8 +1,7 @@
-"""Labelled trajectories of walks: motion, forces, energy and positions, with units and provenance.
+"""Labeled trajectories of walks: motion, forces, energy and positions, with units and provenance.
 
-In the frame, x points downhill along the slope, z is normal to the slope, and the origin is the
-first foot. Angles and leg labels refer to the present step, so theta and the lengths jump at a
-landing.
+The axis x points downhill along the slope, and z is normal to the slope. The origin is the first
+foot. Angles and leg labels refer to the present step, so theta and the lengths jump at a landing.
 """
 
 from __future__ import annotations
@@ -187,9 +186,7 @@ class SampledStep(NamedTuple):
 
 
 class TrajectorySpecification(NamedTuple):
-    """Description of how a trajectory is sampled: the sampling function of a model, and the
-    variables.
-    """
+    """Sampling function of a model, and the variables of its trajectories."""
 
     sample_step: Callable[[Array, int], SampledStep]  # of a section state and a step index
     variable_names: tuple[str, ...]  # names of the measures over time
@@ -259,7 +256,7 @@ class UnevenGroundLines(NamedTuple):
             )
 
     def rotate_to_line_0(self, k: int, x: Any, z: Any) -> tuple[Any, Any]:
-        """Return the components in the frame of line 0 of a vector in the frame of line k."""
+        """Return a vector in the frame of line 0 from its components in the frame of line k."""
         line_angle = self.line_slopes[k] - self.line_slopes[0]
         sine, cosine = np.sin(line_angle), np.cos(line_angle)
         return x * cosine + z * sine, z * cosine - x * sine
@@ -272,7 +269,7 @@ def sample_walk_steps(
     downslope_weight: float,
     ground_lines: UnevenGroundLines | None = None,
 ) -> SampledWalk:
-    """Return the samples of a walk from the section state x, which ends at the first failure.
+    """Return the samples of a walk from the section state x. The walk ends at the first failure.
 
     Positions along the slope, m, are measured from the first landing. The energies in
     `HEIGHT_DEPENDENT_ENERGIES` decrease by `downslope_weight`, N, times the traveled distance. On
@@ -326,8 +323,9 @@ def sample_walk_steps(
 def _compile_step_sampler(
     model: AbstractWheel, argument_structure: Any, n_samples: int
 ) -> Callable[..., Trajectory]:
-    """Return the compiled function that samples a step. Its arguments are the section state and the
-    leaves of wheel and options.
+    """Return the compiled function that samples a step.
+
+    Its arguments are the section state and the leaves of wheel and options.
     """
 
     def sample_paper_step(x: Array, *leaves: Array) -> Trajectory:
@@ -340,8 +338,8 @@ def _compile_step_sampler(
 def _make_phase_columns(s: Symbols, trajectory: Trajectory) -> dict[str, np.ndarray]:
     """Return the columns of a step by the names of `TRAJECTORY_MEASURES`, shape (phase, sample).
 
-    Positions are relative to the foot of Leg 1. The columns `landing_foot_x` and `landing_foot_z`
-    are added. They give the position of the foot of the leg that lands next, m.
+    Positions are relative to the foot of Leg 1. The additional columns `landing_foot_x` and
+    `landing_foot_z` contain the position of the foot of the leg that lands next, m.
     """
     theta, L1, L2, dtheta, dL1, dL2 = np.moveaxis(np.asarray(trajectory.state), -1, 0)
     kinetic_energy, gravitational_energy, elastic_energy = np.moveaxis(
@@ -392,7 +390,7 @@ StepwiseModelsAndWheels = list[tuple[Any, WheelParams]]
 def specify_phase_trajectory(
     models_and_wheels: StepwiseModelsAndWheels, options: StepOptions, n_samples: int
 ) -> TrajectorySpecification:
-    """Return the description of a trajectory for a model whose steps have the paper's phases."""
+    """Return the trajectory specification of a model whose steps have the paper's phases."""
 
     def prepare_step_sampler(model: AbstractWheel, params: WheelParams) -> tuple:
         argument_leaves, argument_structure = jax.tree.flatten((params, options))
@@ -456,8 +454,9 @@ CONTACT_ENERGY_NAMES = ("kinetic_energy", "gravitational_energy", "elastic_energ
 def _compute_contact_columns(
     model: Any, params: WheelParams, x: Array, options: StepOptions, n_samples: int
 ) -> tuple[UnilateralTrajectory, dict[str, Array]]:
-    """Return the trajectory of a step with unilateral contact, and its columns, shape (phase,
-    sample[, leg]).
+    """Return the trajectory of a step with unilateral contact, and its columns.
+
+    The columns have the shape (phase, sample[, leg]).
     """
     s, trajectory = params.symbols(), model.sample_step(params, x, options, n_samples)
 
@@ -490,12 +489,11 @@ def _compute_contact_columns(
 def specify_contact_trajectory(
     models_and_wheels: StepwiseModelsAndWheels, options: StepOptions, n_samples: int
 ) -> TrajectorySpecification:
-    """Return the description of a trajectory for a model with unilateral contact, over time and
-    leg.
+    """Return the trajectory specification of a model with unilateral contact, over time and leg.
 
     Legs have the labels of their step. Each interval between two events has `n_samples` times,
-    including both ends. For a `LadderWheel`, the variables `rung` and `reason` give the model used
-    at each time and the reason (see `ModelChoice`).
+    including both ends. For a `LadderWheel`, the variables `rung` and `reason` contain the codes of
+    the model and of the reason at each time (see `ModelChoice`).
     """
 
     friction_by_step = [float(model.friction) for model, _ in models_and_wheels]
