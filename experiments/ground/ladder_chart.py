@@ -35,7 +35,7 @@ def compute() -> None:
         vrw.grid(damping=DAMPING), MEASURES, model="auto", options=options
     ).build_scan_engine()
     reasons = [
-        ladder.find_selection_reasons(paper_gaits, np.full(len(DAMPING), mu)) for mu in FRICTION
+        ladder.compute_selection_reasons(paper_gaits, np.full(len(DAMPING), mu)) for mu in FRICTION
     ]
     rows = [
         [f"{c:g}", mu, int(reason), f"{float(paper.dls_fraction[i]):.6g}"]

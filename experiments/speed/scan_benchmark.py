@@ -170,7 +170,7 @@ def compare(size: int) -> None:
     stored, engine = vrw.open_scan(STORES / f"{size}.zarr"), of_values.build_scan_engine()
     assert np.all(stored.outcome.values >= 0), "samples are missing"
     for index in np.linspace(0, of_values.result_layout.n_chunks - 1, N_CHECKED_CHUNKS).astype(int):
-        region = of_values.result_layout.get_chunk_region(int(index))
+        region = of_values.result_layout.compute_chunk_region(int(index))
         for name, values in engine(of_values.design.select_samples(region)).items():
             values_there = stored[name][region].values
             np.testing.assert_array_equal(values.reshape(values_there.shape), values_there, name)

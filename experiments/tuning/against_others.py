@@ -239,7 +239,7 @@ def compare_methods(problem: TuneProblem, n_starts: int, rows: list[dict], name:
     values = values_of(problem)
     starts = starts_of(problem, values, n_starts)
     # Violations are scaled by the change of each constraint over the box, at the config's wheel.
-    first = problem.evaluate_start(problem.normalized_start)
+    first = problem.evaluate_start_trial(problem.normalized_start)
     scales = compute_slack_scales(first.constraint_slacks, first.slack_jacobian)
     observed_values: dict[str, list[MethodHistory]] = {
         "tune": [by_tune(problem, u, scales) for u in starts]

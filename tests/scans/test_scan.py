@@ -284,7 +284,7 @@ def test_every_sample_is_in_exactly_one_chunk() -> None:
         assert np.prod(layout.chunk_shape) <= chunk
         observed_values = np.zeros(design.shape, int)
         for index in range(layout.n_chunks):
-            observed_values[layout.get_chunk_region(index)] += 1
+            observed_values[layout.compute_chunk_region(index)] += 1
         assert np.all(observed_values == 1)
 
 
@@ -485,7 +485,7 @@ def test_parallel_batches_give_the_same_results(
         return lambda values: (both_values.wait(), program(values))[1]
 
     for program in programs:
-        engine._free_programs.put(program._replace(evaluate_cycle=met(program.evaluate_cycle)))
+        engine._free_programs.put(program._replace(cycle_program=met(program.cycle_program)))
     columns = SMALL_GRID.select_samples((slice(None), slice(None)))
     size = SCAN_BATCH_SIZE + SMALL_GRID.size
     joint_result = engine({name: np.resize(column, size) for name, column in columns.items()})
@@ -589,7 +589,7 @@ def compute_backwards(planned: ScanPlan, missing: Sequence[int]) -> Iterator[Chu
         yield (
             index,
             evaluate_arithmetically(
-                planned.design.select_samples(planned.result_layout.get_chunk_region(index))
+                planned.design.select_samples(planned.result_layout.compute_chunk_region(index))
             ),
         )
 

@@ -57,7 +57,7 @@ def run_plan(
                 index,
                 evaluate(
                     running_plan.design.select_samples(
-                        running_plan.result_layout.get_chunk_region(index)
+                        running_plan.result_layout.compute_chunk_region(index)
                     )
                 ),
             )

@@ -16,7 +16,7 @@ from vrw_jax.tuning.objective import (
     compute_max_violation,
     compute_slack_scales,
     parse_constraint_margins,
-    restore_bound_sign,
+    restore_sign_of_bound,
 )
 from vrw_jax.tuning.tune_problem import TuneProblem, make_tune_problem, tune
 from vrw_jax.tuning.tune_result import TuneResult
@@ -290,7 +290,7 @@ def test_constraints_of_a_unilateral_gait_are_lower_bounds_or_ranges():
     given = {"slip": (0.0, 0.05), "speed": 1.0}
     margins = parse_constraint_margins(vrw.WheelParams(), given, ground)
     assert margins == {"-slip": -0.05, "slip": 0.0, "speed": 1.0}
-    assert [restore_bound_sign(*pair) for pair in margins.items()] == [0.05, 0.0, 1.0]
+    assert [restore_sign_of_bound(*pair) for pair in margins.items()] == [0.05, 0.0, 1.0]
     assert parse_constraint_margins(vrw.WheelParams(), None, ground) == {}
     with pytest.raises(ValueError, match="clearance_sls1"):
         parse_constraint_margins(vrw.WheelParams(), ["clearance_sls1"], ground)

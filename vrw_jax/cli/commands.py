@@ -1,7 +1,7 @@
 """The commands: walk a wheel, reproduce the paper, scan parameters, tune, continue branches.
 
-Slow imports are inside the commands, so that help appears quickly. A user's mistake is reported in
-one sentence on stderr, with exit code 2.
+Slow libraries are imported inside the commands, so that help appears quickly. A user's mistake is
+reported in one sentence on stderr, with exit code 2.
 """
 
 import gc
@@ -59,22 +59,23 @@ def main() -> None:
     # Traces consist of many small, long-lived objects. With Python's default thresholds the garbage
     # collector takes a tenth of the first run's time.
     gc.set_threshold(200_000, 20, 20)
-    signal.signal(signal.SIGINT, _interrupt_command)
+    signal.signal(signal.SIGINT, _handle_first_interrupt)
     show_warnings_as_sentences()
     replace_unencodable_output()
     with printing.report_stdout_errors():
         app()
 
 
-def _interrupt_command(_signal: int, _frame: object) -> None:
-    """Handle the first Ctrl-C: end the command regularly, and install the handler of a second
-    Ctrl-C."""
-    signal.signal(signal.SIGINT, _end_process_immediately)
+def _handle_first_interrupt(_signal: int, _frame: object) -> None:
+    """End the command regularly after the first Ctrl-C, and install the handler of a second
+    Ctrl-C.
+    """
+    signal.signal(signal.SIGINT, _handle_second_interrupt)
     raise KeyboardInterrupt
 
 
-def _end_process_immediately(_signal: int, _frame: object) -> None:
-    """Handle the second Ctrl-C: end the process immediately."""
+def _handle_second_interrupt(_signal: int, _frame: object) -> None:
+    """End the process immediately after a second Ctrl-C."""
     os.write(2, b"vrw: stopped at once; run the same to go on.\n")
     os._exit(ExitCode.INTERRUPTED)
 
@@ -91,7 +92,7 @@ def _print_version_and_exit(is_version_requested: bool) -> None:
 
 
 @app.callback()
-def root(
+def configure_root_command(
     version: Annotated[
         bool,
         typer.Option(
@@ -130,8 +131,8 @@ def root(
     """
 
 
-@app.command()
-def gait(
+@app.command("gait")
+def run_gait_command(
     config: Annotated[
         Path | None, typer.Argument(help="TOML file; by default the wheel of Table 1.")
     ] = None,
@@ -183,9 +184,11 @@ def gait(
                     break
                 section_state = step_result.section_state
             model, model_reason = resolve_model_with_reason(params, model)
-            needs_no_guess = start is None or make_finder(model, params.n_legs).supports_cold_start
+            can_search_without_start = (
+                start is None or make_finder(model, params.n_legs).supports_cold_start
+            )
             limit_cycle_result: Any = limit_cycle(
-                params, guess=None if needs_no_guess else section_state, model=model
+                params, guess=None if can_search_without_start else section_state, model=model
             )
             force_peak_dataset = None
             if model.is_compliant and bool(limit_cycle_result.found):
@@ -200,8 +203,8 @@ def gait(
             stdout_console.print(model_reason)
 
 
-@app.command()
-def explore(
+@app.command("explore")
+def run_explore_command(
     changes: Annotated[
         list[str] | None,
         typer.Option("--set", metavar="NAME=VALUE", help="Initial parameter; may be repeated."),
@@ -223,8 +226,8 @@ def explore(
         print(page_address)
 
 
-@app.command()
-def init(
+@app.command("init")
+def run_init_command(
     folder: Annotated[Path, typer.Argument(help="Folder for the configs.")] = Path("configs"),
 ) -> None:
     """Write the example configs, from which you can derive your own.
@@ -265,8 +268,9 @@ def init(
 
 
 def find_example_config_folder() -> Path:
-    """Return the folder of the example configs, which is inside the installed package or beside the
-    package."""
+    """Return the folder of the example configs, which lies in the installed package or beside
+    it.
+    """
     package_folder = Path(__file__).parents[1]
     return next(
         candidate_folder
@@ -276,7 +280,7 @@ def find_example_config_folder() -> Path:
 
 
 def _require_writable_folder(folder: Path) -> None:
-    """Raise a ValueError if the folder cannot be written to. Nothing is created."""
+    """Raise a ValueError if the folder cannot be written to. No folder is created."""
     existing_folder = folder
     while not existing_folder.exists():
         existing_folder = existing_folder.parent
@@ -290,8 +294,8 @@ def _require_writable_folder(folder: Path) -> None:
         ) from write_error
 
 
-@app.command()
-def reproduce(
+@app.command("reproduce")
+def run_reproduce_command(
     folder: Annotated[
         Path, typer.Option("--out", help="Folder for the figures and the table.")
     ] = Path("results/reproduction"),
@@ -327,8 +331,8 @@ def reproduce(
         raise typer.Exit(ExitCode.CHECK_FAILED)
 
 
-@app.command()
-def scan(
+@app.command("scan")
+def run_scan_command(
     config: Annotated[Path, typer.Argument(help="TOML file with the samples and measures.")],
     folder: FolderOption = None,
     explain: Annotated[
@@ -397,8 +401,8 @@ def scan(
             printing.print_written_paths(write_scan_figures(scan_dataset, folder))
 
 
-@app.command()
-def robustness(
+@app.command("robustness")
+def run_robustness_command(
     config: Annotated[Path, typer.Argument(help=r"TOML file with slope_sd in its table \[scan].")],
     folder: FolderOption = None,
     picture: PictureOption = True,
@@ -435,11 +439,11 @@ def robustness(
             print(passage_result)
             print(sensitivity_result)
             return
-    scan(config, folder, picture=picture)
+    run_scan_command(config, folder, picture=picture)
 
 
 @app.command("map")
-def map_special_points(
+def run_map_command(
     config: Annotated[Path, typer.Argument(help="TOML file with a grid over two parameters.")],
     folder: FolderOption = None,
 ) -> None:
@@ -460,18 +464,18 @@ def map_special_points(
         report_command_errors(),
         show_computation_stages(
             "following special points (the first time compiles for minutes)"
-        ) as on_stage,
+        ) as stage_reporter,
     ):
         special_point_map = follow_special_points(
-            scan_dataset, map_config.make_wheel(), map_config.make_model(), on_stage
+            scan_dataset, map_config.make_wheel(), map_config.make_model(), stage_reporter
         )
-        on_stage("drawing the map")
+        stage_reporter("drawing the map")
         written_paths = write_special_point_map(special_point_map, folder)
     printing.print_written_paths(written_paths)
 
 
-@app.command()
-def tune(
+@app.command("tune")
+def run_tune_command(
     config: Annotated[Path, typer.Argument(help="TOML file with objective, bounds, constraints.")],
     folder: FolderOption = None,
     picture: PictureOption = True,
@@ -521,7 +525,7 @@ def tune(
 
 
 @app.command("continue")
-def continue_(
+def run_continue_command(
     config: Annotated[Path, typer.Argument(help=r"TOML file with a table \[branch].")],
     folder: FolderOption = None,
     picture: PictureOption = True,
@@ -593,7 +597,7 @@ def _require_enabled_compilation() -> None:
 
 
 def _require_figure_backend(draws_figure: bool) -> None:
-    """Raise a ValueError if matplotlib lacks the requested backend, before anything is computed."""
+    """Raise a ValueError, before any computation, if matplotlib lacks the requested backend."""
     if not draws_figure:
         return
     try:
@@ -619,8 +623,10 @@ MISSING_CONFIG_TABLE_MESSAGES = {
 def _load_config_with_table(
     config_path: Path, result_folder: Path | None, table_name: str, command_name: str
 ) -> tuple["Config", Path]:
-    """Return the config and the folder of the result. Raise a ValueError if the config lacks the
-    needed table."""
+    """Return the config and the folder of the result.
+
+    Raise a ValueError if the config lacks the needed table.
+    """
     command_config = _start_jax_and_load_config(config_path)
     if getattr(command_config, table_name) is None:
         raise ValueError(f"{command_config.file_name} {MISSING_CONFIG_TABLE_MESSAGES[table_name]}")

@@ -1,6 +1,7 @@
 """Configs: TOML files that define a wheel, samples and measures.
 
-An error in a file is reported in one sentence: what was given, what is allowed and what to do.
+An error in a file is reported in one sentence with the given value, the allowed values and the
+remedy.
 """
 
 import contextlib
@@ -97,8 +98,9 @@ class ScanConfig:
     def from_table(
         cls, config_table: Mapping[str, object], model_class: type[AbstractWheel]
     ) -> "ScanConfig":
-        """Return the settings of `[scan]`. Raise a ValueError if the model does not have a
-        requested measure.
+        """Return the settings of `[scan]`.
+
+        Raise a ValueError if the model does not have a requested measure.
         """
         _require_known_keys(config_table, cls.__dataclass_fields__, "[scan]", "settings")
         measure_names = config_table.get("measures")
@@ -108,8 +110,8 @@ class ScanConfig:
                 isinstance(measure_names, list)
                 and all(isinstance(measure_name, str) for measure_name in measure_names)
             ):
-                requirement = 'a list of names: write measures = ["dls_fraction", "speed"]'
-                raise _make_value_error("measures", measure_names, requirement)
+                requirement_text = 'a list of names: write measures = ["dls_fraction", "speed"]'
+                raise _make_value_error("measures", measure_names, requirement_text)
             measure_catalog = (
                 MEASURE_CATALOGS.get(
                     model_class.capabilities.gait_method, MEASURE_CATALOGS[GaitMethod.COLLOCATION]
@@ -156,11 +158,11 @@ class GaitConfig:
         if start_state is None:
             return cls(n_steps)
         if not (isinstance(start_state, list) and len(start_state) == 3):
-            requirement = (
+            requirement_text = (
                 "the section state before touchdown, three numbers: angle in rad, angular rate in "
             )
             raise _make_value_error(
-                "start", start_state, requirement + "rad/s, rate of Leg 1 in m/s"
+                "start", start_state, requirement_text + "rad/s, rate of Leg 1 in m/s"
             )
         theta, dtheta, dL1 = (
             _parse_finite_number(state_component, "start") for state_component in start_state
@@ -195,11 +197,13 @@ class TuneConfig:
                 for key_name, given_value in objective_setting.items()
             }
         elif not isinstance(objective_setting, str):
-            requirement = (
+            requirement_text = (
                 'a measure or weights of several: write objective = "dls_fraction" or objective = '
             )
             raise _make_value_error(
-                "objective", objective_setting, requirement + "{ dls_fraction = 1.0, speed = 0.1 }"
+                "objective",
+                objective_setting,
+                requirement_text + "{ dls_fraction = 1.0, speed = 0.1 }",
             )
         bounds_table = config_table.get("bounds")
         if not isinstance(bounds_table, dict) or not bounds_table:
@@ -211,9 +215,9 @@ class TuneConfig:
         constraints_table = config_table.get("constraints")
         if constraints_table is not None:
             if not isinstance(constraints_table, dict):
-                requirement = "a table: write [tune.constraints] and below it lines such as "
+                requirement_text = "a table: write [tune.constraints] and below it lines such as "
                 raise _make_value_error(
-                    "constraints", constraints_table, requirement + "clearance_sls1 = 0.001"
+                    "constraints", constraints_table, requirement_text + "clearance_sls1 = 0.001"
                 )
             constraints_table = {
                 key_name: _parse_finite_number(given_value, key_name)
@@ -286,7 +290,7 @@ class BranchConfig:
 
 @dataclass(frozen=True)
 class Config:
-    """Checked values of a config, and the text from which they were read."""
+    """Checked settings of a config, and the text of the file."""
 
     wheel_values: Mapping[str, float | int] = field(default_factory=dict)
     model_name: str = "viscoelastic"
@@ -301,14 +305,14 @@ class Config:
     file_name: str = ""
 
     def make_wheel(self, changed_values: Mapping[str, float | int] | None = None) -> WheelParams:
-        """Return the wheel: Table 1, changed by the values of the config and then by
+        """Return the wheel of Table 1, changed by the parameters of the config and by
         `changed_values`.
         """
         parameter_values: dict[str, Any] = {**self.wheel_values, **(changed_values or {})}
         return WheelParams(**parameter_values)
 
     def make_model(self) -> AbstractWheel:
-        """Return the model with its settings."""
+        """Return the model with the settings of the config."""
         return find_model_class(self.model_name)(**self.model_settings)
 
     def make_options(self) -> StepOptions:
@@ -318,7 +322,7 @@ class Config:
 
 
 def load_config(config_path: str | Path) -> Config:
-    """Return the checked config of a file. Raise a ValueError if the file is invalid."""
+    """Return the checked config of a file, or raise a ValueError if the file is invalid."""
     config_path = Path(config_path)
     if not config_path.exists():
         name_suggestion = format_name_suggestion(
@@ -367,14 +371,14 @@ def parse_config(config_text: str, file_name: str = "config") -> Config:
 def _parse_config_tables(
     config_tables: Mapping[str, object], config_text: str, file_name: str
 ) -> Config:
-    """Return the config of the tables of a file. Raise a ValueError if a table is invalid."""
+    """Return the config of the tables of a file, or raise a ValueError if a table is invalid."""
     _require_known_keys(config_tables, CONFIG_TABLE_NAMES, "the file", "tables")
     for table_key, config_table in config_tables.items():
         if not isinstance(config_table, dict):
-            requirement = (
+            requirement_text = (
                 f"a table: write [{table_key}] on a line of its own and its settings below"
             )
-            raise _make_value_error(f"[{table_key}]", config_table, requirement)
+            raise _make_value_error(f"[{table_key}]", config_table, requirement_text)
     design_kinds = [
         design_kind for design_kind in DESIGN_TABLE_NAMES if design_kind in config_tables
     ]
@@ -448,11 +452,11 @@ def _get_config_table(config_tables: Mapping[str, object], table_name: str) -> d
 
 
 def parse_assignment(assignment_text: str) -> tuple[str, float | int]:
-    """Return a parameter and its value from `parameter_name=value_text` of the command line."""
-    parameter_name, equals_sign, value_text = (
+    """Return parameter and number of a text `parameter_name=value_text` of the command line."""
+    parameter_name, equals_separator, value_text = (
         text_part.strip() for text_part in assignment_text.partition("=")
     )
-    if not equals_sign:
+    if not equals_separator:
         raise ValueError(
             f"--set {assignment_text} has no '=': write a parameter and its value, damping=150."
         )
@@ -492,8 +496,8 @@ def _parse_model_table(
     require_known_name(model_name, list_model_config_names(), "model")
     assert isinstance(model_name, str)
     default_settings = {
-        model_field.name: model_field.default
-        for model_field in fields(find_model_class(model_name))
+        model_field_definition.name: model_field_definition.default
+        for model_field_definition in fields(find_model_class(model_name))
     }
     _require_known_keys(
         config_table, ("name", *default_settings), f'[model] with name = "{model_name}"', "settings"
@@ -582,7 +586,9 @@ def _parse_design_table(
 
 
 def _parse_grid_axis(parameter_name: str, axis_setting: object) -> np.ndarray:
-    """Return the values of a grid's axis, given as a list or as from, to and count."""
+    """Return the values of a grid's axis, given as a list or by first value, last value and
+    count.
+    """
     if not isinstance(axis_setting, dict):
         return _parse_value_list(
             parameter_name, axis_setting, " or { from = ..., to = ..., count = ... }"
@@ -611,7 +617,7 @@ def _parse_grid_axis(parameter_name: str, axis_setting: object) -> np.ndarray:
 def _parse_value_list(
     parameter_name: str, given_list: object, alternative_text: str = ""
 ) -> np.ndarray:
-    """Return a list of values in the domain of a parameter as an array."""
+    """Return a list of numbers in the domain of a parameter as an array."""
     if not isinstance(given_list, list):
         raise _make_value_error(parameter_name, given_list, f"a list of numbers{alternative_text}")
     return np.asarray(
@@ -622,8 +628,9 @@ def _parse_value_list(
 def _parse_parameter_range(
     range_name: str, given_range: object, parameter_name: str = ""
 ) -> tuple[float, float]:
-    """Return lower and upper bound in the domain of a parameter, by default the parameter
-    `range_name`.
+    """Return lower and upper bound of a range in the domain of a parameter.
+
+    The default of `parameter_name` is `range_name`.
     """
     if not (isinstance(given_range, list) and len(given_range) == 2):
         raise _make_value_error(
@@ -637,7 +644,7 @@ def _parse_parameter_range(
 
 
 def _parse_parameter_value(parameter_name: str, given_value: object) -> float:
-    """Return a value as a number. Raise a ValueError if the value is not in the domain of the
+    """Return a value as a number, or raise a ValueError if it is not in the domain of the
     parameter.
     """
     parameter_value = _parse_finite_number(
@@ -651,7 +658,7 @@ def _parse_parameter_value(parameter_name: str, given_value: object) -> float:
 def _parse_finite_number(
     given_value: object, setting_name: str, must_be_positive: bool = False
 ) -> float:
-    """Return a value as a finite float. Raise a ValueError if the value is not a finite number."""
+    """Return a value as a finite float, or raise a ValueError."""
     finite_number = math.nan
     if isinstance(given_value, int | float) and not isinstance(given_value, bool):
         # An integer of hundreds of digits is too large for a float.
@@ -665,7 +672,7 @@ def _parse_finite_number(
 
 
 def _parse_whole_number(given_value: object, setting_name: str, min_value: int) -> int:
-    """Return a value as a whole number of at least `min_value`. Raise a ValueError otherwise."""
+    """Return a value as a whole number of at least `min_value`, or raise a ValueError."""
     if isinstance(given_value, bool) or not isinstance(given_value, int) or given_value < min_value:
         raise _make_value_error(
             setting_name, given_value, f"a whole number of at least {min_value}"
@@ -694,7 +701,7 @@ def _require_known_keys(
 
 
 def _raise_for_renamed_keys(config_table: Mapping[str, object], table_location: str) -> None:
-    """Raise a ValueError if a table has an old key."""
+    """Raise a ValueError if a table contains a key that was renamed."""
     for old_key, new_key in RENAMED_CONFIG_KEYS[table_location].items():
         if old_key in config_table:
             raise ValueError(
@@ -703,8 +710,9 @@ def _raise_for_renamed_keys(config_table: Mapping[str, object], table_location: 
 
 
 def _make_value_error(setting_name: str, given_value: object, requirement_text: str) -> ValueError:
-    """Return the error about a value that does not satisfy a requirement. The message writes the
-    value as in TOML.
+    """Return the error about a value that does not satisfy a requirement.
+
+    The message contains the value as in TOML.
     """
     value_text = format_value(given_value)
     if isinstance(given_value, bool):

@@ -44,8 +44,9 @@ stderr_console = Console(stderr=True)
 def report_command_errors(
     interruption_message: str = "stopped; nothing was written.",
 ) -> Iterator[None]:
-    """Return a context that reports an error in one sentence with exit code 2, and a Ctrl-C with
-    exit code 130.
+    """Return a context that reports an error in one sentence.
+
+    The exit code is 2, and 130 after a Ctrl-C.
     """
     try:
         yield
@@ -68,7 +69,9 @@ def report_command_errors(
 
 @contextlib.contextmanager
 def report_stdout_errors() -> Iterator[None]:
-    """Return a context that reports with exit code 2 that standard output cannot be written."""
+    """Return a context that ends the command with exit code 2 if standard output cannot be
+    written.
+    """
     exit_code: Any = 0
     try:
         yield
@@ -83,12 +86,12 @@ def report_stdout_errors() -> Iterator[None]:
     raise SystemExit(exit_code)
 
 
-def _discard_output_and_exit(output_error: OSError) -> None:
-    """Discard the remaining output, which Python would write at its end, and exit with code 2."""
+def _discard_output_and_exit(stdout_error: OSError) -> None:
+    """Discard the output that Python would still write at its end, and exit with code 2."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-    if not isinstance(output_error, BrokenPipeError):  # The reader has closed the pipe on purpose.
+    if not isinstance(stdout_error, BrokenPipeError):  # The reader has closed the pipe on purpose.
         print_error_sentence(
-            f"standard output can't be written: {_format_system_error(output_error)}"
+            f"standard output can't be written: {_format_system_error(stdout_error)}"
         )
     raise SystemExit(ExitCode.USER_ERROR)
 
@@ -128,10 +131,9 @@ def _format_system_error(system_error: OSError) -> str:
 
 @contextlib.contextmanager
 def show_computation_stages(first_stage_name: str) -> Iterator[Callable[[str], None]]:
-    """Show the stage of a computation and its duration, and yield the function that sets the next
-    stage.
+    """Show stage and duration of a computation, and yield the function that sets the next stage.
 
-    If stderr is not a terminal, each stage that is passed to this function is printed as one line.
+    If stderr is not a terminal, each stage is printed on one line.
     """
     if not stderr_console.is_terminal:
         yield lambda stage_name: stderr_console.print(
@@ -155,9 +157,10 @@ def print_text_table(
     column_headings: Sequence[str] = (),
     right_aligned_headings: Sequence[str] = (),
 ) -> None:
-    """Print a table; without headings the first column is bold.
+    """Print a table. Without headings the first column is bold.
 
-    Texts are printed literally, except that a column with the heading "" may contain color markup.
+    Texts are printed literally, except in a column with the heading "", which may contain color
+    markup.
     """
     rich_table = Table(
         title=table_title, title_justify="left", show_header=bool(column_headings), box=None
@@ -227,13 +230,13 @@ def make_scan_progress_reporter(
     """Return the function that shows rate, fraction without a gait and remaining time of a scan.
 
     The rate is measured from the second chunk on, because the first chunk includes compilation. The
-    bar includes the samples of an earlier run. Rate and fraction are those of this run.
+    bar includes the samples of an earlier run. Rate and fraction refer to the present run.
     """
     import time
 
     from vrw_jax.scans import format_duration
 
-    first_reports: list[tuple[float, int]] = []
+    first_report_times_and_counts: list[tuple[float, int]] = []
 
     def report_progress(scan_progress: "ScanProgress") -> None:
         """Update the progress bar of the scan."""
@@ -242,8 +245,8 @@ def make_scan_progress_reporter(
             f"{scan_progress.n_reused:,} from an earlier run" if scan_progress.n_reused else ""
         )
         if n_samples_done:
-            first_reports.append((present_seconds, n_samples_done))
-            first_report_seconds, n_samples_at_first_report = first_reports[0]
+            first_report_times_and_counts.append((present_seconds, n_samples_done))
+            first_report_seconds, n_samples_at_first_report = first_report_times_and_counts[0]
             bar_note = f"{100 * scan_progress.n_failed / n_samples_done:.0f} % without a gait"
             if present_seconds > first_report_seconds:
                 samples_per_second = (n_samples_done - n_samples_at_first_report) / (
@@ -297,8 +300,7 @@ def print_wheel_and_gait(
     limit_cycle_result: "LimitCycle | ReturnMapCycle",
     force_peak_dataset: "xr.Dataset | None",
 ) -> None:
-    """Print a wheel, the last step of its walk, its limit cycle, and the force peaks of the gait's
-    first step.
+    """Print a wheel, the last step of its walk, its limit cycle and the gait's force peaks.
 
     `start_state` is the state at which the last step began.
     """
@@ -375,12 +377,12 @@ def _print_limit_cycle(limit_cycle_result: "LimitCycle | ReturnMapCycle") -> Non
             f"[bold]Limit cycle[/]  {search_outcome.name}: {search_outcome.meaning}"
         )
         return
-    spectral_radius, multipliers = format_floquet_multipliers(
+    spectral_radius, multiplier_texts = format_floquet_multipliers(
         np.asarray(limit_cycle_result.monodromy_value)
     )
     stability_text = "stable" if spectral_radius < 1.0 else "unstable"
     stdout_console.print(
-        f"[bold]Limit cycle[/]  {stability_text}: multipliers {multipliers}; period "
+        f"[bold]Limit cycle[/]  {stability_text}: multipliers {multiplier_texts}; period "
         f"{float(limit_cycle_result.period):.5f} s, speed {float(limit_cycle_result.speed):.5f} "
         "m/s, "
         f"DLS {100 * float(limit_cycle_result.dls_fraction):.2f} %."

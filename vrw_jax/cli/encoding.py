@@ -18,7 +18,7 @@ ASCII_REPLACEMENTS = {
 
 
 def replace_unencodable_output() -> None:
-    """Make standard output and standard error replace the characters that their encoding lacks."""
+    """Replace characters that its encoding lacks in standard output and standard error."""
     codecs.register_error(ENCODING_ERROR_HANDLER_NAME, _handle_encoding_error)
     for output_stream in (sys.stdout, sys.stderr):
         if isinstance(output_stream, io.TextIOWrapper):
@@ -32,8 +32,7 @@ def replace_unencodable_characters(text: str, encoding_name: str) -> str:
 
 
 def _handle_encoding_error(encoding_error: UnicodeError) -> tuple[str, int]:
-    """Return the replacement of characters that an encoding lacks, and the index after these
-    characters."""
+    """Return the replacement of characters that an encoding lacks, and the index after them."""
     if not isinstance(encoding_error, UnicodeEncodeError):
         raise encoding_error
     return "".join(
@@ -42,9 +41,7 @@ def _handle_encoding_error(encoding_error: UnicodeError) -> tuple[str, int]:
 
 
 def _replace_with_ascii(character: str) -> str:
-    """Return a character in ASCII, which is its replacement or the replacements of its
-    components.
-    """
+    """Return a character in ASCII: its replacement, or the replacements of its components."""
     if character.isascii() or character in ASCII_REPLACEMENTS:
         return ASCII_REPLACEMENTS.get(character, character)
     decomposed_characters = unicodedata.normalize("NFKD", character)

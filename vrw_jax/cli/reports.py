@@ -30,7 +30,7 @@ def write_scan_figures(scan: xr.Dataset, folder: Path) -> list[Path]:
 def write_tuning_report(
     tune_result: TuneResult, folder: Path, draws_figure: bool = True
 ) -> list[Path]:
-    """Write data, summary, config and figure of a tuned gait into `folder`, and return the
+    """Write data, summary, config and figure of a tuned gait into `folder`, and return their
     paths.
     """
     toml_lines = [
@@ -57,7 +57,7 @@ def write_tuning_report(
 
 
 def write_branch_report(branch: Branch, folder: Path, draws_figure: bool = True) -> list[Path]:
-    """Write data, table, summary and figure of a branch into `folder`, and return the paths."""
+    """Write data, table, summary and figure of a branch into `folder`, and return their paths."""
     text_by_file_name = {
         "borders.csv": _format_special_points_csv(branch),
         "summary.md": format_branch_summary(branch),
@@ -72,21 +72,27 @@ def write_branch_report(branch: Branch, folder: Path, draws_figure: bool = True)
 
 
 def write_special_point_map(special_point_map: SpecialPointMap, folder: Path) -> list[Path]:
-    """Write text, table and figure of a map of special points into `folder`, and return the
+    """Write text, table and figure of a map of special points into `folder`, and return their
     paths.
     """
     scan_dataset, special_point_curves, _ = special_point_map
     parameter_names = tuple(map(str, scan_dataset.outcome.dims))
     csv_rows = [
-        [special_point_curve.name, *map("{:.12g}".format, curve_point)]
+        [special_point_curve.name, *map("{:.12g}".format, curve_point_index)]
         for special_point_curve in special_point_curves
-        for curve_point in special_point_curve.values
+        for curve_point_index in special_point_curve.values
     ]
-    csv_text = "\n".join(",".join(csv_row) for csv_row in [["border", *parameter_names], *csv_rows])
+    csv_text = "\n".join(
+        ",".join(csv_row_cells) for csv_row_cells in [["border", *parameter_names], *csv_rows]
+    )
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "map.csv").write_text(csv_text + "\n", encoding="utf-8")
     (folder / "map.md").write_text(f"{special_point_map}\n", encoding="utf-8")
-    measure_name = next(name for name in scan_dataset if name in DIFFERENTIABLE_MEASURES)
+    measure_name = next(
+        parameter_name
+        for parameter_name in scan_dataset
+        if parameter_name in DIFFERENTIABLE_MEASURES
+    )
     figure_paths = figures.save(
         figures.map_figure(scan_dataset, str(measure_name), special_point_curves), folder, "map"
     )
@@ -96,7 +102,7 @@ def write_special_point_map(special_point_map: SpecialPointMap, folder: Path) ->
 def _write_dataset_and_texts(
     folder: Path, store_name: str, dataset: xr.Dataset, text_by_file_name: Mapping[str, str]
 ) -> list[Path]:
-    """Write a dataset and texts into `folder`, and return the paths."""
+    """Write a dataset and texts into `folder`, and return their paths."""
     folder.mkdir(parents=True, exist_ok=True)
     dataset.to_zarr(folder / store_name, mode="w", zarr_format=2)
     for file_name, file_text in text_by_file_name.items():
@@ -137,7 +143,7 @@ def format_tuning_summary(tune_result: TuneResult) -> str:
 
 
 def _format_special_points_csv(branch: Branch) -> str:
-    """Return the table of the special points of a branch as CSV."""
+    """Return a table of the special points of a branch as CSV text."""
     csv_buffer = io.StringIO(newline="")
     csv_writer = csv.writer(csv_buffer)
     csv_writer.writerow([branch.parameter, "kind", "name", "ends_branch", "spectral_radius"])
@@ -167,11 +173,11 @@ def format_branch_summary(branch: Branch) -> str:
     )
     special_point_rows = []
     for special_point in branch.special_points:
-        kind_text = special_point.kind.replace("_", " ")
-        kind_text += " (ends the branch)" * special_point.ends_branch
+        special_point_kind = special_point.kind.replace("_", " ")
+        special_point_kind += " (ends the branch)" * special_point.ends_branch
         violation_text = describe_violation(special_point.name)
         special_point_rows.append(
-            (f"{special_point.value:.9f}", kind_text, special_point.name, violation_text)
+            (f"{special_point.value:.9f}", special_point_kind, special_point.name, violation_text)
         )
     return "\n".join([
         *summary_lines,

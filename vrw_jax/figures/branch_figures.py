@@ -59,28 +59,13 @@ OTHER_MODEL_BRANCH_PANELS = (
 """Panels of a branch of a model without the paper's indicators."""
 
 
-def _split_by_stability(branch: Branch) -> list[tuple[np.ndarray, bool]]:
-    """Return the point indices of pieces of equal stability, and whether each piece is stable.
-
-    A piece ends at the point where the next piece starts.
-    """
-    change_indices = np.flatnonzero(np.diff(branch.stable.astype(int))) + 1
-    piece_indices = np.split(np.arange(branch.values.size), change_indices)
-    last_index = branch.values.size - 1
-    return [
-        (np.append(piece, piece[-1] + 1) if piece[-1] < last_index else piece,
-         bool(branch.stable[piece[0]]))
-        for piece in piece_indices
-    ]  # fmt: skip
-
-
 @figure_style()
 def branch_figure(branch: Branch) -> Figure:
     """Return a figure of a branch with its special points.
 
     The panels show DLS fraction, multipliers, indicators and clearance. For models other than the
-    paper's, speed and period replace the last two. Stable gaits are solid, unstable gaits dashed.
-    Special points are numbered from left to right.
+    paper's, speed and period replace indicators and clearance. Lines of stable gaits are solid, and
+    those of unstable gaits are dashed. Special points are numbered from left to right.
 
     Args:
         branch: result of `vrw.continue_branch` over a parameter of the wheel.
@@ -99,7 +84,15 @@ def branch_figure(branch: Branch) -> Figure:
     figure = Figure(figsize=(PAGE_FIGURE_WIDTH_INCHES, 4.0 + 0.16 * n_legend_rows))
     panel_axes = figure.subplots(2, 2, sharex=True)
     has_indicators = "lambda_2_plus" in branch_dataset
-    stability_pieces = _split_by_stability(branch)
+    change_indices = np.flatnonzero(np.diff(branch.stable.astype(int))) + 1
+    # A piece of equal stability ends at the point where the next piece starts.
+    stability_pieces = [
+        (
+            np.append(piece, piece[-1:] + 1)[: branch.values.size - piece[0]],
+            bool(branch.stable[piece[0]]),
+        )
+        for piece in np.split(np.arange(branch.values.size), change_indices)
+    ]
     shown_panels = PAPER_BRANCH_PANELS if has_indicators else OTHER_MODEL_BRANCH_PANELS
     for axes, (panel_label, panel_series), panel_letter in zip(
         panel_axes.ravel(), shown_panels, "abcd", strict=True
@@ -108,18 +101,19 @@ def branch_figure(branch: Branch) -> Figure:
         for measure_name, line_color in panel_series.items():
             plotted_columns = [branch_dataset[measure_name].values]
             if measure_name == "clearance_sls1":
-                # The clearance is in mm, with a gap at a jump, where a lowest point vanishes.
+                # The clearance is in mm. The line has a gap where the clearance jumps because a
+                # local minimum vanishes.
                 clearance_mm = 1e3 * branch_dataset[measure_name].values
                 clearance_mm[1:][clearance_mm[:-1] * clearance_mm[1:] < 0.0] = np.nan
                 plotted_columns = [clearance_mm]
             if measure_name == "spectral_radius":
                 plotted_columns = list(np.abs(branch.multipliers).T)
-            for plotted_column in plotted_columns:
+            for plotted_measure_values in plotted_columns:
                 for piece_of_indices, is_stable in stability_pieces:
                     line_style = "-" if is_stable else "--"
                     axes.plot(
                         parameter_values[piece_of_indices],
-                        plotted_column[piece_of_indices],
+                        plotted_measure_values[piece_of_indices],
                         line_style,
                         color=line_color,
                     )
@@ -157,7 +151,7 @@ def _select_special_point_color(special_point: SpecialPoint) -> str:
 def _draw_special_points(
     axes: Axes, special_points: list[SpecialPoint], draws_numbers: bool
 ) -> None:
-    """Draw vertical lines at the special points, with numbers if `draws_numbers` is set."""
+    """Draw vertical lines at the special points, and their numbers if `draws_numbers` is true."""
     lower_limit, upper_limit = axes.get_xlim()
     label_position = -np.inf
     for point_number, special_point in enumerate(special_points):
@@ -211,8 +205,8 @@ def _add_branch_legend(figure: Figure, special_points: list[SpecialPoint], param
 def basin_figure(results: list[xr.Dataset], titles: list[str]) -> Figure:
     """Return a figure of basins of attraction, one panel per result.
 
-    Crosses mark the section states of the gaits. Shades of gray give the number of steps until the
-    gait is reached, and colors the falls.
+    Crosses mark the section states of the gaits. Shades of gray show the number of steps until the
+    gait is reached, and colors show the outcomes of falls.
 
     Args:
         results: results of `vrw.basin`, each over a plane of starts.

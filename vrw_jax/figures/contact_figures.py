@@ -48,7 +48,8 @@ OTHER_LEG_LINE_STYLES = (
 class HubAndFootMotion(NamedTuple):
     """Positions of hub and feet over a walk, with contact modes and forces, in the slope's frame.
 
-    Legs have the labels of each step: Leg 1 is the front leg at the landing, and Leg 2 follows it.
+    Legs have the labels of each step: Leg 1 is the front leg at the landing, and Leg 2 is the leg
+    behind Leg 1.
     """
 
     time: np.ndarray  # (time,), s
@@ -62,7 +63,7 @@ class HubAndFootMotion(NamedTuple):
         """Return the positions of hub and feet at the time `t`, s, and the index of the next
         sample.
 
-        Contact modes and forces are taken from that sample.
+        Contact modes and forces at this time are those of the next sample.
         """
         index_after = min(int(np.searchsorted(self.time, t, side="right")), self.time.size - 1)
         index_before = max(index_after - 1, 0)
@@ -70,13 +71,13 @@ class HubAndFootMotion(NamedTuple):
         interval_fraction = (
             (t - self.time[index_before]) / sample_interval if sample_interval > 0.0 else 1.0
         )
-        interpolate_samples = lambda sampled_values: (
+        sample_interpolator = lambda sampled_values: (
             (1.0 - interval_fraction) * sampled_values[index_before]
             + interval_fraction * sampled_values[index_after]
         )
         return (
-            interpolate_samples(self.hub_positions),
-            interpolate_samples(self.foot_positions),
+            sample_interpolator(self.hub_positions),
+            sample_interpolator(self.foot_positions),
             index_after,
         )
 
@@ -87,9 +88,9 @@ def reports_contact_modes(walk: xr.Dataset) -> bool:
 
 
 def compute_foot_motion(walk: xr.Dataset) -> HubAndFootMotion:
-    """Return the motion of the feet of a trajectory of any model.
+    """Return the motion of hub and feet in a trajectory of any model.
 
-    In the paper's phases no foot slides: Leg 1 is at rest, and so is Leg 2 in double support.
+    In the paper's phases no foot slides: Leg 1 is at rest, and Leg 2 is at rest in double support.
     """
     hub_positions = np.stack([walk.hub_x.values, walk.hub_z.values], -1)
     if reports_contact_modes(walk):
@@ -132,9 +133,7 @@ def select_leg_color(leg_number: int) -> str:
 def draw_feet(
     axes: Axes, foot_positions: np.ndarray, contact_modes: np.ndarray, marker_size: float
 ) -> None:
-    """Draw feet at positions of shape (2, feet), as markers in the colors of their contact
-    modes.
-    """
+    """Draw feet at positions of shape (2, feet), in the colors of their contact modes."""
     for contact_mode in np.unique(contact_modes):
         axes.plot(
             *foot_positions[:, contact_modes == contact_mode],
@@ -159,7 +158,10 @@ def make_contact_mode_handles(contact_modes: np.ndarray) -> list[Line2D]:
 
 
 def _select_marked_legs(is_leg_marked: np.ndarray) -> list[int]:
-    """Return the numbers of Legs 1 and 2, and of all legs that are ever marked, (time, leg)."""
+    """Return the numbers of Legs 1 and 2, and of all legs with a mark at any time.
+
+    - `is_leg_marked`: marks, shape (time, leg).
+    """
     return [
         leg_number
         for leg_number, is_ever_marked in enumerate(np.any(is_leg_marked, axis=0).tolist(), 1)
@@ -170,15 +172,15 @@ def _select_marked_legs(is_leg_marked: np.ndarray) -> list[int]:
 def make_contact_panels(walk: xr.Dataset) -> Figure:
     """Return a figure of angle, leg lengths, contact modes, foot heights and forces over time."""
     foot_motion = compute_foot_motion(walk)
-    is_touching = foot_motion.contact_modes != ContactMode.OFF
-    touching_legs = _select_marked_legs(is_touching)
-    moving_legs = _select_marked_legs(is_touching | ~walk.on_stopper.values.astype(bool))
+    is_foot_touching = foot_motion.contact_modes != ContactMode.OFF
+    touching_legs = _select_marked_legs(is_foot_touching)
+    moving_legs = _select_marked_legs(is_foot_touching | ~walk.on_stopper.values.astype(bool))
     # At landings the legs are relabeled.
     landing_indices = np.flatnonzero(np.diff(foot_motion.step)) + 1
-    insert_landing_gaps = lambda leg_values: np.insert(
+    gap_inserter = lambda leg_values: np.insert(
         np.asarray(leg_values, float), landing_indices, np.nan
     )
-    times_with_gaps = insert_landing_gaps(foot_motion.time)
+    times_with_gaps = gap_inserter(foot_motion.time)
     other_leg_lines = iter(OTHER_LEG_LINE_STYLES * len(moving_legs))
     line_style_by_leg = {
         leg_number: LEG_LINE_STYLES.get(leg_number) or next(other_leg_lines)
@@ -189,7 +191,7 @@ def make_contact_panels(walk: xr.Dataset) -> Figure:
     panel_axes = figure.subplots(6, 1, sharex=True, height_ratios=height_ratios)
     for axes, panel_letter in zip(panel_axes, "abcdef", strict=True):
         draw_panel_letter(axes, panel_letter)
-    panel_axes[0].plot(times_with_gaps, insert_landing_gaps(walk.theta), color="black")
+    panel_axes[0].plot(times_with_gaps, gap_inserter(walk.theta), color="black")
     panel_axes[0].set_ylabel(format_axis_label("theta", "{symbol}"))
     leg_panels = (
         (panel_axes[1], moving_legs, walk.length.values, "$L$ [m]"),
@@ -200,7 +202,7 @@ def make_contact_panels(walk: xr.Dataset) -> Figure:
     for axes, drawn_legs, leg_values, panel_label in leg_panels:
         for leg_number in drawn_legs:
             line_color, line_style = line_style_by_leg[leg_number]
-            values_with_gaps = insert_landing_gaps(leg_values[:, leg_number - 1])
+            values_with_gaps = gap_inserter(leg_values[:, leg_number - 1])
             axes.plot(
                 times_with_gaps,
                 values_with_gaps,
@@ -222,8 +224,8 @@ def make_contact_panels(walk: xr.Dataset) -> Figure:
 def _draw_contact_mode_bars(
     axes: Axes, foot_motion: HubAndFootMotion, drawn_legs: list[int]
 ) -> None:
-    """Draw the contact modes of each leg over time as bars in their colors."""
-    for bar_row, leg_number in enumerate(drawn_legs):
+    """Draw the contact modes of each leg over time as colored bars."""
+    for bar_row_index, leg_number in enumerate(drawn_legs):
         contact_modes = foot_motion.contact_modes[:, leg_number - 1]
         change_indices = np.flatnonzero(np.diff(contact_modes) | np.diff(foot_motion.step)) + 1
         for start_index, end_index in zip(
@@ -236,7 +238,7 @@ def _draw_contact_mode_bars(
                 )
                 axes.broken_barh(
                     [bar_start_and_duration],
-                    (bar_row - 0.35, 0.7),
+                    (bar_row_index - 0.35, 0.7),
                     color=CONTACT_MODE_COLORS[contact_modes[start_index]],
                 )
     axes.set_yticks(range(len(drawn_legs)), [str(leg_number) for leg_number in drawn_legs])
@@ -252,7 +254,7 @@ def _draw_contact_mode_bars(
 
 
 def draw_contact_sticks(axes: Axes, walk: xr.Dataset, stick_interval: float) -> None:
-    """Draw Legs 1 and 2 and every leg that touches, with feet in the colors of their contact
+    """Draw Legs 1 and 2 and every leg on the ground, with feet in the colors of their contact
     modes.
     """
     foot_motion = compute_foot_motion(walk)

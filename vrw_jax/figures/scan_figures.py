@@ -72,7 +72,7 @@ MAX_DRAWN_SAMPLES = 20_000
 
 
 def scan_figures(scan: xr.Dataset) -> dict[str, Figure]:
-    """Return the figures of a scan by name, one for each axis beyond the first two.
+    """Return the figures of a scan by name. A grid has one figure for each axis beyond the second.
 
     Args:
         scan: dataset of `vrw.scan` over a grid or samples.
@@ -133,7 +133,7 @@ def draw_scan_slices(
     """Return a figure over the parameters (x, y), with one column per value of `column_parameter`.
 
     The figure shows outcomes and the measures of `SHOWN_MEASURE_NAMES`. All other parameters have
-    their middle value, which the title states. Gray cells have no gait.
+    the middle of their values, which the title states. Gray cells have no gait.
     """
     cut_indices = {
         n_column_values: scan.sizes[n_column_values] // 2
@@ -171,27 +171,35 @@ def draw_scan_slices(
             for column_dataset in column_datasets
         ]
         is_stable = [
-            _get_outcome_codes(column_dataset).transpose(y, x).values == Outcome.STEPPED
+            _compute_displayed_outcome_codes(column_dataset).transpose(y, x).values
+            == Outcome.STEPPED
             for column_dataset in column_datasets
         ]
         color_limits = _find_color_limits(column_values, is_stable)
         color_scale = _make_color_scale(measure_name, color_limits)
-        for axes, column_dataset, cell_values in zip(
+        for axes, column_dataset, measure_values_by_cell in zip(
             axes_of_row, column_datasets, column_values, strict=True
         ):
-            cell_image = _draw_measure_cells(
-                axes, column_dataset[x].values, column_dataset[y].values, cell_values, color_scale
+            cell_mesh = _draw_measure_cells(
+                axes,
+                column_dataset[x].values,
+                column_dataset[y].values,
+                measure_values_by_cell,
+                color_scale,
             )
         extended_ends = _find_extended_color_bar_ends(column_values, color_limits)
         color_bar = figure.colorbar(
-            cell_image, ax=axes_of_row.tolist(), aspect=12, pad=0.01, extend=extended_ends
+            cell_mesh, ax=axes_of_row.tolist(), aspect=12, pad=0.01, extend=extended_ends
         )
         color_bar.set_label(textwrap.fill(format_axis_label(measure_name, "{name}"), 24))
     outcome_codes = np.unique(
-        [_get_outcome_codes(column_dataset).values for column_dataset in column_datasets]
+        [
+            _compute_displayed_outcome_codes(column_dataset).values
+            for column_dataset in column_datasets
+        ]
     )
     for axes, column_dataset in zip(panel_axes[-1], column_datasets, strict=True):
-        cell_outcome_codes = _get_outcome_codes(column_dataset).transpose(y, x).values
+        cell_outcome_codes = _compute_displayed_outcome_codes(column_dataset).transpose(y, x).values
         draw_outcome_cells(
             axes,
             _find_cell_edges(column_dataset[x].values),
@@ -245,7 +253,7 @@ def draw_scan_samples(scan: xr.Dataset, parameter_names: Sequence[str]) -> Figur
             point_collection, ax=axes, location="top", aspect=25, extend=extended_ends
         )
         color_bar.set_label(format_axis_label(measure_name))
-    outcome_codes = _get_outcome_codes(scan).values
+    outcome_codes = _compute_displayed_outcome_codes(scan).values
     _draw_outcome_samples(
         panel_axes[-1], scan[x].values, scan[y].values, outcome_codes, marker_size
     )
@@ -261,13 +269,13 @@ def draw_parameter_pairs(scan: xr.Dataset, parameter_names: Sequence[str]) -> Fi
     """Return a figure of samples over each pair of parameters.
 
     The figure shows a measure below the diagonal and the outcome above it. The measure is the first
-    of `SHOWN_MEASURE_NAMES` that the scan has. The diagonal shows the fraction of samples with a
-    stable cycle. Only the first `MAX_DRAWN_SAMPLES` samples are drawn, which are spread as evenly
+    of `SHOWN_MEASURE_NAMES` in the scan. The diagonal shows the fraction of samples with a stable
+    cycle. Only the first `MAX_DRAWN_SAMPLES` samples are drawn, because they are spread as evenly
     as all samples.
     """
     drawn_samples = scan.isel(sample=slice(MAX_DRAWN_SAMPLES))
     measure_name = next(iter(_list_shown_measures(scan)), None)
-    outcome_codes = _get_outcome_codes(drawn_samples).values
+    outcome_codes = _compute_displayed_outcome_codes(drawn_samples).values
     n_parameters = len(parameter_names)
     marker_size = float(np.clip(8000.0 / len(outcome_codes), 0.6, 8.0))
     figure = Figure(figsize=(PAGE_FIGURE_WIDTH_INCHES, PAGE_FIGURE_WIDTH_INCHES * 0.9))
@@ -311,13 +319,14 @@ def draw_parameter_pairs(scan: xr.Dataset, parameter_names: Sequence[str]) -> Fi
 def _draw_measure_samples(
     axes: Axes, scan: xr.Dataset, x: str, y: str, measure_name: str, marker_size: float
 ) -> PathCollection:
-    """Draw samples in the colors of a measure, or in gray if they have no gait, and return the
-    collection of points.
+    """Draw samples in the colors of a measure, and return the collection of points.
+
+    Samples without a gait are gray.
     """
     dot_style: dict[str, Any] = {"s": marker_size, "linewidths": 0.0, "rasterized": True}
     has_gait, measure_values = scan.outcome.values == Outcome.STEPPED, scan[measure_name].values
     color_limits = _find_color_limits(
-        [measure_values], [_get_outcome_codes(scan).values == Outcome.STEPPED]
+        [measure_values], [_compute_displayed_outcome_codes(scan).values == Outcome.STEPPED]
     )
     x_values, y_values = scan[x].values, scan[y].values
     axes.scatter(x_values[~has_gait], y_values[~has_gait], color=LIGHT_GRAY_COLOR, **dot_style)
@@ -406,17 +415,18 @@ def draw_sobol_indices(indices: xr.Dataset) -> Figure:
     legend_handles, legend_texts = panel_axes[0, 0].get_legend_handles_labels()
     figure.legend(legend_handles, legend_texts, loc="outside lower center", ncols=2)
     left_out_fraction = 100.0 * indices.attrs["left_out"]
-    note_text = (
+    omitted_rows_note = (
         f"{indices.attrs['rows']:,} rows; {left_out_fraction:.1f} % left out, without a gait"
     )
-    figure.suptitle(note_text, fontsize=8.0)
+    figure.suptitle(omitted_rows_note, fontsize=8.0)
     return figure
 
 
 @figure_style()
 def draw_measure_curves(scan: xr.Dataset, x: str) -> Figure:
-    """Return a figure of the measures of `SHOWN_MEASURE_NAMES` along one parameter; gray cells have
-    no gait.
+    """Return a figure of the measures of `SHOWN_MEASURE_NAMES` along one parameter.
+
+    Gray cells have no gait.
     """
     scan = scan.isel(
         {
@@ -447,17 +457,17 @@ def draw_measure_curves(scan: xr.Dataset, x: str) -> Figure:
 
 
 def _list_shown_measures(scan: xr.Dataset) -> list[str]:
-    """Return the names of those measures of a scan that figures show."""
+    """Return the names of the measures of a scan that figures show."""
     return [measure_name for measure_name in SHOWN_MEASURE_NAMES if measure_name in scan]
 
 
 def _find_color_limits(
     panel_values: Sequence[np.ndarray], stable_masks: Sequence[np.ndarray]
 ) -> tuple[float, float]:
-    """Return the color range of a row of panels, which is the range of stable gaits if there are
-    any.
+    """Return the color range of a row of panels.
 
-    A few distant unstable gaits would otherwise give all other gaits the same color.
+    The range is that of the stable gaits if there are any. A few distant unstable gaits would
+    otherwise give all other gaits the same color.
     """
     finite_values = [
         values_of_panel[np.isfinite(values_of_panel)] for values_of_panel in panel_values
@@ -483,7 +493,7 @@ def _make_color_scale(measure_name: str, color_limits: tuple[float, float]) -> N
 def _find_extended_color_bar_ends(
     panel_values: Sequence[np.ndarray], color_limits: tuple[float, float]
 ) -> Literal["neither", "min", "max", "both"]:
-    """Return the ends of a color bar beyond which there are values: "neither", "min", "max" or
+    """Return the ends of a color bar beyond which measures lie: "neither", "min", "max" or
     "both".
     """
     finite_values = np.concatenate(
@@ -504,21 +514,21 @@ def _draw_measure_cells(
     axes: Axes,
     x: np.ndarray,
     y: np.ndarray,
-    cell_values: np.ndarray,
+    measure_values_by_cell: np.ndarray,
     color_scale: Normalize,
 ) -> AxesImage:
-    """Draw one colored cell per sample, without interpolation, and return the image."""
+    """Draw one colored cell per sample, without interpolation, and return the mesh of cells."""
     axes.set_facecolor(LIGHT_GRAY_COLOR)
-    masked_values = np.ma.masked_invalid(cell_values)
-    cell_image = axes.pcolormesh(
+    masked_values = np.ma.masked_invalid(measure_values_by_cell)
+    cell_mesh = axes.pcolormesh(
         _find_cell_edges(x),
         _find_cell_edges(y),
         masked_values,
         cmap="viridis",
         norm=color_scale,
     )
-    cell_image.set_rasterized(True)
-    return cell_image  # type: ignore[return-value]  # A color bar accepts it.
+    cell_mesh.set_rasterized(True)
+    return cell_mesh  # type: ignore[return-value]  # A color bar accepts it.
 
 
 def _find_cell_edges(sample_positions: np.ndarray) -> np.ndarray:
@@ -535,18 +545,19 @@ def _find_cell_edges(sample_positions: np.ndarray) -> np.ndarray:
     return np.concatenate([[first_edge], inner_edges, [last_edge]])
 
 
-def _get_outcome_codes(scan: xr.Dataset) -> xr.DataArray:
-    """Return the outcome codes of a scan, with `UNSTABLE_CYCLE_CODE` for unstable cycles if the
-    spectral radius is known.
+def _compute_displayed_outcome_codes(scan: xr.Dataset) -> xr.DataArray:
+    """Return the outcome codes of a scan, with `UNSTABLE_CYCLE_CODE` for unstable cycles.
+
+    Unstable cycles are marked only if the scan contains the spectral radius.
     """
-    outcome_codes = scan.outcome.astype(int)
+    codes_with_instability = scan.outcome.astype(int)
     if "spectral_radius" not in scan:
-        return outcome_codes
-    return outcome_codes.where(~(scan.spectral_radius >= 1.0), UNSTABLE_CYCLE_CODE)
+        return codes_with_instability
+    return codes_with_instability.where(~(scan.spectral_radius >= 1.0), UNSTABLE_CYCLE_CODE)
 
 
 def _draw_margin_zero_lines(axes: Axes, scan: xr.Dataset, x: str, y: str) -> dict[str, Line2D]:
-    """Draw the lines along which a margin is zero, and return their legend entries by name."""
+    """Draw the lines along which a margin is zero, and return their legend entries by margin."""
     legend_lines = {}
     for margin_name in DRAWN_MARGIN_NAMES:
         if margin_name not in scan or scan.sizes[x] < 2 or scan.sizes[y] < 2:
@@ -637,19 +648,21 @@ def map_figure(scan: xr.Dataset, measure: str, curves: Sequence[SpecialPointCurv
     figure.colorbar(measure_image, ax=axes, aspect=30, pad=0.01).set_label(
         format_axis_label(measure)
     )
-    special_point_names = sorted({curve.name for curve in curves})
+    special_point_names = sorted({special_point_curve.name for special_point_curve in curves})
     legend_texts = {
         special_point_name: typeset_greek_symbols(describe_violation(special_point_name))
         for special_point_name in special_point_names
     }
-    for curve in curves:
-        curve_color, line_style = select_special_point_style(curve.name)
-        is_stable = curve.dataset.spectral_radius.values < 1.0
+    for special_point_curve in curves:
+        curve_color, line_style = select_special_point_style(special_point_curve.name)
+        is_stable = special_point_curve.dataset.spectral_radius.values < 1.0
         for is_drawn, line_width in ((is_stable, 1.2), (~is_stable, 0.5)):
-            # Each piece includes the first point of the next one; the curve has one legend entry.
+            # Each piece includes the first point of the next piece. The curve has one legend entry.
             is_drawn_or_next = is_drawn | np.append(False, is_drawn[:-1])
-            curve_points = np.where(is_drawn_or_next[:, None], curve.values, np.nan)
-            legend_text = legend_texts.pop(curve.name, None) if is_drawn.any() else None
+            curve_points = np.where(is_drawn_or_next[:, None], special_point_curve.values, np.nan)
+            legend_text = (
+                legend_texts.pop(special_point_curve.name, None) if is_drawn.any() else None
+            )
             line_outline = [Stroke(linewidth=line_width + 1.0, foreground="white"), Normal()]
             axes.plot(
                 *curve_points.T, color=curve_color, linestyle=line_style, linewidth=line_width,
@@ -657,7 +670,11 @@ def map_figure(scan: xr.Dataset, measure: str, curves: Sequence[SpecialPointCurv
                 path_effects=line_outline,
             )  # fmt: skip
     codim2_points = np.array(
-        [codim2_point.values for curve in curves for codim2_point in curve.codim2_points]
+        [
+            codim2_point.values
+            for special_point_curve in curves
+            for codim2_point in special_point_curve.codim2_points
+        ]
     )
     axes.plot(
         *codim2_points.reshape(-1, 2).T,

@@ -179,16 +179,15 @@ def save(figure: Figure, folder: str | Path, name: str) -> list[Path]:
 
 
 def require_dataset_variables(
-    argument_name: str, dataset: Any, needed_names: Sequence[str], remedy_text: str
+    argument_name: str, labeled_dataset: Any, needed_names: Sequence[str], remedy_text: str
 ) -> None:
-    """Raise an error unless `dataset` is a dataset that contains the needed variables or
-    attributes.
-    """
-    check_type(argument_name, dataset, xr.Dataset, remedy_text)
+    """Raise an error if `labeled_dataset` is no dataset with the needed variables or attributes."""
+    check_type(argument_name, labeled_dataset, xr.Dataset, remedy_text)
     missing_names = [
         variable_name
         for variable_name in needed_names
-        if variable_name not in dataset.variables and variable_name not in dataset.attrs
+        if variable_name not in labeled_dataset.variables
+        and variable_name not in labeled_dataset.attrs
     ]
     if missing_names:
         raise ValueError(
@@ -199,9 +198,7 @@ def require_dataset_variables(
 def require_variables_of_datasets(
     argument_name: str, datasets: Any, needed_names: Sequence[str], remedy_text: str
 ) -> None:
-    """Raise an error unless `datasets` is a nonempty list of datasets that contain the needed
-    variables.
-    """
+    """Raise an error if `datasets` is no nonempty list of datasets with the needed variables."""
     check_type(argument_name, datasets, (list, tuple), f"{remedy_text}, several in a list")
     if not datasets:
         raise ValueError(f"{argument_name} is empty, but something is to be drawn: {remedy_text}.")
@@ -212,8 +209,9 @@ def require_variables_of_datasets(
 
 
 def typeset_greek_symbols(text: str) -> str:
-    """Return text with symbols such as "λ2⁺" as formulas, because the font lacks some of these
-    symbols.
+    """Return a text in which symbols such as "λ2⁺" are formulas.
+
+    The font lacks some of these symbols.
     """
     return re.sub(r"[θλ]\S*", lambda match: f"${format_mathtext(match[0])}$", text)
 
@@ -264,8 +262,8 @@ def draw_markers(
     fill_color: str,
     **style_overrides: Any,
 ) -> None:
-    """Draw markers without a line, filled with `fill_color`; the fill color "white" makes markers
-    open.
+    """Draw markers without a line, filled with `fill_color`. The fill color "white" gives open
+    markers.
     """
     marker_style: dict[str, Any] = {
         "markersize": 3.2,
@@ -276,8 +274,9 @@ def draw_markers(
 
 
 def select_special_point_style(special_point_name: str) -> tuple[str, Any]:
-    """Return color and line style of a special point. Special points of locked legs differ by
-    leg.
+    """Return color and line style of a special point.
+
+    Special points of locked legs have different styles for different legs.
     """
     for line_color, special_point_names in SPECIAL_POINT_NAMES_BY_COLOR.items():
         if special_point_name in special_point_names:
@@ -292,8 +291,8 @@ def select_special_point_style(special_point_name: str) -> tuple[str, Any]:
 
 
 def select_outcome_style(outcome_code: int) -> tuple[str, str]:
-    """Return label and color of an outcome, of an unstable cycle, or of a sample that is not
-    computed.
+    """Return label and color of an outcome, of an unstable cycle, or of a sample without a
+    result.
     """
     if outcome_code == UNSTABLE_CYCLE_CODE:
         return "unstable limit cycle", OKABE_ITO_YELLOW
@@ -320,14 +319,14 @@ def draw_outcome_cells(
     code_indices = np.ma.masked_where(
         ~np.isin(outcome_codes, drawn_codes), np.searchsorted(drawn_codes, outcome_codes)
     )
-    color_norm = (
+    outcome_color_norm = (
         BoundaryNorm(np.arange(len(drawn_codes) + 1) - 0.5, len(drawn_codes))
         if len(drawn_codes) > 1
         else None
     )
-    axes.pcolormesh(x, y, code_indices, cmap=outcome_color_map, norm=color_norm).set_rasterized(
-        True
-    )
+    axes.pcolormesh(
+        x, y, code_indices, cmap=outcome_color_map, norm=outcome_color_norm
+    ).set_rasterized(True)
 
 
 def make_outcome_patches(outcome_codes: Iterable[int]) -> list[Patch]:

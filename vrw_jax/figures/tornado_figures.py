@@ -1,6 +1,4 @@
-"""Tornado plots: for each measure, the changes that each parameter causes, as bars sorted by
-length.
-"""
+"""Tornado plots: the change of each measure due to each parameter, as bars sorted by length."""
 
 import math
 from collections.abc import Iterable, Mapping
@@ -43,10 +41,10 @@ def tornado_figure(
 ) -> Figure:
     """Return a figure of the change of each measure with each parameter, largest changes on top.
 
-    Changes are of first order, from the derivatives of the gait. By default they are in per cent of
-    the measure for 1 % of each parameter. With `spreads` they are in the unit of the measure for
-    these changes of the parameters. An undefined change, such as for 1 % of a slope of 0, is left
-    out.
+    Changes are of first order, from the derivatives of the gait. By default a change is in per cent
+    of the measure, for 1 % of each parameter. With `spreads` a change is in the unit of the
+    measure, for the given changes of the parameters. Undefined changes, such as for 1 % of a slope
+    of 0, are left out.
 
     Args:
         table: dataset of `vrw.sensitivities`.

@@ -26,8 +26,8 @@ from vrw_jax.validation import check_type
 def tuning_figure(tuned: TuneResult) -> Figure:
     """Return a figure of a tuning run: objective, parameters, and slack of the constraints.
 
-    Filled symbols satisfy every constraint, and open ones violate one. Dotted lines are trials that
-    lost the gait, after which the step was shortened.
+    Filled symbols satisfy every constraint, and open symbols violate a constraint. Dotted lines are
+    trials without a gait, after which the step was shortened.
 
     Args:
         tuned: result of `vrw.tune`.
@@ -43,7 +43,7 @@ def tuning_figure(tuned: TuneResult) -> Figure:
     check_type("tuned", tuned, TuneResult, "give vrw.tune(params, objective, free, bounds)")
     path_dataset = tuned.path
     n_constraints = path_dataset.sizes["constraint"]
-    # Each constraint has one row of text.
+    # Each constraint has one line of text.
     figure_height_inches = max(3.2, 0.19 * n_constraints + 1.0)
     figure = Figure(figsize=(PAGE_FIGURE_WIDTH_INCHES, figure_height_inches))
     panel_axes = figure.subplot_mosaic(

@@ -57,7 +57,7 @@ NO_PAPER_WALK_REMEDY = (
 
 
 def _require_nonempty_walk(argument_name: str, walk: xr.Dataset) -> None:
-    """Raise an error unless `walk` is a trajectory with at least one sample."""
+    """Raise an error if `walk` is not a trajectory with at least one sample."""
     needed_names = ("hub_x", "hub_z", "step", "parameter_n_legs")
     require_dataset_variables(argument_name, walk, needed_names, NO_WALK_REMEDY)
     if not walk.sizes["time"]:
@@ -80,14 +80,12 @@ def find_phase_spans(gait: xr.Dataset) -> list[tuple[float, float, int]]:
     ]
 
 
-def insert_landing_gaps(gait: xr.Dataset, *names: str) -> list[np.ndarray]:
-    """Return time and variables with a gap at each landing, because the legs are relabeled
-    there.
-    """
+def insert_landing_gaps(gait: xr.Dataset, *variable_names: str) -> list[np.ndarray]:
+    """Return time and variables with a gap at each landing, because landings relabel the legs."""
     landing_indices = np.flatnonzero(np.diff(gait.step.values)) + 1
     return [
         np.insert(gait[variable_name].values.astype(float), landing_indices, np.nan)
-        for variable_name in ("time", *names)
+        for variable_name in ("time", *variable_names)
     ]
 
 
@@ -95,7 +93,7 @@ def insert_landing_gaps(gait: xr.Dataset, *names: str) -> list[np.ndarray]:
 def gait_panels(gait: xr.Dataset) -> Figure:
     """Return a figure of angle, leg lengths, load share, foot height and ground forces (Fig. 6).
 
-    Gray bands are double support, and dotted lines are collision II. With unilateral contact the
+    Gray bands mark double support, and dotted lines mark collision II. With unilateral contact the
     panels show angle, leg lengths, contact modes, foot heights, normal and tangential forces.
 
     Args:
@@ -177,8 +175,8 @@ def gait_panels(gait: xr.Dataset) -> Figure:
 def sticks(gait: xr.Dataset, interval: float = 0.05) -> Figure:
     """Return a stick diagram in the X-Z plane (Fig. 7); Leg 1 is solid and Leg 2 dotted.
 
-    With unilateral contact the feet have the colors of their contact modes, in place of the colors
-    of the phases, and other legs on the ground are drawn too.
+    With unilateral contact the feet have the colors of their contact modes instead of the phases,
+    and all other legs on the ground are also drawn.
 
     Args:
         gait: dataset of `vrw.simulate` with any model.
@@ -195,8 +193,8 @@ def sticks(gait: xr.Dataset, interval: float = 0.05) -> Figure:
     check_positive("interval", interval)
     figure = Figure(figsize=(PAGE_FIGURE_WIDTH_INCHES, 2.8))
     axes = figure.subplots()
-    draw_sticks = draw_contact_sticks if reports_contact_modes(gait) else _draw_phase_sticks
-    draw_sticks(axes, gait, interval)
+    stick_drawer = draw_contact_sticks if reports_contact_modes(gait) else _draw_phase_sticks
+    stick_drawer(axes, gait, interval)
     axes.plot(gait.hub_x, gait.hub_z, color=LEG_2_COLOR, linewidth=1.0)
     axes.axhline(0.0, color="black", linewidth=0.8, zorder=1)
     last_hub_x = float(gait.hub_x[-1])
@@ -242,7 +240,7 @@ GAIT_LINE_STYLES = ("-", "--", (0, (4, 1, 1, 1)), ":")
 
 
 def _format_gait_label(gait: xr.Dataset, varied_parameter: str) -> str:
-    """Return the label of a gait by its varied parameter, as in "c = 50 N·s/m"."""
+    """Return the label of a gait by its varied parameter, such as "c = 50 N·s/m"."""
     return format_value_label(varied_parameter, gait.attrs[f"parameter_{varied_parameter}"])
 
 
@@ -345,14 +343,14 @@ def rear_force(gaits: Sequence[xr.Dataset], vary: str = "damping") -> Figure:
 def indicators(gaits: xr.Dataset, every: int = 4) -> Figure:
     """Return a figure of the DLS indicators of period-1 gaits with λ2⁺ >= 0 (Fig. 10).
 
-    Symbols are filled if foot 2 stays clear of the ground, and open if it scuffs.
+    Symbols are filled if foot 2 stays above the ground, and open if foot 2 scuffs.
 
     Args:
         gaits: dataset over one parameter, with `settled`, `lambda_I4` (N s), `lambda_2_plus` and
             `lambda_4_plus` (N), `clearance_sls1` and `clearance_sls2` (m). Its attribute
             `parameter_slope` is the slope in rad.
-        every: parameter values that are multiples of it have symbols, as have the first and the
-            last.
+        every: symbols are drawn at parameter values that are multiples of this number, and at the
+            first and the last value.
 
     Returns:
         Figure: the impulse and the two forces over the parameter.
@@ -432,7 +430,8 @@ def _rotate_to_gravity_frame(
     x: PointCoordinates, z: PointCoordinates, slope: float
 ) -> tuple[PointCoordinates, PointCoordinates]:
     """Return coordinates in a frame with vertical gravity, m, from coordinates in the slope's
-    frame."""
+    frame.
+    """
     return (
         x * np.cos(slope) + z * np.sin(slope),
         z * np.cos(slope) - x * np.sin(slope),
@@ -500,30 +499,32 @@ def walk_frames(
 def _draw_wheel_at_time(
     axes: Axes, foot_motion: HubAndFootMotion, time: float, slope: float
 ) -> int:
-    """Draw hub, legs, feet and forces at a time in s, and return the index of the sample of the
-    contact modes."""
+    """Draw hub, legs, feet and forces at a time in s.
+
+    Return the index of the sample whose contact modes are drawn.
+    """
     hub_position, foot_positions, sample_index = foot_motion.interpolate_at_time(time)
-    rotate_to_view = lambda slope_points: np.array(
+    view_rotation = lambda slope_points: np.array(
         _rotate_to_gravity_frame(slope_points[..., 0], slope_points[..., 1], slope)
     )
     for leg_number, foot_position in enumerate(foot_positions, 1):
         axes.plot(
-            *rotate_to_view(np.stack([hub_position, foot_position])),
+            *view_rotation(np.stack([hub_position, foot_position])),
             color=select_leg_color(leg_number),
             linewidth=3.0 if leg_number < 3 else 1.5,
             solid_capstyle="round",
             zorder=5 if leg_number < 3 else 3,
         )
-    axes.plot(*rotate_to_view(hub_position), "o", color="black", markersize=9, zorder=6)
-    draw_feet(axes, rotate_to_view(foot_positions), foot_motion.contact_modes[sample_index], 6.0)
+    axes.plot(*view_rotation(hub_position), "o", color="black", markersize=9, zorder=6)
+    draw_feet(axes, view_rotation(foot_positions), foot_motion.contact_modes[sample_index], 6.0)
     for foot_position, foot_force in zip(
         foot_positions, foot_motion.foot_forces[sample_index], strict=True
     ):
         if foot_force[1] != 0.0:
             axes.annotate(
                 "",
-                tuple(rotate_to_view(foot_position + foot_force / 300.0)),
-                tuple(rotate_to_view(foot_position)),
+                tuple(view_rotation(foot_position + foot_force / 300.0)),
+                tuple(view_rotation(foot_position)),
                 zorder=7,
                 arrowprops={"arrowstyle": "-|>", "linewidth": 1.2, "color": "black"},
             )

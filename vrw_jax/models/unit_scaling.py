@@ -49,19 +49,14 @@ class UnitScalingPowers(NamedTuple):
         return scaled_output
 
 
-def _make_unit_scaling(unit_index: int) -> UnitScalingPowers:
-    """Return the powers of one unit in inputs and outputs. The index is 0 for length, 1 for time
-    and 2 for mass.
-    """
-    input_and_output_powers = (
-        tuple(UNIT_POWERS[unit_name][unit_index] for unit_name in unit_names)
-        for unit_names in (_STEP_INPUT_UNITS, (*_SECTION_STATE_UNITS, "s", "s", "s"))
-    )
-    return UnitScalingPowers(*input_and_output_powers)
-
-
 LENGTH_UNIT_SCALING, TIME_UNIT_SCALING, MASS_UNIT_SCALING = (
-    _make_unit_scaling(unit) for unit in range(3)
+    UnitScalingPowers(
+        *(
+            tuple(UNIT_POWERS[unit_name][unit_index] for unit_name in unit_names)
+            for unit_names in (_STEP_INPUT_UNITS, (*_SECTION_STATE_UNITS, "s", "s", "s"))
+        )
+    )
+    for unit_index in range(3)
 )
 UNIT_SCALING_BY_PARAMETER_INDEX = {
     PARAMETER_NAMES.index("gravity"): TIME_UNIT_SCALING,

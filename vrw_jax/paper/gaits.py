@@ -1,9 +1,9 @@
 """Gaits that a wheel reaches by walking, also along a parameter from one gait to the next.
 
-No equation is solved for a fixed point. Every gait here is the limit of a walk, so the gait is
-stable and tests the Newton search independently. The model continues formally if the ground would
-have to pull on Leg 1, and if a foot scuffs. Gaits can therefore be continued past the damping at
-which λ2⁺ vanishes. All other gaits are the same as without this continuation.
+Every gait of this module is the limit of a walk, without Newton's method for a fixed point. The
+gaits are therefore stable, and they test the Newton search independently. The model continues
+formally if the ground would have to pull on Leg 1, and if a foot scuffs. Gaits can therefore be
+continued past the damping at which λ2⁺ vanishes. Formal continuation does not change other gaits.
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ class SettlingOptions:
       round-off in 30 steps;
     - `max_state_change`: largest change of the section state per step in a settled gait, chosen as
       ten times the error of a step at the default options;
-    - `n_settled_steps`: number of last steps that must change less than this, chosen because a gait
-      of longer period may repeat once by chance.
+    - `n_settled_steps`: number of last steps whose change must be below `max_state_change`, chosen
+      because a gait of longer period may repeat once by chance.
     """
 
     n_steps: int = 30
@@ -60,7 +60,7 @@ def make_formally_continued_model() -> ViscoelasticWheel:
 def replace_wheel_parameter(
     params: WheelParams, parameter_name: str, parameter_value: float
 ) -> WheelParams:
-    """Return the wheel with another value of one parameter."""
+    """Return the wheel with a new value of one parameter."""
     replaced_fields: dict[str, Any] = {parameter_name: parameter_value}
     return dataclasses.replace(params, **replaced_fields)
 

@@ -1,6 +1,6 @@
 """Reproduction of the paper: its figures, and the table of its published and computed facts.
 
-All gaits are limits of walks from one start; no equation is solved for a fixed point.
+All gaits are limits of walks from one start, without Newton's method for a fixed point.
 """
 
 import math
@@ -24,7 +24,7 @@ from vrw_jax.paper.gaits import (
 from vrw_jax.simulation import paper_start, simulate
 from vrw_jax.wheel import WheelParams
 
-ReportReproductionProgress = Callable[[float, str], None]
+ReproductionProgressCallback = Callable[[float, str], None]
 """Function that is called with the completed fraction, 0 to 1, and the name of the present task."""
 
 FIGURE_8_AND_9_DAMPINGS = (50.0, 100.0, 200.0)
@@ -32,7 +32,7 @@ FIGURE_8_AND_9_DAMPINGS = (50.0, 100.0, 200.0)
 
 
 def ignore_progress(completed_fraction: float, task_name: str) -> None:
-    """Accept a report of progress and do nothing."""
+    """Accept a report of progress without any effect."""
 
 
 def walk_into_table_1_gait() -> xr.Dataset:
@@ -76,17 +76,22 @@ def measure_gaits_along_damping(on_progress: Callable[[float], None] | None = No
     """Return the gaits at each integer c from 1 to 219, and the walks up to 224, for figure 10."""
     params = WheelParams()
     start_state = jnp.asarray(walk_into_table_1_gait().section_state.values[-1])
-    lower_gaits = measure_gaits_along_parameter(
+    gaits_below_table_1 = measure_gaits_along_parameter(
         params, "damping", range(200, 0, -1), start_state, on_progress
     )
-    upper_gaits = measure_gaits_along_parameter(params, "damping", range(201, 225), start_state)
+    gaits_above_table_1 = measure_gaits_along_parameter(
+        params, "damping", range(201, 225), start_state
+    )
     return xr.concat(
-        [lower_gaits, upper_gaits], "damping", data_vars="minimal", combine_attrs="override"
+        [gaits_below_table_1, gaits_above_table_1],
+        "damping",
+        data_vars="minimal",
+        combine_attrs="override",
     )
 
 
 def collect_paper_evidence(
-    on_progress: ReportReproductionProgress = ignore_progress,
+    on_progress: ReproductionProgressCallback = ignore_progress,
 ) -> PaperEvidence:
     """Return all walks that the facts and figures use."""
     table_1_wheel = WheelParams()
@@ -102,12 +107,14 @@ def collect_paper_evidence(
 
     on_progress(0.65, "gaits at slope 0.10")
     start_state = jnp.asarray(damping_branch.section_state.sel(damping=100.0).values)
-    slopes = [0.01 * i for i in range(30, 9, -1)]
+    slope_values = [0.01 * i for i in range(30, 9, -1)]
     medium_damping_wheel, gentle_slope_wheel = (
         replace_wheel_parameter(table_1_wheel, "damping", 100.0),
         replace_wheel_parameter(table_1_wheel, "slope", 0.10),
     )
-    slope_branch = measure_gaits_along_parameter(medium_damping_wheel, "slope", slopes, start_state)
+    slope_branch = measure_gaits_along_parameter(
+        medium_damping_wheel, "slope", slope_values, start_state
+    )
     start_state = jnp.asarray(slope_branch.section_state.sel(slope=0.10, method="nearest").values)
     gentle_slope_branch = measure_gaits_along_parameter(
         gentle_slope_wheel, "damping", range(100, 221, 10), start_state
@@ -153,7 +160,7 @@ def write_paper_figures(evidence: PaperEvidence, folder: Path) -> list[Path]:
 
 
 def reproduce_paper(
-    folder: str | Path, on_progress: ReportReproductionProgress = ignore_progress
+    folder: str | Path, on_progress: ReproductionProgressCallback = ignore_progress
 ) -> list[PaperFact]:
     """Write all figures and the table of facts into `folder`, and return the facts.
 

@@ -30,7 +30,7 @@ GaitOutputs = tuple[Array, Array, dict[str, Array]]
 
 
 class EvaluationRequest(NamedTuple):
-    """Measures to compute for each sample, with the wheel, the model and the options."""
+    """Measures that a scan computes for each sample, with the wheel, the model and the options."""
 
     measure_names: tuple[str, ...]
     base_wheel: WheelParams
@@ -44,7 +44,8 @@ class EvaluationRequest(NamedTuple):
 
 
 class CollocationScanEngine:
-    """Scan engine for the paper's model and a fixed set of measures, compiled by the first call.
+    """Scan engine for the paper's model and a fixed set of measures. The first call compiles the
+    engine.
 
     The engine finds each limit cycle with the requested derivatives by collocation. It then takes
     one event-driven step from the cycle, which gives the margins and checks the cycle. Both
@@ -52,8 +53,9 @@ class CollocationScanEngine:
     """
 
     def __init__(self, request: EvaluationRequest, n_threads: int | None = None) -> None:
-        """Initialize the engine; `n_threads` is the number of CPU threads, by default one per
-        core.
+        """Initialize the engine.
+
+        - `n_threads`: number of CPU threads, by default one per core.
         """
         variable_names, base_wheel, wheel_model = (
             request.measure_names,
@@ -83,7 +85,7 @@ class CollocationScanEngine:
                 for requested_derivative in requested_derivatives
             )
         )
-        differentiation_indices = np.asarray(
+        differentiated_parameter_indices = np.asarray(
             [PARAMETER_NAMES.index(measure_name) for measure_name in differentiation_parameters],
             int,
         )
@@ -95,13 +97,13 @@ class CollocationScanEngine:
         def find_cycle_with_derivatives(
             parameter_values: Array,
         ) -> tuple[AbstractCycle, dict[str, Array]]:
-            """Return the limit cycle of one wheel and the requested derivatives by name."""
+            """Return the limit cycle of one wheel, and the requested derivatives by name."""
 
             def find_measures_and_cycle(
-                varied_values: Array,
+                differentiated_values: Array,
             ) -> tuple[dict[str, Array], AbstractCycle]:
                 limit_cycle = gait_finder.find_cycle_from_values(
-                    parameter_values.at[differentiation_indices].set(varied_values)
+                    parameter_values.at[differentiated_parameter_indices].set(differentiated_values)
                 )
                 return limit_cycle.measures(
                     requested_derivative.measure_name
@@ -109,9 +111,11 @@ class CollocationScanEngine:
                 ), limit_cycle
 
             if not requested_derivatives:
-                return find_measures_and_cycle(parameter_values[differentiation_indices])[1], {}
+                return find_measures_and_cycle(parameter_values[differentiated_parameter_indices])[
+                    1
+                ], {}
             measure_jacobian, limit_cycle = jax.jacfwd(find_measures_and_cycle, has_aux=True)(
-                parameter_values[differentiation_indices]
+                parameter_values[differentiated_parameter_indices]
             )
             return limit_cycle, {
                 requested_derivative.variable_name: measure_jacobian[
@@ -121,9 +125,7 @@ class CollocationScanEngine:
             }
 
         def evaluate_cycle(parameter_values: Array) -> GaitOutputs:
-            """Return the outcome, the section state and the measures of the limit cycle of one
-            wheel.
-            """
+            """Return the outcome, the section state and the measures of one wheel's limit cycle."""
             limit_cycle, derivative_values = find_cycle_with_derivatives(parameter_values)
             cycle_measure_names = (
                 *(
@@ -139,12 +141,10 @@ class CollocationScanEngine:
                 limit_cycle.measures(cycle_measure_names) | derivative_values,
             )
 
-        def evaluate_step(
+        def evaluate_confirming_step(
             parameter_values: Array, section_state: Array, step_options: StepOptions
         ) -> GaitOutputs:
-            """Return the outcome, the section state and the measures of one step from the limit
-            cycle.
-            """
+            """Return the outcome, the end state and the measures of one step from a limit cycle."""
             step_result = wheel_model.take_step(
                 make_wheel_from_parameters(parameter_values, base_wheel.n_legs),
                 section_state,
@@ -166,24 +166,28 @@ class CollocationScanEngine:
             )
 
         self._evaluate_cycle_batch: Callable = jax.vmap(evaluate_cycle)
-        self._evaluate_step_batch: Callable = jax.vmap(evaluate_step, in_axes=(0, 0, None))
-        # The repr of a model omits defaults by identity, and pickling does not preserve identity.
+        self._evaluate_step_batch: Callable = jax.vmap(
+            evaluate_confirming_step, in_axes=(0, 0, None)
+        )
+        # The repr of a model omits fields whose value is the default object itself, and a pickled
+        # copy is another object.
         model_identity = (type(wheel_model).__name__, *vars(wheel_model).items())
         self._cache_key = (variable_names, base_wheel.n_legs, model_identity, cycle_options)
         self._free_programs: SimpleQueue[_CompiledDevicePrograms] = SimpleQueue()
         self._n_workers, self._compilation_lock = 0, Lock()
 
     def __call__(self, sample_columns: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-        """Return the results of all samples by variable. `sample_columns` contains the values of
-        each swept parameter, one per sample.
+        """Return the results of all samples by variable.
+
+        - `sample_columns`: value of each swept parameter for each sample.
         """
         parameter_rows = stack_parameter_rows(sample_columns, self._wheel_model, self._base_wheel)
         with self._compilation_lock:
             if not self._n_workers:
                 self._compile_programs()
         parameter_batches = (
-            parameter_rows[first_sample : first_sample + batch_sizes.SCAN_BATCH_SIZE]
-            for first_sample in range(0, len(parameter_rows), batch_sizes.SCAN_BATCH_SIZE)
+            parameter_rows[first_sample_index : first_sample_index + batch_sizes.SCAN_BATCH_SIZE]
+            for first_sample_index in range(0, len(parameter_rows), batch_sizes.SCAN_BATCH_SIZE)
         )
         with ThreadPoolExecutor(self._n_workers) as thread_pool:
             batch_results = list(thread_pool.map(self._evaluate_sample_batch, parameter_batches))
@@ -196,8 +200,9 @@ class CollocationScanEngine:
 
     @with_default_jax_settings  # It runs in a thread of its own.
     def _evaluate_sample_batch(self, parameter_rows: np.ndarray) -> dict[str, np.ndarray]:
-        """Return the results of a batch of samples, which is padded with copies of its first
-        wheel.
+        """Return the results of a batch of samples by variable.
+
+        A small batch is padded with copies of its first wheel.
         """
         padded_parameter_rows = np.concatenate(
             [
@@ -208,11 +213,11 @@ class CollocationScanEngine:
         device_programs = self._free_programs.get()
         try:
             device_parameter_rows = jax.device_put(padded_parameter_rows, device_programs.device)
-            cycle_outcome, cycle_section_state, cycle_measures = device_programs.evaluate_cycle(
+            cycle_outcome, cycle_section_state, cycle_measures = device_programs.cycle_program(
                 device_parameter_rows
             )
             device_options = jax.device_put(self._step_options, device_programs.device)
-            step_outcome, step_end_state, step_measures = device_programs.evaluate_step(
+            step_outcome, step_end_state, step_measures = device_programs.step_program(
                 device_parameter_rows, cycle_section_state, device_options
             )
             confirmed_outcome = confirm_outcome_by_step(
@@ -224,8 +229,9 @@ class CollocationScanEngine:
         return mask_failed_samples(confirmed_outcome, sample_measures)
 
     def _compile_programs(self) -> None:
-        """Compile both functions in parallel for each device. All cores of a CPU use the same
-        programs.
+        """Compile the functions of cycles and of steps in parallel for each device.
+
+        All cores of a CPU use the same programs.
         """
         local_devices = jax.local_devices()
         parameter_dtype = np.dtype(self._base_wheel.damping.dtype)
@@ -237,12 +243,12 @@ class CollocationScanEngine:
         )
         cache_key = self._cache_key
         # Threads have separate settings.
-        compile_with_defaults = with_default_jax_settings(compile_exported_function)
+        compile_function = with_default_jax_settings(compile_exported_function)
         with ThreadPoolExecutor(2) as thread_pool:
             step_arguments = (parameter_rows_shape, section_states_shape, self._step_options)
             step_programs = [
                 thread_pool.submit(
-                    compile_with_defaults,
+                    compile_function,
                     self._evaluate_step_batch,
                     step_arguments,
                     ("step", *cache_key),
@@ -252,7 +258,7 @@ class CollocationScanEngine:
             ]
             cycle_programs = [
                 thread_pool.submit(
-                    compile_with_defaults,
+                    compile_function,
                     self._evaluate_cycle_batch,
                     (parameter_rows_shape,),
                     ("cycle", *cache_key),
@@ -277,8 +283,8 @@ class _CompiledDevicePrograms(NamedTuple):
     """Compiled functions of cycles and steps on one device."""
 
     device: jax.Device
-    evaluate_cycle: Callable
-    evaluate_step: Callable
+    cycle_program: Callable
+    step_program: Callable
 
 
 def count_available_cores() -> int:
@@ -311,8 +317,9 @@ def stack_parameter_rows(
 def mask_failed_samples(
     outcome: np.ndarray, measures_by_name: Mapping[str, Any]
 ) -> dict[str, np.ndarray]:
-    """Return outcome and measures by name. In samples without a gait, a measure is NaN, or -1 if it
-    is an integer.
+    """Return outcomes and measures by name, with failed samples masked.
+
+    In samples without a gait, a measure is NaN, or -1 if it is an integer.
     """
     masked_measures = {
         variable_name: np.array(variable_values)

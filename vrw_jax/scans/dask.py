@@ -49,8 +49,10 @@ workers that have just started are connected by then."""
 
 @contextlib.contextmanager
 def connect_dask_workers(scheduler_address: str) -> Iterator[ChunkExecutor]:
-    """Yield a function that computes chunks on the cluster at `scheduler_address`. The address
-    "local" starts one process per core."""
+    """Yield a function that computes chunks on the cluster at `scheduler_address`.
+
+    The address "local" starts one process per core.
+    """
     try:
         from distributed import Client, LocalCluster
     except ImportError as connection_error:
@@ -59,7 +61,7 @@ def connect_dask_workers(scheduler_address: str) -> Iterator[ChunkExecutor]:
             "run pip install 'vrw-jax[dask]'."
         ) from connection_error
     with contextlib.ExitStack() as exit_stack:
-        exit_stack.enter_context(_hide_cancelled_tasks())
+        exit_stack.enter_context(hide_cancelled_tasks_in_log())
         if scheduler_address == "local":
             local_cluster = LocalCluster(
                 n_workers=count_available_cores(), threads_per_worker=1, dashboard_address=None
@@ -84,8 +86,8 @@ def connect_dask_workers(scheduler_address: str) -> Iterator[ChunkExecutor]:
 
 
 @contextlib.contextmanager
-def _hide_cancelled_tasks() -> Iterator[None]:
-    """Return a context that removes tasks cancelled with a lost scheduler from the log of
+def hide_cancelled_tasks_in_log() -> Iterator[None]:
+    """Return a context that removes cancelled tasks of a lost scheduler from the log of
     distributed.
     """
     client_logger = logging.getLogger("distributed.client")
@@ -102,8 +104,10 @@ def _hide_cancelled_tasks() -> Iterator[None]:
 
 
 def _require_scheduler_response(scheduler_address: str) -> None:
-    """Raise an error unless a scheduler responds at `scheduler_address`. Without this check, a
-    client would wait without limit."""
+    """Raise an error if no scheduler responds at `scheduler_address`.
+
+    Without this check, a client would wait without limit.
+    """
     from dask.utils import parse_timedelta
     from distributed.comm import connect
     from distributed.security import Security
@@ -135,13 +139,15 @@ def _compute_chunks_on_cluster(
     completed_futures: SimpleQueue[Future] = SimpleQueue()
 
     def submit_remaining_chunks() -> None:
-        """Submit chunks until every thread of the cluster has enough of them."""
+        """Submit chunks until every thread of the cluster has `N_QUEUED_CHUNKS_PER_THREAD`
+        chunks.
+        """
         n_free_slots = N_QUEUED_CHUNKS_PER_THREAD * max(
             1, sum(dask_client.nthreads().values())
         ) - len(chunk_index_by_future)
         for chunk_index in itertools.islice(remaining_chunks, max(n_free_slots, 0)):
             sample_columns = scan_plan.design.select_samples(
-                scan_plan.result_layout.get_chunk_region(chunk_index)
+                scan_plan.result_layout.compute_chunk_region(chunk_index)
             )
             chunk_future = dask_client.submit(
                 _compute_chunk_in_worker, pickled_request, sample_columns, pure=False
@@ -159,13 +165,13 @@ def _compute_chunks_on_cluster(
                 )
             with _explain_lost_cluster(scheduler_address):
                 worker_environment, chunk_results = chunk_future.result()
-            environment_difference = describe_settings_difference(
+            environment_difference_text = describe_settings_difference(
                 local_environment, worker_environment
             )
-            if environment_difference:
+            if environment_difference_text:
                 raise ValueError(
                     "a worker computes by other means than this process: "
-                    f"{environment_difference}. "
+                    f"{environment_difference_text}. "
                     "Start the workers from the same installation on machines of one kind."
                 )
             yield chunk_index_by_future.pop(chunk_future), chunk_results
@@ -180,14 +186,14 @@ def _compute_chunks_on_cluster(
 def _wait_for_completed_future(
     dask_client: "Client", scheduler_address: str, completed_futures: "SimpleQueue[Future]"
 ) -> "Future":
-    """Return the next completed future; warn once if the cluster has no workers."""
-    has_warned = False
+    """Return the next completed future, and warn once if the cluster has no workers."""
+    has_issued_warning = False
     while True:
         try:
             return completed_futures.get(timeout=MAX_SECONDS_WITHOUT_RESULT)
         except Empty:
             pass
-        if not has_warned and not dask_client.nthreads():
+        if not has_issued_warning and not dask_client.nthreads():
             warnings.warn(
                 f"the dask cluster at {scheduler_address} has no workers, so that nothing is "
                 f"computed: start "
@@ -196,18 +202,18 @@ def _wait_for_completed_future(
                 "one.",
                 stacklevel=1,
             )
-            has_warned = True
+            has_issued_warning = True
 
 
 @contextlib.contextmanager
 def _explain_lost_cluster(
     scheduler_address: str, *further_loss_errors: type[Exception]
 ) -> Iterator[None]:
-    """Return a context that replaces errors of lost workers or of a lost scheduler by a ValueError
-    with a remedy.
+    """Return a context that replaces errors of lost workers or schedulers by a ValueError with a
+    remedy.
 
-    `further_loss_errors` are exceptions that the context replaces too, because the chunk itself
-    cannot raise them.
+    `further_loss_errors` are additional exceptions that the context replaces, because the
+    computation of a chunk cannot raise them.
     """
     from distributed import CancelledError, KilledWorker
     from distributed.comm import CommClosedError
@@ -242,7 +248,7 @@ def _compute_chunk_in_worker(
 
 @functools.cache
 def _make_worker_engine(pickled_request: bytes) -> SampleEvaluator:
-    """Return the scan engine of a pickled request, which each worker creates once."""
+    """Return the scan engine of a pickled request. Each worker creates the engine once."""
     from distributed import get_worker
 
     return make_scan_engine(pickle.loads(pickled_request), get_worker().state.nthreads)

@@ -42,11 +42,11 @@ class AbstractSampleDesign(abc.ABC):
     values_by_parameter: Mapping[str, np.ndarray]
 
     def __repr__(self) -> str:
-        column_texts = (
+        printed_columns = (
             f"{parameter_name} {format_quantity(parameter_values, '')}"
             for parameter_name, parameter_values in self.values_by_parameter.items()
         )
-        return f"{self.design_kind} of {self.size:,}: {', '.join(column_texts)}"
+        return f"{self.design_kind} of {self.size:,}: {', '.join(printed_columns)}"
 
     @property
     def swept_parameters(self) -> tuple[str, ...]:
@@ -61,27 +61,30 @@ class AbstractSampleDesign(abc.ABC):
     @property
     @abc.abstractmethod
     def dims(self) -> tuple[str, ...]:
-        """Return the names of the axes of a labeled result."""
+        """Return the names of the axes of the labeled result."""
 
     @property
     @abc.abstractmethod
     def shape(self) -> tuple[int, ...]:
-        """Return the lengths of the axes."""
+        """Return the lengths of the axes of the labeled result."""
 
     @abc.abstractmethod
-    def select_samples(self, region: tuple[slice, ...]) -> SampleColumns:
-        """Return the samples of a rectangular region by parameter, flattened with the last axis
-        varying fastest.
+    def select_samples(self, region_of_samples: tuple[slice, ...]) -> SampleColumns:
+        """Return the samples of a rectangular region by parameter.
+
+        The columns are flattened, with the last axis varying fastest.
         """
 
     @abc.abstractmethod
     def make_result_coordinates(self) -> dict[str, tuple[str, np.ndarray]]:
-        """Return the coordinates of a labeled result. For each name they give the axis and the
-        values.
+        """Return axis and numbers of each coordinate of the labeled result, by the coordinate's
+        name.
         """
 
     def describe_design(self) -> dict[str, object]:
-        """Return the identity of the design: kind, names, shape and a digest of all numbers."""
+        """Return the identity of the design: kind, parameter names, shape and a digest of all
+        samples.
+        """
         return {
             "kind": self.design_kind,
             "swept": list(self.swept_parameters),
@@ -91,9 +94,7 @@ class AbstractSampleDesign(abc.ABC):
 
 
 def digest_sample_columns(design_kind: str, values_by_parameter: Mapping[str, np.ndarray]) -> str:
-    """Return the SHA-256 digest of a design's kind, and of the names and values of its
-    parameters.
-    """
+    """Return the SHA-256 digest of a design's kind, parameter names and samples."""
     column_digest = hashlib.sha256(json.dumps([design_kind, *values_by_parameter]).encode())
     for parameter_values in values_by_parameter.values():
         column_digest.update(np.ascontiguousarray(parameter_values, dtype="<f8").tobytes())
@@ -117,11 +118,11 @@ class GridDesign(AbstractSampleDesign):
             len(parameter_values) for parameter_values in self.values_by_parameter.values()
         )
 
-    def select_samples(self, sample_region: tuple[slice, ...]) -> SampleColumns:
+    def select_samples(self, region_of_samples: tuple[slice, ...]) -> SampleColumns:
         axis_columns = [
             parameter_values[axis_region]
             for parameter_values, axis_region in zip(
-                self.values_by_parameter.values(), sample_region, strict=True
+                self.values_by_parameter.values(), region_of_samples, strict=True
             )
         ]
         mesh_columns = np.meshgrid(*axis_columns, indexing="ij")
@@ -139,7 +140,9 @@ class GridDesign(AbstractSampleDesign):
 
 @dataclass(frozen=True, repr=False)
 class SampleListDesign(AbstractSampleDesign):
-    """Design of single samples along the axis `sample`; all parameters may vary together."""
+    """Design of single samples along the axis `sample`, in which all parameters may vary
+    together.
+    """
 
     values_by_parameter: Mapping[str, np.ndarray]
     design_kind: str = "samples"
@@ -152,9 +155,9 @@ class SampleListDesign(AbstractSampleDesign):
     def shape(self) -> tuple[int, ...]:
         return (len(next(iter(self.values_by_parameter.values()))),)
 
-    def select_samples(self, sample_region: tuple[slice, ...]) -> SampleColumns:
+    def select_samples(self, region_of_samples: tuple[slice, ...]) -> SampleColumns:
         return {
-            parameter_name: parameter_values[sample_region[0]]
+            parameter_name: parameter_values[region_of_samples[0]]
             for parameter_name, parameter_values in self.values_by_parameter.items()
         }
 
@@ -166,11 +169,12 @@ class SampleListDesign(AbstractSampleDesign):
         }
 
 
-def _require_mapping_or_keywords(
+def _merge_mapping_and_keywords(
     function_name: str, parameter_mapping: Mapping | None, parameter_keywords: Mapping
 ) -> Mapping:
-    """Return the parameters of a design, given as one mapping or as keywords. Raise a TypeError if
-    both are given.
+    """Return the parameters of a design, given as one mapping or as keywords.
+
+    Raise a TypeError if both are given.
     """
     if parameter_mapping is not None and parameter_keywords:
         raise TypeError(
@@ -182,7 +186,9 @@ def _require_mapping_or_keywords(
 
 
 def _require_sample_count(function_name: str, n_samples: int | None) -> int:
-    """Return the number of samples; raise a TypeError if it is None, because it has no default."""
+    """Return the number of samples, or raise a TypeError if it is None, because it has no
+    default.
+    """
     if n_samples is None:
         raise TypeError(
             f"n is None, but {function_name} needs a number of samples: give n=1024, say."
@@ -195,7 +201,8 @@ def grid(
     /,
     **parameters: Sequence[float] | np.ndarray,
 ) -> GridDesign:
-    """Return the design of every combination of the values, e.g. `grid(damping=..., slope=...)`.
+    """Return the design of every combination of parameter values, such as `grid(damping=...,
+    slope=...)`.
 
     Args:
         values: the values of each parameter, as any sequence of numbers.
@@ -211,9 +218,9 @@ def grid(
         >>> vrw.grid(damping=[100.0, 150.0], slope=np.linspace(0.28, 0.32, 5)).shape
         (2, 5)
     """
-    values = _require_mapping_or_keywords("grid", values, parameters)
+    values = _merge_mapping_and_keywords("grid", values, parameters)
     value_columns = {
-        parameter_name: _to_value_column(parameter_name, parameter_values)
+        parameter_name: _convert_to_value_column(parameter_name, parameter_values)
         for parameter_name, parameter_values in _require_sweepable_parameters(values).items()
     }
     for parameter_name, value_column in value_columns.items():
@@ -233,7 +240,7 @@ def samples(
 ) -> SampleListDesign:
     """Return the design of given samples, e.g. `samples({"damping": [100], "slope": [0.29]})`.
 
-    A sample outside a parameter's domain, or not finite, gets the outcome BAD_INPUT.
+    A sample that is not finite, or outside the domain of a parameter, has the outcome BAD_INPUT.
 
     Args:
         values: the values of each parameter, all of one length.
@@ -249,9 +256,9 @@ def samples(
         >>> vrw.samples({"damping": [100.0, 150.0], "slope": [0.29, 0.30]}).shape
         (2,)
     """
-    values = _require_mapping_or_keywords("samples", values, parameters)
+    values = _merge_mapping_and_keywords("samples", values, parameters)
     value_columns = {
-        parameter_name: _to_value_column(parameter_name, parameter_values)
+        parameter_name: _convert_to_value_column(parameter_name, parameter_values)
         for parameter_name, parameter_values in _require_sweepable_parameters(values).items()
     }
     column_lengths = {
@@ -273,7 +280,7 @@ def sobol(
 ) -> SampleListDesign:
     """Return `n` samples of a scrambled Sobol' sequence.
 
-    The samples are spread most evenly if n is a power of 2.
+    The samples cover the box most evenly if n is a power of 2.
 
     Args:
         ranges: lower and upper bound of each parameter.
@@ -295,15 +302,15 @@ def sobol(
 
     n, ranges = (
         _require_sample_count("sobol", n),
-        _require_mapping_or_keywords("sobol", ranges, parameters),
+        _merge_mapping_and_keywords("sobol", ranges, parameters),
     )
     parameter_names, lower_bounds, upper_bounds, n = _parse_sampling_box(ranges, n)
-    sample_count_exponent = max(int(n - 1).bit_length(), 0)
-    unit_points = qmc.Sobol(len(parameter_names), rng=_make_random_generator(seed)).random_base2(
-        sample_count_exponent
-    )[:n]
+    sample_count_log2 = max(int(n - 1).bit_length(), 0)
+    unit_cube_points = qmc.Sobol(
+        len(parameter_names), rng=_make_random_generator(seed)
+    ).random_base2(sample_count_log2)[:n]
     return _scale_unit_points_to_box(
-        parameter_names, lower_bounds, upper_bounds, unit_points, "sobol"
+        parameter_names, lower_bounds, upper_bounds, unit_cube_points, "sobol"
     )
 
 
@@ -313,7 +320,7 @@ def uniform(
     seed: int = 0,
     **parameters: ParameterRange,
 ) -> SampleListDesign:
-    """Return `n` independent samples, uniformly distributed over the box.
+    """Return `n` independent samples, uniformly distributed between the bounds of the parameters.
 
     Args:
         ranges: lower and upper bound of each parameter.
@@ -333,12 +340,12 @@ def uniform(
     """
     n, ranges = (
         _require_sample_count("uniform", n),
-        _require_mapping_or_keywords("uniform", ranges, parameters),
+        _merge_mapping_and_keywords("uniform", ranges, parameters),
     )
     parameter_names, lower_bounds, upper_bounds, n = _parse_sampling_box(ranges, n)
-    unit_points = _make_random_generator(seed).random((n, len(parameter_names)))
+    unit_cube_points = _make_random_generator(seed).random((n, len(parameter_names)))
     return _scale_unit_points_to_box(
-        parameter_names, lower_bounds, upper_bounds, unit_points, "uniform"
+        parameter_names, lower_bounds, upper_bounds, unit_cube_points, "uniform"
     )
 
 
@@ -350,8 +357,8 @@ def saltelli(
 ) -> SampleListDesign:
     """Return samples for `sobol_indices`: `n` rows of 2 + d samples for d parameters.
 
-    A row holds two independent points of the box, A and B, and copies of A in which one coordinate
-    is taken from B. Samples are ordered A, B, then by parameter.
+    A row contains two independent points of the box, A and B, and copies of A in which one
+    coordinate is that of B. Samples are ordered A, B, then by parameter.
 
     Args:
         ranges: lower and upper bound of each parameter.
@@ -373,7 +380,7 @@ def saltelli(
 
     n, ranges = (
         _require_sample_count("saltelli", n),
-        _require_mapping_or_keywords("saltelli", ranges, parameters),
+        _merge_mapping_and_keywords("saltelli", ranges, parameters),
     )
     parameter_names, lower_bounds, upper_bounds, n = _parse_sampling_box(ranges, n)
     if n & (n - 1):
@@ -382,19 +389,19 @@ def saltelli(
             f"give n = {1 << n.bit_length()}, say."
         )
     n_parameters = len(parameter_names)
-    unit_points = qmc.Sobol(2 * n_parameters, rng=_make_random_generator(seed)).random_base2(
+    unit_cube_points = qmc.Sobol(2 * n_parameters, rng=_make_random_generator(seed)).random_base2(
         n.bit_length() - 1
     )
-    first_points, second_points = unit_points[:, :n_parameters], unit_points[:, n_parameters:]
-    mixed_points = [
-        np.where(np.arange(n_parameters) == parameter_index, second_points, first_points)
+    points_a, points_b = unit_cube_points[:, :n_parameters], unit_cube_points[:, n_parameters:]
+    points_with_swapped_coordinate = [
+        np.where(np.arange(n_parameters) == parameter_index, points_b, points_a)
         for parameter_index in range(n_parameters)
     ]
     return _scale_unit_points_to_box(
         parameter_names,
         lower_bounds,
         upper_bounds,
-        np.concatenate([first_points, second_points, *mixed_points]),
+        np.concatenate([points_a, points_b, *points_with_swapped_coordinate]),
         SALTELLI_DESIGN_KIND,
     )
 
@@ -403,27 +410,28 @@ def _scale_unit_points_to_box(
     parameter_names: list[str],
     lower_bounds: np.ndarray,
     upper_bounds: np.ndarray,
-    unit_points: np.ndarray,
+    unit_cube_points: np.ndarray,
     design_kind: str,
 ) -> SampleListDesign:
-    """Return the design of points of the unit cube, shape (samples, parameters), scaled to the box
-    between the bounds.
+    """Return the design of points of the unit cube, scaled to the box between the bounds.
+
+    The points have the shape (samples, parameters).
     """
-    scaled_points = lower_bounds + (upper_bounds - lower_bounds) * unit_points
+    box_points = lower_bounds + (upper_bounds - lower_bounds) * unit_cube_points
     return SampleListDesign(
-        dict(zip(parameter_names, np.ascontiguousarray(scaled_points.T), strict=True)), design_kind
+        dict(zip(parameter_names, np.ascontiguousarray(box_points.T), strict=True)), design_kind
     )
 
 
 def _make_random_generator(seed: int) -> np.random.Generator:
-    """Return a generator of random numbers; raise an error if the seed is not a whole number."""
+    """Return a generator of random numbers, or raise an error if the seed is not a whole number."""
     return np.random.default_rng(check_int("seed", seed, 0))
 
 
 def _parse_sampling_box(
     ranges: Mapping[str, ParameterRange], n: int
 ) -> tuple[list[str], np.ndarray, np.ndarray, int]:
-    """Return the parameters, their lower and upper bounds, and the checked number of samples."""
+    """Return the parameters, their lower and upper bounds, and the number of samples."""
     n = check_int("n", n)
     if n > MAX_LISTED_SAMPLES:
         raise ValueError(
@@ -439,8 +447,8 @@ def _parse_sampling_box(
 
 
 def _require_sweepable_parameters(values_by_parameter: Mapping[str, object]) -> Mapping:
-    """Return `values_by_parameter`; raise a ValueError if it is empty or has a name that cannot be
-    swept.
+    """Return `values_by_parameter`, or raise a ValueError for an empty mapping or an unknown
+    parameter.
     """
     check_type("the design", values_by_parameter, Mapping, "write {'damping': (100.0, 200.0)}")
     if not values_by_parameter:
@@ -453,9 +461,9 @@ def _require_sweepable_parameters(values_by_parameter: Mapping[str, object]) -> 
     return values_by_parameter
 
 
-def _to_value_column(parameter_name: str, parameter_values: object) -> np.ndarray:
-    """Return the values of one parameter as a vector of floats; raise an error if they are not
-    numbers.
+def _convert_to_value_column(parameter_name: str, parameter_values: object) -> np.ndarray:
+    """Return the values of one parameter as a vector of floats, or raise an error for other
+    values.
     """
     require_untraced_arguments("a design", "use jax.vmap", parameter_values)
     try:

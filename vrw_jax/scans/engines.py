@@ -1,9 +1,9 @@
 """Scan engines for unilateral contact, for the simplest valid model, and for measures to a
 tolerance.
 
-With unilateral contact the result is the gait to which a walk from a slow start converges, or the
-slowest gait of all starts. For the simplest valid model, the paper's model evaluates all samples
-first. The samples that violate a margin are then evaluated with unilateral contact.
+With unilateral contact the engine returns the gait to which a walk from a slow start converges, or
+the slowest gait of all starts. For the simplest valid model, the paper's model evaluates all
+samples first. Samples that violate a margin are then evaluated with unilateral contact.
 """
 
 import dataclasses
@@ -73,13 +73,13 @@ class UnilateralScanEngine:
         self._gait_finder = dataclasses.replace(
             gait_finder, gait_batch_sizes=(batch_sizes.GAIT_READ_BATCH_SIZE,)
         )
-        read_measure = type(gait_finder).read_measure
+        measure_reader = type(gait_finder).read_measure
         self._measure_reader, self._requested_derivatives = (
-            MeasureReader(read_measure, measure_names),
+            MeasureReader(measure_reader, measure_names),
             requested_derivatives,
         )
         self._derivative_reader = MeasureReader(
-            read_measure,
+            measure_reader,
             tuple(
                 dict.fromkeys(
                     requested_derivative.measure_name
@@ -89,8 +89,9 @@ class UnilateralScanEngine:
         )
 
     def __call__(self, sample_columns: SampleColumnMapping) -> VariableColumns:
-        """Return the results of all samples by variable. `sample_columns` contains the values of
-        each swept parameter, one per sample.
+        """Return the results of all samples by variable.
+
+        - `sample_columns`: value of each swept parameter for each sample.
         """
         parameter_rows = stack_parameter_rows(sample_columns, self._wheel_model, self._base_wheel)
         parameter_row_parts = np.array_split(
@@ -98,7 +99,7 @@ class UnilateralScanEngine:
             max(self._n_threads, -(-len(parameter_rows) // batch_sizes.SCAN_TASK_SIZE)),
         )
         first_parameter_rows, *other_parameter_rows = (
-            part_result for part_result in parameter_row_parts if len(part_result)
+            results_of_part for results_of_part in parameter_row_parts if len(results_of_part)
         )
         part_results = [
             self._evaluate_sample_part(first_parameter_rows)
@@ -107,16 +108,18 @@ class UnilateralScanEngine:
             part_results += n_threads.map(self._evaluate_sample_part, other_parameter_rows)
         return {
             variable_name: np.concatenate(
-                [part_result[variable_name] for part_result in part_results]
+                [results_of_part[variable_name] for results_of_part in part_results]
             )
             for variable_name in part_results[0]
         }
 
     @with_default_jax_settings  # It runs in a thread of its own.
     def _evaluate_sample_part(self, parameter_rows: np.ndarray) -> VariableColumns:
-        """Return the results of each sample's gait, to which a walk from a slow start converges."""
-        # Over a period friction balances the weight along the slope; with less friction there is no
-        # gait.
+        """Return the results, by variable, of the gait to which a walk from a slow start
+        converges.
+        """
+        # Over a period friction balances the weight along the slope. Without enough friction no
+        # gait exists.
         friction, slope = parameter_rows[:, -1], parameter_rows[:, PARAMETER_NAMES.index("slope")]
         has_enough_friction = friction >= np.tan(slope)
         gait_results = self._evaluate_gaits(
@@ -134,7 +137,7 @@ class UnilateralScanEngine:
         return mask_failed_samples(sample_outcome, sample_results)
 
     def _evaluate_gaits(self, parameter_rows: np.ndarray) -> VariableColumns:
-        """Return outcome, measures and derivatives of the gaits of some wheels by name, shape
+        """Return outcomes, measures and derivatives of the gaits of some wheels by name, shape
         (wheels,).
         """
         slow_gaits = find_slow_gaits(self._gait_finder, parameter_rows)
@@ -210,8 +213,8 @@ class ModelSelectionScanEngine:
         )
 
     def __call__(self, sample_columns: SampleColumnMapping) -> VariableColumns:
-        """Return the results of all samples by variable, including `model_codes` (the code of the
-        model) and `selection_reasons`.
+        """Return the results of all samples by variable, with `model_codes` and
+        `selection_reasons`.
         """
         n_samples = len(next(iter(sample_columns.values())))
         sample_friction = sample_columns.get(
@@ -225,7 +228,7 @@ class ModelSelectionScanEngine:
                 if variable_name != FRICTION_NAME
             }
         )
-        selection_reasons = self.find_selection_reasons(paper_results, sample_friction)
+        selection_reasons = self.compute_selection_reasons(paper_results, sample_friction)
         model_codes = np.where(
             selection_reasons == 0, ModelCode.VISCOELASTIC, ModelCode.UNILATERAL
         ).astype(np.int8)
@@ -256,7 +259,7 @@ class ModelSelectionScanEngine:
                 ]
         return sample_results | {"rung": model_codes, "reason": selection_reasons}
 
-    def find_selection_reasons(
+    def compute_selection_reasons(
         self, paper_results: VariableColumns, sample_friction: np.ndarray
     ) -> np.ndarray:
         """Return `ModelChoice.reason_code` of each sample, from the margins of its gait with the
@@ -264,7 +267,7 @@ class ModelSelectionScanEngine:
         """
         variable_names = (*MODEL_SELECTION_MARGINS, "outcome")
         selection_reasons = map_in_numpy_batches(
-            _find_selection_reasons,
+            _find_batch_selection_reasons,
             (batch_sizes.GAIT_READ_BATCH_SIZE,),
             {variable_name: paper_results[variable_name] for variable_name in variable_names},
             sample_friction - self._paper_model.friction,
@@ -273,13 +276,13 @@ class ModelSelectionScanEngine:
 
 
 @jax.jit
-def _find_selection_reasons(measures: dict[str, Array], friction_difference: Array) -> Array:
+def _find_batch_selection_reasons(measures: dict[str, Array], friction_difference: Array) -> Array:
     """Return `ModelChoice.reason_code` of a batch of viscoelastic steps."""
     return find_selection_reason(measures, friction_difference)[0]
 
 
 class ToleranceScanEngine:
-    """Scan engine that computes measures to a tolerance; see `vrw.measure_to_tolerance`."""
+    """Scan engine that computes measures to a tolerance. See `vrw.measure_to_tolerance`."""
 
     def __init__(self, request: EvaluationRequest) -> None:
         assert request.error_tolerance is not None
@@ -291,8 +294,9 @@ class ToleranceScanEngine:
         self._error_tolerance = request.error_tolerance
 
     def __call__(self, sample_columns: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-        """Return the results of all samples by variable. `sample_columns` contains the values of
-        each swept parameter, one per sample.
+        """Return the results of all samples by variable.
+
+        - `sample_columns`: value of each swept parameter for each sample.
         """
         *wheel_columns, sample_friction = stack_parameter_rows(
             sample_columns, self._wheel_model, self._base_wheel
@@ -335,13 +339,16 @@ class PassageScanEngine:
             slope_standard_deviation,
         )
         self._passage_measure_names = tuple(
-            name for name in request.measure_names if name in PASSAGE_MEASURES
+            measure_name
+            for measure_name in request.measure_names
+            if measure_name in PASSAGE_MEASURES
         )
         self._gait_engine = gait_engine
 
     def __call__(self, sample_columns: SampleColumnMapping) -> VariableColumns:
-        """Return the results of all samples by variable. `sample_columns` contains the values of
-        each swept parameter, one per sample.
+        """Return the results of all samples by variable.
+
+        - `sample_columns`: value of each swept parameter for each sample.
         """
         sample_results: VariableColumns = dict(self._gait_engine(sample_columns))
         gait_outcomes = sample_results["outcome"]
@@ -363,7 +370,7 @@ class PassageScanEngine:
         )
 
     def _measure_sample_passage(self, swept_values: Mapping[str, float]) -> list[float]:
-        """Return the passage measures of one sample; they are NaN if hardly any step of the walks
+        """Return the passage measures of one sample. They are NaN if hardly any step of the walks
         succeeds.
         """
         wheel_model, params = self._wheel_model, self._base_wheel

@@ -83,9 +83,9 @@ def scan(
     where it stopped and ends with bitwise the same data. A finished scan is only opened, but its
     damaged chunks are computed again, with a warning.
 
-    `model` may be a `UnilateralWheel`, for which each sample walks to its gait. It may be "auto",
-    which gives each sample the simplest valid model and adds the variables `rung` and `reason`.
-    Both accept `friction` as a swept parameter.
+    `model` may be a `UnilateralWheel`, whose gaits are found by walks. `model` may also be "auto",
+    which selects the simplest valid model for each sample and adds the variables `rung` and
+    `reason`. With both models, `friction` may be a swept parameter.
 
     Args:
         design: the samples, from `grid`, `samples`, `sobol`, `uniform` or `saltelli`.
@@ -94,13 +94,13 @@ def scan(
         model: the model; "auto" for the simplest valid model of each sample.
         options: numerical options of the steps that check the gaits.
         cycle_options: numerical options of the gaits.
-        store: folder that holds the result.
+        store: folder that contains the result.
         chunk: number of samples that are written at a time; 4,096 by default.
         on_progress: function that is called with the `ScanProgress` after each chunk.
         dask: address of a dask cluster that computes the chunks, or "local" to start one.
         tol: permitted error of each measure, in its unit, with respect to a `UnilateralWheel`. Each
             sample is computed by the simplest model whose error bound permits it (see
-            `vrw.measure_to_tolerance`). The dataset holds `rung` and the errors, such as
+            `vrw.measure_to_tolerance`). The dataset contains `rung` and the errors, such as
             `speed_error`.
         slope_sd: standard deviation of random slopes, rad, which adds "mean_steps",
             "mean_steps_error" and "failure_probability" to the measures (see `vrw.first_passage`).
@@ -110,8 +110,8 @@ def scan(
         A dataset over the axes of the design.
 
     Raises:
-        TypeError, ValueError: if an argument is invalid, or if the store holds another scan or is
-            locked by another process; the message names the remedy.
+        TypeError, ValueError: if an argument is invalid, or if the store contains another scan or
+            is locked by another process; the message names the remedy.
 
     Examples:
         >>> gaits = vrw.scan(vrw.grid(damping=[150.0, 300.0]), ["speed"])
@@ -138,8 +138,9 @@ def scan(
 
 
 def resolve_executor(dask: str | None) -> contextlib.AbstractContextManager[ChunkExecutor | None]:
-    """Return the context of an executor on a dask cluster, or a context of None if this process
-    computes.
+    """Return the context of an executor on a dask cluster, or a context of None if `dask` is None.
+
+    With None, this process computes the chunks.
     """
     if dask is None:
         return contextlib.nullcontext()
@@ -156,8 +157,9 @@ def run_scan(
     on_progress: ProgressCallback | None = None,
     chunk_executor: ChunkExecutor | None = None,
 ) -> xr.Dataset:
-    """Return the labeled dataset of a scan plan, computed in this process or by
-    `chunk_executor`.
+    """Return the labeled dataset of a scan plan.
+
+    `chunk_executor` computes the chunks, or this process if `chunk_executor` is None.
     """
     if isinstance(store, AbstractResultStore):
         result_store = store
@@ -186,9 +188,11 @@ def _compute_and_write_chunks(
     on_progress: ProgressCallback | None,
     chunk_executor: ChunkExecutor,
 ) -> None:
-    """Compute the missing chunks, write each to the store, and report the progress after each."""
+    """Compute the missing chunks, write each chunk to the store, and report the progress after
+    each.
+    """
     chunk_shapes = {
-        chunk_index: scan_plan.result_layout.get_chunk_sample_shape(chunk_index)
+        chunk_index: scan_plan.result_layout.compute_chunk_sample_shape(chunk_index)
         for chunk_index in missing_chunks
     }
     n_samples, n_samples_done, n_samples_failed = sum(map(math.prod, chunk_shapes.values())), 0, 0
@@ -243,8 +247,8 @@ def _compute_and_write_chunks(
 def _compute_chunks_in_process(
     scan_plan: ScanPlan, missing_chunks: Sequence[int]
 ) -> Iterator[ChunkResult]:
-    """Yield the index and the results of each missing chunk, computed one after another in this
-    process.
+    """Yield the index and the results of each missing chunk. This process computes one after
+    another.
     """
     scan_engine = scan_plan.build_scan_engine()
     for chunk_index in missing_chunks:
@@ -252,15 +256,16 @@ def _compute_chunks_in_process(
             chunk_index,
             scan_engine(
                 scan_plan.design.select_samples(
-                    scan_plan.result_layout.get_chunk_region(chunk_index)
+                    scan_plan.result_layout.compute_chunk_region(chunk_index)
                 )
             ),
         )
 
 
 def open_or_create_store(scan_plan: ScanPlan, store_path: Path) -> ZarrResultStore:
-    """Return the store at `store_path`, created if there is none. Raise a ValueError if the store
-    contains another scan.
+    """Return the store at `store_path`, which is created if it does not exist.
+
+    Raise a ValueError if the store contains another scan.
     """
     zarr_store = find_matching_store(scan_plan, store_path)
     if zarr_store is None:
@@ -291,8 +296,9 @@ def open_or_create_store(scan_plan: ScanPlan, store_path: Path) -> ZarrResultSto
 def find_matching_store(
     scan_plan: ScanPlan, store_path: Path, verifies_files: bool = True
 ) -> ZarrResultStore | None:
-    """Return the store at `store_path`, or None if there is none. Raise a ValueError if the store
-    contains another scan.
+    """Return the store at `store_path`, or None if it does not exist.
+
+    Raise a ValueError if the store contains another scan.
     """
     stored_manifest = read_stored_manifest(store_path)
     if stored_manifest is None:

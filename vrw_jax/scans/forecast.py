@@ -1,4 +1,4 @@
-"""Forecast of the time and memory of a scan, measured on some of its samples."""
+"""Forecast of the time and memory of a scan, from the computation of some of its samples."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ TYPICAL_SCAN_MEMORY_BYTES = 0.5e9
 
 @with_default_jax_settings
 def forecast_scan(scan_plan: ScanPlan, store_path: str | Path | None = None) -> dict[str, str]:
-    """Return sizes, chunks, memory and time of a scan as texts by name, without writing anything.
+    """Return sizes, chunks, memory and time of a scan as texts by name. No file is written.
 
-    Time and memory are measured by computing samples that are spread over the design.
+    Time and memory are measured while samples are computed that are spread over the design.
     """
     result_layout, n_samples = scan_plan.result_layout, scan_plan.design.size
     measure_catalog = select_measure_catalog(
@@ -46,7 +46,7 @@ def forecast_scan(scan_plan: ScanPlan, store_path: str | Path | None = None) -> 
         else existing_store.find_missing_chunks()
     )
     n_samples_left = sum(
-        math.prod(result_layout.get_chunk_sample_shape(chunk_index))
+        math.prod(result_layout.compute_chunk_sample_shape(chunk_index))
         for chunk_index in missing_chunks
     )
     chunk_size = math.prod(result_layout.chunk_shape)
@@ -72,9 +72,9 @@ def forecast_scan(scan_plan: ScanPlan, store_path: str | Path | None = None) -> 
     scan_engine = scan_plan.build_scan_engine()
     start_seconds = perf_counter()
     scan_engine(_select_spread_samples(scan_plan.design, 1))
-    compiled_seconds = perf_counter()
+    compilation_end_seconds = perf_counter()
     scan_engine(_select_spread_samples(scan_plan.design, n_measured_samples))
-    samples_per_second = n_measured_samples / (perf_counter() - compiled_seconds)
+    samples_per_second = n_measured_samples / (perf_counter() - compilation_end_seconds)
     forecast_memory_bytes = (
         _measure_peak_memory_bytes() + chunk_size * 2 * result_layout.bytes_per_sample
     )
@@ -86,7 +86,7 @@ def forecast_scan(scan_plan: ScanPlan, store_path: str | Path | None = None) -> 
         f"{n_samples_left:,} samples at {samples_per_second:,.0f} per "
         f"second on {count_available_cores()} cores, {SCAN_STARTUP_SECONDS:.0f} s to start",
         "measured": f"just now, on {n_measured_samples:,} samples spread over the design; the code "
-        f"for it took {compiled_seconds - start_seconds:.0f} s and is kept",
+        f"for it took {compilation_end_seconds - start_seconds:.0f} s and is kept",
     }
 
 
@@ -107,7 +107,7 @@ def _select_spread_samples(design: AbstractSampleDesign, n_selected_samples: int
 
 
 def _measure_peak_memory_bytes() -> float:
-    """Return the peak memory of this process, in bytes."""
+    """Return the peak memory of this process, bytes."""
     try:
         import resource
     except ImportError:  # Windows has no such module.
@@ -118,15 +118,15 @@ def _measure_peak_memory_bytes() -> float:
 
 def _format_bytes(n_bytes: int | float) -> str:
     """Return a number of bytes as text in B, kB, MB or GB."""
-    for byte_unit in ("B", "kB", "MB"):
+    for unit_of_bytes in ("B", "kB", "MB"):
         if n_bytes < 1000:
-            return f"{n_bytes:.3g} {byte_unit}"
+            return f"{n_bytes:.3g} {unit_of_bytes}"
         n_bytes /= 1000
     return f"{n_bytes:.3g} GB"
 
 
 def format_duration(seconds: float) -> str:
-    """Return a time in seconds as text in s, min or h."""
+    """Return a duration in seconds as text in s, min or h."""
     if seconds < 90:
         return f"{seconds:.0f} s"
     return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"

@@ -3,8 +3,8 @@
 The mark of a chunk is a digest of the scan's settings, the chunk's number and the files of its
 variables. A mark states that the chunk is written, and reveals a damaged, truncated, deleted or
 moved file. The attributes of the group of marks list the scan's variables, so that foreign
-variables are ignored. They also repeat the store's attributes. In stores without that list, a mark
-is a digest of the files alone.
+variables are ignored. The attributes also repeat those of the store. In stores without the list of
+variables, a mark is a digest of the files alone.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ METADATA_FILE_NAME = "zarr.json"
 
 
 def read_scan_manifest(store_attributes: Any) -> dict[str, Any]:
-    """Return the settings with which a store or a labeled result was made."""
+    """Return the settings of the scan that a store or a labeled result contains."""
     stored_manifest = store_attributes.get(MANIFEST_ATTRIBUTE, {})
     return (
         json.loads(stored_manifest) if isinstance(stored_manifest, str) else dict(stored_manifest)
@@ -61,9 +61,11 @@ def read_scan_manifest(store_attributes: Any) -> dict[str, Any]:
 
 
 def add_attribute_seal(mark_attributes: dict[str, Any]) -> dict[str, Any]:
-    """Return the attributes of the group of marks, with a digest of these attributes added."""
+    """Return the attributes of the group of marks, with a digest of the attributes added."""
     unsealed_attributes = {
-        key: value for key, value in mark_attributes.items() if key != ATTRIBUTE_SEAL_KEY
+        key: attribute_value
+        for key, attribute_value in mark_attributes.items()
+        if key != ATTRIBUTE_SEAL_KEY
     }
     return unsealed_attributes | {
         ATTRIBUTE_SEAL_KEY: _compute_hex_digest(
@@ -73,7 +75,9 @@ def add_attribute_seal(mark_attributes: dict[str, Any]) -> dict[str, Any]:
 
 
 def digest_coordinate_values(coordinate_values: np.ndarray) -> str:
-    """Return the digest of a coordinate's type, shape and values as hexadecimal text."""
+    """Return the digest of the type, the shape and the values of a coordinate as hexadecimal
+    text.
+    """
     return _compute_hex_digest(
         f"{coordinate_values.dtype.str} {coordinate_values.shape} ".encode()
         + coordinate_values.tobytes()
@@ -90,8 +94,9 @@ def read_metadata_file(metadata_path: Path) -> dict[str, Any]:
 
 
 class StoredMetadata:
-    """Metadata of a store, of which two copies exist: a file for each array, and one file for all
-    arrays."""
+    """Metadata of a store, which has two copies: a file for each array, and one file for all
+    arrays.
+    """
 
     def __init__(self, store_path: Path) -> None:
         self._store_path, self.root_metadata = (
@@ -107,17 +112,20 @@ class StoredMetadata:
             consolidated_arrays if isinstance(consolidated_arrays, dict) else {}
         )
         """Metadata of all arrays and groups by name, from the one file for all."""
+        group_metadata_copies = (
+            self.consolidated_metadata.get(CHECKSUM_GROUP_NAME),
+            self._read_array_metadata(CHECKSUM_GROUP_NAME),
+        )
         attribute_copies = [
-            _get_metadata_attributes(group_metadata)
-            for group_metadata in (
-                self.consolidated_metadata.get(CHECKSUM_GROUP_NAME),
-                self._read_array_metadata(CHECKSUM_GROUP_NAME),
-            )
+            group_metadata.get("attributes")
+            for group_metadata in group_metadata_copies
+            if isinstance(group_metadata, dict)
         ]
         usable_copies = [
             attribute_copy
             for attribute_copy in attribute_copies
-            if isinstance(attribute_copy.get(SCAN_VARIABLES_KEY), list)
+            if isinstance(attribute_copy, dict)
+            and isinstance(attribute_copy.get(SCAN_VARIABLES_KEY), list)
         ]
         intact_copies = (
             attribute_copy
@@ -146,7 +154,7 @@ class StoredMetadata:
         )
 
     def select_scan_variables(self, array_names: Iterable[str]) -> list[str]:
-        """Return those arrays among `array_names` that the scan wrote, without coordinates."""
+        """Return the arrays among `array_names` that the scan wrote, without coordinates."""
         if SCAN_VARIABLES_KEY in self.mark_attributes:
             return sorted(self.mark_attributes[SCAN_VARIABLES_KEY])
         stored_manifest = read_scan_manifest(self.store_attributes)
@@ -159,13 +167,13 @@ class StoredMetadata:
             array_name
             for array_name in array_names
             if array_name not in excluded_names
-            and (array_name in measure_names or _is_scan_measure(array_name))
+            and (array_name in measure_names or _is_scan_measure_name(array_name))
         )
 
     def find_damaged_metadata(self) -> list[str]:
-        """Return the names of the arrays whose two copies of metadata differ.
+        """Return the names of the arrays with two different copies of metadata.
 
-        The list contains "attributes" if the attributes of the store differ.
+        The list contains "attributes" if the two copies of the store's attributes differ.
         """
         array_names = [
             array_name
@@ -189,8 +197,8 @@ class StoredMetadata:
             damaged_names.append(CHECKSUM_GROUP_NAME)
         sealed_attributes = self.mark_attributes.get(STORE_ATTRIBUTES_KEY, {})
         if any(
-            self._root_attributes.get(key, value) != value
-            for key, value in sealed_attributes.items()
+            self._root_attributes.get(key, attribute_value) != attribute_value
+            for key, attribute_value in sealed_attributes.items()
         ):
             damaged_names.append("attributes")
         return damaged_names
@@ -222,26 +230,17 @@ class StoredMetadata:
             metadata_path = self._store_path / array_name / METADATA_FILE_NAME
             if read_metadata_file(metadata_path) != array_metadata:
                 metadata_path.parent.mkdir(parents=True, exist_ok=True)
-                partial_path = metadata_path.with_name(f"{METADATA_FILE_NAME}.partial")
-                partial_path.write_text(json.dumps(array_metadata, indent=2), encoding="utf-8")
-                partial_path.replace(metadata_path)
+                temporary_path = metadata_path.with_name(f"{METADATA_FILE_NAME}.partial")
+                temporary_path.write_text(json.dumps(array_metadata, indent=2), encoding="utf-8")
+                temporary_path.replace(metadata_path)
 
     def _read_array_metadata(self, array_name: str) -> dict[str, Any]:
-        """Return the metadata of one array or group from its separate file."""
+        """Return the metadata of one array or group from the array's separate file."""
         return read_metadata_file(self._store_path / array_name / METADATA_FILE_NAME)
 
 
-def _get_metadata_attributes(array_metadata: object) -> dict[str, Any]:
-    """Return the attributes in the metadata of an array or group, or an empty dictionary if there
-    are none."""
-    metadata_attributes = (
-        array_metadata.get("attributes") if isinstance(array_metadata, dict) else None
-    )
-    return metadata_attributes if isinstance(metadata_attributes, dict) else {}
-
-
-def _is_scan_measure(variable_name: str) -> bool:
-    """Return whether a variable with this name is a measure of a scan."""
+def _is_scan_measure_name(variable_name: str) -> bool:
+    """Return whether `variable_name` is the name of a measure of a scan."""
     try:
         return parse_derivative(variable_name) is None and bool(
             get_variable_attributes(variable_name)
@@ -256,7 +255,7 @@ def _compute_hex_digest(digested_bytes: bytes) -> str:
 
 
 class ChunkChecksums:
-    """Marks of the chunks of a store, and their comparison with the files."""
+    """Marks of the chunks of a store, and the comparison of marks with files."""
 
     def __init__(
         self, store_path: Path, zarr_group: ZarrGroup, stored_metadata: StoredMetadata
@@ -293,7 +292,7 @@ class ChunkChecksums:
     def _read_chunk_marks(self) -> np.ndarray:
         """Return the marks of all chunks, shape (chunks, bytes of a mark).
 
-        A mark that cannot be read gets the value 255, so that its chunk counts as damaged.
+        A mark that cannot be read is replaced by bytes of 255, so that its chunk counts as damaged.
         """
         try:
             return np.asarray(self._chunk_marks[:])
@@ -311,7 +310,7 @@ class ChunkChecksums:
         ]
 
     def find_damaged_chunks(self) -> list[int]:
-        """Return the indices of marked chunks whose files differ from those that were written.
+        """Return the indices of marked chunks whose files differ from the written files.
 
         The marks are read once, before any file, because a running scan marks a chunk after it has
         written the files.
@@ -327,7 +326,7 @@ class ChunkChecksums:
         ]
 
     def find_damaged_coordinates(self) -> list[str]:
-        """Return the names of coordinates whose values differ from those that were written.
+        """Return the names of coordinates whose values differ from the written values.
 
         In stores without a digest of each coordinate, return the swept parameters if their values
         differ from those of the samples.
@@ -360,7 +359,7 @@ class ChunkChecksums:
         return [] if are_coordinates_intact else list(design_settings["swept"])
 
     def _digest_stored_coordinate(self, coordinate_name: str) -> str:
-        """Return the digest of a coordinate's values, or "" if the values cannot be read."""
+        """Return the digest of the values of a coordinate, or "" if the values cannot be read."""
         try:
             return digest_coordinate_values(np.asarray(self._zarr_group[coordinate_name][:]))
         except (KeyError, *ZARR_READ_ERRORS):
@@ -401,7 +400,7 @@ def describe_store_damage(
     damaged_coordinates: list[str],
     damaged_metadata: list[str],
 ) -> str:
-    """Return a sentence that describes the damage of a store, or "" if there is none."""
+    """Return a sentence that describes the damage of a store, or "" for an intact store."""
     damage_texts = []
     if damaged_chunks:
         chunks_text = ", ".join(map(str, damaged_chunks[:10])) + (
@@ -420,8 +419,10 @@ def describe_store_damage(
 
 @contextlib.contextmanager
 def lock_store(store_path: Path) -> Iterator[None]:
-    """Return a context that holds the lock of a store. Raise a ValueError if another scan holds the
-    lock."""
+    """Return a context that holds the lock of a store.
+
+    Raise a ValueError if another scan holds the lock.
+    """
     try:
         import fcntl
         import os

@@ -1,4 +1,4 @@
-"""Measures that a scan can compute: those of the steady gait, and their derivatives, by name."""
+"""Measures that a scan can compute, by name: measures of the steady gait, and their derivatives."""
 
 import re
 from collections.abc import Iterable
@@ -107,10 +107,10 @@ def select_measure_catalog(
     error_tolerance: float | None = None,
     slope_standard_deviation: float | None = None,
 ) -> MeasureCatalog:
-    """Return the catalog of a model, or the catalog of scans to a tolerance if `error_tolerance` is
-    given.
+    """Return the catalog of the measures that a scan of one model can compute.
 
-    If `slope_standard_deviation` is given, the catalog also contains measures of walks over random
+    If `error_tolerance` is given, the catalog is that of scans to a tolerance. If
+    `slope_standard_deviation` is given, the catalog also contains measures of walks over random
     slopes.
     """
     if error_tolerance is not None:
@@ -124,8 +124,9 @@ def select_measure_catalog(
 
 
 def add_passage_measures(measure_catalog: MeasureCatalog) -> MeasureCatalog:
-    """Return a catalog extended by measures of walks over random slopes, which take a second per
-    sample.
+    """Return a catalog that also contains the measures of walks over random slopes.
+
+    The measures of such walks take a second per sample.
     """
     return measure_catalog._replace(
         requestable_measures=(*measure_catalog.requestable_measures, *PASSAGE_MEASURES),
@@ -173,14 +174,17 @@ class MeasureDerivative(NamedTuple):
 
 
 def parse_derivative(variable_name: str) -> MeasureDerivative | None:
-    """Return the derivative named as in 'd dls_fraction / d damping', or None for a measure."""
+    """Return the derivative that a name such as 'd dls_fraction / d damping' denotes, otherwise
+    None.
+    """
     name_match = _DERIVATIVE_NAME_PATTERN.fullmatch(variable_name.strip())
     return MeasureDerivative(*name_match.groups()) if name_match else None
 
 
 def canonicalize_variable_name(measure_name: str) -> str:
-    """Return the name of the variable that contains the requested measure. The name is valid as a
-    file name.
+    """Return the name of the variable that contains the requested measure.
+
+    The name of the variable is valid as a file name.
     """
     requested_derivative = parse_derivative(measure_name)
     return (
@@ -191,10 +195,9 @@ def canonicalize_variable_name(measure_name: str) -> str:
 def check_measure_names(
     measure_names: Iterable[str], measure_catalog: MeasureCatalog
 ) -> tuple[str, ...]:
-    """Return the names of the requested variables, each once, without the variables that every scan
-    contains.
+    """Return the names of the requested variables, each once.
 
-    Raise a ValueError for an unknown name.
+    Variables that every scan contains are omitted. Raise a ValueError for an unknown name.
     """
     checked_names: dict[str, None] = {}
     known_names = (

@@ -56,10 +56,10 @@ N_PASSAGE_SAMPLES_PER_CHUNK = 16
 is chosen because each sample takes a second or more."""
 
 
-STORED_CLASS_NAMES = {"StepOptions": "Options"}
+STORED_NAME_BY_CLASS = {"StepOptions": "Options"}
 """Names of classes in stores, by name in Python, if the two names differ."""
 
-STORED_FIELD_NAMES = {
+STORED_NAMES_BY_FIELD_OF_CLASS = {
     "StepOptions": {
         "dt0": "first_step",
         "max_event_iterations": "event_steps",
@@ -77,7 +77,7 @@ STORED_FIELD_NAMES = {
 }
 """Names of fields in stores, by class and name in Python, if the two names differ."""
 
-STORED_MODEL_NAMES = {
+STORED_NAME_BY_MODEL_FIELD = {
     "model_name": "rung",
     "reports_contacts": "tells_contacts",
     "batch_kernel": "lanes",
@@ -99,18 +99,18 @@ order.
 
 @dataclass(frozen=True)
 class ScanPlan:
-    """Checked arguments and layout of a scan."""
+    """Checked arguments of a scan, and the layout of its result."""
 
     design: AbstractSampleDesign
     evaluation_request: EvaluationRequest
     result_layout: ResultLayout
     requested_measures: tuple[str, ...]  # names of the requested measures, as the caller gave them
-    config_text: str
+    config_file_text: str
 
     @property
     def scan_settings(self) -> dict[str, object]:
-        """Return the settings that a store must have so that this scan can continue in the
-        store.
+        """Return the settings that identify the scan. A store must contain the same settings to
+        continue.
         """
         (
             measure_names,
@@ -134,9 +134,9 @@ class ScanPlan:
             }
             | {"n_legs": base_wheel.n_legs},
             "measures": list(measure_names),
-            "model": _record_settings(wheel_model),
-            "options": _record_settings(step_options),
-            "cycle_options": _record_settings(cycle_options),
+            "model": _convert_settings_to_json(wheel_model),
+            "options": _convert_settings_to_json(step_options),
+            "cycle_options": _convert_settings_to_json(cycle_options),
             "dtype": str(base_wheel.damping.dtype),
             "chunk": list(self.result_layout.chunk_shape),
         } | {
@@ -158,7 +158,7 @@ class ScanPlan:
             MANIFEST_ATTRIBUTE: json.dumps(self.scan_settings),  # Other formats have no tables.
             PROVENANCE_ATTRIBUTE: json.dumps(describe_computing_environment()),
             REQUESTED_MEASURES_ATTRIBUTE: ", ".join(self.requested_measures),
-            "config": self.config_text,
+            "config": self.config_file_text,
         }
 
     def build_scan_engine(self) -> SampleEvaluator:
@@ -179,7 +179,7 @@ def plan_scan(
     tol: float | None = None,
     slope_sd: float | None = None,
 ) -> ScanPlan:
-    """Return the checked plan of a scan, with the layout of its result; nothing is computed."""
+    """Return the checked plan of a scan, with the layout of its result. No gait is computed."""
     if not isinstance(design, AbstractSampleDesign):
         raise TypeError(
             f"design is a {type(design).__name__}, but it must say which samples: write "
@@ -211,7 +211,7 @@ def plan_scan(
             "the design sweeps friction, which does not affect the paper's wheel: give "
             f"model={describe_accepted_models('scan', FRICTION_NAME)}."
         )
-    tol = None if tol is None else _check_tolerance_of_model(model, check_positive("tol", tol))
+    tol = None if tol is None else _require_reference_model(model, check_positive("tol", tol))
     if slope_sd is not None:
         slope_sd = check_positive("slope_sd", slope_sd)
         if tol is not None:
@@ -245,8 +245,10 @@ def plan_scan(
     return ScanPlan(design, evaluation_request, result_layout, requested_measures, config_text)
 
 
-def _check_tolerance_of_model(wheel_model: AbstractWheel, error_tolerance: float) -> float:
-    """Return the tolerance of errors; raise a ValueError if no tolerance can refer to the model."""
+def _require_reference_model(wheel_model: AbstractWheel, error_tolerance: float) -> float:
+    """Return the tolerance of errors, or raise a ValueError if the model cannot be their
+    reference.
+    """
     model_fields: dict[str, Any] = type(wheel_model).__dataclass_fields__
     default_only_fields = wheel_model.capabilities.fixed_by_tolerance
     if default_only_fields is None or any(
@@ -287,7 +289,7 @@ digits."""
 
 
 def describe_settings_difference(stored_settings: object, current_settings: object) -> str:
-    """Return a sentence about the first setting that differs, or an empty string."""
+    """Return a sentence about the first setting that differs, or "" if no setting differs."""
     setting_name, stored_value, current_value = find_first_settings_difference(
         stored_settings, current_settings
     )
@@ -306,8 +308,9 @@ def _make_result_layout(
     base_wheel: WheelParams,
     chunk_size: int,
 ) -> ResultLayout:
-    """Return the layout of the variables of a result over a design, in chunks of at most
-    `chunk_size` samples.
+    """Return the layout of the variables of a result over a design.
+
+    - `chunk_size`: largest number of samples in a chunk.
     """
     parameter_dtype = str(base_wheel.damping.dtype)
     locked_legs = make_locked_leg_coordinate(base_wheel.n_legs)
@@ -355,19 +358,21 @@ def _make_result_layout(
     )
 
 
-def _record_settings(settings_object: object) -> dict[str, object]:
-    """Return the class name and the fields of an object as values of JSON."""
+def _convert_settings_to_json(settings_object: object) -> dict[str, object]:
+    """Return the class name and the fields of an object as JSON values."""
     class_name = type(settings_object).__name__
-    field_record: dict[str, object] = {"kind": STORED_CLASS_NAMES.get(class_name, class_name)}
-    stored_names = STORED_MODEL_NAMES | STORED_FIELD_NAMES.get(class_name, {})
+    field_value_by_name: dict[str, object] = {
+        "kind": STORED_NAME_BY_CLASS.get(class_name, class_name)
+    }
+    stored_names = STORED_NAME_BY_MODEL_FIELD | STORED_NAMES_BY_FIELD_OF_CLASS.get(class_name, {})
     for field_name in type(settings_object).__dataclass_fields__:  # type: ignore[attr-defined]
         field_value = getattr(settings_object, field_name)
         if isinstance(field_value, StepOptions | ModelCapabilities):
             continue  # Options are recorded separately, and capabilities are code.
         if field_value is None or isinstance(field_value, bool | int | str):
-            field_record[stored_names.get(field_name, field_name)] = field_value
+            field_value_by_name[stored_names.get(field_name, field_name)] = field_value
         elif isinstance(field_value, tuple):
-            field_record[stored_names.get(field_name, field_name)] = list(field_value)
+            field_value_by_name[stored_names.get(field_name, field_name)] = list(field_value)
         else:
-            field_record[stored_names.get(field_name, field_name)] = float(field_value)
-    return field_record
+            field_value_by_name[stored_names.get(field_name, field_name)] = float(field_value)
+    return field_value_by_name

@@ -43,17 +43,17 @@ def sobol_indices(
 ) -> xr.Dataset:
     """Return first-order and total Sobol' indices, shape (measure, parameter), dimensionless.
 
-    The first-order index is the share of a measure's variance that one parameter causes by itself.
-    The total index is the share that would vanish if the parameter were known. Each has the bounds
-    `lower_bounds` and `upper_bounds` of a 95 % bootstrap interval.
+    The first-order index is the fraction of a measure's variance that one parameter causes by
+    itself. The total index is the fraction that would vanish if the other parameters were known.
+    Each index has the bounds `lower_bounds` and `upper_bounds` of a 95 % bootstrap interval.
 
-    Rows with a sample without a gait are omitted, and then more rows, so that their number `rows`
-    is a power of two. `left_out` is the share of rows without a gait. If it is not small, the
-    indices are biased: wheels near those without a gait lose more of their rows than other wheels.
-    The indices are then not those of the region with gaits.
+    Rows that contain a sample without a gait are omitted. Further rows are omitted until the number
+    `rows` is a power of two. `left_out` is the fraction of rows that contain a sample without a
+    gait. If `left_out` is not small, the indices are biased: wheels near those without a gait lose
+    more of their rows than other wheels. The indices are then not those of the region with gaits.
 
-    A measure that varies by no more than round-off has no variance: its indices are 0, it is marked
-    in `is_constant_measure`, and a warning names it.
+    If a measure varies only by round-off, its indices are 0. Such a measure is marked in
+    `is_constant_measure`, and a warning names it.
 
     Args:
         scan: dataset of a scan over a `saltelli` design.
@@ -115,19 +115,20 @@ def sobol_indices(
     )
 
     random_generator = np.random.default_rng(0)  # The same scan gives the same intervals.
-    estimate_indices = _SobolIndexEstimator(measure_values, sobol_options.max_roundoff_spread)
-    index_estimates = estimate_indices(np.arange(n_rows))
+    index_estimator = _SobolIndexEstimator(measure_values, sobol_options.max_roundoff_spread)
+    index_estimates = index_estimator(np.arange(n_rows))
     resampled_estimates = [
-        estimate_indices(random_generator.integers(0, n_rows, n_rows))
+        index_estimator(random_generator.integers(0, n_rows, n_rows))
         for _ in range(sobol_options.n_bootstrap_resamples)
     ]
     lower_bounds, upper_bounds = np.quantile(
         resampled_estimates, sobol_options.interval_quantiles, axis=0
     )
-    has_no_variance = estimate_indices.is_constant_measure(measure_values)
-    if has_no_variance.any():
+    is_constant_measure = index_estimator.detect_constant_measures(measure_values)
+    if is_constant_measure.any():
         warnings.warn(
-            f"{', '.join(np.array(measure_names)[has_no_variance])}: constant over these samples "
+            f"{', '.join(np.array(measure_names)[is_constant_measure])}: constant over these "
+            "samples "
             "but for round-off, so that there is no variance to share, and the indices are 0.",
             stacklevel=2,
         )
@@ -136,19 +137,19 @@ def sobol_indices(
         (("first_order", "first-order"), ("total", "total"))
     ):
         index_attributes = {"units": "1", "long_name": f"{index_label} Sobol' index"}
-        for index_suffix, interval_bounds in (
+        for index_suffix, interval_bound_values in (
             ("", index_estimates),
             ("_lower", lower_bounds),
             ("_upper", upper_bounds),
         ):
             index_variables[measure_name + index_suffix] = (
                 ("measure", "parameter"),
-                interval_bounds[i],
+                interval_bound_values[i],
                 index_attributes,
             )
     index_variables["is_constant_measure"] = (
         "measure",
-        has_no_variance,
+        is_constant_measure,
         {"long_name": "varies by round-off alone"},
     )
     return xr.Dataset(
@@ -169,7 +170,7 @@ class _SobolIndexEstimator:
         self.measure_values = measure_values
         self.roundoff_spreads = max_roundoff_spread * np.abs(measure_values).max(axis=(0, 2))
 
-    def is_constant_measure(self, sample_values: np.ndarray) -> np.ndarray:
+    def detect_constant_measures(self, sample_values: np.ndarray) -> np.ndarray:
         """Return whether each measure varies only by round-off between the samples."""
         has_small_spread: np.ndarray = (
             np.ptp(sample_values[:2], axis=(0, 2)) <= self.roundoff_spreads
@@ -178,12 +179,13 @@ class _SobolIndexEstimator:
 
     def __call__(self, row_indices: np.ndarray) -> np.ndarray:
         """Return the indices from the rows with `row_indices`, shape (2, measures, parameters).
+
         Indices of constant measures are 0.
         """
         from scipy.stats import sobol_indices as compute_sobol_indices
 
         resampled_values = self.measure_values[..., row_indices]
-        varying_measures = np.flatnonzero(~self.is_constant_measure(resampled_values))
+        varying_measures = np.flatnonzero(~self.detect_constant_measures(resampled_values))
         n_samples_per_row, n_measures, _ = resampled_values.shape
         index_estimates = np.zeros((2, n_measures, n_samples_per_row - 2))
         if len(varying_measures):
@@ -193,11 +195,11 @@ class _SobolIndexEstimator:
                 "f_B": resampled_values[1],
                 "f_AB": resampled_values[2:],
             }
-            scipy_estimate = compute_sobol_indices(func=measure_functions, n=len(row_indices))
+            scipy_result = compute_sobol_indices(func=measure_functions, n=len(row_indices))
             index_estimates[0, varying_measures] = np.reshape(
-                scipy_estimate.first_order, (len(varying_measures), -1)
+                scipy_result.first_order, (len(varying_measures), -1)
             )
             index_estimates[1, varying_measures] = np.reshape(
-                scipy_estimate.total_order, (len(varying_measures), -1)
+                scipy_result.total_order, (len(varying_measures), -1)
             )
         return index_estimates

@@ -43,7 +43,9 @@ class SpecialPointMap(NamedTuple):
 
     @property
     def ending(self) -> str:
-        """Return the number of changes between samples that no curve explains, as a sentence."""
+        """Return a sentence with the number of sign changes between samples that no curve
+        explains.
+        """
         n_changes = len(self.unexplained_changes)
         return f"{n_changes} changes of sign between neighboring samples have no curve nearby."
 
@@ -79,9 +81,9 @@ def map_special_points(
 ) -> SpecialPointMap:
     """Scan a grid over two parameters, and follow all special points of its gaits.
 
-    It is the function behind `vrw map`. Curves start on branches across the grid. If a quantity has
-    different signs at neighboring samples and no curve runs between them, branches through these
-    samples are searched for further curves.
+    The command `vrw map` calls this function. Curves start on branches across the grid. If a
+    quantity has different signs at neighboring samples and no curve runs between these samples,
+    branches through the samples are searched for further curves.
 
     Args:
         design: a `vrw.grid` over two parameters with ascending values.
@@ -89,7 +91,7 @@ def map_special_points(
         base: the wheel whose parameters are not swept; Table 1 by default.
         model: a `ViscoelasticWheel`, which is the default.
         options: numerical options of the steps that check the gaits of the scan.
-        store: folder that holds the scan.
+        store: folder that contains the scan.
         on_progress: function that is called with the `ScanProgress` after each chunk.
         on_stage: function that is called with a description of each stage after the scan.
 
@@ -136,8 +138,10 @@ def follow_special_points(
     wheel_model: Any,
     on_stage: Callable[[str], None] | None = None,
 ) -> SpecialPointMap:
-    """Return the map of special points over the two parameters of a scan, which must contain the
-    measures of special points."""
+    """Return the map of special points over the two parameters of a scan.
+
+    The scan must contain the measures of special points.
+    """
     if not np.any(scanned_samples.outcome.values == Outcome.STEPPED):
         raise ValueError("no gait was found on the grid: choose another.")
     return SpecialPointMap(
@@ -146,7 +150,7 @@ def follow_special_points(
 
 
 def require_map_grid(design: AbstractSampleDesign) -> None:
-    """Raise a ValueError unless the design is a grid over two parameters with ascending values."""
+    """Raise a ValueError if the design is not a grid over two parameters with ascending values."""
     if len(design.shape) != 2:
         raise ValueError(
             f"the design sweeps {', '.join(design.swept_parameters)}, but a map is a grid over two "

@@ -1,10 +1,10 @@
 """Storage of a scan's results: in memory, or in a Zarr store that survives a killed process.
 
 A store is a Zarr group with one array per variable, divided into the scan's chunks, so that
-`xarray.open_zarr` reads it. It is built in a temporary folder and then renamed. The data of a chunk
-is written before its mark, which is a digest of the data (see `integrity`). Every file is written
-under a temporary name and renamed. Whenever the process dies, a chunk is therefore either marked
-and complete, or it is computed again.
+`xarray.open_zarr` reads it. The store is built in a temporary folder and then renamed. The data of
+a chunk is written before its mark, which is a digest of the data (see `integrity`). Every file is
+written under a temporary name and renamed. Whenever the process dies, a chunk is therefore either
+marked and complete, or it is computed again.
 """
 
 from __future__ import annotations
@@ -63,8 +63,10 @@ ChunkVariables = Mapping[str, np.ndarray]
 
 @dataclass(frozen=True)
 class VariableLayout:
-    """Description of one variable of a result. Its dimensions and its shape do not include the axes
-    of the samples."""
+    """Description of one variable of a result.
+
+    The dimensions and the shape do not include the axes of the samples.
+    """
 
     variable_name: str
     dtype: str
@@ -75,7 +77,7 @@ class VariableLayout:
 
     @property
     def bytes_per_sample(self) -> int:
-        """Return the size of the variable's value of one sample, in bytes."""
+        """Return the number of bytes of the variable for one sample."""
         return np.dtype(self.dtype).itemsize * math.prod(self.extra_shape)
 
 
@@ -102,7 +104,7 @@ class ResultLayout:
             for axis_length, chunk_length in zip(self.sample_shape, self.chunk_shape, strict=True)
         )
 
-    def get_chunk_region(self, chunk_index: int) -> ChunkRegion:
+    def compute_chunk_region(self, chunk_index: int) -> ChunkRegion:
         """Return the slices of a chunk along the axes of the samples."""
         chunk_indices = np.unravel_index(chunk_index, self._chunks_per_axis)
         return tuple(
@@ -115,22 +117,27 @@ class ResultLayout:
             )
         )
 
-    def get_chunk_sample_shape(self, chunk_index: int) -> tuple[int, ...]:
-        """Return the shape of a chunk along the axes of the samples; a chunk at the end of an axis
-        may be smaller."""
+    def compute_chunk_sample_shape(self, chunk_index: int) -> tuple[int, ...]:
+        """Return the shape of a chunk along the axes of the samples.
+
+        A chunk at the end of an axis may be smaller than others.
+        """
         return tuple(
-            axis_slice.stop - axis_slice.start for axis_slice in self.get_chunk_region(chunk_index)
+            chunk_slice.stop - chunk_slice.start
+            for chunk_slice in self.compute_chunk_region(chunk_index)
         )
 
     @property
     def bytes_per_sample(self) -> int:
-        """Return the size of the results of one sample, uncompressed, in bytes."""
-        return sum(variable.bytes_per_sample for variable in self.variable_layouts)
+        """Return the number of bytes of the uncompressed results of one sample."""
+        return sum(variable_layout.bytes_per_sample for variable_layout in self.variable_layouts)
 
 
 def choose_chunk_shape(sample_shape: tuple[int, ...], max_chunk_samples: int) -> tuple[int, ...]:
-    """Return the shape of chunks of at most `max_chunk_samples` samples, in which the last axes are
-    complete."""
+    """Return the shape of chunks of at most `max_chunk_samples` samples.
+
+    The last axes of a chunk are complete.
+    """
     chunk_shape, samples_left = [1] * len(sample_shape), max_chunk_samples
     for axis_index in range(len(sample_shape) - 1, -1, -1):
         chunk_shape[axis_index] = min(sample_shape[axis_index], max(samples_left, 1))
@@ -142,7 +149,8 @@ def choose_chunk_shape(sample_shape: tuple[int, ...], max_chunk_samples: int) ->
 
 class AbstractResultStore(abc.ABC):
     """Storage that accepts the results of chunks, lists missing chunks and returns the labeled
-    result."""
+    result.
+    """
 
     store_location: str = "memory"
     damage_description: str = ""
@@ -150,7 +158,7 @@ class AbstractResultStore(abc.ABC):
 
     @abc.abstractmethod
     def find_missing_chunks(self) -> list[int]:
-        """Return the indices of the chunks that are not computed yet, in ascending order."""
+        """Return the indices of the chunks without results, in ascending order."""
 
     @abc.abstractmethod
     def write_chunk(self, chunk_index: int, chunk_results: ChunkVariables) -> None:
@@ -162,7 +170,10 @@ class AbstractResultStore(abc.ABC):
 
     @abc.abstractmethod
     def open_for_writing(self) -> contextlib.AbstractContextManager[None]:
-        """Return the context of all writing, which removes unfinished files and holds the lock."""
+        """Return the context in which chunks are written.
+
+        The context removes unfinished files and holds the lock of the store.
+        """
 
 
 class MemoryResultStore(AbstractResultStore):
@@ -193,7 +204,7 @@ class MemoryResultStore(AbstractResultStore):
         return [int(chunk_index) for chunk_index in np.flatnonzero(~self._is_chunk_done)]
 
     def write_chunk(self, chunk_index: int, chunk_results: ChunkVariables) -> None:
-        chunk_region = self._result_layout.get_chunk_region(chunk_index)
+        chunk_region = self._result_layout.compute_chunk_region(chunk_index)
         for variable_name, variable_array in self._variable_arrays.items():
             variable_array[chunk_region] = chunk_results[variable_name]
         self._is_chunk_done[chunk_index] = True
@@ -226,8 +237,10 @@ class MemoryResultStore(AbstractResultStore):
 
 
 class ZarrResultStore(AbstractResultStore):
-    """Storage of a scan's results in a folder; `verifies_files` selects the search for damaged
-    chunks."""
+    """Storage of a scan's results in a folder.
+
+    - `verifies_files`: whether damaged chunks are searched for.
+    """
 
     def __init__(
         self, store_path: Path, result_layout: ResultLayout, verifies_files: bool = True
@@ -272,9 +285,9 @@ class ZarrResultStore(AbstractResultStore):
         return [int(chunk_index) for chunk_index in np.flatnonzero(~are_chunks_done)]
 
     def write_chunk(self, chunk_index: int, chunk_results: ChunkVariables) -> None:
-        chunk_region = self._result_layout.get_chunk_region(chunk_index)
+        chunk_region = self._result_layout.compute_chunk_region(chunk_index)
         for variable_layout in self._result_layout.variable_layouts:
-            _get_zarr_array(self._zarr_group, variable_layout.variable_name)[chunk_region] = (
+            _select_zarr_array(self._zarr_group, variable_layout.variable_name)[chunk_region] = (
                 chunk_results[variable_layout.variable_name]
             )
         assert self._chunk_checksums is not None
@@ -289,31 +302,41 @@ class ZarrResultStore(AbstractResultStore):
     @contextlib.contextmanager
     def open_for_writing(self) -> Iterator[None]:
         with lock_store(self._store_path):
-            for partial_path in self._store_path.rglob("*.partial"):
-                partial_path.unlink(missing_ok=True)
+            for unfinished_path in self._store_path.rglob("*.partial"):
+                unfinished_path.unlink(missing_ok=True)
             if self._damaged_metadata:
-                _rewrite_store_metadata(self._store_path, self._result_layout)
+                # The metadata are copied from a temporary new store.
+                stored_metadata = StoredMetadata(self._store_path)
+                store_attributes = stored_metadata.store_attributes
+                temporary_name = f".{self._store_path.name}.{os.urandom(8).hex()}"
+                temporary_path = self._store_path.parent / temporary_name
+                try:
+                    temporary_path.mkdir()
+                    _create_zarr_arrays(temporary_path, self._result_layout, store_attributes)
+                    stored_metadata.restore_from_intact_store(StoredMetadata(temporary_path))
+                finally:
+                    shutil.rmtree(temporary_path, ignore_errors=True)
                 self._open_arrays()
             for coordinate_name in self._damaged_coordinates:
-                _get_zarr_array(self._zarr_group, coordinate_name)[:] = (
+                _select_zarr_array(self._zarr_group, coordinate_name)[:] = (
                     self._result_layout.result_coordinates[coordinate_name][1]
                 )
             self._damaged_coordinates = []
             yield
 
 
-def _get_zarr_array(zarr_group: zarr.Group, array_name: str) -> zarr.Array:
-    """Return an array of a Zarr group; raise an error if the name belongs to a group."""
+def _select_zarr_array(zarr_group: zarr.Group, array_name: str) -> zarr.Array:
+    """Return an array of a Zarr group, or raise an error if the name belongs to a group."""
     zarr_array = zarr_group[array_name]
     assert isinstance(zarr_array, zarr.Array)
     return zarr_array
 
 
 def open_scan(path: str | Path, *, verify: bool = True) -> xr.Dataset:
-    """Return the labeled result of a scan, finished or not; values are read when they are used.
+    """Return the labeled result of a scan, finished or not. Arrays are read when they are used.
 
-    In an unfinished scan, samples that are not yet computed have the outcome -1 and the measures
-    NaN. A store with damaged files raises a ValueError; `verify=False` skips that check.
+    In an unfinished scan, samples without results have the outcome -1 and the measures NaN. A store
+    with damaged files raises a ValueError. `verify=False` skips the search for damage.
 
     Args:
         path: folder of the store.
@@ -404,7 +427,7 @@ def _open_zarr_group(
                 use_consolidated=uses_consolidated_metadata,
             )
             for array_name in (*stored_metadata.coordinate_names, *variable_names, "outcome"):
-                _get_zarr_array(zarr_group, array_name)
+                _select_zarr_array(zarr_group, array_name)
             return zarr_group
         except ZARR_METADATA_ERRORS:
             if uses_consolidated_metadata is False:
@@ -413,11 +436,10 @@ def _open_zarr_group(
 
 
 def _arrange_requested_variables(dataset: xr.Dataset) -> xr.Dataset:
-    """Return the dataset with the requested variables first, in the requested order and with the
-    requested names.
+    """Return the dataset with the requested variables first, in the requested order and names.
 
-    A file name cannot be "d speed / d damping", so the array of that variable has another name in a
-    store.
+    A file name cannot be "d speed / d damping", so the array of such a variable has another name in
+    a store.
     """
     requested_text = dataset.attrs.get(REQUESTED_MEASURES_ATTRIBUTE)
     requested_measures = (
@@ -451,8 +473,9 @@ def _arrange_requested_variables(dataset: xr.Dataset) -> xr.Dataset:
 
 
 def _read_scan_metadata(store_path: Path) -> StoredMetadata:
-    """Return the metadata of a store; raise a ValueError if the folder does not contain a store of
-    a scan."""
+    """Return the metadata of a store, or raise a ValueError if the folder contains no store of a
+    scan.
+    """
     stored_metadata = StoredMetadata(store_path)
     if (
         stored_metadata.root_metadata.get("node_type") != "group"
@@ -471,7 +494,7 @@ def _read_scan_metadata(store_path: Path) -> StoredMetadata:
 
 
 def read_stored_manifest(store_path: Path) -> dict | None:
-    """Return settings and provenance of the store at `store_path`, or None if there is no store."""
+    """Return settings and provenance of the store at `store_path`, or None if it does not exist."""
     if not store_path.exists() or (store_path.is_dir() and not any(store_path.iterdir())):
         return None
     store_attributes = _read_scan_metadata(store_path).store_attributes
@@ -495,7 +518,10 @@ def read_stored_manifest(store_path: Path) -> dict | None:
 def find_first_settings_difference(
     stored_settings: object, current_settings: object, setting_path: str = ""
 ) -> tuple[str, object, object]:
-    """Return the name and both values of the first setting that differs, or ("", None, None)."""
+    """Return the name of the first setting that differs, and both of its values.
+
+    If no setting differs, return ("", None, None).
+    """
     if isinstance(stored_settings, dict) and isinstance(current_settings, dict):
         for setting_name in [
             *stored_settings,
@@ -523,8 +549,10 @@ def find_first_settings_difference(
 def create_empty_store(
     store_path: Path, result_layout: ResultLayout, store_attributes: Mapping[str, object]
 ) -> None:
-    """Create an empty store at `store_path` atomically. If another process creates a store there
-    first, keep that store."""
+    """Create an empty store at `store_path` atomically.
+
+    If another process creates a store there first, that store is not changed.
+    """
     try:
         store_path.parent.mkdir(parents=True, exist_ok=True)
         temporary_path = store_path.parent / f".{store_path.name}.{os.urandom(8).hex()}"
@@ -626,16 +654,3 @@ def _create_zarr_arrays(
         "metadata": metadata_by_name,
     }
     root_metadata_path.write_text(json.dumps(root_metadata, indent=2))
-
-
-def _rewrite_store_metadata(store_path: Path, result_layout: ResultLayout) -> None:
-    """Write the metadata of the scan's arrays anew, copied from a new store that is made
-    temporarily."""
-    stored_metadata = StoredMetadata(store_path)
-    temporary_path = store_path.parent / f".{store_path.name}.{os.urandom(8).hex()}"
-    try:
-        temporary_path.mkdir()
-        _create_zarr_arrays(temporary_path, result_layout, stored_metadata.store_attributes)
-        stored_metadata.restore_from_intact_store(StoredMetadata(temporary_path))
-    finally:
-        shutil.rmtree(temporary_path, ignore_errors=True)

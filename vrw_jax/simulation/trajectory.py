@@ -67,7 +67,7 @@ def simulate(
     engine: EngineName = "auto",
     n_samples: int = 100,
 ) -> xr.Dataset:
-    """Return a walk from the section state `x` as a labelled trajectory over time.
+    """Return a walk from the section state `x` as a labeled trajectory over time.
 
     Without `x` the walk begins at the default start of the model, near the gait of Table 1. Uneven
     ground is given as in `vrw.walk`. Positions are then in the frame of line 0. Angles and forces

@@ -1,7 +1,7 @@
 """Exploration of many starts: an augmented Lagrangian, maximized by optax's Adam in one batch.
 
-First-order steps bring every start near a local optimum, and the maximization continues from the
-best start. If a trial loses its gait, its start keeps the previous parameters, and its step size is
+First-order steps bring every start near a local optimum. The maximization continues from the best
+start. If a trial has no gait, the parameters of its start do not change, and its step size is
 halved.
 """
 
@@ -44,13 +44,13 @@ class ExplorationOptions:
 DEFAULT_EXPLORATION_OPTIONS = ExplorationOptions()
 """Options of the exploration by `vrw.tune`."""
 
-EvaluateGaitBatch = Callable[[np.ndarray, GaitEvaluation | None], GaitEvaluation]
+GaitBatchEvaluator = Callable[[np.ndarray, GaitEvaluation | None], GaitEvaluation]
 """Function that returns the gaits at rows of normalized parameters, one per start. The search
 begins at neighboring gaits, if given."""
 
 
 class ExplorationResult(NamedTuple):
-    """Results of the exploration, one row per start."""
+    """Results of the exploration. Each array has a leading axis over starts."""
 
     normalized_starts: np.ndarray  # (n_starts, n_free): starts in widths of the bounds
     normalized_parameters: np.ndarray
@@ -62,30 +62,32 @@ class ExplorationResult(NamedTuple):
 
     @property
     def best_start_index(self) -> int:
-        """Return the index of the start with the highest penalized objective, from which the
-        maximization continues.
+        """Return the index of the start with the highest penalized objective.
+
+        The maximization continues from this start.
         """
         return int(np.nanargmax(self.penalized_objectives))
 
 
 def explore_starts(
-    evaluate_gaits: EvaluateGaitBatch,
+    gait_batch_evaluator: GaitBatchEvaluator,
     normalized_starts: np.ndarray,
-    compute_parameter_changes: Callable[[np.ndarray], np.ndarray],
+    parameter_change_function: Callable[[np.ndarray], np.ndarray],
     free_indices: list[int],
     bound_widths: np.ndarray,
     min_constraint_values: np.ndarray,
     exploration_options: ExplorationOptions = DEFAULT_EXPLORATION_OPTIONS,
 ) -> ExplorationResult:
-    """Take first-order steps from every start, and return the ends.
+    """Take first-order steps from every start, and return the parameters and gaits at their ends.
 
-    `compute_parameter_changes` converts changes of normalized parameters to changes of all
-    parameters. Jacobians of a gait are with respect to all parameters; `free_indices` selects the
-    free ones.
+    - `parameter_change_function`: function that converts changes of normalized parameters to
+      changes of all parameters;
+    - `free_indices`: indices of the free parameters, with respect to which Jacobians of a gait are
+      selected.
     """
     n_starts = normalized_starts.shape[0]
-    trial_evaluation = evaluate_gaits(normalized_starts, None)
-    has_active_gait = find_starts_with_gait(trial_evaluation) & _find_finite_evaluations(
+    trial_evaluation = gait_batch_evaluator(normalized_starts, None)
+    has_active_gait = are_starts_on_gait(trial_evaluation) & _are_evaluations_finite(
         trial_evaluation, free_indices
     )
     constraint_slacks, slack_jacobians = _compute_slacks_and_jacobians(
@@ -141,15 +143,15 @@ def explore_starts(
         trial_parameters = np.clip(
             normalized_parameters + trial_step_lengths * np.asarray(adam_update), 0.0, 1.0
         )
-        trial_evaluation = evaluate_gaits(trial_parameters, current_evaluation)
+        trial_evaluation = gait_batch_evaluator(trial_parameters, current_evaluation)
         is_trial_accepted = (
-            find_starts_with_gait(trial_evaluation)
-            & _find_finite_evaluations(trial_evaluation, free_indices)
+            are_starts_on_gait(trial_evaluation)
+            & _are_evaluations_finite(trial_evaluation, free_indices)
             & has_active_gait
-            & _find_trials_on_branch(
+            & _are_trials_on_branch(
                 current_evaluation,
                 trial_evaluation,
-                compute_parameter_changes(trial_parameters - normalized_parameters),
+                parameter_change_function(trial_parameters - normalized_parameters),
             )
         )
         n_lost_trials += has_active_gait & ~is_trial_accepted
@@ -157,10 +159,12 @@ def explore_starts(
         normalized_parameters = np.where(
             is_trial_accepted[:, None], trial_parameters, normalized_parameters
         )
-        select_accepted = lambda new_leaf, old_leaf, accepted=is_trial_accepted: jnp.where(
+        accepted_leaf_selector = lambda new_leaf, old_leaf, accepted=is_trial_accepted: jnp.where(
             accepted.reshape(-1, *(1,) * (jnp.ndim(new_leaf) - 1)), new_leaf, old_leaf
         )
-        current_evaluation = jax.tree.map(select_accepted, trial_evaluation, current_evaluation)
+        current_evaluation = jax.tree.map(
+            accepted_leaf_selector, trial_evaluation, current_evaluation
+        )
     constraint_slacks, _ = _compute_slacks_and_jacobians(
         current_evaluation, free_indices, bound_widths, min_constraint_values
     )
@@ -182,15 +186,13 @@ def explore_starts(
     )
 
 
-def find_starts_with_gait(gait_evaluation: GaitEvaluation) -> np.ndarray:
+def are_starts_on_gait(gait_evaluation: GaitEvaluation) -> np.ndarray:
     """Return whether each start has a gait that the event-driven step confirms."""
     return gait_evaluation.gait.outcome == Outcome.STEPPED
 
 
-def _find_finite_evaluations(
-    gait_evaluation: GaitEvaluation, free_indices: list[int]
-) -> np.ndarray:
-    """Return whether all values of each start, and their derivatives by the free parameters, are
+def _are_evaluations_finite(gait_evaluation: GaitEvaluation, free_indices: list[int]) -> np.ndarray:
+    """Return whether the objective, the constraints and their derivatives of each start are
     finite.
     """
     free_jacobian = np.asarray(gait_evaluation.jacobian)[:, free_indices]
@@ -200,7 +202,9 @@ def _find_finite_evaluations(
 def _compute_objective_gradients(
     gait_evaluation: GaitEvaluation, free_indices: list[int], bound_widths: np.ndarray
 ) -> np.ndarray:
-    """Return the gradient of the objective by the normalized parameters, shape (starts, free)."""
+    """Return the gradient of the objective with respect to normalized parameters, shape (starts,
+    free).
+    """
     return np.asarray(gait_evaluation.jacobian)[:, free_indices, 0] * bound_widths
 
 
@@ -210,8 +214,9 @@ def _compute_slacks_and_jacobians(
     bound_widths: np.ndarray,
     min_constraint_values: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the slacks (starts, constraints), and their derivatives by the normalized parameters
-    (starts, constraints, free).
+    """Return the slacks (starts, constraints) and their Jacobians (starts, constraints, free).
+
+    The Jacobians are with respect to the normalized parameters.
     """
     slack_jacobians = (
         np.swapaxes(np.asarray(gait_evaluation.jacobian)[:, free_indices, 1:], 1, 2) * bound_widths
@@ -219,21 +224,26 @@ def _compute_slacks_and_jacobians(
     return np.asarray(gait_evaluation.values)[:, 1:] - min_constraint_values, slack_jacobians
 
 
-def _find_trials_on_branch(
+def _are_trials_on_branch(
     previous_evaluation: GaitEvaluation,
     trial_evaluation: GaitEvaluation,
     parameter_changes: np.ndarray,
 ) -> np.ndarray:
-    """Return whether each trial's gait is on the branch of the previous gait of its start."""
+    """Return whether the gait of each trial is on the branch of the previous gait of its start."""
     previous_points, trial_points = (
         previous_evaluation.gait.branch_point,
         trial_evaluation.gait.branch_point,
     )
-    point_pairs = (
+    previous_and_trial_points = (
         (
             *select_tree_rows((previous_points, trial_points), start_index),
             parameter_changes_of_start,
         )
         for start_index, parameter_changes_of_start in enumerate(parameter_changes)
     )
-    return np.array([is_same_branch(*point_pair) for point_pair in point_pairs])
+    return np.array(
+        [
+            is_same_branch(*previous_and_trial_point)
+            for previous_and_trial_point in previous_and_trial_points
+        ]
+    )

@@ -2,8 +2,8 @@
 
 SLSQP is sequential quadratic programming with exact gradients. It does not handle trial wheels
 without a gait, or with a gait of another branch. After such a trial the maximization continues from
-the last iterate within half the distance, and the path records the trial. Parameters are measured
-in widths of their bounds, so that every free parameter is between 0 and 1.
+the last iterate in a box of half the size, and the path records the trial. Parameters are
+normalized by the widths of their bounds, so that every free parameter is between 0 and 1.
 """
 
 import enum
@@ -19,7 +19,7 @@ from vrw_jax.tuning.objective import (
     GaitEvaluation,
     compute_max_violation,
     compute_slack_scales,
-    restore_bound_sign,
+    restore_sign_of_bound,
 )
 from vrw_jax.wheel import Outcome
 
@@ -44,7 +44,7 @@ class TrialKind(enum.IntEnum):
 
 
 class EvaluatedTrial(NamedTuple):
-    """Wheel with its evaluated gait. If the gait is lost, all numbers are NaN."""
+    """Trial wheel with its evaluated gait. If the wheel has no gait, all numbers are NaN."""
 
     normalized_parameters: np.ndarray  # free parameters in widths of their bounds
     outcome: Outcome
@@ -82,8 +82,9 @@ class EvaluatedTrial(NamedTuple):
         constraint_names: tuple[str, ...],
         min_constraint_values: np.ndarray,
     ) -> str:
-        """Return a text about the first number that is not finite, in the order of objective and
-        constraints."""
+        """Return a text about the first number that is not finite, of the objective or else of a
+        constraint.
+        """
         measure_values = self.objective, *map(float, self.constraint_slacks + min_constraint_values)
         measure_gradients = self.objective_gradient, *self.slack_jacobian
         for measure_name, measure_value, measure_gradient in zip(
@@ -91,7 +92,9 @@ class EvaluatedTrial(NamedTuple):
         ):
             unprefixed_name = measure_name.removeprefix(UPPER_BOUND_PREFIX)
             if not np.isfinite(measure_value):
-                return f"{unprefixed_name} is {restore_bound_sign(measure_name, measure_value):g}"
+                return (
+                    f"{unprefixed_name} is {restore_sign_of_bound(measure_name, measure_value):g}"
+                )
             if not np.isfinite(measure_gradient).all():
                 return f"{unprefixed_name} has a derivative that is not finite"
         raise ValueError("Every number of this trial is finite: describe another.")
@@ -148,7 +151,7 @@ class MaximizationOptions:
 DEFAULT_MAXIMIZATION_OPTIONS = MaximizationOptions()
 """Options of the maximization by `vrw.tune`."""
 
-EvaluateTrialGait = Callable[[np.ndarray, EvaluatedTrial | None], EvaluatedTrial]
+TrialEvaluator = Callable[[np.ndarray, EvaluatedTrial | None], EvaluatedTrial]
 """Function that returns the trial at normalized parameters. The search for the gait begins at the
 gait of a neighbor, if given."""
 
@@ -158,19 +161,20 @@ class _TrialRecord:
 
     def __init__(
         self,
-        evaluate_trial_gait: EvaluateTrialGait,
+        trial_evaluator: TrialEvaluator,
         start_trial: EvaluatedTrial,
         max_evaluations: int,
     ) -> None:
         self.evaluated_trials, self.trial_kinds = [start_trial], [TrialKind.START]
-        self._evaluate_trial_gait, self._max_evaluations = evaluate_trial_gait, max_evaluations
+        self._evaluate_trial_gait, self._max_evaluations = trial_evaluator, max_evaluations
         self._trial_index_by_parameters = {start_trial.normalized_parameters.tobytes(): 0}
 
     def evaluate_trial_once(self, normalized_parameters: np.ndarray) -> EvaluatedTrial:
-        """Return the trial at the normalized parameters, which is evaluated unless the record
-        contains it.
+        """Return the trial at the normalized parameters, which is evaluated only if the record
+        lacks it.
 
-        Raise an exception if the trial is unusable or the allowed number of evaluations is reached.
+        Raise an exception if the trial is unusable, or if the allowed number of evaluations is
+        reached.
         """
         trial_index = self._trial_index_by_parameters.get(normalized_parameters.tobytes())
         if trial_index is None:
@@ -206,18 +210,19 @@ class _TrialRecord:
 
 
 def maximize_objective(
-    evaluate_trial_gait: EvaluateTrialGait,
+    trial_evaluator: TrialEvaluator,
     start_trial: EvaluatedTrial,
     *,
     tolerance: float,
     max_evaluations: int,
     maximization_options: MaximizationOptions = DEFAULT_MAXIMIZATION_OPTIONS,
 ) -> MaximizationResult:
-    """Return the result of maximizing the objective locally from `start_trial`, with every slack at
-    least zero."""
+    """Return the result of a local maximization from `start_trial`, with every slack at least
+    zero.
+    """
     from scipy.optimize import minimize  # This import is slow.
 
-    trial_record = _TrialRecord(evaluate_trial_gait, start_trial, max_evaluations)
+    trial_record = _TrialRecord(trial_evaluator, start_trial, max_evaluations)
     gradient_norm = max(float(np.linalg.norm(start_trial.objective_gradient)), 1e-12)
     slack_scales = compute_slack_scales(start_trial.constraint_slacks, start_trial.slack_jacobian)
 
@@ -302,10 +307,10 @@ def maximize_objective(
         except _EvaluationLimitReachedError:
             tune_status = TuneStatus.MAX_EVALUATIONS_REACHED
             break
-        is_at_inner_box_side = (end_trial.normalized_parameters <= lower_box_side + 1e-9) & (
+        has_reached_inner_box_side = (end_trial.normalized_parameters <= lower_box_side + 1e-9) & (
             lower_box_side > 0.0
         )
-        is_at_inner_box_side |= (end_trial.normalized_parameters >= upper_box_side - 1e-9) & (
+        has_reached_inner_box_side |= (end_trial.normalized_parameters >= upper_box_side - 1e-9) & (
             upper_box_side < 1.0
         )
         center_trial = end_trial
@@ -313,7 +318,7 @@ def maximize_objective(
             break
         box_radius = (
             min(2.0 * box_radius, maximization_options.full_box_radius)
-            if is_at_inner_box_side.any()
+            if has_reached_inner_box_side.any()
             else maximization_options.full_box_radius
         )
     best_trial = center_trial
@@ -340,20 +345,21 @@ def _find_best_trial(
     last_trial: EvaluatedTrial,
     maximization_options: MaximizationOptions,
 ) -> EvaluatedTrial:
-    """Return the best gait that satisfies all constraints, or else the gait with the smallest
-    violation."""
+    """Return the best gait that satisfies all constraints, or else that with the smallest
+    violation.
+    """
     usable_trials = [trial for trial in trial_record.evaluated_trials if trial.is_usable_trial]
-    satisfies_constraints = lambda trial: (
+    is_feasible = lambda trial: (
         compute_max_violation(trial.constraint_slacks, slack_scales)
         <= maximization_options.active_bound_tolerance
     )
-    feasible_gaits = [trial for trial in usable_trials if satisfies_constraints(trial)]
+    feasible_gaits = [trial for trial in usable_trials if is_feasible(trial)]
     if not feasible_gaits:
         return min(
             usable_trials,
             key=lambda trial: compute_max_violation(trial.constraint_slacks, slack_scales),
         )
-    if satisfies_constraints(last_trial):
+    if is_feasible(last_trial):
         feasible_gaits.append(last_trial)
     return max(feasible_gaits, key=lambda trial: trial.objective)
 
@@ -370,8 +376,10 @@ class OptimalityConditions(NamedTuple):
 def compute_optimality_conditions(
     trial: EvaluatedTrial, maximization_options: MaximizationOptions = DEFAULT_MAXIMIZATION_OPTIONS
 ) -> OptimalityConditions:
-    """Return the multipliers of the Karush-Kuhn-Tucker conditions at a gait, by non-negative least
-    squares."""
+    """Return the multipliers of the Karush-Kuhn-Tucker conditions at a gait.
+
+    The multipliers are a solution by non-negative least squares.
+    """
     from scipy.optimize import nnls  # This import is slow.
 
     n_free, active_tolerance = (

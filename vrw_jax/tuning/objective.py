@@ -15,7 +15,7 @@ from vrw_jax.wheel import WheelParams
 
 ObjectiveFunction = Callable[[AbstractCycle, AbstractStep], Array]
 ConstraintSpecification = Mapping[str, float | tuple[float | None, float | None]] | Sequence[str]
-ReadMeasureFunction = Callable[[str, AbstractCycle, AbstractStep], Array]
+MeasureReaderFunction = Callable[[str, AbstractCycle, AbstractStep], Array]
 
 UPPER_BOUND_PREFIX = "-"
 """Prefix of a measure with an upper bound, which is a lower bound of its negative."""
@@ -25,12 +25,12 @@ UPPER_BOUND_PREFIX = "-"
 class WeightedMeasureSum:
     """Weighted sum of measures of cycle and step, as an objective."""
 
-    read_measure: ReadMeasureFunction
+    measure_reader: MeasureReaderFunction
     measure_weights: tuple[tuple[str, float], ...]
 
     def __call__(self, cycle: AbstractCycle, step: AbstractStep) -> Array:
         weighted_measures = [
-            measure_weight * self.read_measure(measure_name, cycle, step)
+            measure_weight * self.measure_reader(measure_name, cycle, step)
             for measure_name, measure_weight in self.measure_weights
         ]
         return sum(weighted_measures[1:], start=weighted_measures[0])
@@ -38,7 +38,7 @@ class WeightedMeasureSum:
 
 @dataclass(frozen=True)
 class CycleObjective:
-    """A user's function of the cycle alone, as an objective of cycle and step."""
+    """Objective that is a user's function of the cycle alone."""
 
     cycle_function: Callable[[Any], Array]
 
@@ -50,12 +50,12 @@ class CycleObjective:
 class ObjectiveAndConstraints:
     """Objective and constraints of a gait as one array, with the objective first.
 
-    A constraint is a measure with a lower bound. With the prefix `UPPER_BOUND_PREFIX` it is a
-    measure with an upper bound.
+    A constraint is a measure with a lower bound. A constraint with the prefix `UPPER_BOUND_PREFIX`
+    is a measure with an upper bound.
     """
 
     objective_function: ObjectiveFunction
-    read_measure: ReadMeasureFunction
+    measure_reader: MeasureReaderFunction
     constraint_names: tuple[str, ...]
 
     def __call__(self, cycle: AbstractCycle, step: AbstractStep) -> Array:
@@ -68,7 +68,7 @@ class ObjectiveAndConstraints:
         constraint_values = []
         for constraint_name in self.constraint_names:
             measure_name = constraint_name.removeprefix(UPPER_BOUND_PREFIX)
-            measure_value = jnp.ravel(self.read_measure(measure_name, cycle, step))
+            measure_value = jnp.ravel(self.measure_reader(measure_name, cycle, step))
             constraint_values.append(
                 measure_value if measure_name == constraint_name else -measure_value
             )
@@ -76,7 +76,7 @@ class ObjectiveAndConstraints:
 
 
 class GaitEvaluation(NamedTuple):
-    """Gait with its objective and constraints; in a batch, the batch axis comes first."""
+    """Gait with its objective and constraints. In a batch, the batch axis comes first."""
 
     gait: Gait
     values: Array  # (1 + n_constraints,): the objective, then the constraints
@@ -90,8 +90,8 @@ def parse_constraint_margins(
 ) -> dict[str, float]:
     """Return the smallest allowed value of each constrained measure by name.
 
-    A measure with an upper bound has the prefix `UPPER_BOUND_PREFIX`. Its smallest value is that of
-    the negative measure.
+    A measure with an upper bound has the prefix `UPPER_BOUND_PREFIX`, and its smallest value is
+    that of the negative measure.
     """
     if constraints is None:
         default_margin_by_name = default_margins(params)
@@ -123,7 +123,7 @@ def _parse_constraint_bound(
 ) -> dict[str, float]:
     """Return the smallest allowed values of one measure and of its negative, by name.
 
-    `bound_or_range` is a lower bound, or a pair of bounds of which one may be None.
+    - `bound_or_range`: lower bound, or a pair of bounds of which one may be None.
     """
     if not isinstance(bound_or_range, tuple):
         return {measure_name: check_real(f"the margin of {measure_name}", bound_or_range)}
@@ -146,16 +146,17 @@ def _parse_constraint_bound(
     return {measure_name: check_real(f"the lower end of {measure_name}", lower_end)}
 
 
-def restore_bound_sign(constraint_name: str, lower_bound: float) -> float:
-    """Return a bound with the sign of its measure. A bound of a name with the upper-bound prefix
-    has the opposite sign.
+def restore_sign_of_bound(constraint_name: str, lower_bound: float) -> float:
+    """Return a bound with the sign of its measure.
+
+    The bound of a constraint with the upper-bound prefix has the opposite sign.
     """
     return float(-lower_bound if constraint_name.startswith(UPPER_BOUND_PREFIX) else lower_bound)
 
 
 def compute_slack_scales(constraint_slacks: np.ndarray, slack_jacobian: np.ndarray) -> np.ndarray:
-    """Return the scale of each slack, which is the change of the slack over one width of the
-    bounds.
+    """Return the change of each slack over one width of the bounds, which is the scale of the
+    slack.
     """
     return np.maximum(
         np.linalg.norm(slack_jacobian, axis=-1), 1e-3 * np.abs(constraint_slacks) + 1e-12
@@ -163,9 +164,9 @@ def compute_slack_scales(constraint_slacks: np.ndarray, slack_jacobian: np.ndarr
 
 
 def compute_max_violation(constraint_slacks: np.ndarray, slack_scales: np.ndarray) -> Any:
-    """Return the largest violation of a constraint in widths of the bounds, or 0 if no constraint
-    is violated.
+    """Return the largest violation of a constraint in widths of the bounds, or 0 without a
+    violation.
 
-    The result is NaN if the gait is lost.
+    The violation is NaN if the wheel has no gait.
     """
     return np.max(-constraint_slacks / slack_scales, axis=-1, initial=0.0)

@@ -1,8 +1,8 @@
-"""Tuning of a wheel: maximization of a gait's objective with margins as constraints, with exact
+"""Tuning of a wheel: maximization of a gait's objective, with margins as constraints and exact
 gradients.
 
-Without margins as constraints, the maximization would increase double support by letting the foot
-scuff.
+Without margins as constraints, the maximization would increase double support until the foot
+scuffs.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ from vrw_jax.tuning.objective import (
     compute_max_violation,
     compute_slack_scales,
     parse_constraint_margins,
-    restore_bound_sign,
+    restore_sign_of_bound,
 )
 from vrw_jax.tuning.tune_result import ActiveConstraint, TuneResult, WalkValidation
 from vrw_jax.validation import (
@@ -90,7 +90,7 @@ ObjectiveSpecification = str | Mapping[str, float] | Callable[..., Array]
 class WalkValidationOptions:
     """Options of the walk that validates a tuned wheel.
 
-    - `n_validation_steps`: number of steps;
+    - `n_steps_of_walk`: number of steps;
     - `relative_start_displacement`: relative displacement of the start from the limit cycle;
     - `constraint_value_tolerance`: accepted violation of a constraint, as a fraction of its value.
       Both tolerances are chosen for two reasons. The optimum satisfies a constraint within 1e-6 of
@@ -100,7 +100,7 @@ class WalkValidationOptions:
       margin.
     """
 
-    n_validation_steps: int = 10
+    n_steps_of_walk: int = 10
     relative_start_displacement: float = 1e-5
     constraint_value_tolerance: float = 1e-3
     default_margin_tolerance: float = 1e-2
@@ -124,17 +124,17 @@ def tune(
 ) -> TuneResult:
     """Return the wheel near `params` whose gait maximizes an objective under constraints.
 
-    The default constraints are all margins that gaits of this model can keep (`default_margins`);
-    {} is none. A constraint counts as satisfied within 1e-6 of its change over the bounds. The
-    method is local: it ends at an optimum of the branch of `params`. With `n_starts` above 1 it
-    begins with `params` and random wheels within the bounds. They take 25 first-order steps in one
-    batch, and the maximization continues from the best.
+    The default constraints are all margins that gaits of the model can satisfy (`default_margins`).
+    {} means no constraints. A constraint counts as satisfied within 1e-6 of its change over the
+    bounds. The method is local and ends at an optimum on the branch of `params`. With `n_starts`
+    above 1 the search begins with `params` and random wheels within the bounds. All starts take 25
+    first-order steps in one batch, and the maximization continues from the best.
 
     With unilateral contact (`UnilateralWheel`) the objective is a measure of a step or a weighted
-    sum of several. A walk from the start finds the first gait. Constraints, none by default, are on
-    such measures, for example {"slip": (0.0, 0.05)}. Model "auto" uses the model that is selected
-    for the start's gait. If that is the paper's, its margins are the constraints, so that it stays
-    valid.
+    sum of measures. A walk from the start finds the first gait. There are no default constraints,
+    and constraints are on measures of a step, for example {"slip": (0.0, 0.05)}. The model "auto"
+    is the model that is selected for the gait of the start. If this is the paper's model, its
+    margins are the constraints, so that the model stays valid.
 
     Args:
         params: the start, one wheel.
@@ -179,9 +179,11 @@ def tune(
         options=options,
         cycle_options=cycle_options,
     )
-    exploration_result = tune_problem.explore_starts(n_starts, seed) if n_starts > 1 else None
+    exploration_result = (
+        tune_problem.explore_random_starts(n_starts, seed) if n_starts > 1 else None
+    )
     tune_problem.gait_finder.precompile_programs(params)
-    start_trial = tune_problem.evaluate_start(
+    start_trial = tune_problem.evaluate_start_trial(
         tune_problem.normalized_start
         if exploration_result is None
         else exploration_result.normalized_parameters[exploration_result.best_start_index]
@@ -224,14 +226,16 @@ class TuneProblem:
 
     @property
     def constraint_names(self) -> tuple[str, ...]:
-        """Return the name of each constrained number. A margin of the locked legs has one number
-        per leg.
+        """Return the name of each constrained number.
+
+        A margin of the locked legs has one number per leg.
         """
         constraint_names: list[str] = []
         for measure_name in self.margins:
             if get_measure(measure_name).leg_dimension:
                 constraint_names += [
-                    f"{measure_name}[leg {leg}]" for leg in range(3, self.params.n_legs + 1)
+                    f"{measure_name}[leg {leg_number}]"
+                    for leg_number in range(3, self.params.n_legs + 1)
                 ]
             else:
                 constraint_names.append(measure_name)
@@ -250,8 +254,9 @@ class TuneProblem:
         )
 
     def denormalize_parameters(self, normalized_parameters: np.ndarray) -> np.ndarray:
-        """Return the values of all float parameters. The free ones are given in widths of the
-        bounds above the lower bounds.
+        """Return all float parameters of the wheel with the given normalized free parameters.
+
+        A normalized parameter is the distance from the lower bound in widths of the bounds.
         """
         parameter_values = np.array(self.gait_finder.model.parameter_values(self.params))
         parameter_values[self.free_parameter_indices] = (
@@ -273,9 +278,10 @@ class TuneProblem:
         )
         return np.clip((start_values - self.lower_bounds) / self.bound_widths, 0.0, 1.0)
 
-    def evaluate_start(self, u: np.ndarray) -> EvaluatedTrial:
-        """Return the trial at the normalized parameters `u`. Raise a ValueError if the trial is
-        unusable.
+    def evaluate_start_trial(self, u: np.ndarray) -> EvaluatedTrial:
+        """Return the trial at the normalized parameters `u`.
+
+        Raise a ValueError if the trial is unusable.
         """
         start_trial = self.evaluate_trial(u, None)
         if not start_trial.has_gait_on_branch:
@@ -298,8 +304,9 @@ class TuneProblem:
     def evaluate_trial(
         self, normalized_parameters: np.ndarray, neighbor_trial: EvaluatedTrial | None
     ) -> EvaluatedTrial:
-        """Return the trial at the normalized parameters. The search begins at the gait of
-        `neighbor_trial`, if given.
+        """Return the trial at the normalized parameters.
+
+        If `neighbor_trial` is given, the search begins at its gait.
         """
         parameter_values = jnp.asarray(self.denormalize_parameters(normalized_parameters))
         neighbor_evaluation = None if neighbor_trial is None else neighbor_trial.gait_evaluation
@@ -337,7 +344,7 @@ class TuneProblem:
         gait_outcome: Outcome,
         is_on_branch: bool,
     ) -> EvaluatedTrial:
-        """Return a trial from the objective and constraints of a gait."""
+        """Return a trial with the objective and constraints of a gait."""
         objective_and_constraint_values = np.array(gait_evaluation.values)
         free_jacobian = (
             np.array(gait_evaluation.jacobian)[self.free_parameter_indices].T * self.bound_widths
@@ -358,15 +365,15 @@ class TuneProblem:
             gait_evaluation,
         )
 
-    def explore_starts(self, n_starts: int, seed: int) -> ExplorationResult:
-        """Return the ends of first-order steps from this wheel and from random wheels, all in one
+    def explore_random_starts(self, n_starts: int, seed: int) -> ExplorationResult:
+        """Return the ends of first-order steps from this wheel and from random wheels, in one
         batch.
         """
         random_starts = np.random.default_rng(seed).uniform(
             size=(n_starts - 1, len(self.free_parameters))
         )
 
-        def compute_parameter_changes(normalized_changes: np.ndarray) -> np.ndarray:
+        def denormalize_parameter_changes(normalized_changes: np.ndarray) -> np.ndarray:
             parameter_changes = np.zeros(
                 (normalized_changes.shape[0], len(self.gait_finder.model.parameter_names))
             )
@@ -378,7 +385,7 @@ class TuneProblem:
         exploration_result = explore_starts(
             self._evaluate_gait_batch,
             np.vstack([self.normalized_start, random_starts]),
-            compute_parameter_changes,
+            denormalize_parameter_changes,
             self.free_parameter_indices,
             self.bound_widths,
             self.min_constraint_values,
@@ -393,8 +400,9 @@ class TuneProblem:
     def _evaluate_gait_batch(
         self, normalized_parameters: np.ndarray, neighbor_evaluation: GaitEvaluation | None
     ) -> GaitEvaluation:
-        """Return the gaits at rows of normalized parameters. The search begins at the gaits of
-        `neighbor_evaluation`, if given.
+        """Return the gaits at rows of normalized parameters.
+
+        If `neighbor_evaluation` is given, the search begins at its gaits.
         """
         parameter_values = jnp.asarray(
             [self.denormalize_parameters(parameter_row) for parameter_row in normalized_parameters]
@@ -417,7 +425,9 @@ class TuneProblem:
         compiled_seconds: float,
         exploration_result: ExplorationResult | None = None,
     ) -> TuneResult:
-        """Return the result of a maximization, with active constraints and a validation walk."""
+        """Return the `TuneResult` of a maximization, with active constraints and a validation
+        walk.
+        """
         best_trial = maximization_result.best_trial
         assert best_trial.gait_evaluation is not None
         best_gait = best_trial.gait_evaluation.gait
@@ -426,7 +436,7 @@ class TuneProblem:
         active_constraints = [
             ActiveConstraint(
                 measure_name.removeprefix(UPPER_BOUND_PREFIX),
-                restore_bound_sign(measure_name, limit_value),
+                restore_sign_of_bound(measure_name, limit_value),
                 get_measure(measure_name).unit,
                 objective_price,
             )
@@ -457,7 +467,7 @@ class TuneProblem:
                         )
                     )
         end_seconds = time.perf_counter()
-        walk_validation = self._validate_by_walking(params, best_gait)
+        walk_validation = self._validate_tuned_wheel_by_walking(params, best_gait)
         step_measures = best_gait.step.measures()
         violated_names = [
             measure_name
@@ -490,14 +500,14 @@ class TuneProblem:
             exploration=exploration_result,
         )
 
-    def _validate_by_walking(self, params: WheelParams, gait: Gait) -> WalkValidation:
-        """Return the result of a walk from a state near the section state of the gait."""
+    def _validate_tuned_wheel_by_walking(self, params: WheelParams, gait: Gait) -> WalkValidation:
+        """Return the result of a walk that starts near the section state of the gait."""
         cycle_state, walk_options = np.array(gait.cycle.section_state), self.validation_options
         # The state is scaled down, not up, because no leg may be beyond its stopper.
         section_state = cycle_state * (1.0 - walk_options.relative_start_displacement)
         is_feasible, walk_outcome, n_walked = True, Outcome.STEPPED, 0
         margins_by_default = default_margins(params)
-        for _ in range(walk_options.n_validation_steps):
+        for _ in range(walk_options.n_steps_of_walk):
             step_result = self.gait_finder.take_step(params, jnp.asarray(section_state))
             walk_outcome = Outcome(int(step_result.outcome))
             if walk_outcome != Outcome.STEPPED:
@@ -530,7 +540,7 @@ class TuneProblem:
         )
 
     def _make_path_dataset(self, maximization_result: MaximizationResult) -> xr.Dataset:
-        """Return the dataset of all trials of a maximization, in order."""
+        """Return a dataset of all trials of a maximization, in order."""
         evaluation_dimension = "evaluation"
         normalized_parameters = np.array(
             [trial.normalized_parameters for trial in maximization_result.evaluated_trials]
@@ -630,7 +640,8 @@ def make_tune_problem(
     options: StepOptions | None = None,
     cycle_options: CycleOptions | None = None,
 ) -> TuneProblem:
-    """Return the validated problem that `tune` solves, for single gaits or another method.
+    """Return the validated problem that `tune` solves, for evaluations of single gaits or other
+    methods.
 
     Raises:
         TypeError, ValueError: if an argument is invalid; the message names the remedy.
@@ -685,7 +696,7 @@ def make_tune_problem(
 def _parse_objective_function(
     objective: ObjectiveSpecification, gait_finder: AbstractGaitFinder
 ) -> tuple[ObjectiveFunction, str]:
-    """Return the function of an objective and its label."""
+    """Return the function of an objective, and its label."""
     if not (callable(objective) or isinstance(objective, str | Mapping)):
         raise TypeError(
             f"objective is {format_value(objective)}, but it is a measure's name, weights of "
@@ -730,7 +741,7 @@ def _parse_objective_function(
 def _check_parameter_bounds(
     params: WheelParams, free: Sequence[str], bounds: Mapping[str, tuple[float, float]]
 ) -> tuple[tuple[str, ...], np.ndarray, np.ndarray]:
-    """Return the names of the free parameters, their lower and their upper bounds."""
+    """Return the names of the free parameters, and the arrays of their lower and upper bounds."""
     free_parameters = check_names("free", free)
     check_type("bounds", bounds, Mapping, "write {'damping': (100.0, 200.0)}")
     if len(set(free_parameters)) < len(free_parameters):

@@ -1,4 +1,4 @@
-"""Result of tuning: the gait, all evaluated gaits, and the constraints that are active."""
+"""Result of tuning: the gait, all evaluated gaits, and the active constraints."""
 
 from __future__ import annotations
 
@@ -51,11 +51,12 @@ class WalkValidation(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class TuneResult:
-    """Result of tuning: the gait, how it was found, and the constraints that are active.
+    """Result of tuning: the gait, the path of the maximization, and the active constraints.
 
     - `params`: the wheel;
     - `status`: reason why the maximization ended;
-    - `objective`, `value`, `start_value`: name of the objective, its value here and at the start;
+    - `objective`, `value`, `start_value`: name of the objective, and its value at the tuned gait
+      and at the start;
     - `active`: constraints and bounds that are active, each with its price;
     - `validation`: a walk of ten steps of the wheel;
     - `cycle`: LimitCycle, or ReturnMapCycle with unilateral contact;
@@ -102,11 +103,11 @@ class TuneResult:
 
     @property
     def ending(self) -> str:
-        """Return why the maximization ended, as a sentence."""
+        """Return a sentence with the reason why the maximization ended."""
         return self.status.meaning
 
     def describe(self) -> dict[str, str]:
-        """Return the printed lines of the result by label."""
+        """Return the printed texts of the result by label."""
         free_names = self.path.attrs["free"].split()
         parameter_texts = [
             f"{parameter_name} "

@@ -64,7 +64,9 @@ it.
 
 
 def find_wheel_page() -> Path:
-    """Return the path of the page, which is inside the installed package or beside the package."""
+    """Return the path of the page docs/wheel.html, which lies in the installed package or beside
+    it.
+    """
     package_folder = Path(__file__).parents[1]
     return next(
         candidate_path
@@ -77,7 +79,7 @@ def find_wheel_page() -> Path:
 
 
 def make_page_address(params: WheelParams, model_name: str = PAGE_MODEL_NAMES[0]) -> str:
-    """Return the address of the page that shows this wheel."""
+    """Return the address of the page docs/wheel.html with the parameters of this wheel."""
     default_values = _make_page_values(WheelParams(), 1.0, PAGE_MODEL_NAMES[0])
     page_values = _make_page_values(
         params, 1.0, check_choice("model_name", model_name, PAGE_MODEL_NAMES)
@@ -101,11 +103,11 @@ def explore(
 ) -> Any:
     """Return an interactive widget of the wheel for Jupyter, JupyterLab, VS Code and marimo.
 
-    It is the page docs/wheel.html, which computes in the browser with the step of this library. The
-    property `params` of the widget is the wheel that is shown; setting it moves the sliders. The
-    properties `friction` and `model_name` work likewise. `measures` holds the measures of the step
-    by the names of `vrw.MEASURES`. The package anywidget is required:
-    `pip install 'vrw-jax[explore]'`.
+    The widget is the page docs/wheel.html, which computes in the browser with the step of this
+    library. The property `params` of the widget is the displayed wheel. An assignment to `params`
+    moves the sliders. The properties `friction` and `model_name` work likewise. `measures` contains
+    the measures of the step by the names of `vrw.MEASURES`. The package anywidget is required: `pip
+    install 'vrw-jax[explore]'`.
 
     Args:
         params: the wheel at the start; by default that of Table 1.
@@ -116,7 +118,7 @@ def explore(
         height: height of the widget, in pixels.
 
     Returns:
-        The widget, to be shown in a cell of its own.
+        The widget, which a notebook displays as the result of a cell.
 
     Raises:
         TypeError, ValueError: if an argument is invalid; the message names the remedy.
@@ -146,9 +148,7 @@ def explore(
 
 @functools.cache
 def _make_widget_class() -> type:
-    """Return the class of the widget, which is created on first use because anywidget is
-    optional.
-    """
+    """Return the class of the widget. It is created on first use because anywidget is optional."""
     try:
         import anywidget
         import traitlets
@@ -159,7 +159,9 @@ def _make_widget_class() -> type:
         ) from error
 
     class Explorer(anywidget.AnyWidget):
-        """Widget that shows the page in a frame and exchanges numbers with it."""
+        """Widget that shows the page in a frame and exchanges parameters and measures with the
+        page.
+        """
 
         _esm = WIDGET_JAVASCRIPT
         page = traitlets.Unicode().tag(sync=True)
@@ -171,8 +173,11 @@ def _make_widget_class() -> type:
         @property
         def params(self) -> WheelParams:
             """Return the wheel that is shown."""
-            numbers = {name: float(self.values[name]) for name in PARAMETER_DOMAINS}
-            return WheelParams(**numbers, n_legs=int(self.values["n_legs"]))
+            parameter_values = {
+                parameter_name: float(self.values[parameter_name])
+                for parameter_name in PARAMETER_DOMAINS
+            }
+            return WheelParams(**parameter_values, n_legs=int(self.values["n_legs"]))
 
         @params.setter
         def params(self, params: WheelParams) -> None:
@@ -184,8 +189,11 @@ def _make_widget_class() -> type:
             return float(self.values[FRICTION_NAME])
 
         @friction.setter
-        def friction(self, value: float) -> None:
-            self.values = {**self.values, FRICTION_NAME: require_known_friction(value)}
+        def friction(self, friction_coefficient: float) -> None:
+            self.values = {
+                **self.values,
+                FRICTION_NAME: require_known_friction(friction_coefficient),
+            }
 
         @property
         def model_name(self) -> str:
@@ -205,7 +213,7 @@ def _make_widget_class() -> type:
 def _make_page_values(
     params: WheelParams, friction: float, model_name: str
 ) -> dict[str, float | str]:
-    """Return the values that the page exchanges: parameters, friction and model, by name."""
+    """Return the inputs of the page by name: parameters, friction and model."""
     parameter_values = {
         parameter_name: float(getattr(params, parameter_name))
         for parameter_name in PARAMETER_DOMAINS
@@ -221,8 +229,8 @@ def _make_page_values(
 def _make_page_map(dataset: "xr.Dataset") -> dict[str, Any]:
     """Return a scan over two parameters in the format of the page's map.
 
-    Values that are not finite become None. A measure with one value per leg is replaced by its
-    smallest value.
+    Numbers that are not finite become None. A measure with one number per leg is replaced by the
+    smallest of these numbers.
     """
     import xarray
 
@@ -252,13 +260,15 @@ def _make_page_map(dataset: "xr.Dataset") -> dict[str, Any]:
             if dimension_name not in map_axes
         ]
         if measure_array.dtype.kind == "f" and set(map_axes) <= set(measure_array.dims):
-            lowest_values = measure_array.min(other_dimensions).transpose(*map_axes[::-1]).values
+            min_values_over_legs = (
+                measure_array.min(other_dimensions).transpose(*map_axes[::-1]).values
+            )
             map_measures[str(variable_name)] = [
                 [
                     float(measure_value) if math.isfinite(measure_value) else None
                     for measure_value in value_row
                 ]
-                for value_row in lowest_values.tolist()
+                for value_row in min_values_over_legs.tolist()
             ]
     return {
         "axes": [

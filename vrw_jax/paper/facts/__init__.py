@@ -1,3 +1,3 @@
-"""Facts of the paper, published and computed."""
+"""Published facts of the paper, and the computed counterpart of each fact."""
 
 from vrw_jax.paper.facts.table import compute_paper_facts, format_facts_page, write_facts_files

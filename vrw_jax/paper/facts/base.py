@@ -14,8 +14,9 @@ from vrw_jax.wheel import WheelParams
 
 @dataclass(frozen=True)
 class PaperFact:
-    """One fact of the table: claim, source, published and computed value, and whether the values
-    agree."""
+    """One fact of the table: claim, source, published and computed value, and whether the two
+    agree.
+    """
 
     group: str
     claim: str
@@ -27,14 +28,16 @@ class PaperFact:
 
     @property
     def is_from_reference_code(self) -> bool:
-        """Return whether an independent code gives the reference number, not the paper."""
+        """Return whether the published value of the fact is from independent code instead of the
+        paper.
+        """
         return (
             INDEPENDENT_CODE_LABEL in self.source or INDEPENDENT_CODE_LABEL in self.published_value
         )
 
     @property
     def verdict(self) -> str:
-        """Return whether the fact holds, as text."""
+        """Return a text that states whether the fact holds."""
         return "holds" if self.holds else "does not hold"
 
 
@@ -77,7 +80,7 @@ ClaimNumbers = Mapping[str, Any]
 
 @dataclass(frozen=True)
 class PaperClaim:
-    """Published statement, text of the computed value, and condition under which the two agree."""
+    """Published statement, text of the computed value, and test of their agreement."""
 
     claim: str
     source: str
@@ -92,12 +95,12 @@ class PaperClaimGroup:
     """Claims under one heading, computed from the same numbers."""
 
     title: str
-    compute_numbers: Callable[[PaperEvidence], ClaimNumbers]
+    number_function: Callable[[PaperEvidence], ClaimNumbers]
     claims: tuple[PaperClaim, ...]
 
     def make_facts(self, evidence: PaperEvidence) -> list[PaperFact]:
-        """Return the facts of the claims, computed from the evidence."""
-        numbers_by_name = self.compute_numbers(evidence)
+        """Return the facts of the group's claims, computed from the evidence."""
+        numbers_by_name = self.number_function(evidence)
         number_namespace = SimpleNamespace(**numbers_by_name)
         return [
             PaperFact(

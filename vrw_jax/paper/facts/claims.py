@@ -22,30 +22,32 @@ from vrw_jax.paper.gaits import DEFAULT_SETTLING_OPTIONS
 from vrw_jax.wheel import Outcome
 
 
-def _compute_typical_gait_numbers(e: PaperEvidence) -> ClaimNumbers:
-    """Return the numbers for the claims on the gait of Table 1, by name."""
-    first_step = select_first_step_of_trajectory(e.table_1_trajectory)
+def _compute_typical_gait_numbers(paper_evidence: PaperEvidence) -> ClaimNumbers:
+    """Return the computed numbers for the claims on the gait of Table 1, by name."""
+    first_step = select_first_step_of_trajectory(paper_evidence.table_1_trajectory)
     phase_trajectories = double_support, single_support_1, single_support_2 = (
         split_trajectory_by_phase(first_step)
     )
-    state_changes = e.settling_walk.change.values[1:]
+    state_changes = paper_evidence.settling_walk.change.values[1:]
     convergence_ratio = float((state_changes[12] / state_changes[4]) ** (1.0 / 8.0))
     rear_load_fraction = double_support.lambda_4.values / (
         double_support.lambda_2.values + double_support.lambda_4.values
     )
     step_period = float(first_step.time[-1] - first_step.time[0])
     total_energies = first_step.total_energy.values
-    count_local_maxima = lambda x: int(np.sum((x[1:-1] > x[:-2]) & (x[1:-1] >= x[2:])))
+    local_maximum_counter = lambda x: int(np.sum((x[1:-1] > x[:-2]) & (x[1:-1] >= x[2:])))
     return {
         "shrink": convergence_ratio,
         "change": state_changes[-1],
-        "settled": bool(e.settling_walk.settled and convergence_ratio < 1.0),
+        "settled": bool(paper_evidence.settling_walk.settled and convergence_ratio < 1.0),
         "theta": float(first_step.theta[0]),
         "dtheta": float(first_step.dtheta[0]),
         "period": step_period,
-        "speed": float(e.table_1_trajectory.x[-1] - e.table_1_trajectory.x[0])
+        "speed": float(
+            paper_evidence.table_1_trajectory.x[-1] - paper_evidence.table_1_trajectory.x[0]
+        )
         / (2.0 * step_period),
-        "share": 100 * float(e.table_1_gait.dls_fraction),
+        "share": 100 * float(paper_evidence.table_1_gait.dls_fraction),
         "durations": [
             float(phase_trajectory.time[-1] - phase_trajectory.time[0])
             for phase_trajectory in phase_trajectories
@@ -54,7 +56,9 @@ def _compute_typical_gait_numbers(e: PaperEvidence) -> ClaimNumbers:
         "fore_rate": float(first_step.dL1.max()),
         "rear_rate": min(float(double_support.dL2.min()), float(single_support_1.dL2.min())),
         "rear_length": float(single_support_1.L2[-1]),
-        "off_stopper": abs(float(single_support_1.L2[-1]) - float(e.params.locked_length)),
+        "off_stopper": abs(
+            float(single_support_1.L2[-1]) - float(paper_evidence.params.locked_length)
+        ),
         "load_before": float(first_step.lambda_2[-1]),
         "first_rear": 100 * rear_load_fraction[0],
         "most_rear": 100 * rear_load_fraction.max(),
@@ -63,7 +67,7 @@ def _compute_typical_gait_numbers(e: PaperEvidence) -> ClaimNumbers:
         "jump": (float(double_support.lambda_2[-1]), float(single_support_1.lambda_2[0])),
         "tangential": (float(double_support.lambda_3[-1]), float(single_support_1.lambda_3[0])),
         "peaks": sum(
-            count_local_maxima(phase_trajectory.lambda_2.values)
+            local_maximum_counter(phase_trajectory.lambda_2.values)
             for phase_trajectory in phase_trajectories
         ),
         "peak": float(first_step.lambda_2.max()),
@@ -73,27 +77,31 @@ def _compute_typical_gait_numbers(e: PaperEvidence) -> ClaimNumbers:
     }
 
 
-def _compute_damping_numbers(e: PaperEvidence) -> ClaimNumbers:
-    """Return the numbers for the claims on foot height and rear force at three values of damping,
-    by name."""
-    gaits_by_damping = {g.attrs["parameter_damping"]: g for g in e.gaits_by_damping}
+def _compute_damping_numbers(paper_evidence: PaperEvidence) -> ClaimNumbers:
+    """Return the computed numbers for the claims on foot height and rear force, by name.
+
+    The claims are on gaits with three values of damping.
+    """
+    gaits_by_damping = {g.attrs["parameter_damping"]: g for g in paper_evidence.gaits_by_damping}
     lowest_foot_heights = {
         c: float(gaits_by_damping[c].foot_2_z.min()) for c in sorted(gaits_by_damping)
     }
     first_rear_forces = {
         c: float(gaits_by_damping[c].lambda_4[0]) for c in sorted(gaits_by_damping)
     }
-    lowest_clearances = np.minimum(e.damping_branch.clearance_sls1, e.damping_branch.clearance_sls2)
-    is_scuffing = e.damping_branch.settled.values & (lowest_clearances.values < 0.0)
+    lowest_clearances = np.minimum(
+        paper_evidence.damping_branch.clearance_sls1, paper_evidence.damping_branch.clearance_sls2
+    )
+    is_scuffing = paper_evidence.damping_branch.settled.values & (lowest_clearances.values < 0.0)
     return {
         "lowest": ", ".join(
             f"{round(1e3 * z, 2) + 0.0:.2f} mm" for z in lowest_foot_heights.values()
         ),
         "below": {c: z < -STEP_ERROR_TOLERANCE for c, z in lowest_foot_heights.items()},
-        "last": float(e.damping_branch.damping.values[is_scuffing].max())
+        "last": float(paper_evidence.damping_branch.damping.values[is_scuffing].max())
         if is_scuffing.any()
         else math.nan,
-        "all_below": bool(is_scuffing[e.damping_branch.damping.values <= 100.0].all()),
+        "all_below": bool(is_scuffing[paper_evidence.damping_branch.damping.values <= 100.0].all()),
         "first": " > ".join(f"{rear_force:.1f}" for rear_force in first_rear_forces.values()),
         "falls": first_rear_forces[50.0]
         > first_rear_forces[100.0]
@@ -177,49 +185,56 @@ DAMPING_CLAIMS = PaperClaimGroup("Foot 2 and rear force for three dampings",
 # fmt: on
 
 
-def _compute_indicator_numbers(e: PaperEvidence) -> ClaimNumbers:
-    """Return the numbers for the claims on double-support indicators along the damping, by name."""
-    damping_branch = e.damping_branch
-    lower_branch = damping_branch.sel(damping=slice(1.0, 219.0))
-    upper_branch = damping_branch.sel(damping=slice(220.0, None))
-    get_branch_value = lambda c, name: float(damping_branch[name].sel(damping=c))
-    branch_impulses = lower_branch.lambda_I4.values
+def _compute_indicator_numbers(paper_evidence: PaperEvidence) -> ClaimNumbers:
+    """Return the computed numbers for the claims on double-support indicators along the damping, by
+    name.
+    """
+    damping_branch = paper_evidence.damping_branch
+    gaits_to_damping_219 = damping_branch.sel(damping=slice(1.0, 219.0))
+    gaits_from_damping_220 = damping_branch.sel(damping=slice(220.0, None))
+    branch_value_reader = lambda c, indicator_name: float(
+        damping_branch[indicator_name].sel(damping=c)
+    )
+    branch_impulses = gaits_to_damping_219.lambda_I4.values
     landing_impulses = np.array(
         [
-            printed.compute_printed_landing(e.params, x).impulse
-            for x in lower_branch.section_state.values
+            printed.compute_printed_landing(paper_evidence.params, x).corrected_impulse
+            for x in gaits_to_damping_219.section_state.values
         ]
     )
-    rear_forces = {c: get_branch_value(c, "lambda_4_plus") for c in (1.0, 218.0, 219.0)}
-    continues_walking = bool((upper_branch.outcome == Outcome.STEPPED).all())
+    rear_forces = {c: branch_value_reader(c, "lambda_4_plus") for c in (1.0, 218.0, 219.0)}
+    continues_walking = bool((gaits_from_damping_220.outcome == Outcome.STEPPED).all())
     return {
-        "n_settled": int(lower_branch.settled.sum()),
-        "n": lower_branch.sizes["damping"],
+        "n_settled": int(gaits_to_damping_219.settled.sum()),
+        "n": gaits_to_damping_219.sizes["damping"],
         "rear": (rear_forces[1.0], rear_forces[219.0], 2 * rear_forces[219.0] - rear_forces[218.0]),
         "last_rear": rear_forces[219.0],
-        "rear_falls": bool((np.diff(lower_branch.lambda_4_plus) < 0.0).all()),
-        "fore": (get_branch_value(219.0, "lambda_2_plus"), get_branch_value(1.0, "lambda_2_plus")),
-        "fore_5": get_branch_value(5.0, "lambda_2_plus"),
-        "fore_4": get_branch_value(4.0, "lambda_2_plus"),
-        "fore_grows": bool((np.diff(lower_branch.lambda_2_plus) > 0.0).all()),
+        "rear_falls": bool((np.diff(gaits_to_damping_219.lambda_4_plus) < 0.0).all()),
+        "fore": (
+            branch_value_reader(219.0, "lambda_2_plus"),
+            branch_value_reader(1.0, "lambda_2_plus"),
+        ),
+        "fore_5": branch_value_reader(5.0, "lambda_2_plus"),
+        "fore_4": branch_value_reader(4.0, "lambda_2_plus"),
+        "fore_grows": bool((np.diff(gaits_to_damping_219.lambda_2_plus) > 0.0).all()),
         "least": branch_impulses.min(),
         "most": branch_impulses.max(),
         "fore_impulse": (landing_impulses[:, 1].min(), landing_impulses[:, 1].max()),
         "smallest": [
             min(
-                get_branch_value(c, name)
-                for name in ("lambda_I4", "lambda_2_plus", "lambda_4_plus")
+                branch_value_reader(c, indicator_name)
+                for indicator_name in ("lambda_I4", "lambda_2_plus", "lambda_4_plus")
             )
             for c in (50.0, 100.0, 200.0)
         ],
         "walks_on": continues_walking,
         "yes_or_no": "yes" if continues_walking else "no",
-        "never_settles": not bool(upper_branch.settled.any()),
-        "change": float(upper_branch.change.min()),
-        "end": float(upper_branch.damping.max()),
-        "share": 100 * get_branch_value(219.0, "dls_fraction"),
-        "too_fast": e.fast_start_walk.outcome,
-        "too_fast_ends": str(e.fast_start_walk.outcome).lower().replace("_", " "),
+        "never_settles": not bool(gaits_from_damping_220.settled.any()),
+        "change": float(gaits_from_damping_220.change.min()),
+        "end": float(gaits_from_damping_220.damping.max()),
+        "share": 100 * branch_value_reader(219.0, "dls_fraction"),
+        "too_fast": paper_evidence.fast_start_walk.outcome,
+        "too_fast_ends": str(paper_evidence.fast_start_walk.outcome).lower().replace("_", " "),
     }
 
 
@@ -273,18 +288,24 @@ INDICATOR_CLAIMS = PaperClaimGroup("DLS indicators over c, slope 0.30 rad",
 # fmt: on
 
 
-def _compute_assumption_numbers(e: PaperEvidence) -> ClaimNumbers:
-    """Return the numbers for the claims on the model's assumptions at Table 1, by name."""
-    table_1_gait, first_step = e.table_1_gait, select_first_step_of_trajectory(e.table_1_trajectory)
+def _compute_assumption_numbers(paper_evidence: PaperEvidence) -> ClaimNumbers:
+    """Return the computed numbers for the claims on the model's assumptions at Table 1, by name."""
+    table_1_gait, first_step = (
+        paper_evidence.table_1_gait,
+        select_first_step_of_trajectory(paper_evidence.table_1_trajectory),
+    )
     double_support, *_ = split_trajectory_by_phase(first_step)
-    natural_length, locked_length = float(e.params.natural_length), float(e.params.locked_length)
+    natural_length, locked_length = (
+        float(paper_evidence.params.natural_length),
+        float(paper_evidence.params.locked_length),
+    )
     stopper_impulses_per_mass = table_1_gait.landing_stopper_impulse.values / float(
-        e.params.leg_mass
+        paper_evidence.params.leg_mass
     )
     separation_speeds = np.sort(stopper_impulses_per_mass[stopper_impulses_per_mass < 0.0])
     landing_impulse = printed.compute_printed_landing(
-        e.params, table_1_gait.section_state.values
-    ).impulse
+        paper_evidence.params, table_1_gait.section_state.values
+    ).corrected_impulse
     required_friction = np.abs(
         double_support.lambda_3.values[:-1] / double_support.lambda_4.values[:-1]
     )
@@ -303,7 +324,7 @@ def _compute_assumption_numbers(e: PaperEvidence) -> ClaimNumbers:
         "last_rear_force": abs(float(double_support.lambda_4[-1])),
         "clearance": min(float(table_1_gait.clearance_sls1), float(table_1_gait.clearance_sls2)),
         "locked_force": float(table_1_gait.locked_stopper_force.min()),
-        "preload": float(e.params.stiffness) * (natural_length - locked_length),
+        "preload": float(paper_evidence.params.stiffness) * (natural_length - locked_length),
         "contraction": locked_length - float(first_step.L1[1:].max()),
         "order": " → ".join(phase_order),
         "back_in_time": phase_order == list(PHASE_NAMES)

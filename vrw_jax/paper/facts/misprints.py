@@ -1,4 +1,4 @@
-"""Misprints of the paper, each with numbers that demonstrate the misprint."""
+"""Misprints of the paper, each with numbers that show the misprint."""
 
 import math
 
@@ -16,51 +16,65 @@ from vrw_jax.paper.facts.base import (
 from vrw_jax.wheel import Outcome
 
 
-def _compute_misprint_numbers(e: PaperEvidence) -> ClaimNumbers:
-    """Return the numbers for the claims on misprints, from equations as printed and as corrected,
-    by name."""
+def _compute_misprint_numbers(paper_evidence: PaperEvidence) -> ClaimNumbers:
+    """Return the computed numbers for the claims on misprints, by name.
+
+    The numbers follow from equations as printed and from corrected equations.
+    """
     section_state, library_impulse = (
-        e.table_1_gait.section_state.values,
-        float(e.table_1_gait.lambda_I4),
+        paper_evidence.table_1_gait.section_state.values,
+        float(paper_evidence.table_1_gait.lambda_I4),
     )
-    printed_landing = printed.compute_printed_landing(e.params, section_state)
-    reference_velocity = printed.differentiate_landing_foot_position(e.params, section_state)
-    compute_velocity_error = lambda rate: float(
+    printed_landing = printed.compute_printed_landing(paper_evidence.params, section_state)
+    reference_velocity = printed.differentiate_landing_foot_position(
+        paper_evidence.params, section_state
+    )
+    velocity_error_function = lambda rate: float(
         np.abs(
-            printed.compute_landing_foot_velocity(e.params, section_state, rate)
+            printed.compute_landing_foot_velocity(paper_evidence.params, section_state, rate)
             - reference_velocity
         ).max()
     )
-    gentle_slope_gait = e.slope_branch.sel(slope=0.10, method="nearest")
-    has_settled_gait = e.gentle_slope_branch.settled.values
+    gentle_slope_gait = paper_evidence.slope_branch.sel(slope=0.10, method="nearest")
+    has_settled_gait = paper_evidence.gentle_slope_branch.settled.values
     return {
-        "wrong": printed.compute_constraint_violation(e.table_1_trajectory, is_as_printed=True),
-        "right": printed.compute_constraint_violation(e.table_1_trajectory, is_as_printed=False),
+        "wrong": printed.compute_constraint_violation(
+            paper_evidence.table_1_trajectory, is_as_printed=True
+        ),
+        "right": printed.compute_constraint_violation(
+            paper_evidence.table_1_trajectory, is_as_printed=False
+        ),
         "residual": printed_landing.momentum_residual,
         "velocities": bool(
-            np.array_equal(printed_landing.printed_impulse, printed_landing.velocity_after)
+            np.array_equal(
+                printed_landing.impulse_as_printed, printed_landing.coordinate_rates_after
+            )
         ),
-        "impulse": printed_landing.impulse[3],
+        "impulse": printed_landing.corrected_impulse[3],
         "here": library_impulse,
-        "off": abs(printed_landing.impulse[3] - library_impulse),
-        "off_new": compute_velocity_error(0.0),
-        "off_old": compute_velocity_error(float(section_state[2])),
+        "off": abs(printed_landing.corrected_impulse[3] - library_impulse),
+        "off_new": velocity_error_function(0.0),
+        "off_old": velocity_error_function(float(section_state[2])),
         "slow_settled": bool(gentle_slope_gait.settled),
         "share": 100.0 * float(gentle_slope_gait.dls_fraction),
         "period": float(gentle_slope_gait.period),
-        "rear": float(e.gentle_slope_branch.lambda_4_plus.values[has_settled_gait].min())
+        "rear": float(
+            paper_evidence.gentle_slope_branch.lambda_4_plus.values[has_settled_gait].min()
+        )
         if has_settled_gait.any()
         else math.nan,
-        "last": float(e.gentle_slope_branch.damping.values[has_settled_gait].max())
+        "last": float(paper_evidence.gentle_slope_branch.damping.values[has_settled_gait].max())
         if has_settled_gait.any()
         else math.nan,
-        "end": float(e.gentle_slope_branch.damping.max()),
+        "end": float(paper_evidence.gentle_slope_branch.damping.max()),
         "end_walks": has_settled_gait[-1],
-        "end_outcome": Outcome(int(e.gentle_slope_branch.outcome.values[-1]))
+        "end_outcome": Outcome(int(paper_evidence.gentle_slope_branch.outcome.values[-1]))
         .name.lower()
         .replace("_", " "),
-        "low": float(e.gentle_slope_low_damping_branch.lambda_2_plus.sel(damping=4.0)),
-        "low_settled": bool(e.gentle_slope_low_damping_branch.settled.sel(damping=4.0)),
+        "low": float(paper_evidence.gentle_slope_low_damping_branch.lambda_2_plus.sel(damping=4.0)),
+        "low_settled": bool(
+            paper_evidence.gentle_slope_low_damping_branch.settled.sel(damping=4.0)
+        ),
     }
 
 

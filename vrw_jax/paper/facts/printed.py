@@ -1,8 +1,7 @@
-"""Equations of the paper, as printed and in corrected form, if numbers can distinguish the two
-forms.
+"""Equations of the paper, as printed and corrected, if numbers can distinguish the two forms.
 
-The equations use the paper's five coordinates q = (x, z, theta, L1, L2). Only the mass matrix and
-the momentum are taken from the simulator.
+The equations use the paper's five coordinates q = (x, z, theta, L1, L2). The simulator provides
+only the mass matrix and the momentum.
 """
 
 from typing import NamedTuple
@@ -76,9 +75,9 @@ def compute_constraint_violation(walk_trajectory: xr.Dataset, is_as_printed: boo
 class PrintedLandingResult(NamedTuple):
     """Result of collision I by eqs (15)-(21) and (33)-(35), corrected and as printed."""
 
-    velocity_after: np.ndarray  # q'+ of eq. (20)
-    impulse: np.ndarray  # lambda_I = -X^-1 J q'
-    printed_impulse: np.ndarray  # eq. (35) as printed: five numbers
+    coordinate_rates_after: np.ndarray  # q'+ of eq. (20)
+    corrected_impulse: np.ndarray  # lambda_I = -X^-1 J q'
+    impulse_as_printed: np.ndarray  # eq. (35) as printed: five numbers
     momentum_residual: float  # largest |M (q'+ - q') - J^T lambda_I|, N s
 
 

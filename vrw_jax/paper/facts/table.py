@@ -1,6 +1,4 @@
-"""Table of every fact that the paper publishes, with the computed value and whether the two
-agree.
-"""
+"""Table of the facts that the paper publishes, with computed values and their agreement."""
 
 import csv
 import itertools
