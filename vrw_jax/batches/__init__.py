@@ -1,4 +1,4 @@
-"""Gait steps of many wheels in one call, computed by one of several engines."""
+"""Gait steps of many wheels, computed in one call by one of several engines."""
 
 from vrw_jax.batches import batch_steps, collocation_step, programs
 from vrw_jax.batches.batch_steps import step_batch

@@ -1,10 +1,10 @@
 """Gait steps of batches of wheels: one function with a choice of engines.
 
-On a CPU the engine "lanes" is machine code for a few lanes at a time (`simd`). On a GPU it is an
-XLA program for very many lanes, and unfinished lanes run again in smaller batches. Every lane runs
-the same code, and no data pass between lanes. The result of a batch element is therefore bitwise
-the same alone, in any batch and in any order. Wheels whose steps need similar work are placed side
-by side.
+On a CPU the engine "lanes" is machine code that computes a few lanes (elements of the batch) at a
+time (`simd`). On a GPU it is an XLA program for very many lanes, which runs again in smaller
+batches for the unfinished lanes. Every lane runs the same code, and no data pass between lanes. The
+result for a batch element is therefore bitwise the same alone, in any batch and in any order.
+Wheels whose steps need similar work are neighbors in the batch.
 """
 
 import dataclasses
@@ -68,15 +68,15 @@ BatchEngineName = Literal["auto", "lanes", "diffrax", "collocation"]
 BATCH_ENGINE_NAMES: tuple[str, ...] = get_args(BatchEngineName)
 
 PAPER_STEP_INPUT_NAMES = (START_INPUT_NAME, *PARAMETER_NAMES)
-"""Names of the step inputs of the paper's model for which derivatives are available."""
+"""Names of the inputs of a gait step with respect to which the paper's model has derivatives."""
 
 SLOPE_INPUT_INDEX = PARAMETER_NAMES.index("slope")
-"""Index of the slope among the inputs of a step.
+"""Index of the slope among the inputs of a gait step.
 
-The inputs are the parameters, the section state and the slope of the next line.
+The inputs are the parameters, the section state and the slope of the ground after the next landing.
 """
 NEXT_SLOPE_INPUT_INDEX = len(PARAMETER_NAMES) + 3
-"""Index of the slope of the next line among the inputs of a step."""
+"""Index, among the inputs of a gait step, of the slope of the ground after the next landing."""
 
 
 @with_default_jax_settings
@@ -94,40 +94,44 @@ def step_batch(
     """Return the result of up to `n_steps` gait steps of many wheels, with derivatives if
     requested.
 
-    Engine "lanes" is the fastest engine, for the viscoelastic wheel and explicit solvers. "diffrax"
-    maps `model.advance` over the batch and accepts any solver. "auto" selects "lanes" if possible;
-    `StepBatchResult.engine` is the selected engine. `options` limits the error of each solver step
-    in both engines, whose results differ by about ten times the tolerance.
+    The engine "lanes" is the fastest. It supports the viscoelastic wheel and explicit solvers. The
+    engine "diffrax" maps `model.advance` over the batch and accepts any solver. "auto" selects
+    "lanes" if possible; `StepBatchResult.engine` is the selected engine. In "lanes" and "diffrax",
+    `options` limits the error of each solver step. The results of the two engines differ by about
+    ten times the tolerance.
 
     "auto" also replaces the requested solver if the airborne leg is so stiff that another solver is
     cheaper. `StepBatchResult.solver_index` identifies the selected solver. Tsit5 is selected if
-    stability limits the solver steps. At the default options this is the case from c/m = 1,900 1/s;
+    stability limits the solver steps. At the default options it is selected from c/m = 1,900 1/s;
     at a tolerance of 1e-6, from 300 1/s. Kvaerno5 in "diffrax" is selected if Tsit5 failed, or if
-    explicit solvers need too many steps. At the default options this is the case from c/m = 4e5
-    1/s; at a tolerance of 1e-6, from 1.4e5 1/s.
+    explicit solvers need too many solver steps. At the default options it is selected from
+    c/m = 4e5 1/s; at a tolerance of 1e-6, from 1.4e5 1/s.
 
-    Derivatives include all steps and their events. They are zero for a wheel that fell, and not
-    available by collocation. With unilateral contact (`UnilateralWheel`) the only engine is
-    "lanes"; friction is a scalar or an array over the batch. The function compiles its programs
-    itself, so it cannot be called inside `jax.jit`.
+    Derivatives are those of the result of all gait steps and include their events. The derivatives
+    are zero for a wheel that fell, and not available by collocation. With unilateral contact
+    (`UnilateralWheel`) the only engine is "lanes", and friction is a scalar or an array over the
+    batch. The function compiles its programs itself, so it cannot be called inside `jax.jit`.
 
-    On uneven ground the slope has the shape (elements, n_steps) or (elements, n_steps + 1), over
-    the steps of each element as in `walk`. With unilateral contact, friction may have these shapes
-    too. Derivatives with respect to such an array have the axis over steps last.
+    On uneven ground the slope has the shape (elements, n_steps) or (elements, n_steps + 1), with
+    one value per gait step as in `walk`. With unilateral contact, friction may have these shapes
+    too. Derivatives with respect to such an array have the axis over gait steps last.
 
     Args:
-        params: the wheels; fields are scalars or of shape (elements,); the slope as above.
-        states: section states, shape (elements, 3), rad, rad/s, m/s, or those of the model.
-        n_steps: largest number of steps.
+        params: parameters of the wheels. Each field is a scalar or has the shape (elements,); the
+            slope may also have the shapes above.
+        states: section states in the form of the paper's model, shape (elements, 3), rad, rad/s,
+            m/s, or in the form of `model`.
+        n_steps: largest number of gait steps.
         model: model of the wheel; by default the paper's, `ViscoelasticWheel()`.
-        options: numerical options of the steps.
-        engine: "auto", "lanes", "diffrax" or "collocation", as above.
+        options: numerical options of the gait steps.
+        engine: "auto", "lanes", "diffrax" or "collocation" (steps of a fixed amount of work, near
+            `durations`).
         durations: for "collocation", expected durations of the phases, shape (elements, 3), s.
-        derivatives: "section_state" and names of parameters; with unilateral contact "friction"
-            too.
+        derivatives: inputs with respect to which derivatives are computed: "section_state" and
+            names of parameters; with unilateral contact "friction" too.
 
     Returns:
-        A `StepBatchResult`, for the last step of each element.
+        A `StepBatchResult` for the last gait step of each element.
 
     Raises:
         TypeError, ValueError: if an argument is invalid; the message names the remedy.
@@ -203,10 +207,11 @@ def _check_parameter_shapes(
     options: StepOptions,
     n_steps: int,
 ) -> list[np.ndarray]:
-    """Return each parameter as a scalar or an array over the batch.
+    """Return each parameter as a scalar or an array over the batch, in the order of
+    `PARAMETER_NAMES`.
 
-    The slope, and with unilateral contact the friction, may have a second axis over steps. Raise
-    ValueError if the shapes of states and parameters do not fit.
+    The slope, and with unilateral contact the friction, may have a second axis over gait steps.
+    Raise ValueError if the shapes of states and parameters do not fit.
     """
     section_sizes = [3]
     if section_states.ndim != 2 or section_states.shape[1] != 3:
@@ -377,7 +382,8 @@ def _step_batch_without_contact(
 def _split_slopes_by_step(
     element_slopes: np.ndarray, n_steps: int, requested_engine: str
 ) -> tuple[Any, dict[str, StepwiseParameter]]:
-    """Return the slopes of the lines of all steps, and the role of the slope in the chain rule.
+    """Return the slopes of the ground for all gait steps, and the `StepwiseParameter` of the slope
+    by name.
 
     On flat ground, return a list with one slope, and an empty mapping.
     """
@@ -399,12 +405,13 @@ def _split_slopes_by_step(
 def order_wheels_by_work(
     parameter_columns: list[np.ndarray], section_states: np.ndarray
 ) -> np.ndarray:
-    """Return an order of the batch that places wheels with steps of similar work side by side.
+    """Return the batch indices sorted by the estimated work of a gait step, shape (elements,).
 
-    A group of lanes takes as long as its slowest lane. Most work of a step belongs to SLS-I, in
-    which stability limits the solver steps by m/c. Leg 2 extends at the rate k (Ls - L)/c from its
-    length at release. The exponents are rounded from a fit to numbers of solver steps, for wheels
-    near their gaits and far from them (`python -m experiments.speed.straggler_steps`).
+    A group of lanes takes as long as its slowest lane, so wheels that need similar work become
+    neighbors. Most of the work is in SLS-I, in which stability limits the solver steps by m/c.
+    Leg 2 extends at the rate k (Ls - L)/c from its length at release. The exponents are rounded
+    from a fit to measured numbers of solver steps, for states near the gaits and far from them
+    (`python -m experiments.speed.straggler_steps`).
     """
     parameters_by_name = dict(zip(PARAMETER_NAMES, parameter_columns, strict=True))
     get_float32_parameter = lambda parameter_name: np.asarray(
@@ -431,16 +438,18 @@ def order_wheels_by_work(
 
 
 class _BatchEngine(NamedTuple):
-    """Engine that takes one gait step of any number of lanes. Arrays are NumPy arrays, lanes
-    last.
+    """Engine that computes one gait step for any number of lanes. The last axis of its NumPy arrays
+    is that of the lanes.
     """
 
     engine_name: str
     take_lane_steps: Callable[..., tuple[np.ndarray, ...]]
-    """Function of parameters, section states and, on uneven ground, slopes of the next lines.
+    """Function that computes one gait step. Its arguments are parameters, section states and, on
+    uneven ground, the slopes after the next landing.
 
     The function returns section states, durations, outcomes, numbers of solver steps and, if
-    derivatives are requested, Jacobians."""
+    derivatives are requested, Jacobians.
+    """
 
 
 def _select_batch_engine(
@@ -450,7 +459,9 @@ def _select_batch_engine(
     n_legs: int,
     input_indices: tuple[int, ...],
 ) -> _BatchEngine:
-    """Return the requested engine, or the fastest possible engine if "auto" is requested."""
+    """Return the requested engine, or the fastest engine that supports the model and the solver if
+    "auto" is requested.
+    """
     has_lane_kernel = (
         model.batch_kernel == "phases" and load_explicit_tableau(options.solver) is not None
     )
@@ -479,7 +490,7 @@ def _step_lanes_by_kernel(
     section_states: np.ndarray,
     *next_slopes: np.ndarray,
 ) -> tuple[np.ndarray, ...]:
-    """Return one gait step of all lanes by machine code or XLA.
+    """Return the results of one gait step of all lanes, computed by machine code or XLA.
 
     The results are those of `_BatchEngine.take_lane_steps`.
     """
@@ -553,9 +564,10 @@ def _step_lanes_by_collocation(
     section_states: np.ndarray,
     expected_phase_durations: np.ndarray,
 ) -> tuple[tuple[np.ndarray, ...], np.ndarray]:
-    """Return one step of all lanes by collocation, and whether each lane passed its checks.
+    """Return the results of one gait step of all lanes by collocation, and whether each lane passed
+    the checks of its accuracy.
 
-    `lane_engine` repeats the step of lanes that failed a check. The results are those of
+    `lane_engine` computes the step again for lanes that failed a check. The results are those of
     `_BatchEngine.take_lane_steps`.
     """
     stop_at_lift_off, n_parameters = model.stop_at_lift_off, len(PARAMETER_NAMES)
@@ -599,7 +611,8 @@ def _step_lanes_by_diffrax(
     section_states: np.ndarray,
     *next_slopes: np.ndarray,
 ) -> tuple[np.ndarray, ...]:
-    """Return one step of all lanes by `model.advance` under `jax.vmap`.
+    """Return the results of one gait step of all lanes, computed by `model.advance` under
+    `jax.vmap`.
 
     The results are those of `_BatchEngine.take_lane_steps`.
     """
@@ -628,8 +641,8 @@ def _step_lanes_by_diffrax(
         return jax.tree.map(lambda x: np.array(x).T, step_arrays)
 
     def step_elements_with_jacobian(step_input_matrix: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Return the step of all elements with derivatives, which are zero for elements without
-        any.
+        """Return the results of the gait step of all elements with Jacobians, which are zero where
+        no derivative exists.
 
         diffrax raises an error for the whole batch if the implicit solver's linear equations for
         the derivative of one element cannot be solved. Bisection isolates that element.
@@ -679,9 +692,11 @@ def _step_elements_by_vmap(
     input_indices: tuple[int, ...],
     step_input_matrix: Array,
 ) -> tuple[Array, ...]:
-    """Return one step of each element, with its Jacobian if `input_indices` are given.
+    """Return section states, durations, outcomes and numbers of solver steps of one gait step, and
+    Jacobians if `input_indices` are given.
 
-    `step_input_matrix` contains the step inputs, shape (elements, inputs).
+    - `step_input_matrix`: inputs of the step, shape (elements, inputs);
+    - `input_indices`: indices of the inputs with respect to which the Jacobian is computed.
     """
     n_parameters = len(PARAMETER_NAMES)
 

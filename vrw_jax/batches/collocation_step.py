@@ -2,10 +2,11 @@
 
 The method is Gauss collocation of order 8 on a few graded mesh intervals. The unknowns are the
 accelerations at the four nodes of an interval. The airborne leg's fast mode, whose rate is near
-c/m, forces explicit solvers to small steps, but costs collocation no additional work. A fixed
-number of Newton iterations ("sweeps") with one Jacobian solves the node equations. In the
-eigenvectors of the Gauss rule the equations separate into two complex systems of the phase's size.
-In the last interval the duration of the phase is corrected too, towards the event.
+c/m, forces explicit solvers to small solver steps, but costs collocation no additional work. A
+fixed number of Newton iterations ("sweeps") with one Jacobian solves the equations at the nodes. In
+the eigenvectors of the Gauss rule these equations separate into two complex systems, each of the
+size of the phase. In the last interval, Newton iterations also correct the duration of the phase,
+toward the event.
 
 All lanes do the same work, which cannot adapt to errors. Each phase therefore returns three
 indicators of its accuracy. The first indicator is the size of the last corrections. The second
@@ -55,7 +56,9 @@ _INTEGRATION_MATRIX_EIGENVALUES, _INTEGRATION_MATRIX_EIGENVECTORS = np.linalg.ei
 )
 _UPPER_HALF_PLANE_INDICES = np.flatnonzero(_INTEGRATION_MATRIX_EIGENVALUES.imag > 0.0)
 INTEGRATION_MATRIX_EIGENVALUES = _INTEGRATION_MATRIX_EIGENVALUES[_UPPER_HALF_PLANE_INDICES]
-"""Eigenvalues of the Gauss rule's integration matrix, one of each complex conjugate pair."""
+"""Eigenvalues of the Gauss rule's integration matrix with positive imaginary part, one for each
+complex conjugate pair.
+"""
 EIGENVECTOR_PROJECTION_MATRIX = np.linalg.inv(_INTEGRATION_MATRIX_EIGENVECTORS)[
     _UPPER_HALF_PLANE_INDICES
 ]
@@ -70,35 +73,43 @@ MIDDLE_INTERPOLATION_WEIGHTS = compute_lagrange_weights(0.5)
 END_EXTRAPOLATION_WEIGHTS = compute_lagrange_weights(1.0)
 """Weights that extrapolate node values to the end of a mesh interval."""
 MIDDLE_INTEGRATION_WEIGHTS = compute_integration_weights(0.5)
-"""Weights of node values in the single and double integral from the start to the middle of an
-interval."""
+"""Weights of node values in the single and the double integral over the first half of a mesh
+interval.
+"""
 _DIFFERENTIATION_MATRIX = build_differentiation_matrix()
 INTERVAL_STRETCH_WEIGHTS = GAUSS_NODES[:, None] * _DIFFERENTIATION_MATRIX
-"""First derivative of the node values with respect to the relative length of the mesh interval."""
+"""Matrix that maps node values to their first derivatives with respect to the relative length of
+the mesh interval.
+"""
 INTERVAL_STRETCH_CURVATURE_WEIGHTS = (
     0.5 * (GAUSS_NODES * GAUSS_NODES)[:, None] * (_DIFFERENTIATION_MATRIX @ _DIFFERENTIATION_MATRIX)
 )
-"""Half of the second derivative of the node values with respect to the relative interval length."""
+"""Matrix that maps node values to half of their second derivatives with respect to the relative
+length of the mesh interval.
+"""
 
 DEFAULT_COLLOCATION_PHASE_MESHES = PhaseMesh(4, 1.0), PhaseMesh(5, 4.0), PhaseMesh(2, 1.0)
 
 
 @dataclass(frozen=True)
 class CollocationStepOptions:
-    """Options of a step by collocation: amounts of work, and limits of the accuracy indicators."""
+    """Options of a gait step by collocation: the amount of work, and limits of the accuracy
+    indicators.
+    """
 
     phase_meshes: tuple[PhaseMesh, ...] = DEFAULT_COLLOCATION_PHASE_MESHES
     """Meshes of DLS, SLS-I and SLS-II.
 
-    The meshes are chosen as the cheapest tested meshes with errors below 1e-8, which is the 99th
+    These meshes are the cheapest tested ones with an error below 1e-8. The error is the 99th
     percentile over lanes near their gaits. The cost includes the lanes that the adaptive engine
-    repeats (experiments/speed/engine_benchmark.py)."""
+    repeats (experiments/speed/engine_benchmark.py).
+    """
     n_sweeps_per_interval: int = 3
     """Number of Newton sweeps in each mesh interval except the last one of a phase."""
     n_duration_corrections: int = 2
-    """Number of corrections of the duration in the last mesh interval."""
+    """Number of Newton corrections of the phase's duration in the last mesh interval."""
     n_sweeps_per_duration_correction: int = 2
-    """Number of Newton sweeps after each correction of the duration."""
+    """Number of Newton sweeps after each correction of the phase's duration."""
     max_expected_duration: float = 10.0
     """Largest accepted expected duration in the wheel's unit of time, chosen because no phase of a
     gait lasts that long."""
@@ -107,20 +118,22 @@ class CollocationStepOptions:
     max_duration_correction: float = 1e-5
     """Largest accepted `CollocatedPhaseEnd.last_duration_correction`, in the wheel's unit of time.
 
-    The state at the end is extrapolated by the last correction. The error is half the square of the
-    correction times the rate of an acceleration."""
+    The end state is extrapolated over the last correction of the duration. Its error is half the
+    square of that correction times the rate of an acceleration.
+    """
     max_start_rate_errors: tuple[float, float, float] = (2e-3, 1.2e-1, 8e-5)
     """Largest accepted `CollocatedPhaseEnd.largest_start_rate_error` in DLS, SLS-I and SLS-II.
 
-    The limits are chosen because an error is at most the square of a mismatch. One in a hundred
-    lanes near their gaits exceeds a limit."""
+    The limits are chosen because the error of the result is at most the square of the start rate
+    error. One in a hundred lanes near their gaits exceeds a limit.
+    """
 
 
 COLLOCATION_STEP_OPTIONS = CollocationStepOptions()
 
 
 class CollocatedPhaseEnd(NamedTuple):
-    """State at the end of a phase by collocation, with indicators of the phase's accuracy."""
+    """State at the end of a phase computed by collocation, with indicators of its accuracy."""
 
     q: Vector
     v: Vector
@@ -136,7 +149,9 @@ NodeAccelerations = tuple[Vector, ...]
 
 
 class _NewtonSweepState(NamedTuple):
-    """State of the Newton sweeps of one mesh interval."""
+    """Unknowns of one mesh interval during the Newton sweeps, and the sizes of their last
+    corrections.
+    """
 
     interval_length: Array
     node_accelerations: NodeAccelerations
@@ -162,9 +177,9 @@ def solve_phase_by_collocation(
     phase_mesh: PhaseMesh,
     options: CollocationStepOptions = COLLOCATION_STEP_OPTIONS,
 ) -> CollocatedPhaseEnd:
-    """Return the end of a phase that starts from (q, v).
+    """Return the state at the end of a phase that starts with coordinates `q` and rates `v`.
 
-    The phase ends at its first guard, near the expected duration.
+    The phase ends at the root of its event guard that is near `expected_duration`.
     """
     interval_fractions, zero_indicators = (
         phase_mesh.interval_fractions,
@@ -257,7 +272,9 @@ def solve_phase_by_collocation(
 
 
 def _estimate_next_correction(newton_sweep_state: _NewtonSweepState) -> Array:
-    """Return the estimated correction by one more sweep, extrapolated from the last two sweeps."""
+    """Return the correction that one more Newton sweep would make, extrapolated from the last two
+    sweeps.
+    """
     correction_ratio = newton_sweep_state.rate_correction / jnp.maximum(
         newton_sweep_state.previous_rate_correction, 1e-300
     )
@@ -267,7 +284,7 @@ def _estimate_next_correction(newton_sweep_state: _NewtonSweepState) -> Array:
 def _sum_weighted_accelerations(
     node_weights: np.ndarray, node_accelerations: NodeAccelerations, coordinate_index: int
 ) -> Any:
-    """Return the weighted sum of one coordinate's accelerations over all nodes."""
+    """Return the sum of one coordinate's accelerations over all nodes, weighted by `node_weights`."""
     return sum(
         float(node_weight) * node_acceleration[coordinate_index]
         for node_weight, node_acceleration in zip(node_weights, node_accelerations, strict=True)
@@ -277,7 +294,9 @@ def _sum_weighted_accelerations(
 def _compute_interval_end_state(
     q: Vector, v: Vector, h: Array, node_accelerations: NodeAccelerations
 ) -> tuple[Vector, Vector]:
-    """Return coordinates and rates at the end of a mesh interval."""
+    """Return coordinates and rates at the end of a mesh interval of length `h` that starts at
+    (q, v).
+    """
     n = range(len(q))
     return (
         tuple(
@@ -295,7 +314,9 @@ def _compute_interval_end_state(
 def _compute_node_state(
     node_index: int, q: Vector, v: Vector, h: Array, node_accelerations: NodeAccelerations
 ) -> tuple:
-    """Return coordinates and rates at one node of a mesh interval."""
+    """Return coordinates and rates at one node of a mesh interval of length `h` that starts at
+    (q, v).
+    """
     n, node_fraction = range(len(q)), float(GAUSS_NODES[node_index])
     return (
         tuple(
@@ -327,13 +348,13 @@ def _solve_mesh_interval(
     options: CollocationStepOptions,
     ends_at_event: bool = False,
 ) -> _SolvedMeshInterval:
-    """Return the solution of one mesh interval by Newton sweeps.
+    """Return the solution of the collocation equations in one mesh interval by Newton sweeps.
 
-    If the interval ends at an event, its length is an additional unknown. The Jacobian is taken at
-    the middle of the interval, and each sweep gains about two digits. The sweeps start from the
-    solution of the equations linearized at the middle, plus the `nonlinear_accelerations` of the
-    previous interval. If the length changes, the node accelerations change along the polynomial
-    through their values.
+    The interval starts at (q, v) and has the length `h`. If the interval ends at an event, its
+    length is an additional unknown. The Jacobian is evaluated at the middle of the interval, and
+    each sweep gains about two digits. The sweeps start from the solution of the equations that are
+    linearized at the middle, plus the `nonlinear_accelerations` of the previous interval. If the
+    length changes, the new node accelerations are values of the polynomial through the old ones.
     """
     n_dof = len(q)
     start_acceleration = phase.solve_acceleration(phase.compute_motion(q, v))[:n_dof]
@@ -422,7 +443,9 @@ def _solve_mesh_interval(
         return phase.compute_end_guard(phase_instant), phase_instant.acceleration[: phase.n_dof]
 
     def compute_time_to_event(newton_sweep_state: _NewtonSweepState) -> Array:
-        """Return Newton's estimate of the time from the end of the interval to the event, s."""
+        """Return the time from the end of the interval to the event, estimated by one Newton step,
+        in the unit of `h`.
+        """
         end_q, end_v = _compute_interval_end_state(
             q, v, newton_sweep_state.interval_length, newton_sweep_state.node_accelerations
         )
@@ -523,7 +546,7 @@ def _add_node_accelerations(
     added_accelerations: NodeAccelerations,
     acceleration_factor: float,
 ) -> NodeAccelerations:
-    """Return the first node accelerations plus `acceleration_factor` times the second ones."""
+    """Return `node_accelerations` plus `acceleration_factor` times `added_accelerations`."""
     node_pairs = zip(node_accelerations, added_accelerations, strict=True)
     return tuple(
         tuple(x + acceleration_factor * y for x, y in zip(*node_pair, strict=True))
@@ -534,7 +557,7 @@ def _add_node_accelerations(
 def _stretch_node_accelerations(
     node_accelerations: NodeAccelerations, relative_length_change: Array
 ) -> NodeAccelerations:
-    """Return the node accelerations after a small relative change of the interval's length."""
+    """Return the node accelerations of the interval after a small relative change of its length."""
     coordinate_indices = range(len(node_accelerations[0]))
     return tuple(
         tuple(
@@ -558,8 +581,9 @@ def _stretch_node_accelerations(
 
 
 def _linearize_dynamics_residual(phase: AbstractPhase, q: Vector, v: Vector, a: Vector) -> tuple:
-    """Return the residual of the equations of motion, and its derivatives by q, v and a, as
-    columns."""
+    """Return the residual of the equations of motion, and its Jacobians with respect to `q`, `v`
+    and `a` as lists of columns.
+    """
     n = len(q)
 
     def evaluate_dynamics_residual(*residual_arguments: Array) -> Vector:
@@ -601,10 +625,11 @@ def _add_complex_pairs(complex_numbers: Sequence[ComplexNumberPair]) -> ComplexN
 def _invert_stage_matrix(
     gauss_eigenvalue: complex, h: Array, residual_by_q: Any, residual_by_v: Any, residual_by_a: Any
 ) -> Any:
-    """Return the inverse of the complex stage matrix A + h e V + (h e)^2 Q.
+    """Return the inverse of the complex stage matrix A + h e V + (h e)^2 Q as nested lists of
+    complex pairs.
 
-    Here e is the eigenvalue, and A, V and Q are the derivatives of the residual with respect to
-    accelerations, rates and coordinates.
+    Here e is `gauss_eigenvalue`, and h is the length of the interval. A, V and Q are the
+    derivatives of the residual with respect to accelerations, rates and coordinates.
     """
     n, squared_eigenvalue = len(residual_by_q), gauss_eigenvalue * gauss_eigenvalue
     scaled_eigenvalue = (h * gauss_eigenvalue.real, h * gauss_eigenvalue.imag)
@@ -676,11 +701,11 @@ def _compute_adjugate_and_determinant(
 def _project_linearized_residuals(
     middle_residual: Vector, residual_by_q: Any, residual_by_v: Any, v: Vector, a: Vector, h: Array
 ) -> list[list[ComplexNumberPair]]:
-    """Return the projections of the nodes' residuals onto all eigenvectors, with a correction's
-    sign.
+    """Return the projections of the negative node residuals onto all eigenvectors, as complex
+    pairs.
 
-    The residuals are those of constant accelerations `a` in the equations that are linearized about
-    the middle of the interval.
+    The residuals are those of constant accelerations `a` in the equations of motion that are
+    linearized about the middle of the interval.
     """
     n = range(len(v))
     multiply_by_columns = lambda derivative_columns, x: tuple(
@@ -724,7 +749,7 @@ def _correct_node_accelerations(
     eigenvector_corrections: list[list[ComplexNumberPair]],
     h: Array,
 ) -> tuple[NodeAccelerations, Array]:
-    """Return the corrected node accelerations, and the largest resulting change of a rate."""
+    """Return the corrected node accelerations, and the largest change of a rate that results."""
     corrected_accelerations, largest_acceleration_change = [], jnp.zeros_like(h)
     for node_index in range(N_GAUSS_NODES):
         corrected_node_acceleration = []
@@ -754,14 +779,15 @@ def _find_lowest_guard(
     start_guards: Vector,
     n_event_guards: int,
 ) -> tuple[Array, Vector]:
-    """Return the lowest guard at the middle and end of an interval, and all guards at the end.
+    """Return the lowest guard value at the middle and the end of an interval, and all guard values
+    at the end.
 
-    Between start, middle and end a guard may be lower than at these points, by a quarter of its
-    second difference. If a guard may be negative there, the lowest guard is -1.
+    Between start, middle and end, a guard may be lower than at these points by a quarter of its
+    second difference. If a guard may be negative between them, the lowest guard value is -1.
 
-    - `start_guards`: guards at the start of the interval;
-    - `n_event_guards`: 1 in the last interval, whose first guard is the event and zero at the end;
-      otherwise 0.
+    - `start_guards`: guard values at the start of the interval;
+    - `n_event_guards`: 1 in the last interval, whose first guard is that of the event and has the
+      value 0 at the end; otherwise 0.
     """
     newton_sweep_state, coordinate_indices = solved_mesh_interval.newton_sweep_state, range(len(q))
     middle_acceleration = tuple(
@@ -818,7 +844,7 @@ def _find_lowest_guard(
 
 
 class CollocationStep(NamedTuple):
-    """Result of one gait step of a block of lanes."""
+    """Result of one gait step of each lane by collocation."""
 
     section_state: Vector  # (theta-, dtheta-, dL1-), three arrays
     phase_durations: Vector  # of DLS, SLS-I, SLS-II, s
@@ -832,9 +858,11 @@ def take_collocation_step(
     stop_at_lift_off: bool,
     options: CollocationStepOptions = COLLOCATION_STEP_OPTIONS,
 ) -> CollocationStep:
-    """Return one gait step of every lane, near the expected durations of DLS, SLS-I and SLS-II (s).
+    """Return the result of one gait step of every lane, computed near expected phase durations.
 
-    The step is computed in units of the wheel, to which the limits of `options` refer.
+    - `x`: components of the section states, arrays over lanes, rad, rad/s, m/s;
+    - `expected_durations`: expected durations of DLS, SLS-I and SLS-II, arrays over lanes, s;
+    - `options`: amount of work and limits, in units of the wheel.
     """
     is_lane_valid = is_valid_start_state(params, x)
     params, x = replace_invalid_inputs(is_lane_valid, params, x, PAPER_START_STATE)
@@ -886,7 +914,7 @@ def take_collocation_step(
         phase_durations.append(phase_end.phase_duration)
 
     def convert_trusted_to_si(lane_arrays: Iterable[Array], si_units: Iterable[Any]) -> Vector:
-        """Return the arrays in SI units, with zeros in lanes that are not trusted."""
+        """Return the arrays in SI units, with the value 0 in lanes that failed a check."""
         return tuple(
             jnp.where(is_trusted, lane_array * si_unit, 0.0)
             for lane_array, si_unit in zip(lane_arrays, si_units, strict=True)

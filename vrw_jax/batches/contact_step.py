@@ -19,15 +19,15 @@ from vrw_jax.wheel import PARAMETER_NAMES
 
 CONTACT_PARAMETER_NAMES = (*PARAMETER_NAMES, "friction")
 UNEVEN_GROUND_PARAMETER_NAMES = ("previous_friction", "tilt")
-"""Additional parameters of a step on uneven ground.
+"""Names of the additional parameters of a gait step on uneven ground.
 
-They are the friction of the feet that landed earlier, and the increase of the slope from this line
-to the next line, rad.
+The parameters are the friction of the feet that landed earlier, and the increase of the slope from
+this line of the ground to the next one, rad.
 """
 CONTACT_SLOPE_INDEX = CONTACT_PARAMETER_NAMES.index("slope")
 CONTACT_FRICTION_INDEX = CONTACT_PARAMETER_NAMES.index("friction")
 CONTACT_STEP_INPUT_NAMES = (START_INPUT_NAME, *CONTACT_PARAMETER_NAMES)
-"""Names of the inputs of a step with unilateral contact for which derivatives are available."""
+"""Names of the inputs with respect to which a gait step with unilateral contact has derivatives."""
 
 
 def step_batch_with_contact(
@@ -40,9 +40,9 @@ def step_batch_with_contact(
     n_legs: int,
     derivative_names: Sequence[str],
 ) -> StepBatchResult:
-    """Return the result of `step_batch` with unilateral contact.
+    """Return the result of `step_batch` for a model with unilateral contact.
 
-    Without derivatives, all steps of an element on flat ground are one call of the kernel.
+    Without derivatives on flat ground, one call of the kernel computes all gait steps.
     """
     element_friction = np.asarray(model.friction, section_states.dtype)
     is_uneven = any(np.ndim(x) == 2 for x in (*parameter_columns, element_friction))
@@ -147,7 +147,7 @@ def step_batch_with_contact(
 
 
 class _StepwiseGround(NamedTuple):
-    """Slope and friction of the ground for each step."""
+    """Slope and friction of the ground in each gait step."""
 
     slopes_by_step: np.ndarray  # (n_steps + 1, elements), rad
     friction_by_step: np.ndarray  # (n_steps, elements)
@@ -158,7 +158,9 @@ class _StepwiseGround(NamedTuple):
     def repeat_over_steps(
         cls, element_slopes: np.ndarray, element_friction: np.ndarray, n_elements: int, n_steps: int
     ) -> "_StepwiseGround":
-        """Return the ground of all steps, from values with or without axes over steps and batch."""
+        """Return slope and friction for all gait steps, repeated over steps and over the batch
+        where the argument has no such axis.
+        """
         n_given_values = (
             x.shape[1] if x.ndim == 2 else None for x in (element_slopes, element_friction)
         )
@@ -178,9 +180,9 @@ class _StepwiseGround(NamedTuple):
         )
 
     def make_step_parameters(self, k: int, parameter_matrix: np.ndarray) -> np.ndarray:
-        """Return the parameters of step k, shape (parameters, elements).
+        """Return the parameters of gait step `k`, shape (parameters, elements).
 
-        The last ones are `UNEVEN_GROUND_PARAMETER_NAMES`.
+        The last two parameters are `UNEVEN_GROUND_PARAMETER_NAMES`.
         """
         parameter_matrix = np.concatenate(
             [
@@ -199,7 +201,9 @@ class _StepwiseGround(NamedTuple):
         return parameter_matrix
 
     def make_stepwise_parameters(self) -> dict[str, StepwiseParameter]:
-        """Return the roles of slope and friction in the chain rule over steps, by name."""
+        """Return the `StepwiseParameter` of the friction and, if slopes vary over steps, that of
+        the slope, by parameter name.
+        """
         previous_friction_index = len(CONTACT_PARAMETER_NAMES)
         tilt_index = previous_friction_index + 1
         n_given_slopes, n_given_frictions = self.n_given_slopes, self.n_given_frictions

@@ -1,4 +1,4 @@
-"""Compiled functions of lanes for NumPy arrays: machine code, or XLA programs for blocks of
+"""Compiled functions over lanes that take NumPy arrays: machine code, or XLA programs for blocks of
 lanes.
 """
 
@@ -14,14 +14,14 @@ from vrw_jax.numerics import batch_sizes
 from vrw_jax.runtime import compile_cached_lane_program
 
 STRAGGLER_COUNT_DIVISOR = 8
-"""Inverse of the fraction of running lanes below which an XLA program stops.
+"""Ratio of the block size to the number of unfinished lanes at which an XLA program stops.
 
-The unfinished lanes of all blocks then run again together. The value is chosen because a block with
-fewer running lanes wastes most of its work.
+The program then runs again for the unfinished lanes of all blocks together. The value is chosen
+because a block with fewer unfinished lanes wastes most of its work.
 """
 
 _compiled_lane_programs: dict[Any, Callable] = {}
-"""Compiled functions of lanes, by all settings on which their traces depend."""
+"""Compiled functions over lanes, by all settings on which their traces depend."""
 
 
 def run_compiled_lane_function(
@@ -31,9 +31,10 @@ def run_compiled_lane_function(
     cache_key: Any,
     register_limits: simd.RegisterLimits = simd.DEFAULT_REGISTER_LIMITS,
 ) -> list[np.ndarray]:
-    """Return the results of `lane_function(scalars, lanes, straggler_count)` by compiled code.
+    """Return the results of `lane_function(scalars, lanes, straggler_count)`, computed by compiled
+    code.
 
-    The first result of `lane_function` marks unfinished lanes.
+    The first result of `lane_function` must be a boolean array that marks unfinished lanes.
 
     - `cache_key`: all settings on which `lane_function` depends, besides its arguments.
     """
@@ -64,9 +65,10 @@ def _run_xla_program_by_blocks(
     scalar_arguments: list[np.ndarray],
     lane_arrays: list[np.ndarray],
 ) -> list[np.ndarray]:
-    """Return the results of an XLA program that runs for one block of lanes after another.
+    """Return the results of an XLA program that runs for one block of `block_size` lanes after
+    another.
 
-    The unfinished lanes of all blocks run again together.
+    The program then runs again for the unfinished lanes of all blocks together.
     """
     result_arrays: list[np.ndarray] = []
     unfinished_lanes = np.arange(len(lane_arrays[0]))

@@ -1,4 +1,4 @@
-"""Selection of the cheapest solver for each wheel, from the stiffness of its airborne leg."""
+"""Selection of the cheapest solver for each wheel, based on the stiffness of its airborne leg."""
 
 import functools
 from dataclasses import dataclass
@@ -21,18 +21,20 @@ class SolverIndex(IntEnum):
 
 @dataclass(frozen=True)
 class SolverSelectionOptions:
-    """Solvers for stiff wheels, and the cost that `select_cheapest_solver` assumes."""
+    """Solvers for stiff wheels, and their costs, which `select_cheapest_solver` compares."""
 
     stable_solver: SolverName = "Tsit5"
-    """Explicit solver for steps that stability limits.
+    """Explicit solver for wheels whose solver steps are limited by stability.
 
-    Tsit5 is chosen because it has the largest stable step per evaluation among diffrax's solvers of
-    order 5 and more. That step is 0.58 over the mode's rate, and 0.40 for Dopri8."""
+    Tsit5 is chosen because it has the largest stable solver step per evaluation among diffrax's
+    solvers of order 5 and more. That step is 0.58 divided by the rate of the mode, and 0.40 for
+    Dopri8.
+    """
     stable_solver_tightening_factor: float = 4.0
-    """Factor by which the tolerance of the stable solver is tightened.
+    """Factor by which the tolerances of the stable solver are divided.
 
-    The factor is chosen because the tighter tolerance costs little, and because the error is then
-    at most that of Dopri8 at tolerances of 1e-6 and below.
+    The factor is chosen because the tighter tolerance costs little. At tolerances of 1e-6 and
+    below, the error is then at most that of Dopri8.
     """
     implicit_solver: SolverName = "Kvaerno5"
     """Solver for wheels that are too stiff for explicit solvers."""
@@ -52,15 +54,16 @@ def select_cheapest_solver(
     options: StepOptions,
     selection_options: SolverSelectionOptions = SOLVER_SELECTION_OPTIONS,
 ) -> np.ndarray:
-    """Return the `SolverIndex` of the cheapest solver for each lane.
+    """Return the `SolverIndex` of the cheapest solver for each lane, shape (lanes,).
 
     If legs are light, the airborne leg's fast mode decays at the rate 1.03 c/m for about 0.67
-    sqrt(L0 / g), s. Stability limits the product of step size and decay rate. Rejected steps add a
-    tenth to the number of steps. The requested solver is kept if accuracy requires more steps of
-    the stable solver than stability does. For accuracy, that number is about the tolerance to the
-    power of -1/5. A solver that would need more than `max_solver_steps` is excluded.
+    sqrt(L0 / g), s. Stability limits the product of solver step and decay rate. Rejected solver
+    steps add a tenth to their number. The requested solver stays selected if accuracy requires more
+    steps of the stable solver than stability does. The number that accuracy requires is about the
+    tolerance to the power of -1/5. A solver that would need more than `max_solver_steps` is
+    excluded.
 
-    - `parameter_matrix`: parameters in the order of `PARAMETER_NAMES`, (9, lanes).
+    - `parameter_matrix`: parameters in the order of `PARAMETER_NAMES`, shape (9, lanes).
     """
     leg_damping, leg_mass, locked_length, gravity_acceleration = (
         parameter_matrix[PARAMETER_NAMES.index(parameter_name)]
@@ -98,9 +101,9 @@ def select_cheapest_solver(
 
 @functools.cache
 def _get_stages_and_stability_limit(solver_name: str) -> tuple[int, float]:
-    """Return an explicit solver's number of evaluations per step, and its limit of stability.
+    """Return an explicit solver's number of evaluations per solver step, and its stability limit.
 
-    The limit is the largest stable product of step size and decay rate.
+    The limit is the largest stable product of solver step and decay rate.
     """
     solver_tableau = load_explicit_tableau(solver_name)
     assert solver_tableau is not None  # The caller has checked the solver.

@@ -19,10 +19,10 @@ from vrw_jax.wheel import Outcome
 
 
 class StepSensitivity(eqx.Module):
-    """Derivatives of the end of a walk with respect to one input, the start or a parameter.
+    """Derivatives of the last section state and durations of walks with respect to one input.
 
-    The derivatives have an additional last axis if the input is the start, or a parameter that
-    varies over steps.
+    The input is the start or a parameter. The arrays have an additional last axis if the input is
+    the start, or a parameter that varies over gait steps.
     """
 
     section_state: Float[np.ndarray, "lanes section *start"]
@@ -30,23 +30,24 @@ class StepSensitivity(eqx.Module):
 
 
 class StepBatchResult(AbstractPrintable):
-    """Result of a batch of walks for the last step of each element, with the batch on the leading
-    axis.
+    """Results of the last gait step of each walk in a batch; the first axis of every array is that
+    of the batch.
 
     Arrays are NumPy arrays, because a conversion of thousands of values to JAX takes as long as
-    some hundred steps.
+    some hundred gait steps.
 
     - `section_state`: state before the next touchdown; zeros if the step failed;
     - `durations`: durations of DLS, SLS-I and SLS-II, s; see `UnilateralWheel` for unilateral
       contact;
     - `outcome`: `Outcome` of the walk, which ends at the first outcome that is not STEPPED;
-    - `n_stepped`: number of steps that ended in a touchdown;
+    - `n_stepped`: number of gait steps that ended in a touchdown;
     - `solver_steps`: number of attempted solver steps, summed over all gait steps;
-    - `is_collocated`: whether the last step was computed by collocation, in a fixed amount of work;
+    - `is_collocated`: whether the last gait step was computed by collocation, in a fixed amount of
+      work;
     - `solver_index`: index of the element's solver in `solver_names`, which "auto" selects by
       stiffness;
     - `engine`: "lanes", "diffrax" or "collocation";
-    - `solver_names`: names of the solvers, of which the first is that of the options;
+    - `solver_names`: names of the solvers; the first is the solver in the options;
     - `derivatives`: `StepSensitivity` by the name of the requested input.
 
     Examples:
@@ -68,11 +69,11 @@ class StepBatchResult(AbstractPrintable):
 
     @property
     def ending(self) -> Any:
-        """Return one sentence on the end of each walk, as an array."""
+        """Return one sentence on the end of each walk, as an array over the batch."""
         return describe_step_ending(self.outcome, Outcome)
 
     def summary_rows(self) -> list[LabelAndText]:
-        """Return labels and texts of the printed result."""
+        """Return pairs of label and text for outcomes, numbers of gait steps, engine and time."""
         n_by_solver = np.bincount(np.ravel(self.solver_index), minlength=len(self.solver_names))
         solver_texts = (
             f"{n_elements:,} by {solver_name}"
@@ -91,23 +92,25 @@ START_INPUT_NAME = "section_state"
 
 
 class StepwiseParameter(NamedTuple):
-    """Role of a parameter in the steps of a walk, for the chain rule.
+    """Terms by which a parameter enters the chain rule over the gait steps of a walk.
 
-    The parameter may determine several inputs of a step, and may vary from step to step.
+    The parameter may determine several inputs of a gait step, and may vary from step to step.
     """
 
     input_indices: tuple[int, ...]  # among the inputs of a step
     n_stepwise_values: int | None  # per lane; None for a single number
     list_chain_rule_terms: Callable[[int], tuple[tuple[int, int, float], ...]]
-    """Function that maps the index of a step to the terms of the chain rule.
+    """Function that maps the index of a gait step to the terms of the chain rule.
 
-    A term is (position of the input, index of the value, derivative of the input by the value)."""
+    A term is (position of the input in `input_indices`, index of the parameter's value, derivative
+    of the input with respect to the value).
+    """
 
 
 def complete_slopes_over_steps(given_slopes: np.ndarray, n_steps: int) -> np.ndarray:
-    """Return the slopes of the lines of n steps, (n_steps + 1, lanes), rad.
+    """Return the slopes of the ground for `n_steps` gait steps, shape (n_steps + 1, lanes), rad.
 
-    If n slopes are given per lane, the last slope is repeated.
+    If `given_slopes` has only `n_steps` slopes per lane, the last slope is repeated.
     """
     return (
         given_slopes.T
@@ -126,13 +129,13 @@ class WalkBatch:
         step_parameter_names: tuple[str, ...],
         stepwise_parameters: Mapping[str, StepwiseParameter],
     ) -> None:
-        """Start the walks from section states of shape (section, lanes).
+        """Start the walks from section states of shape (components, lanes).
 
         - `derivative_names`: names of the requested derivatives, from `START_INPUT_NAME` and
           `step_parameter_names`;
-        - `step_parameter_names`: names of the first inputs of a step, which the section state
-          follows;
-        - `stepwise_parameters`: parameters that are not one equal input of every step.
+        - `step_parameter_names`: names of the inputs of a gait step that precede the section state;
+        - `stepwise_parameters`: parameters that are not one equal input of every gait step, by
+          name.
         """
         state_size, n_lanes = section_states.shape
         self.section_state, self.durations = (
@@ -177,7 +180,7 @@ class WalkBatch:
         )
 
     def find_walking_lanes(self) -> np.ndarray:
-        """Return the indices of the lanes whose walk has not ended."""
+        """Return the indices of the lanes whose walks have not ended."""
         return np.flatnonzero(self.outcome == Outcome.STEPPED)
 
     def make_batch_result(
@@ -187,8 +190,9 @@ class WalkBatch:
         engine: str,
         solver_names: tuple[str, ...],
     ) -> StepBatchResult:
-        """Return the result, with the lanes in their order before they were sorted by
-        `lane_order`.
+        """Return the result for the lanes in their original order.
+
+        - `lane_order`: original index of each lane of this batch, which was sorted.
         """
         inverse_lane_order = np.empty_like(lane_order)
         inverse_lane_order[lane_order] = np.arange(len(lane_order))
@@ -207,7 +211,11 @@ class WalkBatch:
         )
 
     def split_jacobian_by_input(self, inverse_lane_order: np.ndarray) -> dict[str, StepSensitivity]:
-        """Return the derivatives of the walks by the name of the input, zero for failed walks."""
+        """Return the derivatives of the walks by the name of the input, with the value 0 for failed
+        walks.
+
+        - `inverse_lane_order`: index in this batch of each lane of the original order.
+        """
         if not self.derivative_names:
             return {}
         self.walk_jacobian[..., self.outcome != Outcome.STEPPED] = 0.0
@@ -245,10 +253,10 @@ class WalkBatch:
         step_values: tuple[np.ndarray, ...],
         is_collocated: np.ndarray,
     ) -> None:
-        """Store the results of one step of the lanes at `lane_indices`.
+        """Store the results of one gait step of the lanes at `lane_indices`.
 
-        `step_values` contains section states, durations, outcomes, numbers of solver steps and,
-        with derivatives, Jacobians.
+        `step_values` contains section states, durations, outcomes, numbers of solver steps and, if
+        derivatives are requested, Jacobians.
         """
         section_state, phase_durations, outcome, n_solver_steps, *step_jacobian = step_values
         lane_selection = select_lanes(lane_indices, self)
@@ -266,7 +274,7 @@ class WalkBatch:
         self.solver_steps[lane_selection] += n_solver_steps
 
     def _chain_walk_jacobian(self, lane_selection: Any, step_jacobian: np.ndarray) -> np.ndarray:
-        """Return the Jacobian of the walk after the last step, (inputs, outputs, lanes).
+        """Return the Jacobian of the walk after the last gait step, shape (inputs, outputs, lanes).
 
         The products are summed one after another, so that a lane's digits do not depend on the
         batch.
@@ -287,10 +295,11 @@ class WalkBatch:
     def _chain_stepwise_jacobian(
         self, lane_selection: Any, step_jacobian: np.ndarray
     ) -> np.ndarray:
-        """Return the Jacobian of the walk, with one row per value of each parameter that varies
-        over steps.
+        """Return the Jacobian of the walk, shape (inputs, outputs, lanes), if some parameters vary
+        over gait steps.
 
-        The derivatives by values of later steps are still zero.
+        Axis 0 has one index for each value of such a parameter. The derivatives with respect to
+        values of later steps are still 0.
         """
         state_size, first_start_row = len(self.section_state), self.first_jacobian_rows[-1]
         n_inputs = len(step_jacobian) - state_size
@@ -331,14 +340,17 @@ class WalkBatch:
 
 
 def select_lanes(lane_indices: np.ndarray, walk_batch: WalkBatch) -> Any:
-    """Return an index of the given lanes: a slice, which copies nothing, if all lanes are given."""
+    """Return an index that selects the lanes at `lane_indices`.
+
+    If these are all lanes, the index is a slice, which copies nothing.
+    """
     return slice(None) if len(lane_indices) == len(walk_batch.outcome) else lane_indices
 
 
 def _replace_lane_values(
     lane_values: np.ndarray, lane_selection: Any, new_lane_values: np.ndarray
 ) -> np.ndarray:
-    """Return the array with new values of the selected lanes.
+    """Return `lane_values` with new values of the selected lanes.
 
     Unless all lanes are selected, the array is changed in place.
     """
