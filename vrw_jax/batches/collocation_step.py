@@ -284,7 +284,7 @@ def _estimate_next_correction(newton_sweep_state: _NewtonSweepState) -> Array:
 def _sum_weighted_accelerations(
     node_weights: np.ndarray, node_accelerations: NodeAccelerations, coordinate_index: int
 ) -> Any:
-    """Return the sum of one coordinate's accelerations over all nodes, weighted by `node_weights`."""
+    """Return the sum of one coordinate's accelerations at all nodes, weighted by `node_weights`."""
     return sum(
         float(node_weight) * node_acceleration[coordinate_index]
         for node_weight, node_acceleration in zip(node_weights, node_accelerations, strict=True)

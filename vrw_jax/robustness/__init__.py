@@ -1,4 +1,6 @@
-"""Robustness of gaits: uneven ground, first passage, basins of attraction and disturbances."""
+"""Robustness of gaits: uneven ground, first-passage times, basins of attraction, and disturbances
+of the state.
+"""
 
 from vrw_jax.robustness.basin_share import BasinShare, basin_share
 from vrw_jax.robustness.branch_basins import measure_basins

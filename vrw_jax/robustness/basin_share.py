@@ -1,4 +1,4 @@
-"""Share of the starts in a box from which a wheel reaches its gait."""
+"""Share of the start states in a box from which a wheel reaches its gait."""
 
 from collections.abc import Mapping
 from typing import Any, Literal, NamedTuple, get_args
@@ -19,23 +19,23 @@ from vrw_jax.wheel import Outcome, WheelParams
 
 StartSamplingName = Literal["sobol", "random"]
 StartBox = Mapping[str, float | tuple[float, float]]
-"""Bounds (lower, upper) of each component of a start, by the name of the component.
+"""Bounds (lower, upper) of each component of a start state, by the name of the component.
 
 A single number fixes the component.
 """
 
 
 class BasinShare(AbstractPrintable):
-    """Share of the starts in a box from which a wheel arrives at its gait.
+    """Share of the start states in a box from which a wheel arrives at its gait.
 
     - `share`: share of the starts whose walk arrives at the gait;
     - `share_error`: standard error of `share` for independent starts;
-    - `walking_share`: share of the starts whose walk continues after 1, 2, ... steps, on the gait
-      or not, shape (max_steps,);
+    - `walking_share`: share of the starts whose walk has not failed after 1, 2, ... gait steps,
+      shape (max_steps,);
     - `walking_share_error`: standard errors of `walking_share`, shape (max_steps,);
-    - `elsewhere_share`: share of the starts whose walk of `max_steps` steps does not arrive at the
-      gait;
-    - `failure_shares`: share of the starts whose walk fails, by the name of the outcome;
+    - `elsewhere_share`: share of the starts whose walk neither fails nor arrives at the gait within
+      `max_steps` gait steps;
+    - `failure_shares`: shares of the starts whose walk fails, by the name of the `Outcome`;
     - `n_starts`: number of starts.
 
     Examples:
@@ -58,7 +58,7 @@ class BasinShare(AbstractPrintable):
     n_starts: int = eqx.field(static=True)
 
     def summary_rows(self) -> list[LabelAndText]:
-        """Return labels and texts of the shares, with their standard errors."""
+        """Return pairs of label and text for the shares, with their standard errors."""
         n = len(self.walking_share)
         final_walking_share, final_walking_share_error = (
             self.walking_share[-1],
@@ -91,27 +91,29 @@ def basin_share(
     sampling: StartSamplingName = "sobol",
     seed: int = 0,
 ) -> BasinShare:
-    """Return the share of a box of starts from which the wheel ends up on its gait.
+    """Return the share of the start states in a box from which a wheel arrives at its gait.
 
     The starts are spread evenly over `box`. A walk arrives at the gait if its section state differs
     from that of the gait by less than 1e-6 in units of the wheel (`compute_wheel_units`). The gait
     must be stable, so that the walk stays on it.
 
-    The errors are standard errors of a binomial share. One start is added on either side, so that
-    the error is positive for a share of 0 or 1. The errors hold for `sampling="random"`. In most
-    boxes, points of a scrambled Sobol' sequence have smaller errors than these.
+    The errors are standard errors of a binomial share. For the error, one start that arrives and
+    one that does not are added, so that the error is positive for a share of 0 or 1. The errors
+    hold for `sampling="random"`. In most boxes, points of a scrambled Sobol' sequence have smaller
+    errors.
 
     Args:
         params: the wheel.
-        box: bounds (lower, upper) or a number for all of "theta_touchdown", "dtheta_touchdown" and
-            "dL1_touchdown", in rad, rad/s, m/s; or for both "theta_post_impact" and
-            "dtheta_post_impact". Starts to which no landing leads count as BAD_INPUT.
-        model: the model; by default that of the paper, `ViscoelasticWheel()`. "auto" means
+        box: bounds (lower, upper) or a number for each of "theta_touchdown", "dtheta_touchdown" and
+            "dL1_touchdown", in rad, rad/s, m/s; or for each of "theta_post_impact" and
+            "dtheta_post_impact", in rad, rad/s. Starts to which no landing leads count as
+            BAD_INPUT.
+        model: model of the wheel; by default that of the paper, `ViscoelasticWheel()`. "auto" means
             unilateral contact, which is valid for all starts.
-        cycle: the gait; by default that of `limit_cycle`.
-        options: numerical options of the steps.
+        cycle: the gait; by default the result of `limit_cycle`.
+        options: numerical options of the gait steps.
         n_starts: number of starts, best a power of 2.
-        max_steps: largest number of steps of a walk.
+        max_steps: largest number of gait steps of a walk.
         sampling: "sobol", or "random" for independent starts.
         seed: seed of the starts.
 
@@ -136,7 +138,7 @@ def basin_share(
 
 
 class StartBoxBounds(NamedTuple):
-    """Names and bounds of the components of starts, in rad, rad/s and m/s."""
+    """Names and bounds of the components of start states, in rad, rad/s and m/s."""
 
     component_names: tuple[str, ...]
     lower_bounds: np.ndarray
@@ -151,7 +153,9 @@ def compute_basin_share(
     sampling_name: str = "sobol",
     seed: int = 0,
 ) -> BasinShare:
-    """Return the `BasinShare` of a stable gait, for validated arguments of `basin_share`."""
+    """Return the `BasinShare` of a stable gait; the arguments of `basin_share` must be validated
+    before.
+    """
     n_components = len(box_bounds.component_names)
     random_generator = np.random.default_rng(seed)
     if sampling_name == "random":
@@ -203,18 +207,17 @@ def compute_basin_share(
 
 
 def compute_share_error(sampled_share: Any, n_draws: int) -> Any:
-    """Return the standard error of a share of `n_draws` independent draws, or of an array of
-    shares.
+    """Return the standard error of a share that is estimated from `n_draws` independent draws.
 
-    One draw with each result is added (Laplace's rule of succession), so that the error is
-    positive.
+    `sampled_share` is a share or an array of shares. One draw with each result is added (Laplace's
+    rule of succession), so that the error is positive.
     """
     smoothed_share = (sampled_share * n_draws + 1.0) / (n_draws + 2.0)
     return (smoothed_share * (1.0 - smoothed_share) / n_draws) ** 0.5
 
 
 def parse_start_box(box: StartBox) -> StartBoxBounds:
-    """Return the names and bounds of the components of starts in a box.
+    """Return the names and bounds of the components of start states in `box`.
 
     Raise TypeError if the box is not a mapping. Raise ValueError unless the box bounds all
     components of one kind of start.

@@ -1,4 +1,4 @@
-"""Sizes of the basins of attraction of the gaits along a branch."""
+"""Sizes of the basins of attraction of gaits at points of a branch."""
 
 from __future__ import annotations
 
@@ -39,25 +39,25 @@ def measure_basins(
     n_starts: int = 1024,
     max_steps: int = 200,
 ) -> xr.Dataset:
-    """Return the sizes of the basins of the stable gaits along a branch.
+    """Return the sizes of the basins of attraction of the stable gaits on a branch.
 
     The result has at most `n_points` points, evenly spaced over the points of the branch, both ends
-    included. Its coordinate is the parameter of the branch. Numbers of unstable gaits are NaN. With
-    a `box`, the variables include `basin_share` and `basin_share_error` (see `basin_share`). For
-    models that can begin within a step, they include `smallest_disturbance` and
-    `smallest_disturbance_error`, rad/s (see `smallest_disturbance`).
+    included. Its coordinate is the parameter of the branch. Variables are NaN at points of unstable
+    gaits. With a `box`, the variables include `basin_share` and `basin_share_error` (see
+    `basin_share`). For models that can start within a step, the variables include
+    `smallest_disturbance` and `smallest_disturbance_error`, rad/s (see `smallest_disturbance`).
 
     Args:
         branch: a branch of gaits of one step, from `continue_branch`.
-        box: bounds of the starts, as in `basin_share`; None leaves the shares out.
+        box: bounds of the starts, as in `basin_share`; without a box, no shares are computed.
         model: the model of the branch, if it is not the paper's.
-        options: numerical options of the steps.
+        options: numerical options of the gait steps.
         n_points: largest number of points.
-        n_starts: number of starts at each point.
-        max_steps: largest number of steps of a walk.
+        n_starts: number of start states at each point.
+        max_steps: largest number of gait steps of a walk.
 
     Returns:
-        A dataset over `point`.
+        A dataset with the dimension `point`.
 
     Raises:
         TypeError, ValueError: if an argument is invalid, or if the branch has another model.
@@ -126,7 +126,7 @@ def measure_basins(
 def _load_branch_gait(
     branch: Branch, point_index: int, model: AbstractWheel, options: StepOptions
 ) -> StableGait:
-    """Return the gait of one step at a point of a branch.
+    """Return the stable gait of one step at point `point_index` of a branch.
 
     Raise ValueError if the gait does not repeat after one step.
     """

@@ -1,8 +1,8 @@
 """Gaussian mixtures that are fitted to rare failures of walks, for importance sampling.
 
-The method is the cross-entropy method (Rubinstein and Kroese 2004). An inflation multiplies the
-standard deviation of the slopes, so that failures are frequent. A mixture is then fitted to the
-failures, and the inflation decreases to 1 in stages.
+The method is the cross-entropy method (Rubinstein and Kroese 2004). At first the standard deviation
+of the slopes is multiplied by an inflation factor, so that failures are frequent. A mixture is then
+fitted to the failures, and the inflation decreases to 1 in stages.
 """
 
 from collections.abc import Callable
@@ -11,10 +11,11 @@ from dataclasses import dataclass
 import numpy as np
 
 DeviationWalkFunction = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
-"""Function that runs one walk for each sequence of standardized slopes, shape (walks, lines).
+"""Function that simulates one walk for each sequence of standardized slopes.
 
-The function returns two boolean arrays of shape (walks,): whether a walk fails in its last step,
-and whether it fails in any step.
+The argument has the shape (walks, lines), with one slope for each line of the ground between two
+footholds. The function returns two boolean arrays of shape (walks,): whether a walk fails in its
+last step, and whether it fails in any step.
 """
 
 
@@ -32,39 +33,49 @@ class FailureDensityOptions:
     The value is chosen because the paper's wheel fails in two ways, each in a curved region of
     slopes."""
     nominal_walk_fraction: float = 0.1
-    """Fraction of walks that are drawn from the nominal density of the slopes.
+    """Fraction of walks whose slopes are drawn from the nominal density.
 
     The inverse of the fraction bounds all likelihood ratios. The nominal walks also find frequent
-    failures that the fit missed."""
+    failures that the fit missed.
+    """
     wide_walk_fraction: float = 0.2
-    """Fraction of walks that are drawn from the fitted Gaussians with wider standard deviations.
+    """Fraction of walks whose slopes are drawn from the fitted Gaussians with wider standard
+    deviations.
 
-    The wide walks bound the likelihood ratios of failures outside the fitted Gaussians."""
+    The wide Gaussians bound the likelihood ratios of failures outside the fitted ones.
+    """
     widening_factor: float = 1.7
-    """Factor by which the standard deviations of the wide Gaussians exceed those of the fit."""
+    """Ratio of the standard deviations of the wide Gaussians to those of the fitted Gaussians."""
     n_uninflated_fits: int = 2
-    """Number of fits without inflation.
+    """Number of fits with the nominal standard deviation of the slopes.
 
-    The value is chosen because the second fit uses failures that the first fit produces."""
+    The value is chosen because the second fit uses failures of walks that the first fit proposes.
+    """
     min_failure_fraction: float = 0.15
-    """Smallest fraction of failing walks at which the inflation of the slopes suffices.
+    """Smallest fraction of failing walks at which the inflation of the slopes is not increased
+    further.
 
-    The value is chosen because about a third of the failing walks fail in their last step."""
+    The value is chosen because about a third of the failing walks fail in their last step.
+    """
     slope_inflation_factor: float = 1.3
-    """Ratio of successive inflations of the slopes' standard deviation."""
+    """Ratio of successive inflation factors of the slopes' standard deviation."""
     max_slope_inflation: float = 20.0
-    """Largest inflation of the slopes' standard deviation.
+    """Largest inflation factor of the slopes' standard deviation.
 
     The value is chosen because failures that need a larger inflation have probabilities below
-    1e-80."""
+    1e-80.
+    """
     min_effective_failures_per_dimension: float = 60.0
-    """Smallest effective number of failures per dimension at the next, smaller inflation.
+    """Smallest effective number of failures at the next, smaller inflation, per dimension of the
+    mixture.
 
-    The value is chosen because each Gaussian in five dimensions has 20 parameters."""
+    The value is chosen because each Gaussian in five dimensions has 20 parameters.
+    """
     min_gaussian_variance: float = 0.02
-    """Variance that is added to each Gaussian in every direction.
+    """Variance that is added to each fitted Gaussian in every direction.
 
-    The variance bounds the likelihood ratios if failures are few."""
+    The variance bounds the likelihood ratios if only few walks fail.
+    """
     n_em_iterations: int = 25
     """Number of iterations of expectation maximization.
 
@@ -79,7 +90,7 @@ FAILURE_DENSITY_OPTIONS = FailureDensityOptions()
 
 @dataclass(frozen=True)
 class GaussianMixture:
-    """Mixture of Gaussians over standardized deviations of slopes."""
+    """Mixture of Gaussian densities of standardized slope deviations."""
 
     component_weights: np.ndarray  # (components,), sum 1
     component_means: np.ndarray  # (components, dimensions)
@@ -90,8 +101,9 @@ class GaussianMixture:
     def make_isotropic_gaussian(
         cls, n_dimensions: int, standard_deviation: float
     ) -> "GaussianMixture":
-        """Return a mixture of one Gaussian with mean zero and the same standard deviation in all
-        directions."""
+        """Return a mixture of one Gaussian with mean zero, and with the same standard deviation in
+        all directions.
+        """
         return cls(
             np.ones(1), np.zeros((1, n_dimensions)), standard_deviation * np.eye(n_dimensions)[None]
         )
@@ -100,7 +112,10 @@ class GaussianMixture:
         self, added_mixture: "GaussianMixture", added_weight: float
     ) -> "GaussianMixture":
         """Return the weighted sum of this mixture and `added_mixture`, whose weight is
-        `added_weight`."""
+        `added_weight`.
+
+        The weight of this mixture is 1 - `added_weight`.
+        """
         return GaussianMixture(
             np.concatenate(
                 [
@@ -123,8 +138,9 @@ class GaussianMixture:
         )
 
     def compute_component_log_densities(self, slope_deviations: np.ndarray) -> np.ndarray:
-        """Return the logarithm of each weighted Gaussian at each sample, shape (components,
-        samples)."""
+        """Return the logarithm of each Gaussian's weighted density at each sample, shape
+        (components, samples).
+        """
         log_densities = []
         for component_weight, component_mean, covariance_cholesky_factor in zip(
             self.component_weights,
@@ -152,7 +168,7 @@ class GaussianMixture:
         return log_densities
 
     def draw_samples(self, n_samples: int, random_generator: np.random.Generator) -> np.ndarray:
-        """Return independent samples of the mixture, shape (samples, dimensions)."""
+        """Return independent samples from the mixture, shape (samples, dimensions)."""
         component_indices = random_generator.choice(
             len(self.component_weights), n_samples, p=self.component_weights
         )
@@ -240,10 +256,12 @@ def fit_failure_density(
     random_generator: np.random.Generator,
     density_options: FailureDensityOptions = FAILURE_DENSITY_OPTIONS,
 ) -> GaussianMixture | None:
-    """Return a density of slopes for which walks often fail in their last step.
+    """Return a density of standardized slopes on which walks often fail in their last step.
 
-    The slopes are standardized, so that their nominal density is standard normal. The returned
-    mixture contains a fraction of the nominal density. The result is None if no walk fails.
+    The nominal density of standardized slopes is the standard normal density. The returned mixture
+    includes it with the weight `nominal_walk_fraction`. The result is None if no walk fails.
+
+    - `n_dimensions`: number of slopes per walk.
     """
     nominal_density = GaussianMixture.make_isotropic_gaussian(n_dimensions, 1.0)
     slope_inflation = 1.0
@@ -299,9 +317,14 @@ def _find_next_slope_inflation(
     slope_inflation: float,
     density_options: FailureDensityOptions,
 ) -> tuple[float, np.ndarray]:
-    """Return the next inflation, and the weights of the failures at that inflation.
+    """Return the next inflation factor, and the normalized importance weights of the failures at
+    that inflation.
 
-    The next inflation is the smallest one at which enough failures have weight.
+    The next inflation is the smallest one at which the effective number of failures suffices.
+
+    - `failing_deviations`: standardized slopes of failing walks, shape (failures, dimensions);
+    - `log_proposal_density`: logarithm of the density from which these slopes were drawn, shape
+      (failures,).
     """
 
     def compute_weights(target_inflation: float) -> np.ndarray:

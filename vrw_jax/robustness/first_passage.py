@@ -1,4 +1,4 @@
-"""Mean number of steps until a wheel fails on uneven ground (first-passage time)."""
+"""Mean number of gait steps until a wheel fails on uneven ground (first-passage time)."""
 
 import functools
 from collections.abc import Callable
@@ -30,16 +30,18 @@ from vrw_jax.validation import (
 from vrw_jax.wheel import PARAMETER_NAMES, Outcome, WheelParams
 
 MAX_QUADRATURE_NODES = 3200
-"""Largest number of quadrature nodes, chosen because a matrix of this size takes 80 MB."""
+"""Largest number n of quadrature nodes, chosen because an n by n matrix then takes 80 MB."""
 
 SAMPLED_STEP_TOLERANCE = 1e-6
-"""Tolerance of sampled steps without unilateral contact. The value is chosen because the error of
-an event time is then a ten-thousandth of the standard deviation that random slopes cause. With
-unilateral contact and infinite friction, one step in a thousand would end with a spurious Painlevé
-paradox at this tolerance."""
+"""Relative and absolute tolerance of sampled gait steps without unilateral contact.
+
+The value is chosen because the error of an event time is then only a ten-thousandth of its standard
+deviation over random slopes. With unilateral contact and infinite friction, one step in a thousand
+would end with a spurious Painlevé paradox at this tolerance.
+"""
 
 SAMPLED_TRACING_REMEDY = "take jax.grad of a function that is not compiled"
-"""Remedy for a sampled computation inside `jit` or `vmap`."""
+"""Remedy in the error message for a sampled computation inside `jit` or `vmap`."""
 
 
 class PassageStatus(StatusCode):
@@ -55,28 +57,28 @@ class PassageStatus(StatusCode):
 
 
 class FirstPassage(AbstractPrintable):
-    """Mean numbers of steps until failure, with the eigenvalues of the survival operator.
+    """Mean numbers of gait steps until failure, with the eigenvalues of the survival operator.
 
-    Means count the random lines on which the wheel lands, including the line on which the wheel
-    fails.
+    A line joins two footholds. Means include the step onto the line on which the wheel fails.
 
-    - `mean_steps`: mean from the quasi-stationary distribution, 1/(1 - kappa_1);
-    - `mean_steps_from_gait`: mean from the gait, before a landing on a line of the mean slope. With
-      samples, its relative error is at most 1.5 times that of `mean_steps`;
+    - `mean_steps`: mean for starts from the quasi-stationary distribution, 1/(1 - kappa_1);
+    - `mean_steps_from_gait`: mean for a start on the gait, before a landing on a line of the mean
+      slope. If walks are sampled, its relative error is at most 1.5 times that of `mean_steps`;
     - `failure_probability`: probability 1 - kappa_1 that a step from the quasi-stationary
       distribution fails;
-    - `kappa_2`: second eigenvalue, the factor per step by which the effect of the start decays.
-      With samples, its error is some hundredths;
-    - `error`: error estimate of `mean_steps`. With samples, it is half a confidence interval of 99
-      %. It is infinite if sampled walks miss failures, or if a few of them dominate the mean;
-    - `states`: states of the quasi-stationary distribution. With quadrature, they are squared rates
-      with the stance leg vertical, 1/s^2, shape (n, 1). With samples, they are section states with
-      the slope as last component;
-    - `weights`: weights of the states, whose sum is 1;
+    - `kappa_2`: second eigenvalue, the factor per step by which the effect of the start decays. If
+      walks are sampled, its error is some hundredths;
+    - `error`: error estimate of `mean_steps`. If walks are sampled, it is half the width of a 99 %
+      confidence interval. It is infinite if the sampled walks miss failures, or if a few walks
+      dominate the mean;
+    - `states`: states of the quasi-stationary distribution. For quadrature, they are squared
+      angular rates at the instant at which the stance leg is vertical, 1/s^2, shape (n, 1). For
+      sampled walks, they are section states with the slope as last component;
+    - `weights`: weights of the states, with the sum 1;
     - `status`: a `PassageStatus`;
-    - `end_names`, `end_fractions`: outcomes that end walks, and the fraction of walks that each
-      outcome ends;
-    - `n_steps`: number of sampled steps; 0 with quadrature.
+    - `end_names`, `end_fractions`: names of the outcomes that end walks, and the fraction of walks
+      that each outcome ends;
+    - `n_steps`: number of sampled gait steps; 0 for quadrature.
 
     Examples:
         >>> wheel = vrw.RigidWheel(stop_at_lift_off=False)
@@ -100,18 +102,18 @@ class FirstPassage(AbstractPrintable):
 
     @property
     def kappa_1(self) -> Scalar:
-        """Return the leading eigenvalue of the survival operator, which is the probability to
-        survive a step.
+        """Return the leading eigenvalue of the survival operator: the probability that a step from
+        the quasi-stationary distribution succeeds.
         """
         return 1.0 - self.failure_probability
 
     @property
     def ending(self) -> str:
-        """Return a sentence about whether the error is within the tolerance."""
+        """Return a sentence on whether the error is within the tolerance."""
         return describe_step_ending(self.status, PassageStatus)
 
     def summary_rows(self) -> list[LabelAndText]:
-        """Return pairs of label and text for means, probability, outcomes and status."""
+        """Return pairs of label and text for means, failure probability, outcomes and status."""
         outcome_fractions = zip(self.end_names, np.asarray(self.end_fractions), strict=True)
         sampled_steps_text = f"{self.n_steps:,}" if self.n_steps else "none: quadrature"
         return [
@@ -144,16 +146,17 @@ def first_passage(
     tol: float | None = None,
     max_steps: int = 5_000_000,
 ) -> FirstPassage:
-    """Return the mean number of steps until failure on random slopes (Byl and Tedrake 2009).
+    """Return the mean number of gait steps until failure on random slopes (Byl and Tedrake 2009).
 
     The slopes of the lines that join the footholds are independent and normal, with mean
-    `params.slope`. A walk ends at the first step whose outcome is not STEPPED. A step onto a slope
-    outside its domain also ends the walk. On the paper's wheel a failure is a departure from the
-    sequence of phases, and mostly no fall. `UnilateralWheel` continues after such a departure.
+    `params.slope`. A walk ends at the first step whose outcome is not STEPPED. A landing on a slope
+    outside the domain of slopes also ends the walk. In the paper's model, a failure is a departure
+    from the sequence of phases, and mostly no fall. Walks of a `UnilateralWheel` continue after
+    such a departure.
 
-    For the rigid wheel the kernel of its one-dimensional map has a closed form, and quadrature
-    gives means of any length. The model must be `RigidWheel(stop_at_lift_off=False)`. `mean_steps`
-    then has first derivatives with respect to `params` and `slope_sd`.
+    For the rigid wheel, the kernel of its one-dimensional map has a closed form. Quadrature then
+    computes means of any length. The model must be `RigidWheel(stop_at_lift_off=False)`, and
+    `mean_steps` has first derivatives with respect to `params` and `slope_sd`.
 
     For other models, walks are sampled. Importance sampling makes failures frequent, so that the
     number of sampled steps does not grow with the mean. The error is then half the width of a 99 %
@@ -161,27 +164,29 @@ def first_passage(
 
     `jax.grad` of a sampled mean returns first derivatives with an error of some per cent. A walk
     fails beyond a radius in the space of slopes, and this radius is a smooth function of the
-    parameters. The derivatives neglect terms of the relative size 1/`mean_steps`. They need known
-    numbers, so that `jit`, `vmap` and `tune` do not accept sampled means.
+    parameters. The derivatives neglect terms of the relative size 1/`mean_steps`. Their computation
+    needs concrete values, so `jit`, `vmap` and `tune` do not accept sampled means.
 
     Args:
-        params: the wheel, whose slope is the mean slope.
+        params: parameters of the wheel; the slope is the mean slope.
         slope_sd: standard deviation of the slopes, rad.
-        model: the model; the paper's, `ViscoelasticWheel()`, by default.
-        options: numerical choices of sampled steps; by default rtol and atol are 1e-6, and those of
-            `StepOptions()` with unilateral contact.
-        seed: of the random slopes.
-        n_nodes: number of nodes of the quadrature; doubled until `tol` is met.
-        n_walkers: number of walks side by side.
-        tol: relative error of `mean_steps`: by default 1e-8 with quadrature, 0.02 with samples.
-        max_steps: number of sampled steps after which no further walks begin.
+        model: model of the wheel; by default the paper's, `ViscoelasticWheel()`.
+        options: numerical options of sampled gait steps; by default rtol and atol are 1e-6, or with
+            unilateral contact those of `StepOptions()`.
+        seed: seed of the random slopes.
+        n_nodes: initial number of quadrature nodes, doubled until the relative error is at most
+            `tol`.
+        n_walkers: number of walks that are simulated at the same time.
+        tol: relative error of `mean_steps`; by default 1e-8 for quadrature and 0.02 for sampled
+            walks.
+        max_steps: number of sampled gait steps after which no further walks begin.
 
     Returns:
         A `FirstPassage`.
 
     Raises:
-        TypeError, ValueError: an invalid argument, a wheel without a gait, or slopes so uneven that
-            no step succeeds, described in one sentence.
+        TypeError, ValueError: if an argument is invalid, if the wheel has no gait, or if the slopes
+            are so uneven that no step succeeds.
 
     Examples:
         >>> passage = vrw.first_passage(vrw.WheelParams(), 0.02, tol=0.1)
@@ -226,9 +231,9 @@ def _estimate_differentiable_passage(
     params: WheelParams,
     slope_sd: Any,
 ) -> FirstPassage:
-    """Return sampled first-passage times, with first derivatives of the means.
+    """Return first-passage times from sampled walks, such that the means have first derivatives.
 
-    Raise TypeError if the numbers of the wheel are unknown, as inside `jit` and `vmap`.
+    Raise TypeError if the parameters of the wheel are abstract, as inside `jit` and `vmap`.
     """
     require_untraced_arguments("vrw.first_passage", SAMPLED_TRACING_REMEDY, params, slope_sd)
     return estimate_passage(params, float(slope_sd))[0]
@@ -240,7 +245,7 @@ def _differentiate_passage(
     primals: tuple[WheelParams, Any],
     tangents: tuple[WheelParams, Any],
 ) -> tuple[FirstPassage, FirstPassage]:
-    """Return sampled first-passage times and their tangents."""
+    """Return first-passage times from sampled walks, and their tangents."""
     params, slope_sd = primals
     require_untraced_arguments("vrw.first_passage", SAMPLED_TRACING_REMEDY, params, slope_sd)
     params_tangent, slope_sd_tangent = tangents
@@ -276,10 +281,11 @@ def _differentiate_passage(
 def _solve_passage_by_quadrature(
     params: WheelParams, slope_sd: Array, model: Any, n_nodes: int, relative_tolerance: float
 ) -> FirstPassage:
-    """Return the first-passage times of the rigid wheel by quadrature.
+    """Return the first-passage times of the rigid wheel, computed by quadrature.
 
-    The number of nodes is doubled until the error is within `relative_tolerance`. Traced arguments
-    use `n_nodes` once. Raise ValueError if the model stops at lift-off or the wheel has no gait.
+    The number of nodes is doubled until the error is within `relative_tolerance`. For traced
+    arguments, the number is not doubled. Raise ValueError if the model stops at lift-off or the
+    wheel has no gait.
     """
     if model.stop_at_lift_off:
         raise ValueError(
@@ -341,10 +347,11 @@ def _estimate_passage_by_sampling(
     max_steps: int,
     differentiated_names: tuple[str, ...] = (),
 ) -> tuple[FirstPassage, dict[str, float]]:
-    """Return the first-passage times of a model by sampled walks.
+    """Return the first-passage times of a model, estimated by sampled walks, and derivatives of the
+    logarithm of `mean_steps` by parameter name.
 
-    Return also the derivatives of the logarithm of `mean_steps`, by the names of the parameters.
-    Raise ValueError if the wheel has no gait, or if hardly any step succeeds.
+    The derivatives are those with respect to the parameters `differentiated_names`. Raise
+    ValueError if the wheel has no gait, or if hardly any step succeeds.
     """
     limit_cycle_result: Any = limit_cycle(params, model=model)
     if int(limit_cycle_result.outcome) != Outcome.STEPPED:

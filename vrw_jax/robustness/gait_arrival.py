@@ -1,4 +1,4 @@
-"""Walks of one wheel from many starts, until each walk arrives at a stable gait or fails."""
+"""Walks of one wheel from many start states, until each walk arrives at a stable gait or fails."""
 
 import functools
 from dataclasses import dataclass
@@ -22,19 +22,22 @@ class ArrivalOptions:
     """Numerical options of the test whether a walk has arrived at a gait."""
 
     max_gait_distance: float = 1e-6
-    """Largest distance of a section state from the gait at which the walk has arrived.
+    """Largest distance between the section states of a walk and of the gait at which the walk has
+    arrived.
 
-    Distances are in units of the wheel. The value is chosen far above the errors of a step and of a
-    gait, and far below the distances of most gaits from the boundaries of their basins."""
+    Distances are in units of the wheel. The value is chosen far above the errors of a gait step and
+    of a gait. It is far below the distances of most gaits from the boundaries of their basins.
+    """
     steps_per_arrival_test: int = 10
-    """Number of steps between two tests, chosen because more frequent tests need many calls."""
+    """Number of gait steps between two tests, chosen because more frequent tests need many calls.
+    """
 
 
 ARRIVAL_OPTIONS = ArrivalOptions()
 
 
 class StableGait(NamedTuple):
-    """Stable gait of one wheel, with the wheel, the model and the options of its steps."""
+    """Stable gait of one wheel, with the wheel's parameters, the model and the step options."""
 
     params: WheelParams
     model: AbstractWheel
@@ -50,10 +53,10 @@ class StableGait(NamedTuple):
         cycle: AbstractCycle | None,
         options: StepOptions | None,
     ) -> "StableGait":
-        """Return the gait of `cycle`, or of `limit_cycle` by default.
+        """Return the stable gait of `cycle`, which is by default the result of `limit_cycle`.
 
-        Raise TypeError or ValueError if an argument is invalid or the gait is not stable. Messages
-        contain `caller_name`, the name of the public function.
+        Raise TypeError or ValueError if an argument is invalid or the gait is not stable. The
+        messages contain `caller_name`, the name of the public function.
         """
         require_untraced_arguments(
             caller_name, "map vrw.walk over the starts", params, options, cycle
@@ -95,7 +98,11 @@ class StableGait(NamedTuple):
     def is_on_gait(
         self, section_states: np.ndarray, arrival_options: ArrivalOptions = ARRIVAL_OPTIONS
     ) -> np.ndarray:
-        """Return whether each section state equals a section state of the gait, shape (states,)."""
+        """Return whether each section state agrees with a section state of the gait, shape
+        (states,).
+
+        Two states agree if their distance is at most `max_gait_distance`.
+        """
         state_units = self.model.section_units(
             compute_wheel_units(self.params.symbols()), self.params.n_legs
         )
@@ -107,7 +114,7 @@ class StableGait(NamedTuple):
 
 
 class ArrivalWalkResult(NamedTuple):
-    """Result of walks toward a gait, with a leading axis over starts."""
+    """Results of walks toward a gait; the first axis of each array is over starts."""
 
     is_on_gait: np.ndarray
     walk_outcomes: np.ndarray  # `Outcome` of each walk, STEPPED if the walk continues
@@ -120,7 +127,10 @@ def walk_until_on_gait(
     max_steps: int,
     arrival_options: ArrivalOptions = ARRIVAL_OPTIONS,
 ) -> ArrivalWalkResult:
-    """Return the result of a walk of at most `max_steps` steps from each start."""
+    """Return the results of walks of at most `max_steps` gait steps from `start_states`.
+
+    - `start_states`: section states before the first landing, shape (starts, components).
+    """
     n_starts = len(start_states)
     is_on_gait, walk_outcomes = np.zeros(n_starts, bool), np.full(n_starts, int(Outcome.STEPPED))
     n_steps_by_walk = np.zeros(n_starts, int)

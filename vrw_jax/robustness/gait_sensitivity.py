@@ -29,22 +29,25 @@ class GaitSensitivity(AbstractPrintable):
 
     The norm is the standard deviation of a measure in a long walk over independent slopes, divided
     by the standard deviation of the slopes, in the limit of small deviations. The norm is infinite
-    if the gait is not stable. The squares of `ending_step`, `beginning_step` and `later_steps` sum
-    to the square of the norm.
+    if the gait is not stable. A line of the ground joins two footholds. The squares of
+    `ending_step`, `beginning_step` and `later_steps` sum to the square of the norm.
 
     - `norm`: norms in the order of `measures`;
     - `ending_step`: signed response of the step that ends on a line to the slope of that line;
     - `beginning_step`: signed response of the step that begins on a line to the slope of that line;
-    - `later_steps`: root of the sum of the squared responses of all later steps;
+    - `later_steps`: square root of the sum of the squared responses of all later steps to the slope
+      of the line;
     - `spectral_radius`: spectral radius of the gait's return map;
-    - `outcome`: Outcome.STEPPED, or the reason why there is no gait; all other numbers are then
-      zero;
+    - `outcome`: Outcome.STEPPED, or the reason why there is no gait; without a gait, all other
+      numbers are zero;
     - `measures`: names of the measures.
 
-    Examples: >>> print(vrw.gait_sensitivity(vrw.WheelParams(), ["period"])) GaitSensitivity step
-    period T: 3.50861 s per rad (step that ends on a line: 0.566241, step that begins on it:
-    -2.78338, later steps: 2.05973) spectral radius of the gait: 0.32862
-    """
+    Examples:
+        >>> print(vrw.gait_sensitivity(vrw.WheelParams(), ["period"]))
+        GaitSensitivity
+          step period T: 3.50861 s per rad (step that ends on a line: 0.566241, step that begins on it: -2.78338, later steps: 2.05973)
+          spectral radius of the gait: 0.32862
+    """  # noqa: E501
 
     norm: Float[Array, " n_measures"]
     ending_step: Float[Array, " n_measures"]
@@ -56,7 +59,7 @@ class GaitSensitivity(AbstractPrintable):
 
     @property
     def ending(self) -> str:
-        """Return a sentence on whether the norms are finite, with the reason."""
+        """Return a sentence on whether the norms are finite, with the reason if they are not."""
         if self.outcome != Outcome.STEPPED:
             return describe_step_ending(self.outcome, Outcome)
         if self.spectral_radius < 1.0:
@@ -64,7 +67,7 @@ class GaitSensitivity(AbstractPrintable):
         return "The gait is not stable: deviations grow from step to step, and no norm is finite."
 
     def summary_rows(self) -> list[LabelAndText]:
-        """Return labels and texts of the norms of all measures, with their parts."""
+        """Return pairs of label and text for the norms of all measures, with their parts."""
         if self.outcome != Outcome.STEPPED:
             return [("outcome", self.ending)]
         text_rows = []
@@ -94,21 +97,22 @@ def gait_sensitivity(
     guess: UserCycleGuess | None = None,
     options: CycleOptions | StepOptions | None = None,
 ) -> GaitSensitivity:
-    """Return the gait sensitivity norm of each measure of a step.
+    """Return the gait sensitivity norm of each measure of a gait step.
 
     The slopes of the lines that join the footholds are independent, with mean `params.slope`. A
     line influences two steps directly: the step that ends on the line and the step that begins on
     it. A discrete Lyapunov equation sums the response of all later steps. Hobbelen and Wisse (2007)
     sum over a few steps.
 
-    Norms are differentiable with respect to `params` in every mode. Margins depend on more than
-    durations and the first landing. Their gradients need second derivatives of a step, whose
-    compilation takes minutes. With unilateral contact, norms have no derivatives.
+    Norms are differentiable with respect to `params` in forward and reverse mode. The gradient of
+    the norm of a margin needs second derivatives of a step, whose compilation takes minutes,
+    because margins depend on more than durations and the first landing. With unilateral contact,
+    norms have no derivatives.
 
     Args:
-        params: the wheel, whose slope is the mean slope.
-        measures: names of measures of a step, such as "period", "speed" or a margin.
-        model: the model; the paper's, `ViscoelasticWheel()`, by default.
+        params: parameters of the wheel; the slope is the mean slope.
+        measures: names of measures of a gait step, such as "period", "speed" or a margin.
+        model: model of the wheel; by default the paper's, `ViscoelasticWheel()`.
         guess: as in `limit_cycle`.
         options: as in `limit_cycle`.
 
@@ -116,8 +120,7 @@ def gait_sensitivity(
         A `GaitSensitivity`.
 
     Raises:
-        TypeError, ValueError: an invalid argument, or a wheel without a gait, described in one
-            sentence.
+        TypeError, ValueError: if an argument is invalid or the wheel has no gait.
 
     Examples:
         >>> print(vrw.gait_sensitivity(vrw.WheelParams(), ["period", "speed"]).norm.round(3))

@@ -1,11 +1,12 @@
-"""Derivatives of sampled mean numbers of steps with respect to the parameters of the wheel.
+"""Derivatives of sampled mean numbers of gait steps with respect to the parameters of the wheel.
 
-A walk over slopes with standardized deviations z fails if z is far enough from zero. The failure
-radius of the walk is the smallest factor r at which the walk over the deviations r z/|z| fails. It
-is a smooth function of the parameters, although the outcome of a walk is not. The norm |z| of n
-independent normal numbers has the chi distribution with n degrees of freedom. The derivative of the
-logarithm of the mean number of steps is therefore a mean over failing walks. Its terms are the
-hazard rate of that distribution at the failure radius, times the derivative of the failure radius.
+Let z be the vector of the standardized deviations of the slopes in a walk. The walk fails if z is
+far enough from zero. The failure radius of the walk is the smallest factor r at which the walk with
+the deviations r z/|z| fails. The failure radius is a smooth function of the parameters, although
+the outcome of a walk is not. The norm |z| of n independent normal numbers has the chi distribution
+with n degrees of freedom. The derivative of the logarithm of the mean number of steps is therefore
+a mean over failing walks. The terms of this mean are the hazard rate of the chi distribution at the
+failure radius, times the derivative of the failure radius.
 """
 
 from dataclasses import dataclass
@@ -24,7 +25,7 @@ from vrw_jax.wheel import Outcome, WheelParams
 
 @dataclass(frozen=True)
 class PassageGradientOptions:
-    """Numerical options of the derivatives of sampled mean numbers of steps."""
+    """Numerical options of the derivatives of sampled mean numbers of gait steps."""
 
     n_failing_walks: int = 1024
     """Number of failing walks whose failure radii are computed.
@@ -35,24 +36,28 @@ class PassageGradientOptions:
     relative_parameter_step: float = 3e-4
     """Relative change of a parameter in a difference quotient of failure radii.
 
-    The value is chosen because failure radii then change by less than `bracket_half_width`."""
+    The value is chosen because the resulting changes of failure radii are below
+    `bracket_half_width`.
+    """
     bracket_half_width: float = 0.2
-    """Half the width of the bracket of a changed wheel's failure radius.
+    """Half the width of the interval that brackets the failure radius for a changed parameter.
 
-    The unit is the standard deviation of a slope."""
+    The unit is the standard deviation of a slope.
+    """
     n_bisections: int = 22
-    """Number of bisections for each failure radius of the given wheel."""
+    """Number of bisections for each failure radius at the original parameters."""
     n_changed_bisections: int = 14
-    """Number of bisections for each failure radius of a changed wheel.
+    """Number of bisections for each failure radius at a changed parameter.
 
-    The value is chosen because the error of the radius is then a hundredth of a typical change."""
+    The value is chosen because the error of the radius is then a hundredth of a typical change.
+    """
 
 
 PASSAGE_GRADIENT_OPTIONS = PassageGradientOptions()
 
 
 class FailingWalks(NamedTuple):
-    """Walks that fail in their last step, which start from the quasi-stationary distribution."""
+    """Walks that start from the quasi-stationary distribution and fail in their last step."""
 
     section_states: np.ndarray  # at the starts, (walks, components)
     start_slopes: np.ndarray  # of the lines at the starts, (walks,), rad
@@ -68,9 +73,11 @@ def differentiate_log_mean_steps(
 ) -> dict[str, float]:
     """Return the derivatives of the logarithm of the mean number of steps, by parameter name.
 
-    "slope_sd" is the name of the standard deviation of the slopes. A derivative is NaN if a wheel
+    The name "slope_sd" means the standard deviation of the slopes. A derivative is NaN if a wheel
     with a slightly changed parameter has no gait. The result neglects the influence of failures on
     the quasi-stationary distribution, which has the relative size 1/`mean_steps`.
+
+    - `walk_density`: density from which the slope deviations of walks are drawn.
     """
     from scipy import stats  # This import is slow.
 
@@ -100,7 +107,9 @@ def differentiate_log_mean_steps(
     gait_state = walker_groups.gait_states[0]
 
     def differentiate_failure_radii(parameter_name: str) -> np.ndarray:
-        """Return the derivatives of all failure radii with respect to one parameter."""
+        """Return the derivatives of all failure radii with respect to one parameter, shape
+        (walks,).
+        """
         if parameter_name == "slope_sd":
             return -failure_radii / slope_sd
         parameter_value = float(getattr(params, parameter_name))
@@ -148,7 +157,8 @@ def _draw_failing_walks(
     walk_density: GaussianMixture,
     gradient_options: PassageGradientOptions,
 ) -> FailingWalks:
-    """Return failing walks with equal weights, resampled from rounds of biased walks.
+    """Return failing walks with equal weights, resampled from walks with slopes drawn from
+    `walk_density`.
 
     Raise ValueError if no walk fails in its last step.
     """
@@ -189,8 +199,9 @@ def _test_walk_failures(
     failing_walks: FailingWalks,
     deviation_norms: np.ndarray,
 ) -> np.ndarray:
-    """Return whether each walk fails if its slope deviations have the given norms, shape
-    (walks,).
+    """Return whether each walk fails if its slope deviations are scaled to norm `deviation_norms`.
+
+    The result has the shape (walks,).
     """
     landing_slopes = (
         float(params.slope)
@@ -216,8 +227,10 @@ def _bisect_failure_radii(
     upper_radii: np.ndarray,
     n_bisections: int,
 ) -> np.ndarray:
-    """Return the failure radius of each walk, between a radius of survival and a radius of
-    failure.
+    """Return the failure radius of each walk, shape (walks,), by bisection.
+
+    - `lower_radii`: radii at which the walks do not fail;
+    - `upper_radii`: radii at which the walks fail.
     """
     for _ in range(n_bisections):
         middle_radii = 0.5 * (lower_radii + upper_radii)

@@ -1,8 +1,8 @@
-"""First passage of the rigid wheel by quadrature, with a kernel in closed form.
+"""First-passage times of the rigid wheel by quadrature, with a kernel in closed form.
 
-The state is one number, the squared angular rate with the stance leg vertical. This rate and the
-slope of the next line determine the next rate. The probability density of the slopes therefore
-determines the kernel.
+The state is one number: the squared angular rate at the instant at which the stance leg is
+vertical. This rate and the slope of the next line of the ground determine the next rate. The
+probability density of the slopes therefore determines the kernel.
 """
 
 import functools
@@ -27,12 +27,12 @@ MAX_SLOPE_STANDARD_DEVIATIONS = 10.0
 """Largest deviation of a slope from its mean, in standard deviations.
 
 The limit bounds the states. The value is chosen because larger deviations have a probability of
-1e-23.
+only 1e-23.
 """
 
 
 class RigidPassage(NamedTuple):
-    """First passage of the rigid wheel, computed with a given number of quadrature nodes."""
+    """First-passage times of the rigid wheel, computed with a given number of quadrature nodes."""
 
     survival_analysis: SurvivalAnalysis
     mean_steps_from_gait: Scalar
@@ -43,7 +43,7 @@ class RigidPassage(NamedTuple):
 def solve_rigid_passage(
     params: WheelParams, slope_sd: Scalar, rigid_model: Any, n_nodes: int
 ) -> RigidPassage:
-    """Return the first passage by Gauss-Legendre quadrature with `n_nodes` nodes.
+    """Return the first-passage times by Gauss-Legendre quadrature with `n_nodes` nodes.
 
     - `slope_sd`: standard deviation of the slopes, rad.
     """
@@ -57,8 +57,9 @@ def solve_rigid_passage(
     node_weights = 0.5 * largest_squared_rate * legendre_weights
 
     def evaluate_kernel_row(squared_rate: Array) -> tuple[Array, Array]:
-        """Return the row of the survival operator at a squared rate, and the probability of failure
-        there."""
+        """Return the kernel from a squared rate to all nodes, times the quadrature weights, and the
+        probability that the step fails.
+        """
         compute_slope_cosine = lambda next_squared_rate: (
             (next_squared_rate - vertical_rate_map.compute_slope_independent_part(squared_rate))
             / vertical_rate_map.slope_amplitude

@@ -1,10 +1,11 @@
-"""First passage by sampled walks, with failures made frequent by importance sampling.
+"""First-passage times from sampled walks, with failures made frequent by importance sampling.
 
-Groups of walkers walk over random slopes until the effect of the start has decayed. A walker that
-fails is replaced by a copy of another walker of its group (Fleming and Viot). So all walkers have
-the quasi-stationary distribution. Then walks of a few steps are drawn from a density on which many
-walks fail in their last step. Likelihood ratios give the probability of that failure without bias.
-Groups are independent, so that the spread between groups gives the error.
+Groups of simulated wheels, the walkers, walk over random slopes until the effect of the start has
+decayed. A walker that fails is replaced by a copy of another walker of its group (Fleming and
+Viot). All walkers then have the quasi-stationary distribution. From there, walks of a few steps are
+sampled with slopes from a density for which many walks fail in their last step. Likelihood ratios
+give the probability of that failure without bias. Groups are independent, so that the spread
+between groups gives the error.
 """
 
 import dataclasses
@@ -28,51 +29,78 @@ from vrw_jax.wheel import Outcome, WheelParams
 
 @dataclass(frozen=True)
 class PassageSamplingOptions:
-    """Numerical options of first-passage times from sampled walks."""
+    """Numerical options for estimating first-passage times by sampled walks."""
 
     n_walker_groups: int = 32
-    """Number of independent groups of walkers. The value is chosen because the quantile for 99 % of
-    Student's distribution is then within 7 % of that of the normal distribution."""
+    """Number of independent groups of walkers.
+
+    The value is chosen because the quantile for 99 % of Student's distribution is then within 7 %
+    of that of the normal distribution.
+    """
     negligible_line_effect: float = 0.01
-    """Effect of a line on a later state, relative to that on the next state, below which the line's
-    slope is drawn without bias. The result has no bias for any value. The value is chosen because
-    likelihood ratios are then similar."""
+    """Relative effect of a line's slope below which the slope is drawn without bias.
+
+    A line joins two footholds. The effect is that on a later state, divided by that on the next
+    state. The result has no bias for any value. The value is chosen because likelihood ratios are
+    then similar.
+    """
     max_biased_lines: int = 12
-    """Largest number of lines whose slopes are drawn with a bias. The value is chosen because fits
-    in more dimensions need more samples."""
+    """Largest number of lines of the ground whose slopes are drawn with a bias.
+
+    The value is chosen because fits in more dimensions need more samples.
+    """
     min_failures_for_counting: float = 0.2
     """Expected number of failures over the biased lines above which failures are counted without
-    bias. The value is chosen because counting and importance sampling then need equally many steps.
+    bias.
+
+    The value is chosen because counting and importance sampling then need equally many steps.
     """
     min_forgetting_steps: int = 6
-    """Smallest number of steps after which the effect of the start counts as decayed."""
+    """Smallest number of gait steps after which the effect of the start is considered to have
+    decayed.
+    """
     max_forgetting_steps: int = 100
-    """Largest number of steps after which the effect of the start counts as decayed. The value is
-    chosen because gaits with slower decay are almost unstable."""
+    """Largest number of gait steps after which the effect of the start is considered to have
+    decayed.
+
+    The value is chosen because gaits with slower decay are almost unstable.
+    """
     max_gait_rounds: int = 40
-    """Largest number of rounds of walks from the gait. The value is chosen because more rounds are
-    needed only if most walks fail within three steps."""
+    """Largest number of rounds of walks that start on the gait.
+
+    The value is chosen because more rounds are needed only if most walks fail within three steps.
+    """
     n_kappa_2_steps: int = 4
-    """Number of steps whose states before and after are used to estimate kappa_2."""
+    """Number of gait steps whose states before and after the step are used to estimate kappa_2."""
     min_sampling_rounds: int = 4
-    """Smallest number of rounds of all walkers. The value is chosen because the error estimate of
-    fewer rounds is uncertain."""
+    """Smallest number of rounds, each with one walk per walker.
+
+    The value is chosen because the error estimate of fewer rounds is uncertain.
+    """
     max_start_effect_per_tol: float = 0.1
-    """Largest fraction of the start's effect that may remain, divided by the tolerance."""
+    """Largest remaining fraction of the effect of the start, divided by the tolerance."""
     min_effective_failures: float = 100.0
-    """Smallest effective number of sampled failures for which an error is estimated. The value is
-    chosen because a few likelihood ratios dominate smaller samples. Their spread is then no
-    estimate of the error."""
+    """Smallest effective number of sampled failures for which an error is estimated.
+
+    The value is chosen because a few likelihood ratios dominate smaller samples. The spread of
+    these ratios is then no estimate of the error.
+    """
     min_effective_failure_fraction: float = 0.02
-    """Smallest effective number of sampled failures, divided by the number of failing walks. The
-    value is chosen because it is a tenth of the usual one. Lower values belong to fits that miss a
-    part of the failures, and failures are then counted if they are frequent enough."""
+    """Smallest accepted ratio of the effective number of failures to the number of failing walks.
+
+    The value is chosen because it is a tenth of the usual ratio. A lower ratio means that the fit
+    misses a part of the failures. Failures are then counted if they are frequent enough.
+    """
     n_check_steps: int = 12
-    """Number of steps of all walkers whose failures are counted to check importance sampling. The
-    value is chosen because these steps take a sixth of the time of a usual wheel."""
+    """Number of gait steps per walker whose failures are counted to check importance sampling.
+
+    The value is chosen because these steps take a sixth of the computing time for a usual wheel.
+    """
     min_check_probability: float = 1e-4
-    """Smallest probability at which the counted failures may be due to chance. The value is chosen
-    because a wrong alarm is then rare among some thousands of wheels."""
+    """Smallest probability at which the number of counted failures is attributed to chance.
+
+    The value is chosen because a wrong alarm is then rare among some thousands of wheels.
+    """
     confidence_level: float = 0.99
     """Confidence level of the error estimate."""
 
@@ -80,13 +108,17 @@ class PassageSamplingOptions:
 PASSAGE_SAMPLING_OPTIONS = PassageSamplingOptions()
 
 N_FIXED_POINT_ITERATIONS = 60
-"""Number of fixed-point iterations, chosen because each iteration reduces the error by a factor of
-two or more."""
+"""Number of fixed-point iterations for the failure probability, chosen because each iteration
+reduces the error by a factor of two or more.
+"""
 
 MIN_RELATIVE_SINGULAR_VALUE = 0.003
 """Smallest singular value of standardized states that enters the regression, relative to the
-largest one. The value is chosen because noise dominates smaller ones: a landing with two feet held
-leaves two degrees of freedom."""
+largest.
+
+The value is chosen because noise dominates smaller singular values. For example, a landing after
+which both feet stick leaves two degrees of freedom.
+"""
 
 
 class ExtinctGroupError(ValueError):
@@ -108,7 +140,7 @@ class SampledPassage(NamedTuple):
 
 
 class WalkerGroups:
-    """Groups of walkers on random slopes, simulated as one batch. All walkers start at the gait."""
+    """Groups of walkers on random slopes, simulated as one batch. All walkers start on the gait."""
 
     def __init__(
         self,
@@ -133,11 +165,12 @@ class WalkerGroups:
         self.weight_by_outcome: dict[int, float] = {}
 
     def run_walks(self, slope_deviations: np.ndarray) -> StepBatchResult:
-        """Return the results of walks that begin at the states of the walkers, over given slopes.
+        """Return the results of walks that begin at the present states of the walkers.
 
         Walk i begins at walker i modulo the number of walkers.
 
-        - `slope_deviations`: standardized deviations of the slopes, shape (walks, lines).
+        - `slope_deviations`: standardized deviations of the slopes on which the wheels land, shape
+          (walks, lines).
         """
         landing_slopes = self.mean_slope + self.slope_sd * slope_deviations
         walker_indices = np.arange(len(slope_deviations)) % len(self.states)
@@ -158,7 +191,7 @@ class WalkerGroups:
         return walk_results
 
     def add_failure_weights(self, walk_outcomes: np.ndarray, walk_weights: np.ndarray) -> None:
-        """Add the weights of failed walks to the total weight of each outcome."""
+        """Add the weights of failed walks to `weight_by_outcome`, the total for each outcome."""
         for outcome_code in np.unique(walk_outcomes[walk_weights > 0.0]):
             outcome_weight = float(np.sum(walk_weights[walk_outcomes == outcome_code]))
             self.weight_by_outcome[int(outcome_code)] = (
@@ -166,22 +199,24 @@ class WalkerGroups:
             )
 
     def restart_at_gait(self) -> None:
-        """Move all walkers to the gait, on lines of the mean slope."""
+        """Reset all walkers to the section state of the gait, on ground of the mean slope."""
         self.states, self.slopes = self.gait_states, np.full(len(self.gait_states), self.mean_slope)
 
     def stack_states_and_slopes(self) -> np.ndarray:
         """Return section states with the slope as last component, shape (walkers, components).
 
-        By the Markov property, a section state and the slope of its line determine the distribution
+        By the Markov property, the section state and the present slope determine the distribution
         of later states.
         """
         return np.concatenate([self.states, self.slopes[:, None]], 1)
 
     def step_and_replace_failures(self) -> tuple[np.ndarray, np.ndarray]:
-        """Take one step of every walker, and replace walkers that fail by copies of other walkers.
+        """Simulate one gait step of every walker, and replace walkers that fail by copies of other
+        walkers.
 
         Return whether each walker survived, and the standardized deviations of the slopes on which
-        the walkers landed. Raise `ExtinctGroupError` if no walker of a group survived.
+        the walkers landed, both of shape (walkers,). Raise `ExtinctGroupError` if no walker of a
+        group survived.
         """
         n_walkers = len(self.states)
         slope_deviations = self.random.standard_normal((n_walkers, 1))
@@ -209,15 +244,15 @@ def sample_passage(
     max_steps: int,
     sampling_options: PassageSamplingOptions = PASSAGE_SAMPLING_OPTIONS,
 ) -> SampledPassage:
-    """Return first-passage times from walks of groups of walkers.
+    """Return first-passage times, estimated from walks of groups of walkers.
 
     Walks are sampled until the error is within the tolerance.
 
     Args:
-        walker_groups: groups of walkers at the gait.
+        walker_groups: groups of walkers on the gait.
         spectral_radius: spectral radius of the gait.
         relative_tolerance: relative error at which the sampling ends.
-        max_steps: number of steps after which no further walks begin.
+        max_steps: number of gait steps after which no further walks begin.
         sampling_options: numerical options of the sampling.
 
     Raises:
@@ -329,16 +364,16 @@ def _estimate_failure_probability(
     max_steps: int,
     sampling_options: PassageSamplingOptions,
 ) -> tuple[float, float]:
-    """Return the failure probability of a step, and its relative error.
+    """Return the failure probability of a gait step, and the relative error of that probability.
 
-    Rounds of all walkers are repeated until the relative error is within the tolerance. The error
-    is infinite if a few walks dominate the probability.
+    Rounds with one walk per walker are repeated until the relative error is within the tolerance.
+    The error is infinite if a few walks dominate the probability.
 
     - `failure_weight_sampler`: function that returns the weight of each walk of a round, which is 0
       unless the walk fails in its last step;
-    - `n_lines`: number of lines of each walk;
-    - `start_effect_decay`: factor per step of the start's effect, and number of steps before the
-      walks.
+    - `n_lines`: number of lines of the ground in each walk;
+    - `start_effect_decay`: factor per step by which the effect of the start decays, and number of
+      steps before the walks.
     """
     group_weight_sums, n_rounds = np.zeros(walker_groups.n_groups), 0
     failure_weight_sum, squared_weight_sum, n_failing_walks = 0.0, 0.0, 0
@@ -387,10 +422,10 @@ def _estimate_survival_from_gait(
     relative_tolerance: float,
     sampling_options: PassageSamplingOptions,
 ) -> np.ndarray:
-    """Return the fractions of walks from the gait that survive 0, 1, ..., `n_steps` steps.
+    """Return the fractions of walks from the gait that survive 0, 1, ..., `n_steps` gait steps.
 
-    Rounds of all walkers are repeated until the last fraction has the relative standard error
-    `relative_tolerance`.
+    The result has the shape (n_steps + 1,). Rounds with one walk per walker are repeated until the
+    last fraction has the relative standard error `relative_tolerance`.
     """
     n_survivors, n_walks = np.zeros(n_steps + 1), 0
     for _ in range(sampling_options.max_gait_rounds):
@@ -409,7 +444,7 @@ def _estimate_survival_from_gait(
 def _fit_density_of_failures(walker_groups: WalkerGroups, n_lines: int) -> GaussianMixture | None:
     """Return a density of slope deviations for which walks often fail in their last step.
 
-    The walks have `n_lines` lines. The result is None if no walk fails.
+    Each walk has `n_lines` steps. The result is None if no walk fails.
     """
 
     def find_failures(slope_deviations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -431,7 +466,7 @@ def _has_missed_failures(
     max_failure_probability: float,
     sampling_options: PassageSamplingOptions,
 ) -> bool:
-    """Return whether more counted steps fail with some outcome than importance sampling predicts.
+    """Return whether some outcome ends more counted steps than importance sampling predicts.
 
     Importance sampling may miss an outcome that no large slope causes. For example, a landing may
     release the rear foot, and the wheel then falls back a step later.
@@ -463,11 +498,11 @@ def _has_missed_failures(
 def run_biased_walks(
     walker_groups: WalkerGroups, walk_density: GaussianMixture
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Run one walk from every walker, over lines whose slope deviations are drawn from a density.
+    """Return the slope deviations and failure weights of one walk from every walker.
 
-    Return the slope deviations, shape (walkers, lines), and the weight of each walk. The weight is
-    the likelihood ratio if the walk fails in its last step, and 0 otherwise. The mean weight is the
-    probability of a failure in the last step.
+    The slope deviations, shape (walkers, lines), are drawn from `walk_density`. The weight of a
+    walk, shape (walkers,), is the likelihood ratio if the walk fails in its last step, and 0
+    otherwise. The mean weight is the probability of a failure in the last step.
     """
     n_lines = walk_density.component_means.shape[1]
     slope_deviations = walk_density.draw_samples(len(walker_groups.states), walker_groups.random)
@@ -491,9 +526,9 @@ def _solve_failure_probability(
     """Return the failure probability p of a step, and the amplification of its relative error.
 
     Each step from the quasi-stationary distribution fails with probability p. A walk therefore
-    fails in the last of `n_biased_lines` steps with probability p (1 - p)^(n_biased_lines - 1),
-    which is `last_step_failure_probability`. The amplification is the ratio of the relative errors
-    of p and of that probability.
+    fails in the last of `n_biased_lines` steps with probability p (1 - p)^(n_biased_lines - 1).
+    This probability is `last_step_failure_probability`. The amplification is the ratio of the
+    relative error of p to that of this probability.
     """
     p = last_step_failure_probability
     if n_biased_lines == 1:
@@ -510,11 +545,14 @@ def _estimate_kappa_2(
 ) -> float:
     """Return the second eigenvalue of the survival operator, projected on quadratic functions.
 
-    A transition consists of states before a step, survival, deviations of the slopes on which the
-    step ends, and states after the step. The projection is the extended dynamic mode decomposition
-    (Williams, Kevrekidis and Rowley 2015). Hermite polynomials of the deviations have a mean of
-    zero in any state. As regressors, they remove most of the noise. As the slopes become equal, the
-    eigenvalue becomes the leading multiplier of the gait.
+    The projection is the extended dynamic mode decomposition (Williams, Kevrekidis and Rowley
+    2015). Hermite polynomials of the slope deviations have a mean of zero in any state. As
+    regressors, they remove most of the noise. In the limit of equal slopes, the eigenvalue becomes
+    the leading multiplier of the gait.
+
+    - `step_transitions`: arrays for each gait step: states before the step, survival, deviations of
+      the slopes on which the step ends, and states after the step;
+    - `n_continuous`: number of continuous components of a section state.
     """
     states_before, is_alive, landing_deviations, states_after = (
         np.concatenate(transition_parts) for transition_parts in zip(*step_transitions, strict=True)

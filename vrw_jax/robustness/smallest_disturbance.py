@@ -21,40 +21,46 @@ from vrw_jax.validation import check_int, check_positive
 from vrw_jax.wheel import Outcome, WheelParams
 
 DISTURBANCE_SIGNS = np.array([-1.0, 1.0])
-"""Signs of the change of the angular velocity: backward, then forward."""
+"""Signs of the change of the angular velocity in backward and forward disturbances, in this order.
+"""
 DISTURBED_PHASE_NAMES = ("DLS", "SLS-I", "SLS-II")
 ANGULAR_VELOCITY_INDEX = 3
-"""Index of the angular velocity dtheta in a state (theta, L1, L2 and their rates)."""
+"""Index of the angular velocity dtheta in a state (theta, L1, L2, dtheta, dL1, dL2)."""
 
 
 @dataclass(frozen=True)
 class DisturbanceSearchOptions:
     """Numerical options of the search for the smallest disturbance.
 
-    The search is over the instants of a step and over the sizes of the disturbance.
+    The search considers instants of a gait step and sizes of the disturbance.
     """
 
     sample_strides: tuple[int, ...] = (512, 64, 8, 1)
-    """Distance between neighboring instants in each pass, in samples of a phase.
+    """Distances between neighboring instants, in samples of a phase, one for each pass of the
+    search.
 
-    The values are chosen because each pass then covers two intervals of the previous pass, and the
-    last pass resolves a ten-thousandth of a phase."""
+    The values are chosen because each pass then covers two intervals of the previous pass. The last
+    pass resolves a ten-thousandth of a phase.
+    """
     n_pass_intervals: int = 16
-    """Number of intervals between the instants of a pass."""
+    """Number of intervals between the instants that one pass considers in a phase."""
     n_grid_sizes: int = 24
-    """Number of sizes in the first grid.
+    """Number of disturbance sizes in the first grid.
 
-    An interval of sizes that leave the basin may be missed if the grid spacing exceeds the width of
-    the interval."""
+    An interval of sizes that leave the basin may be missed if the grid spacing exceeds its width.
+    """
     n_bisection_sizes: int = 8
     """Number of sizes that divide a bracket, chosen because each batch then gains one digit."""
     final_size_tolerance: float = 1e-8
-    """Width of a bracket in the last pass, relative to the size, chosen as the relative error of a
-    step."""
-    early_size_tolerance: float = 1e-5
-    """Width of a bracket in all earlier passes, relative to the size.
+    """Width of a bracket of sizes in the last pass, relative to the size.
 
-    The value is chosen because sizes at neighboring instants differ by more than the width."""
+    The value is chosen as the relative error of a gait step.
+    """
+    early_size_tolerance: float = 1e-5
+    """Width of a bracket of sizes in all earlier passes, relative to the size.
+
+    The value is chosen because sizes at neighboring instants differ by more than this width.
+    """
 
     @property
     def n_phase_samples(self) -> int:
@@ -66,20 +72,20 @@ DISTURBANCE_SEARCH_OPTIONS = DisturbanceSearchOptions()
 
 
 class SmallestDisturbance(AbstractPrintable):
-    """Smallest change of the angular velocity within a step that leaves the basin of the gait.
+    """Smallest change of the angular velocity within a step that takes the state out of the basin.
 
     - `size`: smallest change, rad/s; infinite if no change up to `max_size` leaves the basin;
     - `size_error`: error estimate of `size`, rad/s;
     - `direction`: 1 if the change makes the wheel faster, -1 if slower;
     - `time`: instant of the disturbance after the landing, s;
     - `phase_index`: phase of that instant, 0, 1, 2 for DLS, SLS-I, SLS-II;
-    - `outcome`: Outcome that ends the walk after a slightly larger disturbance; STEPPED if the
-      wheel continues to walk, but not on this gait;
-    - `profile_times`: instants of the profile after the landing, s, shape (instants,);
-    - `profile_phase_indices`: phase of each instant of the profile, shape (instants,);
-    - `backward_sizes`, `forward_sizes`: smallest change that leaves the basin at each instant of
-      the profile, rad/s, shape (instants,);
-    - `max_size`: largest change that was tried, rad/s.
+    - `outcome`: Outcome that ends the walk after a slightly larger disturbance; STEPPED if the walk
+      continues, but not on this gait;
+    - `profile_times`: instants of the profile of sizes, after the landing, s, shape (instants,);
+    - `profile_phase_indices`: index of the phase at each instant of the profile, shape (instants,);
+    - `backward_sizes`, `forward_sizes`: smallest change in each direction that leaves the basin, at
+      each instant of the profile, rad/s, shape (instants,);
+    - `max_size`: largest change that the search tried, rad/s.
 
     Examples:
         >>> result = vrw.smallest_disturbance(vrw.WheelParams())
@@ -101,7 +107,7 @@ class SmallestDisturbance(AbstractPrintable):
 
     @property
     def ending(self) -> str:
-        """Return a sentence on the end of a walk after a slightly larger disturbance."""
+        """Return a sentence on how the walk ends after a slightly larger disturbance."""
         if not np.isfinite(self.size):
             return "No disturbance of the tried sizes leaves the basin."
         if self.outcome == Outcome.STEPPED:
@@ -109,7 +115,7 @@ class SmallestDisturbance(AbstractPrintable):
         return Outcome(int(self.outcome)).meaning
 
     def summary_rows(self) -> list[LabelAndText]:
-        """Return labels and texts of size, direction, instant and outcome."""
+        """Return pairs of label and text for size, direction, instant and outcome."""
         if not np.isfinite(self.size):
             return [("largest tried size", f"{self.max_size:.6g} rad/s"), ("ending", self.ending)]
         direction_text = "faster" if self.direction > 0 else "slower"
@@ -138,24 +144,26 @@ def smallest_disturbance(
     A disturbance is a sudden change of the angular velocity dtheta at one instant of the gait's
     step, from just after the landing to just before the next landing. Its size is the modulus of
     the change, rad/s. Positions do not change. In double support both feet stay on the ground, so
-    that dtheta determines the rates of both legs. In single support the rates of the legs do not
+    that dtheta determines the rates of the two legs. In single support the rates of the legs do not
     change. A disturbance leaves the basin if the walk after it does not arrive at the gait (see
-    `basin_share`). With the paper's model, a departure from the sequence of phases ends the walk,
-    which need not be a fall.
+    `basin_share`). With the paper's model, a departure from the sequence of phases, which need not
+    be a fall, ends the walk.
 
-    The search considers 17 instants of each phase and both directions. A grid of sizes brackets the
-    first size that leaves the basin, and bisection in batches refines it. Later passes refine the
-    instants around the smallest size of each phase and direction. `size_error` adds the width of
-    the last bracket and the difference between neighboring instants of the last pass.
+    The search considers 17 instants of each phase, and forward and backward disturbances. A grid of
+    sizes brackets the smallest size that leaves the basin, and bisection in batches refines the
+    bracket. Later passes refine the instants around the smallest size of each phase and direction.
+    `size_error` is the sum of the width of the last bracket and the difference between sizes at
+    neighboring instants of the last pass.
 
     Args:
-        params: the wheel.
-        model: the paper's model, `ViscoelasticWheel()`, by default, or `RigidWheel()`.
-        cycle: the gait, of one step; by default that of `limit_cycle`.
-        options: numerical options of the steps.
-        max_size: largest change that is tried, rad/s; by default twice the largest angular velocity
-            of the gait.
-        max_steps: largest number of steps of a walk after the disturbance.
+        params: parameters of the wheel.
+        model: model of the wheel: `ViscoelasticWheel()`, the paper's and the default, or
+            `RigidWheel()`.
+        cycle: a gait of one step; by default the result of `limit_cycle`.
+        options: numerical options of the gait steps.
+        max_size: largest change that the search tries, rad/s; by default twice the largest angular
+            velocity of the gait.
+        max_steps: largest number of gait steps of a walk after the disturbance.
 
     Returns:
         A `SmallestDisturbance`.
@@ -186,7 +194,7 @@ def smallest_disturbance(
 
 
 class _GaitStep(NamedTuple):
-    """Samples of one step of a gait, with axes over phases and samples."""
+    """Times and states sampled in one step of a gait, with axes over phases and samples."""
 
     sample_times: np.ndarray  # after the landing, s, (phase, sample)
     sample_states: np.ndarray  # (theta, L1, L2) and their rates, (phase, sample, 6)
@@ -200,7 +208,9 @@ def compute_smallest_disturbance(
     max_steps: int,
     search_options: DisturbanceSearchOptions = DISTURBANCE_SEARCH_OPTIONS,
 ) -> SmallestDisturbance:
-    """Return the `SmallestDisturbance` of a gait of one step, for validated arguments."""
+    """Return the `SmallestDisturbance` of a gait of one step, for arguments that are already
+    validated.
+    """
     params, model, options, section_states = stable_gait
     start_state = jnp.asarray(section_states[0])
     step_trajectory = model.sample_step(
@@ -219,7 +229,7 @@ def compute_smallest_disturbance(
 
 
 class _DirectedInstants(NamedTuple):
-    """Instants of a step, each with the direction of a disturbance, as arrays of shape
+    """Instants of a gait step, each with the direction of a disturbance, as arrays of shape
     (instants,).
     """
 
@@ -229,7 +239,10 @@ class _DirectedInstants(NamedTuple):
 
 
 class _ExitSizeBrackets(NamedTuple):
-    """Brackets of the smallest size that leaves the basin, for each instant and direction."""
+    """Brackets of the smallest size that leaves the basin, for each instant and direction.
+
+    Each array has the shape (instants,).
+    """
 
     lower_sizes: np.ndarray  # rad/s
     upper_sizes: np.ndarray  # rad/s, infinite if no tried size leaves the basin
@@ -237,7 +250,7 @@ class _ExitSizeBrackets(NamedTuple):
 
     @property
     def middle_sizes(self) -> np.ndarray:
-        """Return the middle of each bracket, rad/s."""
+        """Return the middle of each bracket, rad/s, shape (instants,)."""
         return 0.5 * (self.lower_sizes + self.upper_sizes)
 
 
@@ -248,7 +261,7 @@ def _search_disturbance_instants(
     max_steps: int,
     search_options: DisturbanceSearchOptions,
 ) -> SmallestDisturbance:
-    """Return the smallest disturbance over all instants, by passes with increasingly fine
+    """Return the smallest disturbance over all instants, found in passes over increasingly close
     instants.
     """
     phase_directions = [
@@ -357,8 +370,9 @@ def _bracket_exit_sizes(
     size_tolerance: float,
     search_options: DisturbanceSearchOptions,
 ) -> _ExitSizeBrackets:
-    """Return brackets of the smallest size that leaves the basin, for each instant and
-    direction.
+    """Return a bracket of the smallest size that leaves the basin, for each instant and direction.
+
+    - `size_tolerance`: width of the final brackets, relative to the size.
     """
     n_directed_instants = len(directed_instants.disturbance_signs)
     lower_sizes, upper_sizes = np.zeros(n_directed_instants), np.full(n_directed_instants, np.inf)
@@ -417,8 +431,10 @@ def _walk_after_disturbance(
     disturbance_sizes: np.ndarray,
     max_steps: int,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return whether each disturbed walk leaves the basin, and its `Outcome`, both (instants,
-    sizes)."""
+    """Return whether each walk after a disturbance leaves the basin, and the `Outcome` of the walk.
+
+    The two arrays have the shape (instants, sizes) of `disturbance_sizes`, rad/s.
+    """
     n_sizes = disturbance_sizes.shape[1]
     disturbed_states = np.repeat(
         gait_step.sample_states[directed_instants.phase_indices, directed_instants.sample_indices],
@@ -468,7 +484,12 @@ def _finish_disturbed_steps(
     foot_distance: Array,
     phase_states: Array,
 ) -> AdvanceResult:
-    """Return the result of the rest of a step from each state within a phase."""
+    """Return the results of gait steps that begin at `phase_states`, within the phase
+    `phase_index`.
+
+    - `phase_states`: states (theta, L1, L2) and their rates after the disturbance, shape (states,
+      6).
+    """
     finish_step = lambda phase_state: model.finish_step(
         params, phase_index, foot_distance, phase_state, options
     )

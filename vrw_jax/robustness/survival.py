@@ -1,8 +1,8 @@
 """Leading eigenvalues of a survival operator, and mean first-passage times.
 
-The operator K is a matrix: (K f)(i) is the mean of f over the states after one step from state i,
-and failures count as 0. F(i) is the probability that this step fails, so that K 1 = 1 - F. The
-source is Byl and Tedrake, "Metastable walking machines" (2009).
+The operator K is a matrix. (K f)(i) is the mean of f over the states after one step from state i,
+with the value 0 for failures. F(i) is the probability that this step fails, so that K 1 = 1 - F.
+The source is Byl and Tedrake, "Metastable walking machines" (2009).
 """
 
 from typing import NamedTuple
@@ -32,11 +32,11 @@ class SurvivalAnalysis(NamedTuple):
 def analyze_survival_operator(
     survival_matrix: Float[Array, "n n"], failure_probabilities: Float[Array, " n"]
 ) -> SurvivalAnalysis:
-    """Return the leading eigenvalues and eigenvectors of a survival operator.
+    """Return the leading eigenvalues and eigenvectors of the survival operator `survival_matrix`.
 
     Let q be the quasi-stationary distribution and u the right eigenvector, with q.1 = q.u = 1. The
-    failure probability is q.F. Its first derivatives are those of q.(F - K (u - 1)) with constant q
-    and u.
+    failure probability is q.F, where F is `failure_probabilities`. Its first derivatives are those
+    of q.(F - K (u - 1)) with constant q and u.
     """
     K = lax.stop_gradient(survival_matrix)
     quasi_stationary_weights = _compute_leading_eigenvector(K.T)
@@ -89,12 +89,13 @@ def compute_mean_steps(
     start_survival_row: Array,
     start_failure_probability: Scalar,
 ) -> Scalar:
-    """Return the mean number of steps from one start, including the failing step.
+    """Return the mean number of gait steps from one start, including the failing step.
 
-    The mean m solves m = 1 + K m. The solution is M u + g with M = 1/(1 - kappa_1). The remainder g
-    solves (I - K + u q) g = 1 - u and stays small.
+    The mean m solves m = 1 + K m. The solution is M u + g with M = 1/(1 - kappa_1). Here u is the
+    leading eigenvector and q the quasi-stationary distribution. The remainder g solves (I - K + u
+    q) g = 1 - u and stays small.
 
-    - `start_survival_row`: row of the survival operator at the start;
+    - `start_survival_row`: row of the survival operator for the start;
     - `start_failure_probability`: probability that the first step fails.
     """
     p, u, q = (
