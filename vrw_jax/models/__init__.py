@@ -1,4 +1,4 @@
-"""Models of the wheel, one per file, with one interface."""
+"""Models of the wheel with a common interface, one model per file."""
 
 from vrw_jax.models import batch_step, unit_scaling
 from vrw_jax.models.batch_step import (

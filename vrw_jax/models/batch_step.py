@@ -1,9 +1,8 @@
-"""The paper's step in batches: one source for machine code and GPUs, for steps and their
-derivatives.
+"""Batches of steps computed with the paper's model, as values and as derivatives.
 
-The phases are those of the diffrax engine. Each array contains one quantity of all wheels.
-`build_step_function` returns a function of one wheel that `jax.vmap` maps onto lanes, for use in
-JAX programs.
+The same source is compiled to machine code and runs on GPUs. The phases are those of the diffrax
+engine. Each array holds one quantity for all wheels. `build_step_function` returns a function for
+one wheel. Under `jax.vmap`, this function runs once for the whole batch.
 """
 
 import dataclasses
@@ -71,26 +70,31 @@ from vrw_jax.wheel import (
 
 @dataclasses.dataclass(frozen=True)
 class StiffStartOptions:
-    """Upper bounds of the first solver step of SLS-I.
+    """Upper bounds on the first solver step in SLS-I.
 
-    The loss of the rear foot's force excites the fast mode of the airborne leg, which decays within
-    0.05 s. A first step above these bounds would be rejected and repeated.
+    At lift-off the rear foot loses its force. This excites the fast mode of the airborne leg, which
+    decays within 0.05 s. A first solver step above these bounds would be rejected and repeated.
     """
 
     max_first_step_ratio: float = 0.3
-    """Upper bound as a fraction of the solver step that DLS proposes next."""
+    """Upper bound, as a fraction of the step size that the controller proposes at the end of
+    DLS.
+    """
     max_first_step_in_transient_times: float = 7.0
-    """Upper bound in units of m/c times the tolerance's root of the solver's order.
+    """Upper bound, as a multiple of (m/c) rtol^(1/p), where p is the order of the solver.
 
     The value is chosen because the step-size controller settles at 7.2 to 9.5. This holds for
-    solvers of orders 5 to 8 and tolerances of 1e-4 to 1e-10."""
+    solvers of orders 5 to 8 and tolerances of 1e-4 to 1e-10.
+    """
 
 
 DEFAULT_STIFF_START_OPTIONS = StiffStartOptions()
 
 
 class BatchAdvanceResult(NamedTuple):
-    """Minimal results of one gait step of every lane: next section state, durations, outcome."""
+    """Minimal results of one walking step per batch element: next section state, durations,
+    outcome.
+    """
 
     section_state: Vector  # (theta-, dtheta-, dL1-), three arrays
     durations: Vector  # of DLS, SLS-I, SLS-II, s
@@ -100,7 +104,7 @@ class BatchAdvanceResult(NamedTuple):
 
 
 class _PhaseCarry(NamedTuple):
-    """Data that a phase passes to the next phase."""
+    """Data that the integration of a phase passes to the integration of the next phase."""
 
     next_dt: Array  # step size that the controller proposes next, s
     has_phase_run: Bool[Array, " lanes"]  # whether the phase took place
@@ -110,7 +114,7 @@ class _PhaseCarry(NamedTuple):
 def make_batch_phase(
     phase: AbstractPhase, records_margins: bool, is_compiled_separately: bool = False
 ) -> BatchPhase:
-    """Return the functions of a phase in the form that the batched integrator requires.
+    """Return the functions that the batched integrator needs to integrate a phase.
 
     - `records_margins`: whether the integrator also evaluates margins.
     """
@@ -162,7 +166,8 @@ def take_gait_step(
     stop_at_lift_off: bool,
     straggler_count: Array | None = None,
 ) -> BatchAdvanceResult:
-    """Return the minimal results of one gait step of every lane, from touchdown to touchdown.
+    """Return the minimal results of one walking step per batch element, from touchdown to
+    touchdown.
 
     - `x`: section state of each lane;
     - `straggler_count`: see `integrate_batch_phase`.
@@ -204,7 +209,7 @@ def run_batch_phases(
     is_compiled_separately: bool = False,
     stiff_start_options: StiffStartOptions = DEFAULT_STIFF_START_OPTIONS,
 ) -> PhaseSequenceResult:
-    """Return the result of all phases of every lane's step.
+    """Integrate all phases of one walking step per batch element and return their starts and ends.
 
     - `straggler_count`: see `integrate_batch_phase`;
     - `is_compiled_separately`: see `BatchPhase`.
@@ -229,7 +234,7 @@ def _make_phase_runner(
     is_compiled_separately: bool,
     stiff_start_options: StiffStartOptions,
 ) -> PhaseRunner:
-    """Return a function that integrates one phase of every lane to its end."""
+    """Return a function that integrates one phase to its end, for all batch elements."""
 
     def run_phase(
         phase: AbstractPhase,
@@ -289,9 +294,9 @@ def _make_phase_runner(
 
 
 def can_use_batch_kernel(options: StepOptions) -> bool:
-    """Return whether the batch kernel can take the step.
+    """Return whether the batch kernel can compute the step.
 
-    The batch kernel needs machine code and an explicit solver. Raise a `ValueError` if the options
+    The kernel requires machine code and an explicit solver. Raise a `ValueError` if the options
     require the batch kernel and it is not available.
     """
     is_explicit = load_explicit_tableau(options.solver) is not None
@@ -304,7 +309,7 @@ def can_use_batch_kernel(options: StepOptions) -> bool:
 
 
 class _StepTraceConfig(NamedTuple):
-    """Settings on which the trace of a batched step depends, besides the shapes of its arrays."""
+    """Settings, other than its arrays, on which the trace of a batched step depends."""
 
     argument_structure: Any  # tree structure of (params, x, options)
     stop_at_lift_off: bool
@@ -312,15 +317,18 @@ class _StepTraceConfig(NamedTuple):
 
     @property
     def cache_key(self) -> tuple:
-        """Return the key of the trace in caches, which compare keys by `repr`."""
+        """Return the key under which caches store the trace; caches compare keys by their
+        `repr`.
+        """
         return str(self.argument_structure), self.stop_at_lift_off, self.friction
 
     def run_phases_of_lanes(
         self, *argument_leaves: Array
     ) -> tuple[PhaseSequenceResult, ButcherTableau, StepOptions]:
-        """Return the results of all phases of the lanes, the tableau and the options.
+        """Integrate the phases of a batch of walking steps.
 
-        The argument leaves have the lanes on their last axis.
+        The leaves have the batch on their last axis. Returns the starts and ends of all phases, the
+        Butcher tableau and the solver options.
         """
         params, x, options = jax.tree.unflatten(self.argument_structure, argument_leaves)
         tableau = load_explicit_tableau(options.solver)
@@ -330,7 +338,9 @@ class _StepTraceConfig(NamedTuple):
         return run_batch_phases(*phase_arguments, is_compiled_separately=True), tableau, options
 
     def compute_step_outputs(self, *argument_leaves: Array) -> tuple:
-        """Return the results of a step over lanes, split into floats and other arrays."""
+        """Return the results of a batch of walking steps, split into float arrays and other
+        arrays.
+        """
         phase_sequence, friction = self.run_phases_of_lanes(*argument_leaves)[0], self.friction
         if friction is None:
             return eqx.partition(make_advance_result(phase_sequence, "lanes"), eqx.is_inexact_array)
@@ -346,7 +356,9 @@ class _StepTraceConfig(NamedTuple):
         return eqx.partition(step_result, eqx.is_inexact_array)
 
     def make_output_template(self, *argument_leaves: Array) -> tuple:
-        """Return arrays in the structure of the results of `compute_step_outputs` for one wheel."""
+        """Return arrays for one wheel with the structure of the results of
+        `compute_step_outputs`.
+        """
         x = argument_leaves[0]
         int_zeros = jnp.zeros_like(x, jnp.int32)
         two_rows, three_rows = (jnp.broadcast_to(x, (n, *x.shape)) for n in (2, 3))
@@ -370,17 +382,18 @@ class _StepTraceConfig(NamedTuple):
 
 
 def _fill_all_fields(record_type: Any, x: Array) -> Any:
-    """Return a record of the class `record_type` whose fields all contain `x`."""
+    """Return a record of the class `record_type` whose fields all equal `x`."""
     return record_type(*(x for _ in dataclasses.fields(record_type)))
 
 
 def build_step_function(
     argument_structure: Any, stop_at_lift_off: bool, friction: float | None
 ) -> ForwardFunction:
-    """Return a function from the leaves of (params, x, options) to the results of a step.
+    """Return a function that computes the results of a walking step from the leaves of (params, x,
+    options).
 
-    The results are split into floats and other arrays. All modes of automatic differentiation are
-    derived from the returned function.
+    The results are split into float arrays and other arrays. All AD modes can be built from the
+    function, because it serves as a forward rule.
     """
     trace_config = _StepTraceConfig(argument_structure, stop_at_lift_off, friction)
     cache_key = ("gait step", *trace_config.cache_key)
@@ -394,10 +407,10 @@ def build_step_function(
 def build_step_finisher(
     argument_structure: Any, phase_index: int, stop_at_lift_off: bool
 ) -> BatchFunction:
-    """Return a function from the leaves of (params, foot distance, state, options) to the end of a
-    step.
+    """Return a function that computes the results of `finish_step` from a list of leaves.
 
-    The function evaluates `finish_step`. Its results are split into floats and other arrays.
+    The leaves are those of (params, distance, state, options). The results are split into float
+    arrays and other arrays.
     """
 
     def compute_finish_outputs(*argument_leaves: Array) -> tuple:
@@ -427,9 +440,9 @@ def build_step_finisher(
 def build_step_sampler(
     argument_structure: Any, stop_at_lift_off: bool, n_samples: int
 ) -> BatchFunction:
-    """Return a function from the leaves of (params, x, options) to samples of a step.
+    """Return a function that samples a walking step at `n_samples` equidistant times of each phase.
 
-    The samples are at equal time intervals in each phase.
+    The arguments of the function are the leaves of (params, x, options).
     """
     trace_config = _StepTraceConfig(argument_structure, stop_at_lift_off, None)
 
@@ -481,10 +494,10 @@ def build_step_jacobian(
     friction: float | None,
     input_indices: tuple[int, ...],
 ) -> ForwardFunction:
-    """Return a function that computes the Jacobian of the step of `build_step_function`.
+    """Return a function that computes the Jacobian of the results of `build_step_function`.
 
-    The returned function gives (Jacobian with respect to the leaves at `input_indices`, float
-    results) and the other results.
+    That function returns the Jacobian of the float results with respect to the leaves at
+    `input_indices`, the float results, and the other results.
     """
     trace_config = _StepTraceConfig(argument_structure, stop_at_lift_off, friction)
 
@@ -531,7 +544,7 @@ def build_step_jacobian(
 def split_jacobian_by_leaf(
     jacobian_columns: Any, argument_leaves: Sequence[Array], input_indices: Sequence[int]
 ) -> tuple:
-    """Return a Jacobian as one tree of derivatives for each selected leaf.
+    """Split a Jacobian into one tree per selected leaf.
 
     The leading axis of `jacobian_columns` runs over all entries of the selected leaves.
     """
@@ -548,21 +561,21 @@ def split_jacobian_by_leaf(
 
 
 N_STEP_INPUTS = len(PARAMETER_NAMES) + 3
-"""Number of inputs of a step on flat ground, which are parameters and section state.
+"""Number of inputs of a step on flat ground: the parameters and the section state.
 
-Uneven ground adds the slope of the next line. Machine code keeps one number per derivative in
-registers.
+Uneven ground adds the slope of the next line of the ground. Machine code keeps one number per
+derivative in registers.
 """
 
 
 def compute_jacobian_columns(
     batch_function: BatchFunction, argument_leaves: Sequence[Array], input_indices: Sequence[int]
 ) -> tuple:
-    """Return the Jacobian columns, the float results and the other results of `batch_function`.
+    """Return the Jacobian columns, the float results and the other results of a batched function.
 
-    The columns are derivatives with respect to the entries of the leaves at `input_indices`, on the
-    leading axis. `batch_function(*argument_leaves)` returns floats over lanes and auxiliary
-    outputs.
+    The columns are derivatives with respect to the leaves at `input_indices`; their leading axis
+    runs over the entries of these leaves. `batch_function` returns float arrays with the batch on
+    the last axis, and auxiliary outputs.
     """
 
     def evaluate_at_selected_leaves(*varied_leaves: Array) -> tuple:
@@ -582,9 +595,10 @@ def compute_jacobian_columns(
 
 
 def _make_unit_tangents(selected_leaves: Sequence[Array]) -> list[Array]:
-    """Return the unit vectors of all entries of the leaves, split by leaf, on the leading axis.
+    """Return one unit vector per entry of the leaves, on the leading axis, split by leaf.
 
-    Each zero and each one is a separate constant, so that machine code omits products with zeros.
+    Each entry of a unit vector is a separate constant 0 or 1, so that machine code omits products
+    with 0.
     """
     entries_per_leaf = [int(np.prod(selected_leaf.shape[:-1])) for selected_leaf in selected_leaves]
     unit_vectors, leaf_tangents, entry_offset = np.eye(sum(entries_per_leaf)), [], 0

@@ -1,30 +1,36 @@
-"""Features of the library that each model declares, and that other packages read."""
+"""Features of the library that each model supports.
+
+Each model declares its features, and other packages read these declarations.
+"""
 
 import enum
 from dataclasses import dataclass
 
 
 class GaitMethod(enum.StrEnum):
-    """Methods that find, follow and scan the gaits of a model."""
+    """Methods for gait search, continuation and scans with a model."""
 
     COLLOCATION = enum.auto()
-    """Newton's method on the whole cycle, for a fixed sequence of phases."""
+    """Newton's method for all states of the cycle at once, with a fixed sequence of phases."""
     CONTACT_WALKS = enum.auto()
-    """Walks that settle on a gait, then Newton's method on the return map with fixed contact
-    modes."""
+    """Simulated walks that settle on a gait, then Newton's method for the return map with fixed
+    contact modes.
+    """
     RETURN_MAP = enum.auto()
-    """Newton's method on the return map."""
+    """Newton's method for the return map."""
     SELECTION = enum.auto()
-    """Method of the model that is selected for each wheel."""
+    """The method of whichever model is selected for each wheel."""
 
 
 class PassageMethod(enum.StrEnum):
     """Methods that compute mean first-passage times of a model on uneven ground."""
 
     QUADRATURE = enum.auto()
-    """Quadrature of the closed-form kernel of the model's `make_vertical_rate_map`."""
+    """Quadrature with the closed-form transition kernel from the model's
+    `make_vertical_rate_map`.
+    """
     SAMPLING = enum.auto()
-    """Importance sampling of many walks."""
+    """Importance sampling with many simulated walks."""
 
 
 @dataclass(frozen=True)
@@ -34,13 +40,18 @@ class ModelCapabilities:
     config_name: str
     """Name of the model in a configuration and on the command line."""
     gait_method: GaitMethod
-    """Method that finds the gaits of the model; branches and scans follow from it."""
+    """Method of the gait search with this model; it determines the methods of branches and
+    scans.
+    """
     commands: frozenset[str]
     """Commands that accept the model: "scan", "map", "tune", "branch" and "explore"."""
     fixed_by_tolerance: tuple[str, ...] | None = None
-    """Fields that need their default values if measures are requested to a tolerance. None means
-    that the model does not support measures to a tolerance."""
+    """Fields that must have their default values for a measure requested to a tolerance. None means
+    that the model does not support measures to a tolerance.
+    """
     passage_method: PassageMethod = PassageMethod.SAMPLING
-    """Method of `first_passage`."""
+    """Method that `first_passage` uses with this model."""
     begins_within_step: bool = False
-    """Whether the model has `finish_step`, so that a step can be disturbed at any instant."""
+    """Whether the model implements `finish_step`, so that a step can be disturbed at any
+    instant.
+    """

@@ -1,4 +1,4 @@
-"""Interface of every model: its declarations, and the methods that take its steps."""
+"""Interface of every model: its declarations, and the methods that compute its steps."""
 
 import abc
 from typing import Any, ClassVar
@@ -23,14 +23,16 @@ from vrw_jax.wheel import (
 )
 
 StepGroundValues = tuple[Array, ...]
-"""Ground of one step or of all steps, in the form of the arguments of `with_ground`."""
+"""Ground of one step or of all steps, in the form of the argument of `with_ground`."""
 
 
 class AbstractWheel(eqx.Module):
-    """Model of the wheel. Model classes are final, and the rest of the library uses only this
-    interface.
+    """Model of the wheel.
 
-    `advance` and `take_step` compile themselves, once for each structure of their arguments.
+    The classes of models are final, and the rest of the library uses only this interface.
+
+    `advance` and `take_step` are compiled on their first call, once per structure of their
+    arguments.
 
     Examples:
         >>> isinstance(vrw.RigidWheel(), vrw.AbstractWheel)
@@ -38,17 +40,23 @@ class AbstractWheel(eqx.Module):
     """
 
     model_name: eqx.AbstractClassVar[str]
-    """Name of the model in results."""
+    """Name of the model that results report."""
     capabilities: eqx.AbstractClassVar[ModelCapabilities]
-    """Features of the library for the model."""
+    """Features of the library that the model supports."""
     parameter_names: eqx.AbstractClassVar[tuple[str, ...]]
-    """Inputs of the motion: the wheel's parameters and, if the motion depends on it, friction."""
+    """Inputs of the motion: the wheel's parameters and, if the motion depends on friction,
+    friction.
+    """
     reports_contacts: eqx.AbstractClassVar[bool]
     """Whether trajectories report the contact of every leg instead of the paper's phases."""
     batch_kernel: ClassVar[str] = ""
-    """Kind of the compiled batch kernel: the paper's "phases", "legs", or "" for none."""
+    """Kind of the compiled batch kernel: "phases" for the paper's phases, "legs", or "" for no
+    kernel.
+    """
     is_compliant: ClassVar[bool] = True
-    """Whether springs and dampers affect the motion. Tuning and scans vary them only then."""
+    """Whether springs and dampers affect the motion. Only then do tuning and scans vary their
+    parameters.
+    """
 
     def __repr__(self) -> str:
         if has_traced_leaf(self):
@@ -65,8 +73,7 @@ class AbstractWheel(eqx.Module):
     def fallback_model(self) -> "AbstractWheel":
         """Return the model that can take a step from any start.
 
-        For a ladder of models this is the most general model, and for any other model the model
-        itself.
+        It is the most general model of a ladder of models; any other model returns itself.
         """
         return self
 
@@ -84,7 +91,7 @@ class AbstractWheel(eqx.Module):
         )
 
     def parameter_rows(self, params: WheelParams) -> Float[np.ndarray, "wheels n_values"]:
-        """Return the numbers of `parameter_names` of each wheel of a batch, by NumPy.
+        """Return the `parameter_values` of each wheel in a batch, computed with numpy.
 
         JAX would compile a program for each batch size.
         """
@@ -97,9 +104,9 @@ class AbstractWheel(eqx.Module):
     def from_values(
         self, parameter_values: Array | tuple[Array, ...], n_legs: int
     ) -> tuple["AbstractWheel", WheelParams]:
-        """Return model and wheel with the given numbers of `parameter_names`, which may be tracers.
+        """Return a model and a wheel with these values of `parameter_names`.
 
-        The function is the inverse of `parameter_values`.
+        This function is the inverse of `parameter_values`. The values may be tracers.
         """
         n = len(PARAMETER_NAMES)
         model_with_friction = self
@@ -112,8 +119,9 @@ class AbstractWheel(eqx.Module):
     def with_parameter(
         self, params: WheelParams, parameter_name: str, parameter_value: Elementwise
     ) -> tuple["AbstractWheel", WheelParams]:
-        """Return model and wheel with a new value of the parameter `parameter_name`, which may be a
-        tracer.
+        """Return the model and the wheel with a new value of one of `parameter_names`.
+
+        The value may be a tracer.
         """
         if parameter_name == FRICTION_NAME:
             return eqx.tree_at(lambda ground: ground.friction, self, parameter_value), params
@@ -123,27 +131,26 @@ class AbstractWheel(eqx.Module):
 
     @abc.abstractmethod
     def advance(self, params: WheelParams, x: SectionState, options: StepOptions) -> AdvanceResult:
-        """Return the minimal results of one step from the section state `x`.
+        """Return the minimal results of one walking step.
 
         The results are differentiable in any mode, to any order.
         """
 
     @abc.abstractmethod
     def take_step(self, params: WheelParams, x: SectionState, options: StepOptions) -> Any:
-        """Return all results of one step from the section state `x`: indicators, margins and
-        energies.
+        """Return all results of one walking step, including indicators, margins and energies.
 
-        The type is `StepResult`, or the step type of the model. The results are differentiable in
-        any mode.
+        The type is `StepResult`, or the model's counterpart of it. The results are differentiable
+        in any mode.
         """
 
     @abc.abstractmethod
     def sample_step(
         self, params: WheelParams, x: SectionState, options: StepOptions, n_samples: int
     ) -> Any:
-        """Return the motion of a step at `n_samples` times of each phase.
+        """Return the motion during a walking step at `n_samples` times of each phase.
 
-        The type is `Trajectory`, or the trajectory type of the model.
+        The type is `Trajectory`, or the model's counterpart of it.
         """
 
     def finish_step(
@@ -154,10 +161,11 @@ class AbstractWheel(eqx.Module):
         state: Float[Array, " 6"],
         options: StepOptions,
     ) -> AdvanceResult:
-        """Return the end of a step on flat ground, from a state within one of its phases.
+        """Compute the rest of a step on flat ground, starting from a state within one of its
+        phases.
 
-        - `phase_index`: index of the paper's phase;
-        - `distance`: distance between both feet in the double support of the step, m;
+        - `phase_index`: index of the phase (0 for DLS, 1 for SLS-I, 2 for SLS-II);
+        - `distance`: distance between the two feet in the double support of this step, m;
         - `state`: (theta, L1, L2) and their rates, rad, m, rad/s, m/s.
 
         Only models whose capabilities have `begins_within_step` implement this method.
@@ -169,8 +177,9 @@ class AbstractWheel(eqx.Module):
         """Return a section state from which a walk can start."""
 
     def split_ground(self, params: WheelParams, n_steps: int) -> StepGroundValues | None:
-        """Return the ground of each step, or None if neither slope nor friction is an array over
-        steps.
+        """Return the ground of each step if slope or friction are arrays with one entry per step.
+
+        Return None otherwise.
         """
         if jnp.ndim(params.slope) == 0:
             return None
@@ -180,9 +189,9 @@ class AbstractWheel(eqx.Module):
     def with_ground(
         self, params: WheelParams, step_ground: StepGroundValues
     ) -> tuple["AbstractWheel", WheelParams]:
-        """Return model and wheel on the ground of one step, which has the slopes of two lines.
+        """Return the model and the wheel on the ground of one step.
 
-        See `split_slopes`.
+        `step_ground` contains the slopes of two lines of the ground, see `split_slopes`.
         """
         return self, eqx.tree_at(lambda wheel: wheel.slope, params, step_ground[0])
 
@@ -191,18 +200,19 @@ class AbstractWheel(eqx.Module):
         return 3
 
     def n_continuous(self, params: WheelParams) -> int:
-        """Return the number of leading entries of a section state that vary continuously.
+        """Return the number of entries of a section state that vary continuously.
 
-        The other entries are codes.
+        These entries come first. The other entries are integer codes.
         """
         return self.section_size(params)
 
     def section_units(self, units: WheelUnits, n_legs: int) -> list[Elementwise]:
-        """Return the wheel's unit of each entry of a section state."""
+        """Return the unit of each entry of a section state, computed from the wheel's own units."""
         return [units.length_unit / units.length_unit, units.rate_unit, units.velocity_unit]
 
     def embed_section(self, params: WheelParams, x: Array) -> Array:
-        """Return the section state of this model for `x`, which may be a section state of the
-        paper's model.
+        """Return `x` as a section state of this model.
+
+        `x` may be the paper's section state, which has three entries.
         """
         return x

@@ -1,8 +1,8 @@
 """The paper's step from landing to landing, for any engine that integrates its phases.
 
-An engine provides a `PhaseRunner`, which integrates one phase to its end. This module selects the
-phases that take place, and computes their starts, the end of the step and its results. All
-functions work elementwise, for one wheel or a batch.
+An engine provides a `PhaseRunner`, which integrates one phase to its end. This module determines
+which phases occur, where they start, when the step ends, and the results of the step. All functions
+work elementwise, for one wheel or for a batch.
 """
 
 import functools
@@ -51,12 +51,15 @@ from vrw_jax.wheel import (
 )
 
 SAFE_SINGLE_SUPPORT_STATE = (-0.3, 0.9, 0.95, 1.0, 0.0, 0.0)
-"""Regular posture (theta, L1, L2 and rates), which replaces the state of a wheel whose step has
-failed. This state is never integrated."""
+"""Regular posture (theta, L1, L2 and their rates) that replaces the state of a wheel after a failed
+step. This state is never integrated.
+"""
 
 
 class PhaseResult(NamedTuple):
-    """State and time at the end of a phase. For an inactive phase, the end equals the start."""
+    """State and data at the end of a phase. The state equals the start if the phase was not
+    active.
+    """
 
     q: Vector
     v: Vector
@@ -69,8 +72,9 @@ class PhaseResult(NamedTuple):
 
 
 PhaseRunner = Callable[[AbstractPhase, Vector, Vector, Array, PhaseResult | None], PhaseResult]
-"""Function that returns the end of a phase from its start (q, v), its active mask and the end of
-the previous phase."""
+"""Function that integrates one phase. Its arguments are the phase, its start (q, v), the mask of
+active elements, and the end of the previous phase; it returns the end of the phase.
+"""
 
 
 class PhaseSequenceResult(NamedTuple):
@@ -94,14 +98,14 @@ def run_step_phases(
     stop_at_lift_off: bool,
     evaluate_landing: Callable[..., Landing] = transitions.resolve_landing,
 ) -> PhaseSequenceResult:
-    """Return the result of all phases of one step.
+    """Integrate all phases of one walking step from the section state `x`, and return the results.
 
-    The motion is in the frame of the line under both feet in double support. On uneven ground (see
-    `split_slopes`), the touchdown and the section state at the end refer to the next line.
+    `x` contains one array per entry. The motion is in the frame of the line of the ground under
+    both feet in double support. On uneven ground (see `split_slopes`), the touchdown and the
+    section state at the end refer to the next line of the ground.
 
-    - `integrate_phase`: function of the engine that integrates one phase;
-    - `x`: section state, given entry by entry;
-    - `evaluate_landing`: function that computes the landing with which the step begins.
+    - `integrate_phase`: engine that integrates a phase;
+    - `evaluate_landing`: function that computes the landing at the beginning of the step.
     """
     params, is_valid_step, next_line_tilt = select_stance_line_and_tilt(params, x)
     params, x = replace_invalid_inputs(is_valid_step, params, x, PAPER_START_STATE)
@@ -141,10 +145,11 @@ def _run_remaining_phases(
     is_phase_active: Array,
     options: StepOptions,
 ) -> _RemainingPhases:
-    """Return the results of the remaining phases of a step, from a motion in the first of them.
+    """Integrate the remaining phases of a step, starting from a motion in the first of these
+    phases.
 
-    - `is_valid_step`: whether a step takes place;
-    - `is_phase_active`: whether the first of the remaining phases takes place.
+    - `is_valid_step`: whether the inputs are valid, so that a step takes place;
+    - `is_phase_active`: whether the first of these phases takes place.
     """
     step_outcome = jnp.where(
         is_valid_step, jnp.int32(Outcome.STEPPED), jnp.int32(Outcome.BAD_INPUT)
@@ -205,12 +210,12 @@ def finish_step(
     stop_at_lift_off: bool,
     engine: str,
 ) -> AdvanceResult:
-    """Return the end of a step on flat ground, from a state within one of its phases.
+    """Compute the rest of a step on flat ground, starting from a state within one of its phases.
 
     - `phase_index`: index of the phase in the step;
-    - `foot_distance`: distance between both feet in the double support of the step, m;
-    - `phase_state`: (theta, L1, L2) and their rates. Entries that follow from other entries in the
-      phase are ignored.
+    - `foot_distance`: distance between the two feet in the double support of this step, m;
+    - `phase_state`: (theta, L1, L2) and their rates. Entries that the constraints of the phase
+      determine are ignored.
     """
     bounded_inputs = [
         jnp.abs(input_value) < MAX_SI_VALUE for input_value in (*phase_state, foot_distance)
@@ -253,7 +258,7 @@ def finish_step(
 def get_next_section_state(phase_sequence: PhaseSequenceResult) -> Vector:
     """Return (theta-, dtheta-, dL1-) at the end of the step in rad, rad/s and m/s.
 
-    The angle is in the frame of the line of the next landing.
+    The angle theta- is measured in the frame of the line of the ground at the next landing.
     """
     touchdown_angle, touchdown_rates = (
         phase_sequence.phase_ends[2].q[0],
@@ -265,7 +270,9 @@ def get_next_section_state(phase_sequence: PhaseSequenceResult) -> Vector:
 
 
 def make_advance_result(phase_sequence: PhaseSequenceResult, engine: str) -> AdvanceResult:
-    """Return the minimal results of a step. The section state is zero if the step failed."""
+    """Return the minimal results of a step. All entries of the section state are 0 if the step
+    failed.
+    """
     theta, dtheta, dL1 = get_next_section_state(phase_sequence)
     has_stepped = phase_sequence.outcome == Outcome.STEPPED
     solver_steps = [phase_end.n_solver_steps for phase_end in phase_sequence.phase_ends]
@@ -281,7 +288,7 @@ def make_advance_result(phase_sequence: PhaseSequenceResult, engine: str) -> Adv
 def make_step_result(
     phase_sequence: PhaseSequenceResult, friction: Elementwise | float, engine: str
 ) -> StepResult:
-    """Return all results of a step, for one wheel or a batch.
+    """Return all results of a step, for one wheel or for a batch.
 
     The phase results must contain the minima of the margins.
     """
@@ -349,7 +356,7 @@ def make_step_result(
 def make_trajectory(
     phase_sequence: PhaseSequenceResult, phase_samples: Sequence[Array]
 ) -> Trajectory:
-    """Return the trajectory of a step from samples at equal time intervals in each phase.
+    """Return the trajectory of a step, computed from samples at equidistant times of each phase.
 
     - `phase_samples`: samples of each phase, with axes (sample, coordinates and rates, ...).
     """
@@ -375,10 +382,10 @@ def make_trajectory(
 
 
 def evaluate_phase_states(phase: AbstractPhase, y: Array) -> tuple[Array, Array, Array]:
-    """Return coordinates with rates, ground forces (N) and energies (J) at states of a phase.
+    """Return coordinates and rates, ground forces (N) and energies (J) for given states of a phase.
 
-    - `y`: the phase's coordinates, then their rates, on the first axis. All results have the other
-      axes of `y`.
+    - `y`: coordinates of the phase, then their rates, on the first axis. The first axis of each
+      result holds its components; the other axes are those of `y`.
     """
     coordinates = tuple(y)
     wheel_motion = phase.compute_motion(coordinates[: phase.n_dof], coordinates[phase.n_dof :])
@@ -408,7 +415,7 @@ def _make_step_margins(
     stopper_hit: transitions.StopperCollision,
     friction: Elementwise | float,
 ) -> Margins:
-    """Return the margins of a step.
+    """Return the margins for one step.
 
     - `rear_force`: force on the rear foot just after the landing, N;
     - `liftoff_motion`: motion at the end of double support;
@@ -430,8 +437,8 @@ def _make_step_margins(
     ]
 
     def find_lowest_margin(margin_name: str, *phase_indices: int) -> Array:
-        """Return the minimum of a margin over those of the given phases that took place, otherwise
-        0.
+        """Return the lowest minimum of a margin over the phases that occurred, or 0 if none
+        occurred.
         """
         lowest_value: Any = jnp.inf
         for phase_index in phase_indices:

@@ -1,4 +1,4 @@
-"""Rigid model: all legs are rigid, so a step has a closed form without numerical integration."""
+"""Rigid model: all legs are rigid, so a step has a closed form and needs no integration."""
 
 from dataclasses import dataclass
 from functools import partial
@@ -43,17 +43,23 @@ from vrw_jax.wheel import (
 
 @dataclass(frozen=True)
 class MarginMinimumSearchOptions:
-    """Options of the search for the minimum of each margin over the angle, by repeated zooming."""
+    """Options of the search for the minimum of each margin with respect to the angle.
+
+    The search samples a bracket of angles and repeatedly narrows the bracket around the lowest
+    sample.
+    """
 
     n_angles_per_round: int = 33
-    """Number of angles in each round.
+    """Number of angles that each round samples.
 
-    The value is chosen because forces are smooth over the 45 degrees of a step."""
+    The value is chosen because forces are smooth over the 45 degrees of a step.
+    """
     n_zoom_rounds: int = 5
     """Number of rounds.
 
-    The value is chosen because the angle is then accurate to 1e-6 rad, and the error of a minimum
-    is the square of that."""
+    The value is chosen because the angle is then accurate to 1e-6 rad. The error of a minimum is
+    the square of the error of its angle.
+    """
 
 
 MARGIN_MINIMUM_SEARCH_OPTIONS = MarginMinimumSearchOptions()
@@ -62,16 +68,18 @@ MARGIN_MINIMUM_SEARCH_OPTIONS = MarginMinimumSearchOptions()
 class RigidWheel(AbstractWheel):
     """Rimless wheel with rigid legs and leg masses; springs, dampers and L* have no effect.
 
-    The section state is (alpha/2, dtheta-, 0). Only the rate is free, and the other entries of a
-    start are ignored. The whole step counts as SLS-II.
+    The section state is (alpha/2, dtheta-, 0). Only dtheta- can vary, and the other entries of a
+    start are ignored. The duration of the whole step is reported as that of SLS-II.
 
-    - `friction`: coefficient of the ground, which enters the friction margins but not the motion;
-    - `stop_at_lift_off`: whether a step ends if the normal force of the ground would become
+    - `friction`: friction coefficient of the ground. It affects the friction margins, but not the
+      motion;
+    - `stop_at_lift_off`: whether a step fails if the normal force of the ground would become
       negative;
-    - `held_landing`: whether the rear foot is held during the impulse of a landing. False is the
-      classic landing, whose rear foot leaves without an impulse, so that angular momentum about the
-      new foot is constant. True is the stiff limit of the paper's landing (A4), that is, the limit
-      of `ViscoelasticWheel`; docs/explanation/physics.md derives this limit.
+    - `held_landing`: whether the rear foot stays fixed to the ground during the landing impulse.
+      False means the classic landing: the rear foot leaves without an impulse, so the landing
+      conserves angular momentum about the new foot. True means the stiff limit of the paper's
+      landing (A4), which is the limit of `ViscoelasticWheel`; docs/explanation/physics.md derives
+      this limit.
 
     Examples:
         >>> params = vrw.WheelParams(slope=0.15)
@@ -101,8 +109,8 @@ class RigidWheel(AbstractWheel):
     )
 
     def default_start(self, params: WheelParams) -> SectionState:
-        """Return the section state of the rolling fixed point, or a fast start if no fixed point
-        exists.
+        """Return the section state at the rolling fixed point, or a fast start if there is no fixed
+        point.
         """
         s = params.symbols()
         landing_rate_ratio = self._compute_landing_rate_ratio(s)
@@ -122,7 +130,7 @@ class RigidWheel(AbstractWheel):
         )
 
     def _compute_landing_rate_ratio(self, s: Symbols) -> Elementwise:
-        """Return the ratio of the angular rate after the landing to the angular rate before it."""
+        """Return the angular rate just after a landing divided by that just before it."""
         foot_inertia = _compute_foot_inertia(s)
         if not self.held_landing:
             return (s.Mt * s.L0**2 * s.cos_alpha + _compute_hub_inertia(s)) / foot_inertia
@@ -139,8 +147,9 @@ class RigidWheel(AbstractWheel):
         )
 
     def make_vertical_rate_map(self, params: WheelParams) -> "VerticalRateMap":
-        """Return the map of the squared angular rate from one stance leg at the vertical to the
-        next.
+        """Return the map of the squared angular rate from one vertical passage to the next.
+
+        At a vertical passage, the stance leg is vertical.
         """
         s = params.symbols()
         half_angle, doubled_gravity_stiffness = 0.5 * s.alpha, 2.0 * _compute_gravity_stiffness(s)
@@ -155,7 +164,7 @@ class RigidWheel(AbstractWheel):
     def compute_step_elementwise(
         self, params: WheelParams, x: SectionStateEntries, friction: Elementwise
     ) -> StepResult:
-        """Return the results of a step elementwise, for one wheel or a batch."""
+        """Return the results of a step, computed elementwise for one wheel or for a batch."""
         half_angle = jnp.asarray(0.5 * params.leg_angle, x[1].dtype)
         x = (half_angle + 0.0 * x[0], x[1], 0.0 * x[2])
         params, is_valid_step, next_line_tilt = select_stance_line_and_tilt(params, x)
@@ -246,8 +255,8 @@ class RigidWheel(AbstractWheel):
         state: Float[Array, " 6"],
         options: StepOptions,
     ) -> AdvanceResult:
-        """Return the end of the step from theta and its rate. The other entries of the state have
-        no effect.
+        """Compute the rest of the step from theta and its rate. The other arguments have no
+        effect.
         """
         wheel_angle, angular_rate = state[0], state[3]
         s, half_angle = params.symbols(), jnp.asarray(0.5 * params.leg_angle, wheel_angle.dtype)
@@ -287,11 +296,11 @@ class RigidWheel(AbstractWheel):
         rolling_motion: "RollingMotion",
         friction: Elementwise,
     ) -> tuple:
-        """Return the rear impulse (N s), the friction margins and the stopper impulses (N s) of a
-        landing.
+        """Return the impulse on the rear foot, the friction margins of the landing, and the stopper
+        impulses.
 
-        The friction margins are those of fore and rear foot. The stopper impulses are those of legs
-        3..n.
+        The impulses are in N s. The friction margins are those of the fore foot and of the rear
+        foot. The stopper impulses are those of legs 3 to n.
         """
         zero = jnp.zeros_like(x[1])
         motion_after = rolling_motion.compute_motion_at_angle(
@@ -323,7 +332,7 @@ class RigidWheel(AbstractWheel):
     def sample_step(
         self, params: WheelParams, x: SectionState, options: StepOptions, n_samples: int
     ) -> Trajectory:
-        """Return the motion of a step at equal angles instead of equal times."""
+        """Return the motion during a step at equidistant angles, not at equidistant times."""
         step_result = self.take_step(params, x, options)
         params, next_slope = split_slopes(params)
         s, half_angle = params.symbols(), 0.5 * params.leg_angle
@@ -352,11 +361,12 @@ class RigidWheel(AbstractWheel):
 
 
 class VerticalRateMap(NamedTuple):
-    """Map of the squared rate x at the vertical of one stance leg to that of the next leg, 1/s^2.
+    """Map of the squared angular rate from one vertical passage to the next on uneven ground.
 
-    The map is x' = r (x + G (1 - cos(h + slope))) - G (1 - cos(h - slope)) at the slope of the next
-    line. The wheel falls back if x' < 0, for a slope below h. As a function of the slope, x' =
-    offset(x) + amplitude cos(slope - slope_of_maximum).
+    The map is x' = r (x + G (1 - cos(h + slope))) - G (1 - cos(h - slope)), where slope is that of
+    the next line of the ground. Here x is the squared rate with the stance leg vertical, 1/s^2. The
+    wheel falls back if x' < 0, for a slope below h. As a function of the slope, x' = offset(x) +
+    amplitude cos(slope - slope_of_maximum).
     """
 
     retained_fraction: Elementwise  # r, retained fraction of the squared rate in a landing
@@ -365,13 +375,13 @@ class VerticalRateMap(NamedTuple):
 
     @property
     def _cosine_and_sine_coefficients(self) -> tuple[Elementwise, Elementwise]:
-        """Return the coefficients of cosine and sine of the slope in x', divided by G."""
+        """Return the coefficients with which cos(slope) and sin(slope) enter x', divided by G."""
         r, h = self.retained_fraction, self.half_angle
         return (1.0 - r) * jnp.cos(h), (1.0 + r) * jnp.sin(h)
 
     @property
     def slope_of_maximum(self) -> Elementwise:
-        """Return the slope at which x' is largest, rad. Below this slope, x' grows with the
+        """Return the slope at which x' is largest, rad. At smaller slopes, x' increases with the
         slope.
         """
         cosine_coefficient, sine_coefficient = self._cosine_and_sine_coefficients
@@ -379,7 +389,7 @@ class VerticalRateMap(NamedTuple):
 
     @property
     def slope_amplitude(self) -> Elementwise:
-        """Return the amplitude of x' over the slope, 1/s^2."""
+        """Return the amplitude of x' as a function of the slope, 1/s^2."""
         cosine_coefficient, sine_coefficient = self._cosine_and_sine_coefficients
         return self.doubled_gravity_stiffness * jnp.sqrt(
             cosine_coefficient**2 + sine_coefficient**2
@@ -392,15 +402,17 @@ class VerticalRateMap(NamedTuple):
         )
 
     def compute_fixed_point(self, slope: Elementwise) -> Elementwise:
-        """Return the squared rate x that the map reproduces on lines of the given slope (rad),
-        1/s^2.
+        """Return the squared rate x that repeats itself if all lines of the ground have this slope
+        (rad), 1/s^2.
         """
         periodic_part = self.slope_amplitude * jnp.cos(slope - self.slope_of_maximum)
         return periodic_part / (1.0 - self.retained_fraction) - self.doubled_gravity_stiffness
 
 
 class RollingMotion(eqx.Module):
-    """Rolling over one foot from a first angle at a given rate, with conserved energy."""
+    """Rolling motion about one foot, computed from the rate at the first angle by energy
+    conservation.
+    """
 
     s: Symbols
     phi: Elementwise  # slope, rad
@@ -418,9 +430,9 @@ class RollingMotion(eqx.Module):
         return self.given_first_angle
 
     def compute_squared_rate(self, theta: Elementwise) -> Elementwise:
-        """Return the square of dtheta at theta, rad^2/s^2.
+        """Return the square of dtheta at the angle theta, rad^2/s^2.
 
-        The square is negative if the wheel does not reach theta.
+        The value is negative if the wheel does not reach theta.
         """
         s = self.s
         height_drop = _compute_cosine_from_vertical(
@@ -429,7 +441,7 @@ class RollingMotion(eqx.Module):
         return self.initial_rate**2 + 2.0 * _compute_gravity_stiffness(s) * height_drop
 
     def compute_time_to_angle(self, theta: Elementwise) -> Elementwise:
-        """Return the time from the first angle to theta, s, by Carlson's R_F.
+        """Return the time between the first angle and theta, s, computed with Carlson's R_F.
 
         Let t be sin^2 of half the angle from the vertical. The rate is the square root of a linear
         function of t. Therefore the time is the complete cubic form of the elliptic integral.
@@ -467,7 +479,9 @@ class RollingMotion(eqx.Module):
         return time_to_end + time_to_vertical
 
     def compute_motion_at_angle(self, theta: Elementwise) -> Motion:
-        """Return the motion at theta, with rate zero if the wheel does not reach theta."""
+        """Return the motion at the angle theta. Its angular rate is 0 if the wheel does not reach
+        theta.
+        """
         zero = 0.0 * theta
         squared_rate = self.compute_squared_rate(theta)
         is_moving = squared_rate > 0.0
@@ -476,15 +490,16 @@ class RollingMotion(eqx.Module):
         return Motion.from_angle(theta, leg_length, leg_length, angular_rate, zero, zero)
 
     def compute_acceleration_at_angle(self, theta: Elementwise) -> dynamics.Acceleration:
-        """Return the angular acceleration due to gravity at theta, rad/s^2, with legs of constant
-        length.
+        """Return the accelerations at the angle theta, for legs of constant length.
+
+        Only the angular acceleration (rad/s^2) due to gravity differs from 0.
         """
         zero = 0.0 * theta
         sin_p = jnp.sin(theta) * self.s.cos_phi + jnp.cos(theta) * self.s.sin_phi
         return dynamics.Acceleration(_compute_gravity_stiffness(self.s) * sin_p, zero, zero)
 
     def compute_foot_force_at_angle(self, theta: Elementwise) -> dynamics.FootForce:
-        """Return the force of the ground on the stance foot at theta, N."""
+        """Return the force that the ground exerts on the stance foot at the angle theta, N."""
         return dynamics.compute_fore_foot_force(
             self.s, self.compute_motion_at_angle(theta), self.compute_acceleration_at_angle(theta)
         )
@@ -492,7 +507,7 @@ class RollingMotion(eqx.Module):
     def compute_stopper_force_at_angle(
         self, theta: Elementwise, legs: range
     ) -> Float[Array, "n ..."]:
-        """Return the forces of the stoppers of the legs `legs` at theta, N."""
+        """Return the forces on the stoppers of `legs` at the angle theta, N."""
         return dynamics.compute_stopper_force(
             self.s,
             self.compute_motion_at_angle(theta),
@@ -501,9 +516,10 @@ class RollingMotion(eqx.Module):
         )
 
     def evaluate_states_at_angles(self, theta: Elementwise) -> tuple[Array, Array, Array]:
-        """Return coordinates with rates, forces of both feet (N) and energies (J) at theta.
+        """Return coordinates and rates, the forces on both feet (N), and the energies (J) at the
+        angles theta.
 
-        The quantities are on the first axis of each array.
+        The first axis of each result holds its components.
         """
         wheel_motion, foot_force, zero = (
             self.compute_motion_at_angle(theta),
@@ -528,10 +544,10 @@ class RollingMotion(eqx.Module):
         )
 
     def evaluate_margins_at_angles(self, theta: Array) -> Array:
-        """Return one margin at each angle: margin i at `theta[i]`.
+        """Return margin i at the angle `theta[i]`, for each margin.
 
-        The margins are the normal force (N), minus the required friction, and the stopper forces of
-        legs 2..n (N).
+        The margins are the normal force (N), the negative of the required friction, and the stopper
+        forces of legs 2 to n (N).
         """
         stopper_forces = [
             self.compute_stopper_force_at_angle(theta[leg], range(leg, leg + 1))[0]
@@ -547,11 +563,10 @@ class RollingMotion(eqx.Module):
     def find_margin_minima(
         self, search_options: MarginMinimumSearchOptions = MARGIN_MINIMUM_SEARCH_OPTIONS
     ) -> Array:
-        """Return the minimum of each margin of `evaluate_margins_at_angles` from landing to
-        landing.
+        """Return the minima of the margins between two landings, accurate to round-off.
 
-        The minima are accurate to round-off. Each minimum is found by repeated zooming, and its
-        error is proportional to the square of the error of its angle.
+        The margins are those of `evaluate_margins_at_angles`. Each minimum is found by repeated
+        zooming. Its error is the square of the remaining error of its angle.
         """
         half_angle = jnp.asarray(0.5 * self.s.alpha, self.initial_rate.dtype)
         end_angle = half_angle if self.end_angle is None else self.end_angle
@@ -600,20 +615,20 @@ def _compute_hub_inertia(s: Symbols) -> Elementwise:
 
 
 def _compute_foot_inertia(s: Symbols) -> Elementwise:
-    """Return the moment of inertia of the wheel about a foot, kg m^2."""
+    """Return the moment of inertia of the wheel about the stance foot, kg m^2."""
     return s.Mt * s.L0**2 + _compute_hub_inertia(s)
 
 
 def _compute_gravity_stiffness(s: Symbols) -> Elementwise:
-    """Return Mt g L0 over the inertia about the foot, 1/s^2.
+    """Return Mt g L0 divided by the moment of inertia about the foot, 1/s^2.
 
-    The quotient is g/l for a rimless wheel without leg masses.
+    For a rimless wheel without leg masses, this is g/l.
     """
     return s.Mt * s.g * s.L0 / _compute_foot_inertia(s)
 
 
 def _compute_cosine_from_vertical(s: Symbols, theta: Elementwise | float) -> Elementwise:
-    """Return the cosine of the angle from the vertical, theta + phi."""
+    """Return the cosine of the angle between the stance leg and the vertical, theta + phi."""
     return jnp.cos(theta) * s.cos_phi - jnp.sin(theta) * s.sin_phi
 
 
@@ -625,9 +640,9 @@ def _compute_rolling_time(
 ) -> Elementwise:
     """Return the time between two half-angles on one side of the vertical, s.
 
-    The half-angles are given by their squares. The time is the integral of dt / sqrt(t (1 - t)
-    (min_rate_squared + 2 kappa t)) over t = sin^2. Its closed form is 2 R_F (DLMF 19.29.4). The
-    time is zero if both half-angles are equal.
+    The arguments are the squares of the half-angles. With t = sin^2 of the half-angle, the time is
+    the integral of dt / sqrt(t (1 - t) (min_rate_squared + 2 kappa t)). Its closed form is 2 R_F
+    (DLMF 19.29.4). The result is 0 if the two half-angles are equal.
     """
     is_nonempty = end_angle_squared > begin_angle_squared
     lower_squared = jnp.where(is_nonempty, begin_angle_squared, 0.0)
@@ -649,11 +664,11 @@ def _compute_rolling_time(
 
 
 def evaluate_carlson_rf(x: Elementwise, y: Elementwise, z: Elementwise) -> Elementwise:
-    """Return Carlson's symmetric elliptic integral R_F to round-off, by duplication (DLMF 19.36.1).
+    """Return Carlson's symmetric elliptic integral R_F, accurate to round-off (DLMF 19.36.1).
 
-    Each duplication reduces the differences between the arguments to a quarter. After 12
-    duplications, the fifth-order series is exact in float64 for arguments within ten decades of
-    each other.
+    The method is duplication: each duplication divides the differences between the arguments by
+    four. After 12 duplications, the fifth-order series is exact in float64 if the arguments lie
+    within ten decades of each other.
     """
 
     def duplicate_arguments(

@@ -1,4 +1,4 @@
-"""Inputs of a step: section states, and the slopes of uneven ground, with their checks.
+"""Inputs of a step: section states and the slopes of uneven ground, with the checks of both.
 
 Uneven ground consists of straight lines between the footholds.
 """
@@ -16,23 +16,31 @@ from vrw_jax.numerics import Elementwise
 from vrw_jax.wheel import MAX_SI_VALUE, PARAMETER_DOMAINS, WheelParams
 
 SectionState = Float[Array, "3"]
-"""State (theta-, dtheta-, dL1-) just before touchdown, in the leg labels of the ending step: rad,
-rad/s, m/s. The length of Leg 1 follows from the touchdown condition. Leg 2 is on its stopper."""
+"""State (theta-, dtheta-, dL1-) just before touchdown, in rad, rad/s and m/s. The leg labels are
+those of the step that ends. The touchdown condition determines the length of Leg 1. Leg 2 is on its
+stopper.
+"""
 AnySectionState = Float[Array, "section ..."]
-"""Section state of any model: a `SectionState` or a longer vector. In a batch, elements are on the
-last axis."""
+"""Section state of any model: a `SectionState` or a longer vector. A batch has its elements on the
+last axis.
+"""
 PAPER_START_STATE = (0.1, 1.6, -0.1)
-"""Start near the gait of Table 1, inside its basin of attraction: rad, rad/s, m/s."""
+"""Start near the gait of Table 1 of the paper, inside the gait's basin of attraction: rad, rad/s,
+m/s.
+"""
 
 
 SectionStateEntries = Float[Array, "section ..."] | tuple[Array, ...]
-"""Section state as one array or as separate entries, each of which may be an array over a batch."""
+"""Section state as one array, or as separate entries. Each entry may be an array with one value per
+batch element.
+"""
 
 
 def is_valid_start_state(params: WheelParams, x: SectionStateEntries) -> Array:
-    """Return whether parameters and start are finite, in their domains and rolling forward.
+    """Return whether the parameters and the start state are valid.
 
-    NaN gives False.
+    They are valid if all values are finite and within their domains, and if the wheel rolls
+    forward. NaN gives False.
     """
     wheel_angle, angular_rate = x[0], x[1]
     is_upright = (jnp.abs(wheel_angle) < 0.5 * jnp.pi) & (
@@ -50,9 +58,10 @@ def replace_invalid_inputs(
     x: SectionStateEntries,
     fallback_state: Any,
 ) -> tuple[WheelParams, Any]:
-    """Return parameters and start, with Table 1 and `fallback_state` in place of invalid inputs.
+    """Return the parameters and the start state, with invalid inputs replaced.
 
-    The replacement prevents NaN in the step and in its derivatives.
+    The wheel of Table 1 of the paper and `fallback_state` replace them. The replacement prevents
+    NaN in the step and its derivatives.
     """
     return jax.tree.map(
         lambda given_value, safe_value: jnp.where(
@@ -64,7 +73,7 @@ def replace_invalid_inputs(
 
 
 def complete_line_slopes(slope: Array, n_steps: int) -> Array:
-    """Return the slopes of the n + 1 lines of n steps, rad.
+    """Return the slopes of the n + 1 lines of the ground under a walk of n steps, rad.
 
     If `slope` has n entries, the last slope is repeated.
     """
@@ -73,7 +82,7 @@ def complete_line_slopes(slope: Array, n_steps: int) -> Array:
 
 
 def check_stepwise_shape(quantity_name: str, stepwise_values: Array, n_steps: int) -> None:
-    """Raise a `ValueError` if an array does not have n or n + 1 entries for n steps."""
+    """Raise a `ValueError` unless an array has n or n + 1 entries for n steps."""
     if jnp.shape(stepwise_values) not in ((n_steps,), (n_steps + 1,)):
         steps_text = "a step" if n_steps == 1 else f"a walk of {n_steps} steps"
         raise ValueError(
@@ -85,11 +94,11 @@ def check_stepwise_shape(quantity_name: str, stepwise_values: Array, n_steps: in
 
 
 def split_slopes(params: WheelParams) -> tuple[WheelParams, Elementwise | None]:
-    """Return the wheel on the line under both feet in double support, and the slope of the next
-    line, rad.
+    """Return the wheel on the present line of the ground, and the slope of the next line, rad.
 
-    On uneven ground `params.slope` has both slopes on a leading axis, which no other parameter has.
-    On flat ground, `params.slope` has no such axis and the second result is None.
+    The present line is the one under both feet in double support. On uneven ground, `params.slope`
+    has both slopes on a leading axis that no other parameter has. On flat ground, `params.slope`
+    has no such axis and the second result is None.
     """
     if jnp.ndim(params.slope) == jnp.ndim(params.damping):
         return params, None
@@ -98,18 +107,18 @@ def split_slopes(params: WheelParams) -> tuple[WheelParams, Elementwise | None]:
 
 
 def is_valid_slope(slope: Elementwise) -> Array:
-    """Return whether a slope (rad) lies in its domain. NaN gives False."""
+    """Return whether a slope (rad) lies in the allowed domain. NaN gives False."""
     return jnp.asarray(PARAMETER_DOMAINS["slope"].contains_value(slope))
 
 
 def select_stance_line_and_tilt(
     params: WheelParams, x: SectionStateEntries
 ) -> tuple[WheelParams, Array, Elementwise | None]:
-    """Return the wheel on the line under both feet, whether a step may start, and the next line's
+    """Return the wheel on the present line of the ground, whether a step may start, and the next
     tilt.
 
-    The tilt is the angle by which the next line is steeper than the present line, rad. On flat
-    ground it is None.
+    The present line is the one under both feet in double support. The tilt is the angle by which
+    the next line is steeper than the present line, rad. On flat ground the tilt is None.
     """
     params, next_slope = split_slopes(params)
     is_valid = is_valid_start_state(params, x)

@@ -1,4 +1,4 @@
-"""Results of one step: measures, margins and energies, and the part that all models share."""
+"""Results of one step: measures, margins and energies. All models share a common part."""
 
 import abc
 from collections.abc import Mapping
@@ -21,24 +21,24 @@ from vrw_jax.printing import (
 from vrw_jax.wheel import Outcome
 
 MeasureValue = Float[Array, "..."]
-"""Value of a measure of a step; in a batch, one value per element."""
+"""Value of a measure for a step; a batch has one value per element."""
 
 
 class AbstractMeasureGroup(AbstractPrintable):
-    """Group of measures. Each field is one of `measures.MEASURES`."""
+    """Group of measures. Each field is one of the measures in `measures.MEASURES`."""
 
     measure_names: eqx.AbstractClassVar[Mapping[str, str]]
-    """Names in `measures.MEASURES` of the fields that have another name there."""
+    """Names of the measures in `measures.MEASURES`, by field, for the fields whose names differ."""
 
     def measures(self) -> dict[str, Array]:
-        """Return the measures of the group by their names in `measures.MEASURES`."""
+        """Return the value of each field, by the name of its measure in `measures.MEASURES`."""
         return {
             self.measure_names.get(field_name, field_name): field_value
             for field_name, field_value in vars(self).items()
         }
 
     def summary_rows(self) -> list[LabelAndText]:
-        """Return label and printed number of each measure."""
+        """Return the label and the printed value for each measure."""
         measure_items = self.measures().items()
         return [
             (
@@ -50,11 +50,13 @@ class AbstractMeasureGroup(AbstractPrintable):
 
 
 class DoubleSupportIndicators(AbstractMeasureGroup):
-    """Indicators of double-limb support of Section 5.1, for the landing that opens the step.
+    """Indicators of double-limb support (Section 5.1 of the paper), for the landing that opens the
+    step.
 
-    - `lambda_I4`: normal impulse of the rear foot in the landing, both feet held, N s;
-    - `lambda_2`: normal force of the fore foot just after the landing, N;
-    - `lambda_4`: normal force of the rear foot just after the landing, N.
+    - `lambda_I4`: normal impulse on the rear foot in the landing, if both feet stay fixed to the
+      ground, N s;
+    - `lambda_2`: normal force on the fore foot just after the landing, N;
+    - `lambda_4`: normal force on the rear foot just after the landing, N.
 
     Examples:
         >>> indicators = vrw.limit_cycle(vrw.WheelParams()).indicators
@@ -70,11 +72,10 @@ class DoubleSupportIndicators(AbstractMeasureGroup):
 
 
 class EnergyLoss(AbstractMeasureGroup):
-    """Mechanical energy lost in the step, J. A loss is positive.
+    """Mechanical energy that the wheel loses in the step, J. Each part is positive for a loss.
 
-    - `landing`: energy lost in the landing;
-    - `stopper`: energy lost in the collision of Leg 2 with its stopper;
-    - `damping`: energy lost in the legs' dampers.
+    - `landing`, `stopper`: loss in the landing and in the collision of Leg 2 with its stopper;
+    - `damping`: loss in the dampers of the legs.
 
     Examples:
         >>> step = vrw.step(vrw.WheelParams(damping=150.0), vrw.paper_start())
@@ -92,20 +93,21 @@ class EnergyLoss(AbstractMeasureGroup):
 
 
 class Margins(AbstractMeasureGroup):
-    """Margins of the viscoelastic model's assumptions over one step, negative if violated.
+    """Margins of the viscoelastic model's assumptions in one step. A negative margin is a
+    violation.
 
     Margins do not affect the motion. Forces and lengths are minima over the step, accurate to the
-    integrator's tolerance. A quantity may be zero by construction at the start of a phase, for
-    example the height of a foot that leaves the ground. The minimum is then taken from the first
-    later local minimum on. Friction margins are the model's `friction` minus the required
-    coefficient. The friction margin of the rear foot is that just after landing, because the
-    required coefficient grows without bound as the foot unloads. Phases that did not take place are
-    ignored. A step that did not begin has zero margins.
+    integrator's tolerance. A quantity may be 0 by construction at the start of a phase, for example
+    the height of a foot that leaves the ground. Its margin then ignores that start and begins at
+    the first later minimum. Friction margins are the model's `friction` minus the required
+    coefficient. The friction margin of the rear foot is evaluated just after landing, because the
+    required coefficient grows without bound as the foot unloads. Phases that did not occur are
+    ignored. A step that did not begin has margins of 0.
 
     - `fore_foot_force`: lambda_2, N;
     - `takeoff_acceleration`: acceleration of foot 2 normal to the slope at the start of SLS-I,
-      m/s^2. The sign determines whether the foot rises or scuffs. At the boundary of scuffing the
-      value is smooth, and `clearance_sls1` is not;
+      m/s^2. The sign determines whether the foot rises or scuffs. At the boundary of scuffing this
+      margin is smooth, whereas `clearance_sls1` is not;
     - `clearance_sls1`: height of foot 2 in SLS-I, m;
     - `clearance_sls2`: height of foot 2 in SLS-II, m;
     - `locked_stopper_force`: stopper force of legs 3..n, N;
@@ -145,7 +147,7 @@ class Margins(AbstractMeasureGroup):
 
 
 class AbstractStep(AbstractPrintable):
-    """Results of one step that every model reports. Under `vmap` each field has a batch axis."""
+    """Results that the steps of every model report. Under `vmap` each field gains a batch axis."""
 
     section_state: eqx.AbstractVar[Array]  # just before the next touchdown
     post_impact: eqx.AbstractVar[Float[Array, "2 ..."]]  # (theta, dtheta), rad, rad/s
@@ -156,8 +158,8 @@ class AbstractStep(AbstractPrintable):
 
     @property
     def ending(self) -> Any:
-        """Return a sentence that describes how the step ended, or an array of sentences for a
-        batch.
+        """Return a sentence that describes how the step ended; a batch has an array of
+        sentences.
         """
         return describe_step_ending(self.outcome, Outcome)
 
@@ -168,20 +170,20 @@ class AbstractStep(AbstractPrintable):
 
     @property
     def dls_fraction(self) -> Array:
-        """Return the fraction of the step with two loaded feet, or 0 for a step of zero
-        duration.
+        """Return the duration of double support divided by that of the step; 0 for a step of
+        duration 0.
         """
         period = self.period
         return self.durations[..., 0] / jnp.where(period > 0.0, period, 1.0)
 
     @property
     def speed(self) -> Array:
-        """Return the step length divided by the duration, m/s, or 0 for a step of zero duration."""
+        """Return the step length divided by the duration, m/s; 0 for a step of duration 0."""
         period = self.period
         return jnp.where(period > 0.0, self.step_length / jnp.where(period > 0.0, period, 1.0), 0.0)
 
     def measures(self) -> dict[str, Array]:
-        """Return all measures of the step by their names in `measures.MEASURES`.
+        """Return the value of each measure of the step, by its name in `measures.MEASURES`.
 
         Batch axes come first, and the axis of legs comes last.
         """
@@ -201,8 +203,8 @@ class AbstractStep(AbstractPrintable):
         return shared_measures | self.model_measures()
 
     def summary_rows(self) -> list[LabelAndText]:
-        """Return labels and texts of all measures, and of each margin with a verdict on its
-        sign.
+        """Return labels and printed values: first measures, then margins and whether each of them
+        holds.
         """
         step_outcome, measure_values = np.asarray(self.outcome), self.measures()
         if step_outcome.ndim:
@@ -227,21 +229,23 @@ class AbstractStep(AbstractPrintable):
         return text_rows
 
     def model_selection(self) -> dict[str, Array]:
-        """Return the codes of the selected model and of the reason, by the names of the dataset
-        variables.
+        """Return two integer codes: that of the model that computed the step, and that of the
+        reason.
 
-        The dictionary is empty for a model that does not select another model.
+        The keys are the names of the dataset variables. The result is empty for a model that does
+        not select another model.
         """
         return {}
 
     @abc.abstractmethod
     def model_measures(self) -> dict[str, Array]:
-        """Return the measures that only some models have, by name."""
+        """Return the values of the measures that only some models have, by name."""
 
 
 class AbstractContactStep(AbstractStep):
-    """Step with contacts in any order, whose `durations` are those with two, one and no loaded
-    feet, s.
+    """Results of a step in which contacts may occur in any order.
+
+    The `durations` are the times with two, one and no loaded feet, s.
     """
 
     energy_impacts: eqx.AbstractVar[MeasureValue]  # lost in impacts, J
@@ -250,6 +254,7 @@ class AbstractContactStep(AbstractStep):
     slip: eqx.AbstractVar[MeasureValue]  # path length of sliding feet, m
 
     def model_measures(self) -> dict[str, Array]:
+        """Return the values of the measures that only contact steps have, by name."""
         return {
             "energy_lost_damping": self.energy_damping,
             "duration_single": self.durations[..., 1],
@@ -261,18 +266,18 @@ class AbstractContactStep(AbstractStep):
 
 
 class StepResult(AbstractStep):
-    """One step from touchdown to touchdown. Under `vmap` each field has a batch axis.
+    """Results of one step from touchdown to touchdown. Under `vmap`, each field gains a batch axis.
 
-    If the outcome is not STEPPED, the fields are finite and describe the partial motion. The
-    `section_state` then consists of zeros, which is not a valid section state.
+    If the outcome is not STEPPED, the fields are finite and describe the partial motion. All
+    entries of `section_state` are then 0, which is not a valid section state.
 
-    - `section_state`: just before the next touchdown;
+    - `section_state`: section state just before the next touchdown;
     - `post_impact`: (theta, dtheta) just after the opening landing, rad, rad/s;
-    - `durations`: of DLS, SLS-I, SLS-II, s;
+    - `durations`: durations of DLS, SLS-I and SLS-II, s;
     - `step_length`: distance between the feet at the opening landing, m;
     - `indicators`, `margins`, `energy`: `DoubleSupportIndicators`, `Margins` and `EnergyLoss`;
-    - `outcome`: an Outcome;
-    - `solver_steps`: attempted solver steps;
+    - `outcome`: code of the `Outcome`;
+    - `solver_steps`: number of attempted solver steps;
     - `engine`: name of the engine, see `StepOptions`.
 
     Examples:
@@ -293,8 +298,9 @@ class StepResult(AbstractStep):
     engine: str = eqx.field(static=True, default="")
 
     def model_measures(self) -> dict[str, Array]:
-        """Return the measures, by name, that only steps with the paper's phases have."""
-        """Return the measures of contact steps by name."""
+        """Return the values of the measures that only models with the paper's phases have, by
+        name.
+        """
         return {
             "duration_sls1": self.durations[..., 1],
             "duration_sls2": self.durations[..., 2],
@@ -320,10 +326,10 @@ class AdvanceResult(eqx.Module):
 
 
 class Trajectory(eqx.Module):
-    """States of one step at samples of each phase, with forces and energies.
+    """States, forces and energies at samples of each phase of one step; both ends are included.
 
-    The axes are phase (DLS, SLS-I, SLS-II) and sample. The samples of a phase include both ends. A
-    phase that did not take place has duration 0 and repeats its start. Coordinates use the leg
+    The first axis runs over the phases (DLS, SLS-I, SLS-II), the second over the samples. A phase
+    that did not occur has duration 0, and all its samples equal its start. Coordinates use the leg
     labels of this step, and the foot of Leg 1 is the origin. The last three fields are those of the
     `AdvanceResult`.
     """

@@ -1,11 +1,12 @@
 """Derivatives that follow from the units of length, time and mass by Euler's theorem.
 
-Gaits do not depend on the units of length, time and mass. Every output of a step or a cycle is
-therefore a homogeneous function of the wheel and the start. By Euler's theorem, each unit gives one
-column of the Jacobian from the other columns. The Jacobian of a step obtains two columns in this
-way. The unit of mass would give a third column, but no mass is always large enough as a divisor:
-the column of a light leg would lose its digits. The columns of the Jacobian of a cycle are more
-expensive. For a cycle, the direction in which both masses grow also follows from the unit of mass.
+The choice of these units does not affect a gait. So every output of a step or a cycle is a
+homogeneous function of the parameters and the start. By Euler's theorem, each unit determines one
+column of the Jacobian from the other columns. Two columns of the Jacobian of a step are computed in
+this way. The unit of mass would determine a third column, but no mass is always large enough to
+divide by: the column for the mass of a light leg would lose its digits. The columns of the Jacobian
+of a cycle are more expensive. For a cycle, the unit of mass also determines the derivative in the
+direction in which both masses grow.
 """
 
 from collections.abc import Mapping, Sequence
@@ -27,7 +28,7 @@ _STEP_INPUT_UNITS = (
 
 
 class UnitScalingPowers(NamedTuple):
-    """Powers of one unit in the inputs and outputs of a step."""
+    """Exponents of one unit in the units of the inputs and outputs of a step."""
 
     input_powers: tuple[int, ...]  # of parameters, start, and slope of the next line
     output_powers: tuple[int, ...]  # of section state and durations
@@ -35,11 +36,11 @@ class UnitScalingPowers(NamedTuple):
     def subtract_known_columns(
         self, scaled_output: Array, step_inputs: Sequence[Array], known_columns: Mapping[int, Array]
     ) -> Array:
-        """Return `scaled_output` minus each known column times its input and the power of this
-        input.
+        """Subtract the contribution of each known Jacobian column from the Euler sum.
 
-        `scaled_output` is the output times its power. By Euler's theorem, the difference is the sum
-        of the same products over the unknown columns.
+        `scaled_output` is the output times its exponent. The contribution of a column is the column
+        times its input and the exponent of this input. By Euler's theorem, the result is the sum of
+        the contributions of the unknown columns.
         """
         for i, known_column in known_columns.items():
             if self.input_powers[i]:
@@ -47,6 +48,17 @@ class UnitScalingPowers(NamedTuple):
                     scaled_output - (self.input_powers[i] * step_inputs[i]) * known_column
                 )
         return scaled_output
+
+
+def _make_unit_scaling(unit_index: int) -> UnitScalingPowers:
+    """Return the exponents of one unit in the units of inputs and outputs. The index is 0 for
+    length, 1 for time and 2 for mass.
+    """
+    input_and_output_powers = (
+        tuple(UNIT_POWERS[unit_name][unit_index] for unit_name in unit_names)
+        for unit_names in (_STEP_INPUT_UNITS, (*_SECTION_STATE_UNITS, "s", "s", "s"))
+    )
+    return UnitScalingPowers(*input_and_output_powers)
 
 
 LENGTH_UNIT_SCALING, TIME_UNIT_SCALING, MASS_UNIT_SCALING = (
@@ -62,8 +74,9 @@ UNIT_SCALING_BY_PARAMETER_INDEX = {
     PARAMETER_NAMES.index("gravity"): TIME_UNIT_SCALING,
     PARAMETER_NAMES.index("locked_length"): LENGTH_UNIT_SCALING,
 }
-"""Unit scaling that gives the Jacobian column of a parameter, by the index of the parameter.
-Gravity comes first, because its unit contains a length."""
+"""Unit scaling that determines the Jacobian column of a parameter, by the index of the parameter.
+Gravity comes first, because its unit contains a length.
+"""
 
 
 def complete_jacobian_by_scaling(
@@ -71,12 +84,12 @@ def complete_jacobian_by_scaling(
     known_columns: Mapping[int, Array],
     scaled_outputs: Mapping[int, Array],
 ) -> dict[int, Array]:
-    """Return all columns of a Jacobian by the index of their input.
+    """Return all columns of a Jacobian, by the index of the input.
 
-    The columns of `UNIT_SCALING_BY_PARAMETER_INDEX` follow from Euler's theorem.
+    Euler's theorem determines the columns of `UNIT_SCALING_BY_PARAMETER_INDEX`.
 
     - `known_columns`: all other columns, by the index of the input;
-    - `scaled_outputs`: outputs times their powers, by the index of the parameter.
+    - `scaled_outputs`: outputs times their exponents, by the index of the parameter.
     """
     known_columns = dict(known_columns)
     for parameter_index, unit_scaling in UNIT_SCALING_BY_PARAMETER_INDEX.items():
@@ -92,11 +105,14 @@ def complete_jacobian_by_scaling(
 def complete_jacobian_columns(
     batch_function: BatchFunction, step_inputs: Sequence[Array], input_indices: Sequence[int]
 ) -> tuple:
-    """Return the Jacobian columns of section state and durations with respect to all inputs.
+    """Compute the Jacobian of section state and durations with respect to all inputs of a step.
 
-    `compute_jacobian_columns` gives all columns except two, which follow by scaling.
+    The results are those of `compute_jacobian_columns`.
 
-    - `step_inputs`: parameters, then the start, then on uneven ground the slope of the next line;
+    Two columns follow from the other columns by unit scaling.
+
+    - `step_inputs`: parameters, then the start, then on uneven ground the slope of the next line of
+      the ground;
     - `input_indices`: indices of all inputs, in the order of the returned columns.
     """
     computed_indices = [

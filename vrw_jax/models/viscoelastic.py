@@ -1,4 +1,6 @@
-"""Viscoelastic model of the paper: landing, double support, single support I, stopper, single
+"""The paper's viscoelastic model.
+
+Its step consists of a landing, double support, single support I, a stopper collision and single
 support II.
 """
 
@@ -53,7 +55,9 @@ from vrw_jax.wheel import (
 
 
 class DiffraxPhaseFunctions(NamedTuple):
-    """Functions of a phase for the diffrax integrator, whose state y = (q, v) is one vector."""
+    """Functions that the diffrax integrator calls for a phase. The state y = (q, v) is one
+    vector.
+    """
 
     unpack_motion: Callable[[StateArray], Motion]
     vector_field: VectorField
@@ -95,13 +99,14 @@ def make_diffrax_phase(phase: AbstractPhase, records_margins: bool) -> DiffraxPh
 
 
 class ViscoelasticWheel(AbstractWheel):
-    """Model of the paper: fixed leg roles, no slip, no scuffing, and margins without effect on
-    motion.
+    """The paper's model: legs have fixed roles, and feet neither slip nor scuff. Margins are
+    computed, not enforced.
 
-    - `friction`: coefficient of the ground, which enters the friction margins but not the motion;
-    - `stop_at_lift_off`: whether a step ends if the ground would have to pull on Leg 1, since the
-      model does not describe bouncing. Otherwise the step continues formally, as in the paper for
-      scuffing, and the margins report the violation.
+    - `friction`: friction coefficient of the ground. It affects the friction margins, but not the
+      motion;
+    - `stop_at_lift_off`: whether a step fails if the ground would have to pull on Leg 1, because
+      the model does not describe bouncing. If False, the step continues formally, as the paper's
+      steps do after scuffing, and the margins report the violation.
 
     Examples:
         >>> wheel = vrw.ViscoelasticWheel(friction=20.0)
@@ -127,7 +132,9 @@ class ViscoelasticWheel(AbstractWheel):
     )
 
     def default_start(self, params: WheelParams) -> SectionState:
-        """Return a section state close to the gait of Table 1, inside its basin of attraction."""
+        """Return a section state near the gait of Table 1 of the paper, inside its basin of
+        attraction.
+        """
         return jnp.asarray(PAPER_START_STATE, params.damping.dtype)
 
     def advance(self, params: WheelParams, x: SectionState, options: StepOptions) -> AdvanceResult:
@@ -139,7 +146,7 @@ class ViscoelasticWheel(AbstractWheel):
     def _compute_step(
         self, params: WheelParams, x: SectionState, options: StepOptions, is_detailed: bool
     ) -> Any:
-        """Return the results of a step, computed by the compiled function of the step."""
+        """Return the results of a step, computed with the compiled function."""
         argument_leaves, argument_structure = jax.tree.flatten((params, x, options))
         return eqx.combine(
             *_compile_step_function(self, argument_structure, is_detailed)(*argument_leaves)
@@ -195,7 +202,7 @@ class ViscoelasticWheel(AbstractWheel):
     def _run_phases(
         self, params: WheelParams, x: SectionState, options: StepOptions, records_margins: bool
     ) -> PhaseSequenceResult:
-        """Return the result of all phases of a step that diffrax integrates."""
+        """Integrate all phases of a step with diffrax and return their starts and ends."""
         integrate_phase = _make_diffrax_phase_runner(options, records_margins)
         return run_step_phases(integrate_phase, params, tuple(x), options, self.stop_at_lift_off)
 
@@ -223,7 +230,7 @@ class ViscoelasticWheel(AbstractWheel):
 
 
 def _make_diffrax_phase_runner(options: StepOptions, records_margins: bool) -> PhaseRunner:
-    """Return a function that integrates one phase to its end by diffrax."""
+    """Return a function that integrates one phase to its end with diffrax."""
 
     def run_phase(
         phase: AbstractPhase, q: Vector, v: Vector, is_active: Array, _: PhaseResult | None
@@ -256,9 +263,9 @@ def _make_diffrax_phase_runner(options: StepOptions, records_margins: bool) -> P
 def _compile_step_function(
     model: ViscoelasticWheel, argument_structure: Any, is_detailed: bool
 ) -> ForwardFunction:
-    """Return the compiled function of a step, differentiable in any mode.
+    """Return a function that computes a step from the leaves of (params, x, options).
 
-    Its arguments are the leaves of (params, x, options).
+    The function is differentiable in any mode.
     """
 
     static_options = jax.tree.unflatten(argument_structure, [0.0] * argument_structure.num_leaves)[
@@ -267,10 +274,11 @@ def _compile_step_function(
     engine_name = "lanes" if can_use_batch_kernel(static_options) else "diffrax"
 
     def compute_with_diffrax(tightens_tolerances: bool, *argument_leaves: Array) -> tuple:
-        """Return the results of a step by diffrax, split into floats and other arrays.
+        """Compute a step with diffrax and return its results, split into float arrays and other
+        arrays.
 
-        If the batch kernel is the engine, this function computes only derivatives of derivatives,
-        and the results have the name of the batch kernel's engine.
+        If the batch kernel is the engine, this function is used only for second and higher
+        derivatives. The results still report the name of the batch kernel's engine.
         """
         params, x, options = jax.tree.unflatten(argument_structure, argument_leaves)
         options = options.with_derivative_tolerances() if tightens_tolerances else options
