@@ -1,11 +1,11 @@
 """Accelerations of the wheel in each phase, and the forces of ground and stoppers.
 
-With the foot of Leg 1 at rest the wheel has the coordinates (theta, L1, L2). Written with the hub's
-velocity in the frame of Leg 1, the mass matrix does not depend on theta. The equations of motion of
-every phase follow from `compute_equation_terms`. Double support restricts these equations to the
-circle of the hub, with one degree of freedom. Single support I solves all three equations. Single
-support II drops L2 and has two degrees of freedom. The constraints of eq. (2) hold by construction.
-The page docs/explanation/physics.md contains the derivations.
+With the foot of Leg 1 at rest, the coordinates of the wheel are (theta, L1, L2). The mass matrix is
+written with the hub's velocity in the frame of Leg 1, so it does not depend on theta. The equations
+of motion of every phase follow from `compute_equation_terms`. In double support, the hub moves on a
+circle, so one degree of freedom remains. Single support I uses all three equations. Single support
+II omits L2 and has two degrees of freedom. The constraints of eq. (2) of the paper hold by
+construction. The page docs/explanation/physics.md contains the derivations.
 """
 
 from typing import NamedTuple
@@ -33,7 +33,7 @@ class Acceleration(NamedTuple):
 
 
 class MassMatrix(NamedTuple):
-    """Symmetric mass matrix over (theta, L1, L2), of which M22, M33 and M23 are constants."""
+    """Symmetric mass matrix for (theta, L1, L2). M22, M33 and M23 are constants."""
 
     M11: Elementwise  # kg m^2
     M12: Elementwise  # kg m
@@ -43,7 +43,7 @@ class MassMatrix(NamedTuple):
     M33: Elementwise  # kg
 
     def multiply_vector(self, x: tuple[Elementwise, Elementwise, Elementwise]) -> Vector:
-        """Return the product of the mass matrix and a vector with components along theta, L1 and
+        """Return the product of the mass matrix and a vector with components for theta, L1 and
         L2.
         """
         return (
@@ -54,7 +54,7 @@ class MassMatrix(NamedTuple):
 
 
 class EquationTerms(NamedTuple):
-    """Mass matrix M and applied forces f of the equation M q'' = f + constraint forces (eq. 1)."""
+    """Mass matrix M and applied forces f of M q'' = f + constraint forces (eq. 1 of the paper)."""
 
     mass_matrix: MassMatrix
     applied_moment_theta: Elementwise  # N m, along theta
@@ -63,7 +63,7 @@ class EquationTerms(NamedTuple):
 
 
 def compute_mass_matrix(s: Symbols, L1: Elementwise, L2: Elementwise) -> MassMatrix:
-    """Return the mass matrix M(q) of eq. (1), restricted to a planted Leg 1."""
+    """Return the mass matrix M(q) of eq. (1) of the paper for a planted foot of Leg 1."""
     b, hub_fixed_mass_moment = L2 - s.a, _compute_hub_fixed_mass_moment(s, L2)
     # This sum is grouped first, because it depends on parameters only.
     constant_inertia = s.m * (s.a * s.a + (s.n - 2) * s.c0 * s.c0)
@@ -78,14 +78,15 @@ def compute_mass_matrix(s: Symbols, L1: Elementwise, L2: Elementwise) -> MassMat
 
 
 def _compute_hub_fixed_mass_moment(s: Symbols, L2: Elementwise) -> Elementwise:
-    """Return the first moment of the mass that turns with the hub, kg m."""
+    """Return the first moment of the mass that turns rigidly with the hub, kg m."""
     return s.m * (s.c0 + s.cos_alpha * s.L0) - s.m * s.cos_alpha * L2
 
 
 def compute_equation_terms(s: Symbols, motion: Motion) -> EquationTerms:
-    """Return the mass matrix and the applied forces at a motion.
+    """Return the mass matrix and the applied forces for a motion.
 
-    The applied forces are gravity, springs and dampers (eq. 3) and the inertial forces.
+    The applied forces are gravity, the forces of springs and dampers (eq. 3 of the paper), and the
+    inertial forces.
     """
     sin, cos, L1, L2, dtheta, dL1, dL2 = motion
     mass = compute_mass_matrix(s, L1, L2)
@@ -122,15 +123,17 @@ def compute_equation_terms(s: Symbols, motion: Motion) -> EquationTerms:
 
 
 def solve_single_support_1(s: Symbols, motion: Motion) -> Acceleration:
-    """Return the accelerations in SLS-I, which has three degrees of freedom (Section 3.3.2).
+    """Return the accelerations in SLS-I, which has three degrees of freedom.
 
-    The foot of Leg 2 is in the air, and the length of Leg 2 is free.
+    The foot of Leg 2 is in the air, and the length of Leg 2 can vary (Section 3.3.2 of the paper).
     """
     return solve_unconstrained_dynamics(s, motion.L1, compute_equation_terms(s, motion))
 
 
 def solve_unconstrained_dynamics(s: Symbols, L1: Elementwise, terms: EquationTerms) -> Acceleration:
-    """Return the accelerations q'' with M q'' = f, for which only foot 1 is held."""
+    """Solve M q'' = f for the accelerations q''. The only constraint is that foot 1 stays at
+    rest.
+    """
     M, f1, f2, f3 = terms
     q = s.sin_alpha * L1  # L2 is eliminated: its row of M is m (-q, -cos alpha, 1).
     A11 = M.M11 + M.M13 * q
@@ -146,13 +149,14 @@ def solve_unconstrained_dynamics(s: Symbols, L1: Elementwise, terms: EquationTer
 
 
 def compute_takeoff_acceleration(s: Symbols, motion: Motion) -> Elementwise:
-    """Return the normal acceleration of foot 2 at the start `motion` of SLS-I, m/s^2.
+    """Return the acceleration of foot 2 normal to the slope at the start of SLS-I, m/s^2.
 
-    Foot 2 is at rest on the ground at that instant. The foot rises if the acceleration is positive
-    and scuffs if the acceleration is negative. The acceleration jumps from zero because the
-    tangential force of the ground vanishes. It is smooth at the boundary of scuffing. The
-    clearance, which is the smallest later height of the foot, is not smooth there. On one side of
-    the boundary, the clearance vanishes with the cube of the distance to the boundary. On the other
+    At that instant, whose motion is `motion`, foot 2 is at rest on the ground. The foot rises if
+    the acceleration is positive and scuffs if the acceleration is negative. The acceleration jumps
+    from 0 because the tangential force of the ground vanishes. At the boundary of scuffing, the
+    acceleration is smooth. The clearance, which is the smallest later height of the foot, is not
+    smooth there. On one side of the boundary, the clearance vanishes with the cube of the distance
+    to the boundary. On the other
     side, the clearance jumps.
     """
     L1, L2, dtheta = motion.L1, motion.L2, motion.dtheta
@@ -171,9 +175,9 @@ def compute_takeoff_acceleration(s: Symbols, motion: Motion) -> Elementwise:
 
 
 def solve_single_support_2(s: Symbols, motion: Motion) -> Acceleration:
-    """Return the accelerations in SLS-II, which has two degrees of freedom (Section 3.3.3).
+    """Return the accelerations in SLS-II, which has two degrees of freedom.
 
-    Leg 2 is on its stopper, and M12 = 0.
+    Leg 2 is on its stopper, and M12 = 0 (Section 3.3.3 of the paper).
     """
     M, f1, f2, _ = compute_equation_terms(s, motion)
     inverse_mass = 1.0 / M.M22
@@ -181,7 +185,7 @@ def solve_single_support_2(s: Symbols, motion: Motion) -> Acceleration:
 
 
 class SingleDofEquation(NamedTuple):
-    """Equation of motion with one degree of freedom: inertia_factor * ddtheta =
+    """Equation of motion for one degree of freedom: inertia_factor * ddtheta =
     generalized_force.
     """
 
@@ -192,12 +196,12 @@ class SingleDofEquation(NamedTuple):
 def compute_double_support_equation(
     s: Symbols, foot_distance: Elementwise, motion: Motion
 ) -> SingleDofEquation:
-    """Return the equation of motion in DLS, where the hub moves on a circle (Section 3.3.1).
+    """Return the equation of motion in DLS, where the hub moves on a circle.
 
-    The equation is that of `compute_equation_terms`, restricted to the circle. The sine and cosine
-    of the bisector of both legs are proportional to the sums of the legs' sines and cosines. As a
-    function of the bisector, every term is a trigonometric polynomial with coefficients that depend
-    only on the wheel. This form halves the cost of the restriction.
+    The equation is that of `compute_equation_terms`, restricted to the circle (Section 3.3.1 of the
+    paper). The sine and cosine of the bisector of the two legs are proportional to the sums of the
+    legs' sines and cosines. Every term is a trigonometric polynomial in the angle of the bisector,
+    with coefficients that depend only on the wheel. This form halves the cost of the restriction.
     """
     hub_circle_diameter, squared_bisector_factor = (
         foot_distance / s.sin_alpha,
@@ -240,8 +244,9 @@ def compute_double_support_equation(
 
 
 def solve_double_support(s: Symbols, foot_distance: Elementwise, motion: Motion) -> Acceleration:
-    """Return the accelerations of (theta, L1, L2) in DLS, from
-    `compute_double_support_equation`.
+    """Return the accelerations of (theta, L1, L2) in DLS.
+
+    They solve the equation of `compute_double_support_equation`.
     """
     inertia, force = compute_double_support_equation(s, foot_distance, motion)
     hub_circle = compute_double_support_circle(s, foot_distance, motion.sin_theta, motion.cos_theta)
@@ -251,7 +256,9 @@ def solve_double_support(s: Symbols, foot_distance: Elementwise, motion: Motion)
 def complete_accelerations_on_hub_circle(
     hub_circle: DoubleSupportCircle, dtheta: Elementwise, ddtheta: Elementwise
 ) -> Acceleration:
-    """Return the accelerations of (theta, L1, L2) in double support, from that of theta."""
+    """Return the accelerations of (theta, L1, L2) in double support, computed from that of
+    theta.
+    """
     squared_rate = dtheta * dtheta
     return Acceleration(
         ddtheta,
@@ -261,14 +268,18 @@ def complete_accelerations_on_hub_circle(
 
 
 class FootForce(NamedTuple):
-    """Force (N) or impulse (N s) of the ground on a foot."""
+    """Force (N) or impulse (N s) that the ground exerts on a foot."""
 
     tangential: Elementwise  # downhill positive: lambda_1 (fore) or lambda_3 (rear)
     normal: Elementwise  # pushing positive: lambda_2 (fore) or lambda_4 (rear)
 
 
 def compute_required_friction(force: FootForce) -> Elementwise:
-    """Return the ratio of tangential to normal force, or 0 if the normal force is not positive."""
+    """Return the ratio of the tangential to the normal force, which is the required friction
+    coefficient.
+
+    The result is 0 if the normal force is not positive.
+    """
     is_foot_loaded = force.normal > 0.0
     friction_ratio = jnp.abs(force.tangential) / jnp.where(is_foot_loaded, force.normal, 1.0)
     return jnp.where(is_foot_loaded, friction_ratio, 0.0)
@@ -277,8 +288,9 @@ def compute_required_friction(force: FootForce) -> Elementwise:
 def compute_rear_force_from_residual(
     s: Symbols, motion: Motion, residual_L1: Elementwise, residual_L2: Elementwise
 ) -> FootForce:
-    """Return the force of the ground on the rear foot from its generalized forces along L1 and L2
-    (eq. 1).
+    """Return the force of the ground on the rear foot, computed from its generalized forces.
+
+    `residual_L1` and `residual_L2` are the generalized forces for L1 and L2 (eq. 1 of the paper).
     """
     rear_leg = rotate_to_rear_leg(s, motion.sin_theta, motion.cos_theta)
     return FootForce(
@@ -288,7 +300,7 @@ def compute_rear_force_from_residual(
 
 
 def compute_rear_foot_force(s: Symbols, motion: Motion, acceleration: Acceleration) -> FootForce:
-    """Return (lambda_3, lambda_4) in double support, N.
+    """Return the force of the ground on the rear foot in double support, (lambda_3, lambda_4), N.
 
     The force is the part of M q'' that the applied forces do not supply.
     """
@@ -302,9 +314,10 @@ def compute_rear_foot_force(s: Symbols, motion: Motion, acceleration: Accelerati
 def compute_fore_foot_force(
     s: Symbols, motion: Motion, acceleration: Acceleration, rear_force: FootForce | None = None
 ) -> FootForce:
-    """Return (lambda_1, lambda_2), N.
+    """Return the force of the ground on the fore foot, (lambda_1, lambda_2), N.
 
-    The force is the rate of the total momentum minus the weight and the force on the rear foot.
+    The force is the time derivative of the total momentum minus the weight and the force on the
+    rear foot.
     """
     sin, cos, L1, L2, dtheta, dL1, dL2 = motion
     ddtheta, ddL1, ddL2 = acceleration
@@ -335,7 +348,9 @@ def compute_fore_foot_force(
 
 
 def compute_momentum(s: Symbols, motion: Motion) -> tuple[Elementwise, Elementwise]:
-    """Return the total linear momentum along (x, z), kg m/s, with the foot of Leg 1 at rest."""
+    """Return the total linear momentum in the directions x and z, kg m/s, with the foot of Leg 1 at
+    rest.
+    """
     sin, cos, L1, L2, dtheta, dL1, dL2 = motion
     rear_leg = rotate_to_rear_leg(s, sin, cos)
     radial_momentum_1, tangential_momentum_1 = s.Mh * dL1, (s.Mh * L1 + s.m * s.L0) * dtheta
@@ -355,10 +370,11 @@ def compute_momentum(s: Symbols, motion: Motion) -> tuple[Elementwise, Elementwi
 def compute_stopper_force(
     s: Symbols, motion: Motion, acceleration: Acceleration, leg_numbers: range
 ) -> Float[Array, "n_legs_asked ..."]:
-    """Return the force of the stopper that holds each of `leg_numbers` at the length L0, N.
+    """Return the force that the stopper exerts on each leg of `leg_numbers`, N.
 
-    The force is negative if the leg would leave its stopper. The spring presses with k (L* - L0).
-    The weight and the acceleration of the leg's mass reduce the force.
+    Each of these legs has the length L0. The force is negative if the leg would leave its stopper.
+    The spring presses the leg against the stopper with the force k (L* - L0). The weight and the
+    acceleration of the leg's mass reduce the force.
     """
     leg_angles = s.alpha * (np.asarray(leg_numbers).reshape(-1, *(1,) * jnp.ndim(motion.L1)) - 1)
     radial_hub_acceleration = acceleration.ddL1 - motion.L1 * motion.dtheta * motion.dtheta
@@ -382,7 +398,7 @@ def compute_stopper_force(
 class Energy(NamedTuple):
     """Mechanical energy, J.
 
-    The gravitational energy is zero at the present foot of Leg 1 (Section 3.5).
+    The gravitational energy is 0 at the present foot of Leg 1 (Section 3.5 of the paper).
     """
 
     kinetic_energy: Elementwise
@@ -391,12 +407,12 @@ class Energy(NamedTuple):
 
     @property
     def total_energy(self) -> Elementwise:
-        """Return the total energy E of eq. (26), J."""
+        """Return the total energy E of eq. (26) of the paper, J."""
         return self.kinetic_energy + self.gravitational_energy + self.elastic_energy
 
 
 def compute_kinetic_energy(s: Symbols, motion: Motion) -> Elementwise:
-    """Return the kinetic energy, half of q' M q', J."""
+    """Return the kinetic energy, q' M q' / 2, J."""
     coordinate_rates = (motion.dtheta, motion.dL1, motion.dL2)
     p = compute_mass_matrix(s, motion.L1, motion.L2).multiply_vector(coordinate_rates)
     return 0.5 * (
@@ -405,7 +421,7 @@ def compute_kinetic_energy(s: Symbols, motion: Motion) -> Elementwise:
 
 
 def compute_mechanical_energy(s: Symbols, motion: Motion) -> Energy:
-    """Return the kinetic, gravitational and elastic energy (eqs 26, 27), J."""
+    """Return the kinetic, gravitational and elastic energy (eqs 26, 27 of the paper), J."""
     sin_theta_plus_phi = motion.sin_theta * s.cos_phi + motion.cos_theta * s.sin_phi
     cos_theta_plus_phi = motion.cos_theta * s.cos_phi - motion.sin_theta * s.sin_phi
     cos_rear_leg_plus_phi = cos_theta_plus_phi * s.cos_alpha - sin_theta_plus_phi * s.sin_alpha
@@ -418,5 +434,5 @@ def compute_mechanical_energy(s: Symbols, motion: Motion) -> Energy:
 
 
 def compute_damping_power(s: Symbols, motion: Motion) -> Elementwise:
-    """Return the power c (dL1^2 + dL2^2) that the dampers dissipate, W (eq. 29)."""
+    """Return the power c (dL1^2 + dL2^2) that the dampers dissipate, W (eq. 29 of the paper)."""
     return s.c * (motion.dL1 * motion.dL1 + motion.dL2 * motion.dL2)

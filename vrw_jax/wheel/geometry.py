@@ -1,10 +1,10 @@
-"""Positions of the wheel's points: hub, feet and the distances in guards.
+"""Positions of the hub and the feet, and the distances that guards evaluate.
 
 The frame is tilted with the slope: x points downhill along the slope, and z is normal to the slope.
-Angles are measured from the normal, and theta grows as the wheel rolls downhill. Leg j has the
+Angles are measured from the normal, and theta increases as the wheel rolls downhill. Leg j has the
 angle theta + (j - 1) alpha. Leg 1 is the fore leg on the ground, Leg 2 is the rear leg, and leg n,
 at theta - alpha, lands next. The origin is the foot of Leg 1. A posture depends on theta only
-through its sine and cosine.
+through sin(theta) and cos(theta).
 """
 
 from typing import NamedTuple
@@ -14,7 +14,7 @@ from vrw_jax.wheel.params import Symbols
 
 
 class Motion(NamedTuple):
-    """Posture and rates in the coordinates (theta, L1, L2), with the foot of Leg 1 at rest."""
+    """Posture and rates of change of (theta, L1, L2), with the foot of Leg 1 at rest."""
 
     sin_theta: Elementwise  # of theta
     cos_theta: Elementwise  # of theta
@@ -34,7 +34,7 @@ class Motion(NamedTuple):
         dL1: Elementwise,
         dL2: Elementwise,
     ) -> "Motion":
-        """Return the motion at the angle theta (rad) with these lengths (m) and rates."""
+        """Return the motion for the angle theta (rad), the leg lengths (m), and their rates."""
         return cls(*compute_sine_cosine(theta), L1, L2, dtheta, dL1, dL2)
 
 
@@ -62,8 +62,9 @@ def rotate_to_landing_leg(s: Symbols, sin_theta: Elementwise, cos_theta: Element
 
 
 def compute_rear_foot_height(s: Symbols, motion: Motion) -> Elementwise:
-    """Return the height of foot 2 above the slope, m. It is negative if the foot scuffs (Section
-    3.3.1).
+    """Return the height of foot 2 above the slope, m.
+
+    The height is negative if the foot scuffs (Section 3.3.1 of the paper).
     """
     return (
         motion.L1 * motion.cos_theta
@@ -72,7 +73,7 @@ def compute_rear_foot_height(s: Symbols, motion: Motion) -> Elementwise:
 
 
 def compute_landing_foot_height(s: Symbols, motion: Motion) -> Elementwise:
-    """Return the height of the next leg's foot above the slope, m. It is zero at touchdown."""
+    """Return the height above the slope of the foot that lands next, m. It is 0 at touchdown."""
     return (
         motion.L1 * motion.cos_theta
         - s.L0 * rotate_to_landing_leg(s, motion.sin_theta, motion.cos_theta).cos
@@ -80,13 +81,13 @@ def compute_landing_foot_height(s: Symbols, motion: Motion) -> Elementwise:
 
 
 def compute_length_at_touchdown(s: Symbols, theta: Elementwise) -> Elementwise:
-    """Return the length of Leg 1 if the next foot meets the ground at the angle theta, m."""
+    """Return the length of Leg 1 at which the next foot meets the ground at the angle theta, m."""
     sin_theta, cos_theta = compute_sine_cosine(theta)
     return s.L0 * rotate_to_landing_leg(s, sin_theta, cos_theta).cos / cos_theta
 
 
 class DoubleSupportCircle(NamedTuple):
-    """Leg lengths and their derivatives with respect to theta, with the hub on its circle."""
+    """Leg lengths and their derivatives with respect to theta, for a hub on its circle."""
 
     L1: Elementwise  # m
     L2: Elementwise  # m
@@ -97,9 +98,10 @@ class DoubleSupportCircle(NamedTuple):
 def compute_double_support_circle(
     s: Symbols, foot_distance: Elementwise, sin_theta: Elementwise, cos_theta: Elementwise
 ) -> DoubleSupportCircle:
-    """Return the leg lengths and their derivatives with both feet planted `foot_distance` m apart.
+    """Return the leg lengths and their derivatives in double support.
 
-    The hub moves on a circle with the inscribed angle alpha (Section 2).
+    The distance between the feet is `foot_distance`, m. The hub moves on a circle with the
+    inscribed angle alpha (Section 2 of the paper).
     """
     hub_circle_diameter = foot_distance / s.sin_alpha
     rear_leg = rotate_to_rear_leg(s, sin_theta, cos_theta)

@@ -1,11 +1,11 @@
-"""Outcomes of a step: one integer code per batch element, with a name and a sentence."""
+"""Outcomes of a step: one integer code per batch element. Each code has a name and a sentence."""
 
 from vrw_jax.numerics import StatusCode
 
 
 class Outcome(StatusCode):
-    """Outcome of a step. Only a step with the outcome STEPPED has a section state at its end. Every
-    other outcome ends the walk.
+    """Outcome of a step. Only a step with the outcome STEPPED ends in a section state. Every other
+    outcome ends the walk.
 
     Examples:
         >>> vrw.Outcome.FELL_BACK.meaning

@@ -8,12 +8,12 @@ from vrw_jax.wheel.params import WheelParams
 
 @dataclass(frozen=True)
 class ParameterSet:
-    """Named set of wheel parameters. Parameters that the set does not list have the values of Table
-    1.
+    """Named set of wheel parameters. A parameter that the set does not list has its value in Table
+    1 of the paper.
 
-    - `values`: parameters that differ from Table 1 at slope 0.30 rad, in SI units;
+    - `values`: parameters that differ from Table 1 of the paper at slope 0.30 rad, in SI units;
     - `description`: property of the wheel that the set illustrates;
-    - `source`: source of the numbers and of their confirmation.
+    - `source`: source of the values, and of their confirmation.
 
     Examples:
         >>> two_peaks = vrw.parameter_sets["two_peaks"]

@@ -1,4 +1,4 @@
-"""Parameters of the wheel with units and domains, and the symbols of the paper."""
+"""Parameters of the wheel, their units and domains, and their symbols in the paper."""
 
 import functools
 import math
@@ -48,14 +48,18 @@ class ParameterDomain(NamedTuple):
 
 
 MIN_SI_VALUE = 1e-15
-"""Smallest SI number of a positive parameter, chosen because quotients of smaller numbers
-overflow."""
+"""Smallest value of a positive parameter in SI units, chosen because quotients of smaller values
+overflow.
+"""
 MAX_SI_VALUE = 1e60
-"""Bound of the SI numbers of a wheel, chosen because products of four larger numbers are near the
-largest number of 64 bits."""
+"""Upper bound on the parameters of a wheel in SI units. The value is chosen because products of
+four larger values come near the largest 64-bit floating-point number.
+"""
 MAX_RELATIVE_VALUE = 1e9
-"""Bound of natural length, stiffness and damping in units of total mass, locked length and gravity,
-chosen because it is far above the values of legs whose motion a solver resolves."""
+"""Upper bound on the natural length, stiffness and damping in units of total mass, locked length
+and gravity. The value is chosen because it is far above the values for legs whose motion a solver
+resolves.
+"""
 
 PARAMETER_DOMAINS: dict[str, ParameterDomain] = {
     "hub_mass": ParameterDomain("m_H", "kg", 0.0, MAX_SI_VALUE, True, "mass of the body frame"),
@@ -82,18 +86,19 @@ PARAMETER_DOMAINS: dict[str, ParameterDomain] = {
         "g", "m/s^2", MIN_SI_VALUE, MAX_SI_VALUE, True, "gravitational acceleration"
     ),
 }
-"""Domain of every float parameter of `WheelParams`, in the order of its fields."""
+"""Domain of each floating-point parameter of `WheelParams`, in the order of its fields."""
 
 UNIT_POWERS = {
     "kg": (0, 0, 1), "m": (1, 0, 0), "N/m": (0, -2, 1), "N s/m": (0, -1, 1), "rad": (0, 0, 0),
     "m/s^2": (1, -2, 0), "rad/s": (0, -1, 0), "m/s": (1, -1, 0), "s": (0, 1, 0),
 }  # fmt: skip
-"""Powers of length, time and mass in the units of the wheel's parameters and of a step's
-outputs."""
+"""Exponents of length, time and mass in the units of the wheel's parameters and of the outputs of a
+step.
+"""
 
 
 class Symbols(NamedTuple):
-    """Parameters by their symbols in the paper, and quantities that several formulas use."""
+    """Parameters by their symbols in the paper, and quantities that several formulas share."""
 
     m: Elementwise
     a: Elementwise
@@ -117,7 +122,7 @@ class Symbols(NamedTuple):
 
 
 def _make_parameter_field(parameter_name: str, default_value: float) -> Any:
-    """Return the dataclass field of a float parameter."""
+    """Return a dataclass field for a floating-point parameter."""
     return eqx.field(
         converter=functools.partial(check_reals, parameter_name), default=default_value
     )
@@ -132,14 +137,13 @@ _check_n_legs = functools.partial(
 
 
 class WheelParams(AbstractPrintable):
-    """Parameters of the viscoelastic-legged rimless wheel; the defaults are Table 1 with slope
-    0.30.
+    """Parameters of the viscoelastic-legged rimless wheel. The defaults are Table 1 of the paper at
+    slope 0.30 rad.
 
     All fields except `n_legs` are pytree leaves in SI units and may be swept and differentiated.
-    The paper does not print g; 9.81 m/s^2 reproduces its numbers. A number outside its domain
-    raises an error here. In a batch, a wheel with such a number has `Outcome.BAD_INPUT`. In units
-    of total mass, locked length and gravity, natural length, stiffness and damping must be below
-    1e9.
+    The paper does not print g; 9.81 m/s^2 reproduces its results. A value outside its domain raises
+    an error. In a batch, a wheel with such a value has `Outcome.BAD_INPUT` instead. In units of
+    total mass, locked length and gravity, natural length, stiffness and damping must be below 1e9.
 
     - `hub_mass`: m_H, mass of the body frame, in [0, 1e+60) kg;
     - `leg_mass`: m, mass of one leg frame, a point, in [1e-15, 1e+60) kg;
@@ -172,7 +176,9 @@ class WheelParams(AbstractPrintable):
     n_legs: int = eqx.field(static=True, converter=_check_n_legs, default=8)
 
     def __new__(cls, *_: Any, **given_parameters: Any) -> "WheelParams":
-        """Raise a `TypeError` for keywords that are no parameters, before the wheel is made."""
+        """Raise a `TypeError` for keywords that are not parameters, before an instance is
+        created.
+        """
         for parameter_name in given_parameters:
             try:
                 check_parameter_name(
@@ -233,8 +239,8 @@ class WheelParams(AbstractPrintable):
 
     @property
     def in_axes(self) -> "WheelParams":
-        """Return the argument `in_axes` of `jax.vmap`: 0 for each parameter with an axis, None for
-        others.
+        """Return the argument `in_axes` for `jax.vmap`: 0 for each parameter with an axis, and None
+        otherwise.
 
         For example `jax.vmap(vrw.limit_cycle, in_axes=(params.in_axes,))(params)`.
         """
@@ -251,15 +257,16 @@ class WheelParams(AbstractPrintable):
 
     @property
     def printed_heading(self) -> str:
-        """Return the class name, with a note if a parameter is out of its domain."""
+        """Return the class name, with a note if a parameter lies outside its domain."""
         title_suffix = (
             "" if np.all(self.is_in_domain()) else " out of its domain: a gradient or a difference"
         )
         return "WheelParams" + title_suffix
 
     def summary_rows(self) -> list[LabelAndText]:
-        """Return symbol, value and unit of each parameter. A gradient has rows "by" each
-        parameter.
+        """Return the label and the printed value of each parameter.
+
+        A gradient has labels that begin with "by", one for each parameter.
         """
         value_by_parameter = {
             parameter_name: getattr(self, parameter_name) for parameter_name in PARAMETER_DOMAINS
@@ -289,7 +296,7 @@ class WheelParams(AbstractPrintable):
     def is_in_domain(self) -> Bool[Array, "..."]:
         """Return whether all parameters of each wheel are finite and in their domains.
 
-        Products of four parameters must also be finite in their floating type.
+        Products of four parameters must also be finite in their floating-point type.
         """
         is_in_all_domains = self.leg_com < self.locked_length
         value_by_parameter = {
@@ -315,7 +322,7 @@ class WheelParams(AbstractPrintable):
         length: RealInput | int = 1.0,
         time: RealInput | int = 1.0,
     ) -> "WheelParams":
-        """Return the similar wheel whose masses, lengths and times are larger by the given factors.
+        """Return the similar wheel whose masses, lengths and times are scaled by the given factors.
 
         Similar wheels have the same gaits: a period grows by `time`, a speed by `length / time`, a
             force by `mass * length / time**2`. Angles, fractions and multipliers stay the same. By
@@ -360,7 +367,7 @@ class WheelParams(AbstractPrintable):
         return WheelParams(**scaled_values, n_legs=self.n_legs)
 
     def symbols(self) -> Symbols:
-        """Return the parameters of this wheel by their symbols, with quantities that formulas
+        """Return the parameters by their symbols in the paper, and quantities that several formulas
         share.
         """
         return compute_symbols(
@@ -369,9 +376,9 @@ class WheelParams(AbstractPrintable):
 
 
 def _square_relative_values(value_by_parameter: Mapping[str, Any], n_legs: int) -> dict[str, Any]:
-    """Return the squares of relative natural length, stiffness and damping, by parameter name.
+    """Return the squares of the relative natural length, stiffness and damping, by parameter name.
 
-    The relative values are in units of total mass, locked length and gravity.
+    Relative values are values in units of total mass, locked length and gravity.
 
     - `value_by_parameter`: values of all parameters in SI units.
     """
@@ -386,8 +393,8 @@ def _square_relative_values(value_by_parameter: Mapping[str, Any], n_legs: int) 
 
 
 def _require_small_relative_values(value_by_parameter: Mapping[str, float], n_legs: int) -> None:
-    """Raise a `ValueError` if a parameter is too large for the mass, length and gravity of its
-    wheel.
+    """Raise a `ValueError` if a parameter is too large relative to the wheel's mass, length and
+    gravity.
     """
     for parameter_name, squared_relative_value in _square_relative_values(
         value_by_parameter, n_legs
@@ -414,7 +421,7 @@ def compute_symbols(
     slope: Elementwise,
     gravity: Elementwise,
 ) -> Symbols:
-    """Return the `Symbols` of parameters in SI units, which may be complex numbers."""
+    """Return the `Symbols` for parameters in SI units. The parameters may be complex numbers."""
     alpha = 2.0 * math.pi / n_legs
     sin_phi, cos_phi = compute_sine_cosine(slope)
     return Symbols(
@@ -439,18 +446,20 @@ def compute_symbols(
 
 PARAMETER_NAMES: tuple[str, ...] = tuple(PARAMETER_DOMAINS)
 FRICTION_NAME = "friction"
-"""Name of the ground's coefficient of friction, which designs and branches may also vary."""
+"""Name of the friction coefficient of the ground, which designs and branches may also vary."""
 
 PARAMETER_BY_SYMBOL: dict[str, str] = {
     **{domain.symbol: name for name, domain in PARAMETER_DOMAINS.items()},
     **{"mH": "hub_mass", "L0": "locked_length", "L_s": "natural_length", "Ls": "natural_length"},
     **{"φ": "slope", "n": "n_legs", "mu": FRICTION_NAME, "μ": FRICTION_NAME},
 }
-"""Name of the parameter of each symbol of the paper, in its usual spellings."""
+"""Parameter name for each symbol of the paper, in the usual spellings of the symbol."""
 
 
 def raise_for_parameter_symbol(given_name: Any, allowed_names: Iterable[str]) -> None:
-    """Raise a `ValueError` if `given_name` is the symbol of a parameter whose name is allowed."""
+    """Raise a `ValueError` if `given_name` is the paper's symbol for a parameter with an allowed
+    name.
+    """
     allowed_names = tuple(allowed_names)
     parameter_name = PARAMETER_BY_SYMBOL.get(given_name) if isinstance(given_name, str) else None
     if given_name not in allowed_names and parameter_name in allowed_names:
@@ -460,14 +469,14 @@ def raise_for_parameter_symbol(given_name: Any, allowed_names: Iterable[str]) ->
 def check_parameter_name(given_name: Any, allowed_names: Sequence[str], name_kind: str) -> None:
     """Raise a `ValueError` if `given_name` is not the name of an allowed parameter.
 
-    If the given name is a symbol of the paper, the message states the name of the parameter.
+    If the given name is a symbol of the paper, the error message states the parameter's name.
     """
     raise_for_parameter_symbol(given_name, allowed_names)
     require_known_name(given_name, allowed_names, name_kind)
 
 
 def convert_friction(given_friction: object) -> Array:
-    """Return a coefficient of friction, or an array of such coefficients, as a JAX array.
+    """Return one friction coefficient, or an array of them, as a JAX array.
 
     Raise a `ValueError` for a negative number or NaN.
     """
@@ -484,10 +493,10 @@ def convert_friction(given_friction: object) -> Array:
 
 
 def require_known_friction(given_friction: Any) -> float:
-    """Return the coefficient of friction as a float, for models whose motion does not depend on
+    """Return the friction coefficient as a float, for models whose motion does not depend on
     friction.
 
-    Raise a `TypeError` for an array with an axis or a traced value.
+    Raise a `TypeError` for an array with an axis, or for a traced value.
     """
     if convert_friction(given_friction).ndim or isinstance(given_friction, jax.core.Tracer):
         raise TypeError(
@@ -499,8 +508,9 @@ def require_known_friction(given_friction: Any) -> float:
 
 
 def stack_parameters(params: WheelParams) -> Array:
-    """Return the float parameters of a wheel as one array, whose first axis follows
-    `PARAMETER_NAMES`.
+    """Return the floating-point parameters of a wheel as one array.
+
+    The first axis has the order of `PARAMETER_NAMES`.
     """
     return jnp.stack([getattr(params, parameter_name) for parameter_name in PARAMETER_NAMES])
 
@@ -508,10 +518,10 @@ def stack_parameters(params: WheelParams) -> Array:
 def make_wheel_from_parameters(
     parameter_values: Array | tuple[Array, ...], n_legs: int, next_slope: Elementwise | None = None
 ) -> WheelParams:
-    """Return the wheel with float parameters in the order of `PARAMETER_NAMES`.
+    """Return a wheel from its floating-point parameters in the order of `PARAMETER_NAMES`.
 
-    - `next_slope`: slope of the next line on uneven ground, rad. With it, the parameter `slope` has
-      both slopes on a leading axis.
+    - `next_slope`: slope of the next line of uneven ground, rad. If it is given, the parameter
+      `slope` has both slopes on a leading axis.
     """
     wheel = WheelParams(**dict(zip(PARAMETER_NAMES, parameter_values, strict=True)), n_legs=n_legs)
     if next_slope is None:

@@ -1,10 +1,10 @@
-"""The three phases of the paper's step (Section 3.3), shared by every engine.
+"""The three phases of the paper's step (Section 3.3 of the paper), shared by every engine.
 
 A phase integrates the first `n_dof` of the coordinates (theta, L1, L2). The other coordinates
-follow from the integrated ones. All functions work elementwise, for one wheel, a batch, or the
-nodes of a collocation. Guards are positive inside the phase and trigger when they fall through
-zero. The first guard marks the regular end of the phase. `reset_motion` maps the motion at that end
-to the initial motion of the next of `PAPER_PHASES`.
+follow from these. All functions work elementwise, for one wheel, a batch, or the nodes of a
+collocation method. Guards are positive inside the phase and trigger when they fall through 0. The
+first guard marks the regular end of the phase. `reset_motion` maps the motion at that end to the
+initial motion of the next phase in `PAPER_PHASES`.
 """
 
 import abc
@@ -33,11 +33,11 @@ from vrw_jax.wheel.rest import are_coordinates_at_rest
 from vrw_jax.wheel.units import compute_wheel_units
 
 SHARED_FAILURE_OUTCOMES = (Outcome.FELL_BACK, Outcome.COLLAPSED, Outcome.LEG_1_LIFTED_OFF)
-"""Outcomes by which every phase can leave the paper's sequence."""
+"""Outcomes with which any phase can end instead of the regular end."""
 
 
 class PhaseMargins(NamedTuple):
-    """Margins of a phase, which do not affect its motion.
+    """Margins of the model's assumptions in a phase. Margins do not affect the motion.
 
     A margin is negative if its assumption is violated.
     """
@@ -51,7 +51,7 @@ class PhaseMargins(NamedTuple):
 
     @classmethod
     def from_values(cls, margin_values: Vector, n_legs: int) -> "PhaseMargins":
-        """Return the margins from the sequence of all margin values."""
+        """Return the margins, taken from the sequence of all margin values."""
         n_locked_legs = n_legs - 2
         fore_foot_force, contraction, friction, *remaining_margin_values = margin_values
         locked_stopper_force, optional_margin_values = (
@@ -65,36 +65,42 @@ class PhaseMargins(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class AbstractPhase(abc.ABC):
-    """Phase of a step of the wheel `s`: equations of motion, guards, margins and reset."""
+    """Phase of a step for the wheel `s`: its equations of motion, guards, margins and reset."""
 
     s: Symbols
     phase_constants: Vector  # constants of the phase: in double support the distance of the feet, m
     stop_at_lift_off: bool  # whether the phase ends when the ground would pull
     tilt_sine_cosine: Vector = ()
-    """Sine and cosine of the angle by which the next line is steeper; empty on flat ground."""
+    """Sine and cosine of the angle by which the next line of the ground is steeper; empty on flat
+    ground.
+    """
 
     name: ClassVar[str]
     n_dof: ClassVar[int]
     """Number of degrees of freedom of the phase."""
     guard_outcomes: ClassVar[tuple[Outcome, ...]]
-    """Outcomes of the guards of `compute_end_guard` and `compute_specific_guards`, in this "
-    "order."""
+    """Outcomes of the guards from `compute_end_guard` and `compute_specific_guards`, in this
+    order.
+    """
     counts_contraction_at_start: ClassVar[bool] = False
     counts_specific_margins_at_start: ClassVar[tuple[bool, ...]] = ()
-    """Whether Leg 1's contraction and the specific margins of this phase count at its start. A
-    margin that is zero at the start by construction does not count."""
+    """Whether Leg 1's contraction and the specific margins of this phase are evaluated at its
+    start. A margin that is 0 at the start by construction is not evaluated there.
+    """
     can_come_to_rest: ClassVar[bool] = False
     """Whether the phase contains a stable equilibrium of the wheel."""
     has_stiff_start: ClassVar[bool] = False
-    """Whether the phase starts with the fast mode of the airborne leg, near c/m, which decays
-    quickly."""
+    """Whether the start of the phase excites the fast mode of the airborne leg. This mode decays at
+    a rate near c/m.
+    """
 
     @abc.abstractmethod
     def complete_motion(
         self, sin_theta: Elementwise, cos_theta: Elementwise, q: Vector, v: Vector
     ) -> Motion:
-        """Return the full motion from the phase's coordinates q, their rates v, and sine and cosine
-        of theta.
+        """Return the full motion.
+
+        It is computed from the phase's coordinates q, their rates v, sin(theta) and cos(theta).
         """
 
     @abc.abstractmethod
@@ -103,7 +109,8 @@ class AbstractPhase(abc.ABC):
 
     @abc.abstractmethod
     def compute_dynamics_residual(self, motion: Motion, phase_acceleration: Vector) -> Vector:
-        """Return the residual of the equations of motion at `phase_acceleration`.
+        """Return the residual of the equations of motion for the accelerations
+        `phase_acceleration`.
 
         The residual is linear in the accelerations. Its derivative costs far less than that of the
         accelerations that satisfy the equations.
@@ -111,24 +118,26 @@ class AbstractPhase(abc.ABC):
 
     @abc.abstractmethod
     def solve_dynamics(self, motion: Motion, right_hand_side: Vector) -> Vector:
-        """Return the accelerations for which the linear part of the residual equals
+        """Return the accelerations for which the linear part of the residual is
         `right_hand_side`.
         """
 
     @abc.abstractmethod
     def complete_acceleration(self, motion: Motion, phase_acceleration: Vector) -> Acceleration:
-        """Return the accelerations of (theta, L1, L2) from those of the phase's coordinates."""
+        """Return the accelerations of (theta, L1, L2), computed from those of the phase's
+        coordinates.
+        """
 
     @abc.abstractmethod
     def compute_end_guard(self, instant: "PhaseInstant") -> Elementwise:
-        """Return the guard whose zero is the regular end of the phase, m or N.
+        """Return the guard whose root is the regular end of the phase, m or N.
 
         The guard is positive before the end.
         """
 
     @abc.abstractmethod
     def compute_specific_guards(self, instant: "PhaseInstant") -> Vector:
-        """Return the guards that only this phase has, without that of its regular end."""
+        """Return the guards that only this phase has, except that of its regular end."""
 
     @abc.abstractmethod
     def compute_specific_margins(self, instant: "PhaseInstant") -> Vector:
@@ -139,15 +148,15 @@ class AbstractPhase(abc.ABC):
         """Return the motion just after the regular end of the phase."""
 
     def compute_landing_height(self, motion: Motion) -> Elementwise:
-        """Return the height of the next leg's foot above the line on which the foot lands, m.
+        """Return the height of the next foot above the line of the ground on which it lands, m.
 
-        The line begins at the foot of Leg 1. In the frame of the line, the height has the same form
-        as on flat ground.
+        The line begins at the foot of Leg 1. In the frame of this line, the height has the same
+        form as on flat ground.
         """
         return compute_landing_foot_height(self.s, self._rotate_to_next_line(motion))
 
     def compute_landing_rate(self, motion: Motion) -> Elementwise:
-        """Return the time derivative of the height of `compute_landing_height`, m/s."""
+        """Return the time derivative of the height from `compute_landing_height`, m/s."""
         rotated_motion = self._rotate_to_next_line(motion)
         landing_leg = rotate_to_landing_leg(
             self.s, rotated_motion.sin_theta, rotated_motion.cos_theta
@@ -156,7 +165,7 @@ class AbstractPhase(abc.ABC):
         return rotated_motion.dL1 * rotated_motion.cos_theta + lever_arm * rotated_motion.dtheta
 
     def _rotate_to_next_line(self, motion: Motion) -> Motion:
-        """Return the motion in the frame of the next line of the ground."""
+        """Return the motion, expressed in the frame of the next line of the ground."""
         if not self.tilt_sine_cosine:
             return motion
         tilt_sin, tilt_cos = self.tilt_sine_cosine
@@ -166,7 +175,9 @@ class AbstractPhase(abc.ABC):
 
     @property
     def coordinate_units(self) -> Vector:
-        """Return the wheel's units of the phase's coordinates, followed by those of their rates."""
+        """Return the units of the phase's coordinates and then of their rates, computed from the
+        wheel.
+        """
         wheel_units = compute_wheel_units(self.s)
         position_units = (
             jnp.ones_like(wheel_units.length_unit),
@@ -177,7 +188,7 @@ class AbstractPhase(abc.ABC):
         return *position_units[: self.n_dof], *rate_units[: self.n_dof]
 
     def compute_motion(self, q: Vector, v: Vector) -> Motion:
-        """Return the full motion at the phase's coordinates q and their rates v."""
+        """Return the full motion for the phase's coordinates q and their rates v."""
         return self.complete_motion(*compute_sine_cosine(q[0]), q, v)
 
     def compute_rear_force(self, motion: Motion, acceleration: Acceleration) -> FootForce | None:
@@ -185,8 +196,9 @@ class AbstractPhase(abc.ABC):
         return None
 
     def compute_guards(self, instant: "PhaseInstant") -> Vector:
-        """Return all guard values: first those of this phase, then those of
-        `SHARED_FAILURE_OUTCOMES`.
+        """Return the values of all guards.
+
+        The guards of this phase come first, those of `SHARED_FAILURE_OUTCOMES` last.
         """
         m = instant.motion
         guard_values = (
@@ -205,7 +217,7 @@ class AbstractPhase(abc.ABC):
         )
 
     def compute_margins(self, instant: "PhaseInstant") -> Vector:
-        """Return all margin values, in the order of `PhaseMargins`."""
+        """Return the values of all margins, in the order of `PhaseMargins`."""
         s, m = self.s, instant.motion
         locked_stopper_force = dynamics.compute_stopper_force(
             s, m, instant.acceleration, range(3, s.n + 1)
@@ -223,7 +235,7 @@ class AbstractPhase(abc.ABC):
 
     @property
     def margins_counted_at_start(self) -> tuple[bool, ...]:
-        """Return a flag for each margin: whether the margin counts at the start of the phase."""
+        """Return one flag per margin: whether the margin is evaluated at the start of the phase."""
         are_stoppers_counted = (True,) * (self.s.n - 2)
         return (
             True,
@@ -238,7 +250,7 @@ class AbstractPhase(abc.ABC):
     ) -> Array:
         """Return the `Outcome` of a phase that ended at the guard with index `guard_index`.
 
-        The regular end gives STEPPED. An index of -1 means that no guard ended the phase.
+        The regular end has the outcome STEPPED. An index of -1 means that no guard ended the phase.
         """
         outcome = jnp.full_like(guard_index, Outcome.SOLVER_FAILED)
         for known_guard_index, guard_outcome in enumerate(self.all_guard_outcomes):
@@ -246,9 +258,9 @@ class AbstractPhase(abc.ABC):
         return jnp.where(is_timed_out, jnp.int32(Outcome.NO_TOUCHDOWN_IN_TIME), outcome)
 
     def is_at_rest(self, q: Vector, v: Vector, atol: Elementwise) -> Bool[Array, "..."]:
-        """Return whether the wheel is at rest at the coordinates q with the rates v.
+        """Return whether the wheel is at rest in the state (q, v).
 
-        - `atol`: absolute tolerance in the wheel's units.
+        - `atol`: absolute tolerance in the wheel's own units.
         """
         q, v = lax.stop_gradient((q, v))
         acceleration = self.solve_acceleration(self.compute_motion(q, v))[: self.n_dof]
@@ -259,13 +271,13 @@ class AbstractPhase(abc.ABC):
 
     @classmethod
     def select_coordinates(cls, theta: Elementwise, motion: Motion) -> tuple[Vector, Vector]:
-        """Return coordinates and rates of the phase from a motion at the angle `theta`."""
+        """Return the phase's coordinates and their rates for a motion at the angle `theta`."""
         q, v = (theta, motion.L1, motion.L2), (motion.dtheta, motion.dL1, motion.dL2)
         return q[: cls.n_dof], v[: cls.n_dof]
 
 
 class PhaseInstant:
-    """State of a phase at one time. Forces are computed when they are first read.
+    """State of a phase at one instant. Forces are computed on first access.
 
     - `phase_acceleration`: accelerations of the phase's coordinates. None means the accelerations
       that satisfy the equations of motion.
@@ -297,8 +309,9 @@ class PhaseInstant:
 
 
 class DoubleSupport(AbstractPhase):
-    """DLS, with the coordinate theta: the hub moves on a circle until the rear foot lifts off
-    (Section 3.3.1).
+    """DLS, with the coordinate theta. The hub moves on a circle until the rear foot lifts off.
+
+    See Section 3.3.1 of the paper.
     """
 
     name, n_dof = "DLS", 1
@@ -310,11 +323,13 @@ class DoubleSupport(AbstractPhase):
     def _compute_hub_circle(
         self, sin_theta: Elementwise, cos_theta: Elementwise
     ) -> DoubleSupportCircle:
-        """Return leg lengths and their derivatives on the hub's circle, at an angle of Leg 1."""
+        """Return the leg lengths and their derivatives on the hub's circle, for an angle of Leg
+        1.
+        """
         return compute_double_support_circle(self.s, self.phase_constants[0], sin_theta, cos_theta)
 
     def _compute_equation(self, motion: Motion) -> dynamics.SingleDofEquation:
-        """Return the equation of motion with the hub on its circle."""
+        """Return the equation of motion for a hub on its circle."""
         return dynamics.compute_double_support_equation(self.s, self.phase_constants[0], motion)
 
     def complete_motion(
@@ -355,13 +370,16 @@ class DoubleSupport(AbstractPhase):
         return ()
 
     def reset_motion(self, motion: Motion) -> Motion:
-        """Return the motion unchanged, because the rear foot leaves the ground at rest."""
+        """Return the motion unchanged, because the rear foot is at rest when it leaves the
+        ground.
+        """
         return motion
 
 
 class SingleSupport1(AbstractPhase):
-    """SLS-I, with the coordinates (theta, L1, L2): Leg 2 moves freely until it meets its stopper
-    (Section 3.3.2).
+    """SLS-I, with the coordinates (theta, L1, L2). Leg 2 moves freely until it meets its stopper.
+
+    See Section 3.3.2 of the paper.
     """
 
     name, n_dof = "SLS-I", 3
@@ -406,8 +424,9 @@ class SingleSupport1(AbstractPhase):
 
 
 class SingleSupport2(AbstractPhase):
-    """SLS-II, with the coordinates (theta, L1): Leg 2 is on its stopper until touchdown (Section
-    3.3.3).
+    """SLS-II, with the coordinates (theta, L1). Leg 2 is on its stopper until touchdown.
+
+    See Section 3.3.3 of the paper.
     """
 
     name, n_dof = "SLS-II", 2
@@ -447,8 +466,9 @@ class SingleSupport2(AbstractPhase):
         return compute_rear_foot_height(s, m), *rear_stopper_force
 
     def reset_motion(self, motion: Motion) -> Motion:
-        """Return the motion unchanged, because `transitions.resolve_landing` of the next step
-        resolves the touchdown.
+        """Return the motion unchanged.
+
+        The next step begins with the touchdown, which `transitions.resolve_landing` computes.
         """
         return motion
 
@@ -460,8 +480,7 @@ PAPER_PHASES: tuple[type[AbstractPhase], ...] = (DoubleSupport, SingleSupport1, 
 def make_phases(
     s: Symbols, foot_distance: Elementwise, stop_at_lift_off: bool, tilt_sine_cosine: Vector = ()
 ) -> tuple[AbstractPhase, ...]:
-    """Return the three phases of a step with an initial distance of `foot_distance` m between the
-    feet.
+    """Return the three phases of a step that begins with feet `foot_distance` m apart.
 
     - `tilt_sine_cosine`: see `AbstractPhase.tilt_sine_cosine`.
     """

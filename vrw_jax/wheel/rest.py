@@ -1,7 +1,8 @@
-"""Detection of wheels at rest among those whose step has ended without a touchdown.
+"""Detection of wheels at rest after a step has ended without a touchdown.
 
-Round-off decides which guard ends the step of a wheel at rest, or whether any guard does. The
-outcome therefore depends only on the state at the end, and is the same with every engine.
+For a wheel at rest, round-off decides which guard ends the step, or whether any guard does. The
+outcome therefore depends only on the state at the end of the step. It is the same with every
+engine.
 """
 
 import functools
@@ -15,27 +16,31 @@ from vrw_jax.numerics import Elementwise
 from vrw_jax.wheel.outcomes import Outcome
 
 POSSIBLE_OUTCOMES_AT_REST = (Outcome.FELL_BACK, Outcome.NO_TOUCHDOWN_IN_TIME, Outcome.SOLVER_FAILED)
-"""Outcomes by which the step of a wheel at rest can end."""
+"""Outcomes with which a step can end before the wheel is recognized to be at rest."""
 
 MAX_REST_SPEED = 1e-8
-"""Largest speed of a wheel at rest, in the wheel's units, chosen because it is a thousand times the
-error of a solver step at the default tolerances."""
+"""Largest speed of a wheel at rest, in the wheel's own units. The value is chosen because it is a
+thousand times the error of a solver step at the default tolerances.
+"""
 REST_SPEED_PER_ATOL = 10.0
-"""Factor of the absolute tolerance that also bounds the speed of a wheel at rest. The value is
-chosen because the errors of solver steps stay below one tolerance."""
+"""Upper bound on the speed of a wheel at rest, divided by the absolute tolerance. The larger of
+this bound and `MAX_REST_SPEED` is used. The value is chosen because the errors of solver steps stay
+below one tolerance.
+"""
 MAX_REST_ACCELERATION = 1e-4
-"""Largest acceleration of a wheel at rest, in the wheel's units. The value is chosen between two
-others. Errors of the accelerations of stiff legs are below 1e-5. Accelerations of wheels that fall
-back are near 1."""
+"""Largest acceleration of a wheel at rest, in the wheel's own units. The value is chosen because it
+lies between two scales: errors of the accelerations of stiff legs are below 1e-5, and accelerations
+of wheels that fall back are near 1.
+"""
 
 
 def are_rates_negligible(
     coordinate_rates: Iterable[Elementwise], rate_units: Iterable[Elementwise], atol: Elementwise
 ) -> Bool[Array, "..."]:
-    """Return whether all rates are zero, to the accuracy of the solver steps.
+    """Return whether all rates are 0 within the accuracy of the solver steps.
 
-    - `rate_units`: unit of each rate for this wheel;
-    - `atol`: absolute tolerance in units of the wheel.
+    - `rate_units`: the wheel's own unit of each rate;
+    - `atol`: absolute tolerance in the wheel's own units.
     """
     max_speed = jnp.maximum(MAX_REST_SPEED, REST_SPEED_PER_ATOL * atol)
     return _are_quantities_small(coordinate_rates, rate_units, max_speed)
@@ -50,8 +55,8 @@ def are_coordinates_at_rest(
 ) -> Bool[Array, "..."]:
     """Return whether rates and accelerations of all coordinates are negligible.
 
-    - `rate_units`, `time_unit`: units of the rates and of time for this wheel;
-    - `atol`: absolute tolerance in units of the wheel.
+    - `rate_units`, `time_unit`: the wheel's own units of the rates and of time;
+    - `atol`: absolute tolerance in the wheel's own units.
     """
     max_acceleration = MAX_REST_ACCELERATION / time_unit
     return are_rates_negligible(coordinate_rates, rate_units, atol) & _are_quantities_small(
@@ -64,7 +69,7 @@ def _are_quantities_small(
     quantity_units: Iterable[Elementwise],
     max_value_in_units: Elementwise,
 ) -> Bool[Array, "..."]:
-    """Return whether every quantity is at most `max_value_in_units` times its unit."""
+    """Return whether the absolute value of every quantity is at most `max_value_in_units` units."""
     is_quantity_small = [
         jnp.abs(x) <= max_value_in_units * quantity_unit
         for x, quantity_unit in zip(quantities, quantity_units, strict=True)
@@ -75,7 +80,9 @@ def _are_quantities_small(
 def replace_rest_outcome(
     step_outcome: Int[Array, "..."], is_at_rest: Bool[Array, "..."]
 ) -> Int[Array, "..."]:
-    """Return the outcomes of steps, with CAME_TO_REST for wheels that are at rest at the end."""
+    """Return the outcomes of steps. The outcome is CAME_TO_REST if the wheel is at rest at the
+    end.
+    """
     has_rest_outcome = functools.reduce(
         operator.or_,
         [step_outcome == possible_outcome for possible_outcome in POSSIBLE_OUTCOMES_AT_REST],

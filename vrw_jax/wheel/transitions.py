@@ -1,4 +1,5 @@
-"""Collisions between the phases: the landing of a foot, and Leg 2 at its stopper.
+"""Collisions between the phases: the landing of a foot, and the collision of Leg 2 with its
+stopper.
 
 The landing follows Section 3.4.1 of the paper with the procedure of Section 5.1. The collision with
 the stopper follows Section 3.4.2.
@@ -35,14 +36,14 @@ from vrw_jax.wheel.params import Symbols
 
 
 class Landing(NamedTuple):
-    """Motion just after the landing of a foot, with impulses and energy loss."""
+    """Motion just after the landing of a foot, with the impulses and the energy loss."""
 
     theta_after: Elementwise  # rad, in the leg labels of the starting step
     motion_after: Motion  # just after the impact
     foot_distance: Elementwise  # D, between both feet, m
     is_rear_foot_planted: Bool[Array, "..."]  # whether lambda_I4 >= 0: (A4), else (A3)
     fore_impulse: FootForce  # (lambda_I1, lambda_I2), N s, of the actual impact
-    rear_impulse: FootForce  # (lambda_I3, lambda_I4), N s, with both feet held (A1)
+    rear_impulse: FootForce  # (lambda_I3, lambda_I4), N s, if both feet stay on the ground (A1)
     energy_loss: Elementwise  # J
     hub_velocity_jump: tuple[
         Elementwise, Elementwise
@@ -52,7 +53,7 @@ class Landing(NamedTuple):
 def compute_motion_before_landing(
     s: Symbols, theta: Elementwise, dtheta: Elementwise, dL1: Elementwise
 ) -> Motion:
-    """Return the motion just before a landing, from (theta-, dtheta-, dL1-).
+    """Return the motion just before a landing, computed from (theta-, dtheta-, dL1-).
 
     Leg 2 is on its stopper, and the next foot is on the ground.
     """
@@ -62,7 +63,9 @@ def compute_motion_before_landing(
 
 
 class _BothFeetLanding(NamedTuple):
-    """Landing after which both feet are on the ground (A1), with intermediate results."""
+    """Landing after which both feet are on the ground (eq. A1 of the paper), with intermediate
+    results.
+    """
 
     motion_before: Motion
     motion_after: Motion
@@ -80,7 +83,7 @@ class _BothFeetLanding(NamedTuple):
 def _solve_both_feet_landing(
     s: Symbols, theta: Elementwise, dtheta: Elementwise, dL1: Elementwise
 ) -> _BothFeetLanding:
-    """Return the landing with both feet held on the ground (A1)."""
+    """Compute a landing in which both feet stay on the ground (eq. A1 of the paper)."""
     motion_before = compute_motion_before_landing(s, theta, dtheta, dL1)
     L1_before = motion_before.L1
     # The velocity of the landing foot follows eqs (16), (17) with the rate of L1 before the impact.
@@ -108,7 +111,7 @@ def _solve_both_feet_landing(
         rear_leg.sin * foot_velocity_x + rear_leg.cos * foot_velocity_z
     )
 
-    # (A1) With both feet held, the hub can only move on its circle.
+    # (A1) If both feet stay on the ground, the hub can only move on its circle.
     foot_distance = s.L0 * s.sin_alpha / rear_leg.cos
     hub_circle = compute_double_support_circle(s, foot_distance, sin, cos)
     momentum_per_circle_rate = M.multiply_vector(
@@ -146,18 +149,18 @@ def _solve_both_feet_landing(
 def resolve_two_foot_landing(
     s: Symbols, theta: Elementwise, dtheta: Elementwise, dL1: Elementwise
 ) -> tuple[Elementwise, Elementwise]:
-    """Return (theta+, dtheta+) just after a landing with both feet on the ground, rad and rad/s."""
+    """Return (theta+, dtheta+) just after a landing on both feet, rad and rad/s."""
     return theta - s.alpha, _solve_both_feet_landing(s, theta, dtheta, dL1).motion_after.dtheta
 
 
 def resolve_landing(
     s: Symbols, theta: Elementwise, dtheta: Elementwise, dL1: Elementwise
 ) -> Landing:
-    """Return the result of the exchange of legs and of the inelastic landing, eqs (15)-(21),
-    (A1)-(A4).
+    """Compute the inelastic landing and exchange the leg labels, eqs (15)-(21), (A1)-(A4) of the
+    paper.
 
-    The arguments theta, dtheta, dL1 are the section state just before touchdown, in the leg labels
-    of the ending step. The result uses the leg labels of the starting step.
+    The arguments theta, dtheta and dL1 are the section state just before touchdown, in the leg
+    labels of the step that ends. The result uses the leg labels of the step that starts.
     """
     (
         motion_before,
@@ -182,7 +185,7 @@ def resolve_landing(
     )
     is_rear_foot_planted = rear_impulse.normal >= 0.0
 
-    # (A3) With only the landing foot held, M rates = p.
+    # (A3) If only the landing foot stays on the ground, M rates = p.
     rates_without_rear_foot = solve_unconstrained_dynamics(s, s.L0, EquationTerms(M, p1, p2, p3))
     motion_after = motion_on_both_feet._replace(
         dtheta=jnp.where(is_rear_foot_planted, dtheta_both_feet, rates_without_rear_foot.ddtheta),
@@ -218,7 +221,7 @@ def resolve_landing(
 
 
 def lock_leg_2(s: Symbols, motion_before: Motion) -> Motion:
-    """Return the motion after the collision of Leg 2, at L2 = L0, with its stopper."""
+    """Return the motion just after Leg 2 hits its stopper. The collision is at L2 = L0."""
     M = compute_mass_matrix(s, motion_before.L1, motion_before.L2)
     return motion_before._replace(
         dtheta=motion_before.dtheta + M.M13 * motion_before.dL2 / M.M11,
@@ -228,7 +231,9 @@ def lock_leg_2(s: Symbols, motion_before: Motion) -> Motion:
 
 
 class StopperCollision(NamedTuple):
-    """Motion just after the collision of Leg 2 with its stopper, with impulses and energy loss."""
+    """Motion just after the collision of Leg 2 with its stopper, with the impulses and the energy
+    loss.
+    """
 
     motion_after: Motion  # just after the impact, L2 = L0 exactly
     stopper_impulse: Elementwise  # on the mass of Leg 2, towards the hub, N s
@@ -238,10 +243,10 @@ class StopperCollision(NamedTuple):
 
 
 def resolve_stopper_collision(s: Symbols, motion: Motion) -> StopperCollision:
-    """Return the result of the inelastic collision of Leg 2 with its stopper at L2 = L0, eqs
-    (22)-(25).
+    """Compute the inelastic collision of Leg 2 with its stopper at L2 = L0.
 
-    M12 vanishes at this length, so the impact needs only two divisions.
+    The equations are (22)-(25) of the paper. M12 vanishes at this length, so the impact needs only
+    two divisions.
     """
     motion_before = motion._replace(L2=s.L0 + 0.0 * motion.L2)
     motion_after = lock_leg_2(s, motion_before)
@@ -263,7 +268,9 @@ def resolve_stopper_collision(s: Symbols, motion: Motion) -> StopperCollision:
 
 
 def compute_hub_velocity(motion: Motion) -> tuple[Elementwise, Elementwise]:
-    """Return the velocity of the hub along (x, z), m/s, with the foot of Leg 1 at rest."""
+    """Return the velocity of the hub in the directions x and z, m/s, with the foot of Leg 1 at
+    rest.
+    """
     transverse_velocity = motion.L1 * motion.dtheta
     return (
         motion.dL1 * motion.sin_theta + transverse_velocity * motion.cos_theta,
@@ -274,7 +281,7 @@ def compute_hub_velocity(motion: Motion) -> tuple[Elementwise, Elementwise]:
 def compute_hub_velocity_jump(
     motion_before: Motion, motion_after: Motion
 ) -> tuple[Elementwise, Elementwise]:
-    """Return the jump of the hub's velocity along (x, z), m/s."""
+    """Return the jump of the hub's velocity in the directions x and z, m/s."""
     (x, z), (velocity_after_x, velocity_after_z) = (
         compute_hub_velocity(motion_before),
         compute_hub_velocity(motion_after),
@@ -288,7 +295,7 @@ def compute_locked_leg_impulses(
     hub_jump: tuple[Elementwise, Elementwise],
     leg_numbers: range,
 ) -> Float[Array, "n_legs_asked ..."]:
-    """Return the impulse of the stopper on the mass of each of `leg_numbers`, N s.
+    """Return the impulse that the stopper exerts on the mass of each leg of `leg_numbers`, N s.
 
     The impulse follows from the jump of the hub's velocity. It is negative if the collision throws
     the leg off its stopper, because the preload of a spring resists no impulse.
@@ -304,9 +311,9 @@ def compute_locked_leg_impulses(
 
 
 def compute_landing_forces(s: Symbols, landing: Landing) -> tuple[FootForce, FootForce]:
-    """Return the fore and the rear foot force just after a landing with both feet planted, N.
+    """Return the forces on the fore and the rear foot just after a landing on both feet, N.
 
-    The forces follow (B1) and eq. (38).
+    The forces follow (B1) and eq. (38) of the paper.
     """
     hub_circle = compute_double_support_circle(
         s, landing.foot_distance, landing.motion_after.sin_theta, landing.motion_after.cos_theta

@@ -1,8 +1,9 @@
-"""Units of length, time and mass of a wheel, in which numerical options are stated.
+"""Units of length, time and mass that are derived from each wheel. Numerical options use these
+units.
 
-The tolerances and time limits of a step refer to a wheel with Table 1's length, mass and gravity.
-In its own units, every wheel has the size of Table 1's wheel. Therefore no result depends on the
-units of the parameters.
+The tolerances and time limits of a step refer to a wheel with the length, mass and gravity of Table
+1 of the paper. In its own units, every wheel has the size of that wheel. Therefore no result
+depends on the units of the parameters.
 """
 
 from typing import Any, NamedTuple
@@ -22,23 +23,24 @@ from vrw_jax.wheel.params import (
 )
 
 TABLE_1_LENGTH_M = 1.0
-"""Length of a locked leg of the wheel whose units are those of SI, chosen because the defaults of
-`StepOptions` are for the wheel of Table 1."""
+"""Locked leg length of the wheel whose own units are those of SI. The value is chosen because the
+defaults of `StepOptions` are for the wheel of Table 1 of the paper.
+"""
 TABLE_1_GRAVITY_M_PER_S2 = 9.81
-"""Gravity of the wheel whose units are those of SI."""
+"""Gravity of the wheel whose own units are those of SI."""
 TABLE_1_MASS_KG = 18.0
-"""Total mass of the wheel whose units are those of SI."""
+"""Total mass of the wheel whose own units are those of SI."""
 
 
 class WheelUnits(NamedTuple):
-    """Units of length, time and mass of a wheel, as SI numbers without derivatives."""
+    """A wheel's own units of length, time and mass, in SI units and without derivatives."""
 
     length_unit: Any  # m
     time_unit: Any  # s
     mass_unit: Any  # kg
 
     def compute_unit_in_si(self, si_unit: str) -> Elementwise:
-        """Return the wheel's unit of a quantity as an SI number.
+        """Return the wheel's own unit of a quantity, in SI units.
 
         - `si_unit`: SI unit of the quantity, such as "N s/m".
         """
@@ -49,28 +51,26 @@ class WheelUnits(NamedTuple):
 
     @property
     def velocity_unit(self) -> Elementwise:
-        """Return the wheel's unit of velocity, m/s."""
+        """Return the wheel's own unit of velocity, m/s."""
         return self.length_unit / self.time_unit
 
     @property
     def rate_unit(self) -> Elementwise:
-        """Return the wheel's unit of angular velocity, rad/s."""
+        """Return the wheel's own unit of angular velocity, rad/s."""
         return 1.0 / self.time_unit
 
     @property
     def acceleration_unit(self) -> Elementwise:
-        """Return the wheel's unit of acceleration, m/s^2."""
+        """Return the wheel's own unit of acceleration, m/s^2."""
         return self.velocity_unit / self.time_unit
 
     @property
     def energy_unit(self) -> Elementwise:
-        """Return the wheel's unit of energy, J."""
+        """Return the wheel's own unit of energy, J."""
         return self.mass_unit * self.velocity_unit * self.velocity_unit
 
     def scale_times_to_seconds(self, options: StepOptions) -> StepOptions:
-        """Return step options with times in seconds, from options with times in the wheel's
-        unit.
-        """
+        """Convert the times in step options from the wheel's own unit to seconds."""
         time_selector = lambda o: (o.max_phase_time, o.dt0)
         return eqx.tree_at(
             time_selector, options, tuple(self.time_unit * x for x in time_selector(options))
@@ -78,7 +78,9 @@ class WheelUnits(NamedTuple):
 
 
 def compute_wheel_units(s: Symbols) -> WheelUnits:
-    """Return the units of a wheel. For Table 1's wheel they are exactly 1 m, 1 s and 1 kg."""
+    """Return a wheel's own units. For the wheel of Table 1 of the paper, they are exactly 1 m, 1 s
+    and 1 kg.
+    """
     length_ratio, gravity_ratio = s.L0 / TABLE_1_LENGTH_M, s.g / TABLE_1_GRAVITY_M_PER_S2
     return lax.stop_gradient(
         WheelUnits(length_ratio, jnp.sqrt(length_ratio / gravity_ratio), s.Mt / TABLE_1_MASS_KG)
@@ -86,8 +88,9 @@ def compute_wheel_units(s: Symbols) -> WheelUnits:
 
 
 def convert_to_wheel_units(params: WheelParams) -> WheelParams:
-    """Return `params` in the wheel's own units, which is a similar wheel with Table 1's length,
-    gravity and mass.
+    """Return `params` in the wheel's own units.
+
+    The result is a similar wheel with the length, gravity and mass of Table 1 of the paper.
     """
     wheel_units = compute_wheel_units(params.symbols())
     return WheelParams(
@@ -101,7 +104,7 @@ def convert_to_wheel_units(params: WheelParams) -> WheelParams:
 
 
 def compute_wheel_units_of_rows(parameter_rows: np.ndarray, n_legs: int) -> WheelUnits:
-    """Return the units of many wheels, computed by NumPy. The units of an invalid wheel are 1.
+    """Return the units of many wheels, computed with NumPy. The units of an invalid wheel are 1.
 
     - `parameter_rows`: parameters of each wheel in the order of `PARAMETER_NAMES`.
     """
