@@ -169,7 +169,7 @@ def take_gait_step(
     """Return the minimal results of one walking step per batch element, from touchdown to
     touchdown.
 
-    - `x`: section state of each lane;
+    - `x`: section state of each batch element;
     - `straggler_count`: see `integrate_batch_phase`.
     """
     phase_sequence = run_batch_phases(

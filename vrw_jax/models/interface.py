@@ -71,7 +71,7 @@ class AbstractWheel(eqx.Module):
 
     @property
     def fallback_model(self) -> "AbstractWheel":
-        """Return the model that can take a step from any start.
+        """Return the model that is valid for any start.
 
         It is the most general model of a ladder of models; any other model returns itself.
         """

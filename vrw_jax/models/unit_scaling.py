@@ -50,17 +50,6 @@ class UnitScalingPowers(NamedTuple):
         return scaled_output
 
 
-def _make_unit_scaling(unit_index: int) -> UnitScalingPowers:
-    """Return the exponents of one unit in the units of inputs and outputs. The index is 0 for
-    length, 1 for time and 2 for mass.
-    """
-    input_and_output_powers = (
-        tuple(UNIT_POWERS[unit_name][unit_index] for unit_name in unit_names)
-        for unit_names in (_STEP_INPUT_UNITS, (*_SECTION_STATE_UNITS, "s", "s", "s"))
-    )
-    return UnitScalingPowers(*input_and_output_powers)
-
-
 LENGTH_UNIT_SCALING, TIME_UNIT_SCALING, MASS_UNIT_SCALING = (
     UnitScalingPowers(
         *(
