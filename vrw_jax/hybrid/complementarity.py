@@ -1,6 +1,4 @@
-"""All solutions of a linear complementarity problem (LCP) of unilateral contacts, by
-enumeration.
-"""
+"""Enumerate all solutions of a linear complementarity problem (LCP) for unilateral contacts."""
 
 import itertools
 from collections.abc import Sequence
@@ -16,8 +14,9 @@ from vrw_jax.numerics import StatusCode
 from vrw_jax.validation import has_traced_leaf
 
 MAX_LCP_CONTACTS = 10
-"""Largest number of contacts of an LCP, chosen because the enumeration solves two to that power
-linear systems.
+"""Largest number of contacts in an LCP.
+
+For n contacts, the enumeration solves 2^n linear systems. The value is chosen to limit this number.
 """
 
 
@@ -43,11 +42,14 @@ class LCPSolutions(NamedTuple):
 def enumerate_lcp_solutions(
     matrix: ArrayLike | Sequence, free_gap: ArrayLike | Sequence, tolerance: float = 1e-12
 ) -> LCPSolutions:
-    """Return all solutions of an LCP with a square matrix, symmetric or not.
+    """Return all solutions of w = `matrix` z + `free_gap`, z >= 0, w >= 0, z . w = 0.
 
-    `matrix` has the shape (n, n) and `free_gap` the shape (n,). Signs are accurate to `tolerance`
-    times the largest number of the problem. Solutions with the same forces count once. The result
-    is differentiable as long as the same solution exists.
+    The unknowns are the forces z and the gaps w.
+
+    `matrix` has the shape (n, n) and need not be symmetric. `free_gap` has the shape (n,). Values
+    are compared with zero to within `tolerance`, relative to the largest force or gap. Solutions
+    with the same forces are counted once. The result is differentiable as long as the same contacts
+    are closed. A wrong shape or a value that is not finite raises a ValueError.
     """
     free_gap = jnp.asarray(free_gap, float)
     matrix = jnp.asarray(matrix, free_gap.dtype)

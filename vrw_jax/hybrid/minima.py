@@ -1,7 +1,8 @@
-"""Minima of margins along a phase, as accurate as the integration.
+"""Minima of margins during a phase, as accurate as the integration.
 
-During the integration, the step that contains the lowest minimum of each margin is stored.
-Afterwards, secant steps on the margin's rate locate the minimum, one margin after another.
+During the integration, the solver step that contains the lowest minimum of each margin is stored.
+Afterwards, a secant iteration for the root of the margin's time derivative locates each minimum.
+The margins are refined one after another.
 """
 
 from collections.abc import Callable
@@ -15,22 +16,27 @@ from vrw_jax.numerics import MINIMUM_LOCATION_TOLERANCE, Scalar, find_cubic_mini
 
 StateArray = Float[Array, " dim"]
 EvaluateMonitored = Callable[[StateArray], Float[Array, " n_watched"]]
-"""Function of the state that returns guards and margins."""
+"""Function that returns the values of all guards, followed by all margins, at a state."""
 
 
 class MonitoredFunctions(NamedTuple):
-    """Functions that are evaluated along a phase: guards, which end the phase, and margins, whose
-    minima are computed.
+    """Guards and margins that the integration evaluates during a phase.
 
-    - `evaluate_monitored`: function of the state that returns the guards, then the margins;
-    - `includes_start`: whether each margin counts at the start of the phase. A margin that is zero
-      there by construction does not count, such as the height of a foot that leaves the ground. All
-      margins count at interior minima and at the end;
+    A guard ends the phase when it falls to zero. The integration computes the minimum of each
+    margin over the phase.
+
+    - `evaluate_monitored`: function that returns the guards, followed by the margins, at a state;
+    - `n_guards`: number of guards;
+    - `includes_start`: whether the minimum of each margin includes its value at the start of the
+      phase. The value is False for a margin that is zero there by construction, such as the height
+      of a foot that leaves the ground. Interior minima and the value at the end are always
+      included;
     - `guard_scales`: magnitude of the terms whose difference is the guard. A guard within some
-      round-offs of this magnitude counts as zero, because a guard that is negative only for
+      round-offs of this magnitude is treated as zero, because a guard that is negative only for
       microseconds has no better root;
-    - `is_zero_at_start`: whether each guard counts as zero at the start in spite of round-off. With
-      None, a guard counts as zero if it is exactly zero or within round-off of its scale.
+    - `is_zero_at_start`: whether each guard is treated as zero at the start in spite of round-off.
+      If the field is None, a guard is treated as zero if its value is 0 or within round-off of its
+      scale.
     """
 
     evaluate_monitored: EvaluateMonitored
@@ -41,9 +47,9 @@ class MonitoredFunctions(NamedTuple):
 
 
 GUARD_ROUNDOFF_IN_EPS = 32.0
-"""Round-off of a guard's value, in units of the round-off of its scale.
+"""Largest round-off error of a guard, in units of the machine epsilon times the guard's scale.
 
-It is chosen because a guard is a sum of several terms, each with its own round-off.
+The value is chosen because a guard is a sum of several terms, each with its own round-off.
 """
 
 
@@ -52,7 +58,10 @@ def is_guard_at_roundoff(
     is_crossing: Bool[Array, " n_guards"],
     guard_values: Float[Array, " n_guards"],
 ) -> tuple[Bool[Array, ""], Int[Array, ""]]:
-    """Return whether the lowest of the crossing guards is zero up to round-off, and its index."""
+    """Return whether the lowest crossing guard is zero within round-off, and its index.
+
+    Guards are compared after division by their scales.
+    """
     guard_scales = (
         jnp.ones_like(guard_values)
         if monitored_functions.guard_scales is None
@@ -72,12 +81,12 @@ def find_guards_met_at_start(
     guard_values: Float[Array, " n_guards"],
     guard_rates: Float[Array, " n_guards"],
 ) -> tuple[Bool[Array, " n_guards"], Bool[Array, " n_guards"]]:
-    """Return whether each guard ends the phase at its start, and whether it falls through zero
-    there.
+    """Return whether each guard ends the phase at the start, and whether it falls there.
 
-    A guard that ends the phase without falling through zero is below zero, or stays at zero. Its
-    event time does not depend on the start state. `guard_rates` are the time derivatives of the
-    guards.
+    A guard ends the phase at the start if it is negative, or if it is zero and its time derivative
+    is not positive. The second flag is True if such a guard is zero with a negative time
+    derivative. Only then does the event time depend on the start state. `guard_rates` are the time
+    derivatives of the guards.
     """
     ends_phase = (guard_values < 0.0) | ((guard_values == 0.0) & (guard_rates <= 0.0))
     is_guard_zero = guard_values == 0.0
@@ -93,7 +102,7 @@ def find_guards_met_at_start(
 
 
 class AcceptedPhaseStep(NamedTuple):
-    """End of the last accepted solver step of a phase, with the monitored functions there."""
+    """State, guards and margins at the end of the last accepted solver step."""
 
     end_time: Scalar
     state: StateArray
@@ -107,34 +116,35 @@ class InteriorMinimum(NamedTuple):
 
     minimum_values: Float[Array, " n"]
     start_state: Float[Array, "n dim"]
-    step_length: Float[Array, " n"]  # length of the step from its start, s
-    time_to_minimum: Float[Array, " n"]  # time from the step's start to the minimum, s
+    step_length: Float[Array, " n"]  # length of the solver step, s
+    time_to_minimum: Float[Array, " n"]  # time from the start of the solver step, s
     start_margin_rates: Float[Array, " n"]
 
     @property
     def has_minimum(self) -> Bool[Array, " n"]:
-        """Return whether each margin has an interior minimum, (margins,)."""
+        """Return whether each margin has an interior minimum, shape (margins,)."""
         return jnp.isfinite(self.minimum_values)
 
 
 class MinimumRefinement(NamedTuple):
-    """State of the secant iterations that refine the minima after the integration.
+    """State of the secant iterations that refine the minima of the margins after the integration.
 
-    Each iteration is on the rate of one margin, and the margins follow one another.
+    The iterations find the time at which the time derivative of one margin is zero. They treat one
+    margin after another.
     """
 
     margin_index: Int[Array, ""]
     n_iterations: Int[Array, ""]
-    best_step_length: Scalar  # time from the step's start with the smallest rate so far, s
+    best_step_length: Scalar  # time from the step's start at which the rate was smallest, s
     best_margin_rate: Scalar
-    # refined minima, and before them the values at the phase's start
+    # refined minima; before the refinement, the margins at the phase's start
     lowest_margin_values: Float[Array, " n"]
 
 
 def make_empty_interior_minimum(
     monitored_functions: MonitoredFunctions, start: StateArray
 ) -> InteriorMinimum:
-    """Return the interior minima before the first solver step: no margin has a minimum."""
+    """Return an `InteriorMinimum` in which no margin has a minimum yet."""
     n_margins = len(monitored_functions.includes_start)
     zero_margins = jnp.zeros((n_margins,), start.dtype)
     return InteriorMinimum(
@@ -154,11 +164,14 @@ def update_interior_minimum(
     length: Scalar,
     is_step_counted: Bool[Array, ""],
 ) -> InteriorMinimum:
-    """Return the interior minima, updated with the minima inside one solver step.
+    """Return the lowest interior minima after one more solver step from `step_start` to `step_end`.
 
-    A margin has a minimum inside the step if its rate changes from negative to positive. The rate
-    of a margin that is zero at the start of the phase by construction is also zero there, so that a
-    negative rate is round-off and counts as zero.
+    - `length`: duration of the solver step, s;
+    - `is_step_counted`: whether the step is part of the phase. If False, nothing changes.
+
+    A margin has a minimum inside the step if its time derivative changes from negative to positive.
+    A margin that is zero at the start of the phase by construction cannot fall there. Its negative
+    time derivative at the start is round-off and is replaced by zero.
     """
     if not monitored_functions.includes_start:
         return interior_minimum
@@ -198,7 +211,7 @@ def update_interior_minimum(
 
 
 def select_entry_by_mask(entry_index: Int[Array, ""], stacked_entries: Array) -> Array:
-    """Return the entry at an index of the first axis, computed as a masked sum.
+    """Return the entry of `stacked_entries` at `entry_index` on the first axis, using a masked sum.
 
     In a batch, the masked sum is cheaper than a gather.
     """
@@ -223,13 +236,20 @@ def advance_minimum_refinement(
     max_iterations: int,
     min_tries: int = 3,
 ) -> tuple[MinimumRefinement, Bool[Array, ""], Scalar]:
-    """Return the next state of the refinement, whether another step is needed, and its length, s.
+    """Return the next refinement state, whether another solver step is needed, and its length, s.
 
-    After the integration, secant steps on its rate locate the minimum of each margin. Each secant
-    step is a solver step of `length` from the start of the step that contains the minimum. The flag
-    `is_refining` is True if `tried_step` was such a step. At least `min_tries` and at most
-    `max_iterations` steps are taken. A least number is required because each step makes the
-    derivatives of the location accurate to more digits.
+    After the integration, a secant iteration finds the time at which the time derivative of each
+    margin is zero. Each iteration takes a solver step of `length` from the start of the solver step
+    that contains the minimum.
+
+    - `tried_step`: end of the last solver step;
+    - `is_refining`: whether `tried_step` was such an iteration;
+    - `begins_refinement`: whether `tried_step` is the start of the phase, where the margins are
+      stored;
+    - `is_phase_end`: whether the integration has ended, so that the first margin is refined next;
+    - `max_iterations`, `min_tries`: largest and smallest number of iterations per margin. The
+      smallest number is required because each iteration makes the derivatives of the minimum's time
+      accurate to more digits.
     """
     margin_values = tried_step.monitored_values[monitored_functions.n_guards :]
     margin_rates = tried_step.monitored_rates[monitored_functions.n_guards :]

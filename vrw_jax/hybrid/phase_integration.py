@@ -1,10 +1,10 @@
-"""Integration of one phase from its start to its earliest event by diffrax.
+"""Integrate one phase with diffrax from its start to its earliest event.
 
-diffrax's solvers and step-size controller are called step by step, so that an event's state has the
-accuracy of the integrator and not of an interpolant. An accepted step that brackets an event is
-repeated with a length that Newton's method corrects until the step ends on the event. These last
-steps are differentiated, so first and second derivatives of the event's state and time are accurate
-as well.
+The solvers and the step-size controller of diffrax are called for one solver step at a time. The
+state at an event therefore has the accuracy of the integrator and not of an interpolant. An
+accepted solver step that brackets an event is repeated. Newton's method corrects the length of the
+repeated step until the step ends at the event. Derivatives pass through these last steps, so first
+and second derivatives of the event's state and time are accurate as well.
 """
 
 from __future__ import annotations
@@ -49,11 +49,11 @@ else:
     diffrax = lazy_import("diffrax")
 
 VectorField = Callable[[StateArray], StateArray]
-"""Autonomous vector field of a phase: the time derivative of the state."""
+"""Autonomous vector field of a phase: function that returns the time derivative of the state."""
 
 
 class PhaseEnd(NamedTuple):
-    """End of a phase: state, duration, index of the triggered guard, and failure flags."""
+    """State at the end of a phase, duration, triggered guard, and failure flags."""
 
     state: StateArray
     duration: Scalar  # duration of the phase, s
@@ -65,7 +65,7 @@ class PhaseEnd(NamedTuple):
 
 
 class StepPurpose(IntEnum):
-    """Code of the purpose of the next solver step."""
+    """Purpose of the next solver step."""
 
     START = 0  # A step of length zero evaluates the start.
     INTEGRATION = 1
@@ -76,48 +76,58 @@ class StepPurpose(IntEnum):
 
 @dataclass(frozen=True)
 class EventSearchOptions:
-    """Options of the search for an event inside a solver step, and of the growth of steps."""
+    """Options of the search for an event, and of the growth of solver steps."""
 
     max_step_growth: float = 2.0
-    """Largest ratio of the lengths of successive solver steps. The error estimate of a step far
-    shorter than needed is round-off, and a length derived from that estimate would grow without
-    bound. A batch element would then differ from the same element alone by 1e-12. The value is
-    chosen to avoid this difference, which is more than a hundred times the element's round-off."""
+    """Largest ratio of the lengths of successive solver steps.
+
+    The error estimate for a solver step far shorter than needed is round-off. A length derived from
+    that estimate would grow without bound. The results for a system in a batch and alone would then
+    differ by 1e-12, more than a hundred times the round-off. The value is chosen to avoid this
+    difference.
+    """
     n_required_confirmations: int = 3
-    """Number of tries at the located event that must confirm the event's time. The value is chosen
-    because the first try makes the event's time accurate to first order in its derivatives and the
-    second to third order. The last try evaluates the state at the event."""
+    """Number of solver steps to the located event that must confirm the event's time.
+
+    The value is chosen because of the derivatives of the event's time. The first step makes them
+    accurate to first order, the second to third order. The last step evaluates the state at the
+    event.
+    """
     max_confirmed_length_change: float = 1e-4
-    """Largest change of the event's time by a try that confirms it, as a fraction of the phase's
-    duration. The value is chosen because Newton's method squares the change in each of the next two
-    tries, to 1e-16 in the last try."""
+    """Largest correction of the event's time by a Newton iteration that confirms this time.
+
+    The correction is relative to the duration of the phase. The value is chosen because Newton's
+    method squares the correction in each of the next two iterations, to 1e-16 in the last.
+    """
     min_stalled_change_ratio: float = 0.9
-    """Ratio of successive changes of the event's time above which the change is round-off. The
-    value is chosen because Newton's method at least halves changes, and reduces them to two thirds
-    at a triple root."""
+    """Ratio of successive corrections of the event's time above which a correction is round-off.
+
+    The value is chosen because Newton's method at least halves the corrections. The exception is a
+    triple root, at which it reduces them to two thirds.
+    """
 
 
 EVENT_SEARCH_OPTIONS = EventSearchOptions()
 
 
 class _EventSearch(NamedTuple):
-    """State of Newton's search for the earliest event inside a solver step."""
+    """State of the Newton iteration that locates the earliest event inside a solver step."""
 
     is_guard_crossing: Bool[Array, " n_guards"]
-    lower_length_bound: Scalar  # bracket of the event, s from the step's start
+    lower_length_bound: Scalar  # bracket of the event's time, s from the start of the solver step
     upper_length_bound: Scalar
     time_tolerance: Scalar  # tolerance of the event's time, s
     n_iterations: Int[Array, ""]
-    n_confirmed_proposals: Int[Array, ""]  # number of tries that confirmed the event's time
-    last_length_change: Scalar  # change of the event's time by the last try, s
+    n_confirmed_proposals: Int[Array, ""]  # number of solver steps that confirmed the time
+    last_length_change: Scalar  # last correction of the event's time, s
 
 
 class _PhaseState(NamedTuple):
     """State of the loop that integrates a phase."""
 
     step_purpose: Int[Array, ""]  # a StepPurpose
-    accepted_step: AcceptedPhaseStep  # the last accepted step
-    next_step_length: Scalar  # length of the next step to try, s
+    accepted_step: AcceptedPhaseStep  # the last accepted solver step
+    next_step_length: Scalar  # length of the next solver step, s
     controller_state: Any
     event_search: _EventSearch
     interior_minimum: InteriorMinimum
@@ -129,7 +139,7 @@ class _PhaseState(NamedTuple):
 
 
 class _SolverStepper(NamedTuple):
-    """Pair of a diffrax solver and a step-size controller, for single steps of one vector field."""
+    """diffrax solver and step-size controller for single solver steps in one vector field."""
 
     vector_field: VectorField
     diffrax_solver: diffrax.AbstractAdaptiveSolver
@@ -139,7 +149,7 @@ class _SolverStepper(NamedTuple):
     def init_solver_and_controller(
         self, state: StateArray, options: StepOptions
     ) -> tuple[Any, Any]:
-        """Return the initial states of diffrax's solver and step-size controller."""
+        """Return the initial internal states of diffrax's solver and step-size controller."""
         zero_time = jnp.zeros((), state.dtype)
         _, controller_state = self.step_size_controller.init(
             self.ode_term,
@@ -154,15 +164,16 @@ class _SolverStepper(NamedTuple):
         return self.init_solver_state(state, options), controller_state
 
     def init_solver_state(self, state: StateArray, options: StepOptions) -> Any:
-        """Return the internal state of diffrax's solver at a state of the system."""
+        """Return the internal state of diffrax's solver for a start at `state`."""
         zero_time = jnp.zeros((), state.dtype)
         return self.diffrax_solver.init(self.ode_term, zero_time, options.dt0, state, None)
 
     def take_solver_step(
         self, state: StateArray, solver_state: Any, length: Scalar
     ) -> tuple[StateArray, StateArray, Any]:
-        """Return the state after a step of `length`, s, its error estimate, and the internal state
-        of the solver.
+        """Return the state after a solver step of `length`, s, and its error estimate.
+
+        The third result is the new internal state of the solver.
         """
         zero_time = jnp.zeros_like(length)
         end_state, error_estimate, _, solver_state, solver_result = self.diffrax_solver.step(
@@ -186,10 +197,10 @@ class _SolverStepper(NamedTuple):
         length: Scalar,
         controller_state: Any,
     ) -> tuple[Bool[Array, ""], Scalar, Any]:
-        """Return whether the error of a step is within tolerance, the length of the next step, s,
-        and the state of the controller.
+        """Return whether the error of a solver step is acceptable, and the next step length, s.
 
-        The results have no derivatives, because only the steps that were taken are differentiated.
+        The third result is the new state of the controller. The results have no derivatives,
+        because only the solver steps are differentiated.
         """
         start_state, end_state, error_estimate = lax.stop_gradient(
             (start_state, end_state, error_estimate)
@@ -215,7 +226,10 @@ class _SolverStepper(NamedTuple):
 
 
 def make_solver(name: str, options: StepOptions) -> diffrax.AbstractAdaptiveSolver:
-    """Return the diffrax solver with this name, configured for forward-mode derivatives."""
+    """Return the diffrax solver called `name`, configured for forward-mode derivatives.
+
+    An unknown name, or a solver without an error estimate, raises a ValueError.
+    """
     diffrax_solver_class = getattr(diffrax, name, None)
     if not (
         isinstance(diffrax_solver_class, type)
@@ -236,7 +250,7 @@ def make_solver(name: str, options: StepOptions) -> diffrax.AbstractAdaptiveSolv
 
 
 def _make_stepper(field: VectorField, options: StepOptions, max_growth: float) -> _SolverStepper:
-    """Return a solver and a step-size controller for a vector field, as given by the options.
+    """Return the solver and step-size controller that `options` select for a vector field.
 
     `max_growth` is the largest ratio of successive step lengths.
     """
@@ -258,17 +272,18 @@ def integrate_phase(
     options: StepOptions,
     event_options: EventSearchOptions = EVENT_SEARCH_OPTIONS,
 ) -> PhaseEnd:
-    """Return the end of the phase that begins at `start` and ends at the first zero of a guard.
+    """Return the end of the phase that begins at `start` and ends when a guard first falls to zero.
 
     A guard that is negative at the start, or zero and not rising, ends the phase immediately with
     duration 0. A guard that is zero and rising does not end the phase. If a guard falls through
     zero at the start, the event time has a derivative. This derivative is minus the guard's
-    derivative with respect to the start, divided by the guard's rate.
+    derivative with respect to the start, divided by the guard's time derivative.
 
-    A guard may be negative only inside a step. If the cubic through its values and rates may be
-    negative, the step is repeated up to the minimum of the cubic. Of two guards that are zero at
-    the same time, the first in the list ends the phase. If `is_active` is False, nothing is
-    integrated. Errors are those of the solver at the tolerances of `options`.
+    The integration also detects a guard that is negative only inside a solver step. If the cubic
+    through the guard's values and time derivatives may be negative, the solver step is repeated up
+    to the minimum of the cubic. If two guards are zero at the same time, the first in the list ends
+    the phase. If `is_active` is False, nothing is integrated. Errors are those of the solver for
+    the tolerances of `options`.
     """
     solver_stepper = _make_stepper(field, options, event_options.max_step_growth)
     phase_context = _PhaseContext(solver_stepper, monitored_functions, options, event_options)
@@ -295,7 +310,7 @@ def integrate_phase(
 
 
 class _PhaseContext(NamedTuple):
-    """Arguments of the integration loop that are constant during a phase."""
+    """Arguments of the integration loop that do not change during a phase."""
 
     solver_stepper: _SolverStepper
     monitored_functions: MonitoredFunctions
@@ -306,11 +321,10 @@ class _PhaseContext(NamedTuple):
 def _init_phase_state(
     phase_context: _PhaseContext, start_state: StateArray, is_active: Bool[Array, ""]
 ) -> _PhaseState:
-    """Return the state of the integration loop before the first step.
+    """Return the state of the integration loop before the first solver step.
 
-    All numbers that the loop will batch or differentiate are batched or differentiated from the
-    start. Otherwise JAX would trace the loop again whenever one more number becomes batched or
-    differentiated.
+    All arrays that the loop batches or differentiates are batched or differentiated from the start.
+    Otherwise JAX would trace the loop again for each array that becomes batched or differentiated.
     """
     solver_stepper, monitored_functions, options, _ = phase_context
     zero_time = 0.0 * start_state[0]
@@ -358,8 +372,9 @@ def _init_phase_state(
 
 
 def _advance_phase_state(phase_context: _PhaseContext, phase_state: _PhaseState) -> _PhaseState:
-    """Return the loop state after one solver step, with updated searches for the event and for
-    minima.
+    """Return the loop state after one solver step.
+
+    The searches for the event and for minima of margins are updated.
     """
     _, monitored_functions, options, event_options = phase_context
     n_guards, event_search = monitored_functions.n_guards, phase_state.event_search
@@ -506,10 +521,9 @@ def _advance_phase_state(phase_context: _PhaseContext, phase_state: _PhaseState)
 def _try_solver_step(
     phase_context: _PhaseContext, phase_state: _PhaseState
 ) -> tuple[AcceptedPhaseStep, Array]:
-    """Return the end of one tried solver step, with the monitored functions there, and the error
-    estimate.
+    """Return the end of one tried solver step with guards and margins, and the error estimate.
 
-    The same call of solver and monitored functions is used for every purpose of a step, so that
+    All purposes of a solver step share this call of the solver and of the monitored functions, so
     this code is compiled once.
     """
     solver_stepper, monitored_functions, options, _ = phase_context
@@ -545,7 +559,7 @@ def _try_solver_step(
 
 
 class _StepAssessment(NamedTuple):
-    """Result of the examination of a tried solver step."""
+    """Acceptance of a tried solver step, crossing guards, and length of the next step."""
 
     is_accepted: Bool[Array, ""]  # whether the step is accepted; the start is
     has_guard_crossed: Bool[Array, ""]  # whether the step brackets an event
@@ -563,9 +577,9 @@ def _assess_solver_step(
     tried_step: AcceptedPhaseStep,
     error_estimate: Array,
 ) -> _StepAssessment:
-    """Return whether the tried step is accepted, whether a guard crosses zero, and the next length.
+    """Return whether a solver step is accepted, which guards cross zero, and the next length.
 
-    A guard may cross zero at the end of the step or inside the step.
+    A guard may cross zero at the end of the solver step or inside it.
     """
     solver_stepper, monitored_functions, options, _ = phase_context
     n_guards = monitored_functions.n_guards
@@ -634,11 +648,11 @@ def _find_guard_minima(
     length: Scalar,
     n_guards: int,
 ) -> tuple[Array, Array]:
-    """Return the fraction of the step to each guard's minimum, and whether each guard may be
-    negative.
+    """Return each guard's minimum as a fraction of the solver step, and a flag per guard.
 
-    The cubic through values and rates is nowhere below the smallest of its Bernstein coefficients,
-    so that a guard with positive coefficients stays positive. Otherwise the step is repeated up to
+    The flag is True if the guard may be negative inside the step. The cubic through the guard's
+    values and time derivatives is nowhere below the smallest of its Bernstein coefficients. A guard
+    with positive coefficients therefore stays positive. Otherwise the solver step is repeated up to
     the minimum of the cubic, at most nine tenths of the step. In shorter steps, the coefficients
     are closer to the guard. The repetition ends when the coefficients are positive or the guard is
     negative at the end of a step.
@@ -675,9 +689,10 @@ def _guess_event_length(
     n_guards: int,
     is_guard_crossing: Array,
 ) -> Scalar:
-    """Return the time from the step's start to the earliest zero of the crossing guards' cubics, s.
+    """Return the time from the start of a solver step to the earliest root of a guard, s.
 
-    The zero is located by the secant, then by Newton's method.
+    Each guard is approximated by the cubic through its values and time derivatives. The secant
+    method, followed by Newton's method, locates the root of the cubic.
     """
     start_guards, start_rates, end_guards, end_rates = lax.stop_gradient(
         (
@@ -738,8 +753,9 @@ def _guess_event_length(
 
 
 class _EventProposal(NamedTuple):
-    """Next proposal of Newton's method for the time of an event, and the remaining bracket, s from
-    the step's start.
+    """Next estimate of an event's time by Newton's method, and the remaining bracket.
+
+    The times are in s from the start of the solver step.
     """
 
     proposed_step_length: Scalar
@@ -751,10 +767,11 @@ class _EventProposal(NamedTuple):
 def _propose_event_time(
     event_search: _EventSearch, guard_values: Array, guard_rates: Array, length: Scalar
 ) -> _EventProposal:
-    """Return the earliest of the event times that Newton's method proposes for the crossing guards.
+    """Return the earliest event time that Newton's method proposes for the crossing guards.
 
-    Bisection keeps the proposal inside the shrinking bracket. The proposal carries derivatives:
-    after k proposals in the quadratic regime, derivatives are accurate to order 2^k - 1.
+    A proposal outside the bracket is replaced by the bracket's midpoint. The proposal has
+    derivatives. After k proposals in the range of quadratic convergence, derivatives are accurate
+    to order 2^k - 1.
     """
     is_guard_falling = event_search.is_guard_crossing & (guard_rates < 0.0)
     time_to_zero = -guard_values / jnp.where(is_guard_falling, guard_rates, -1.0)
@@ -798,10 +815,9 @@ def _propose_event_time(
 def sample_phase(
     field: VectorField, start: StateArray, duration: Scalar, n_samples: int, options: StepOptions
 ) -> Float[Array, "n_samples dim"]:
-    """Return the states at `n_samples` equally spaced times of a phase, at the accuracy of the
-    solver.
+    """Return the states at `n_samples` equally spaced times of a phase, as accurate as the solver.
 
-    The first and the last sample are at the ends of the phase.
+    The first sample is `start` and the last is the state after `duration`, s.
     """
     solver_stepper = _make_stepper(field, options, EVENT_SEARCH_OPTIONS.max_step_growth)
     sample_interval = duration / (n_samples - 1)
@@ -820,9 +836,9 @@ def _integrate_sample_interval(
     sampled_duration: Scalar,
     options: StepOptions,
 ) -> StateArray:
-    """Return the state after the time `sampled_duration`, s, integrated by adaptive steps.
+    """Return the state after `sampled_duration`, s, integrated with adaptive solver steps.
 
-    The last step ends exactly at this time.
+    The last solver step ends exactly at this time.
     """
 
     def take_interval_step(loop_carry: tuple) -> tuple:

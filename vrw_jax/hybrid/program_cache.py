@@ -1,9 +1,10 @@
 """Cache of compiled programs, in which equal functions share one program.
 
-Examples are the functions of a user's modes. Outside of `jax.jit` JAX compiles a loop again at each
-call if its body closes over functions, and keeps each program. The cache compares functions by
-their code and by the values to which they refer. Equal functions share a program, whether or not
-they are the same object. A function with another constant has another program.
+The cache serves functions of users, such as the vector fields and guards of modes. Outside of
+`jax.jit`, JAX compiles a loop again at each call if its body closes over functions, and stores each
+program. The cache compares functions by their code and by the values to which they refer. Equal
+functions share a program, even if they are different objects. Functions with different constants
+have different programs.
 """
 
 import dataclasses
@@ -21,29 +22,37 @@ import numpy as np
 from vrw_jax.numerics import is_inside_jit
 
 MAX_CACHED_PROGRAMS = 32
-"""Largest number of programs that are kept. The value is chosen because a program takes some
-14 MB."""
+"""Largest number of programs in the cache.
+
+The value is chosen because a program occupies about 14 MB.
+"""
 
 MAX_HASHED_ARRAY_BYTES = 1_000_000
-"""Largest size in bytes of a JAX array that is compared by content. The value is chosen because a
-copy to the host and its digest then take a millisecond. Larger arrays are compared by identity."""
+"""Largest size in bytes of a JAX array that the cache compares by content.
+
+Larger arrays are compared by identity. The value is chosen because a copy to the host and its
+digest then take a millisecond.
+"""
 
 UNCHANGING_PACKAGES = frozenset({"jax", "jaxlib", "numpy", "vrw_jax"}) | sys.stdlib_module_names
-"""Packages whose functions, classes and modules are compared by identity. They are chosen because
-users do not change them while a process runs."""
+"""Packages whose functions, classes and modules are compared by identity.
+
+They are chosen because users do not change them while a process runs.
+"""
 
 _program_by_key: OrderedDict[Hashable, Callable] = OrderedDict()
 
 
 class _UncacheableFunctionError(Exception):
-    """Error for a function without a key, which refers to a traced value or to an object that can
-    change unnoticed.
+    """Error for a function without a key.
+
+    Such a function refers to a traced value or to an object that can change unnoticed.
     """
 
 
 @dataclasses.dataclass(frozen=True)
 class _IdentityKey:
-    """Key of an object that is compared by identity.
+    """Key for an object that the cache compares by identity.
 
     The key contains the object, so that its address is not reused.
     """
@@ -61,12 +70,11 @@ class _IdentityKey:
 
 
 def call_compiled_program(function: Callable, constants: Any, *arguments: Any) -> Any:
-    """Return `function(constants, *arguments)`, computed by one compiled program for equal
-    `constants`.
+    """Return `function(constants, *arguments)`, computed by a compiled program.
 
-    `constants` is a tree of functions and values. A function that refers to a traced value or to an
-    object that can change unnoticed is compiled for this call alone. Inside `jax.jit` the function
-    becomes part of the caller's program.
+    `constants` is a tree of functions and values. Calls with equal `constants` share one program. A
+    function that refers to a traced value or to an object that can change unnoticed is compiled for
+    this call alone. Inside `jax.jit` the function becomes part of the caller's program.
     """
     if is_inside_jit():
         return function(constants, *arguments)
@@ -75,11 +83,11 @@ def call_compiled_program(function: Callable, constants: Any, *arguments: Any) -
 
 
 def find_program(function: Callable, constants: Any, *arguments: Any) -> Callable | None:
-    """Return the compiled program for equal `constants` and arguments of these types, or None if no
-    key exists.
+    """Return the compiled program for equal `constants`, or None if they have no key.
 
-    The key contains the types of the arguments. Each program is therefore traced once, when
-    `constants` has the values from which the key is made.
+    No key exists inside `jax.jit`, or if `constants` refers to a traced value or to an object that
+    can change unnoticed. The key contains the types of the arguments. Each program is therefore
+    traced once, when `constants` has the values from which the key is made.
     """
     if is_inside_jit():
         return None
@@ -98,10 +106,10 @@ def find_program(function: Callable, constants: Any, *arguments: Any) -> Callabl
 
 
 def _make_key(keyed_value: Any, enclosing_ids: frozenset) -> Hashable:
-    """Return the key of a value. Equal keys belong to values that lead to the same program.
+    """Return a hashable key for a value. Values with equal keys lead to the same program.
 
-    - `enclosing_ids`: identities of the objects that contain the value. A reference to one of them
-      raises `_UncacheableFunctionError`.
+    - `enclosing_ids`: identities of the objects that contain the value. A reference to one of these
+      objects raises `_UncacheableFunctionError`.
     """
     if isinstance(keyed_value, jax.core.Tracer) or id(keyed_value) in enclosing_ids:
         raise _UncacheableFunctionError
@@ -165,14 +173,12 @@ def _make_key(keyed_value: Any, enclosing_ids: frozenset) -> Hashable:
 
 
 def _is_in_unchanging_package(module_name: str | None) -> bool:
-    """Return whether the module of the given name belongs to a package that users do not change."""
+    """Return whether `module_name` is a module of a package in `UNCHANGING_PACKAGES`."""
     return (module_name or "").split(".")[0] in UNCHANGING_PACKAGES
 
 
 def _make_class_key(value_type: type, enclosing_ids: frozenset) -> Hashable:
-    """Return the key of a class. The key of a user's class contains those of its methods and
-    constants.
-    """
+    """Return the key for a class. The key for a user's class contains its methods and constants."""
     if _is_in_unchanging_package(value_type.__module__):
         return _IdentityKey(value_type)
     class_attributes = {
@@ -186,7 +192,7 @@ def _make_class_key(value_type: type, enclosing_ids: frozenset) -> Hashable:
 
 
 def _make_function_key(function: types.FunctionType, enclosing_ids: frozenset) -> Hashable:
-    """Return the key of a function: its code, and the keys of all values to which it refers."""
+    """Return the key for a function: its code, and the keys for all values to which it refers."""
     if _is_in_unchanging_package(function.__module__) and not function.__closure__:
         return _IdentityKey(function)
     global_names = {
@@ -206,9 +212,9 @@ def _make_function_key(function: types.FunctionType, enclosing_ids: frozenset) -
 
 
 def _make_scope_key(objects_by_name: dict, names: set[str], enclosing_ids: frozenset) -> Hashable:
-    """Return the keys of the objects with these names, together with the names.
+    """Return pairs of name and key for those `names` that occur in `objects_by_name`.
 
-    A module is replaced by its objects with these names.
+    The key for a user's module contains the module's objects with these names.
     """
 
     def make_entry_key(value: Any) -> Hashable:
@@ -226,7 +232,7 @@ def _make_scope_key(objects_by_name: dict, names: set[str], enclosing_ids: froze
 
 
 def _iterate_code_objects(code_object: types.CodeType) -> Iterator[types.CodeType]:
-    """Return a code object and the code objects of all functions that are defined inside it."""
+    """Yield a code object and the code objects of all functions that are defined inside it."""
     yield code_object
     for code_constant in code_object.co_consts:
         if isinstance(code_constant, types.CodeType):

@@ -14,16 +14,16 @@ from vrw_jax.numerics import StepOptions
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class ReturnMap:
-    """Map from section coordinates to the section coordinates after `events` events of a
-    simulation.
+    """Map from section coordinates to the section coordinates after `events` events.
 
-    The map is NaN if the simulation ends early, so that its last state is not used as a return.
-    `solve_fixed_point` returns the termination with the fixed point.
+    The map returns NaN if the simulation ends early, so that its last state is not taken for a
+    return. `solve_fixed_point` reports the termination of the simulation in addition to the fixed
+    point.
 
     - `modes`: modes of the system, as in `simulate_hybrid`;
     - `embed`: function from section coordinates to the state in which the simulation begins;
     - `project`: function from the state after the last event to its section coordinates;
-    - `events`: number of events of one return;
+    - `events`: number of events per return;
     - `mode`: index of the mode in which the simulation begins;
     - `options`: options of the simulation.
     """
@@ -43,7 +43,10 @@ class ReturnMap:
         )
 
     def __call__(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
-        """Return the next section coordinates, shape (n,); NaN if the simulation ended early."""
+        """Return the section coordinates after one return from `x`, shape (n,).
+
+        The result is NaN if the simulation ends early.
+        """
         hybrid_solution = self.simulate(x)
         section_coordinates = self.project(hybrid_solution.state)
         return section_coordinates * jnp.where(
@@ -51,7 +54,7 @@ class ReturnMap:
         ).astype(section_coordinates.dtype)
 
     def find_termination(self, x: Float[Array, " n"], period_n: int = 1) -> Int[Array, ""]:
-        """Return the `Termination` of the first of `period_n` returns that ends early.
+        """Return the `Termination` of the first of `period_n` returns from `x` that ends early.
 
         If no return ends early, the result is the termination of the last return.
         """

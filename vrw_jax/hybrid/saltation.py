@@ -1,5 +1,6 @@
-"""Determinant of the flow's Jacobian through modes and events, by Liouville's formula and saltation
-matrices.
+"""Determinant of the flow's Jacobian over a sequence of modes and events.
+
+The computation uses Liouville's formula and saltation matrices.
 """
 
 from collections.abc import Callable, Sequence
@@ -23,19 +24,27 @@ def flow_jacobian_determinant(
     solution: HybridSolution,
     options: StepOptions | None = None,
 ) -> Scalar:
-    """Return the determinant of the final state's Jacobian with respect to `start`, after the last
-    event.
+    """Return the determinant of the flow's Jacobian from `start` to the last event.
 
-    Each mode contributes the exponential of the integrated divergence of its field (Liouville).
-    Each event contributes the determinant of its saltation matrix (R. I. Leine and H. Nijmeijer,
-    Dynamics and Bifurcations of Non-Smooth Mechanical Systems, 2004, section 7). For an orbit that
-    is periodic after these events, the result is the product of all multipliers, including the
-    multiplier 1 along the orbit. A
-    return map's Jacobian loses the digits of that product if a guard is grazed, because its entries
-    grow as one over the guard's rate.
+    The Jacobian is that of the state after the event's reset with respect to `start`.
 
-    The result is NaN if the solver steps are exhausted. Transforms of JAX apply, except reverse
-    mode.
+    Each mode contributes the exponential of the time integral of its field's divergence
+    (Liouville). Each event contributes the determinant of its saltation matrix (R. I. Leine and H.
+    Nijmeijer, Dynamics and Bifurcations of Non-Smooth Mechanical Systems, 2004, section 7). For an
+    orbit that is periodic after these events, the result is the product of all multipliers. This
+    product includes the multiplier 1 in the direction of the flow.
+
+    The Jacobian of a return map does not yield this product accurately if a guard is grazed. The
+    entries of the Jacobian then grow in inverse proportion to the guard's time derivative.
+
+    The result is NaN if the number of solver steps reaches its limit. All transforms of JAX except
+    reverse mode are supported.
+
+    Args:
+        modes: modes of the system, as in `simulate_hybrid`.
+        start: state at which `solution` begins, shape (dim,).
+        solution: result of `simulate_hybrid`.
+        options: options of the integration.
     """
     options = StepOptions() if options is None else options
     modes, start = convert_modes_to_tuple(modes), check_reals("start", start)
@@ -95,8 +104,9 @@ def _multiply_event_determinants(
 
 
 def _make_event_determinant_function(mode: Mode, guard: Guard, options: StepOptions) -> Callable:
-    """Return a function that computes the factor of the determinant for one mode and the guard that
-    ends the mode.
+    """Return a function that computes one factor of the determinant.
+
+    The factor is that of one phase in `mode` and of the event of `guard` that ends the phase.
     """
 
     def evaluate_flow_and_divergence(z: Array) -> Array:

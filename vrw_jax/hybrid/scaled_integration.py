@@ -1,4 +1,4 @@
-"""Integration of phases in units of the system, in which the options of the solver are given."""
+"""Integrate phases in units of the system, in which the tolerances of the solver are expressed."""
 
 from jax import lax
 from jaxtyping import Array, Bool, Float
@@ -17,11 +17,13 @@ def integrate_in_units(
     state_units: StateArray,
     time_unit: Scalar,
 ) -> PhaseEnd:
-    """Return the result of `integrate_phase` in SI, integrated in other units.
+    """Return the result of `integrate_phase` in SI units, computed in scaled units.
 
-    `state_units` are the units of the state's coordinates, and `time_unit` is in s. The tolerances,
-    the first step and the time limit of `options` are in these units. All other arguments are in
-    SI, including guards and margins.
+    - `state_units`: SI value of one scaled unit for each coordinate of the state;
+    - `time_unit`: scaled unit of time, s.
+
+    The tolerances, the first step length and the time limit of `options` are in scaled units. All
+    other arguments are in SI units, including guards and margins.
     """
     state_units, time_unit = lax.stop_gradient((state_units, time_unit))
     evaluate_in_si = lambda y: monitored_functions.evaluate_monitored(y * state_units)
@@ -46,7 +48,7 @@ def sample_in_units(
     state_units: StateArray,
     time_unit: Scalar,
 ) -> Float[Array, "n_samples dim"]:
-    """Return the states of `sample_phase` in SI, integrated in other units.
+    """Return the result of `sample_phase` in SI units, computed in scaled units.
 
     The arguments are those of `integrate_in_units`.
     """

@@ -1,9 +1,11 @@
-"""Multipliers of a periodic orbit from its segments, without the product of their Jacobians.
+"""Multipliers of a periodic orbit from the Jacobians of its segments.
+
+The product of these Jacobians is not computed.
 
 In a product of matrices, growing directions stay accurate and decaying directions do not. If one
-multiplier is 1 and another 1e-20, the product has no correct digit of the small multiplier.
-Orthogonal iteration around the period makes every factor triangular instead (a periodic Schur
-form). A multiplier is then a product of diagonal entries, each of which is accurate.
+multiplier is 1 and another 1e-20, the product has no correct digit of the small multiplier. An
+orthogonal iteration around the period makes every factor triangular (a periodic Schur form). Each
+multiplier is then a product of diagonal entries, all of which are accurate.
 """
 
 from collections.abc import Sequence
@@ -22,7 +24,7 @@ from vrw_jax.numerics import Scalar, StepOptions, forbid_reverse_mode
 
 
 class FlowSegments(NamedTuple):
-    """A flow divided into segments of equal time."""
+    """Flow of a vector field, divided into segments of equal duration."""
 
     states: Float[Array, "n_ends dim"]  # states at the segments' ends, the start first
     jacobians: Float[
@@ -39,14 +41,21 @@ def segment_maps(
     options: StepOptions,
     n_directions: int | None = None,
 ) -> FlowSegments:
-    """Return the flow of `field` over `duration`, s, in `n_segments` segments, with the Jacobian of
-    each segment.
+    """Return states and Jacobians of the flow of `field`, divided into segments of equal duration.
 
-    The Jacobians are with respect to the first `n_directions` coordinates, by default all. The
-    step-size control includes the errors of derivatives. Each tangent is stored as a direction of
-    about constant length and the logarithm of its growth, so that decaying directions stay
-    accurate. A segment is NaN if its solver steps are exhausted. A coordinate that is a clock comes
-    after all other coordinates and is not a direction.
+    The step-size control includes the errors of derivatives. Each tangent is stored as a direction
+    of nearly constant length and the logarithm of its growth, so that decaying directions stay
+    accurate. A coordinate that measures time comes after all other coordinates and is not a
+    direction. The Jacobian of a segment is NaN if the number of its solver steps reaches the limit.
+
+    Args:
+        field: vector field.
+        start: state at the start, shape (dim,).
+        duration: duration of all segments together, s.
+        n_segments: number of segments.
+        options: options of the integration.
+        n_directions: number of leading coordinates with respect to which the Jacobians are
+            computed, by default all.
     """
     start = jnp.asarray(start, float)
     output_shape = jax.eval_shape(field, start)
@@ -124,30 +133,32 @@ def _integrate_flow_segments(
 
 
 class ProductMultipliers(NamedTuple):
-    """Eigenvalues of a product of matrices, the largest modulus first."""
+    """Eigenvalues of a product of matrices, in order of decreasing modulus."""
 
     values: np.ndarray  # eigenvalues, complex; NaN if `is_known` is False
-    logarithms: np.ndarray  # logarithms of their moduli, finite even if the value underflows
-    relative_error: np.ndarray  # estimated relative error
+    logarithms: np.ndarray  # logarithms of the moduli, finite even if an eigenvalue underflows
+    relative_error: np.ndarray  # estimated relative errors
     is_known: np.ndarray  # whether the relative error is within `accuracy`
 
 
 N_SCHUR_SWEEPS = 60
-"""Largest number of sweeps around the period.
+"""Largest number of orthogonal iterations around the period.
 
-It is chosen because moduli that differ by a factor of two are then separated to the last digit.
-Closer moduli stay together in one block, whose product loses few digits.
+The value is chosen because moduli that differ by a factor of two are then separated to the last
+digit. Closer moduli stay together in one block, whose product loses few digits.
 """
 
 
 def product_multipliers(
     jacobians: ArrayLike | Sequence, accuracy: float = 1e-6, tolerance: float = 1e-15
 ) -> ProductMultipliers:
-    """Return the eigenvalues of jacobians[-1] @ ... @ jacobians[0], and whether each eigenvalue has
-    the relative `accuracy`.
+    """Return the eigenvalues of jacobians[-1] @ ... @ jacobians[0], with estimated errors.
 
-    `jacobians` has the shape (n_segments, n, n), and `tolerance` is the error of a Jacobian
-    relative to its norm. The function accepts concrete matrices only.
+    Args:
+        jacobians: concrete matrices, shape (n_segments, n, n).
+        accuracy: largest relative error with which an eigenvalue is returned. An eigenvalue with a
+            larger error is NaN.
+        tolerance: error of each Jacobian relative to its norm.
     """
     jacobians = np.asarray(jacobians, float)
     if jacobians.ndim != 3 or jacobians.shape[1] != jacobians.shape[2] or not jacobians.size:
@@ -205,9 +216,7 @@ def _compute_block_multipliers(
     jacobian_norms: np.ndarray,
     tolerance: float,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the multipliers of one diagonal block, the logarithms of their moduli, and relative
-    errors.
-    """
+    """Return the multipliers of one diagonal block, logarithms of moduli, and relative errors."""
     diagonal_blocks = triangular_factors[:, block_slice, block_slice]
     block_size = block_slice.stop - block_slice.start
     diagonal = np.abs(np.diagonal(diagonal_blocks, axis1=1, axis2=2))

@@ -32,12 +32,15 @@ from vrw_jax.runtime import with_default_jax_settings
 from vrw_jax.validation import check_callable, check_int, check_reals, check_type
 
 MAX_STORED_NUMBERS = 100_000_000
-"""Largest amount of numbers stored in the events of a simulation. The value is chosen because
-times, states before and states after then take 2.4 GB."""
+"""Largest product of the number of events and the dimension of the state.
+
+The value is chosen because the times, the states before and the states after the events then occupy
+2.4 GB.
+"""
 
 
 class Guard(NamedTuple):
-    """Guard function `value` with the reset and the next mode of its event.
+    """Guard function `value`, with the reset and the next mode that follow its event.
 
     The function `value` of the state is positive inside its mode. The mode ends when `value` falls
     to zero. Then `reset` is applied to the state, and the mode with the index `target_mode` begins.
@@ -51,8 +54,8 @@ class Guard(NamedTuple):
 class Mode(NamedTuple):
     """Autonomous vector field, from shape (dim,) to (dim,), and the guards that end the mode.
 
-    A single guard may be given without a tuple. If the field depends on time, time is one of its
-    coordinates.
+    A single guard may be passed without a tuple. If the field depends on time, time is one of the
+    coordinates of the state.
     """
 
     field: VectorField
@@ -81,26 +84,24 @@ class Termination(StatusCode):
 
 
 STATUS_RUNNING_CODE = -1
-"""Code of a simulation that has not ended, stored in place of its `Termination`."""
+"""Termination code of a simulation that has not ended. It is no member of `Termination`."""
 
 
 class HybridSolution(NamedTuple):
-    """Events of a simulation in order of time, and its end.
+    """Events of a simulation in order of time, and the final state of the simulation.
 
     Entries after the first `n_events` events are zero.
     """
 
     times: Float[Array, " events"]
     time_tolerance: Float[Array, " events"]
-    """Error of each event's time that corresponds to the tolerances of the state; it is no
-    bound.
-    """
+    """Error of each event's time due to the tolerances of the state, s. It is no bound."""
     time_roundoff: Float[Array, " events"]
-    """Error of each event's time that corresponds to the round-off of the state."""
+    """Error of each event's time due to the round-off of the state, s."""
     states_before: Float[Array, "events dim"]  # states on the guard
     states_after: Float[Array, "events dim"]  # states after the reset
     modes: Int[Array, " events"]  # indices of the modes that ended
-    guards: Int[Array, " events"]  # indices of the guards that ended them
+    guards: Int[Array, " events"]  # indices of the guards that ended the modes
     n_events: Int[Array, ""]
     time: Scalar  # time of the last state
     state: StateArray  # state at the end of the simulation
@@ -110,7 +111,7 @@ class HybridSolution(NamedTuple):
 
     @property
     def ending(self) -> Any:
-        """Return a sentence about the end of the simulation; for a batch, an array of sentences."""
+        """Return a sentence on how the simulation ended; for a batch, an array of sentences."""
         return describe_step_ending(self.termination, Termination)
 
 
@@ -123,16 +124,23 @@ def simulate_hybrid(
     mode: int = 0,
     options: StepOptions | None = None,
 ) -> HybridSolution:
-    """Return the simulation of `modes` from `start` through at most `events` events.
+    """Return the simulation that starts at `start` and passes through at most `events` events.
 
-    `mode` is the index of the first mode. `integrate_phase` locates the earliest event of each mode
-    at the accuracy of the integrator, with derivatives of its time and state. At the start of a
-    mode, a guard counts as zero if its time of zero is within round-off. A guard that is zero with
-    a zero rate there ends the mode only if it will not rise.
+    `integrate_phase` locates the earliest event of each mode as accurately as the integrator, with
+    derivatives of the event's time and state. At the start of a mode, a guard is treated as zero if
+    its root is within round-off of the start time. If the guard's time derivative is also zero, the
+    guard ends the mode unless its second time derivative is positive.
 
-    The transforms `jax.jit`, `jax.jacfwd` and `jax.vmap` are supported; reverse mode is not. A
-    single mode, and the only guard of a mode, may be given without a tuple. Outside of `jax.jit`,
-    functions with equal code and equal constants share a compiled program.
+    The transforms `jax.jit`, `jax.jacfwd` and `jax.vmap` are supported; reverse mode is not.
+    Outside of `jax.jit`, functions with equal code and equal constants share a compiled program.
+
+    Args:
+        modes: modes of the system. A single mode, and a single guard of a mode, may be passed
+            without a tuple.
+        start: state at the start, shape (dim,).
+        events: largest number of events.
+        mode: index of the first mode.
+        options: options of the integration.
     """
     options = StepOptions() if options is None else options
     check_type("options", options, StepOptions, "give vrw.StepOptions()")
@@ -151,20 +159,24 @@ def time_errors(
     solution: HybridSolution,
     options: StepOptions | None = None,
 ) -> Float[Array, " events"]:
-    """Return estimated errors of the event times, s, shape (events,), from simulations at two
-    looser tolerances.
+    """Return estimated errors of the event times, s, shape (events,).
 
     The simulation is repeated with tolerances that are ten and a hundred times as large. The change
-    of each event's time is divided by the `time_tolerance` of that event. The estimate of an event
-    is twice the largest ratio of this and all earlier events, at least 1, times its
-    `time_tolerance`. The estimate is not below the sum of the round-off of all states and of the
-    time.
+    of each event's time is divided by the `time_tolerance` of that event. Ratios below 1 are
+    replaced by 1. The estimate for an event is twice its `time_tolerance` times the largest ratio
+    for this and all earlier events. The estimate is at least the sum of the round-off of all states
+    and of the time.
 
-    Unlike `time_tolerance`, the estimate contains errors of steps that add up and errors of earlier
-    events. The estimate also contains errors that an implicit solver's own estimate omits in a
+    Unlike `time_tolerance`, the estimate includes the accumulated errors of solver steps and of
+    earlier events. It also includes errors that the error estimate of an implicit solver omits in a
     stiff field. The estimate is infinite from the first event that the simulation at ten times the
-    tolerance does not reach. The estimate is measured and has no proof. `options` are those of the
-    simulation.
+    tolerance does not reach. The estimate is no proven bound.
+
+    Args:
+        modes: modes of the system, as in `simulate_hybrid`.
+        start: state at which `solution` begins, shape (dim,).
+        solution: result of `simulate_hybrid`.
+        options: options with which `solution` was computed.
     """
     options = StepOptions() if options is None else options
     modes = convert_modes_to_tuple(modes)
@@ -175,7 +187,7 @@ def time_errors(
 def _estimate_time_errors(
     modes: tuple[Mode, ...], start: Array, solution: HybridSolution, options: StepOptions
 ) -> Float[Array, " events"]:
-    """Return the result of `time_errors` for modes that are given as tuples."""
+    """Return the result of `time_errors` for a tuple of modes whose guards are tuples."""
     event_indices = jnp.arange(len(solution.times))
 
     def compute_time_change(tolerance_factor: Array) -> Array:
@@ -221,7 +233,7 @@ def _estimate_time_errors(
 def convert_modes_to_tuple(modes: Sequence[Mode] | Mode) -> tuple[Mode, ...]:
     """Return the modes as a tuple, with the guards of each mode as a tuple.
 
-    A single mode or guard may be given without a tuple.
+    A single mode or guard may be passed without a tuple. An object of another type raises an error.
     """
     if isinstance(modes, Mode | Guard):  # Mode and Guard are tuples themselves.
         modes = (modes,)  # type: ignore[assignment]
@@ -240,7 +252,10 @@ def convert_modes_to_tuple(modes: Sequence[Mode] | Mode) -> tuple[Mode, ...]:
 def _check_simulation_arguments(
     modes: tuple[Mode, ...], start: Array, events: int, mode: int
 ) -> None:
-    """Raise a ValueError if start, events, mode and the functions of the modes do not agree."""
+    """Raise a ValueError if an argument of `simulate_hybrid` is invalid.
+
+    The check includes the shapes that the functions of the modes return at `start`.
+    """
     if start.ndim != 1 or not start.size:
         raise ValueError(f"start has shape {start.shape}, but a state is one row of numbers.")
     if not isinstance(start, jax.core.Tracer) and not np.all(np.isfinite(start)):
@@ -267,7 +282,7 @@ def _check_simulation_arguments(
 
 
 def _check_output_shape(name: str, function: Callable, start: Array, shape: tuple) -> None:
-    """Raise a ValueError unless `function(start)` returns floats of this shape."""
+    """Raise a ValueError unless `function(start)` returns floats of the shape `shape`."""
     check_callable(name, function, "of the state")
     output: Any = jax.eval_shape(function, start)
     output_shape = getattr(output, "shape", None)
@@ -287,7 +302,7 @@ def _check_output_shape(name: str, function: Callable, start: Array, shape: tupl
 def _integrate_mode(
     mode: Mode, state: Array, time: Array, options: StepOptions
 ) -> tuple[PhaseEnd, Array]:
-    """Return the end of a mode, and whether a guard is violated at the start of the mode."""
+    """Return the end of the phase in `mode`, and whether a guard is violated at its start."""
     guard_rates = lambda y: jax.jvp(mode.guard_values, (y,), (mode.field(y),))[1]
     guard_values = mode.guard_values(state)
     guard_rate_values, second_guard_rates = jax.jvp(guard_rates, (state,), (mode.field(state),))
@@ -321,7 +336,7 @@ def _integrate_mode(
 def _compute_event_time_errors(
     mode: Mode, phase_end: PhaseEnd, options: StepOptions
 ) -> tuple[Array, Array]:
-    """Return two errors of the event time, s: due to the tolerance and to round-off of the state.
+    """Return the errors of the event time due to tolerance and to round-off of the state, s.
 
     The errors are large if the guard is grazed.
     """
@@ -349,7 +364,10 @@ def _add_with_roundoff(first_time: Scalar, second_time: Scalar) -> tuple[Scalar,
 def _simulate_modes(
     modes_and_events: tuple[tuple[Mode, ...], int], options: StepOptions, start: Array, mode: Array
 ) -> HybridSolution:
-    """Return the simulation. `modes_and_events` is a pair of modes and largest number of events."""
+    """Return the simulation that begins at `start` in the mode with the index `mode`.
+
+    `modes_and_events` is a pair of the modes and the largest number of events.
+    """
     modes, events = modes_and_events
 
     def make_mode_branch(mode_index: int) -> Callable:
