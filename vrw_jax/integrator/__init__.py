@@ -1,6 +1,4 @@
-"""A batched Runge-Kutta integrator that locates events and minima of margins, and propagates
-tangents.
-"""
+"""Batched Runge-Kutta integrator with location of events and minima, and with tangents."""
 
 from vrw_jax.integrator import tableaus
 from vrw_jax.integrator.integrate import (

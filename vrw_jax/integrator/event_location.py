@@ -1,4 +1,4 @@
-"""Location of the earliest zero of the guards within a solver step, for each batch element."""
+"""Locate the earliest root of the guards inside a solver step, for each batch element."""
 
 import functools
 from collections.abc import Callable
@@ -23,26 +23,26 @@ from vrw_jax.numerics import StepOptions, Vector, select_tree_leaves
 
 
 class CrossingStep(NamedTuple):
-    """Last solver step of each batch element, with the guards that cross zero in it."""
+    """Last solver step of each batch element, with the guards that cross zero during this step."""
 
-    start_state: StageState  # state at the start of the step
-    start_guard_values: Vector  # guards at the start of the step
+    start_state: StageState  # state at the start of the solver step
+    start_guard_values: Vector  # guards at the start of the solver step
     middle_guard_values: Vector  # guards at the tableau's stage `middle_stage_index`
-    end_guard_values: Vector  # guards at the end of the step
+    end_guard_values: Vector  # guards at the end of the solver step
     step_length: Array
     crossing_bits: Array  # bit i is set if guard i crosses
     has_guard_crossed: Array  # whether the step of this batch element contains a crossing
 
 
 class EventSearch(NamedTuple):
-    """State and result of the event search of each batch element."""
+    """State and result of the search for the event of each batch element."""
 
-    event_step_length: Array  # length of the next try, or of the event once it is found, s
+    event_step_length: Array  # length of the next solver step, or time to the event, s
     lower_length_bound: Array
     upper_length_bound: Array
     is_unresolved: Array
     end_state: StageState
-    remaining_time: Array  # from `end` to the event, by Newton's method, s
+    remaining_time: Array  # time from `end_state` to the event, by Newton's method, s
     guard_index: Array
     n_tried_steps: Array
     n_iterations: Array
@@ -56,13 +56,16 @@ def locate_event(
     crossing_step: CrossingStep,
     options: StepOptions,
 ) -> EventSearch:
-    """Return the search results with the earliest event inside each crossing step.
+    """Return, for each batch element, the earliest event inside its crossing solver step.
 
-    Newton's method corrects the length of the step. The first length is the earliest zero of the
-    parabolas through the crossing guards. The next length is the earliest of the times that
-    Newton's method proposes for the crossing guards, if it is inside the bracket. Otherwise the
-    bracket is bisected. A short step of low order reaches a near event if no guard is too curved
-    for Newton's method. The state is extrapolated along its rate over the remaining time.
+    Newton's method corrects the length of the solver step until the step ends at the event. The
+    first length is the earliest root of the parabolas through the values of the crossing guards.
+    The next length is the earliest event time that Newton's method proposes for the crossing
+    guards. If this time is outside the bracket, the bracket is bisected instead.
+
+    When the event is near and no guard is too curved for Newton's method, a short solver step of
+    low order replaces the last corrections. The state is then extrapolated linearly over the
+    remaining time.
     """
     step_length, event_time_rtol = crossing_step.step_length, jnp.sqrt(options.rtol)
     max_extrapolation_time = 0.1 * event_time_rtol * step_length
@@ -178,16 +181,16 @@ def _refine_event_location(
     step_time_limits: tuple[Array, Array],
     options: StepOptions,
 ) -> EventSearch:
-    """Return the search results with the event located by short steps of low order from a near
-    state.
+    """Return the search result after short solver steps of low order from a state near the event.
 
-    - `step_time_limits`: largest time of extrapolation, and largest length of a short step, s.
+    - `step_time_limits`: largest time of the linear extrapolation, and largest length of a short
+      solver step, s.
 
-    One step suffices unless a guard grazes zero. The event stays unresolved if Newton's method
-    diverges.
+    One short solver step suffices unless a guard grazes zero. The event stays unresolved if
+    Newton's method diverges.
     """
     max_extrapolation_time, max_short_step_time = step_time_limits
-    # Over a thousandth of a step, a method of order 3 is accurate to round-off.
+    # During a thousandth of a solver step, a method of order 3 is accurate to round-off.
     low_order_tableau = load_explicit_tableau("Bosh3")
     assert low_order_tableau is not None
 
@@ -261,11 +264,10 @@ def _refine_event_location(
 def _classify_guard_crossing(
     start_guard_value: Array, guard_value: Array, guard_rate: Array, length: Array
 ) -> tuple[Array, Array]:
-    """Return whether a guard has crossed zero, and whether it is too curved for Newton's method
-    alone.
+    """Return whether a guard has crossed zero, and whether it is too curved for Newton's method.
 
-    `guard_value` and `guard_rate` are the guard and its rate after `length`. `start_guard_value` is
-    the guard at the start of the step.
+    - `start_guard_value`: value of the guard at the start of the solver step;
+    - `guard_value`, `guard_rate`: value and time derivative of the guard after `length`, s.
     """
     # A guard that rises from zero has not crossed.
     has_crossed = (guard_value < 0.0) | ((guard_value == 0.0) & (guard_rate <= 0.0))
@@ -278,11 +280,11 @@ def _classify_guard_crossing(
 def _propose_earliest_event(
     guard_values: Vector, guard_rates: Vector, crossing_bits: Array
 ) -> tuple[Array, Array]:
-    """Return the time to the earliest zero of a crossing guard's tangent line, s, and the guard's
-    index.
+    """Return the time to the earliest event, s, by one Newton step, and the guard's index.
 
-    A guard that is below zero and rises has crossed zero at an unknown earlier time, which counts
-    as minus infinity.
+    The time is negative if the event is earlier than the present state. It is minus infinity for a
+    guard that is negative and rises, because this guard crossed zero at an unknown earlier time.
+    `crossing_bits` has bit i set if guard i crosses zero.
     """
     time_to_event = jnp.full_like(guard_values[0], jnp.inf)
     guard_index = jnp.zeros_like(crossing_bits)
@@ -299,9 +301,10 @@ def _propose_earliest_event(
 
 @jax.jit  # The function is traced once for all guards.
 def _compute_time_to_zero(is_crossing: Array, guard_value: Array, guard_rate: Array) -> Array:
-    """Return the time to the zero of a guard's tangent line, s.
+    """Return the time from the present state to the root of a guard's tangent line, s.
 
-    The time is infinite if the guard does not cross zero.
+    The time is infinite for a guard that does not cross zero. It is minus infinity for a crossing
+    guard that is negative and does not fall.
     """
     is_guard_falling = is_crossing & (guard_rate < 0.0)
     time_without_fall = jnp.where(is_crossing & (guard_value < 0.0), -jnp.inf, jnp.inf)
@@ -320,10 +323,10 @@ def _find_parabola_zero(
     middle_guard_value: Array,
     end_guard_value: Array,
 ) -> Array:
-    """Return the zero of the parabola through three values of a guard, as a fraction of the step.
+    """Return the root of a guard's parabola, as a fraction of the solver step.
 
-    The three values are at the start, at the middle stage and at the end of the step. The zero is
-    located by the secant, then by Newton's method.
+    The parabola passes through the guard's values at the start, at the middle stage and at the end.
+    The secant method, followed by Newton's method, locates the root.
     """
     curvature, linear_rate = fit_guard_parabola(
         tableau, start_guard_value, middle_guard_value, end_guard_value

@@ -1,9 +1,9 @@
-"""Integration of one phase for a batch to the earliest event, with a step size for each element.
+"""Integrate one phase of a batch to its earliest event, with a separate step size for each element.
 
-The elements are integrated together until each has ended or has a step that crosses a guard. Then
-all events are located together: the crossing step is repeated with its length corrected by Newton's
-method. The result of an element never depends on the other elements, because an element that has
-ended does not change.
+The elements are integrated together until each has ended or has a solver step in which a guard
+crosses zero. Then all events are located together. The crossing solver step is repeated, and
+Newton's method corrects its length. An element that has ended does not change, so its result never
+depends on the other elements.
 """
 
 from collections.abc import Callable
@@ -49,11 +49,12 @@ from vrw_jax.simd import mark_noinline
 
 
 class BatchPhase(NamedTuple):
-    """Functions of a phase, which are elementwise over the batch.
+    """Functions that define a phase, elementwise for all batch elements.
 
-    `evaluate_acceleration` returns the accelerations at a state. The guards are positive inside the
-    phase, and an event is the fall of a guard through zero. The earliest event ends the phase. Of
-    two events at the same time, the first guard in the list ends the phase.
+    The function `evaluate_acceleration` returns the accelerations at a state. The guards are
+    positive inside the phase, and an event occurs when a guard falls through zero. The earliest
+    event ends the phase. If two guards are zero at the same time, the first in the list ends the
+    phase.
     """
 
     evaluate_acceleration: EvaluateAcceleration
@@ -62,35 +63,40 @@ class BatchPhase(NamedTuple):
     # equations of motion in implicit form, for derivatives
     implicit_dynamics: ImplicitDynamics | None = None
     is_noinline: bool = False
-    """Whether machine code calls the phase's functions instead of inlining them at each use. With
-    calls, the code compiles in half of the time and runs a sixth slower than with inlining."""
+    """Whether machine code calls the phase's functions instead of inlining them at each use.
+
+    With calls, the code compiles in half of the time and runs a sixth slower than with inlining.
+    """
     state_units: Vector | None = None
-    """Units of q and of v for the absolute tolerance. The default is SI."""
+    """Units of the coordinates `q` and of their rates `v` for the absolute tolerance.
+
+    The default is SI units.
+    """
 
 
 class BatchPhaseEnd(NamedTuple):
-    """End of a phase: state, duration, guard and failure flags of each batch element."""
+    """State at the end of a phase, duration, triggered guard and failure flags of each element."""
 
     state: StageState
     duration: Array  # s
     guard: Array  # index of the guard that ended the phase; -1 if none did
     timed_out: Array
-    # whether the element was cut off as a straggler, see `integrate_batch_phase`
+    # whether the element is a straggler, see `integrate_batch_phase`
     is_unfinished: Array
     n_tried_steps: Array  # number of solver steps, accepted or not
-    next_dt: Array  # next step length of the controller, s
+    next_dt: Array  # next step length that the controller proposes, s
     minima: Array | None  # minima of the margins, (margins, batch)
 
 
 class _IntegratorState(NamedTuple):
-    """State of the integration loop of each batch element."""
+    """State of the integration loop for each batch element."""
 
     state: StageState
-    guard_values: Vector  # guards at the state
+    guard_values: Vector  # guards at `state`
     next_step_length: Array
     elapsed_time: Array
     integration_status: Array  # an IntegrationStatus, after the last tried step
-    crossing_bits: Array  # bit i is set if guard i crosses in that step
+    crossing_bits: Array  # bit i is set if guard i crosses zero in that step
     middle_guard_values: Vector  # guards at the middle stage of the crossing step
     end_guard_values: Vector
     n_tried_steps: Array
@@ -104,7 +110,7 @@ class _IntegratorState(NamedTuple):
 
 
 class IntegrationStatus(IntEnum):
-    """Status code of a batch element in the integration."""
+    """Status of a batch element in the integration loop."""
 
     RUNNING = 0
     TIMED_OUT = 1
@@ -114,12 +120,14 @@ class IntegrationStatus(IntEnum):
 
 
 STRAGGLER_ITERATION_FACTOR = 2
-"""Ratio of the iterations after which stragglers are cut off to the iterations after which half of
-the batch had ended. The value is chosen because a ratio near 1 would cut off regular elements."""
+"""Ratio of two iteration counts: when stragglers are cut off, and when half of the batch had ended.
+
+The value is chosen because a ratio near 1 would cut off regular elements.
+"""
 
 
 MakeBatchPhase = Callable[[Any, Vector], BatchPhase]
-"""Function of constants that returns a phase, see `tangents.ImplicitDynamicsFn`."""
+"""Function that returns a phase for its constants, see `tangents.ImplicitDynamicsFn`."""
 
 
 def integrate_batch_phase(
@@ -136,12 +144,21 @@ def integrate_batch_phase(
 ) -> BatchPhaseEnd:
     """Return the end of a phase that begins at positions `q` and rates `v`, for each batch element.
 
+    - `make_phase`: function that returns the phase for `constants` and `held_constants`;
+    - `constants`, `held_constants`: constants of the equations, see `tangents.ImplicitDynamicsFn`;
+    - `tableau`: tableau of the Runge-Kutta method;
+    - `q`, `v`: tuples of arrays (batch,), one array per coordinate;
+    - `is_active`: which elements are integrated, (batch,);
+    - `initial_dt`: length of the first solver step, (batch,), s;
+    - `straggler_count`: largest number of elements that may be cut off; None for no cut-off.
+
     Each active element is integrated to its earliest event. Errors are those of
     `hybrid.integrate_phase`. Stragglers are the last `straggler_count` elements of a large batch
     that take `STRAGGLER_ITERATION_FACTOR` times as many iterations as half of the batch. Their
-    integration stops unfinished, and the caller integrates them again together with other
-    stragglers. The result is differentiable with respect to `constants`, `held_constants`, `q` and
-    `v`, see `tangents`.
+    integration stops early, and the caller integrates them again in a batch of stragglers.
+
+    The result is differentiable with respect to `constants`, `held_constants`, `q` and `v`, see
+    `tangents`.
     """
     integrate_with_rule = jax.custom_jvp(
         lambda *arguments: _integrate_to_event(make_phase, tableau, None, *arguments).phase_end
@@ -185,7 +202,7 @@ def integrate_batch_phase(
 
 
 class _PhaseRun(NamedTuple):
-    """End of a phase, with the intermediate results that the tangents of the end require."""
+    """End of a phase, with the intermediate results from which its tangents are computed."""
 
     step_function: TakeStep
     start_state: StageState
@@ -201,10 +218,10 @@ def _compute_phase_end_jvp(
     phase_tangents: PhaseTangents,
     phase_run: _PhaseRun,
 ) -> tuple[Vector, Vector, Array, Array | None]:
-    """Return the tangents of a phase's end along tangents of its start and constants.
+    """Return the tangents at the end of a phase, for given tangents of its start and constants.
 
-    The result contains tangents of positions, rates, duration and minima of the margins. The
-    directions are on the first axis.
+    The result contains the tangents of positions, rates, duration and minima of the margins. The
+    first axis contains the directions.
     """
     step_function, start_state, phase_end, integrator_state, minima_state, minima_result = phase_run
     n = len(start_state.q)
@@ -258,7 +275,7 @@ def _compute_event_time_jvp(
     integrator_state: _IntegratorState,
     event_guard: Array,
 ) -> Array:
-    """Return the tangent of the event's time, s.
+    """Return the tangent of the event's time, s, shape (directions, batch).
 
     The tangent follows from the condition that the guard is zero at the event of the perturbed
     motion.
@@ -300,7 +317,7 @@ def _integrate_to_event(
     options: StepOptions,
     straggler_count: Array | None,
 ) -> _PhaseRun:
-    """Return the end of a phase, its event and minima, with all intermediate results."""
+    """Return the end of a phase with all intermediate results, for each batch element."""
     phase = make_phase(constants, held_constants)
     phase = _wrap_each_phase_function(phase, mark_noinline if phase.is_noinline else jax.jit)
     step_function = _make_step_function(phase, tableau)
@@ -404,7 +421,7 @@ def _integrate_to_event(
 
 
 def _make_step_function(phase: BatchPhase, tableau: ButcherTableau) -> TakeStep:
-    """Return a function of state and length that takes a Runge-Kutta step of the phase.
+    """Return a function of state and length that takes one Runge-Kutta step in the phase.
 
     The function is traced once for all its calls.
     """
@@ -412,7 +429,7 @@ def _make_step_function(phase: BatchPhase, tableau: ButcherTableau) -> TakeStep:
 
 
 def _wrap_each_phase_function(phase: BatchPhase, wrap_function: Callable) -> BatchPhase:
-    """Return a copy of the phase with all its functions wrapped by `wrap_function`."""
+    """Return a copy of the phase in which `wrap_function` has been applied to each function."""
     margins = phase.margin_functions
     if margins is not None:
         margins = margins._replace(evaluate_margins=wrap_function(margins.evaluate_margins))
@@ -435,9 +452,10 @@ def _integrate_until_crossing(
     straggler_count: Array | None,
     phase_tangents: PhaseTangents | None,
 ) -> _IntegratorState:
-    """Return the loop state after adaptive steps until no batch element is running.
+    """Return the state of the integration loop after adaptive solver steps in all batch elements.
 
-    An element stops when a guard crosses zero, at the time limit, or when it fails.
+    An element stops when a guard crosses zero, when it reaches the time limit, or when it fails.
+    The loop ends when no element is running, or earlier if it cuts off stragglers.
     """
 
     def take_one_step(integrator_state: _IntegratorState) -> _IntegratorState:
@@ -570,11 +588,13 @@ def _classify_step(
     is_rejected: Array,
     end_guard_values: Vector,
 ) -> tuple[Array, Array, Array, Array, Array]:
-    """Return status, bits of crossing guards, acceptance, time (s) and next step length (s) of each
-    element.
+    """Return the outcome of the last solver step for each batch element.
 
-    A step is not rejected for a minimum of a guard so close to its start that the time would not
-    advance. The last step ends at the time limit.
+    The result contains the status, the bits of the crossing guards, whether the step is accepted,
+    the elapsed time, s, and the next step length, s. For a crossing solver step, the length is that
+    of the step itself. The last solver step ends at the time limit. An element fails if its next
+    step is too short for the time to advance, or if the number of its solver steps reaches the
+    limit.
     """
     is_running = integrator_state.integration_status == IntegrationStatus.RUNNING
     is_valid_step = is_running & ~is_rejected
@@ -621,10 +641,14 @@ def _compute_mean_squared_error(
     options: StepOptions,
     state_units: Vector | None,
 ) -> Array:
-    """Return the mean square of the error of a step, relative to its tolerance.
+    """Return the mean square of the error of a solver step, divided by the tolerance.
 
-    The result is infinite for a step whose end is not finite. The mean is computed in float32,
-    because an error estimate needs no higher precision.
+    The result is infinite for a solver step whose end is not finite. The mean is computed in
+    float32, because an error estimate needs no higher precision.
+
+    - `weighted_guards`: guards at the end of the step, which must be finite;
+    - `state_units`: units of the coordinates and rates for the absolute tolerance; None for SI
+      units.
     """
     start_numbers = (*start_state.q, *start_state.v)
     end_numbers = (*rk_step.end_state.q, *rk_step.end_state.v)
@@ -655,8 +679,8 @@ def sample_batch_phase(
 ) -> Array:
     """Return positions and rates at `n_samples` equally spaced times of a phase.
 
-    The first and the last sample are at the ends of the phase. The positions come before the rates
-    in the shape (samples, 2 coordinates, batch).
+    The first sample is at the start of the phase, and the last is after `duration`, s. The result
+    has the shape (samples, 2 coordinates, batch), with the positions before the rates.
     """
 
     def step_function(state: StageState, step_length: Array) -> tuple[StageState, Array]:
@@ -681,11 +705,12 @@ def sample_at_equal_times(
     n_samples: int,
     options: StepOptions,
 ) -> Array:
-    """Return samples at `n_samples` equally spaced times from the start to the end of `duration`.
+    """Return samples at `n_samples` equally spaced times from 0 to `duration`, s.
 
-    - `step_function`: function of state and step length that returns the end of a step, and the
-      square of its error over its tolerance;
-    - `pack_sample`: function from a state to a sample. The samples are on the first axis.
+    - `step_function`: function of state and step length, s, that returns the state at the end of a
+      solver step and the squared ratio of its error to the tolerance;
+    - `pack_sample`: function that returns the sample for a state. The first axis of the result
+      contains the samples.
     """
     zero_count = jnp.zeros((), jnp.int32)
 

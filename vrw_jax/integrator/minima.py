@@ -1,8 +1,9 @@
-"""Minima of margins along a phase, for a batch, as accurate as the integration.
+"""Minima of margins during a phase of a batch, as accurate as the integration.
 
-The method is that of `hybrid/minima` for one wheel. During the integration, the step that contains
-the lowest minimum of each margin is stored. Afterwards, secant steps on the margin's rate locate
-the minimum, one margin after the other.
+The method is that of `hybrid/minima`, applied to all batch elements. During the integration, the
+solver step that contains the lowest minimum of each margin is stored. Afterwards, a secant
+iteration for the root of the margin's time derivative locates each minimum, one margin after
+another.
 """
 
 import functools
@@ -27,7 +28,7 @@ from vrw_jax.numerics import (
 
 
 class MarginFunctions(NamedTuple):
-    """Function that evaluates the margins whose minima are computed, and its options."""
+    """Function that returns all margins at a state, and whether each minimum includes the start."""
 
     evaluate_margins: Callable[[StageState], Vector]
     # whether the margin at the phase's start counts, see `hybrid.MonitoredFunctions`
@@ -35,9 +36,7 @@ class MarginFunctions(NamedTuple):
 
 
 class MinimaState(NamedTuple):
-    """Margins at the present state, and the solver step with the lowest minimum of each margin so
-    far.
-    """
+    """Margins at the present state, and the lowest minimum of each margin so far."""
 
     margin_values: Array  # margins at the present state, (margins, batch)
     margin_rates: Array
@@ -58,7 +57,7 @@ def evaluate_with_rates(
     evaluate_acceleration: EvaluateAcceleration,
     motion_state: StageState,
 ) -> tuple[Vector, Vector]:
-    """Return functions of the state at a state, and their time derivatives along the motion."""
+    """Return the values of `evaluate_functions` at a state, and their time derivatives."""
     n_coordinates = len(motion_state.q)
 
     def evaluate_along_motion(q: Vector, v: Vector) -> Vector:
@@ -79,8 +78,8 @@ def init_minima_state(
 ) -> MinimaState:
     """Return the state of the search for minima before the first solver step.
 
-    A margin that is zero at the start by construction has no negative rate at the start except
-    round-off. A negative rate therefore counts as zero.
+    A margin that is zero at the start of the phase by construction cannot fall there. Its negative
+    time derivative at the start is round-off and is replaced by zero.
     """
     margin_values, margin_rates = map(
         jnp.stack,
@@ -111,7 +110,7 @@ def init_minima_state(
 
 
 class AcceptedStep(NamedTuple):
-    """Solver step of all batch elements, and whether each element has accepted it."""
+    """Solver step of all batch elements, and whether each element accepts the step."""
 
     start_state: StageState
     end_state: StageState
@@ -126,7 +125,7 @@ def update_minima_state(
     minima_state: MinimaState,
     accepted_step: AcceptedStep,
 ) -> MinimaState:
-    """Return the search for minima, updated with the minima inside an accepted step."""
+    """Return the lowest interior minima after one more accepted solver step."""
     step_start, step_end, step_length, is_accepted, _ = accepted_step
     margin_values, margin_rates = map(
         jnp.stack,
@@ -176,18 +175,18 @@ def update_minima_state(
 
 
 class MinimaResult(NamedTuple):
-    """Minima of margins over a phase, each an array (margins, batch)."""
+    """Minima of margins over a phase; each field has the shape (margins, batch)."""
 
     phase_minima: Array  # minima over the phase, ends included
-    interior_minima: Array  # interior minima; infinity if there is none
+    interior_minima: Array  # interior minima; infinity if a margin has none
     length_to_minimum: Array  # length of the step from the stored start to the interior minimum, s
 
 
 class _MinimumSearch(NamedTuple):
     """State of the secant iteration for the minimum of one margin in each batch element."""
 
-    step_length: Array  # length of the next try, s
-    best_step_length: Array  # length with the smallest rate so far, s
+    step_length: Array  # length of the next solver step, s
+    best_step_length: Array  # length of the step that ended with the smallest rate, s
     best_margin_rate: Array
     margin_value: Array
     is_unresolved: Array
@@ -202,11 +201,11 @@ def refine_minima(
     start_values: Array,
     options: StepOptions,
 ) -> MinimaResult:
-    """Return the minima of the margins over the phase, refined by secant steps.
+    """Return the minima of the margins over the phase, refined by a secant iteration.
 
-    `start_values` are the margins at the start of the phase. Each minimum takes at most
-    `max_margin_search_iterations` secant steps. Each secant step begins at the start of the solver
-    step that contains the minimum.
+    `start_values` are the margins at the start of the phase, (margins, batch). Each iteration takes
+    a solver step from the start of the solver step that contains the minimum. At most
+    `max_margin_search_iterations` iterations are made per margin.
     """
 
     def refine_margin_minimum(_: None, margin_inputs: tuple) -> tuple[None, tuple[Array, Array]]:
@@ -303,11 +302,11 @@ def compute_minima_jvp(
     phase_ends: tuple[StageState, StageState],
     end_tangents: Array,
 ) -> Array:
-    """Return the tangents of the minima, an array (directions, margins, batch).
+    """Return the tangents of the minima of the margins, shape (directions, margins, batch).
 
-    The tangents are those of the margins at fixed times, because the shift of a minimum has no
-    first-order effect. `phase_ends` are the start and the end of the phase, and `end_tangents` are
-    the tangents of the end state.
+    The tangents are those of the margins at fixed times, because the shift of a minimum in time has
+    no first-order effect. `phase_ends` are the states at the start and at the end of the phase, and
+    `end_tangents` are the tangents of the end state.
     """
     margin_functions, evaluate_acceleration = make_margins(
         phase_tangents.constants, phase_tangents.held_constants

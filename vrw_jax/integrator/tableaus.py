@@ -1,9 +1,9 @@
-"""One explicit Runge-Kutta step for a batch, with a separate array for each component.
+"""Take one explicit Runge-Kutta step for a batch, with a separate array for each coordinate.
 
-The equations of motion are of second order, q'' = f(q, q'), so a step stores only the accelerations
-of its stages. Rates follow from the accelerations by the tableau's matrix, positions by its square.
-The method is the same as for the first-order system, with half of the stored derivatives. The
-tableaus are those of diffrax.
+The equations of motion are of second order, q'' = f(q, q'), so a solver step stores only the
+accelerations at its stages. The tableau's matrix converts these accelerations to rates, and its
+square converts them to positions. The method is the same as for the first-order system, with half
+of the stored derivatives. The tableaus are those of diffrax.
 """
 
 import functools
@@ -26,8 +26,9 @@ from vrw_jax.numerics import Vector, run_if_any
 
 
 class ButcherTableau(NamedTuple):
-    """Tableau of an explicit Runge-Kutta method whose last stage is the first stage of the next
-    step.
+    """Butcher tableau of an explicit Runge-Kutta method with the first-same-as-last property.
+
+    The last stage of a solver step is the first stage of the next.
     """
 
     convergence_order: int
@@ -37,15 +38,17 @@ class ButcherTableau(NamedTuple):
     rate_error_weights: np.ndarray
     position_error_weights: np.ndarray
     middle_stage_index: int
-    """Index of a stage well inside the step, at which the parabolas through guards are fitted."""
+    """Index of a stage well inside the step, at which parabolas through guards are fitted."""
     guard_stage_indices: tuple[int, ...]
-    """Indices of the stages at which guards are sampled to find minima inside a step. They are
-    separated from each other and from both ends.
+    """Indices of the stages at which guards are evaluated to find minima inside a solver step.
+
+    The nodes of these stages are separated from each other and from both ends.
     """
     bernstein_matrix: np.ndarray
-    """Matrix from guard values to the inner Bernstein coefficients of the polynomial through
-    them. The polynomial does not fall below its least coefficient. The values are those at the
-    start, at `guard_stage_indices` and at the end.
+    """Matrix that maps guard values to the inner Bernstein coefficients of their polynomial.
+
+    The guard values are those at the start, at `guard_stage_indices` and at the end. The polynomial
+    through these values does not fall below its smallest coefficient.
     """
 
     def __eq__(self, other: object) -> bool:
@@ -57,11 +60,10 @@ class ButcherTableau(NamedTuple):
 
 @functools.cache
 def load_explicit_tableau(solver_name: str) -> ButcherTableau | None:
-    """Return diffrax's tableau of the given name, or None for a method that is not an explicit
-    Runge-Kutta method.
+    """Return the tableau of diffrax's solver `solver_name`; None if it is not an explicit method.
 
-    The numbers are stored in a file beside this module, because the import of diffrax takes a fifth
-    of the time of a start with cached programs.
+    The tableau is read from a file in this package, because the import of diffrax takes a fifth of
+    the time of a start with cached programs.
     """
     tableaus = json.loads(Path(__file__).with_name("tableaus.json").read_text(encoding="utf-8"))
     if solver_name not in tableaus:
@@ -101,17 +103,17 @@ def load_explicit_tableau(solver_name: str) -> ButcherTableau | None:
 
 
 GUARD_STAGE_NODES = (0.15, 0.47, 0.92)
-"""Nodes, in step lengths, near which guards are sampled inside a step.
+"""Nodes, as fractions of the solver step, near which guards are evaluated inside the step.
 
-They are chosen nearer to the ends than equally spaced nodes, because a minimum just after the start
-or before the end is the hardest to detect.
+The values are chosen nearer to the ends than equally spaced nodes, because a minimum just after the
+start or before the end is the hardest to detect.
 """
 
 
 def _choose_guard_stages(stage_nodes: np.ndarray) -> tuple[int, ...]:
     """Return the indices of the stages nearest to GUARD_STAGE_NODES.
 
-    Of several stages at one node the last stage is returned, because it is the most accurate.
+    Of several stages at one node, the last stage is chosen, because it is the most accurate.
     """
     last_stage_at_node = {
         round(float(target_stage_node), 3): i
@@ -134,11 +136,10 @@ def _choose_guard_stages(stage_nodes: np.ndarray) -> tuple[int, ...]:
 def fit_guard_parabola(
     tableau: ButcherTableau, start_value: Array, middle_value: Array, end_value: Array
 ) -> tuple[Array, Array]:
-    """Return the quadratic and the linear coefficient of the parabola through three values of a
-    guard.
+    """Return the quadratic and linear coefficients of the parabola through three values of a guard.
 
-    The parabola is a function of the fraction of the step. `middle_value` is the guard at the stage
-    `middle_stage_index`.
+    The variable of the parabola is the fraction of the solver step. `middle_value` is the guard at
+    the stage `middle_stage_index`.
     """
     middle_node = float(tableau.stage_nodes[tableau.middle_stage_index])
     curvature = (end_value - start_value - (middle_value - start_value) / middle_node) / (
@@ -150,9 +151,9 @@ def fit_guard_parabola(
 def _compute_bernstein_coefficients(
     tableau: ButcherTableau, guard_values: list[Array]
 ) -> list[Array]:
-    """Return a guard's Bernstein coefficients except the last one.
+    """Return the Bernstein coefficients, except the last, of the polynomial through guard values.
 
-    The guard is positive if all coefficients are positive. `guard_values` are the values of the
+    If all coefficients are positive, so is the polynomial. `guard_values` are the values of the
     guard at the start, at the stages `guard_stage_indices`, and at the end.
     """
     return [
@@ -163,19 +164,18 @@ def _compute_bernstein_coefficients(
 
 @functools.partial(jax.jit, static_argnums=0)  # The function is traced once for all guards.
 def _may_cross_inside_step(tableau: ButcherTableau, guard_values: list[Array]) -> Array:
-    """Return whether a guard may fall below zero inside a step and be positive again at its end."""
+    """Return whether a guard may be negative inside a solver step and positive at its end."""
     bernstein_coefficients = _compute_bernstein_coefficients(tableau, guard_values)
     return (functools.reduce(jnp.minimum, bernstein_coefficients) <= 0.0) & (guard_values[-1] > 0.0)
 
 
 @functools.partial(jax.jit, static_argnums=0)  # The function is traced once for all guards.
 def find_guard_minimum(tableau: ButcherTableau, guard_values: list[Array]) -> tuple[Array, Array]:
-    """Return whether a guard may have a negative minimum inside a step, and the fraction to the
-    minimum.
+    """Return whether a guard may have a negative minimum inside a solver step, and where.
 
-    The fraction of the step is the node of the lowest Bernstein coefficient. A guard that only
-    decreases has no minimum. `guard_values` are the values of the guard at the start, at the stages
-    `guard_stage_indices`, and at the end.
+    The location is the node of the lowest Bernstein coefficient, as a fraction of the step. A guard
+    that only decreases has no minimum. `guard_values` are the values of the guard at the start, at
+    the stages `guard_stage_indices`, and at the end.
     """
     min_bernstein_coefficient, *inner_coefficients = _compute_bernstein_coefficients(
         tableau, guard_values
@@ -203,11 +203,11 @@ def find_guard_minimum(tableau: ButcherTableau, guard_values: list[Array]) -> tu
 def find_earliest_guard_minimum_fraction(
     tableau: ButcherTableau, guard_values: list[Vector]
 ) -> Array:
-    """Return the fraction of the step to the earliest minimum at which some guard may be negative.
+    """Return the location of the earliest minimum at which some guard may be negative.
 
-    The result is 1 if there is no such minimum. `guard_values` are the guards at the start, at the
-    stages `guard_stage_indices`, and at the end. The minimum is located only if some batch element
-    may have a minimum.
+    The location is a fraction of the solver step, or 1 if no guard has such a minimum.
+    `guard_values` are the guards at the start, at the stages `guard_stage_indices`, and at the end.
+    The computation is skipped if no batch element may have a minimum.
     """
     values_by_guard = [list(guard_values) for guard_values in zip(*guard_values, strict=True)]
     may_cross_inside = functools.reduce(
@@ -238,9 +238,9 @@ class StepSizeController:
     """
 
     safety_factor: float = 0.9
-    """Factor on the step length that would meet the tolerance exactly."""
+    """Factor by which the estimated step length for the tolerance is multiplied."""
     min_factor: float = 0.2
-    """Least ratio of successive step lengths."""
+    """Smallest ratio of successive step lengths."""
     max_factor: float = 5.0
     """Largest ratio of successive step lengths; after a rejected step the ratio is at most 1."""
 
@@ -254,9 +254,9 @@ def compute_step_size_factor(
     float_dtype: Any,
     step_size_controller: StepSizeController = STEP_SIZE_CONTROLLER,
 ) -> Array:
-    """Return the ratio of the length of the next step to that of the present step.
+    """Return the ratio of the next step length to the present one, as `float_dtype`.
 
-    `squared_error` is the mean square of the step's error over its tolerance.
+    `squared_error` is the mean square of the solver step's error divided by the tolerance.
     """
     error_power = jnp.exp(
         jnp.log(jnp.clip(squared_error, 1e-20, 1e20)) * (-0.5 / tableau.convergence_order)
@@ -269,12 +269,12 @@ def compute_step_size_factor(
 
 
 def _set_roundoff_to_zero(x: np.ndarray) -> np.ndarray:
-    """Return the matrix with zeros in place of entries that are round-off."""
+    """Return the array with zeros in place of entries that are within round-off of zero."""
     return np.where(np.abs(x) < 1e-14 * np.max(np.abs(x)), 0.0, x)
 
 
 class StageAccelerations(NamedTuple):
-    """Accelerations at one state, with the sine and cosine of theta."""
+    """Accelerations at one state, and sine and cosine of the wheel's angle theta."""
 
     sin: Array  # sine of theta
     cos: Array
@@ -284,7 +284,7 @@ class StageAccelerations(NamedTuple):
 def compute_real_stability_limit(tableau: ButcherTableau) -> float:
     """Return the largest z with |R(-z)| <= 1, where R is the stability function of the method.
 
-    For a motion that decays at the rate r, the largest stable step is z / r.
+    For a motion that decays as exp(-r t), the longest stable solver step is z / r.
     """
     z = np.linspace(0.01, 20.0, 2000)
     stage_values = np.ones(len(tableau.stage_nodes))
@@ -299,7 +299,7 @@ def compute_real_stability_limit(tableau: ButcherTableau) -> float:
 
 
 class StageState(NamedTuple):
-    """Positions, rates and accelerations of one stage, each a tuple of arrays (batch,)."""
+    """Positions, rates and accelerations at one stage; each is a tuple of arrays (batch,)."""
 
     q: Vector
     v: Vector
@@ -307,7 +307,7 @@ class StageState(NamedTuple):
 
 
 class RKStep(NamedTuple):
-    """Result of a Runge-Kutta step: state at the end, error estimate, and states of all stages."""
+    """Result of a Runge-Kutta step: state at the end, error estimate, and states at all stages."""
 
     end_state: StageState
     error_estimate: Vector  # error estimates of the positions, then of the rates
@@ -325,7 +325,10 @@ def take_rk_step(
     h: Array,
     with_error: bool = True,
 ) -> RKStep:
-    """Return end state, error estimate and stages of one Runge-Kutta step of length `h`, s."""
+    """Return the result of one Runge-Kutta step of length `h`, s.
+
+    If `with_error` is False, the error estimate is empty.
+    """
     n = len(start_state.q)
     stage_states, stage_accelerations = [start_state], [start_state.acceleration.acceleration[:n]]
     for i in range(1, len(tableau.stage_nodes)):
@@ -361,8 +364,9 @@ def evaluate_stage(
     stage_accelerations: list[Vector],
     h: Array,
 ) -> tuple[Vector, Vector]:
-    """Return positions and rates at the stage `stage_index`, given the accelerations of the earlier
-    stages.
+    """Return positions and rates at one stage from accelerations at the earlier stages.
+
+    `h` is the length of the solver step, s.
     """
     stage_positions, stage_rates = [], []
     for coordinate in range(len(start_positions)):
@@ -394,8 +398,8 @@ def evaluate_stage(
 def _sum_weighted_terms(weights: np.ndarray, summed_terms: list[Array]) -> Any:
     """Return the sum of `weights` times `summed_terms`, or None if all weights are zero.
 
-    The sum uses functions of `lax`, which are traced in a third of the time of Python's operators.
-    Half of the operations of a step are such sums.
+    Half of the operations in a solver step are such sums. The sum uses functions of `lax`, because
+    they are traced in a third of the time of Python's operators.
     """
     weights_and_terms = zip(weights, summed_terms, strict=False)
     weighted_terms = [lax.mul(x.dtype.type(w), x) for w, x in weights_and_terms if w != 0.0]

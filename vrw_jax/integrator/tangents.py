@@ -1,13 +1,13 @@
-"""Tangents of the end of a phase along tangents of its start and of its constants, for a batch.
+"""Propagate tangents from the start and the constants of a phase to its end, for a batch.
 
 Each Runge-Kutta step is repeated for the linearized equations, for all requested directions. The
 Jacobians at the stages are the same for all directions and are computed once. Each direction then
-costs some hundred products. Step sizes and iterations of the event search are not differentiated.
-The derivative is that of the discrete flow with the step lengths that were taken, and of the time
-at which the guard vanishes.
+costs about a hundred products. Step sizes and iterations of the event search are not
+differentiated. The derivative is that of the discrete flow with constant step lengths, and of the
+time at which the guard becomes zero.
 
-Directions come from `jax.vmap` around a derivative. This module makes the directions the first axis
-of arrays, so that loops are traced once and not again for the vmap.
+Directions come from `jax.vmap` around a derivative. This module stores the directions on the first
+axis of arrays. Loops are therefore traced once and not again for the vmap.
 """
 
 import functools
@@ -34,31 +34,32 @@ from vrw_jax.runtime import with_default_jax_settings
 
 
 class ImplicitDynamics(NamedTuple):
-    """Implicit form of the equations of motion, near a state with known accelerations."""
+    """Implicit form of the equations of motion near a state."""
 
     evaluate_residual: Callable[[StageState], Vector]
-    """Function that returns the left side minus the right side of the equations at the state's
-    accelerations."""
+    """Function that returns the left minus the right side of the equations of motion."""
     solve_for_accelerations: Callable[[StageState, Vector], Vector]
-    """Function that returns the accelerations for which the left side equals the given values."""
+    """Function that returns accelerations for which the left side equals the second argument."""
 
 
 ImplicitDynamicsFn = Callable[[Any, Vector], ImplicitDynamics]
-"""Function of the constants of the equations that returns an `ImplicitDynamics`.
+"""Function that returns the `ImplicitDynamics` for two kinds of constants.
 
-The constants are a tree of arrays with few tangent directions, and numbers with any tangent, such
-as the start of a phase.
+The first argument is a tree of arrays with few tangent directions. The second argument contains the
+held constants. These are arrays that are constant during the phase and have arbitrary tangents,
+such as the state at its start.
 """
 
 
 def apply_batched_jvp_rule(
     evaluate_rule: Callable[[Any, Any], tuple[Any, Any]], primals: Any, tangents: Any
 ) -> tuple[Any, Any]:
-    """Return the (values, tangents) of a JVP rule that computes all directions of a vmap together.
+    """Return the values and tangents of a JVP rule that computes all directions of a vmap together.
 
-    `primals` and `tangents` are the arguments of the rule. The tangents of `evaluate_rule` have the
-    directions on the first axis, whose length is 1 if all directions agree. `evaluate_rule` returns
-    the values, and their tangents in the same form.
+    - `evaluate_rule`: function of primals and tangents that returns the values and their tangents.
+      The first axis of its tangents contains the directions. Its length is 1 if all directions
+      agree;
+    - `primals`, `tangents`: arguments of the JVP rule, without an axis of directions.
     """
     leaves, tree_structure = jax.tree.flatten((primals, tangents))
     n_primal_leaves = len(jax.tree.leaves(primals))
@@ -98,7 +99,7 @@ def apply_batched_jvp_rule(
 
 @custom_vmap
 def _count_vmapped_directions(_: Any) -> Array:
-    """Return zeros whose length is the number of directions of an enclosing `jax.vmap`.
+    """Return zeros whose length is the number of directions in an enclosing `jax.vmap`.
 
     Without such a vmap, the array is empty.
     """
@@ -122,8 +123,9 @@ loops again.
 
 
 def _map_sequentially(evaluate_direction: Callable[[Any], Any], directions: Any) -> Any:
-    """Return a function evaluated for each direction in a loop, so that a direction stays in
-    registers.
+    """Return the results of a function for all directions, computed in a loop.
+
+    The loop makes the values for one direction fit into registers.
     """
     leaves, tree_structure = jax.tree.flatten(directions)
     has_several_directions = [len(x) > 1 for x in leaves]
@@ -150,12 +152,12 @@ def _map_sequentially(evaluate_direction: Callable[[Any], Any], directions: Any)
 
 
 def stack_directions(directions: Vector) -> Array:
-    """Return the tangents of several numbers as one array (directions, numbers, batch)."""
+    """Return the tangents of several quantities as one array (directions, quantities, batch)."""
     return jnp.stack(jnp.broadcast_arrays(*directions), 1)
 
 
 class StageJacobians(NamedTuple):
-    """Jacobians of the accelerations at the stages of a Runge-Kutta step."""
+    """Derivatives of the accelerations at the stages of a Runge-Kutta step."""
 
     # (stages, coordinates, components, batch): with respect to positions, rates, then held
     # constants
@@ -172,7 +174,7 @@ def _compute_stage_jacobians(
     held_constants: Vector,
     stage_states: list[StageState],
 ) -> StageJacobians:
-    """Return the Jacobians of the accelerations at all stages of a step except the last."""
+    """Return derivatives of the accelerations at all stages of a solver step except the last."""
 
     def linearize_stage(packed_state: Array) -> tuple[Array, Array]:
         stage_state = _unpack_state(packed_state)
@@ -215,8 +217,9 @@ def _compute_stage_jacobians(
 
 
 def _map_unrolled(evaluate_direction: Callable[[Any], Array], directions: Any) -> Array:
-    """Return a function evaluated for each direction without a loop, so that the compiler removes
-    known zeros.
+    """Return the results of a function for all directions, computed without a loop.
+
+    Without a loop, the compiler removes entries that are known to be zero.
     """
     leaves, tree_structure = jax.tree.flatten(directions)
     if all(len(x) == 1 for x in leaves):
@@ -229,14 +232,17 @@ def _map_unrolled(evaluate_direction: Callable[[Any], Array], directions: Any) -
 
 
 def _pack_state(state: StageState) -> Array:
-    """Return the components of a state as one array (components, batch)."""
+    """Return positions, rates, sine and cosine of theta, and accelerations as one array.
+
+    The array has the shape (components, batch).
+    """
     n = len(state.q)
     sin, cos, acceleration = state.acceleration
     return jnp.stack([*state.q, *state.v, sin, cos, *acceleration[:n]])
 
 
 def _unpack_state(packed_state: Array) -> StageState:
-    """Return the state whose components are in one array, the inverse of `_pack_state`."""
+    """Return the state for an array from `_pack_state`."""
     n = (len(packed_state) - 2) // 3
     state_components = tuple(packed_state)
     acceleration = StageAccelerations(
@@ -246,7 +252,7 @@ def _unpack_state(packed_state: Array) -> StageState:
 
 
 def _make_unit_vectors(template_state: Vector) -> list[Vector]:
-    """Return the unit vectors of the coordinates of `template_state`, in its structure."""
+    """Return the unit vectors for the coordinates of `template_state`, as tuples of arrays."""
     n = len(template_state)
     return [
         tuple(jnp.full_like(template_state[j], float(i == j)) for j in range(n)) for i in range(n)
@@ -259,7 +265,7 @@ def _compute_acceleration_tangent(
     position_tangent: Vector,
     rate_tangent: Vector,
 ) -> Vector:
-    """Return the tangent of the accelerations along tangents of positions and rates."""
+    """Return the tangent of the accelerations for given tangents of positions and rates."""
     sin, cos, acceleration = state.acceleration
     zero_accelerations = tuple(jnp.zeros_like(x) for x in acceleration)
     state_tangent = StageState(
@@ -287,8 +293,9 @@ def _solve_acceleration(
 def _propagate_tangents(
     tableau: ButcherTableau, stage_jacobians: StageJacobians, start_tangents: Array, h: Array
 ) -> Array:
-    """Return the tangents of positions, rates and held constants at the end of a step, given the
-    tangents at its start.
+    """Return the tangents at the end of a solver step, given the tangents at its start.
+
+    The tangents are those of positions, rates and held constants. `h` is the length of the step, s.
     """
     state_jacobian, n = stage_jacobians.state_jacobians, stage_jacobians.state_jacobians.shape[1]
 
@@ -337,7 +344,7 @@ def _propagate_tangents(
 
 
 def compute_each_jvp(function: Callable[..., Any], primals: tuple, directions: tuple) -> Any:
-    """Return the tangents of a function's result along all directions, by `jax.jvp`.
+    """Return the tangents of a function's result for all directions, computed with `jax.jvp`.
 
     The program is as short as for one direction.
     """
@@ -345,7 +352,10 @@ def compute_each_jvp(function: Callable[..., Any], primals: tuple, directions: t
 
 
 def with_batched_jvp(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Return `function`, with derivatives with respect to its floats by `compute_each_jvp`."""
+    """Return `function` with a JVP rule that computes the tangents of all directions together.
+
+    The rule differentiates with respect to all floating-point arrays among the arguments.
+    """
 
     def call_with_batched_jvp(*arguments: Any) -> Any:
         float_arguments, other_arguments = eqx.partition(arguments, eqx.is_inexact_array)
@@ -375,7 +385,7 @@ def with_batched_jvp(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 class PhaseTangents(NamedTuple):
-    """Tangents of the constants, of the start state and of the held constants of a phase."""
+    """Tangents of the start state, of the constants and of the held constants of a phase."""
 
     make_dynamics: ImplicitDynamicsFn
     constants: Any
@@ -391,7 +401,10 @@ class PhaseTangents(NamedTuple):
         start_tangents: Array,
         h: Array,
     ) -> Array:
-        """Return the tangents at the end of a step, given the tangents at its start."""
+        """Return the tangents at the end of a solver step, given the tangents at its start.
+
+        `h` is the length of the step, s.
+        """
         stage_jacobians = _compute_stage_jacobians(
             self.make_dynamics,
             self.constants,
@@ -409,10 +422,10 @@ class PhaseTangents(NamedTuple):
         h: Array,
         is_accepted: Array,
     ) -> Array:
-        """Return the tangents after a step in batch elements that accept it, and the start tangents
-        in all other elements.
+        """Return the tangents after a solver step in the batch elements that accept the step.
 
-        The computation is skipped if no element accepts the step.
+        All other elements have their `start_tangents`. The computation is skipped if no element
+        accepts the step. `h` is the length of the step, s.
         """
 
         def propagate_accepted_tangents(start_tangents: Array) -> Array:
@@ -427,8 +440,9 @@ class PhaseTangents(NamedTuple):
     def evaluate_tangents(
         self, evaluate_function: Callable[..., Any], state: StageState, directions: Array
     ) -> Any:
-        """Return the tangents of `evaluate_function(constants, held_constants, q, v)` at a state,
-        for all directions.
+        """Return the tangents of `evaluate_function(constants, held_constants, q, v)` at a state.
+
+        The first axis of the result contains the directions.
         """
         n, direction_components = len(state.q), tuple(jnp.moveaxis(directions, 1, 0))
         primals = self.constants, self.held_constants, state.q, state.v
