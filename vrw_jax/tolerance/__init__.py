@@ -1,4 +1,4 @@
-"""Measures to a given tolerance by the cheapest model, and multifidelity means."""
+"""Measures to a required tolerance from the simplest sufficient model, and multifidelity means."""
 
 from vrw_jax.tolerance.lower_fidelity import ModelIndex
 from vrw_jax.tolerance.measure_result import MeasureResult

@@ -1,4 +1,4 @@
-"""Batched steps with unilateral contact, and their derivatives."""
+"""Batched walking steps with unilateral contact, and their Jacobians."""
 
 import dataclasses
 from typing import Any, NamedTuple
@@ -21,16 +21,18 @@ from vrw_jax.wheel import PARAMETER_NAMES, WheelParams
 
 @dataclasses.dataclass(frozen=True)
 class StepTolerances:
-    """Tolerances of the solver in steps with unilateral contact.
+    """Solver tolerances for walking steps with unilateral contact.
 
-    - `tight_tolerance`: tolerance of most steps, chosen because steps at a looser tolerance save a
+    - `tight_tolerance`: tolerance for most steps, chosen because steps at a looser tolerance save a
       seventh of the time but miss events;
-    - `very_tight_tolerance`: tolerance of steps for measures with a small error. These steps cost a
-      third more than tight steps;
-    - `walk_tolerance`: tolerance of walks by Tsit5, whose steps cost a quarter of a tight step. It
-      is chosen because walks at 1e-5 miss three of 118 gaits;
-    - `tight_comparison_tolerances`, `very_tight_comparison_tolerances`: other tolerances of steps.
-      Differences between the steps measure the numerical error if feet may graze the ground.
+    - `very_tight_tolerance`: tolerance for measures with a small allowed error. A step at this
+      tolerance costs a third more than a step at `tight_tolerance`;
+    - `walk_tolerance`: tolerance for walks with the solver Tsit5. A step at this tolerance costs a
+      quarter of a step at `tight_tolerance`. The value is chosen because walks at 1e-5 miss three
+      of 118 gaits;
+    - `tight_comparison_tolerances`, `very_tight_comparison_tolerances`: further tolerances at which
+      steps are repeated if feet may graze the ground. The numerical error is estimated from the
+      differences between these steps.
     """
 
     tight_tolerance: float = 1e-10
@@ -41,11 +43,11 @@ class StepTolerances:
 
 
 STEP_TOLERANCES = StepTolerances()
-"""Tolerances of steps for all measures."""
+"""Solver tolerances for all measures."""
 
 
 class StepQuantities(NamedTuple):
-    """Section states and quantities after a step of some wheels of a batch."""
+    """Section states, step quantities and outcomes of walking steps, one for each wheel."""
 
     # (wheels, 4 + 3 n): section states after the step; zeros if the step failed
     section_states: np.ndarray
@@ -67,7 +69,7 @@ class ContactWheelBatch:
     def from_params(
         cls, params: WheelParams, friction: np.ndarray, stoppers: str, options: StepOptions
     ) -> "ContactWheelBatch":
-        """Return the batch of wheels, given wheel parameters and friction with one batch axis."""
+        """Return the batch of wheels whose `params` and `friction` have one batch axis."""
         parameter_columns = [
             *(np.asarray(getattr(params, parameter_name)) for parameter_name in PARAMETER_NAMES),
             friction,
@@ -78,10 +80,9 @@ class ContactWheelBatch:
     def embed_paper_states(
         self, wheel_indices: np.ndarray, section_states: np.ndarray, has_rigid_legs: Any = False
     ) -> np.ndarray:
-        """Return full section states, (wheels, 4 + 3 n), from the paper's section states, (wheels,
-        3).
+        """Return full section states, (wheels, 4 + 3 n), for states of the paper, (wheels, 3).
 
-        Leg 1 is on its stopper if the wheel `has_rigid_legs`.
+        `wheel_indices` selects the wheels. Leg 1 is on its stopper where `has_rigid_legs` is True.
         """
         full_section_states = np.array(
             embed_section_states(
@@ -96,7 +97,10 @@ class ContactWheelBatch:
     def take_steps(
         self, wheel_indices: np.ndarray, section_states: np.ndarray, n_steps: int = 1
     ) -> StepQuantities:
-        """Return section states and quantities after `n_steps` steps from full section states."""
+        """Return the result of `n_steps` walking steps that begin at `section_states`.
+
+        The section states are full, (wheels, 4 + 3 n). `wheel_indices` selects the wheels.
+        """
         parameter_columns = self.parameter_columns[:, wheel_indices]
         end_states, durations, step_outcomes, *_, step_length = walk_batch(
             parameter_columns,
@@ -112,8 +116,11 @@ class ContactWheelBatch:
     def linearize_steps(
         self, wheel_indices: np.ndarray, section_states: np.ndarray
     ) -> tuple[StepQuantities, np.ndarray, np.ndarray]:
-        """Return section states and quantities after one step from full section states, and their
-        Jacobians with respect to the full section states.
+        """Return the result of one walking step from full section states, and two Jacobians.
+
+        The first Jacobian is that of the next section state, (wheels, 4 + 3 n, 4 + 3 n), and the
+        second that of the step quantities, (wheels, 7, 4 + 3 n). The derivatives are with respect
+        to the full section state at the start.
         """
         parameter_columns = self.parameter_columns[:, wheel_indices]
         n_parameter_columns = len(parameter_columns)
@@ -144,12 +151,12 @@ class ContactWheelBatch:
     def _stack_step_quantities(
         self, durations: Any, step_length: Any, end_states: Any
     ) -> np.ndarray:
-        """Return an array (wheels, 7, ...) of the step quantities or of their derivatives."""
+        """Return the step quantities or their derivatives as one array, (wheels, 7, ...)."""
         paper_states = end_states[:, self.list_paper_state_indices()]
         return np.concatenate([durations, step_length[:, None], paper_states], 1)
 
     def make_batch_for_walks(self) -> "ContactWheelBatch":
-        """Return a copy of the batch whose steps have the looser tolerance of walks."""
+        """Return a copy of the batch with the looser solver tolerance for walks."""
         solver_tolerance = self.step_tolerances.walk_tolerance
         return dataclasses.replace(
             self,
@@ -157,7 +164,7 @@ class ContactWheelBatch:
         )
 
     def make_comparison_batches(self) -> list["ContactWheelBatch"]:
-        """Return copies of the batch, one for each comparison tolerance of steps."""
+        """Return copies of the batch, one for each comparison tolerance."""
         comparison_tolerances = (
             self.step_tolerances.very_tight_comparison_tolerances
             if float(self.step_options.rtol) < 0.5 * self.step_tolerances.tight_tolerance
@@ -171,11 +178,9 @@ class ContactWheelBatch:
         ]
 
     def compute_min_contact_duration(self, wheel_indices: np.ndarray) -> np.ndarray:
-        """Return the shortest duration of a contact that the solver resolves, s, for each selected
-        wheel.
+        """Return the shortest contact duration that the solver resolves for each selected wheel, s.
 
-        The duration is that of a free flight as high as the smallest bounce that the solver
-        resolves.
+        It is the flight time of the smallest bounce that the solver resolves.
         """
         select_parameter = lambda parameter_name: self.parameter_columns[
             PARAMETER_NAMES.index(parameter_name)
@@ -186,5 +191,5 @@ class ContactWheelBatch:
         return np.sqrt(8.0 * bounce_height / select_parameter("gravity"))[wheel_indices]
 
     def list_paper_state_indices(self) -> np.ndarray:
-        """Return the indices, in a full section state, of the paper's section state."""
+        """Return the indices of theta-, dtheta- and dL1- in a full section state."""
         return np.array([0, 1, 4 + self.n_legs])

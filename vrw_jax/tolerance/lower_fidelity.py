@@ -1,5 +1,7 @@
-"""Gaits of the rigid model and of the paper's model, with matrices that propagate a defect of the
-return map to the measures."""
+"""Gaits computed with the rigid model and with the paper's model.
+
+The Jacobians of each gait propagate a defect of the return map to the measures.
+"""
 
 import enum
 from typing import NamedTuple
@@ -24,7 +26,7 @@ from vrw_jax.wheel import Outcome, WheelParams
 
 
 class ModelIndex(enum.IntEnum):
-    """Index of a wheel model, in the order of fidelity."""
+    """Index of a wheel model, in order of increasing fidelity."""
 
     NONE = 0
     RIGID = 1
@@ -41,18 +43,23 @@ MODEL_NAMES = (
 SECTION_STATE_NAME = "section_state"
 
 FINAL_OUTCOMES = (Outcome.STEPPED, Outcome.EVENT_ORDER_MISMATCH)
-"""Outcomes of a search after which no walk is tried. Of 210 wheels with 6 to 12 legs whose
+"""Outcomes of a gait search after which no walk is tried.
+
+They are chosen because few further gaits are reached. Of 210 wheels with 6 to 12 legs whose
 solution has another order of phases, only 3 reach a gait by a walk.
 """
 
 
 class LowerFidelityGaits(NamedTuple):
-    """Gait of each wheel by a model with the paper's section state; the batch axis is first."""
+    """Gait of each wheel, computed with a model whose section state is (theta-, dtheta-, dL1-).
+
+    The first axis of each field contains the wheels.
+    """
 
     model_index: np.ndarray  # a ModelIndex, NONE if there is no gait
     section_states: np.ndarray  # (wheels, 3)
-    step_quantities: np.ndarray  # (wheels, 7): quantities of the step from the section state
-    newton_matrix: np.ndarray  # (wheels, 3, 3): (I - DP)^-1
+    step_quantities: np.ndarray  # (wheels, 7): step quantities from the section state
+    newton_matrix: np.ndarray  # (wheels, 3, 3): (I - DP)^-1, where P is the return map
     # (wheels, 7, 3): derivatives of the step quantities with respect to the section state
     step_quantity_jacobian: np.ndarray
     section_state_error: (
@@ -62,7 +69,7 @@ class LowerFidelityGaits(NamedTuple):
 
 
 def make_empty_gaits(n_wheels: int) -> LowerFidelityGaits:
-    """Return the result for `n_wheels` wheels without a gait."""
+    """Return a `LowerFidelityGaits` in which none of `n_wheels` wheels has a gait."""
     return LowerFidelityGaits(
         np.full(n_wheels, ModelIndex.NONE),
         np.zeros((n_wheels, 3)),
@@ -79,15 +86,15 @@ def replace_gaits(
     replaced_indices: np.ndarray,
     new_gaits: LowerFidelityGaits,
 ) -> None:
-    """Replace the gaits at the indices `replaced_indices` by new gaits, in place."""
+    """Replace, in place, the gaits with the indices `replaced_indices` by `new_gaits`."""
     for gait_array, new_gait_array in zip(gaits_with_steps, new_gaits, strict=True):
         gait_array[replaced_indices] = new_gait_array
 
 
 def find_paper_gaits(params: WheelParams, step_options: StepOptions) -> LowerFidelityGaits:
-    """Return the gaits of the paper's model by collocation.
+    """Return the gaits of wheels by the paper's model, computed by collocation.
 
-    The derivatives are those of one step by machine code.
+    The Jacobians are those of one walking step from each gait's section state.
     """
     cycle_finder = make_finder(None, params.n_legs)
     limit_cycles = map_in_batches(cycle_finder.find_cycles, batch_sizes.GAIT_BATCH_SIZES, params)
@@ -165,11 +172,11 @@ def find_paper_gaits(params: WheelParams, step_options: StepOptions) -> LowerFid
 
 
 def find_rigid_gaits(params: WheelParams) -> LowerFidelityGaits:
-    """Return the gaits of the rigid model in closed form, with the classic landing.
+    """Return the gaits of rigid wheels with the classic impact, in closed form.
 
-    The rear foot leaves the ground at the classic landing. Gaits of stiff legs with unilateral
-    contact approach this gait. If the rear foot is held at landing, as in the paper, the gait is
-    half as fast again.
+    In the classic impact, the rear foot leaves the ground at landing. If legs are stiff, gaits with
+    unilateral contact approach this gait. If the rear foot stays on the ground at landing, as in
+    the paper, the gait is half as fast again.
     """
     (
         section_states,
@@ -204,7 +211,7 @@ def find_rigid_gaits(params: WheelParams) -> LowerFidelityGaits:
 
 
 def compute_static_leg_contraction(params: WheelParams) -> np.ndarray:
-    """Return the contraction of a leg under the wheel's weight, relative to the leg length.
+    """Return the static contraction of one leg under the wheel's weight, divided by the leg length.
 
     The relative error of the rigid model has this order of magnitude.
     """
@@ -220,7 +227,7 @@ def _make_lower_fidelity_gaits(
     return_map_jacobian: np.ndarray,
     step_quantity_jacobian: np.ndarray,
 ) -> LowerFidelityGaits:
-    """Return the gaits of one model, given the section states and derivatives of their steps."""
+    """Return the gaits of one model from the start, end and Jacobians of their walking steps."""
     with np.errstate(all="ignore"):
         newton_matrix = np.linalg.inv(np.eye(3) - return_map_jacobian)
     section_state_error = np.einsum("ijk,ik->ij", newton_matrix, step_end_states - section_states)
@@ -238,11 +245,10 @@ def _make_lower_fidelity_gaits(
 
 @jax.jit
 def _compute_rigid_gaits(params: WheelParams) -> tuple:
-    """Return section states, step lengths (m), durations (s) and Jacobians of the gaits of rigid
-    wheels.
+    """Return section states, step lengths, durations and Jacobians for the gaits of rigid wheels.
 
-    The result is (section states, section states after one step, step lengths, durations,
-    Jacobians of the return map, Jacobians of the durations).
+    The result is (section states, section states after one walking step, step lengths in m,
+    durations in s, Jacobians of the return map, Jacobians of the durations).
     """
     rigid_model, step_options = RigidWheel(stop_at_lift_off=False), StepOptions()
 

@@ -1,4 +1,4 @@
-"""Result of a measure to within a tolerance."""
+"""Result of `vrw.measure_to_tolerance`."""
 
 import math
 from typing import Any
@@ -20,7 +20,7 @@ from vrw_jax.wheel import Outcome
 
 
 class MeasureStatus(StatusCode):
-    """Code of the method by which a measure was computed."""
+    """Method by which a measure was computed."""
 
     CHECKED_BY_ONE_STEP = 0, "checked by one step with unilateral contact"
     CONTINUES_LOWER_GAIT = 1, "the gait that continues the lower model's"
@@ -41,24 +41,24 @@ MODEL_LABELS = ("no model", "the rigid wheel", "the paper's wheel", "unilateral 
 
 
 class MeasureResult(AbstractPrintable):
-    """Measures of a gait and bounds of their errors; for a batch, every property has the batch
-    axis.
+    """Measures of a gait and bounds for their errors, computed by `vrw.measure_to_tolerance`.
 
-    If one measure was requested by its name, a property is a number or an array. Otherwise a
-    property is a dictionary by names of measures. Without a gait, the measure is NaN and the error
-    infinite.
+    Each property is a dictionary whose keys are the names of the measures. If a single name was
+    requested, the property is the value of that measure. For a batch, each value is an array with
+    the batch axis. Without a gait, the measure is NaN and the error infinite.
 
-    - `values`, `errors`, `model_errors`, `numerical_errors`: measures, bounds of their errors,
-      errors of the lower model, and bounds of numerical errors, with the measures on the last axis;
-    - `models`, `statuses`: a `ModelIndex` and a `MeasureStatus` of each element;
-    - `states`: section states with unilateral contact near the gait, as starts for walks and
-      searches;
-    - `n_steps`: number of steps with unilateral contact, where a step with its Jacobian counts as
-      four steps;
-    - `n_gaits`: number of gaits from which the gait was selected, 0 without a selection;
-    - `outcomes`: STEPPED, or the reason why there is no gait;
+    - `values`, `errors`, `model_errors`, `numerical_errors`: measures, bounds for their errors,
+      errors of the lower model, and bounds for the numerical errors. The last axis contains the
+      measures;
+    - `models`, `statuses`: `ModelIndex` and `MeasureStatus` of each batch element;
+    - `states`: full section states near the gait, at which walks and searches with unilateral
+      contact can start;
+    - `n_steps`: number of walking steps with unilateral contact. A step with its Jacobian is
+      equivalent to four steps;
+    - `n_gaits`: number of gaits among which `which` selected; 0 if `which` is None;
+    - `outcomes`: `Outcome` of each batch element: STEPPED, or the reason why no gait was found;
     - `names`, `is_single`: names of the measures, and whether the request was a single name;
-    - `seconds`: time of the whole call, s.
+    - `seconds`: wall-clock time of the whole call, s.
 
     Examples:
         >>> wheel = vrw.WheelParams(damping=150.0)
@@ -74,16 +74,17 @@ class MeasureResult(AbstractPrintable):
     states: np.ndarray  # (*batch, 4 + 3 n)
     models: np.ndarray  # (*batch,), indices in MODEL_NAMES
     statuses: np.ndarray
-    n_steps: np.ndarray  # number of steps with unilateral contact
+    n_steps: np.ndarray  # number of walking steps with unilateral contact
     outcomes: np.ndarray
     n_gaits: np.ndarray
     names: tuple[str, ...] = eqx.field(static=True)
     is_single: bool = eqx.field(static=True)
-    seconds: float = eqx.field(static=True)  # time of the whole call, s
+    seconds: float = eqx.field(static=True)  # wall-clock time of the whole call, s
 
     def _index_by_measure_name(self, measure_values: np.ndarray) -> Any:
-        """Return a dictionary of arrays by measure name, or one array if the request was a single
-        name.
+        """Return the last axis of an array as a dictionary with the names of the measures as keys.
+
+        If a single name was requested, return the array or number for that measure.
         """
         values_by_measure_name = {
             measure_name: measure_values[..., measure_index]
@@ -98,52 +99,51 @@ class MeasureResult(AbstractPrintable):
 
     @property
     def value(self) -> Any:
-        """Return the measure by the selected model, in the measure's unit."""
+        """Return the measure computed with the selected model, in the measure's unit."""
         return self._index_by_measure_name(self.values)
 
     @property
     def error(self) -> Any:
-        """Return a bound of the error of the measure, from all sources, in the measure's unit."""
+        """Return a bound for the total error of the measure, in the measure's unit."""
         return self._index_by_measure_name(self.errors)
 
     @property
     def model_error(self) -> Any:
-        """Return the lower model's measure minus the measure with unilateral contact, in the
-        measure's unit.
+        """Return the error of the measure by the lower model, in the measure's unit.
 
-        The result `value` contains this error only if the lower model is selected. The error is NaN
-        if the lower model has no gait.
+        It is the lower model's measure minus the measure with unilateral contact. `value` contains
+        this error only if the lower model is selected. The error is NaN if the lower model has no
+        gait.
         """
         return self._index_by_measure_name(self.model_errors)
 
     @property
     def numerical_error(self) -> Any:
-        """Return a bound of the measure's error due to tolerances, meshes and iterations, in the
-        measure's unit.
+        """Return a bound for the numerical error of the measure, in the measure's unit.
+
+        Numerical errors are due to tolerances, meshes and iterations.
         """
         return self._index_by_measure_name(self.numerical_errors)
 
     @property
     def model(self) -> Any:
-        """Return the name of the selected model."""
+        """Return the name of the selected model; for a batch, an array of names."""
         selected_model_names = np.asarray(MODEL_NAMES)[self.models]
         return selected_model_names if self.models.ndim else str(selected_model_names)
 
     @property
     def found(self) -> Any:
-        """Return whether a gait was found."""
+        """Return whether a gait was found; for a batch, an array of flags."""
         return (self.outcomes == Outcome.STEPPED)[()]
 
     @property
     def ending(self) -> Any:
-        """Return how the search for the gait ended, as a sentence; for a batch, an array of
-        sentences.
-        """
+        """Return a sentence on how the gait search ended; for a batch, an array of sentences."""
         return describe_step_ending(self.outcomes, Outcome)
 
     @property
     def why(self) -> Any:
-        """Return why the model was selected, as a sentence; for a batch, an array of sentences."""
+        """Return a sentence on why the model was selected; for a batch, an array of sentences."""
         return map_text_of_elements(
             _describe_selection,
             self.models,
@@ -188,7 +188,7 @@ class MeasureResult(AbstractPrintable):
         ]
 
     def _format_measure_value(self, measure_index: int) -> str:
-        """Return the text of a measure with its unit and errors."""
+        """Return a measure with its unit and its errors as text."""
         measure = MEASURES[self.names[measure_index]]
         if not self.found:
             return f"no {measure.name}"
@@ -208,7 +208,7 @@ class MeasureResult(AbstractPrintable):
 def _describe_selection(
     model_index: int, status: int, n_steps: int, search_outcome: int, n_gaits: int
 ) -> str:
-    """Return a sentence on the selected model and method of one element."""
+    """Return a sentence on the model and the method that were selected for one batch element."""
     status_meaning = MeasureStatus(int(status)).meaning
     if status == MeasureStatus.NO_GAIT:
         gait_count_text = f"; gaits that attract: {n_gaits}" if n_gaits else ""
@@ -221,7 +221,7 @@ def _describe_selection(
 
 
 def _format_rounded_number(measure_value: float) -> str:
-    """Return the text of a number with one digit and a power of ten, or with three digits."""
+    """Return a number as text with three digits, or with one digit and a power of ten."""
     if measure_value == 0.0 or 0.1 <= abs(measure_value) < 1e4:
         return f"{measure_value:.3g}"
     mantissa_text, exponent_text = f"{measure_value:.0e}".split("e")

@@ -1,13 +1,14 @@
-"""Means over many wheels with unilateral contact, with a lower model as a control variate.
+"""Means over many wheels with unilateral contact, with the paper's model as a control variate.
 
-The values of the lower model are known for all wheels, and only the difference from unilateral
-contact is sampled (M. B. Giles, Acta Numerica 24, 2015; B. Peherstorfer, K. Willcox and M.
-Gunzburger, SIAM Review 60, 2018). A pilot sample of wheels determines the weight of the control
-variate, the control that is worth its cost, and the number of further wheels. The measures of the
-pilot's wheels count as known, and further wheels are drawn from the remaining wheels. No estimate
-is therefore applied to the numbers from which it was computed, and the mean is unbiased. If some
-wheels have no gait, the mean is a ratio of sums over all wheels. Its bias is then of the order of
-one over the number of sampled wheels.
+The measure by the paper's model is computed for all wheels. Only its difference from the measure
+with unilateral contact is sampled (M. B. Giles, Acta Numerica 24, 2015; B. Peherstorfer, K. Willcox
+and M. Gunzburger, SIAM Review 60, 2018). A pilot sample of wheels determines which control variate
+reduces the total cost most, its weight, and the number of further wheels.
+
+The measures of the pilot's wheels enter the sum directly, and further wheels are drawn from the
+remaining wheels. The weight is therefore never applied to the measures from which it was computed,
+and the mean is unbiased. If some wheels have no gait, the mean is a ratio of sums over all wheels.
+Its bias is then inversely proportional to the number of sampled wheels.
 """
 
 import math
@@ -41,14 +42,15 @@ from vrw_jax.wheel import WheelParams, convert_friction
 
 @dataclass(frozen=True)
 class SamplingOptions:
-    """Options of the sampling of a mean.
+    """Options of the sampling for a mean.
 
-    - `n_standard_errors`: number of standard errors in the stated error of a mean;
-    - `gait_error_fraction`: fraction of the mean's allowed error that is allowed for each gait;
-    - `min_pilot_gaits`: smallest number of wheels with a gait in the pilot sample, which an
-      estimate of the variance needs;
+    - `n_standard_errors`: number of standard errors in the reported error of a mean;
+    - `gait_error_fraction`: allowed error of each gait's measure, as a fraction of the mean's
+      allowed error;
+    - `min_pilot_gaits`: smallest number of wheels with a gait in the pilot sample, from which the
+      variance is estimated;
     - `singular_value_tolerance`: fraction of the largest singular value below which a singular
-      value of the control columns counts as zero.
+      value of the control columns is treated as zero.
     """
 
     n_standard_errors: float = 2.0
@@ -62,7 +64,7 @@ SAMPLING_OPTIONS = SamplingOptions()
 
 
 class _ControlVariate(NamedTuple):
-    """Control variate of a mean; its cost per wheel is in steps with unilateral contact."""
+    """Name of a control variate, and its cost per wheel in steps with unilateral contact."""
 
     control_name: str
     cost_in_steps: float
@@ -73,9 +75,10 @@ CONTROL_VARIATES = (
     _ControlVariate("the paper's gaits", 1.0),
     _ControlVariate("the paper's gaits with one contact step", 2.0),
 )
-"""Control variates. The sampling uses the one with the cheapest plan.
+"""Control variates. The sampling uses the control variate whose plan has the lowest cost.
 
-In batches, the paper's gait costs as much as one step with unilateral contact."""
+In batches, the paper's gait costs as much as one walking step with unilateral contact.
+"""
 
 
 class MultifidelityMean(AbstractPrintable):
@@ -83,15 +86,16 @@ class MultifidelityMean(AbstractPrintable):
 
     - `measure`: name of the measure;
     - `value`: mean, in the measure's unit;
-    - `error`: two standard errors of the mean, plus the mean error of the gaits;
-    - `n_gaits`: number of sampled wheels with a gait with unilateral contact;
-    - `n_high_fidelity`: number of wheels computed with unilateral contact, the pilot included;
+    - `error`: two standard errors of the mean, plus the mean of the error bounds for the gaits;
+    - `n_gaits`: number of sampled wheels that have a gait with unilateral contact;
+    - `n_high_fidelity`: number of wheels computed with unilateral contact, including the pilot
+      sample;
     - `control`: name of the control variate;
     - `weight`: weight of the control variate;
-    - `cost`: number of steps with unilateral contact, including the equivalent cost of the control
-      variate;
-    - `cost_high_fidelity_only`: expected cost of a mean of the same error without a control
-      variate.
+    - `cost`: total cost in walking steps with unilateral contact, including the equivalent cost of
+      the control variate;
+    - `cost_high_fidelity_only`: expected cost of a mean with the same error, computed without a
+      control variate, in walking steps.
 
     Examples:
         >>> wheels = vrw.WheelParams(damping=jnp.linspace(120.0, 200.0, 60))
@@ -134,8 +138,8 @@ class MultifidelityMean(AbstractPrintable):
 class _SamplingPlan(NamedTuple):
     """Plan of the sampling for a mean with one of the control variates."""
 
-    expected_cost_in_steps: float  # expected cost in steps with unilateral contact
-    n_drawn_wheels: int  # number of wheels to draw
+    expected_cost_in_steps: float  # expected cost, walking steps
+    n_drawn_wheels: int  # number of further wheels to compute with unilateral contact
     control_weights: np.ndarray  # (2,): weights of the two control columns
     control_index: int  # index in `CONTROL_VARIATES`
 
@@ -151,13 +155,13 @@ def multifidelity_mean(
     seed: int = 0,
     stoppers: str = "bilateral",
 ) -> MultifidelityMean:
-    """Return the mean of a measure over these wheels with unilateral contact, to within `tol`.
+    """Return the mean of a measure over wheels with unilateral contact, to within `tol`.
 
     Fields of `params` and `friction` have one axis of wheels, such as a design or samples of
-    manufacturing tolerances. Wheels without a gait with unilateral contact do not count.
+    manufacturing tolerances. The mean is over the wheels that have a gait with unilateral contact.
 
     Args:
-        measure: one of the measures of `measure_to_tolerance`.
+        measure: name of one of the measures of `measure_to_tolerance`.
         params: the wheels.
         tol: allowed error (two standard errors), in the measure's unit.
         friction: friction coefficient of the ground.
@@ -252,15 +256,15 @@ def multifidelity_mean(
 
 
 class _SampledMeasures(NamedTuple):
-    """Measures of the wheels of a sample, with unilateral contact."""
+    """Measures with unilateral contact for the wheels in a sample."""
 
     measure_values: np.ndarray  # measure of each wheel, zero if the wheel has no gait
     has_gait: np.ndarray  # whether the wheel has a gait
-    mean_steps_per_wheel: float  # mean number of steps per wheel
+    mean_steps_per_wheel: float  # mean number of walking steps per wheel
 
     @classmethod
     def from_results(cls, measure_results: MeasureResult) -> "_SampledMeasures":
-        """Return the sampled measures, given the results of `measure_to_tolerance`."""
+        """Return the sampled measures from the result of `measure_to_tolerance`."""
         has_gait = measure_results.found.astype(float)
         return cls(
             np.where(measure_results.found, measure_results.value, 0.0),
@@ -270,7 +274,7 @@ class _SampledMeasures(NamedTuple):
 
 
 class _MeasuredWheels(NamedTuple):
-    """All wheels of a mean, and the measure that is evaluated."""
+    """All wheels of a mean, and the name of the averaged measure."""
 
     measure_name: str
     params: WheelParams
@@ -278,13 +282,13 @@ class _MeasuredWheels(NamedTuple):
     stoppers: str
 
     def take_wheels(self, wheel_indices: np.ndarray) -> WheelParams:
-        """Return the wheels at these indices."""
+        """Return the parameters of the wheels with the indices `wheel_indices`."""
         return jax.device_put(select_tree_rows(self.params, wheel_indices))
 
     def measure_selected_wheels(
         self, wheel_indices: np.ndarray, measure_tolerance: float
     ) -> MeasureResult:
-        """Return the measure of the selected wheels with unilateral contact."""
+        """Return the measure with unilateral contact for the selected wheels."""
         measure_arguments = self.measure_name, self.take_wheels(wheel_indices), measure_tolerance
         return measure_to_tolerance(
             *measure_arguments,
@@ -293,8 +297,10 @@ class _MeasuredWheels(NamedTuple):
         )
 
     def evaluate_control_variate(self, wheel_indices: np.ndarray, control_index: int) -> np.ndarray:
-        """Return a control variate of the selected wheels, NaN for wheels without a gait of the
-        paper's model.
+        """Return one control variate for the selected wheels, shape (wheels,).
+
+        The value is NaN for a wheel without a gait by the paper's model. `control_index` is an
+        index in `CONTROL_VARIATES`.
         """
         control_values = np.full(len(wheel_indices), np.nan)
         if not control_index:
@@ -336,7 +342,7 @@ class _MeasuredWheels(NamedTuple):
 
 
 def _stack_control_columns(control_values: np.ndarray) -> np.ndarray:
-    """Return the two columns of a control variate, (wheels, 2).
+    """Return the two regressors of a control variate, (wheels, 2).
 
     The first column is the control variate, or zero for a wheel without a finite control variate.
     The second column is 1 for a finite control variate and 0 otherwise.
@@ -353,10 +359,10 @@ def _plan_sampling(
     n_other_wheels: int,
     sampling_options: SamplingOptions,
 ) -> _SamplingPlan:
-    """Return the sampling plan of a control variate for a mean to within a tolerance.
+    """Return the sampling plan for a mean to within `mean_tolerance`, with one control variate.
 
-    The weights of the control columns and the number of wheels follow from the pilot sample. The
-    mean M is over the wheels with a gait, so that it is a ratio. The controlled quantity is the
+    The pilot sample determines the weights of the control columns and the number of further wheels.
+    The mean M over the wheels with a gait is a ratio of two sums. The controlled quantity is the
     wheel's measure minus M, or zero for a wheel without a gait. The sum of this quantity over all
     wheels is zero.
     """
@@ -402,7 +408,7 @@ def _estimate_mean(
 ) -> tuple[float, float]:
     """Return the mean of a measure and its standard error.
 
-    - `control_columns`: control columns of all wheels except the pilot's wheels. The drawn wheels
+    - `control_columns`: control columns of all wheels outside the pilot sample. The drawn wheels
       come first.
     """
     n_other_wheels = len(control_columns)
@@ -433,10 +439,9 @@ def _estimate_mean(
 def _compute_unseen_wheel_variance(
     pilot_sample: _SampledMeasures, centered_values: np.ndarray
 ) -> float:
-    """Return the variance due to one more wheel whose control variate is wrong, or zero if all
-    wheels of the pilot sample have a gait.
+    """Return the variance due to one more wheel whose control variate is wrong.
 
-    A wheel may have a gait of the paper's model and no gait with unilateral contact. A small sample
-    may contain no such wheel.
+    A wheel may have a gait by the paper's model and no gait with unilateral contact. A small sample
+    may contain no such wheel. The result is zero if all wheels in the pilot sample have a gait.
     """
     return 0.0 if np.all(pilot_sample.has_gait) else float(np.var(centered_values))

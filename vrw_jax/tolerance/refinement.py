@@ -1,10 +1,10 @@
-"""Refinement of gaits with unilateral contact by Newton's method, with bounds of their errors.
+"""Refine gaits with unilateral contact by Newton's method, with bounds for the errors of measures.
 
-One step with unilateral contact from a state x gives the defect r = P(x) - x. Multiplied by the
-inverse of I - DP, it is Newton's correction d. The gait's quantities are those of this step plus
-their change along d, to first order. The exact Jacobian of one step serves several corrections
-(chord iteration). The Jacobian is computed again if corrections contract slowly or the legs' codes
-change.
+One walking step with unilateral contact from a section state x yields the defect r = P(x) - x,
+where P is the return map. Newton's correction is d = (I - DP)^-1 r. The gait's step quantities are
+those of this step plus their first-order change due to d. The Jacobian DP of one step is used for
+several corrections (chord iteration). It is computed again if corrections contract slowly or the
+contact codes of the legs change.
 """
 
 import dataclasses
@@ -26,29 +26,29 @@ from vrw_jax.wheel import Outcome
 
 @dataclasses.dataclass(frozen=True)
 class RefinementOptions:
-    """Options of the refinement of gaits; section states are in rad, rad/s, m, m/s.
+    """Options of the refinement of gaits. Entries of section states are in rad, rad/s, m and m/s.
 
-    - `max_jacobians_per_gait`: largest number of Jacobians for one gait;
-    - `max_corrections_per_jacobian`: largest number of corrections by one Jacobian, chosen because
-      so many corrections reach round-off at `max_contraction_rate`;
-    - `max_contraction_rate`: contraction rate of corrections above which the Jacobian is computed
-      again;
-    - `max_correction_length`: length of the longest accepted correction, chosen because the
-      linearization is unknown beyond this length;
-    - `stall_length_in_tolerances`: length of a correction, in tolerances of the step, below which
-      corrections that contract slowly are at the level of the integrator's errors;
-    - `error_safety_factor`: bound of the remaining error over the effect of the last correction.
-      The same factor is the bound of the numerical error over the difference between steps at two
-      tolerances. The factor is chosen because a factor of four was too small for 4 of 10,365
-      results;
-    - `step_error_in_tolerances`: bound of the error of a step, in tolerances of its solver steps,
-      chosen because 99 of 100 errors are within a third of this bound;
-    - `n_presumed_missed_contacts`: number of shortest contacts of a foot that a step may miss or
-      add;
-    - `max_presumed_error_fraction`: largest fraction of the allowed error that is presumed for
-      missed contacts. If the fraction is larger, steps at other tolerances measure the error;
-    - `jacobian_cost_in_steps`: cost of a step with its Jacobian, in steps, chosen because this step
-      takes 3.7 times the CPU time of a step without derivatives.
+    - `max_jacobians_per_gait`: largest number of Jacobians computed for one gait;
+    - `max_corrections_per_jacobian`: largest number of Newton corrections with one Jacobian, chosen
+      because this number of corrections reaches round-off at `max_contraction_rate`;
+    - `max_contraction_rate`: largest ratio of successive correction lengths. If it is exceeded, the
+      Jacobian is computed again;
+    - `max_correction_length`: largest length of an accepted correction, chosen because the
+      linearization may be invalid beyond this length;
+    - `stall_length_in_tolerances`: ratio of a correction's length to the solver tolerance. Below
+      this ratio, corrections that contract slowly are at the level of the integrator's errors;
+    - `error_safety_factor`: ratio of the bound for the remaining error to the effect of the last
+      correction. It is also the ratio of the bound for the numerical error to the difference
+      between steps at two tolerances. The value is chosen because a factor of four was too small
+      for 4 of 10,365 results;
+    - `step_error_in_tolerances`: ratio of the bound for a walking step's error to the solver
+      tolerance, chosen because 99 of 100 errors are within a third of this bound;
+    - `n_presumed_missed_contacts`: presumed number of contacts of shortest duration that a walking
+      step misses or adds;
+    - `max_presumed_error_fraction`: largest fraction of the allowed error that may be presumed for
+      missed contacts. If it is exceeded, the error is estimated from steps at other tolerances;
+    - `jacobian_cost_in_steps`: cost of a walking step with its Jacobian, in steps without
+      derivatives, chosen because the measured ratio of CPU times is 3.7.
     """
 
     max_jacobians_per_gait: int = 4
@@ -68,20 +68,20 @@ REFINEMENT_OPTIONS = RefinementOptions()
 
 
 class MeasureEstimates(NamedTuple):
-    """Estimates of the measures of gaits, each from one step with unilateral contact.
+    """Estimated measures of gaits, each from one walking step with unilateral contact.
 
-    - `has_same_leg_codes`: whether the legs have the same codes before and after the step,
-      (gaits,);
+    - `has_same_leg_codes`: whether the contact codes of the legs are the same before and after the
+      step, (gaits,);
     - `newton_correction`: Newton's correction of the section state, (gaits, coordinates);
     - `measure_values`: estimated measures of the gaits, (gaits, measures);
     - `correction_effect_on_measures`: sum of the absolute effects of the correction's coordinates
       on each measure, (gaits, measures);
     - `measure_jacobian`: derivatives of the measures with respect to the step quantities, (gaits,
       measures, 7);
-    - `numerical_error_bound`: bound of the measures' error due to the integrator, (gaits,
+    - `numerical_error_bound`: bound for the measures' error due to the integrator, (gaits,
       measures);
-    - `missed_contact_error_bound`: bound of the measures' error due to contacts that are too short
-      to be resolved, (gaits, measures).
+    - `missed_contact_error_bound`: bound for the measures' error due to contacts too short to be
+      resolved, (gaits, measures).
     """
 
     has_same_leg_codes: np.ndarray
@@ -104,18 +104,20 @@ def estimate_measures(
     section_coordinates: Any = slice(None),
     refinement_options: RefinementOptions = REFINEMENT_OPTIONS,
 ) -> MeasureEstimates:
-    """Return estimates of the measures of gaits near section states, each from one step.
+    """Return estimated measures of the gaits near section states, each from one walking step.
 
     Args:
         wheel_batch: batch of wheels.
         wheel_indices: index of the wheel of each gait.
-        section_states: full section states at the start of the steps, (gaits, 4 + 3 n).
-        contact_step: section states and quantities after the steps.
-        newton_matrix: inverse of I - DP in the section coordinates.
-        step_quantity_jacobian: derivatives of the step quantities, (gaits, 7, coordinates).
+        section_states: full section states at which the steps begin, (gaits, 4 + 3 n).
+        contact_step: section states and step quantities after the steps.
+        newton_matrix: inverse of I - DP, where P is the return map, (gaits, coordinates,
+            coordinates).
+        step_quantity_jacobian: derivatives of the step quantities with respect to the section
+            state, (gaits, 7, coordinates).
         measure_names: names of the measures.
         section_coordinates: indices of the corrected coordinates of a section state.
-        refinement_options: options of the bounds.
+        refinement_options: options with the factors of the error bounds.
     """
     n_continuous = section_states.shape[1] - wheel_batch.n_legs
     has_same_leg_codes = np.all(
@@ -158,13 +160,13 @@ def estimate_measures(
 
 
 class RefinedGaits(NamedTuple):
-    """Gaits with unilateral contact and their measures, after the refinement."""
+    """Gaits with unilateral contact after the refinement, with their measures."""
 
     is_found: np.ndarray  # whether the iteration has converged
     is_attracting: np.ndarray  # whether all multipliers are inside the unit circle
     measure_values: np.ndarray  # (gaits, measures)
     error_bounds: np.ndarray  # (gaits, measures)
-    n_steps: np.ndarray  # number of steps; a Jacobian counts as `jacobian_cost_in_steps` steps
+    n_steps: np.ndarray  # walking steps; a Jacobian costs `jacobian_cost_in_steps`
     section_states: np.ndarray  # (gaits, 4 + 3 n)
     walking_speed: np.ndarray  # mean speed of the last step, m/s
 
@@ -178,12 +180,16 @@ def refine_gaits(
     always_compares_tolerances: bool,
     refinement_options: RefinementOptions = REFINEMENT_OPTIONS,
 ) -> RefinedGaits:
-    """Return the gaits near section states, with their measures and bounds of the errors.
+    """Return the gaits near full section states, with their measures and bounds for the errors.
 
-    Newton's corrections of a gait end when the remaining error is below the goal. The argument
-    `compute_error_goal` is a function from measures to their allowed errors. Steps at other
-    tolerances measure the numerical error in two cases: `always_compares_tolerances` is true, or
-    the error due to missed contacts is too large to be presumed.
+    - `wheel_indices`: index of the wheel of each gait, (gaits,);
+    - `section_states`: initial guesses for the section states, (gaits, 4 + 3 n);
+    - `compute_error_goal`: function that returns the allowed errors for given measures;
+    - `always_compares_tolerances`: whether the numerical error is always estimated from walking
+      steps at other tolerances. Otherwise it is so only for gaits whose error due to missed
+      contacts is too large to be presumed.
+
+    Newton's corrections of a gait end when the remaining error is below the allowed error.
     """
     n_gaits, n_coordinates = section_states.shape
     gait_states = section_states.copy()

@@ -1,10 +1,11 @@
-"""Walks with unilateral contact until they settle, by loose steps with extrapolation between them.
+"""Walk with unilateral contact until the motion settles, with extrapolation between walking steps.
 
-On a fast wheel the states of the legs decay within a few steps, and the remaining motion drifts
-slowly along one curve, for hundreds of steps. A few steps determine the drift and its decay. A leap
-along the drift replaces the remaining steps (projective integration: C. W. Gear and I. G.
-Kevrekidis, SIAM J. Sci. Comput. 24, 2003). A leap ends at the latest at the predicted limit of the
-drift. The end of a walk is not a gait but the start of corrections by exact steps.
+In a fast walk, the states of the legs decay within a few steps. The remaining motion then drifts
+slowly along one curve for hundreds of steps. A few steps determine the drift per step and its
+decay. A leap along the drift replaces the remaining steps (projective integration: C. W. Gear and
+I. G. Kevrekidis, SIAM J. Sci. Comput. 24, 2003). A leap ends at the latest at the predicted limit
+of the drift. The state at the end of a walk is not the gait but the initial guess for its
+refinement.
 """
 
 from dataclasses import dataclass
@@ -18,21 +19,22 @@ from vrw_jax.wheel import Outcome
 
 @dataclass(frozen=True)
 class LeapOptions:
-    """Options of walks with leaps; states are in rad, rad/s, m, m/s.
+    """Options of walks with leaps. Entries of section states are in rad, rad/s, m and m/s.
 
-    - `n_warmup_steps`: number of steps before the first leap;
+    - `n_warmup_steps`: number of walking steps before the first leap;
     - `max_leaps`: largest number of leaps;
-    - `steps_per_leap`: number of steps after a leap. It is chosen because five steps miss three of
-      118 gaits, among 451 wheels without a gait of the paper's model;
-    - `max_leap_distance`: length of the longest leap, chosen because longer leaps pass over pairs
-      of close gaits;
-    - `max_fade_distance_ratio`: largest ratio of the fade distance to the distance of all remaining
-      leaps. A walk with a larger ratio ends. The fade distance is the distance to the predicted
-      limit of the drift;
-    - `max_leaps_left_to_give_up`: largest number of remaining leaps at which this ratio is tested,
-      chosen because a drift may first grow for a while and then fade;
-    - `max_settled_drift`: largest drift per step, and largest fade distance, of a settled walk;
-    - `drift_noise_level`: drift per step that is as small as the errors of the steps.
+    - `steps_per_leap`: number of walking steps after a leap. The value is chosen because five steps
+      miss three of 118 gaits, among 451 wheels without a gait by the paper's model;
+    - `max_leap_distance`: largest length of a leap, chosen because longer leaps skip pairs of close
+      gaits;
+    - `max_fade_distance_ratio`: largest ratio of the fade distance to the length of all remaining
+      leaps together. A walk with a larger ratio ends. The fade distance is the distance to the
+      predicted limit of the drift;
+    - `max_leaps_left_to_give_up`: largest number of remaining leaps at which
+      `max_fade_distance_ratio` is tested, chosen because a drift may first grow and then decay;
+    - `max_settled_drift`: largest drift per walking step, and largest fade distance, in a settled
+      walk;
+    - `drift_noise_level`: drift per walking step below which errors of the steps dominate.
     """
 
     n_warmup_steps: int = 20
@@ -50,12 +52,12 @@ LEAP_OPTIONS = LeapOptions()
 
 
 class WalkEnds(NamedTuple):
-    """End of each walk."""
+    """Full section state and outcome at the end of each walk."""
 
     has_settled: np.ndarray  # whether the walk has settled, probably near a gait
     section_states: np.ndarray  # (walks, 4 + 3 n)
     walk_outcomes: np.ndarray  # STEPPED, or the failure that ended the walk
-    n_steps: np.ndarray  # number of steps of the walk
+    n_steps: np.ndarray  # number of walking steps
 
 
 def walk_until_settled(
@@ -64,7 +66,10 @@ def walk_until_settled(
     section_states: np.ndarray,
     leap_options: LeapOptions = LEAP_OPTIONS,
 ) -> WalkEnds:
-    """Return the ends of walks from full section states, each of which settles or fails."""
+    """Return the ends of walks that start at full section states, (walks, 4 + 3 n).
+
+    Each walk settles, fails, or ends without settling after the last leap.
+    """
     n_walks, n_continuous = len(wheel_indices), section_states.shape[1] - wheel_batch.n_legs
     loose_step_batch = wheel_batch.make_batch_for_walks()
     walk_ends = WalkEnds(
@@ -134,7 +139,7 @@ def walk_until_settled(
             step_array[is_continued] for step_array in (active_walks, leap_vectors)
         )
         start_states = walk_ends.section_states[active_walks]
-        # A step places loaded feet on the slope, so that the end of a leap is a valid start.
+        # Each walking step first places loaded feet on the slope, so a leap ends at a valid start.
         start_states[:, :n_continuous] += leap_vectors
     return walk_ends
 
@@ -148,10 +153,10 @@ def _extrapolate_drift(
 ) -> tuple[np.ndarray, ...]:
     """Return whether each walk has settled, the leap of each walk, and the fade distance.
 
-    The arguments are three successive section states of each walk, of which the first
-    `n_continuous` entries are continuous. A leap starts at the last of these states. The fade
-    distance is the distance to the predicted limit of the drift. Leap and fade distance are zero if
-    the legs' codes change.
+    The arguments are three successive section states of each walk, (walks, 4 + 3 n). The first
+    `n_continuous` entries are continuous. A leap starts at the last of the three states. The fade
+    distance is the distance from this state to the predicted limit of the drift. The leap and the
+    fade distance are zero if the contact codes of the legs change.
     """
     has_same_leg_codes = np.all(
         (earlier_states[:, n_continuous:] == current_states[:, n_continuous:])

@@ -1,4 +1,4 @@
-"""Quantities of one step that every model has, and the measures that follow from them."""
+"""Quantities of one walking step that every model provides, and the measures computed from them."""
 
 from collections.abc import Callable, Sequence
 
@@ -16,17 +16,18 @@ QUANTITY_NAMES = (
 """Names of the step quantities.
 
 These are durations with two feet, one foot and no foot on the ground (s), the step length (m) and
-the paper's section state after the step."""
+the paper's section state (theta-, dtheta-, dL1-) after the walking step.
+"""
 
 N_STEP_QUANTITIES = len(QUANTITY_NAMES)
-"""Number of quantities of a step."""
+"""Number of quantities of a walking step."""
 
 N_DURATIONS = 3
-"""Number of durations, which are the first of the step quantities."""
+"""Number of durations, which are the first entries of the step quantities."""
 
 
 def _compute_step_period(step_quantities: np.ndarray) -> np.ndarray:
-    """Return the duration of a step, which is the sum of its first three quantities, s."""
+    """Return the duration of a walking step, s, which is the sum of its first three quantities."""
     return step_quantities[..., 0] + step_quantities[..., 1] + step_quantities[..., 2]
 
 
@@ -42,17 +43,19 @@ MEASURE_FUNCTIONS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "dtheta_touchdown": lambda t: t[..., 5],
     "dL1_touchdown": lambda t: t[..., 6],
 }
-"""Functions from step quantities to the measures of every model, by names of
-`measures.MEASURES`."""
+"""Functions that compute the measures of every model from the step quantities.
+
+The keys are names in `measures.MEASURES`.
+"""
 
 COMPLEX_STEP = 1e-30
-"""Imaginary step of complex-step derivatives, chosen so small that its square has no effect."""
+"""Imaginary increment of complex-step derivatives, chosen so that its square has no effect."""
 
 
 def evaluate_measures(measure_names: Sequence[str], step_quantities: np.ndarray) -> np.ndarray:
-    """Return the measures (wheels, measures) that follow from step quantities (wheels, 7).
+    """Return the measures, (wheels, measures), computed from step quantities, (wheels, 7).
 
-    The measures of a failed step are NaN.
+    The measures of a failed walking step are NaN.
     """
     with np.errstate(invalid="ignore"):
         return np.stack(
@@ -65,7 +68,7 @@ def compute_measure_derivatives(
 ) -> np.ndarray:
     """Return the derivatives of measures with respect to step quantities, (wheels, measures, 7).
 
-    The derivatives are computed by complex steps.
+    The derivatives are computed by the complex-step method.
     """
     complex_quantities = step_quantities[:, None, :] + 1j * COMPLEX_STEP * np.eye(N_STEP_QUANTITIES)
     return np.stack(

@@ -1,11 +1,12 @@
-"""Measures to within a tolerance, from the simplest model whose error can be bounded.
+"""Compute measures to within a tolerance, from the simplest model whose error can be bounded.
 
-The lower model's gait takes one step with unilateral contact. The defect, propagated to the measure
-by the lower model's derivatives, is that model's error to second order. The estimate is a
-dual-weighted residual (R. Becker and R. Rannacher, Acta Numerica 10, 2001) with the next model in
-place of the finer mesh. If the error is within the tolerance, the lower model's value is returned.
-Otherwise Newton's method leads from the end of that step to the gait with unilateral contact. If
-that gait is far from the lower model's, a walk leads to another gait.
+One walking step with unilateral contact starts at the gait of the lower model. The defect of this
+step, propagated to the measure by the lower model's derivatives, is the model error to second
+order. The estimate is a dual-weighted residual (R. Becker and R. Rannacher, Acta Numerica 10,
+2001), in which the next model replaces the finer mesh. If the error is within the tolerance, the
+lower model's measure is returned. Otherwise Newton's method, starting at the end of that step,
+finds the gait with unilateral contact. If that gait is far from the lower model's gait, a walk to
+another gait is computed.
 """
 
 import time
@@ -47,18 +48,20 @@ from vrw_jax.wheel import FRICTION_NAME, Outcome, WheelParams, convert_friction
 
 @dataclass(frozen=True)
 class MeasureRequestOptions:
-    """Options of the search for a model and a gait that give measures to a tolerance.
+    """Options of the search for the model and the gait that yield measures to within a tolerance.
 
-    - `error_safety_factor`: bound of the error over its estimate from one step, chosen because the
-      bound holds as long as each correction is at most 3/4 as long as the previous correction;
-    - `min_tol_for_tight_steps`: smallest tolerance of a measure for which steps have the tight
-      tolerance. Below this value, they have the very tight tolerance;
-    - `n_cold_starts`: number of starts, slow starts first, for wheels without a lower gait. It is
-      chosen because the first two starts lead 100 of 232 wheels to a gait, and the other starts
-      lead no other wheel to a gait;
-    - `max_gait_distance_ratio`: largest distance from the lower gait to the gait that continues it,
-      in lengths of the first correction. The ratio is chosen because the sum of corrections that
-      are halved each time is twice the first correction.
+    - `error_safety_factor`: ratio of the error bound to the error estimated from one walking step.
+      It is chosen because the bound holds if each Newton correction is at most 3/4 as long as the
+      previous correction;
+    - `min_tol_for_tight_steps`: smallest tolerance of a measure for which walking steps are
+      computed at `StepTolerances.tight_tolerance`. Below this value, they are computed at
+      `very_tight_tolerance`;
+    - `n_cold_starts`: number of starts of walks, slow starts first, for wheels without a gait by
+      the lower model. It is chosen because walks from the first two starts reach a gait for 100 of
+      232 wheels, and walks from further starts reach a gait for no other wheel;
+    - `max_gait_distance_ratio`: ratio of the largest accepted distance between the lower model's
+      gait and the gait with unilateral contact to the length of the first correction. It is chosen
+      because the sum of corrections that are halved each time is twice the first correction.
     """
 
     error_safety_factor: float = 4.0
@@ -82,24 +85,25 @@ def measure_to_tolerance(
     stoppers: str = "bilateral",
     which: GaitChoice | None = None,
 ) -> MeasureResult:
-    """Return measures of the wheel's gait on ground of this friction, each to within `tol`.
+    """Return measures of the wheel's gait with unilateral contact, each to within `tol`.
 
-    The reference is `UnilateralWheel(friction, stoppers=stoppers)`. Its gait is the gait that
-    continues the paper's gait. If there is none, it is the gait that a walk from the paper's gait
-    reaches. `MeasureResult.why` names the case. Fields of `params` and `friction` may have one
-    batch axis; the elements of a batch are independent.
+    The reference model is `UnilateralWheel(friction, stoppers=stoppers)`. By default, the gait is
+    the one that Newton's method reaches from the gait by the paper's model. If that gait is too far
+    away, it is the gait that a walk from the paper's gait reaches. `MeasureResult.why` names the
+    method. Fields of `params` and `friction` may have one batch axis; the elements of a batch are
+    independent.
 
-    This function cannot be used inside `jax.jit`, because the models that it runs depend on the
-    numbers.
+    This function cannot be used inside `jax.jit`, because the values of the arguments determine
+    which models are computed.
 
     Args:
         measures: one name or several of speed, period, dls_fraction, step_length, duration_dls,
             duration_single, duration_flight, theta_touchdown, dtheta_touchdown, dL1_touchdown.
         params: the wheel, or a batch of wheels.
         tol: allowed error, in the measure's unit or relative to the value.
-        friction: friction coefficient of the ground.
+        friction: coefficient of Coulomb friction between feet and ground.
         relative: whether `tol` is relative to the value itself.
-        stoppers: stoppers of the reference wheel, "bilateral" or "one-sided".
+        stoppers: stoppers in the reference model, "bilateral" or "one-sided".
         which: "slowest", "fastest" or an index, slowest first, among the gaits with unilateral
             contact that walks from a stated set of starts reach. By default, the gait is the one
             described above.
@@ -164,9 +168,10 @@ def measure_to_tolerance(
 def broadcast_params_and_friction(
     params: WheelParams, friction: Any
 ) -> tuple[WheelParams, np.ndarray, tuple[int, ...]]:
-    """Return wheels and friction with one batch axis, and the batch shape of the arguments.
+    """Return parameters and friction with one batch axis, and the batch shape of the arguments.
 
-    Raise ValueError if the arguments have several batch axes or different lengths.
+    The batch shape is () for a single wheel. Raise a ValueError if the arguments have several batch
+    axes or different lengths.
     """
     check_type("params", params, WheelParams, "write vrw.WheelParams(damping=..., slope=...)")
     argument_shapes = {
@@ -191,11 +196,11 @@ def broadcast_params_and_friction(
 
 
 GAIT_RESULT_NAMES = ("values", "errors", "model_errors", "numerical_errors", "states")
-"""Names of those results of a request that a gait determines."""
+"""Names of the results that depend on the gait, as keys of `_MeasureRequest.result_arrays`."""
 
 
 class _MeasureRequest:
-    """Request for measures of a batch of wheels, with an array of each result."""
+    """State of the computation of measures for a batch of wheels, with the results so far."""
 
     def __init__(
         self,
@@ -229,7 +234,7 @@ class _MeasureRequest:
         }
 
     def compute_error_goal(self, measure_values: np.ndarray) -> np.ndarray:
-        """Return the allowed absolute errors of measures of about this size."""
+        """Return the allowed absolute errors for measures with the values `measure_values`."""
         return self.tol * (
             np.abs(measure_values) if self.relative else np.ones_like(measure_values)
         )
@@ -239,7 +244,7 @@ class _MeasureRequest:
         return np.flatnonzero(self.result_arrays["models"] == ModelIndex.NONE)
 
     def try_rigid_model(self) -> None:
-        """Check the rigid gaits of wheels with stiff legs, and record the accepted measures."""
+        """Compute rigid gaits of wheels with stiff legs, and store measures to within `tol`."""
         with np.errstate(all="ignore"):
             wheel_indices = np.flatnonzero(
                 self.request_options.error_safety_factor
@@ -257,7 +262,11 @@ class _MeasureRequest:
         self._correct_lower_gaits(wheel_indices, continues_iteration=False)
 
     def try_paper_model(self) -> None:
-        """Check the paper's gaits, refine the rejected gaits, and record the accepted measures."""
+        """Compute gaits by the paper's model, and store measures to within `tol`.
+
+        If the error of a gait is larger, the gait with unilateral contact near it is computed and
+        stored.
+        """
         wheel_indices = self.find_unfinished_indices()
         if not len(wheel_indices):
             return
@@ -272,7 +281,7 @@ class _MeasureRequest:
         )
 
     def walk_to_gaits(self) -> None:
-        """Walk with the wheels without a result, and record the measures of the gaits reached."""
+        """Compute walks of wheels without a result, and store the measures of the gaits reached."""
         wheel_indices = self.find_unfinished_indices()
         has_lower_gait = self.lower_gaits.model_index[wheel_indices] != ModelIndex.NONE
         lower_section_states = self.lower_gaits.section_states[wheel_indices[has_lower_gait]]
@@ -293,8 +302,9 @@ class _MeasureRequest:
             )
 
     def select_gait_by_rank(self, gait_rank: int) -> None:
-        """Record the measures of the gait of this rank, slowest first, among the gaits that walks
-        from all starts reach.
+        """Store the measures of the gait with the index `gait_rank`, slowest first.
+
+        The gaits are those that walks from all starts reach.
         """
         wheel_indices = self.find_unfinished_indices()
         walk_starts = compute_walk_starts(self.params)
@@ -317,14 +327,15 @@ class _MeasureRequest:
         )
 
     def _take_wheels(self, wheel_indices: np.ndarray) -> WheelParams:
-        """Return the wheels at these indices."""
+        """Return the parameters of the wheels with the indices `wheel_indices`."""
         return jax.device_put(select_tree_rows(self.params, wheel_indices))
 
     def _correct_lower_gaits(self, wheel_indices: np.ndarray, continues_iteration: bool) -> None:
-        """Take one step with unilateral contact from each lower gait, and record the accepted
-        measures.
+        """Compute one step with unilateral contact from each lower gait, and store measures.
 
-        If `continues_iteration`, the gaits near the rejected lower gaits are refined and recorded.
+        The measures of a lower gait are stored if the estimated errors are within `tol`. If
+        `continues_iteration` is True, the other lower gaits are the initial guesses for gaits with
+        unilateral contact, whose measures are stored as well.
         """
         lower_gaits = LowerFidelityGaits(
             *(gait_array[wheel_indices] for gait_array in self.lower_gaits)
@@ -414,8 +425,9 @@ class _MeasureRequest:
     def _walk_and_record_gaits(
         self, wheel_indices: np.ndarray, section_states: np.ndarray, status: MeasureStatus
     ) -> None:
-        """Walk from the paper's section states, and record the measures of the gaits that are
-        reached.
+        """Compute walks from the paper's section states, and store measures of the gaits reached.
+
+        The section states have the shape (wheels, 3).
         """
         wheel_indices_of_gaits, refined_gaits = self._walk_and_refine_gaits(
             wheel_indices, section_states
@@ -430,7 +442,7 @@ class _MeasureRequest:
     def _walk_and_refine_gaits(
         self, wheel_indices: np.ndarray, section_states: np.ndarray
     ) -> tuple[np.ndarray, RefinedGaits]:
-        """Return the refined gaits at the ends of walks from the paper's section states.
+        """Return the gaits at the ends of walks from the paper's section states, after refinement.
 
         The result is (wheel index of each gait, gaits).
         """
@@ -465,7 +477,11 @@ class _MeasureRequest:
         selected_gait_positions: np.ndarray,
         status: MeasureStatus,
     ) -> None:
-        """Record the measures of the selected gaits with unilateral contact."""
+        """Store the measures of the selected gaits with unilateral contact.
+
+        - `wheel_indices_of_gaits`: index of the wheel of each gait;
+        - `selected_gait_positions`: indices or mask of the selected gaits.
+        """
         wheel_indices = wheel_indices_of_gaits[selected_gait_positions]
         refined_gaits = RefinedGaits(
             *(gait_array[selected_gait_positions] for gait_array in refined_gaits)
@@ -489,8 +505,10 @@ class _MeasureRequest:
         status: MeasureStatus,
         *gait_results: np.ndarray,
     ) -> None:
-        """Record the results of some wheels, in the order of `GAIT_RESULT_NAMES`, with their model
-        and method.
+        """Store the results of the wheels with the indices `wheel_indices`.
+
+        `gait_results` contains the arrays in the order of `GAIT_RESULT_NAMES`. `model_index` and
+        `status` are the model and the method of the results.
         """
         for result_name, result_values in zip(GAIT_RESULT_NAMES, gait_results, strict=True):
             self.result_arrays[result_name][wheel_indices] = result_values
@@ -500,9 +518,10 @@ class _MeasureRequest:
 
 
 def _find_distinct_gaits(refined_gaits: RefinedGaits, candidate_positions: np.ndarray) -> list[int]:
-    """Return the positions of the different attracting gaits, slowest first.
+    """Return the indices of the different attracting gaits of one wheel, slowest first.
 
-    Two gaits are different if a measure differs by more than the sum of both error bounds.
+    `candidate_positions` are the indices of the wheel's gaits in `refined_gaits`. Two gaits are
+    different if a measure differs by more than the sum of both error bounds.
     """
     distinct_positions: list[int] = []
     is_attracting_gait = (refined_gaits.is_found & refined_gaits.is_attracting)[candidate_positions]
