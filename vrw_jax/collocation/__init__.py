@@ -1,4 +1,4 @@
-"""Gauss collocation of limit cycles, with the durations of the phases among the unknowns."""
+"""Solve for limit cycles by Gauss collocation, with the durations of the phases as unknowns."""
 
 from vrw_jax.collocation.extrema import (
     CollocatedPhaseMotion,

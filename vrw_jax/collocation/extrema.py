@@ -1,10 +1,12 @@
-"""Smooth extrema of a quantity within one phase of a collocated cycle.
+"""Find the smooth extrema of a quantity within one phase of a collocated cycle.
 
-Let F be a quantity of the state, and let R and S be its first and second time derivatives. The
-extrema of R are zeros of S. Between two neighboring extrema R is monotone, so that each sign change
-of R is one extremum of F. The zeros are first located on a polynomial of F in each mesh interval.
-The state at a zero is then the end of an additional interval of Gauss nodes. F, R and S are
-evaluated at that state, and the time of the zero is corrected. The extrema are therefore as
+Let F be a quantity that depends on the state. Let R and S be its first and second time derivatives.
+The extrema of R are roots of S. Between two neighboring extrema R is monotone, so that each sign
+change of R is one extremum of F.
+
+The roots are first located on a polynomial approximation of F in each mesh interval. The state at a
+root is then computed as the end of an additional interval with Gauss nodes. F, R and S are
+evaluated at that state, and the time of the root is corrected. The extrema are therefore as
 accurate as the cycle.
 """
 
@@ -33,26 +35,30 @@ from vrw_jax.numerics import Scalar
 
 @dataclass(frozen=True)
 class ExtremumSearchOptions:
-    """Numerical options of the search for extrema of a quantity F in a phase; R is its rate."""
+    """Numerical options of the search for extrema of a quantity F in a phase.
+
+    R denotes the time derivative of F.
+    """
 
     n_samples_per_interval: int = 8
-    """Number of samples of F per mesh interval, chosen because the polynomial through the samples
-    is then more accurate than the motion between two nodes.
+    """Number of samples of F per mesh interval. The value is chosen because the polynomial through
+    the samples is then more accurate than the motion between two nodes.
     """
     max_rate_extrema_per_phase: int = 6
-    """Largest number of extrema of R per phase, chosen because R has at most five extrema if legs
-    are stiff and lightly damped.
+    """Largest number of extrema of R per phase. The value is chosen because R has at most five
+    extrema if the legs are stiff and lightly damped.
     """
     n_bracketing_iterations: int = 12
-    """Number of bracketing iterations on the polynomials, chosen because the error of a zero is
-    then that of the polynomials.
+    """Number of bracketing iterations on the polynomials. The value is chosen because the error of
+    a root is then only that of the polynomials.
     """
     n_time_corrections: int = 3
-    """Number of corrections of the time of an extremum, chosen because each correction shrinks the
-    initial error of 1e-4 mesh intervals at least a hundredfold."""
+    """Number of corrections of the time of an extremum. The value is chosen because each correction
+    reduces the initial error, 1e-4 mesh intervals, at least a hundredfold.
+    """
     n_state_newton_iterations: int = 3
-    """Number of Newton iterations for a state, chosen because the initial error is 1e-5 and
-    Newton's method converges quadratically.
+    """Number of Newton iterations for the state at an extremum. The value is chosen because the
+    initial error is 1e-5 and Newton's method converges quadratically.
     """
 
 
@@ -61,7 +67,7 @@ DEFAULT_EXTREMUM_SEARCH_OPTIONS = ExtremumSearchOptions()
 
 
 class QuantityTimeDerivatives(NamedTuple):
-    """Value of a quantity at one state, with its first and second time derivatives."""
+    """Value of a quantity at one state, and its first and second time derivatives."""
 
     quantity_value: Scalar
     first_time_derivative: Scalar
@@ -69,25 +75,24 @@ class QuantityTimeDerivatives(NamedTuple):
 
 
 class PhaseExtrema(NamedTuple):
-    """Extrema of a quantity F in one phase, and extrema of its rate, both in the order of time.
+    """Extrema of a quantity F in one phase, and extrema of its rate R, each in the order of time.
 
-    Arrays have a fixed length. An element that is no extremum has false flags, and its times and
-    values are meaningless. Times have no derivatives. The values have exact first derivatives
-    without derivatives of the times, because F is stationary in time at its extrema, as is its
-    rate.
+    All arrays have a fixed length. An element that is no extremum has false flags, and its times
+    and values are meaningless. The times carry no derivatives. The values nevertheless have exact
+    first derivatives, because F and R are stationary in time at their extrema.
     """
 
-    extremum_times: Float[Array, " pieces"]  # since the start of the phase, s; for `value`
+    extremum_times: Float[Array, " pieces"]  # since the start of the phase, s
     extremum_values: Float[Array, " pieces"]
     is_quantity_maximum: Bool[Array, " pieces"]
     is_quantity_minimum: Bool[Array, " pieces"]
-    rate_extremum_times: Float[Array, " rates"]  # since the start of the phase, s; for `rate`
-    rate_extremum_values: Float[Array, " rates"]  # rate of F at its extrema
+    rate_extremum_times: Float[Array, " rates"]  # since the start of the phase, s
+    rate_extremum_values: Float[Array, " rates"]  # value of R at its extrema
     is_rate_maximum: Bool[Array, " rates"]
 
 
 FunctionOfCoordinatesAndRates = Callable[[Array, Array], Array]
-"""Function of coordinates and rates, each of shape (coordinates,)."""
+"""Function that maps coordinates and rates, each of shape (coordinates,), to an array."""
 
 
 class CollocatedPhaseMotion(NamedTuple):
@@ -110,8 +115,11 @@ class CollocatedPhaseMotion(NamedTuple):
         phase_duration: Scalar,
         node_accelerations: Array,
     ) -> "CollocatedPhaseMotion":
-        """Return the motion that starts at the given state and has the given duration (s) and node
-        accelerations."""
+        """Build the motion from its initial state, its duration and its node accelerations.
+
+        `start_q` and `start_v` have the shape (coordinates,). `phase_duration` is in s.
+        `node_accelerations` has the shape (intervals, nodes, coordinates).
+        """
         interval_lengths = (
             jnp.asarray(mesh.interval_fractions, phase_duration.dtype)[:, None] * phase_duration
         )
@@ -136,8 +144,10 @@ class CollocatedPhaseMotion(NamedTuple):
         )
 
     def find_interval_at_time(self, time_in_phase: Scalar) -> Array:
-        """Return the index of the mesh interval that contains a time, in s since the start of the
-        phase."""
+        """Return the index of the mesh interval that contains a time.
+
+        `time_in_phase` is the time since the start of the phase, in s.
+        """
         last_interval_index = len(self.boundary_times) - 2
         return jnp.clip(
             jnp.searchsorted(self.boundary_times, time_in_phase, side="right") - 1,
@@ -146,9 +156,9 @@ class CollocatedPhaseMotion(NamedTuple):
         )
 
     def evaluate_states_in_intervals(self, location_in_interval: float) -> tuple[Array, Array]:
-        """Return coordinates and rates at one relative location of every mesh interval.
+        """Return the coordinates and the rates at one relative location in every mesh interval.
 
-        `location_in_interval` is in [0, 1]. Both arrays have the shape (intervals, coordinates).
+        `location_in_interval` is in [0, 1]. The two arrays have the shape (intervals, coordinates).
         """
         interval_lengths = jnp.diff(self.boundary_times)[:, None]
         rate_node_weights, position_node_weights = compute_integration_weights(location_in_interval)
@@ -167,10 +177,11 @@ class CollocatedPhaseMotion(NamedTuple):
         compute_acceleration: FunctionOfCoordinatesAndRates,
         n_newton_iterations: int,
     ) -> tuple[Array, Array]:
-        """Return coordinates and rates at a time, in s since the start of the phase.
+        """Return the coordinates and the rates at a time within the phase.
 
-        The time is the end of an additional mesh interval, which begins at the mesh boundary before
-        it. Newton's method solves for the node accelerations of that interval. The state has
+        `time_in_phase` is the time since the start of the phase, in s. It is the end of an
+        additional mesh interval, which begins at the last mesh boundary before that time. Newton's
+        method solves for the node accelerations of the additional interval. The state has
         derivatives with respect to the motion but not with respect to the time.
         """
         interval_index = self.find_interval_at_time(time_in_phase)
@@ -209,7 +220,10 @@ class CollocatedPhaseMotion(NamedTuple):
 
 
 class _PiecewiseQuantityPolynomial(NamedTuple):
-    """Quantity in one phase, as a polynomial of time in each mesh interval, without derivatives."""
+    """Quantity in one phase as a polynomial of time in each mesh interval.
+
+    The coefficients carry no derivatives.
+    """
 
     boundary_times: Float[Array, " boundaries"]
     interval_coefficients: Float[Array, "intervals powers"]  # of powers of the location in [0, 1]
@@ -221,9 +235,7 @@ class _PiecewiseQuantityPolynomial(NamedTuple):
         compute_quantity: FunctionOfCoordinatesAndRates,
         n_samples_per_interval: int,
     ) -> "_PiecewiseQuantityPolynomial":
-        """Return the polynomials through `n_samples_per_interval` values of the quantity in
-        each mesh interval.
-        """
+        """Interpolate `n_samples_per_interval` values of the quantity in each mesh interval."""
         chebyshev_angles = (
             np.pi * (np.arange(n_samples_per_interval) + 0.5) / n_samples_per_interval
         )
@@ -245,7 +257,10 @@ class _PiecewiseQuantityPolynomial(NamedTuple):
         )
 
     def evaluate_time_derivative(self, evaluation_times: Array, derivative_order: int) -> Array:
-        """Return the first or second time derivative of the quantity at each evaluation time."""
+        """Return the first or the second time derivative of the quantity at each evaluation time.
+
+        `derivative_order` is 1 or 2. Times are in s since the start of the phase.
+        """
         last_interval_index = len(self.boundary_times) - 2
         interval_indices = jnp.clip(
             jnp.searchsorted(self.boundary_times, evaluation_times, side="right") - 1,
@@ -268,8 +283,11 @@ class _PiecewiseQuantityPolynomial(NamedTuple):
 
     @property
     def sample_times_in_phase(self) -> Array:
-        """Return increasing times in the phase, in s: several per interval, and both ends of the
-        phase."""
+        """Return increasing sample times in s since the start of the phase.
+
+        Each mesh interval contains several sample times. The start and the end of the phase are
+        included.
+        """
         locations_in_interval = np.linspace(
             0.0, 1.0, self.interval_coefficients.shape[1], endpoint=False
         )
@@ -286,13 +304,14 @@ def find_quantity_extrema(
     compute_quantity: FunctionOfCoordinatesAndRates,
     search_options: ExtremumSearchOptions = DEFAULT_EXTREMUM_SEARCH_OPTIONS,
 ) -> PhaseExtrema:
-    """Return the extrema of a quantity inside a phase, with exact first derivatives of their
-    values.
+    """Find the extrema of a quantity inside a phase.
+
+    The values of the extrema have exact first derivatives.
 
     Args:
         phase_motion: motion during the phase.
-        compute_acceleration: function from coordinates and rates to the accelerations.
-        compute_quantity: function from coordinates and rates to the quantity, a scalar.
+        compute_acceleration: function that maps coordinates and rates to accelerations.
+        compute_quantity: function that maps coordinates and rates to the quantity, a scalar.
         search_options: numerical options of the search.
     """
     quantity_polynomial = _PiecewiseQuantityPolynomial.interpolate_motion(
@@ -342,10 +361,11 @@ def find_quantity_extrema(
     def correct_times(
         compute_time_corrections: Callable[[QuantityTimeDerivatives], Array], extremum_times: Array
     ) -> tuple:
-        """Return corrected times, and the quantity with its time derivatives at these times.
+        """Return the corrected times, and the time derivatives of the quantity at the corrected
+        times.
 
-        `compute_time_corrections` returns the error of each time from the quantity's time
-        derivatives.
+        `compute_time_corrections` maps the time derivatives of the quantity to the error of each
+        time.
         """
 
         def evaluate_at_time(time_in_phase: Array) -> QuantityTimeDerivatives:
@@ -419,7 +439,7 @@ def evaluate_quantity_time_derivatives(
     q: Array,
     v: Array,
 ) -> QuantityTimeDerivatives:
-    """Return a quantity at the state (q, v), with its first and second time derivatives."""
+    """Return the value and the first two time derivatives of a quantity at the state (q, v)."""
 
     def compute_with_time_derivative(function_of_state: Callable, q: Array, v: Array) -> tuple:
         return jax.jvp(function_of_state, (q, v), (v, compute_acceleration(q, v)))
@@ -437,11 +457,11 @@ def _find_bracketed_zeros(
     bracket_values: tuple[Array, Array],
     n_iterations: int,
 ) -> Array:
-    """Return a zero of `function` in each bracket, without derivatives.
+    """Return one root of `function` in each bracket. The roots carry no derivatives.
 
-    `bracket_values` are the values of `function` at the two ends of the brackets. If both values of
-    a bracket have the same sign, its start is returned. The method is Chandrupatla's (Adv. Eng.
-    Softw. 28, 145-149, 1997).
+    `bracket_values` contains the values of `function` at the two ends of each bracket. If the two
+    values of a bracket have the same sign, the start of the bracket is returned. The method is
+    Chandrupatla's (Adv. Eng. Softw. 28, 145-149, 1997).
     """
     bracket_starts, bracket_ends, bracket_start_values, bracket_end_values = lax.stop_gradient(
         (*bracket_end_points, *bracket_values)

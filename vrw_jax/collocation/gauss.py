@@ -1,4 +1,4 @@
-"""Gauss nodes and integration matrices of a mesh in time, independent of any model."""
+"""Define Gauss nodes, integration matrices and graded meshes in time, independent of any model."""
 
 from typing import NamedTuple
 
@@ -6,33 +6,40 @@ import numpy as np
 from numpy.polynomial import legendre
 
 N_GAUSS_NODES = 4
-"""Number of Gauss nodes per mesh interval, chosen because order 8 reaches errors of 1e-8 with few
-intervals."""
+"""Number of Gauss nodes per mesh interval. The value is chosen because a method of order 8 reaches
+errors of 1e-8 with few intervals.
+"""
 
 GAUSS_NODES = (legendre.leggauss(N_GAUSS_NODES)[0] + 1.0) / 2.0
 """Nodes of Gauss collocation as locations in [0, 1], in increasing order."""
 _MONOMIAL_POWERS = np.arange(N_GAUSS_NODES)
 _COEFFICIENTS_FROM_NODE_VALUES = np.linalg.inv(GAUSS_NODES[:, None] ** _MONOMIAL_POWERS)
-"""Matrix from node values to the coefficients of their polynomial, in increasing powers."""
+"""Matrix that maps the values of a polynomial at the nodes to its coefficients, in
+increasing powers.
+"""
 INTEGRATION_MATRIX = (
     GAUSS_NODES[:, None] ** (_MONOMIAL_POWERS + 1) / (_MONOMIAL_POWERS + 1)
 ) @ _COEFFICIENTS_FROM_NODE_VALUES
-"""Matrix from node values to their integrals from the interval's start to each node.
+"""Matrix that maps node values to their integrals from the start of the interval to each node.
 
 The interval has length 1.
 """
 END_WEIGHTS = (1.0 / (_MONOMIAL_POWERS + 1)) @ _COEFFICIENTS_FROM_NODE_VALUES
-"""Weights of the node values in the integral over an interval of length 1."""
+"""Weights that the node values have in the integral over an interval of length 1."""
 DOUBLE_INTEGRATION_MATRIX = INTEGRATION_MATRIX @ INTEGRATION_MATRIX
-"""Matrix from node values to their double integrals from the interval's start to each node."""
+"""Matrix that maps node values to their double integrals from the start of the interval to each
+node.
+
+The interval has length 1.
+"""
 DOUBLE_END_WEIGHTS = END_WEIGHTS @ INTEGRATION_MATRIX
-"""Weights of the node values in the double integral over an interval of length 1."""
+"""Weights that the node values have in the double integral over an interval of length 1."""
 
 
 class PhaseMesh(NamedTuple):
-    """Mesh of one phase: intervals whose lengths form a geometric sequence.
+    """Mesh of one phase, in which the lengths of the intervals form a geometric sequence.
 
-    The last interval is about `grading` times as long as the first.
+    The last interval is about `grading` times as long as the first interval.
     """
 
     n_intervals: int
@@ -40,7 +47,7 @@ class PhaseMesh(NamedTuple):
 
     @property
     def interval_fractions(self) -> np.ndarray:
-        """Return the lengths of the mesh intervals as fractions of the phase's duration."""
+        """Return the length of each mesh interval as a fraction of the phase's duration."""
         boundary_fractions = np.linspace(0.0, 1.0, self.n_intervals + 1)
         log_grading = np.log(self.grading)
         if abs(log_grading) > 1e-12:
@@ -49,18 +56,19 @@ class PhaseMesh(NamedTuple):
 
     @property
     def node_fractions(self) -> np.ndarray:
-        """Return the times of all nodes since the start of the phase, as fractions of its
-        duration.
+        """Return the time of each node as a fraction of the phase's duration.
+
+        Times are measured from the start of the phase.
         """
         interval_starts = np.cumsum(self.interval_fractions) - self.interval_fractions
         return (interval_starts[:, None] + self.interval_fractions[:, None] * GAUSS_NODES).ravel()
 
 
 def build_phase_integration_matrices(phase_mesh: PhaseMesh) -> tuple[np.ndarray, ...]:
-    """Return times, and matrices from node accelerations to rates and to positions.
+    """Return node times, and matrices that map node accelerations to rates and to positions.
 
-    The rows belong to all nodes in order and, last, to the end of the phase. The phase has duration
-    1 and starts at rest at the origin.
+    The phase has duration 1 and starts at rest at the origin. The times and the rows of the
+    matrices belong to the nodes in the order of time. The last row belongs to the end of the phase.
     """
     n_nodes = phase_mesh.n_intervals * N_GAUSS_NODES
     rate_matrix, position_matrix = (
@@ -95,9 +103,11 @@ def build_phase_integration_matrices(phase_mesh: PhaseMesh) -> tuple[np.ndarray,
 
 
 def compute_lagrange_weights(location_in_interval: float) -> np.ndarray:
-    """Return the weights of node values in the value of their polynomial at one location.
+    """Return the weights with which node values enter the interpolated value at one location.
 
-    `location_in_interval` is the time since the start of the mesh interval, in interval lengths.
+    The value is that of the polynomial through the node values. `location_in_interval` is the time
+    since the start of the mesh interval, in interval lengths. The weights have the shape
+    (N_GAUSS_NODES,).
     """
     node_differences = GAUSS_NODES[:, None] - GAUSS_NODES + np.eye(N_GAUSS_NODES)
     lagrange_factors = np.where(
@@ -109,7 +119,8 @@ def compute_lagrange_weights(location_in_interval: float) -> np.ndarray:
 
 
 def build_mesh_transfer_matrix(source_mesh: PhaseMesh, target_mesh: PhaseMesh) -> np.ndarray:
-    """Return the matrix from node accelerations on one mesh to node accelerations on another mesh.
+    """Build the matrix that maps node accelerations on one mesh to node accelerations on another
+    mesh.
 
     The matrix has the shape (target nodes, source nodes). The transfer is exact for accelerations
     that are cubic polynomials in each interval of the source mesh.
@@ -145,7 +156,7 @@ def build_mesh_transfer_matrix(source_mesh: PhaseMesh, target_mesh: PhaseMesh) -
 
 
 def build_differentiation_matrix() -> np.ndarray:
-    """Return the matrix from node values to the derivative of their polynomial at the nodes.
+    """Build the matrix that maps node values to the derivative of their polynomial at each node.
 
     The interval has length 1.
     """
@@ -156,10 +167,10 @@ def build_differentiation_matrix() -> np.ndarray:
 
 
 def compute_integration_weights(location_in_interval: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the weights of node values in the single and the double integral from 0 to
-    `location_in_interval`.
+    """Return the weights with which node values enter the single and the double integral.
 
-    `location_in_interval` is the time since the start of the mesh interval, in interval lengths.
+    The integrals extend from 0 to `location_in_interval`, the time since the start of the mesh
+    interval in interval lengths. Each array of weights has the shape (N_GAUSS_NODES,).
     """
     integrated_powers = location_in_interval ** (_MONOMIAL_POWERS + 1) / (_MONOMIAL_POWERS + 1)
     twice_integrated_powers = location_in_interval * integrated_powers / (_MONOMIAL_POWERS + 2)

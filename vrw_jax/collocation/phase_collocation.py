@@ -1,17 +1,18 @@
-"""Collocation equations of a limit cycle, and their linearization.
+"""Linearize the collocation equations of a limit cycle.
 
 The unknowns of the cycle are the section state, the durations of all phases and the accelerations
 at all nodes. Each phase is divided into mesh intervals with four Gauss nodes (order 8). Positions
 and rates are explicit functions of the unknowns.
 
-`linearize_cycle` visits each mesh interval once and propagates a few tangents: the Newton
-correction, one tangent per component of the section state, one per requested parameter, and one for
-the duration of the current phase. The node equations are eliminated in each interval. The duration
-of a phase is eliminated at its event, and the section state when the cycle is closed. The monodromy
-matrix and the sensitivities of all unknowns are therefore tangents of one linearization.
+`linearize_cycle` visits each mesh interval once and propagates a few tangents. The first tangent is
+the Newton correction. Further tangents belong to the components of the section state, to the
+requested parameters, and to the duration of the current phase. The node equations are eliminated in
+each interval. The duration of a phase is eliminated at its end event. The section state is
+eliminated when the cycle is closed. The monodromy matrix and the sensitivities of all unknowns are
+therefore tangents of one linearization.
 
-Arrays have batch elements (independent wheels) on their last axis, and the code has no branches
-that depend on values.
+The last axis of each array contains the batch elements, which are independent wheels. No branch of
+the code depends on values.
 """
 
 import functools
@@ -51,11 +52,14 @@ from vrw_jax.numerics import (
 )
 
 PhaseConstants = tuple[Elementwise, ...]
-"""Constants of the equations of motion of all phases, one array per constant."""
+"""Constants in the equations of motion of all phases, one array per constant."""
 
 
 class PhasePoint(NamedTuple):
-    """State within a phase: constants that are held since its start, coordinates and rates."""
+    """State at one time of a phase: coordinates, rates and held constants.
+
+    The held constants are set at the start of the phase and do not change during the phase.
+    """
 
     held_constants: Vector
     q: Vector
@@ -63,14 +67,15 @@ class PhasePoint(NamedTuple):
 
 
 class CollocationPhase(NamedTuple):
-    """One phase, described by functions that are elementwise over the batch.
+    """One phase of a gait step, described by functions that are elementwise over the batch.
 
-    `residual_function` maps (constants, point, accelerations) to the residual of the equations of
-    motion. The residual is linear in the accelerations, and far cheaper to differentiate than the
-    solved equations. `end_event_function` maps (constants, point) to a scalar that is zero at the
-    end of the phase. `guards_function` maps (constants, point) to guards that are positive during
-    the phase. `reset_map` maps (constants, end point) to the start point of the next phase. The
-    reset of the last phase returns the section state as `q`.
+    - `residual_function` maps (constants, point, accelerations) to the residual of the equations of
+      motion. The residual is linear in the accelerations, and its derivatives are far cheaper than
+      those of the solved equations.
+    - `end_event_function` maps (constants, point) to a scalar that is zero at the end of the phase.
+    - `guards_function` maps (constants, point) to guards that are positive during the phase.
+    - `reset_map` maps (constants, end point) to the start point of the next phase. The reset of the
+      last phase returns the section state as `q`.
     """
 
     phase_name: str
@@ -83,11 +88,11 @@ class CollocationPhase(NamedTuple):
 
 
 class PhaseSequence(NamedTuple):
-    """Phases between two crossings of the section, which has `section_size` coordinates.
+    """Sequence of the phases between two crossings of the section.
 
-    `start_map` maps (constants, section state) to the start point of the first phase.
-    `margins_function` maps the constants, the points of all phases and the flags of active
-    phases to the margins, which are positive if the gait is admissible.
+    `section_size` is the number of section coordinates. `start_map` maps (constants, section state)
+    to the start point of the first phase. `margins_function` maps (constants, points of all phases,
+    flags of active phases) to the margins, which are positive if the gait is admissible.
     """
 
     section_size: int
@@ -97,7 +102,7 @@ class PhaseSequence(NamedTuple):
 
 
 class CollocationSolution(NamedTuple):
-    """Unknowns of a cycle of n gait steps, with batch elements on the last axis.
+    """Unknowns of a cycle that consists of n gait steps. The last axis contains the batch elements.
 
     Each gait step consists of all phases of the sequence.
     """
@@ -109,26 +114,26 @@ class CollocationSolution(NamedTuple):
 
 
 class CycleLinearization(NamedTuple):
-    """Newton correction, tangents and monodromy matrix of a cycle at a trial solution."""
+    """Newton correction, parameter tangents and monodromy matrix of a cycle at a trial solution."""
 
     newton_correction: CollocationSolution
     parameter_tangents: (
         # derivatives of the solution; requested parameters on a leading axis
         CollocationSolution
     )
-    # corrected coordinates and rates at the end of each gait step, (n, 2 n_coordinates, batch)
+    # corrected coordinates and rates at the end of each gait step: (n, 2 n_coordinates, batch)
     step_end_states: LaneArray
-    # derivatives of `step_ends`; requested parameters on a leading axis
+    # derivatives of `step_end_states`; requested parameters on a leading axis
     step_end_tangents: LaneArray
     monodromy: LaneArray  # Jacobian of the return map, (row, column, batch)
 
 
 class _LinearizationContext(NamedTuple):
-    """Inputs of a linearization, and the order of its tangents.
+    """Inputs of a linearization, which also define the order of the tangents.
 
-    The first tangent is the Newton correction. The next tangents are those of the components of the
-    section state, and then those of the parameters in `parameter_indices`. Within a phase the last
-    tangent is that of the phase's duration.
+    The first tangent is the Newton correction. Tangents for the components of the section state
+    follow, and then tangents for the parameters in `parameter_indices`. Within a phase, the last
+    tangent belongs to the duration of that phase.
     """
 
     section_size: int
@@ -143,18 +148,20 @@ class _LinearizationContext(NamedTuple):
 
     @property
     def n_tangents(self) -> int:
-        """Return the number of tangents between phases, where no tangent belongs to a duration."""
+        """Return the number of tangents at a phase boundary, where no tangent belongs
+        to a duration.
+        """
         return 1 + self.section_size + len(self.parameter_indices)
 
     @property
     def section_tangent_slice(self) -> slice:
-        """Return the slice of the tangents that belong to the section state."""
+        """Return the slice that selects the tangents for the section state."""
         return slice(1, 1 + self.section_size)
 
     def evaluate_with_tangents(
         self, function_of_point: Callable, point: tuple, point_tangents: tuple
     ) -> tuple:
-        """Return the value of `function_of_point(*point, *phase_constants)` and its tangents."""
+        """Evaluate `function_of_point(*point, *phase_constants)` and its tangents."""
         if not self.parameter_indices:
             return evaluate_with_jvps(
                 lambda *point: function_of_point(*point, *self.phase_constants),
@@ -183,7 +190,9 @@ def _make_linearization_context(
     parameters: LaneArray,
     compute_phase_constants: Callable[..., PhaseConstants],
 ) -> _LinearizationContext:
-    """Return the context of a linearization, with the phase constants and their tangents."""
+    """Compute the phase constants and their tangents, and return them in a
+    linearization context.
+    """
     prevent_fusion = make_fusion_barrier(parameters)
     dtype, lane_shape = parameters.dtype, parameters.shape[1:]
     unit_parameter_tangents = np.eye(parameters.shape[0], dtype=dtype)[list(parameter_indices)]
@@ -209,9 +218,9 @@ def _make_linearization_context(
 
 
 def _stack_phase_point(phase_point: PhasePoint, template_array: Array) -> tuple[Array, ...]:
-    """Return held constants, coordinates and rates of a point as three arrays with a leading axis.
+    """Stack the held constants, the coordinates and the rates of a point into one array each.
 
-    A part without components becomes an empty array with the trailing shape and type of
+    A part without components becomes an empty array. Its trailing shape and type are those of
     `template_array`.
     """
     empty_array = jnp.zeros((0, *template_array.shape[1:]), template_array.dtype)
@@ -222,7 +231,10 @@ def _stack_phase_point(phase_point: PhasePoint, template_array: Array) -> tuple[
 
 
 class _PhaseTangentState(NamedTuple):
-    """State within a phase, and its tangents, which have an additional leading axis."""
+    """State at one time of a phase, and its tangents.
+
+    The tangents have an additional leading axis.
+    """
 
     held_constants: LaneArray
     q: LaneArray
@@ -233,7 +245,7 @@ class _PhaseTangentState(NamedTuple):
 
 
 class _MeshInterval(NamedTuple):
-    """Length and node accelerations of one mesh interval of a phase."""
+    """Length and node accelerations of one mesh interval in a phase."""
 
     length_fraction: Array  # fraction of the phase's duration
     h: LaneArray  # length, s
@@ -241,14 +253,14 @@ class _MeshInterval(NamedTuple):
 
 
 def _make_unit_tangent(n_tangents: int, tangent_index: int, float_dtype: Any) -> np.ndarray:
-    """Return a unit vector over the tangents, of shape (n_tangents, 1, 1, 1)."""
+    """Return the unit vector that selects one tangent, of shape (n_tangents, 1, 1, 1)."""
     return np.eye(n_tangents, dtype=float_dtype)[tangent_index][:, None, None, None]
 
 
 def _evaluate_interval_nodes(
     tangent_state: _PhaseTangentState, mesh_interval: _MeshInterval
 ) -> tuple[Array, ...]:
-    """Return coordinates and rates at the nodes of a mesh interval, and their tangents."""
+    """Return the coordinates, the rates and their tangents at the nodes of a mesh interval."""
     length_fraction, h, node_accelerations = mesh_interval
     v, q_tangents, v_tangents = tangent_state.v, tangent_state.q_tangents, tangent_state.v_tangents
     gauss_node_column = GAUSS_NODES.astype(h.dtype)[:, None, None]
@@ -274,7 +286,7 @@ def _evaluate_interval_end(
     mesh_interval: _MeshInterval,
     acceleration_tangents: LaneArray,
 ) -> _PhaseTangentState:
-    """Return the state and the tangents at the end of a mesh interval."""
+    """Return the state and its tangents at the end of a mesh interval."""
     length_fraction, h, node_accelerations = mesh_interval
     _, q, v, _, q_tangents, v_tangents = tangent_state
     duration_unit_tangent = _make_unit_tangent(q_tangents.shape[0], -1, h.dtype)[:, 0]
@@ -308,9 +320,9 @@ def _linearize_residual(
 ) -> tuple[Array, Array, Any]:
     """Return the residual of the equations of motion at the nodes, and its partial derivatives.
 
-    The Jacobian has the axes (node, equation, argument, batch). Its arguments are q, v, the
-    accelerations and the held constants. The derivatives with respect to the parameters are a
-    separate array with the parameters on the leading axis.
+    The Jacobian has the axes (node, equation, argument, batch). Its arguments are the coordinates,
+    the rates, the accelerations and the held constants. The partial derivatives with respect to the
+    parameters are a separate array with the parameters on the leading axis.
     """
     n_coordinates, n_held_constants = phase.n_coordinates, tangent_state.held_constants.shape[0]
 
@@ -373,9 +385,9 @@ def _assemble_node_system(
     linearized_residual: tuple,
     state_tangents: LaneArray,
 ) -> tuple[Array, Array]:
-    """Return matrix and right-hand sides of the equations for the node accelerations' tangents.
+    """Assemble the linear equations whose solutions are the tangents of the node accelerations.
 
-    There is one right-hand side per tangent.
+    Return the matrix and the right-hand sides. Each tangent has one right-hand side.
     """
     residual_value, residual_jacobian, parameter_partials = linearized_residual
     n_tangents, n_coordinates, float_dtype = (
@@ -480,7 +492,7 @@ def _linearize_phase(
 
 
 PROPAGATED_STATE_FIELDS = ("q", "v", "q_tangents", "v_tangents")
-"""Names of the fields of `_PhaseTangentState` that change during a phase."""
+"""Names of those fields of `_PhaseTangentState` that change during a phase."""
 
 
 def _eliminate_duration(
@@ -490,11 +502,11 @@ def _eliminate_duration(
     phase_duration: LaneArray,
     is_phase_active: Bool[Array, " lanes"],
 ) -> tuple[_PhaseTangentState, LaneArray, Callable[[Array], Array]]:
-    """Eliminate the tangent of a phase's duration by the phase's event, and apply the reset.
+    """Eliminate the duration tangent of a phase by the phase's end event, and apply the reset.
 
-    Return the state at the start of the next phase, the tangents of the duration, and a function
-    that eliminates the tangent of the duration from other tangents. An inactive phase has duration
-    zero.
+    Return the state at the start of the next phase, the tangents of the duration, and a function.
+    The function eliminates the duration tangent from other tangents. The duration of an inactive
+    phase is 0 s.
     """
 
     def evaluate_end(held_constants: Array, q: Array, v: Array, *constants: Array) -> tuple:
@@ -541,10 +553,10 @@ def _linearize_gait_step(
     section_and_tangents: tuple,
     step_inputs: tuple,
 ) -> tuple:
-    """Return the section state after one gait step with its tangents, and the outputs of the step.
+    """Linearize one gait step, and return the section state after it, its tangents and the outputs.
 
-    The outputs are the state at the end of the step, its tangents, and the tangents of the phase
-    durations and of the node accelerations.
+    The outputs are the state at the end of the gait step and its tangents. Further outputs are the
+    tangents of the phase durations and of the node accelerations.
     """
     section_state, section_tangents = section_and_tangents
     phase_durations, accelerations_by_phase, is_phase_active = step_inputs
@@ -604,11 +616,11 @@ def linearize_cycle(
     is_phase_active: Bool[Array, "n n_phases lanes"],
     parameter_indices: tuple[int, ...] = (),
 ) -> CycleLinearization:
-    """Return the Newton correction, the monodromy matrix and the parameter tangents at
-    `trial_solution`.
+    """Return the Newton correction, the monodromy matrix and the parameter tangents of a cycle.
 
-    An inactive phase, which `is_phase_active` marks as False, has duration zero and only applies
-    its reset.
+    The equations are linearized at `trial_solution`. A phase is inactive if `is_phase_active` is
+    False. Its duration is 0 s, and only its reset is applied. `parameter_indices` selects the
+    parameters to which the parameter tangents belong.
     """
     linearization_context = _make_linearization_context(
         phase_sequence.section_size, parameter_indices, parameters, compute_phase_constants
@@ -659,7 +671,7 @@ def linearize_cycle(
     )
 
     def close_cycle(open_tangents: Array) -> Array:
-        """Return the tangents of the closed cycle, which do not depend on a given section state.
+        """Return the tangents of the closed cycle, whose section state is an unknown.
 
         The axes (n, tangent, ...) of the argument become (tangent, n, ...).
         """
@@ -693,7 +705,9 @@ def linearize_cycle(
 
 
 class PhasePoints(NamedTuple):
-    """Points of one phase: its start, all its nodes (on a leading axis) and its end."""
+    """Points of one phase: the start point, all node points (on a leading axis) and the
+    end point.
+    """
 
     start_point: PhasePoint
     node_points: PhasePoint
@@ -708,10 +722,10 @@ def reconstruct_step(
     phase_durations: Array,
     accelerations_by_phase: tuple[Array, ...],
 ) -> tuple[Vector, tuple[PhasePoints, ...]]:
-    """Return the section state after a gait step, and the points of the step's phases.
+    """Reconstruct the motion of a gait step from its phase durations and node accelerations.
 
-    The states follow from the given durations and node accelerations, and no equation is solved.
-    Arrays may have additional trailing axes.
+    Return the section state at the end of the gait step, and the points of each phase. No equation
+    is solved. Arrays may have additional trailing axes.
     """
     start_point = phase_sequence.start_map(phase_constants, section_state)
     phase_points = []
@@ -745,17 +759,18 @@ def estimate_mesh_error(
     solution: CollocationSolution,
     error_per_jump: float = 0.05,
 ) -> LaneArray:
-    """Return an estimate of the discretization error of a cycle, shape (batch,).
+    """Estimate the discretization error of a cycle for each batch element, shape (batch,).
 
-    The unit is rad for angles, m for lengths and the period for times. The accelerations are a
-    separate polynomial in each mesh interval. At a boundary, two polynomials differ by their
-    errors. The estimate is the largest such jump times the square of the longer interval, times
-    `error_per_jump`. Phases with `is_smooth` False do not count, because their error in one
+    The unit is rad for angles and m for lengths; times are in units of the period. The
+    accelerations are a separate polynomial in each mesh interval. At the boundary between two
+    intervals, the two polynomials differ by their errors. Each such jump is multiplied by the
+    square of the longer interval. The estimate is the largest product, multiplied by
+    `error_per_jump`. Phases whose `is_smooth` is False are ignored, because their error in one
     interval hardly affects the next phase.
 
-    - `error_per_jump`: dimensionless factor, chosen because the estimate then bounds the error
-      except for round-off in tests with random gaits of periods to 10 s. For most gaits the
-      estimate is far above the error.
+    - `error_per_jump`: dimensionless factor. The value is chosen because, except for round-off, the
+      estimate bounds the error in tests with random gaits that have periods up to 10 s. For most
+      gaits the estimate is far above the error.
     """
     largest_acceleration_jump = jnp.zeros(
         solution.section_state.shape[-1], solution.section_state.dtype
