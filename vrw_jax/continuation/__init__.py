@@ -1,4 +1,6 @@
-"""Fixed points of maps, Floquet multipliers, pseudo-arclength continuation and test functions."""
+"""Provide fixed points of maps, Floquet multipliers, pseudo-arclength continuation,
+test functions.
+"""
 
 from vrw_jax.continuation import arclength, floquet
 from vrw_jax.continuation.arclength import (

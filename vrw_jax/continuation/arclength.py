@@ -1,4 +1,4 @@
-"""Pseudo-arclength continuation of fixed points in one parameter, through folds.
+"""Continue fixed points in one parameter by pseudo-arclength continuation, also through folds.
 
 An `AbstractContinuationProblem` defines Newton's correction of the unknowns z at a parameter p, and
 the derivative dz/dp. Many branches are continued concurrently, and each branch has a buffer of
@@ -33,7 +33,7 @@ from vrw_jax.validation import (
 )
 
 ProblemUnknowns = Any
-"""Tree of float arrays that Newton's method corrects: the unknowns of a continuation problem."""
+"""Tree of float arrays: the unknowns of a continuation problem, which Newton's method corrects."""
 SectionStateVector = Float[Array, " n"]
 
 
@@ -46,20 +46,22 @@ SectionStateVector = Float[Array, " n"]
 )
 @dataclasses.dataclass(frozen=True)
 class ArclengthOptions:
-    """Numerical options of a continuation. Every change of an option compiles the continuation
-    again.
+    """Numerical options of a continuation.
 
-    - `initial_ds`, `max_ds`, `min_ds`: first, largest and smallest continuation step, an arc length
-      in the section state and the fraction of the parameter's range;
+    JAX compiles the continuation again whenever an option changes. The length of a continuation
+    step is an arc length in the section state and in the parameter as a fraction of its range.
+
+    - `initial_ds`, `max_ds`, `min_ds`: length of the first, the longest and the shortest
+      continuation step;
     - `max_points`: largest number of points in each direction;
     - `max_newton_iterations`: largest number of Newton iterations for one point;
     - `tolerance`: largest norm of Newton's last correction;
-    - `max_turn_angle`: largest angle between the tangents of neighboring points, rad;
-    - `kink_step_factor`: continuation steps below this multiple of `min_ds` may pass a kink of the
-      branch at any angle. The value is chosen because three halvings then remain for failures of
-      Newton's method between two smooth pieces;
+    - `max_turn_angle`: largest angle between the tangents at neighboring points, rad;
+    - `kink_step_factor`: continuation steps shorter than this multiple of `min_ds` may pass a kink
+      of the branch at any angle. The value is chosen because three halvings of the step then remain
+      for failures of Newton's method between two smooth pieces;
     - `jacobian_reuse_fraction`: if a correction is below this fraction of `tolerance`, the
-      iteration ends and the Jacobian of the trial is returned. The value is chosen because that
+      iteration ends and the Jacobian at the trial is returned. The value is chosen because that
       Jacobian is then exact.
 
     Examples:
@@ -103,17 +105,18 @@ class NewtonStep(NamedTuple):
 class AbstractContinuationProblem(eqx.Module):
     """Base class of continuation problems.
 
-    The argument `args` of each method is a pytree of all inputs except z and p.
+    The argument `z` contains the unknowns, and `p` is the continued parameter. The argument `args`
+    is a pytree of all other inputs.
     """
 
     is_traceable: ClassVar[bool] = True
-    """Whether JAX can trace `linearize`. If not, `linearize` is called outside of compiled code,
-    for a batch of points.
+    """Whether JAX can trace `linearize`. If False, `linearize` is called outside compiled code, for
+    a batch of points.
     """
 
     has_multipliers: ClassVar[bool] = True
-    """Whether `NewtonStep.jacobian` is the Jacobian of the equations that are continued, so that
-    its eigenvalues show bifurcations of the branch.
+    """Whether the eigenvalues of `NewtonStep.return_map_jacobian` show bifurcations of the branch.
+    This requires that the matrix is the Jacobian of the continued equations.
     """
 
     has_kinks: ClassVar[bool] = False
@@ -121,8 +124,10 @@ class AbstractContinuationProblem(eqx.Module):
 
     @abc.abstractmethod
     def linearize(self, args: Any, z: ProblemUnknowns, p: Scalar) -> NewtonStep:
-        """Return correction, tangent and Jacobian at (z, p), not finite if the map is undefined
-        there."""
+        """Return Newton's correction, the tangent and the Jacobian at (z, p).
+
+        The values are not finite if the map is undefined at (z, p).
+        """
 
     @abc.abstractmethod
     def section_state(self, z: ProblemUnknowns) -> SectionStateVector:
@@ -131,16 +136,17 @@ class AbstractContinuationProblem(eqx.Module):
     def interpolate_unknowns(
         self, left_point: ProblemUnknowns, right_point: ProblemUnknowns, location_fraction: Scalar
     ) -> ProblemUnknowns:
-        """Return the unknowns at a fraction in [0, 1] of the way between two points of a branch.
+        """Interpolate the unknowns between two points of a branch.
 
-        The result is the initial guess of Newton's method.
+        `location_fraction` is 0 at `left_point` and 1 at `right_point`. The result is the initial
+        guess of Newton's method.
         """
         return jax.tree.map(lambda a, b: a + location_fraction * (b - a), left_point, right_point)
 
     def is_smooth_between(
         self, left_point: ProblemUnknowns, right_point: ProblemUnknowns
     ) -> Bool[Array, ""]:
-        """Return whether the branch shows no kink between two neighboring points."""
+        """Return whether the branch has no detected kink between two neighboring points."""
         return jnp.asarray(True)
 
     def correction_norm(self, z: ProblemUnknowns, correction: ProblemUnknowns) -> Scalar:
@@ -148,17 +154,17 @@ class AbstractContinuationProblem(eqx.Module):
         return jnp.max(jnp.abs(correction))
 
     def is_admissible(self, args: Any, z: ProblemUnknowns, p: Scalar) -> Bool[Array, ""]:
-        """Return whether converged unknowns z satisfy the conditions of their branch."""
+        """Return whether the converged unknowns z satisfy the conditions of their branch."""
         return jnp.all(jnp.isfinite(z))
 
 
 def compute_fixed_point_newton_step(
     return_map: Callable[[Array, Scalar], Array], z: Array, p: Scalar, n_continuous: int
 ) -> NewtonStep:
-    """Return Newton's correction and the tangent for the equation `return_map(z, p)` = z.
+    """Return Newton's correction and the branch tangent for the equation `return_map(z, p)` = z.
 
-    The first `n_continuous` components of z are continuous. The other components are codes, whose
-    corrections are the differences from their images.
+    The first `n_continuous` components of z are continuous. The other components are integer codes.
+    The correction of a code is the difference between its image under the map and the code.
     """
     continuous_map = lambda x, p: return_map(jnp.concatenate([x, z[n_continuous:]]), p)
     mapped_point, partial_jacobians = evaluate_with_jacobian(continuous_map, z[:n_continuous], p)
@@ -178,9 +184,9 @@ def compute_fixed_point_newton_step(
 
 
 class FixedPointProblem(AbstractContinuationProblem):
-    """Continuation problem of fixed points of a map x -> `function(args, x, p)`.
+    """Continuation problem for the fixed points of a map x -> `function(args, x, p)`.
 
-    JAX differentiates the map in forward mode. The map returns NaN if it is not defined.
+    JAX differentiates the map in forward mode. The map returns NaN where it is undefined.
     """
 
     function: Callable[[Any, SectionStateVector, Scalar], SectionStateVector] = eqx.field(
@@ -197,7 +203,7 @@ class FixedPointProblem(AbstractContinuationProblem):
 
 
 class ContinuationStatus(StatusCode):
-    """Reason for the end of a continuation in one direction."""
+    """Reason for which a continuation ended in one direction."""
 
     RUNNING = 0, "The continuation was still running."
     RANGE_END_REACHED = 1, "The parameter's range ended."
@@ -209,7 +215,7 @@ class ContinuationStatus(StatusCode):
 
 
 class ContinuationPoint(NamedTuple):
-    """Point of a branch, with the derivatives of the branch with respect to arc length."""
+    """Point of a branch, and the derivatives of the branch with respect to arc length."""
 
     z: ProblemUnknowns
     p: Scalar
@@ -221,8 +227,9 @@ class ContinuationPoint(NamedTuple):
 
 
 class ContinuationResult(NamedTuple):
-    """Points of all branches, in buffers of `max_points`, of which the first `n_points` are
-    valid.
+    """Points of all branches, in buffers of length `max_points`.
+
+    Only the first `n_points` elements of each buffer are valid.
     """
 
     points: ContinuationPoint
@@ -232,9 +239,11 @@ class ContinuationResult(NamedTuple):
 
 
 class CorrectorPlane(NamedTuple):
-    """Plane in which Newton's method solves for a point of a branch: a point and a normal vector.
+    """Plane in which Newton's method solves for a point of a branch, defined by a point and a
+    normal.
 
-    Both have a part in the section state and a part in the fraction of the parameter's range.
+    The point and the normal each have a part in the section state and a part in the fraction of the
+    parameter's range.
     """
 
     plane_section_state: SectionStateVector
@@ -244,7 +253,7 @@ class CorrectorPlane(NamedTuple):
 
 
 class CorrectorState(NamedTuple):
-    """State of the corrector after a Newton iteration."""
+    """State of the corrector after one Newton iteration."""
 
     z: ProblemUnknowns
     parameter_fraction: Scalar
@@ -261,7 +270,7 @@ def evaluate_newton_step_at_fraction(
     z: ProblemUnknowns,
     parameter_fraction: Scalar,
 ) -> NewtonStep:
-    """Return the Newton step at z and at a fraction of the parameter's range."""
+    """Evaluate the Newton step at the unknowns z and at a fraction of the parameter's range."""
     return problem.linearize(
         args,
         z,
@@ -277,7 +286,7 @@ def correct_trial_point(
     z: ProblemUnknowns,
     parameter_fraction: Scalar,
 ) -> CorrectorState:
-    """Return the corrector state after one Newton iteration in the constraint plane."""
+    """Apply one Newton iteration within the corrector plane, and return the new corrector state."""
     parameter_range = parameter_bounds[1] - parameter_bounds[0]
     fraction_tangent = jax.tree.map(
         lambda section_state: parameter_range * section_state, newton_step.branch_tangent
@@ -309,13 +318,16 @@ def _compute_parameter_fraction(p: Array, parameter_bounds: Array) -> Array:
 
 
 def compute_parameter_from_fraction(parameter_fraction: Array, parameter_bounds: Array) -> Array:
-    """Return the parameter at a fraction of its range, exactly the bounds at fractions 0 and 1."""
+    """Return the parameter at a fraction of its range.
+
+    Fractions 0 and 1 return the exact bounds.
+    """
     p = parameter_bounds[0] + (parameter_bounds[1] - parameter_bounds[0]) * parameter_fraction
     return jnp.where(parameter_fraction == 1.0, parameter_bounds[1], p)
 
 
 class _TrialPoint(NamedTuple):
-    """Predicted point of a branch, and the plane in which Newton's method corrects it."""
+    """Predicted point of a branch, and the plane in which Newton's method corrects that point."""
 
     corrector_plane: CorrectorPlane
     z: ProblemUnknowns
@@ -332,12 +344,12 @@ def _predict_trial_point(
     ds: Scalar,
     parameter_bounds: Array,
 ) -> _TrialPoint:
-    """Return the trial point one continuation step ahead, or at the end of the range if that is
+    """Predict the trial point one continuation step ahead, or at the end of the range if it is
     nearer.
 
-    With `has_previous_point`, the prediction is the cubic polynomial through the last two points
-    and their tangents. Its error is two orders smaller than that of the tangent, which saves one of
-    three Newton iterations.
+    If `has_previous_point` is true, the prediction is the cubic polynomial through the last two
+    points and their tangents. Its error is two orders smaller than the error of a prediction by the
+    tangent. This saves one of three Newton iterations.
     """
     fraction = _compute_parameter_fraction(current_point.p, parameter_bounds)
     fraction_rate = current_point.fraction_rate
@@ -420,8 +432,10 @@ class ContinuationState(NamedTuple):
 
 
 class _TrialVerdict(NamedTuple):
-    """Verdict on a trial point after one Newton iteration; without a flag, another iteration
-    follows."""
+    """Verdict on a trial point after one Newton iteration.
+
+    If the trial is neither accepted nor failed, another Newton iteration follows.
+    """
 
     is_accepted: Bool[Array, ""]
     has_failed: Bool[Array, ""]
@@ -437,7 +451,7 @@ def _assess_trial(
     corrector_state: CorrectorState,
     direction_sign: Scalar,
 ) -> _TrialVerdict:
-    """Return the verdict on a trial point after one Newton iteration."""
+    """Assess a trial point after one Newton iteration, and return the verdict."""
     current_point, trial_point, is_first_point = (
         continuation_state.current_point,
         continuation_state.trial_point,
@@ -494,8 +508,9 @@ def _is_jump_suspicious(
     trial_assessment: _TrialVerdict,
     new_point: ContinuationPoint,
 ) -> Bool[Array, ""]:
-    """Return whether an accepted trial may lie on another branch, which a shorter step may
-    avoid.
+    """Return whether an accepted trial may lie on another branch.
+
+    A shorter continuation step may then avoid the jump.
     """
     if not problem.has_multipliers:
         return jnp.asarray(False)
@@ -520,8 +535,8 @@ def _choose_next_step_length(
 ) -> Scalar:
     """Return the length of the next continuation step.
 
-    The step is lengthened after few Newton iterations, shortened after many, and halved after a
-    failure.
+    The continuation step is lengthened after few Newton iterations, shortened after many, and
+    halved after a failure.
     """
     has_converged_quickly, has_converged_slowly = (
         continuation_state.n_newton_iterations < 4,
@@ -543,7 +558,7 @@ def _is_curve_closed(
     next_point: ContinuationPoint,
     parameter_bounds: Array,
 ) -> Bool[Array, ""]:
-    """Return whether the branch's start lies on the segment between two successive points."""
+    """Return whether the start of the branch lies on the segment between two successive points."""
     stack_coordinates = lambda point: jnp.append(
         problem.section_state(point.z), _compute_parameter_fraction(point.p, parameter_bounds)
     )
@@ -574,7 +589,8 @@ def _update_continuation_status(
 ) -> Int[Array, ""]:
     """Return the `ContinuationStatus` of a branch after a trial.
 
-    `next_arc_length` is the arc length of the next continuation step.
+    `ds` is the proposed length of the next continuation step. `next_arc_length` is its predicted
+    arc length, which is shorter at the end of the range.
     """
     is_accepted, has_failed = trial_assessment.is_accepted, trial_assessment.has_failed
     n_points, reasons_and_statuses = (
@@ -610,7 +626,7 @@ def _init_continuation_state(
     p: Scalar,
     direction_sign: Scalar,
 ) -> ContinuationState:
-    """Return the initial state of one branch. Its first trial point is (z, p)."""
+    """Return the initial state of one branch, whose first trial point is (z, p)."""
     section_state = problem.section_state(z)
     n_section, float_dtype = section_state.shape[0], section_state.dtype
     zero_step_length, zero_count, false_flag = (
@@ -659,7 +675,7 @@ def _init_continuation_state(
 
 
 BranchBatch = tuple[ContinuationState, ContinuationPoint]
-"""States of concurrent branches, and the buffers of their points."""
+"""States of the concurrent branches, and the buffers that store the points of the branches."""
 
 
 def init_branches(
@@ -671,7 +687,10 @@ def init_branches(
     direction_signs: Array,
     is_branch_requested: Array,
 ) -> BranchBatch:
-    """Return the initial states of branches, and empty buffers for their points."""
+    """Return the initial states of all branches, and empty buffers for their points.
+
+    A branch starts only if its element of `is_branch_requested` is true.
+    """
     continuation_states = jax.vmap(
         functools.partial(_init_continuation_state, problem, options, parameter_bounds)
     )(z, p, direction_signs)
@@ -702,9 +721,9 @@ def iterate_branches(
     branch_batch: BranchBatch,
     newton_steps: NewtonStep,
 ) -> BranchBatch:
-    """Return the branches after one Newton iteration of each trial, with accepted points stored.
+    """Apply one Newton iteration to the trial of each branch, and store the accepted points.
 
-    Accepted points of branch i are stored in the buffer `buffer_indices[i]`.
+    Accepted points of branch i are stored in the buffer with index `buffer_indices[i]`.
     """
 
     def iterate_branch(
@@ -814,7 +833,7 @@ def iterate_branches(
         )
         return next_continuation_state, new_point, trial_verdict.is_accepted
 
-    # Buffers are updated outside of `tree_where`, which would copy them in every iteration.
+    # Buffers are updated outside `select_tree_leaves`, which would copy them in every iteration.
     continuation_state, branch_points = branch_batch
     next_continuation_states, new_points, is_accepted = jax.vmap(iterate_branch)(
         args_by_branch, direction_signs, continuation_state, newton_steps
@@ -836,7 +855,7 @@ def iterate_branches(
 
 
 def make_continuation_result(branch_batch: BranchBatch) -> ContinuationResult:
-    """Return the points, their numbers and the statuses of all branches."""
+    """Return the points of all branches, the number of points per branch, and the statuses."""
     continuation_states, branch_points = branch_batch
     return ContinuationResult(
         branch_points,
@@ -859,11 +878,13 @@ def continue_from(
 ) -> ContinuationResult:
     """Continue branches from the points near (z, p), and return all points.
 
-    A direction of 1 increases the parameter, and a direction of -1 decreases it. The input is one
-    branch, or several branches with a leading axis, of which only the requested ones run. A branch
-    ends at the end of the parameter's range, or with its first point that is not admissible; that
-    point is included. A group of branches runs concurrently, with one linearization per branch and
-    iteration. When a branch of the group ends, the next branch starts.
+    The sign 1 in `direction_signs` increases the parameter, and the sign -1 decreases it. The input
+    is one branch, or several branches on a leading axis. Only the branches selected by
+    `is_branch_requested` are continued; the default selects all.
+
+    A branch ends at the end of the parameter's range, or at its first point that is not admissible.
+    That point is included. A group of branches runs concurrently, with one linearization per branch
+    and iteration. When a branch of the group ends, the next branch starts.
     """
     if p.ndim == 0:
         add_branch_axis = lambda tree: jax.tree.map(lambda x: x[None], tree)

@@ -1,8 +1,7 @@
-"""Points of branches on given planes, and continuation outside of compiled code.
+"""Solve for points of branches on planes, and continue branches outside compiled code.
 
 JAX cannot trace a map that is machine code for a batch of points. The linearizations of such a map
-are called outside of compiled code, and the functions of `arclength` perform the rest of each
-iteration.
+are called outside compiled code. The functions of `arclength` perform the rest of each iteration.
 """
 
 import functools
@@ -44,7 +43,7 @@ class PlaneNewtonState(NamedTuple):
 
 
 def init_plane_newton(z: ProblemUnknowns, corrector_plane: CorrectorPlane) -> PlaneNewtonState:
-    """Return the initial state of Newton's method in a plane, from the guess z."""
+    """Return the initial state of Newton's method in a plane, with the initial guess z."""
     n_section = corrector_plane.plane_section_state.shape[0]
     make_zero_tangent, zero_count = jax.tree.map(jnp.zeros_like, z), jnp.zeros((), jnp.int32)
     zero_jacobian = jnp.zeros((n_section, n_section), corrector_plane.plane_section_state.dtype)
@@ -77,7 +76,7 @@ def iterate_plane_newton(
     plane_newton_state: PlaneNewtonState,
     newton_step: NewtonStep,
 ) -> PlaneNewtonState:
-    """Return the state of Newton's method in a plane after one more iteration."""
+    """Apply one Newton iteration in a plane, and return the new state of Newton's method."""
     corrector_state = plane_newton_state.corrector_state
     next_corrector = correct_trial_point(
         problem,
@@ -110,9 +109,9 @@ def make_plane_newton_point(
     corrector_plane: CorrectorPlane,
     plane_newton_state: PlaneNewtonState,
 ) -> tuple[ContinuationPoint, Bool[Array, ""]]:
-    """Return the point of the branch in a plane, and whether Newton's method converged.
+    """Return the point at which the branch crosses a plane, and whether Newton's method converged.
 
-    `fraction_rate` of the point has the sign that belongs to the direction of the plane's normal.
+    The sign of the point's `fraction_rate` follows the direction of the plane's normal.
     """
     corrector_state, p = (
         plane_newton_state.corrector_state,
@@ -142,10 +141,11 @@ def solve_on_plane(
     corrector_plane: CorrectorPlane,
     parameter_bounds: Float[Array, "2"],
 ) -> tuple[ContinuationPoint, Bool[Array, ""]]:
-    """Return the point at which a branch crosses a plane, and whether Newton's method converged.
+    """Solve for the point at which a branch crosses a plane.
 
-    Newton's method starts from z. After convergence another iteration follows, unless the last
-    correction is negligible. The Jacobian is therefore as accurate as the point.
+    Return the point, and whether Newton's method converged. The initial guess is z. After
+    convergence another iteration follows, unless the last correction is negligible. The Jacobian is
+    therefore as accurate as the point.
     """
 
     def iterate_once(plane_newton_state: PlaneNewtonState) -> PlaneNewtonState:
@@ -179,7 +179,7 @@ def continue_branches_uncompiled(
     direction_signs: Float[Array, " branches"],
     is_branch_requested: Bool[Array, " branches"],
 ) -> ContinuationResult:
-    """Continue many branches outside of compiled code, and return all points.
+    """Continue many branches outside compiled code, and return all points.
 
     The arguments and the result are those of `arclength.continue_from`.
     """
@@ -218,7 +218,7 @@ def _linearize_selected_branches(
     parameter_fractions: Array,
     is_selected: Any,
 ) -> NewtonStep:
-    """Return the Newton steps of the selected branches, and NaN for other branches."""
+    """Return the Newton steps for the selected branches. All other branches receive NaN."""
     lower_bound, upper_bound = np.asarray(parameter_bounds)
     parameter_values = lower_bound + (upper_bound - lower_bound) * np.asarray(parameter_fractions)
     selected_steps = problem.linearize(
@@ -243,9 +243,10 @@ def solve_on_many_planes(
     corrector_planes: CorrectorPlane,
     parameter_bounds: Float[Array, "2"],
 ) -> tuple[ContinuationPoint, Bool[Array, " many"]]:
-    """Return the points at which many branches cross planes, and whether Newton's method converged.
+    """Solve for the points at which many branches cross planes.
 
-    Every array has a leading axis over the branches; see `solve_on_plane`.
+    Return the points, and whether Newton's method converged for each branch. Every array has a
+    leading axis over the branches; see `solve_on_plane`.
     """
     plane_newton_states = _init_plane_newton_jit(z, corrector_planes)
     while np.any(
@@ -281,7 +282,9 @@ def _make_plane_newton_points(
     corrector_planes: CorrectorPlane,
     plane_newton_states: PlaneNewtonState,
 ) -> tuple[ContinuationPoint, Bool[Array, " many"]]:
-    """Return the points of many branches in planes, and whether Newton's method converged."""
+    """Return the points at which many branches cross planes, and whether Newton's
+    method converged.
+    """
     finish_plane_newton = lambda args, corrector_plane, plane_newton_state: make_plane_newton_point(
         problem, args, parameter_bounds, corrector_plane, plane_newton_state
     )
@@ -297,8 +300,8 @@ def _iterate_unfinished_plane_newton(
     plane_newton_states: PlaneNewtonState,
     newton_steps: NewtonStep,
 ) -> PlaneNewtonState:
-    """Return the states of many plane solves, where each unfinished solve has made one
-    iteration.
+    """Apply one Newton iteration to each unfinished plane solve, and return the states
+    of all solves.
     """
 
     def iterate_if_unfinished(

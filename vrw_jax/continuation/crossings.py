@@ -1,8 +1,8 @@
-"""Test by Floquet multipliers whether two neighboring points belong to one branch.
+"""Test by Floquet multipliers whether two neighboring points belong to the same branch.
 
-A continuation step may pass several special points, or reach a nearby branch. Both change the
-number of multipliers outside the unit circle, or the sign of the determinant of Newton's equations.
-Along a branch this sign changes only at branch points.
+A continuation step may pass several special points, or may end on a nearby branch. Each of these
+events changes the number of multipliers outside the unit circle, or the sign of the determinant of
+Newton's equations. On a single branch the sign of the determinant changes only at branch points.
 """
 
 from typing import NamedTuple
@@ -29,6 +29,7 @@ def is_multiplier_change_explained(
 ) -> Bool[Array, ""]:
     """Return whether bifurcations explain the change of the multipliers between two points.
 
+    `jacobian_before` and `jacobian_after` are the Jacobians of the return map at the two points.
     `has_turned_back` is whether the parameter changes its direction between the points.
     """
     margins_before, margins_after = map(
@@ -44,8 +45,8 @@ def is_multiplier_change_explained(
     )
 
     def count_outside(jacobian: Array) -> tuple[Array, Array]:
-        """Return the least and the largest possible number of multipliers outside the unit
-        circle.
+        """Return the least and the largest possible number of multipliers outside the
+        unit circle.
         """
         multiplier_moduli, tolerance = (
             jnp.abs(floquet_multipliers(jacobian)),
@@ -64,12 +65,13 @@ def is_multiplier_change_explained(
 
 
 class BranchJumpSuspicion(NamedTuple):
-    """Suspicion that the last continuation step reached another branch, which shortens the next
-    steps.
+    """Suspicion that the last continuation step reached another branch.
 
-    - `suspicious_ds`: length of the first suspicious continuation step, 0 if there is none;
-    - `accepts_any_multipliers`: whether shorter steps did not help, so that the next step is
-      accepted with any multipliers.
+    A suspicion shortens the next continuation steps.
+
+    - `suspicious_ds`: length of the first suspicious continuation step; 0 if no step is suspicious;
+    - `accepts_any_multipliers`: whether the next continuation step is accepted with any
+      multipliers, because shorter steps did not help.
     """
 
     suspicious_ds: Scalar
@@ -78,7 +80,7 @@ class BranchJumpSuspicion(NamedTuple):
     def update_after_trial(
         self, is_suspicious: Bool[Array, ""], trial_ds: Scalar
     ) -> "BranchJumpSuspicion":
-        """Return the suspicion after a trial with a continuation step of length `trial_ds`."""
+        """Return the suspicion after a trial whose continuation step has the length `trial_ds`."""
         is_first_suspicion = is_suspicious & (self.suspicious_ds == 0.0)
         return self._replace(
             suspicious_ds=jnp.where(is_first_suspicion, trial_ds, self.suspicious_ds)
@@ -87,8 +89,7 @@ class BranchJumpSuspicion(NamedTuple):
     def choose_trial_ds(
         self, is_accepted: Bool[Array, ""], proposed_ds: Scalar, min_ds: float
     ) -> tuple["BranchJumpSuspicion", Scalar]:
-        """Return the suspicion before the next trial, and the length of the trial's continuation
-        step.
+        """Return the suspicion before the next trial, and the length of the next continuation step.
 
         The length is `proposed_ds`, or `suspicious_ds` if `proposed_ds` is below `min_ds`.
         """

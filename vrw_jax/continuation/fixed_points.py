@@ -1,4 +1,4 @@
-"""Fixed points of return maps by Newton's method on the section, for any system."""
+"""Find fixed points of return maps by Newton's method on the section, for any system."""
 
 import functools
 from collections.abc import Callable
@@ -31,13 +31,13 @@ from vrw_jax.validation import (
 class FixedPointResult(NamedTuple):
     """Fixed point of a map, and the Jacobian of the map at that point.
 
-    - `x`: the fixed point, shape (n,);
+    - `x`: fixed point, shape (n,);
     - `jacobian`: Jacobian of the `period_n`-th iterate of the map, shape (n, n);
     - `residual`: largest absolute component of map(x) - x;
     - `converged`: whether Newton's method converged;
     - `n_iterations`: number of Newton iterations;
-    - `termination`: `Termination` of the simulation of a `ReturnMap` from `x`; None for any other
-      map.
+    - `termination`: `Termination` status of the simulation of a `ReturnMap` from `x`; None for any
+      other map.
 
     Examples:
         >>> result = vrw.solve_fixed_point(lambda x: 0.5 * x + 1.0, jnp.zeros(1))
@@ -54,8 +54,10 @@ class FixedPointResult(NamedTuple):
 
     @property
     def ending(self) -> Any:
-        """Return a sentence on the convergence of Newton's method; for a batch, an array of
-        sentences."""
+        """Return a sentence that describes whether Newton's method converged.
+
+        For a batch the result is an array of such sentences.
+        """
         return map_text_of_elements(_describe_newton_convergence, self.converged, self.n_iterations)
 
     def __repr__(self) -> str:
@@ -76,7 +78,7 @@ class FixedPointResult(NamedTuple):
 
 
 def _describe_newton_convergence(converged: bool, n_iterations: int) -> str:
-    """Return a sentence on the convergence of Newton's method to one fixed point."""
+    """Return a sentence that describes whether Newton's method converged to one fixed point."""
     if converged:
         return f"Newton's method converged after {n_iterations} iterations."
     return (
@@ -86,8 +88,9 @@ def _describe_newton_convergence(converged: bool, n_iterations: int) -> str:
 
 
 MAX_NEWTON_ITERATIONS = 30
-"""Default limit of Newton iterations, chosen far above the number that is needed from a start near
-the fixed point."""
+"""Default limit of Newton iterations. The value is chosen far above the number that a start near
+the fixed point needs.
+"""
 
 
 @with_renamed_arguments(iterations="max_iterations")
@@ -99,18 +102,18 @@ def solve_fixed_point(
     tolerance: float | Scalar = 1e-12,
     max_iterations: int = MAX_NEWTON_ITERATIONS,
 ) -> FixedPointResult:
-    """Return a fixed point of `function` applied `period_n` times, by Newton's method.
+    """Find a fixed point of `function` applied `period_n` times, by Newton's method.
 
     The result is differentiable with respect to all values that `function` closes over. Two further
-    iterations with derivatives give the point's derivatives to third order, and the Jacobian's to
-    first order. If Newton's method does not converge, the start is returned unchanged, without
-    derivatives.
+    Newton iterations with derivatives provide the derivatives of the fixed point to third order.
+    They provide the derivatives of its Jacobian to first order. If Newton's method does not
+    converge, the start is returned unchanged, without derivatives.
 
     Args:
-        function: map of a vector to a vector of its shape, differentiable in forward mode. For a
-            hybrid system the map is a `ReturnMap`, which has no fixed point if its simulation ends
-            early.
-        start: start of Newton's method, shape (n,).
+        function: map from a vector to a vector of the same shape, differentiable in forward mode.
+            For a hybrid system the map is a `ReturnMap`, which has no fixed point if its simulation
+            ends early.
+        start: initial guess of Newton's method, shape (n,).
         period_n: number of times that the map is applied.
         tolerance: largest norm of Newton's last correction, in units of `start`.
         max_iterations: largest number of Newton iterations.
@@ -144,10 +147,10 @@ def solve_fixed_point_implicit(
     period_n: int = 1,
     tolerance: float | Scalar = 1e-12,
 ) -> FixedPointResult:
-    """Return a fixed point of a map whose second derivatives are expensive.
+    """Find a fixed point of a map whose second derivatives are expensive.
 
-    Derivatives of order n of the fixed point need only derivatives of order n of `function`.
-    Derivatives of the Jacobian are NaN.
+    The arguments are those of `solve_fixed_point`. Derivatives of order n of the fixed point
+    require only derivatives of order n of `function`. Derivatives of the Jacobian are NaN.
     """
     return _solve_checked_fixed_point(
         _run_newton_implicit, function, start, period_n, tolerance, MAX_NEWTON_ITERATIONS
@@ -162,7 +165,7 @@ def _solve_checked_fixed_point(
     tolerance: float | Scalar,
     max_iterations: int,
 ) -> FixedPointResult:
-    """Return the fixed point by a given form of Newton's method, after checks of the arguments."""
+    """Check the arguments, and find the fixed point by `newton_method`."""
     check_callable("function", function, "that maps a state to the next")
     start, period_n = check_reals("start", start), check_int("period_n", period_n)
     max_iterations = check_int("max_iterations", max_iterations)
@@ -230,8 +233,9 @@ def _compute_newton_correction(
 
 
 N_DERIVATIVE_ITERATIONS = 2
-"""Number of Newton iterations with derivatives, chosen because one iteration gives only first
-derivatives of the point."""
+"""Number of Newton iterations with derivatives. The value is chosen because a single iteration
+provides only first derivatives of the fixed point.
+"""
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0, 1))
@@ -242,9 +246,9 @@ def _run_newton_loop(
     tolerance: Array,
     *closed_over_values: Any,
 ) -> FixedPointResult:
-    """Return the fixed point by Newton's method in a single loop.
+    """Find the fixed point by Newton's method in a single loop.
 
-    A single loop compiles the map, which is often a large program, only once.
+    With a single loop the map, which is often a large program, is compiled only once.
     """
 
     def is_newton_searching(correction_norm: Array, n_iterations: Array) -> Array:
@@ -302,8 +306,10 @@ def _run_newton_loop(
 def _run_newton_jvp(
     converted_map: ClosureConvertedMap, iterations: int, primals: tuple, tangents: tuple
 ) -> tuple[FixedPointResult, FixedPointResult]:
-    """Return the fixed point and its tangent, by iterations with derivatives that start at the
-    point."""
+    """Return the fixed point and its tangent, by Newton iterations with derivatives.
+
+    The iterations start at the fixed point.
+    """
     start, _, *closed_over_values = primals
     newton_result = _run_newton_loop(converted_map, iterations, *lax.stop_gradient(primals))
 
@@ -334,8 +340,9 @@ def _run_newton_implicit(
     tolerance: Array,
     *closed_over_values: Any,
 ) -> FixedPointResult:
-    """Return the fixed point by Newton's method; its derivatives follow from the implicit function
-    theorem."""
+    """Find the fixed point by Newton's method, with derivatives by the implicit
+    function theorem.
+    """
     return _run_newton_loop(converted_map, iterations, start, tolerance, *closed_over_values)
 
 
@@ -346,7 +353,7 @@ def _run_newton_implicit_jvp(
 ) -> tuple[FixedPointResult, FixedPointResult]:
     """Return the fixed point and its tangent by the implicit function theorem.
 
-    The tangent depends on the fixed point, to which the same derivative rule applies.
+    The tangent depends on the fixed point. Derivatives of the tangent therefore use the same rule.
     """
     newton_result = _run_newton_implicit(converted_map, iterations, *primals)
     closed_over_values, closed_over_tangents = tuple(primals[2:]), tuple(tangents[2:])

@@ -1,9 +1,9 @@
-"""Floquet multipliers of small real matrices in closed form, differentiable and batched.
+"""Compute Floquet multipliers of small real matrices in closed form, differentiably and in batches.
 
 A matrix is the Jacobian of a return map, of shape (..., n, n) with n at most 3. For larger matrices
 LAPACK computes the multipliers, the spectral radius and the bifurcation margins on a CPU. An
-eigenvalue is not differentiable if it equals another one. The Jury margins are polynomials of the
-matrix and always differentiable.
+eigenvalue is not differentiable if it equals another eigenvalue. The Jury margins are polynomials
+of the matrix entries and always differentiable.
 """
 
 import functools
@@ -22,25 +22,25 @@ MAX_CLOSED_FORM_SIZE = 3
 """Size of the largest matrix whose characteristic polynomial is solved in closed form."""
 
 SMOOTH_MIN_SHARPNESS = 50.0
-"""Sharpness of the smooth minimum in `compute_stability_margin`, chosen because the result is then
-at most log(4)/50 below the exact minimum.
+"""Sharpness of the smooth minimum in `compute_stability_margin`. The value is chosen because the
+result is then at most log(4)/50 below the exact minimum.
 """
 
 
 @dataclass(frozen=True)
 class MultiplierTolerances:
-    """Tolerances within which multipliers count as equal, as real, or as on the unit circle.
+    """Tolerances within which multipliers are treated as equal, as real, or as on the unit circle.
 
-    - `unit_circle_distance`: largest distance from modulus 1 at which a multiplier counts to both
-      sides of the circle. The value is chosen because maps that preserve areas have multipliers on
-      the circle up to round-off, which is 1e-8 for two equal multipliers;
+    - `unit_circle_distance`: largest distance from modulus 1 at which a multiplier may lie on
+      either side of the circle. The value is chosen because area-preserving maps have multipliers
+      on the circle up to round-off, which is 1e-8 for two equal multipliers;
     - `located_pair_circle_distance`: largest distance from modulus 1 of the pair at a located
       Neimark-Sacker bifurcation;
-    - `min_imaginary_part`: imaginary part below which a multiplier on the unit circle counts as
+    - `min_imaginary_part`: imaginary part below which a multiplier on the unit circle is treated as
       real. The value is chosen because three equal real multipliers are computed with imaginary
       parts of 1e-5;
-    - `equal_moduli_distance`: largest difference of two moduli that count as equal, chosen as
-      `unit_circle_distance`.
+    - `equal_moduli_distance`: largest difference of two moduli that are treated as equal. The value
+      is that of `unit_circle_distance`.
     """
 
     unit_circle_distance: float = 1e-6
@@ -50,7 +50,7 @@ class MultiplierTolerances:
 
 
 MULTIPLIER_TOLERANCES = MultiplierTolerances()
-"""Tolerances of multipliers in all continuations."""
+"""Tolerances for multipliers in all continuations."""
 
 
 def compute_characteristic_polynomial(matrix: RealSquareMatrix) -> tuple[Array, ...]:
@@ -89,14 +89,17 @@ def compute_characteristic_polynomial(matrix: RealSquareMatrix) -> tuple[Array, 
 
 
 def _differentiable_square_root(x: Array) -> Array:
-    """Return the square root of max(x, 0), whose derivative is zero for x <= 0."""
+    """Return the square root of max(x, 0). Its derivative is zero for x <= 0."""
     is_positive = x > 0.0
     return jnp.where(is_positive, jnp.sqrt(jnp.where(is_positive, x, 1.0)), 0.0)
 
 
 class _EigenvaluePair(NamedTuple):
-    """Pair of eigenvalues: mean ± real_offset if they are real, mean ± i imaginary_offset
-    otherwise."""
+    """Pair of eigenvalues, which are real or complex conjugates.
+
+    The eigenvalues are pair_mean ± real_offset if they are real, and pair_mean ± i imaginary_offset
+    otherwise.
+    """
 
     pair_mean: Array
     real_offset: Array
@@ -104,7 +107,7 @@ class _EigenvaluePair(NamedTuple):
 
     @property
     def modulus(self) -> Array:
-        """Return the modulus of a complex pair."""
+        """Return the common modulus of a complex pair."""
         return _differentiable_square_root(
             self.pair_mean * self.pair_mean + self.imaginary_offset * self.imaginary_offset
         )
@@ -122,8 +125,8 @@ def _solve_quadratic_pair(a0: Array, a1: Array) -> _EigenvaluePair:
 def _solve_cubic_real_root(a0: Array, a1: Array, a2: Array) -> Array:
     """Return the real root of z^3 + a2 z^2 + a1 z + a0 that is farthest from the other roots.
 
-    A closed form gives the root without derivatives. Newton's method then makes the root exact,
-    with derivatives up to order 3.
+    A closed form first computes the root without derivatives. Newton's method then makes the root
+    exact, and provides derivatives up to order 3.
     """
     b0, b1, b2 = map(lax.stop_gradient, (a0, a1, a2))
     mean_root = -b2 / 3.0
@@ -165,8 +168,11 @@ def _solve_cubic_real_root(a0: Array, a1: Array, a2: Array) -> Array:
 def _split_into_isolated_and_pair(
     matrix: RealSquareMatrix,
 ) -> tuple[list[Array], _EigenvaluePair | None]:
-    """Return the isolated real eigenvalues of a small matrix, and the remaining pair if there is
-    one."""
+    """Return the isolated real eigenvalues of a small matrix, and the remaining pair of
+    eigenvalues.
+
+    The pair is None for a 1x1 matrix.
+    """
     coefficients = compute_characteristic_polynomial(matrix)
     if len(coefficients) == 1:
         return [-coefficients[0]], None
@@ -182,8 +188,9 @@ def _split_into_isolated_and_pair(
 
 @jax.jit
 def floquet_multipliers(matrix: RealSquareMatrix) -> Complex[Array, "... n"]:
-    """Return all eigenvalues of a return map's Jacobian, the largest modulus first, shape (...,
-    n).
+    """Return all eigenvalues of a return map's Jacobian, shape (..., n).
+
+    The eigenvalues are in the order of decreasing modulus.
     """
     if matrix.shape[-1] > MAX_CLOSED_FORM_SIZE:
         return _sort_eigenvalues_by_modulus(jnp.linalg.eigvals(matrix))
@@ -206,7 +213,7 @@ def _sort_eigenvalues_by_modulus(eigenvalues: Array) -> Array:
 
 @jax.jit
 def compute_spectral_radius(matrix: RealSquareMatrix) -> Float[Array, "..."]:
-    """Return the largest modulus of the eigenvalues.
+    """Return the largest modulus of the eigenvalues of `matrix`.
 
     If two eigenvalues are equal, the derivative is one-sided or zero.
     """
@@ -229,8 +236,8 @@ def compute_jury_margins(matrix: RealSquareMatrix) -> Float[Array, "... n_margin
     """Return the Jury margins, which are all positive if and only if all multipliers are stable.
 
     The first margin vanishes at a fold (multiplier 1), and the second at a period doubling
-    (multiplier -1). For n > 1 the third margin vanishes if a pair crosses the unit circle. For n =
-    3 the fourth margin completes the criterion.
+    (multiplier -1). For n > 1 the third margin vanishes when a pair of multipliers crosses the unit
+    circle. For n = 3 the fourth margin completes the criterion.
     """
     polynomial_coefficients = compute_characteristic_polynomial(matrix)
     if len(polynomial_coefficients) == 1:
@@ -246,12 +253,11 @@ def compute_jury_margins(matrix: RealSquareMatrix) -> Float[Array, "... n_margin
 
 @jax.jit
 def compute_bifurcation_margins(matrix: RealSquareMatrix) -> Float[Array, "... n_margins"]:
-    """Return the margins to fold, period doubling and Neimark-Sacker bifurcation, for any matrix
-    size.
+    """Return the margins to fold, period doubling and Neimark-Sacker bifurcation.
 
-    For small matrices these are the first Jury margins. For large matrices the margins are det(1 -
-    matrix), det(1 + matrix), and the product of 1 - z_i z_j over all pairs of eigenvalues. The
-    third margin is absent for n = 1.
+    If n is at most 3, these are the first Jury margins. For larger matrices the margins are det(1 -
+    matrix), det(1 + matrix), and the product of 1 - z_i z_j over all pairs of eigenvalues z_i and
+    z_j. The third margin is missing for n = 1.
     """
     n = matrix.shape[-1]
     if n <= MAX_CLOSED_FORM_SIZE:
@@ -287,8 +293,9 @@ def has_double_multiplier(
 ) -> Bool[Array, "..."]:
     """Return whether the two largest moduli are equal within `modulus_tolerance`.
 
-    The spectral radius then has a kink. A complex pair has equal moduli that are smooth, so a pair
-    counts only if it is about to become real.
+    The spectral radius then has a kink. The moduli of a complex pair are equal and smooth. Such a
+    pair therefore satisfies the test only if its imaginary part is at most `modulus_tolerance`, or
+    if a real multiplier has the same modulus.
     """
     isolated_eigenvalues, remaining_pair = _split_into_isolated_and_pair(matrix)
     if remaining_pair is None:

@@ -1,6 +1,6 @@
-"""Sign changes of quantities along a branch, and their exact locations.
+"""Find sign changes of quantities on a branch, and locate them exactly.
 
-All brackets are searched in one batch, with one evaluation per round for all of them.
+All brackets are searched in one batch. Each round evaluates the quantities once for all brackets.
 """
 
 from collections.abc import Callable
@@ -18,17 +18,18 @@ from vrw_jax.continuation.floquet import (
 )
 
 BIFURCATION_NAMES = ("fold", "period_doubling", "neimark_sacker")
-"""Names of the bifurcations, at which a multiplier is 1, a multiplier is -1, or a pair has modulus
-1."""
+"""Names of the bifurcations. A multiplier is 1 at a fold and -1 at a period doubling; a pair of
+multipliers has modulus 1 at a Neimark-Sacker bifurcation.
+"""
 
 
 @dataclass(frozen=True)
 class ZeroSearchOptions:
     """Numerical options of `locate_function_zeros`.
 
-    - `max_smooth_rounds`: number of rounds after which an unresolved bracket counts as a jump;
-    - `n_sections_per_jump_bracket`: number of equal sections into which a round divides a bracket
-      with a jump.
+    - `max_smooth_rounds`: number of rounds after which an unresolved bracket is treated as a jump;
+    - `n_sections_per_jump_bracket`: number of equal sections into which each round divides a
+      bracket that contains a jump.
     """
 
     max_smooth_rounds: int = 12
@@ -40,9 +41,9 @@ ZERO_SEARCH_OPTIONS = ZeroSearchOptions()
 
 
 def evaluate_bifurcation_functions(jacobians: np.ndarray) -> np.ndarray:
-    """Return the values of the test functions of `BIFURCATION_NAMES`, shape (..., 3).
+    """Evaluate the test functions of the bifurcations in `BIFURCATION_NAMES`, shape (..., 3).
 
-    `jacobians` has the shape (..., n, n). A value is NaN if matrices of size n cannot have the
+    `jacobians` has the shape (..., n, n). A value is NaN if a matrix of size n cannot have that
     bifurcation.
     """
     bifurcation_margin_values = np.asarray(compute_bifurcation_margins(jnp.asarray(jacobians)))
@@ -60,7 +61,7 @@ def has_unit_circle_pair(
     """Return whether a complex pair of multipliers lies on the unit circle.
 
     The test function of the Neimark-Sacker bifurcation also vanishes for two real reciprocal
-    multipliers, which are no bifurcation.
+    multipliers. Such multipliers are no bifurcation.
     """
     multipliers = np.asarray(floquet_multipliers(jnp.asarray(jacobian)))
     is_complex_pair = np.abs(multipliers.imag) > multiplier_tolerances.min_imaginary_part
@@ -71,7 +72,7 @@ def has_unit_circle_pair(
 
 
 class QuantitySignChange(NamedTuple):
-    """Sign change of one quantity between two points of a branch, given by three indices."""
+    """Sign change of one quantity between two points of a branch, described by three indices."""
 
     left_point_index: int
     right_point_index: int
@@ -79,11 +80,10 @@ class QuantitySignChange(NamedTuple):
 
 
 def find_sign_changes(quantity_values: np.ndarray) -> list[QuantitySignChange]:
-    """Return the sign changes between neighboring points, from values of shape (points,
-    quantities).
+    """Find the sign changes of each quantity between neighboring points.
 
-    NaN and zero have no sign. Two sign changes between neighboring points cancel and are not
-    detected.
+    `quantity_values` has the shape (points, quantities). NaN and 0 have no sign. Two sign changes
+    between the same neighboring points cancel, and neither is detected.
     """
     quantity_signs = np.sign(np.nan_to_num(quantity_values))
     signed_points = np.argwhere(quantity_signs[:-1] * quantity_signs[1:] < 0.0)
@@ -94,8 +94,9 @@ def find_sign_changes(quantity_values: np.ndarray) -> list[QuantitySignChange]:
 
 
 class ZeroLocations(NamedTuple):
-    """Locations of zeros in [0, 1] and the brackets that enclose them, each of shape
-    (brackets,).
+    """Locations of roots in [0, 1], and the ends of the brackets that enclose them.
+
+    Each array has the shape (brackets,).
     """
 
     best_locations: np.ndarray  # bracket end with the smaller absolute value
@@ -109,14 +110,14 @@ def locate_function_zeros(
     max_bracket_width: np.ndarray,
     options: ZeroSearchOptions = ZERO_SEARCH_OPTIONS,
 ) -> ZeroLocations:
-    """Return the zeros of functions that have opposite signs at 0 and 1, by Chandrupatla's method.
+    """Locate the roots of functions that have opposite signs at 0 and 1, by Chandrupatla's method.
 
-    `function` maps locations and the indices of their brackets to function values. `end_values` are
-    the function values at 0 and 1. A round uses inverse quadratic interpolation if it is reliable,
-    and bisection otherwise. A bracket in which the function jumps or stalls is divided into several
-    sections per round. A jump is therefore located as reliably as a smooth zero. The search ends
-    when every bracket is narrower than `max_bracket_width` or has an exact zero. A location at
-    which the function is NaN gets the sign of location 1.
+    `function` maps locations and the indices of their brackets to function values. `end_values`
+    contains the function values at 0 and at 1. A round uses inverse quadratic interpolation if it
+    is reliable, and bisection otherwise. A bracket in which the function jumps or stalls is divided
+    into several sections per round. A jump is therefore located as reliably as a smooth root. The
+    search ends when every bracket is narrower than `max_bracket_width` or has an exact root. If the
+    function is NaN at a location, that location is treated as having the sign of location 1.
     """
     values_at_zero, values_at_one = end_values
     # The rows are the newest location, the end with the other sign, and the location replaced by
@@ -193,7 +194,9 @@ def locate_function_zeros(
 def _propose_zero_location(
     bracket_locations: np.ndarray, function_values: np.ndarray, max_bracket_width: np.ndarray
 ) -> np.ndarray:
-    """Return the next location in each bracket by Chandrupatla's method (1997, doi 10/d9zjj8)."""
+    """Return the next trial location in each bracket by Chandrupatla's method (1997,
+    doi 10/d9zjj8).
+    """
     with np.errstate(divide="ignore", invalid="ignore"):
         location_ratio, value_ratio = (
             (bracket_locations[0] - bracket_locations[1])

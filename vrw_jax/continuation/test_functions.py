@@ -1,8 +1,8 @@
-"""Curves in two parameters on which a test function of fixed points is zero.
+"""Continue curves in two parameters on which a test function of fixed points is zero.
 
 Newton's method has the second parameter as an additional unknown, and the test function as an
-additional equation. A curve is then continued by `arclength` along the first parameter. It may turn
-back as a branch does at a fold.
+additional equation. A curve is then continued by `arclength` in the first parameter. The curve may
+turn back like a branch at a fold.
 """
 
 import abc
@@ -27,7 +27,9 @@ ParameterPair = Float[Array, "2"]
 
 
 class TestFunctionNewtonStep(NamedTuple):
-    """Newton step at a trial (z, p), and the test function whose zeros are continued."""
+    """Newton step at trial unknowns z and trial parameters p, and the value of the test
+    function.
+    """
 
     newton_correction: ProblemUnknowns  # of z at fixed p
     # derivatives dz/dp of the fixed point with respect to both parameters
@@ -39,14 +41,15 @@ class TestFunctionNewtonStep(NamedTuple):
 
 
 class AbstractTestFunction(eqx.Module):
-    """Base class of test functions of fixed points in two parameters.
+    """Base class of test functions that are evaluated at fixed points, in two parameters.
 
-    The argument `args` of each method is a pytree of all inputs except z and p.
+    The argument `z` contains the unknowns of the fixed point. The argument `p` contains the values
+    of the two parameters. The argument `args` is a pytree of all other inputs.
     """
 
     @abc.abstractmethod
     def linearize(self, args: Any, z: ProblemUnknowns, p: ParameterPair) -> TestFunctionNewtonStep:
-        """Return the Newton step at (z, p), not finite if the map is undefined there."""
+        """Return the Newton step at (z, p). It is not finite if the map is undefined there."""
 
     @abc.abstractmethod
     def section_state(self, z: ProblemUnknowns) -> SectionStateVector:
@@ -57,21 +60,21 @@ class AbstractTestFunction(eqx.Module):
         return jnp.max(jnp.abs(correction))
 
     def is_admissible(self, args: Any, z: ProblemUnknowns, p: ParameterPair) -> Bool[Array, ""]:
-        """Return whether converged unknowns z satisfy the conditions of their branch."""
+        """Return whether the converged unknowns z satisfy the conditions of their branch."""
         return jnp.all(jnp.isfinite(self.section_state(z)))
 
 
 class TestFunctionPoint(NamedTuple):
-    """Unknowns of a point of the curve: those of the fixed point, and the second parameter."""
+    """Unknowns at a point of the curve: those of the fixed point, and the second parameter."""
 
     z: ProblemUnknowns
     second_parameter_fraction: Elementwise  # of the second parameter's range
 
 
 class TestFunctionCurve(AbstractContinuationProblem):
-    """Continuation problem of the curve on which a test function of two parameters is zero.
+    """Continuation problem for the curve on which a test function of two parameters is zero.
 
-    The curve is continued along the first parameter. Arc lengths include the second parameter as a
+    The curve is continued in the first parameter. Arc lengths include the second parameter as a
     fraction of its range. The curve ends when this fraction leaves [0, 1].
     """
 
@@ -131,7 +134,7 @@ class TestFunctionCurve(AbstractContinuationProblem):
 
 
 JURY_MARGIN_OFFSET = 1e-6
-"""Value of the fold's margin on the curve that represents the fold.
+"""Value that the margin to the fold has on the curve by which the fold is represented.
 
 The value is above zero, because the equations are singular at the fold. It is small, because the
 error of the parameters is the square of the value.
@@ -139,5 +142,7 @@ error of the parameters is the square of the value.
 
 
 def compute_offset_bifurcation_margins(jacobian: Float[Array, "n n"]) -> Array:
-    """Return the bifurcation margins, where that of the fold is reduced by `JURY_MARGIN_OFFSET`."""
+    """Return the bifurcation margins, with the margin to the fold reduced by
+    `JURY_MARGIN_OFFSET`.
+    """
     return compute_bifurcation_margins(jacobian).at[0].add(-JURY_MARGIN_OFFSET)
