@@ -1,4 +1,4 @@
-"""Limit cycles of each model: finders, admissibility checks and derivatives."""
+"""Find limit cycles of each model, check that they are admissible, and differentiate them."""
 
 from vrw_jax.cycles import (
     collocation_search,

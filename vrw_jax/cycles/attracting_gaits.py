@@ -1,4 +1,4 @@
-"""Attracting gaits of wheels, found by walks from fixed starts and refined by Newton's method."""
+"""Find the attracting gaits of wheels by walks from fixed starts, refined by Newton's method."""
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -20,23 +20,26 @@ from vrw_jax.runtime import with_default_jax_settings
 from vrw_jax.wheel import Outcome, WheelParams
 
 DUPLICATE_GAIT_DISTANCE = 1e-5
-"""Distance of section states, in units of the wheel, below which two gaits count as equal."""
+"""Distance between section states, in units of the wheel, below which two gaits are
+treated as equal.
+"""
 
 
 def find_attracting_gaits(gait_finder: Any, parameter_values: Any) -> tuple[np.ndarray, Any]:
-    """Return the attracting gaits of each wheel, slowest first.
+    """Find the attracting gaits of each wheel, in the order of increasing speed.
 
-    Walks begin at WALK_STARTS. For a wheel without a gait from these starts, walks also begin at
+    Walks begin at WALK_STARTS. If a wheel has no gait from these starts, walks also begin at
     FALLBACK_WALK_STARTS. A wheel without an attracting gait has one cycle, whose outcome is a
     failure.
 
     Args:
         gait_finder: finder of gaits with unilateral contact.
-        parameter_values: values of each wheel, (wheels, n_values); see
+        parameter_values: parameters of each wheel, shape (wheels, n_values), in the order of
             `AbstractWheel.parameter_values`.
 
     Returns:
-        Index of the wheel of each gait, (gaits,), and cycles with the leading axis (gaits,).
+        Index of the wheel to which each gait belongs, shape (gaits,), and the cycles, whose leading
+        axis is (gaits,).
     """
     parameter_values = np.asarray(parameter_values)
     gait_wheel_indices, gaits_from_first_starts = _find_gaits_from_starts(
@@ -66,10 +69,11 @@ def _find_gaits_from_starts(
     parameter_values: np.ndarray,
     compute_start_states: Callable[[WheelParams], np.ndarray],
 ) -> tuple[np.ndarray, Any]:
-    """Return the index of the wheel of each attracting gait, and the gaits that walks reach.
+    """Find the attracting gaits that walks from given starts reach.
 
-    The walks begin at the states that `compute_start_states` returns. The gaits of a wheel are
-    ordered by speed, slowest first.
+    Return the index of the wheel to which each gait belongs, and the gaits. The walks begin at the
+    states that `compute_start_states` returns. The gaits of a wheel are in the order of increasing
+    speed.
     """
     n_wheels = len(parameter_values)
     with ThreadPoolExecutor(1) as compile_thread:
@@ -125,7 +129,7 @@ def _find_gaits_from_starts(
         selected_indices += (
             [] if len(selected_indices) > n_selected_before else [int(candidate_indices[0])]
         )
-    # The cycle of a wheel without a valid candidate contains zeros and counts as not found.
+    # The cycle of a wheel without a valid candidate contains zeros and has a failure as outcome.
     selected_gaits = select_tree_rows(candidate_gaits, selected_indices)
     is_missing = ~is_gait_valid[selected_indices]
     broadcast_mask = lambda gait_array: is_missing.reshape(-1, *[1] * (gait_array.ndim - 1))
@@ -146,10 +150,10 @@ def _find_gaits_from_starts(
 
 
 def find_slow_gaits(gait_finder: Any, parameter_values: Any) -> Any:
-    """Return for each wheel the gait that a walk from a slow start reaches.
+    """Find for each wheel the gait that a walk from a slow start reaches.
 
-    If the walk reaches no gait, the slowest attracting gait is returned. For 1,200 random wheels,
-    both gaits are the same.
+    If the walk reaches no gait, the slowest attracting gait is returned. The two gaits are equal
+    for each of 1,200 random wheels.
     """
     parameter_values = np.asarray(parameter_values)
     compute_slow_start = lambda params: compute_walk_starts(params)[:1]
@@ -170,5 +174,5 @@ def find_slow_gaits(gait_finder: Any, parameter_values: Any) -> Any:
 
 
 def find_slowest_gait_indices(gait_wheel_indices: np.ndarray, n_wheels: int) -> np.ndarray:
-    """Return the index of each wheel's first gait, which is its slowest one, shape (wheels,)."""
+    """Return the index of each wheel's first gait, which is its slowest gait, shape (wheels,)."""
     return np.searchsorted(gait_wheel_indices, np.arange(n_wheels))

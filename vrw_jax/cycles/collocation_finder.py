@@ -1,4 +1,4 @@
-"""Finder of the paper's gaits by collocation, with a check by one event-driven step."""
+"""Find gaits of the paper's model by collocation, and check each gait by one event-driven step."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -57,7 +57,7 @@ from vrw_jax.wheel import (
 
 
 class CollocationFinder(AbstractGaitFinder):
-    """Finder of the paper's limit cycles, which needs no start.
+    """Finder of limit cycles of the paper's model, which requires no start near the gait.
 
     `period_n` applies only to `find_cycle`.
     """
@@ -102,18 +102,18 @@ class CollocationFinder(AbstractGaitFinder):
 
     @property
     def collocation_system(self) -> CollocationSystem:
-        """Return the collocation system of the search."""
+        """Return the collocation system that the search solves."""
         return CollocationSystem(
             self.n_legs, self.period_n, self.cycle_options, self.model.stop_at_lift_off
         )
 
     def with_finer_mesh(self) -> "CollocationFinder":
-        """Return a finder with a finer mesh of each phase."""
+        """Return a finder whose meshes are finer in each phase."""
         return dataclasses.replace(self, cycle_options=self.cycle_options.refine_mesh())
 
     @classmethod
     def read_measure(cls, measure_name: str, cycle: AbstractCycle, step: AbstractStep) -> Array:
-        """Return a measure of a gait by name.
+        """Return the measure of a gait with the given name.
 
         At a scuffing take-off the clearance in SLS-I jumps, and the clearance in SLS-II is returned
         instead. Callers must therefore also check `takeoff_acceleration`.
@@ -148,8 +148,10 @@ class CollocationFinder(AbstractGaitFinder):
     def guess_cycle_from_state(
         self, params: WheelParams, section_state: SectionState
     ) -> CollocationState:
-        """Return the guess of a cycle from a walk of `period_n` steps that starts at a section
-        state."""
+        """Compute the guess of a cycle from a walk of `period_n` gait steps.
+
+        The walk starts at `section_state`.
+        """
         walk_samples = sample_walk_in_time(self.model, params, section_state, self.period_n)
         return guess_cycle_from_walk(self.collocation_system, params, walk_samples)
 
@@ -157,7 +159,7 @@ class CollocationFinder(AbstractGaitFinder):
     def shift_first_step(
         self, first_step_index: int, params: WheelParams, collocation_state: CollocationState
     ) -> CollocationState:
-        """Return the same cycle with another step as its first step."""
+        """Return the same cycle with another gait step as its first step."""
         previous_end_state = collocation_state.step_end_states[first_step_index - 1]
         landing_result = transitions.resolve_landing(
             params.symbols(), previous_end_state[0], *previous_end_state[2:]
@@ -180,9 +182,7 @@ class CollocationFinder(AbstractGaitFinder):
     def transfer_state_to_mesh(
         self, source_system: CollocationSystem, collocation_state: CollocationState
     ) -> CollocationState:
-        """Return a collocation state on this finder's mesh, from a state on the mesh of
-        `source_system`.
-        """
+        """Transfer a collocation state from the mesh of `source_system` to this finder's mesh."""
         transferred_solution = transfer_solution_to_mesh(
             source_system, self.collocation_system, collocation_state.solution
         )
@@ -242,10 +242,12 @@ class CollocationFinder(AbstractGaitFinder):
     def compute_slope_response(
         self, params: WheelParams, cycle: Any, measure_names: Sequence[str]
     ) -> SlopeResponse:
-        """Return the response of the step and of its measures to the slopes of its two lines.
+        """Return the linear response of the gait step and of its measures to the slopes of the
+        ground.
 
-        The response is computed from the collocation if that determines the measures, and from the
-        event-driven step otherwise.
+        Uneven ground consists of lines with different slopes, and one gait step depends on two
+        successive lines. The response is computed from the collocation if it determines the
+        measures. Otherwise it is computed from the event-driven step.
         """
         if not set(measure_names) <= set(COLLOCATION_RESPONSE_MEASURES):
             return super().compute_slope_response(params, cycle, measure_names)
@@ -283,8 +285,9 @@ class CollocationFinder(AbstractGaitFinder):
 def compute_cycle_and_derivatives(
     collocation_system: CollocationSystem, parameter_values: Array, cycle_guess: CollocationState
 ) -> tuple[LimitCycle, LimitCycle]:
-    """Return the cycle near `cycle_guess`, and its derivatives by all parameters on a leading
-    axis.
+    """Return the cycle near `cycle_guess`, and its derivatives with respect to all parameters.
+
+    The derivatives have the parameters on a leading axis.
     """
 
     find_cycle = lambda parameter_values: solve_limit_cycle(
@@ -305,9 +308,11 @@ def compute_step_and_derivatives(
     section_state_derivatives: Array,
     options: StepOptions,
 ) -> tuple[StepResult, StepResult]:
-    """Return one step, and its derivatives by all parameters along the branch of gaits.
+    """Return one gait step, and its derivatives with respect to all parameters on the branch of
+    gaits.
 
-    `section_state_derivatives` contains the derivatives of the section state by the parameters.
+    `section_state_derivatives` contains the derivatives of the section state with respect to the
+    parameters.
     """
 
     n_values = parameter_values.shape[0]

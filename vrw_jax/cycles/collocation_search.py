@@ -1,7 +1,10 @@
 """Search for limit cycles of many wheels by collocation and Newton's method.
 
-Newton's method on the collocation system also converges to solutions that are not gaits. A cycle
-therefore counts as found only if all signs that its sequence of phases assumes hold at all nodes.
+A lane is the batch element of one wheel. Arrays of type `LaneArray` have the lanes on the last
+axis.
+
+Newton's method on the collocation system also converges to solutions that are not gaits. A cycle is
+therefore accepted only if all signs that its sequence of phases assumes are true at all nodes.
 After each attempt, the wheels without a cycle are gathered for the next attempt.
 """
 
@@ -43,34 +46,39 @@ from vrw_jax.numerics import BatchFunction, LaneArray, Vector
 from vrw_jax.wheel import WheelParams, make_wheel_from_parameters, stack_parameters
 
 LaneParameters = Float[Array, "n_parameters lanes"]
-"""Parameters of each lane as floats, in the order of PARAMETER_NAMES."""
+"""Parameters of each wheel (lane) as floats, in the order of PARAMETER_NAMES."""
 
 
 @dataclass(frozen=True)
 class CycleSearchLimits:
-    """Limits of the search for limit cycles that are no options of the user."""
+    """Limits in the search for limit cycles that a user cannot set."""
 
     end_guard_tolerance: float = 1e-6
-    """Largest negative value of the end guard at the end of its phase, N, m or rad/s."""
+    """Largest absolute value of a negative end guard at the end of its phase, N, m or rad/s."""
     max_accepted_mesh_error: float = 1e-5
-    """Largest estimated mesh error of a solution that counts as found.
+    """Largest estimated mesh error of an accepted solution.
 
-    The value is chosen because the errors of some hundred random wheels are smaller, most of them
-    much smaller."""
+    The value is chosen because the errors for some hundred random wheels are smaller, most of them
+    much smaller.
+    """
     n_homotopy_segments: int = 16
     """Number of segments of the last homotopy.
 
-    If no root is found, the gait of Table 1 is continued on the line from Table 1's wheel to the
-    searched wheel. If the homotopy ends on the way, its last segment determines the reason."""
+    If no root is found, the gait of the wheel in Table 1 of the paper is continued to the searched
+    wheel. The parameters vary on the straight line between the two wheels. If the homotopy ends
+    before the searched wheel, its last segment determines the reason.
+    """
     max_lanes_without_gathering: int = 16
-    """Largest number of lanes for which the lanes that need another attempt are not gathered."""
+    """Largest batch size for which the wheels (lanes) that need another attempt are not
+    gathered.
+    """
 
 
 CYCLE_SEARCH_LIMITS = CycleSearchLimits()
 
 
 class CollocationSystem(NamedTuple):
-    """Collocation system of a limit cycle: phases, number of steps and meshes."""
+    """Collocation system of a limit cycle: phases, number of gait steps, and meshes."""
 
     n_legs: int
     period_n: int
@@ -80,7 +88,7 @@ class CollocationSystem(NamedTuple):
 
     @property
     def phase_sequence(self) -> PhaseSequence:
-        """Return the phases of one gait step and their functions."""
+        """Return the phases of one gait step and the functions that describe them."""
         return make_held_landing_sequence(self.n_legs, self.stop_at_lift_off)
 
     @property
@@ -95,7 +103,9 @@ class CollocationSystem(NamedTuple):
 
     @property
     def phase_constants_function(self) -> Callable:
-        """Return the function from the parameters to the constants of the equations of motion."""
+        """Return the function that maps the parameters to the constants of the
+        equations of motion.
+        """
         return functools.partial(compute_phase_constants, self.n_legs)
 
     def linearize_at(
@@ -104,9 +114,9 @@ class CollocationSystem(NamedTuple):
         collocation_state: "CollocationState",
         parameter_indices: tuple[int, ...] = (),
     ) -> CycleLinearization:
-        """Return the linearization of the collocation equations at a state.
+        """Linearize the collocation equations at a collocation state.
 
-        The result has tangents with respect to the parameters in `parameter_indices`.
+        The result contains tangents with respect to the parameters in `parameter_indices`.
         """
         return linearize_cycle(
             self.phase_sequence,
@@ -121,9 +131,10 @@ class CollocationSystem(NamedTuple):
     def evaluate_phase_points(
         self, parameters: Array, collocation_solution: CollocationSolution
     ) -> tuple[Vector, list[tuple[PhasePoints, ...]]]:
-        """Return the section state after the last step, and the points of all phases of each step.
+        """Return the section state after the last gait step, and the points of all phases in each
+        step.
 
-        The arguments belong to one wheel or to several lanes.
+        The arguments belong to one wheel, or to several wheels on the last axis.
         """
         phase_constants, section_state = (
             self.phase_constants_function(*parameters),
@@ -148,8 +159,9 @@ class CollocationSystem(NamedTuple):
 
 
 class CollocationState(NamedTuple):
-    """Solution of the collocation system with the flags that select it, as floats with lanes
-    last.
+    """Solution of the collocation system, and the flags that select it.
+
+    All fields are floats with the wheels (lanes) on the last axis.
     """
 
     solution: CollocationSolution
@@ -163,7 +175,7 @@ class CollocationState(NamedTuple):
 
 
 class CycleSearchResult(NamedTuple):
-    """Result of a search for limit cycles, with lanes on the last axis."""
+    """Result of a search for limit cycles, with the wheels (lanes) on the last axis."""
 
     collocation_state: CollocationState
     monodromy_matrix: LaneArray  # (row, column, lanes)
@@ -183,7 +195,7 @@ def register_export_types() -> None:
 def predict_start_from_gait_surface(
     collocation_system: CollocationSystem, parameters: LaneParameters, has_dls: Array
 ) -> CollocationState:
-    """Return the prediction of the stored gait surface as a start of the search.
+    """Return the gait that the stored gait surface predicts, as a start of the search.
 
     Without DLS, the duration of SLS-I includes that of DLS.
     """
@@ -221,8 +233,10 @@ def make_start_state(
     phase_durations: Array,
     has_dls: Array,
 ) -> CollocationState:
-    """Return a start of the search with zero accelerations and the same state and durations in all
-    steps."""
+    """Build a start of the search in which all accelerations are zero.
+
+    The section state and the phase durations are the same in all gait steps.
+    """
     period_n, n_phases = collocation_system.period_n, len(collocation_system.phase_sequence.phases)
     n_lanes = section_state.shape[-1]
     zero_accelerations = tuple(
@@ -255,7 +269,7 @@ def make_start_state(
 def init_search_flags(
     collocation_system: CollocationSystem, section_state: Array
 ) -> tuple[Array, Array, Array]:
-    """Return initial values of `has_cycle`, `failed_check` and `step_end_states`."""
+    """Return the initial values of `has_cycle`, `failed_check` and `step_end_states`."""
     lane_shape, n_end_components = (
         section_state.shape[1:],
         2 * collocation_system.phase_sequence.phases[-1].n_coordinates,
@@ -267,10 +281,10 @@ def init_search_flags(
 def reduce_over_non_lane_axes(
     combine_two_arrays: Callable[[Array, Array], Array], lane_values: Array
 ) -> LaneArray:
-    """Return `lane_values` reduced by `combine_two_arrays` over all axes except that of the lanes.
+    """Reduce `lane_values` by `combine_two_arrays` over all axes except the last axis.
 
-    The halves of the array are combined repeatedly, because XLA's reduction runs along the wrong
-    axis.
+    The halves of the array are combined repeatedly, because XLA's own reduction runs along the
+    wrong axis.
     """
     if simd.targets_machine_code():
         machine_reduction = jnp.max if combine_two_arrays is jnp.maximum else jnp.min
@@ -296,8 +310,8 @@ def compute_correction_norm(
 ) -> LaneArray:
     """Return the norm of a Newton correction: its largest absolute component, shape (lanes,).
 
-    Accelerations are multiplied by the square of the phase's duration, as in their effect on
-    positions.
+    The correction of each acceleration is multiplied by the square of the phase's duration, as in
+    its effect on positions.
     """
     max_by_lane = functools.partial(reduce_over_non_lane_axes, jnp.maximum)
     correction_norm = jnp.maximum(
@@ -315,10 +329,10 @@ def compute_correction_norm(
 def _compute_correction_fraction(
     collocation_solution: CollocationSolution, newton_correction: CollocationSolution
 ) -> LaneArray:
-    """Return the largest fraction of a Newton correction, at most 1, whose changes are within
-    limits.
+    """Return the largest admissible fraction of a Newton correction, at most 1.
 
-    The limits apply to the section state and the durations.
+    With this fraction, the changes of the section state and of the durations are within their
+    limits.
     """
     step_time = jnp.sum(collocation_solution.durations, 1, keepdims=True)
     change_limits = jnp.concatenate(
@@ -345,7 +359,7 @@ def _compute_correction_fraction(
 def compute_state_tangents(
     cycle_linearization: CycleLinearization, collocation_state: CollocationState
 ) -> CollocationState:
-    """Return the tangents of a collocation state from its linearization.
+    """Return the tangents of a collocation state, computed from its linearization.
 
     The flags that select the solution have zero tangents.
     """
@@ -366,7 +380,7 @@ def compute_state_tangents(
 
 
 class _NewtonState(NamedTuple):
-    """State of the loop of Newton's method for all lanes."""
+    """Loop state of Newton's method for all wheels (lanes)."""
 
     iteration_index: Int[Array, ""]
     collocation_state: CollocationState
@@ -386,11 +400,12 @@ def run_newton_iterations(
     max_iterations: Array | int,
     is_lane_requested: Bool[Array, " lanes"],
 ) -> CycleSearchResult:
-    """Run Newton's method with limited corrections on the requested lanes, and return the result.
+    """Run Newton's method with limited corrections on the requested wheels (lanes).
 
-    During the first `homotopy_steps` iterations the parameters move from `initial_parameters` to
-    their final values. A lane stops when it converges, or when round-off keeps its corrections from
-    decreasing. The result of a lane therefore does not depend on other lanes.
+    During the first `homotopy_steps` iterations the parameters change from `initial_parameters` to
+    their final values. The iteration of a wheel ends when it converges, or when round-off prevents
+    its corrections from decreasing. The result for a wheel therefore does not depend on other
+    wheels.
     """
     cycle_options = collocation_system.cycle_options
     machine_epsilon = float(jnp.finfo(parameters.dtype).eps)
@@ -497,7 +512,7 @@ def _compute_guard_minima(
 ) -> Vector:
     """Return the minimum of each guard over the start and the nodes of a phase.
 
-    A loop over the nodes computes the minima.
+    The minima are computed by a loop over the nodes.
     """
 
     def update_minimum(
@@ -519,10 +534,11 @@ def find_first_failed_check(
     parameters: LaneParameters,
     collocation_state: CollocationState,
 ) -> LaneArray:
-    """Return the code of the first failed admissibility check of each lane, or 0 if no check fails.
+    """Return the number of the first failed admissibility check for each wheel, or 0 if no check
+    fails.
 
-    The code is 1 + the index of the check in ADMISSIBILITY_CHECKS. Durations, guards at all nodes
-    and the margins at the transitions must be positive.
+    The number is 1 + the index of the check in ADMISSIBILITY_CHECKS. Durations, guards at all nodes
+    and margins at the transitions must be positive.
     """
     phase_sequence = collocation_system.phase_sequence
     phase_constants = collocation_system.phase_constants_function(*parameters)
@@ -594,7 +610,7 @@ def find_first_failed_check(
 
 
 def _has_attempt_name(attempt_index: Array, *attempt_names: str) -> Array:
-    """Return whether the attempt with a given index has one of the given names."""
+    """Return whether the attempt with the index `attempt_index` has one of the given names."""
     return functools.reduce(
         operator.or_,
         [attempt_index == SEARCH_ATTEMPTS.index(attempt_name) for attempt_name in attempt_names],
@@ -608,7 +624,9 @@ def _run_search_attempt(
     search_result: CycleSearchResult,
     search_guess: CollocationState | None,
 ) -> CycleSearchResult:
-    """Run one attempt on the lanes without a cycle, and return the merged result."""
+    """Run one attempt on the wheels (lanes) without a cycle, and return the merged
+    search result.
+    """
     cycle_options, n_segments = (
         collocation_system.cycle_options,
         collocation_system.search_limits.n_homotopy_segments,
@@ -741,7 +759,7 @@ def run_search_attempts(
     end_index: Int[Array, ""],
     search_guess: CollocationState | None = None,
 ) -> CycleSearchResult:
-    """Run the attempts `attempt_index`, ..., `end_index` - 1 on the lanes without a cycle.
+    """Run the attempts `attempt_index`, ..., `end_index` - 1 on the wheels (lanes) without a cycle.
 
     Return the search result. The parameters must be in their domains.
     """
@@ -766,10 +784,10 @@ def run_search_attempts(
 def search_all_attempts(
     collocation_system: CollocationSystem, run_attempts: BatchFunction, *parameters_and_guess: Any
 ) -> CycleSearchResult:
-    """Return the search result of each lane after all attempts.
+    """Run all attempts, and return the search result for each wheel (lane).
 
-    Blocks of lanes are searched together, and a block takes as long as its slowest lane. The lanes
-    without a cycle are therefore gathered before each stage.
+    Blocks of wheels are searched together, and a block takes as long as its slowest wheel. The
+    wheels without a cycle are therefore gathered before each stage.
 
     - `run_attempts`: batched form of `run_search_attempts`;
     - `parameters_and_guess`: the parameters and, optionally, a guess.
@@ -833,7 +851,7 @@ def search_all_attempts(
 def _can_attempt_change_result(
     attempt_index: Int[Array, ""], search_result: CycleSearchResult
 ) -> Bool[Array, " lanes"]:
-    """Return for each lane whether an attempt can still change its result."""
+    """Return for each wheel (lane) whether an attempt can still change its search result."""
     is_lane_decided = (search_result.collocation_state.failed_check > 0.0) | (
         search_result.collocation_state.failed_check == HomotopyFailure.BOTH_TRIES
     )
@@ -864,24 +882,26 @@ def init_search_result(
 
 
 MESH_CHECK_CODE = len(ADMISSIBILITY_CHECKS)
-"""Value of `CollocationState.failed_check` for a root with a too coarse mesh."""
+"""Value of `CollocationState.failed_check` for a root whose mesh is too coarse."""
 
 HOMOTOPY_OFFSET = float(len(ADMISSIBILITY_CHECKS))
-"""Offset of `CollocationState.failed_check` for a check that a wheel on the homotopy fails."""
+"""Offset of `CollocationState.failed_check` if the failed check belongs to a wheel on
+the homotopy.
+"""
 
 
 class HomotopyFailure(IntEnum):
-    """Values of `CollocationState.failed_check` for a homotopy on which Newton's method fails."""
+    """Values of `CollocationState.failed_check` if Newton's method fails on the homotopy."""
 
     FIRST_TRY = -1
     BOTH_TRIES = -2
 
 
 SEARCH_ATTEMPTS = ("guess", "guess, on", "surface", "surface, on", "homotopy", "without DLS")
-"""Names of the attempts in their order.
+"""Names of the attempts in the order in which they run.
 
 The first two attempts start from the guess, if there is one. The next two start from the gait that
-the stored surface predicts. A homotopy from Table 1 follows, and then a cycle without double
-support. The attempts "guess" and "surface" have few iterations, so that the lanes of a batch that
-need more are gathered in separate blocks.
+the stored surface predicts. A homotopy from the wheel in Table 1 of the paper follows. The last
+attempt searches for a cycle without double support. The attempts "guess" and "surface" have few
+Newton iterations, so that wheels that need more iterations are gathered in separate blocks.
 """

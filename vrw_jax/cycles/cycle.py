@@ -1,4 +1,4 @@
-"""Interface of limit cycles of all models and search methods."""
+"""Define the interface of limit cycles for all models and search methods."""
 
 import abc
 import dataclasses
@@ -26,7 +26,7 @@ from vrw_jax.validation import check_choice
 from vrw_jax.wheel import Outcome, WheelParams
 
 SAME_STATE_RELATIVE_TOLERANCE = 1e-7
-"""Relative distance below which two section states of a cycle count as equal.
+"""Relative distance below which two section states of a cycle are treated as equal.
 
 The value is chosen as ten times the allowed difference between two computations of a gait
 (`finder.STATE_AGREEMENT_TOLERANCE`).
@@ -34,11 +34,11 @@ The value is chosen as ten times the allowed difference between two computations
 
 
 class AbstractCycle(AbstractPrintable):
-    """Gait that repeats after `period_n` steps. Under vmap, the batch axis of every field comes
-    first.
+    """Gait that repeats after `period_n` gait steps.
 
     If no gait is found, `outcome` is the reason, and all other fields and their derivatives are
-    zero. For `period_n` 1, arrays have no axis over the steps.
+    zero. For `period_n` 1, arrays have no axis over the gait steps. Under `jax.vmap`, the batch
+    axis of every field comes first.
     """
 
     # before touchdown; fixed point of `period_n` return maps
@@ -53,29 +53,32 @@ class AbstractCycle(AbstractPrintable):
     @property
     @abc.abstractmethod
     def period_n(self) -> int:
-        """Return the number of steps after which the gait repeats."""
+        """Return the number of gait steps after which the gait repeats."""
 
     @property
     @abc.abstractmethod
     def monodromy(self) -> Array:
-        """Return the monodromy matrix, the differentiable Jacobian of the return map."""
+        """Return the monodromy matrix, which is the differentiable Jacobian of the return map."""
 
     @property
     @abc.abstractmethod
     def warm_start(self) -> Any:
-        """Return a start of the search for the gait of a similar wheel."""
+        """Return a start from which the gait of a similar wheel can be searched."""
 
     @property
     @abc.abstractmethod
     def step_ends(self) -> Array:
-        """Return the section state at the end of each step; the last two axes are steps and
-        coordinates."""
+        """Return the section state at the end of each gait step.
+
+        The last two axes are gait steps and section coordinates.
+        """
 
     @property
     def minimal_period(self) -> Int[Array, "..."]:
-        """Return the fewest steps after which the gait repeats, or 0 if there is no gait.
+        """Return the smallest number of gait steps after which the gait repeats.
 
-        The result divides `period_n`: a gait that repeats after one step also repeats after two.
+        The result is 0 if there is no gait. It divides `period_n`: a gait that repeats after one
+        step also repeats after two steps.
         """
         step_ends, period_n = self.step_ends, self.period_n
         largest_coordinate = jnp.max(jnp.abs(step_ends), (-2, -1))
@@ -101,7 +104,7 @@ class AbstractCycle(AbstractPrintable):
     def replace_missing_gaits_by_nan(self, params: WheelParams) -> Any:
         """Return the cycle with NaN instead of zeros if no gait was found.
 
-        Derivatives with respect to `params` are then also NaN.
+        In that case, derivatives with respect to `params` are also NaN.
         """
         nan_without_gait = jnp.where(self.found, 0.0, jnp.nan)
         # The weight contains the parameters, so that derivatives are also NaN.
@@ -127,7 +130,7 @@ class AbstractCycle(AbstractPrintable):
     def reduce_over_steps(
         self, step_values: Array, reduce_values: Callable[[Array, int], Array]
     ) -> Array:
-        """Return one value per cycle from the values of its steps, which are on the last axis."""
+        """Reduce the values of the gait steps, on the last axis, to one value per cycle."""
         return reduce_values(step_values, -1) if self.period_n > 1 else step_values
 
     @property
@@ -137,12 +140,15 @@ class AbstractCycle(AbstractPrintable):
 
     @property
     def ending(self) -> Any:
-        """Return a sentence on the end of the search; for a batch, an array of sentences."""
+        """Return a sentence that describes how the search ended.
+
+        For a batch the result is an array of such sentences.
+        """
         return describe_step_ending(self.outcome, Outcome)
 
     @property
     def why(self) -> Any:
-        """Return the sentence of `ending`, which is the reason if no gait was found."""
+        """Return the sentence of `ending`, which contains the reason if no gait was found."""
         return self.ending
 
     @property
@@ -152,27 +158,29 @@ class AbstractCycle(AbstractPrintable):
 
     @property
     def dls_fraction(self) -> Array:
-        """Return the fraction of the period that is double support."""
+        """Return the duration of double support divided by the period."""
         dls_duration, period = self.reduce_over_steps(self.durations[..., 0], jnp.sum), self.period
         return dls_duration / jnp.where(period > 0.0, period, 1.0)
 
     @property
     def speed(self) -> Array:
-        """Return the mean speed of the cycle: its distance over its period, m/s."""
+        """Return the mean speed: the distance per cycle divided by the period, m/s."""
         cycle_distance, period = self.reduce_over_steps(self.step_length, jnp.sum), self.period
         return cycle_distance / jnp.where(period > 0.0, period, 1.0)
 
     @property
     def multipliers(self) -> Complex[Array, "... n"]:
-        """Return the Floquet multipliers, largest modulus first.
+        """Return the Floquet multipliers in the order of decreasing modulus.
 
-        The multipliers are differentiable for sections of at most three coordinates.
+        The multipliers are differentiable if the section has at most three coordinates.
         """
         return floquet.floquet_multipliers(self.monodromy)
 
     @property
     def spectral_radius(self) -> Array:
-        """Return the largest modulus of the Floquet multipliers, below 1 for stable gaits."""
+        """Return the largest modulus of the Floquet multipliers, which is below 1 for
+        stable gaits.
+        """
         return floquet.compute_spectral_radius(self.monodromy)
 
     @property
@@ -182,12 +190,12 @@ class AbstractCycle(AbstractPrintable):
 
     @property
     def spectral_margin(self) -> Array:
-        """Return 1 minus the spectral radius, positive for stable gaits of every model."""
+        """Return 1 minus the spectral radius, which is positive for stable gaits of every model."""
         return self._zero_without_gait(1.0 - self.spectral_radius)
 
     @property
     def stability_margin(self) -> Array:
-        """Return the smooth minimum of the Jury margins, positive only for stable gaits.
+        """Return the smooth minimum of the Jury margins, which is positive only for stable gaits.
 
         See `floquet.compute_stability_margin`. The margin is defined for sections of at most three
         coordinates, and therefore not for unilateral contact.
@@ -196,7 +204,7 @@ class AbstractCycle(AbstractPrintable):
 
     @property
     def condition_number(self) -> Array:
-        """Return the condition number of I - monodromy.
+        """Return the condition number of the matrix I - monodromy.
 
         The cycle amplifies a disturbance by this factor.
         """
@@ -205,22 +213,23 @@ class AbstractCycle(AbstractPrintable):
 
     @with_default_jax_settings
     def measure(self, measure_name: str) -> Array:
-        """Return a measure of the cycle by its name in `CYCLE_MEASURE_FUNCTIONS`, with batch axes
-        first.
+        """Return the measure of the cycle with a name in `CYCLE_MEASURE_FUNCTIONS`.
 
-        Durations are sums over the cycle's steps, and indicators are minima over the steps.
+        Durations are sums over the gait steps of the cycle, and indicators are minima over the gait
+        steps. Batch axes come first.
         """
         return CYCLE_MEASURE_FUNCTIONS[
             check_choice("the measure", measure_name, tuple(CYCLE_MEASURE_FUNCTIONS))
         ](self)
 
     def measures(self, measure_names: Iterable[str]) -> dict[str, Array]:
-        """Return the named measures by name; only these measures are traced."""
+        """Return the requested measures by name. Only these measures are traced."""
         return {measure_name: self.measure(measure_name) for measure_name in measure_names}
 
     def summary_rows(self) -> list[LabelAndText]:
-        """Return labels and texts of the printed cycle; for a batch, of the number of found
-        cycles.
+        """Return the labels and texts that a printed cycle contains.
+
+        For a batch they contain the number of found cycles.
         """
         outcome_codes = np.asarray(self.outcome)
         if outcome_codes.ndim:
@@ -246,13 +255,14 @@ class AbstractCycle(AbstractPrintable):
 
     @abc.abstractmethod
     def model_summary_rows(self) -> list[LabelAndText]:
-        """Return labels and texts that are printed only for cycles of this model."""
+        """Return the labels and texts that are printed only for cycles of this model."""
 
 
 def format_floquet_multipliers(monodromy_matrix: np.ndarray) -> tuple[float, str]:
-    """Return the spectral radius, and a text of the Floquet multipliers, largest modulus first.
+    """Return the spectral radius, and a text that lists the Floquet multipliers.
 
-    Multipliers that are zero to five digits are only counted.
+    The multipliers are in the order of decreasing modulus. If multipliers are zero to five digits,
+    the text contains only their number.
     """
     floquet_multipliers = sorted(np.linalg.eigvals(monodromy_matrix), key=abs, reverse=True)
     shown_multipliers = [
@@ -283,31 +293,31 @@ FIELDS_ZERO_WITHOUT_GAIT = (
     "steps",
     "monodromy_value",
 )
-"""Names of the fields of a cycle that are zero if no gait is found."""
+"""Names of those fields of a cycle that are zero if no gait is found."""
 
 
 def _make_property_reader(property_name: str) -> Callable[[AbstractCycle], Array]:
-    """Return a function that reads the named property of a cycle."""
+    """Return a function that reads the property `property_name` of a cycle."""
     return lambda cycle: getattr(cycle, property_name)
 
 
 def _make_duration_reader(phase_index: int) -> Callable[[AbstractCycle], Array]:
-    """Return a function that reads the duration of a phase, summed over the steps of a cycle, s."""
+    """Return a function that computes the total duration of one phase over a cycle, s."""
     return lambda cycle: cycle.reduce_over_steps(cycle.durations[..., phase_index], jnp.sum)
 
 
 def _make_indicator_reader(indicator_name: str) -> Callable[[Any], Array]:
-    """Return a function that reads a double-support indicator of a cycle."""
+    """Return a function that computes the minimum of a double-support indicator over a cycle."""
     return lambda cycle: cycle.reduce_over_steps(getattr(cycle.indicators, indicator_name), jnp.min)
 
 
 def _make_sensitivity_reader(measure_name: str) -> Callable[[Any], Array]:
-    """Return a function that reads the gait sensitivity norm of a measure of a cycle."""
+    """Return a function that computes the gait sensitivity norm of one measure for a cycle."""
     return lambda cycle: cycle.gait_sensitivity(measure_name)
 
 
 def _make_force_peak_reader(measure_name: str) -> Callable[[Any], Array]:
-    """Return a function that reads a force-peak measure of a cycle."""
+    """Return a function that reads one force-peak measure of a cycle."""
     return lambda cycle: cycle.force_peaks[measure_name]
 
 
@@ -336,8 +346,8 @@ CYCLE_MEASURE_FUNCTIONS: dict[str, Callable[[AbstractCycle], Array]] = {
     "gait_sensitivity_speed": _make_sensitivity_reader("speed"),
     **{name: _make_force_peak_reader(name) for name in FORCE_PEAK_MEASURES},
 }
-"""Functions from a cycle to a measure, by the name of the measure.
+"""Functions that map a cycle to a measure, by the name of the measure.
 
-Derivatives of the stability measures are second derivatives of the motion. They need an additional
-compiled program, and take twice as long as derivatives of other measures.
+Derivatives of the stability measures are second derivatives of the motion. Their computation
+requires an additional compiled program. It takes twice as long as for other measures.
 """

@@ -1,8 +1,9 @@
-"""Derivatives of limit cycles by the implicit function theorem, of any order and in any mode.
+"""Differentiate limit cycles by the implicit function theorem, to any order and in any mode.
 
-First derivatives are the tangents of the linearization at the cycle. Second derivatives are
-derivatives of the linearization, of its tangents and of the monodromy matrix along the tangents of
-the cycle, one parameter after another. On a CPU, both orders are machine code.
+First derivatives are the tangents of the linearization at the cycle. Second derivatives are JVPs of
+the linearization, of its tangents and of the monodromy matrix. The direction of each JVP is the
+derivative of the cycle with respect to one parameter. On a CPU, the first and the second order are
+computed by machine code. A lane is the batch element of one wheel.
 """
 
 import functools
@@ -51,9 +52,10 @@ def _compute_collocation_tangents(
     parameters: LaneParameters,
     collocation_state: CollocationState,
 ) -> CollocationState:
-    """Return the derivatives of the collocation state by the parameters, on a leading axis.
+    """Return the derivatives of the collocation state with respect to the parameters.
 
-    The derivatives are zero in lanes without a cycle.
+    The parameters are on a leading axis. The derivatives are zero for wheels (lanes) without a
+    cycle.
     """
     cycle_linearization = collocation_system.linearize_at(
         parameters, collocation_state, tuple(range(parameters.shape[0]))
@@ -68,7 +70,9 @@ def _compute_masked_monodromy(
     parameters: LaneParameters,
     collocation_state: CollocationState,
 ) -> Array:
-    """Return the monodromy matrix of each lane, zero in lanes without a cycle."""
+    """Return the monodromy matrix for each wheel (lane), which is zero if the wheel has
+    no cycle.
+    """
     return _zero_without_cycle(
         collocation_state, collocation_system.linearize_at(parameters, collocation_state).monodromy
     )
@@ -79,15 +83,15 @@ def _compute_monodromy_tangents(
     parameters: LaneParameters,
     solution_and_tangents: tuple[CollocationState, CollocationState],
 ) -> Array:
-    """Return the derivatives of the monodromy matrix along the branch, parameters on a leading
-    axis.
+    """Return the derivatives of the monodromy matrix with respect to the parameters on the branch.
 
-    The directions are computed one after another, so that the compiled code is as short as for one
-    direction. Three of the nine derivatives follow from changes of units. A change of the unit of
-    mass scales both masses by one factor, so that only the orthogonal direction of the two masses
-    is computed.
+    The parameters are on a leading axis. The directions are computed one after another, so that the
+    compiled program is as short as for one direction. Three of the nine derivatives follow from
+    changes of units. A change of the unit of mass scales hub mass and leg mass by one factor.
+    Therefore only the orthogonal direction of the two masses is computed.
 
-    - `solution_and_tangents`: the solution z and its derivatives dz/dp.
+    - `solution_and_tangents`: the solution z and its derivatives dz/dp with respect to the
+      parameters.
     """
     collocation_state, state_tangents = solution_and_tangents
     hub_mass_index, leg_mass_index = (
@@ -171,7 +175,7 @@ def _compute_monodromy_tangents(
 
 
 def _zero_without_cycle(collocation_state: CollocationState, tree_over_lanes: Any) -> Any:
-    """Return the tree with zeros in the lanes without a cycle."""
+    """Return `tree_over_lanes` with zeros for the wheels (lanes) without a cycle."""
     return jax.tree.map(
         lambda x: jnp.where(collocation_state.has_cycle > 0.5, x, 0.0), tree_over_lanes
     )
@@ -183,9 +187,10 @@ def compile_batch_function(
     cache_key: tuple,
     batch_size: int,
 ) -> BatchFunction:
-    """Return a batch function compiled in its fastest form.
+    """Compile a batch function in its fastest form, and return the compiled function.
 
-    The fastest form is machine code on a CPU, and XLA in blocks of `batch_size` lanes otherwise.
+    On a CPU the function becomes machine code. Otherwise XLA compiles the function, which is then
+    called for blocks of `batch_size` wheels (lanes).
     """
     if simd.is_machine_code_available():
         return compile_cached_lane_function(function_of_element, make_output_template, cache_key)
@@ -198,9 +203,9 @@ def _make_derivative_compiler(
     make_output_templates: tuple[Callable, ...],
     collocation_system: CollocationSystem,
 ) -> ExecutionWrapper:
-    """Return a function that compiles a batch function for a given order of derivatives.
+    """Return a function that compiles a batch function for one order of derivatives.
 
-    Orders with an output template use `compile_batch_function`, and higher orders use XLA.
+    An order with an output template uses `compile_batch_function`, and higher orders use XLA.
     """
     batch_size = collocation_system.cycle_options.batch_size
 
@@ -220,7 +225,9 @@ def _make_derivative_compiler(
 
 
 def _make_tangent_function(collocation_system: CollocationSystem) -> Callable:
-    """Return `_compute_collocation_tangents` of one wheel as a differentiable function."""
+    """Return a differentiable function that computes `_compute_collocation_tangents`
+    for one wheel.
+    """
     make_output_templates = (
         (lambda parameters, collocation_state: collocation_state),
         (lambda parameters, solution_and_tangents: solution_and_tangents[0]),
@@ -242,11 +249,11 @@ def _search_in_scaled_units(
     parameters: LaneParameters,
     *si_guess: CollocationState,
 ) -> CycleSearchResult:
-    """Return the result of `search_all_attempts` in SI units.
+    """Run `search_all_attempts` in units of the wheel, and return the result in SI units.
 
-    The search uses the wheel's units of length and time. The section state is (theta, dtheta) after
-    a landing, and the step ends are (theta, L1) and their rates. Mass is not converted, because no
-    unknown contains it.
+    The units of the wheel are those of length and time. The section state is (theta, dtheta) after
+    a landing. The state at the end of each gait step is (theta, L1) and their rates. Mass is not
+    converted, because no unknown contains mass.
     """
     wheel_units = compute_wheel_units(
         compute_symbols(collocation_system.n_legs, *parameters)
@@ -259,7 +266,7 @@ def _search_in_scaled_units(
     def convert_units(
         collocation_state: CollocationState, apply_unit: Callable[[Array, Array], Array]
     ) -> CollocationState:
-        """Return the state, each number of which is converted by `apply_unit(number, unit)`."""
+        """Convert each number of a collocation state by `apply_unit(number, unit)`."""
         collocation_solution = collocation_state.solution
         accelerations = tuple(
             apply_unit(x, position_units[: x.shape[-2]] / (time_unit * time_unit))
@@ -297,7 +304,7 @@ def _search_in_scaled_units(
 def solve_cycle_with_derivatives(
     collocation_system: CollocationSystem, parameters: Array, search_guess: CollocationState | None
 ) -> tuple[CollocationState, tuple]:
-    """Return the collocation state of one wheel's cycle, and diagnostics of the search.
+    """Return the collocation state for the cycle of one wheel, and diagnostics of the search.
 
     The state is differentiable with respect to the parameters. The guess has no derivatives.
     """
@@ -340,7 +347,9 @@ def attach_monodromy_derivatives(
     parameters: Array,
     collocation_state: CollocationState,
 ) -> Array:
-    """Return `monodromy_value` with the derivatives of the monodromy matrix along the branch."""
+    """Return `monodromy_value` with the derivatives of the monodromy matrix on the
+    branch of cycles.
+    """
     make_output_template = lambda parameters, solution_and_tangents: parameters
     compile_function = _make_derivative_compiler(
         "monodromy", (make_output_template, make_output_template), collocation_system

@@ -1,5 +1,6 @@
-"""Interface of gait finders, each of which finds, checks and differentiates the gaits of a
-model.
+"""Define the interface of gait finders.
+
+A gait finder finds, checks and differentiates the gaits of one model.
 """
 
 import abc
@@ -21,10 +22,11 @@ from vrw_jax.numerics import StepOptions, evaluate_with_jacobian, select_tree_ro
 from vrw_jax.wheel import Outcome, WheelParams
 
 STATE_AGREEMENT_TOLERANCE = 1e-8
-"""Largest accepted change of the section state of a cycle over its event-driven step.
+"""Largest accepted difference between the section states at the start and the end of a gait step.
 
-The unit is rad, rad/s and m/s. Collocation and event-driven step are independent. At the default
-options, each of them has a tenth of this error for steps of up to about 1.5 s.
+The start is the section state of a cycle, and the gait step is event-driven. The unit is rad, rad/s
+and m/s. Collocation and event-driven step are independent computations. With the default options,
+each of them has a tenth of this error for gait steps of up to about 1.5 s.
 """
 
 ParameterValues = Float[Array, " n_values"]
@@ -32,7 +34,7 @@ ParameterValues = Float[Array, " n_values"]
 
 
 class GaitBranchPoint(NamedTuple):
-    """Gait as a point of a branch, with the data that `is_same_branch` compares."""
+    """Gait as a point of a branch, described by the data that `is_same_branch` compares."""
 
     gait_coordinates: Any  # section state and durations
     # with a leading axis over the model's parameters
@@ -42,9 +44,10 @@ class GaitBranchPoint(NamedTuple):
 
 
 class Gait(eqx.Module):
-    """Gait that repeats after one step, with its event-driven step and the derivatives of both.
+    """Gait that repeats after one step, its event-driven step, and the derivatives of cycle and
+    step.
 
-    The derivatives are taken along the branch of gaits, and have a leading axis over the
+    The derivatives describe changes of the gait on its branch, and have a leading axis over the
     parameters. In a batch of gaits, the batch axis comes first.
     """
 
@@ -58,7 +61,7 @@ class Gait(eqx.Module):
     def outcome(self) -> np.ndarray:
         """Return the outcome of the cycle, or the failure of the step from its section state.
 
-        The step also fails if it ends at another section state.
+        The step is also treated as a failure if it ends at another section state.
         """
         cycle, step = self.cycle, self.step
         return confirm_outcome_by_step(
@@ -73,8 +76,8 @@ def is_same_branch(
 ) -> bool:
     """Return whether a branch connects two gaits whose parameters differ by `parameter_change`.
 
-    The mean of the tangents at both gaits must predict most of their distance. The same phases must
-    occur in both gaits, and no multiplier may have crossed 1.
+    The mean of the tangents at the two gaits must predict most of the distance between the gaits.
+    The same phases must occur in the two gaits, and no multiplier may cross 1 between them.
     """
     first_gait_point, second_gait_point = select_tree_rows(
         (first_gait_point, second_gait_point), ...
@@ -129,7 +132,7 @@ class AbstractGaitFinder(eqx.Module):
     # names of measures that depend only on the cycle
     cycle_measures: eqx.AbstractClassVar[tuple[str, ...]]
     differentiable_measures: eqx.AbstractClassVar[tuple[str, ...]]
-    """Names of scalar measures with derivatives along the branch."""
+    """Names of scalar measures that have derivatives on the branch of gaits."""
     # names of measures that are returned by default
     default_measures: eqx.AbstractClassVar[tuple[str, ...]]
     # names of all measures, including measures with one value per leg
@@ -137,7 +140,9 @@ class AbstractGaitFinder(eqx.Module):
     # whether the search needs no start near the gait
     supports_cold_start: eqx.AbstractClassVar[bool]
     is_multistable: ClassVar[bool] = False
-    """Whether several gaits of a wheel may attract, which walks from several starts distinguish."""
+    """Whether several gaits of a wheel may be attracting. Walks from several starts
+    distinguish them.
+    """
 
     @classmethod
     @abc.abstractmethod
@@ -149,27 +154,27 @@ class AbstractGaitFinder(eqx.Module):
         period_n: int,
         cycle_options: CycleOptions,
     ) -> "AbstractGaitFinder":
-        """Return a finder with the options of its steps and, if it has any, of its search."""
+        """Build a finder from the options of its gait steps and, if it has any, of its search."""
 
     @property
     def search_options(self) -> Any:
-        """Return the options of the search, of type `options_type`."""
+        """Return the options of the search, which have the type `options_type`."""
         return self.step_options
 
     @abc.abstractmethod
     def find_cycle(self, params: WheelParams, cycle_guess: Any = None) -> AbstractCycle:
-        """Return the cycle of one wheel near `cycle_guess`.
+        """Find the cycle of one wheel near `cycle_guess`.
 
         The guess is the `warm_start` of a similar wheel's cycle, a section state or None.
         """
 
     def find_cycles(self, params: WheelParams, cycle_guess: Any = None) -> Any:
-        """Return the cycles of a batch of wheels, with a leading axis over wheels."""
+        """Find the cycles of a batch of wheels, which have a leading axis over the wheels."""
         return jax.vmap(self.find_cycle)(params, cycle_guess)
 
     @abc.abstractmethod
     def make_initial_guess(self, parameter_values: ParameterValues) -> Any:
-        """Return a start of the search for a wheel without a known similar wheel."""
+        """Return a start of the search for a wheel if no similar wheel is known."""
 
     def make_initial_guesses(self, parameter_values: Float[Array, "lanes n_values"]) -> Any:
         """Return starts of the search for a batch of wheels."""
@@ -177,13 +182,15 @@ class AbstractGaitFinder(eqx.Module):
 
     @abc.abstractmethod
     def find_gait(self, parameter_values: ParameterValues, cycle_guess: Any) -> Gait:
-        """Return the gait near `cycle_guess` with its derivatives, by compiled programs."""
+        """Find the gait near `cycle_guess` and its derivatives, by compiled programs."""
 
     def find_gaits(
         self, parameter_values: Float[Array, "lanes n_values"], cycle_guess: Any
     ) -> Gait:
-        """Return the gaits of a batch of wheels with their derivatives, with a leading axis over
-        wheels."""
+        """Find the gaits of a batch of wheels and their derivatives.
+
+        The gaits have a leading axis over the wheels.
+        """
         return eqx.filter_vmap(self.find_gait)(parameter_values, cycle_guess)
 
     @abc.abstractmethod
@@ -191,8 +198,8 @@ class AbstractGaitFinder(eqx.Module):
         """Compile the programs of `find_gait`, in parallel if possible."""
 
     def take_step(self, params: WheelParams, section_state: Array) -> AbstractStep:
-        """Return one event-driven step from a section state, by a program that is already
-        compiled.
+        """Compute one event-driven step from a section state, by a program that is
+        already compiled.
         """
         event_driven_step: AbstractStep = self.model.take_step(
             params, section_state, self.step_options
@@ -202,7 +209,7 @@ class AbstractGaitFinder(eqx.Module):
     def find_cycle_from_values(
         self, parameter_values: ParameterValues, cycle_guess: Any = None
     ) -> AbstractCycle:
-        """Return the cycle near `cycle_guess` of the wheel with the given parameter values."""
+        """Find the cycle near `cycle_guess` for the wheel that `parameter_values` describes."""
         model, params = self.model.from_values(parameter_values, self.n_legs)
         return eqx.tree_at(lambda gait_finder: gait_finder.model, self, model).find_cycle(
             params, cycle_guess
@@ -211,7 +218,7 @@ class AbstractGaitFinder(eqx.Module):
     def measure_gait(
         self, parameter_values: ParameterValues, cycle_guess: Any, measure_names: tuple[str, ...]
     ) -> "GaitMeasures":
-        """Return the named measures of the gait near `cycle_guess`, with their derivatives.
+        """Return measures of the gait near `cycle_guess`, and their derivatives.
 
         `measure_names` is a selection of `differentiable_measures`. Derivatives of stability
         measures are second derivatives of the motion.
@@ -221,15 +228,21 @@ class AbstractGaitFinder(eqx.Module):
     def compute_slope_response(
         self, params: WheelParams, cycle: Any, measure_names: Sequence[str]
     ) -> SlopeResponse:
-        """Return the linear response of the cycle's step and measures to the slopes of its two
-        lines."""
+        """Return the linear response of the cycle's step and measures to the slopes of uneven
+        ground.
+
+        A step depends on the slopes of two successive lines of the ground.
+        """
         return _compute_step_slope_response(
             self.model, params, cycle.section_state, tuple(measure_names), self.step_options
         )
 
     @classmethod
     def read_measure(cls, measure_name: str, cycle: AbstractCycle, step: AbstractStep) -> Array:
-        """Return a measure of a gait by name; margins of locked legs have one value per leg."""
+        """Return the measure of a gait with the given name.
+
+        Margins of locked legs have one value per leg.
+        """
         return (
             cycle.measure(measure_name)
             if measure_name in cls.cycle_measures
@@ -241,7 +254,7 @@ _compute_step_slope_response = eqx.filter_jit(compute_step_slope_response)
 
 
 class GaitMeasures(NamedTuple):
-    """Measures of a gait, with their derivatives by the model's parameter values."""
+    """Measures of a gait, and their derivatives with respect to the model's parameter values."""
 
     measure_values: Float[Array, " n_names"]
     parameter_jacobian: Float[Array, "n_names n_values"]
@@ -255,7 +268,7 @@ def compute_cycle_measures(
     cycle_guess: Any,
     measure_names: tuple[str, ...],
 ) -> GaitMeasures:
-    """Return measures that depend only on the cycle, with their derivatives."""
+    """Return measures that depend only on the cycle, and their derivatives."""
 
     def compute_measures_and_outcome(parameter_values: ParameterValues) -> tuple[Array, Array]:
         cycle = gait_finder.find_cycle_from_values(parameter_values, cycle_guess)
@@ -268,14 +281,16 @@ def compute_cycle_measures(
 
 
 def move_derivative_axis_first(derivative_tree: Any) -> Any:
-    """Return a tree with the last axis, over the model's parameters, moved to the front."""
+    """Return the tree with the last axis of each array, over the model's parameters, moved to the
+    front.
+    """
     return jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), derivative_tree)
 
 
 def compute_value_and_tangents(
     function: Callable, input_values: tuple, input_tangents: tuple
 ) -> tuple[Any, Any]:
-    """Return the value of a function at `input_values`, and its JVP along each of the
+    """Return the value of a function at `input_values`, and one JVP for each of the
     `input_tangents`.
 
     The tangents have a leading axis.
@@ -293,8 +308,9 @@ def compute_value_and_tangents(
 
 @eqx.filter_jit
 def evaluate_on_gait(function_of_cycle_and_step: Callable, gait: Gait) -> tuple[Any, Any]:
-    """Return `function_of_cycle_and_step(cycle, step)` of one gait and its derivatives along
-    the branch.
+    """Evaluate `function_of_cycle_and_step(cycle, step)` for one gait.
+
+    Return the value and its derivatives on the branch of gaits.
     """
     return compute_value_and_tangents(
         function_of_cycle_and_step,
@@ -305,8 +321,9 @@ def evaluate_on_gait(function_of_cycle_and_step: Callable, gait: Gait) -> tuple[
 
 @eqx.filter_jit
 def evaluate_on_gaits(function_of_cycle_and_step: Callable, gait: Gait) -> tuple[Any, Any]:
-    """Return `function_of_cycle_and_step(cycle, step)` of each gait of a batch, and its derivatives
-    along the branches.
+    """Evaluate `function_of_cycle_and_step(cycle, step)` for each gait of a batch.
+
+    Return the values and their derivatives on the branches of gaits.
     """
     cycles_and_steps = (gait.cycle, gait.step), (gait.cycle_derivatives, gait.step_derivatives)
     return eqx.filter_vmap(
@@ -318,7 +335,7 @@ def evaluate_on_gaits(function_of_cycle_and_step: Callable, gait: Gait) -> tuple
 
 @dataclass(frozen=True)
 class MeasureReader:
-    """Function from cycle and step to the named measures."""
+    """Function that maps a cycle and a step to the measures with the names `measure_names`."""
 
     read_measure: Callable[[str, AbstractCycle, AbstractStep], Array]
     measure_names: tuple[str, ...]
@@ -333,7 +350,9 @@ class MeasureReader:
 def compute_gait_measures(
     gait: Gait, read_measure: Callable, measure_names: tuple[str, ...]
 ) -> GaitMeasures:
-    """Return measures of a gait with derivatives, from the gait's stored derivatives."""
+    """Return measures of a gait and their derivatives, computed from the gait's stored
+    derivatives.
+    """
     measure_values, measure_tangents = evaluate_on_gait(
         MeasureReader(read_measure, measure_names), gait
     )

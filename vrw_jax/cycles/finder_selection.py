@@ -1,4 +1,4 @@
-"""Selection of the gait finder of a model, and checks of the arguments of a search."""
+"""Select the gait finder for a model, and check the arguments of a search."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -30,7 +30,7 @@ from vrw_jax.validation import check_type, has_traced_leaf
 from vrw_jax.wheel import WheelParams
 
 UserCycleGuess = LimitCycle | ReturnMapCycle | Array | np.ndarray | Sequence[float]
-"""Guess of a user: a similar wheel's cycle, or a section state near the gait."""
+"""Guess that a user provides: a similar wheel's cycle, or a section state near the gait."""
 
 FINDER_CLASS_BY_METHOD: dict[GaitMethod, type[AbstractGaitFinder]] = {
     GaitMethod.COLLOCATION: CollocationFinder,
@@ -49,7 +49,7 @@ def make_finder(
     cycle_options: CycleOptions | None = None,
     step_options: StepOptions | None = None,
 ) -> AbstractGaitFinder:
-    """Return the finder of the gaits of a model."""
+    """Return the gait finder for a model."""
     if cycle_options is not None:
         check_type("cycle_options", cycle_options, CycleOptions, "give vrw.CycleOptions()")
     resolved_model = check_model(model)
@@ -62,11 +62,12 @@ def make_finder(
 
 
 def resolve_model(params: WheelParams, model: ModelLike | None) -> ModelLike | None:
-    """Return the model of a wheel's gait.
+    """Return the model to which a wheel's gait belongs.
 
-    For the ladder, this is the lowest model whose margins are met. The paper's gait is tried first.
-    If it is not found or violates a margin on its ground, the upper model is returned. If the
-    parameters have no concrete values, the ladder is returned unchanged, as is any other model.
+    The ladder is a model that selects the simplest of several models whose margins are positive.
+    The gait of the paper's model is computed first. If it is not found or violates a margin on its
+    ground, a more general model is returned. If the parameters have no concrete values, the ladder
+    is returned unchanged. Any other model is also returned unchanged.
     """
     return resolve_model_with_reason(params, model)[0]
 
@@ -74,7 +75,9 @@ def resolve_model(params: WheelParams, model: ModelLike | None) -> ModelLike | N
 def resolve_model_with_reason(
     params: WheelParams, model: ModelLike | None
 ) -> tuple[ModelLike | None, str | None]:
-    """Return the model of a wheel's gait and, for the ladder, the reason in one sentence."""
+    """Return the model to which a wheel's gait belongs and, for the ladder, the reason in one
+    sentence.
+    """
     selected_model: Any = check_model(model)
     if selected_model.fallback_model is selected_model or not isinstance(params, WheelParams):
         return model, None
@@ -89,7 +92,7 @@ def resolve_model_with_reason(
 
 
 def check_cycle_guess(cycle_guess: Any) -> Any:
-    """Return a user's guess as a cycle, a `CollocationState` or a finite section state.
+    """Convert a user's guess to a cycle, a `CollocationState` or a finite section state.
 
     Raise ValueError if the section state is not finite.
     """
@@ -110,7 +113,7 @@ def resolve_finder(
     options: CycleOptions | StepOptions | None,
     period_n: int = 1,
 ) -> AbstractGaitFinder:
-    """Return the finder of a model and options, after checks of the arguments.
+    """Check the arguments of a search, and return the gait finder for a model and options.
 
     Raise TypeError or ValueError if the arguments do not fit the model.
     """

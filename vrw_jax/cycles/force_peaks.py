@@ -1,7 +1,7 @@
-"""Peaks of the ground's normal force in a gait of the paper's model.
+"""Locate peaks of the ground's normal force in a gait of the paper's model.
 
-The peaks are located on the collocation of the gait. A peak is a smooth maximum inside a phase.
-Impacts and changes of phase are no peaks.
+The peaks are located on the collocation solution of the gait. A peak is a smooth maximum inside a
+phase. Impacts and changes of phase are no peaks.
 """
 
 import functools
@@ -32,7 +32,10 @@ from vrw_jax.wheel import (
 def compute_force_peaks(
     system: CollocationSystem, parameters: Array, solution: CollocationSolution
 ) -> dict[str, Scalar]:
-    """Return the `measures.FORCE_PEAK_MEASURES` of a cycle by name, the largest over its steps."""
+    """Return the `measures.FORCE_PEAK_MEASURES` of a cycle by name.
+
+    Each measure is the largest value over the gait steps of the cycle.
+    """
     wheel_symbols = make_wheel_from_parameters(parameters, system.n_legs).symbols()
     peaks_by_step, (_, phase_points_by_step) = (
         [],
@@ -88,7 +91,7 @@ def compute_force_peaks(
 def _find_force_extrema(
     phase: AbstractPhase, collocated_phase: CollocatedPhaseMotion, with_rear_foot: bool
 ) -> PhaseExtrema:
-    """Return the extrema of the normal force on the fore foot, or on both feet, in a phase."""
+    """Return the extrema of the normal force in a phase, on the fore foot or on both feet."""
 
     def evaluate_acceleration(q: Array, v: Array) -> Array:
         return jnp.stack(
@@ -106,7 +109,7 @@ def _find_force_extrema(
 
 
 class _ForcePeaks(NamedTuple):
-    """Peaks of a force over one step, as in `measures.FORCE_PEAK_MEASURES`."""
+    """Measures for the peaks of a force in one gait step, as in `measures.FORCE_PEAK_MEASURES`."""
 
     n_peaks: Scalar
     peak_force: Scalar
@@ -117,7 +120,7 @@ class _ForcePeaks(NamedTuple):
 def _summarize_force_extrema(
     extrema_of_phases: list[PhaseExtrema], phase_durations: Array
 ) -> _ForcePeaks:
-    """Return the peaks of a step from the extrema in its phases."""
+    """Compute the force-peak measures of a gait step from the extrema in its phases."""
     phase_start_times = jnp.cumsum(phase_durations) - phase_durations
     shifted_extrema = [
         step_extrema._replace(

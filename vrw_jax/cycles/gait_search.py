@@ -1,9 +1,10 @@
 """Search for limit cycles, with finer meshes and walks as fallbacks.
 
-The search of `collocation_search` starts from predicted gaits of the paper's parameter ranges, on a
-mesh that suits them. If it fails, batches of walks (`batches`) begin at starts that scale with the
-wheel. A walk that settles is the start of another search. If the mesh is too coarse, it is refined.
-These fallbacks depend on concrete values, so only the search runs under a caller's `jit` or `vmap`.
+The search in `collocation_search` starts from predicted gaits for the paper's parameter ranges, on
+a mesh that suits these gaits. If it fails, batches of walks (`batches`) begin at starts that scale
+with the wheel. The end of a walk that settles is the start of another search. If the mesh is too
+coarse, it is refined. These fallbacks depend on concrete values. Under a caller's `jit` or `vmap`,
+only the search runs.
 """
 
 import functools
@@ -62,12 +63,15 @@ RETRY_OUTCOMES = (
 
 @dataclass(frozen=True)
 class SearchFallbackOptions:
-    """Options of the finer meshes that are fallbacks of the search for the paper's gaits."""
+    """Options for finer meshes, which are fallbacks in the search for gaits of the
+    paper's model.
+    """
 
     max_unrefined_mesh_error: float = 1e-7
     """Estimated mesh error above which a finer mesh is used.
 
-    The value is chosen because actual errors are a hundredth of the estimate."""
+    The value is chosen because actual errors are a hundredth of the estimate.
+    """
     max_mesh_refinements: int = 3
     """Largest number of times that the number of mesh intervals is doubled."""
 
@@ -78,9 +82,9 @@ FailureFillName = Literal["zeros", "nan"]
 FAILURE_FILLS: tuple[str, ...] = get_args(FailureFillName)
 
 GaitChoice = Literal["slowest", "fastest"] | int
-"""Choice among the attracting gaits of a wheel: the slowest, the fastest, or an index by speed.
+"""Choice among the attracting gaits of a wheel: the slowest, the fastest, or an index.
 
-Index 0 is the slowest gait.
+Index 0 selects the slowest gait, and speed increases with the index.
 """
 
 
@@ -122,39 +126,41 @@ def limit_cycle(
     on_failure: FailureFillName = "zeros",
     which: GaitChoice = "slowest",
 ) -> LimitCycle | ReturnMapCycle:
-    """Return the limit cycle of this wheel: the gait that repeats after `period_n` steps.
+    """Find the limit cycle of a wheel: the gait that repeats after `period_n` gait steps.
 
-    For `period_n` 1 no start is needed. With a `guess`, a neighbor's cycle or a section state
-    (theta-, dtheta-, dL1-) near the gait, the search is faster and selects that branch. Found
-    cycles satisfy the paper's sequence of phases at all nodes, stable or not. Errors are 1e-9
-    relative in values and 1e-8 in first derivatives. Without `options` the mesh is made as fine as
-    these errors require. With `options` the mesh is fixed, and `mesh_error` estimates its error.
-    The cycle is differentiable in every mode and order.
+    For `period_n` 1 no start is needed. A `guess` is the cycle of a similar wheel, or a section
+    state (theta-, dtheta-, dL1-) near the gait. It makes the search faster and selects a branch.
+    Each returned cycle, stable or not, satisfies the paper's sequence of phases at all nodes.
+    Relative errors are 1e-9 in values and 1e-8 in first derivatives. Without `options` the mesh is
+    made as fine as these errors require. With `options` the mesh is fixed, and `mesh_error`
+    estimates its error. The cycle is differentiable in every mode and to every order.
 
-    If the search fails, walks and finer meshes are tried. Under `jax.jit` and `jax.vmap` neither is
-    possible; the search then runs alone, on the mesh of the options. See `limit_cycles`.
+    If the search fails, walks and finer meshes are used. Under `jax.jit` and `jax.vmap` this is not
+    possible. Only the search then runs, on the mesh of the options. See `limit_cycles`.
 
-    If no gait is found, `outcome` and `why` give the reason, and numbers and derivatives
-    are zero. With `on_failure="nan"` they are NaN, so that an optimization loop does not stop
+    If no gait is found, `outcome` and `why` contain the reason, and numbers and derivatives are
+    zero. With `on_failure="nan"` they are NaN, so that an optimization loop does not stop
     unnoticed.
 
-    For any other model, the fixed point of its return map is computed, with the `StepOptions` of
-    its step. The result is a `ReturnMapCycle` with the errors of the step. With unilateral contact
-    several gaits may attract. Without a `guess`, walks from a stated set of starts distinguish them
-    (`cycles.gait_walks`). `which` selects the "slowest", the "fastest" or an index in their
-    list, slowest first. `limit_cycles` returns all. Model "auto" selects the lowest model whose
-    margins the gait meets on its ground. A `LimitCycle` then belongs to the paper's model, a
-    `ReturnMapCycle` to unilateral contact.
+    For any model other than the paper's, the fixed point of its return map is computed, with the
+    `StepOptions` of its gait step. The result is a `ReturnMapCycle`, whose errors are those of the
+    gait step. With unilateral contact a wheel may have several attracting gaits. Without a `guess`,
+    walks from fixed starts find these gaits (`cycles.gait_walks`). `which` then selects the
+    "slowest" gait, the "fastest" gait, or an index in the order of increasing speed. `limit_cycles`
+    returns all attracting gaits. Model "auto" selects the lowest model whose margins are positive
+    for the gait on its ground. A `LimitCycle` then belongs to the paper's model, a `ReturnMapCycle`
+    to unilateral contact.
 
     Args:
         params: the wheel.
-        guess: a neighbor's cycle, or a section state near the gait; a cycle that was not found
-            counts as no guess.
-        period_n: number of steps after which the gait repeats.
+        guess: a similar wheel's cycle, or a section state near the gait; a cycle that was not found
+            is ignored.
+        period_n: number of gait steps after which the gait repeats.
         model: the model; the paper's, `ViscoelasticWheel()`, by default.
         options: `CycleOptions`; for other models `StepOptions`.
-        on_failure: values where there is no gait, "zeros" or "nan".
-        which: with unilateral contact "slowest", "fastest", or an index in the list, slowest first.
+        on_failure: values that are returned if there is no gait, "zeros" or "nan".
+        which: with unilateral contact "slowest", "fastest", or an index in the order of increasing
+            speed.
 
     Returns:
         A `LimitCycle`; a `ReturnMapCycle` for other models.
@@ -194,21 +200,21 @@ def limit_cycles(
     options: CycleOptions | StepOptions | None = None,
     which: GaitChoice = "slowest",
 ) -> LimitCycle | ReturnMapCycle:
-    """Return `limit_cycle` of a batch of wheels. Fields of `params` and of the result have one
-    leading axis.
+    """Find the limit cycles of a batch of wheels, as `limit_cycle` does for one wheel.
 
-    All cycles are computed on one mesh, as fine as any of them needs. For a single wheel with
-    unilateral contact, return all attracting gaits, slowest first.
+    Fields of `params` and of the result have one leading axis. All cycles are computed on one mesh,
+    which is as fine as any of the cycles requires. For a single wheel with unilateral contact, all
+    attracting gaits are returned, in the order of increasing speed.
 
     Args:
         params: the wheels; fields are scalars or of shape (wheels,).
-        period_n: number of steps after which the gaits repeat.
+        period_n: number of gait steps after which the gaits repeat.
         model: the model; the paper's, `ViscoelasticWheel()`, by default.
         options: as in `limit_cycle`.
         which: as in `limit_cycle`, for batches.
 
     Returns:
-        A `LimitCycle` or `ReturnMapCycle` whose fields have a leading axis over wheels.
+        A `LimitCycle` or `ReturnMapCycle` whose fields have a leading axis over the wheels.
 
     Raises:
         TypeError, ValueError: if an argument is invalid; the message names the remedy.
@@ -249,7 +255,9 @@ def limit_cycles(
 
 
 def parse_gait_choice(which: GaitChoice) -> int:
-    """Return the index of the chosen gait in a list of gaits, slowest first."""
+    """Return the index of the chosen gait in a list of gaits that are sorted by
+    increasing speed.
+    """
     if isinstance(which, str):
         return 0 if check_choice("which", which, ("slowest", "fastest")) == "slowest" else -1
     if not check_real("which", which).is_integer():
@@ -261,7 +269,7 @@ def parse_gait_choice(which: GaitChoice) -> int:
 
 
 def _find_chosen_gaits(gait_finder: Any, params: WheelParams, gait_choice: GaitChoice) -> Any:
-    """Return the attracting gait of each wheel that `gait_choice` selects."""
+    """Find for each wheel the attracting gait that `gait_choice` selects."""
     n_wheels, gait_rank = params.damping.shape[0], parse_gait_choice(gait_choice)
     gait_wheel_indices, attracting_gaits = find_attracting_gaits(
         gait_finder, gait_finder.model.parameter_rows(params)
@@ -290,7 +298,7 @@ def _search_with_fallbacks(
     can_refine_mesh: bool,
     gait_choice: GaitChoice,
 ) -> Any:
-    """Return the cycle of one wheel or of a batch, by the search and all fallbacks."""
+    """Find the cycle of one wheel or of each wheel in a batch, by the search and all fallbacks."""
     is_batch = params.damping.ndim > 0
     params_without_tangents = lax.stop_gradient(params)
     has_no_values, is_concrete = (
@@ -360,9 +368,11 @@ def _search_with_fallbacks(
 
 
 def _keep_first_failure_reason(cycle: LimitCycle, retried_cycle: LimitCycle) -> LimitCycle:
-    """Return the cycles of the retry, with the reason of the first search if no gait exists.
+    """Return the cycles of the second search, with the failure reason of the first if no gait
+    exists.
 
-    All functions therefore report the same reason, with or without fallbacks and in any batch.
+    All functions therefore report the same reason, whether fallbacks are used or not, and for any
+    batch.
     """
     get_failure_reason = lambda cycle: (cycle.outcome, cycle.collocation_state.failed_check)
     first_failure_reason, last_failure_reason = (
@@ -389,7 +399,7 @@ def _keep_first_failure_reason(cycle: LimitCycle, retried_cycle: LimitCycle) -> 
 def _search_without_fallbacks(
     gait_finder: AbstractGaitFinder, params: WheelParams, cycle_guess: Any
 ) -> Any:
-    """Return the cycle of one wheel, or the cycles of a batch, without fallbacks."""
+    """Find the cycle of one wheel or of each wheel in a batch, without fallbacks."""
     if not params.damping.ndim:
         return gait_finder.find_cycle(params, cycle_guess)
     if cycle_guess is not None or has_traced_leaf(params):
@@ -424,12 +434,12 @@ def _find_walk_end_states(
     needs_walk: np.ndarray,
     guess_states: np.ndarray | None,
 ) -> np.ndarray:
-    """Return for each wheel the end of its walk with the smallest period defect.
+    """Return for each wheel the state at the end of its walk with the smallest period defect.
 
-    The ends are section states, shape (wheels, 3). They are NaN if no walk of the wheel nearly
-    repeats, and for wheels that need no walk. A guess that nearly repeats replaces the walks of its
-    wheel. Wheels that are too stiff for explicit solvers do not walk, because the walks of one such
-    wheel would take minutes with an implicit solver.
+    The states are section states, shape (wheels, 3). A state is NaN if no walk of the wheel nearly
+    repeats, or if the wheel requires no walk. If a guess nearly repeats, it is returned instead of
+    the end of a walk. No walks are computed for wheels that are too stiff for explicit solvers.
+    With an implicit solver, the walks of one such wheel would take minutes.
     """
     # NumPy is used, because JAX would compile a program for each number of wheels.
     parameter_matrix = np.stack([np.asarray(getattr(params, name)) for name in PARAMETER_NAMES])
@@ -474,9 +484,10 @@ def _make_search_starts(
     has_known_state: np.ndarray,
     walk_end_states: np.ndarray,
 ) -> CollocationState:
-    """Return starts of searches: known states, otherwise states from walks, otherwise predictions.
+    """Return the start of the search for each wheel.
 
-    The gait surface determines the predictions.
+    The start is a known state if there is one, and otherwise the end state of a walk. For all
+    remaining wheels the gait surface predicts the start.
     """
     start_states = map_in_batches(
         lambda batch_params: gait_finder.make_initial_guesses(stack_parameters(batch_params).T),
@@ -512,7 +523,7 @@ def _find_fallback_starts(
     """Return a finder and starts from which it finds more gaits of a batch, or None.
 
     `guess_states` contains the section states of guesses, shape (wheels, 3). A finer mesh is used
-    only if `can_refine_mesh` is set.
+    only if `can_refine_mesh` is true.
     """
     search_outcomes = np.asarray(cycle.outcome)
     mesh_errors = map_in_batches(
@@ -594,9 +605,9 @@ def _find_fallback_starts(
 def retry_from_walks(
     gait_finder: Any, params: WheelParams, search_result: LimitCycle
 ) -> LimitCycle:
-    """Return the search result, completed by cycles from walks on the same mesh.
+    """Search again for the wheels without a cycle, starting from walks on the same mesh.
 
-    Only wheels without a cycle are searched again.
+    Return the search result, completed by the cycles of the second search.
     """
     finder_and_starts = _find_fallback_starts(
         gait_finder, params, search_result, None, can_refine_mesh=False
@@ -615,11 +626,11 @@ def _retry_from_other_steps(
     cycle: LimitCycle,
     section_states: np.ndarray,
 ) -> tuple[CollocationFinder, CollocationState] | None:
-    """Return a finder and the same gaits, found with another step as the first step.
+    """Search for the same gaits with another gait step as the first step.
 
-    If no gait is found, None is returned. A guess contains the accelerations of all steps, whose
-    errors accumulate. A step without double support is the most sensitive step, which as the first
-    or last step may make the search fail.
+    Return a finder and the gaits, or None if no gait is found. A guess contains the accelerations
+    of all gait steps, whose errors accumulate. A gait step without double support is the most
+    sensitive step. If it is the first or the last step, the search may fail.
     """
     missing_wheels = np.flatnonzero(np.isin(np.asarray(cycle.outcome), RETRY_OUTCOMES))
     if not len(missing_wheels):
@@ -656,8 +667,10 @@ def _align_first_step(
     start_section_states: np.ndarray,
     finder_and_starts: tuple[CollocationFinder, CollocationState] | None,
 ) -> tuple[CollocationFinder, CollocationState] | None:
-    """Return a finder and the same gaits, whose first step starts nearest to
-    `start_section_states`."""
+    """Return a finder and the same gaits, with the first step selected by its section state.
+
+    The first step is the gait step that starts nearest to `start_section_states`.
+    """
     gait_finder, collocation_state = finder_and_starts or (gait_finder, cycle.collocation_state)
     end_states = np.asarray(collocation_state.step_end_states)[:, :, [0, 2, 3]]
     distances_to_start = np.abs(np.roll(end_states, 1, axis=1) - start_section_states[:, None]).max(

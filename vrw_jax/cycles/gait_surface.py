@@ -1,10 +1,11 @@
-"""Prediction of gaits by cubic polynomials that were fitted to the gaits of many wheels.
+"""Predict gaits by cubic polynomials that were fitted to the gaits of many wheels.
 
-The prediction is the start of every search. Lengths are in L0, times in sqrt(L0 / g) and masses in
-the total mass, so that wheels of any size are covered. `experiments/gaits/fit_surface.py` fitted
-the surface to gaits that a continuation from Table 1 reaches. For Table 1's mass ratio, center of
-mass and eight legs, which the fit uses, the prediction is accurate to about 1 %. For other wheels,
-the parameters are clipped to the range of the fit, and the prediction is the start of a homotopy.
+The prediction is the start of every search. Lengths are in units of L0, times in sqrt(L0 / g), and
+masses in the total mass. The surface therefore covers wheels of any size.
+`experiments/gaits/fit_surface.py` fitted the surface to gaits that a continuation from the wheel in
+Table 1 of the paper reaches. The fit uses the mass ratio and the center of mass of that wheel, and
+eight legs. For such wheels the prediction is accurate to about 1 %. For other wheels the parameters
+are clipped to the range of the fit, and the prediction is the start of a homotopy.
 """
 
 import functools
@@ -26,16 +27,16 @@ from vrw_jax.numerics import Elementwise
 from vrw_jax.wheel import PAPER_PHASES, WheelParams
 
 GAIT_SURFACE_MESHES = (PhaseMesh(2, 1.0), PhaseMesh(4, 2.0), PhaseMesh(1, 1.0))
-"""Meshes of the predicted accelerations in DLS, SLS-I and SLS-II."""
+"""Meshes for the predicted accelerations in DLS, SLS-I and SLS-II."""
 GAIT_SURFACE_DEGREE = 3
 """Degree of the polynomials whose coefficients are stored."""
 
 
 class GaitSurface(NamedTuple):
-    """Polynomial coefficients of the gait surface, (monomials, unknowns), and ranges of its
-    coordinates.
+    """Polynomial coefficients of the gait surface, and the ranges of its coordinates.
 
-    The polynomials are functions of the centered coordinates.
+    The coefficients have the shape (monomials, unknowns). The polynomials are functions of the
+    centered coordinates.
     """
 
     centre: np.ndarray
@@ -47,21 +48,21 @@ class GaitSurface(NamedTuple):
 
 @functools.cache
 def load_gait_surface() -> GaitSurface:
-    """Return the gait surface from the file beside this module."""
+    """Load the gait surface from the file `surface.npz` in this package."""
     surface_file = importlib.resources.files(__package__) / "surface.npz"
     with surface_file.open("rb") as surface_stream, np.load(surface_stream) as stored_arrays:
         return GaitSurface(**{name: stored_arrays[name] for name in GaitSurface._fields})
 
 
 def compute_time_unit(params: WheelParams) -> Elementwise:
-    """Return the unit of time of a wheel, sqrt(L0 / g), s."""
+    """Return the unit of time for a wheel, sqrt(L0 / g), s."""
     return jnp.sqrt(params.locked_length / params.gravity)
 
 
 def compute_surface_coordinates(params: WheelParams) -> tuple[Elementwise, ...]:
-    """Return the dimensionless coordinates of the gait surface.
+    """Return the dimensionless coordinates of a wheel on the gait surface.
 
-    The coordinates depend on the square root of the damping, on stiffness, natural length and
+    The coordinates depend on the square root of the damping, and on stiffness, natural length and
     slope.
     """
     total_mass = params.hub_mass + params.n_legs * params.leg_mass
@@ -75,8 +76,9 @@ def compute_surface_coordinates(params: WheelParams) -> tuple[Elementwise, ...]:
 
 
 def evaluate_monomials(centered_coordinates: tuple[Elementwise, ...]) -> list[Elementwise]:
-    """Return all monomials of the coordinates up to the degree of the surface, the constant
-    first.
+    """Return all monomials of the coordinates up to the degree of the surface.
+
+    The constant monomial is the first.
     """
     constant_monomial = jnp.ones_like(centered_coordinates[0])
     return [
@@ -89,9 +91,9 @@ def evaluate_monomials(centered_coordinates: tuple[Elementwise, ...]) -> list[El
 
 
 def predict_gait(params: WheelParams, phase_meshes: tuple[PhaseMesh, ...]) -> CollocationSolution:
-    """Return the predicted section state, durations and accelerations of each lane.
+    """Predict the section state, the durations and the accelerations for the gait of each wheel.
 
-    The accelerations belong to the nodes of `phase_meshes`. Lanes are on the last axis.
+    The accelerations belong to the nodes of `phase_meshes`. The wheels are on the last axis.
     """
     gait_surface = load_gait_surface()
     # With Python floats, the dtype of the parameters is kept.

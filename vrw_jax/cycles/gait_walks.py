@@ -1,4 +1,4 @@
-"""Walks of many wheels from fixed starts until they settle on gaits."""
+"""Simulate walks of many wheels from fixed starts until they settle on gaits."""
 
 import math
 from collections.abc import Callable
@@ -17,55 +17,62 @@ from vrw_jax.wheel import PARAMETER_NAMES, Outcome, WheelParams, compute_wheel_u
 
 @dataclass(frozen=True)
 class GaitWalkOptions:
-    """Numerical options of the walks toward attracting gaits.
+    """Numerical options of the walks that approach attracting gaits.
 
-    Distances are those of section states in units of the wheel.
+    Distances are distances between section states, in units of the wheel.
     """
 
     steps_by_round: tuple[int, ...] = (8, 12, 30, 50, 100)
-    """Number of steps in each round.
+    """Number of gait steps in each round.
 
-    After a round, settled walks stop, and walks to the same gait are merged."""
+    After a round, settled walks stop, and walks to the same gait are merged.
+    """
     walk_step_tolerance: float = 1e-8
-    """Tolerance of the Tsit5 steps of walks, which is independent of the tolerance of the gait."""
+    """Tolerance of the Tsit5 solver in walks, which is independent of the tolerance of the gait."""
     max_settled_defect: float = 1e-3
-    """Largest distance between states of a settled walk that are one period apart."""
+    """Largest distance between two states of a settled walk that are one period apart."""
     max_newton_start_defect: float = 0.1
-    """Largest distance between states of an unsettled walk, one period apart, from which Newton's
-    method starts."""
+    """Largest period defect of an unsettled walk from whose end Newton's method starts.
+
+    The period defect is the distance between two states that are one period apart.
+    """
     walk_merge_distance: float = 0.02
-    """Largest distance between the ends of two walks that count as walks to the same gait."""
+    """Largest distance between the ends of two walks that are treated as walks to the same gait."""
 
 
 GAIT_WALK_OPTIONS = GaitWalkOptions()
 
 WALK_STARTS = ((1.0, 0.45), (1.0, 0.7), (1.0, 1.0), (0.5, 1.0), (0.0, 1.0))
-"""Starts of walks, each given by a contraction and a rate.
+"""Starts of walks, each described by a contraction and a rate.
 
 The first number is the static contraction of Leg 1 at touchdown, as a fraction. The second number
-is the rate of the hub, as a fraction of the rigid rolling gait's rate. Of 4,800 random wheels with
-5 to 16 legs, 1,240 wheels walk from one of these starts or from a grid of 78 starts. From these
-starts alone, 1,175 wheels walk (ranges: experiments/gaits/off_the_box.py).
+is the rate of the hub, as a fraction of the rate in the rigid rolling gait. A test used 4,800
+random wheels with 5 to 16 legs. Of these wheels, 1,240 reach a gait from one of these starts or
+from a grid of 78 starts. These starts alone suffice for 1,175 wheels (ranges:
+experiments/gaits/off_the_box.py).
 """
 
 FALLBACK_WALK_STARTS = (
     (0.002, 0.4), (0.002, 0.3), (0.002, 0.5), (0.5, 1.1), (0.2, 0.4), (0.2, 1.1), (0.2, 0.8),
     (0.35, 1.0), (0.35, 1.1), (0.43, 1.6), (0.4, 1.35), (0.46, 1.6), (0.43, 1.35),
 )  # fmt: skip
-"""Starts of walks for wheels that reach no gait from WALK_STARTS, each given by an angle and a
+"""Starts of walks for wheels that reach no gait from WALK_STARTS, each described by an angle and a
 rate.
 
 The first number is Leg 1's angle to the slope's normal at touchdown, as a fraction of the angle
-between legs. The second number is the rate, as in WALK_STARTS. The first nine starts reach 65
-wheels that WALK_STARTS miss. With many legs, gaits roll from double support into double support,
-with an angle near 0. The last four starts are chosen because some gaits with few legs are reached
-only from large angles and high rates. Of 442 wheels with 5 to 7 legs that walk from one of these
-starts or from a grid of 30, the last four starts reach 18 wheels that other starts miss.
+between legs. The second number is the rate, as in WALK_STARTS. The first nine starts reach gaits of
+65 wheels for which WALK_STARTS reach none. With many legs, double support can follow directly on
+double support, with an angle near 0. The last four starts are chosen because some gaits with few
+legs are reached only from large angles and high rates. A test used 442 wheels with 5 to 7 legs that
+reach a gait from one of these starts or from a grid of 30 starts. For 18 of these wheels only the
+last four starts reach a gait.
 """
 
 
 def compute_walk_starts(params: WheelParams) -> np.ndarray:
-    """Return the section states of WALK_STARTS for each wheel, shape (starts, wheels, 3)."""
+    """Return the section states that WALK_STARTS describe for each wheel, shape
+    (starts, wheels, 3).
+    """
     numpy_params, slope_sine, slope_cosine = (
         _convert_params_to_numpy(params),
         math.sin(params.leg_angle),
@@ -92,8 +99,9 @@ def compute_walk_starts(params: WheelParams) -> np.ndarray:
 
 
 def compute_fallback_walk_starts(params: WheelParams) -> np.ndarray:
-    """Return the section states of FALLBACK_WALK_STARTS for each wheel, shape (starts, wheels,
-    3).
+    """Return the section states that FALLBACK_WALK_STARTS describe for each wheel.
+
+    The shape is (starts, wheels, 3).
     """
     touchdown_angles = [
         np.full(np.shape(params.slope), touchdown_angle_share * params.leg_angle)
@@ -115,9 +123,9 @@ def _convert_params_to_numpy(params: WheelParams) -> Any:
 def _make_section_states(
     params: WheelParams, touchdown_angles: list[np.ndarray], rolling_rate_shares: list[float]
 ) -> np.ndarray:
-    """Return section states with the given touchdown angles, rad, shape (starts, wheels, 3).
+    """Build section states from touchdown angles, rad, and rates, shape (starts, wheels, 3).
 
-    The rates of the hub are given as fractions of the rigid rolling gait's rate.
+    The rate of the hub is a fraction of its rate in the rigid rolling gait.
     """
     numpy_params, leg_angle = _convert_params_to_numpy(params), params.leg_angle
     rigid_leg_rate = np.sqrt(
@@ -141,20 +149,22 @@ def _make_section_states(
 
 
 def stack_section_units(model: Any, parameter_values: np.ndarray, n_legs: int) -> np.ndarray:
-    """Return the units of each wheel's section state, shape (wheels, section)."""
+    """Return the units of the section state for each wheel, shape (wheels, section)."""
     return np.stack(
         model.section_units(compute_wheel_units_of_rows(parameter_values, n_legs), n_legs), -1
     )
 
 
 def count_section_coordinates(gait_finder: Any) -> int:
-    """Return the number of continuous components of a section state. The other components are
-    codes."""
+    """Return the number of continuous components in a section state.
+
+    The remaining components are codes.
+    """
     return int(gait_finder.model.n_continuous(WheelParams(n_legs=gait_finder.n_legs)))
 
 
 class DistinctWalkEnds(NamedTuple):
-    """Distinct ends of walks in the order of the wheels, at least one for each wheel."""
+    """Distinct end states of walks in the order of the wheels, at least one for each wheel."""
 
     wheel_indices: np.ndarray  # (ends,)
     section_states: np.ndarray  # (ends, section)
@@ -167,17 +177,18 @@ def walk_to_gaits(
     compute_start_states: Callable[[WheelParams], np.ndarray],
     walk_options: GaitWalkOptions = GAIT_WALK_OPTIONS,
 ) -> DistinctWalkEnds:
-    """Return the distinct ends of the walks of each wheel.
+    """Simulate walks of each wheel, and return the distinct states at their ends.
 
-    Of several walks that reach the same state, the walk with the smallest period defect is kept. A
-    walk that fails ends at the state of its last round, which may be near a repelling gait. If no
-    walk of a wheel nearly repeats, the end of its first walk is returned.
+    If several walks reach the same state, only the walk with the smallest period defect is
+    returned. For a walk that fails, the returned state is that of its last round, which may be near
+    a repelling gait. If no walk of a wheel nearly repeats, the end of its first walk is returned.
 
     Args:
-        gait_finder: finder of gaits, whose model takes the steps.
-        parameter_values: values of each wheel, (wheels, n_values); see
+        gait_finder: finder of gaits, whose model computes the gait steps.
+        parameter_values: parameters of each wheel, shape (wheels, n_values), in the order of
             `AbstractWheel.parameter_values`.
-        compute_start_states: function from wheels to section states of shape (starts, wheels, 3).
+        compute_start_states: function that maps wheels to section states, shape (starts, wheels,
+            3).
         walk_options: numerical options of the walks.
     """
     start_section_states = compute_start_states(
@@ -250,7 +261,7 @@ def measure_period_defects(
 ) -> np.ndarray:
     """Return the largest change of each section state over one period, shape (wheels,).
 
-    Changes are in units of the wheel, and infinite if a step fails.
+    Changes are in units of the wheel. The result is infinite if a gait step fails.
     """
     end_states, period_outcomes = _walk_wheels(
         gait_finder, parameter_values, section_states, gait_finder.period_n, walk_options
@@ -268,7 +279,7 @@ def _walk_wheels(
     n_steps: int,
     walk_options: GaitWalkOptions,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the section states after `n_steps` steps of each wheel, and the outcomes."""
+    """Return the section state after `n_steps` gait steps for each wheel, and the outcomes."""
     model, params = _split_parameter_values(gait_finder, parameter_values)
     step_options = StepOptions(
         solver="Tsit5", rtol=walk_options.walk_step_tolerance, atol=walk_options.walk_step_tolerance
@@ -283,7 +294,9 @@ def _walk_wheels(
 def _split_parameter_values(
     gait_finder: Any, parameter_values: np.ndarray
 ) -> tuple[Any, WheelParams]:
-    """Return the model and the wheels with the given parameter values, (wheels, n_values)."""
+    """Return the model and the wheels that `parameter_values` of shape (wheels,
+    n_values) describe.
+    """
     model, params = gait_finder.model.from_values(
         tuple(jax.device_put(list(parameter_values.T))), gait_finder.n_legs
     )
@@ -301,7 +314,7 @@ def _find_duplicate_walks(
 
     Two states are the same if their distance is within `walk_merge_distance`. If the other walk has
     settled to within `max_settled_defect`, a distance of three times the first walk's defect is
-    also allowed. The axes are starts, wheels and, for states, coordinates.
+    also allowed. The axes of the arguments are starts, wheels and, for states, coordinates.
     """
     scaled_walk_states, period_defects = (
         scaled_walk_states.reshape(-1, n_wheels, scaled_walk_states.shape[-1]),

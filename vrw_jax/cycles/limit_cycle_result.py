@@ -1,8 +1,8 @@
-"""Limit cycles of the paper's model as differentiable functions of its parameters.
+"""Represent limit cycles of the paper's model as differentiable functions of its parameters.
 
 The search (see `collocation_search`) has no derivatives. The derivatives are the tangents of the
-linearization at the cycle, by the implicit function theorem. They are valid on unstable cycles too,
-in forward and reverse mode, and to any order.
+linearization at the cycle, by the implicit function theorem. They are also valid for unstable
+cycles, in forward and reverse mode, and to any order.
 """
 
 import functools
@@ -58,11 +58,10 @@ from vrw_jax.wheel import (
 
 
 class LimitCycle(AbstractCycle):
-    """Gait of the paper's model, found by collocation. Under vmap, the batch axis of fields comes
-    first.
+    """Gait of the paper's model, found by collocation.
 
-    See `AbstractCycle`. The cycle is differentiable in the parameters, in every mode and to any
-    order.
+    See `AbstractCycle`. The cycle is differentiable with respect to the parameters, in every mode
+    and to any order. Under `jax.vmap`, the batch axis of every field comes first.
 
     - `section_state`: (theta-, dtheta-, dL1-) before touchdown, a fixed point of the return map;
     - `post_impact`: (theta, dtheta) after the first landing, rad, rad/s;
@@ -73,8 +72,7 @@ class LimitCycle(AbstractCycle):
     - `residual`: norm of Newton's last correction, in units of the wheel;
     - `n_newton_iterations`: number of linearizations in the search;
     - `parameters`: parameters as floats, in the order of params.PARAMETER_NAMES;
-    - `collocation_state`: solution with its active phases, a start of the search for similar
-      wheels;
+    - `collocation_state`: solution and its active phases, a start of the search for similar wheels;
     - `monodromy_value`: monodromy matrix, without derivatives;
     - `system`, `model`: the collocation system and the model.
 
@@ -113,7 +111,9 @@ class LimitCycle(AbstractCycle):
         return self.collocation_state
 
     def _vmap_over_batch_axes(self, function_of_cycle: Callable) -> Callable:
-        """Return a function of one cycle, mapped over the batch axes of this cycle."""
+        """Map a function of one cycle over the batch axes of this cycle, and return the mapped
+        function.
+        """
         for _ in range(self.outcome.ndim):
             function_of_cycle = jax.vmap(function_of_cycle)
         return with_default_jax_settings(function_of_cycle)
@@ -123,7 +123,7 @@ class LimitCycle(AbstractCycle):
         """Return the Jacobian of the return map after the impact, in the coordinates (theta+,
         dtheta+).
 
-        The return map before the impact has one more multiplier, which is zero.
+        The return map before the impact has one additional multiplier, which is zero.
         """
         attach_derivatives = (
             attach_monodromy_derivatives if is_inside_jit() else _attach_monodromy_compiled
@@ -150,10 +150,11 @@ class LimitCycle(AbstractCycle):
 
     @property
     def mesh_error(self) -> Array:
-        """Return an estimate of the discretization error, which in most cases exceeds the error.
+        """Return an estimate of the discretization error, which in most cases exceeds the actual
+        error.
 
-        See `collocation.estimate_mesh_error`. A gait whose estimate is above 1e-5 does not count as
-        found. More mesh intervals in `CycleOptions` reduce the error.
+        See `collocation.estimate_mesh_error`. A gait whose estimate is above 1e-5 is rejected. More
+        mesh intervals in `CycleOptions` reduce the error.
         """
         estimate_error = functools.partial(_estimate_found_mesh_error, self.system)
         return self._vmap_over_batch_axes(estimate_error)(
@@ -162,7 +163,7 @@ class LimitCycle(AbstractCycle):
 
     @property
     def takeoff_acceleration(self) -> Array:
-        """Return the rear foot's lowest acceleration at take-off over the steps, m/s^2.
+        """Return the lowest acceleration of the rear foot at take-off over the gait steps, m/s^2.
 
         See `margin_defaults`.
         """
@@ -177,9 +178,10 @@ class LimitCycle(AbstractCycle):
 
     @property
     def slope_response(self) -> SlopeResponse:
-        """Return the linear response of the step to the slopes of its two lines.
+        """Return the linear response of the gait step to the slopes of uneven ground.
 
-        The measures are `slope_response.COLLOCATION_RESPONSE_MEASURES`.
+        The gait step depends on the slopes of two successive lines of the ground. The measures are
+        `slope_response.COLLOCATION_RESPONSE_MEASURES`.
         """
         if self.period_n > 1:
             raise ValueError(
@@ -192,7 +194,7 @@ class LimitCycle(AbstractCycle):
     def gait_sensitivity(self, measure_name: str) -> Array:
         """Return the gait sensitivity norm of a measure, in the measure's unit per rad of slope.
 
-        See `gait_sensitivity`.
+        See `slope_response.compute_sensitivity_norms`.
         """
         response_index = COLLOCATION_RESPONSE_MEASURES.index(measure_name)
 
@@ -207,9 +209,10 @@ class LimitCycle(AbstractCycle):
 
     @property
     def force_peaks(self) -> dict[str, Array]:
-        """Return the `measures.FORCE_PEAK_MEASURES` by name, each the largest over the steps.
+        """Return the `measures.FORCE_PEAK_MEASURES` by name.
 
-        The measures have first derivatives, which are zero for numbers of peaks.
+        Each measure is the largest value over the gait steps. The measures have first derivatives.
+        The derivatives of the number of peaks are zero.
         """
         compute_peaks = functools.partial(compute_force_peaks, self.system)
         collocation_solution = self.collocation_state.solution
@@ -235,7 +238,7 @@ class LimitCycle(AbstractCycle):
 
     @property
     def margins(self) -> Margins:
-        """Return the margins of the first step, computed by an event-driven step."""
+        """Return the margins of the first gait step, computed by an event-driven step."""
 
         def compute_step_margins(parameters: Array, section_state: Array) -> Margins:
             wheel_params = make_wheel_from_parameters(parameters, self.system.n_legs)
@@ -295,7 +298,7 @@ def _estimate_found_mesh_error(
 def _compute_takeoff_acceleration(
     collocation_system: CollocationSystem, parameters: Array, collocation_state: CollocationState
 ) -> Array:
-    """Return the lowest take-off acceleration over the steps of a cycle, m/s^2."""
+    """Return the lowest take-off acceleration over the gait steps of a cycle, m/s^2."""
     s = make_wheel_from_parameters(parameters, collocation_system.n_legs).symbols()
     _, points_by_step = collocation_system.evaluate_phase_points(
         parameters, collocation_state.solution
@@ -313,7 +316,7 @@ _attach_monodromy_compiled = jax.jit(attach_monodromy_derivatives, static_argnum
 def solve_limit_cycle(
     params: WheelParams, collocation_system: CollocationSystem, guess: CollocationState | None
 ) -> LimitCycle:
-    """Return the cycle of one wheel by the search, without fallbacks."""
+    """Find the cycle of one wheel by the search, without fallbacks."""
     find_cycle = _solve_limit_cycle if is_inside_jit() else _solve_limit_cycle_compiled
     return find_cycle(params, collocation_system, guess)
 
@@ -321,7 +324,7 @@ def solve_limit_cycle(
 def _solve_limit_cycle(
     params: WheelParams, collocation_system: CollocationSystem, guess: CollocationState | None
 ) -> LimitCycle:
-    """Return the cycle of one wheel by the search, without compilation."""
+    """Find the cycle of one wheel by the search, outside compiled code."""
     is_in_domain = params.is_in_domain()
     table_1_params = WheelParams(n_legs=collocation_system.n_legs)
     in_domain_params = jax.tree.map(
@@ -405,7 +408,7 @@ _solve_limit_cycle_compiled = eqx.filter_jit(_solve_limit_cycle)
 
 
 class WalkSamples(NamedTuple):
-    """Samples of an event-driven walk in time, for a start on any mesh."""
+    """Samples in time of an event-driven walk, from which a start on any mesh is computed."""
 
     post_impact: Float[Array, "2"]  # (theta, dtheta) after the first landing
     landing_distances: Float[Array, " n"]  # distance between the feet at each landing, m
@@ -421,11 +424,11 @@ def sample_walk_in_time(
     n_steps: int,
     n_samples: int = 1025,
 ) -> WalkSamples:
-    """Return samples in time of `n_steps` event-driven steps from a section state.
+    """Sample `n_steps` event-driven gait steps in time, starting from a section state.
 
-    - `n_samples`: number of points per phase. The value is chosen because with few points, the
-      samples miss the fast start of a step without double support, and Newton's method fails (33 at
-      c = 221).
+    - `n_samples`: number of samples per phase. The value is chosen because few samples miss the
+      fast start of a gait step without double support. Newton's method then fails, for example with
+      33 samples at c = 221 N s/m.
     """
     step_options, wheel_symbols = StepOptions(), params.symbols()
     landing_result = transitions.resolve_landing(wheel_symbols, *section_state)
@@ -448,7 +451,7 @@ def sample_walk_in_time(
 def guess_cycle_from_walk(
     collocation_system: CollocationSystem, params: WheelParams, walk_samples: WalkSamples
 ) -> CollocationState:
-    """Return the guess of a cycle from a walk of `period_n` steps."""
+    """Compute the guess of a cycle from the samples of a walk with `period_n` gait steps."""
     sample_accelerations = functools.partial(
         _sample_node_accelerations, collocation_system, params.symbols()
     )
@@ -471,7 +474,7 @@ def transfer_solution_to_mesh(
     target_system: CollocationSystem,
     source_solution: CollocationSolution,
 ) -> CollocationSolution:
-    """Return a collocation solution on the mesh of another system.
+    """Transfer a collocation solution from the mesh of one system to the mesh of another system.
 
     The accelerations in each mesh interval are a polynomial of time.
     """
@@ -506,7 +509,7 @@ def _sample_node_accelerations(
     foot_distance: Scalar,
     sample_states: Float[Array, "3 n_samples 6"],
 ) -> tuple[Array, ...]:
-    """Return the accelerations at the nodes of each phase of a sampled step.
+    """Return the accelerations at the nodes of each phase, computed from a sampled gait step.
 
     The axes of each array are (interval, node, coordinate).
     """

@@ -1,5 +1,5 @@
-"""Margins that searches along gaits of the paper's model keep positive, and their default
-limits.
+"""Define the margins that searches for gaits of the paper's model keep positive, and
+their limits.
 """
 
 from collections.abc import Mapping
@@ -13,7 +13,7 @@ from vrw_jax.wheel import Motion, Symbols, WheelParams, dynamics
 
 
 def compute_takeoff_acceleration(s: Symbols, sls1_points: PhasePoints) -> Elementwise:
-    """Return the rear foot's acceleration at the start of SLS-I, m/s^2.
+    """Return the acceleration of the rear foot at the start of SLS-I, m/s^2.
 
     See `dynamics.compute_takeoff_acceleration`.
     """
@@ -35,7 +35,7 @@ KEPT_MARGIN_NAMES: tuple[str, ...] = (
     "lambda_2_plus",
     "lambda_4_plus",
 )
-"""Names of the margins on forces, clearances and indicators that can be kept positive."""
+"""Names of the margins (forces, clearances and indicators) that a search can keep positive."""
 
 DEFAULT_MARGIN_SHARE = 1e-3
 """Default lower limit of a margin, as a fraction of the wheel's weight, leg length or gravity."""
@@ -43,11 +43,11 @@ DEFAULT_MARGIN_SHARE = 1e-3
 
 @with_default_jax_settings
 def default_margins(params: WheelParams) -> Mapping[str, float]:
-    """Return lower limits of the margins in `KEPT_MARGIN_NAMES`.
+    """Return the default lower limit for each margin in `KEPT_MARGIN_NAMES`.
 
     Each limit is a thousandth of the margin's natural scale for this wheel. The limits are above
     zero, because a search needs a distance from the boundary. At lambda_4_plus = 0, for example,
-    the gaits end.
+    the branch of gaits ends.
 
     Args:
         params: one wheel.

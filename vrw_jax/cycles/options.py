@@ -1,4 +1,4 @@
-"""Numerical options of the search for limit cycles."""
+"""Define numerical options of the search for limit cycles."""
 
 import dataclasses
 
@@ -24,17 +24,20 @@ from vrw_jax.validation import (
 )
 @dataclasses.dataclass(frozen=True)
 class CycleOptions:
-    """Numerical options of `limit_cycle`. Every change of an option compiles the search again.
+    """Numerical options of `limit_cycle`.
 
-    The defaults reach relative errors of 1e-9 in values and 1e-8 in first derivatives.
+    JAX compiles the search again whenever an option changes. With the defaults, relative errors are
+    1e-9 in values and 1e-8 in first derivatives.
 
-    - `mesh_intervals`: numbers of mesh intervals, of order 8, in DLS, SLS-I and SLS-II;
+    - `mesh_intervals`: number of mesh intervals in each of DLS, SLS-I and SLS-II; the method has
+      order 8;
     - `mesh_grading`: ratio of the last to the first mesh interval in SLS-I;
     - `tolerance`: largest norm of Newton's last correction, in units of the wheel;
     - `max_newton_iterations`: largest number of Newton iterations in one attempt;
-    - `first_newton_iterations`: number of iterations after which a batch gathers the wheels that
-      need more;
-    - `homotopy_steps`: number of steps of a homotopy from Table 1, used if the first attempt fails;
+    - `first_newton_iterations`: number of Newton iterations after which the wheels of a batch that
+      need more iterations are gathered;
+    - `homotopy_steps`: number of parameter steps in a homotopy from the wheel in Table 1 of the
+      paper, which is used if the first attempt fails;
     - `batch_size`: number of wheels that are solved together.
 
     Examples:
@@ -80,7 +83,8 @@ class CycleOptions:
     def check_tolerances(self, parameter_dtype: np.dtype) -> None:
         """Raise ValueError if the number format cannot resolve the tolerance.
 
-        As in JAX, 64-bit parameters of a wheel count as 32-bit numbers if `jax_enable_x64` is off.
+        If `jax_enable_x64` is off, 64-bit parameters of a wheel are treated as 32-bit numbers, as
+        in JAX.
         """
         jax_dtype = jax.dtypes.canonicalize_dtype(parameter_dtype)
         if self.tolerance < jnp.finfo(jax_dtype).eps:
@@ -108,5 +112,5 @@ class CycleOptions:
 
     @classmethod
     def tight(cls) -> "CycleOptions":
-        """Return options with errors of about 1e-12 in values and 1e-10 in first derivatives."""
+        """Return options whose errors are about 1e-12 in values and 1e-10 in first derivatives."""
         return cls(mesh_intervals=(16, 20, 4), tolerance=1e-13)

@@ -1,9 +1,9 @@
-"""Phases of the paper's model as functions for the collocation: dynamics, end events and resets.
+"""Describe the phases of the paper's model for the collocation: dynamics, end events and resets.
 
 `make_held_landing_sequence` uses the plane section (theta+, dtheta+) just after an impact that ends
-with both feet on the ground. If double support is absent, the rear foot lifts immediately (case
-B3). An impact at which the rear foot leaves the ground (case A3) is not in that plane, so the
-search does not find such gaits.
+with both feet on the ground. If double support is absent, the rear foot lifts immediately (case B3
+of the paper). An impact at which the rear foot leaves the ground (case A3) is not in that plane.
+The search therefore does not find such gaits.
 """
 
 import functools
@@ -34,14 +34,14 @@ from vrw_jax.wheel import (
 )
 
 N_LANE_SYMBOLS = 12
-"""Number of fields of `Symbols` that vary between lanes.
+"""Number of those fields of `Symbols` that vary between wheels.
 
 The other fields follow from the number of legs.
 """
 
 
 def compute_phase_constants(n_legs: int, *parameters: Elementwise) -> PhaseConstants:
-    """Return the combinations of parameters that the formulas of all phases contain.
+    """Return the combinations of parameters that occur in the formulas of all phases.
 
     The arguments are the parameters in the order of PARAMETER_NAMES.
     """
@@ -50,7 +50,7 @@ def compute_phase_constants(n_legs: int, *parameters: Elementwise) -> PhaseConst
 
 
 def _restore_symbols(n_legs: int, phase_constants: PhaseConstants) -> Symbols:
-    """Return all symbols of the wheel from the symbols that vary between lanes."""
+    """Return all symbols of a wheel, computed from the symbols that vary between wheels."""
     leg_angle = 2.0 * math.pi / n_legs
     symbol_values: tuple[Any, ...] = (
         *phase_constants[:N_LANE_SYMBOLS],
@@ -63,14 +63,18 @@ def _restore_symbols(n_legs: int, phase_constants: PhaseConstants) -> Symbols:
 
 
 def _has_line_turn(phase_constants: PhaseConstants) -> bool:
-    """Return whether the constants contain the angle, rad, by which the next line is steeper."""
+    """Return whether the constants contain the angle by which the next line of the ground is
+    steeper.
+
+    The unit of the angle is rad.
+    """
     return len(phase_constants) > N_LANE_SYMBOLS
 
 
 def _make_collocation_phase(
     n_legs: int, stop_at_lift_off: bool, phase_index: int
 ) -> CollocationPhase:
-    """Return a phase of the wheel as functions of the constants of `compute_phase_constants`."""
+    """Describe a phase by functions of the constants that `compute_phase_constants` returns."""
     phase_class = PAPER_PHASES[phase_index]
 
     def evaluate_phase(
@@ -136,7 +140,7 @@ def _make_collocation_phase(
 
 
 def _list_admissibility_checks() -> tuple[str, ...]:
-    """Return a phrase for each check of the phases and their transitions."""
+    """Return a phrase for each check of the phases and of the transitions between them."""
     check_phrases: list[str] = []
     for phase_class in PAPER_PHASES:
         failure_outcomes = (*phase_class.guard_outcomes[1:], *SHARED_FAILURE_OUTCOMES)
@@ -154,16 +158,18 @@ def _list_admissibility_checks() -> tuple[str, ...]:
 
 
 ADMISSIBILITY_CHECKS = (*_list_admissibility_checks(), "mesh")
-"""Assumptions about a gait, in the order of their checks.
+"""Assumptions about a gait, in the order in which they are checked.
 
-The first checks are the duration and the guards of each phase. The transitions between phases and
-the resolution of the mesh follow.
+The first checks concern the duration and the guards of each phase. Checks of the transitions
+between phases and of the mesh follow.
 """
 
 
 @functools.cache
 def make_held_landing_sequence(n_legs: int, stop_at_lift_off: bool = True) -> PhaseSequence:
-    """Return DLS, SLS-I and SLS-II on the plane section (theta+, dtheta+) after the impact."""
+    """Build the sequence DLS, SLS-I and SLS-II on the plane section (theta+, dtheta+) after the
+    impact.
+    """
     collocation_phases = tuple(
         _make_collocation_phase(n_legs, stop_at_lift_off, phase_index)
         for phase_index in range(len(PAPER_PHASES))

@@ -1,4 +1,4 @@
-"""Gaits of any model, found by Newton's method on its return map from a start near the gait.
+"""Find gaits of any model by Newton's method on its return map, from a start near the gait.
 
 Only the interface of models is used. For the paper's model, `collocation_finder` is a faster
 method.
@@ -38,26 +38,29 @@ from vrw_jax.simulation import validate_arguments, walk_toward_gait
 from vrw_jax.wheel import Outcome, WheelParams, compute_wheel_units
 
 MIN_NEWTON_TOLERANCE = 1e-12
-"""Smallest tolerance of Newton's last correction, which is at least the tolerance of the step."""
+"""Smallest tolerance for Newton's last correction.
+
+The tolerance is also at least that of the gait step.
+"""
 
 
 def compute_newton_tolerance(options: StepOptions) -> Scalar:
-    """Return the tolerance of Newton's last correction for the given step options."""
+    """Return the tolerance for Newton's last correction that suits the options of the gait step."""
     return jnp.maximum(MIN_NEWTON_TOLERANCE, options.rtol)
 
 
 class ReturnMapCycle(AbstractCycle):
-    """Gait that repeats after `period_n` steps, as a fixed point of a model's return map.
+    """Gait that repeats after `period_n` gait steps, as a fixed point of a model's return map.
 
-    Under vmap, the batch axis of fields comes first. The cycle is differentiable in the parameters
-    by the implicit function theorem, to second order. If no gait is found, `outcome` is the reason,
-    and all other fields are zero.
+    The cycle is differentiable with respect to the parameters by the implicit function theorem, to
+    second order. If no gait is found, `outcome` is the reason, and all other fields are zero. Under
+    `jax.vmap`, the batch axis of every field comes first.
 
     - `section_state`: fixed point of `period_n` return maps;
     - `post_impact`: (theta, dtheta) after the first landing, rad, rad/s;
     - `durations`: durations that the model's step returns, s; (n, 3) for period_n = n > 1;
     - `step_length`: distance between the feet at the landing, m;
-    - `steps`: step results of the model, with an axis over the steps of one cycle;
+    - `steps`: step results of the model, with an axis over the gait steps of one cycle;
     - `monodromy_value`: Jacobian of the return map;
     - `outcome`: Outcome.STEPPED, or the reason of the failure;
     - `residual`: largest absolute component of map(x) - x, in units of the wheel;
@@ -85,7 +88,7 @@ class ReturnMapCycle(AbstractCycle):
         return self.steps.durations.shape[self.outcome.ndim]
 
     def _drop_single_step_axis(self, tree_over_steps: Any) -> Any:
-        """Return the tree without its axis over the steps if there is only one step."""
+        """Return the tree without its axis over the gait steps if the cycle has only one step."""
         step_axis, is_single_step = self.outcome.ndim, self.period_n == 1
         return jax.tree.map(
             lambda array_over_steps: (
@@ -101,7 +104,7 @@ class ReturnMapCycle(AbstractCycle):
 
     @property
     def margins(self) -> Any:
-        """Return the margins of each step."""
+        """Return the margins of each gait step."""
         return self._drop_single_step_axis(self.steps.margins)
 
     @property
@@ -129,11 +132,11 @@ def find_return_map_cycle(
     period_n: int,
     uses_implicit_jvp: bool,
 ) -> ReturnMapCycle:
-    """Return the cycle of a wheel by Newton's method on the model's return map.
+    """Find the cycle of a wheel by Newton's method on the model's return map.
 
-    With `uses_implicit_jvp`, `solve_fixed_point_implicit` is used, because second derivatives of a
-    step with unilateral contact are expensive. The search then uses the same step as the result, so
-    that only one program is compiled.
+    If `uses_implicit_jvp` is true, `solve_fixed_point_implicit` is used, because second derivatives
+    of a gait step with unilateral contact are expensive. The search then uses the same step
+    function as the result, so that only one program is compiled.
     """
     evaluate_step, find_fixed_point = (
         (model.take_step, solve_fixed_point_implicit)
@@ -170,7 +173,7 @@ def find_return_map_cycle(
 def make_return_map_cycle(
     params: WheelParams, fixed_point: FixedPointResult, cycle_steps: Any
 ) -> ReturnMapCycle:
-    """Return the cycle of a fixed point, from its steps with a leading axis."""
+    """Build the cycle that belongs to a fixed point, from its gait steps on a leading axis."""
     # A failed step returns zeros, to which Newton's method may converge.
     is_gait_valid = fixed_point.converged & jnp.all(cycle_steps.outcome == Outcome.STEPPED)
     failure_outcome = jnp.where(params.is_in_domain(), Outcome.NO_CYCLE_FOUND, Outcome.BAD_INPUT)
@@ -190,9 +193,9 @@ def make_return_map_cycle(
 
 
 def summarize_cycle_steps(cycle_steps: Any) -> tuple[Array, Array, Array]:
-    """Return post-impact state, durations, s, and step lengths, m, of a cycle.
+    """Return the post-impact state, the phase durations, s, and the step lengths, m, of a cycle.
 
-    The steps of the cycle have a leading axis.
+    The gait steps of the cycle are on a leading axis.
     """
     phase_durations, step_lengths = cycle_steps.durations, cycle_steps.step_length
     if len(phase_durations) == 1:
@@ -201,7 +204,7 @@ def summarize_cycle_steps(cycle_steps: Any) -> tuple[Array, Array, Array]:
 
 
 class AbstractReturnMapFinder(AbstractGaitFinder):
-    """Finder of gaits as fixed points of the return map over `period_n` steps."""
+    """Finder of gaits as fixed points of the return map over `period_n` gait steps."""
 
     model: AbstractWheel
     n_legs: int = eqx.field(static=True)
@@ -227,7 +230,7 @@ class AbstractReturnMapFinder(AbstractGaitFinder):
         return find_return_map_cycle(*search_arguments, self.period_n, uses_implicit_jvp=False)
 
     def make_initial_guess(self, parameter_values: ParameterValues) -> Array:
-        """Return the last section state of a walk from the model's default start."""
+        """Return the last section state of a walk that begins at the model's default start."""
         model, params = self.model.from_values(parameter_values, self.n_legs)
         return walk_toward_gait(model, params, self.step_options).steps.section_state[-1]
 
@@ -236,7 +239,7 @@ class AbstractReturnMapFinder(AbstractGaitFinder):
 
 
 class ReturnMapFinder(AbstractReturnMapFinder):
-    """Finder of the gaits of any model, whose derivatives are those of Newton's method."""
+    """Finder of the gaits of any model, which obtains derivatives from Newton's method."""
 
     cycle_measures: ClassVar[tuple[str, ...]] = tuple(
         measure_name
@@ -290,7 +293,9 @@ class ReturnMapFinder(AbstractReturnMapFinder):
 def prepare_search(
     gait_finder: AbstractReturnMapFinder, params: WheelParams, cycle_guess: Any
 ) -> tuple[WheelParams, Array, AbstractWheel, StepOptions]:
-    """Return wheel, section state, model and options of a search near `cycle_guess`."""
+    """Return the wheel, the section state, the model and the options for a search near
+    `cycle_guess`.
+    """
     guess_state = (
         cycle_guess.section_state if isinstance(cycle_guess, AbstractCycle) else cycle_guess
     )
@@ -306,10 +311,10 @@ def make_return_map_gait(
     cycle_derivatives: Any,
     step_derivatives: Any,
 ) -> Gait:
-    """Return a gait with the data that identify its branch.
+    """Build a gait with the data that identify its branch.
 
-    The active phases do not identify a branch, because with unilateral contact the order of events
-    may change along a branch.
+    The active phases do not identify a branch. With unilateral contact the order of events may
+    change on a branch.
     """
     n_coordinates = model.n_continuous(WheelParams(n_legs=n_legs))
     gait_coordinates = lambda cycle, event_driven_step: jnp.concatenate(

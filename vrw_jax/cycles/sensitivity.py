@@ -1,4 +1,4 @@
-"""Sensitivities of the measures of a gait to all parameters, as a labeled table."""
+"""Compute the sensitivities of a gait's measures to all parameters, as a labeled table."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ def sensitivities(
     model: ModelLike | None = None,
     options: CycleOptions | StepOptions | None = None,
 ) -> xr.Dataset:
-    """Return the derivatives of measures of one gait by all parameters, with elasticities and
-    values.
+    """Return the values, derivatives and elasticities of one gait's measures.
 
-    An elasticity is the relative change of a measure per relative change of a parameter. It is NaN
-    if the measure is zero. Without the stability measures, most of the compile time is saved. With
-    unilateral contact, friction is a parameter too. With model "auto", `attrs` contains the name of
-    the model that was selected for the gait.
+    The derivatives and elasticities are with respect to all parameters. An elasticity is the
+    relative change of a measure per relative change of a parameter. It is NaN if the measure is
+    zero. If the stability measures are omitted, compilation takes much less time. With unilateral
+    contact, friction is also a parameter. With model "auto", `attrs` contains the name of the model
+    that was selected for the gait.
 
     Args:
         params: the wheel.
@@ -47,7 +47,7 @@ def sensitivities(
         options: as in `limit_cycle`.
 
     Returns:
-        A dataset of `value` (measure), `derivative` and `elasticity` (measure, parameter).
+        A dataset with `value` (measure), `derivative` and `elasticity` (measure, parameter).
 
     Raises:
         TypeError, ValueError: if an argument is invalid; the message names the remedy.

@@ -1,7 +1,8 @@
-"""Linear response of a gait's step to the slopes of uneven ground, and the gait sensitivity norm.
+"""Compute the linear response of a gait's step to uneven ground, and the gait sensitivity norm.
 
-The norm is that of Hobbelen and Wisse, "A disturbance rejection measure for limit cycle walkers:
-the gait sensitivity norm" (2007). Its sum over all later steps has a closed form.
+Uneven ground consists of straight lines with different slopes. The norm is that of Hobbelen and
+Wisse, "A disturbance rejection measure for limit cycle walkers: the gait sensitivity norm" (2007).
+Its sum over all later gait steps has a closed form.
 """
 
 import functools
@@ -23,7 +24,7 @@ from vrw_jax.numerics import ForwardFunction, StepOptions, enable_all_ad_modes
 from vrw_jax.wheel import PARAMETER_NAMES, WheelParams
 
 N_CHORD_ITERATIONS = 3
-"""Number of Newton iterations with one Jacobian.
+"""Number of Newton iterations that use the same Jacobian.
 
 Each iteration makes the derivatives of one more order exact. The value is chosen because a gradient
 of the norm needs derivatives of second order.
@@ -31,10 +32,11 @@ of the norm needs derivatives of second order.
 
 
 class SlopeResponse(NamedTuple):
-    """Derivatives of a step's end state and measures by its start and the slopes of its two lines.
+    """Derivatives of a gait step with respect to its start state and the slopes of the ground.
 
-    Let x[k] be the start of step k, y[k] its measures, and e[k] the deviation of the slope of line
-    k. Then x[k+1] = A x[k] + B1 e[k] + B0 e[k+1] and y[k] = C x[k] + D1 e[k] + D0 e[k+1].
+    A gait step depends on two successive lines of the ground. Let x[k] be the start state of step
+    k, y[k] its measures, and e[k] the deviation of the slope of line k. Then x[k+1] = A x[k] + B1
+    e[k] + B0 e[k+1] and y[k] = C x[k] + D1 e[k] + D0 e[k+1].
     """
 
     A: Float[Array, "n n"]
@@ -46,8 +48,10 @@ class SlopeResponse(NamedTuple):
 
     @classmethod
     def from_jacobian(cls, step_jacobian: Array, n_states: int) -> "SlopeResponse":
-        """Return the response from the Jacobian of (end state, measures) by (start, slope, next
-        slope)."""
+        """Build the response from the Jacobian of (end state, measures).
+
+        The Jacobian is with respect to (start state, slope, next slope).
+        """
         end_state_rows, measure_rows = step_jacobian[:n_states], step_jacobian[n_states:]
         return cls(
             end_state_rows[:, :n_states],
@@ -59,7 +63,7 @@ class SlopeResponse(NamedTuple):
         )
 
     def select_measures(self, measure_indices: Sequence[int]) -> "SlopeResponse":
-        """Return the response of the selected measures."""
+        """Return the response of the measures with the indices `measure_indices`."""
         measure_index_array = jnp.asarray(measure_indices)
         return self._replace(
             C=self.C[measure_index_array],
@@ -71,9 +75,10 @@ class SlopeResponse(NamedTuple):
 class SensitivityNormParts(NamedTuple):
     """Gait sensitivity norm of each measure and its three parts, in the measure's unit per rad.
 
-    The squares of the parts sum to the square of the norm. A part is the response to the deviation
-    of one line. The first two parts have a sign and belong to the steps that end and begin on that
-    line. The third part belongs to all later steps.
+    The squares of the parts sum to the square of the norm. Each part is a response to the deviation
+    of the slope of one line of the ground. The first two parts have a sign. They belong to the gait
+    step that ends on that line and to the step that begins on it. The third part belongs to all
+    later steps.
     """
 
     sensitivity_norms: Float[Array, " n_measures"]
@@ -85,9 +90,9 @@ class SensitivityNormParts(NamedTuple):
 def compute_sensitivity_norms(slope_response: SlopeResponse) -> SensitivityNormParts:
     """Return the ratio of each measure's standard deviation to that of independent slopes.
 
-    The responses to the deviation of one line are D0, then C B0 + D1, then C A^j b with b = A B0 +
-    B1. The squares of C A^j b sum to C P C^T, where P solves the discrete Lyapunov equation P = A P
-    A^T + b b^T. The norm is infinite if the gait is not stable.
+    The responses to the deviation of one line are D0, then C B0 + D1, then C A^j b. Here b = A B0 +
+    B1 and j = 0, 1, .... The squares of C A^j b sum to C P C^T. The matrix P solves the discrete
+    Lyapunov equation P = A P A^T + b b^T. The norm is infinite if the gait is not stable.
     """
     A, B1, B0, C, D1, D0 = slope_response
     n = len(A)
@@ -116,10 +121,10 @@ def compute_sensitivity_norms(slope_response: SlopeResponse) -> SensitivityNormP
 
 
 def invert_by_elimination(square_matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
-    """Return the inverse of a matrix by Gauss-Jordan elimination with row exchanges.
+    """Invert a matrix by Gauss-Jordan elimination with row exchanges.
 
-    LAPACK's batched solver uses threads of the pool on which XLA runs the program. Two such
-    programs at a time, as in a scan on two cores, block each other (jaxlib 0.10).
+    LAPACK's batched solver uses threads of the pool on which XLA runs the program. If two such
+    programs run at a time, as in a scan on two cores, they block each other (jaxlib 0.10).
     """
     n = len(square_matrix)
     augmented_matrix = jnp.concatenate(
@@ -144,7 +149,7 @@ def invert_by_elimination(square_matrix: Float[Array, "n n"]) -> Float[Array, "n
 
 
 def _safe_square_root(squared_value: Array) -> Array:
-    """Return the square root of max(squared_value, 0), whose derivative at zero is zero."""
+    """Return the square root of max(squared_value, 0). Its derivative at zero is zero."""
     is_positive = squared_value > 0.0
     return jnp.where(is_positive, jnp.sqrt(jnp.where(is_positive, squared_value, 1.0)), 0.0)
 
@@ -156,9 +161,9 @@ def compute_step_slope_response(
     measure_names: Sequence[str],
     options: StepOptions,
 ) -> SlopeResponse:
-    """Return the slope response of a model's event-driven step from the section state of its gait.
+    """Return the slope response of an event-driven step that starts at the section state of a gait.
 
-    The components of the section state that are codes do not vary.
+    The code components of the section state do not vary.
     """
     n_states = model.n_continuous(params)
     section_state_codes = section_state[n_states:]
@@ -194,17 +199,17 @@ COLLOCATION_RESPONSE_MEASURES = (
     "duration_sls1",
     "duration_sls2",
 )
-"""Measures of a step that follow from its durations and its first landing."""
+"""Names of the measures of a gait step that follow from its durations and its first landing."""
 
 
 def compute_collocation_slope_response(
     collocation_system: CollocationSystem, parameters: Array, collocation_state: CollocationState
 ) -> SlopeResponse:
-    """Return the slope response of the paper's step, from its collocation.
+    """Return the slope response of a gait step of the paper's model, computed from its collocation.
 
     The measures are `COLLOCATION_RESPONSE_MEASURES`. The state is (theta+, dtheta+) just after a
-    landing, in the frame of the line under both feet. The response is differentiable along the
-    branch of gaits in every mode, up to second order.
+    landing, in the frame of the line of the ground under both feet. The response is differentiable
+    on the branch of gaits in every mode, up to second order.
     """
     collocation_solution, is_active = (
         collocation_state.solution,
@@ -224,11 +229,11 @@ def compute_collocation_slope_response(
 
 @functools.cache
 def _make_collocation_response_function(collocation_system: CollocationSystem) -> ForwardFunction:
-    """Return a function that computes the slope response of a collocated step.
+    """Return a function that computes the slope response of a collocated gait step.
 
     The arguments of the function are the parameters, the section state and the solution of the
-    step. Newton's method with the Jacobian of the gait's step determines durations and
-    accelerations for other starts and slopes.
+    step. Newton's method computes durations and accelerations for other start states and slopes.
+    Its Jacobian is that of the gait's step.
     """
     slope_index = PARAMETER_NAMES.index("slope")
 

@@ -1,7 +1,7 @@
-"""Gaits with unilateral contact, found by Newton's method on batches of steps.
+"""Find gaits with unilateral contact by Newton's method on batches of gait steps.
 
-The machine code of a step also computes its tangents. Many wheels are therefore searched together,
-and no large program is compiled for the derivatives.
+The machine code for a gait step also computes its tangents. Many wheels are therefore searched
+together, and no large program is compiled for the derivatives.
 """
 
 import functools
@@ -53,11 +53,11 @@ class ContactNewtonOptions:
     max_iterations: int = 15
     """Largest number of Newton iterations."""
     max_halvings: int = 6
-    """Largest number of halvings of a correction after which no step completes."""
+    """Largest number of times that a correction is halved if no gait step completes after it."""
     far_step_tolerance: float = 1e-6
-    """Tolerance of steps that start far from a gait."""
+    """Tolerance of gait steps that start far from a gait."""
     max_near_correction: float = 1e-4
-    """Correction below which a state counts as near a gait, rad, rad/s, m/s."""
+    """Correction below which a state is treated as near a gait, rad, rad/s, m/s."""
     clear_convergence_fraction: float = 0.01
     """Fraction of the tolerance below which one correction suffices for convergence."""
 
@@ -66,7 +66,10 @@ CONTACT_NEWTON_OPTIONS = ContactNewtonOptions()
 
 
 class UnilateralFinder(AbstractReturnMapFinder):
-    """Finder of gaits with unilateral contact and their first derivatives, also by friction."""
+    """Finder of gaits with unilateral contact and their first derivatives.
+
+    The derivatives are with respect to all parameters, including friction.
+    """
 
     model: UnilateralWheel
     gait_batch_sizes: tuple[int, ...] = eqx.field(
@@ -91,9 +94,10 @@ class UnilateralFinder(AbstractReturnMapFinder):
         return cls(model, n_legs, step_options, period_n)
 
     def find_cycle(self, params: WheelParams, cycle_guess: Any = None) -> ReturnMapCycle:
-        """Return the cycle, by the batched engine if all inputs are concrete.
+        """Find the cycle, by the batched engine if all inputs are concrete.
 
-        With traced inputs, the derivatives of the single step are used.
+        With traced inputs, the derivatives are those of a single gait step, by the implicit
+        function theorem.
         """
         params, section_state, model, options = prepare_search(self, params, cycle_guess)
         if has_traced_leaf(params, section_state, model):
@@ -117,13 +121,15 @@ class UnilateralFinder(AbstractReturnMapFinder):
         return self.find_cycles_near(parameter_values, section_states)
 
     def find_cycles_near(self, parameter_values: Any, section_states: Any) -> ReturnMapCycle:
-        """Return the gaits near section states, one for each wheel, without derivatives."""
+        """Find one gait for each wheel near the given section states, without derivatives."""
         return self._solve_and_evaluate(
             _make_contact_cycle, parameter_values, section_states, with_parameter_derivatives=False
         )
 
     def precompile_newton_programs(self, parameter_values: np.ndarray) -> None:
-        """Compile the programs of Newton's method while another thread walks toward its start."""
+        """Compile the programs of Newton's method while another thread computes walks toward its
+        start.
+        """
         n_section = self.model.section_size(WheelParams(n_legs=self.n_legs))
         period_map = PeriodMap(self.model, self.n_legs, self.period_n, parameter_values)
         section_states = np.zeros((len(parameter_values), n_section))
@@ -133,8 +139,9 @@ class UnilateralFinder(AbstractReturnMapFinder):
         return _remove_batch_axis(self.make_initial_guesses(_add_batch_axis(parameter_values)))
 
     def make_initial_guesses(self, parameter_values: Array) -> Array:
-        """Return the section state of a slow attracting gait of each wheel, or NaN if there is
-        none."""
+        """Return the section state of a slow attracting gait for each wheel, or NaN if
+        there is none.
+        """
         slow_gaits = find_slow_gaits(self, parameter_values)
         is_found = np.asarray(slow_gaits.outcome) == Outcome.STEPPED
         return jax.device_put(np.where(is_found[:, None], slow_gaits.section_state, np.nan))
@@ -159,7 +166,7 @@ class UnilateralFinder(AbstractReturnMapFinder):
         section_states: Any,
         with_parameter_derivatives: bool,
     ) -> Any:
-        """Return the values of `evaluate_fixed_point` at the fixed points of all wheels."""
+        """Evaluate `evaluate_fixed_point` at the fixed point of each wheel."""
         newton_arguments = (
             np.asarray(parameter_values),
             np.asarray(section_states),
@@ -192,8 +199,9 @@ class UnilateralFinder(AbstractReturnMapFinder):
     def measure_gait(
         self, parameter_values: ParameterValues, cycle_guess: Any, measure_names: tuple[str, ...]
     ) -> GaitMeasures:
-        """Return the named measures of a gait with their derivatives, from one Jacobian of the
-        step."""
+        """Return measures of a gait and their derivatives, computed from one Jacobian of the gait
+        step.
+        """
         model, params = self.model.from_values(
             tuple(jax.device_put(list(np.asarray(parameter_values)))), self.n_legs
         )
@@ -223,19 +231,21 @@ def _remove_batch_axis(batched_tree: Any) -> Any:
 
 
 class _ContactFixedPoints(NamedTuple):
-    """Fixed points of the return maps of many wheels, with a leading axis over wheels."""
+    """Fixed points of the return maps of many wheels, with a leading axis over the wheels."""
 
     fixed_section_states: Any
-    period_steps: Any  # steps from the fixed point, (period_n, ...)
-    step_jacobians: Any  # by parameter values and section state
+    period_steps: Any  # gait steps from the fixed point, (period_n, ...)
+    step_jacobians: Any  # with respect to parameter values and section state
     newton_residuals: Any
     is_gait_found: Any
     n_newton_iterations: Any
 
 
 class PeriodMap(NamedTuple):
-    """Map of section states over one period for many wheels, by the batched engine outside
-    `jax.jit`."""
+    """Map that advances the section states of many wheels by one period.
+
+    The map uses the batched engine outside `jax.jit`.
+    """
 
     model: Any
     n_legs: int
@@ -244,11 +254,11 @@ class PeriodMap(NamedTuple):
 
     @property
     def section_units(self) -> np.ndarray:
-        """Return the units of each wheel's section state, (wheels, section)."""
+        """Return the units of the section state for each wheel, shape (wheels, section)."""
         return stack_section_units(self.model, self.parameter_values, self.n_legs)
 
     def select_wheels(self, wheel_indices: np.ndarray) -> "PeriodMap":
-        """Return the map of the selected wheels."""
+        """Return the map for the wheels with the indices `wheel_indices`."""
         return self._replace(parameter_values=self.parameter_values[wheel_indices])
 
     def evaluate_period(
@@ -258,9 +268,10 @@ class PeriodMap(NamedTuple):
         is_value_differentiated: Any = True,
         is_start_differentiated: bool = True,
     ) -> "PeriodEvaluation":
-        """Return the steps of one period from the given section states, with derivatives.
+        """Compute the gait steps of one period from the given section states, and their
+        derivatives.
 
-        The derivatives are those by the selected parameter values and by the section states.
+        The derivatives are with respect to the selected parameter values and to the section states.
         """
         steps_and_jacobians, (n_values, n_section) = (
             [],
@@ -308,7 +319,9 @@ class PeriodMap(NamedTuple):
 
 
 class PeriodEvaluation(NamedTuple):
-    """Steps of one period with their Jacobians, the end states, and flags of complete periods."""
+    """Gait steps of one period and their Jacobians, the end states, and flags of
+    complete periods.
+    """
 
     period_steps: Any
     step_jacobians: Any
@@ -320,7 +333,9 @@ class PeriodEvaluation(NamedTuple):
     def compute_newton_correction(
         self, section_states: np.ndarray, return_map_jacobian: np.ndarray
     ) -> np.ndarray:
-        """Return Newton's correction of the section states, zero if a period is not complete."""
+        """Return Newton's correction of the section states, which is zero if a period
+        is not complete.
+        """
         newton_correction, is_complete = np.zeros_like(section_states), self.is_complete
         newton_matrix = np.eye(section_states.shape[1]) - return_map_jacobian[is_complete]
         newton_correction[is_complete] = solve_linear_systems(
@@ -330,7 +345,7 @@ class PeriodEvaluation(NamedTuple):
 
 
 def solve_linear_systems(system_matrices: np.ndarray, right_sides: np.ndarray) -> np.ndarray:
-    """Return the solutions of many linear systems, NaN for a singular system."""
+    """Solve many linear systems. The solution of a singular system is NaN."""
     try:
         return np.linalg.solve(system_matrices, right_sides)
     except np.linalg.LinAlgError:
@@ -353,13 +368,13 @@ def _find_contact_fixed_points(
     with_parameter_derivatives: bool,
     newton_options: ContactNewtonOptions = CONTACT_NEWTON_OPTIONS,
 ) -> _ContactFixedPoints:
-    """Return the fixed points near `start_states`.
+    """Find the fixed points of the return maps near `start_states`.
 
-    The codes at the end of a section state are copied from its image. Newton's method first uses
-    steps of loose tolerance, until corrections are small. It then takes a step at the tolerance of
-    `step_options` with the same Jacobian. The gait is evaluated by one more step, with all
-    derivatives. If loose steps move away from a state that an exact step hardly changes, all steps
-    are exact.
+    The code components at the end of a section state are copied from its image. Newton's method
+    first uses gait steps with a loose tolerance, until corrections are small. It then uses one step
+    at the tolerance of `step_options`, with the same Jacobian. One more step evaluates the gait
+    with all derivatives. If loose steps move away from a state that an exact step hardly changes,
+    all steps are exact.
     """
     period_map = PeriodMap(model, n_legs, period_n, parameter_values)
     loose_step_tolerances = [
@@ -433,11 +448,11 @@ def _run_contact_newton(
 ) -> tuple[_ContactFixedPoints, np.ndarray]:
     """Run Newton's method on the requested wheels until corrections are small.
 
-    Return the fixed points and the Jacobians of the return map. A correction after which no period
-    completes is halved. With `stops_at_small_correction`, a single small correction ends the
-    iteration. Otherwise the gait is evaluated again at the corrected state. Two small corrections
-    in succession are then needed, because the map may jump between two states if a foot grazes the
-    ground.
+    Return the fixed points and the Jacobians of the return map. If no period completes after a
+    correction, the correction is halved. If `stops_at_small_correction` is true, a single small
+    correction ends the iteration. Otherwise the gait is evaluated again at the corrected state. Two
+    small corrections in succession are then needed, because the map may jump between two states if
+    a foot grazes the ground.
     """
     n_wheels, n_legs = len(start_states), period_map.n_legs
     section_states, last_section_states, section_units = (
@@ -530,7 +545,7 @@ def _evaluate_over_wheels(
     parameter_values: Array,
     fixed_points: _ContactFixedPoints,
 ) -> Any:
-    """Return the values of `evaluate_fixed_point` for all wheels, by a program for the batch."""
+    """Evaluate `evaluate_fixed_point` for all wheels, by one program for the batch."""
     return eqx.filter_vmap(
         lambda parameter_values, fixed_points: evaluate_fixed_point(
             model, n_legs, parameter_values, fixed_points
