@@ -1,4 +1,4 @@
-"""Branches of gaits along one parameter, and curves of their special points in two parameters."""
+"""Continue branches of gaits in one parameter, and curves of special points in two parameters."""
 
 from vrw_jax.branches.branch import Branch, SpecialPoint, SpecialPointCurve
 from vrw_jax.branches.continuation import continue_branch, continue_branches, continue_map

@@ -1,4 +1,6 @@
-"""Results of a continuation: branches with their special points, and curves of special points."""
+"""Define the results of a continuation: branches with special points, and curves of
+special points.
+"""
 
 from __future__ import annotations
 
@@ -17,8 +19,8 @@ from vrw_jax.runtime import xarray as xr
 from vrw_jax.wheel import Outcome
 
 MAX_PRINTED_SPECIAL_POINTS = 20
-"""Largest number of special points that are printed, chosen because a branch then fits on a
-screen.
+"""Largest number of special points that are printed. The value is chosen because a branch then fits
+on a screen.
 """
 
 
@@ -36,7 +38,7 @@ class FixedPoint(NamedTuple):
 
     @property
     def multipliers(self) -> np.ndarray:
-        """Return the Floquet multipliers, largest modulus first."""
+        """Return the Floquet multipliers in the order of decreasing modulus."""
         return np.asarray(floquet.floquet_multipliers(jnp.asarray(self.jacobian)))
 
     @property
@@ -49,13 +51,14 @@ class FixedPoint(NamedTuple):
 class SpecialPoint:
     """Special point of a branch: a bifurcation, a border collision or an end.
 
-    `kind` is "fold", "branch_point", "period_doubling", "neimark_sacker", "border_collision" (the
-    indicator or margin `name` is zero), "order_of_contacts_changes" (the branch continues with a
-    kink or a jump) or "lost" (the order of events changes, as `name` describes).
+    At a border collision, an indicator or a margin is zero.
 
+    - `kind`: "fold", "branch_point", "period_doubling", "neimark_sacker", "border_collision",
+      "order_of_contacts_changes" (the branch continues with a kink or a jump) or "lost" (the order
+      of events changes, as `name` describes);
     - `name`: name of the bifurcation, or of the quantity that vanishes or changes its sign;
     - `value`: value of the continued parameter at the special point;
-    - `point`: fixed point beside the special point, on the side that belongs to the branch;
+    - `point`: fixed point next to the special point, on the side that belongs to the branch;
     - `ends_branch`: whether the branch ends at the special point;
     - `find_cycle`: function that finds the gait at the special point, for the property `cycle`;
     - `n_multipliers`: number of multipliers that cross the unit circle, 0 for other kinds.
@@ -77,8 +80,10 @@ class SpecialPoint:
 
     @functools.cached_property
     def cycle(self) -> Any:
-        """Return the `LimitCycle` at the special point, or the `FixedPoint` beside it for other
-        models."""
+        """Return the `LimitCycle` at the special point.
+
+        If the special point has no `find_cycle`, return the `FixedPoint` next to it.
+        """
         return self.point if self.find_cycle is None else self.find_cycle()
 
     def __str__(self) -> str:
@@ -95,13 +100,13 @@ class SpecialPoint:
 
 @dataclass(frozen=True, repr=False)
 class Branch:
-    """Branch of gaits along one parameter, and its special points, in the order of the branch.
+    """Branch of gaits in one parameter, and its special points in the order of the branch.
 
     - `parameter`: name of the continued parameter;
-    - `dataset`: measures over the dimension `point`, with the parameter as coordinate. The
-      parameter turns back at folds;
+    - `dataset`: measures over the dimension `point`, with the parameter as a coordinate. The
+      parameter changes its direction at folds;
     - `special_points`: bifurcations, border collisions and ends;
-    - `ends`: reasons for the ends of the branch at its first and its last point;
+    - `ends`: reasons for which the branch ends at its first and at its last point;
     - `outcome`: NO_CYCLE_FOUND or BAD_INPUT if there is no gait from which a branch starts.
 
     Examples:
@@ -124,8 +129,10 @@ class Branch:
 
     @property
     def multipliers(self) -> np.ndarray:
-        """Return the complex Floquet multipliers at each point, largest modulus first, shape
-        (points, n)."""
+        """Return the complex Floquet multipliers at each point, shape (points, n).
+
+        The multipliers of a point are in the order of decreasing modulus.
+        """
         return self.dataset.multiplier_real.values + 1j * self.dataset.multiplier_imag.values
 
     @property
@@ -135,8 +142,9 @@ class Branch:
 
     @property
     def ending(self) -> str:
-        """Return the reasons for the ends of the branch at its first and its last point, as one
-        text."""
+        """Return one text with the reasons for which the branch ends at its first and at its last
+        point.
+        """
         if not self.values.size:
             return self.outcome.meaning
         return f"At the first point: {self.ends[0]} At the last point: {self.ends[1]}"
@@ -195,15 +203,15 @@ class Codim2Point:
 
 @dataclass(frozen=True, repr=False)
 class SpecialPointCurve:
-    """Curve of a special point in two parameters, with the points in order along the dimension
-    `point`.
+    """Curve of a special point in two parameters.
 
     - `name`: name of the special point;
     - `parameters`: names of the two parameters;
-    - `dataset`: durations, spectral radius and section state along the curve;
+    - `dataset`: durations, spectral radius and section state at each point of the curve, over the
+      dimension `point`;
     - `codim2_points`: points at which the curve meets other special points;
-    - `ends`: reasons for the ends of the curve at its first and its last point, equal for a closed
-      curve.
+    - `ends`: reasons for which the curve ends at its first and at its last point; they are equal
+      for a closed curve.
 
     Examples:
         >>> cycle = vrw.limit_cycle(vrw.WheelParams(damping=150.0))
@@ -220,13 +228,14 @@ class SpecialPointCurve:
 
     @property
     def values(self) -> np.ndarray:
-        """Return the values of both parameters at each point, shape (points, 2)."""
+        """Return the values of the two parameters at each point, shape (points, 2)."""
         return np.stack([self.dataset[name].values for name in self.parameters], -1)
 
     @property
     def ending(self) -> str:
-        """Return the reasons for the ends of the curve at its first and its last point, as one
-        text."""
+        """Return one text with the reasons for which the curve ends at its first and at its last
+        point.
+        """
         return f"At the first point: {self.ends[0]} At the last point: {self.ends[1]}"
 
     def __str__(self) -> str:

@@ -1,7 +1,7 @@
-"""Continuation of branches and location of their special points, for any model.
+"""Continue branches and locate their special points, for any model.
 
 Several branches are continued concurrently, each in both directions. The ends of the admissible
-points of each branch are located next. Finally, all sign changes between neighboring admissible
+part of each branch are located next. Finally, all sign changes between neighboring admissible
 points are located.
 """
 
@@ -63,13 +63,13 @@ from vrw_jax.numerics import (
 
 @dataclass(frozen=True)
 class SpecialPointLocationOptions:
-    """Numerical options of the location of special points.
+    """Numerical options for the location of special points.
 
     - `parameter_accuracy`: width of the bracket, in the parameter, at which the search ends;
-    - `min_bracket_fraction`: smallest width of the bracket as a fraction of its initial width,
-      chosen because near a fold the parameter varies with the square of the distance;
-    - `retry_chord_fractions`: fractions of the chord up to an ill-conditioned zero at which the
-      point beside the zero is computed again.
+    - `min_bracket_fraction`: smallest width of the bracket as a fraction of its initial width. The
+      value is chosen because near a fold the parameter varies with the square of the distance;
+    - `retry_chord_fractions`: fractions of the chord up to an ill-conditioned root, at which the
+      point next to the root is computed again.
     """
 
     parameter_accuracy: float = 1e-10
@@ -78,11 +78,11 @@ class SpecialPointLocationOptions:
 
 
 DEFAULT_LOCATION_OPTIONS = SpecialPointLocationOptions()
-"""Default options of the location of special points."""
+"""Default options for the location of special points."""
 
 
 ADMISSIBILITY_COLUMN = "sequence"
-"""Name of the quantity that is 1 at admissible points and -1 at other points."""
+"""Name of the quantity that is 1 at admissible points and -1 at all other points."""
 
 QuantitiesByName = dict[str, np.ndarray]
 """Arrays over a batch of points, by the name of the quantity."""
@@ -90,8 +90,9 @@ QuantitiesByName = dict[str, np.ndarray]
 
 @dataclass(frozen=True)
 class AbstractContinuation(abc.ABC):
-    """Continuation of the gaits of several wheels, with the quantities at the points of their
-    branches."""
+    """Continuation of the gaits of several wheels, and of the quantities at the points of their
+    branches.
+    """
 
     continuation_problem: AbstractContinuationProblem
     arclength_options: ArclengthOptions
@@ -99,40 +100,40 @@ class AbstractContinuation(abc.ABC):
     parameter_bounds: np.ndarray
 
     branch_ending_quantities: ClassVar[tuple[str, ...]] = ()
-    """Names of the quantities at whose zeros the order of events changes and a branch ends."""
+    """Names of the quantities that end a branch if they vanish, because the order of
+    events changes.
+    """
 
     border_collision_quantities: ClassVar[tuple[str, ...]] = ()
-    """Names of margins and indicators, whose zeros are border collisions."""
+    """Names of margins and indicators. A border collision occurs if one of them vanishes."""
 
     linear_margin_substitutes: ClassVar[Mapping[str, str]] = {}
-    """Names of margins whose zero is ill-conditioned, each with the name of a quantity that
-    vanishes linearly at the same point.
+    """Names of margins whose roots are ill-conditioned. Each margin is mapped to the name of a
+    quantity that vanishes linearly at the same point.
     """
 
     @abc.abstractmethod
     def evaluate_point_quantities(self, wheels: Any, points: ContinuationPoint) -> QuantitiesByName:
-        """Return the quantities at points that do not follow from the Jacobian.
+        """Return those quantities at the points that do not follow from the Jacobian.
 
         There is one wheel per point.
         """
 
     @abc.abstractmethod
     def are_points_admissible(self, quantity_table: QuantitiesByName) -> np.ndarray:
-        """Return whether each point is admissible, from the table of the points' quantities."""
+        """Return whether each point is admissible, from the table of quantities at the points."""
 
     def is_margin_name(self, column_name: str) -> bool:
-        """Return whether a zero of the named column is a border collision.
+        """Return whether a root of the named quantity is a border collision.
 
-        The name may end with the number of a leg in brackets.
+        The name may end with a leg index in brackets.
         """
         return column_name.partition("[")[0] in self.border_collision_quantities
 
     def mask_undefined_quantities(
         self, quantity_table: QuantitiesByName, wheel_indices: np.ndarray
     ) -> QuantitiesByName:
-        """Return the table with NaN for each quantity that is undefined for the wheel of a
-        point.
-        """
+        """Replace each quantity that is undefined for the wheel of a point by NaN."""
         return quantity_table
 
     def name_branch_end(self, quantity_table: QuantitiesByName, point_index: int) -> str:
@@ -142,29 +143,30 @@ class AbstractContinuation(abc.ABC):
     def is_same_gait(
         self, table_before: QuantitiesByName, table_after: QuantitiesByName
     ) -> np.ndarray:
-        """Return whether the branch contains both points of each pair, before and after a jump."""
+        """Return whether the two points of each pair, before and after a jump, belong to the same
+        branch.
+        """
         return table_after[ADMISSIBILITY_COLUMN] > 0.0
 
     def describe_branch_end(self, end_name: str, parameter_value: float) -> str:
-        """Return a sentence on the end of a branch.
+        """Return a sentence that describes the end of a branch.
 
         `end_name` is the name of the special point, and `parameter_value` is the value of the
-        parameter.
+        continued parameter.
         """
         return f"{end_name.replace('_', ' ')} at {parameter_value:.9g} ends it."
 
     def is_mesh_limited(self, quantity_table: QuantitiesByName, end_names: tuple[str, ...]) -> bool:
         """Return whether the mesh limits the extent or the accuracy of a branch.
 
-        `end_names` are the names of the special points at the ends of the branch.
+        `end_names` contains the names of the special points at the ends of the branch.
         """
         return False
 
     def map_over_points(
         self, function_of_points: Callable, batch_size: int, *point_trees: Any
     ) -> Any:
-        """Return the result of a function of points, whose compiled form is called in batches of
-        points.
+        """Apply a compiled function of points in batches of points, and return its results.
 
         Leaves of `point_trees` are NumPy arrays with a leading axis over the points.
         """
@@ -178,8 +180,10 @@ class AbstractContinuation(abc.ABC):
     def make_quantity_table(
         self, points: ContinuationPoint, wheel_indices: np.ndarray
     ) -> QuantitiesByName:
-        """Return all quantities at each point, with the bifurcation functions and
-        `ADMISSIBILITY_COLUMN`."""
+        """Return all quantities at each point by name.
+
+        The table includes the bifurcation functions and `ADMISSIBILITY_COLUMN`.
+        """
         point_wheels = select_tree_rows(self.wheels, wheel_indices)
         quantity_table = self.evaluate_point_quantities(point_wheels, points)
         bifurcation_values = map_in_numpy_batches(
@@ -211,17 +215,18 @@ class AbstractContinuation(abc.ABC):
 
 
 def _format_combined_margin_name(margin_name: str) -> str:
-    """Return the name of the column that combines a margin with its substitute."""
+    """Return the name of the quantity that combines a margin with its substitute."""
     return f"{margin_name} for certain"
 
 
 def combine_margin_with_substitute(
     margin_values: np.ndarray, substitute_values: np.ndarray
 ) -> np.ndarray:
-    """Return a quantity that is positive if and only if both a margin and its substitute are
+    """Return a quantity that is positive if and only if a margin and its substitute are both
     positive.
 
-    The quantity crosses zero continuously. It is the substitute if that is negative.
+    The quantity crosses zero continuously. If the substitute is negative, the quantity equals the
+    substitute.
     """
     return np.where(
         substitute_values < 0.0, substitute_values, np.minimum(substitute_values, margin_values)
@@ -283,10 +288,10 @@ def _solve_for_points_on_chords(
     right_points: ContinuationPoint,
     chord_fractions: Array,
 ) -> tuple[ContinuationPoint, Array]:
-    """Return points of a branch between neighboring points, and whether Newton's method converged.
+    """Solve for points of a branch between neighboring points.
 
-    The planes of the new points divide the chords between the neighbors at `chord_fractions`, in
-    [0, 1].
+    Return the points, and whether Newton's method converged. Each new point lies in a plane that
+    divides the chord between its neighbors at the fraction in `chord_fractions`, in [0, 1].
     """
 
     def solve_for_point_on_chord(
@@ -317,8 +322,8 @@ def _guess_point_on_chord(
     right_point: ContinuationPoint,
     chord_fraction: Array,
 ) -> tuple[Any, CorrectorPlane]:
-    """Return the initial guess of a point between neighboring points, and the plane of that
-    point.
+    """Return the initial guess for a point between neighboring points, and the plane of
+    that point.
     """
     z = continuation_problem.interpolate_unknowns(left_point.z, right_point.z, chord_fraction)
     parameter_range = parameter_bounds[1] - parameter_bounds[0]
@@ -351,7 +356,7 @@ def _solve_for_points_on_chords_untraced(
     right_points: ContinuationPoint,
     chord_fractions: Array,
 ) -> tuple[ContinuationPoint, Array]:
-    """Return the result of `_solve_for_points_on_chords`, for a problem that JAX cannot trace."""
+    """Return the result of `_solve_for_points_on_chords` for a problem that JAX cannot trace."""
     z, corrector_planes = _guess_points_on_chords(
         continuation_problem, parameter_bounds, left_points, right_points, chord_fractions
     )
@@ -361,7 +366,8 @@ def _solve_for_points_on_chords_untraced(
 
 
 class _AdmissibleRange(NamedTuple):
-    """Admissible points of one wheel's branch, and the first points beyond its two ends.
+    """Admissible points of one wheel's branch, and the first points beyond the two ends of this
+    range.
 
     An index is -1 if the branch has no point beyond that end.
     """
@@ -382,9 +388,9 @@ class _BranchPointTable(NamedTuple):
     def from_results(
         cls, branch_continuation: AbstractContinuation, direction_results: ContinuationResult
     ) -> "_BranchPointTable":
-        """Return all points of a continuation in both directions.
+        """Collect all points of a continuation in both directions.
 
-        The points of both directions are joined at the start of each wheel's branch.
+        The two directions are joined at the start of each wheel's branch.
         """
         points_by_direction, wheel_indices = [], []
         for wheel_index in range(direction_results.n_points.shape[0]):
@@ -424,18 +430,17 @@ class _BranchPointTable(NamedTuple):
         )
 
     def find_neighbor_pairs(self, point_indices: np.ndarray) -> list[tuple[int, int]]:
-        """Return the pairs of successive points in `point_indices` that belong to the same
-        branch.
+        """Return the pairs of successive points in `point_indices` that belong to the
+        same branch.
         """
         successive_pairs = zip(point_indices[:-1].tolist(), point_indices[1:].tolist(), strict=True)
         is_same_wheel = lambda i, j: self.wheel_indices[i] == self.wheel_indices[j]
         return [(i, j) for i, j in successive_pairs if is_same_wheel(i, j)]
 
     def find_admissible_ranges(self, start_positions: Mapping[int, int]) -> list[_AdmissibleRange]:
-        """Return for each wheel the range of admissible points that contains the start of its
-        branch.
+        """Find for each wheel the range of admissible points that contains the start of its branch.
 
-        `start_positions` are positions on the branch by the index of the wheel.
+        `start_positions` maps the index of a wheel to the position of the start on its branch.
         """
         admissible_ranges = []
         for wheel_index, start_position in start_positions.items():
@@ -473,8 +478,9 @@ class _BranchPointTable(NamedTuple):
         admissible_ranges: list[_AdmissibleRange],
         located_ends: Mapping[tuple[int, int], "_LocatedZero"],
     ) -> "_BranchPointTable":
-        """Return the admissible points of all ranges, together with the points beside the located
-        ends."""
+        """Return a table with the admissible points of all ranges and the points next to the
+        located ends.
+        """
         point_groups, wheel_index_groups, quantity_tables = [], [], []
 
         def append_points(
@@ -522,7 +528,7 @@ class _BranchPointTable(NamedTuple):
 
 
 class _LocatedZero(NamedTuple):
-    """Located zero of a quantity between two points of a branch."""
+    """Located root of a quantity between two points of a branch."""
 
     bracket_and_quantity: tuple[
         int, int, str
@@ -536,7 +542,9 @@ class _LocatedZero(NamedTuple):
     def from_jump(
         cls, point_table: _BranchPointTable, jump_pair: tuple[int, int]
     ) -> "_LocatedZero":
-        """Return the zero at a jump: the point of the pair at which the continuation stalled."""
+        """Represent a jump as a located root, at that point of the pair where the continuation
+        stalled.
+        """
         i, j = jump_pair
         jump_parameter_values, last_index = (
             point_table.all_points.p,
@@ -566,7 +574,7 @@ def _locate_requested_zeros(
     zero_requests: list[tuple[int, int, str]],
     location_options: SpecialPointLocationOptions = DEFAULT_LOCATION_OPTIONS,
 ) -> list[_LocatedZero]:
-    """Return the located zero of each request (left point, right point, name of the quantity).
+    """Locate the root that each request (left point, right point, name of the quantity) describes.
 
     The quantity has opposite signs at the two points.
     """
@@ -730,9 +738,9 @@ def _find_crossed_quantities(
     admissible_range: _AdmissibleRange,
     point_index_beyond: int,
 ) -> list[str]:
-    """Return the names of the ending quantities that change sign at one end of a range.
+    """Return the names of the branch-ending quantities that change sign at one end of a range.
 
-    The signs are those at the last point of the range and at the first point beyond it.
+    The signs are compared between the last point of the range and the first point beyond the range.
     """
     last_point_index = admissible_range.admissible_point_indices[
         0 if point_index_beyond < admissible_range.admissible_point_indices[0] else -1
@@ -756,8 +764,9 @@ def _locate_branch_ends(
     point_table: _BranchPointTable,
     admissible_ranges: list[_AdmissibleRange],
 ) -> dict[tuple[int, int], _LocatedZero]:
-    """Return the nearest zero beyond each end of each branch, by (wheel index, 0 or 1 for the
-    end).
+    """Locate the nearest root beyond each end of each branch.
+
+    The keys of the result are (wheel index, end), where the end is 0 or 1.
     """
     zero_requests, wheel_and_end_keys = [], []
     for admissible_range in admissible_ranges:
@@ -789,7 +798,7 @@ def _locate_branch_ends(
 def _locate_inner_special_points(
     branch_continuation: AbstractContinuation, point_table: _BranchPointTable
 ) -> list[NamedLocatedZero]:
-    """Return all special points of the branches except their ends."""
+    """Locate all special points of the branches except their ends."""
     zero_requests, special_point_names = _list_zero_requests(branch_continuation, point_table)
     quantity_table, all_point_indices = (
         point_table.quantity_table,
@@ -877,10 +886,10 @@ def _locate_inner_special_points(
 def _list_zero_requests(
     branch_continuation: AbstractContinuation, point_table: _BranchPointTable
 ) -> tuple[list[tuple[int, int, str]], list[str]]:
-    """Return requests for the zeros of bifurcation functions and margins, and special-point names.
+    """List the roots of bifurcation functions and margins that are to be located.
 
-    A request is (left point, right point, column). The second list contains the name of the special
-    point at the zero of each request.
+    Return requests and names. A request is (left point, right point, quantity name). The second
+    list contains the name of the special point for each request.
     """
     quantity_table = point_table.quantity_table
     skipped_quantity_names = (
@@ -940,7 +949,7 @@ def _list_zero_requests(
 
 
 class BranchData(NamedTuple):
-    """Branch of one wheel with located special points, without labels."""
+    """Branch of one wheel and its located special points, without labels."""
 
     points: ContinuationPoint
     quantity_table: QuantitiesByName
@@ -951,8 +960,9 @@ class BranchData(NamedTuple):
 
 
 CycleFinderFactory = Callable[[int, ContinuationPoint], Callable[[], Any] | None]
-"""Function that maps the index of a wheel and a point to a function that finds the limit cycle
-there."""
+"""Function that maps (wheel index, point) to a function that finds the limit cycle at
+that point.
+"""
 
 
 def continue_and_locate_special_points(
@@ -965,9 +975,9 @@ def continue_and_locate_special_points(
 ) -> list[BranchData | None]:
     """Continue branches, and return them with their located special points.
 
-    The result is None for a wheel without a start. `z` and `parameter_values` are the starts. On a
-    mesh that is not the finest one, special points of mesh-limited branches are not located,
-    because these branches are continued again on a finer mesh.
+    The result is None for a wheel without a start. `z` and `parameter_values` are the starts. A
+    branch that the mesh limits is later continued again on a finer mesh. Its special points are
+    located only if `is_finest_mesh` is true.
     """
     direction_results = _continue_in_both_directions(
         branch_continuation, z, parameter_values, has_start
@@ -1018,7 +1028,7 @@ def continue_and_locate_special_points(
         ends_branch: bool,
         n_multipliers: int = 0,
     ) -> SpecialPoint:
-        """Return the special point at a located zero."""
+        """Build the special point at a located root."""
         point_beside_zero = select_tree_rows(located_zero.point_beside_zero, 0)
         section_state = np.asarray(
             branch_continuation.continuation_problem.section_state(

@@ -1,4 +1,6 @@
-"""First gaits of branches, and the wheels and equations of their continuation, for each model."""
+"""Find the first gaits of branches, and define the equations of their continuation, for
+each model.
+"""
 
 import dataclasses
 from collections.abc import Callable
@@ -33,7 +35,7 @@ from vrw_jax.wheel import WheelParams
 
 
 class BranchRequest(NamedTuple):
-    """Arguments of a continuation of the gaits of several wheels along one parameter."""
+    """Arguments for the continuation of the gaits of several wheels in one parameter."""
 
     params: WheelParams  # with one leading axis over wheels
     model: AbstractWheel
@@ -46,7 +48,7 @@ class BranchRequest(NamedTuple):
 
 
 class BranchStart(NamedTuple):
-    """First gaits of branches, with the wheels and the equations of the continuation."""
+    """First gaits of branches, and the wheels and equations of the continuation."""
 
     continuation_problem: AbstractGaitProblem
     wheels: BranchWheel
@@ -65,8 +67,8 @@ class LimitCycleFinder:
     - `gait_finder`, `model`: finder and model of the branch's gaits;
     - `parameter_name`: name of the continued parameter;
     - `start_params`, `start_cycle`: wheel and gait at the start of the branch;
-    - `solution_beside`, `parameter_value_beside`: collocation solution and value of the parameter
-      beside the special point.
+    - `solution_beside`, `parameter_value_beside`: collocation solution and parameter value at the
+      point next to the special point.
     """
 
     gait_finder: Any
@@ -78,7 +80,7 @@ class LimitCycleFinder:
     parameter_value_beside: Any
 
     def __call__(self) -> LimitCycle:
-        """Return the limit cycle at the special point."""
+        """Find the limit cycle at the special point."""
         params, guess_cycle = jax.device_put((self.start_params, self.start_cycle))
         collocation_state = guess_cycle.collocation_state._replace(
             solution=jax.tree.map(jnp.asarray, self.solution_beside)
@@ -96,9 +98,10 @@ class LimitCycleFinder:
 
 
 def find_collocation_starts(branch_request: BranchRequest, given_cycle: Any) -> BranchStart:
-    """Return the starts of branches from limit cycles by collocation, given or found.
+    """Return the starts of branches that are continued by collocation.
 
-    Without cycle options the mesh of the branch is not coarser than that of the limit cycles.
+    The limit cycles at the starts are those in `given_cycle`, or they are found. Without cycle
+    options the mesh of the branch is not coarser than that of the limit cycles.
     """
     params, parameter_name, period_n = (
         branch_request.params,
@@ -158,9 +161,9 @@ def find_collocation_starts(branch_request: BranchRequest, given_cycle: Any) -> 
 
 
 def find_return_map_starts(branch_request: BranchRequest, given_cycle: Any) -> BranchStart:
-    """Return the starts of branches from fixed points of a model's return map.
+    """Return the starts of branches that are continued as fixed points of a model's return map.
 
-    The fixed points are given, or they are found from the last states of walks.
+    The fixed points are those in `given_cycle`, or they are found from the last states of walks.
     """
     params, model, step_options = (
         branch_request.params,
@@ -197,9 +200,9 @@ def find_return_map_starts(branch_request: BranchRequest, given_cycle: Any) -> B
 
 
 def find_contact_gait_starts(branch_request: BranchRequest, start_cycle: Any) -> BranchStart:
-    """Return the starts of branches from gaits with unilateral contact.
+    """Return the starts of branches whose gaits have unilateral contact.
 
-    Without given gaits, each branch starts from the slowest attracting gait.
+    If no start gaits are given, each branch starts from the slowest attracting gait.
     """
     params, step_options = branch_request.params, branch_request.step_options
     model: Any = branch_request.model

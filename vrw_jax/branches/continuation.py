@@ -1,8 +1,8 @@
-"""Branches of stable and unstable gaits along one parameter, with all their special points.
+"""Continue branches of stable and unstable gaits in one parameter, with all their special points.
 
-A special point is a bifurcation, or a border collision, at which an indicator or a margin vanishes.
-During the search for a special point, the gait is computed anew at every trial. Special points are
-therefore as accurate as the gaits.
+A special point is a bifurcation or a border collision. At a border collision an indicator or a
+margin vanishes. During the search for a special point, the gait is computed anew at every trial.
+Special points are therefore as accurate as the gaits.
 """
 
 from __future__ import annotations
@@ -78,25 +78,27 @@ BRANCH_ENDING_QUANTITIES = (
     "duration_sls1",
     "duration_sls2",
 )
-"""Names of the quantities at whose zeros the order of events changes and the branch ends."""
+"""Names of the quantities that end a branch if they vanish, because the order of events changes."""
 
 SECOND_PEAK_RATE_NAME = "second_peak_rate"
-"""Name of the measure of the gait's force whose zero is the appearance of a second force peak."""
+"""Name of a measure of the gait's force. A second force peak appears if the measure is zero."""
 
 DIFFERENTIATION_ADVICE = "differentiate vrw.limit_cycle"
 """Advice in the error message for a caller who differentiates a branch."""
 
 COARSE_MESH_END_NAME = Outcome.MESH_TOO_COARSE.name.lower()
-"""Name of the end of a branch at which the mesh is so coarse that gaits do not repeat in a walk."""
+"""Name of a branch end at which the mesh is too coarse. Event-driven steps that start from the
+computed gaits then do not repeat.
+"""
 
 
 @dataclass(frozen=True)
 class GaitContinuationOptions:
-    """Numerical options of the continuation of gaits.
+    """Numerical options for the continuation of gaits.
 
     - `max_measure_change_at_jump`: largest relative change of period and step length at a jump of
-      the section state within one branch. The value is chosen because a change of the order of two
-      impacts changes both by 1e-4;
+      the section state within one branch. The value is chosen because a change in the order of two
+      impacts changes period and step length by 1e-4;
     - `max_unrefined_mesh_error`: estimated mesh error above which the mesh is refined;
     - `max_mesh_refinements`: largest number of mesh refinements.
     """
@@ -107,12 +109,15 @@ class GaitContinuationOptions:
 
 
 DEFAULT_GAIT_CONTINUATION_OPTIONS = GaitContinuationOptions()
-"""Default options of the continuation of gaits."""
+"""Default options for the continuation of gaits."""
 
 
 @dataclass(frozen=True)
 class GaitContinuation(AbstractContinuation):
-    """Continuation of gaits, which are admissible if their event-driven step repeats."""
+    """Continuation of gaits.
+
+    A gait is admissible if its event-driven step returns to its section state.
+    """
 
     model: AbstractWheel
     step_options: StepOptions
@@ -131,17 +136,20 @@ class GaitContinuation(AbstractContinuation):
     linear_margin_substitutes: ClassVar[Mapping[str, str]] = {
         "clearance_sls1": "takeoff_acceleration"
     }
-    """Names of margins that vanish as a cube, each with a quantity that vanishes linearly.
+    """Names of margins that vanish as a cube. Each margin is mapped to a quantity that vanishes
+    linearly at the same point.
 
-    Both vanish at the same point. A foot that takes off less steeply descends less deeply, until it
-    rises immediately. A solver cannot resolve the shallowest descents, but the linear quantity
-    changes its sign."""
+    A foot that takes off less steeply descends less deeply, until it rises immediately. A solver
+    cannot resolve the shallowest descents, but the linear quantity changes its sign.
+    """
 
     def evaluate_point_quantities(
         self, wheels: BranchWheel, points: ContinuationPoint
     ) -> QuantitiesByName:
-        """Return the measures of the gaits by name, with one column per leg for each margin of the
-        legs."""
+        """Return the measures of the gaits by name.
+
+        A margin that each leg has is returned as one quantity per leg.
+        """
         gait_problem: Any = self.continuation_problem
         measure_gaits = functools.partial(gait_problem.measure_gaits, self.model, self.step_options)
         quantity_table = self.map_over_points(
@@ -210,39 +218,43 @@ def continue_branch(
     step_options: StepOptions | None = None,
     force_peaks: bool = False,
 ) -> Branch:
-    """Return the branch of limit cycles through `params` along a parameter within `bounds`.
+    """Continue the branch of limit cycles through `params` in one parameter, within `bounds`.
 
-    The continuation starts from the limit cycle at `params`, or from the given `cycle` of the same
-    parameters. The branch is continued in both directions, through folds, over stable and unstable
-    gaits, to the bounds or to its end. `Branch.ends` contains the reasons for both ends. A branch
-    ends if the events change their order, or if the mesh is too coarse (`mesh_too_coarse`). Without
-    `cycle_options` the mesh is first refined, up to eight times.
+    The continuation starts from the limit cycle at `params`, or from `cycle`, which belongs to the
+    same parameters. The branch is continued in both directions, through folds, over stable and
+    unstable gaits, to the bounds or to its end. `Branch.ends` contains the reasons for both ends. A
+    branch ends if the events change their order, or if the mesh is too coarse (`mesh_too_coarse`).
+    Without `cycle_options` the mesh is first refined, up to eight times.
 
     Each special point is located to 1e-9 in the parameter. Two sign changes within one continuation
     step (`options.max_ds`) cancel and are not found. The gaits use `cycle_options`, by default at
-    least `CycleOptions.tight()`. One event-driven step checks each gait, and determines its
+    least `CycleOptions.tight()`. One event-driven gait step checks each gait, and determines its
     indicators and margins.
 
-    For other models the gaits are fixed points of their return map, as accurate as `step_options`.
-    With unilateral contact `name` may also be "friction". The start is then a given
-    `ReturnMapCycle`, or the end of a walk. If the order of contacts changes, the branch continues
-    with a kink or a jump, which is a special point. The branch ends if friction equals tan(slope).
-    Model "auto" is the model that is selected for the start. A violated margin of the paper's model
-    is a special point with the name of the margin, beyond which unilateral contact is selected.
+    For models other than the paper's, the gaits are fixed points of the return map, as accurate as
+    `step_options`. With unilateral contact `name` may also be "friction". The start is then a
+    `ReturnMapCycle` in `cycle`, or the end of a walk. If the order of contacts changes, the branch
+    continues with a kink or a jump, which is a special point. The branch ends if friction equals
+    tan(slope).
+
+    Model "auto" is replaced by the model that is selected for the start. If a margin of the paper's
+    model is violated, the branch has a special point with the name of the margin. Beyond this point
+    unilateral contact would be selected.
 
     Args:
         params: one wheel; its gait is on the branch.
         name: name of the continued parameter.
         bounds: lower and upper bound of the parameter.
         cycle: the gait at `params`, if it is known.
-        period_n: number of steps after which the gaits repeat.
+        period_n: number of gait steps after which the gaits repeat.
         model: the model; the paper's, `ViscoelasticWheel()`, by default.
         options: `ArclengthOptions` of the branch.
         cycle_options: options of the gaits.
-        step_options: options of the checking steps, and of the gaits of other models.
-        force_peaks: for the paper's model, add the measures of the gait's force. The wheel at which
-            a second peak appears, with first and second time derivative of the force zero at one
-            instant, is then the special point "second_peak_rate".
+        step_options: options of the event-driven steps that check gaits, and of the gaits of other
+            models.
+        force_peaks: for the paper's model, add the measures of the gait's force. The branch then
+            has the special point "second_peak_rate", at which a second peak appears. There the
+            first and the second time derivative of the force are zero at the same time.
 
     Returns:
         A `Branch`. If there is no gait from which to start, `outcome` is the reason.
@@ -283,17 +295,17 @@ def continue_branches(
     step_options: StepOptions | None = None,
     force_peaks: bool = False,
 ) -> tuple[Branch, ...]:
-    """Return `continue_branch` of a batch of wheels; every parameter has one leading axis.
+    """Continue the branches of a batch of wheels, as `continue_branch` does for one wheel.
 
-    If a wheel has no limit cycle to start from, its branch has no points, and its outcome is the
-    reason.
+    Every parameter has one leading axis. If a wheel has no limit cycle from which to start, its
+    branch has no points, and its outcome is the reason.
 
     Args:
-        params: the wheels; every field of shape (wheels,).
-        name: name of the parameter.
-        bounds: range of the parameter.
+        params: the wheels; every field has the shape (wheels,).
+        name: name of the continued parameter.
+        bounds: lower and upper bound of the parameter.
         cycle: the gaits at `params`, if they are known.
-        period_n: number of steps after which the gaits repeat.
+        period_n: number of gait steps after which the gaits repeat.
         model: the model; the paper's, `ViscoelasticWheel()`, by default.
         options: `ArclengthOptions` of the branches.
         cycle_options: options of the gaits.
@@ -389,11 +401,11 @@ def _continue_gait_branches(
     n_wheels: int,
     continuation_options: GaitContinuationOptions = DEFAULT_GAIT_CONTINUATION_OPTIONS,
 ) -> tuple[np.ndarray, list[BranchData | None]]:
-    """Return the outcomes of the starts, and the data of the branches of the first `n_wheels`
-    wheels.
+    """Continue the branches of the first `n_wheels` wheels from their start gaits.
 
-    Any further wheels only pad the batch. The mesh is that of the cycle options. Without cycle
-    options it is refined until it limits no branch.
+    Return the outcomes of the starts, and the data of the branches. Any further wheels only pad the
+    batch. The mesh is that of the cycle options. Without cycle options the mesh is refined until it
+    limits no branch.
     """
     can_refine_mesh = branch_request.cycle_options is None
     for refinement_index in range(1 + continuation_options.max_mesh_refinements):
@@ -438,11 +450,14 @@ def _continue_gait_branches(
 
 
 MEASURES_OUTSIDE_BRANCHES = ("outcome", "solver_steps")
-"""Names of measures of the checking step that the dataset of a branch does not contain."""
+"""Names of measures of the event-driven step that the dataset of a branch does not contain."""
 
 
 def _check_arclength_options(options: ArclengthOptions | None) -> ArclengthOptions:
-    """Return the given options of a continuation, or `ArclengthOptions()` if there are none."""
+    """Check the options of a continuation.
+
+    Return them, or `ArclengthOptions()` if they are None.
+    """
     if options is not None:
         check_type("options", options, ArclengthOptions, "give vrw.ArclengthOptions()")
     return ArclengthOptions() if options is None else options
@@ -456,7 +471,10 @@ def _make_labeled_gait_branch(
     step_options: StepOptions,
     start_outcome: int,
 ) -> Branch:
-    """Return the labeled branch of one wheel. `start_outcome` is the outcome of its start."""
+    """Build the labeled branch of one wheel.
+
+    `start_outcome` is the outcome of the start of the branch.
+    """
     start_provenance = collect_provenance_attributes(params, model, step_options)
     start_provenance.pop(f"parameter_{parameter_name}", None)
     branch_attrs = {"title": f"Branch of limit cycles along {parameter_name}"} | start_provenance
@@ -527,7 +545,9 @@ def _make_labeled_gait_branch(
 
 
 def _make_stability_variables(return_map_jacobians: np.ndarray) -> dict[str, xr.Variable]:
-    """Return labeled variables of the multipliers and the stability measures along a branch."""
+    """Build labeled variables with the multipliers and the stability measures at each point of a
+    branch.
+    """
     multiplier_values = map_in_numpy_batches(
         floquet_multipliers, (batch_sizes.POINT_BATCH_SIZE,), return_map_jacobians
     )
@@ -559,7 +579,7 @@ def _make_stability_variables(return_map_jacobians: np.ndarray) -> dict[str, xr.
 
 
 class MapContinuation(AbstractContinuation):
-    """Continuation of the fixed points of any map, all of which are admissible."""
+    """Continuation of the fixed points of any map. All finite fixed points are admissible."""
 
     def evaluate_point_quantities(self, wheels: Any, points: ContinuationPoint) -> QuantitiesByName:
         return {
@@ -585,10 +605,11 @@ def continue_map(
     name: str = "parameter",
     options: ArclengthOptions | None = None,
 ) -> Branch:
-    """Return the branch of fixed points through (x, p) of a map x -> `function(constants, x, p)`.
+    """Continue the branch of fixed points through (x, p) for a map x -> `function(constants, x,
+    p)`.
 
-    The map must be differentiable in forward mode, and return NaN if it is undefined. Bifurcations
-    are located as in `continue_branch`.
+    The map must be differentiable in forward mode, and return NaN where it is undefined.
+    Bifurcations are located as in `continue_branch`.
 
     Args:
         function: `function(constants, x, p)`, which returns an array of the shape of `x`.

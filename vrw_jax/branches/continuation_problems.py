@@ -1,9 +1,9 @@
-"""Continuation problems of gaits, and the measures of the gaits at points of their branches.
+"""Define continuation problems of gaits, and measure the gaits at points of their branches.
 
 `CollocationProblem` is the fastest problem. It solves the collocation equations of the paper's
 sequence of phases, with one linearization per Newton iteration. `GroundProblem` uses batches of
-steps with unilateral contact. `ReturnMapProblem` applies to every model, whose step it iterates and
-differentiates in forward mode.
+gait steps with unilateral contact. `ReturnMapProblem` applies to every model. It iterates the gait
+step of the model and differentiates it in forward mode.
 """
 
 import abc
@@ -60,8 +60,8 @@ The tangent is the smallest friction coefficient for which a gait exists.
 MIN_FRICTION_SURPLUS = 1e-9
 """Smallest admissible surplus of friction, as a fraction of the slope's tangent.
 
-The value is chosen because gaits of every speed repeat if friction equals the tangent, up to the
-round-off of friction.
+The value is chosen to exceed the round-off of friction. If friction equals the tangent, gaits of
+every speed repeat.
 """
 
 
@@ -73,14 +73,14 @@ class BranchWheel(NamedTuple):
 
 
 class AbstractGaitProblem(AbstractContinuationProblem):
-    """Continuation problem of gaits of `n_steps` steps along one parameter of the wheel."""
+    """Continuation problem of gaits with `n_steps` gait steps, in one parameter of the wheel."""
 
     parameter_name: eqx.AbstractVar[str]
 
     @property
     @abc.abstractmethod
     def n_steps(self) -> int:
-        """Return the number of steps after which the gaits repeat."""
+        """Return the number of gait steps after which the gaits repeat."""
 
     @abc.abstractmethod
     def read_gait_state(
@@ -99,7 +99,9 @@ class AbstractGaitProblem(AbstractContinuationProblem):
         wheels: BranchWheel,
         points: ContinuationPoint,
     ) -> dict[str, Array]:
-        """Return the measures of the gaits at many points by name, from event-driven steps."""
+        """Return the measures of the gaits at many points by name, computed by
+        event-driven steps.
+        """
 
         def measure_point(wheel: BranchWheel, z: Any, p: Array) -> dict[str, Array]:
             section_state, continued_quantities = self.read_gait_state(wheel, z, p)
@@ -113,12 +115,13 @@ class AbstractGaitProblem(AbstractContinuationProblem):
 
 
 class CollocationProblem(AbstractGaitProblem):
-    """Continuation problem of limit cycles by collocation; the unknowns z are a
+    """Continuation problem of limit cycles by collocation. The unknowns z are a
     `CollocationSolution`.
 
-    Beyond the zero of an indicator the solution continues, but the event-driven step rejects it as
-    a gait. `compute_additional_quantities` is a function of the phase points of the first step and
-    of z. If `measures_force_peaks` is set, points also have the measures of the gait's force.
+    If an indicator changes its sign, the solution still exists, but the event-driven step does not
+    confirm it as a gait. `compute_additional_quantities` is a function of the wheel's symbols, the
+    phase points of the first gait step and z. If `measures_force_peaks` is true, the points also
+    have the measures of the gait's force.
     """
 
     collocation_system: CollocationSystem = eqx.field(static=True)
@@ -131,7 +134,9 @@ class CollocationProblem(AbstractGaitProblem):
         return self.collocation_system.period_n
 
     def _stack_parameters_at(self, wheel: BranchWheel, p: Scalar) -> Array:
-        """Return the wheel's parameters as a vector, with the continued parameter equal to p."""
+        """Return the wheel's parameters as a vector, in which the continued parameter
+        has the value p.
+        """
         return stack_parameters(
             eqx.tree_at(lambda w: getattr(w, self.parameter_name), wheel.params, p)
         )
@@ -165,8 +170,9 @@ class CollocationProblem(AbstractGaitProblem):
     ) -> tuple[AnySectionState, dict[str, Array]]:
         """Return the section state before the first landing, and the continued quantities by name.
 
-        They are the shortest duration of each phase over the steps, s, and `takeoff_acceleration`,
-        the rear foot's lowest acceleration at take-off over the steps, m/s^2.
+        The continued quantities are the shortest duration of each phase over the gait steps, s, and
+        `takeoff_acceleration`, m/s^2. The latter is the lowest acceleration of the rear foot at
+        take-off over the gait steps.
         """
         parameters = self._stack_parameters_at(wheel, p)
         wheel_symbols = make_wheel_from_parameters(
@@ -204,7 +210,7 @@ class CollocationProblem(AbstractGaitProblem):
 
 
 ComputeGaitQuantities = Callable[[CollocationSystem, Array, Array, CollocationSolution], Array]
-"""Function that returns quantities of collocated gaits over lanes.
+"""Function that computes quantities of collocated gaits, with the batch elements on the last axis.
 
 Its arguments are the collocation system, the parameters, `is_phase_active` and the solution.
 """
@@ -219,8 +225,9 @@ def make_trial_linearizer(
 
     The arguments of the function are (parameters, is_phase_active, solution), and `jax.vmap` can
     map it over wheels. It returns Newton's correction, the tangents with respect to the selected
-    parameters and the monodromy matrix. With `compute_quantities` it also returns the computed
-    quantities, and their derivatives along the correction and along each tangent.
+    parameters and the monodromy matrix. If `compute_quantities` is not None, it also returns the
+    computed quantities and their JVPs. The directions of the JVPs are the correction and each
+    tangent.
     """
 
     def linearize_trial(parameters: Array, is_phase_active: Array, z: CollocationSolution) -> tuple:
@@ -282,11 +289,11 @@ def make_trial_linearizer(
 
 
 class AbstractReturnMapProblem(AbstractGaitProblem):
-    """Continuation problem of fixed points of the return map over `period_n` steps.
+    """Continuation problem of fixed points of the return map over `period_n` gait steps.
 
     The unknowns z are the section state. Its last components are codes (see
-    `AbstractWheel.n_continuous`), which are copied from the image in every iteration. Newton's
-    method converges only if the codes of state and image are equal.
+    `AbstractWheel.n_continuous`), which are copied from the image in every Newton iteration.
+    Newton's method converges only if the codes of state and image are equal.
     """
 
     period_n: eqx.AbstractVar[int]
@@ -309,7 +316,7 @@ class AbstractReturnMapProblem(AbstractGaitProblem):
     def is_smooth_between(
         self, left_point: ProblemUnknowns, right_point: ProblemUnknowns
     ) -> Bool[Array, ""]:
-        """Return whether the codes of two neighboring points are equal."""
+        """Return whether two neighboring points have equal codes in their section states."""
         return jnp.all(left_point[self.n_coordinates :] == right_point[self.n_coordinates :])
 
     def read_gait_state(
@@ -323,7 +330,7 @@ class AbstractReturnMapProblem(AbstractGaitProblem):
 
 
 class ReturnMapProblem(AbstractReturnMapProblem):
-    """Continuation problem of the gaits of a model whose steps JAX differentiates."""
+    """Continuation problem of the gaits of a model whose gait steps JAX can differentiate."""
 
     model: AbstractWheel
     step_options: StepOptions
@@ -345,7 +352,7 @@ class ReturnMapProblem(AbstractReturnMapProblem):
 
 
 class GroundProblem(AbstractReturnMapProblem):
-    """Continuation problem of gaits with unilateral contact, by batches of steps."""
+    """Continuation problem of gaits with unilateral contact, solved by batches of gait steps."""
 
     model: UnilateralWheel
     step_options: StepOptions
@@ -358,7 +365,9 @@ class GroundProblem(AbstractReturnMapProblem):
     has_kinks: ClassVar[bool] = True
 
     def stack_parameter_values(self, wheels: BranchWheel, p: Array) -> Array:
-        """Return the parameter values of many wheels, with the continued parameter equal to p."""
+        """Return the parameter values of many wheels, in which the continued parameter has the
+        value p.
+        """
 
         def select_values(wheel: BranchWheel, p: Array) -> Array:
             model, params = self.model.with_parameter(wheel.params, self.parameter_name, p)
@@ -367,7 +376,7 @@ class GroundProblem(AbstractReturnMapProblem):
         return jax.vmap(select_values)(wheels, p)
 
     def _make_period_map(self, wheels: BranchWheel, p: Array) -> PeriodMap:
-        """Return the return map of many wheels over one period."""
+        """Return the map that advances the section states of many wheels by one period."""
         parameter_values = np.asarray(self.stack_parameter_values(wheels, p))
         return PeriodMap(self.model, self.n_legs, self.period_n, parameter_values)
 
@@ -424,24 +433,24 @@ class GroundProblem(AbstractReturnMapProblem):
     def _compute_friction_surplus(self, wheel: BranchWheel, p: Array) -> Array:
         """Return the friction coefficient minus the slope's tangent.
 
-        Over a period, the ground's tangential impulse balances that of the weight along the slope.
-        The tangential impulse is at most the friction coefficient times the normal impulse, so no
-        gait repeats without a surplus.
+        Over a period, the ground's tangential impulse balances the impulse of the weight parallel
+        to the slope. The tangential impulse is at most the friction coefficient times the normal
+        impulse. Therefore no gait repeats without a surplus.
         """
         model: Any
         model, params = self.model.with_parameter(wheel.params, self.parameter_name, p)
         return model.friction - jnp.tan(params.slope) * (1.0 + MIN_FRICTION_SURPLUS)
 
     def is_admissible(self, wheel: BranchWheel, z: ProblemUnknowns, p: Scalar) -> Bool[Array, ""]:
-        """Return whether friction can balance the weight along the slope."""
+        """Return whether friction can balance the component of the weight parallel to the slope."""
         return jnp.all(jnp.isfinite(z)) & (self._compute_friction_surplus(wheel, p) > 0.0)
 
 
 def compute_contact_order_numbers(period_steps: Any, n_legs: int) -> np.ndarray:
     """Return a number for each period that identifies its order of contacts, shape (periods,).
 
-    The number is a checksum of the contact modes that occur, the counts of events and the final
-    contact modes.
+    The number is a checksum of the contact modes that occur, the event counts and the final contact
+    modes.
     """
     has_mode_occurred = np.asarray(period_steps.mode_durations) > 0.0
     contact_codes = np.asarray(period_steps.section_state)[..., -n_legs:]
@@ -462,7 +471,10 @@ def compute_contact_order_numbers(period_steps: Any, n_legs: int) -> np.ndarray:
 def _combine_period_measures(
     step_results: AbstractStep, section_states: AnySectionState
 ) -> dict[str, Array]:
-    """Return the measures of many periods, whose first section states are given."""
+    """Combine the measures of the gait steps in each period.
+
+    `section_states` contains the first section state of each period.
+    """
     return combine_step_measures(
         step_results.section_state[-1],
         jax.vmap(lambda step_result: step_result.measures())(step_results),
@@ -473,7 +485,7 @@ def _combine_period_measures(
 def interpolate_section_states(
     left_state: Array, right_state: Array, state_fraction: Scalar, n_coordinates: int
 ) -> Array:
-    """Return a section state between two section states, with the codes of the nearer one."""
+    """Interpolate linearly between two section states. The codes are those of the nearer state."""
     nearer_codes = jnp.where(state_fraction < 0.5, left_state, right_state)[n_coordinates:]
     return jnp.concatenate(
         [(left_state + state_fraction * (right_state - left_state))[:n_coordinates], nearer_codes]
@@ -487,9 +499,9 @@ def measure_gait(
     step_options: StepOptions,
     period_n: int,
 ) -> dict[str, Array]:
-    """Return all measures of one period of a gait, which starts from its section state.
+    """Return all measures of one period of a gait, which starts at `section_state`.
 
-    Indicators and margins are minima over the steps, and durations and energies are sums. The
+    Indicators and margins are minima over the gait steps, and durations and energies are sums. The
     section state is that of the last step, and the post-impact state is that of the first step.
     `outcome` is the first failure of a step, if any. `closure` is the largest change of the section
     state over the period.
@@ -508,7 +520,9 @@ def measure_gait(
 def combine_step_measures(
     end_state: AnySectionState, step_measures: dict[str, Array], section_state: AnySectionState
 ) -> dict[str, Array]:
-    """Return the result of `measure_gait` from the measures of each step and the end state."""
+    """Return the result of `measure_gait`, computed from the measures of each step and
+    the end state.
+    """
     period_measures = {}
     for measure_name, step_values in step_measures.items():
         if measure_name in MARGIN_MEASURES | STOPPER_MARGIN_MEASURES or measure_name.startswith(

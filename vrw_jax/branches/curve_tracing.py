@@ -1,4 +1,4 @@
-"""Curves of special points in two parameters, traced in batches, each curve once.
+"""Trace curves of special points in two parameters, in batches, each curve once.
 
 A special point and its gait are unknowns of the same equations, so that the points of a curve are
 as accurate as the gaits. If a curve meets another special point, a new curve is traced from the
@@ -61,21 +61,24 @@ RANGE_EDGE_COLUMN = "edge of the box"
 """Name of the quantity that vanishes if the second parameter is at an end of its range."""
 
 DEFAULT_CURVE_OPTIONS = ArclengthOptions(initial_ds=5e-4)
-"""Default options of curves, with a short first continuation step because some curves are short."""
+"""Default continuation options of curves. The first continuation step is short because some curves
+are short.
+"""
 
 
 @dataclass(frozen=True)
 class CurveTracingOptions:
-    """Numerical options of the tracing of curves. Lengths are arc lengths.
+    """Numerical options of the tracing of curves. All distances are arc lengths.
 
-    - `same_curve_distance`: largest distance at which a point counts as a point of a curve;
+    - `same_curve_distance`: largest distance from a curve at which a point is treated as a point of
+      the curve;
     - `codim2_overrun_distance`: distance beyond a point of codimension two at which the
       continuation of the other curve starts;
-    - `relative_codim2_tolerance`: tolerance of Newton's last correction at a point of codimension
+    - `relative_codim2_tolerance`: tolerance for Newton's last correction at a point of codimension
       two, relative to the values of the parameters;
-    - `max_zero_dls_duration`: largest duration of double support that counts as zero, s. The value
-      is chosen above round-off because the duration is ill-conditioned near zero;
-    - `dls_duration_guess`: initial guess of a nonzero duration of double support, s.
+    - `max_zero_dls_duration`: largest duration of double support that is treated as zero, s. The
+      value is chosen above round-off because the duration is ill-conditioned near zero;
+    - `dls_duration_guess`: initial guess for a nonzero duration of double support, s.
     """
 
     same_curve_distance: float = 2e-3
@@ -143,9 +146,7 @@ class CurveContinuation(AbstractContinuation):
     def mask_undefined_quantities(
         self, quantity_table: QuantitiesByName, wheel_indices: np.ndarray
     ) -> QuantitiesByName:
-        """Return the table with NaN for quantities that are zero or undefined on the whole
-        curve.
-        """
+        """Replace each quantity that is zero or undefined on the whole curve by NaN."""
         point_names = np.array(self.special_point_names)[wheel_indices]
         is_dls_vanishing = point_names == DLS_VANISHING_NAME
         is_discontinuous = np.isin(point_names, (*DISCONTINUOUS_QUANTITIES, DLS_VANISHING_NAME))
@@ -217,7 +218,7 @@ class CurveSeed(NamedTuple):
 
 
 class TracedCurve(NamedTuple):
-    """Traced curve of special points, with seeds at the other special points that it meets."""
+    """Traced curve of special points, and seeds at the other special points that it meets."""
 
     special_point_curve: SpecialPointCurve
     # section states and both parameters, as fractions of their ranges, (point, coordinate)
@@ -238,7 +239,7 @@ class CurveTracer(NamedTuple):
     measures_force_peaks: bool = False  # whether branches measure the peaks of the gait's force
 
     def report_stage(self, stage_description: str) -> None:
-        """Pass a description of the next stage to `stage_reporter`, if it is given."""
+        """Pass a description of the next stage to `stage_reporter`, unless it is None."""
         if self.stage_reporter is not None:
             self.stage_reporter(stage_description)
 
@@ -253,15 +254,19 @@ class CurveTracer(NamedTuple):
         return params
 
     def compute_parameter_fractions(self, parameter_values: np.ndarray) -> np.ndarray:
-        """Return the two parameters, which are on the last axis, as fractions of their ranges."""
+        """Return each parameter as a fraction of its range.
+
+        The two parameters are on the last axis.
+        """
         return (parameter_values - self.parameter_ranges[:, 0]) / np.ptp(self.parameter_ranges, 1)
 
     def find_seeds(
         self, parameter_index: int, params: WheelParams, start_cycles: LimitCycle | None = None
     ) -> list[CurveSeed]:
-        """Return seeds at the special points of the wheels' branches along one parameter.
+        """Find seeds at the special points on the wheels' branches in one of the two parameters.
 
-        `start_cycles` are the gaits of the wheels, if they are known.
+        `parameter_index` selects the parameter. `start_cycles` contains the gaits of the wheels, if
+        they are known.
         """
         parameter_name, curve_seeds = self.parameter_names[parameter_index], []
         lower_bound, upper_bound = self.parameter_ranges[parameter_index]
@@ -281,7 +286,7 @@ class CurveTracer(NamedTuple):
         return curve_seeds
 
     def _make_seed(self, special_point: SpecialPoint) -> CurveSeed:
-        """Return the seed at a special point of a branch."""
+        """Build the seed at a special point of a branch."""
         limit_cycle = special_point.cycle
         params = make_wheel_from_parameters(limit_cycle.parameters, limit_cycle.system.n_legs)
         first_parameter_value, second_parameter_value = (
@@ -303,7 +308,7 @@ class CurveTracer(NamedTuple):
     def trace_curves(
         self, seeds: Sequence[CurveSeed], known_curves: Sequence[TracedCurve]
     ) -> list[TracedCurve]:
-        """Return the curves through all seeds that lie on no known curve."""
+        """Trace the curves through all seeds that lie on no known curve."""
         new_curves: list[TracedCurve] = []
         new_seeds = [
             seed
@@ -363,8 +368,11 @@ class CurveTracer(NamedTuple):
         )
 
     def are_same_curve(self, traced_curve: TracedCurve, other_curve: TracedCurve) -> bool:
-        """Return whether two curves have one name and all points of the first curve lie on the
-        second."""
+        """Return whether two curves are the same curve.
+
+        The special points must have the same name, and all points of the first curve must lie on
+        the second curve.
+        """
         has_same_name = (
             traced_curve.special_point_curve.name == other_curve.special_point_curve.name
         )
@@ -381,9 +389,9 @@ class CurveTracer(NamedTuple):
     def _trace_curves_of_batch(
         self, quantity_group: tuple[str, ...], curve_seeds: list[CurveSeed]
     ) -> list[TracedCurve]:
-        """Return the curves through the seeds of one batch, on a sufficiently fine mesh.
+        """Trace the curves through the seeds of one batch, on a sufficiently fine mesh.
 
-        A seed through which there is no curve is omitted.
+        A seed is omitted if there is no curve through it.
         """
         traced_curves: list[TracedCurve] = []
         special_point_names = ", ".join(
@@ -420,7 +428,7 @@ class CurveTracer(NamedTuple):
 
     @staticmethod
     def _transfer_seed(curve_seed: CurveSeed, collocation_system: CollocationSystem) -> CurveSeed:
-        """Return the seed on the mesh of `collocation_system`."""
+        """Transfer a seed to the mesh of `collocation_system`."""
         if curve_seed.collocation_system == collocation_system:
             return curve_seed
         return curve_seed._replace(
@@ -433,10 +441,9 @@ class CurveTracer(NamedTuple):
     def _continue_curves_of_batch(
         self, quantity_group: tuple[str, ...], curve_seeds: list[CurveSeed], is_finest_mesh: bool
     ) -> list[tuple[BranchData | None, CollocationSystem]]:
-        """Return the data of the curve through each seed, with the collocation system of that
-        curve.
+        """Continue the curve through each seed, and return its data and its collocation system.
 
-        The collocation system has the finest mesh of the seeds.
+        The collocation system has the finest mesh that any of the seeds has.
         """
         collocation_system = max(
             (curve_seed.collocation_system for curve_seed in curve_seeds),
@@ -513,7 +520,7 @@ class CurveTracer(NamedTuple):
         ]
 
     def _make_traced_curve(self, curve_seed: CurveSeed, branch_data: BranchData) -> TracedCurve:
-        """Return a labeled curve with seeds at the special points that it meets."""
+        """Build a labeled curve, and seeds at the special points that the curve meets."""
         parameter_points = np.stack(
             [branch_data.points.p, branch_data.quantity_table["second"]], -1
         )
@@ -586,7 +593,10 @@ class CurveTracer(NamedTuple):
     def _locate_jump_onset(
         self, curve_seed: CurveSeed, z: CollocationSolution, start_values: Any
     ) -> tuple[float, float]:
-        """Return both parameters at the onset of the jump, or `start_values` if it is not found."""
+        """Return the two parameters at the onset of the jump.
+
+        If the onset is not found, return `start_values`.
+        """
         test_function = GaitTestFunction(
             curve_seed.collocation_system,
             self.parameter_names,
@@ -612,10 +622,10 @@ class CurveTracer(NamedTuple):
         z: CollocationSolution,
         meeting_values: Any,
     ) -> CurveSeed:
-        """Return a seed beyond the point at which the rear foot's force starts to rise or fall.
+        """Build a seed beyond the point at which the rear foot's force starts to rise or to fall.
 
-        The force is zero along the curve. Two curves cross at that point and continue in the same
-        direction. `meeting_values` are both parameters at the crossing.
+        The force is zero on the curve. Two curves cross at that point and continue in the same
+        direction. `meeting_values` contains the two parameters at the crossing.
         """
         starts_at_meeting = (
             abs(parameter_points[0] - meeting_values).max()
@@ -654,7 +664,7 @@ class CurveTracer(NamedTuple):
     def _make_labeled_curve(
         self, curve_seed: CurveSeed, branch_data: BranchData, codim2_points: tuple[Codim2Point, ...]
     ) -> SpecialPointCurve:
-        """Return a labeled curve from the data of its continuation."""
+        """Build a labeled curve from the data of its continuation."""
         spectral_radius = np.abs(
             np.linalg.eigvals(np.asarray(branch_data.points.return_map_jacobian))
         ).max(-1)

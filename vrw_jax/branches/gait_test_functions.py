@@ -1,7 +1,8 @@
-"""Test functions of collocated gaits in two parameters, whose zeros are special points.
+"""Define test functions of collocated gaits in two parameters, whose roots are special points.
 
-One call of machine code computes Newton's correction, the tangents, the quantities and their
-derivatives. Event-driven steps compute the margins that the collocation does not determine.
+One call of machine code computes Newton's correction, the tangents, the quantities and the
+derivatives of the quantities. Event-driven steps compute the margins that the collocation does not
+determine.
 """
 
 from collections.abc import Mapping
@@ -55,24 +56,26 @@ from vrw_jax.wheel import (
 )
 
 LINEAR_MARGIN_SUBSTITUTES: Mapping[str, str] = GaitContinuation.linear_margin_substitutes
-"""Names of margins that vanish as a cube, each with a quantity that vanishes linearly at that
-point."""
+"""Names of margins that vanish as a cube. Each margin is mapped to a quantity that vanishes
+linearly at the same point.
+"""
 
 DISCONTINUOUS_QUANTITIES = (*DOUBLE_SUPPORT_INDICATOR_NAMES, "duration_sls1", "duration_sls2")
-"""Names of the quantities at whose zeros the step is discontinuous, so that its measures are
-undefined."""
+"""Names of the quantities that make the gait step discontinuous if they vanish. The measures of the
+step are then undefined.
+"""
 
 DLS_VANISHING_NAME = "duration_dls"
 """Name of the special point at which the duration of double support vanishes.
 
-At that point the rear foot's force is zero and decreases. At the zero of `lambda_4_plus` the force
-is zero and increases, and the step jumps.
+At that point the rear foot's force is zero and decreases. Where `lambda_4_plus` vanishes, the force
+is zero and increases, and the gait jumps.
 """
 
 INITIAL_FORCE_FALL_NAME = "fall of the rear foot's force at first"
 """Name of the rate at which the rear foot's force first decreases, N/s.
 
-The rate is positive on the curve of `DLS_VANISHING_NAME`, which ends at the zero of the rate.
+The rate is positive on the curve of `DLS_VANISHING_NAME`. The curve ends where the rate is zero.
 """
 
 MEAN_FORCE_FALL_NAME = "its mean fall in double support"
@@ -88,13 +91,11 @@ CONTINUED_QUANTITIES = (
     INITIAL_FORCE_FALL_NAME,
     MEAN_FORCE_FALL_NAME,
 )
-"""Names of quantities of the collocated gait, which are defined on both sides of a special
-point.
-"""
+"""Names of quantities of the collocated gait that are defined on both sides of a special point."""
 
 
 FORCE_QUANTITY_NAMES = (SECOND_PEAK_RATE_NAME,)
-"""Quantities of the force in a gait, whose extrema are located on its collocation."""
+"""Names of quantities of the gait's force, whose extrema are located on its collocation."""
 
 
 @dataclass(frozen=True)
@@ -102,9 +103,9 @@ class TestFunctionOptions:
     """Numerical options of the test functions of gaits.
 
     - `n_codim2_iterations`: number of Newton iterations for a point of codimension two;
-    - `max_duration_roundoff`: largest round-off of a duration that is zero along a whole curve, s;
-    - `relative_difference_step`: finite difference of the section state and the relative
-      parameters, for derivatives of the step's quantities.
+    - `max_duration_roundoff`: largest round-off of a duration that is zero on a whole curve, s;
+    - `relative_difference_step`: finite difference of the section state and of the relative
+      parameters, for derivatives of quantities that an event-driven step determines.
     """
 
     n_codim2_iterations: int = 8
@@ -113,7 +114,7 @@ class TestFunctionOptions:
 
 
 def select_test_quantity(special_point_name: str, has_double_support: bool) -> str:
-    """Return the name of the quantity whose zero is the named special point.
+    """Return the name of the quantity that vanishes at the named special point.
 
     The quantity depends on whether the gait has double support.
     """
@@ -127,9 +128,7 @@ def select_test_quantity(special_point_name: str, has_double_support: bool) -> s
 
 
 def find_test_quantity_group(quantity_name: str, n_legs: int) -> tuple[str, ...]:
-    """Return the names of the quantities that are evaluated together with that of a special
-    point.
-    """
+    """Return the names of all quantities that are evaluated together with `quantity_name`."""
     leg_suffixes = [f"[{leg_number}]" for leg_number in range(3, n_legs + 1)]
     step_quantities = [
         quantity_name + leg_number
@@ -154,8 +153,8 @@ def find_test_quantity_group(quantity_name: str, n_legs: int) -> tuple[str, ...]
 
 
 class TestFunctionWheel(NamedTuple):
-    """Wheel on a curve of special points, and the index of the quantity that vanishes on the
-    curve.
+    """Wheel on a curve of special points, and the index of the quantity that vanishes
+    on the curve.
     """
 
     branch_wheel: BranchWheel
@@ -163,8 +162,9 @@ class TestFunctionWheel(NamedTuple):
 
 
 class GaitTestFunction(AbstractTestFunction):
-    """Test function in two parameters: one quantity of a group of quantities of collocated
-    gaits.
+    """Test function in two parameters: one of several quantities of collocated gaits.
+
+    `quantity_names` lists the quantities that are evaluated together.
     """
 
     collocation_system: CollocationSystem = eqx.field(static=True)
@@ -236,13 +236,13 @@ class GaitTestFunction(AbstractTestFunction):
         newton_correction: CollocationSolution,
         tangents_by_parameter: tuple,
     ) -> tuple[Array, Array]:
-        """Return the step's quantities at the corrected gait, and their derivatives by both
-        parameters.
+        """Return the step's quantities at the corrected gait, and their derivatives.
 
-        Newton's method needs only a few digits of the derivatives. Finite differences of steps are
-        cheaper than derivatives of the step, and use the same machine code. Near a fold the
-        tangents and the correction grow without bound and become parallel. The differences are
-        therefore taken along an orthonormal basis, from the point of the tangents' plane that is
+        The derivatives are with respect to the two parameters. Newton's method needs only a few
+        digits of them. Finite differences of gait steps are cheaper than derivatives of the step,
+        and use the same machine code. Near a fold the tangents and the correction grow without
+        bound and become parallel. The differences are therefore taken in the directions of an
+        orthonormal basis of the tangents' plane. They start from the point of that plane that is
         nearest to the trial.
         """
         scaled_tangents = jnp.stack(
@@ -284,7 +284,7 @@ class GaitTestFunction(AbstractTestFunction):
         ] + correction_coordinates @ quantity_gradients, parameter_gradient
 
     def with_parameters(self, branch_wheel: BranchWheel, p: Array) -> BranchWheel:
-        """Return the wheel with both parameters equal to the components of p."""
+        """Return the wheel with the two parameters replaced by the components of p."""
         params = branch_wheel.params
         for parameter_name, parameter_value in zip(self.parameter_names, p, strict=True):
             params = self.model.with_parameter(params, parameter_name, parameter_value)[1]
@@ -292,7 +292,7 @@ class GaitTestFunction(AbstractTestFunction):
 
     @property
     def gait_problem(self) -> CollocationProblem:
-        """Return the continuation problem of the gaits along the first parameter."""
+        """Return the problem that continues the gaits in the first parameter."""
         return CollocationProblem(
             collocation_system=self.collocation_system,
             parameter_name=self.parameter_names[0],
@@ -300,8 +300,10 @@ class GaitTestFunction(AbstractTestFunction):
         )
 
     def measure_step(self, branch_wheel: BranchWheel, z: CollocationSolution, p: Array) -> Array:
-        """Return the quantities of the gait's force or of an event-driven step from the gait, in
-        the order of `quantity_names`.
+        """Return the quantities of the gait that the collocation equations do not contain.
+
+        They are either those of the gait's force, or those of an event-driven step that starts from
+        the gait. Their order is that of `quantity_names`.
         """
         params = self.with_parameters(branch_wheel, p).params
         if self.quantity_names == FORCE_QUANTITY_NAMES:
@@ -339,12 +341,12 @@ class GaitTestFunction(AbstractTestFunction):
 def locate_jump_onset(
     test_function: GaitTestFunction, branch_wheel: BranchWheel, z: CollocationSolution, p: Array
 ) -> tuple[Array, Array]:
-    """Return both parameters at which `DLS_VANISHING_NAME` meets `lambda_4_plus`.
+    """Locate the two parameters at which `DLS_VANISHING_NAME` meets `lambda_4_plus`.
 
-    The second result is the last relative change of the parameters. The search starts from a nearby
-    gait and its parameters. If double support has zero duration, the equations of both curves are
-    singular. The search therefore uses the equations of the gait without double support, which are
-    regular, with zero rear-foot force and zero force rate.
+    Return the parameters and their last relative change. The search starts from a nearby gait and
+    its parameters. If the duration of double support is zero, the equations of both curves are
+    singular. The search therefore uses the equations for the gait without double support, which are
+    regular. The rear foot's force and its rate must be zero.
     """
     branch_wheel = branch_wheel._replace(
         is_phase_active=branch_wheel.is_phase_active.at[0, 0].set(0.0)
@@ -412,7 +414,9 @@ def _stack_continued_quantities(
 def _compute_continued_quantities(
     wheel_symbols: Symbols, phase_points: Any, z: CollocationSolution
 ) -> dict[str, Array]:
-    """Return the `CONTINUED_QUANTITIES` of a step by name, from the points of its phases."""
+    """Return the `CONTINUED_QUANTITIES` of a gait step by name, computed from the points of its
+    phases.
+    """
     dls_points, sls1_points, sls2_points = phase_points
     landing_result = transitions.resolve_landing(
         wheel_symbols, sls2_points.end_point.q[0], *sls2_points.end_point.v

@@ -1,4 +1,4 @@
-"""Continuation of branches beyond jumps of the section state.
+"""Continue branches beyond jumps of the section state.
 
 With unilateral contact, the section state jumps if two impacts change their order, because the
 effects of two impacts do not commute. No continuation step leads to the gait beyond the jump,
@@ -18,7 +18,7 @@ from vrw_jax.numerics import select_tree_rows
 
 @dataclass(frozen=True)
 class JumpOptions:
-    """Numerical options of the continuation beyond jumps of the section state.
+    """Numerical options for the continuation beyond jumps of the section state.
 
     - `max_jumps_per_direction`: largest number of jumps in one direction of a branch;
     - `parameter_change_fractions`: changes of the parameter, as fractions of its range, after which
@@ -38,7 +38,7 @@ class JumpOptions:
 
 
 DEFAULT_JUMP_OPTIONS = JumpOptions()
-"""Default options of the continuation beyond jumps."""
+"""Default options for the continuation beyond jumps."""
 
 
 def continue_beyond_jumps(
@@ -48,10 +48,10 @@ def continue_beyond_jumps(
     direction_results: ContinuationResult,
     jump_options: JumpOptions = DEFAULT_JUMP_OPTIONS,
 ) -> ContinuationResult:
-    """Return the points of all branches, with the points beyond jumps at which branches stalled.
+    """Continue stalled branches beyond jumps, and return the points of all branches.
 
-    The gait beyond a jump is searched for from the last gait, at the smallest change of the
-    parameter that leads to a similar gait. `continue_branches` is the function that continues
+    The search for the gait beyond a jump starts from the last gait. It uses the smallest change of
+    the parameter that leads to a similar gait. `continue_branches` is the function that continues
     branches of `branch_continuation`.
     """
     branch_indices, parameter_bounds = (
@@ -110,7 +110,7 @@ def continue_beyond_jumps(
 def append_results(
     direction_results: ContinuationResult, new_results: ContinuationResult, is_appended: np.ndarray
 ) -> ContinuationResult:
-    """Return the results with the points of `new_results` appended to the selected branches."""
+    """Append the points in `new_results` to the selected branches, and return all results."""
     if not is_appended.any():
         return direction_results
     n_points = direction_results.n_points + np.where(is_appended, new_results.n_points, 0)
@@ -141,8 +141,8 @@ def find_state_jumps(
 ) -> list[tuple[int, int]]:
     """Return the pairs of points between which the section state jumps.
 
-    `parameter_fractions` is the parameter as a fraction of its range, and `fraction_rates` is the
-    derivative of that fraction with respect to arc length.
+    `parameter_fractions` contains the parameter at each point as a fraction of its range.
+    `fraction_rates` contains the derivative of that fraction with respect to arc length.
     """
 
     def has_jump(left_index: int, right_index: int) -> bool:

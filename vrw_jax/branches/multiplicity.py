@@ -1,8 +1,9 @@
-"""Bifurcations of several multipliers at once, which change no sign of a determinant.
+"""Locate bifurcations of several multipliers at once, which change no sign of a determinant.
 
-Multipliers are ranked by modulus, the largest first. If more multipliers leave the unit circle than
-the located bifurcations explain, the crossings of 1 by the moduli of single ranks are located. If
-several ranks cross together, the mean of their moduli is located.
+Multipliers are ranked by modulus, the largest first. The located bifurcations may explain only some
+of the multipliers that leave the unit circle. In that case, the point at which the modulus of each
+single rank crosses 1 is located. If several ranks cross together, the point at which the mean of
+their moduli crosses 1 is located.
 """
 
 from collections.abc import Callable
@@ -16,21 +17,21 @@ from vrw_jax.continuation import MULTIPLIER_TOLERANCES, MultiplierTolerances
 BRANCH_POINT_KIND = "branch_point"
 """Kind of a special point at which a multiplier is 1 but the branch does not turn back.
 
-Another branch crosses at this point, and the equations are singular. The continuation step limits
-the accuracy of the location.
+Another branch crosses at this point, and the equations are singular. The length of the continuation
+step limits the accuracy of the location.
 """
 
 MULTIPLIER_MODULI_COLUMN = "multiplier_moduli"
-"""Name of the column with the moduli of all multipliers, largest first."""
+"""Name of the quantity that contains the moduli of all multipliers, largest first."""
 
 CONTACT_ORDER_COLUMN = "contact_order"
-"""Name of the column with the number that identifies the order of contacts."""
+"""Name of the quantity that contains the number by which the order of contacts is identified."""
 
 CONTACT_ORDER_CHANGE = "order_of_contacts_changes"
 """Name of the special point at which the order of contacts changes."""
 
 NamedLocatedZero = tuple[str, Any, int]
-"""Name of a special point, its located zero, and the number of multipliers on the unit circle."""
+"""Name of a special point, its located root, and the number of multipliers on the unit circle."""
 
 CROSSING_MULTIPLIER_COUNTS = {
     "fold": 1,
@@ -43,17 +44,18 @@ CROSSING_MULTIPLIER_COUNTS = {
 
 @dataclass(frozen=True)
 class LocatedZeroTolerances:
-    """Tolerances that decide whether located zeros are equal, and whether they are zeros at all.
+    """Tolerances that decide whether two located roots are equal, and whether a located root is
+    valid.
 
-    - `max_zero_margin`: largest absolute value of a fold's margin whose sign is round-off. The
-      value is chosen because a determinant of numbers of order one is computed to 1e-15, and points
-      so near to a branch point are rare;
-    - `max_equal_location_distance`: fraction of a bracket within which ranks count as crossing
-      together. The value is chosen because three equal multipliers are computed to 1e-5, which is
-      1e-4 of a bracket;
-    - `max_value_beside_zero`: largest ratio of a quantity beside its zero to the quantity at an end
-      of the bracket; at a jump the ratio is larger. The value is chosen because the point beside
-      the zero may be at nine tenths of the way to the zero;
+    - `max_zero_margin`: largest absolute value of a margin to the fold whose sign is only
+      round-off. The value is chosen because a determinant of numbers of order one is computed to
+      1e-15, and points so near to a branch point are rare;
+    - `max_equal_location_distance`: fraction of a bracket within which ranks are treated as
+      crossing together. The value is chosen because three equal multipliers are computed to 1e-5,
+      which is 1e-4 of a bracket;
+    - `max_value_beside_zero`: largest ratio of the quantity next to its root to the quantity at an
+      end of the bracket; at a jump the ratio is larger. The value is chosen because the point next
+      to the root may be at nine tenths of the distance to the root;
     - `max_equal_parameter_distance`: relative distance below which two changes of the order of
       contacts are the same change. The value is chosen because two searches may differ by the
       change of the parameter over the shortest continuation step.
@@ -66,11 +68,13 @@ class LocatedZeroTolerances:
 
 
 LOCATED_ZERO_TOLERANCES = LocatedZeroTolerances()
-"""Tolerances of located zeros on all branches."""
+"""Tolerances for located roots on all branches."""
 
 
 def sort_multiplier_moduli(return_map_jacobians: np.ndarray) -> np.ndarray:
-    """Return the moduli of the multipliers, largest first; NaN if a matrix is not finite."""
+    """Return the moduli of the multipliers in decreasing order, or NaN if a matrix is
+    not finite.
+    """
     is_jacobian_finite = np.isfinite(return_map_jacobians).all((-1, -2))
     multiplier_moduli = np.abs(
         np.linalg.eigvals(np.where(is_jacobian_finite[..., None, None], return_map_jacobians, 0.0))
@@ -81,7 +85,7 @@ def sort_multiplier_moduli(return_map_jacobians: np.ndarray) -> np.ndarray:
 
 
 def format_rank_quantity_name(first_rank: int, last_rank: int) -> str:
-    """Return the name of the quantity that vanishes if several ranks cross 1 together.
+    """Return the name of the quantity that vanishes if several ranks cross modulus 1 together.
 
     The ranks are `first_rank`, ..., `last_rank` - 1.
     """
@@ -89,9 +93,9 @@ def format_rank_quantity_name(first_rank: int, last_rank: int) -> str:
 
 
 def format_contact_order_quantity_name(contact_order: float) -> str:
-    """Return the name of the quantity that is positive only for one order of contacts.
+    """Return the name of the quantity that is positive for only one order of contacts.
 
-    The quantity is negative for other orders.
+    The quantity is negative for all other orders.
     """
     return f"{CONTACT_ORDER_COLUMN}:{int(contact_order)}"
 
@@ -99,10 +103,10 @@ def format_contact_order_quantity_name(contact_order: float) -> str:
 def evaluate_named_quantity(
     quantity_table: dict[str, np.ndarray], quantity_name: str
 ) -> np.ndarray:
-    """Return a named quantity at each point.
+    """Return the quantity with the given name at each point.
 
-    The quantity is a column of the table, the mean modulus of several ranks minus 1, or a sign that
-    identifies one order of contacts.
+    The quantity is one of three kinds: a quantity of the table, the mean modulus of several ranks
+    minus 1, or a sign that identifies one order of contacts.
     """
     if quantity_name.startswith(CONTACT_ORDER_COLUMN + ":"):
         contact_orders = quantity_table[CONTACT_ORDER_COLUMN]
@@ -120,7 +124,9 @@ def are_multipliers_off_circle(
     multiplier_moduli: np.ndarray,
     multiplier_tolerances: MultiplierTolerances = MULTIPLIER_TOLERANCES,
 ) -> np.ndarray:
-    """Return for each point whether no multiplier is on the unit circle within the tolerance."""
+    """Return for each point whether all multipliers are off the unit circle by more than the
+    tolerance.
+    """
     return np.asarray(
         (np.abs(multiplier_moduli - 1.0) > multiplier_tolerances.unit_circle_distance).all(-1)
     )
@@ -131,7 +137,10 @@ def find_unexplained_ranks(
     multiplier_moduli_after: np.ndarray,
     bifurcation_names: list[str],
 ) -> range:
-    """Return the ranks that cross 1 between two points, empty if the bifurcations explain them."""
+    """Return the ranks whose moduli cross 1 between two points.
+
+    The result is empty if the bifurcations in `bifurcation_names` explain all crossings.
+    """
     first_rank, last_rank = sorted(
         int(np.sum(multiplier_moduli > 1.0))
         for multiplier_moduli in (multiplier_moduli_before, multiplier_moduli_after)
@@ -152,7 +161,10 @@ def classify_crossing_ranks(
     has_turning_parameter: bool,
     multiplier_tolerances: MultiplierTolerances = MULTIPLIER_TOLERANCES,
 ) -> dict[str, int]:
-    """Return the number of multipliers by bifurcation name, for ranks on the unit circle."""
+    """Return the number of multipliers for each bifurcation, by the name of the bifurcation.
+
+    The multipliers are those of the ranks in `crossing_ranks`, which are on the unit circle.
+    """
     multipliers = np.linalg.eigvals(return_map_jacobian)
     multipliers = multipliers[np.argsort(-np.abs(multipliers), kind="stable")][list(crossing_ranks)]
     is_complex_pair = np.abs(multipliers.imag) > multiplier_tolerances.min_imaginary_part
@@ -174,7 +186,7 @@ def vanishes_at_zero(
     located_zero: Any,
     zero_tolerances: LocatedZeroTolerances = LOCATED_ZERO_TOLERANCES,
 ) -> bool:
-    """Return whether a quantity vanishes at its located zero, where it otherwise jumps."""
+    """Return whether a quantity vanishes at its located root. Otherwise it jumps there."""
     left_index, right_index, quantity_name = located_zero.bracket_and_quantity
     values_at_bracket_ends = evaluate_named_quantity(quantity_table, quantity_name)[
         [left_index, right_index]
@@ -191,7 +203,7 @@ def drop_duplicate_order_changes(
     named_zeros: list[NamedLocatedZero],
     zero_tolerances: LocatedZeroTolerances = LOCATED_ZERO_TOLERANCES,
 ) -> list[NamedLocatedZero]:
-    """Return the zeros, with every change of the order of contacts only once.
+    """Return the roots, in which every change of the order of contacts occurs only once.
 
     Each change is located twice, as the end of one order and as the start of the next order.
     """
@@ -228,11 +240,10 @@ def add_multiple_bifurcations(
     zero_tolerances: LocatedZeroTolerances = LOCATED_ZERO_TOLERANCES,
     multiplier_tolerances: MultiplierTolerances = MULTIPLIER_TOLERANCES,
 ) -> list[NamedLocatedZero]:
-    """Return the zeros, in which complete bifurcations of several multipliers replace incomplete
-    ones.
+    """Replace incomplete bifurcations by complete bifurcations of several multipliers.
 
-    `neighbor_pairs` are pairs of neighboring points on a branch. `locate_requested_zeros` is the
-    function that locates zeros of quantities between these points.
+    Return all roots. `neighbor_pairs` contains pairs of neighboring points on a branch.
+    `locate_requested_zeros` is the function that locates roots of quantities between these points.
     """
     is_zero_within = lambda located_zero, point_pair: (
         point_pair[0] <= located_zero.bracket_and_quantity[0]

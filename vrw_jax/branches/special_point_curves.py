@@ -1,4 +1,4 @@
-"""Continuation of special points of gaits as curves in two parameters."""
+"""Continue special points of gaits as curves in two parameters."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -23,7 +23,7 @@ DEFAULT_PARAMETER_BOUNDS: ParameterBounds = {
     "natural_length": (1.001, 1.06),
     "slope": (0.05, 0.5),
 }
-"""Default bounds of the parameters of a curve, for wheels with legs of 1 m."""
+"""Default bounds of the two parameters of a curve, for wheels with legs of 1 m."""
 
 
 def continue_special_point(
@@ -35,16 +35,17 @@ def continue_special_point(
     options: ArclengthOptions | None = None,
     step_options: StepOptions | None = None,
 ) -> SpecialPointCurve:
-    """Return the curve of the special point `name` over two parameters, near a gait of one step.
+    """Continue the special point `name` as a curve in two parameters, near a gait of one gait step.
 
-    `name` is that of a `SpecialPoint`: an indicator, a phase's duration, a margin (of a locked leg
-    as "locked_stopper_force[5]"), "second_peak_rate" of the force, or "fold", "period_doubling",
-    "neimark_sacker". The special point is searched for along the first parameter from the gait,
-    then along the second. The curve is continued through turning points, within `bounds` of the two
-    parameters. The default bounds are `branches.special_point_curves.DEFAULT_PARAMETER_BOUNDS`. The
-    curve ends when it closes or leaves the bounds, or when the gaits end. Each point is accurate to
-    1e-9. `codim2_points` are the points at which other special points occur. On the curve of an
-    indicator these are other indicators and bifurcations, on other curves also margins.
+    `name` is the name of a `SpecialPoint`. It may be an indicator, the duration of a phase, a
+    margin (of a locked leg as "locked_stopper_force[5]"), or "second_peak_rate" of the force. It
+    may also be "fold", "period_doubling" or "neimark_sacker". The search for the special point
+    starts from the gait and varies the first parameter, then the second parameter. The curve is
+    continued through turning points, within `bounds` of the two parameters. The default bounds are
+    `branches.special_point_curves.DEFAULT_PARAMETER_BOUNDS`. The curve ends when it closes or
+    leaves the bounds, or when the gaits end. Each point is accurate to 1e-9. `codim2_points` are
+    the points at which other special points occur. On the curve of an indicator, the other special
+    points are indicators and bifurcations. On all other curves, they also include margins.
 
     Args:
         name: name of the special point.
@@ -52,7 +53,7 @@ def continue_special_point(
         cycle: the gait near which the search starts.
         bounds: bounds of the parameters, by name.
         options: `ArclengthOptions` of the curve.
-        step_options: options of the steps that evaluate margins.
+        step_options: options of the event-driven steps that evaluate margins.
 
     Returns:
         A `SpecialPointCurve`.
@@ -74,9 +75,10 @@ def continue_special_point(
 
 
 def _check_parameter_plane(parameters: Any, bounds: Any) -> tuple[tuple[str, str], np.ndarray]:
-    """Return the names of the two parameters, and their bounds as an array of shape (2, 2).
+    """Check the names and bounds of two parameters.
 
-    Raise TypeError or ValueError if names or bounds are invalid.
+    Return the names, and the bounds as an array of shape (2, 2). Raise TypeError or ValueError if
+    names or bounds are invalid.
     """
     check_type("bounds", bounds, (Mapping, type(None)), "write {'damping': (100.0, 200.0)}")
     bounds_by_parameter = {**DEFAULT_PARAMETER_BOUNDS, **(bounds or {})}
@@ -109,8 +111,8 @@ def continue_special_points(
     options: ArclengthOptions | None = None,
     step_options: StepOptions | None = None,
 ) -> tuple[SpecialPointCurve, ...]:
-    """Return the curves of several special points over two parameters, as
-    `continue_special_point`.
+    """Continue several special points as curves in two parameters, as
+    `continue_special_point` does.
     """
     parameters, parameter_ranges = _check_parameter_plane(parameters, bounds)
     first_parameter_name, second_parameter = parameters

@@ -1,4 +1,4 @@
-"""Map of all special points of gaits over two parameters, checked against a scan.
+"""Map all special points of gaits in two parameters, and check the map against a scan.
 
 If a quantity has opposite signs at neighboring samples of a scan, a curve of special points lies
 between the samples. A curve that is not traced yet is found on branches through these samples.
@@ -37,7 +37,7 @@ from vrw_jax.wheel import Outcome, WheelParams
 class SpecialPointMapOptions:
     """Numerical options of the map of special points. Distances are in cells of the scan.
 
-    - `n_parallel_branches`: number of parallel branches along each parameter, from which the map
+    - `n_parallel_branches`: number of parallel branches in each parameter, from which the map
       starts;
     - `n_meeting_rounds`: number of rounds in which special points on new curves are continued;
     - `max_search_rounds`: largest number of rounds in which sign changes are examined;
@@ -62,7 +62,9 @@ STABILITY_CHANGE_NAME = "spectral_radius"
 """Name of the change between a stable and an unstable gait."""
 
 SPECIAL_POINT_MEASURES = ("lambda_4_plus", STABILITY_CHANGE_NAME)
-"""Measures of a scan whose zeros indicate special points, besides the margins."""
+"""Names of the measures of a scan that vanish or cross 1 at special points, in addition to the
+margins.
+"""
 
 EXPLAINING_CURVE_NAMES: Mapping[str, tuple[str, ...]] = {
     GAIT_CHANGE_NAME: (*BRANCH_ENDING_QUANTITIES, *BIFURCATION_NAMES),
@@ -72,7 +74,7 @@ EXPLAINING_CURVE_NAMES: Mapping[str, tuple[str, ...]] = {
 }
 """Names of the curves that explain a sign change, by the name of the quantity.
 
-By default the curve of the same name explains the change.
+By default the curve with the name of the quantity explains the change.
 """
 
 
@@ -93,10 +95,11 @@ def trace_special_points(
     on_stage: Callable[[str], None] | None = None,
     map_options: SpecialPointMapOptions = DEFAULT_SPECIAL_POINT_MAP_OPTIONS,
 ) -> tuple[tuple[SpecialPointCurve, ...], tuple[ScanSignChange, ...]]:
-    """Return the curves of special points over a scan's parameters, and unexplained sign changes.
+    """Trace the curves of special points in the two parameters of a scan.
 
-    The scan contains `SPECIAL_POINT_MEASURES` and margins. A sign change between two samples is
-    unexplained if no curve is near it. `on_stage` is called with a description of each stage.
+    Return the curves, and the sign changes that no curve explains. The scan contains
+    `SPECIAL_POINT_MEASURES` and margins. A sign change between two samples is unexplained if no
+    curve is near it. `on_stage` is called with a description of each stage.
     """
     parameter_names = tuple(map(str, scan_dataset.outcome.dims))
     parameter_ranges = np.array(
@@ -163,8 +166,10 @@ def _trace_curves_and_meetings(
     traced_curves: list[TracedCurve],
     map_options: SpecialPointMapOptions,
 ) -> list[TracedCurve]:
-    """Return the known curves, with the curves through seeds and through special points on new
-    curves."""
+    """Trace the curves through the seeds, and the curves through special points on new curves.
+
+    Return these curves together with the known curves.
+    """
     for _ in range(map_options.n_meeting_rounds):
         new_curves = curve_tracer.trace_curves(curve_seeds, traced_curves)
         known_curves = [
@@ -186,8 +191,10 @@ def find_seeds_on_parallel_lines(
     params: WheelParams,
     map_options: SpecialPointMapOptions = DEFAULT_SPECIAL_POINT_MAP_OPTIONS,
 ) -> list[CurveSeed]:
-    """Return seeds on branches that start at evenly spaced values on the middle line of each
-    range.
+    """Find seeds on parallel branches in each of the two parameters.
+
+    A branch in one parameter starts at the middle of that parameter's range. The branches differ by
+    evenly spaced values of the other parameter.
     """
     curve_seeds, range_midpoints, n_lines = (
         [],
@@ -217,7 +224,7 @@ def find_seeds_on_parallel_lines(
 def _find_seeds_in_batches(
     curve_tracer: CurveTracer, parameter_index: int, wheels: list[WheelParams], batch_size: int
 ) -> list[CurveSeed]:
-    """Return seeds on the wheels' branches, which are continued in batches of one size.
+    """Find seeds on the wheels' branches, which are continued in batches of the same size.
 
     A single size needs only one compiled program.
     """
@@ -262,7 +269,7 @@ def find_sign_changes_in_scan(
 ) -> list[ScanSignChange]:
     """Return the sign changes between all neighboring samples.
 
-    Sign changes of measures count only if both samples or neither sample has double support.
+    A sign change of a measure is ignored if exactly one of the two samples has double support.
     """
     outcome_codes = scan_dataset.outcome.transpose(*parameter_names).values
     has_gait, has_coarse_mesh = (
@@ -370,8 +377,9 @@ def _select_distant_changes(
     examined_changes: Sequence[ScanSignChange],
     map_options: SpecialPointMapOptions,
 ) -> list[ScanSignChange]:
-    """Return sign changes of each name that are distant from each other and from examined
-    changes.
+    """Select sign changes of each quantity that are distant from each other.
+
+    They must also be distant from the examined changes.
     """
     selected_changes: list[ScanSignChange] = []
     for sign_change in unexplained_changes:
