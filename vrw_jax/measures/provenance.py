@@ -1,4 +1,4 @@
-"""Provenance of results: versions, device, floating type, tolerances and parameters."""
+"""Provenance of results: versions, device, floating-point type, tolerances and parameters."""
 
 import functools
 import importlib.metadata
@@ -13,8 +13,9 @@ from vrw_jax.wheel import PARAMETER_NAMES, WheelParams
 def collect_provenance_attributes(
     params: WheelParams, model: object, options: StepOptions
 ) -> dict[str, str | float | int]:
-    """Return dataset attributes with the versions, device, floating type, tolerances and parameters
-    of a result.
+    """Return dataset attributes that describe how a result was computed.
+
+    They state versions, device, floating-point type, tolerances and parameters.
     """
     library_names = ("vrw-jax", "jax", "diffrax", "numpy")
     parameter_attributes: dict[str, str | float | int] = {

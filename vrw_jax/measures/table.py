@@ -1,4 +1,4 @@
-"""Measures of a step, a cycle or a trajectory: one table of names, units and symbols.
+"""Table of the measures of steps, cycles and trajectories, with names, units and symbols.
 
 Every labeled result takes its units and long names from this table, so that scans, trajectories and
 figures use the same names. The axis x points downhill along the slope, and z is normal to the
@@ -19,16 +19,16 @@ from vrw_jax.wheel import PAPER_PHASES, PARAMETER_DOMAINS, Outcome
 
 @dataclass(frozen=True)
 class Measure:
-    """Quantity with name, unit, symbol and description.
+    """Measured quantity with its name, unit, symbol and description.
 
     - `unit`: SI unit, "1" for a pure number;
-    - `equation`: number of the paper's equation, "" if there is none;
-    - `leg_dimension`: "leg" if the measure has one number per leg, otherwise "". Margins have
-      numbers for the locked legs 3..n, `CONTACT_MEASURES` for every leg;
-    - `violation_text`: clause on the consequence of a negative margin, otherwise "";
+    - `equation`: equation or section of the paper, "" if there is none;
+    - `leg_dimension`: "leg" if the measure has one value per leg, otherwise "". Margins have values
+      for the locked legs 3 to n, `CONTACT_MEASURES` for every leg;
+    - `violation_text`: clause that states what a negative margin means, otherwise "";
     - `is_shared`: whether the steps of every model have the measure;
-    - `is_code`: whether the measure is a whole number without derivatives;
-    - `is_ratio`: whether several steps are summarized by the mean, not by the sum.
+    - `is_code`: whether the measure is an integer code or count without derivatives;
+    - `is_ratio`: whether the measure of several steps is their mean instead of their sum.
     """
 
     name: str
@@ -45,18 +45,20 @@ class Measure:
 
     @property
     def mathtext(self) -> str:
-        """Return the symbol as mathtext, without dollar signs."""
+        """Return the symbol as Matplotlib mathtext, without dollar signs."""
         return format_mathtext(self.symbol)
 
     @property
     def label_with_symbol(self) -> str:
-        """Return the name with the symbol."""
+        """Return the long name followed by the symbol, or the long name alone if it contains the
+        symbol.
+        """
         has_symbol = self.symbol in self.long_name
         return self.long_name if has_symbol else f"{self.long_name} {self.symbol}"
 
     @property
     def display_unit(self) -> str:
-        """Return the unit for a reader, "" for a pure number."""
+        """Return the unit to be printed, which is "" for a pure number."""
         return "" if self.unit == "1" else self.unit
 
     @property
@@ -71,12 +73,12 @@ class Measure:
         return attributes | ({"equation": self.equation} if self.equation else {})
 
     def format_with_unit(self, measured_value: object) -> str:
-        """Return a number with this measure's unit as text, with six significant digits."""
+        """Return a value as text with the unit of this measure and six significant digits."""
         return f"{float(np.asarray(measured_value)):.6g} {self.display_unit}".strip()
 
 
 def _index_measures_by_name(*measures: Measure) -> dict[str, Measure]:
-    """Return a dictionary of the measures by name.
+    """Return a dictionary that maps names to measures.
 
     Raise a `ValueError` if two measures have the same name.
     """
@@ -185,7 +187,7 @@ MARGIN_MEASURES = _index_measures_by_name(
             "Friction coefficient minus the one that the rear foot needs in the landing impulse.",
             violation_text="rear foot slides in the landing"),
 )
-"""Margins of the model over one step, signed, negative where violated: `Margins`."""
+"""Margins of the model in one step, as in `Margins`. A negative margin is a violation."""
 
 UNILATERAL_STEP_MEASURES = _index_measures_by_name(
     Measure("duration_single", "s", "t₁", "time on one foot", "Time with one loaded foot."),
@@ -198,7 +200,7 @@ UNILATERAL_STEP_MEASURES = _index_measures_by_name(
     Measure("friction", "1", "μ", "friction coefficient",
             "Coulomb's coefficient of friction of the ground."),
 )
-"""Measures of a step with unilateral contact, beside those of `STEP_MEASURES` that it shares."""
+"""Measures that steps with unilateral contact have in addition to shared `STEP_MEASURES`."""
 
 STOPPER_MARGIN_MEASURES = _index_measures_by_name(
     Measure("stopper_force", "N", "min F_stop", "least force of a stopper on a leg in the air",
@@ -209,8 +211,9 @@ STOPPER_MARGIN_MEASURES = _index_measures_by_name(
             "Negative if a stopper has to pull on a leg in an impact.",
             violation_text="an impact throws a leg off its stopper"),
 )
-"""Margins of a step with unilateral contact and stoppers that hold legs in the air, negative if
-violated."""
+"""Margins of a step in which contact is unilateral but stoppers hold the legs in the air. A
+negative margin is a violation.
+"""
 
 PRE_TOUCHDOWN_COMPONENT_NAMES = ("theta_touchdown", "dtheta_touchdown", "dL1_touchdown")
 """Names of the components of a section state just before touchdown, in rad, rad/s, m/s."""
@@ -225,7 +228,7 @@ SHARED_STEP_MEASURE_NAMES = tuple(name for name,
 DIFFERENTIABLE_STEP_NAMES = tuple(
     name for name, measure in STEP_MEASURES.items() if not measure.is_code
 )
-"""Names of the `STEP_MEASURES` that have derivatives along a branch of gaits."""
+"""Names of the `STEP_MEASURES` that have derivatives with respect to the parameter of a branch."""
 
 UNILATERAL_DIFFERENTIABLE_NAMES = tuple(
     name
@@ -255,7 +258,9 @@ GAIT_SENSITIVITY_MEASURES = _index_measures_by_name(
     Measure("gait_sensitivity_speed", "m/(s rad)", "G_v", "gait sensitivity of the speed",
             "Standard deviation of the speed on uneven ground divided by that of the slopes."),
 )
-"""Gait sensitivity norms of a limit cycle, for independent slopes of small standard deviation."""
+"""Gait sensitivity norms of a limit cycle, for independent slopes with a small standard
+deviation.
+"""
 
 FORCE_PEAK_MEASURES = _index_measures_by_name(
     Measure("n_force_peaks", "1", "n_F", "number of force peaks",
@@ -276,8 +281,9 @@ FORCE_PEAK_MEASURES = _index_measures_by_name(
             "Normal impulse of the ground on the fore foot in the landing.", "(18)"),
 )
 """Measures of the peaks of the ground's normal force in a step of a gait. Peaks lie inside the
-phases; impacts and changes of phase are no peaks. For gaits of several steps, the measures are the
-largest over the steps."""
+phases; impacts and changes of phase are not peaks. For a gait of several steps, each measure is the
+largest of its values in these steps.
+"""
 
 PASSAGE_MEASURES = _index_measures_by_name(
     Measure("mean_steps", "1", "M", "mean number of steps until failure",
@@ -288,7 +294,7 @@ PASSAGE_MEASURES = _index_measures_by_name(
     Measure("failure_probability", "1", "1 - κ_1", "failure probability of a step",
             "On random slopes, from their quasi-stationary distribution."),
 )
-"""Measures of walks over random slopes of a given standard deviation."""
+"""Measures of walks on random slopes with a given standard deviation."""
 
 TRAJECTORY_MEASURES = _index_measures_by_name(
     Measure("time", "s", "t", "time", "Time since the landing at the start of the first step."),
@@ -349,7 +355,7 @@ CONTACT_MEASURES = _index_measures_by_name(
     Measure("on_stopper", "1", "on stopper", "whether the leg is on its stopper", "1 or 0.",
             leg_dimension="leg"),
 )
-"""Variables of a trajectory with unilateral contact, of each leg 1..n."""
+"""Variables of a trajectory with unilateral contact, one value for each of the legs 1 to n."""
 
 # fmt: on
 PARAMETER_MEASURES = _index_measures_by_name(
@@ -358,7 +364,7 @@ PARAMETER_MEASURES = _index_measures_by_name(
         for name, domain in PARAMETER_DOMAINS.items()
     )
 )
-"""Parameters of the wheel, for the axes of a scan."""
+"""Parameters of the wheel as measures, for the axes of a scan."""
 
 MEASURES: dict[str, Measure] = (
     STEP_MEASURES
@@ -373,7 +379,7 @@ MEASURES: dict[str, Measure] = (
     | CONTACT_MEASURES
     | PARAMETER_MEASURES
 )
-"""All quantities by name."""
+"""All measures by name."""
 
 PHASE_NAMES = tuple(phase.name for phase in PAPER_PHASES)
 """Names of the phases of a step, in order: values 0, 1, 2 of `phase`."""
@@ -383,7 +389,7 @@ CONTACT_MODE_NAMES = ("in the air", "at rest", "sliding downhill", "sliding uphi
 
 
 def make_flag_attributes(flag_names: Iterable[str]) -> dict[str, object]:
-    """Return the CF attributes of an integer variable whose numbers 0, 1, ... mean `flag_names`."""
+    """Return the CF attributes of an integer variable whose values 0, 1, ... mean `flag_names`."""
     flag_names = [flag_name.replace(" ", "_") for flag_name in flag_names]
     return {"flag_values": list(range(len(flag_names))), "flag_meanings": " ".join(flag_names)}
 
@@ -391,7 +397,7 @@ def make_flag_attributes(flag_names: Iterable[str]) -> dict[str, object]:
 def get_measure(measure_name: str) -> Measure:
     """Return the measure with the name `measure_name`.
 
-    The name may end with a leg, as "[5]", and begin with the minus of an upper bound.
+    The name may end with a leg label, as "[5]", and may begin with "-", which marks an upper bound.
     """
     return MEASURES[measure_name.removeprefix("-").partition("[")[0]]
 
@@ -399,8 +405,9 @@ def get_measure(measure_name: str) -> Measure:
 def make_labeled_variables(
     columns_by_name: Mapping[str, np.ndarray], row_dimension: str
 ) -> dict[str, xr.Variable]:
-    """Return dataset variables of columns over one dimension, and over `leg` for measures per
-    leg.
+    """Return dataset variables for columns of values over the dimension `row_dimension`.
+
+    Measures with one value per leg also have the dimension `leg`.
     """
     dimension_selector = lambda name: (
         (row_dimension, MEASURES[name].leg_dimension)
@@ -414,15 +421,15 @@ def make_labeled_variables(
 
 
 def make_locked_leg_coordinate(n_legs: int) -> xr.Variable:
-    """Return the dataset coordinate `leg` of margins of the locked legs 3..n."""
+    """Return the dataset coordinate `leg` for margins of the locked legs 3 to n."""
     attributes = {"long_name": "locked leg", "units": "1"}
     return xr.Variable("leg", np.arange(3, n_legs + 1), attributes)
 
 
 def describe_violation(margin_name: str) -> str:
-    """Return a text that describes the event at which a margin or indicator is zero.
+    """Return a text that describes the event at which a margin or indicator crosses 0.
 
-    The name may end with a leg, as "[5]".
+    The name may end with a leg label, as "[5]".
     """
     name_without_leg, _, leg_suffix = margin_name.partition("[")
     if name_without_leg in STEP_MEASURES and not MEASURES[name_without_leg].violation_text:
@@ -440,7 +447,10 @@ def describe_violation(margin_name: str) -> str:
 
 
 def make_measure_attributes(variable_name: str) -> dict[str, object]:
-    """Return the attributes of the dataset variable `variable_name`, with flag names for codes."""
+    """Return the attributes of the dataset variable `variable_name`.
+
+    For integer codes, they include the names of the codes.
+    """
     attributes: dict[str, object] = dict(MEASURES[variable_name].variable_attributes)
     if variable_name == "phase":
         attributes |= make_flag_attributes(PHASE_NAMES)
