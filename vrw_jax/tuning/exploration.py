@@ -1,8 +1,8 @@
-"""Exploration of many starts: an augmented Lagrangian, maximized by optax's Adam in one batch.
+"""Exploration of many starts with an augmented Lagrangian that optax's Adam maximizes in one batch.
 
-First-order steps bring every start near a local optimum. The maximization continues from the best
-start. If a trial has no gait, the parameters of its start do not change, and its step size is
-halved.
+First-order optimizer steps bring every start near a local optimum. The maximization continues from
+the best start. If a trial has no gait, the parameters of its start do not change, and its step size
+is halved.
 """
 
 from collections.abc import Callable
@@ -26,11 +26,11 @@ optax = lazy_import("optax")
 class ExplorationOptions:
     """Options of the exploration of many starts.
 
-    - `n_first_order_steps`: number of first-order steps;
-    - `first_step_length`: length of Adam's first step, in widths of the bounds;
-    - `gradient_decay`, `squared_gradient_decay`: decay rates of Adam's averages of the gradient and
-      of its square;
-    - `penalty_weight`: penalty on a violation of one width of the bounds, in units of the
+    - `n_first_order_steps`: number of first-order optimizer steps;
+    - `first_step_length`: length of Adam's first step, in widths between the bounds;
+    - `gradient_decay`, `squared_gradient_decay`: decay rates of Adam's running averages of the
+      gradient and of the squared gradient;
+    - `penalty_weight`: penalty on a violation of one width between the bounds, in units of the
       objective.
     """
 
@@ -42,11 +42,12 @@ class ExplorationOptions:
 
 
 DEFAULT_EXPLORATION_OPTIONS = ExplorationOptions()
-"""Options of the exploration by `vrw.tune`."""
+"""Options of the exploration that `vrw.tune` uses."""
 
 GaitBatchEvaluator = Callable[[np.ndarray, GaitEvaluation | None], GaitEvaluation]
-"""Function that returns the gaits at rows of normalized parameters, one per start. The search
-begins at neighboring gaits, if given."""
+"""Function that finds and evaluates gaits for an array of normalized parameters, (starts, free). If
+evaluations of neighboring gaits are given, the searches begin at these gaits.
+"""
 
 
 class ExplorationResult(NamedTuple):
@@ -64,7 +65,7 @@ class ExplorationResult(NamedTuple):
     def best_start_index(self) -> int:
         """Return the index of the start with the highest penalized objective.
 
-        The maximization continues from this start.
+        The maximization continues from the end of this start's exploration.
         """
         return int(np.nanargmax(self.penalized_objectives))
 
@@ -78,12 +79,12 @@ def explore_starts(
     min_constraint_values: np.ndarray,
     exploration_options: ExplorationOptions = DEFAULT_EXPLORATION_OPTIONS,
 ) -> ExplorationResult:
-    """Take first-order steps from every start, and return the parameters and gaits at their ends.
+    """Take first-order optimizer steps from every start, and return the parameters and gaits at the
+    ends.
 
     - `parameter_change_function`: function that converts changes of normalized parameters to
       changes of all parameters;
-    - `free_indices`: indices of the free parameters, with respect to which Jacobians of a gait are
-      selected.
+    - `free_indices`: indices of the free parameters in the Jacobian of a gait.
     """
     n_starts = normalized_starts.shape[0]
     trial_evaluation = gait_batch_evaluator(normalized_starts, None)
@@ -187,14 +188,12 @@ def explore_starts(
 
 
 def are_starts_on_gait(gait_evaluation: GaitEvaluation) -> np.ndarray:
-    """Return whether each start has a gait that the event-driven step confirms."""
+    """Return whether each start has a gait that an event-driven step confirms."""
     return gait_evaluation.gait.outcome == Outcome.STEPPED
 
 
 def _are_evaluations_finite(gait_evaluation: GaitEvaluation, free_indices: list[int]) -> np.ndarray:
-    """Return whether the objective, the constraints and their derivatives of each start are
-    finite.
-    """
+    """Return, for each start, whether objective, constraints and their derivatives are finite."""
     free_jacobian = np.asarray(gait_evaluation.jacobian)[:, free_indices]
     return np.isfinite(gait_evaluation.values).all(-1) & np.isfinite(free_jacobian).all((-1, -2))
 
@@ -202,8 +201,9 @@ def _are_evaluations_finite(gait_evaluation: GaitEvaluation, free_indices: list[
 def _compute_objective_gradients(
     gait_evaluation: GaitEvaluation, free_indices: list[int], bound_widths: np.ndarray
 ) -> np.ndarray:
-    """Return the gradient of the objective with respect to normalized parameters, shape (starts,
-    free).
+    """Return the gradient of the objective with respect to the normalized parameters.
+
+    Its shape is (starts, free).
     """
     return np.asarray(gait_evaluation.jacobian)[:, free_indices, 0] * bound_widths
 
@@ -214,9 +214,10 @@ def _compute_slacks_and_jacobians(
     bound_widths: np.ndarray,
     min_constraint_values: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the slacks (starts, constraints) and their Jacobians (starts, constraints, free).
+    """Return the slacks of the constraints and their Jacobians with respect to normalized
+    parameters.
 
-    The Jacobians are with respect to the normalized parameters.
+    The shapes are (starts, constraints) and (starts, constraints, free).
     """
     slack_jacobians = (
         np.swapaxes(np.asarray(gait_evaluation.jacobian)[:, free_indices, 1:], 1, 2) * bound_widths
@@ -229,7 +230,9 @@ def _are_trials_on_branch(
     trial_evaluation: GaitEvaluation,
     parameter_changes: np.ndarray,
 ) -> np.ndarray:
-    """Return whether the gait of each trial is on the branch of the previous gait of its start."""
+    """Return, for each start, whether the trial's gait is on the branch of the start's previous
+    gait.
+    """
     previous_points, trial_points = (
         previous_evaluation.gait.branch_point,
         trial_evaluation.gait.branch_point,

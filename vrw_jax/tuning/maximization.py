@@ -1,9 +1,10 @@
-"""Maximization along a branch of gaits by SciPy's SLSQP, in a box that shrinks after lost gaits.
+"""Maximization on a branch of gaits with SciPy's SLSQP, in a box that shrinks after failed trials.
 
-SLSQP is sequential quadratic programming with exact gradients. It does not handle trial wheels
-without a gait, or with a gait of another branch. After such a trial the maximization continues from
-the last iterate in a box of half the size, and the path records the trial. Parameters are
-normalized by the widths of their bounds, so that every free parameter is between 0 and 1.
+SLSQP is sequential quadratic programming with exact gradients. It cannot handle trial wheels
+without a gait, or with a gait on another branch. After such a trial, the maximization continues
+from the last iterate in a smaller box: half the side of the box is half the distance to the trial.
+The path records the trial. Parameters are normalized by the widths between their bounds, so that
+every free parameter is between 0 and 1.
 """
 
 import enum
@@ -34,7 +35,7 @@ class TuneStatus(StatusCode):
 
 
 class TrialKind(enum.IntEnum):
-    """Role of an evaluated gait in the maximization."""
+    """Kind of a trial in the maximization."""
 
     START = 0
     TRIAL = 1
@@ -44,7 +45,7 @@ class TrialKind(enum.IntEnum):
 
 
 class EvaluatedTrial(NamedTuple):
-    """Trial wheel with its evaluated gait. If the wheel has no gait, all numbers are NaN."""
+    """Trial wheel with its evaluated gait. If the wheel has no gait, all values are NaN."""
 
     normalized_parameters: np.ndarray  # free parameters in widths of their bounds
     outcome: Outcome
@@ -62,7 +63,7 @@ class EvaluatedTrial(NamedTuple):
 
     @property
     def has_finite_numbers(self) -> bool:
-        """Return whether objective, constraints and their derivatives are finite numbers."""
+        """Return whether the objective, the constraints and their derivatives are finite."""
         trial_arrays = (
             self.objective,
             self.objective_gradient,
@@ -82,8 +83,9 @@ class EvaluatedTrial(NamedTuple):
         constraint_names: tuple[str, ...],
         min_constraint_values: np.ndarray,
     ) -> str:
-        """Return a text about the first number that is not finite, of the objective or else of a
-        constraint.
+        """Return a text that names the first value or derivative that is not finite.
+
+        The objective is checked first, then the constraints in their order.
         """
         measure_values = self.objective, *map(float, self.constraint_slacks + min_constraint_values)
         measure_gradients = self.objective_gradient, *self.slack_jacobian
@@ -101,7 +103,9 @@ class EvaluatedTrial(NamedTuple):
 
 
 class MaximizationResult(NamedTuple):
-    """Best trial of a maximization, its status, and all trials in order with their kinds."""
+    """Best trial of a maximization, the reason why it ended, and all trials in order with their
+    kinds.
+    """
 
     best_trial: EvaluatedTrial
     status: TuneStatus
@@ -110,18 +114,20 @@ class MaximizationResult(NamedTuple):
 
 
 class _LostBranchError(Exception):
-    """Exception raised if a trial has no usable gait."""
+    """Exception that signals a trial without a usable gait."""
 
     def __init__(self, lost_trial: EvaluatedTrial) -> None:
         self.lost_trial = lost_trial
 
 
 class _EvaluationLimitReachedError(Exception):
-    """Exception raised if the allowed number of gaits is evaluated."""
+    """Exception that signals that the allowed number of gaits has been evaluated."""
 
 
 class _OptimumReachedError(Exception):
-    """Exception raised if a trial satisfies the first-order condition and the constraints."""
+    """Exception that signals a trial that satisfies the first-order condition and the
+    constraints.
+    """
 
     def __init__(self, optimal_trial: EvaluatedTrial) -> None:
         self.optimal_trial = optimal_trial
@@ -129,16 +135,16 @@ class _OptimumReachedError(Exception):
 
 @dataclass(frozen=True)
 class MaximizationOptions:
-    """Options of the maximization; lengths are in widths of the bounds.
+    """Options of the maximization. Lengths are in widths between the bounds.
 
     - `full_box_radius`: half the side of the largest box, chosen because that box contains all
       bounds from any center;
-    - `min_box_radius`: half the side of the box at which the end of a branch counts as reached;
+    - `min_box_radius`: half the side of a box so small that the branch is considered to end there;
     - `coarse_objective_tolerance`: relative change of the objective at which SLSQP stops in a box
-      smaller than the largest, chosen because the search continues from there;
+      smaller than the largest, chosen because another search continues from the result;
     - `fine_objective_tolerance`: relative change of the objective at which SLSQP stops in the
-      largest box, chosen because gaits are not more accurate;
-    - `active_bound_tolerance`: slack below which a constraint counts as active.
+      largest box, chosen because the objective of a gait is not more accurate;
+    - `active_bound_tolerance`: relative slack below which a constraint is treated as active.
     """
 
     full_box_radius: float = 1.0
@@ -149,15 +155,16 @@ class MaximizationOptions:
 
 
 DEFAULT_MAXIMIZATION_OPTIONS = MaximizationOptions()
-"""Options of the maximization by `vrw.tune`."""
+"""Options of the maximization that `vrw.tune` uses."""
 
 TrialEvaluator = Callable[[np.ndarray, EvaluatedTrial | None], EvaluatedTrial]
-"""Function that returns the trial at normalized parameters. The search for the gait begins at the
-gait of a neighbor, if given."""
+"""Function that evaluates the trial with given normalized parameters. If a neighboring trial is
+given, the search for the gait begins at its gait.
+"""
 
 
 class _TrialRecord:
-    """Record of trials in order, in which each point is evaluated once."""
+    """Record of all trials in order. Each point is evaluated only once."""
 
     def __init__(
         self,
@@ -170,8 +177,8 @@ class _TrialRecord:
         self._trial_index_by_parameters = {start_trial.normalized_parameters.tobytes(): 0}
 
     def evaluate_trial_once(self, normalized_parameters: np.ndarray) -> EvaluatedTrial:
-        """Return the trial at the normalized parameters, which is evaluated only if the record
-        lacks it.
+        """Return the trial with these normalized parameters, and evaluate it if it is not yet
+        recorded.
 
         Raise an exception if the trial is unusable, or if the allowed number of evaluations is
         reached.
@@ -201,7 +208,7 @@ class _TrialRecord:
         return trial
 
     def evaluate_iterate_once(self, normalized_parameters: np.ndarray) -> EvaluatedTrial:
-        """Return the trial at the normalized parameters, and record it as an iterate."""
+        """Return the trial with these normalized parameters, and record it as an iterate."""
         trial = self.evaluate_trial_once(normalized_parameters)
         trial_index = self._trial_index_by_parameters[normalized_parameters.tobytes()]
         if trial_index:
@@ -217,9 +224,7 @@ def maximize_objective(
     max_evaluations: int,
     maximization_options: MaximizationOptions = DEFAULT_MAXIMIZATION_OPTIONS,
 ) -> MaximizationResult:
-    """Return the result of a local maximization from `start_trial`, with every slack at least
-    zero.
-    """
+    """Maximize the objective locally from `start_trial`, subject to slacks of at least 0."""
     from scipy.optimize import minimize  # This import is slow.
 
     trial_record = _TrialRecord(trial_evaluator, start_trial, max_evaluations)
@@ -345,8 +350,9 @@ def _find_best_trial(
     last_trial: EvaluatedTrial,
     maximization_options: MaximizationOptions,
 ) -> EvaluatedTrial:
-    """Return the best gait that satisfies all constraints, or else that with the smallest
-    violation.
+    """Return the best trial that satisfies all constraints.
+
+    If there is none, return the trial with the smallest violation.
     """
     usable_trials = [trial for trial in trial_record.evaluated_trials if trial.is_usable_trial]
     is_feasible = lambda trial: (
@@ -365,7 +371,7 @@ def _find_best_trial(
 
 
 class OptimalityConditions(NamedTuple):
-    """Multipliers of the constraints and bounds that are active at an optimum."""
+    """Lagrange multipliers of the active constraints and bounds at an optimum."""
 
     constraint_prices: np.ndarray  # gain of the objective per unit of a relaxed margin
     lower_bound_prices: np.ndarray  # gain of the objective per width of a relaxed lower bound
@@ -376,9 +382,9 @@ class OptimalityConditions(NamedTuple):
 def compute_optimality_conditions(
     trial: EvaluatedTrial, maximization_options: MaximizationOptions = DEFAULT_MAXIMIZATION_OPTIONS
 ) -> OptimalityConditions:
-    """Return the multipliers of the Karush-Kuhn-Tucker conditions at a gait.
+    """Return the multipliers of the Karush-Kuhn-Tucker conditions for a gait.
 
-    The multipliers are a solution by non-negative least squares.
+    They are computed by non-negative least squares.
     """
     from scipy.optimize import nnls  # This import is slow.
 

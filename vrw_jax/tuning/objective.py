@@ -1,4 +1,4 @@
-"""Objective and constraints of a gait from a user's specification, with exact gradients."""
+"""Objective and constraints of a gait, with exact gradients, from a user's specification."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -18,12 +18,12 @@ ConstraintSpecification = Mapping[str, float | tuple[float | None, float | None]
 MeasureReaderFunction = Callable[[str, AbstractCycle, AbstractStep], Array]
 
 UPPER_BOUND_PREFIX = "-"
-"""Prefix of a measure with an upper bound, which is a lower bound of its negative."""
+"""Prefix that marks an upper bound on a measure, which is a lower bound on its negative."""
 
 
 @dataclass(frozen=True)
 class WeightedMeasureSum:
-    """Weighted sum of measures of cycle and step, as an objective."""
+    """Objective that is a weighted sum of measures of the cycle and the step."""
 
     measure_reader: MeasureReaderFunction
     measure_weights: tuple[tuple[str, float], ...]
@@ -38,7 +38,7 @@ class WeightedMeasureSum:
 
 @dataclass(frozen=True)
 class CycleObjective:
-    """Objective that is a user's function of the cycle alone."""
+    """Objective that a user's function computes from the cycle alone."""
 
     cycle_function: Callable[[Any], Array]
 
@@ -48,10 +48,11 @@ class CycleObjective:
 
 @dataclass(frozen=True)
 class ObjectiveAndConstraints:
-    """Objective and constraints of a gait as one array, with the objective first.
+    """Function that returns the objective and the constraints of a gait as one array, objective
+    first.
 
-    A constraint is a measure with a lower bound. A constraint with the prefix `UPPER_BOUND_PREFIX`
-    is a measure with an upper bound.
+    A constraint is a measure with a lower bound. A constraint whose name has the prefix
+    `UPPER_BOUND_PREFIX` is a measure with an upper bound.
     """
 
     objective_function: ObjectiveFunction
@@ -88,10 +89,10 @@ def parse_constraint_margins(
     constraints: ConstraintSpecification | None,
     gait_finder: AbstractGaitFinder,
 ) -> dict[str, float]:
-    """Return the smallest allowed value of each constrained measure by name.
+    """Return the smallest allowed value of each constrained measure, by name.
 
-    A measure with an upper bound has the prefix `UPPER_BOUND_PREFIX`, and its smallest value is
-    that of the negative measure.
+    The name of a measure with an upper bound has the prefix `UPPER_BOUND_PREFIX`. Its value is then
+    the smallest allowed value of the negative measure.
     """
     if constraints is None:
         default_margin_by_name = default_margins(params)
@@ -123,7 +124,8 @@ def _parse_constraint_bound(
 ) -> dict[str, float]:
     """Return the smallest allowed values of one measure and of its negative, by name.
 
-    - `bound_or_range`: lower bound, or a pair of bounds of which one may be None.
+    - `bound_or_range`: lower bound, or pair of a lower and an upper bound, one of which may be
+      None.
     """
     if not isinstance(bound_or_range, tuple):
         return {measure_name: check_real(f"the margin of {measure_name}", bound_or_range)}
@@ -147,16 +149,18 @@ def _parse_constraint_bound(
 
 
 def restore_sign_of_bound(constraint_name: str, lower_bound: float) -> float:
-    """Return a bound with the sign of its measure.
+    """Return the bound on a measure, converted from the smallest allowed value of a constraint.
 
-    The bound of a constraint with the upper-bound prefix has the opposite sign.
+    The sign changes if the name of the constraint has the prefix of upper bounds.
     """
     return float(-lower_bound if constraint_name.startswith(UPPER_BOUND_PREFIX) else lower_bound)
 
 
 def compute_slack_scales(constraint_slacks: np.ndarray, slack_jacobian: np.ndarray) -> np.ndarray:
-    """Return the change of each slack over one width of the bounds, which is the scale of the
-    slack.
+    """Return the scale of each slack.
+
+    The scale is the norm of the slack's gradient with respect to normalized parameters, that is,
+    the change of the slack per width between the bounds.
     """
     return np.maximum(
         np.linalg.norm(slack_jacobian, axis=-1), 1e-3 * np.abs(constraint_slacks) + 1e-12
@@ -164,9 +168,9 @@ def compute_slack_scales(constraint_slacks: np.ndarray, slack_jacobian: np.ndarr
 
 
 def compute_max_violation(constraint_slacks: np.ndarray, slack_scales: np.ndarray) -> Any:
-    """Return the largest violation of a constraint in widths of the bounds, or 0 without a
-    violation.
+    """Return the largest violation of a constraint, in widths between the bounds, or 0 if there is
+    none.
 
-    The violation is NaN if the wheel has no gait.
+    The result is NaN if the wheel has no gait.
     """
     return np.max(-constraint_slacks / slack_scales, axis=-1, initial=0.0)

@@ -1,8 +1,7 @@
-"""Tuning of a wheel: maximization of a gait's objective, with margins as constraints and exact
-gradients.
+"""Tuning of a wheel: maximization of an objective for its gait, with margins as constraints.
 
-Without margins as constraints, the maximization would increase double support until the foot
-scuffs.
+Gradients are exact. Without margins as constraints, the maximization would increase double support
+until the foot scuffs.
 """
 
 from __future__ import annotations
@@ -90,12 +89,12 @@ ObjectiveSpecification = str | Mapping[str, float] | Callable[..., Array]
 class WalkValidationOptions:
     """Options of the walk that validates a tuned wheel.
 
-    - `n_steps_of_walk`: number of steps;
+    - `n_steps_of_walk`: number of walking steps;
     - `relative_start_displacement`: relative displacement of the start from the limit cycle;
     - `constraint_value_tolerance`: accepted violation of a constraint, as a fraction of its value.
-      Both tolerances are chosen for two reasons. The optimum satisfies a constraint within 1e-6 of
-      its change over the bounds, and the start is displaced. Each effect is some thousandths of a
-      take-off margin;
+      This tolerance and the next are chosen because of two effects: the optimum satisfies a
+          constraint within 1e-6 of its change between the bounds, and the start is displaced. Each
+          effect is some thousandths of a take-off margin;
     - `default_margin_tolerance`: accepted violation, as a fraction of the constraint's default
       margin.
     """
@@ -125,10 +124,11 @@ def tune(
     """Return the wheel near `params` whose gait maximizes an objective under constraints.
 
     The default constraints are all margins that gaits of the model can satisfy (`default_margins`).
-    {} means no constraints. A constraint counts as satisfied within 1e-6 of its change over the
-    bounds. The method is local and ends at an optimum on the branch of `params`. With `n_starts`
-    above 1 the search begins with `params` and random wheels within the bounds. All starts take 25
-    first-order steps in one batch, and the maximization continues from the best.
+    An empty mapping {} means no constraints. A constraint may be violated by 1e-6 of its change
+    between the bounds. The method is local and ends at an optimum on the branch of `params`. If
+    `n_starts` is above 1, the search begins with `params` and random wheels within the bounds. 25
+    first-order optimizer steps improve all starts in one batch, and the maximization continues from
+    the best.
 
     With unilateral contact (`UnilateralWheel`) the objective is a measure of a step or a weighted
     sum of measures. A walk from the start finds the first gait. There are no default constraints,
@@ -138,15 +138,15 @@ def tune(
 
     Args:
         params: the start, one wheel.
-        objective: maximized quantity: a measure's name, weights of several, or a function of a
-            LimitCycle (and, if it takes two arguments, of the StepResult from it).
+        objective: quantity to maximize: name of a measure, weights of measures by name, or a
+            function of a LimitCycle. A function of two arguments also gets the cycle's StepResult.
         free: names of the parameters that may change.
         bounds: lower and upper bound of each free parameter.
         constraints: lower bounds of measures by name, or pairs of lower and upper bounds, of which
-            one may be None: (None, 0.6). Names without bounds have the lower bound zero.
+            one may be None: (None, 0.6). A sequence of names means lower bounds of 0.
         model: the model; the paper's, `ViscoelasticWheel()`, by default.
-        options: options of the steps.
-        cycle_options: options of the gaits.
+        options: numerical options of the walking steps.
+        cycle_options: options of the gait search.
         tolerance: tolerance of the first-order condition, relative to the objective's gradient.
         max_evaluations: largest number of evaluated gaits.
         n_starts: number of starts; the maximization continues from the best.
@@ -202,7 +202,7 @@ def tune(
 
 @dataclasses.dataclass(frozen=True)
 class TuneProblem:
-    """Validated tuning problem: free parameters, objective and constraints."""
+    """Validated tuning problem with its free parameters, objective and constraints."""
 
     params: WheelParams
     free_parameters: tuple[str, ...]
@@ -216,7 +216,7 @@ class TuneProblem:
 
     @property
     def bound_widths(self) -> np.ndarray:
-        """Return the widths of the bounds, shape (free,)."""
+        """Return the width between the bounds of each free parameter, shape (free,)."""
         return self.upper_bounds - self.lower_bounds
 
     @property
@@ -226,9 +226,9 @@ class TuneProblem:
 
     @property
     def constraint_names(self) -> tuple[str, ...]:
-        """Return the name of each constrained number.
+        """Return the name of each constrained value.
 
-        A margin of the locked legs has one number per leg.
+        A margin of the locked legs has one value per leg.
         """
         constraint_names: list[str] = []
         for measure_name in self.margins:
@@ -243,7 +243,7 @@ class TuneProblem:
 
     @property
     def min_constraint_values(self) -> np.ndarray:
-        """Return the smallest allowed values of the constraints, in the order of
+        """Return the smallest allowed value of each constraint, in the order of
         `constraint_names`.
         """
         return np.array(
@@ -254,9 +254,10 @@ class TuneProblem:
         )
 
     def denormalize_parameters(self, normalized_parameters: np.ndarray) -> np.ndarray:
-        """Return all float parameters of the wheel with the given normalized free parameters.
+        """Return all floating-point parameters of the wheel with these normalized free parameters.
 
-        A normalized parameter is the distance from the lower bound in widths of the bounds.
+        A normalized parameter is its distance from the lower bound divided by the width between the
+        bounds.
         """
         parameter_values = np.array(self.gait_finder.model.parameter_values(self.params))
         parameter_values[self.free_parameter_indices] = (
@@ -265,21 +266,22 @@ class TuneProblem:
         return parameter_values
 
     def make_wheel(self, normalized_parameters: np.ndarray) -> WheelParams:
-        """Return the wheel with the given normalized free parameters."""
+        """Return the wheel with these normalized free parameters."""
         return self.gait_finder.model.from_values(
             jnp.asarray(self.denormalize_parameters(normalized_parameters)), self.params.n_legs
         )[1]
 
     @property
     def normalized_start(self) -> np.ndarray:
-        """Return the normalized free parameters of the start, shape (free,)."""
+        """Return the normalized free parameters of the start wheel, shape (free,)."""
         start_values = np.array(
             [float(getattr(self.params, parameter_name)) for parameter_name in self.free_parameters]
         )
         return np.clip((start_values - self.lower_bounds) / self.bound_widths, 0.0, 1.0)
 
     def evaluate_start_trial(self, u: np.ndarray) -> EvaluatedTrial:
-        """Return the trial at the normalized parameters `u`.
+        """Evaluate the trial with the normalized parameters `u`, from which the maximization
+        starts.
 
         Raise a ValueError if the trial is unusable.
         """
@@ -304,9 +306,9 @@ class TuneProblem:
     def evaluate_trial(
         self, normalized_parameters: np.ndarray, neighbor_trial: EvaluatedTrial | None
     ) -> EvaluatedTrial:
-        """Return the trial at the normalized parameters.
+        """Evaluate the trial with these normalized parameters.
 
-        If `neighbor_trial` is given, the search begins at its gait.
+        If `neighbor_trial` is given, the search for the gait begins at its gait.
         """
         parameter_values = jnp.asarray(self.denormalize_parameters(normalized_parameters))
         neighbor_evaluation = None if neighbor_trial is None else neighbor_trial.gait_evaluation
@@ -344,7 +346,7 @@ class TuneProblem:
         gait_outcome: Outcome,
         is_on_branch: bool,
     ) -> EvaluatedTrial:
-        """Return a trial with the objective and constraints of a gait."""
+        """Return the trial for a gait whose objective and constraints have been evaluated."""
         objective_and_constraint_values = np.array(gait_evaluation.values)
         free_jacobian = (
             np.array(gait_evaluation.jacobian)[self.free_parameter_indices].T * self.bound_widths
@@ -366,9 +368,7 @@ class TuneProblem:
         )
 
     def explore_random_starts(self, n_starts: int, seed: int) -> ExplorationResult:
-        """Return the ends of first-order steps from this wheel and from random wheels, in one
-        batch.
-        """
+        """Explore from this wheel and from random wheels in one batch, and return the ends."""
         random_starts = np.random.default_rng(seed).uniform(
             size=(n_starts - 1, len(self.free_parameters))
         )
@@ -400,9 +400,9 @@ class TuneProblem:
     def _evaluate_gait_batch(
         self, normalized_parameters: np.ndarray, neighbor_evaluation: GaitEvaluation | None
     ) -> GaitEvaluation:
-        """Return the gaits at rows of normalized parameters.
+        """Find and evaluate the gaits for an array of normalized parameters, shape (starts, free).
 
-        If `neighbor_evaluation` is given, the search begins at its gaits.
+        If `neighbor_evaluation` is given, the searches begin at its gaits.
         """
         parameter_values = jnp.asarray(
             [self.denormalize_parameters(parameter_row) for parameter_row in normalized_parameters]
@@ -425,7 +425,7 @@ class TuneProblem:
         compiled_seconds: float,
         exploration_result: ExplorationResult | None = None,
     ) -> TuneResult:
-        """Return the `TuneResult` of a maximization, with active constraints and a validation
+        """Return the `TuneResult` for a maximization, with active constraints and a validation
         walk.
         """
         best_trial = maximization_result.best_trial
@@ -501,7 +501,9 @@ class TuneProblem:
         )
 
     def _validate_tuned_wheel_by_walking(self, params: WheelParams, gait: Gait) -> WalkValidation:
-        """Return the result of a walk that starts near the section state of the gait."""
+        """Simulate a walk that starts near the section state of the gait, and return its
+        validation.
+        """
         cycle_state, walk_options = np.array(gait.cycle.section_state), self.validation_options
         # The state is scaled down, not up, because no leg may be beyond its stopper.
         section_state = cycle_state * (1.0 - walk_options.relative_start_displacement)
@@ -640,8 +642,9 @@ def make_tune_problem(
     options: StepOptions | None = None,
     cycle_options: CycleOptions | None = None,
 ) -> TuneProblem:
-    """Return the validated problem that `tune` solves, for evaluations of single gaits or other
-    methods.
+    """Validate the arguments of `tune` and return the problem that it solves.
+
+    The problem can also be used to evaluate single gaits, or with other optimization methods.
 
     Raises:
         TypeError, ValueError: if an argument is invalid; the message names the remedy.
@@ -696,7 +699,7 @@ def make_tune_problem(
 def _parse_objective_function(
     objective: ObjectiveSpecification, gait_finder: AbstractGaitFinder
 ) -> tuple[ObjectiveFunction, str]:
-    """Return the function of an objective, and its label."""
+    """Return the objective as a function, and its label."""
     if not (callable(objective) or isinstance(objective, str | Mapping)):
         raise TypeError(
             f"objective is {format_value(objective)}, but it is a measure's name, weights of "

@@ -18,15 +18,15 @@ NO_ACTIVE_CONSTRAINT_TEXTS = {
     TuneStatus.MAX_EVALUATIONS_REACHED: "nothing so far: the maximization has not ended",
     TuneStatus.NO_FEASIBLE_GAIT: "nothing: a constraint is broken here",
 }
-"""Texts for a gait without an active constraint or bound, by the status of the maximization."""
+"""Texts that state why no constraint or bound is active, by the status of the maximization."""
 
 
 class ActiveConstraint(NamedTuple):
     """Active constraint or bound at the optimum.
 
-    - `name`: name of the constraint, with the leg if it has one, or of the parameter;
-    - `limit`: margin of the constraint, or the bound;
-    - `price`: gain of the objective per unit of a relaxed limit.
+    - `name`: name of the parameter, or of the constraint with its leg label if it has one;
+    - `limit`: bound on the parameter or on the constrained measure;
+    - `price`: gain of the objective per unit by which the limit is relaxed.
     """
 
     name: str
@@ -39,8 +39,8 @@ class WalkValidation(NamedTuple):
     """Validation of the tuned wheel by a walk from a slightly displaced start.
 
     - `distance`: distance from the limit cycle after the last step, rad, rad/s and m/s;
-    - `is_feasible`: whether every step satisfied every constraint on a margin, within 1e-3 of its
-      value and 1e-2 of its default margin.
+    - `is_feasible`: whether every step satisfied every constraint on a margin, to within the sum of
+      1e-3 of its value and 1e-2 of its default margin.
     """
 
     n_steps: int
@@ -53,22 +53,22 @@ class WalkValidation(NamedTuple):
 class TuneResult:
     """Result of tuning: the gait, the path of the maximization, and the active constraints.
 
-    - `params`: the wheel;
+    - `params`: the tuned wheel;
     - `status`: reason why the maximization ended;
     - `objective`, `value`, `start_value`: name of the objective, and its value at the tuned gait
       and at the start;
     - `active`: constraints and bounds that are active, each with its price;
-    - `validation`: a walk of ten steps of the wheel;
-    - `cycle`: LimitCycle, or ReturnMapCycle with unilateral contact;
-    - `step`: StepResult, or UnilateralStep;
+    - `validation`: validation by a walk of ten steps of the tuned wheel;
+    - `cycle`: the gait as a LimitCycle, or as a ReturnMapCycle with unilateral contact;
+    - `step`: step of the gait, as a StepResult or a UnilateralStep;
     - `kkt_residual`: residual of the first-order condition, relative to the objective's gradient;
-    - `violated_margins`: violated margins that are not constraints;
+    - `violated_margins`: names of violated margins that are not constraints;
     - `path`: every gait that was evaluated, in order;
-    - `n_evaluations`: number of limit cycles, each with one step;
-    - `n_backtracks`: number of trials that lost the gait or its branch, or whose numbers are not
+    - `n_evaluations`: number of evaluated gaits, each with one walking step;
+    - `n_backtracks`: number of trials without a gait on the branch, or with values that are not
       finite;
     - `seconds`: total time, s;
-    - `compile_seconds`: time of compilation, and of the exploration if there are many starts;
+    - `compile_seconds`: time of compilation, and of the exploration if there are many starts, s;
     - `exploration`: results of many starts before the maximization.
 
     Examples:
@@ -107,7 +107,7 @@ class TuneResult:
         return self.status.meaning
 
     def describe(self) -> dict[str, str]:
-        """Return the printed texts of the result by label."""
+        """Return the printed texts that summarize the result, by label."""
         free_names = self.path.attrs["free"].split()
         parameter_texts = [
             f"{parameter_name} "
