@@ -1,7 +1,7 @@
 """Attractors: walks from many starts, until the motion is periodic or the wheel falls.
 
-Starts may belong to different wheels. Only the walks without a decision after a round continue in
-the next round, so that long transients cost little.
+Starts may belong to different wheels. After each round of steps, only walks that are neither
+periodic nor failed continue, so that long transients cost little.
 """
 
 import functools
@@ -32,15 +32,18 @@ class AttractorOptions:
     """Options of the tests for periodic walks. All distances are between section states."""
 
     n_steps_per_round: int = 10
-    """Number of steps between two tests for periodic motion."""
+    """Number of walking steps between two tests for periodic motion."""
     periodicity_tolerance: float = 1e-7
-    """Largest change of the section states over one period in periodic motion."""
+    """Largest change of a section state from one period to the next for which motion counts as
+    periodic.
+    """
     arrival_distance: float = 1e-3
-    """Largest distance to its orbit at which a walk counts as arrived."""
+    """Largest distance between a walk and its orbit at which the walk has arrived at the orbit."""
     same_orbit_distance: float = 1e-4
-    """Largest distance between two orbits that count as the same.
+    """Largest distance between two orbits that are treated as the same orbit.
 
-    The value is chosen because it is far above the periodicity tolerance."""
+    The value is chosen because it is far above the periodicity tolerance.
+    """
 
 
 DEFAULT_ATTRACTOR_OPTIONS = AttractorOptions()
@@ -53,15 +56,19 @@ class PeriodicWalkEnds(NamedTuple):
     period: np.ndarray  # period of the orbit, in steps; 0 if not periodic
     n_steps_to_orbit: np.ndarray  # number of steps until the orbit, or until the fall
     orbit_states: np.ndarray
-    """Section states of the orbit, (start, max_period, m): the state with the lowest dtheta- first,
-    NaN after the last."""
+    """Section states of the orbit, (start, max_period, m). The state with the lowest dtheta- comes
+    first, and the array is padded with NaN.
+    """
 
 
 @eqx.filter_jit
 def _walk_round_of_block(
     model: AbstractWheel, options: StepOptions, n_steps: int, params: WheelParams, x: Array
 ) -> tuple[Array, Array]:
-    """Return section states and outcomes of one round of steps, shape (starts, steps, ...)."""
+    """Return the section states and outcomes after each step of one round of walking steps.
+
+    The arrays have the shapes (starts, steps, m) and (starts, steps).
+    """
     walk_one_round = lambda params, x: walk(params, x, n_steps, model=model, options=options)
     batch_walks = jax.vmap(walk_one_round)(params, x)
     return batch_walks.steps.section_state, batch_walks.steps.outcome
@@ -70,10 +77,10 @@ def _walk_round_of_block(
 def _walk_round_with_contact(
     model: Any, options: StepOptions, n_steps: int, params: WheelParams, x: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return section states and outcomes of one round of steps with unilateral contact.
+    """Return the section states and outcomes of one round of walking steps with unilateral contact.
 
-    The arrays have the shape (starts, steps, ...). The batch kernel takes the steps, for any number
-    of starts.
+    The arrays have the shapes (starts, steps, m) and (starts, steps). The batch kernel computes the
+    steps for any number of starts.
     """
     n_legs, parameter_rows = params.n_legs, np.asarray(jax.vmap(model.parameter_values)(params)).T
     x = embed_section_states(parameter_rows, np.asarray(x), n_legs)
@@ -100,7 +107,7 @@ def walk_until_periodic(
     max_period: int,
     attractor_options: AttractorOptions = DEFAULT_ATTRACTOR_OPTIONS,
 ) -> PeriodicWalkEnds:
-    """Return the end of the walk from each start.
+    """Simulate the walk from each start until it is periodic or has failed, and return its end.
 
     - `params`: one wheel, or one wheel per start on the leading axis;
     - `start_states`: section states, (starts, m);
@@ -170,8 +177,7 @@ def walk_until_periodic(
 def _detect_walk_periods(
     state_history: np.ndarray, max_period: int, periodicity_tolerance: float
 ) -> np.ndarray:
-    """Return the shortest period of each walk, in steps, that its last two periods confirm,
-    otherwise 0.
+    """Return the shortest period that the last two periods of each walk confirm, in steps, or 0.
 
     - `state_history`: section states, (starts, steps, m).
     """
@@ -187,7 +193,9 @@ def _detect_walk_periods(
 
 
 class DistinctOrbits(NamedTuple):
-    """Distinct orbits that walks from many starts reach, ordered by decreasing number of starts."""
+    """Distinct orbits that walks from many starts reach, in decreasing order of their number of
+    starts.
+    """
 
     orbit_indices: np.ndarray  # index of the orbit of each start; -1 without an orbit
     orbit_states: list[np.ndarray]  # section states of each orbit, (period, m)
@@ -198,7 +206,7 @@ def find_distinct_orbits(
 ) -> DistinctOrbits:
     """Return the distinct orbits that the walks reach.
 
-    Two orbits are compared state by state, beginning with the state of lowest dtheta-.
+    Two orbits are compared state by state, beginning with the state that has the lowest dtheta-.
     """
     orbit_indices = np.full(len(walk_ends.period), -1)
     distinct_orbits: list[np.ndarray] = []
@@ -225,14 +233,17 @@ def find_distinct_orbits(
 def _measure_steps_of_block(
     model: AbstractWheel, options: StepOptions, params: WheelParams, x: Array
 ) -> dict[str, Array]:
-    """Return all measures of one step from each start of a block, by name."""
+    """Return all measures of one step from each start of a batch, by name."""
     return jax.vmap(lambda p, x: model.take_step(p, x, options).measures())(params, x)
 
 
 def measure_orbit_steps(
     params: WheelParams, section_states: np.ndarray, model: AbstractWheel, options: StepOptions
 ) -> dict[str, np.ndarray]:
-    """Return all measures of one step from each of the section states, shape (n, m), by name."""
+    """Return all measures of one step from each section state, by name.
+
+    `section_states` has the shape (n, m).
+    """
     n_states = len(section_states)
     repeated_wheels = jax.tree.map(lambda x: np.broadcast_to(np.asarray(x), n_states), params)
     if model.batch_kernel == "legs":

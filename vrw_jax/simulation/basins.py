@@ -1,4 +1,4 @@
-"""Basins of attraction: the gait or the failure that a walk from each start of a grid reaches."""
+"""Basins of attraction: the gait or the failure in which a walk from each start of a grid ends."""
 
 from __future__ import annotations
 
@@ -42,7 +42,9 @@ from vrw_jax.validation import (
 from vrw_jax.wheel import Outcome, WheelParams, transitions
 
 StartGrid = Mapping[str, float | Sequence[float] | np.ndarray]
-"""Values of each component of a start, by name. A single number is not an axis."""
+"""One or more values of each component of a start, by name. A component with a single number is not
+an axis.
+"""
 
 
 @with_default_jax_settings
@@ -57,7 +59,7 @@ def basin(
     max_steps: int = 200,
     max_period: int = 16,
 ) -> xr.Dataset:
-    """Return the orbit or the failure that a walk from each start of `grid` reaches, as a dataset.
+    """Return the orbit or the failure in which a walk from each start of `grid` ends, as a dataset.
 
     `grid` names all components of a start before touchdown, such as {"theta_touchdown": 0.09,
     "dtheta_touchdown": np.linspace(1.0, 2.5, 60), "dL1_touchdown": np.linspace(-0.5, 0.2, 60)}, or
@@ -66,12 +68,13 @@ def basin(
 
     - `attractor`: index of the orbit that the walk reaches within `max_steps`, or -1;
     - `outcome`: STEPPED, or the code of the failure; BAD_INPUT if no landing leads to the start;
-    - `steps`: number of steps until the walk stays within 1e-3 of the orbit, or until the fall.
+    - `steps`: number of steps until the walk stays within 1e-3 of the orbit, or until it fails.
 
     The orbits are in `orbit_state` over (attractor_index, orbit_step), ordered by decreasing number
     of starts. The dataset has an `orbit_period` in steps, a DLS fraction and, for the paper's
     model, the minimum margins of each orbit. With unilateral contact, section states are full
-    states. "auto" means unilateral contact, which is valid for all starts.
+    states of `UnilateralWheel`. The model "auto" means unilateral contact, which is valid for all
+    starts.
 
     Args:
         params: the wheel.
@@ -170,8 +173,8 @@ def basin(
 def _parse_start_grid(grid: StartGrid) -> dict[str, np.ndarray]:
     """Return the values of each component of a start as an array with one axis.
 
-    Raise a `ValueError` if the grid does not contain all components of one kind, each as a number
-    or as an axis of numbers.
+    Raise a `ValueError` unless the grid contains all components before touchdown or all components
+    after landing. Each component is a number or an array with one axis.
     """
     check_type("grid", grid, Mapping, "write {'theta_touchdown': 0.09, 'dtheta_touchdown': ...}")
     for component_names in (PRE_TOUCHDOWN_COMPONENT_NAMES, POST_LANDING_COMPONENT_NAMES):
@@ -202,10 +205,10 @@ def _parse_start_grid(grid: StartGrid) -> dict[str, np.ndarray]:
 
 
 def invert_landing_map(params: WheelParams, post_landing_states: np.ndarray) -> np.ndarray:
-    """Return section states with dL1- = 0 whose landing leads to (theta+, dtheta+).
+    """Return section states with dL1- = 0 whose landings result in given (theta+, dtheta+).
 
-    A row is NaN if no such section state exists. With dL1- = 0, the angular rates before and after
-    the landing are proportional.
+    The states are NaN where no such section state exists. For dL1- = 0, the angular rates before
+    and after the landing are proportional.
     """
     s = params.symbols()
 
@@ -232,7 +235,7 @@ def _make_orbit_variables(
     model: AbstractWheel,
     options: StepOptions,
 ) -> dict[str, xr.Variable]:
-    """Return the dataset variables of the orbits: states, periods, DLS fractions and minimum
+    """Return the dataset variables for the orbits: states, periods, DLS fractions and minimum
     margins.
     """
     n_orbits = len(orbit_states)
@@ -274,9 +277,9 @@ def _make_orbit_variables(
 
 
 def compute_walk_end_fractions(basins: xr.Dataset) -> dict[str, float]:
-    """Return the fraction of starts for each end of a walk, by name.
+    """Return the fraction of starts for each end of a walk, by the name of the end.
 
-    The names are "attractor 0", ..., "unsettled", and the names of outcomes.
+    The names are "attractor 0", "attractor 1" and so on, "unsettled", and the names of outcomes.
     """
     attractor_indices = basins.attractor.values.ravel()
     outcome_codes = basins.outcome.values.ravel()

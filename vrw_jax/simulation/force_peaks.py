@@ -17,11 +17,14 @@ class ForcePeakOptions:
     """Options of the search for force peaks in a sampled walk."""
 
     spline_degree: int = 7
-    """Degree of the spline through the samples of an interval, chosen because its error with the
-    default number of samples is that of the solver."""
+    """Degree of the spline through the samples of an interval. The value is chosen because the
+    spline's error with the default number of samples is that of the solver.
+    """
     min_extremum_height_fraction: float = 1e-7
-    """Smallest rise and fall beside an extremum, as a fraction of the largest force, chosen because
-    errors of the solver would otherwise be extrema of a constant force."""
+    """Smallest height of an extremum above or below its neighborhood, as a fraction of the largest
+    force. The value is chosen because errors of the solver would otherwise be extrema of a constant
+    force.
+    """
 
 
 FORCE_PEAK_OPTIONS = ForcePeakOptions()
@@ -29,7 +32,7 @@ FORCE_PEAK_OPTIONS = ForcePeakOptions()
 SAMPLED_FORCE_PEAK_MEASURES = tuple(
     name for name in FORCE_PEAK_MEASURES if name != "landing_impulse"
 )
-"""Measures of the normal force between impacts."""
+"""Measures of the peaks of the normal force between impacts."""
 
 
 def force_peaks(walk: xr.Dataset) -> xr.Dataset:
@@ -44,8 +47,8 @@ def force_peaks(walk: xr.Dataset) -> xr.Dataset:
         walk: a trajectory with at least 9 samples per phase.
 
     Returns:
-        A dataset of the force measures over `step_index`. Over `extremum` it has `force`,
-        `force_time`, `force_step` and `is_maximum` of each extremum of the fore foot's force.
+        A dataset of the force measures over `step_index`. Its variables `force`, `force_time`,
+        `force_step` and `is_maximum` over `extremum` describe the extrema of the fore foot's force.
 
     Raises:
         TypeError, ValueError: an invalid argument, described in one sentence.
@@ -127,7 +130,7 @@ def force_peaks(walk: xr.Dataset) -> xr.Dataset:
 
 
 class _ForceExtrema(NamedTuple):
-    """Extrema of a force in one step, in the order of time."""
+    """Extrema of a force in one step, in order of time."""
 
     time: np.ndarray  # s
     force: np.ndarray  # N
@@ -139,7 +142,7 @@ class _ForceExtrema(NamedTuple):
 def _find_force_extrema(
     sample_times: np.ndarray, sampled_forces: np.ndarray, interval_indices: list[np.ndarray]
 ) -> _ForceExtrema:
-    """Return the extrema of a force between the events of one step.
+    """Return the extrema of a force within the intervals between the events of one step.
 
     - `interval_indices`: sample indices of each interval between two events.
     """
@@ -211,8 +214,9 @@ def _find_force_extrema(
 def _summarize_force_extrema(
     fore_extrema: _ForceExtrema, total_extrema: _ForceExtrema
 ) -> dict[str, Any]:
-    """Return the force measures of one step from the extrema of its fore force and of its total
-    force.
+    """Return the force measures of one step, computed from the extrema of two forces.
+
+    These are the normal force on the fore foot and the total normal force.
     """
     trough_depth = 0.0
     for i in np.flatnonzero(~fore_extrema.is_maximum):

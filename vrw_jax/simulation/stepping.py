@@ -1,7 +1,7 @@
 """Single steps, the return map, and walks of many steps.
 
-All functions are pure, take a single wheel, and work with `jit`, `vmap` and every mode of
-differentiation. A model compiles its step once.
+All functions are pure and take a single wheel. They work with `jit`, `vmap` and every mode of
+differentiation. The step of a model is compiled once.
 """
 
 import dataclasses
@@ -40,17 +40,19 @@ from vrw_jax.validation import check_int, check_reals, check_type, format_value
 from vrw_jax.wheel import Outcome, WheelParams
 
 SectionStateLike = Array | np.ndarray | Sequence[float]
-"""Section state as a caller gives it; `validate_arguments` converts it to an array."""
+"""Section state in any form that users may pass; `validate_arguments` converts it to an array."""
 ModelLike = AbstractWheel | Literal["auto"]
-"""Model as a caller gives it; "auto" means `LadderWheel()`, the simplest valid model."""
+"""Model in any form that users may pass. "auto" means `LadderWheel()`, which uses the simplest
+valid model.
+"""
 
 
 @with_default_jax_settings
 def paper_start() -> SectionState:
-    """Return a section state (theta-, dtheta-, dL1-) in the basin of the gait of Table 1.
+    """Return a section state in the basin of attraction of the gait of Table 1 of the paper.
 
     Returns:
-        The section state, shape (3,), in rad, rad/s, m/s.
+        The section state (theta-, dtheta-, dL1-), shape (3,), in rad, rad/s, m/s.
 
     Examples:
         >>> vrw.paper_start().round(4).tolist()
@@ -60,10 +62,10 @@ def paper_start() -> SectionState:
 
 
 def check_model(model: ModelLike | None, allows_arrays: bool = False) -> AbstractWheel:
-    """Return the paper's model for None, a `LadderWheel` for "auto", and otherwise the given model.
+    """Return the given model, the paper's model for None, or a `LadderWheel` for "auto".
 
-    Raise a `TypeError` if the argument is no model. Raise a `ValueError` if its friction is an
-    array although `allows_arrays` is False.
+    Raise a `TypeError` if the argument is not a model. Raise a `ValueError` if the model's friction
+    is an array although `allows_arrays` is False.
     """
     if model is None:
         return _make_default_model()
@@ -89,14 +91,14 @@ _make_default_model = functools.cache(ViscoelasticWheel)
 def check_single_wheel(params: Any, remedy: str) -> None:
     """Raise a `TypeError` or a `ValueError` if `params` is not a single wheel.
 
-    - `remedy`: end of the error message.
+    - `remedy`: advice with which the error message ends.
     """
     check_type("params", params, WheelParams, "write vrw.WheelParams(damping=..., slope=...)")
     WheelParams.require_single_wheel(params, remedy)  # An unbound call is much faster.
 
 
 def check_step_options(options: StepOptions | None) -> StepOptions:
-    """Return the given options of steps, or `StepOptions()` for None.
+    """Return the given step options, or `StepOptions()` for None.
 
     Raise a `TypeError` if the argument has another type.
     """
@@ -112,9 +114,9 @@ def check_step_options(options: StepOptions | None) -> StepOptions:
 
 @functools.cache
 def _make_default_step_options(dtype: np.dtype) -> StepOptions:
-    """Return the default options for a floating type.
+    """Return the default step options for a floating-point type.
 
-    They are made once, and are concrete even inside `jit`.
+    They are concrete even inside `jit`, and are created once per type.
     """
     with jax.ensure_compile_time_eval():
         return StepOptions()
@@ -123,7 +125,10 @@ def _make_default_step_options(dtype: np.dtype) -> StepOptions:
 def check_section_state(
     x: Any, argument_description: str = "the section state", convert_state: Callable = check_reals
 ) -> Any:
-    """Return the section state as an array, made by `convert_state`, or raise an error."""
+    """Return the section state as an array, converted by `convert_state`.
+
+    `convert_state` raises an error if the state is invalid.
+    """
     return convert_state(
         argument_description,
         x,
@@ -139,7 +144,7 @@ def validate_arguments(
     options: StepOptions | None,
     engine: EngineName = "auto",
 ) -> tuple[WheelParams, Array, AbstractWheel, StepOptions]:
-    """Return wheel, section state, model and options, all of one floating type.
+    """Return wheel, section state, model and options, converted to one floating-point type.
 
     Raise a `TypeError` or a `ValueError` if an argument is invalid.
     """
@@ -167,7 +172,7 @@ def validate_arguments(
     StepOptions.check_tolerances(options, common_dtype)
 
     def convert_to_common_dtype(array_tree: Any) -> Any:
-        """Return the tree with all leaves converted to the common floating type."""
+        """Return the tree with all leaves converted to the common floating-point type."""
         if all(leaf.dtype == common_dtype for leaf in jax.tree.leaves(array_tree)):
             return array_tree
         return jax.tree.map(lambda leaf: leaf.astype(common_dtype), array_tree)
@@ -222,11 +227,11 @@ def step(
     options: StepOptions | None = None,
     engine: EngineName = "auto",
 ) -> StepResult | UnilateralStep | LadderStep:
-    """Return one step from touchdown to touchdown, with indicators, margins and energies.
+    """Compute one step from touchdown to touchdown, with its indicators, margins and energies.
 
-    The `outcome` of the step describes how the step ended. A fall raises no error. Errors of the
-    results and their first derivatives are below 1e-9 with the default options, and below 1e-12
-    with `StepOptions.tight()`.
+    The `outcome` of the step describes how the step ended. A fall raises no exception. Numerical
+    errors of the results and of their first derivatives are below 1e-9 with the default options,
+    and below 1e-12 with `StepOptions.tight()`.
 
     Args:
         params: the wheel.
@@ -265,9 +270,10 @@ def return_map(
     options: StepOptions | None = None,
     engine: EngineName = "auto",
 ) -> Array:
-    """Return the section state one step later, or zeros if the step failed.
+    """Return the section state after one step, or zeros if the step failed.
 
-    No margins are computed. The map is differentiable in forward and reverse mode, to any order.
+    The function computes no margins. The map is differentiable in forward and reverse mode, to any
+    order.
 
     Args:
         params: the wheel.
@@ -300,7 +306,7 @@ def return_map(
 
 
 class Walk(AbstractPrintable):
-    """Results of consecutive steps without margins, with a leading axis over steps.
+    """Results of consecutive steps, without margins. Arrays have a leading axis over steps.
 
     - `start`: section state at the start;
     - `steps`: section state, durations and outcome of each step;
@@ -332,7 +338,7 @@ class Walk(AbstractPrintable):
         return describe_step_ending(self.outcome, Outcome)
 
     def summary_rows(self) -> list[LabelAndText]:
-        """Return labels and texts of outcome, number of steps, start, last state and time."""
+        """Return labels and printed texts: outcome, number of steps, start, last state and time."""
         walk_outcome = np.asarray(self.outcome)
         if walk_outcome.ndim:
             return [("walks", format_outcome_counts(walk_outcome, Outcome))]
@@ -355,12 +361,14 @@ def _walk_by_scan(
     n_steps: int,
     stepwise_ground: StepGroundValues | None,
 ) -> Walk:
-    """Return a walk of `n_steps` steps. The steps after a failure repeat its outcome."""
+    """Return a walk of `n_steps` steps. Steps after a failure repeat the outcome of the failed
+    step.
+    """
 
     def advance_one_step(state_and_outcome: tuple, step_ground: StepGroundValues | None) -> tuple:
-        """Return the state and the outcome after one step, and the results of the step.
+        """Return the state and the outcome after one step, and the results of this step.
 
-        After a failure no step is taken.
+        After a failure, the state and the outcome do not change.
         """
         x, outcome = state_and_outcome
         is_unfinished = outcome == Outcome.STEPPED
@@ -397,16 +405,18 @@ def walk(
     options: StepOptions | None = None,
     engine: EngineName = "auto",
 ) -> Walk:
-    """Return a walk of `n_steps` steps. The steps after a failure repeat its outcome.
+    """Simulate a walk of `n_steps` steps. Steps after a failure repeat the outcome of the failed
+    step.
 
-    On uneven ground `params.slope` is an array over steps. The ground then consists of straight
-    lines of these slopes, which join the footholds. In the double support of step k both feet are
-    on line k. The step begins at the foothold where this line ends. The step ends when the next
+    On uneven ground, `params.slope` is an array with one slope per step. The ground then consists
+    of straight lines between the footholds with these slopes. In the double support of step k both
+    feet are on line k. The step begins at the foothold where this line ends. The step ends when the
+    next
     foot meets line k + 1. Therefore n steps use n + 1 slopes; if n slopes are given, the last one
     is used twice. A section state is in the frame of the line that ends at its landing; the start
-    is in the frame of line 0. Forces are along and normal to line k. With unilateral contact the
-    friction of the model may also be an array over steps. Each foot then keeps the friction of the
-    step in which it landed.
+    is in the frame of line 0. Force components are tangential and normal to line k. With unilateral
+    contact, the friction of the model may also be an array with one coefficient per step. The
+    coefficient of each foot is that of the step in which it landed.
 
     Args:
         params: the wheel.
@@ -443,9 +453,9 @@ def walk(
 def split_stepwise_ground(
     params: Any, model: ModelLike | None, n_steps: int
 ) -> tuple[AbstractWheel, Any, StepGroundValues | None]:
-    """Return model and wheel on the ground of the first step, and the ground of each step.
+    """Return the model and the wheel on the ground of the first step, and the ground of each step.
 
-    On flat ground, model and wheel are unchanged and the third result is None.
+    On flat ground, model and wheel do not change and the third result is None.
     """
     checked_model = check_model(model, allows_arrays=True)
     if not isinstance(params, WheelParams):
@@ -464,16 +474,16 @@ def split_stepwise_ground(
 def _get_first_step_ground(
     stepwise_ground: StepGroundValues, ground_dtype: Any
 ) -> StepGroundValues:
-    """Return the ground of the first step, converted to a floating type."""
+    """Return the ground of the first step, converted to the floating-point type `ground_dtype`."""
     return tuple(ground_values[0].astype(ground_dtype) for ground_values in stepwise_ground)
 
 
 def walk_toward_gait(
     model: AbstractWheel, params: WheelParams, options: StepOptions, n_steps: int = 100
 ) -> Walk:
-    """Return a walk toward an attracting gait from the default start of the model.
+    """Simulate a walk from the default start of the model toward an attracting gait.
 
-    - `n_steps`: number of steps, which need not reach the gait, because a search from the last
+    - `n_steps`: number of steps. The walk need not reach the gait, because a search from its last
       state follows.
     """
     return walk(params, model.default_start(params), n_steps, model=model, options=options)
@@ -489,8 +499,8 @@ def choose_model(
 ) -> ModelChoice:
     """Return the simplest model whose margins hold over one step from `start`.
 
-    `start` is the section state (theta-, dtheta-, dL1-) of the paper's model, or the full one of
-    `UnilateralWheel`. The function can be mapped over batches with `jax.vmap`.
+    `start` is the section state (theta-, dtheta-, dL1-) of the paper's model, or the full section
+    state of `UnilateralWheel`. `jax.vmap` can map the function over batches.
 
     Args:
         params: the wheel.

@@ -1,7 +1,8 @@
 """Labeled trajectories of walks: motion, forces, energy and positions, with units and provenance.
 
 The axis x points downhill along the slope, and z is normal to the slope. The origin is the first
-foot. Angles and leg labels refer to the present step, so theta and the lengths jump at a landing.
+foothold. Angles and leg labels refer to the present step, so theta and the lengths jump at a
+landing.
 """
 
 from __future__ import annotations
@@ -67,17 +68,17 @@ def simulate(
     engine: EngineName = "auto",
     n_samples: int = 100,
 ) -> xr.Dataset:
-    """Return a walk from the section state `x` as a labeled trajectory over time.
+    """Simulate a walk from the section state `x` and return it as a labeled trajectory over time.
 
-    Without `x` the walk begins at the default start of the model, near the gait of Table 1. Uneven
-    ground is given as in `vrw.walk`. Positions are then in the frame of line 0. Angles and forces
-    of a step are in the frame of the line under both feet of its double support. The attribute
-    `line_slopes` holds the slopes of the lines.
+    If `x` is None, the walk begins at the default start of the model, near the gait of Table 1 of
+    the paper. Uneven ground is specified as in `vrw.walk`. Positions are then in the frame of the
+    first line of the ground. Angles and forces of a step are in the frame of the line under both
+    feet in double support. The attribute `line_slopes` contains the slopes of all lines.
 
     Each phase has `n_samples` equidistant times, including both ends. A time at which a quantity
     jumps is therefore listed twice, with the values before and after the jump. A failed step ends
     the trajectory at the event, and the attributes `outcome` and `outcome_meaning` give the cause.
-    Errors are those of `vrw.step`.
+    Numerical errors are those of `vrw.step`.
 
     Args:
         params: the wheel.
@@ -90,8 +91,8 @@ def simulate(
         n_samples: number of times per phase, including both ends, at least 2.
 
     Returns:
-        A dataset over `time` of coordinates, rates, feet, forces and energies, with units. With
-        unilateral contact it is also over `leg`.
+        A dataset over `time` with coordinates, rates, foot positions, forces and energies, and
+        their units. With unilateral contact, some variables also have the dimension `leg`.
 
     Raises:
         TypeError, ValueError: if an argument is invalid; the message names the remedy.
@@ -174,7 +175,7 @@ def simulate(
 
 
 class SampledStep(NamedTuple):
-    """Samples of one step, in each interval between two events."""
+    """Samples of one step in each interval between two events."""
 
     sampled_columns: dict[str, np.ndarray]  # (interval, sample, ...), time in s since the landing
     durations: np.ndarray  # duration of each interval, s; 0 if it did not occur
@@ -186,7 +187,9 @@ class SampledStep(NamedTuple):
 
 
 class TrajectorySpecification(NamedTuple):
-    """Sampling function of a model, and the variables of its trajectories."""
+    """Function that samples a step of a model, and names and attributes of the resulting
+    trajectory.
+    """
 
     sample_step: Callable[[Array, int], SampledStep]  # of a section state and a step index
     variable_names: tuple[str, ...]  # names of the measures over time
@@ -206,7 +209,7 @@ class SampledWalk(NamedTuple):
 
 
 HEIGHT_DEPENDENT_ENERGIES = ("gravitational_energy", "total_energy")
-"""Energies that depend on the height of the reference point, which is the first foot of the
+"""Energies that depend on the height of the reference point, which is the first foothold of the
 walk.
 """
 
@@ -231,8 +234,10 @@ class UnevenGroundLines(NamedTuple):
         k: int,
         foothold: np.ndarray,
     ) -> None:
-        """Convert positions (m) and energies (J) of step k in place, from the frame of the step's
-        line to that of line 0.
+        """Convert positions (m) and energies (J) of step k in place to the frame of line 0 of the
+        ground.
+
+        Before the conversion they are in the frame of the step's own line.
 
         - `position_names`: names of the columns that are positions along the slope;
         - `foothold`: position of the first foot of step k in the frame of line 0, m.
@@ -256,7 +261,10 @@ class UnevenGroundLines(NamedTuple):
             )
 
     def rotate_to_line_0(self, k: int, x: Any, z: Any) -> tuple[Any, Any]:
-        """Return a vector in the frame of line 0 from its components in the frame of line k."""
+        """Return the components of a vector in the frame of line 0 of the ground.
+
+        x and z are its components in the frame of line k.
+        """
         line_angle = self.line_slopes[k] - self.line_slopes[0]
         sine, cosine = np.sin(line_angle), np.cos(line_angle)
         return x * cosine + z * sine, z * cosine - x * sine
@@ -269,10 +277,10 @@ def sample_walk_steps(
     downslope_weight: float,
     ground_lines: UnevenGroundLines | None = None,
 ) -> SampledWalk:
-    """Return the samples of a walk from the section state x. The walk ends at the first failure.
+    """Return samples of the walk from the section state x. The walk ends at the first failure.
 
-    Positions along the slope, m, are measured from the first landing. The energies in
-    `HEIGHT_DEPENDENT_ENERGIES` decrease by `downslope_weight`, N, times the traveled distance. On
+    Positions along the slope (m) are measured from the first foothold. The energies in
+    `HEIGHT_DEPENDENT_ENERGIES` decrease by `downslope_weight` (N) times the traveled distance. On
     uneven ground, `UnevenGroundLines.convert_to_walk_frame` converts positions and energies
     instead.
     """
@@ -323,9 +331,9 @@ def sample_walk_steps(
 def _compile_step_sampler(
     model: AbstractWheel, argument_structure: Any, n_samples: int
 ) -> Callable[..., Trajectory]:
-    """Return the compiled function that samples a step.
+    """Return a compiled function that samples a step.
 
-    Its arguments are the section state and the leaves of wheel and options.
+    Its arguments are the section state and the leaves of (params, options).
     """
 
     def sample_paper_step(x: Array, *leaves: Array) -> Trajectory:
@@ -336,10 +344,11 @@ def _compile_step_sampler(
 
 
 def _make_phase_columns(s: Symbols, trajectory: Trajectory) -> dict[str, np.ndarray]:
-    """Return the columns of a step by the names of `TRAJECTORY_MEASURES`, shape (phase, sample).
+    """Return the samples of each trajectory variable in a step, by name, shape (phase, sample).
 
-    Positions are relative to the foot of Leg 1. The additional columns `landing_foot_x` and
-    `landing_foot_z` contain the position of the foot of the leg that lands next, m.
+    The names are those of `TRAJECTORY_MEASURES`. Positions are relative to the foot of Leg 1. The
+    additional entries `landing_foot_x` and `landing_foot_z` contain the position of the foot that
+    lands next, m.
     """
     theta, L1, L2, dtheta, dL1, dL2 = np.moveaxis(np.asarray(trajectory.state), -1, 0)
     kinetic_energy, gravitational_energy, elastic_energy = np.moveaxis(
@@ -384,13 +393,13 @@ def _make_phase_columns(s: Symbols, trajectory: Trajectory) -> dict[str, np.ndar
 
 
 StepwiseModelsAndWheels = list[tuple[Any, WheelParams]]
-"""Model and wheel of each step, or one pair for all steps."""
+"""Model and wheel for each step, or one pair for all steps."""
 
 
 def specify_phase_trajectory(
     models_and_wheels: StepwiseModelsAndWheels, options: StepOptions, n_samples: int
 ) -> TrajectorySpecification:
-    """Return the trajectory specification of a model whose steps have the paper's phases."""
+    """Return the trajectory specification for a model whose steps have the paper's phases."""
 
     def prepare_step_sampler(model: AbstractWheel, params: WheelParams) -> tuple:
         argument_leaves, argument_structure = jax.tree.flatten((params, options))
@@ -443,7 +452,7 @@ def specify_phase_trajectory(
 
 
 PHASE_SLOPE_POSITION_NAMES = ("x", "foot_1_x", "foot_2_x", "hub_x")
-"""Names of the columns that are positions along the slope."""
+"""Names of the variables that are positions along the slope."""
 
 
 CONTACT_MOTION_NAMES = ("time", "step", "hub_x", "hub_z", "theta", "dtheta")
@@ -454,14 +463,16 @@ CONTACT_ENERGY_NAMES = ("kinetic_energy", "gravitational_energy", "elastic_energ
 def _compute_contact_columns(
     model: Any, params: WheelParams, x: Array, options: StepOptions, n_samples: int
 ) -> tuple[UnilateralTrajectory, dict[str, Array]]:
-    """Return the trajectory of a step with unilateral contact, and its columns.
+    """Return the trajectory of a step with unilateral contact, and the samples of each variable.
 
-    The columns have the shape (phase, sample[, leg]).
+    The samples have the shape (phase, sample) or (phase, sample, leg).
     """
     s, trajectory = params.symbols(), model.sample_step(params, x, options, n_samples)
 
     def compute_state_quantities(y: PackedState) -> dict[str, Array]:
-        """Return positions (m), rates and energies (J) of one state by column name."""
+        """Return positions (m), rates and energies (J) for one state, by the name of the
+        variable.
+        """
         wheel_motion, _ = unpack_state(y)
         leg_directions_of_state = compute_leg_directions(s, wheel_motion.theta)
         gravitational_energy, elastic_energy = compute_potential_energy(s, wheel_motion)
@@ -489,10 +500,11 @@ def _compute_contact_columns(
 def specify_contact_trajectory(
     models_and_wheels: StepwiseModelsAndWheels, options: StepOptions, n_samples: int
 ) -> TrajectorySpecification:
-    """Return the trajectory specification of a model with unilateral contact, over time and leg.
+    """Return the trajectory specification for a model with unilateral contact.
 
-    Legs have the labels of their step. Each interval between two events has `n_samples` times,
-    including both ends. For a `LadderWheel`, the variables `rung` and `reason` contain the codes of
+    Its variables are over time and leg. Leg labels are those of the current step. Each interval
+    between two events has `n_samples` times, including both ends. For a `LadderWheel`, the
+    variables `rung` and `reason` contain the codes of
     the model and of the reason at each time (see `ModelChoice`).
     """
 
