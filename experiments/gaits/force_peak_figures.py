@@ -108,7 +108,8 @@ def draw_stances(axis: Axes) -> None:
         axis.plot(read_column(rows, "time_to_period"), read_column(rows, "force_to_weight"),
                   color=color, label=labels.get(walker, walker))  # fmt: skip
     axis.axvline(1.0, color=plots.DARK_GRAY_COLOR, linewidth=0.7, linestyle=":")
-    axis.text(1.01, 0.93, "next touchdown", fontsize=8, transform=axis.get_xaxis_transform())
+    axis.text(0.99, 0.93, "next touchdown", fontsize=8, ha="right",
+              transform=axis.get_xaxis_transform())  # fmt: skip
     axis.set_xlabel("time since the landing of the foot [durations of a step]")
     axis.set_ylabel("force on the foot / weight")
     axis.set_ylim(0.0, 1.6)
@@ -149,7 +150,12 @@ def draw_dampings(axis: Axes) -> None:
     axis.set_title(f"slope {MAP_SLOPE:g} rad")
     axis.set_xlim(left=0.0)
     format_stiffness_axis(axis)
-    axis.legend(loc="upper center", bbox_to_anchor=(0.5, -0.28), ncols=2, fontsize=7)
+    color_handles = [
+        Patch(color=plots.LIGHT_GRAY_COLOR, label="no gait found"),
+        *(Patch(color=PEAK_COLORS[n], label=PEAK_LABELS[n]) for n in range(3)),
+    ]
+    axis.legend(handles=[*color_handles, *axis.get_legend_handles_labels()[0]],
+                loc="upper center", bbox_to_anchor=(0.5, -0.24), ncols=2, fontsize=7)  # fmt: skip
 
 
 def format_stiffness_axis(axis: Axes) -> None:
