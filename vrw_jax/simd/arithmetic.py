@@ -1,8 +1,8 @@
-"""Rules that emit LLVM instructions for elementwise JAX primitives: the table `ELEMENTWISE_RULES`.
+"""Rules that emit LLVM instructions for elementwise JAX primitives, in the table
+`ELEMENTWISE_RULES`.
 
-The arguments of a rule are the value emitter, the primitive's parameters, the dtypes of its first
-operand and of its result, and the LLVM values of its operands. The rule returns the LLVM value of
-the result.
+A rule takes the value emitter, the primitive's parameters, the dtypes of the first operand and of
+the result, and the LLVM values of the operands. It returns the LLVM value of the result.
 """
 
 from collections.abc import Callable, Sequence
@@ -14,11 +14,16 @@ from vrw_jax.simd.llvm_library import ir
 from vrw_jax.simd.value_emitter import I32, LLVM_NUMBER_TYPES, LlvmValue, ValueEmitter
 
 FUSED_MULTIPLY_ADD_FLAGS = ("contract",)
-"""LLVM's fast-math flags that allow a product and a sum to be rounded once instead of twice. These
-flags allow no other reordering."""
+"""LLVM's fast-math flag that lets the processor round a product and a following sum once instead of
+twice.
+
+The flag allows no reordering of operations.
+"""
 RECIPROCAL_DIVISION_FLAGS = (*FUSED_MULTIPLY_ADD_FLAGS, "arcp")
-"""LLVM's fast-math flags that allow the inverse of a repeated divisor to be computed once. The
-flags are used only in float64, because processors approximate the inverse in float32."""
+"""LLVM's fast-math flags that let the inverse of a repeated divisor be computed once.
+
+The flags apply only to float64, because processors approximate the inverse in float32.
+"""
 
 ElementwiseRule = Callable[..., LlvmValue]
 
@@ -31,10 +36,10 @@ def emit_llvm_elementwise(
     result_dtype: Any,
     operands: Sequence[LlvmValue],
 ) -> LlvmValue:
-    """Emit the JAX primitive `primitive_name` for operands of type `operand_dtype`, and return its
-    value of type `result_dtype`.
+    """Emit the JAX primitive `primitive_name` for LLVM operands of type `operand_dtype`.
 
-    A repeated call with equal operands returns the first value and emits no instructions.
+    Return the LLVM value of the result, which has the type `result_dtype`. A repeated call with
+    equal operands returns the first value and emits no instructions.
     """
     instruction_key = (
         primitive_name,
@@ -62,7 +67,7 @@ def _emit_llvm_sum(
     x: LlvmValue,
     y: LlvmValue,
 ) -> LlvmValue:
-    """Emit the sum x + y and return its value; an operand known to be zero needs no instruction."""
+    """Emit the sum x + y and return its LLVM value. A constant operand 0 needs no instruction."""
     if _equals_llvm_constant(y, 0):
         return x
     return (
@@ -80,8 +85,9 @@ def _emit_llvm_difference(
     x: LlvmValue,
     y: LlvmValue,
 ) -> LlvmValue:
-    """Emit the difference x - y and return its value; an operand y known to be zero needs no
-    instruction."""
+    """Emit the difference x - y and return its LLVM value. A constant operand y = 0 needs no
+    instruction.
+    """
     return (
         x
         if _equals_llvm_constant(y, 0)
@@ -97,8 +103,9 @@ def _emit_llvm_product(
     x: LlvmValue,
     y: LlvmValue,
 ) -> LlvmValue:
-    """Emit the product x * y and return its value; a factor known to be zero or one needs no
-    instruction."""
+    """Emit the product x * y and return its LLVM value. A constant factor 0 or 1 needs no
+    instruction.
+    """
     if _equals_llvm_constant(y, 1) or _equals_llvm_constant(x, 0):
         return x
     return (
@@ -116,7 +123,7 @@ def _emit_llvm_quotient(
     x: LlvmValue,
     y: LlvmValue,
 ) -> LlvmValue:
-    """Emit the quotient x / y of two floats and return its value."""
+    """Emit the quotient x / y of two floats and return its LLVM value."""
     # An integer division by zero would stop the process.
     _require_float_dtype("div", operand_dtype)
     if _equals_llvm_constant(y, 1):
@@ -139,7 +146,7 @@ def _emit_llvm_integer_power(
     x: LlvmValue,
 ) -> LlvmValue:
     """Emit the power of `x` with a constant integer exponent by repeated squaring, and return its
-    value.
+    LLVM value.
     """
     emit_product = lambda x, y: _emit_binary_instruction(
         value_emitter, operand_dtype, ("fmul", "mul"), x, y
@@ -174,7 +181,7 @@ def _emit_llvm_negation(
     result_dtype: Any,
     x: LlvmValue,
 ) -> LlvmValue:
-    """Emit -x and return its value."""
+    """Emit the negation -x and return its LLVM value."""
     return (
         value_emitter.builder.fneg(x) if operand_dtype.kind == "f" else value_emitter.builder.neg(x)
     )
@@ -187,7 +194,7 @@ def _emit_llvm_absolute_value(
     result_dtype: Any,
     x: LlvmValue,
 ) -> LlvmValue:
-    """Emit the absolute value of `x` and return it."""
+    """Emit the absolute value of `x` and return its LLVM value."""
     if operand_dtype.kind == "f":
         return _emit_llvm_intrinsic_call(value_emitter, "fabs", x)
     is_negative_value = _emit_llvm_comparison(
@@ -208,8 +215,11 @@ def _return_operand(
 
 
 def _make_bitwise_rule(builder_method_name: str) -> ElementwiseRule:
-    """Return the rule that emits a bitwise instruction with the method `builder_method_name` of
-    llvmlite's builder."""
+    """Return an elementwise rule that emits a bitwise instruction.
+
+    - `builder_method_name`: name of the method of llvmlite's `IRBuilder` that emits the
+      instruction.
+    """
 
     def emit_llvm_bitwise(
         value_emitter: ValueEmitter,
@@ -227,7 +237,7 @@ def _make_bitwise_rule(builder_method_name: str) -> ElementwiseRule:
 
 
 def _make_comparison_rule(comparison_operator: str) -> ElementwiseRule:
-    """Return the rule that emits the comparison of two numbers by an operator such as "<"."""
+    """Return an elementwise rule that compares two numbers by an operator such as "<"."""
 
     def emit_llvm_comparison(
         value_emitter: ValueEmitter,
@@ -248,7 +258,7 @@ def _make_comparison_rule(comparison_operator: str) -> ElementwiseRule:
 
 
 def _make_extremum_rule(comparison_operator: str) -> ElementwiseRule:
-    """Return the rule that emits the maximum (operator ">") or the minimum ("<") of two
+    """Return an elementwise rule that emits the maximum (operator ">") or the minimum ("<") of two
     operands.
     """
 
@@ -281,8 +291,11 @@ def _emit_llvm_select(
     result_dtype: Any,
     *condition_and_cases: LlvmValue,
 ) -> LlvmValue:
-    """Emit the selection, for each lane, of one of two values by a condition, and return the
-    selected value."""
+    """Emit the selection of the first case where the condition is false, and of the second where it
+    is true.
+
+    Return the LLVM value that contains the selected case of each lane.
+    """
     lane_condition, *case_values = condition_and_cases
     if (
         all(_equals_llvm_constant(case_value, 0) for case_value in case_values)
@@ -302,7 +315,7 @@ def _emit_llvm_finiteness_test(
     result_dtype: Any,
     x: LlvmValue,
 ) -> LlvmValue:
-    """Emit the test whether the float `x` is finite, and return its truth value."""
+    """Emit the test whether the float `x` is finite, and return its LLVM truth value."""
     absolute_value = _emit_llvm_intrinsic_call(value_emitter, "fabs", x)
     return value_emitter.builder.fcmp_ordered(
         "<", absolute_value, value_emitter.make_llvm_constant(absolute_value.type, np.inf)
@@ -313,8 +326,10 @@ def _make_intrinsic_rule(
     intrinsic_function_name: str,
     emit_float32_value: Callable[[ValueEmitter, LlvmValue], LlvmValue] | None = None,
 ) -> ElementwiseRule:
-    """Return the rule that calls an LLVM intrinsic function. If `emit_float32_value` is given, that
-    function emits the float32 instructions instead."""
+    """Return an elementwise rule that emits a call of an LLVM intrinsic function, such as "sqrt".
+
+    For float32 operands, `emit_float32_value` emits the instructions instead, if it is given.
+    """
 
     def emit_llvm_intrinsic(
         value_emitter: ValueEmitter,
@@ -348,8 +363,11 @@ def _emit_binary_instruction(
     x: LlvmValue,
     y: LlvmValue,
 ) -> LlvmValue:
-    """Emit the first of two instructions if `operand_dtype` is a float type, else the second, and
-    return the value."""
+    """Emit an instruction with two operands and return its LLVM value.
+
+    The opcode is the first of `float_and_integer_opcodes` if `operand_dtype` is a float type, else
+    the second.
+    """
     x, y = value_emitter.to_scalars_or_vectors(x, y)
     return value_emitter.emit_binary_instruction(
         f"{float_and_integer_opcodes[0]} {' '.join(FUSED_MULTIPLY_ADD_FLAGS)}"
@@ -367,7 +385,10 @@ def _emit_llvm_comparison(
     x: LlvmValue,
     y: LlvmValue,
 ) -> LlvmValue:
-    """Emit the comparison of two numbers of type `operand_dtype`, and return its truth value."""
+    """Emit the comparison of two numbers of type `operand_dtype`, and return the LLVM truth value.
+
+    `comparison_operator` is an operator such as "<".
+    """
     if operand_dtype.kind == "b":  # The signed value of true would be -1.
         return value_emitter.builder.icmp_unsigned(comparison_operator, x, y)
     if operand_dtype.kind != "f":
@@ -383,8 +404,8 @@ def _emit_llvm_comparison(
 def convert_llvm_value(
     value_emitter: ValueEmitter, llvm_value: LlvmValue, operand_dtype: Any, result_dtype: Any
 ) -> LlvmValue:
-    """Emit the conversion of a value from `operand_dtype` to `result_dtype`, and return the new
-    value.
+    """Emit the conversion of an LLVM value from `operand_dtype` to `result_dtype`, and return the
+    converted value.
     """
     builder, result_llvm_type = value_emitter.builder, LLVM_NUMBER_TYPES[result_dtype.name]
     result_llvm_type = (
@@ -422,8 +443,10 @@ def convert_llvm_value(
 def _emit_llvm_intrinsic_call(
     value_emitter: ValueEmitter, intrinsic_function_name: str, operand: LlvmValue
 ) -> LlvmValue:
-    """Emit a call of an LLVM intrinsic function, such as "sqrt", for the type of the operand, and
-    return the result of the call."""
+    """Emit a call of an LLVM intrinsic function, such as "sqrt", and return its LLVM value.
+
+    The called variant of the function is the one for the operand's type.
+    """
     llvm_type = operand.type
     is_vector = isinstance(llvm_type, ir.VectorType)
     llvm_element_type = llvm_type.element if is_vector else llvm_type
@@ -440,8 +463,9 @@ def _emit_llvm_intrinsic_call(
 def _emit_llvm_polynomial(
     value_emitter: ValueEmitter, x: LlvmValue, polynomial_coefficients: Sequence[float]
 ) -> LlvmValue:
-    """Emit a polynomial in `x` by Horner's scheme and return its value; the coefficients begin with
-    the lowest power."""
+    """Emit a polynomial in `x` by Horner's scheme and return its LLVM value. The coefficients begin
+    with the lowest power.
+    """
     builder, horner_sum = (
         value_emitter.builder,
         value_emitter.make_llvm_constant(x.type, polynomial_coefficients[-1]),
@@ -457,10 +481,10 @@ def _emit_llvm_polynomial(
 
 
 def _emit_float32_logarithm(value_emitter: ValueEmitter, operand: LlvmValue) -> LlvmValue:
-    """Emit the natural logarithm of positive normal float32 numbers, accurate to 1e-5, and return
-    its value.
+    """Emit the natural logarithm of a positive normal float32 number, accurate to 1e-5, and return
+    its LLVM value.
 
-    LLVM's logarithm would call the C library once per lane.
+    LLVM's own logarithm would call the C library once per lane.
     """
     builder, llvm_type = value_emitter.builder, operand.type
     llvm_integer_type = (
@@ -487,8 +511,10 @@ def _emit_float32_logarithm(value_emitter: ValueEmitter, operand: LlvmValue) -> 
 
 
 def _emit_float32_exponential(value_emitter: ValueEmitter, operand: LlvmValue) -> LlvmValue:
-    """Emit the exponential of float32 numbers between -87 and 88, and return its value, accurate to
-    a relative error of 1e-6."""
+    """Emit the exponential of a float32 number between -87 and 88, and return its LLVM value.
+
+    The relative error is at most 1e-6.
+    """
     builder, llvm_type = value_emitter.builder, operand.type
     llvm_integer_type = (
         ir.VectorType(I32, llvm_type.count) if isinstance(llvm_type, ir.VectorType) else I32
@@ -520,7 +546,7 @@ def _equals_llvm_constant(llvm_value: LlvmValue, expected_number: int) -> bool:
 
 
 def _has_equal_constant_entries(constant_content: Any, expected_number: int) -> bool:
-    """Return whether all entries of an LLVM constant, nested to any depth, equal a number."""
+    """Return whether all entries of a constant, nested to any depth, equal `expected_number`."""
     if isinstance(constant_content, (list, tuple)):
         return all(
             _has_equal_constant_entries(constant_entry.constant, expected_number)
@@ -532,8 +558,10 @@ def _has_equal_constant_entries(constant_content: Any, expected_number: int) -> 
 def _fit_polynomial(
     fitted_function: Callable[[np.ndarray], np.ndarray], polynomial_degree: int
 ) -> list[float]:
-    """Return the coefficients, lowest power first, of a polynomial fitted to `fitted_function` at
-    Chebyshev's points on [0, 1].
+    """Return the coefficients, lowest power first, of a polynomial that interpolates
+    `fitted_function`.
+
+    The interpolation points are Chebyshev's points on [0, 1].
     """
     x = 0.5 - 0.5 * np.cos(
         np.pi * (np.arange(polynomial_degree + 1) + 0.5) / (polynomial_degree + 1)

@@ -1,11 +1,11 @@
 """Emission of array operations: small arrays have entries in registers, and lazy arrays compute
 entries on access.
 
-A lane is one element of the batch. An array of the trace whose last axis is that of the lanes
-becomes an array of LLVM vectors without that axis. Any other array becomes one of scalars.
+A lane is one element of the batch. An array of the trace whose last axis is the lane axis becomes
+an array of LLVM vectors without that axis. Any other array becomes an array of LLVM scalars.
 
-Small arrays are divided into entries, which live in registers, so moving axes, slicing and stacking
-cost nothing. Large arrays are lazy: each entry is computed or loaded on access, in a loop over the
+Small arrays are divided into entries in registers, so moving axes, slicing and stacking cost
+nothing. Large arrays are lazy: each entry is computed or loaded on access, in a loop over the
 index. A lazy array is stored in memory only if a loop carries it, if a long sum ends, or at an
 `optimization_barrier` of the trace. The code therefore stays short and compiles fast. No operation
 may combine lanes, except the test whether any or all lanes continue.
@@ -43,24 +43,23 @@ class RegisterLimits:
     """
 
     max_unrolled_entries: int = 8
-    """Largest number of entries of a lazy array that are computed individually."""
+    """Largest number of entries of a lazy array for which each entry has its own instructions."""
     max_unrolled_reduction_terms: int = 8
-    """Largest number of terms of a sum or a reduction that are emitted one after the other, without
-    a loop.
-    """
+    """Largest number of terms of a sum or another reduction for which no loop is emitted."""
     max_register_entries: int = 32
-    """Largest number of entries of an array that a loop carries in registers, and of a constant
-    without a table in memory.
+    """Largest number of entries of an array that a loop carries in registers.
+
+    The limit also applies to constants; a larger constant is a table in memory.
     """
     max_innermost_register_entries: int = 64
-    """Largest number of entries that an innermost loop carries in registers."""
+    """Largest number of entries of an array that an innermost loop carries in registers."""
 
 
 DEFAULT_REGISTER_LIMITS = RegisterLimits()
 
 
 class PrimitiveCall(NamedTuple):
-    """Equation of a trace with one result.
+    """Equation with one result in a jaxpr.
 
     The fields are the primitive, its parameters, and the shapes and types of operands and result.
     """
@@ -72,8 +71,9 @@ class PrimitiveCall(NamedTuple):
 
 
 class ArrayEmitter:
-    """Emitter of array operations, which adds LLVM instructions to the function of its value
-    emitter.
+    """Emitter of array operations.
+
+    It adds LLVM instructions to the function of its value emitter.
     """
 
     def __init__(
@@ -92,8 +92,9 @@ class ArrayEmitter:
         self.is_in_innermost_loop = is_in_innermost_loop
 
     def get_entry_type(self, aval: Any) -> ir.Type:
-        """Return the LLVM type of the entries of an array: a vector if the array has lanes, else a
-        scalar.
+        """Return the LLVM type of an entry of an array with the abstract value `aval`.
+
+        The type is a vector if the array has a lane axis, else a scalar.
         """
         return (
             self.value_emitter.make_vector_type(get_llvm_number_type(aval))
@@ -102,7 +103,7 @@ class ArrayEmitter:
         )
 
     def emit_constant_array(self, constant_array: np.ndarray, aval: Any) -> LlvmArray:
-        """Return an array of LLVM constants with the entries of `constant_array`."""
+        """Return an array of LLVM constants that equal the entries of `constant_array`."""
         if LANE_AXIS_SENTINEL in aval.shape:
             raise make_lane_axis_error("A constant", aval)
         llvm_entry_type = get_llvm_number_type(aval)
@@ -120,7 +121,7 @@ class ArrayEmitter:
         return constant_entries if fits_registers else self.make_memory_table(constant_entries)
 
     def get_array_entries(self, array: LlvmArray) -> np.ndarray:
-        """Return all entries of an array as an array of LLVM values, in its shape."""
+        """Return a NumPy array of the LLVM values of all entries, in the shape of `array`."""
         if isinstance(array, np.ndarray):
             return array
         return make_entry_array(
@@ -128,8 +129,10 @@ class ArrayEmitter:
         )
 
     def get_array_entry(self, array: LlvmArray, entry_index: EntryIndex) -> LlvmValue:
-        """Return the LLVM value of the entry at an index. The instructions are emitted once for
-        each index."""
+        """Return the LLVM value of the entry at `entry_index`.
+
+        Its instructions are emitted only on the first call for the index.
+        """
         self.objects_kept_alive.append(array)
         if isinstance(array, LazyArray):
             entry_key = (
@@ -159,8 +162,9 @@ class ArrayEmitter:
     def flatten_array_entries(
         self, arrays: Sequence[LlvmArray], avals: Sequence[Any]
     ) -> list[LlvmValue]:
-        """Return the entries of all arrays in one list. Entries of an array with lanes are
-        vectors.
+        """Return a list of the LLVM values of all entries of all arrays.
+
+        Entries of an array with a lane axis are vectors.
         """
         flat_entries: list[LlvmValue] = []
         for array, aval in zip(arrays, avals, strict=True):
@@ -174,8 +178,11 @@ class ArrayEmitter:
         return flat_entries
 
     def emit_memory_offset(self, entry_index: EntryIndex, array_shape: Sequence[int]) -> LlvmValue:
-        """Emit the offset of an entry from the start of an array in memory, counted in entries, and
-        return it. The last axis varies fastest."""
+        """Emit the offset of an entry from the start of an array in memory, and return the LLVM
+        value of the offset.
+
+        The unit is one entry. The last axis varies fastest.
+        """
         axis_stride, constant_offset = math.prod(array_shape), 0
         memory_offset: LlvmValue = None
         for i, axis_length in zip(entry_index, array_shape, strict=True):
@@ -205,9 +212,10 @@ class ArrayEmitter:
         emit_body: Callable[[EntryIndex, list[LlvmValue]], Sequence[LlvmValue]],
         loop_carry: Sequence[LlvmValue] = (),
     ) -> list[LlvmValue]:
-        """Emit nested loops over all indices of `index_shape`, and return the last `loop_carry`.
+        """Emit nested loops over all indices of an array of shape `index_shape`.
 
-        Each iteration is `loop_carry = emit_body(index, loop_carry)`.
+        Each iteration computes `loop_carry = emit_body(index, loop_carry)`. Return the loop carry
+        after the last iteration.
         """
 
         def emit_nested_index_loops(
@@ -232,8 +240,9 @@ class ArrayEmitter:
         emit_body: Callable[[LlvmValue, list[LlvmValue]], Sequence[LlvmValue]],
         initial_loop_carry: Sequence[LlvmValue],
     ) -> list[LlvmValue]:
-        """Emit a loop of `n_iterations` iterations `carry = emit_body(i, carry)`, and return
-        the last `carry`.
+        """Emit a loop of `n_iterations` iterations, and return the loop carry after the last one.
+
+        Iteration i computes `carry = emit_body(i, carry)`.
         """
         return self.emit_range_loop(
             ir.Constant(I64, 0), ir.Constant(I64, n_iterations), emit_body, initial_loop_carry
@@ -246,8 +255,10 @@ class ArrayEmitter:
         emit_body: Callable[[LlvmValue, list[LlvmValue]], Sequence[LlvmValue]],
         initial_loop_carry: Sequence[LlvmValue] = (),
     ) -> list[LlvmValue]:
-        """Emit a loop over `range(first_iteration, end_iteration)` of `carry = emit_body(i,
-        carry)`, and return the last `carry`.
+        """Emit a loop over `range(first_iteration, end_iteration)`, and return the loop carry after
+        its end.
+
+        Iteration i computes `carry = emit_body(i, carry)`.
         """
 
         def emit_range_body(loop_values: list[LlvmValue]) -> list[LlvmValue]:
@@ -262,8 +273,10 @@ class ArrayEmitter:
         )[1:]
 
     def allocate_memory_array(self, array_shape: Sequence[int], entry_type: ir.Type) -> MemoryArray:
-        """Return an uninitialized array of this shape in memory, which is allocated once, at the
-        start of the function."""
+        """Return a new uninitialized array of shape `array_shape` in memory.
+
+        The memory is allocated once, at the start of the LLVM function.
+        """
         with self.builder.goto_entry_block():
             base_pointer = self.builder.alloca(
                 entry_type, ir.Constant(I64, max(1, math.prod(array_shape)))
@@ -292,8 +305,10 @@ class ArrayEmitter:
         self.emit_index_loops(memory_array.shape, store_entry)
 
     def store_in_memory(self, array: LlvmArray) -> MemoryArray:
-        """Return the array with all entries computed and stored in memory, where an LLVM value can
-        serve as an index."""
+        """Return the array with all entries computed and stored in memory.
+
+        In memory, an LLVM value can serve as an index.
+        """
         if isinstance(array, MemoryArray):
             return array
         if isinstance(array, LazyArray):
@@ -313,8 +328,10 @@ class ArrayEmitter:
         return memory_array
 
     def make_memory_table(self, array: np.ndarray) -> MemoryArray:
-        """Return the array in memory, where an LLVM value can serve as an index. Constants are
-        stored in the program."""
+        """Return the array stored in memory, where an LLVM value can serve as an index.
+
+        An array of constants becomes part of the program.
+        """
         if not all(isinstance(x, ir.Constant) for x in array.ravel()):
             return self.store_in_memory(array)
         llvm_element_type = array.ravel()[0].type
@@ -330,7 +347,7 @@ class ArrayEmitter:
     def emit_elementwise_array(
         self, primitive_call: PrimitiveCall, operand_arrays: Sequence[LlvmArray]
     ) -> LlvmArray:
-        """Emit an elementwise primitive for arrays of values, and return the array of its
+        """Emit an elementwise primitive for each entry of the operands, and return the array of the
         results.
         """
         primitive_name, primitive_params, operand_avals, result_aval = primitive_call
@@ -394,14 +411,16 @@ class ArrayEmitter:
     def reshape_if_needed(
         self, array: LlvmArray, new_shape: tuple[int, ...], needs_reshape: bool
     ) -> LlvmArray:
-        """Return the array, reshaped to `new_shape` if `needs_reshape` is true."""
+        """Return the array, reshaped to `new_shape` if `needs_reshape` is True."""
         return self.reshape_array(array, new_shape) if needs_reshape else array
 
     def broadcast_array(
         self, array: LlvmArray, broadcast_shape: tuple[int, ...], axis_positions: Sequence[int]
     ) -> LlvmArray:
-        """Return the array broadcast to `broadcast_shape`; `axis_positions` are the positions of
-        the array's axes in that shape."""
+        """Return the array broadcast to `broadcast_shape`.
+
+        - `axis_positions`: for each axis of the array, its position in `broadcast_shape`.
+        """
         axis_lengths = array.shape
         if axis_lengths == broadcast_shape and tuple(axis_positions) == tuple(
             range(len(broadcast_shape))
@@ -475,14 +494,16 @@ class ArrayEmitter:
         return LazyArray(new_shape, array.entry_type, get_reshaped_entry)
 
     def emit_affine_index(self, i: Any, index_start: int, index_step: int = 1) -> Any:
-        """Emit the index index_start + index_step * i and return it."""
+        """Emit the index index_start + index_step * i, and return its LLVM value, or an integer if
+        `i` is one.
+        """
         if isinstance(i, int):
             return index_start + index_step * i
         i = i if index_step == 1 else self.builder.mul(i, ir.Constant(I64, index_step))
         return i if index_start == 0 else self.builder.add(i, ir.Constant(I64, index_start))
 
     def emit_clamped_index(self, i: LlvmValue, last_index: int) -> LlvmValue:
-        """Emit the index from 0 to `last_index` that is nearest to `i`, and return it."""
+        """Emit the index from 0 to `last_index` that is nearest to `i`, and return its value."""
         builder, llvm_zero, llvm_last_index = (
             self.builder,
             ir.Constant(I64, 0),
@@ -492,7 +513,7 @@ class ArrayEmitter:
         return builder.select(builder.icmp_signed(">", i, llvm_last_index), llvm_last_index, i)
 
     def emit_index_sum(self, entry_index: EntryIndex, offset_index: EntryIndex) -> EntryIndex:
-        """Emit the sum of two indices, axis by axis, and return it."""
+        """Emit the sum of two array indices for each axis, and return the resulting array index."""
 
         def add_axis_indices(i: Any, j: Any) -> Any:
             if isinstance(j, int):
@@ -502,9 +523,9 @@ class ArrayEmitter:
         return tuple(add_axis_indices(i, j) for i, j in zip(entry_index, offset_index, strict=True))
 
     def make_llvm_zero(self, entry_type: ir.Type) -> LlvmValue:
-        """Return the LLVM value zero from which a sum starts.
+        """Return the LLVM value 0 from which a sum starts.
 
-        Unlike a known constant zero, this zero is not omitted from the sum.
+        Unlike other constants 0, this start value is not omitted from the sum.
         """
         llvm_element_type = (
             entry_type.element if isinstance(entry_type, ir.VectorType) else entry_type
@@ -521,7 +542,7 @@ _LLVM_FLOAT_TYPES = (ir.FloatType, ir.DoubleType)
 
 
 def has_lanes(aval: Any) -> bool:
-    """Return whether the last axis of an array of the trace is that of the lanes."""
+    """Return whether the last axis of an array of the trace is the lane axis."""
     return bool(aval.shape) and aval.shape[-1] == LANE_AXIS_SENTINEL
 
 
@@ -531,8 +552,10 @@ def get_shape_without_lanes(aval: Any) -> tuple[int, ...]:
 
 
 def make_lane_axis_error(array_description: str, aval: Any) -> NotImplementedError:
-    """Return the error for an axis that has the length of the lane axis but is not the last
+    """Return the error for an axis that has the length of the lane axis without being the last
     axis.
+
+    - `array_description`: subject of the message, such as "An argument".
     """
     return NotImplementedError(
         f"{array_description} has the shape {aval.str_short()}: an axis of {LANE_AXIS_SENTINEL} is "
@@ -542,9 +565,7 @@ def make_lane_axis_error(array_description: str, aval: Any) -> NotImplementedErr
 
 
 def make_lane_mixing_error(primitive_name: str) -> NotImplementedError:
-    """Return the error for a primitive that would combine lanes or move the lane
-    axis.
-    """
+    """Return the error for a primitive that would combine lanes or move the lane axis."""
     return NotImplementedError(
         f"{primitive_name} moves, joins or selects lanes: do the same to each lane; only `any` and "
         "`all` may combine them."
@@ -552,7 +573,7 @@ def make_lane_mixing_error(primitive_name: str) -> NotImplementedError:
 
 
 def get_llvm_number_type(aval: Any) -> ir.Type:
-    """Return the LLVM type of one entry of an array of the trace, for one lane."""
+    """Return the LLVM type of one entry, for one lane, of an array of the trace."""
     if aval.dtype not in _LLVM_TYPE_BY_DTYPE:
         raise NotImplementedError(
             f"{aval.str_short()} has numbers that machine code does not support: convert them to "
@@ -568,7 +589,7 @@ _LLVM_TYPE_BY_DTYPE = {
 
 
 def make_entry_array(array_shape: tuple[int, ...], llvm_entries: Sequence[LlvmValue]) -> np.ndarray:
-    """Return a NumPy array of this shape whose entries are the given LLVM values."""
+    """Return a NumPy array of shape `array_shape` whose entries are `llvm_entries`."""
     entry_array = np.empty(len(llvm_entries), object)
     entry_array[:] = llvm_entries
     return entry_array.reshape(array_shape)
@@ -577,9 +598,9 @@ def make_entry_array(array_shape: tuple[int, ...], llvm_entries: Sequence[LlvmVa
 def split_into_entry_arrays(
     flat_entries: Sequence[LlvmValue], avals: Sequence[Any]
 ) -> list[LlvmArray]:
-    """Return the arrays whose entries are in the list `flat_entries`.
+    """Return arrays of the shapes in `avals`, whose entries are those of the list `flat_entries`.
 
-    This is the inverse of `ArrayEmitter.flatten_array_entries`.
+    This function is the inverse of `ArrayEmitter.flatten_array_entries`.
     """
     entry_arrays: list[LlvmArray] = []
     first_entry = 0

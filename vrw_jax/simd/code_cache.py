@@ -1,10 +1,10 @@
 """Cache of machine code by content: traces that give the same LLVM text share one compilation.
 
-Each program is one record of the store. The record is named by a digest of the text that LLVM
-compiles and of the processor. A second record, the index, contains the name of the program. The
-index is named by everything on which the function's trace depends. An edit of the source that
-changes no trace therefore costs a trace, but no compilation. The name by which JAX programs call
-the code does not change.
+Each program is one record of the store. The name of the record is a digest of the processor and of
+the text that LLVM compiles. A second record, the index, contains the name of the program. The name
+of the index is a digest of everything on which the function's trace depends. An edit of the source
+that changes no trace therefore costs a trace, but no compilation. JAX programs then call the code
+by the same name as before the edit.
 """
 
 import contextlib
@@ -33,7 +33,10 @@ from vrw_jax.simd.machine import (
 
 @runtime_checkable
 class CodeStore(Protocol):
-    """Store of machine code for several processes: an object or a module with two functions."""
+    """Store of machine code that several processes share.
+
+    The store is an object or a module with two functions.
+    """
 
     def load_bytes(self, record_name: str) -> bytes | None:
         """Return the bytes saved under `record_name`, or None if no undamaged record has that
@@ -45,10 +48,7 @@ class CodeStore(Protocol):
 
 
 class MachineCode(NamedTuple):
-    """Machine code of a function over lanes.
-
-    The compilation of the code may still run in the background.
-    """
+    """Machine code of a function over lanes, which may still be compiled in the background."""
 
     code_name: str  # digest of the text that LLVM compiles; JAX programs call the code by it
     result_shapes_and_dtypes: tuple[
@@ -69,12 +69,14 @@ def get_machine_code(
     code_store: CodeStore | None,
     register_limits: RegisterLimits,
 ) -> MachineCode:
-    """Return the machine code of a function.
+    """Return machine code for a function over lanes.
 
-    The code is that of this process or of `code_store`. Code that neither contains is compiled.
+    The code is taken from this process or from `code_store`. If neither contains it, the function
+    is traced and compiled.
 
-    `argument_shapes` are the shapes of the arguments, and the code computes `group_width` lanes at
-    a time. `trace_key` identifies all other inputs of the trace.
+    - `argument_shapes`: shapes and dtypes of the arguments;
+    - `trace_key`: object whose `repr` identifies all other inputs of the trace;
+    - `group_width`: number of lanes that the code computes at a time.
     """
     index_key = (
         trace_key,
@@ -113,8 +115,10 @@ def _trace_and_compile_function(
     code_store: CodeStore | None,
     register_limits: RegisterLimits,
 ) -> MachineCode:
-    """Trace a function and return its machine code. The compilation runs in the background, unless
-    the cache contains code of the same LLVM text."""
+    """Trace a function over lanes and return its machine code.
+
+    The compilation runs in the background, unless the cache contains code for the same LLVM text.
+    """
     with _jax_tracing_lock, _pause_garbage_collection():
         closed_jaxpr = trace_for_machine_code(lane_function, *argument_shapes)
         llvm_text = write_llvm_kernel(closed_jaxpr, group_width, register_limits)
@@ -159,8 +163,10 @@ def _compile_and_save_code(
 
 
 def load_machine_code(code_name: str, code_store: CodeStore | None) -> MachineCode | None:
-    """Return the machine code named `code_name` from this process or from `code_store`. Return None
-    if neither contains the code."""
+    """Return the machine code named `code_name` from this process or from `code_store`.
+
+    Return None if neither contains the code.
+    """
     if code_name not in _machine_code_by_name:
         record_content = code_store.load_bytes(code_name) if code_store is not None else None
         if record_content is None:
@@ -186,13 +192,15 @@ def load_machine_code(code_name: str, code_store: CodeStore | None) -> MachineCo
 
 
 def _compute_sha256_digest(digested_bytes: bytes) -> str:
-    """Return the SHA-256 digest of bytes in hexadecimal digits."""
+    """Return the SHA-256 digest of `digested_bytes` in hexadecimal digits."""
     return hashlib.sha256(digested_bytes).hexdigest()
 
 
 _machine_code_by_name: dict[str, MachineCode] = {}
-"""Machine code of this process by the name of its index record and by its code name. Programs
-traced for several batch sizes share the code."""
+"""Machine code of this process, by the name of its index record and by its code name.
+
+Programs that are traced for several batch sizes share the code.
+"""
 
 
 @contextlib.contextmanager
@@ -211,18 +219,20 @@ def _pause_garbage_collection() -> Iterator[None]:
 
 
 _jax_tracing_lock = RLock()
-"""Lock by which only one thread traces at a time. The later compilation by LLVM needs no lock."""
+"""Lock that lets only one thread trace at a time. The later compilation by LLVM needs no lock."""
 
 
 _llvm_compiler_pool = ThreadPoolExecutor(1, "llvm")
-"""Thread that compiles in the background while Python traces. One thread suffices, because LLVM's
-lock lets only one thread compile."""
+"""Thread that compiles in the background while Python traces.
+
+One thread suffices, because LLVM's lock lets only one thread compile.
+"""
 
 
 def _parse_result_shapes_and_dtypes(
     encoded_result_types: str | bytes,
 ) -> tuple[tuple[tuple[int, ...], np.dtype], ...]:
-    """Return the field `result_shapes_and_dtypes` of `MachineCode` from its JSON text."""
+    """Return `MachineCode.result_shapes_and_dtypes`, parsed from JSON."""
     return tuple(
         (tuple(axis_lengths), np.dtype(dtype_name))
         for axis_lengths, dtype_name in json.loads(encoded_result_types)
@@ -230,8 +240,10 @@ def _parse_result_shapes_and_dtypes(
 
 
 def trace_for_machine_code(lane_function: Callable, *argument_shapes: Any) -> ClosedJaxpr:
-    """Return the jaxpr of a function for arguments with these shapes. During the trace,
-    `targets_machine_code` returns True."""
+    """Return the jaxpr of a function for arguments with the shapes and dtypes `argument_shapes`.
+
+    During the trace, `targets_machine_code` returns True.
+    """
     context_token = _is_tracing_for_machine_code.set(True)
     try:  # The loops are traced in this mesh, so that JAX's trace cache finds them again.
         with jax.sharding.use_abstract_mesh(jax.sharding.AbstractMesh((), ())):

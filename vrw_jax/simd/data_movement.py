@@ -1,5 +1,6 @@
-"""Rules of primitives that move entries: indexing, slicing, concatenation and reshaping. Each
-returns an array of LLVM values.
+"""Rules of primitives that move entries: indexing, slicing, concatenation and reshaping.
+
+Each rule returns an array of LLVM values.
 """
 
 import math
@@ -93,7 +94,7 @@ def emit_transposed_array(
 def emit_static_slice(
     array_emitter: ArrayEmitter, primitive_call: PrimitiveCall, array: LlvmArray
 ) -> LlvmArray:
-    """Return the entries between two indices of each axis, with strides."""
+    """Return the entries from a start index to a limit along each axis, with a stride."""
     slice_strides = primitive_call.primitive_params["strides"] or (1,) * len(
         primitive_call.primitive_params["start_indices"]
     )
@@ -127,7 +128,7 @@ def emit_static_slice(
 def emit_concatenated_array(
     array_emitter: ArrayEmitter, primitive_call: PrimitiveCall, *joined_arrays: LlvmArray
 ) -> LlvmArray:
-    """Return arrays joined along an existing axis."""
+    """Return the arrays joined along an existing axis."""
     return _concatenate_along_axis(
         array_emitter, primitive_call, primitive_call.primitive_params["dimension"], joined_arrays
     )
@@ -136,7 +137,7 @@ def emit_concatenated_array(
 def emit_stacked_array(
     array_emitter: ArrayEmitter, primitive_call: PrimitiveCall, *stacked_arrays: LlvmArray
 ) -> LlvmArray:
-    """Return arrays of one shape stacked along a new axis."""
+    """Return the arrays, all of one shape, stacked along a new axis."""
     new_axis = primitive_call.primitive_params["axis"]
     expanded_arrays = [
         array_emitter.reshape_array(x, (*x.shape[:new_axis], 1, *x.shape[new_axis:]))
@@ -148,7 +149,7 @@ def emit_stacked_array(
 def emit_unstacked_arrays(
     jaxpr_lowering: JaxprLowering, equation: Any, operands: list[LlvmArray]
 ) -> list[LlvmArray]:
-    """Return the arrays, all of one shape, into which an array is split along an axis."""
+    """Return the arrays of equal shape that result from splitting an array along one axis."""
     (array,), split_axis, array_emitter = (
         operands,
         equation.params["axis"],
@@ -175,7 +176,7 @@ def _concatenate_along_axis(
     join_axis: int,
     joined_arrays: Sequence[LlvmArray],
 ) -> LlvmArray:
-    """Return arrays joined along the existing axis `join_axis`."""
+    """Return the arrays joined along the existing axis `join_axis`."""
     result_shape = get_shape_without_lanes(primitive_call.result_aval)
     if join_axis == len(result_shape):
         raise make_lane_mixing_error(primitive_call.primitive_name)
@@ -251,9 +252,7 @@ def emit_padded_array(
 def emit_uninitialized_array(
     array_emitter: ArrayEmitter, primitive_call: PrimitiveCall
 ) -> LlvmArray:
-    """Return an uninitialized array, whose entries read as zeros except in memory that loops
-    carry.
-    """
+    """Return an uninitialized array. Its entries read as 0, except in memory of a loop."""
     entry_type = array_emitter.get_entry_type(primitive_call.result_aval)
     return UninitializedArray(
         get_shape_without_lanes(primitive_call.result_aval),
@@ -263,7 +262,9 @@ def emit_uninitialized_array(
 
 
 def emit_index_array(array_emitter: ArrayEmitter, primitive_call: PrimitiveCall) -> LlvmArray:
-    """Return an array of indices along one axis, as `jax.lax.broadcasted_iota`."""
+    """Return an array whose entries are their indices along one axis, as
+    `jax.lax.broadcasted_iota`.
+    """
     return array_emitter.emit_constant_array(
         np.indices(primitive_call.result_aval.shape)[primitive_call.primitive_params["dimension"]],
         primitive_call.result_aval,
@@ -276,9 +277,7 @@ def emit_dynamic_slice(
     array: LlvmArray,
     *axis_starts: LlvmArray,
 ) -> LlvmArray:
-    """Return the part of an array that begins at computed indices, which are the same for all
-    lanes.
-    """
+    """Return a part of the array that begins at a computed index, the same for all lanes."""
     start_index = _clamp_start_index(
         array_emitter,
         primitive_call.operand_avals,
@@ -303,7 +302,7 @@ def emit_dynamic_slice_update(
     update_array: LlvmArray,
     *axis_starts: LlvmArray,
 ) -> LlvmArray:
-    """Return the array with one part replaced; the part begins at computed indices, the same for
+    """Return the array with one part replaced. The part begins at a computed index, the same for
     all lanes.
     """
     if has_lanes(primitive_call.result_aval) and not has_lanes(primitive_call.operand_avals[1]):
@@ -332,7 +331,9 @@ def _clamp_start_index(
     part_shape: EntryIndex,
     axis_starts: Sequence[LlvmArray],
 ) -> tuple[Any, ...]:
-    """Return the start index of a part, clamped so that the part lies inside the array."""
+    """Return the index `axis_starts`, clamped so that a part of shape `part_shape` lies inside the
+    array.
+    """
     clamped_start_index: list[Any] = []
     for start_aval, n, m, axis_start in zip(
         operand_avals[1:], array_shape, part_shape, axis_starts, strict=False

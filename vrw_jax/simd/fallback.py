@@ -1,4 +1,4 @@
-"""Fallback to XLA on releases of JAX with which machine code was not tested."""
+"""Fallback to XLA on releases of JAX with which machine code has not been tested."""
 
 import warnings
 
@@ -8,13 +8,13 @@ LATEST_TESTED_JAX_RELEASE = (0, 12)
 """Latest release of JAX (major, minor) with which all tests of machine code pass."""
 
 _machine_code_failures: list[str] = []
-"""Reasons why this process uses XLA instead of machine code; the list is empty as long as machine
+"""Reasons why this process uses XLA instead of machine code. The list is empty as long as machine
 code works.
 """
 
 
 def is_tested_jax_release() -> bool:
-    """Return whether machine code was tested with the installed release of JAX."""
+    """Return whether machine code has been tested with the installed release of JAX."""
     return jax.__version_info__[:2] <= LATEST_TESTED_JAX_RELEASE
 
 
@@ -24,7 +24,9 @@ def is_machine_code_disabled() -> bool:
 
 
 def disable_machine_code(failure_reason: object) -> None:
-    """Use XLA instead of machine code from now on, and issue a warning the first time."""
+    """Disable machine code in this process, so that XLA computes instead. Issue a warning the first
+    time.
+    """
     _machine_code_failures.append(str(failure_reason))
     if len(_machine_code_failures) == 1:
         latest_tested_release = ".".join(map(str, LATEST_TESTED_JAX_RELEASE))

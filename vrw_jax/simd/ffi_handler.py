@@ -13,14 +13,15 @@ from vrw_jax.simd.value_emitter import I8, I32, I64
 FFI_HANDLER_NAME = "handler"
 
 FFI_METADATA_EXTENSION_TYPE = 1
-"""Type of the extension by which XLA requests the metadata of a handler, from XLA's
-xla/ffi/api/c_api.h.
+"""Number of the extension type by which XLA requests the metadata of a handler.
+
+The number is from XLA's xla/ffi/api/c_api.h.
 """
 
 
 @functools.cache
 def read_ffi_api_version() -> tuple[int, int]:
-    """Return the version (major, minor) of the call interface in the installed header of XLA.
+    """Return the version (major, minor) of XLA's call interface, read from the installed header.
 
     Return (0, 0), which XLA rejects, if the header is missing or has another form.
     """
@@ -41,12 +42,12 @@ def add_ffi_handler(
     group_width: int,
     ffi_api_version: tuple[int, int],
 ) -> None:
-    """Add the function `XLA_FFI_Error *handler(XLA_FFI_CallFrame *)`, which calls `llvm_kernel`, to
-    the module.
+    """Add the function `XLA_FFI_Error *handler(XLA_FFI_CallFrame *)` to the LLVM module.
 
-    The function reads pointers to `n_inputs` arguments and `n_outputs` results from the call frame.
-    Offsets are in bytes, from XLA's xla/ffi/api/c_api.h, whose structs only grow at their ends. If
-    XLA requests the metadata, the handler reports `ffi_api_version`, for which it is compiled.
+    The function calls `llvm_kernel` with pointers to `n_inputs` arguments and `n_outputs` results,
+    which it reads from the call frame. Offsets in the frame are in bytes, from XLA's
+    xla/ffi/api/c_api.h, whose structs only grow at their ends. If XLA requests the metadata, the
+    handler reports `ffi_api_version`, for which it is compiled.
     """
     llvm_pointer_type = ir.PointerType()
     llvm_handler = ir.Function(
@@ -89,9 +90,10 @@ def add_ffi_handler(
     builder.position_at_end(execute_basic_block)
 
     def emit_buffer_pointer_table(buffer_list_offset: int, n_buffers: int) -> tuple[Any, Any]:
-        """Return a table of pointers to the data of `n_buffers` buffers, and the last buffer.
+        """Return LLVM values: a table of pointers to the data of `n_buffers` buffers, and the last
+        buffer.
 
-        `buffer_list_offset` is the offset of the list of buffers in the call frame, in bytes.
+        - `buffer_list_offset`: offset of the list of buffers in the call frame, bytes.
         """
         buffer_list, ffi_buffer = emit_field_load(ffi_call_frame, buffer_list_offset), None
         data_pointer_table = builder.alloca(llvm_pointer_type, ir.Constant(I64, n_buffers))

@@ -1,4 +1,4 @@
-"""The JAX primitive that calls machine code by its name from JAX programs."""
+"""JAX primitive by which JAX programs call machine code by its name."""
 
 import functools
 from collections.abc import Callable, Sequence
@@ -14,8 +14,10 @@ from vrw_jax.simd.ffi_handler import FFI_HANDLER_NAME
 from vrw_jax.simd.machine import LoadedMachineCode
 
 LOADED_CODE_BY_NAME: dict[str, LoadedMachineCode] = {}
-"""Loaded machine code by the name under which JAX programs call it. The code stays loaded, because
-XLA never releases a registered function."""
+"""Loaded machine code by the name under which JAX programs call it.
+
+The code stays loaded, because XLA never releases a registered function.
+"""
 _loaded_code_lock = Lock()
 
 
@@ -34,8 +36,9 @@ def register_machine_code(machine_code: MachineCode) -> None:
 
 
 MACHINE_CODE_PRIMITIVE = Primitive("machine_code")
-"""Primitive that calls machine code from JAX programs. The code is required only when the program
-is compiled, so LLVM can compile it in the meantime.
+"""JAX primitive that calls machine code from JAX programs.
+
+Only the compilation of the JAX program needs the code, so LLVM can compile the code before it.
 """
 MACHINE_CODE_PRIMITIVE.multiple_results = True
 
@@ -44,7 +47,7 @@ MACHINE_CODE_PRIMITIVE.multiple_results = True
 def _make_abstract_results(
     *call_arguments: Any, code: MachineCode, result_shapes: Sequence[jax.ShapeDtypeStruct]
 ) -> list[Any]:
-    """Return the abstract values (shapes and dtypes) of the results of a call."""
+    """Return the abstract values (shapes and dtypes) of the results of a machine code call."""
     return [jax.core.ShapedArray(x.shape, x.dtype) for x in result_shapes]
 
 
@@ -52,7 +55,7 @@ def _make_abstract_results(
 def _call_machine_code(
     *call_arguments: Any, code: MachineCode, result_shapes: Sequence[jax.ShapeDtypeStruct]
 ) -> Any:
-    """Return the results of a call outside of `jax.jit`."""
+    """Return the results of a machine code call outside of `jax.jit`."""
     with jax.disable_jit(False):  # Only a compiled program can call machine code.
         return _make_calling_program(code, tuple(result_shapes))(*call_arguments)
 
@@ -73,13 +76,13 @@ def _lower_machine_code_call(
     code: MachineCode,
     result_shapes: Sequence[jax.ShapeDtypeStruct],
 ) -> Any:
-    """Register the machine code, and return XLA's lowering of its call."""
+    """Register the machine code with XLA, and return the lowering of its call."""
     register_machine_code(code)
     return jax.ffi.ffi_lowering(code.code_name)(lowering_context, *call_arguments)
 
 
 def _raise_unsupported_transform(*_: Any, **__: Any) -> Any:
-    """Raise a NotImplementedError for a transform that machine code does not support."""
+    """Raise a NotImplementedError for a JAX transform that machine code does not support."""
     raise NotImplementedError(
         "Machine code can neither be mapped by `jax.vmap` nor differentiated from outside: give "
         "all lanes at once, on the last axis, and for derivatives the function that returns them."

@@ -1,4 +1,4 @@
-"""The LLVM module of a trace: a loop over groups of lanes with its inputs and outputs."""
+"""LLVM module for a jaxpr: a loop over groups of lanes that reads arguments and writes results."""
 
 import math
 from typing import Any
@@ -28,12 +28,13 @@ def write_llvm_kernel(
     group_width: int,
     register_limits: RegisterLimits = DEFAULT_REGISTER_LIMITS,
 ) -> str:
-    """Return the LLVM text of a function that computes a range of groups of lanes.
+    """Return the LLVM text of a function that computes the jaxpr for a range of groups of lanes.
 
-    Its signature is `void lanes(const void **inputs, void **outputs, int64 lanes, int64 begin,
-    int64 end)`. The function loops over the groups from `begin` to `end`, each of `group_width`
-    lanes. A single lane is computed twice, as a vector, because LLVM's code for scalars differs in
-    the last digits.
+    The signature is
+    `void lanes(const void **inputs, void **outputs, int64 lanes, int64 begin, int64 end)`. The
+    function loops over the groups from `begin` to `end`, each of `group_width` lanes. If
+    `group_width` is 1, the lane is computed twice, in a vector, because LLVM's code for scalars
+    differs in the last digits.
     """
     _check_lane_axes(closed_jaxpr)
     llvm_module = ir.Module(LANE_KERNEL_NAME)
@@ -96,8 +97,9 @@ def write_llvm_kernel(
 
 
 def _check_lane_axes(closed_jaxpr: ClosedJaxpr) -> None:
-    """Raise a NotImplementedError unless the lane axis is the last axis of every argument and
-    result, and no other axis."""
+    """Raise a NotImplementedError unless the lane axis is the last axis of every result, and no
+    other axis of an argument or a result has its length.
+    """
     for array_description, checked_avals in (
         ("An argument", closed_jaxpr.in_avals),
         ("A result", closed_jaxpr.out_avals),
@@ -114,7 +116,10 @@ def _check_lane_axes(closed_jaxpr: ClosedJaxpr) -> None:
 
 
 class _LaneGroupAccess:
-    """Access of one group of lanes to the caller's arrays, whose last axis is that of the lanes."""
+    """Emitter of loads and stores for one group of lanes in the caller's arrays.
+
+    The last axis of these arrays is the lane axis.
+    """
 
     def __init__(
         self,
@@ -127,8 +132,10 @@ class _LaneGroupAccess:
         self.n_lanes, self.first_lane = n_lanes, first_lane
 
     def read_argument_array(self, base_pointer: LlvmValue, aval: Any) -> LlvmArray:
-        """Return an argument as an array of LLVM values. An argument without axes is the same
-        number for all lanes."""
+        """Return the argument at `base_pointer` as an array of LLVM values.
+
+        An argument without axes is one number for all lanes.
+        """
         builder = self.array_emitter.builder
 
         def emit_entry_load(entry_index: EntryIndex) -> LlvmValue:
@@ -166,8 +173,9 @@ class _LaneGroupAccess:
     def write_result_array(
         self, base_pointer: LlvmValue, aval: Any, result_array: LlvmArray
     ) -> None:
-        """Emit stores of one result of a group of lanes into the memory that begins at
-        `base_pointer`."""
+        """Emit stores of `result_array`, for the lanes of the group, into the memory at
+        `base_pointer`.
+        """
         builder = self.array_emitter.builder
 
         def emit_entry_store(entry_index: EntryIndex, _: Any) -> list[LlvmValue]:
@@ -189,8 +197,9 @@ class _LaneGroupAccess:
     def emit_group_address(
         self, base_pointer: LlvmValue, aval: Any, entry_index: EntryIndex
     ) -> tuple[LlvmValue, ir.Type]:
-        """Return the address of one array entry for the first lane of the group, and the LLVM type
-        of the stored lanes."""
+        """Return the address of an array entry for the first lane of the group, and the LLVM type
+        to load or store there.
+        """
         builder, llvm_element_type = self.array_emitter.builder, LLVM_NUMBER_TYPES[aval.dtype.name]
         llvm_element_type = I8 if llvm_element_type == I1 else llvm_element_type
         if aval.shape == ():

@@ -1,6 +1,6 @@
 """Large arrays of LLVM values, whose entries are computed on access or stored in memory.
 
-Arrays that emit instructions contain the `ArrayEmitter` to which they belong.
+Arrays that emit instructions have a reference to their `ArrayEmitter`.
 """
 
 from collections.abc import Callable, Sequence
@@ -12,12 +12,12 @@ from vrw_jax.simd.llvm_library import ir
 from vrw_jax.simd.value_emitter import LlvmValue
 
 EntryIndex = tuple[Any, ...]
-"""Index of an array entry: for each axis an integer, or an LLVM value of type I64."""
+"""Index of an array entry. For each axis it contains an integer, or an LLVM value of type I64."""
 
 
 class LazyArray:
-    """A large array of type `entry_type`. The function `get_entry_at(index)` computes or loads an
-    entry.
+    """Large array of type `entry_type`, whose entries are computed or loaded by
+    `get_entry_at(index)`.
 
     If `entry_type` is a vector, an entry may also be a scalar, which is the same for all lanes.
     """
@@ -40,7 +40,7 @@ class UninitializedArray(LazyArray):
 
 
 class PendingArrayUpdate(LazyArray):
-    """An array in memory, or an array of one repeated number, with one part replaced."""
+    """Array in memory, or array of one repeated number, of which one part is replaced."""
 
     def __init__(
         self,
@@ -63,15 +63,20 @@ class PendingArrayUpdate(LazyArray):
         )
 
     def emit_entry_load(self, entry_index: EntryIndex) -> LlvmValue:
-        """Return the entry at an index, from the update if the index is inside the replaced part,
-        else from the base array."""
+        """Return the LLVM value of the entry at `entry_index`.
+
+        The entry is that of the update inside the replaced part, and that of the base array
+        elsewhere.
+        """
         return self.array_emitter.get_array_entry(
             self.array_emitter.store_in_memory(self), entry_index
         )
 
     def store_update_in_memory(self) -> "PendingArrayUpdate":
-        """Return an equal update whose part is stored in memory, because the part may depend on the
-        entries that it replaces."""
+        """Return an equal update whose replacing part is stored in memory.
+
+        The part may depend on the entries that it replaces, so it is computed before they change.
+        """
         if isinstance(self.update_array, np.ndarray):
             return self
         return PendingArrayUpdate(
@@ -82,8 +87,10 @@ class PendingArrayUpdate(LazyArray):
         )
 
     def emit_update_stores(self, memory_array: "MemoryArray") -> None:
-        """Emit stores that overwrite the replaced part of `memory_array`. The update must be stored
-        in memory first."""
+        """Emit stores that overwrite the replaced part of `memory_array`.
+
+        The replacing part must be stored in memory before.
+        """
         array_emitter = self.array_emitter
 
         def store_updated_entry(update_index: EntryIndex, _: Any = None) -> list[LlvmValue]:
@@ -101,10 +108,10 @@ class PendingArrayUpdate(LazyArray):
 
 
 class MemoryArray(LazyArray):
-    """A large array stored in memory, entry after entry, at `base_pointer`.
+    """Large array whose entries are stored one after another in memory, from `base_pointer` on.
 
-    The flag `is_overwritable` is True if no other array uses the memory, so that the consumer may
-    overwrite it.
+    `is_overwritable` is True if no other array uses the memory, so that a consumer may overwrite
+    it.
     """
 
     def __init__(
@@ -123,20 +130,20 @@ class MemoryArray(LazyArray):
         )
 
     def emit_entry_address(self, entry_index: EntryIndex) -> LlvmValue:
-        """Return the address of the entry at an index."""
+        """Return the LLVM value of the address of the entry at `entry_index`."""
         memory_offset = self.array_emitter.emit_memory_offset(entry_index, self.shape)
         return self.array_emitter.builder.gep(
             self.base_pointer, [memory_offset], source_etype=self.entry_type
         )
 
     def emit_entry_load(self, entry_index: EntryIndex) -> LlvmValue:
-        """Emit a load of the entry at an index, and return its value."""
+        """Emit a load of the entry at `entry_index`, and return its LLVM value."""
         return self.array_emitter.builder.load(
             self.emit_entry_address(entry_index), typ=self.entry_type
         )
 
     def emit_entry_store(self, entry_index: EntryIndex, stored_value: LlvmValue) -> None:
-        """Emit a store of `stored_value` at an index."""
+        """Emit a store of `stored_value` into the entry at `entry_index`."""
         stored_value = (
             self.array_emitter.value_emitter.to_lane_vector(stored_value)
             if isinstance(self.entry_type, ir.VectorType)
@@ -145,7 +152,7 @@ class MemoryArray(LazyArray):
         self.array_emitter.builder.store(stored_value, self.emit_entry_address(entry_index))
 
     def get_subarray(self, first_axis_index: LlvmValue) -> "MemoryArray":
-        """Return the part of the array at one index of the first axis, in the same memory."""
+        """Return the subarray at one index of the first axis, in the memory of this array."""
         zero_indices = (0,) * (len(self.shape) - 1)
         return MemoryArray(
             self.array_emitter,
@@ -156,10 +163,10 @@ class MemoryArray(LazyArray):
 
 
 class TransposedMemoryView(LazyArray):
-    """A view of an array in memory with its axes in another order."""
+    """View of an array in memory, with the axes in another order."""
 
     def get_subarray(self, first_axis_index: LlvmValue) -> LazyArray:
-        """Return the part of the array at one index of the first axis."""
+        """Return the subarray at one index of the first axis."""
         return LazyArray(
             self.shape[1:],
             self.entry_type,
@@ -168,12 +175,15 @@ class TransposedMemoryView(LazyArray):
 
 
 LlvmArray = np.ndarray | LazyArray
-"""Array of LLVM values without the lane axis, in registers (NumPy) or lazy."""
+"""Array of LLVM values without the lane axis: a NumPy array of values in registers, or a lazy
+array.
+"""
 
 
 def mark_as_shared(array: LlvmArray) -> LlvmArray:
-    """Return the array marked as read by further consumers, so that no consumer overwrites its
-    memory."""
+    """Return the array with a mark that other consumers still read it, so that no consumer
+    overwrites its memory.
+    """
     if isinstance(array, PendingArrayUpdate):
         return PendingArrayUpdate(
             array.array_emitter,

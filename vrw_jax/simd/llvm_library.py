@@ -1,5 +1,6 @@
-"""The modules of llvmlite, or stand-ins if llvmlite is not installed. Without llvmlite, XLA
-computes everything."""
+"""Modules of llvmlite, or stand-ins if llvmlite is not installed. Without llvmlite, XLA computes
+everything.
+"""
 
 from typing import Any
 
@@ -13,7 +14,7 @@ except ImportError:
 
 
 class _MissingLlvmType:
-    """Stand-in for a type of llvmlite that the emitters name and extend."""
+    """Stand-in for a type of llvmlite that other modules use or subclass."""
 
     def __init__(self, *_: Any) -> None: ...
 
@@ -26,7 +27,7 @@ class _MissingLlvmTypes:
 
 
 class _MissingLlvmCompiler:
-    """Stand-in for the module `llvmlite.binding`, whose use raises an ImportError."""
+    """Stand-in for the module `llvmlite.binding`. Any use of it raises an ImportError."""
 
     def __getattr__(self, attribute_name: str) -> Any:
         raise ImportError("machine code needs llvmlite, which is not installed: pip install it.")

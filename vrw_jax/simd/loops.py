@@ -1,4 +1,4 @@
-"""Lowering of JAX loops to LLVM: small carried arrays are in registers, large ones in memory."""
+"""Lowering of JAX loops to LLVM. Small carried arrays are in registers, large ones in memory."""
 
 import math
 from collections.abc import Sequence
@@ -25,7 +25,7 @@ from vrw_jax.simd.value_emitter import I64, LlvmValue
 def emit_while_loop(
     jaxpr_lowering: JaxprLowering, equation: Any, operands: list[LlvmArray]
 ) -> list[LlvmArray]:
-    """Emit a `while` loop, and return the arrays it carries after the last iteration.
+    """Emit a `while` loop, and return the arrays that it carries after the last iteration.
 
     Each group of lanes evaluates the condition separately, so a group ends with its own slowest
     lane.
@@ -75,7 +75,8 @@ def emit_while_loop(
 def emit_scan_loop(
     jaxpr_lowering: JaxprLowering, equation: Any, operands: list[LlvmArray]
 ) -> list[LlvmArray]:
-    """Emit a loop of known length, and return the last carried arrays and the stacked outputs.
+    """Emit a `scan` loop, and return the arrays that it carries after the last iteration and the
+    stacked outputs.
 
     Scanned inputs and stacked outputs are in memory.
     """
@@ -165,9 +166,9 @@ def emit_scan_loop(
 class _LoopCarry:
     """Arrays that a loop carries from one iteration to the next.
 
-    An array of at most `max_register_entries` entries is kept in registers, and a larger array in
-    memory. The memory of the initial value is used if no other array uses it. Otherwise new memory
-    is allocated for the loop.
+    Arrays of at most `max_register_entries` entries are in registers, and larger arrays in memory.
+    A larger array uses the memory of its initial value if no other array does, and new memory
+    otherwise.
     """
 
     def __init__(
@@ -186,8 +187,9 @@ class _LoopCarry:
         ]
 
     def choose_carried_memory(self, carried_aval: Any, initial_array: LlvmArray) -> MemoryArray:
-        """Return the memory of the initial array if it may be overwritten and has the same type,
-        else new memory."""
+        """Return the memory of the initial array if the loop may overwrite it and its entry type
+        fits, else new memory.
+        """
         entry_type = self.array_emitter.get_entry_type(carried_aval)
         initial_array = (
             initial_array.base_array
@@ -205,8 +207,9 @@ class _LoopCarry:
         )
 
     def make_carried_arrays(self, register_values: Sequence[LlvmValue]) -> list[LlvmArray]:
-        """Return the carried arrays of one iteration from the values in registers and from
-        memory.
+        """Return the carried arrays at the start of an iteration, or after the last one.
+
+        - `register_values`: entries of the arrays that are carried in registers.
         """
         register_avals = [
             carried_aval
@@ -231,8 +234,9 @@ class _LoopCarry:
         ]
 
     def store_initial_arrays(self, initial_arrays: Sequence[LlvmArray]) -> list[LlvmValue]:
-        """Return the initial values of all registers, and emit stores of the carried arrays that
-        are kept in memory."""
+        """Emit stores of the initial arrays that are carried in memory, and return the initial
+        values of all registers.
+        """
         for initial_array, memory_array in zip(initial_arrays, self.carried_memory, strict=True):
             if memory_array is None or initial_array is memory_array:
                 continue
@@ -246,11 +250,11 @@ class _LoopCarry:
         return self._flatten_register_entries(initial_arrays)
 
     def get_next_register_values(self, next_arrays: Sequence[LlvmArray]) -> list[LlvmValue]:
-        """Return the values of all registers in the next iteration, and emit stores of the arrays
-        kept in memory.
+        """Emit stores of the next arrays that are carried in memory, and return the next values of
+        all registers.
 
-        A new array may depend on every old one, so all new arrays are computed before any is
-        stored.
+        A next array may depend on every present array, so all next arrays are computed before any
+        is stored.
         """
         register_values = self._flatten_register_entries(next_arrays)
         pending_copies: list[tuple[MemoryArray, MemoryArray | PendingArrayUpdate]] = []
@@ -294,7 +298,7 @@ class _LoopCarry:
         )
 
     def _flatten_register_entries(self, carried_arrays: Sequence[LlvmArray]) -> list[LlvmValue]:
-        """Return the entries of all carried arrays that are kept in registers, in one list."""
+        """Return a list of the entries of all carried arrays that are in registers."""
         arrays_avals_memory = zip(
             carried_arrays, self.carried_avals, self.carried_memory, strict=True
         )

@@ -1,4 +1,4 @@
-"""Lowering of JAX traces to LLVM: equations one after another, and calls of other traces."""
+"""Lowering of jaxprs to LLVM: one equation after another, and calls of other jaxprs."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -20,8 +20,8 @@ from vrw_jax.simd.llvm_library import ir
 from vrw_jax.simd.value_emitter import LlvmValue, ValueEmitter
 
 PrimitiveRule = Callable[["JaxprLowering", Any, list[LlvmArray]], list[LlvmArray]]
-"""Rule of a primitive: a function of the lowering, an equation and its operands that emits
-instructions and returns the results.
+"""Function that lowers one primitive. It takes the lowering, an equation and the operands, emits
+instructions, and returns the results.
 """
 
 NOINLINE_FUNCTION_NAME = "noinline"
@@ -40,7 +40,7 @@ LOOP_PRIMITIVE_NAMES = "while", "scan"
 
 
 def mark_noinline(function: Callable) -> Callable:
-    """Return `function` marked so that machine code calls it as a separate function instead of
+    """Return a wrapper of `function` that machine code calls as a separate function instead of
     inlining it.
     """
 
@@ -51,8 +51,8 @@ def mark_noinline(function: Callable) -> Callable:
 
 
 class JaxprLowering:
-    """Lowering of traces into the LLVM function of `array_emitter`, by a table of rules of
-    primitives.
+    """Lowering of jaxprs into the LLVM function of `array_emitter`, by the rules in
+    `primitive_rules`.
     """
 
     def __init__(
@@ -69,7 +69,9 @@ class JaxprLowering:
     def lower_jaxpr(
         self, closed_jaxpr: ClosedJaxpr, argument_arrays: Sequence[LlvmArray]
     ) -> list[LlvmArray]:
-        """Emit all equations of a trace for these arguments, and return its results."""
+        """Emit all equations of a jaxpr for the arguments `argument_arrays`, and return the result
+        arrays.
+        """
         jaxpr, emit_constant_array = closed_jaxpr.jaxpr, self.array_emitter.emit_constant_array
         overwriting_equations, array_by_variable = (
             _find_overwriting_equations(jaxpr),
@@ -118,7 +120,7 @@ class JaxprLowering:
         return [read_jaxpr_atom(jaxpr_atom, len(jaxpr.eqns)) for jaxpr_atom in jaxpr.outvars]
 
     def _lower_equation(self, equation: Any, operands: list[LlvmArray]) -> list[LlvmArray]:
-        """Emit one equation of a trace, and return its results."""
+        """Emit one equation of a jaxpr, and return its result arrays."""
         primitive_name = equation.primitive.name
         if primitive_name not in self.primitive_rules:
             raise NotImplementedError(
@@ -134,8 +136,11 @@ class JaxprLowering:
     def emit_separate_function_call(
         self, closed_jaxpr: ClosedJaxpr, argument_arrays: Sequence[LlvmArray]
     ) -> list[LlvmArray]:
-        """Emit a call of a trace as a separate function, and return the results. The first call
-        defines the function."""
+        """Emit a call of a separate LLVM function that computes a jaxpr, and return the result
+        arrays.
+
+        The first call for a jaxpr defines the function.
+        """
         builder = self.array_emitter.builder
         if id(closed_jaxpr) not in self.separate_functions:
             self.separate_functions[id(closed_jaxpr)] = (
@@ -154,10 +159,10 @@ class JaxprLowering:
         return split_into_entry_arrays(result_entries, closed_jaxpr.out_avals)
 
     def _define_separate_function(self, closed_jaxpr: ClosedJaxpr) -> ir.Function:
-        """Return a new LLVM function that computes a trace.
+        """Return a new LLVM function that computes a jaxpr.
 
-        The function takes the entries of all arguments of the trace, and returns a struct of the
-        entries of all results.
+        The function takes the entries of all arguments, and returns a struct of the entries of all
+        results.
         """
         list_entry_types = lambda array_avals: [
             self.array_emitter.get_entry_type(x)
@@ -197,10 +202,10 @@ class JaxprLowering:
 
 
 def _find_overwriting_equations(jaxpr: Any) -> dict[Any, int | None]:
-    """Return the index of the equation that may overwrite the memory of each variable, or None.
+    """Return, for each variable, the index of the equation that may overwrite its memory, or None.
 
-    The equation is the last one that reads the variable, if all earlier readers are loops. A loop
-    reads nothing after its end.
+    This equation is the last one that reads the variable, if all earlier readers are loops. A loop
+    reads no operand after its end.
     """
     overwriting_equations: dict[Any, int | None] = {}
     is_loop_equation = [equation.primitive.name in LOOP_PRIMITIVE_NAMES for equation in jaxpr.eqns]
@@ -219,15 +224,13 @@ def _find_overwriting_equations(jaxpr: Any) -> dict[Any, int | None]:
 
 
 def make_call_rule(jaxpr_parameter_name: str) -> PrimitiveRule:
-    """Return the rule of a primitive that calls the jaxpr in the parameter
-    `jaxpr_parameter_name`.
-    """
+    """Return the rule for a primitive that calls the jaxpr in one of its parameters."""
 
     def emit_called_jaxpr(
         jaxpr_lowering: JaxprLowering, equation: Any, operands: list[LlvmArray]
     ) -> list[LlvmArray]:
-        """Emit the called trace, inline or, if it is marked by `mark_noinline`, as a function;
-        return its results.
+        """Emit the called jaxpr and return its results. The code is inline, or a separate function
+        if `mark_noinline` marks it.
         """
         closed_jaxpr = equation.params[jaxpr_parameter_name]
         if equation.params.get("name") == NOINLINE_FUNCTION_NAME:

@@ -1,4 +1,4 @@
-"""Interface to LLVM: the target processor, object code for it, and code loaded into memory."""
+"""Interface to LLVM: the target processor, object code for it, and loading of code into memory."""
 
 import ctypes
 import functools
@@ -19,22 +19,22 @@ LLVM_PASS_NAMES = (
     "aggressive_dce",
     "sinking",
 )
-"""LLVM passes that simplify the module.
+"""Names of the LLVM passes that simplify the module.
 
 They are chosen because the emitter repeats no computation and already uses vectors. LLVM's usual
-list would take as long as the whole remaining compilation, for code at most a twentieth faster.
+passes would take as long as the whole remaining compilation, for code at most a twentieth faster.
 """
 
 ELF_FILE_SIGNATURE = b"\x7fELF\x02\x01"
 """First bytes of the object files that LLVM writes on 64-bit Linux."""
 ELF_HEADER_LAYOUT = struct.Struct("<16sHHIQQQIHHHHHH")
-"""Layout of the header of an ELF file, as a format of `struct`."""
+"""Layout of the header of an ELF file, in the format of Python's `struct`."""
 ELF_SECTION_LAYOUT = struct.Struct("<IIQQQQIIQQ")
-"""Layout of an entry of the section table of an ELF file, as a format of `struct`."""
+"""Layout of one entry of the section table of an ELF file, in the format of Python's `struct`."""
 
 
 class ElfSectionType(IntEnum):
-    """Code of the type of an ELF section, as the check of an object file distinguishes them."""
+    """Types of ELF sections that the check of an object file distinguishes."""
 
     ELF_STRING_TABLE = 3
     ELF_ZERO_FILLED_MEMORY = 8  # memory for which the file contains no bytes
@@ -45,7 +45,7 @@ def describe_processor() -> tuple[str, str, str]:
     """Return the target of machine code: the target triple, the processor's name, and the list of
     the processor's features.
 
-    Without llvmlite the triple is the kind of machine, and the other two texts are empty.
+    Without llvmlite, return the kind of machine and two empty strings.
     """
     if not is_llvmlite_installed:
         return platform.machine(), "", ""
@@ -54,7 +54,9 @@ def describe_processor() -> tuple[str, str, str]:
 
 
 def describe_compilation() -> str:
-    """Return a text that identifies all that object code depends on, except LLVM's input."""
+    """Return a string that identifies everything on which object code depends, except the LLVM
+    text.
+    """
     return repr(
         (llvm.llvm_version_info, describe_processor(), LLVM_OPTIMIZATION_LEVEL, LLVM_PASS_NAMES)
     )
@@ -66,17 +68,18 @@ def has_512_bit_vectors() -> bool:
 
 
 def compile_llvm_for_processor(llvm_text: str) -> bytes:
-    """Return object code for this processor from LLVM text."""
+    """Return the object code, for this processor, that LLVM compiles from LLVM text."""
     return _emit_object_code(llvm.parse_assembly(llvm_text), _make_llvm_target_machine())
 
 
 def compile_llvm_for_webassembly(
     llvm_text: str, entry_function_name: str, exported_function_name: str
 ) -> bytes:
-    """Return object code for WebAssembly from LLVM text, for vectors of 128 bits.
+    """Return the object code, for WebAssembly with vectors of 128 bits, that LLVM compiles from
+    LLVM text.
 
-    The object file is to be linked with others. The only exported function is
-    `entry_function_name`, renamed to `exported_function_name`.
+    The object file must still be linked. The only exported function is `entry_function_name`, under
+    the name `exported_function_name`.
     """
     llvm_module = llvm.parse_assembly(llvm_text)
     for llvm_symbol in (*llvm_module.functions, *llvm_module.global_variables):
@@ -115,12 +118,12 @@ def _emit_object_code(
 
 
 def require_object_file(object_code: bytes, function_name: str) -> None:
-    """Raise a ValueError unless `object_code` is a complete object file with a function called
+    """Raise a ValueError unless `object_code` is a complete object file that contains the function
     `function_name`.
 
-    LLVM ends the process if a file is damaged, so this function checks the file's tables. Only
-    files in the ELF format are checked completely. In other formats the check only looks for the
-    name.
+    LLVM ends the process if a file is damaged, so this function checks the file's tables first.
+    Only files in the ELF format are checked completely. In other formats the check only looks for
+    the name.
     """
     if (
         f"\0{function_name}\0".encode() not in object_code
@@ -165,11 +168,13 @@ class LoadedMachineCode:
         self._llvm_engine.finalize_object()
 
     def find_function_address(self, function_name: str) -> int:
-        """Return the address of a loaded function in memory."""
+        """Return the memory address of a loaded function."""
         return self._llvm_engine.get_function_address(function_name)
 
     def make_function_capsule(self, function_name: str) -> Any:
-        """Return a loaded function as a PyCapsule, by which XLA can call it."""
+        """Return a PyCapsule that contains the address of a loaded function, by which XLA can call
+        it.
+        """
         create_py_capsule = ctypes.pythonapi.PyCapsule_New
         create_py_capsule.restype = ctypes.py_object
         create_py_capsule.argtypes = [ctypes.c_void_p, ctypes.c_char_p, ctypes.c_void_p]

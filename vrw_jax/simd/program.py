@@ -1,10 +1,10 @@
-"""Compilation of functions over lanes to machine code for CPUs.
+"""Compilation of functions over lanes (elements of a batch) to machine code for CPUs.
 
 XLA on a CPU generates a loop over all lanes for every few operations, and stores intermediate
 results in memory. XLA's `while` loop runs until the slowest of hundreds of lanes ends. Here the
 trace of the whole function becomes one loop over groups of a few lanes, compiled by LLVM. The
-numbers of a group stay in registers, and a group ends with its slowest lane. A later process
-neither traces nor compiles code that a store contains.
+values of a group stay in registers, and the loops of a group end with its slowest lane. A later
+process neither traces nor compiles code that a store contains.
 """
 
 import ctypes
@@ -41,18 +41,22 @@ from vrw_jax.simd.machine import (
 )
 
 LANES_PER_256_BITS = {np.dtype(np.float64): 4, np.dtype(np.float32): 8}
-"""Number of lanes in 256 bits for each float type. A vector has 256 bits, or 512 on processors with
-such registers.
+"""Number of lanes in 256 bits for each float type.
+
+A vector has 256 bits, or 512 bits on processors with such registers.
 """
 GROUPS_PER_TASK = 64
-"""Number of groups of lanes in one task of a thread, chosen because the start of a task then takes
-a negligible time."""
+"""Number of groups of lanes in one task of a thread.
+
+The value is chosen because the start of a task then takes a negligible time.
+"""
 
 
 def is_machine_code_available() -> bool:
     """Return whether functions can be compiled to machine code in this process.
 
-    Machine code needs llvmlite, the CPU as JAX's backend, and a release of JAX with which it works.
+    Machine code needs llvmlite and the CPU as JAX's backend. It also needs a release of JAX with
+    which it works.
     """
     if (
         not is_llvmlite_installed
@@ -65,7 +69,7 @@ def is_machine_code_available() -> bool:
 
 @functools.cache
 def _can_xla_call_machine_code() -> bool:
-    """Return whether XLA can call a small test program of machine code with a correct result."""
+    """Return whether XLA can call machine code: whether a small test succeeds."""
     increment_program = compile_lane_function(
         lambda x: x + 1.0, lambda x: x, "interface check", None
     )
@@ -90,18 +94,21 @@ def compile_lane_program(
     code_store: CodeStore | None,
     register_limits: RegisterLimits = DEFAULT_REGISTER_LIMITS,
 ) -> Callable[[Sequence[Any], Sequence[np.ndarray]], list[np.ndarray]]:
-    """Return a compiled program of `lane_function(scalars, lanes)`.
+    """Return a compiled program that computes `lane_function(scalars, lanes)`.
 
-    Scalars have the types `scalar_dtypes`, and arrays the float type `lane_dtype`. The function
-    must be elementwise over lanes, except for loops that end when no lane continues. The function
-    returns a flat tuple of arrays whose last axis is that of the lanes. The `repr` of `trace_key`
-    identifies everything on which the trace depends except shapes: the values in the function's
-    closure, and its source. Code is saved in `code_store`, if given. `register_limits` decides
-    which arrays are kept in registers.
+    The function must be elementwise over lanes, except for loops that end when no lane continues.
+    It returns a flat tuple of arrays whose last axis is the lane axis.
 
-    The program takes NumPy arrays of any equal length, and returns a list of arrays. The results of
-    a lane are bitwise the same whatever the other lanes are. The program uses all cores available
-    to the process.
+    The program takes `n_lane_arrays` NumPy arrays of any equal length, and returns a list of
+    arrays. The results of a lane are bitwise the same whatever the other lanes are. The program
+    uses all cores available to the process.
+
+    - `scalar_dtypes`: dtypes of the scalars;
+    - `lane_dtype`: float type of the arrays;
+    - `trace_key`: object whose `repr` identifies everything on which the trace depends except
+      shapes: the values in the function's closure, and its source;
+    - `code_store`: store that saves the code; None saves nothing;
+    - `register_limits`: limits that decide which arrays are in registers.
     """
     # The group has two vectors of 256 bits, so that one computes during the latency of the other.
     group_width = 2 * LANES_PER_256_BITS[lane_dtype]
@@ -129,14 +136,14 @@ def compile_wasm_object(
     exported_function_name: str,
     register_limits: RegisterLimits = DEFAULT_REGISTER_LIMITS,
 ) -> bytes:
-    """Return `lane_function(*scalars, *arrays)` as object code for WebAssembly, which computes two
+    """Return object code for WebAssembly that computes `lane_function(*scalars, *arrays)` for two
     lanes at a time.
 
-    The arguments are float64: `n_scalars` numbers, and arrays of shapes (rows, lanes) with the
-    given numbers of rows. The compiled function takes (inputs, outputs, lanes, begin, end). The
-    first two are tables of pointers to arguments and results. The third is the number of lanes. The
-    last two are the range of pairs of lanes to compute. The caller provides `sin` and `cos` if the
-    trace uses them.
+    The arguments are `n_scalars` scalars and arrays of shapes (n, lanes), all of type float64; the
+    lengths n are `n_rows_by_array`. The compiled function takes (inputs, outputs, lanes, begin,
+    end). The first two are tables of pointers to arguments and results. The third is the number of
+    lanes. The last two are the range of pairs of lanes to compute. The caller must provide `sin`
+    and `cos` if the trace uses them.
     """
     lane_array_shapes = [
         jax.ShapeDtypeStruct((n, LANE_AXIS_SENTINEL), np.float64) for n in n_rows_by_array
@@ -158,14 +165,14 @@ def compile_lane_function(
     code_store: CodeStore | None,
     register_limits: RegisterLimits = DEFAULT_REGISTER_LIMITS,
 ) -> Callable[..., Any]:
-    """Return `lane_function`, compiled to machine code, as one call within JAX programs.
+    """Return a function that calls `lane_function`, compiled to machine code, from JAX programs.
 
-    The arguments are trees of arrays whose last axis is that of the lanes. The first array has
-    lanes, and numbers without axes are the same for all lanes. The results form the same tree as
-    those of `result_shape_function`, which is fast to trace. The other arguments are as in
-    `compile_lane_program`. A single lane has separate code, which computes no other lanes and gives
-    the same bits. The call has no derivatives, works on CPUs only, and uses the one core that runs
-    the program.
+    The returned function takes trees of arrays whose last axis is the lane axis. The first array
+    must have lanes; scalars are the same for all lanes. The result is a tree of the structure that
+    `result_shape_function` returns, which should be fast to trace. `trace_key`, `code_store` and
+    `register_limits` are as in `compile_lane_program`. A single lane has separate code, which
+    computes no other lanes and gives the same bits. The call has no derivatives, works on CPUs
+    only, and uses one core.
     """
 
     def call_compiled_function(*argument_trees: Any) -> Any:
@@ -227,15 +234,19 @@ def compile_lane_function(
 
 
 def _reraise_on_tested_release(compilation_error: Exception) -> None:
-    """Raise the error on a tested release of JAX. On any other release, disable machine code."""
+    """Raise the error on a tested release of JAX. On any other release, disable machine code
+    instead.
+    """
     if fallback.is_tested_jax_release():
         raise compilation_error
     fallback.disable_machine_code(compilation_error)
 
 
 def load_saved_machine_code(code_names: Sequence[str], code_store: CodeStore | None) -> bool:
-    """Register the saved machine code of these names, and return whether the code of every name is
-    available."""
+    """Load the saved machine code of all `code_names`, so that JAX programs can call it.
+
+    Return whether the code of every name is available.
+    """
     for code_name in code_names:
         machine_code = (
             None if code_name in LOADED_CODE_BY_NAME else load_machine_code(code_name, code_store)
@@ -246,7 +257,7 @@ def load_saved_machine_code(code_names: Sequence[str], code_store: CodeStore | N
 
 
 class _LoadedLaneProgram:
-    """Loaded machine code that is called with NumPy arrays."""
+    """Callable that runs loaded machine code on NumPy arrays."""
 
     def __init__(self, machine_code: MachineCode, lanes_per_group: int) -> None:
         self.result_shapes_and_dtypes, self.lanes_per_group = (
@@ -296,7 +307,7 @@ class _LoadedLaneProgram:
 
 
 def _pad_lane_array(x: np.ndarray, n_padded_lanes: int) -> np.ndarray:
-    """Return `x` as a contiguous array of `n_padded_lanes` numbers, padded with its last number."""
+    """Return `x` as a contiguous array of length `n_padded_lanes`, padded with its last entry."""
     if len(x) == n_padded_lanes:
         return np.ascontiguousarray(x)
     padded_array = np.full(n_padded_lanes, x[-1])
@@ -305,12 +316,12 @@ def _pad_lane_array(x: np.ndarray, n_padded_lanes: int) -> np.ndarray:
 
 
 def _make_pointer_table(numpy_arrays: Sequence[np.ndarray]) -> Any:
-    """Return a C array of pointers to the arrays' data."""
+    """Return a C array of pointers to the data of the NumPy arrays."""
     return (ctypes.c_void_p * len(numpy_arrays))(*(x.ctypes.data for x in numpy_arrays))
 
 
 def _count_available_cores() -> int:
-    """Return the number of cores available to the process."""
+    """Return the number of processor cores that this process may use."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1

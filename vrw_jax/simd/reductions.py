@@ -1,4 +1,6 @@
-"""Rules of primitives that reduce arrays along axes. Only `any` and `all` reduce over lanes."""
+"""Rules of primitives that reduce arrays along axes. Only `reduce_and` and `reduce_or` reduce over
+lanes.
+"""
 
 import functools
 import math
@@ -24,7 +26,7 @@ from vrw_jax.simd.value_emitter import LlvmValue
 def emit_cumulative_sum(
     array_emitter: ArrayEmitter, primitive_call: PrimitiveCall, array: LlvmArray
 ) -> LlvmArray:
-    """Return cumulative sums along an axis, from its start or, with `reverse`, from its end."""
+    """Return the cumulative sums along an axis, from its start or, with `reverse`, from its end."""
     if primitive_call.primitive_params["axis"] == len(array.shape):
         raise make_lane_mixing_error(primitive_call.primitive_name)
     summed_terms = np.moveaxis(
@@ -58,7 +60,7 @@ def emit_array_product(
     left_array: LlvmArray,
     right_array: LlvmArray,
 ) -> LlvmArray:
-    """Return the product of two arrays, summed over one axis of each."""
+    """Return the product of two arrays, summed over one axis of each array."""
     (contracted_left_axes, contracted_right_axes), (batch_axes, _) = (
         primitive_call.primitive_params["dimension_numbers"]
     )
@@ -125,12 +127,14 @@ def emit_array_product(
 
 
 def make_reduction_rule(combining_primitive: str) -> Callable[..., LlvmArray]:
-    """Return the rule of a reduction by an elementwise primitive such as "add"."""
+    """Return the rule for a reduction that combines entries by an elementwise primitive such as
+    "add".
+    """
 
     def emit_reduced_array(
         array_emitter: ArrayEmitter, primitive_call: PrimitiveCall, array: LlvmArray
     ) -> LlvmArray:
-        """Reduce an array along axes, and return the result; only `any` and `all` also reduce over
+        """Return the array reduced along axes. Only `reduce_and` and `reduce_or` also reduce over
         lanes.
         """
         reduces_over_lanes = has_lanes(primitive_call.operand_avals[0]) and not has_lanes(
@@ -197,8 +201,10 @@ def make_reduction_rule(combining_primitive: str) -> Callable[..., LlvmArray]:
 def _emit_any_or_all_lanes(
     array_emitter: ArrayEmitter, combining_primitive: str, lane_flags: LlvmValue
 ) -> LlvmValue:
-    """Emit the test whether any ("or") or all ("and") lanes of a group are true, and return its
-    truth value."""
+    """Emit the test whether any ("or") or all ("and") lanes of a group are true.
+
+    Return its LLVM truth value, a scalar.
+    """
     builder = array_emitter.builder
     if not isinstance(lane_flags.type, ir.VectorType):
         return lane_flags

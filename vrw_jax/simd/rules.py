@@ -1,4 +1,4 @@
-"""Table `PRIMITIVE_RULES` of the lowering rules of JAX primitives. A new primitive needs one more
+"""Table `PRIMITIVE_RULES` of the rules that lower JAX primitives. A new primitive needs one more
 entry.
 """
 
@@ -27,8 +27,10 @@ from vrw_jax.simd.lowering import (
 
 
 def _make_single_result_rule(emit_single_result: Callable[..., LlvmArray]) -> PrimitiveRule:
-    """Return a rule of a primitive with one result from a function `emit(emitter, call,
-    *values)`.
+    """Return a `PrimitiveRule` for a primitive with one result.
+
+    - `emit_single_result`: function of an `ArrayEmitter`, a `PrimitiveCall` and the operands that
+      returns the result.
     """
 
     def emit_checked_result(
@@ -73,14 +75,14 @@ def _make_single_result_rule(emit_single_result: Callable[..., LlvmArray]) -> Pr
 def _emit_elementwise_result(
     array_emitter: Any, primitive_call: PrimitiveCall, *operands: LlvmArray
 ) -> LlvmArray:
-    """Return the primitive applied to each entry."""
+    """Apply the primitive to each entry, and return the array of the results."""
     return array_emitter.emit_elementwise_array(primitive_call, operands)
 
 
 def _emit_optimization_barrier(
     jaxpr_lowering: JaxprLowering, equation: Any, operands: list[LlvmArray]
 ) -> list[LlvmArray]:
-    """Return the arrays, of which large lazy ones are computed and stored in memory at this
+    """Return the operands. Large lazy arrays among them are computed and stored in memory at this
     point.
     """
     return [
@@ -120,8 +122,10 @@ PRIMITIVE_RULES: dict[str, PrimitiveRule] = {
 
 
 def describe_supported_primitives() -> dict[str, str]:
-    """Return, for each JAX primitive that has machine code, the first paragraph of its rule's
-    docstring.
+    """Return descriptions of the rules by the name of the JAX primitive, for all supported
+    primitives.
+
+    A description is the first paragraph of the rule's docstring.
     """
     get_first_paragraph = lambda text: " ".join(text.partition("\n\n")[0].split())
     return {

@@ -23,10 +23,10 @@ LLVM_NUMBER_TYPES = {
 
 
 class LlvmBinaryInstruction:
-    """An LLVM instruction with two operands of one type.
+    """LLVM instruction with two operands of one type.
 
-    Most of a program consists of such instructions. llvmlite's instructions can be changed later,
-    so they take six times as long to create and to write as these.
+    Most instructions of a program are of this class. llvmlite's own instructions can be changed
+    later, so they take six times as long to create and to write.
     """
 
     __slots__ = ("name", "text", "type")
@@ -35,7 +35,7 @@ class LlvmBinaryInstruction:
         self.name, self.type, self.text = result_name, llvm_type, instruction_text
 
     def get_reference(self) -> str:
-        """Return the name by which other instructions refer to the result."""
+        """Return the name by which other instructions refer to the result of this instruction."""
         return self.name
 
     def __str__(self) -> str:
@@ -43,15 +43,16 @@ class LlvmBinaryInstruction:
 
 
 class _LlvmSplatConstant(ir.Constant):
-    """An LLVM constant that is the same for all lanes, written once in LLVM's text."""
+    """LLVM vector constant with one number for all lanes, which the LLVM text contains once."""
 
     def _get_reference(self) -> str:
         return f"splat ({self.constant[0]})"
 
 
 class ValueEmitter:
-    """Emitter of LLVM values into the function of `builder`; a vector has `n_vector_lanes`
-    lanes.
+    """Emitter of LLVM values into the function of `builder`.
+
+    An LLVM vector has `n_vector_lanes` lanes.
     """
 
     def __init__(self, builder: ir.IRBuilder, n_vector_lanes: int) -> None:
@@ -70,7 +71,7 @@ class ValueEmitter:
         return ir.VectorType(llvm_number_type, self.n_vector_lanes)
 
     def make_llvm_constant(self, llvm_type: ir.Type, constant_value: Any) -> ir.Constant:
-        """Return an LLVM constant of the given type, the same for all lanes."""
+        """Return an LLVM constant of type `llvm_type` that equals `constant_value` in all lanes."""
         if isinstance(llvm_type, ir.VectorType):
             return self.to_lane_vector(self.make_llvm_constant(llvm_type.element, constant_value))
         python_number = (
@@ -81,8 +82,10 @@ class ValueEmitter:
         )
 
     def to_lane_vector(self, scalar_value: LlvmValue) -> LlvmValue:
-        """Return a scalar as a vector whose entries all equal the scalar. A vector is returned
-        unchanged."""
+        """Return a vector whose entries all equal the LLVM value `scalar_value`.
+
+        A vector is returned unchanged.
+        """
         if isinstance(scalar_value.type, ir.VectorType):
             return scalar_value
         llvm_vector_type = self.make_vector_type(scalar_value.type)
@@ -109,8 +112,8 @@ class ValueEmitter:
         return self.emit_value_once(("spread", id(scalar_value)), emit_equal_lanes)
 
     def emit_value_once(self, value_key: tuple, create_llvm_value: Callable[[], Any]) -> Any:
-        """Return the value stored under `value_key`, which `create_llvm_value` creates on the first
-        call.
+        """Return the value stored under `value_key`; on the first call, `create_llvm_value` creates
+        it.
 
         An object that a key identifies by `id` must live as long as this emitter.
         """
@@ -122,8 +125,9 @@ class ValueEmitter:
     def emit_binary_instruction(
         self, llvm_opcode: str, x: LlvmValue, y: LlvmValue
     ) -> LlvmBinaryInstruction:
-        """Emit an instruction on two values of the same type, and return its result of that
-        type.
+        """Emit an instruction with two operands of the same type, and return the instruction.
+
+        The type of its result is that of the operands.
         """
         self.n_emitted_instructions += 1
         result_name, llvm_type = f"%o{self.n_emitted_instructions}", x.type
@@ -135,14 +139,16 @@ class ValueEmitter:
         return instruction
 
     def to_scalars_or_vectors(self, *llvm_values: LlvmValue) -> list[LlvmValue]:
-        """Return the values as vectors if one of them is a vector, else unchanged."""
+        """Return all LLVM values as vectors if one of them is a vector, else unchanged."""
         if any(isinstance(llvm_value.type, ir.VectorType) for llvm_value in llvm_values):
             return [self.to_lane_vector(llvm_value) for llvm_value in llvm_values]
         return list(llvm_values)
 
     @contextlib.contextmanager
     def discard_inner_values(self) -> Iterator[None]:
-        """Return a context at whose end the values computed within it are discarded."""
+        """Return a context that, at its end, discards the values stored within it by
+        `emit_value_once`.
+        """
         outer_keys, self.recent_value_keys = self.recent_value_keys, []
         yield
         for key in self.recent_value_keys:
@@ -155,8 +161,10 @@ class ValueEmitter:
         emit_loop_condition: Callable[[list[LlvmValue]], LlvmValue],
         emit_loop_body: Callable[[list[LlvmValue]], Sequence[LlvmValue]],
     ) -> list[LlvmValue]:
-        """Emit the loop `while emit_loop_condition(values): values = emit_loop_body(values)`, and
-        return the last values."""
+        """Emit a loop that carries LLVM values, and return these values after the last iteration.
+
+        The loop is `while emit_loop_condition(values): values = emit_loop_body(values)`.
+        """
         builder, entry_basic_block = self.builder, self.builder.block
         head_basic_block, body_basic_block, exit_basic_block = (
             builder.append_basic_block(name) for name in ("head", "body", "after")
