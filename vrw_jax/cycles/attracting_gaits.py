@@ -91,7 +91,7 @@ def _find_gaits_from_starts(
     is_gait_valid = (np.asarray(candidate_gaits.outcome) == Outcome.STEPPED) & is_attracting
     step_end_states = np.asarray(
         candidate_gaits.steps.section_state
-    )  # section states at the ends of all steps
+    )  # section states at the ends of all gait steps
     sum_over_steps = lambda walk_states: (
         np.asarray(walk_states).reshape(len(candidate_wheel_indices), -1).sum(-1)
     )

@@ -93,7 +93,7 @@ class CollocationSystem(NamedTuple):
 
     @property
     def phase_meshes(self) -> tuple[PhaseMesh, ...]:
-        """Return the meshes of DLS, SLS-I and SLS-II."""
+        """Return the meshes of the phases DLS, SLS-I and SLS-II."""
         n_dls_intervals, n_sls1_intervals, n_sls2_intervals = self.cycle_options.mesh_intervals
         return (
             PhaseMesh(n_dls_intervals, 1.0),
@@ -165,11 +165,11 @@ class CollocationState(NamedTuple):
     """
 
     solution: CollocationSolution
-    is_phase_active: LaneArray  # (n, n_phases, lanes): 1 if the phase takes place, else 0
+    is_phase_active: LaneArray  # (n, n_phases, lanes): 1 if the phase occurs, else 0
     # (lanes,): 1 for a limit cycle, 0 for a replacement of a missing cycle
     has_cycle: LaneArray
     # (lanes,): 1 + index in ADMISSIBILITY_CHECKS of the check that a root fails;
-    # plus HOMOTOPY_OFFSET for a root of a wheel on the homotopy; a NewtonFailure; else 0
+    # plus HOMOTOPY_OFFSET for a root of a wheel on the homotopy; a HomotopyFailure; else 0
     failed_check: LaneArray
     step_end_states: LaneArray  # (n, 4, lanes): theta, L1 and their rates at the end of each step
 
@@ -179,7 +179,7 @@ class CycleSearchResult(NamedTuple):
 
     collocation_state: CollocationState
     monodromy_matrix: LaneArray  # (row, column, lanes)
-    correction_norm: LaneArray  # of Newton's last correction
+    correction_norm: LaneArray  # norm of Newton's last correction
     n_newton_iterations: Int[Array, " lanes"]  # number of linearizations of the system
 
 
@@ -793,7 +793,7 @@ def search_all_attempts(
     - `parameters_and_guess`: the parameters and, optionally, a guess.
     """
     parameters, n_lanes = parameters_and_guess[0], parameters_and_guess[0].shape[-1]
-    # With several steps, the homotopy would continue a gait of one step, which decides nothing.
+    # For several gait steps, the homotopy would continue a gait of one step, which decides nothing.
     n_attempts = len(SEARCH_ATTEMPTS) + 2 * collocation_system.search_limits.n_homotopy_segments * (
         collocation_system.period_n == 1
     )
@@ -863,7 +863,7 @@ def _can_attempt_change_result(
 def init_search_result(
     collocation_system: CollocationSystem, parameters: LaneParameters
 ) -> CycleSearchResult:
-    """Return the search result before the first attempt."""
+    """Return the search result of each wheel (lane) before the first attempt."""
     section_size, n_phases = (
         collocation_system.phase_sequence.section_size,
         len(collocation_system.phase_sequence.phases),

@@ -41,10 +41,10 @@ class AbstractCycle(AbstractPrintable):
     axis of every field comes first.
     """
 
-    # before touchdown; fixed point of `period_n` return maps
+    # section state before touchdown, a fixed point of `period_n` return maps
     section_state: eqx.AbstractVar[Array]
     post_impact: eqx.AbstractVar[Float[Array, "2"]]  # (theta, dtheta) after the first landing
-    # of the phases, s, double support first
+    # durations of the phases, s, double support first
     durations: eqx.AbstractVar[Float[Array, "*n 3"]]
     step_length: eqx.AbstractVar[Float[Array, "*n"]]  # distance between the feet at each landing, m
     monodromy_value: eqx.AbstractVar[Array]  # the monodromy matrix without derivatives
@@ -124,7 +124,7 @@ class AbstractCycle(AbstractPrintable):
 
         After `replace_missing_gaits_by_nan` the result and its derivatives are NaN instead of zero.
         """
-        # The derivative of the zero is also zero.
+        # The derivative of this value 0 is also 0.
         return jnp.where(self.found, value_of_gait, 0.0 * self.monodromy_value[..., 0, 0])
 
     def reduce_over_steps(

@@ -161,7 +161,7 @@ def _compute_monodromy_tangents(
     ) / squared_direction_norm
     time_scale_tangent = (
         jnp.asarray([[0, 1], [-1, 0]])[..., None] * monodromy_matrices[0]
-    )  # by the logarithm of the time unit
+    )  # derivative with respect to the logarithm of the time unit
     time_scale_tangents = {
         i: time_scale_tangent
         if unit_scale is scales.TIME_UNIT_SCALING

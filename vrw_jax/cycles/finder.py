@@ -37,9 +37,9 @@ class GaitBranchPoint(NamedTuple):
     """Gait as a point of a branch, described by the data that `is_same_branch` compares."""
 
     gait_coordinates: Any  # section state and durations
-    # with a leading axis over the model's parameters
+    # derivatives of the coordinates, with a leading axis over the model's parameters
     coordinate_derivatives: Any
-    is_phase_active: Any  # whether each phase occurs; constant along a branch
+    is_phase_active: Any  # whether each phase occurs; the same on a whole branch
     return_map_jacobian: Any  # with respect to the section state
 
 
@@ -52,7 +52,7 @@ class Gait(eqx.Module):
     """
 
     cycle: AbstractCycle
-    step: AbstractStep  # event-driven, from the cycle's section state
+    step: AbstractStep  # event-driven step from the cycle's section state
     cycle_derivatives: AbstractCycle
     step_derivatives: AbstractStep
     branch_point: GaitBranchPoint
@@ -128,7 +128,7 @@ class AbstractGaitFinder(eqx.Module):
     model: eqx.AbstractVar[AbstractWheel]
     n_legs: eqx.AbstractVar[int]
     step_options: eqx.AbstractVar[StepOptions]
-    options_type: eqx.AbstractClassVar[type]  # of the options that `limit_cycle` accepts
+    options_type: eqx.AbstractClassVar[type]  # type of the options that `limit_cycle` accepts
     # names of measures that depend only on the cycle
     cycle_measures: eqx.AbstractClassVar[tuple[str, ...]]
     differentiable_measures: eqx.AbstractClassVar[tuple[str, ...]]
@@ -137,7 +137,7 @@ class AbstractGaitFinder(eqx.Module):
     default_measures: eqx.AbstractClassVar[tuple[str, ...]]
     # names of all measures, including measures with one value per leg
     readable_measures: eqx.AbstractClassVar[tuple[str, ...]]
-    # whether the search needs no start near the gait
+    # whether the search requires no start near the gait
     supports_cold_start: eqx.AbstractClassVar[bool]
     is_multistable: ClassVar[bool] = False
     """Whether several gaits of a wheel may be attracting. Walks from several starts

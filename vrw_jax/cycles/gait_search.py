@@ -58,7 +58,7 @@ RETRY_OUTCOMES = (
     Outcome.BRANCH_ENDS_BEFORE_TARGET,
     Outcome.MESH_TOO_COARSE,
 )
-"""Outcomes of a search that may have missed an existing gait."""
+"""Outcomes after which the search is repeated, because it may have missed an existing gait."""
 
 
 @dataclass(frozen=True)
@@ -322,7 +322,7 @@ def _search_with_fallbacks(
     cycle = _search_without_fallbacks(gait_finder, params, cycle_guess)
     params_and_cycle = lax.stop_gradient(
         (params, cycle)
-    )  # Arrays that are differentiated have values too.
+    )  # Differentiated arrays also have concrete values.
     if not gait_finder.supports_cold_start or has_traced_leaf(params_and_cycle):
         return cycle
     if not is_batch:
@@ -537,7 +537,7 @@ def _find_fallback_starts(
     if not needs_better_gait.any():
         return None
     walk_end_states = _find_walk_end_states(gait_finder, params, is_gait_missing, guess_states)
-    # `collocation_state` holds the best start of each wheel so far, on the mesh of the last finder.
+    # `collocation_state` contains the best start so far of each wheel, on the last finder's mesh.
     collocation_state, has_known_state = cycle.collocation_state, has_large_mesh_error.copy()
     is_mesh_too_coarse = search_outcomes == Outcome.MESH_TOO_COARSE
     best_finder_and_starts = None
@@ -552,7 +552,7 @@ def _find_fallback_starts(
             collocation_state = map_in_batches(
                 transfer_solution, batch_sizes.GAIT_BATCH_SIZES, collocation_state
             )
-        # The search without walks has used this mesh already. One finer mesh is always tried.
+        # The search without walks has already used this mesh. One finer mesh is always used.
         is_retry_promising = (
             np.isfinite(walk_end_states[:, 0])
             | has_known_state

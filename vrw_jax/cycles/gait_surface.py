@@ -96,7 +96,7 @@ def predict_gait(params: WheelParams, phase_meshes: tuple[PhaseMesh, ...]) -> Co
     The accelerations belong to the nodes of `phase_meshes`. The wheels are on the last axis.
     """
     gait_surface = load_gait_surface()
-    # With Python floats, the dtype of the parameters is kept.
+    # Python floats do not change the dtype of the parameters.
     coordinate_ranges = (surface_coordinate.tolist() for surface_coordinate in gait_surface[:4])
     centered_coordinates = tuple(
         (jnp.clip(surface_coordinate, lower_bound, upper_bound) - center) / half_range

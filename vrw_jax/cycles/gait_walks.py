@@ -115,7 +115,7 @@ def compute_fallback_walk_starts(params: WheelParams) -> np.ndarray:
 def _convert_params_to_numpy(params: WheelParams) -> Any:
     """Return the parameters as NumPy arrays.
 
-    JAX would compile each operation for every number of wheels.
+    With JAX arrays, each operation would be compiled for every number of wheels.
     """
     return SimpleNamespace(**{name: np.asarray(getattr(params, name)) for name in PARAMETER_NAMES})
 
@@ -158,7 +158,7 @@ def stack_section_units(model: Any, parameter_values: np.ndarray, n_legs: int) -
 def count_section_coordinates(gait_finder: Any) -> int:
     """Return the number of continuous components in a section state.
 
-    The remaining components are codes.
+    The remaining components are discrete codes.
     """
     return int(gait_finder.model.n_continuous(WheelParams(n_legs=gait_finder.n_legs)))
 
@@ -168,7 +168,7 @@ class DistinctWalkEnds(NamedTuple):
 
     wheel_indices: np.ndarray  # (ends,)
     section_states: np.ndarray  # (ends, section)
-    period_defects: np.ndarray  # (ends,); see `measure_period_defects`
+    period_defects: np.ndarray  # (ends,), in units of the wheel; see `measure_period_defects`
 
 
 def walk_to_gaits(
@@ -242,7 +242,7 @@ def walk_to_gaits(
         walk_options,
     )
     is_walk_selected = ~is_walk_duplicate & (period_defects < walk_options.max_newton_start_defect)
-    # The first start is selected for a wheel without any usable walk.
+    # If a wheel has no usable walk, its first start is selected.
     is_walk_selected[np.setdiff1d(np.arange(n_wheels), walk_wheel_indices[is_walk_selected])] = True
     selected_walks = np.flatnonzero(is_walk_selected)
     selected_walks = selected_walks[np.argsort(walk_wheel_indices[selected_walks], kind="stable")]

@@ -163,7 +163,7 @@ def compute_step_slope_response(
 ) -> SlopeResponse:
     """Return the slope response of an event-driven step that starts at the section state of a gait.
 
-    The code components of the section state do not vary.
+    The discrete codes in the section state do not vary.
     """
     n_states = model.n_continuous(params)
     section_state_codes = section_state[n_states:]

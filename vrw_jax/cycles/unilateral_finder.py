@@ -370,11 +370,11 @@ def _find_contact_fixed_points(
 ) -> _ContactFixedPoints:
     """Find the fixed points of the return maps near `start_states`.
 
-    The code components at the end of a section state are copied from its image. Newton's method
-    first uses gait steps with a loose tolerance, until corrections are small. It then uses one step
-    at the tolerance of `step_options`, with the same Jacobian. One more step evaluates the gait
-    with all derivatives. If loose steps move away from a state that an exact step hardly changes,
-    all steps are exact.
+    The last components of a section state are discrete codes, which are copied from its image.
+    Newton's method first uses gait steps with a loose tolerance, until corrections are small. It
+    then uses one step at the tolerance of `step_options`, with the same Jacobian. One more step
+    evaluates the gait with all derivatives. If loose steps move away from a state that an exact
+    step hardly changes, all steps are exact.
     """
     period_map = PeriodMap(model, n_legs, period_n, parameter_values)
     loose_step_tolerances = [
@@ -568,7 +568,7 @@ def _compute_return_map_jacobian_of_steps(
 def _make_contact_cycle(
     model: AbstractWheel, n_legs: int, parameter_values: Array, fixed_points: _ContactFixedPoints
 ) -> ReturnMapCycle:
-    """Return the cycle at a fixed point."""
+    """Build the cycle that belongs to a fixed point."""
     newton_diagnostics = (
         fixed_points.newton_residuals,
         fixed_points.is_gait_found,
@@ -586,7 +586,9 @@ def _make_contact_cycle(
 def _make_contact_gait(
     model: AbstractWheel, n_legs: int, parameter_values: Array, fixed_points: _ContactFixedPoints
 ) -> Gait:
-    """Return the gait at a fixed point, with derivatives by the implicit function theorem."""
+    """Build the gait that belongs to a fixed point, with derivatives by the implicit
+    function theorem.
+    """
     n_values = parameter_values.shape[0]
     identity_matrix = jnp.eye(
         fixed_points.fixed_section_states.shape[0], dtype=fixed_points.fixed_section_states.dtype
