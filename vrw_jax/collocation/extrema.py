@@ -101,7 +101,7 @@ class CollocatedPhaseMotion(NamedTuple):
     In each mesh interval the accelerations are a polynomial of time.
     """
 
-    boundary_times: Float[Array, " boundaries"]  # of the interval boundaries, s
+    boundary_times: Float[Array, " boundaries"]  # times of the interval boundaries, s
     boundary_q: Float[Array, "boundaries coordinates"]
     boundary_v: Float[Array, "boundaries coordinates"]
     node_accelerations: Float[Array, "intervals nodes coordinates"]
@@ -226,7 +226,7 @@ class _PiecewiseQuantityPolynomial(NamedTuple):
     """
 
     boundary_times: Float[Array, " boundaries"]
-    interval_coefficients: Float[Array, "intervals powers"]  # of powers of the location in [0, 1]
+    interval_coefficients: Float[Array, "intervals powers"]  # in powers of the location in [0, 1]
 
     @classmethod
     def interpolate_motion(

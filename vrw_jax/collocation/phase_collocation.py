@@ -84,7 +84,7 @@ class CollocationPhase(NamedTuple):
     end_event_function: Callable[[PhaseConstants, PhasePoint], Elementwise]
     reset_map: Callable[[PhaseConstants, PhasePoint], PhasePoint]
     guards_function: Callable[[PhaseConstants, PhasePoint], Vector]
-    is_smooth: bool = True  # False if the first interval leaves a fast decaying mode unresolved
+    is_smooth: bool = True  # False if the first interval does not resolve a rapidly decaying mode
 
 
 class PhaseSequence(NamedTuple):
@@ -125,7 +125,7 @@ class CycleLinearization(NamedTuple):
     step_end_states: LaneArray
     # derivatives of `step_end_states`; requested parameters on a leading axis
     step_end_tangents: LaneArray
-    monodromy: LaneArray  # Jacobian of the return map, (row, column, batch)
+    monodromy: LaneArray  # Jacobian of the return map: (row, column, batch)
 
 
 class _LinearizationContext(NamedTuple):
@@ -143,7 +143,7 @@ class _LinearizationContext(NamedTuple):
     phase_constants: PhaseConstants
     constant_tangents: tuple[
         LaneArray, ...
-    ]  # of each constant, with respect to the requested parameters
+    ]  # tangents of each constant with respect to the requested parameters
     prevent_fusion: FusionBarrierFn
 
     @property
