@@ -96,10 +96,8 @@ class NewtonStep(NamedTuple):
     """Newton's correction and the tangent of the branch at a trial point (z, p)."""
 
     newton_correction: ProblemUnknowns  # of z at fixed p
-    branch_tangent: ProblemUnknowns  # dz/dp, the tangent of the branch
-    return_map_jacobian: Float[
-        Array, "n n"
-    ]  # Jacobian of the return map with respect to the section state
+    branch_tangent: ProblemUnknowns  # derivative dz/dp
+    return_map_jacobian: Float[Array, "n n"]  # with respect to the section state
 
 
 class AbstractContinuationProblem(eqx.Module):
@@ -163,8 +161,8 @@ def compute_fixed_point_newton_step(
 ) -> NewtonStep:
     """Return Newton's correction and the branch tangent for the equation `return_map(z, p)` = z.
 
-    The first `n_continuous` components of z are continuous. The other components are integer codes.
-    The correction of a code is the difference between its image under the map and the code.
+    The first `n_continuous` components of z are continuous. The remaining components are discrete
+    codes. The correction of a code is the difference between its image under the map and the code.
     """
     continuous_map = lambda x, p: return_map(jnp.concatenate([x, z[n_continuous:]]), p)
     mapped_point, partial_jacobians = evaluate_with_jacobian(continuous_map, z[:n_continuous], p)
@@ -333,7 +331,7 @@ class _TrialPoint(NamedTuple):
     z: ProblemUnknowns
     parameter_fraction: Scalar
     predicted_arc_length: Scalar  # from the last point of the branch
-    is_range_end: Bool[Array, ""]  # whether the plane is an end of the parameter's range
+    is_range_end: Bool[Array, ""]  # whether the plane is at an end of the parameter's range
 
 
 def _predict_trial_point(
@@ -441,7 +439,7 @@ class _TrialVerdict(NamedTuple):
     has_failed: Bool[Array, ""]
     # whether the trial is accepted despite a turn of more than `max_turn_angle`
     is_kink: Bool[Array, ""]
-    fraction_rate: Scalar  # rate of the parameter in the direction of continuation
+    fraction_rate: Scalar  # derivative of the parameter fraction in the direction of continuation
 
 
 def _assess_trial(

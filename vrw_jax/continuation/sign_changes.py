@@ -170,7 +170,7 @@ def locate_function_zeros(
             proposal_values == 0.0
         ]
         is_left_side = np.sign(section_values) != np.sign(values_at_one[jump_brackets])[:, None]
-        # The zero lies between the last location with the sign of 0 and the next location.
+        # The root lies between the last location with the sign of location 0 and the next location.
         last_left_index = np.sum(np.cumprod(is_left_side, 1), 1)
         locations[:2, jump_brackets] = section_ends[
             np.arange(len(jump_brackets)), np.stack([last_left_index, last_left_index + 1])

@@ -68,7 +68,7 @@ class TestFunctionPoint(NamedTuple):
     """Unknowns at a point of the curve: those of the fixed point, and the second parameter."""
 
     z: ProblemUnknowns
-    second_parameter_fraction: Elementwise  # of the second parameter's range
+    second_parameter_fraction: Elementwise  # second parameter as a fraction of its range
 
 
 class TestFunctionCurve(AbstractContinuationProblem):
