@@ -85,7 +85,7 @@ ADMISSIBILITY_COLUMN = "sequence"
 """Name of the quantity that is 1 at admissible points and -1 at all other points."""
 
 QuantitiesByName = dict[str, np.ndarray]
-"""Arrays over a batch of points, by the name of the quantity."""
+"""Arrays of quantities with one element per point, by the name of the quantity."""
 
 
 @dataclass(frozen=True)
@@ -137,7 +137,7 @@ class AbstractContinuation(abc.ABC):
         return quantity_table
 
     def name_branch_end(self, quantity_table: QuantitiesByName, point_index: int) -> str:
-        """Return a name for the end of a branch, from the first point beyond the end."""
+        """Return the name of a branch's end, derived from the first point beyond the end."""
         return ADMISSIBILITY_COLUMN
 
     def is_same_gait(
@@ -381,7 +381,7 @@ class _BranchPointTable(NamedTuple):
     """Points of all wheels in one array, in the order of each wheel's branch."""
 
     all_points: ContinuationPoint
-    wheel_indices: np.ndarray  # of each point
+    wheel_indices: np.ndarray  # index of the wheel to which each point belongs
     quantity_table: QuantitiesByName
 
     @classmethod
@@ -532,9 +532,9 @@ class _LocatedZero(NamedTuple):
 
     bracket_and_quantity: tuple[
         int, int, str
-    ]  # indices of left and right point, and name of the quantity
-    parameter_value: float  # at the zero
-    chord_fraction: float  # of the chord from the left to the right point
+    ]  # index of the left point, index of the right point, name of the quantity
+    parameter_value: float  # value of the continued parameter at the root
+    chord_fraction: float  # location of the root on the chord from the left to the right point
     point_beside_zero: ContinuationPoint  # on the side of the left point; leading axis of length 1
     quantities_beside_zero: QuantitiesByName  # at `point_beside_zero`
 
@@ -670,7 +670,7 @@ def _locate_requested_zeros(
         bracket_tolerances,
     )
     request_indices = np.arange(len(zero_requests))
-    # Even for an exact zero, the point beside lies to the left, where the gaits are admissible.
+    # Even for an exact root, the point next to it lies to the left, where the gaits are admissible.
     points_beside_zeros, quantities_beside_zeros = solve_at_fractions(
         np.maximum(zero_locations.left_bracket_ends - bracket_tolerances, 0.0), request_indices
     )

@@ -39,7 +39,7 @@ class BranchRequest(NamedTuple):
 
     params: WheelParams  # with one leading axis over wheels
     model: AbstractWheel
-    parameter_name: str  # of the continued parameter
+    parameter_name: str  # name of the continued parameter
     parameter_values: Array  # values of the continued parameter at the starts
     period_n: int
     cycle_options: CycleOptions | None
@@ -53,7 +53,7 @@ class BranchStart(NamedTuple):
     continuation_problem: AbstractGaitProblem
     wheels: BranchWheel
     start_unknowns: Any
-    start_outcomes: np.ndarray  # of the first gaits
+    start_outcomes: np.ndarray  # outcomes of the first gaits
     make_cycle_finder: CycleFinderFactory
     start_cycles: Any = None  # the first gaits
     # None for a problem without a mesh

@@ -148,7 +148,7 @@ class GaitContinuation(AbstractContinuation):
     ) -> QuantitiesByName:
         """Return the measures of the gaits by name.
 
-        A margin that each leg has is returned as one quantity per leg.
+        If a margin has one value per leg, the result contains one quantity for each leg.
         """
         gait_problem: Any = self.continuation_problem
         measure_gaits = functools.partial(gait_problem.measure_gaits, self.model, self.step_options)

@@ -66,7 +66,10 @@ every speed repeat.
 
 
 class BranchWheel(NamedTuple):
-    """Wheel whose gaits are continued. A problem replaces the continued parameter in `params`."""
+    """Wheel whose gaits are continued.
+
+    The continuation problem replaces the continued parameter in `params`.
+    """
 
     params: WheelParams
     is_phase_active: Float[Array, "n n_phases"]  # 1 if the phase occurs in the cycle, else 0
@@ -291,7 +294,7 @@ def make_trial_linearizer(
 class AbstractReturnMapProblem(AbstractGaitProblem):
     """Continuation problem of fixed points of the return map over `period_n` gait steps.
 
-    The unknowns z are the section state. Its last components are codes (see
+    The unknowns z are the section state. Its last components are discrete codes (see
     `AbstractWheel.n_continuous`), which are copied from the image in every Newton iteration.
     Newton's method converges only if the codes of state and image are equal.
     """
@@ -316,7 +319,9 @@ class AbstractReturnMapProblem(AbstractGaitProblem):
     def is_smooth_between(
         self, left_point: ProblemUnknowns, right_point: ProblemUnknowns
     ) -> Bool[Array, ""]:
-        """Return whether two neighboring points have equal codes in their section states."""
+        """Return whether two neighboring points have equal discrete codes in their
+        section states.
+        """
         return jnp.all(left_point[self.n_coordinates :] == right_point[self.n_coordinates :])
 
     def read_gait_state(
@@ -485,7 +490,10 @@ def _combine_period_measures(
 def interpolate_section_states(
     left_state: Array, right_state: Array, state_fraction: Scalar, n_coordinates: int
 ) -> Array:
-    """Interpolate linearly between two section states. The codes are those of the nearer state."""
+    """Interpolate linearly between two section states.
+
+    The discrete codes are those of the nearer state.
+    """
     nearer_codes = jnp.where(state_fraction < 0.5, left_state, right_state)[n_coordinates:]
     return jnp.concatenate(
         [(left_state + state_fraction * (right_state - left_state))[:n_coordinates], nearer_codes]

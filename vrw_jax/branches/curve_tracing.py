@@ -89,21 +89,21 @@ class CurveTracingOptions:
 
 
 DEFAULT_CURVE_TRACING_OPTIONS = CurveTracingOptions()
-"""Default options of the tracing of curves."""
+"""Default options for the tracing of curves."""
 
 
 @dataclass(frozen=True)
 class CurveContinuation(AbstractContinuation):
     """Continuation of special points as curves in two parameters.
 
-    The quantities at its points are those of gaits, without the quantity that vanishes on the whole
-    curve.
+    The quantities at a point of a curve are those of its gait, except the quantity that vanishes on
+    the whole curve.
     """
 
     continuation_problem: TestFunctionCurve
     second_parameter_name: str
-    special_point_names: tuple[str, ...]  # of each wheel
-    gait_continuation: GaitContinuation  # along the first parameter
+    special_point_names: tuple[str, ...]  # one name per wheel
+    gait_continuation: GaitContinuation  # continuation of the gaits in the first parameter
 
     branch_ending_quantities: ClassVar[tuple[str, ...]] = (
         *BRANCH_ENDING_QUANTITIES,
@@ -221,7 +221,7 @@ class TracedCurve(NamedTuple):
     """Traced curve of special points, and seeds at the other special points that it meets."""
 
     special_point_curve: SpecialPointCurve
-    # section states and both parameters, as fractions of their ranges, (point, coordinate)
+    # section state, and the two parameters as fractions of their ranges: (point, coordinate)
     scaled_vertices: np.ndarray
     meeting_seeds: tuple[CurveSeed, ...]
 
@@ -727,7 +727,10 @@ def choose_continued_special_point_name(
     z: CollocationSolution,
     tracing_options: CurveTracingOptions = DEFAULT_CURVE_TRACING_OPTIONS,
 ) -> str:
-    """Return the name under which a special point of a gait is continued as a curve."""
+    """Return the name of the curve on which a special point of a gait lies.
+
+    The name is that of the special point that is continued as a curve.
+    """
     # A curve of folds may continue in one direction at its special points.
     if special_point_name == BRANCH_POINT_KIND:
         return "fold"

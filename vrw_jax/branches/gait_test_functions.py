@@ -169,7 +169,7 @@ class GaitTestFunction(AbstractTestFunction):
 
     collocation_system: CollocationSystem = eqx.field(static=True)
     parameter_names: tuple[str, str] = eqx.field(static=True)
-    quantity_names: tuple[str, ...] = eqx.field(static=True)  # of one group of quantities
+    quantity_names: tuple[str, ...] = eqx.field(static=True)  # names of the quantities in one group
     model: ViscoelasticWheel
     step_options: StepOptions
     test_function_options: TestFunctionOptions = eqx.field(
@@ -238,11 +238,11 @@ class GaitTestFunction(AbstractTestFunction):
     ) -> tuple[Array, Array]:
         """Return the step's quantities at the corrected gait, and their derivatives.
 
-        The derivatives are with respect to the two parameters. Newton's method needs only a few
-        digits of them. Finite differences of gait steps are cheaper than derivatives of the step,
-        and use the same machine code. Near a fold the tangents and the correction grow without
-        bound and become parallel. The differences are therefore taken in the directions of an
-        orthonormal basis of the tangents' plane. They start from the point of that plane that is
+        The derivatives are with respect to the two parameters. Newton's method requires only a few
+        digits of the derivatives. Finite differences of gait steps are cheaper than automatic
+        derivatives, and use the same machine code. Near a fold the tangents and the correction grow
+        without bound and become parallel. The differences are therefore taken in the directions of
+        an orthonormal basis of the tangents' plane. They start from the point of that plane that is
         nearest to the trial.
         """
         scaled_tangents = jnp.stack(
@@ -472,4 +472,6 @@ QUANTITY_FUNCTION_BY_GROUP = {
     CONTINUED_QUANTITIES: _stack_continued_quantities,
     BIFURCATION_NAMES: _compute_trial_monodromy,
 }
-"""Function that computes a group of quantities without an event-driven step, by the group."""
+"""Function that computes a group of quantities without an event-driven step, by the names in the
+group.
+"""

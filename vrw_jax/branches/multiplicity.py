@@ -271,7 +271,7 @@ def add_multiple_bifurcations(
         return named_zeros
     groups_of_zeros: list[
         list[Any]
-    ] = []  # Each group contains the zeros of ranks that may cross the unit circle together.
+    ] = []  # Each group contains the roots for ranks that may cross the unit circle together.
     for located_zero in locate_requested_zeros(rank_zero_requests):
         if not vanishes_at_zero(quantity_table, located_zero, zero_tolerances):
             continue

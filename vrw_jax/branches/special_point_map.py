@@ -83,8 +83,8 @@ class ScanSignChange(NamedTuple):
 
     quantity_name: str
     parameter_index: int
-    sample_indices: tuple[int, int]  # of the first sample, which has a gait
-    position_in_cells: tuple[float, float]  # of the change, along both parameters
+    sample_indices: tuple[int, int]  # indices of the first sample, which has a gait
+    position_in_cells: tuple[float, float]  # position of the change in each parameter
 
 
 @with_default_jax_settings
@@ -241,7 +241,7 @@ def _find_seeds_in_batches(
 def _collect_signed_quantities(
     scan_dataset: xr.Dataset, parameter_names: tuple[str, str]
 ) -> dict[str, np.ndarray]:
-    """Return the quantities whose signs may change by name, as arrays over the two parameters."""
+    """Return by name the quantities whose signs may change, as arrays over the two parameters."""
     signed_quantities = {
         "lambda_4_plus": scan_dataset.lambda_4_plus.transpose(*parameter_names).values
     }
