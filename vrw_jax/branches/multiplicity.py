@@ -48,8 +48,8 @@ class LocatedZeroTolerances:
     valid.
 
     - `max_zero_margin`: largest absolute value of a margin to the fold whose sign is only
-      round-off. The value is chosen because a determinant of numbers of order one is computed to
-      1e-15, and points so near to a branch point are rare;
+      round-off. The value is chosen above the round-off of a determinant of numbers of order one,
+      which is 1e-15. Points so near to a branch point are rare;
     - `max_equal_location_distance`: fraction of a bracket within which ranks are treated as
       crossing together. The value is chosen because three equal multipliers are computed to 1e-5,
       which is 1e-4 of a bracket;

@@ -86,7 +86,7 @@ def iterate_plane_newton(
         corrector_state.z,
         corrector_state.parameter_fraction,
     )
-    # A trial that is not finite leaves the state unchanged. NaN thus reaches no other batch element.
+    # A trial that is not finite leaves the state unchanged. NaN reaches no other batch element.
     is_valid = jnp.isfinite(next_corrector.correction_norm)
     next_corrector = select_tree_leaves(is_valid, next_corrector, corrector_state)._replace(
         correction_norm=next_corrector.correction_norm

@@ -255,9 +255,9 @@ def compute_jury_margins(matrix: RealSquareMatrix) -> Float[Array, "... n_margin
 def compute_bifurcation_margins(matrix: RealSquareMatrix) -> Float[Array, "... n_margins"]:
     """Return the margins to fold, period doubling and Neimark-Sacker bifurcation.
 
-    If n is at most 3, these are the first Jury margins. For larger matrices the margins are det(1 -
-    matrix), det(1 + matrix), and the product of 1 - z_i z_j over all pairs of eigenvalues z_i and
-    z_j. The third margin is missing for n = 1.
+    If n is at most 3, these are the first Jury margins. For larger matrices the first two margins
+    are det(1 - matrix) and det(1 + matrix). The third margin is the product of 1 - z_i z_j over all
+    pairs of eigenvalues z_i and z_j. It is missing for n = 1.
     """
     n = matrix.shape[-1]
     if n <= MAX_CLOSED_FORM_SIZE:

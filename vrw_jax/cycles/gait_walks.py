@@ -63,9 +63,9 @@ The first number is Leg 1's angle to the slope's normal at touchdown, as a fract
 between legs. The second number is the rate, as in WALK_STARTS. The first nine starts reach gaits of
 65 wheels for which WALK_STARTS reach none. With many legs, double support can follow directly on
 double support, with an angle near 0. The last four starts are chosen because some gaits with few
-legs are reached only from large angles and high rates. A test used 442 wheels with 5 to 7 legs that
-reach a gait from one of these starts or from a grid of 30 starts. For 18 of these wheels only the
-last four starts reach a gait.
+legs are reached only from large angles and high rates. A test used 442 wheels with 5 to 7 legs.
+Each of them reaches a gait from one of these starts or from a grid of 30 starts. For 18 of these
+wheels only the last four starts reach a gait.
 """
 
 
