@@ -1,4 +1,4 @@
-"""Figures of labeled results. No other package imports matplotlib."""
+"""Figures of labeled results. Only this package imports matplotlib."""
 
 from vrw_jax.figures import branch_figures, style
 from vrw_jax.figures.branch_figures import basin_figure, branch_figure

@@ -29,10 +29,10 @@ from vrw_jax.validation import check_type
 from vrw_jax.wheel import Outcome
 
 BRANCH_END_COLOR = OKABE_ITO_PINK
-"""Color of the end of a branch, chosen because no curve has this color."""
+"""Color that marks the end of a branch, chosen because no curve has this color."""
 
 SPECIAL_POINT_LINE_STYLE = (0, (1, 1.2))
-"""Dotted line style of a special point, chosen because no curve has this style."""
+"""Dotted line style that marks a special point, chosen because no curve has this style."""
 
 SPECIAL_POINT_COLORS = {"lost": BRANCH_END_COLOR, "border_collision": OKABE_ITO_GREEN}
 """Colors of special points by kind. Other kinds, which change the stability, are black."""
@@ -41,7 +41,7 @@ COMMON_BRANCH_PANELS = (
     ("DLS fraction", {"dls_fraction": LEG_1_COLOR}),
     ("moduli of multipliers", {"spectral_radius": "black"}),
 )
-"""Panels of every branch: label, and the color of each measure."""
+"""Panels of every branch figure: the label, and the color of each measure in the panel."""
 PAPER_BRANCH_PANELS = (
     *COMMON_BRANCH_PANELS,
     (
@@ -50,28 +50,31 @@ PAPER_BRANCH_PANELS = (
     ),
     ("clearance in SLS-I [mm]", {"clearance_sls1": LEG_2_COLOR}),
 )
-"""Panels of a branch of the paper's model."""
+"""Panels of the figure of a branch that was computed with the paper's model."""
 OTHER_MODEL_BRANCH_PANELS = (
     *COMMON_BRANCH_PANELS,
     ("walking speed [m/s]", {"speed": "black"}),
     ("step period [s]", {"period": "black"}),
 )
-"""Panels of a branch of a model without the paper's indicators."""
+"""Panels of the figure of a branch that was computed with a model without the paper's
+indicators.
+"""
 
 
 @figure_style()
 def branch_figure(branch: Branch) -> Figure:
-    """Return a figure of a branch with its special points.
+    """Return a figure of a branch and its special points.
 
-    The panels show DLS fraction, multipliers, indicators and clearance. For models other than the
-    paper's, speed and period replace indicators and clearance. Lines of stable gaits are solid, and
-    those of unstable gaits are dashed. Special points are numbered from left to right.
+    The panels show the DLS fraction, the moduli of multipliers, indicators and clearance. For
+    models other than the paper's, speed and period replace indicators and clearance. Curves are
+    solid where gaits are stable, and dashed where gaits are unstable. Special points are numbered
+    from left to right.
 
     Args:
-        branch: result of `vrw.continue_branch` over a parameter of the wheel.
+        branch: result of `vrw.continue_branch` with respect to a parameter of the wheel.
 
     Returns:
-        Figure: four panels over the parameter, in SI units.
+        Figure: four panels with the parameter on the horizontal axis, in SI units.
 
     Examples:
         >>> branch = vrw.continue_branch(vrw.WheelParams(), "damping", (190.0, 230.0))
@@ -140,7 +143,7 @@ def branch_figure(branch: Branch) -> Figure:
 
 
 def _select_special_point_color(special_point: SpecialPoint) -> str:
-    """Return the color of a special point."""
+    """Return the color in which a special point is drawn."""
     return (
         BRANCH_END_COLOR
         if special_point.ends_branch
@@ -151,7 +154,7 @@ def _select_special_point_color(special_point: SpecialPoint) -> str:
 def _draw_special_points(
     axes: Axes, special_points: list[SpecialPoint], draws_numbers: bool
 ) -> None:
-    """Draw vertical lines at the special points, and their numbers if `draws_numbers` is true."""
+    """Draw a vertical line at each special point, with its number if `draws_numbers` is true."""
     lower_limit, upper_limit = axes.get_xlim()
     label_position = -np.inf
     for point_number, special_point in enumerate(special_points):
@@ -178,7 +181,7 @@ def _draw_special_points(
 
 
 def _add_branch_legend(figure: Figure, special_points: list[SpecialPoint], parameter: str) -> None:
-    """Add a legend of the special points and of the line styles to a figure."""
+    """Add a legend that explains the special points and the line styles to a figure."""
     legend_handles = []
     for point_number, special_point in enumerate(special_points):
         violation_text = typeset_greek_symbols(describe_violation(special_point.name))
@@ -205,11 +208,11 @@ def _add_branch_legend(figure: Figure, special_points: list[SpecialPoint], param
 def basin_figure(results: list[xr.Dataset], titles: list[str]) -> Figure:
     """Return a figure of basins of attraction, one panel per result.
 
-    Crosses mark the section states of the gaits. Shades of gray show the number of steps until the
-    gait is reached, and colors show the outcomes of falls.
+    Crosses mark the section states of the gaits. Shades of gray show after how many steps a walk
+    reaches the gait, and colors show the outcomes of failed walks.
 
     Args:
-        results: results of `vrw.basin`, each over a plane of starts.
+        results: results of `vrw.basin`, each with two axes of starts.
         titles: title of each panel.
 
     Returns:

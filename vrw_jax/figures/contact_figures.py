@@ -1,4 +1,4 @@
-"""Motion of the feet of any model, and figures of their contact modes."""
+"""Motion of the feet for any model, and figures of their contact modes."""
 
 from typing import NamedTuple
 
@@ -25,30 +25,32 @@ from vrw_jax.figures.style import (
 from vrw_jax.measures import CONTACT_MODE_NAMES
 
 CONTACT_MODE_COLORS = ("white", OKABE_ITO_GREEN, OKABE_ITO_AMBER, OKABE_ITO_PINK)
-"""Colors of the contact modes, by code."""
+"""Colors of the contact modes, by contact code."""
 
 CONTACT_MODE_MARKERS = ("o", "o", ">", "<")
-"""Markers of the contact modes by code, chosen because some readers see green and pink as one
-gray.
+"""Markers of the contact modes, by contact code. They differ because some readers see the green and
+the pink as the same gray.
 """
 
 OTHER_LEG_COLOR = "#999999"
 """Color of every leg other than Legs 1 and 2."""
 
 LEG_LINE_STYLES = {1: (LEG_1_COLOR, "-"), 2: (LEG_2_COLOR, "--")}
-"""Color and line style of Legs 1 and 2 over time."""
+"""Color and line style of Legs 1 and 2 in plots over time."""
 
 OTHER_LEG_LINE_STYLES = (
     (OKABE_ITO_SKY_BLUE, "-."), (OKABE_ITO_PINK, ":"), (OKABE_ITO_AMBER, (0, (8, 3))),
     (DARK_GRAY_COLOR, (0, (5, 1, 1, 1, 1, 1))),
 )  # fmt: skip
-"""Color and line style of the other legs that move or touch, in the order of their numbers."""
+"""Colors and line styles of the other legs that move or touch the ground, in the order of leg
+labels.
+"""
 
 
 class HubAndFootMotion(NamedTuple):
-    """Positions of hub and feet over a walk, with contact modes and forces, in the slope's frame.
+    """Positions of hub and feet during a walk, with contact modes and forces, in the slope's frame.
 
-    Legs have the labels of each step: Leg 1 is the front leg at the landing, and Leg 2 is the leg
+    Leg labels change with each step: Leg 1 is the front leg at the landing, and Leg 2 is the leg
     behind Leg 1.
     """
 
@@ -60,7 +62,7 @@ class HubAndFootMotion(NamedTuple):
     step: np.ndarray  # (time,), number of the step
 
     def interpolate_at_time(self, t: float) -> tuple[np.ndarray, np.ndarray, int]:
-        """Return the positions of hub and feet at the time `t`, s, and the index of the next
+        """Return the positions of hub and feet at the time `t` (s), and the index of the next
         sample.
 
         Contact modes and forces at this time are those of the next sample.
@@ -83,14 +85,15 @@ class HubAndFootMotion(NamedTuple):
 
 
 def reports_contact_modes(walk: xr.Dataset) -> bool:
-    """Return whether a trajectory contains the contact modes of each leg."""
+    """Return whether a trajectory contains the contact mode of each leg."""
     return "contact" in walk.variables
 
 
 def compute_foot_motion(walk: xr.Dataset) -> HubAndFootMotion:
-    """Return the motion of hub and feet in a trajectory of any model.
+    """Return the motion of hub and feet in a trajectory that was computed with any model.
 
-    In the paper's phases no foot slides: Leg 1 is at rest, and Leg 2 is at rest in double support.
+    In the paper's phases no foot slides: foot 1 is at rest, and foot 2 is at rest in double
+    support.
     """
     hub_positions = np.stack([walk.hub_x.values, walk.hub_z.values], -1)
     if reports_contact_modes(walk):
@@ -126,14 +129,14 @@ def compute_foot_motion(walk: xr.Dataset) -> HubAndFootMotion:
 
 
 def select_leg_color(leg_number: int) -> str:
-    """Return the color of a leg by its number, from 1."""
+    """Return the color of the leg with the label `leg_number`, which starts from 1."""
     return {1: LEG_1_COLOR, 2: LEG_2_COLOR}.get(leg_number, OTHER_LEG_COLOR)
 
 
 def draw_feet(
     axes: Axes, foot_positions: np.ndarray, contact_modes: np.ndarray, marker_size: float
 ) -> None:
-    """Draw feet at positions of shape (2, feet), in the colors of their contact modes."""
+    """Draw feet in the colors of their contact modes, at positions of shape (2, feet)."""
     for contact_mode in np.unique(contact_modes):
         axes.plot(
             *foot_positions[:, contact_modes == contact_mode],
@@ -147,7 +150,7 @@ def draw_feet(
 
 
 def make_contact_mode_handles(contact_modes: np.ndarray) -> list[Line2D]:
-    """Return a legend entry for each contact mode that occurs."""
+    """Return a legend entry for each contact mode that occurs in `contact_modes`."""
     return [
         Line2D([], [], linestyle="", marker=CONTACT_MODE_MARKERS[contact_mode],
         color=CONTACT_MODE_COLORS[contact_mode],
@@ -158,9 +161,9 @@ def make_contact_mode_handles(contact_modes: np.ndarray) -> list[Line2D]:
 
 
 def _select_marked_legs(is_leg_marked: np.ndarray) -> list[int]:
-    """Return the numbers of Legs 1 and 2, and of all legs with a mark at any time.
+    """Return the labels of Legs 1 and 2, and of all legs that are marked at any time.
 
-    - `is_leg_marked`: marks, shape (time, leg).
+    - `is_leg_marked`: whether a leg is marked, shape (time, leg).
     """
     return [
         leg_number
@@ -170,7 +173,10 @@ def _select_marked_legs(is_leg_marked: np.ndarray) -> list[int]:
 
 
 def make_contact_panels(walk: xr.Dataset) -> Figure:
-    """Return a figure of angle, leg lengths, contact modes, foot heights and forces over time."""
+    """Return a figure of angle, leg lengths, contact modes, foot heights and forces over time.
+
+    The walk is a trajectory with contact modes.
+    """
     foot_motion = compute_foot_motion(walk)
     is_foot_touching = foot_motion.contact_modes != ContactMode.OFF
     touching_legs = _select_marked_legs(is_foot_touching)
@@ -224,7 +230,7 @@ def make_contact_panels(walk: xr.Dataset) -> Figure:
 def _draw_contact_mode_bars(
     axes: Axes, foot_motion: HubAndFootMotion, drawn_legs: list[int]
 ) -> None:
-    """Draw the contact modes of each leg over time as colored bars."""
+    """Draw the contact modes of each leg as colored bars over time."""
     for bar_row_index, leg_number in enumerate(drawn_legs):
         contact_modes = foot_motion.contact_modes[:, leg_number - 1]
         change_indices = np.flatnonzero(np.diff(contact_modes) | np.diff(foot_motion.step)) + 1
@@ -254,8 +260,9 @@ def _draw_contact_mode_bars(
 
 
 def draw_contact_sticks(axes: Axes, walk: xr.Dataset, stick_interval: float) -> None:
-    """Draw Legs 1 and 2 and every leg on the ground, with feet in the colors of their contact
-    modes.
+    """Draw Legs 1 and 2 and every leg on the ground at equal time intervals.
+
+    The feet have the colors of their contact modes. `stick_interval` is in s.
     """
     foot_motion = compute_foot_motion(walk)
     sample_indices = np.searchsorted(
@@ -299,5 +306,5 @@ def draw_contact_sticks(axes: Axes, walk: xr.Dataset, stick_interval: float) -> 
 
 
 def _select_stick_line_style(leg_number: int) -> str:
-    """Return the line style of a leg in a stick diagram."""
+    """Return the line style for a leg in a stick diagram."""
     return {1: "-", 2: ":"}.get(leg_number, "--")

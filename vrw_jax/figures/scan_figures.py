@@ -1,4 +1,6 @@
-"""Figures of scans: measures and outcomes over parameters, with zero lines of margins."""
+"""Figures of scans: measures and outcomes over parameters, and the curves on which margins are
+0.
+"""
 
 import textwrap
 from collections.abc import Mapping, Sequence
@@ -44,38 +46,44 @@ from vrw_jax.scans import (
 from vrw_jax.wheel import Outcome
 
 PARAMETER_AXIS_ORDER = ("damping", "slope", "stiffness", "natural_length", *SWEEPABLE_PARAMETERS)
-"""Parameters in the order in which figures use them: horizontal, vertical, then columns."""
+"""Parameters in the order in which figures assign them to the horizontal axis, the vertical axis
+and the panel columns.
+"""
 
 DRAWN_MARGIN_NAMES = (
     "fore_foot_force", "takeoff_acceleration", "clearance_sls1", "clearance_sls2",
     "locked_stopper_force", "rear_stopper_force", "contraction", "friction_fore",
     "landing_friction_fore", "hit_planted_impulse",
 )  # fmt: skip
-"""Margins whose zero lines are drawn."""
+"""Names of the margins for which figures draw the curve of value 0."""
 
 SHOWN_MEASURE_NAMES = ("mean_steps", "dls_fraction", "speed")
-"""Names of the measures that figures show, if the scan has them."""
+"""Names of the measures that figures show if the scan contains them."""
 
 LOGARITHMIC_MEASURE_NAMES = ("mean_steps",)
-"""Names of the measures on a logarithmic scale, chosen because these measures vary by powers of
-ten."""
+"""Names of the measures that are shown on a logarithmic scale, chosen because these measures vary
+by powers of ten.
+"""
 
 MAX_PANEL_COLUMNS = 4
-"""Largest number of columns of panels, chosen because more columns leave no space for labels."""
+"""Largest number of panels in a row, chosen because more panels leave no space for labels."""
 
 MAX_PAIRED_PARAMETERS = 6
-"""Largest number of parameters shown in pairs, chosen because more parameters leave no space for
-labels."""
+"""Largest number of parameters in a figure of parameter pairs, chosen because more parameters leave
+no space for labels.
+"""
 
 MAX_DRAWN_SAMPLES = 20_000
-"""Largest number of samples drawn in pairs, chosen because more samples would cover each other."""
+"""Largest number of samples in a figure of parameter pairs, chosen because more samples would cover
+each other.
+"""
 
 
 def scan_figures(scan: xr.Dataset) -> dict[str, Figure]:
-    """Return the figures of a scan by name. A grid has one figure for each axis beyond the second.
+    """Return the figures of a scan, by name. A grid has one figure for each axis beyond the second.
 
     Args:
-        scan: dataset of `vrw.scan` over a grid or samples.
+        scan: dataset that `vrw.scan` returns for a grid or for samples.
 
     Returns:
         dict[str, Figure]: the figures, whose names depend on the design.
@@ -130,10 +138,12 @@ def scan_figures(scan: xr.Dataset) -> dict[str, Figure]:
 def draw_scan_slices(
     scan: xr.Dataset, x: str, y: str, column_parameter: str | None = None
 ) -> Figure:
-    """Return a figure over the parameters (x, y), with one column per value of `column_parameter`.
+    """Return a figure over two parameters, with one column of panels per value of
+    `column_parameter`.
 
-    The figure shows outcomes and the measures of `SHOWN_MEASURE_NAMES`. All other parameters have
-    the middle of their values, which the title states. Gray cells have no gait.
+    `x` and `y` are the names of the two parameters. The figure shows outcomes and the measures in
+    `SHOWN_MEASURE_NAMES`. Every other parameter has the middle one of its values, which the title
+    states. Cells without a gait are gray.
     """
     cut_indices = {
         n_column_values: scan.sizes[n_column_values] // 2
@@ -234,7 +244,7 @@ def draw_scan_slices(
 
 @figure_style()
 def draw_scan_samples(scan: xr.Dataset, parameter_names: Sequence[str]) -> Figure:
-    """Return a figure of single samples over the first two parameters."""
+    """Return a figure of individual samples over the first two parameters."""
     x, y = (
         (parameter_names[0], parameter_names[1])
         if len(parameter_names) > 1
@@ -266,12 +276,12 @@ def draw_scan_samples(scan: xr.Dataset, parameter_names: Sequence[str]) -> Figur
 
 @figure_style()
 def draw_parameter_pairs(scan: xr.Dataset, parameter_names: Sequence[str]) -> Figure:
-    """Return a figure of samples over each pair of parameters.
+    """Return a figure with one panel of samples per pair of parameters.
 
-    The figure shows a measure below the diagonal and the outcome above it. The measure is the first
-    of `SHOWN_MEASURE_NAMES` in the scan. The diagonal shows the fraction of samples with a stable
-    cycle. Only the first `MAX_DRAWN_SAMPLES` samples are drawn, because they are spread as evenly
-    as all samples.
+    Panels below the diagonal show a measure, and panels above the diagonal show the outcome. The
+    measure is the first of `SHOWN_MEASURE_NAMES` that the scan contains. Panels on the diagonal
+    show the fraction of samples with a stable cycle. Only the first `MAX_DRAWN_SAMPLES` samples are
+    drawn, because they are spread as evenly as all samples.
     """
     drawn_samples = scan.isel(sample=slice(MAX_DRAWN_SAMPLES))
     measure_name = next(iter(_list_shown_measures(scan)), None)
@@ -319,7 +329,7 @@ def draw_parameter_pairs(scan: xr.Dataset, parameter_names: Sequence[str]) -> Fi
 def _draw_measure_samples(
     axes: Axes, scan: xr.Dataset, x: str, y: str, measure_name: str, marker_size: float
 ) -> PathCollection:
-    """Draw samples in the colors of a measure, and return the collection of points.
+    """Draw samples in colors that show a measure, and return the collection of points.
 
     Samples without a gait are gray.
     """
@@ -348,7 +358,7 @@ def _draw_outcome_samples(
 
 
 def _draw_stable_fraction(axes: Axes, x: np.ndarray, has_stable_gait: np.ndarray) -> None:
-    """Draw the fraction of samples with a stable gait along a parameter."""
+    """Draw the fraction of samples with a stable gait as a function of a parameter."""
     histogram_edges = np.linspace(x.min(), x.max(), 13)
     n_samples, n_stable = (
         np.histogram(parameter_values, histogram_edges)[0]
@@ -365,7 +375,7 @@ def _draw_stable_fraction(axes: Axes, x: np.ndarray, has_stable_gait: np.ndarray
 
 @figure_style()
 def draw_sobol_indices(indices: xr.Dataset) -> Figure:
-    """Return a figure of the Sobol' indices of each measure with their intervals."""
+    """Return a figure of the Sobol' indices of each measure, with their confidence intervals."""
     measure_names, parameter_names = (
         indices.measure.values,
         [str(parameter_name) for parameter_name in indices.parameter.values],
@@ -424,9 +434,9 @@ def draw_sobol_indices(indices: xr.Dataset) -> Figure:
 
 @figure_style()
 def draw_measure_curves(scan: xr.Dataset, x: str) -> Figure:
-    """Return a figure of the measures of `SHOWN_MEASURE_NAMES` along one parameter.
+    """Return a figure of the measures in `SHOWN_MEASURE_NAMES` as functions of one parameter.
 
-    Gray cells have no gait.
+    Parameter values without a gait are gray.
     """
     scan = scan.isel(
         {
@@ -457,17 +467,17 @@ def draw_measure_curves(scan: xr.Dataset, x: str) -> Figure:
 
 
 def _list_shown_measures(scan: xr.Dataset) -> list[str]:
-    """Return the names of the measures of a scan that figures show."""
+    """Return the names of the measures that figures show for this scan."""
     return [measure_name for measure_name in SHOWN_MEASURE_NAMES if measure_name in scan]
 
 
 def _find_color_limits(
     panel_values: Sequence[np.ndarray], stable_masks: Sequence[np.ndarray]
 ) -> tuple[float, float]:
-    """Return the color range of a row of panels.
+    """Return the color range for the panels of one measure.
 
-    The range is that of the stable gaits if there are any. A few distant unstable gaits would
-    otherwise give all other gaits the same color.
+    The range is that of the stable gaits if there are any. Otherwise a few distant unstable gaits
+    would make the colors of all other gaits equal.
     """
     finite_values = [
         values_of_panel[np.isfinite(values_of_panel)] for values_of_panel in panel_values
@@ -484,7 +494,7 @@ def _find_color_limits(
 
 
 def _make_color_scale(measure_name: str, color_limits: tuple[float, float]) -> Normalize:
-    """Return the linear or logarithmic scale of the colors of a measure."""
+    """Return the linear or logarithmic color scale for a measure."""
     if measure_name in LOGARITHMIC_MEASURE_NAMES and color_limits[0] > 0.0:
         return LogNorm(*color_limits)
     return Normalize(*color_limits)
@@ -493,9 +503,7 @@ def _make_color_scale(measure_name: str, color_limits: tuple[float, float]) -> N
 def _find_extended_color_bar_ends(
     panel_values: Sequence[np.ndarray], color_limits: tuple[float, float]
 ) -> Literal["neither", "min", "max", "both"]:
-    """Return the ends of a color bar beyond which measures lie: "neither", "min", "max" or
-    "both".
-    """
+    """Return the ends of a color bar beyond which values lie: "neither", "min", "max" or "both"."""
     finite_values = np.concatenate(
         [values_of_panel[np.isfinite(values_of_panel)] for values_of_panel in panel_values]
     )
@@ -517,7 +525,7 @@ def _draw_measure_cells(
     measure_values_by_cell: np.ndarray,
     color_scale: Normalize,
 ) -> AxesImage:
-    """Draw one colored cell per sample, without interpolation, and return the mesh of cells."""
+    """Draw one colored cell per grid point, without interpolation, and return the mesh of cells."""
     axes.set_facecolor(LIGHT_GRAY_COLOR)
     masked_values = np.ma.masked_invalid(measure_values_by_cell)
     cell_mesh = axes.pcolormesh(
@@ -532,7 +540,7 @@ def _draw_measure_cells(
 
 
 def _find_cell_edges(sample_positions: np.ndarray) -> np.ndarray:
-    """Return the edges of the cells around sample positions."""
+    """Return the edges of cells around the given positions."""
     if len(sample_positions) == 1:
         return sample_positions[0] + np.array([-0.5, 0.5]) * max(
             abs(sample_positions[0]) * 0.01, 1e-6
@@ -546,9 +554,9 @@ def _find_cell_edges(sample_positions: np.ndarray) -> np.ndarray:
 
 
 def _compute_displayed_outcome_codes(scan: xr.Dataset) -> xr.DataArray:
-    """Return the outcome codes of a scan, with `UNSTABLE_CYCLE_CODE` for unstable cycles.
+    """Return the outcome codes of a scan, with unstable cycles replaced by `UNSTABLE_CYCLE_CODE`.
 
-    Unstable cycles are marked only if the scan contains the spectral radius.
+    They are replaced only if the scan contains the spectral radius.
     """
     codes_with_instability = scan.outcome.astype(int)
     if "spectral_radius" not in scan:
@@ -557,7 +565,7 @@ def _compute_displayed_outcome_codes(scan: xr.Dataset) -> xr.DataArray:
 
 
 def _draw_margin_zero_lines(axes: Axes, scan: xr.Dataset, x: str, y: str) -> dict[str, Line2D]:
-    """Draw the lines along which a margin is zero, and return their legend entries by margin."""
+    """Draw the curves on which a margin is 0, and return their legend entries, by margin name."""
     legend_lines = {}
     for margin_name in DRAWN_MARGIN_NAMES:
         if margin_name not in scan or scan.sizes[x] < 2 or scan.sizes[y] < 2:
@@ -590,7 +598,7 @@ def _draw_margin_zero_lines(axes: Axes, scan: xr.Dataset, x: str, y: str) -> dic
 def _add_scan_legend(
     figure: Figure, outcome_codes: np.ndarray, legend_lines: Mapping[str, Line2D], n_columns: int
 ) -> None:
-    """Add the legend of outcomes and lines below a figure."""
+    """Add a legend of outcomes and of margin curves below a figure."""
     margin_lines = [
         legend_lines[margin_name]
         for margin_name in DRAWN_MARGIN_NAMES
@@ -609,12 +617,12 @@ def _add_scan_legend(
 def map_figure(scan: xr.Dataset, measure: str, curves: Sequence[SpecialPointCurve]) -> Figure:
     """Return a map of a measure over two parameters, with curves of special points.
 
-    Gray cells have no gait. A curve is thin where its gaits are unstable.
+    Cells without a gait are gray. A curve is thin where its gaits are unstable.
 
     Args:
-        scan: dataset of `vrw.scan` over a grid of two parameters.
-        measure: name of a variable of the scan.
-        curves: results of `vrw.continue_special_point` over the same parameters; may be empty.
+        scan: dataset that `vrw.scan` returns for a grid of two parameters.
+        measure: name of a measure in the scan.
+        curves: results of `vrw.continue_special_point` for the same parameters; may be empty.
 
     Returns:
         Figure: one panel, in SI units.

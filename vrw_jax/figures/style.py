@@ -1,7 +1,7 @@
 """Style of all figures: journal widths, distinguishable colors, vector output, labels with units.
 
-Figures are created inside `figure_style()` and written by `save`. No global setting of matplotlib
-changes, and no window opens.
+Figures are created inside `figure_style()`, and `save` writes them to files. No global setting of
+matplotlib changes, and no window opens.
 """
 
 import re
@@ -31,13 +31,13 @@ OKABE_ITO_PINK = "#CC79A7"
 OKABE_ITO_SKY_BLUE = "#56B4E9"
 OKABE_ITO_AMBER = "#E69F00"
 OKABE_ITO_YELLOW = "#F0E442"
-"""Last of the seven colors of Okabe and Ito, which color-blind readers can distinguish."""
+"""Last of the seven colors of Okabe and Ito. Color-blind readers can distinguish these colors."""
 
 LEG_1_COLOR = OKABE_ITO_BLUE
 LEG_2_COLOR = OKABE_ITO_ORANGE
 DARK_GRAY_COLOR = "#555555"
 LIGHT_GRAY_COLOR = "#E9E9E9"
-"""Color of areas without a gait, and of double support."""
+"""Color of areas without a gait, and of areas that mark double support."""
 
 MATPLOTLIB_SETTINGS: dict[Any, Any] = {
     "font.family": "serif",
@@ -72,14 +72,15 @@ MATPLOTLIB_SETTINGS: dict[Any, Any] = {
     "savefig.dpi": 200,
     "svg.hashsalt": "vrw_jax",  # The same figure then gives the same file.
 }
-"""Settings of matplotlib for all figures, with the serif font that matplotlib includes and the
-journal uses."""
+"""Matplotlib settings for all figures. The serif font is included in matplotlib, and the journal
+uses it.
+"""
 
 COLUMN_FIGURE_WIDTH_INCHES = 3.4
-"""Width of a figure in one column, chosen as the column width of the journal."""
+"""Width of a figure in one column, inches, chosen because it is the column width of the journal."""
 
 PAGE_FIGURE_WIDTH_INCHES = 6.9
-"""Width of a figure over the page, chosen as the text width of the journal."""
+"""Width of a figure across the page, inches, chosen because it is the text width of the journal."""
 
 OUTCOME_LABELS_AND_COLORS: dict[Outcome, tuple[str, str]] = {
     Outcome.STEPPED: ("stable limit cycle", OKABE_ITO_BLUE),
@@ -101,11 +102,12 @@ OUTCOME_LABELS_AND_COLORS: dict[Outcome, tuple[str, str]] = {
     Outcome.PAINLEVE_PARADOX: ("friction paradox", "#862DB8"),
     Outcome.CAME_TO_REST: ("came to rest", "#8C6D31"),
 }
-"""Label and color of each outcome."""
+"""Label and color for each outcome."""
 
 SPECIAL_POINT_LINE_STYLES = ("-", "--", ":", "-.", (0, (5, 1, 1, 1, 1, 1)), (0, (8, 3)))
-"""Line styles of curves of special points, in the order of the names in
-`SPECIAL_POINT_NAMES_BY_COLOR`."""
+"""Line styles for curves of special points, in the order of names in
+`SPECIAL_POINT_NAMES_BY_COLOR`.
+"""
 
 SPECIAL_POINT_NAMES_BY_COLOR = {
     "black": ("fold", "period_doubling", "neimark_sacker", "branch_point"),
@@ -120,15 +122,18 @@ SPECIAL_POINT_NAMES_BY_COLOR = {
         "landing_stopper_impulse",
     ),
 }  # fmt: skip
-"""Names of special points by color. The index of a name gives the line style of the special point,
-which is the same in every figure. Green and pink, which color-blind readers may confuse, share no
-line style."""
+"""Names of special points, by color. The index of a name determines the line style of the special
+point, which is the same in every figure. Green and pink share no line style, because color-blind
+readers may confuse them.
+"""
 
 NOT_COMPUTED_SAMPLE_STYLE = ("not computed", "#FFFFFF")
-"""Label and color of a sample that is not computed."""
+"""Label and color for a sample that has not been computed."""
 
 UNSTABLE_CYCLE_CODE = 100
-"""Code of a cycle whose spectral radius is 1 or more, chosen above all codes of `Outcome`."""
+"""Outcome code that figures use for a cycle with a spectral radius of at least 1. It is chosen
+above all codes of `Outcome`.
+"""
 
 
 @contextmanager
@@ -136,7 +141,7 @@ def figure_style() -> Iterator[None]:
     """Apply the style of all figures within a `with` block.
 
     Returns:
-        A context manager, which is also a decorator, with the settings of matplotlib.
+        A context manager that applies the matplotlib settings; it can also be used as a decorator.
 
     Examples:
         >>> gait = vrw.simulate(vrw.WheelParams(), vrw.paper_start(), n_steps=1)
@@ -148,18 +153,18 @@ def figure_style() -> Iterator[None]:
 
 
 def save(figure: Figure, folder: str | Path, name: str) -> list[Path]:
-    """Write `figure` as SVG and PNG into `folder`, and return the paths.
+    """Write `figure` as SVG and PNG files into `folder`, and return the paths.
 
     Args:
         figure: a figure of matplotlib.
-        folder: folder of the files, created if it does not exist.
+        folder: folder for the files, created if it does not exist.
         name: name of the files without the suffix.
 
     Returns:
         list[Path]: the paths of `name`.svg and `name`.png.
 
     Raises:
-        TypeError: if `folder` is no path.
+        TypeError: if `folder` is not a path.
         OSError: if a file cannot be written.
 
     Examples:
@@ -181,7 +186,9 @@ def save(figure: Figure, folder: str | Path, name: str) -> list[Path]:
 def require_dataset_variables(
     argument_name: str, labeled_dataset: Any, needed_names: Sequence[str], remedy_text: str
 ) -> None:
-    """Raise an error if `labeled_dataset` is no dataset with the needed variables or attributes."""
+    """Raise an error unless `labeled_dataset` is a dataset with the needed variables or
+    attributes.
+    """
     check_type(argument_name, labeled_dataset, xr.Dataset, remedy_text)
     missing_names = [
         variable_name
@@ -198,7 +205,7 @@ def require_dataset_variables(
 def require_variables_of_datasets(
     argument_name: str, datasets: Any, needed_names: Sequence[str], remedy_text: str
 ) -> None:
-    """Raise an error if `datasets` is no nonempty list of datasets with the needed variables."""
+    """Raise an error unless `datasets` is a nonempty list of datasets with the needed variables."""
     check_type(argument_name, datasets, (list, tuple), f"{remedy_text}, several in a list")
     if not datasets:
         raise ValueError(f"{argument_name} is empty, but something is to be drawn: {remedy_text}.")
@@ -209,20 +216,20 @@ def require_variables_of_datasets(
 
 
 def typeset_greek_symbols(text: str) -> str:
-    """Return a text in which symbols such as "λ2⁺" are formulas.
+    """Return a text in which symbols such as "λ2⁺" are written as mathtext formulas.
 
-    The font lacks some of these symbols.
+    The text font lacks some of these symbols.
     """
     return re.sub(r"[θλ]\S*", lambda match: f"${format_mathtext(match[0])}$", text)
 
 
 def _format_figure_unit(quantity_name: str) -> str:
-    """Return the unit of a quantity as figures write it, such as "N·s/m"."""
+    """Return the unit of a quantity in the form that figures use, such as "N·s/m"."""
     return MEASURES[quantity_name].display_unit.replace(" ", "·").replace("^2", "²")
 
 
 def format_axis_label(quantity_name: str, label_format: str = "{name} {symbol}") -> str:
-    """Return the label of a quantity with its unit, formatted by `label_format`.
+    """Return an axis label for a quantity, with its unit, formatted with `label_format`.
 
     An unknown name is returned unchanged.
     """
@@ -241,7 +248,7 @@ def format_axis_label(quantity_name: str, label_format: str = "{name} {symbol}")
 
 
 def format_value_label(quantity_name: str, quantity_value: float, n_digits: int = 4) -> str:
-    """Return the text of a quantity with its value, as in "c = 50 N·s/m"."""
+    """Return the symbol of a quantity with its value and unit, as in "c = 50 N·s/m"."""
     if quantity_name not in MEASURES:
         return f"{quantity_name} = {quantity_value:.{n_digits}g}"
     symbol_text, unit_text = MEASURES[quantity_name].mathtext, _format_figure_unit(quantity_name)
@@ -249,7 +256,7 @@ def format_value_label(quantity_name: str, quantity_value: float, n_digits: int 
 
 
 def draw_panel_letter(axes: Axes, panel_letter: str) -> None:
-    """Write the letter of a panel to the left of its top edge."""
+    """Write the letter of a panel to the left of the panel's top edge."""
     axes.text(-0.12, 1.02, f"({panel_letter})", transform=axes.transAxes, ha="right", va="bottom")
 
 
@@ -262,8 +269,9 @@ def draw_markers(
     fill_color: str,
     **style_overrides: Any,
 ) -> None:
-    """Draw markers without a line, filled with `fill_color`. The fill color "white" gives open
-    markers.
+    """Draw markers without a connecting line, filled with `fill_color`.
+
+    The fill color "white" gives open markers.
     """
     marker_style: dict[str, Any] = {
         "markersize": 3.2,
@@ -274,9 +282,9 @@ def draw_markers(
 
 
 def select_special_point_style(special_point_name: str) -> tuple[str, Any]:
-    """Return color and line style of a special point.
+    """Return the color and the line style for a special point.
 
-    Special points of locked legs have different styles for different legs.
+    Special points that belong to different locked legs have different styles.
     """
     for line_color, special_point_names in SPECIAL_POINT_NAMES_BY_COLOR.items():
         if special_point_name in special_point_names:
@@ -291,8 +299,9 @@ def select_special_point_style(special_point_name: str) -> tuple[str, Any]:
 
 
 def select_outcome_style(outcome_code: int) -> tuple[str, str]:
-    """Return label and color of an outcome, of an unstable cycle, or of a sample without a
-    result.
+    """Return the label and the color for an outcome code.
+
+    The code may also mean an unstable cycle, or a sample that has not been computed.
     """
     if outcome_code == UNSTABLE_CYCLE_CODE:
         return "unstable limit cycle", OKABE_ITO_YELLOW
@@ -310,8 +319,9 @@ def draw_outcome_cells(
     outcome_codes: np.ndarray,
     drawn_codes: Sequence[int] | np.ndarray,
 ) -> None:
-    """Draw cells over (x, y) in the colors of their outcomes. Codes not in `drawn_codes` are
-    omitted.
+    """Draw cells over (x, y) in the colors of their outcomes.
+
+    Cells with codes that are not in `drawn_codes` are omitted.
     """
     outcome_color_map = ListedColormap(
         [select_outcome_style(int(drawn_code))[1] for drawn_code in drawn_codes]
@@ -330,7 +340,7 @@ def draw_outcome_cells(
 
 
 def make_outcome_patches(outcome_codes: Iterable[int]) -> list[Patch]:
-    """Return the legend entries of outcomes."""
+    """Return a legend entry for each outcome code."""
     return [
         Patch(facecolor=outcome_color, edgecolor="#888888", linewidth=0.4, label=outcome_label)
         for outcome_label, outcome_color in (

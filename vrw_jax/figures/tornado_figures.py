@@ -1,4 +1,4 @@
-"""Tornado plots: the change of each measure due to each parameter, as bars sorted by length."""
+"""Tornado plots: bars that show the change of each measure per parameter, sorted by length."""
 
 import math
 from collections.abc import Iterable, Mapping
@@ -23,13 +23,18 @@ from vrw_jax.wheel import check_parameter_name
 
 MAX_PANELS_PER_ROW = 3
 """Largest number of panels in a row, chosen because four panels leave no space for parameter
-symbols."""
+symbols.
+"""
 
 MAX_DEFAULT_DRAWN_MEASURES = 6
-"""Largest number of measures drawn by default, chosen because two rows of panels fit a page."""
+"""Largest number of measures that are drawn by default, chosen because two rows of panels fit a
+page.
+"""
 
 PARAMETER_ROW_HEIGHT_INCHES = 0.2
-"""Height of the row of one parameter, chosen because the parameter's symbol has that height."""
+"""Height of the bar of one parameter, inches, chosen because the parameter's symbol has that
+height.
+"""
 
 
 @figure_style()
@@ -39,20 +44,22 @@ def tornado_figure(
     *,
     spreads: Mapping[str, float] | None = None,
 ) -> Figure:
-    """Return a figure of the change of each measure with each parameter, largest changes on top.
+    """Return a figure of the change of each measure with each parameter, with largest changes on
+    top.
 
-    Changes are of first order, from the derivatives of the gait. By default a change is in per cent
-    of the measure, for 1 % of each parameter. With `spreads` a change is in the unit of the
-    measure, for the given changes of the parameters. Undefined changes, such as for 1 % of a slope
-    of 0, are left out.
+    Changes are first-order estimates, computed from the derivatives of the gait. By default they
+    are in per cent of the measure, for a change of each parameter by 1 %. If `spreads` is given,
+    they are in the unit of the measure, for the changes of the parameters in `spreads`. Undefined
+    changes, such as for 1 % of a slope of 0, are omitted.
 
     Args:
-        table: dataset of `vrw.sensitivities`.
+        table: dataset that `vrw.sensitivities` returns.
         measures: names of the measures; by default the first six of the table.
-        spreads: change of each parameter by name, in its unit; other parameters are left out.
+        spreads: change of each parameter, by name, in the parameter's unit; other parameters are
+            omitted.
 
     Returns:
-        Figure: one panel per measure, with bars over the parameters.
+        Figure: one panel per measure, with one bar per parameter.
 
     Raises:
         TypeError, ValueError: if an argument is invalid.
@@ -113,7 +120,7 @@ def tornado_figure(
 
 
 def _draw_sorted_bars(axes: Axes, measure_changes: xr.DataArray) -> None:
-    """Draw the bars of one measure, the longest on top."""
+    """Draw the bars for one measure, with the longest on top."""
     measure_changes = measure_changes[np.isfinite(measure_changes.values)]
     measure_changes = measure_changes[np.argsort(-np.abs(measure_changes.values), kind="stable")]
     bar_positions = np.arange(measure_changes.size)

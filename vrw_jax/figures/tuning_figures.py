@@ -24,16 +24,17 @@ from vrw_jax.validation import check_type
 
 @figure_style()
 def tuning_figure(tuned: TuneResult) -> Figure:
-    """Return a figure of a tuning run: objective, parameters, and slack of the constraints.
+    """Return a figure of a tuning run: objective, parameters, and slacks of the constraints.
 
-    Filled symbols satisfy every constraint, and open symbols violate a constraint. Dotted lines are
-    trials without a gait, after which the step was shortened.
+    Filled symbols are gaits that satisfy every constraint; open symbols are gaits that violate a
+    constraint. Dotted lines mark trials without a usable gait, after which the optimizer step was
+    shortened.
 
     Args:
         tuned: result of `vrw.tune`.
 
     Returns:
-        Figure: the path over the evaluated gaits, and the slack at start and end.
+        Figure: objective and parameters over the evaluated gaits, and the slacks at start and end.
 
     Examples:
         >>> bounds = {"damping": (100.0, 215.0)}
@@ -57,7 +58,7 @@ def tuning_figure(tuned: TuneResult) -> Figure:
 
 
 def _draw_objective_path(axes: Axes, path_dataset: xr.Dataset) -> None:
-    """Draw the objective over the evaluated gaits."""
+    """Draw the objective of each evaluated gait."""
     evaluation_numbers, objective_values = (
         path_dataset.gait_evaluation.values,
         path_dataset.objective.values,
@@ -105,7 +106,7 @@ def _draw_objective_path(axes: Axes, path_dataset: xr.Dataset) -> None:
 
 
 def _draw_parameter_paths(axes: Axes, path_dataset: xr.Dataset) -> None:
-    """Draw the parameters over the evaluated gaits, scaled to their bounds."""
+    """Draw the parameters of each evaluated gait, scaled so that their bounds are 0 and 1."""
     lower_bounds, upper_bounds = (
         np.asarray(path_dataset.attrs["lower"]),
         np.asarray(path_dataset.attrs["upper"]),
@@ -129,7 +130,7 @@ def _draw_parameter_paths(axes: Axes, path_dataset: xr.Dataset) -> None:
 
 
 def _draw_constraint_slacks(axes: Axes, tune_result: TuneResult) -> None:
-    """Draw the slack of each constraint at the start and at the tuned gait as bars."""
+    """Draw bars for the slack of each constraint at the start and at the tuned gait."""
     path_dataset = tune_result.path
     constraint_names = [str(constraint_name) for constraint_name in path_dataset.constraint.values]
     constraint_values = path_dataset.constraint_value.values

@@ -1,4 +1,4 @@
-"""Figures of walks: the paper's figures 6 to 10, and an animation of the walk."""
+"""Figures of walks: Figs 6 to 10 of the paper, and an animation of a walk."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -40,24 +40,24 @@ from vrw_jax.measures import MEASURES, PHASE_NAMES
 from vrw_jax.validation import check_int, check_path, check_positive, check_type
 
 PointCoordinates = float | np.ndarray
-"""One coordinate of points, in m."""
+"""x or z coordinates of one or more points, m."""
 
 GROUND_FORCE_NAMES = ("lambda_1", "lambda_2", "lambda_3", "lambda_4")
-"""Names of the ground forces on the feet of Leg 1 and Leg 2, which are in N."""
+"""Names of the ground forces (N) on the feet of Leg 1 and Leg 2."""
 
 
 NO_WALK_REMEDY = "give vrw.simulate(params, model=...), of any model"
-"""Remedy in the error message about a dataset that is not a walk."""
+"""Remedy in the error message for a dataset that is not a walk."""
 
 NO_PAPER_WALK_REMEDY = (
     "give vrw.simulate(params) of the paper's wheel; vrw.plot.gait_panels, sticks and walk_frames "
     "draw walks of any model"
 )
-"""Remedy in the error message about a walk without the phases of the paper."""
+"""Remedy in the error message for a walk without the phases of the paper."""
 
 
 def _require_nonempty_walk(argument_name: str, walk: xr.Dataset) -> None:
-    """Raise an error if `walk` is not a trajectory with at least one sample."""
+    """Raise an error unless `walk` is a trajectory with at least one sample."""
     needed_names = ("hub_x", "hub_z", "step", "parameter_n_legs")
     require_dataset_variables(argument_name, walk, needed_names, NO_WALK_REMEDY)
     if not walk.sizes["time"]:
@@ -69,7 +69,9 @@ def _require_nonempty_walk(argument_name: str, walk: xr.Dataset) -> None:
 
 
 def find_phase_spans(gait: xr.Dataset) -> list[tuple[float, float, int]]:
-    """Return the start time, the end time (s) and the code of every phase of a trajectory."""
+    """Return the start time (s), the end time (s) and the phase code for every phase of a
+    trajectory.
+    """
     step_and_phase = 3 * gait.step.values + gait.phase.values
     change_indices = np.flatnonzero(np.diff(step_and_phase)) + 1
     times_by_phase = np.split(gait.time.values, change_indices)
@@ -81,7 +83,10 @@ def find_phase_spans(gait: xr.Dataset) -> list[tuple[float, float, int]]:
 
 
 def insert_landing_gaps(gait: xr.Dataset, *variable_names: str) -> list[np.ndarray]:
-    """Return time and variables with a gap at each landing, because landings relabel the legs."""
+    """Return the time and variables of a trajectory, with NaN inserted at each landing.
+
+    The gaps separate steps in plots, because landings relabel the legs.
+    """
     landing_indices = np.flatnonzero(np.diff(gait.step.values)) + 1
     return [
         np.insert(gait[variable_name].values.astype(float), landing_indices, np.nan)
@@ -91,13 +96,14 @@ def insert_landing_gaps(gait: xr.Dataset, *variable_names: str) -> list[np.ndarr
 
 @figure_style()
 def gait_panels(gait: xr.Dataset) -> Figure:
-    """Return a figure of angle, leg lengths, load share, foot height and ground forces (Fig. 6).
+    """Return a figure of the motion and the ground forces of a gait (Fig. 6 of the paper).
 
-    Gray bands mark double support, and dotted lines mark collision II. With unilateral contact the
+    The panels show angle, leg lengths, load share, foot height and ground forces. Gray bands mark
+    double support, and dotted lines mark collision II. For walks with unilateral contact, the
     panels show angle, leg lengths, contact modes, foot heights, normal and tangential forces.
 
     Args:
-        gait: dataset of `vrw.simulate` with any model.
+        gait: dataset that `vrw.simulate` returns for any model.
 
     Returns:
         Figure: panels over time in s, in SI units.
@@ -173,13 +179,14 @@ def gait_panels(gait: xr.Dataset) -> Figure:
 
 @figure_style()
 def sticks(gait: xr.Dataset, interval: float = 0.05) -> Figure:
-    """Return a stick diagram in the X-Z plane (Fig. 7); Leg 1 is solid and Leg 2 dotted.
+    """Return a stick diagram in the X-Z plane (Fig. 7 of the paper).
 
-    With unilateral contact the feet have the colors of their contact modes instead of the phases,
-    and all other legs on the ground are also drawn.
+    Leg 1 is solid and Leg 2 is dotted. Colors show the phases. For walks with unilateral contact,
+    the colors of the feet show their contact modes instead, and all other legs on the ground are
+    also drawn.
 
     Args:
-        gait: dataset of `vrw.simulate` with any model.
+        gait: dataset that `vrw.simulate` returns for any model.
         interval: time between two sticks, in s.
 
     Returns:
@@ -215,7 +222,7 @@ def sticks(gait: xr.Dataset, interval: float = 0.05) -> Figure:
 
 
 def _draw_phase_sticks(axes: Axes, gait: xr.Dataset, interval: float) -> None:
-    """Draw Legs 1 and 2 of a walk, in the colors of its phases."""
+    """Draw Legs 1 and 2 in the colors of the phases, at equal time intervals of `interval` s."""
     phase_colors = ("#A0A0A0", OKABE_ITO_SKY_BLUE, "#000000")
     sample_times = gait.time.values
     for i in np.searchsorted(sample_times, np.arange(0.0, sample_times[-1], interval)):
@@ -236,22 +243,22 @@ def _draw_phase_sticks(axes: Axes, gait: xr.Dataset, interval: float) -> None:
 
 
 GAIT_LINE_STYLES = ("-", "--", (0, (4, 1, 1, 1)), ":")
-"""Line styles of the gaits of one figure."""
+"""Line styles of the gaits in one figure."""
 
 
 def _format_gait_label(gait: xr.Dataset, varied_parameter: str) -> str:
-    """Return the label of a gait by its varied parameter, such as "c = 50 N·s/m"."""
+    """Return the legend label of a gait: its varied parameter, such as "c = 50 N·s/m"."""
     return format_value_label(varied_parameter, gait.attrs[f"parameter_{varied_parameter}"])
 
 
 @figure_style()
 def foot_height(gaits: Sequence[xr.Dataset], vary: str = "damping") -> Figure:
-    """Return a figure of the height of foot 2 over one step of each gait (Fig. 8).
+    """Return a figure of the height of foot 2 during one step of each gait (Fig. 8 of the paper).
 
     A second panel shows the height around take-off, in mm.
 
     Args:
-        gaits: datasets of `vrw.simulate` over one step, one per line.
+        gaits: datasets that `vrw.simulate` returns for one step, one per curve.
         vary: name of the parameter in which the gaits differ, used in the legend.
 
     Returns:
@@ -299,10 +306,11 @@ def foot_height(gaits: Sequence[xr.Dataset], vary: str = "damping") -> Figure:
 
 @figure_style()
 def rear_force(gaits: Sequence[xr.Dataset], vary: str = "damping") -> Figure:
-    """Return a figure of the normal force on foot 2 over double support of each gait (Fig. 9).
+    """Return a figure of the normal force on foot 2 in double support of each gait (Fig. 9 of the
+    paper).
 
     Args:
-        gaits: datasets of `vrw.simulate` over one step, one per line.
+        gaits: datasets that `vrw.simulate` returns for one step, one per curve.
         vary: name of the parameter in which the gaits differ, used in the legend.
 
     Returns:
@@ -341,7 +349,7 @@ def rear_force(gaits: Sequence[xr.Dataset], vary: str = "damping") -> Figure:
 
 @figure_style()
 def indicators(gaits: xr.Dataset, every: int = 4) -> Figure:
-    """Return a figure of the DLS indicators of period-1 gaits with λ2⁺ >= 0 (Fig. 10).
+    """Return a figure of the DLS indicators of period-1 gaits with λ2⁺ >= 0 (Fig. 10 of the paper).
 
     Symbols are filled if foot 2 stays above the ground, and open if foot 2 scuffs.
 
@@ -349,8 +357,8 @@ def indicators(gaits: xr.Dataset, every: int = 4) -> Figure:
         gaits: dataset over one parameter, with `settled`, `lambda_I4` (N s), `lambda_2_plus` and
             `lambda_4_plus` (N), `clearance_sls1` and `clearance_sls2` (m). Its attribute
             `parameter_slope` is the slope in rad.
-        every: symbols are drawn at parameter values that are multiples of this number, and at the
-            first and the last value.
+        every: spacing of the symbols: they are drawn at parameter values that are multiples of this
+            number, and at the first and the last value.
 
     Returns:
         Figure: the impulse and the two forces over the parameter.
@@ -429,8 +437,9 @@ def indicators(gaits: xr.Dataset, every: int = 4) -> Figure:
 def _rotate_to_gravity_frame(
     x: PointCoordinates, z: PointCoordinates, slope: float
 ) -> tuple[PointCoordinates, PointCoordinates]:
-    """Return coordinates in a frame with vertical gravity, m, from coordinates in the slope's
-    frame.
+    """Return coordinates in a frame whose z axis is vertical, m.
+
+    x and z are the coordinates in the slope's frame.
     """
     return (
         x * np.cos(slope) + z * np.sin(slope),
@@ -442,18 +451,18 @@ def _rotate_to_gravity_frame(
 def walk_frames(
     step: xr.Dataset, n_frames: int = 36, slow: float = 2.0
 ) -> tuple[list[Image.Image], int]:
-    """Return looping frames of one step of a steady gait, and the duration of a frame in ms.
+    """Return the frames of a looping animation of a steady gait, and the duration of a frame in ms.
 
-    The camera moves at the mean speed. Arrows are ground forces, 1 m for 300 N. Feet have the
-    colors of their contact modes.
+    The camera moves at the mean speed. Arrows show ground forces, with a length of 1 m for 300 N.
+    The colors of the feet show their contact modes.
 
     Args:
-        step: dataset of `vrw.simulate` over one step of a gait, or over several, with any model.
+        step: dataset that `vrw.simulate` returns for one or more steps of a gait, with any model.
         n_frames: number of frames.
         slow: factor of slow motion; 2 plays at half speed.
 
     Returns:
-        tuple[list[Image], int]: images of Pillow, and the milliseconds per frame.
+        tuple[list[Image], int]: Pillow images, and the milliseconds per frame.
 
     Examples:
         >>> gait = vrw.simulate(vrw.WheelParams(), vrw.paper_start(), n_steps=1)
@@ -499,7 +508,7 @@ def walk_frames(
 def _draw_wheel_at_time(
     axes: Axes, foot_motion: HubAndFootMotion, time: float, slope: float
 ) -> int:
-    """Draw hub, legs, feet and forces at a time in s.
+    """Draw hub, legs, feet and forces at the time `time`, s.
 
     Return the index of the sample whose contact modes are drawn.
     """
@@ -534,7 +543,9 @@ def _draw_wheel_at_time(
 def _draw_ground_with_marks(
     axes: Axes, slope: float, camera_position: float, stride: float
 ) -> None:
-    """Draw the slope with marks that repeat twice per step, so that the animation loops."""
+    """Draw the sloping ground with two marks per step, so that the animation loops without a
+    jump.
+    """
     ground_ends = np.array([camera_position - 3.0, camera_position + 3.0])
     axes.plot(
         *_rotate_to_gravity_frame(ground_ends, 0.0 * ground_ends, slope),
@@ -553,18 +564,18 @@ def _draw_ground_with_marks(
 
 
 def save_animation(frames: Sequence[Image.Image], milliseconds: int, path: str | Path) -> Path:
-    """Write frames as a looping GIF with one shared palette of 32 colors.
+    """Write frames as a looping GIF file with one shared palette of 32 colors.
 
     Args:
         frames: images as `walk_frames` returns them.
         milliseconds: duration of a frame, in ms.
-        path: path of the GIF.
+        path: path of the GIF file.
 
     Returns:
-        Path: the path of the GIF.
+        Path: the path of the GIF file.
 
     Raises:
-        TypeError: if `frames` is no list, or `path` is no path.
+        TypeError: if `frames` is not a list, or `path` is not a path.
         OSError: if the file cannot be written.
 
     Examples:
