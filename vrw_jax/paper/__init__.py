@@ -1,4 +1,4 @@
-"""Comparison of the published results of the paper with the results of this library."""
+"""Comparison of the paper's published results with results that this library computes."""
 
 from vrw_jax.paper.facts.base import PaperFact
 from vrw_jax.paper.facts.table import summarize_paper_facts

@@ -1,8 +1,8 @@
-"""Gaits that a wheel reaches by walking, also along a parameter from one gait to the next.
+"""Gaits that simulated walks approach, also for a sequence of parameter values.
 
 Every gait of this module is the limit of a walk, without Newton's method for a fixed point. The
-gaits are therefore stable, and they test the Newton search independently. The model continues
-formally if the ground would have to pull on Leg 1, and if a foot scuffs. Gaits can therefore be
+gaits are therefore stable, and they test the Newton search independently. If the ground would have
+to pull on Leg 1, or if a foot scuffs, the motion continues formally. Gaits can therefore be
 continued past the damping at which λ2⁺ vanishes. Formal continuation does not change other gaits.
 """
 
@@ -33,14 +33,14 @@ from vrw_jax.wheel import Outcome, WheelParams
 
 @dataclasses.dataclass(frozen=True)
 class SettlingOptions:
-    """Conditions under which a walk counts as settled in a gait.
+    """Conditions under which a walk is considered to have settled on a gait.
 
-    - `n_steps`: number of steps of a walk, chosen because the slowest gait, c = 70, converges to
-      round-off in 30 steps;
-    - `max_state_change`: largest change of the section state per step in a settled gait, chosen as
-      ten times the error of a step at the default options;
+    - `n_steps`: number of steps of a walk, chosen because the gait with the slowest convergence (c
+      = 70 N s/m) converges to round-off in 30 steps;
+    - `max_state_change`: largest change of the section state per step after a walk has settled,
+      chosen because it is ten times the error of a step with the default options;
     - `n_settled_steps`: number of last steps whose change must be below `max_state_change`, chosen
-      because a gait of longer period may repeat once by chance.
+      because the states of a gait with a longer period may agree once by chance.
     """
 
     n_steps: int = 30
@@ -49,11 +49,11 @@ class SettlingOptions:
 
 
 DEFAULT_SETTLING_OPTIONS = SettlingOptions()
-"""Options of all walks of the reproduction."""
+"""Options of all walks in the reproduction of the paper."""
 
 
 def make_formally_continued_model() -> ViscoelasticWheel:
-    """Return the paper's model, which continues formally after Leg 1 lifts off."""
+    """Return the paper's model with motion that continues formally after Leg 1 lifts off."""
     return ViscoelasticWheel(stop_at_lift_off=False)
 
 
@@ -70,11 +70,11 @@ def walk_into_gait(
     x: SectionState,
     settling_options: SettlingOptions = DEFAULT_SETTLING_OPTIONS,
 ) -> xr.Dataset:
-    """Return a dataset of the section states of a walk and their change per step.
+    """Simulate a walk into a gait, and return its section states and their change per step.
 
-    `change` is the Euclidean distance to the previous section state in (rad, rad/s, m/s). `settled`
-    is whether the walk reached a period-1 gait, that is, whether each of the last changes is small
-    enough.
+    The variable `change` of the dataset is the Euclidean distance to the previous section state in
+    (rad, rad/s, m/s). `settled` states whether the walk reached a period-1 gait, that is, whether
+    each of the last changes is small enough.
     """
     gait_walk = walk(params, x, settling_options.n_steps, model=make_formally_continued_model())
     n_stepped = int(gait_walk.n_stepped)
@@ -112,7 +112,7 @@ def walk_into_gait(
 def walk_along_parameter(
     params: WheelParams, parameter_name: str, parameter_values: Sequence[float], x: SectionState
 ) -> Iterator[xr.Dataset]:
-    """Yield a dataset of the walk at each value of a parameter, see `walk_into_gait`.
+    """Yield the dataset that `walk_into_gait` returns for each value of a parameter.
 
     The start of each walk is extrapolated from the last two settled gaits. Walks that fail or do
     not settle are not used for the extrapolation.
@@ -137,13 +137,12 @@ def measure_gaits_along_parameter(
     x: SectionState,
     on_progress: Callable[[float], None] | None = None,
 ) -> xr.Dataset:
-    """Return a dataset of the gaits of `walk_along_parameter` with all measures, over the
-    parameter.
+    """Return all measures of the gaits that `walk_along_parameter` reaches, over the parameter.
 
-    The measures are those of one further step. `settled` is whether the walk reached a period-1
-    gait, and `change` is the largest change of its last steps.
+    The measures are those of one further step. The variable `settled` states whether the walk
+    reached a period-1 gait, and `change` is the largest change in its last steps.
 
-    - `on_progress`: function that is called with the completed fraction.
+    - `on_progress`: function that is called with the completed fraction of the work.
     """
     measures_by_value: list[dict[str, np.ndarray]] = []
     for parameter_value, gait_walk in zip(
@@ -186,7 +185,9 @@ def _extrapolate_start_state(
     parameter_value: float,
     x: SectionState,
 ) -> SectionState:
-    """Return a start for a parameter value, on the line through the last two settled gaits."""
+    """Return a start for a parameter value, extrapolated linearly from the last two settled
+    gaits.
+    """
     if not settled_states:
         return x
     if len(settled_states) == 1:
@@ -205,7 +206,7 @@ def _make_gait_dataset(
     parameter_values: Sequence[float],
     measure_columns: dict[str, np.ndarray],
 ) -> xr.Dataset:
-    """Return the labeled dataset of measures over a parameter."""
+    """Return a labeled dataset of measures over a parameter."""
     dataset_variables = make_labeled_variables(
         {
             measure_name: measure_columns[measure_name]

@@ -25,31 +25,35 @@ from vrw_jax.simulation import paper_start, simulate
 from vrw_jax.wheel import WheelParams
 
 ReproductionProgressCallback = Callable[[float, str], None]
-"""Function that is called with the completed fraction, 0 to 1, and the name of the present task."""
+"""Function that is called with the completed fraction, 0 to 1, and the name of the current task."""
 
 FIGURE_8_AND_9_DAMPINGS = (50.0, 100.0, 200.0)
-"""Values of damping in figures 8 and 9, N s/m."""
+"""Damping in Figs 8 and 9 of the paper, N s/m."""
 
 
 def ignore_progress(completed_fraction: float, task_name: str) -> None:
-    """Accept a report of progress without any effect."""
+    """Ignore a report of progress."""
 
 
 def walk_into_table_1_gait() -> xr.Dataset:
-    """Return the walk from the start for Table 1 into its gait."""
+    """Simulate the walk from the paper's start into the gait of Table 1 of the paper."""
     return walk_into_gait(WheelParams(), paper_start())
 
 
 def simulate_table_1_gait(n_steps: int = 3) -> xr.Dataset:
-    """Return the trajectory of the gait of Table 1 at slope 0.30 rad, for figures 6 and 7."""
+    """Return the trajectory of the gait of Table 1 of the paper, for Figs 6 and 7.
+
+    The slope is 0.30 rad.
+    """
     section_state = jnp.asarray(walk_into_table_1_gait().section_state.values[-1])
     return simulate(WheelParams(), section_state, n_steps, model=make_formally_continued_model())
 
 
 def simulate_gaits_at_dampings(dampings: Sequence[float]) -> list[xr.Dataset]:
-    """Return one step of the gait at each of `dampings`, 1 to 219 N s/m, for figures 8 and 9.
+    """Return the trajectory of one step of the gait for each value of `dampings`, for Figs 8 and 9.
 
-    The damping is changed from that of Table 1 by at most 10 N s/m per walk.
+    The values may be 1 to 219 N s/m. From walk to walk, the damping changes by at most 10 N s/m,
+    beginning at that of Table 1 of the paper.
     """
     start_state = jnp.asarray(walk_into_table_1_gait().section_state.values[-1])
     table_1_wheel, gait_trajectories = WheelParams(), []
@@ -73,7 +77,10 @@ def simulate_gaits_at_dampings(dampings: Sequence[float]) -> list[xr.Dataset]:
 
 
 def measure_gaits_along_damping(on_progress: Callable[[float], None] | None = None) -> xr.Dataset:
-    """Return the gaits at each integer c from 1 to 219, and the walks up to 224, for figure 10."""
+    """Return the measures of the gaits for integer c from 1 to 219 N s/m, for Fig. 10 of the paper.
+
+    The dataset also contains the walks for c up to 224 N s/m.
+    """
     params = WheelParams()
     start_state = jnp.asarray(walk_into_table_1_gait().section_state.values[-1])
     gaits_below_table_1 = measure_gaits_along_parameter(
@@ -93,7 +100,7 @@ def measure_gaits_along_damping(on_progress: Callable[[float], None] | None = No
 def collect_paper_evidence(
     on_progress: ReproductionProgressCallback = ignore_progress,
 ) -> PaperEvidence:
-    """Return all walks that the facts and figures use."""
+    """Simulate all walks that the facts and figures use."""
     table_1_wheel = WheelParams()
     on_progress(0.0, "walk from the start for Table 1")
     settling_walk = walk_into_table_1_gait()
@@ -139,7 +146,7 @@ def collect_paper_evidence(
 
 
 def write_paper_figures(evidence: PaperEvidence, folder: Path) -> list[Path]:
-    """Write figures 6 to 10 as SVG and PNG, and the walk as a GIF, and return the paths."""
+    """Write Figs 6 to 10 as SVG and PNG files, and the walk as a GIF file, and return the paths."""
     two_step_trajectory = evidence.table_1_trajectory.isel(
         time=evidence.table_1_trajectory.step.values < 2
     )
@@ -164,9 +171,11 @@ def reproduce_paper(
 ) -> list[PaperFact]:
     """Write all figures and the table of facts into `folder`, and return the facts.
 
-    The table is in `facts.md` and `facts.csv`. The numbers of Figure 10 are in `indicators.csv`.
+    The table is in `facts.md` and `facts.csv`. The values that Fig. 10 shows are in
+    `indicators.csv`.
 
-    - `on_progress`: function that is called with the completed fraction and the present task.
+    - `on_progress`: function that is called with the completed fraction and the name of the current
+      task.
     """
     folder = Path(folder)
     evidence = collect_paper_evidence(on_progress)

@@ -1,4 +1,4 @@
-"""Facts of the table, their evidence, and the comparison of claims with computed numbers."""
+"""Facts of the table, the evidence for them, and the comparison of claims with computed values."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ from vrw_jax.wheel import WheelParams
 
 @dataclass(frozen=True)
 class PaperFact:
-    """One fact of the table: claim, source, published and computed value, and whether the two
+    """One fact of the table: claim, source, published value, computed value, and whether they
     agree.
     """
 
@@ -28,9 +28,7 @@ class PaperFact:
 
     @property
     def is_from_reference_code(self) -> bool:
-        """Return whether the published value of the fact is from independent code instead of the
-        paper.
-        """
+        """Return whether the published value comes from independent code instead of the paper."""
         return (
             INDEPENDENT_CODE_LABEL in self.source or INDEPENDENT_CODE_LABEL in self.published_value
         )
@@ -43,7 +41,7 @@ class PaperFact:
 
 @dataclass(frozen=True)
 class PaperEvidence:
-    """Labeled results from which all facts are computed."""
+    """Labeled simulation results from which all facts are computed."""
 
     params: WheelParams  # of Table 1
     settling_walk: xr.Dataset  # `gaits.walk_into_gait` from the start for Table 1
@@ -58,29 +56,31 @@ class PaperEvidence:
 
     @property
     def table_1_gait(self) -> xr.Dataset:
-        """Return the gait of Table 1."""
+        """Return the measures of the gait for Table 1 of the paper, whose damping is 200 N s/m."""
         return self.damping_branch.sel(damping=200.0)
 
 
 INDEPENDENT_CODE_LABEL = "independent code"
-"""Label of the source of a number that the paper does not print."""
+"""Label for the source of a value that the paper does not print."""
 
 LAST_DIGIT_TOLERANCE_REASON = "half a unit of the last digit published"
-"""Text of the reason for the usual tolerance."""
+"""Text that states the reason for the usual tolerance."""
 
 SIGN_TOLERANCE_REASON = "a sign: no tolerance"
-"""Text of the reason for a comparison without a tolerance."""
+"""Text that states why a comparison has no tolerance."""
 
 STEP_ERROR_TOLERANCE = 1e-9
-"""Tolerance of a number in SI units, chosen as the error of a step at the default options."""
+"""Tolerance for a value in SI units. It is chosen because it is the error of a walking step with
+the default options.
+"""
 
 ClaimNumbers = Mapping[str, Any]
-"""Numbers of a group of claims by name, computed from the evidence."""
+"""Values that the claims of a group need, by name, computed from the evidence."""
 
 
 @dataclass(frozen=True)
 class PaperClaim:
-    """Published statement, text of the computed value, and test of their agreement."""
+    """Published statement, text of the computed value, and test of whether the two agree."""
 
     claim: str
     source: str
@@ -92,14 +92,14 @@ class PaperClaim:
 
 @dataclass(frozen=True)
 class PaperClaimGroup:
-    """Claims under one heading, computed from the same numbers."""
+    """Claims under one heading that are computed from the same values."""
 
     title: str
     number_function: Callable[[PaperEvidence], ClaimNumbers]
     claims: tuple[PaperClaim, ...]
 
     def make_facts(self, evidence: PaperEvidence) -> list[PaperFact]:
-        """Return the facts of the group's claims, computed from the evidence."""
+        """Return the facts for the group's claims, computed from the evidence."""
         numbers_by_name = self.number_function(evidence)
         number_namespace = SimpleNamespace(**numbers_by_name)
         return [
@@ -119,9 +119,9 @@ class PaperClaimGroup:
 def make_agreement_test(
     **published_numbers: tuple[float | tuple[float, ...], float],
 ) -> Callable[[Any], bool]:
-    """Return a function that tests whether each named number is near its published value.
+    """Return a function that tests whether each named value agrees with its published value.
 
-    - `published_numbers`: published value and tolerance of each number, by name.
+    - `published_numbers`: pairs of published value and tolerance, by name.
     """
     return lambda n: all(
         bool(
@@ -132,7 +132,7 @@ def make_agreement_test(
 
 
 def select_first_step_of_trajectory(walk_trajectory: xr.Dataset) -> xr.Dataset:
-    """Return the first step of a trajectory."""
+    """Return the part of a trajectory in its first step."""
     return walk_trajectory.isel(time=walk_trajectory.step.values == 0)
 
 

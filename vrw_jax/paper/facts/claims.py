@@ -1,4 +1,6 @@
-"""Claims of Sections 4 and 5.2: the gait of Table 1, its indicators, and implicit assumptions."""
+"""Claims of Sections 4 and 5.2 of the paper: the gait of Table 1, its indicators, and implicit
+assumptions.
+"""
 
 import math
 
@@ -23,7 +25,7 @@ from vrw_jax.wheel import Outcome
 
 
 def _compute_typical_gait_numbers(paper_evidence: PaperEvidence) -> ClaimNumbers:
-    """Return the computed numbers for the claims on the gait of Table 1, by name."""
+    """Compute the values that the claims on the gait of Table 1 of the paper need, by name."""
     first_step = select_first_step_of_trajectory(paper_evidence.table_1_trajectory)
     phase_trajectories = double_support, single_support_1, single_support_2 = (
         split_trajectory_by_phase(first_step)
@@ -78,9 +80,9 @@ def _compute_typical_gait_numbers(paper_evidence: PaperEvidence) -> ClaimNumbers
 
 
 def _compute_damping_numbers(paper_evidence: PaperEvidence) -> ClaimNumbers:
-    """Return the computed numbers for the claims on foot height and rear force, by name.
+    """Compute the values that the claims on foot height and rear force need, by name.
 
-    The claims are on gaits with three values of damping.
+    The claims concern gaits with three values of damping.
     """
     gaits_by_damping = {g.attrs["parameter_damping"]: g for g in paper_evidence.gaits_by_damping}
     lowest_foot_heights = {
@@ -186,8 +188,9 @@ DAMPING_CLAIMS = PaperClaimGroup("Foot 2 and rear force for three dampings",
 
 
 def _compute_indicator_numbers(paper_evidence: PaperEvidence) -> ClaimNumbers:
-    """Return the computed numbers for the claims on double-support indicators along the damping, by
-    name.
+    """Compute the values that the claims on double-support indicators need, by name.
+
+    The indicators are functions of the damping.
     """
     damping_branch = paper_evidence.damping_branch
     gaits_to_damping_219 = damping_branch.sel(damping=slice(1.0, 219.0))
@@ -289,7 +292,10 @@ INDICATOR_CLAIMS = PaperClaimGroup("DLS indicators over c, slope 0.30 rad",
 
 
 def _compute_assumption_numbers(paper_evidence: PaperEvidence) -> ClaimNumbers:
-    """Return the computed numbers for the claims on the model's assumptions at Table 1, by name."""
+    """Compute the values that the claims on the model's assumptions need, by name.
+
+    The claims concern the gait of Table 1 of the paper.
+    """
     table_1_gait, first_step = (
         paper_evidence.table_1_gait,
         select_first_step_of_trajectory(paper_evidence.table_1_trajectory),

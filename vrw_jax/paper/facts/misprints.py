@@ -1,4 +1,4 @@
-"""Misprints of the paper, each with numbers that show the misprint."""
+"""Misprints of the paper, each with computed values that show the misprint."""
 
 import math
 
@@ -17,9 +17,9 @@ from vrw_jax.wheel import Outcome
 
 
 def _compute_misprint_numbers(paper_evidence: PaperEvidence) -> ClaimNumbers:
-    """Return the computed numbers for the claims on misprints, by name.
+    """Compute the values that the claims on misprints need, by name.
 
-    The numbers follow from equations as printed and from corrected equations.
+    The values follow from equations as printed in the paper and from corrected equations.
     """
     section_state, library_impulse = (
         paper_evidence.table_1_gait.section_state.values,

@@ -1,4 +1,4 @@
-"""Equations of the paper, as printed and corrected, if numbers can distinguish the two forms.
+"""Equations of the paper in printed and in corrected form, if computed values can distinguish them.
 
 The equations use the paper's five coordinates q = (x, z, theta, L1, L2). The simulator provides
 only the mass matrix and the momentum.
@@ -27,7 +27,9 @@ from vrw_jax.wheel import (
 def _compute_symbols_and_touchdown_length(
     params: WheelParams, theta: float
 ) -> tuple[Symbols, Array]:
-    """Return the symbols of the paper, and the length of Leg 1 at touchdown in m."""
+    """Return the parameters by their symbols in the paper, and the length of Leg 1 at touchdown,
+    m.
+    """
     s = params.symbols()
     return s, compute_length_at_touchdown(s, jnp.asarray(theta))
 
@@ -35,9 +37,9 @@ def _compute_symbols_and_touchdown_length(
 def compute_double_support_jacobian(
     theta: np.ndarray, L1: np.ndarray, L2: np.ndarray, alpha: float, is_as_printed: bool
 ) -> np.ndarray:
-    """Return the Jacobian J_DLS of eq. (11), shape (..., 4, 5).
+    """Return the Jacobian J_DLS of eq. (11) of the paper, shape (..., 4, 5).
 
-    The sign of its entry J43 is a misprint.
+    The sign of its entry J43 is misprinted.
 
     - `is_as_printed`: whether the entry J43 has the printed sign.
     """
@@ -55,7 +57,10 @@ def compute_double_support_jacobian(
 
 
 def compute_constraint_violation(walk_trajectory: xr.Dataset, is_as_printed: bool) -> float:
-    """Return the largest foot speed J q' of eq. (2) in the double support of a walk, m/s."""
+    """Return the largest speed of a foot in double support, m/s.
+
+    The speed is J q' of eq. (2) of the paper, evaluated for all samples of a walk.
+    """
     double_support = walk_trajectory.isel(time=walk_trajectory.phase.values == 0)
     alpha = 2.0 * np.pi / walk_trajectory.attrs["parameter_n_legs"]
     J = compute_double_support_jacobian(
@@ -73,7 +78,9 @@ def compute_constraint_violation(walk_trajectory: xr.Dataset, is_as_printed: boo
 
 
 class PrintedLandingResult(NamedTuple):
-    """Result of collision I by eqs (15)-(21) and (33)-(35), corrected and as printed."""
+    """Result of collision I by eqs (15)-(21) and (33)-(35) of the paper, corrected and as
+    printed.
+    """
 
     coordinate_rates_after: np.ndarray  # q'+ of eq. (20)
     corrected_impulse: np.ndarray  # lambda_I = -X^-1 J q'
@@ -82,7 +89,7 @@ class PrintedLandingResult(NamedTuple):
 
 
 def compute_printed_landing(params: WheelParams, section_state: np.ndarray) -> PrintedLandingResult:
-    """Return the result of collision I from (theta-, dtheta-, dL1-), in five coordinates."""
+    """Compute collision I in five coordinates from the section state (theta-, dtheta-, dL1-)."""
     touchdown_angle, touchdown_rate, dL1 = (float(v) for v in section_state)
     s, touchdown_length = jax.tree.map(
         float, _compute_symbols_and_touchdown_length(params, touchdown_angle)
@@ -114,10 +121,9 @@ def compute_printed_landing(params: WheelParams, section_state: np.ndarray) -> P
 
 @jax.jit
 def compute_five_coordinate_mass_matrix(s: Symbols, theta: Scalar, L1: Scalar, L2: Scalar) -> Array:
-    """Return the mass matrix M(q) of eq. (1), shape (5, 5).
+    """Return the mass matrix M(q) of eq. (1) of the paper, shape (5, 5).
 
-    It consists of the mass matrix of the planted wheel and the momentum of a wheel whose foot
-    moves.
+    It consists of the mass matrix for a planted foot, and of the momentum due to a moving foot.
     """
     planted_mass_matrix = compute_mass_matrix(s, L1, L2)
     unit_vectors = jnp.eye(3)
@@ -140,9 +146,9 @@ def compute_five_coordinate_mass_matrix(s: Symbols, theta: Scalar, L1: Scalar, L
 def compute_landing_foot_velocity(
     params: WheelParams, section_state: np.ndarray, leg_1_rate: float
 ) -> np.ndarray:
-    """Return the velocity (x, z) of the landing foot by eqs (16) and (17), m/s.
+    """Return the velocity (x, z) of the landing foot by eqs (16) and (17) of the paper, m/s.
 
-    - `leg_1_rate`: rate of L1 in these equations, m/s.
+    - `leg_1_rate`: time derivative of L1 in these equations, m/s.
     """
     touchdown_angle, touchdown_rate, _ = (float(v) for v in section_state)
     s, touchdown_length = jax.tree.map(
@@ -161,8 +167,9 @@ def compute_landing_foot_velocity(
 def differentiate_landing_foot_position(
     params: WheelParams, section_state: np.ndarray
 ) -> np.ndarray:
-    """Return the velocity (x, z) of the landing foot by central differences, accurate to 1e-11
-    m/s.
+    """Return the velocity (x, z) of the landing foot, m/s, computed by central differences.
+
+    The result is accurate to 1e-11 m/s.
     """
     h = 1e-6  # The step is in s; the error is proportional to its square.
     touchdown_angle, touchdown_rate, dL1 = (float(v) for v in section_state)
@@ -171,7 +178,7 @@ def differentiate_landing_foot_position(
     )
 
     def compute_foot_position(t: float) -> np.ndarray:
-        """Return the position (x, z) of the landing foot at the time t (s), m."""
+        """Return the position (x, z) of the landing foot, m, at the time t, s."""
         wheel_angle, leg_length = touchdown_angle + touchdown_rate * t, touchdown_length + dL1 * t
         hub_position = leg_length * np.array([np.sin(wheel_angle), np.cos(wheel_angle)])
         landing_angle = wheel_angle - float(s.alpha)

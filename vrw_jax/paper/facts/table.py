@@ -1,4 +1,4 @@
-"""Table of the facts that the paper publishes, with computed values and their agreement."""
+"""Table of the facts that the paper publishes, with computed values and whether they agree."""
 
 import csv
 import itertools
@@ -35,12 +35,14 @@ PAPER_CLAIM_GROUPS = (
 
 
 def compute_paper_facts(evidence: PaperEvidence) -> list[PaperFact]:
-    """Return the facts of all groups of claims."""
+    """Return the facts for all groups of claims."""
     return [fact for claim_group in PAPER_CLAIM_GROUPS for fact in claim_group.make_facts(evidence)]
 
 
 def summarize_paper_facts(paper_facts: Sequence[PaperFact]) -> str:
-    """Return a sentence with the number of facts that hold and the sources of their numbers."""
+    """Return a sentence that states how many facts hold, and the sources of their published
+    values.
+    """
     n_facts, n_facts_from_code = (
         len(paper_facts),
         sum(paper_fact.is_from_reference_code for paper_fact in paper_facts),
@@ -53,7 +55,7 @@ def summarize_paper_facts(paper_facts: Sequence[PaperFact]) -> str:
 
 
 def format_facts_page(paper_facts: Sequence[PaperFact]) -> str:
-    """Return the table of facts as a page of Markdown."""
+    """Return the table of facts as a Markdown page."""
     failed_facts = [paper_fact for paper_fact in paper_facts if not paper_fact.holds]
     page_lines = [
         "# The paper's facts",
@@ -104,7 +106,7 @@ def format_facts_page(paper_facts: Sequence[PaperFact]) -> str:
 
 
 def write_facts_files(paper_facts: Sequence[PaperFact], folder: Path) -> list[Path]:
-    """Write the table of facts as facts.md and facts.csv, and return the paths."""
+    """Write the table of facts to facts.md and facts.csv, and return the paths."""
     folder.mkdir(parents=True, exist_ok=True)
     written_paths = [folder / "facts.md", folder / "facts.csv"]
     written_paths[0].write_text(format_facts_page(paper_facts), encoding="utf-8")
