@@ -1,4 +1,4 @@
-"""Command line, which reads configs and writes reports."""
+"""Command line that reads configs and writes reports."""
 
 from vrw_jax.cli import commands, config, scanning
 from vrw_jax.cli.commands import main

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from vrw_jax.cli.config import Config
 
 MAX_OPTION_INTEGER = 10**9
-"""Largest integer of an option, chosen because a scan takes no more samples."""
+"""Largest integer that an option accepts, chosen because no scan has more samples."""
 
 SENSITIVITY_NORM_MEASURES = ("period", "speed")
 """Measures whose gait sensitivity norms `vrw robustness` prints."""
@@ -67,8 +67,9 @@ def main() -> None:
 
 
 def _handle_first_interrupt(_signal: int, _frame: object) -> None:
-    """End the command regularly after the first Ctrl-C, and install the handler of a second
-    Ctrl-C.
+    """Stop the command in an orderly way after the first Ctrl-C.
+
+    Install the handler for a second Ctrl-C.
     """
     signal.signal(signal.SIGINT, _handle_second_interrupt)
     raise KeyboardInterrupt
@@ -81,7 +82,7 @@ def _handle_second_interrupt(_signal: int, _frame: object) -> None:
 
 
 def _print_version_and_exit(is_version_requested: bool) -> None:
-    """Print the version and exit if `--version` is given."""
+    """Print the version and exit if the option `--version` is given."""
     if is_version_requested:
         try:
             version_number = importlib.metadata.version("vrw-jax")
@@ -268,9 +269,7 @@ def run_init_command(
 
 
 def find_example_config_folder() -> Path:
-    """Return the folder of the example configs, which lies in the installed package or beside
-    it.
-    """
+    """Return the folder of the example configs, which is in the installed package or next to it."""
     package_folder = Path(__file__).parents[1]
     return next(
         candidate_folder
@@ -280,7 +279,7 @@ def find_example_config_folder() -> Path:
 
 
 def _require_writable_folder(folder: Path) -> None:
-    """Raise a ValueError if the folder cannot be written to. No folder is created."""
+    """Raise a ValueError if the folder is not writable. No folder is created."""
     existing_folder = folder
     while not existing_folder.exists():
         existing_folder = existing_folder.parent
@@ -576,7 +575,9 @@ def run_continue_command(
 
 
 def _start_jax_and_load_config(config_path: Path | None) -> "Config":
-    """Start JAX, and return the config at `config_path` or the default config."""
+    """Start JAX, and return the config in the file `config_path`, or the default config for
+    None.
+    """
     from vrw_jax.runtime import start_jax
 
     start_jax()
@@ -587,7 +588,7 @@ def _start_jax_and_load_config(config_path: Path | None) -> "Config":
 
 
 def _require_enabled_compilation() -> None:
-    """Raise a ValueError if compilation is disabled, because commands would then take hours."""
+    """Raise a ValueError if compilation is disabled, because commands would then run for hours."""
     import jax
 
     if jax.config.jax_disable_jit:  # type: ignore[attr-defined]
@@ -597,7 +598,9 @@ def _require_enabled_compilation() -> None:
 
 
 def _require_figure_backend(draws_figure: bool) -> None:
-    """Raise a ValueError, before any computation, if matplotlib lacks the requested backend."""
+    """Raise a ValueError before any computation if the requested matplotlib backend does not
+    exist.
+    """
     if not draws_figure:
         return
     try:
@@ -617,15 +620,16 @@ MISSING_CONFIG_TABLE_MESSAGES = {
     "branch": "names no branch, but continuation needs a parameter and bounds: add a table "
     "[branch], as in configs/branch_damping.toml of `vrw init`.",
 }
-"""Messages about a config without the table that a command needs, by name of the table."""
+"""Error messages for a config without the table that a command needs, by name of the table."""
 
 
 def _load_config_with_table(
     config_path: Path, result_folder: Path | None, table_name: str, command_name: str
 ) -> tuple["Config", Path]:
-    """Return the config and the folder of the result.
+    """Load a config, and return it with the folder for the results.
 
-    Raise a ValueError if the config lacks the needed table.
+    Raise a ValueError if the config lacks the table that the command needs, or if the command does
+    not support the model.
     """
     command_config = _start_jax_and_load_config(config_path)
     if getattr(command_config, table_name) is None:

@@ -1,7 +1,7 @@
 """Configs: TOML files that define a wheel, samples and measures.
 
-An error in a file is reported in one sentence with the given value, the allowed values and the
-remedy.
+An error in a file is reported in one sentence that states the given value, the allowed values and
+the remedy.
 """
 
 import contextlib
@@ -55,16 +55,16 @@ CONFIG_TABLE_NAMES = (
 )
 _STEP_OPTION_KEYS = tuple(StepOptions.__dataclass_fields__)
 PARAMETER_SET_KEY = "parameter_set"
-"""Key of `[wheel]` that names a set of parameters. The other keys of the table replace values of
-that set."""
+"""Key of `[wheel]` that names a parameter set. Other keys of the table replace values of this
+set.
+"""
 _GRID_AXIS_KEYS = ("from", "to", "count")
 
 MAX_CONFIG_INTEGER = 2**53
-"""Largest integer of a config, chosen because floats represent all integers up to it."""
+"""Largest integer in a config, chosen because floats represent all integers up to it."""
 
 MAX_CONFIG_LEGS = 1_000
-"""Largest number of legs of a config, chosen because results have a number for each leg of each
-sample."""
+"""Largest number of legs in a config, chosen because results have one value per leg and sample."""
 
 RENAMED_CONFIG_KEYS = {
     "[model]": {"rung": "name"},
@@ -75,15 +75,15 @@ RENAMED_CONFIG_KEYS = {
     },
     "[branch]": {"largest_step": "max_ds"},
 }
-"""Present names of renamed keys by table and old key. A config with an old key raises an error."""
+"""New names of renamed keys, by table and old key. A config with an old key raises an error."""
 
 
 @dataclass(frozen=True)
 class ScanConfig:
-    """Table `[scan]`: measures of a scan, and number of samples that are written at a time.
+    """Table `[scan]`: measures of a scan, and number of samples per write.
 
     - `measures`: names of measures and derivatives; by default DLS fraction, speed and the like;
-    - `chunk`: number of samples that are written at a time; 4,096 by default;
+    - `chunk`: number of samples that are computed and written together; 4,096 by default;
     - `tol`: permitted error of each measure with unilateral contact (`name = "unilateral"`), in its
       unit. Each sample uses the simplest model that permits it;
     - `slope_sd`: standard deviation of random slopes, rad, for the measures of `vrw.first_passage`.
@@ -98,7 +98,7 @@ class ScanConfig:
     def from_table(
         cls, config_table: Mapping[str, object], model_class: type[AbstractWheel]
     ) -> "ScanConfig":
-        """Return the settings of `[scan]`.
+        """Read the settings of the table `[scan]`.
 
         Raise a ValueError if the model does not have a requested measure.
         """
@@ -151,7 +151,7 @@ class GaitConfig:
 
     @classmethod
     def from_table(cls, config_table: Mapping[str, object]) -> "GaitConfig":
-        """Return the settings of `[gait]`."""
+        """Read the settings of the table `[gait]`."""
         _require_known_keys(config_table, cls.__dataclass_fields__, "[gait]", "settings")
         n_steps = _parse_whole_number(config_table.get("steps", cls.steps), "steps", 1)
         start_state = config_table.get("start")
@@ -174,10 +174,10 @@ class GaitConfig:
 class TuneConfig:
     """Table `[tune]`: objective, bounds and constraints of a tuning run.
 
-    - `objective`: a measure, or weights of several, { dls_fraction = 1.0, speed = 0.1 };
+    - `objective`: name of a measure, or weights of measures, { dls_fraction = 1.0, speed = 0.1 };
     - `bounds`: table [tune.bounds] of the free parameters, such as damping = [20.0, 215.0];
-    - `constraints`: table [tune.constraints] of the least values of measures; by default every
-      margin that the model can satisfy;
+    - `constraints`: table [tune.constraints] with the smallest allowed values of measures; by
+      default every margin that the model can satisfy;
     - `evaluations`: largest number of evaluated gaits.
     """
 
@@ -188,7 +188,7 @@ class TuneConfig:
 
     @classmethod
     def from_table(cls, config_table: Mapping[str, object]) -> "TuneConfig":
-        """Return the settings of `[tune]` and its tables."""
+        """Read the settings of the table `[tune]` and of its subtables."""
         _require_known_keys(config_table, cls.__dataclass_fields__, "[tune]", "settings")
         objective_setting = config_table.get("objective", cls.objective)
         if isinstance(objective_setting, dict):
@@ -243,7 +243,8 @@ class BranchConfig:
     - `parameter`: name of the parameter;
     - `bounds`: range of the parameter, [lower, upper];
     - `period`: number of steps until the gait repeats;
-    - `max_ds`: largest distance between points, as a share of the range; 0.02 by default.
+    - `max_ds`: largest distance between two points of the branch, as a fraction of the range; 0.02
+      by default.
     """
 
     parameter: str
@@ -255,8 +256,9 @@ class BranchConfig:
     def from_table(
         cls, config_table: Mapping[str, object], allowed_parameters: tuple[str, ...]
     ) -> "BranchConfig":
-        """Return the settings of `[branch]`, whose parameter must be one of
-        `allowed_parameters`.
+        """Read the settings of the table `[branch]`.
+
+        Its parameter must be one of `allowed_parameters`.
         """
         _raise_for_renamed_keys(config_table, "[branch]")
         _require_known_keys(config_table, cls.__dataclass_fields__, "[branch]", "settings")
@@ -290,7 +292,7 @@ class BranchConfig:
 
 @dataclass(frozen=True)
 class Config:
-    """Checked settings of a config, and the text of the file."""
+    """Validated settings from a config, and the text of the file."""
 
     wheel_values: Mapping[str, float | int] = field(default_factory=dict)
     model_name: str = "viscoelastic"
@@ -305,24 +307,25 @@ class Config:
     file_name: str = ""
 
     def make_wheel(self, changed_values: Mapping[str, float | int] | None = None) -> WheelParams:
-        """Return the wheel of Table 1, changed by the parameters of the config and by
-        `changed_values`.
+        """Return the wheel of Table 1 of the paper with the parameters of the config.
+
+        `changed_values` replaces parameters of the config.
         """
         parameter_values: dict[str, Any] = {**self.wheel_values, **(changed_values or {})}
         return WheelParams(**parameter_values)
 
     def make_model(self) -> AbstractWheel:
-        """Return the model with the settings of the config."""
+        """Return the model with the settings from the config."""
         return find_model_class(self.model_name)(**self.model_settings)
 
     def make_options(self) -> StepOptions:
-        """Return the numerical options of the steps."""
+        """Return the numerical options of the walking steps."""
         option_values: dict[str, Any] = {**self.option_values}
         return StepOptions(**option_values)
 
 
 def load_config(config_path: str | Path) -> Config:
-    """Return the checked config of a file, or raise a ValueError if the file is invalid."""
+    """Read and validate a config file. Raise a ValueError if the file is invalid."""
     config_path = Path(config_path)
     if not config_path.exists():
         name_suggestion = format_name_suggestion(
@@ -346,7 +349,7 @@ def load_config(config_path: str | Path) -> Config:
 
 
 def parse_config(config_text: str, file_name: str = "config") -> Config:
-    """Return the checked config of a text. Every error message begins with `file_name`."""
+    """Parse and validate the text of a config. Every error message begins with `file_name`."""
     try:
         config_tables = tomllib.loads(config_text)
     except tomllib.TOMLDecodeError as config_error:
@@ -371,7 +374,7 @@ def parse_config(config_text: str, file_name: str = "config") -> Config:
 def _parse_config_tables(
     config_tables: Mapping[str, object], config_text: str, file_name: str
 ) -> Config:
-    """Return the config of the tables of a file, or raise a ValueError if a table is invalid."""
+    """Validate the parsed tables of a file. Raise a ValueError if a table is invalid."""
     _require_known_keys(config_tables, CONFIG_TABLE_NAMES, "the file", "tables")
     for table_key, config_table in config_tables.items():
         if not isinstance(config_table, dict):
@@ -452,7 +455,7 @@ def _get_config_table(config_tables: Mapping[str, object], table_name: str) -> d
 
 
 def parse_assignment(assignment_text: str) -> tuple[str, float | int]:
-    """Return parameter and number of a text `parameter_name=value_text` of the command line."""
+    """Return the parameter name and the number in a text such as "damping=150"."""
     parameter_name, equals_separator, value_text = (
         text_part.strip() for text_part in assignment_text.partition("=")
     )
@@ -468,7 +471,7 @@ def parse_assignment(assignment_text: str) -> tuple[str, float | int]:
 
 
 def _parse_wheel_table(config_table: Mapping[str, object]) -> dict[str, float | int]:
-    """Return the parameters of `[wheel]` by name."""
+    """Return the parameters in the table `[wheel]`, by name."""
     known_keys = (*PARAMETER_NAMES, "n_legs", PARAMETER_SET_KEY)
     _require_known_keys(config_table, known_keys, "[wheel]", "parameters")
     parameter_values: dict[str, float | int] = {}
@@ -490,7 +493,7 @@ def _parse_wheel_table(config_table: Mapping[str, object]) -> dict[str, float | 
 def _parse_model_table(
     config_table: Mapping[str, object],
 ) -> tuple[str, dict[str, float | int | str | bool]]:
-    """Return the name and the settings of the model of `[model]`."""
+    """Return the name of the model in the table `[model]`, and the model's settings."""
     _raise_for_renamed_keys(config_table, "[model]")
     model_name = config_table.get("name", Config.model_name)
     require_known_name(model_name, list_model_config_names(), "model")
@@ -513,7 +516,9 @@ def _parse_model_table(
 def _parse_with_default_types(
     config_table: Mapping[str, object], default_values: Mapping[str, object]
 ) -> dict[str, float | int | str | bool]:
-    """Return settings converted to the types of their defaults. Numbers must be positive."""
+    """Return the settings, converted to the types of their default values. Numbers must be
+    positive.
+    """
     parsed_values: dict[str, float | int | str | bool] = {}
     for setting_name, given_value in config_table.items():
         default_value = default_values[setting_name]
@@ -539,7 +544,10 @@ def _parse_with_default_types(
 def _parse_design_table(
     design_kind: str, config_table: Mapping[str, object], allowed_parameters: tuple[str, ...]
 ) -> designs.AbstractSampleDesign:
-    """Return the design of a table that sweeps some of the parameters `allowed_parameters`."""
+    """Return the sample design that a table defines.
+
+    It may sweep only parameters in `allowed_parameters`.
+    """
     design_keys = ("n", "seed") if design_kind in RANDOM_DESIGN_FUNCTIONS else ()
     if FRICTION_NAME in config_table and FRICTION_NAME not in allowed_parameters:
         model_choices = [
@@ -586,8 +594,9 @@ def _parse_design_table(
 
 
 def _parse_grid_axis(parameter_name: str, axis_setting: object) -> np.ndarray:
-    """Return the values of a grid's axis, given as a list or by first value, last value and
-    count.
+    """Return the values on an axis of a grid.
+
+    The setting is a list of values, or a table with the first value, the last value and the count.
     """
     if not isinstance(axis_setting, dict):
         return _parse_value_list(
@@ -617,7 +626,7 @@ def _parse_grid_axis(parameter_name: str, axis_setting: object) -> np.ndarray:
 def _parse_value_list(
     parameter_name: str, given_list: object, alternative_text: str = ""
 ) -> np.ndarray:
-    """Return a list of numbers in the domain of a parameter as an array."""
+    """Return an array of numbers from a list. They must lie in the domain of the parameter."""
     if not isinstance(given_list, list):
         raise _make_value_error(parameter_name, given_list, f"a list of numbers{alternative_text}")
     return np.asarray(
@@ -628,7 +637,7 @@ def _parse_value_list(
 def _parse_parameter_range(
     range_name: str, given_range: object, parameter_name: str = ""
 ) -> tuple[float, float]:
-    """Return lower and upper bound of a range in the domain of a parameter.
+    """Return the lower and the upper bound of a range. They must lie in the domain of a parameter.
 
     The default of `parameter_name` is `range_name`.
     """
@@ -644,8 +653,9 @@ def _parse_parameter_range(
 
 
 def _parse_parameter_value(parameter_name: str, given_value: object) -> float:
-    """Return a value as a number, or raise a ValueError if it is not in the domain of the
-    parameter.
+    """Return a value as a number.
+
+    Raise a ValueError if it is not in the domain of the parameter.
     """
     parameter_value = _parse_finite_number(
         given_value, parameter_name, must_be_positive=parameter_name == FRICTION_NAME
@@ -658,7 +668,7 @@ def _parse_parameter_value(parameter_name: str, given_value: object) -> float:
 def _parse_finite_number(
     given_value: object, setting_name: str, must_be_positive: bool = False
 ) -> float:
-    """Return a value as a finite float, or raise a ValueError."""
+    """Return a value as a finite float. Raise a ValueError if it is not a finite number."""
     finite_number = math.nan
     if isinstance(given_value, int | float) and not isinstance(given_value, bool):
         # An integer of hundreds of digits is too large for a float.
@@ -672,7 +682,9 @@ def _parse_finite_number(
 
 
 def _parse_whole_number(given_value: object, setting_name: str, min_value: int) -> int:
-    """Return a value as a whole number of at least `min_value`, or raise a ValueError."""
+    """Return a value as an integer. Raise a ValueError if it is not an integer of at least
+    `min_value`.
+    """
     if isinstance(given_value, bool) or not isinstance(given_value, int) or given_value < min_value:
         raise _make_value_error(
             setting_name, given_value, f"a whole number of at least {min_value}"
@@ -688,7 +700,7 @@ def _require_known_keys(
     table_location: str,
     key_kind: str,
 ) -> None:
-    """Raise a ValueError if a table has a key that is not allowed."""
+    """Raise a ValueError if a table contains a key that is not allowed."""
     allowed_keys = tuple(allowed_keys)
     for key in config_table:
         raise_for_parameter_symbol(key, allowed_keys)
@@ -701,7 +713,7 @@ def _require_known_keys(
 
 
 def _raise_for_renamed_keys(config_table: Mapping[str, object], table_location: str) -> None:
-    """Raise a ValueError if a table contains a key that was renamed."""
+    """Raise a ValueError if a table contains a key that has a new name."""
     for old_key, new_key in RENAMED_CONFIG_KEYS[table_location].items():
         if old_key in config_table:
             raise ValueError(
@@ -710,9 +722,9 @@ def _raise_for_renamed_keys(config_table: Mapping[str, object], table_location: 
 
 
 def _make_value_error(setting_name: str, given_value: object, requirement_text: str) -> ValueError:
-    """Return the error about a value that does not satisfy a requirement.
+    """Return an error that states that a value does not satisfy a requirement.
 
-    The message contains the value as in TOML.
+    The message contains the value as written in TOML.
     """
     value_text = format_value(given_value)
     if isinstance(given_value, bool):

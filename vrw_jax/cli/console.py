@@ -1,4 +1,4 @@
-"""Output of commands: tables, progress, and one sentence about a user's mistake."""
+"""Output of commands: tables, progress, and one-sentence error messages for mistakes of users."""
 
 import contextlib
 import enum
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 
 class ExitCode(enum.IntEnum):
-    """Exit code of the command line, besides 0 for success."""
+    """Exit codes of the command line other than 0, which means success."""
 
     CHECK_FAILED = 1  # A fact does not hold, a run has no result, or a store is damaged.
     USER_ERROR = 2
@@ -44,9 +44,9 @@ stderr_console = Console(stderr=True)
 def report_command_errors(
     interruption_message: str = "stopped; nothing was written.",
 ) -> Iterator[None]:
-    """Return a context that reports an error in one sentence.
+    """Return a context manager that reports an error in one sentence and ends the command.
 
-    The exit code is 2, and 130 after a Ctrl-C.
+    The exit code is 2, or 130 after Ctrl-C.
     """
     try:
         yield
@@ -69,8 +69,9 @@ def report_command_errors(
 
 @contextlib.contextmanager
 def report_stdout_errors() -> Iterator[None]:
-    """Return a context that ends the command with exit code 2 if standard output cannot be
-    written.
+    """Return a context manager that handles errors of standard output.
+
+    If standard output is not writable, the command ends with exit code 2.
     """
     exit_code: Any = 0
     try:
@@ -87,7 +88,7 @@ def report_stdout_errors() -> Iterator[None]:
 
 
 def _discard_output_and_exit(stdout_error: OSError) -> None:
-    """Discard the output that Python would still write at its end, and exit with code 2."""
+    """Discard the output that Python would still write when it exits, and exit with code 2."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     if not isinstance(stdout_error, BrokenPipeError):  # The reader has closed the pipe on purpose.
         print_error_sentence(
@@ -97,14 +98,14 @@ def _discard_output_and_exit(stdout_error: OSError) -> None:
 
 
 def print_error_sentence(error_sentence: str) -> None:
-    """Print a sentence about an error on stderr."""
+    """Print an error message on standard error."""
     stderr_console.print(
         f"[bold red]vrw:[/] {escape(error_sentence)}", highlight=False, soft_wrap=True
     )
 
 
 def show_warnings_as_sentences() -> None:
-    """Print the library's warnings as sentences, without their location in the code."""
+    """Print the library's warnings as sentences, without their location in the source code."""
     default_show_warning = warnings.showwarning
 
     def show_warning(
@@ -124,14 +125,15 @@ def show_warnings_as_sentences() -> None:
 
 
 def _format_system_error(system_error: OSError) -> str:
-    """Return a sentence about an error of the operating system."""
+    """Return a sentence that describes an error of the operating system."""
     file_text = f"{system_error.filename}: " if system_error.filename else ""
     return f"{file_text}{str(system_error.strerror or system_error).rstrip('.')}."
 
 
 @contextlib.contextmanager
 def show_computation_stages(first_stage_name: str) -> Iterator[Callable[[str], None]]:
-    """Show stage and duration of a computation, and yield the function that sets the next stage.
+    """Show the stage and the duration of a computation, and yield a function that sets the next
+    stage.
 
     If stderr is not a terminal, each stage is printed on one line.
     """
@@ -146,7 +148,7 @@ def show_computation_stages(first_stage_name: str) -> Iterator[Callable[[str], N
 
 
 def print_written_paths(paths: Iterable[Path]) -> None:
-    """Print the paths of files that were written."""
+    """Print the paths of written files."""
     for path in paths:
         stdout_console.print(f"written: {path}", highlight=False, soft_wrap=True)
 
@@ -157,7 +159,7 @@ def print_text_table(
     column_headings: Sequence[str] = (),
     right_aligned_headings: Sequence[str] = (),
 ) -> None:
-    """Print a table. Without headings the first column is bold.
+    """Print a table. If it has no headings, the first column is bold.
 
     Texts are printed literally, except in a column with the heading "", which may contain color
     markup.
@@ -187,7 +189,7 @@ def print_text_table(
 
 
 def print_paper_facts(paper_facts: "list[PaperFact]", folder: Path) -> None:
-    """Print the table of facts, and the number of facts that hold."""
+    """Print the table of facts, and how many facts hold."""
     verdict_texts = ("[bold red]does not hold[/]", "[green]holds[/]")
     print_text_table(
         None,
@@ -211,7 +213,9 @@ def print_paper_facts(paper_facts: "list[PaperFact]", folder: Path) -> None:
 
 
 def make_progress_bar(task_name: str) -> "Bar":
-    """Return a progress bar on stderr. The bar of a scan counts samples and shows a note."""
+    """Return a progress bar on standard error. The bar for a scan counts samples and shows a
+    note.
+    """
     from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn
     from rich.progress import Progress as Bar
 
@@ -227,10 +231,11 @@ def make_progress_bar(task_name: str) -> "Bar":
 def make_scan_progress_reporter(
     update_bar: Callable, progress_task: int
 ) -> Callable[["ScanProgress"], None]:
-    """Return the function that shows rate, fraction without a gait and remaining time of a scan.
+    """Return a function that shows the progress of a scan.
 
-    The rate is measured from the second chunk on, because the first chunk includes compilation. The
-    bar includes the samples of an earlier run. Rate and fraction refer to the present run.
+    It shows the rate, the fraction of samples without a gait, and the remaining time. The rate is
+    measured from the second chunk on, because the first chunk includes compilation. The bar
+    includes the samples of an earlier run; the rate and the fraction refer only to the present run.
     """
     import time
 
@@ -239,7 +244,7 @@ def make_scan_progress_reporter(
     first_report_times_and_counts: list[tuple[float, int]] = []
 
     def report_progress(scan_progress: "ScanProgress") -> None:
-        """Update the progress bar of the scan."""
+        """Update the progress bar from the progress of the scan."""
         present_seconds, n_samples_done = time.monotonic(), scan_progress.n_done
         bar_note = (
             f"{scan_progress.n_reused:,} from an earlier run" if scan_progress.n_reused else ""
@@ -269,7 +274,7 @@ def make_scan_progress_reporter(
 
 
 def print_outcome_counts(scan_dataset: "xr.Dataset") -> None:
-    """Print the number of samples of a scan by outcome."""
+    """Print the number of samples for each outcome of a scan."""
     import numpy as np
 
     from vrw_jax.wheel import Outcome
@@ -300,9 +305,9 @@ def print_wheel_and_gait(
     limit_cycle_result: "LimitCycle | ReturnMapCycle",
     force_peak_dataset: "xr.Dataset | None",
 ) -> None:
-    """Print a wheel, the last step of its walk, its limit cycle and the gait's force peaks.
+    """Print a wheel, the last step of its walk, its limit cycle and the force peaks of the gait.
 
-    `start_state` is the state at which the last step began.
+    `start_state` is the section state at the start of the last step.
     """
     import numpy as np
 
@@ -348,7 +353,7 @@ def print_wheel_and_gait(
 
 
 def _print_measure_table(table_title: str, measure_values: "Mapping[str, Any]") -> None:
-    """Print a table of measures by name."""
+    """Print a table of measures, given as a mapping from names to values."""
     from vrw_jax.measures import MEASURES
 
     measure_rows = (
@@ -365,7 +370,7 @@ def _print_measure_table(table_title: str, measure_values: "Mapping[str, Any]") 
 
 
 def _print_limit_cycle(limit_cycle_result: "LimitCycle | ReturnMapCycle") -> None:
-    """Print stability, period, speed and DLS fraction of a limit cycle."""
+    """Print the stability, period, speed and DLS fraction of a limit cycle."""
     import numpy as np
 
     from vrw_jax.cycles import format_floquet_multipliers
@@ -390,7 +395,7 @@ def _print_limit_cycle(limit_cycle_result: "LimitCycle | ReturnMapCycle") -> Non
 
 
 def _print_step_margins(step_result: "StepResult") -> None:
-    """Print the margins of a step."""
+    """Print the margins of a step, and whether each of them holds."""
     import numpy as np
 
     from vrw_jax.measures import MARGIN_MEASURES

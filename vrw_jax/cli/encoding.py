@@ -1,4 +1,4 @@
-"""Replacement of characters that the encoding of a terminal lacks, such as ASCII or cp1252."""
+"""Replacement of characters that the encoding of a terminal, such as ASCII or cp1252, lacks."""
 
 import codecs
 import io
@@ -6,7 +6,7 @@ import sys
 import unicodedata
 
 ENCODING_ERROR_HANDLER_NAME = "vrw_spell"
-"""Name of the handler of encoding errors, chosen because no other library uses it."""
+"""Name of the handler for encoding errors, chosen because no other library uses it."""
 
 ASCII_REPLACEMENTS = {
     "α": "alpha", "θ": "theta", "κ": "kappa", "λ": "lambda", "μ": "mu", "ρ": "rho", "σ": "sigma",
@@ -14,11 +14,13 @@ ASCII_REPLACEMENTS = {
     "·": ".", "−": "-", "→": "->", "≤": "<=", "≥": ">=", "≈": "~", "±": "+-", "’": "'",
     "“": '"', "”": '"', "§": "section ",
 }  # fmt: skip
-"""Replacements of the characters beyond ASCII that commands print."""
+"""ASCII replacements for the other characters that commands print."""
 
 
 def replace_unencodable_output() -> None:
-    """Replace characters that its encoding lacks in standard output and standard error."""
+    """Replace, in standard output and standard error, characters that the stream's encoding
+    lacks.
+    """
     codecs.register_error(ENCODING_ERROR_HANDLER_NAME, _handle_encoding_error)
     for output_stream in (sys.stdout, sys.stderr):
         if isinstance(output_stream, io.TextIOWrapper):
@@ -26,13 +28,13 @@ def replace_unencodable_output() -> None:
 
 
 def replace_unencodable_characters(text: str, encoding_name: str) -> str:
-    """Return the text with replacements of all characters that the encoding lacks."""
+    """Return a text in which all characters that the encoding lacks are replaced."""
     codecs.register_error(ENCODING_ERROR_HANDLER_NAME, _handle_encoding_error)
     return text.encode(encoding_name, ENCODING_ERROR_HANDLER_NAME).decode(encoding_name)
 
 
 def _handle_encoding_error(encoding_error: UnicodeError) -> tuple[str, int]:
-    """Return the replacement of characters that an encoding lacks, and the index after them."""
+    """Return the replacement for characters that an encoding lacks, and the index after them."""
     if not isinstance(encoding_error, UnicodeEncodeError):
         raise encoding_error
     return "".join(
@@ -41,7 +43,7 @@ def _handle_encoding_error(encoding_error: UnicodeError) -> tuple[str, int]:
 
 
 def _replace_with_ascii(character: str) -> str:
-    """Return a character in ASCII: its replacement, or the replacements of its components."""
+    """Return an ASCII text for a character: its replacement, or replacements of its components."""
     if character.isascii() or character in ASCII_REPLACEMENTS:
         return ASCII_REPLACEMENTS.get(character, character)
     decomposed_characters = unicodedata.normalize("NFKD", character)

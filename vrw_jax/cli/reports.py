@@ -30,7 +30,7 @@ def write_scan_figures(scan: xr.Dataset, folder: Path) -> list[Path]:
 def write_tuning_report(
     tune_result: TuneResult, folder: Path, draws_figure: bool = True
 ) -> list[Path]:
-    """Write data, summary, config and figure of a tuned gait into `folder`, and return their
+    """Write the data, summary, config and figure for a tuned gait into `folder`, and return the
     paths.
     """
     toml_lines = [
@@ -57,7 +57,9 @@ def write_tuning_report(
 
 
 def write_branch_report(branch: Branch, folder: Path, draws_figure: bool = True) -> list[Path]:
-    """Write data, table, summary and figure of a branch into `folder`, and return their paths."""
+    """Write the data, table, summary and figure for a branch into `folder`, and return the
+    paths.
+    """
     text_by_file_name = {
         "borders.csv": _format_special_points_csv(branch),
         "summary.md": format_branch_summary(branch),
@@ -72,8 +74,9 @@ def write_branch_report(branch: Branch, folder: Path, draws_figure: bool = True)
 
 
 def write_special_point_map(special_point_map: SpecialPointMap, folder: Path) -> list[Path]:
-    """Write text, table and figure of a map of special points into `folder`, and return their
-    paths.
+    """Write the text, table and figure for a map of special points into `folder`.
+
+    Return the paths.
     """
     scan_dataset, special_point_curves, _ = special_point_map
     parameter_names = tuple(map(str, scan_dataset.outcome.dims))
@@ -102,7 +105,7 @@ def write_special_point_map(special_point_map: SpecialPointMap, folder: Path) ->
 def _write_dataset_and_texts(
     folder: Path, store_name: str, dataset: xr.Dataset, text_by_file_name: Mapping[str, str]
 ) -> list[Path]:
-    """Write a dataset and texts into `folder`, and return their paths."""
+    """Write a dataset and text files into `folder`, and return the paths."""
     folder.mkdir(parents=True, exist_ok=True)
     dataset.to_zarr(folder / store_name, mode="w", zarr_format=2)
     for file_name, file_text in text_by_file_name.items():
@@ -111,7 +114,7 @@ def _write_dataset_and_texts(
 
 
 def format_tuning_summary(tune_result: TuneResult) -> str:
-    """Return the summary of a tuning run in Markdown."""
+    """Return a Markdown summary of a tuning run."""
     active_rows = [
         (
             active_constraint.name,
@@ -143,7 +146,7 @@ def format_tuning_summary(tune_result: TuneResult) -> str:
 
 
 def _format_special_points_csv(branch: Branch) -> str:
-    """Return a table of the special points of a branch as CSV text."""
+    """Return a CSV table of the special points on a branch."""
     csv_buffer = io.StringIO(newline="")
     csv_writer = csv.writer(csv_buffer)
     csv_writer.writerow([branch.parameter, "kind", "name", "ends_branch", "spectral_radius"])
@@ -162,7 +165,7 @@ def _format_special_points_csv(branch: Branch) -> str:
 
 
 def format_branch_summary(branch: Branch) -> str:
-    """Return the summary of a branch in Markdown."""
+    """Return a Markdown summary of a branch."""
     first_line, *_ = str(branch).split("\n")
     summary_lines = [f"# Branch along {branch.parameter}", "", first_line, ""]
     if not branch.values.size:

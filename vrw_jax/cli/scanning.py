@@ -1,4 +1,4 @@
-"""Scans of the command line: plan from a config, verification and computation."""
+"""Scans from the command line: planning from a config, verification and computation."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 def plan_config_scan(
     command_config: "Config", chunk_size: int | None, additional_measures: tuple[str, ...] = ()
 ) -> "ScanPlan":
-    """Return the plan of the scan that a config defines, with the additional measures."""
+    """Return the plan for the scan that a config defines, extended by additional measures."""
     from vrw_jax.scans import plan_scan
 
     assert command_config.design is not None
@@ -46,7 +46,7 @@ def plan_config_scan(
 
 
 def verify_scan_store(scan_plan: "ScanPlan", store_path: Path) -> None:
-    """Print whether a store is complete and intact, and exit with code 1 if it is damaged."""
+    """Print whether a scan store is complete and intact, and exit with code 1 if it is damaged."""
     from vrw_jax.scans import find_matching_store
 
     zarr_store = find_matching_store(scan_plan, store_path)
@@ -75,7 +75,9 @@ def verify_scan_store(scan_plan: "ScanPlan", store_path: Path) -> None:
 def compute_scan_with_progress(
     scan_plan: "ScanPlan", store_path: Path, dask: str | None
 ) -> "xr.Dataset":
-    """Compute the missing chunks of a store with a progress bar, and return the labeled dataset."""
+    """Compute the missing chunks of a scan store with a progress bar, and return the labeled
+    dataset.
+    """
     from vrw_jax.scans import open_or_create_store, resolve_executor, run_scan
 
     interruption_message = f"stopped; what is done stays in {store_path}, run the same to go on."
