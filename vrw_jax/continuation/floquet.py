@@ -257,7 +257,7 @@ def compute_bifurcation_margins(matrix: RealSquareMatrix) -> Float[Array, "... n
 
     If n is at most 3, these are the first Jury margins. For larger matrices the first two margins
     are det(1 - matrix) and det(1 + matrix). The third margin is the product of 1 - z_i z_j over all
-    pairs of eigenvalues z_i and z_j. It is missing for n = 1.
+    pairs of eigenvalues z_i and z_j. For n = 1 no third margin exists.
     """
     n = matrix.shape[-1]
     if n <= MAX_CLOSED_FORM_SIZE:
