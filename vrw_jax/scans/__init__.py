@@ -1,4 +1,4 @@
-"""Scans: the steady gait of every sample of a design, as one labeled dataset."""
+"""Scans: the steady gait for every sample of a design, as one labeled dataset."""
 
 from vrw_jax.scans import dask, design, execution, forecast, integrity, planning, store
 from vrw_jax.scans.design import (

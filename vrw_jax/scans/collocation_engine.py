@@ -1,7 +1,8 @@
-"""Steady gaits of many wheels by collocation: one compiled function over a batch of fixed size.
+"""Steady gaits of many wheels by collocation, computed by one compiled function for batches of one
+size.
 
-The samples are divided into batches of one size, and the last batch is padded. The same compiled
-code evaluates every batch, so the result of a sample depends neither on its position nor on the
+The samples are divided into batches of equal size, and the last batch is padded. The same compiled
+code evaluates every batch, so the result for a sample depends neither on its position nor on the
 other samples. Batches run in parallel with one compiled program: one thread per core, or one thread
 per GPU.
 """
@@ -26,11 +27,13 @@ from vrw_jax.scans.measure_catalog import DIFFERENTIABLE_MEASURES, parse_derivat
 from vrw_jax.wheel import PARAMETER_NAMES, Outcome, WheelParams, make_wheel_from_parameters
 
 GaitOutputs = tuple[Array, Array, dict[str, Array]]
-"""Outcome of a gait, its section state, and its measures by name."""
+"""Outcome of the search for a gait, section state of the gait, and measures of the gait by name."""
 
 
 class EvaluationRequest(NamedTuple):
-    """Measures that a scan computes for each sample, with the wheel, the model and the options."""
+    """Measures that a scan computes for each sample, with the base wheel, the model and the
+    options.
+    """
 
     measure_names: tuple[str, ...]
     base_wheel: WheelParams
@@ -44,16 +47,15 @@ class EvaluationRequest(NamedTuple):
 
 
 class CollocationScanEngine:
-    """Scan engine for the paper's model and a fixed set of measures. The first call compiles the
-    engine.
+    """Scan engine for the paper's model and a fixed set of measures, compiled on the first call.
 
-    The engine finds each limit cycle with the requested derivatives by collocation. It then takes
-    one event-driven step from the cycle, which gives the margins and checks the cycle. Both
-    functions are compiled in parallel.
+    The engine computes each limit cycle and the requested derivatives by collocation. It then
+    computes one event-driven gait step from the cycle, which gives the margins and checks the
+    cycle. The two functions are compiled in parallel.
     """
 
     def __init__(self, request: EvaluationRequest, n_threads: int | None = None) -> None:
-        """Initialize the engine.
+        """Initialize the engine for the measures and options of `request`.
 
         - `n_threads`: number of CPU threads, by default one per core.
         """
@@ -97,7 +99,9 @@ class CollocationScanEngine:
         def find_cycle_with_derivatives(
             parameter_values: Array,
         ) -> tuple[AbstractCycle, dict[str, Array]]:
-            """Return the limit cycle of one wheel, and the requested derivatives by name."""
+            """Return the limit cycle for one vector of parameters, and the requested derivatives by
+            name.
+            """
 
             def find_measures_and_cycle(
                 differentiated_values: Array,
@@ -125,7 +129,9 @@ class CollocationScanEngine:
             }
 
         def evaluate_cycle(parameter_values: Array) -> GaitOutputs:
-            """Return the outcome, the section state and the measures of one wheel's limit cycle."""
+            """Return outcome, section state and measures of the limit cycle for one vector of
+            parameters.
+            """
             limit_cycle, derivative_values = find_cycle_with_derivatives(parameter_values)
             cycle_measure_names = (
                 *(
@@ -144,7 +150,9 @@ class CollocationScanEngine:
         def evaluate_confirming_step(
             parameter_values: Array, section_state: Array, step_options: StepOptions
         ) -> GaitOutputs:
-            """Return the outcome, the end state and the measures of one step from a limit cycle."""
+            """Return outcome, end state and measures of one gait step from a limit cycle's section
+            state.
+            """
             step_result = wheel_model.take_step(
                 make_wheel_from_parameters(parameter_values, base_wheel.n_legs),
                 section_state,
@@ -177,7 +185,7 @@ class CollocationScanEngine:
         self._n_workers, self._compilation_lock = 0, Lock()
 
     def __call__(self, sample_columns: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-        """Return the results of all samples by variable.
+        """Return the value of each variable for all samples, by the name of the variable.
 
         - `sample_columns`: value of each swept parameter for each sample.
         """
@@ -200,9 +208,11 @@ class CollocationScanEngine:
 
     @with_default_jax_settings  # It runs in a thread of its own.
     def _evaluate_sample_batch(self, parameter_rows: np.ndarray) -> dict[str, np.ndarray]:
-        """Return the results of a batch of samples by variable.
+        """Return the value of each variable for a batch of samples, by the name of the variable.
 
         A small batch is padded with copies of its first wheel.
+
+        - `parameter_rows`: parameters of the wheels, shape (samples, parameters).
         """
         padded_parameter_rows = np.concatenate(
             [
@@ -229,7 +239,7 @@ class CollocationScanEngine:
         return mask_failed_samples(confirmed_outcome, sample_measures)
 
     def _compile_programs(self) -> None:
-        """Compile the functions of cycles and of steps in parallel for each device.
+        """Compile the functions for cycles and for gait steps in parallel, once for each device.
 
         All cores of a CPU use the same programs.
         """
@@ -280,7 +290,7 @@ class CollocationScanEngine:
 
 
 class _CompiledDevicePrograms(NamedTuple):
-    """Compiled functions of cycles and steps on one device."""
+    """Compiled functions for cycles and for gait steps on one device."""
 
     device: jax.Device
     cycle_program: Callable
@@ -288,7 +298,7 @@ class _CompiledDevicePrograms(NamedTuple):
 
 
 def count_available_cores() -> int:
-    """Return the number of cores available to this process."""
+    """Return the number of processor cores that this process may use."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
@@ -297,7 +307,10 @@ def count_available_cores() -> int:
 def stack_parameter_rows(
     sample_columns: Mapping[str, np.ndarray], wheel_model: AbstractWheel, base_wheel: WheelParams
 ) -> np.ndarray:
-    """Return the model's parameters of each sample, shape (samples, parameters)."""
+    """Return the model's parameters for each sample, shape (samples, parameters).
+
+    Parameters that are not swept are those of `base_wheel` and `wheel_model`.
+    """
     n_samples = len(next(iter(sample_columns.values())))
     base_parameter_values = np.asarray(wheel_model.parameter_values(base_wheel))
     return np.stack(
@@ -317,9 +330,9 @@ def stack_parameter_rows(
 def mask_failed_samples(
     outcome: np.ndarray, measures_by_name: Mapping[str, Any]
 ) -> dict[str, np.ndarray]:
-    """Return outcomes and measures by name, with failed samples masked.
+    """Return outcomes and measures by name, with the measures of samples without a gait replaced.
 
-    In samples without a gait, a measure is NaN, or -1 if it is an integer.
+    Such a measure is NaN, or -1 if it is an integer.
     """
     masked_measures = {
         variable_name: np.array(variable_values)

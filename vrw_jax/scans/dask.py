@@ -1,8 +1,9 @@
-"""Scans on the workers of a dask cluster: a free worker computes each chunk of `run_scan`.
+"""Scans on a dask cluster: each worker that is free computes a chunk of samples of `run_scan`.
 
 Workers only compute, and the calling process writes the store. If a worker dies, other workers
 compute its chunks. Each worker returns a description of its environment. A chunk raises an error if
-its environment differs from that of the calling process, because its last digits might differ.
+this environment differs from that of the calling process, because the last digits of its results
+might differ.
 """
 
 import asyncio
@@ -36,22 +37,26 @@ if TYPE_CHECKING:
     from distributed import Client, Future
 
 N_QUEUED_CHUNKS_PER_THREAD = 2
-"""Number of submitted chunks per thread, chosen because a thread then always has work, and little
-memory is used."""
+"""Number of submitted chunks per thread of the cluster.
+
+The value is chosen because a thread then always has work, and little memory is used.
+"""
 
 DASK_SCHEDULER_TIMEOUT = "10s"
-"""Longest time in which a dask scheduler must respond, in dask's notation."""
+"""Longest time until a dask scheduler must respond, in the notation of dask."""
 
 MAX_SECONDS_WITHOUT_RESULT = 10.0
-"""Longest time without a result before the workers are counted, s. The value is chosen because
-workers that have just started are connected by then."""
+"""Longest time without a result, s, after which the connected workers are counted.
+
+The value is chosen because workers that have just started are connected by then.
+"""
 
 
 @contextlib.contextmanager
 def connect_dask_workers(scheduler_address: str) -> Iterator[ChunkExecutor]:
-    """Yield a function that computes chunks on the cluster at `scheduler_address`.
+    """Yield a function that computes chunks on the dask cluster at `scheduler_address`.
 
-    The address "local" starts one process per core.
+    The address "local" starts a cluster with one process per core.
     """
     try:
         from distributed import Client, LocalCluster
@@ -87,9 +92,7 @@ def connect_dask_workers(scheduler_address: str) -> Iterator[ChunkExecutor]:
 
 @contextlib.contextmanager
 def hide_cancelled_tasks_in_log() -> Iterator[None]:
-    """Return a context that removes cancelled tasks of a lost scheduler from the log of
-    distributed.
-    """
+    """Return a context in which the client of dask logs no tasks that a lost scheduler cancels."""
     client_logger = logging.getLogger("distributed.client")
 
     def is_log_record_shown(log_record: logging.LogRecord) -> bool:
@@ -132,15 +135,15 @@ def _compute_chunks_on_cluster(
     scan_plan: ScanPlan,
     missing_chunks: Sequence[int],
 ) -> Iterator[ChunkResult]:
-    """Yield the index and the results of each missing chunk, in the order of completion."""
+    """Yield each missing chunk's index and results, in the order of completion."""
     pickled_request = pickle.dumps(scan_plan.evaluation_request)
     local_environment, remaining_chunks = describe_computing_environment(), iter(missing_chunks)
     chunk_index_by_future: dict[Future, int] = {}
     completed_futures: SimpleQueue[Future] = SimpleQueue()
 
     def submit_remaining_chunks() -> None:
-        """Submit chunks until every thread of the cluster has `N_QUEUED_CHUNKS_PER_THREAD`
-        chunks.
+        """Submit chunks until there are `N_QUEUED_CHUNKS_PER_THREAD` chunks per thread of the
+        cluster, or until all chunks are submitted.
         """
         n_free_slots = N_QUEUED_CHUNKS_PER_THREAD * max(
             1, sum(dask_client.nthreads().values())
@@ -186,7 +189,7 @@ def _compute_chunks_on_cluster(
 def _wait_for_completed_future(
     dask_client: "Client", scheduler_address: str, completed_futures: "SimpleQueue[Future]"
 ) -> "Future":
-    """Return the next completed future, and warn once if the cluster has no workers."""
+    """Return the next completed future. Warn once if the cluster has no workers."""
     has_issued_warning = False
     while True:
         try:
@@ -209,11 +212,11 @@ def _wait_for_completed_future(
 def _explain_lost_cluster(
     scheduler_address: str, *further_loss_errors: type[Exception]
 ) -> Iterator[None]:
-    """Return a context that replaces errors of lost workers or schedulers by a ValueError with a
-    remedy.
+    """Return a context that replaces the error for a lost worker or scheduler by a ValueError with
+    a remedy.
 
-    `further_loss_errors` are additional exceptions that the context replaces, because the
-    computation of a chunk cannot raise them.
+    - `further_loss_errors`: additional exceptions that the context replaces, because the
+      computation of a chunk cannot raise them.
     """
     from distributed import CancelledError, KilledWorker
     from distributed.comm import CommClosedError
@@ -241,14 +244,18 @@ def _explain_lost_cluster(
 def _compute_chunk_in_worker(
     pickled_request: bytes, sample_columns: SampleColumns
 ) -> tuple[dict[str, object], Mapping[str, np.ndarray]]:
-    """Return the environment of the worker and the results of a chunk by variable."""
+    """Return a description of the worker's environment, and the values of each variable for a
+    chunk, by variable.
+    """
     start_jax()
     return describe_computing_environment(), _make_worker_engine(pickled_request)(sample_columns)
 
 
 @functools.cache
 def _make_worker_engine(pickled_request: bytes) -> SampleEvaluator:
-    """Return the scan engine of a pickled request. Each worker creates the engine once."""
+    """Return the scan engine for a pickled `EvaluationRequest`. Each worker creates the engine
+    once.
+    """
     from distributed import get_worker
 
     return make_scan_engine(pickle.loads(pickled_request), get_worker().state.nthreads)

@@ -1,4 +1,4 @@
-"""Designs of a scan: samples of the wheel's parameters, as a grid or as a list."""
+"""Designs of scans: samples of the wheel's parameters, as a grid or as a list."""
 
 import abc
 import hashlib
@@ -22,14 +22,18 @@ SampleColumns = dict[str, np.ndarray]
 """Swept parameters by name, with one value per sample."""
 
 SWEEPABLE_PARAMETERS = (*PARAMETER_NAMES, FRICTION_NAME)
-"""Parameters that a design may sweep: those of the wheel, and the ground's friction."""
+"""Names of the parameters that a design may sweep: those of the wheel, and the friction of the
+ground.
+"""
 
 ParameterRange = tuple[float, float]
 """Lower and upper bound of a parameter, in its unit."""
 
 MAX_LISTED_SAMPLES = 10_000_000
-"""Largest number of values of an axis, or of samples in a list, chosen because such a list fits
-into memory."""
+"""Largest number of values of one axis, or of samples in a list.
+
+The value is chosen because such a list fits into memory.
+"""
 
 SALTELLI_DESIGN_KIND = "saltelli"
 """Kind of the designs from which Sobol' indices are computed."""
@@ -61,28 +65,31 @@ class AbstractSampleDesign(abc.ABC):
     @property
     @abc.abstractmethod
     def dims(self) -> tuple[str, ...]:
-        """Return the names of the axes of the labeled result."""
+        """Return the names of the sample axes of the labeled result."""
 
     @property
     @abc.abstractmethod
     def shape(self) -> tuple[int, ...]:
-        """Return the lengths of the axes of the labeled result."""
+        """Return the lengths of the sample axes of the labeled result."""
 
     @abc.abstractmethod
     def select_samples(self, region_of_samples: tuple[slice, ...]) -> SampleColumns:
-        """Return the samples of a rectangular region by parameter.
+        """Return the values of each swept parameter in a rectangular region of samples, by
+        parameter.
 
         The columns are flattened, with the last axis varying fastest.
+
+        - `region_of_samples`: one slice for each axis of the design.
         """
 
     @abc.abstractmethod
     def make_result_coordinates(self) -> dict[str, tuple[str, np.ndarray]]:
-        """Return axis and numbers of each coordinate of the labeled result, by the coordinate's
-        name.
+        """Return the axis and the values of each coordinate of the labeled result, by the
+        coordinate's name.
         """
 
     def describe_design(self) -> dict[str, object]:
-        """Return the identity of the design: kind, parameter names, shape and a digest of all
+        """Return what identifies the design: kind, parameter names, shape and a digest of all
         samples.
         """
         return {
@@ -103,7 +110,9 @@ def digest_sample_columns(design_kind: str, values_by_parameter: Mapping[str, np
 
 @dataclass(frozen=True, repr=False)
 class GridDesign(AbstractSampleDesign):
-    """Design of every combination of the parameters' values, with one axis per parameter."""
+    """Design that contains every combination of the parameters' values, with one axis per
+    parameter.
+    """
 
     values_by_parameter: Mapping[str, np.ndarray]
     design_kind: str = "grid"
@@ -140,8 +149,9 @@ class GridDesign(AbstractSampleDesign):
 
 @dataclass(frozen=True, repr=False)
 class SampleListDesign(AbstractSampleDesign):
-    """Design of single samples along the axis `sample`, in which all parameters may vary
-    together.
+    """Design that contains a list of samples, in which all parameters may vary together.
+
+    Its axis is `sample`.
     """
 
     values_by_parameter: Mapping[str, np.ndarray]
@@ -172,9 +182,9 @@ class SampleListDesign(AbstractSampleDesign):
 def _merge_mapping_and_keywords(
     function_name: str, parameter_mapping: Mapping | None, parameter_keywords: Mapping
 ) -> Mapping:
-    """Return the parameters of a design, given as one mapping or as keywords.
+    """Return the parameters of a design as one mapping, from a mapping or from keywords.
 
-    Raise a TypeError if both are given.
+    Raise a TypeError if a mapping and keywords are given.
     """
     if parameter_mapping is not None and parameter_keywords:
         raise TypeError(
@@ -186,7 +196,7 @@ def _merge_mapping_and_keywords(
 
 
 def _require_sample_count(function_name: str, n_samples: int | None) -> int:
-    """Return the number of samples, or raise a TypeError if it is None, because it has no
+    """Return `n_samples`, the number of samples. Raise a TypeError if it is None, because it has no
     default.
     """
     if n_samples is None:
@@ -201,12 +211,12 @@ def grid(
     /,
     **parameters: Sequence[float] | np.ndarray,
 ) -> GridDesign:
-    """Return the design of every combination of parameter values, such as `grid(damping=...,
-    slope=...)`.
+    """Return the design that contains every combination of parameter values.
 
     Args:
-        values: the values of each parameter, as any sequence of numbers.
-        **parameters: the values as keywords, if no mapping is given.
+        values: values of each parameter, by the parameter's name, as any sequence of numbers.
+        **parameters: the same values as keywords, such as `grid(damping=..., slope=...)`, if no
+            mapping is given.
 
     Returns:
         A design whose axes are the parameters.
@@ -238,13 +248,14 @@ def samples(
     /,
     **parameters: Sequence[float] | np.ndarray,
 ) -> SampleListDesign:
-    """Return the design of given samples, e.g. `samples({"damping": [100], "slope": [0.29]})`.
+    """Return the design that contains a list of samples, such as `samples({"damping": [100],
+    "slope": [0.29]})`.
 
     A sample that is not finite, or outside the domain of a parameter, has the outcome BAD_INPUT.
 
     Args:
-        values: the values of each parameter, all of one length.
-        **parameters: the same as keywords, if no mapping is given.
+        values: values of each parameter, by the parameter's name, all of one length.
+        **parameters: the same values as keywords, if no mapping is given.
 
     Returns:
         A design over the axis `sample`.
@@ -278,15 +289,15 @@ def sobol(
     seed: int = 0,
     **parameters: ParameterRange,
 ) -> SampleListDesign:
-    """Return `n` samples of a scrambled Sobol' sequence.
+    """Return a design of `n` samples from a scrambled Sobol' sequence.
 
-    The samples cover the box most evenly if n is a power of 2.
+    The samples cover the box between the bounds most evenly if `n` is a power of 2.
 
     Args:
-        ranges: lower and upper bound of each parameter.
+        ranges: lower and upper bound of each parameter, by the parameter's name.
         n: number of samples.
         seed: seed of the scrambling.
-        **parameters: the ranges as keywords, if no mapping is given.
+        **parameters: the same ranges as keywords, if no mapping is given.
 
     Returns:
         A design over the axis `sample`.
@@ -320,13 +331,13 @@ def uniform(
     seed: int = 0,
     **parameters: ParameterRange,
 ) -> SampleListDesign:
-    """Return `n` independent samples, uniformly distributed between the bounds of the parameters.
+    """Return a design of `n` independent samples, uniformly distributed between the bounds.
 
     Args:
-        ranges: lower and upper bound of each parameter.
+        ranges: lower and upper bound of each parameter, by the parameter's name.
         n: number of samples.
         seed: seed of the random numbers.
-        **parameters: the ranges as keywords, if no mapping is given.
+        **parameters: the same ranges as keywords, if no mapping is given.
 
     Returns:
         A design over the axis `sample`.
@@ -355,16 +366,18 @@ def saltelli(
     seed: int = 0,
     **parameters: ParameterRange,
 ) -> SampleListDesign:
-    """Return samples for `sobol_indices`: `n` rows of 2 + d samples for d parameters.
+    """Return the design that `sobol_indices` requires: `n` groups ("rows") of 2 + d samples for d
+    parameters.
 
-    A row contains two independent points of the box, A and B, and copies of A in which one
-    coordinate is that of B. Samples are ordered A, B, then by parameter.
+    A row contains two independent points of the box between the bounds, A and B. It also contains d
+    copies of A, in each of which one coordinate is that of B. Samples are ordered A, B, then by
+    parameter.
 
     Args:
-        ranges: lower and upper bound of each parameter.
+        ranges: lower and upper bound of each parameter, by the parameter's name.
         n: number of rows, a power of two.
         seed: seed of the sequence.
-        **parameters: the ranges as keywords, if no mapping is given.
+        **parameters: the same ranges as keywords, if no mapping is given.
 
     Returns:
         A design over the axis `sample`.
@@ -413,9 +426,10 @@ def _scale_unit_points_to_box(
     unit_cube_points: np.ndarray,
     design_kind: str,
 ) -> SampleListDesign:
-    """Return the design of points of the unit cube, scaled to the box between the bounds.
+    """Return the design whose samples are points of the unit cube, scaled to the box between the
+    bounds.
 
-    The points have the shape (samples, parameters).
+    - `unit_cube_points`: points of the unit cube, shape (samples, parameters).
     """
     box_points = lower_bounds + (upper_bounds - lower_bounds) * unit_cube_points
     return SampleListDesign(
@@ -424,14 +438,14 @@ def _scale_unit_points_to_box(
 
 
 def _make_random_generator(seed: int) -> np.random.Generator:
-    """Return a generator of random numbers, or raise an error if the seed is not a whole number."""
+    """Return a generator of random numbers. Raise an error if the seed is not a whole number."""
     return np.random.default_rng(check_int("seed", seed, 0))
 
 
 def _parse_sampling_box(
     ranges: Mapping[str, ParameterRange], n: int
 ) -> tuple[list[str], np.ndarray, np.ndarray, int]:
-    """Return the parameters, their lower and upper bounds, and the number of samples."""
+    """Return parameter names, lower bounds, upper bounds and the number of samples, all checked."""
     n = check_int("n", n)
     if n > MAX_LISTED_SAMPLES:
         raise ValueError(
@@ -447,7 +461,7 @@ def _parse_sampling_box(
 
 
 def _require_sweepable_parameters(values_by_parameter: Mapping[str, object]) -> Mapping:
-    """Return `values_by_parameter`, or raise a ValueError for an empty mapping or an unknown
+    """Return `values_by_parameter`. Raise a ValueError if it is empty or contains an unknown
     parameter.
     """
     check_type("the design", values_by_parameter, Mapping, "write {'damping': (100.0, 200.0)}")
@@ -462,8 +476,8 @@ def _require_sweepable_parameters(values_by_parameter: Mapping[str, object]) -> 
 
 
 def _convert_to_value_column(parameter_name: str, parameter_values: object) -> np.ndarray:
-    """Return the values of one parameter as a vector of floats, or raise an error for other
-    values.
+    """Return the values of one parameter as a vector of floats. Raise an error if that is
+    impossible.
     """
     require_untraced_arguments("a design", "use jax.vmap", parameter_values)
     try:

@@ -1,9 +1,10 @@
 """Scan engines for unilateral contact, for the simplest valid model, and for measures to a
 tolerance.
 
-With unilateral contact the engine returns the gait to which a walk from a slow start converges, or
-the slowest gait of all starts. For the simplest valid model, the paper's model evaluates all
-samples first. Samples that violate a margin are then evaluated with unilateral contact.
+With unilateral contact, the engine returns the gait to which a walk from a slow start converges. If
+that walk does not converge, it returns the slowest gait of all starts. For the simplest valid
+model, all samples are first evaluated with the paper's model. Samples that violate a margin are
+then evaluated with unilateral contact.
 """
 
 import dataclasses
@@ -44,7 +45,7 @@ from vrw_jax.wheel import FRICTION_NAME, PARAMETER_NAMES, Outcome, make_wheel_fr
 SampleColumnMapping = Mapping[str, np.ndarray]
 """Swept parameters by name, with one value per sample."""
 VariableColumns = dict[str, np.ndarray]
-"""Results by variable, with one value per sample."""
+"""Values of each variable by its name, with one value per sample."""
 
 
 class UnilateralScanEngine:
@@ -89,7 +90,7 @@ class UnilateralScanEngine:
         )
 
     def __call__(self, sample_columns: SampleColumnMapping) -> VariableColumns:
-        """Return the results of all samples by variable.
+        """Return the value of each variable for all samples, by the name of the variable.
 
         - `sample_columns`: value of each swept parameter for each sample.
         """
@@ -115,8 +116,11 @@ class UnilateralScanEngine:
 
     @with_default_jax_settings  # It runs in a thread of its own.
     def _evaluate_sample_part(self, parameter_rows: np.ndarray) -> VariableColumns:
-        """Return the results, by variable, of the gait to which a walk from a slow start
-        converges.
+        """Return the value of each variable for some samples, by the name of the variable.
+
+        The values are those of the gait to which a walk from a slow start converges.
+
+        - `parameter_rows`: parameters of the wheels, shape (samples, parameters).
         """
         # Over a period friction balances the weight along the slope. Without enough friction no
         # gait exists.
@@ -137,8 +141,9 @@ class UnilateralScanEngine:
         return mask_failed_samples(sample_outcome, sample_results)
 
     def _evaluate_gaits(self, parameter_rows: np.ndarray) -> VariableColumns:
-        """Return outcomes, measures and derivatives of the gaits of some wheels by name, shape
-        (wheels,).
+        """Return outcomes, measures and derivatives for the gaits of some wheels, by name.
+
+        Each array has the shape (wheels,).
         """
         slow_gaits = find_slow_gaits(self._gait_finder, parameter_rows)
         gait_results = map_in_batches(
@@ -171,7 +176,7 @@ class UnilateralScanEngine:
 def _read_gait_measures(
     measure_reader: MeasureReader, gait_batch: ReturnMapCycle
 ) -> dict[str, Array]:
-    """Return the measures of a batch of gaits by name."""
+    """Return the requested measures of a batch of gaits, by name."""
     first_step = jax.tree.map(lambda step_values: step_values[:, 0], gait_batch.steps)
     return eqx.filter_vmap(measure_reader)(gait_batch, first_step)
 
@@ -183,12 +188,14 @@ PAPER_MEASURES_BY_CONTACT_MEASURE: dict[str, tuple[str, ...]] = {
     "energy_lost_impacts": ("energy_lost_landing", "energy_lost_stopper"),
     "energy_lost_friction": (),
 }
-"""Measures of the paper's model whose sum is a measure with unilateral contact, by the name of the
-latter."""
+"""Names of the paper's measures whose sum equals a measure with unilateral contact.
+
+The keys are names of measures with unilateral contact.
+"""
 
 
 class ModelSelectionScanEngine:
-    """Scan engine that evaluates each sample with the simplest valid model."""
+    """Scan engine that evaluates each sample with the simplest model valid for it."""
 
     def __init__(self, request: EvaluationRequest, n_threads: int | None = None) -> None:
         self._measure_names, self._base_wheel, self._wheel_model = (
@@ -213,8 +220,10 @@ class ModelSelectionScanEngine:
         )
 
     def __call__(self, sample_columns: SampleColumnMapping) -> VariableColumns:
-        """Return the results of all samples by variable, with `model_codes` and
-        `selection_reasons`.
+        """Return the value of each variable for all samples, by the name of the variable.
+
+        The variables include `rung`, the code of the model, and `reason`, the code of the reason
+        for it.
         """
         n_samples = len(next(iter(sample_columns.values())))
         sample_friction = sample_columns.get(
@@ -262,8 +271,8 @@ class ModelSelectionScanEngine:
     def compute_selection_reasons(
         self, paper_results: VariableColumns, sample_friction: np.ndarray
     ) -> np.ndarray:
-        """Return `ModelChoice.reason_code` of each sample, from the margins of its gait with the
-        paper's model.
+        """Return `ModelChoice.reason_code` for each sample, computed from the margins of its gait
+        with the paper's model.
         """
         variable_names = (*MODEL_SELECTION_MARGINS, "outcome")
         selection_reasons = map_in_numpy_batches(
@@ -277,7 +286,7 @@ class ModelSelectionScanEngine:
 
 @jax.jit
 def _find_batch_selection_reasons(measures: dict[str, Array], friction_difference: Array) -> Array:
-    """Return `ModelChoice.reason_code` of a batch of viscoelastic steps."""
+    """Return `ModelChoice.reason_code` for each viscoelastic gait step of a batch."""
     return find_selection_reason(measures, friction_difference)[0]
 
 
@@ -294,7 +303,7 @@ class ToleranceScanEngine:
         self._error_tolerance = request.error_tolerance
 
     def __call__(self, sample_columns: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-        """Return the results of all samples by variable.
+        """Return the value of each variable for all samples, by the name of the variable.
 
         - `sample_columns`: value of each swept parameter for each sample.
         """
@@ -346,7 +355,7 @@ class PassageScanEngine:
         self._gait_engine = gait_engine
 
     def __call__(self, sample_columns: SampleColumnMapping) -> VariableColumns:
-        """Return the results of all samples by variable.
+        """Return the value of each variable for all samples, by the name of the variable.
 
         - `sample_columns`: value of each swept parameter for each sample.
         """
@@ -370,8 +379,10 @@ class PassageScanEngine:
         )
 
     def _measure_sample_passage(self, swept_values: Mapping[str, float]) -> list[float]:
-        """Return the passage measures of one sample. They are NaN if hardly any step of the walks
-        succeeds.
+        """Return the first-passage measures of one sample, which are NaN if hardly any step of the
+        walks succeeds.
+
+        - `swept_values`: value of each swept parameter for the sample.
         """
         wheel_model, params = self._wheel_model, self._base_wheel
         for parameter_name, parameter_value in swept_values.items():
@@ -405,7 +416,7 @@ def make_scan_engine(
     | ToleranceScanEngine
     | PassageScanEngine
 ):
-    """Return the engine that computes the samples of a request."""
+    """Return the engine that computes the measures of an `EvaluationRequest`."""
     if request.error_tolerance is not None:
         return ToleranceScanEngine(request)
     scan_engine_class: Any = SCAN_ENGINE_CLASSES[request.wheel_model.capabilities.gait_method]
@@ -425,4 +436,4 @@ SCAN_ENGINE_CLASSES = {
     GaitMethod.CONTACT_WALKS: UnilateralScanEngine,
     GaitMethod.SELECTION: ModelSelectionScanEngine,
 }
-"""Engine classes by gait method, for the methods that scans support."""
+"""Engine class for each gait method that scans support."""

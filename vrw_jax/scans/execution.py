@@ -1,7 +1,8 @@
 """Execution of a scan: its chunks are computed, written and returned as one labeled dataset.
 
-A scan is divided into chunks, which the same compiled function computes. If a store is given, each
-chunk is written as soon as it is computed. An interrupted scan continues with the missing chunks.
+A scan is divided into chunks of samples, which the same compiled function computes. If a store is
+given, each chunk is written as soon as it is computed. An interrupted scan continues with the
+missing chunks.
 """
 
 from __future__ import annotations
@@ -73,41 +74,45 @@ def scan(
     tol: float | None = None,
     slope_sd: float | None = None,
 ) -> xr.Dataset:
-    """Return the steady gait of every sample with its outcome and margins, as a labeled dataset.
+    """Return outcome, margins and measures of the steady gait for every sample, as a labeled
+    dataset.
 
-    `measures` are names (see `vrw_jax.scans.measure_catalog`), including derivatives as in
-    'd dls_fraction / d damping'. The variables have the requested names and order. The result of a
-    sample depends neither on other samples nor on `chunk`.
+    `measures` are names (see `vrw_jax.scans.measure_catalog`), including derivatives such as
+    'd dls_fraction / d damping'. The variables of the dataset have these names and this order. The
+    result for a sample depends neither on other samples nor on `chunk`.
 
     If `store` is given, the result is written there chunk by chunk. An interrupted scan continues
     where it stopped and ends with bitwise the same data. A finished scan is only opened, but its
     damaged chunks are computed again, with a warning.
 
-    `model` may be a `UnilateralWheel`, whose gaits are found by walks. `model` may also be "auto",
-    which selects the simplest valid model for each sample and adds the variables `rung` and
-    `reason`. With both models, `friction` may be a swept parameter.
+    `model` may be a `UnilateralWheel`, whose gaits are computed by walks. `model` may also be
+    "auto", which selects the simplest valid model for each sample. Then the dataset also contains
+    `rung`, the code of the model, and `reason`, the code of the reason for it. With
+    `UnilateralWheel` and "auto", `friction` may be a swept parameter.
 
     Args:
         design: the samples, from `grid`, `samples`, `sobol`, `uniform` or `saltelli`.
-        measures: names of the measures; by default DLS fraction, speed and the like.
-        base: the wheel whose parameters are not swept; Table 1 by default.
-        model: the model; "auto" for the simplest valid model of each sample.
-        options: numerical options of the steps that check the gaits.
-        cycle_options: numerical options of the gaits.
-        store: folder that contains the result.
+        measures: names of the measures; by default DLS fraction, speed and similar measures.
+        base: wheel with the parameters that are not swept; by default that of Table 1 of the
+            paper.
+        model: model of the wheel; "auto" for the simplest valid model for each sample.
+        options: numerical options of the gait steps that check the gaits.
+        cycle_options: numerical options of the search for gaits.
+        store: folder to which the result is written.
         chunk: number of samples that are written at a time; 4,096 by default.
         on_progress: function that is called with the `ScanProgress` after each chunk.
         dask: address of a dask cluster that computes the chunks, or "local" to start one.
         tol: permitted error of each measure, in its unit, with respect to a `UnilateralWheel`. Each
-            sample is computed by the simplest model whose error bound permits it (see
-            `vrw.measure_to_tolerance`). The dataset contains `rung` and the errors, such as
-            `speed_error`.
-        slope_sd: standard deviation of random slopes, rad, which adds "mean_steps",
-            "mean_steps_error" and "failure_probability" to the measures (see `vrw.first_passage`).
-            A sample takes about a second, and 16 are written at a time by default.
+            sample is computed with the simplest model whose error bound is within `tol` (see
+            `vrw.measure_to_tolerance`). The dataset also contains `rung`, the code of that model,
+            and the errors of the measures, such as `speed_error`.
+        slope_sd: standard deviation of random slopes, rad. If it is given, "mean_steps",
+            "mean_steps_error" and "failure_probability" are additional measures (see
+            `vrw.first_passage`). A sample then takes about a second, and by default 16 samples are
+            written at a time.
 
     Returns:
-        A dataset over the axes of the design.
+        A dataset whose dimensions are the axes of the design.
 
     Raises:
         TypeError, ValueError: if an argument is invalid, or if the store contains another scan or
@@ -138,9 +143,9 @@ def scan(
 
 
 def resolve_executor(dask: str | None) -> contextlib.AbstractContextManager[ChunkExecutor | None]:
-    """Return the context of an executor on a dask cluster, or a context of None if `dask` is None.
+    """Return a context that provides an executor on a dask cluster, or None if `dask` is None.
 
-    With None, this process computes the chunks.
+    With None, the chunks are computed in this process.
     """
     if dask is None:
         return contextlib.nullcontext()
@@ -157,9 +162,10 @@ def run_scan(
     on_progress: ProgressCallback | None = None,
     chunk_executor: ChunkExecutor | None = None,
 ) -> xr.Dataset:
-    """Return the labeled dataset of a scan plan.
+    """Return the labeled dataset of results for a scan plan.
 
-    `chunk_executor` computes the chunks, or this process if `chunk_executor` is None.
+    - `chunk_executor`: function that computes the chunks; if it is None, this process computes
+      them.
     """
     if isinstance(store, AbstractResultStore):
         result_store = store
@@ -188,8 +194,8 @@ def _compute_and_write_chunks(
     on_progress: ProgressCallback | None,
     chunk_executor: ChunkExecutor,
 ) -> None:
-    """Compute the missing chunks, write each chunk to the store, and report the progress after
-    each.
+    """Compute the missing chunks, write each chunk to the store, and report the progress after each
+    chunk.
     """
     chunk_shapes = {
         chunk_index: scan_plan.result_layout.compute_chunk_sample_shape(chunk_index)
@@ -247,9 +253,7 @@ def _compute_and_write_chunks(
 def _compute_chunks_in_process(
     scan_plan: ScanPlan, missing_chunks: Sequence[int]
 ) -> Iterator[ChunkResult]:
-    """Yield the index and the results of each missing chunk. This process computes one after
-    another.
-    """
+    """Yield each missing chunk's index and results, computed one after another in this process."""
     scan_engine = scan_plan.build_scan_engine()
     for chunk_index in missing_chunks:
         yield (

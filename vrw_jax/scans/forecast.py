@@ -1,4 +1,4 @@
-"""Forecast of the time and memory of a scan, from the computation of some of its samples."""
+"""Forecast of a scan's computing time and memory, measured while some samples are computed."""
 
 from __future__ import annotations
 
@@ -17,17 +17,20 @@ from vrw_jax.scans.measure_catalog import select_measure_catalog
 from vrw_jax.scans.planning import ScanPlan
 
 SCAN_STARTUP_SECONDS = 5.0
-"""Typical time until the first sample with cached code, s; see docs/benchmarks/scans.md."""
+"""Typical time until the first sample is computed with cached code, s; see
+docs/benchmarks/scans.md.
+"""
 
 TYPICAL_SCAN_MEMORY_BYTES = 0.5e9
-"""Typical memory of code and arrays, in bytes; see docs/benchmarks/scans.md."""
+"""Typical memory that code and arrays of a scan occupy, bytes; see docs/benchmarks/scans.md."""
 
 
 @with_default_jax_settings
 def forecast_scan(scan_plan: ScanPlan, store_path: str | Path | None = None) -> dict[str, str]:
-    """Return sizes, chunks, memory and time of a scan as texts by name. No file is written.
+    """Return texts, by label, that state the sizes, chunks, memory and time of a scan. No file is
+    written.
 
-    Time and memory are measured while samples are computed that are spread over the design.
+    Time and memory are measured while samples that are spread over the design are computed.
     """
     result_layout, n_samples = scan_plan.result_layout, scan_plan.design.size
     measure_catalog = select_measure_catalog(
@@ -117,7 +120,7 @@ def _measure_peak_memory_bytes() -> float:
 
 
 def _format_bytes(n_bytes: int | float) -> str:
-    """Return a number of bytes as text in B, kB, MB or GB."""
+    """Return a text that states a number of bytes in B, kB, MB or GB."""
     for unit_of_bytes in ("B", "kB", "MB"):
         if n_bytes < 1000:
             return f"{n_bytes:.3g} {unit_of_bytes}"
@@ -126,7 +129,10 @@ def _format_bytes(n_bytes: int | float) -> str:
 
 
 def format_duration(seconds: float) -> str:
-    """Return a duration in seconds as text in s, min or h."""
+    """Return a text that states a duration in s, min or h.
+
+    - `seconds`: the duration, s.
+    """
     if seconds < 90:
         return f"{seconds:.0f} s"
     return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"

@@ -1,10 +1,10 @@
 """Integrity of a store: a checksum of each chunk's files, and a lock against a second writer.
 
-The mark of a chunk is a digest of the scan's settings, the chunk's number and the files of its
-variables. A mark states that the chunk is written, and reveals a damaged, truncated, deleted or
-moved file. The attributes of the group of marks list the scan's variables, so that foreign
-variables are ignored. The attributes also repeat those of the store. In stores without the list of
-variables, a mark is a digest of the files alone.
+The mark of a chunk is a digest of the scan's settings, of the chunk's index and of the files that
+contain its variables. A mark states that the chunk is written, and reveals a damaged, truncated,
+deleted or moved file. All marks are in one Zarr group. The attributes of this group list the scan's
+variables, so that foreign variables are ignored. They also contain a copy of the attributes of the
+store. In stores without the list of variables, a mark is a digest of the files alone.
 """
 
 from __future__ import annotations
@@ -22,38 +22,38 @@ from vrw_jax.scans.design import digest_sample_columns
 from vrw_jax.scans.measure_catalog import get_variable_attributes, parse_derivative
 
 ZarrGroup = Any
-"""A Zarr group; only the module `store` imports zarr."""
+"""Zarr group; the type is `Any` because only the module `store` imports zarr."""
 
 MANIFEST_ATTRIBUTE = "scan"
-"""Name of the attribute that contains the settings of a scan."""
+"""Name of the attribute of a store that contains the settings of the scan."""
 
 CHECKSUM_GROUP_NAME = "bookkeeping"
-"""Name of the group that contains the marks of chunks and is hidden from users of the store."""
+"""Name of the Zarr group that contains the marks of chunks. Users of the store do not see it."""
 
 CHECKSUM_ARRAY_NAME = "bookkeeping/digest"
-"""Name of the array that contains the marks of chunks."""
+"""Name of the Zarr array that contains the marks of chunks."""
 
 DIGEST_SIZE_BYTES = 16
-"""Size of a mark, in bytes, chosen because existing stores have marks of this size."""
+"""Size of a digest, bytes, chosen because the marks in existing stores have this size."""
 
 SCAN_VARIABLES_KEY = "variables"
-"""Key of the names of the scan's variables in the attributes of the group of marks."""
+"""Key of the scan's variable names, in the attributes of the Zarr group of marks."""
 
 STORE_ATTRIBUTES_KEY = "attributes"
-"""Key of the copy of the store's attributes, in the attributes of the group of marks."""
+"""Key of the copy of the store's attributes, in the attributes of the Zarr group of marks."""
 
 COORDINATE_DIGESTS_KEY = "coordinates"
-"""Key of the digests of the coordinates, in the attributes of the group of marks."""
+"""Key of the digests of the coordinates, in the attributes of the Zarr group of marks."""
 
 ATTRIBUTE_SEAL_KEY = "seal"
-"""Key of the digest of all other attributes in the attributes of the group of marks."""
+"""Key of the digest of all other attributes, in the attributes of the Zarr group of marks."""
 
 METADATA_FILE_NAME = "zarr.json"
-"""Name of the file that contains the metadata of an array or a group."""
+"""Name of the file that contains the metadata of a Zarr array or group."""
 
 
 def read_scan_manifest(store_attributes: Any) -> dict[str, Any]:
-    """Return the settings of the scan that a store or a labeled result contains."""
+    """Return the settings of the scan from the attributes of a store or a labeled result."""
     stored_manifest = store_attributes.get(MANIFEST_ATTRIBUTE, {})
     return (
         json.loads(stored_manifest) if isinstance(stored_manifest, str) else dict(stored_manifest)
@@ -61,7 +61,7 @@ def read_scan_manifest(store_attributes: Any) -> dict[str, Any]:
 
 
 def add_attribute_seal(mark_attributes: dict[str, Any]) -> dict[str, Any]:
-    """Return the attributes of the group of marks, with a digest of the attributes added."""
+    """Return the attributes of the Zarr group of marks, with a digest of these attributes added."""
     unsealed_attributes = {
         key: attribute_value
         for key, attribute_value in mark_attributes.items()
@@ -75,9 +75,7 @@ def add_attribute_seal(mark_attributes: dict[str, Any]) -> dict[str, Any]:
 
 
 def digest_coordinate_values(coordinate_values: np.ndarray) -> str:
-    """Return the digest of the type, the shape and the values of a coordinate as hexadecimal
-    text.
-    """
+    """Return the digest of a coordinate's type, shape and values, in hexadecimal digits."""
     return _compute_hex_digest(
         f"{coordinate_values.dtype.str} {coordinate_values.shape} ".encode()
         + coordinate_values.tobytes()
@@ -94,8 +92,8 @@ def read_metadata_file(metadata_path: Path) -> dict[str, Any]:
 
 
 class StoredMetadata:
-    """Metadata of a store, which has two copies: a file for each array, and one file for all
-    arrays.
+    """Metadata of a store. Each array's metadata has two copies: a separate file, and a part of one
+    file for all arrays.
     """
 
     def __init__(self, store_path: Path) -> None:
@@ -111,7 +109,7 @@ class StoredMetadata:
         self.consolidated_metadata: dict[str, Any] = (
             consolidated_arrays if isinstance(consolidated_arrays, dict) else {}
         )
-        """Metadata of all arrays and groups by name, from the one file for all."""
+        """Metadata of all arrays and groups by name, from the one file for all arrays."""
         group_metadata_copies = (
             self.consolidated_metadata.get(CHECKSUM_GROUP_NAME),
             self._read_array_metadata(CHECKSUM_GROUP_NAME),
@@ -133,19 +131,21 @@ class StoredMetadata:
             if attribute_copy == add_attribute_seal(attribute_copy)
         )
         self.mark_attributes: dict[str, Any] = next(intact_copies, (*usable_copies, {})[0])
-        """Attributes of the group of marks, from the intact copy; empty in stores without them."""
+        """Attributes of the Zarr group of marks, from the intact copy; empty in stores without such
+        attributes.
+        """
         self._root_attributes = root_attributes if isinstance(root_attributes, dict) else {}
         self.store_attributes: dict[str, Any] = self._root_attributes | self.mark_attributes.get(
             STORE_ATTRIBUTES_KEY, {}
         )
-        """Attributes of the store."""
+        """Attributes of the store, completed from the copy in the Zarr group of marks."""
         self._do_mark_attributes_differ = (
             bool(usable_copies) and attribute_copies[0] != attribute_copies[-1]
         )
 
     @property
     def coordinate_names(self) -> list[str]:
-        """Return the names of the coordinates."""
+        """Return the names of the coordinates of the labeled result."""
         coordinate_digests = self.mark_attributes.get(COORDINATE_DIGESTS_KEY)
         return (
             list(coordinate_digests)
@@ -154,7 +154,10 @@ class StoredMetadata:
         )
 
     def select_scan_variables(self, array_names: Iterable[str]) -> list[str]:
-        """Return the arrays among `array_names` that the scan wrote, without coordinates."""
+        """Return the names of the arrays that the scan wrote, without coordinates, sorted.
+
+        - `array_names`: names of all arrays in the store, including foreign ones.
+        """
         if SCAN_VARIABLES_KEY in self.mark_attributes:
             return sorted(self.mark_attributes[SCAN_VARIABLES_KEY])
         stored_manifest = read_scan_manifest(self.store_attributes)
@@ -171,7 +174,7 @@ class StoredMetadata:
         )
 
     def find_damaged_metadata(self) -> list[str]:
-        """Return the names of the arrays with two different copies of metadata.
+        """Return the names of the arrays whose two copies of the metadata differ.
 
         The list contains "attributes" if the two copies of the store's attributes differ.
         """
@@ -204,7 +207,9 @@ class StoredMetadata:
         return damaged_names
 
     def restore_from_intact_store(self, intact_metadata: StoredMetadata) -> None:
-        """Write both copies of all metadata, taken from an intact new store of the same scan."""
+        """Write the two copies of all metadata anew, from the metadata of an intact new store for
+        the same scan.
+        """
         restored_metadata = intact_metadata.consolidated_metadata | {
             CHECKSUM_GROUP_NAME: intact_metadata.consolidated_metadata[CHECKSUM_GROUP_NAME]
             | {"attributes": self.mark_attributes}
@@ -235,12 +240,12 @@ class StoredMetadata:
                 temporary_path.replace(metadata_path)
 
     def _read_array_metadata(self, array_name: str) -> dict[str, Any]:
-        """Return the metadata of one array or group from the array's separate file."""
+        """Return the metadata of one array or group, read from its separate file."""
         return read_metadata_file(self._store_path / array_name / METADATA_FILE_NAME)
 
 
 def _is_scan_measure_name(variable_name: str) -> bool:
-    """Return whether `variable_name` is the name of a measure of a scan."""
+    """Return whether `variable_name` is the name of a measure that a scan can compute."""
     try:
         return parse_derivative(variable_name) is None and bool(
             get_variable_attributes(variable_name)
@@ -250,12 +255,12 @@ def _is_scan_measure_name(variable_name: str) -> bool:
 
 
 def _compute_hex_digest(digested_bytes: bytes) -> str:
-    """Return the digest of bytes as hexadecimal text."""
+    """Return the digest of `digested_bytes` in hexadecimal digits."""
     return hashlib.blake2b(digested_bytes, digest_size=DIGEST_SIZE_BYTES).hexdigest()
 
 
 class ChunkChecksums:
-    """Marks of the chunks of a store, and the comparison of marks with files."""
+    """Marks of the chunks of a store, and methods that compare marks with files."""
 
     def __init__(
         self, store_path: Path, zarr_group: ZarrGroup, stored_metadata: StoredMetadata
@@ -286,13 +291,13 @@ class ChunkChecksums:
             self._settings_digest = _compute_hex_digest(settings_text.encode())
 
     def are_chunks_marked(self) -> np.ndarray:
-        """Return whether each chunk is marked, shape (chunks,)."""
+        """Return whether each chunk has a mark, shape (chunks,)."""
         return _are_chunk_marks_set(self._read_chunk_marks())
 
     def _read_chunk_marks(self) -> np.ndarray:
         """Return the marks of all chunks, shape (chunks, bytes of a mark).
 
-        A mark that cannot be read is replaced by bytes of 255, so that its chunk counts as damaged.
+        The bytes of a mark that cannot be read are set to 255, so that its chunk counts as damaged.
         """
         try:
             return np.asarray(self._chunk_marks[:])
@@ -304,16 +309,16 @@ class ChunkChecksums:
         return chunk_marks
 
     def mark_chunk_as_written(self, chunk_index: int) -> None:
-        """Mark a chunk as written, with the digest of its files."""
+        """Mark a chunk as written, with the digest of its files as the mark."""
         self._chunk_marks[chunk_index : chunk_index + 1] = self._compute_chunk_digest(chunk_index)[
             None
         ]
 
     def find_damaged_chunks(self) -> list[int]:
-        """Return the indices of marked chunks whose files differ from the written files.
+        """Return the indices of marked chunks whose files have changed since the mark was written.
 
-        The marks are read once, before any file, because a running scan marks a chunk after it has
-        written the files.
+        The marks are read once, before any file, because a running scan marks a chunk only after it
+        has written the chunk's files.
         """
         chunk_marks = self._read_chunk_marks()
         is_chunk_intact = lambda chunk_index: bool(
@@ -326,10 +331,10 @@ class ChunkChecksums:
         ]
 
     def find_damaged_coordinates(self) -> list[str]:
-        """Return the names of coordinates whose values differ from the written values.
+        """Return the names of coordinates whose stored values differ from those that were written.
 
-        In stores without a digest of each coordinate, return the swept parameters if their values
-        differ from those of the samples.
+        In stores without a digest of each coordinate, return all swept parameters if any of their
+        values differ from those of the samples.
         """
         if COORDINATE_DIGESTS_KEY in self._stored_metadata.mark_attributes:
             coordinate_digests = self._stored_metadata.mark_attributes[
@@ -359,14 +364,14 @@ class ChunkChecksums:
         return [] if are_coordinates_intact else list(design_settings["swept"])
 
     def _digest_stored_coordinate(self, coordinate_name: str) -> str:
-        """Return the digest of the values of a coordinate, or "" if the values cannot be read."""
+        """Return the digest of a coordinate's stored values, or "" if the values cannot be read."""
         try:
             return digest_coordinate_values(np.asarray(self._zarr_group[coordinate_name][:]))
         except (KeyError, *ZARR_READ_ERRORS):
             return ""
 
     def _compute_chunk_digest(self, chunk_index: int) -> np.ndarray:
-        """Return the digest of the files of a chunk, as an array of bytes."""
+        """Return the digest of a chunk's files as an array of bytes, shape (bytes of a mark,)."""
         chunk_digest = hashlib.blake2b(digest_size=DIGEST_SIZE_BYTES)
         if self._settings_digest:
             chunk_digest.update(f"{self._settings_digest} {chunk_index} ".encode())
@@ -386,7 +391,7 @@ class ChunkChecksums:
 
 
 def _are_chunk_marks_set(chunk_marks: np.ndarray) -> np.ndarray:
-    """Return whether the mark of each chunk is set, shape (chunks,)."""
+    """Return whether each chunk's mark is set, shape (chunks,)."""
     return np.any(chunk_marks.reshape(len(chunk_marks), -1) != 0, axis=1)
 
 
@@ -400,7 +405,7 @@ def describe_store_damage(
     damaged_coordinates: list[str],
     damaged_metadata: list[str],
 ) -> str:
-    """Return a sentence that describes the damage of a store, or "" for an intact store."""
+    """Return a sentence that describes the damage of a store, or "" if the store is intact."""
     damage_texts = []
     if damaged_chunks:
         chunks_text = ", ".join(map(str, damaged_chunks[:10])) + (
@@ -419,9 +424,9 @@ def describe_store_damage(
 
 @contextlib.contextmanager
 def lock_store(store_path: Path) -> Iterator[None]:
-    """Return a context that holds the lock of a store.
+    """Return a context that locks a store against other writers.
 
-    Raise a ValueError if another scan holds the lock.
+    Raise a ValueError if another scan has locked the store.
     """
     try:
         import fcntl

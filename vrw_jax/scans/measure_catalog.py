@@ -1,4 +1,6 @@
-"""Measures that a scan can compute, by name: measures of the steady gait, and their derivatives."""
+"""Measures that a scan can compute, by name: measures of the steady gait, and derivatives of
+measures.
+"""
 
 import re
 from collections.abc import Iterable
@@ -20,10 +22,14 @@ from vrw_jax.validation import format_name_suggestion
 from vrw_jax.wheel import FRICTION_NAME, PARAMETER_NAMES
 
 ALWAYS_INCLUDED_VARIABLES = ("outcome", "spectral_radius", *MARGIN_MEASURES)
-"""Variables of every scan, requested or not: outcome, stability and margins of the gait."""
+"""Names of the variables that every scan contains, requested or not: outcome, spectral radius and
+margins of the gait.
+"""
 
 DIFFERENTIABLE_MEASURES = CollocationFinder.cycle_measures
-"""Measures that are computed from the limit cycle alone. Only these measures have derivatives."""
+"""Names of the measures that are computed from the limit cycle alone. Only these measures have
+derivatives.
+"""
 
 REQUESTABLE_PAPER_MEASURES = (
     *DIFFERENTIABLE_MEASURES,
@@ -45,7 +51,7 @@ DEFAULT_SCAN_MEASURES = (
 
 
 class MeasureCatalog(NamedTuple):
-    """Names of the variables that a scan of one model can compute."""
+    """Names of the variables that a scan with one model can compute."""
 
     requestable_measures: tuple[str, ...]
     always_included_variables: tuple[str, ...]  # measures in every scan, requested or not
@@ -93,13 +99,13 @@ MEASURE_CATALOGS = {
     GaitMethod.CONTACT_WALKS: UNILATERAL_MEASURE_CATALOG,
     GaitMethod.SELECTION: MODEL_SELECTION_MEASURE_CATALOG,
 }
-"""Catalogs by gait method, for the methods that scans support."""
+"""Measure catalog for each gait method that scans support."""
 TOLERANCE_MEASURE_CATALOG = MeasureCatalog(
     tuple(MEASURE_FUNCTIONS), ("outcome", "rung"), (), (), ("dls_fraction", "speed", "period"), 16
 )
-"""Catalog of scans to a tolerance, in which each measure has an error."""
+"""Measure catalog for scans to a tolerance, in which each measure has an error."""
 ERROR_VARIABLE_SUFFIX = "_error"
-"""Suffix of the variable that contains the error of a measure."""
+"""Suffix that distinguishes the variable with the error of a measure from that with its value."""
 
 
 def select_measure_catalog(
@@ -107,9 +113,9 @@ def select_measure_catalog(
     error_tolerance: float | None = None,
     slope_standard_deviation: float | None = None,
 ) -> MeasureCatalog:
-    """Return the catalog of the measures that a scan of one model can compute.
+    """Return the catalog of measures that a scan with `wheel_model` can compute.
 
-    If `error_tolerance` is given, the catalog is that of scans to a tolerance. If
+    If `error_tolerance` is given, the catalog is that for scans to a tolerance. If
     `slope_standard_deviation` is given, the catalog also contains measures of walks over random
     slopes.
     """
@@ -124,9 +130,9 @@ def select_measure_catalog(
 
 
 def add_passage_measures(measure_catalog: MeasureCatalog) -> MeasureCatalog:
-    """Return a catalog that also contains the measures of walks over random slopes.
+    """Return `measure_catalog` with the measures of walks over random slopes added.
 
-    The measures of such walks take a second per sample.
+    These measures take a second per sample.
     """
     return measure_catalog._replace(
         requestable_measures=(*measure_catalog.requestable_measures, *PASSAGE_MEASURES),
@@ -144,7 +150,9 @@ _DERIVATIVE_NAME_PATTERN = re.compile(r"d[ _](\w+?)(?: */ *d |_d_)(\w+)")
 
 
 class MeasureDerivative(NamedTuple):
-    """Derivative of a measure with respect to a parameter, along the branch of limit cycles."""
+    """Derivative of a limit cycle's measure with respect to a parameter, on the branch of limit
+    cycles.
+    """
 
     measure_name: str
     parameter_name: str
@@ -156,7 +164,7 @@ class MeasureDerivative(NamedTuple):
 
     @property
     def variable_attributes(self) -> dict[str, object]:
-        """Return unit, name, symbol and description of the derivative."""
+        """Return unit, long name, symbol and description of the derivative, by attribute name."""
         measure_description, parameter_description = (
             MEASURES[self.measure_name],
             MEASURES[self.parameter_name],
@@ -174,8 +182,9 @@ class MeasureDerivative(NamedTuple):
 
 
 def parse_derivative(variable_name: str) -> MeasureDerivative | None:
-    """Return the derivative that a name such as 'd dls_fraction / d damping' denotes, otherwise
-    None.
+    """Return the derivative that `variable_name` denotes, such as 'd dls_fraction / d damping'.
+
+    Return None for any other name.
     """
     name_match = _DERIVATIVE_NAME_PATTERN.fullmatch(variable_name.strip())
     return MeasureDerivative(*name_match.groups()) if name_match else None
@@ -184,7 +193,7 @@ def parse_derivative(variable_name: str) -> MeasureDerivative | None:
 def canonicalize_variable_name(measure_name: str) -> str:
     """Return the name of the variable that contains the requested measure.
 
-    The name of the variable is valid as a file name.
+    The returned name is valid as a file name.
     """
     requested_derivative = parse_derivative(measure_name)
     return (
@@ -195,7 +204,7 @@ def canonicalize_variable_name(measure_name: str) -> str:
 def check_measure_names(
     measure_names: Iterable[str], measure_catalog: MeasureCatalog
 ) -> tuple[str, ...]:
-    """Return the names of the requested variables, each once.
+    """Return the names of the variables for the requested measures, each once.
 
     Variables that every scan contains are omitted. Raise a ValueError for an unknown name.
     """
@@ -253,7 +262,7 @@ def check_measure_names(
 
 
 def get_variable_attributes(variable_name: str) -> dict[str, object]:
-    """Return unit, long name and description of a variable of a scan."""
+    """Return unit, long name and description of a variable of a scan, by attribute name."""
     if variable_name in MODEL_SELECTION_ATTRIBUTES:
         return dict(MODEL_SELECTION_ATTRIBUTES[variable_name])
     if variable_name.removesuffix(

@@ -1,4 +1,6 @@
-"""Plan of a scan before it runs: checked arguments, layout and identifying settings."""
+"""Plan of a scan before its computation: checked arguments, layout of the result, and the settings
+that identify the scan.
+"""
 
 from __future__ import annotations
 
@@ -47,17 +49,21 @@ from vrw_jax.validation import check_int, check_names, check_positive, check_typ
 from vrw_jax.wheel import FRICTION_NAME, PARAMETER_NAMES, WheelParams
 
 MAX_SCAN_SAMPLES = 1_000_000_000
-"""Largest number of samples of a scan, chosen because so many samples take over a day and some
-hundred GB."""
+"""Largest number of samples in a scan.
+
+The value is chosen because so many samples take over a day and some hundred GB.
+"""
 
 
 N_PASSAGE_SAMPLES_PER_CHUNK = 16
-"""Number of samples that are written at a time if walks over random slopes are measured. The value
-is chosen because each sample takes a second or more."""
+"""Number of samples that are written at a time if a scan measures walks over random slopes.
+
+The value is chosen because each sample takes a second or more.
+"""
 
 
 STORED_NAME_BY_CLASS = {"StepOptions": "Options"}
-"""Names of classes in stores, by name in Python, if the two names differ."""
+"""Names of classes in stores, by their names in Python, where the two names differ."""
 
 STORED_NAMES_BY_FIELD_OF_CLASS = {
     "StepOptions": {
@@ -75,7 +81,7 @@ STORED_NAMES_BY_FIELD_OF_CLASS = {
     },
     "UnilateralWheel": {"infinite_friction_rule": "infinite"},
 }
-"""Names of fields in stores, by class and name in Python, if the two names differ."""
+"""Names of fields in stores, by class and by name in Python, where the two names differ."""
 
 STORED_NAME_BY_MODEL_FIELD = {
     "model_name": "rung",
@@ -83,17 +89,22 @@ STORED_NAME_BY_MODEL_FIELD = {
     "batch_kernel": "lanes",
     "is_compliant": "legs_yield",
 }
-"""Names of class variables of models in stores, by name in Python, if the two names differ."""
+"""Names in stores of class variables of models, by their names in Python, where the two names
+differ.
+"""
 
 SampleEvaluator = Callable[[SampleColumns], Mapping[str, np.ndarray]]
-"""Function that returns the results of samples by variable, with the axis of samples first."""
+"""Function that returns the values of each variable for samples, by the name of the variable.
+
+The first axis of each array is that of the samples.
+"""
 
 ChunkResult = tuple[int, Mapping[str, np.ndarray]]
-"""Index of a chunk, and its results by variable."""
+"""Index of a chunk, and the values of each variable in the chunk, by the name of the variable."""
 
 ChunkExecutor = Callable[["ScanPlan", Sequence[int]], Iterator[ChunkResult]]
-"""Function that computes the chunks with the given indices and yields their results in any
-order.
+"""Function that computes the chunks with the given indices, and yields a `ChunkResult` for each
+chunk in any order.
 """
 
 
@@ -109,8 +120,9 @@ class ScanPlan:
 
     @property
     def scan_settings(self) -> dict[str, object]:
-        """Return the settings that identify the scan. A store must contain the same settings to
-        continue.
+        """Return the settings that identify the scan.
+
+        A scan continues a store only if the store contains the same settings.
         """
         (
             measure_names,
@@ -150,7 +162,7 @@ class ScanPlan:
 
     @property
     def store_attributes(self) -> dict[str, object]:
-        """Return the attributes of the labeled result and its store."""
+        """Return the attributes that the labeled result and its store have."""
         return {
             "title": f"Steady gaits of the viscoelastic-legged rimless wheel over "
             f"{', '.join(self.design.swept_parameters)}",
@@ -246,8 +258,8 @@ def plan_scan(
 
 
 def _require_reference_model(wheel_model: AbstractWheel, error_tolerance: float) -> float:
-    """Return the tolerance of errors, or raise a ValueError if the model cannot be their
-    reference.
+    """Return `error_tolerance`. Raise a ValueError if `wheel_model` cannot be the reference for
+    errors.
     """
     model_fields: dict[str, Any] = type(wheel_model).__dataclass_fields__
     default_only_fields = wheel_model.capabilities.fixed_by_tolerance
@@ -265,7 +277,9 @@ def _require_reference_model(wheel_model: AbstractWheel, error_tolerance: float)
 
 
 def describe_computing_environment() -> dict[str, object]:
-    """Return the digest of the source, the versions and the device of this process."""
+    """Return the digest of the source, the versions of the libraries and the device of this
+    process.
+    """
     provenance_record = collect_provenance_attributes(
         WheelParams(), ViscoelasticWheel(), StepOptions()
     )
@@ -284,12 +298,13 @@ def describe_computing_environment() -> dict[str, object]:
 
 
 VECTOR_INSTRUCTION_SETS = ("avx", "fma", "avx2", "avx512f", "avx512dq", "neon", "sve")
-"""Instruction sets that decide which products and sums the compiler fuses, and thus the last
-digits."""
+"""Processor instruction sets that decide which products and sums the compiler fuses, and thus the
+last digits of results.
+"""
 
 
 def describe_settings_difference(stored_settings: object, current_settings: object) -> str:
-    """Return a sentence about the first setting that differs, or "" if no setting differs."""
+    """Return a sentence that states the first setting that differs, or "" if no setting differs."""
     setting_name, stored_value, current_value = find_first_settings_difference(
         stored_settings, current_settings
     )
@@ -308,7 +323,7 @@ def _make_result_layout(
     base_wheel: WheelParams,
     chunk_size: int,
 ) -> ResultLayout:
-    """Return the layout of the variables of a result over a design.
+    """Return the layout of a scan's variables over the axes of a design.
 
     - `chunk_size`: largest number of samples in a chunk.
     """
@@ -316,7 +331,7 @@ def _make_result_layout(
     locked_legs = make_locked_leg_coordinate(base_wheel.n_legs)
 
     def make_variable_layout(variable_name: str) -> VariableLayout:
-        """Return type, missing value and attributes of one variable."""
+        """Return the layout of one variable: its type, missing value and attributes."""
         variable_attributes = get_variable_attributes(variable_name)
         if variable_name in ("outcome", "rung", "reason"):
             return VariableLayout(variable_name, "int8", -1, variable_attributes)
@@ -359,7 +374,7 @@ def _make_result_layout(
 
 
 def _convert_settings_to_json(settings_object: object) -> dict[str, object]:
-    """Return the class name and the fields of an object as JSON values."""
+    """Return the class name and the fields of `settings_object` as JSON values, by field name."""
     class_name = type(settings_object).__name__
     field_value_by_name: dict[str, object] = {
         "kind": STORED_NAME_BY_CLASS.get(class_name, class_name)

@@ -1,8 +1,9 @@
-"""Global sensitivity: the fraction of a measure's variance due to each parameter, as Sobol'
+"""Global sensitivity: the fraction of a measure's variance that is due to each parameter, as Sobol'
 indices.
 
-`design.saltelli` generates the samples and `scan` computes them like any others. `sobol_indices`
-computes the indices from the result with `scipy.stats.sobol_indices` (Saltelli et al. 2010).
+`design.saltelli` generates the samples, which `scan` computes as for any other design.
+`sobol_indices` computes the indices from the result with `scipy.stats.sobol_indices` (Saltelli et
+al. 2010).
 """
 
 from __future__ import annotations
@@ -22,13 +23,14 @@ from vrw_jax.wheel import Outcome
 
 @dataclass(frozen=True)
 class SobolOptions:
-    """Options of the estimate of Sobol' indices.
+    """Numerical options for estimating Sobol' indices.
 
-    - `min_saltelli_rows`: smallest number of rows, chosen because indices of fewer rows are noise;
+    - `min_saltelli_rows`: smallest number of rows of a `saltelli` design, chosen because indices
+      from fewer rows are noise;
     - `n_bootstrap_resamples`: number of bootstrap resamples of the rows;
-    - `interval_quantiles`: quantiles that bound the interval, chosen for a 95 % interval;
+    - `interval_quantiles`: quantiles that bound the confidence interval, chosen for 95 %;
     - `max_roundoff_spread`: largest spread of a measure that counts as round-off, as a fraction of
-      the largest magnitude. The value is chosen because round-off in the parameters causes spreads
+      its largest magnitude. The value is chosen because round-off in the parameters causes spreads
       of 4e-14 in measures and 5e-12 in margins.
     """
 
@@ -44,23 +46,26 @@ def sobol_indices(
     """Return first-order and total Sobol' indices, shape (measure, parameter), dimensionless.
 
     The first-order index is the fraction of a measure's variance that one parameter causes by
-    itself. The total index is the fraction that would vanish if the other parameters were known.
-    Each index has the bounds `lower_bounds` and `upper_bounds` of a 95 % bootstrap interval.
+    itself. The total index is the fraction of the variance that remains on average if the values of
+    all other parameters are fixed. The suffixes `_lower` and `_upper` name the bounds of a 95 %
+    bootstrap interval, such as `total_lower`.
 
-    Rows that contain a sample without a gait are omitted. Further rows are omitted until the number
-    `rows` is a power of two. `left_out` is the fraction of rows that contain a sample without a
-    gait. If `left_out` is not small, the indices are biased: wheels near those without a gait lose
-    more of their rows than other wheels. The indices are then not those of the region with gaits.
+    A row is a group of samples in a `saltelli` design. Rows that contain a sample without a gait
+    are omitted. Further rows are omitted until their number, the attribute `rows`, is a power of
+    two. The attribute `left_out` is the fraction of rows that contain a sample without a gait. If
+    `left_out` is not small, the indices are biased: wheels near those without a gait lose more of
+    their rows than other wheels. The indices are then not those of the region with gaits.
 
-    If a measure varies only by round-off, its indices are 0. Such a measure is marked in
-    `is_constant_measure`, and a warning names it.
+    If a measure varies only by round-off, its indices are 0. The variable `is_constant_measure`
+    marks such a measure, and a warning names it.
 
     Args:
         scan: dataset of a scan over a `saltelli` design.
         measures: names of variables of the scan.
 
     Returns:
-        A dataset of `first_order`, `total`, their intervals and `is_constant_measure`.
+        A dataset that contains `first_order`, `total`, the bounds of their intervals and
+        `is_constant_measure`.
 
     Raises:
         TypeError, ValueError: if an argument is invalid; the message names the remedy.
@@ -160,7 +165,7 @@ def sobol_indices(
 
 
 class _SobolIndexEstimator:
-    """Estimator of first-order and total Sobol' indices from rows of a design.
+    """Estimator of first-order and total Sobol' indices from the rows of a `saltelli` design.
 
     - `measure_values`: measures of the samples, shape (2 + parameters, measures, rows);
     - `roundoff_spreads`: largest spread of each measure that counts as round-off.
@@ -171,16 +176,19 @@ class _SobolIndexEstimator:
         self.roundoff_spreads = max_roundoff_spread * np.abs(measure_values).max(axis=(0, 2))
 
     def detect_constant_measures(self, sample_values: np.ndarray) -> np.ndarray:
-        """Return whether each measure varies only by round-off between the samples."""
+        """Return whether each measure varies only by round-off between the samples, shape
+        (measures,).
+        """
         has_small_spread: np.ndarray = (
             np.ptp(sample_values[:2], axis=(0, 2)) <= self.roundoff_spreads
         )
         return has_small_spread
 
     def __call__(self, row_indices: np.ndarray) -> np.ndarray:
-        """Return the indices from the rows with `row_indices`, shape (2, measures, parameters).
+        """Return the indices, estimated from the rows at `row_indices`, shape (2, measures,
+        parameters).
 
-        Indices of constant measures are 0.
+        The first axis contains first-order and total indices. Indices of constant measures are 0.
         """
         from scipy.stats import sobol_indices as compute_sobol_indices
 

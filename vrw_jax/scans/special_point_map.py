@@ -1,4 +1,4 @@
-"""Map of special points of gaits over two parameters: a scan, and curves between its samples."""
+"""Map of gaits over two parameters: a scan, and curves of special points between its samples."""
 
 from __future__ import annotations
 
@@ -25,11 +25,12 @@ from vrw_jax.wheel import Outcome, WheelParams
 
 
 class SpecialPointMap(NamedTuple):
-    """Gaits of a grid over two parameters, and all curves of special points between them.
+    """Gaits on a grid over two parameters, and all curves of special points between the samples.
 
-    - `scan`: the samples, as `vrw.scan` returns them;
+    - `scan`: the gaits of the samples, as `vrw.scan` returns them;
     - `curves`: every curve, as `vrw.continue_special_point` returns it;
-    - `unexplained_changes`: changes of sign between neighboring samples without a curve nearby.
+    - `unexplained_changes`: changes of sign of a quantity between neighboring samples that no curve
+      explains.
 
     Examples:
         >>> grid = vrw.grid(damping=[150.0, 180.0, 210.0], slope=[0.28, 0.29, 0.30])
@@ -43,9 +44,7 @@ class SpecialPointMap(NamedTuple):
 
     @property
     def ending(self) -> str:
-        """Return a sentence with the number of sign changes between samples that no curve
-        explains.
-        """
+        """Return a sentence that states how many sign changes between samples no curve explains."""
         n_changes = len(self.unexplained_changes)
         return f"{n_changes} changes of sign between neighboring samples have no curve nearby."
 
@@ -79,19 +78,20 @@ def map_special_points(
     on_progress: ProgressCallback | None = None,
     on_stage: Callable[[str], None] | None = None,
 ) -> SpecialPointMap:
-    """Scan a grid over two parameters, and follow all special points of its gaits.
+    """Scan a grid over two parameters, and compute all curves of special points of its gaits.
 
-    The command `vrw map` calls this function. Curves start on branches across the grid. If a
-    quantity has different signs at neighboring samples and no curve runs between these samples,
-    branches through the samples are searched for further curves.
+    The command `vrw map` calls this function. Curves start on branches of gaits across the grid. A
+    quantity may have different signs at neighboring samples although no curve runs between them.
+    Branches through these samples are then searched for further curves.
 
     Args:
         design: a `vrw.grid` over two parameters with ascending values.
-        measures: names of the measures of the scan, besides those that the curves need.
-        base: the wheel whose parameters are not swept; Table 1 by default.
+        measures: names of measures of the scan, in addition to those that the curves need.
+        base: wheel with the parameters that are not swept; by default that of Table 1 of the
+            paper.
         model: a `ViscoelasticWheel`, which is the default.
-        options: numerical options of the steps that check the gaits of the scan.
-        store: folder that contains the scan.
+        options: numerical options of the gait steps that check the gaits of the scan.
+        store: folder to which the scan is written.
         on_progress: function that is called with the `ScanProgress` after each chunk.
         on_stage: function that is called with a description of each stage after the scan.
 
@@ -140,7 +140,9 @@ def follow_special_points(
 ) -> SpecialPointMap:
     """Return the map of special points over the two parameters of a scan.
 
-    The scan must contain the measures of special points.
+    - `scanned_samples`: dataset of the scan, which must contain the measures that define special
+      points;
+    - `on_stage`: function that is called with a description of each stage.
     """
     if not np.any(scanned_samples.outcome.values == Outcome.STEPPED):
         raise ValueError("no gait was found on the grid: choose another.")

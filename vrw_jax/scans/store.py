@@ -1,10 +1,10 @@
 """Storage of a scan's results: in memory, or in a Zarr store that survives a killed process.
 
 A store is a Zarr group with one array per variable, divided into the scan's chunks, so that
-`xarray.open_zarr` reads it. The store is built in a temporary folder and then renamed. The data of
-a chunk is written before its mark, which is a digest of the data (see `integrity`). Every file is
-written under a temporary name and renamed. Whenever the process dies, a chunk is therefore either
-marked and complete, or it is computed again.
+`xarray.open_zarr` reads it. The store is built in a temporary folder, which is then renamed. The
+data of a chunk are written before its mark, which is a digest of the data (see `integrity`). Every
+file is written under a temporary name and renamed. Whenever the process dies, a chunk is therefore
+either marked and complete, or it is computed again.
 """
 
 from __future__ import annotations
@@ -50,22 +50,22 @@ else:
     zarr = lazy_import("zarr")
 
 PROVENANCE_ATTRIBUTE = "provenance"
-"""Name of the attribute that describes the origin of the results."""
+"""Name of the attribute of a store that describes the origin of the results."""
 
 REQUESTED_MEASURES_ATTRIBUTE = "asked"
-"""Name of the attribute that lists the requested measures."""
+"""Name of the attribute of a store that lists the requested measures."""
 
 ChunkRegion = tuple[slice, ...]
-"""Slices of a chunk along the axes of the samples."""
+"""Slices that select the samples of a chunk, one for each sample axis."""
 ChunkVariables = Mapping[str, np.ndarray]
-"""Results of one chunk by variable; the axes of the samples come first."""
+"""Values of each variable in one chunk, by the name of the variable; the sample axes come first."""
 
 
 @dataclass(frozen=True)
 class VariableLayout:
     """Description of one variable of a result.
 
-    The dimensions and the shape do not include the axes of the samples.
+    The dimensions and the shape do not include the sample axes.
     """
 
     variable_name: str
@@ -77,13 +77,13 @@ class VariableLayout:
 
     @property
     def bytes_per_sample(self) -> int:
-        """Return the number of bytes of the variable for one sample."""
+        """Return the number of bytes that the variable occupies per sample."""
         return np.dtype(self.dtype).itemsize * math.prod(self.extra_shape)
 
 
 @dataclass(frozen=True)
 class ResultLayout:
-    """Description of a result: its axes, chunks, variables and coordinates."""
+    """Description of a result: its sample axes, chunks, variables and coordinates."""
 
     sample_dimension_names: tuple[str, ...]
     sample_shape: tuple[int, ...]
@@ -93,19 +93,19 @@ class ResultLayout:
 
     @property
     def n_chunks(self) -> int:
-        """Return the number of chunks."""
+        """Return the number of chunks of the result."""
         return math.prod(self._chunks_per_axis)
 
     @property
     def _chunks_per_axis(self) -> tuple[int, ...]:
-        """Return the number of chunks along each axis."""
+        """Return the number of chunks along each sample axis."""
         return tuple(
             -(-axis_length // chunk_length)
             for axis_length, chunk_length in zip(self.sample_shape, self.chunk_shape, strict=True)
         )
 
     def compute_chunk_region(self, chunk_index: int) -> ChunkRegion:
-        """Return the slices of a chunk along the axes of the samples."""
+        """Return the slices that select the samples of a chunk, one for each sample axis."""
         chunk_indices = np.unravel_index(chunk_index, self._chunks_per_axis)
         return tuple(
             slice(
@@ -118,7 +118,7 @@ class ResultLayout:
         )
 
     def compute_chunk_sample_shape(self, chunk_index: int) -> tuple[int, ...]:
-        """Return the shape of a chunk along the axes of the samples.
+        """Return the number of samples in a chunk along each sample axis.
 
         A chunk at the end of an axis may be smaller than others.
         """
@@ -129,14 +129,14 @@ class ResultLayout:
 
     @property
     def bytes_per_sample(self) -> int:
-        """Return the number of bytes of the uncompressed results of one sample."""
+        """Return the number of bytes that the uncompressed results of one sample occupy."""
         return sum(variable_layout.bytes_per_sample for variable_layout in self.variable_layouts)
 
 
 def choose_chunk_shape(sample_shape: tuple[int, ...], max_chunk_samples: int) -> tuple[int, ...]:
-    """Return the shape of chunks of at most `max_chunk_samples` samples.
+    """Return the shape of chunks that contain at most `max_chunk_samples` samples.
 
-    The last axes of a chunk are complete.
+    A chunk spans the whole length of the last axes.
     """
     chunk_shape, samples_left = [1] * len(sample_shape), max_chunk_samples
     for axis_index in range(len(sample_shape) - 1, -1, -1):
@@ -154,11 +154,11 @@ class AbstractResultStore(abc.ABC):
 
     store_location: str = "memory"
     damage_description: str = ""
-    """Description of the damage of the store; an empty string if there is none."""
+    """Description of the damage of the store; an empty string if the store is intact."""
 
     @abc.abstractmethod
     def find_missing_chunks(self) -> list[int]:
-        """Return the indices of the chunks without results, in ascending order."""
+        """Return the indices of the chunks whose results are missing, in ascending order."""
 
     @abc.abstractmethod
     def write_chunk(self, chunk_index: int, chunk_results: ChunkVariables) -> None:
@@ -166,13 +166,13 @@ class AbstractResultStore(abc.ABC):
 
     @abc.abstractmethod
     def load_dataset(self) -> xr.Dataset:
-        """Return the labeled result."""
+        """Return the labeled dataset of all results."""
 
     @abc.abstractmethod
     def open_for_writing(self) -> contextlib.AbstractContextManager[None]:
         """Return the context in which chunks are written.
 
-        The context removes unfinished files and holds the lock of the store.
+        The context removes unfinished files and locks the store against other writers.
         """
 
 
@@ -237,9 +237,9 @@ class MemoryResultStore(AbstractResultStore):
 
 
 class ZarrResultStore(AbstractResultStore):
-    """Storage of a scan's results in a folder.
+    """Storage of a scan's results in a folder, as a Zarr store.
 
-    - `verifies_files`: whether damaged chunks are searched for.
+    - `verifies_files`: whether damaged chunks are searched for when the store is opened.
     """
 
     def __init__(
@@ -257,7 +257,7 @@ class ZarrResultStore(AbstractResultStore):
         )
 
     def _open_arrays(self) -> None:
-        """Open the arrays and find damage. Arrays with damaged metadata remain closed."""
+        """Open the arrays and find damage. Arrays with damaged metadata are not opened."""
         stored_metadata, self._chunk_checksums = StoredMetadata(self._store_path), None
         self._damaged_metadata = (
             stored_metadata.find_damaged_metadata() if self._verifies_files else []
@@ -326,7 +326,7 @@ class ZarrResultStore(AbstractResultStore):
 
 
 def _select_zarr_array(zarr_group: zarr.Group, array_name: str) -> zarr.Array:
-    """Return an array of a Zarr group, or raise an error if the name belongs to a group."""
+    """Return an array of a Zarr group. Raise an error if the name belongs to a group."""
     zarr_array = zarr_group[array_name]
     assert isinstance(zarr_array, zarr.Array)
     return zarr_array
@@ -335,12 +335,12 @@ def _select_zarr_array(zarr_group: zarr.Group, array_name: str) -> zarr.Array:
 def open_scan(path: str | Path, *, verify: bool = True) -> xr.Dataset:
     """Return the labeled result of a scan, finished or not. Arrays are read when they are used.
 
-    In an unfinished scan, samples without results have the outcome -1 and the measures NaN. A store
-    with damaged files raises a ValueError. `verify=False` skips the search for damage.
+    In an unfinished scan, a sample without results has the outcome -1, and its measures are NaN. A
+    store with damaged files causes a ValueError. `verify=False` skips the search for damage.
 
     Args:
         path: folder of the store.
-        verify: whether the files of each chunk are compared with their digest.
+        verify: whether the files of each chunk are compared with the digest in the chunk's mark.
 
     Returns:
         The dataset that `scan` returns.
@@ -416,7 +416,9 @@ ZARR_METADATA_ERRORS = (
 def _open_zarr_group(
     store_path: Path, access_mode: Literal["r", "r+"], stored_metadata: StoredMetadata
 ) -> zarr.Group:
-    """Return the group of a store, opened with the first copy of the metadata that can be read."""
+    """Return the Zarr group of a store, opened with the first copy of the metadata that can be
+    read.
+    """
     variable_names = stored_metadata.mark_attributes.get(SCAN_VARIABLES_KEY, ())
     for uses_consolidated_metadata in (None, False):
         try:
@@ -436,7 +438,8 @@ def _open_zarr_group(
 
 
 def _arrange_requested_variables(dataset: xr.Dataset) -> xr.Dataset:
-    """Return the dataset with the requested variables first, in the requested order and names.
+    """Return the dataset with the requested variables first, in the requested order and with the
+    requested names.
 
     A file name cannot be "d speed / d damping", so the array of such a variable has another name in
     a store.
@@ -473,9 +476,7 @@ def _arrange_requested_variables(dataset: xr.Dataset) -> xr.Dataset:
 
 
 def _read_scan_metadata(store_path: Path) -> StoredMetadata:
-    """Return the metadata of a store, or raise a ValueError if the folder contains no store of a
-    scan.
-    """
+    """Return the metadata of a store. Raise a ValueError if the folder contains no scan."""
     stored_metadata = StoredMetadata(store_path)
     if (
         stored_metadata.root_metadata.get("node_type") != "group"
@@ -518,7 +519,7 @@ def read_stored_manifest(store_path: Path) -> dict | None:
 def find_first_settings_difference(
     stored_settings: object, current_settings: object, setting_path: str = ""
 ) -> tuple[str, object, object]:
-    """Return the name of the first setting that differs, and both of its values.
+    """Return the name of the first setting that differs, its stored value and its current value.
 
     If no setting differs, return ("", None, None).
     """
@@ -577,7 +578,9 @@ def create_empty_store(
 def _create_zarr_arrays(
     store_path: Path, result_layout: ResultLayout, store_attributes: Mapping[str, object]
 ) -> None:
-    """Create the Zarr group of a store with its coordinates, empty variables and marks."""
+    """Create the Zarr group of a store, with the coordinates and with empty arrays for variables
+    and marks.
+    """
     from zarr.codecs import Crc32cCodec, ZstdCodec
 
     # xarray reads from this attribute which arrays are coordinates, and removes it on opening.
