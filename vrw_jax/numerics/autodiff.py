@@ -1,10 +1,10 @@
-"""Derivatives of any order and mode of a function that supports only forward-mode AD.
+"""Derivatives of any order and mode for a function that supports only forward-mode AD.
 
-Loops of unknown length, such as adaptive steps until an event, have no reverse mode. The rule of
-this module computes the Jacobian in forward mode, with respect to the inputs that are perturbed,
-and returns Jacobian times tangent. The product is linear in the tangent, so `jax.grad` transposes a
-small matrix instead of a loop. The Jacobian itself has the same rule, so Hessians work in every
-combination of modes.
+Loops of unknown length, such as adaptive solver steps until an event, have no reverse mode. The
+rule in this module computes the Jacobian in forward mode, with respect to the inputs that have
+tangents, and returns the product of the Jacobian and the tangent. The product is linear in the
+tangent, so `jax.grad` transposes a small matrix instead of a loop. The Jacobian itself has the same
+rule, so Hessians work in every combination of modes.
 """
 
 import functools
@@ -23,7 +23,9 @@ from vrw_jax.numerics.batching import BatchFunction, unbatch
 from vrw_jax.runtime import with_default_jax_settings
 
 ForwardFunction = Callable[..., tuple[PyTree[Array], PyTree[Array]]]
-"""Function of float arrays that returns (float outputs, other outputs without derivatives)."""
+"""Function of floating-point arrays that returns (float outputs, other outputs without
+derivatives).
+"""
 
 
 def enable_all_ad_modes(
@@ -33,12 +35,13 @@ def enable_all_ad_modes(
 ) -> ForwardFunction:
     """Return `function` with derivatives in forward and reverse mode, to any order.
 
-    `function(*arrays)` must take only floating-point arrays, be differentiable by `jax.jvp` to the
-    requested order, and not close over values that are themselves differentiated. If
-    `function_to_differentiate` is given, derivatives are computed from it, for example from the
-    same function with tighter tolerances. `make_jacobian` may provide another function that returns
-    (Jacobian with respect to the given arguments, value) and the other outputs. Function and
-    Jacobians are compiled once each: outside of `jit`, forward mode, reverse mode and single
+    All arguments of `function` must be floating-point arrays. `jax.jvp` must be able to
+    differentiate it to the requested order, and its closure must not contain values that are
+    differentiated. If `function_to_differentiate` is given, derivatives are those of this function,
+    which may for example use tighter tolerances. `make_jacobian(argnums)` may provide another
+    function that returns (Jacobians with respect to the arguments `argnums`, float outputs), and
+    the other outputs. Function and Jacobians are compiled once each: outside of `jit`, forward
+    mode, reverse mode and single
     directions all call the same compiled Jacobian.
     """
     differentiable_function = (
@@ -87,8 +90,8 @@ def enable_all_ad_modes(
 def _make_forward_jacobian_function(
     function: ForwardFunction, argnums: tuple[int, ...]
 ) -> ForwardFunction:
-    """Return a function that computes the Jacobians of the float outputs, one for each
-    differentiated argument.
+    """Return a function that computes one Jacobian of the float outputs per differentiated
+    argument.
 
     The returned function gives (Jacobians, float outputs), and the other outputs.
     """
@@ -120,7 +123,7 @@ def _make_forward_jacobian_function(
 def _apply_argument_jacobians(
     output_template: PyTree, jacobians: PyTree, tangents: tuple
 ) -> PyTree:
-    """Return the sum of Jacobians times tangents, leaf by leaf.
+    """Return the sum over arguments of Jacobian times tangent, leaf by leaf.
 
     Products are written as sums, because a matrix product of small arrays is a library call.
     """
@@ -136,7 +139,7 @@ def _apply_argument_jacobians(
 
 
 ExecutionWrapper = Callable[[BatchFunction, int], BatchFunction]
-"""Function that selects how a batch function is executed, given the order of its derivative."""
+"""Function that determines how a batch function is executed, given the order of its derivative."""
 
 
 def with_implicit_derivative(
@@ -145,14 +148,13 @@ def with_implicit_derivative(
     execution_wrapper: ExecutionWrapper,
     derivative_order: int = 0,
 ) -> Callable:
-    """Return `function(p, z)` of one wheel, differentiable along z = z(p) to any order and in any
-    mode.
+    """Return `function(p, z)` for one wheel, differentiable on the branch z = z(p).
 
-    `function(p, z)` acts on a batch. `compute_tangents(p, z)` returns dz/dp of one wheel with a
-    leading axis over p. Its result is correct if z = z(p), and it must itself have been made by
-    `with_implicit_derivative`. The derivative rule returns the total derivative with respect to p
-    times the tangent of p. The rule ignores the tangent of z, which can only be dz/dp times the
-    tangent of p.
+    The result is differentiable to any order and in any mode. `function(p, z)` itself acts on a
+    batch. `compute_tangents(p, z)` returns dz/dp for one wheel, with a leading axis over p. Its
+    result is correct if z = z(p), and it must be a function that `with_implicit_derivative` has
+    returned. The derivative rule returns the total derivative with respect to p times the tangent
+    of p. The rule ignores the tangent of z, because that can only be dz/dp times the tangent of p.
     """
     unbatched_function = unbatch(execution_wrapper(function, derivative_order))
     wrapped_function = jax.custom_jvp(lambda p, z: unbatched_function(p, z))
@@ -177,12 +179,13 @@ def make_implicit_jacobian(
 ) -> Callable:
     """Return a function that computes d function(p, z(p)) / dp, with a leading axis over p.
 
-    The returned function is differentiable as in `with_implicit_derivative`. `make_jacobian(p, (z,
-    dz/dp))` may compute the same Jacobian faster.
+    The returned function is differentiable like that of `with_implicit_derivative`. If
+    `make_jacobian` is given, `make_jacobian(p, (z, dz/dp))` replaces the default computation of the
+    Jacobian by a faster one.
     """
 
     def jvp_sequentially(p: Array, z_and_jacobian: tuple[PyTree, PyTree]) -> PyTree:
-        """Return the derivatives over a batch, computed one direction after another.
+        """Return the derivatives for a batch, computed one direction after another.
 
         The compiled code is then as short as for one direction.
         """
@@ -211,10 +214,10 @@ def make_implicit_jacobian(
 
 
 def evaluate_with_jacobian(function: Callable, *arguments: Array) -> tuple[Any, Any]:
-    """Return the outputs of `function`, and the derivatives of its float outputs on last axes.
+    """Return the outputs of `function` and the derivatives of its float outputs.
 
-    One program computes both. With several arguments, the derivatives of a leaf are a tuple with
-    one derivative for each argument.
+    One program computes both. The last axes of a derivative run over an argument. If there are
+    several arguments, the derivative of an output leaf is a tuple with one entry per argument.
     """
 
     def select_float_outputs(*arguments: Array) -> tuple:
@@ -229,15 +232,17 @@ def evaluate_with_jacobian(function: Callable, *arguments: Array) -> tuple[Any, 
 
 
 def apply_jacobian(jacobian: PyTree, tangent: Array) -> PyTree:
-    """Return the Jacobian times the tangent, leaf by leaf. The leading axis of the Jacobian runs
-    over inputs.
+    """Return the product of the Jacobian and the tangent, leaf by leaf.
+
+    The leading axis of each Jacobian leaf runs over inputs.
     """
     return jax.tree.map(lambda jacobian_leaf: jnp.tensordot(tangent, jacobian_leaf, 1), jacobian)
 
 
 def make_zero_tangent(tree: PyTree) -> PyTree:
-    """Return the zero tangent of a tree of outputs, with float0 leaves for outputs that are not
-    floats.
+    """Return the zero tangent for a tree of outputs.
+
+    Leaves for outputs that are not floats have the type float0.
     """
     leaf_zero_maker = lambda x: (
         jnp.zeros_like(x)

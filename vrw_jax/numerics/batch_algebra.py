@@ -1,8 +1,8 @@
-"""Linear algebra of many small systems together, batch last, as sums of elementwise products.
+"""Linear algebra for batches of small systems, as sums of elementwise products.
 
-XLA on CPU recomputes inexpensive intermediate results for each use, which costs more than all
-arithmetic of this module. A `lax.cond` prevents this recomputation, because XLA cannot prove at
-compile time that its predicate is always true.
+The batch is on the last axis. XLA on CPU recomputes inexpensive intermediate results for each use,
+which costs more than all arithmetic of this module. A `lax.cond` prevents this recomputation,
+because XLA cannot prove at compile time that the predicate of the `lax.cond` is always true.
 """
 
 from collections.abc import Callable, Sequence
@@ -26,7 +26,7 @@ FusionBarrierFn = Callable[[Any], Any]
 def make_fusion_barrier(lane_values: Float[Array, "... lanes"]) -> FusionBarrierFn:
     """Return an identity function across which XLA cannot fuse operations.
 
-    `lane_values` must not contain NaN. XLA cannot prove that it does not.
+    `lane_values` must not contain NaN, which XLA cannot prove.
     """
     if simd.targets_machine_code():
         return lax.optimization_barrier
@@ -41,7 +41,7 @@ def make_fusion_barrier(lane_values: Float[Array, "... lanes"]) -> FusionBarrier
 
 
 def apply_matrix(matrix: np.ndarray, x: Array) -> Array:
-    """Return the product of a matrix and the leading axis of `x`, as a sum of elementwise
+    """Return the product of a matrix with `x` along the leading axis, as a sum of elementwise
     products.
     """
     broadcast_shape = (-1,) + (1,) * (x.ndim - 1)
@@ -58,8 +58,9 @@ def sum_with_weights(weights: np.ndarray, x: Array) -> Array:
 
 
 def contract_inner_axis(left_array: Array, right_array: Array) -> Array:
-    """Return the sum over s of left[..., s, lanes] * right[s, ..., lanes], elementwise over
-    lanes.
+    """Return the sum over s of left[..., s, lanes] * right[s, ..., lanes] for each lane.
+
+    A lane is one element of the batch, on the last axis.
     """
     broadcast_slices = (slice(None),) * (left_array.ndim - 2) + (None,) * (right_array.ndim - 2)
     product_terms = [
@@ -70,7 +71,7 @@ def contract_inner_axis(left_array: Array, right_array: Array) -> Array:
 
 
 def invert_small_matrices(matrix: Float[Array, "n n lanes"]) -> Float[Array, "n n lanes"]:
-    """Return the inverse of each 1x1, 2x2 or 3x3 matrix by cofactors."""
+    """Return the inverse of each 1x1, 2x2 or 3x3 matrix, computed by cofactors."""
     matrix_entries = matrix
     if matrix_entries.shape[0] == 1:
         return 1.0 / matrix_entries
@@ -113,11 +114,11 @@ def solve_node_equations(
     rhs: Float[Array, "nodes dim columns lanes"],
     barrier_values: LaneArray,
 ) -> Float[Array, "nodes dim columns lanes"]:
-    """Return the solution of the node equations of one mesh interval.
+    """Solve the linear equations at the collocation nodes of one mesh interval.
 
     The method is block elimination without pivoting. The matrix is the mass matrix plus terms of
-    order h, so its diagonal blocks stay regular. `barrier_values` is the argument of
-    `make_fusion_barrier`.
+    order h, the length of the mesh interval, so its diagonal blocks stay regular. `barrier_values`
+    is the argument of `make_fusion_barrier`.
     """
     barrier_function = make_fusion_barrier(barrier_values)
     n_nodes, n_coordinates = matrix.shape[:2]
@@ -151,7 +152,7 @@ def solve_node_equations(
 @solve_node_equations.defjvp
 @with_default_jax_settings
 def _solve_node_equations_jvp(primals: tuple, tangents: tuple) -> tuple:
-    """Return the solution and its tangent, which a second solve computes.
+    """Return the solution and its tangent. A second linear solve computes the tangent.
 
     Differentiation of the elimination would double its work.
     """
@@ -170,7 +171,7 @@ def _solve_node_equations_jvp(primals: tuple, tangents: tuple) -> tuple:
 
 
 def evaluate_with_jvps(function: Callable, primals: tuple, tangents: tuple) -> tuple:
-    """Return the value of `function`, and its JVPs along tangents with a leading axis of
+    """Return the value of `function`, and its JVPs for tangents with a leading axis over
     directions.
     """
     linearized_function = lambda *t: jax.jvp(function, primals, t)
@@ -180,10 +181,10 @@ def evaluate_with_jvps(function: Callable, primals: tuple, tangents: tuple) -> t
 def evaluate_with_partials(
     function: Callable[..., Vector], arguments: Sequence[Array]
 ) -> tuple[Vector, list[Vector]]:
-    """Return the value of an elementwise function, and the derivatives of each output with respect
-    to all arguments.
+    """Return the value of an elementwise function, and the derivatives of each of its outputs.
 
-    The derivatives use reverse mode, because a phase has fewer equations than arguments.
+    The derivatives are with respect to all arguments. They use reverse mode, because a phase has
+    fewer equations than arguments.
     """
     function_values, linearized_function = jax.linearize(function, *arguments)
     partials_by_output = []

@@ -1,7 +1,8 @@
-"""Conversion between functions of a batch, with the batch on the last axis, and of one element.
+"""Conversion between functions of a batch and functions of one element.
 
-Code with independent wheels on the last axis runs several times faster than the same code for one
-wheel under `jax.vmap`. `unbatch` merges every `vmap`, including nested ones, into that axis.
+Batches are on the last axis. Code with independent wheels on the last axis runs several times
+faster than the same code for one wheel under `jax.vmap`. `unbatch` merges every `vmap`, including
+nested ones, into the last axis.
 """
 
 import bisect
@@ -18,11 +19,11 @@ from jaxtyping import Array, PyTree
 from vrw_jax.runtime import with_default_jax_settings
 
 BatchFunction = Callable[..., PyTree[Array]]
-"""Function of arrays that all have the batch on their last axis."""
+"""Function of arrays whose last axis is the batch."""
 
 
 def unbatch(function: BatchFunction) -> BatchFunction:
-    """Return `function` for one element, whose arrays have no batch axis.
+    """Return `function` as a function of one element, whose arrays have no batch axis.
 
     Under `jax.vmap` the returned function calls `function` once for the whole batch.
     """
@@ -58,10 +59,10 @@ def unbatch(function: BatchFunction) -> BatchFunction:
 
 
 def apply_in_blocks(function: BatchFunction, block_size: int) -> BatchFunction:
-    """Return `function` applied to `block_size` batch elements at a time, so that arrays stay in
-    cache.
+    """Return a function that applies `function` to `block_size` batch elements at a time.
 
-    The first array has the batch axis. Scalars are the same for all elements.
+    Arrays then stay in the processor's cache. The first array must have the batch axis. Scalars are
+    the same for all elements.
     """
 
     def evaluate_blockwise(*arrays: PyTree) -> PyTree:
@@ -101,9 +102,10 @@ def apply_in_blocks(function: BatchFunction, block_size: int) -> BatchFunction:
 
 
 def is_inside_jit() -> bool:
-    """Return whether an enclosing `jax.jit` compiles the present calls.
+    """Return whether an enclosing `jax.jit` is tracing the current calls.
 
-    A nested jit would only trace the function once more, which is unnecessary under a derivative.
+    In this case a nested jit would only trace the function once more, which is unnecessary under a
+    derivative.
     """
     return isinstance(jnp.zeros(()), jax.core.Tracer)
 
@@ -111,10 +113,10 @@ def is_inside_jit() -> bool:
 def run_if_any(
     is_any_element_active: Array, function: Callable[[PyTree], PyTree], fallback_value: PyTree
 ) -> PyTree:
-    """Return `function(fallback_value)` if `is_any_element_active` is true, otherwise
+    """Return `function(fallback_value)` if `is_any_element_active` is true, and else
     `fallback_value`.
 
-    `is_any_element_active` is one flag for the whole batch. The call is a loop of at most one
+    `is_any_element_active` is one flag for the whole batch. The call is a loop with at most one
     iteration, which machine code skips if the flag is false.
     """
     guarded_call = lambda loop_carry: (jnp.zeros((), bool), function(loop_carry[1]))
@@ -124,33 +126,36 @@ def run_if_any(
 
 
 def make_opaque_condition(loop_condition: Array, nonnegative_count: Array) -> Array:
-    """Return `loop_condition` as a condition that also reads a count, which is never negative.
+    """Return a loop condition that equals `loop_condition` but also reads a nonnegative count.
 
-    If a loop condition reads only one number, XLA looks for an iteration counter in a copy of the
+    If a loop condition reads only one value, XLA looks for an iteration counter in a copy of the
     loop's body. This search takes a fifth of the compile time of a step with unilateral contact.
     """
     return loop_condition & (nonnegative_count >= 0)
 
 
 def select_tree_leaves(condition: Array, tree_if_true: PyTree, tree_if_false: PyTree) -> PyTree:
-    """Return a tree with leaves of `tree_if_true` where `condition` is true, otherwise of
-    `tree_if_false`."""
+    """Select each entry from `tree_if_true` where `condition` is true, and else from
+    `tree_if_false`.
+    """
     return jax.tree.map(lambda a, b: jnp.where(condition, a, b), tree_if_true, tree_if_false)
 
 
 def make_zeros_like_output(function: Callable[..., PyTree], *arguments: PyTree) -> PyTree:
-    """Return zeros in the structure of the output of `function`, without a call of it."""
+    """Return zeros with the structure and shapes of the output of `function`, without calling
+    it.
+    """
     zero_maker = lambda leaf: jnp.zeros(leaf.shape, leaf.dtype)
     return jax.tree.map(zero_maker, jax.eval_shape(function, *arguments))
 
 
 def select_tree_rows(tree: PyTree, row_indices: Any) -> PyTree:
-    """Return selected rows of arrays with a leading axis, as NumPy arrays."""
+    """Select elements along the leading axis of all arrays in a tree, and return NumPy arrays."""
     return jax.tree.map(lambda x: np.asarray(x)[row_indices], tree)
 
 
 def concatenate_tree_rows(*trees: PyTree) -> PyTree:
-    """Return trees of arrays, concatenated along the leading axis, as NumPy arrays."""
+    """Concatenate trees of arrays along their leading axes, and return NumPy arrays."""
     return jax.tree.map(
         lambda *leaf_parts: np.concatenate([np.asarray(leaf_rows) for leaf_rows in leaf_parts]),
         *trees,
@@ -158,11 +163,10 @@ def concatenate_tree_rows(*trees: PyTree) -> PyTree:
 
 
 def map_in_batches(function: Callable, batch_sizes: tuple[int, ...], *trees: PyTree) -> PyTree:
-    """Return `function` of trees with a leading axis, called in batches padded to one of
-    `batch_sizes`.
+    """Apply `function` to trees of arrays in batches along the leading axis, and join the results.
 
-    Padding limits the number of shapes for which the function is compiled. Inputs and outputs are
-    JAX arrays.
+    Each batch is padded to one of `batch_sizes`, which limits the number of shapes for which the
+    function is compiled. Inputs and outputs are JAX arrays.
     """
     if len(jax.tree.leaves(trees)[0]) in batch_sizes:
         return function(*jax.device_put(trees))
@@ -173,10 +177,10 @@ def map_in_batches(function: Callable, batch_sizes: tuple[int, ...], *trees: PyT
 def map_in_numpy_batches(
     function: Callable, batch_sizes: tuple[int, ...], *trees: PyTree
 ) -> PyTree:
-    """Return the result of `map_in_batches` for a compiled function, with NumPy arrays as input and
-    output.
+    """Apply a compiled function in batches as `map_in_batches` does, to NumPy arrays.
 
-    For small batches this takes a fraction of the time of `map_in_batches`.
+    The outputs are also NumPy arrays. For small batches, this function takes a fraction of the time
+    of `map_in_batches`.
     """
     n_rows, batch_results = len(jax.tree.leaves(trees)[0]), []
     first_row = 0
@@ -191,10 +195,10 @@ def map_in_numpy_batches(
 
 
 def _choose_batch_size(n_rows: int, batch_sizes: tuple[int, ...]) -> int:
-    """Return the batch size for a number of rows.
+    """Return the size of the next batch for a number of remaining elements.
 
-    The batch size is the smallest of `batch_sizes` that holds all rows. The next smaller size is
-    chosen if several batches of that size have at most half as many elements.
+    It is the smallest of `batch_sizes` that can contain all elements. The next smaller size is used
+    if several batches of that size have at most half as many elements in total.
     """
     i = min(bisect.bisect_left(batch_sizes, n_rows), len(batch_sizes) - 1)
     if i > 0 and -(-n_rows // batch_sizes[i - 1]) * batch_sizes[i - 1] <= batch_sizes[i] // 2:

@@ -1,20 +1,21 @@
-"""Minimum of a margin within a solver step, from the margin's values and rates at both ends."""
+"""Minimum of a margin within a solver step, computed from its values and rates at both ends."""
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
 MINIMUM_LOCATION_TOLERANCE = 1e-6
-"""Accuracy of a minimum's location, in lengths of the step that contains the minimum. The value is
-chosen because the error of the minimum is the square of this number."""
+"""Accuracy of the location of a minimum, as a fraction of the solver step. The value is chosen
+because the error of the minimum is proportional to the square of the error of its location.
+"""
 
 
 def evaluate_cubic(
     x: Array, value_at_0: Array, rate_at_0: Array, value_at_1: Array, rate_at_1: Array
 ) -> Array:
-    """Return the cubic Hermite interpolant at `x` in [0, 1].
+    """Return the value at `x`, between 0 and 1, of the cubic Hermite interpolant.
 
-    The rates at 0 and 1 are multiplied by the step length.
+    The rates at 0 and 1 must be multiplied by the length of the solver step.
     """
     return (
         (1 + 2 * x) * (1 - x) ** 2 * value_at_0
@@ -28,10 +29,9 @@ def evaluate_cubic(
 def find_cubic_minimum(
     value_at_0: Array, rate_at_0: Array, value_at_1: Array, rate_at_1: Array
 ) -> tuple[Array, Array]:
-    """Return the location in (0, 1) and the value of the interior minimum of the cubic Hermite
-    interpolant.
+    """Return the location and the value of the interior minimum of the cubic Hermite interpolant.
 
-    The value is infinite if the cubic has no interior minimum.
+    The location is between 0 and 1. The value is infinite if there is no interior minimum.
     """
     quadratic_coefficient = 3.0 * (2.0 * value_at_0 + rate_at_0 - 2.0 * value_at_1 + rate_at_1)
     linear_coefficient = 2.0 * (-3.0 * value_at_0 - 2.0 * rate_at_0 + 3.0 * value_at_1 - rate_at_1)

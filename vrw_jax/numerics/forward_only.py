@@ -1,4 +1,4 @@
-"""Error message for reverse mode through a loop of unknown length."""
+"""Error message for reverse-mode differentiation of a loop of unknown length."""
 
 from typing import Any
 
@@ -9,11 +9,11 @@ from jax.interpreters import ad, batching, mlir
 from jaxtyping import PyTree
 
 _FORWARD_ONLY_PRIMITIVE = Primitive("forward_only")
-"""The identity, whose transpose raises an error."""
+"""Identity operation whose transpose raises an error."""
 
 
 def _raise_reverse_mode_error(_cotangent: Any, _value: Any, *, name: str) -> None:
-    """Raise the ValueError that explains the missing reverse mode."""
+    """Raise a ValueError that explains why reverse mode is not available."""
     raise ValueError(
         f"hybrid.{name} has no derivative in reverse mode, since the number of its solver steps "
         "is not known beforehand: use forward mode, jax.jacfwd or jax.jvp, instead of jax.grad, "
@@ -29,8 +29,10 @@ mlir.register_lowering(_FORWARD_ONLY_PRIMITIVE, lambda _context, x, *, name: [x]
 
 
 def forbid_reverse_mode(name: str, function_result: PyTree) -> PyTree:
-    """Return `function_result`, the results of `hybrid.<name>`, marked so that reverse mode raises
-    an error.
+    """Return `function_result` unchanged, marked so that reverse-mode differentiation raises an
+    error.
+
+    `name` is the function in `hybrid` that computed the result.
     """
 
     def mark_leaf(leaf: Any) -> Any:

@@ -1,4 +1,4 @@
-"""Numerical options of the event-driven step."""
+"""Numerical options of the event-driven walking step."""
 
 import dataclasses
 import functools
@@ -23,23 +23,25 @@ SolverName = Literal[
     "Dopri8", "Tsit5", "Dopri5", "Bosh3", "Heun", "Midpoint", "Ralston",
     "Kvaerno3", "Kvaerno4", "Kvaerno5", "ImplicitEuler",
 ]  # fmt: skip
-"""Names of diffrax's Runge-Kutta solvers with an error estimate: explicit ones, then implicit
+"""Names of diffrax's Runge-Kutta solvers with an error estimate: first explicit, then implicit
 ones.
 """
 SOLVER_NAMES: tuple[str, ...] = get_args(SolverName)
 
 EngineName = Literal["auto", "lanes", "diffrax"]
-"""Names of the engines that integrate the steps of wheels with compliant legs."""
+"""Names of the engines that integrate walking steps of wheels with compliant legs."""
 
 TIGHTENING_FLOOR_IN_EPS = 90.0
-"""Smallest tightened tolerance, in units of round-off (2e-14 in float64).
+"""Smallest tightened tolerance in units of round-off; it is 2e-14 in float64.
 
-The value is chosen because a walk of many steps gains nothing below it."""
+The value is chosen because a walk of many steps gains no accuracy from smaller tolerances.
+"""
 MIN_TOLERANCE_IN_EPS = 4.5
-"""Smallest tolerance allowed in float64, in units of round-off.
+"""Smallest tolerance that is allowed in float64, in units of round-off.
 
 The value is chosen because a walk of few steps that grazes a guard gains accuracy down to this
-tolerance."""
+tolerance.
+"""
 
 
 REAL_OPTION_NAMES = ("rtol", "atol", "derivative_tightening", "max_phase_time", "dt0")
@@ -47,12 +49,12 @@ REAL_OPTION_NAMES = ("rtol", "atol", "derivative_tightening", "max_phase_time", 
 
 
 def _make_positive_field(option_name: str, default_value: float) -> Any:
-    """Return the dataclass field of an option that must be a positive number."""
+    """Return a dataclass field for an option that must be a positive number."""
     return eqx.field(converter=functools.partial(check_reals, option_name), default=default_value)
 
 
 def _make_positive_int_field(option_name: str, default_value: int) -> Any:
-    """Return the dataclass field of an option that must be a positive integer."""
+    """Return a dataclass field for an option that must be a positive integer."""
     return eqx.field(
         static=True, converter=functools.partial(check_int, option_name), default=default_value
     )
@@ -64,25 +66,27 @@ def _make_positive_int_field(option_name: str, default_value: int) -> Any:
     monitor_steps="max_margin_search_iterations",
 )
 class StepOptions(AbstractPrintable):
-    """Numerical options of an event-driven step; the tolerances may change without recompiling.
+    """Numerical options of an event-driven walking step. Tolerances may change without
+    recompilation.
 
-    Lengths and times are in the wheel's units, which are SI units for a wheel of Table 1's size.
-    For another wheel `atol`, `max_phase_time` and `dt0` are multiplied by the wheel's units. The
-    unit of length is L_0 / 1 m, and that of time is sqrt((L_0 / 1 m) (9.81 m/s^2 / g)).
+    Lengths and times are in the wheel's own units, which are SI units for the wheel of Table 1 of
+    the paper. For another wheel, `atol`, `max_phase_time` and `dt0` are multiplied by its own
+    units. The unit of length is L_0 / 1 m, and that of time is sqrt((L_0 / 1 m) (9.81 m/s^2 / g)).
 
     - `solver`: one of `SOLVER_NAMES`, diffrax's Runge-Kutta solvers with an error estimate;
-    - `engine`: "diffrax" supports any solver, device and order of derivative; "lanes" is machine
-      code of the same method for explicit solvers on CPUs; "auto" selects "lanes" if it is
+    - `engine`: "diffrax" supports any solver, device and order of derivative; "lanes" runs the same
+      method as machine code, for explicit solvers on CPUs; "auto" selects "lanes" if it is
       available;
     - `rtol`, `atol`: relative and absolute tolerance of each solver step, in m, rad, m/s, rad/s;
     - `derivative_tightening`: factor by which tolerances are divided for derivatives, because
       step-size control ignores derivatives. The error of a derivative is then at most ten times
       that of a value, and at most 300 times with unilateral contact;
-    - `max_phase_time`: limit of the duration of one phase, s;
-    - `max_solver_steps`: limit of attempted solver steps in one phase;
-    - `dt0`: first solver step of each phase, s;
-    - `max_event_iterations`: limit of iterations to locate an event;
-    - `max_margin_search_iterations`: limit of secant steps to the minimum of a margin.
+    - `max_phase_time`: largest duration of one phase, s;
+    - `max_solver_steps`: largest number of attempted solver steps in one phase;
+    - `dt0`: size of the first solver step in each phase, s;
+    - `max_event_iterations`: largest number of iterations that locate an event;
+    - `max_margin_search_iterations`: largest number of secant iterations that locate the minimum of
+      a margin.
 
     Examples:
         >>> options = vrw.StepOptions(rtol=1e-8, atol=1e-8)
@@ -140,26 +144,30 @@ class StepOptions(AbstractPrintable):
         ]
 
     def with_engine(self, engine: EngineName) -> "StepOptions":
-        """Return these options with another engine. "auto" leaves the engine unchanged."""
+        """Return these options with another engine. The value "auto" leaves the engine
+        unchanged.
+        """
         check_choice("engine", engine, get_args(EngineName))
         return self if engine == "auto" else dataclasses.replace(self, engine=engine)
 
     @classmethod
     def tight(cls) -> "StepOptions":
-        """Return options with the tightest useful tolerances in float64, for steps accurate to
-        about 1e-12.
+        """Return options with the tightest useful tolerances in float64.
+
+        Walking steps are then accurate to about 1e-12.
         """
         return cls(rtol=1e-13, atol=1e-13)
 
     def with_derivative_tolerances(self) -> "StepOptions":
-        """Return these options with tolerances tightened for derivatives, but not below
+        """Return these options with tolerances for derivatives, which are tighter but not below
         round-off.
         """
         return self.with_tightened_tolerances(self.derivative_tightening)
 
     def with_tightened_tolerances(self, tightening_factor: Scalar | float) -> "StepOptions":
-        """Return these options with tolerances divided by `tightening_factor`, but not below
-        round-off.
+        """Return these options with tolerances divided by `tightening_factor`.
+
+        The divided tolerances are not below round-off.
         """
         present_tolerances = self.rtol, self.atol
         return eqx.tree_at(
@@ -169,7 +177,7 @@ class StepOptions(AbstractPrintable):
         )
 
     def require_scalar_options(self) -> None:
-        """Raise a `ValueError` if an option contains several numbers."""
+        """Raise a `ValueError` if an option is an array with an axis."""
         for option_name in REAL_OPTION_NAMES:
             if option_shape := getattr(getattr(self, option_name), "shape", ()):
                 raise ValueError(
@@ -179,11 +187,12 @@ class StepOptions(AbstractPrintable):
                 )
 
     def check_tolerances(self, float_dtype: np.dtype) -> None:
-        """Raise a `ValueError` if `rtol` is below the resolution of the floating type
+        """Raise a `ValueError` if `rtol` is below the resolution of the floating-point type
         `float_dtype`.
 
-        `atol` has no such limit, because states may be as small as their units make them. 64-bit
-        arrays that were made before `jax_enable_x64` was switched off count as 32-bit arrays.
+        `atol` has no such limit, because states may have any magnitude in their units. If
+        `jax_enable_x64` is off, 64-bit arrays that were created earlier are treated as 32-bit
+        arrays.
         """
         float_dtype = jax.dtypes.canonicalize_dtype(float_dtype)
         min_rtol = (
@@ -208,7 +217,7 @@ class StepOptions(AbstractPrintable):
 def _tighten_tolerances(
     tolerances: tuple[Scalar, ...], tightening_factor: Scalar | float
 ) -> tuple[Scalar, ...]:
-    """Return tolerances divided by a factor, but not below round-off."""
+    """Return tolerances divided by `tightening_factor`, but not below round-off."""
     min_tolerance = TIGHTENING_FLOOR_IN_EPS * jnp.finfo(tolerances[0].dtype).eps
     return tuple(
         jnp.maximum(x / tightening_factor, jnp.minimum(min_tolerance, x)) for x in tolerances

@@ -1,12 +1,13 @@
-"""Status codes with one sentence each, stored as an integer for each batch element."""
+"""Status codes: integers for batch elements, each with a sentence that explains it."""
 
 import enum
 
 
 class StatusCode(enum.IntEnum):
-    """Base class of status codes, whose members are defined as `NAME = number, "sentence"`.
+    """Base class for enumerations of status codes. Members are defined as `NAME = number,
+    "sentence"`.
 
-    The number is the value of the member, and the sentence is its attribute `meaning`.
+    The number is the member's value, and the sentence is the member's attribute `meaning`.
     """
 
     meaning: str

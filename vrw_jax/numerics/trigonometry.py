@@ -1,4 +1,4 @@
-"""Sine and cosine as polynomials, which all engines evaluate identically."""
+"""Sine and cosine as polynomials that all engines evaluate identically."""
 
 import math
 from types import ModuleType
@@ -12,17 +12,18 @@ from vrw_jax.numerics.types import Elementwise
 from vrw_jax.runtime import with_default_jax_settings
 
 MAX_EXACT_ANGLE = 1.6
-"""Largest angle for which the polynomials are accurate to round-off, rad. It is chosen because
-it exceeds pi/2, the limit of the angle of a valid start.
+"""Largest angle for which the polynomials are accurate to round-off, rad. The value is chosen
+because it exceeds pi/2, the largest angle of a valid start.
 """
 
 
 def _compute_economized_coefficients(odd_offset: int) -> tuple[float, ...]:
     """Return nine coefficients of a polynomial in the squared angle.
 
-    The polynomial approximates the cosine if `odd_offset` is 0, and sine over angle if it is 1. The
-    coefficients are those of Taylor's series, whose last terms are replaced by Chebyshev
-    polynomials of lower degree. With this replacement, three terms fewer give the same error.
+    The polynomial approximates the cosine if `odd_offset` is 0, and the sine divided by the angle
+    if it is 1. The coefficients are those of the Taylor series, in which Chebyshev polynomials of
+    lower degree replace the last terms. The polynomial is as accurate as a Taylor series with three
+    more terms.
     """
     factorial_of_order, squared_angle_limit = math.factorial, MAX_EXACT_ANGLE * MAX_EXACT_ANGLE
     series_coefficients = [
@@ -59,11 +60,11 @@ _SINE_COEFFICIENTS, _COSINE_COEFFICIENTS = (
 
 
 def compute_sine_cosine(angle: Elementwise) -> tuple[Elementwise, Elementwise]:
-    """Return sine and cosine of an angle in rad, computed as polynomials.
+    """Return the sine and the cosine of an angle in rad, computed with polynomials.
 
-    They are accurate to round-off for |angle| < 1.6 rad, and to 1e-13 at 1.8 rad. JAX's functions
+    Both are accurate to round-off for |angle| < 1.6 rad, and to 1e-13 at 1.8 rad. JAX's functions
     are scalar calls in float64 on CPU, while the polynomials are fused and vectorized. For NumPy
-    arrays and Python numbers the results are NumPy numbers, in a tenth of the time of single JAX
+    arrays and Python numbers the results are NumPy numbers, computed in a tenth of the time of JAX
     calls.
     """
     is_concrete = isinstance(angle, (float, np.ndarray))
@@ -73,7 +74,7 @@ def compute_sine_cosine(angle: Elementwise) -> tuple[Elementwise, Elementwise]:
 
 
 def _evaluate_sine_and_cosine(array_module: ModuleType, angle: Any) -> tuple[Any, Any]:
-    """Return sine and cosine as polynomials, evaluated by the module `array_module` (NumPy or
+    """Evaluate the polynomials for sine and cosine with the module `array_module` (NumPy or
     JAX).
     """
     squared_angle = angle * angle
@@ -98,7 +99,7 @@ _differentiable_sine_cosine = jax.custom_jvp(
 @_differentiable_sine_cosine.defjvp
 @with_default_jax_settings
 def _sine_cosine_jvp(primals: tuple, tangents: tuple) -> tuple:
-    """Return (sine, cosine) and the tangents of both."""
+    """Return (sine, cosine) and the tangents of sine and cosine."""
     sin, cos = _differentiable_sine_cosine(*primals)
     (angle_tangent,) = tangents
     return (sin, cos), (cos * angle_tangent, -sin * angle_tangent)

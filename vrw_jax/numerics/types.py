@@ -1,4 +1,4 @@
-"""Types of quantities in signatures: a scalar, an array of any axes, a tuple of components."""
+"""Types of quantities in signatures: scalars, arrays with any axes, and tuples of components."""
 
 from typing import TYPE_CHECKING
 
@@ -10,14 +10,15 @@ if TYPE_CHECKING:
     Elementwise = Array
 else:
     Elementwise = Inexact[Array, "..."] | Inexact[np.ndarray, "..."] | float
-"""Quantity with any leading axes, because formulas below `scans` act element by element.
+"""Quantity with any leading axes, because formulas in lower layers than `scans` act element by
+element.
 
-Complex numbers are allowed too, because a complex-step derivative needs them.
+Complex numbers are also allowed, because complex-step derivatives need them.
 """
 
 Vector = tuple[Elementwise, ...]
-"""Tuple with one array for each component."""
+"""Tuple with one array per component."""
 
 
 RealInput = float | Array | np.ndarray
-"""Real number as a caller gives it, or an array of numbers."""
+"""Real number in any form that users may pass, or an array of numbers."""
