@@ -1,4 +1,4 @@
-"""Process start, lazily imported libraries, disk cache and compiled programs."""
+"""Start of a process, lazy import of libraries, disk cache and compiled programs."""
 
 from vrw_jax.runtime import disk_cache
 from vrw_jax.runtime.cached_programs import (

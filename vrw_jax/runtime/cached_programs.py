@@ -1,10 +1,10 @@
-"""Traced functions saved beside JAX's compilation cache, so that later processes need not trace
+"""Traced functions saved next to JAX's compilation cache, so that later processes need not trace
 them.
 
-JAX's persistent cache avoids compilation but not tracing. Tracing a limit cycle with derivatives
+JAX's persistent cache avoids compilation but not tracing. To trace a limit cycle with derivatives
 takes longer than a scan of thousands of samples. If the persistent cache is on, its folder also
 contains traces. The key of a trace contains everything on which the trace depends, including the
-library's source.
+library's source code.
 """
 
 import hashlib
@@ -29,12 +29,11 @@ def compile_exported_function(
     trace_key_settings: object,
     target_device: jax.Device,
 ) -> Callable:
-    """Return `traced_function`, compiled on `target_device` for arguments with the shapes of
-    `example_arguments`.
+    """Compile `traced_function` on `target_device` for the shapes of `example_arguments`.
 
     The `repr` of `trace_key_settings` identifies the values in the function's closure. The program
-    is always compiled from the exported trace, saved or not, so that all runs compile the same
-    program.
+    is always compiled from the exported trace, whether it was loaded from disk or not. All runs
+    therefore compile the same program.
     """
     exported_trace = _load_or_export_trace(traced_function, example_arguments, trace_key_settings)
     device_sharding = SingleDeviceSharding(target_device)
@@ -51,11 +50,12 @@ def compile_exported_function(
 
 
 def call_through_saved_trace(traced_function: Callable, trace_key_settings: object) -> Callable:
-    """Return a function that calls `traced_function` through its saved trace if there is one.
+    """Return a function that calls `traced_function` through its saved trace.
 
-    The returned function is called while a program is traced. `traced_function` must not be mapped
-    or differentiated from outside. As with `compile_exported_function`, first and later runs use
-    the exported trace.
+    If no trace exists yet, it is exported and saved. Without a cache folder, `traced_function` is
+    called directly. The returned function is called while a program is traced, and it must not be
+    mapped or differentiated. As with `compile_exported_function`, first and later runs use the
+    exported trace.
     """
 
     def evaluate_saved_trace(*arguments: Any) -> Any:
@@ -76,7 +76,8 @@ def compile_cached_lane_program(
     trace_key_settings: Any,
     register_limits: simd.RegisterLimits = simd.DEFAULT_REGISTER_LIMITS,
 ) -> Callable[[Sequence[Any], Sequence[np.ndarray]], list[np.ndarray]]:
-    """Return `simd.compile_lane_program` of a function of this library, saved in the disk cache.
+    """Compile a function with `simd.compile_lane_program`, and save the machine code in the disk
+    cache.
 
     `trace_key_settings` has the same meaning as for `compile_exported_function`.
     """
@@ -92,7 +93,7 @@ def compile_cached_lane_function(
     trace_key_settings: object,
     register_limits: simd.RegisterLimits = simd.DEFAULT_REGISTER_LIMITS,
 ) -> Callable:
-    """Return `simd.compile_lane_function` of a function of this library, saved in the disk
+    """Compile a function with `simd.compile_lane_function`, and save the machine code in the disk
     cache.
     """
     return simd.compile_lane_function(
@@ -107,7 +108,7 @@ def compile_cached_lane_function(
 def _load_or_export_trace(
     traced_function: Callable, example_arguments: tuple, trace_key_settings: object
 ) -> export.Exported:
-    """Return the exported trace of a function, as a function of the flat arguments.
+    """Return the exported trace of a function, as a function of the flattened arguments.
 
     The trace is loaded from disk if a record exists. Otherwise the function is traced for the
     shapes of `example_arguments`.
@@ -166,7 +167,7 @@ def _load_or_export_trace(
 
 
 def _find_machine_code_names(traced_program: Any) -> set[str]:
-    """Return the names of the machine code that a traced program calls."""
+    """Return the names of all machine-code functions that a traced program calls."""
     traced_program = getattr(traced_program, "jaxpr", traced_program)
     machine_code_names = {
         inner_equation.params["code"].code_name

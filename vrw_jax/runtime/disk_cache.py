@@ -1,8 +1,8 @@
-"""Records of traces and machine code on disk, beside JAX's compiled code.
+"""Records of traces and machine code on disk, next to JAX's compiled code.
 
 A record is one file, which begins with a digest of its name and its content. The name identifies
-everything on which the content depends. The content is executed, so records are used only from a
-folder that no other user can write, unless the user has declared the folder trusted.
+everything on which the content depends. The content is executed. Therefore records are read only
+from a folder that no other user can write to, unless the user has declared the folder trusted.
 """
 
 import contextlib
@@ -21,8 +21,9 @@ from typing import Any
 import jax
 
 TRUST_SHARED_CACHE_VARIABLE = "VRW_TRUST_SHARED_CACHE"
-"""Environment variable that allows a cache folder that other users can write, in child processes
-too."""
+"""Environment variable that allows a cache folder to which other users can write, also in child
+processes.
+"""
 
 TRACE_LIBRARY_NAMES = ("jax", "jaxlib", "numpy", "equinox", "diffrax", "optax", "llvmlite")
 """Libraries whose versions affect a trace."""
@@ -31,14 +32,14 @@ CACHE_RECORD_SUFFIX = ".record"
 """Suffix of a record's file name."""
 
 _issued_warning_kinds: set[str] = set()
-"""Kinds of warnings that this process has issued."""
+"""Kinds of warnings that this process has already issued."""
 
 
 @functools.cache
 def compute_source_digest() -> str:
-    """Return a digest of the library's source and tableaus.
+    """Return a digest of the library's source code and Butcher tableaus.
 
-    A change of source or tableaus may change digits of results.
+    A change in either may change digits of results.
     """
     source_hasher = hashlib.sha256()
     package_folder = Path(__file__).parents[1]
@@ -50,7 +51,7 @@ def compute_source_digest() -> str:
 
 @functools.cache
 def _list_library_versions() -> tuple[str, ...]:
-    """Return the versions of Python and of the installed `TRACE_LIBRARY_NAMES`."""
+    """Return the versions of Python and of the installed libraries in `TRACE_LIBRARY_NAMES`."""
     version_texts = [f"python {sys.version_info[0]}.{sys.version_info[1]}"]
     for library_name in TRACE_LIBRARY_NAMES:
         with contextlib.suppress(importlib.metadata.PackageNotFoundError):
@@ -59,7 +60,9 @@ def _list_library_versions() -> tuple[str, ...]:
 
 
 def describe_trace_environment() -> tuple[object, ...]:
-    """Return the settings on which every trace depends: source, versions and number formats."""
+    """Return the settings on which every trace depends: source code, versions and number
+    formats.
+    """
     jax_config: Any = jax.config
     return (
         compute_source_digest(),
@@ -86,9 +89,9 @@ def find_cache_folder() -> Any:
 
 
 def explain_folder_distrust(code_folder: Path) -> str:
-    """Return the reason why code in a folder is not executed, with a remedy.
+    """Return the reason why code in a folder must not be executed, with a remedy.
 
-    The text is empty if the code is executed.
+    The text is empty if the code may be executed.
     """
     try:
         distrust_reason = _explain_file_distrust(code_folder.stat())
@@ -105,14 +108,14 @@ def explain_folder_distrust(code_folder: Path) -> str:
 
 
 def has_shared_cache_trust() -> bool:
-    """Return whether the user trusts everybody who can write the cache."""
+    """Return whether the user trusts everyone who can write to the cache folder."""
     return os.environ.get(TRUST_SHARED_CACHE_VARIABLE, "") not in ("", "0")
 
 
 def create_cache_folder(code_folder: Path) -> None:
     """Create a folder for code, and its parents.
 
-    Only the user can access the folder, unless caches are shared.
+    Only the user can access the folder, unless the user trusts a shared cache.
     """
     for missing_folder in reversed([code_folder, *code_folder.parents]):
         if not missing_folder.exists():
@@ -152,7 +155,7 @@ def load_bytes(record_name: str) -> bytes | None:
 
 
 def warn_of_unusable_record(record_description: str) -> None:
-    """Issue a warning, once per process, that a record of the cache cannot be used."""
+    """Issue a warning, once per process, that a cache record is unusable."""
     _warn_once(
         "record",
         f"the cached code {record_description}: it is compiled again, as is any other such file.",
@@ -160,9 +163,9 @@ def warn_of_unusable_record(record_description: str) -> None:
 
 
 def save_bytes(record_name: str, record_content: bytes) -> None:
-    """Write a record atomically: into a temporary file, which is synchronized and renamed.
+    """Write a record atomically: write a temporary file, synchronize it to disk, and rename it.
 
-    If the cache cannot be written, no error is raised.
+    If the cache folder is not writable, no error is raised.
     """
     if not find_cache_folder():
         return
@@ -188,14 +191,15 @@ def save_bytes(record_name: str, record_content: bytes) -> None:
 
 
 def _compute_record_digest(record_name: str, record_content: bytes) -> bytes:
-    """Return the digest of the name and the content of a record."""
+    """Return the digest of a record's name and content."""
     return hashlib.sha256(record_name.encode() + b"\n" + record_content).digest()
 
 
 def _explain_file_distrust(file_stat_result: os.stat_result) -> str:
     """Return the reason why another user may have written a file.
 
-    The text is empty if no other user can have written the file, or if all users are trusted.
+    The text is empty if no other user can have written the file, or if the user trusts a shared
+    cache.
     """
     if os.name != "posix" or has_shared_cache_trust():
         return ""
@@ -208,7 +212,7 @@ def _explain_file_distrust(file_stat_result: os.stat_result) -> str:
 
 
 def _warn_once(warning_kind: str, warning_sentence: str) -> None:
-    """Issue a warning unless this process has issued a warning of the same kind."""
+    """Issue a warning, unless this process has already issued a warning of the same kind."""
     if warning_kind not in _issued_warning_kinds:
         _issued_warning_kinds.add(warning_kind)
         warnings.warn(warning_sentence, stacklevel=3)

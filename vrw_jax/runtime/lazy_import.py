@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 
 class _LazyLibrary:
-    """Library that is imported when one of its attributes is first read."""
+    """Proxy for a library, which is imported when one of its attributes is first read."""
 
     def __init__(self, library_name: str) -> None:
         self._library_name = library_name
@@ -15,7 +15,9 @@ class _LazyLibrary:
 
 
 def lazy_import(library_name: str) -> Any:
-    """Return a library that is imported when one of its attributes is first read."""
+    """Return a proxy for a library. The library is imported when one of its attributes is first
+    read.
+    """
     return _LazyLibrary(library_name)
 
 

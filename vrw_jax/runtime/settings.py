@@ -1,4 +1,4 @@
-"""Default settings of JAX for this library, for callers that have changed them."""
+"""JAX settings that this library needs, for callers who have changed the default settings."""
 
 import functools
 from collections.abc import Callable
@@ -10,12 +10,12 @@ FunctionType = TypeVar("FunctionType", bound=Callable[..., Any])
 
 
 def with_default_jax_settings(function: FunctionType) -> FunctionType:
-    """Return `function` computed with JAX's default settings, if the process has other settings.
+    """Return a function that runs `function` with JAX's default settings.
 
     `jax_disable_jit` and strict promotion of ranks and dtypes help to find faults in the caller's
-    code. But this library calls machine code from compiled programs only, and its formulas accept
-    numbers, batches and derivatives of any rank. The settings of the caller are restored when
-    `function` returns.
+    code. But only compiled programs can call this library's machine code, and its formulas accept
+    numbers, batches and derivatives of any rank. The caller's settings are restored when `function`
+    returns.
     """
 
     @functools.wraps(function)

@@ -1,4 +1,6 @@
-"""Start-up configuration of a process: 64-bit numbers, a compilation cache, fast compilation."""
+"""Start-up configuration of a process: 64-bit numbers, a compilation cache, and fast
+compilation.
+"""
 
 import contextlib
 import os
@@ -12,22 +14,22 @@ from vrw_jax.validation import check_bool, check_type
 
 
 def start_jax(cache: str | Path | None = None, *, trust_shared: bool = False) -> None:
-    """Set 64-bit numbers, a cache of compiled code, and XLA's faster compilation on CPUs.
+    """Configure JAX: 64-bit numbers, a cache for compiled code, and faster XLA compilation on CPUs.
 
-    Call this function before the first array is created. The library works without this call, but
-    with it processes start in a fraction of the time. The default of `cache` is the folder in
+    Call this function before the first array is created. The library also works without this call,
+    but processes then take much longer to start. The default of `cache` is the folder in
     JAX_COMPILATION_CACHE_DIR, or else a folder in the user's cache folder.
 
     Args:
-        cache: folder of compiled code; `~` is the user's home folder.
-        trust_shared: whether to use a folder that belongs to another user or that others can
-            write. Everyone who can write there can then run code as you.
+        cache: folder for compiled code; `~` means the user's home folder.
+        trust_shared: whether to use a folder that belongs to another user, or to which other users
+            can write. Everyone who can write to the folder can then run code as you.
 
     Returns:
         Nothing.
 
     Raises:
-        TypeError: if `cache` is no path.
+        TypeError: if `cache` is not a path.
         NotADirectoryError: if `cache` is a file.
         PermissionError: if another user may have put code into the folder.
 
@@ -58,8 +60,9 @@ def start_jax(cache: str | Path | None = None, *, trust_shared: bool = False) ->
 
 
 def _require_private_cache_folder() -> None:
-    """Create the cache folder for the user alone, and raise an error if other users can write
-    it.
+    """Create the cache folder for the user alone.
+
+    Raise an error if other users can write to the folder.
     """
     jax_cache_folder = jax.config.jax_compilation_cache_dir  # type: ignore[attr-defined]
     if not jax_cache_folder or "://" in jax_cache_folder:
@@ -73,11 +76,11 @@ def _require_private_cache_folder() -> None:
 
 
 def make_fusion_emitter_options(are_emitters_enabled: bool) -> dict[str, str | bool]:
-    """Return the options of `jax.jit` that switch XLA's fusion emitters on or off on a CPU.
+    """Return options for `jax.jit` that switch XLA's fusion emitters on or off on a CPU.
 
-    Without fusion emitters, XLA compiles in half to two thirds of the time. The code is as fast or,
-    for events with unilateral contact, slower by a seventh. Programs whose digits must not depend
-    on the process always set the option.
+    Without fusion emitters, XLA compiles in half to two thirds of the time. The compiled code is as
+    fast, except for events with unilateral contact, where it is slower by a seventh. Programs whose
+    digits must not depend on the process always set this option.
     """
     emitters_flag = _accepts_fusion_emitters_flag() and jax.default_backend() == "cpu"
     return {_FUSION_EMITTERS_FLAG: are_emitters_enabled} if emitters_flag else {}
@@ -87,7 +90,7 @@ _FUSION_EMITTERS_FLAG = "xla_cpu_use_fusion_emitters"
 
 
 def _accepts_fusion_emitters_flag() -> bool:
-    """Return whether this version of XLA accepts the flag of fusion emitters.
+    """Return whether this version of XLA accepts the flag for fusion emitters.
 
     Other versions may abort the process.
     """
