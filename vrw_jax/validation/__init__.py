@@ -1,4 +1,4 @@
-"""Checks of arguments, whose messages state what was given, what is allowed and what to do."""
+"""Checks of arguments. Error messages state the given value, the allowed values and the remedy."""
 
 from vrw_jax.validation.checks import (
     check_bool,

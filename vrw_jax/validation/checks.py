@@ -1,7 +1,7 @@
 """Validation of the arguments of all public functions.
 
-A message states the given value, the allowed values and the remedy. A value that is not a number
-raises a TypeError, and a number out of range raises a ValueError.
+An error message states the given value, the allowed values and the remedy. A value that is not a
+number raises a TypeError, and a number out of range raises a ValueError.
 """
 
 import difflib
@@ -18,14 +18,14 @@ from jax._src import xla_bridge
 from jaxtyping import Array
 
 MAX_INT64 = np.iinfo(np.int64).max
-"""Largest accepted integer, chosen because arrays use 64-bit indices."""
+"""Largest integer that is accepted, chosen because arrays use 64-bit indices."""
 
 _process_fork_state = {"is_forked": False}
-"""Flag that states whether this process was forked after JAX had made an array."""
+"""Flag that states whether this process was forked after JAX had been initialized."""
 
 
 def _mark_process_as_forked() -> None:
-    """Record in a child process, made by fork, whether JAX's threads are missing."""
+    """Record in a forked child process whether JAX's threads are missing."""
     _process_fork_state["is_forked"] |= bool(xla_bridge.backends_are_initialized())
 
 
@@ -34,7 +34,9 @@ if hasattr(os, "register_at_fork"):  # Windows has no fork.
 
 
 def raise_if_process_forked() -> None:
-    """Raise a RuntimeError in a forked process, in which JAX would wait for missing threads."""
+    """Raise a RuntimeError in a forked process, where JAX would wait forever for missing
+    threads.
+    """
     if _process_fork_state["is_forked"]:
         raise RuntimeError(
             "this process was forked after JAX had made an array, and JAX's threads are not copied,"
@@ -44,15 +46,15 @@ def raise_if_process_forked() -> None:
 
 
 def format_name_suggestion(given_name: object, allowed_names: Iterable[str]) -> str:
-    """Return ' (did you mean ...?)' if an allowed name is similar to the given one, otherwise
-    ''.
+    """Return " (did you mean ...?)" with the most similar allowed name, or "" if no name is
+    similar.
     """
     similar_names = difflib.get_close_matches(str(given_name), list(allowed_names), n=1, cutoff=0.5)
     return f" (did you mean '{similar_names[0]}'?)" if similar_names else ""
 
 
 def require_known_name(given_name: Any, allowed_names: Sequence[str], name_kind: str) -> None:
-    """Raise a ValueError if a name is not among the allowed names."""
+    """Raise a ValueError if a name is not one of the allowed names."""
     if not isinstance(given_name, str) or given_name not in allowed_names:
         allowed_names_text = ", ".join(allowed_names)
         raise ValueError(
@@ -63,7 +65,10 @@ def require_known_name(given_name: Any, allowed_names: Sequence[str], name_kind:
 
 
 def format_value(given_value: object) -> str:
-    """Return the text of a value for a message: its repr if that is short, otherwise its type."""
+    """Return the text of a value for an error message.
+
+    The text is the value's repr if that is short, and else the value's type.
+    """
     if isinstance(given_value, jax.Array | np.ndarray) and np.ndim(given_value):
         return f"an array of shape {np.shape(given_value)}"
     try:
@@ -81,7 +86,9 @@ def format_value(given_value: object) -> str:
 
 
 def _is_single_number(given_value: object) -> bool:
-    """Return whether a value is one real number. True and False do not count as numbers."""
+    """Return whether a value is a single real number. True and False are not numbers in this
+    sense.
+    """
     if isinstance(given_value, int) and not isinstance(given_value, bool):
         return True
     dtype_kind = (
@@ -98,9 +105,9 @@ def _is_single_number(given_value: object) -> bool:
 def check_int(
     argument_name: str, given_value: Any, min_value: int = 1, limit_reason: str = ""
 ) -> int:
-    """Return an integer of at least `min_value`, or raise an error.
+    """Return the given integer. Raise an error if it is not an integer of at least `min_value`.
 
-    The clause `limit_reason` explains the limit in the message.
+    The clause `limit_reason` explains the limit in the error message.
     """
     raise_if_process_forked()
     is_single_number = _is_single_number(given_value) and not isinstance(
@@ -126,7 +133,7 @@ def check_int(
 
 
 def check_real(argument_name: str, given_value: Any) -> float:
-    """Return one finite number as a float, or raise an error for any other value."""
+    """Return the given number as a float. Raise an error if it is not one finite real number."""
     raise_if_process_forked()
     if not _is_single_number(given_value) or isinstance(given_value, jax.core.Tracer):
         raise TypeError(
@@ -145,7 +152,7 @@ def check_real(argument_name: str, given_value: Any) -> float:
 
 
 def check_positive(argument_name: str, given_value: Any) -> float:
-    """Return one positive number as a float, or raise an error for any other value."""
+    """Return the given number as a float. Raise an error if it is not one positive number."""
     if not check_real(argument_name, given_value) > 0.0:
         raise ValueError(
             f"{argument_name} is {float(given_value):g}, but it must be positive: give a number "
@@ -155,7 +162,7 @@ def check_positive(argument_name: str, given_value: Any) -> float:
 
 
 def check_range(argument_name: str, given_bounds: Any) -> tuple[float, float]:
-    """Return a lower and an upper bound as floats, or raise an error if the value is no such
+    """Return a lower and an upper bound as floats. Raise an error if the value is not such a
     pair.
     """
     try:
@@ -181,9 +188,10 @@ def check_range(argument_name: str, given_bounds: Any) -> tuple[float, float]:
 def check_reals(
     argument_name: str, given_value: Any, remedy_text: str = "give a number, or an array of them"
 ) -> Array:
-    """Return real numbers of any shape as a strongly typed JAX array, or raise an error.
+    """Return real numbers of any shape as a strongly typed JAX array.
 
-    Python numbers get JAX's default type.
+    Raise an error if the value does not consist of real numbers. Python numbers get JAX's default
+    type.
     """
     raise_if_process_forked()
     try:
@@ -225,8 +233,9 @@ def check_reals(
 def check_numpy_reals(
     argument_name: str, given_value: Any, remedy_text: str = "give a number, or an array of them"
 ) -> np.ndarray:
-    """Return real numbers as a NumPy array, or raise an error. A valid NumPy array is returned
-    unchanged.
+    """Return real numbers as a NumPy array. A valid NumPy array is returned unchanged.
+
+    Raise an error if the value does not consist of real numbers.
     """
     raise_if_process_forked()
     if isinstance(given_value, np.ndarray) and given_value.dtype == jax.dtypes.canonicalize_dtype(
@@ -237,7 +246,7 @@ def check_numpy_reals(
 
 
 def check_bool(argument_name: str, given_value: Any) -> bool:
-    """Return a Python bool, or raise a TypeError for any other value."""
+    """Return the given value as a Python bool. Raise a TypeError if it is not a bool."""
     raise_if_process_forked()
     if not isinstance(given_value, bool | np.bool_):
         raise TypeError(
@@ -248,7 +257,7 @@ def check_bool(argument_name: str, given_value: Any) -> bool:
 
 
 def check_choice(argument_name: str, given_value: Any, allowed_names: Sequence[str]) -> str:
-    """Return a name that is one of `allowed_names`, or raise an error for any other value."""
+    """Return the given name. Raise an error if it is not one of `allowed_names`."""
     raise_if_process_forked()
     if not isinstance(given_value, str):
         raise TypeError(
@@ -268,8 +277,9 @@ def check_choice(argument_name: str, given_value: Any, allowed_names: Sequence[s
 def check_names(
     argument_name: str, given_value: Any, example_text: str = '"dls_fraction"'
 ) -> tuple[str, ...]:
-    """Return several names as a tuple, or raise an error. A single name may be given as a
-    string.
+    """Return the given names as a tuple. A single string is accepted as one name.
+
+    Raise an error if the value is not a string or a collection of strings.
     """
     raise_if_process_forked()
     try:
@@ -287,7 +297,7 @@ def check_names(
 def check_type(
     argument_name: str, given_value: Any, expected_types: type | tuple[type, ...], remedy_text: str
 ) -> None:
-    """Raise a TypeError if a value does not have the expected type."""
+    """Raise a TypeError if a value does not have one of the expected types."""
     raise_if_process_forked()
     if not isinstance(given_value, expected_types):
         expected_type_name = (
@@ -322,7 +332,9 @@ def check_callable(argument_name: str, given_value: Any, function_description: s
 
 
 def has_traced_leaf(*argument_trees: Any) -> bool:
-    """Return whether any leaf of the trees is a tracer, as inside `jit`, `vmap` or `grad`."""
+    """Return whether any leaf of the trees is a tracer, which is the case inside `jit` or
+    `vmap`.
+    """
     return any(
         isinstance(argument_leaf, jax.core.Tracer)
         for argument_leaf in jax.tree.leaves(argument_trees)
@@ -334,8 +346,8 @@ def require_untraced_arguments(
 ) -> None:
     """Raise a TypeError if an argument of the function `function_name` is traced.
 
-    The function needs concrete values, which `jit`, `vmap` and `grad` do not provide.
-    `alternative_text` states what to use instead.
+    The function needs concrete values, which `jit`, `vmap` and `grad` do not provide. The end of
+    the error message, `alternative_text`, states what to use instead.
     """
     raise_if_process_forked()
     if has_traced_leaf(*argument_trees):

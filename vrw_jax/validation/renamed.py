@@ -1,4 +1,4 @@
-"""Public names of version 0.1. Each raises an error that states the present name."""
+"""Public names of version 0.1. Each of them raises an error that states the new name."""
 
 import functools
 from collections.abc import Callable, Mapping
@@ -21,7 +21,7 @@ PRESENT_PACKAGE_NAME_BY_OLD_NAME = {
     "newton_cycle": "solve_fixed_point",
     "steps": "step_batch",
 }
-"""Present names in `vrw_jax` by old name."""
+"""New names in `vrw_jax`, by old name."""
 
 PRESENT_NUMERICS_NAME_BY_OLD_NAME = {
     "AbstractFollowed": "vrw_jax.continuation.AbstractContinuationProblem",
@@ -42,13 +42,13 @@ PRESENT_NUMERICS_NAME_BY_OLD_NAME = {
     "volume_change": "vrw_jax.hybrid.flow_jacobian_determinant",
     "walk": "vrw_jax.hybrid.simulate_hybrid",
 }
-"""Present names of former attributes of `vrw_jax.numerics` by old name."""
+"""New names of former attributes of `vrw_jax.numerics`, by old name."""
 
 
 def raise_for_missing_numerics_name(missing_name: str) -> Any:
-    """Raise the AttributeError for a name that `vrw_jax.numerics` does not have.
+    """Raise an AttributeError for a name that `vrw_jax.numerics` does not have.
 
-    If the name was renamed, the message states the present name.
+    If the name was changed, the error message states the new name.
     """
     renaming_hint = (
         f": it is called {PRESENT_NUMERICS_NAME_BY_OLD_NAME[missing_name]} now"
@@ -64,8 +64,9 @@ FunctionType = TypeVar("FunctionType", bound=Callable)
 def describe_renamed_attribute(
     module_name: str, attribute_name: str, present_name_by_old_name: Mapping[str, str]
 ) -> str | None:
-    """Return a sentence that states the present name of a renamed attribute, or None for other
-    names.
+    """Return a sentence that states the new name of a renamed attribute.
+
+    Return None if the attribute has not been renamed.
     """
     if attribute_name not in present_name_by_old_name:
         return None
@@ -76,10 +77,10 @@ def describe_renamed_attribute(
 def with_renamed_arguments(
     **present_name_by_old_name: str,
 ) -> Callable[[FunctionType], FunctionType]:
-    """Return a decorator with which old keyword arguments of a function or class raise a TypeError.
+    """Return a decorator for functions and classes whose keyword arguments have been renamed.
 
-    `present_name_by_old_name` maps old names to the present ones. The message states the present
-    name.
+    An old keyword raises a TypeError whose message states the new name. `present_name_by_old_name`
+    maps old names to new names.
     """
 
     def reject_renamed_keywords(callable_name: str, given_keywords: Mapping[str, Any]) -> None:
