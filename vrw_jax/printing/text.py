@@ -1,4 +1,4 @@
-"""Text of results: lines, tables in HTML and Markdown, and symbols as mathtext."""
+"""Text for results: labeled lines, HTML and Markdown tables, and symbols as mathtext."""
 
 import abc
 import enum
@@ -16,7 +16,10 @@ LabelAndText = tuple[str, str]
 
 
 def has_concrete_numbers(result_tree: Any) -> bool:
-    """Return whether all numbers of a result are set and concrete. Inside `jit` they are not."""
+    """Return whether all fields of a result are set and all its numbers are concrete.
+
+    Inside `jit`, numbers are not concrete.
+    """
     concreteness_test = lambda tree_leaf: (
         eqx.is_array_like(tree_leaf) and not isinstance(tree_leaf, int | jax.core.Tracer)
     )
@@ -25,15 +28,15 @@ def has_concrete_numbers(result_tree: Any) -> bool:
 
 
 class AbstractPrintable(eqx.Module):
-    """Base class of results that print as text, and as a table in a notebook."""
+    """Base class for results that are printed as text, and as a table in a notebook."""
 
     @abc.abstractmethod
     def summary_rows(self) -> list[LabelAndText]:
-        """Return pairs (name, text), each of which is printed on one line."""
+        """Return pairs of label and text. Each pair is printed on one line."""
 
     @property
     def printed_heading(self) -> str:
-        """Return the heading of the printed result."""
+        """Return the heading under which the result is printed."""
         return type(self).__name__
 
     def __repr__(self) -> str:
@@ -52,7 +55,7 @@ class AbstractPrintable(eqx.Module):
 
 
 def format_quantity(quantity_value: object, quantity_unit: str) -> str:
-    """Return a number with its unit as text. Several numbers are described by count and range."""
+    """Return a number with its unit as text. An array is described by its size and its range."""
     value_array, quantity_unit = (
         np.asarray(quantity_value),
         "" if quantity_unit == "1" else quantity_unit,
@@ -68,8 +71,8 @@ def format_quantity(quantity_value: object, quantity_unit: str) -> str:
 
 
 def format_outcome_counts(outcomes: Any, status_code_class: type[enum.IntEnum]) -> str:
-    """Return a text with the number of outcomes, the shape of their array, and the count of each
-    outcome.
+    """Return a text that states how often each outcome occurs in an array, with the array's
+    shape.
     """
     n_outcomes, outcome_array_shape = np.size(outcomes), np.shape(outcomes)
     outcome_codes, outcome_counts = np.unique(np.asarray(outcomes), return_counts=True)
@@ -81,18 +84,18 @@ def format_outcome_counts(outcomes: Any, status_code_class: type[enum.IntEnum]) 
 
 
 def map_text_of_elements(element_text_function: Callable[..., str], *element_values: Any) -> Any:
-    """Return the text of one element, or an array with the text of each element of a batch."""
+    """Return the text for one element, or an array of texts with one entry per batch element."""
     return np.vectorize(element_text_function, otypes=[object])(*element_values)[()]
 
 
 def describe_step_ending(status_codes: Any, status_code_class: type[enum.IntEnum]) -> Any:
-    """Return the sentence of a status code, or an array of sentences for a batch."""
+    """Return the sentence that explains a status code, or an array of sentences for a batch."""
     code_describer = lambda code: status_code_class(int(code)).meaning  # type: ignore[attr-defined]
     return map_text_of_elements(code_describer, status_codes)
 
 
 def format_heading_and_rows(heading_text: str, text_rows: Iterable[LabelAndText]) -> str:
-    """Return a heading and indented rows as one text."""
+    """Return a text that consists of a heading and one indented line per row."""
     return "\n".join(
         [heading_text, *(f"  {row_label}: {row_text}" for row_label, row_text in text_rows)]
     )
@@ -101,7 +104,7 @@ def format_heading_and_rows(heading_text: str, text_rows: Iterable[LabelAndText]
 def format_html_table(
     table_title: str, text_rows: Iterable[Sequence[str]], header_cells: Sequence[str] = ()
 ) -> str:
-    """Return rows as an HTML table, in which the first cell of each row is a header."""
+    """Return an HTML table of rows of cells. The first cell of each row is a header."""
     cell_formatter = lambda cell_tag, cell_text: (
         f"<{cell_tag} style='text-align:left'>{escape(cell_text)}</{cell_tag}>"
     )
@@ -122,7 +125,7 @@ def format_html_table(
 def format_markdown_table(
     header_cells: Sequence[str], text_rows: Iterable[Sequence[str]]
 ) -> list[str]:
-    """Return the lines of a Markdown table."""
+    """Return a Markdown table as a list of lines."""
     cell_formatter = lambda cell_text: " " + cell_text.replace("|", r"\|") + " " * bool(cell_text)
     line_formatter = lambda row_cells: "|" + "|".join(map(cell_formatter, row_cells)) + "|"
     return [
@@ -145,14 +148,14 @@ _SYMBOL_TOKEN_PATTERN = re.compile(
 
 
 def format_mathtext(symbol_text: str) -> str:
-    r"""Return a symbol as mathtext: "θ̇⁺" as \dot{\theta}^+, "L1" as L_1."""
+    r"""Convert a symbol to mathtext: "θ̇⁺" to \dot{\theta}^+, "L1" to L_1."""
     return _SYMBOL_TOKEN_PATTERN.sub(
         _format_symbol_token, unicodedata.normalize("NFD", symbol_text)
     )
 
 
 def _format_symbol_token(token_match: re.Match[str]) -> str:
-    """Return the mathtext of one token of a symbol, found by `_SYMBOL_TOKEN_PATTERN`."""
+    """Return the mathtext for one token of a symbol that `_SYMBOL_TOKEN_PATTERN` has matched."""
     token_kind = token_match.lastgroup or ""
     token_text = token_match[token_kind]
     is_upright_text = token_kind == "word" or re.search("[A-Za-z]{3}", token_text)
@@ -168,5 +171,5 @@ def _format_symbol_token(token_match: re.Match[str]) -> str:
 
 
 def format_numbers(printed_numbers: object) -> str:
-    """Return numbers as text, separated by commas."""
+    """Return numbers as text with five significant digits, separated by commas."""
     return ", ".join(f"{number:.5g}" for number in np.ravel(np.asarray(printed_numbers)))
