@@ -1,4 +1,4 @@
-"""Selection of the simplest model that is accurate for a step."""
+"""Selection of the simplest model whose assumptions hold for a step."""
 
 from vrw_jax.selection.ladder import (
     MODEL_SELECTION_ATTRIBUTES,

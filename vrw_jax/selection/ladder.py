@@ -1,9 +1,10 @@
-"""Wheel that takes each step by the simplest model whose assumptions hold ("ladder" of models).
+"""Ladder of models: each step is computed with the simplest model whose assumptions hold.
 
-The viscoelastic model takes the step and measures its margins. If a margin is violated, the
-unilateral model takes the step again. Under `vmap` a model is selected for each batch element.
-Elements for which the viscoelastic model is valid cost no work in the unilateral model. The rigid
-model is never selected, because its assumption of rigid legs fails for every finite stiffness.
+The step is first computed with the viscoelastic model, together with its margins. If a margin is
+violated, the step is computed again with the unilateral model. Under `vmap`, a model is selected
+for each batch element. Elements for which the viscoelastic model is valid cost no work in the
+unilateral model. The rigid model is never selected, because its assumption of rigid legs is
+violated for every finite stiffness.
 """
 
 import dataclasses
@@ -51,7 +52,7 @@ from vrw_jax.wheel import (
 
 
 class ModelCode(enum.IntEnum):
-    """Code of the model that takes a step. Stores contain these numbers."""
+    """Integer code of the model with which a step is computed. Stores contain these codes."""
 
     RIGID = 0
     VISCOELASTIC = 1
@@ -71,11 +72,12 @@ MODEL_SELECTION_MARGINS: dict[str, str] = {
         "landing_friction_rear",
     )
 }
-"""Margins of the assumptions that only the viscoelastic model makes, by name, with the text of a
-violation."""
+"""Margins of the assumptions that only the viscoelastic model makes. The keys are names of margins,
+and the values are texts that describe a violation.
+"""
 
 START_NOT_EMBEDDABLE_REASON_CODE = 1 + len(MODEL_SELECTION_MARGINS)
-"""Reason code of a start that is not a section state of the viscoelastic model."""
+"""Reason code for a start that is not a section state of the viscoelastic model."""
 
 
 MODEL_SELECTION_ATTRIBUTES: dict[str, dict[str, object]] = {
@@ -93,19 +95,20 @@ MODEL_SELECTION_ATTRIBUTES: dict[str, dict[str, object]] = {
         f"of {', '.join(MODEL_SELECTION_MARGINS)}; below: minus that wheel's outcome.",
     },
 }
-"""Attributes of the dataset variables that `model_selection` gives."""
+"""Attributes of the dataset variables that `model_selection` returns."""
 
 
 class ModelChoice(AbstractPrintable):
-    """Selected model of one step, and the reason. Under `vmap` each field has a batch axis.
+    """Model that is selected for a step, and the reason. Under `vmap`, each field has a batch axis.
 
-    - `model_code`: a `ModelCode`, VISCOELASTIC or UNILATERAL;
+    - `model_code`: code of the model, `ModelCode.VISCOELASTIC` or `ModelCode.UNILATERAL`;
     - `reason_code`: 0 if the viscoelastic model is valid. If a margin is violated, the code is 1 +
       the index of the first such margin in `MODEL_SELECTION_MARGINS`. If a leg other than Leg 1 is
       loaded or off its stopper at the start, the code is `START_NOT_EMBEDDABLE_REASON_CODE`. If the
-      viscoelastic step does not reach a touchdown, the code is minus the outcome;
-    - `margins`: margins of `MODEL_SELECTION_MARGINS`, negative if violated;
-    - `friction`: coefficient of the ground.
+      step computed with the viscoelastic model does not reach a touchdown, the code is the negative
+      of the outcome code;
+    - `margins`: values of the margins in `MODEL_SELECTION_MARGINS`, negative for a violation;
+    - `friction`: friction coefficient of the ground.
 
     Examples:
         >>> x = vrw.limit_cycle(vrw.WheelParams()).section_state
@@ -119,7 +122,7 @@ class ModelChoice(AbstractPrintable):
     friction: Scalar
 
     def summary_rows(self) -> list[LabelAndText]:
-        """Return label and text of the model, of the reason and of the margins."""
+        """Return labels and printed texts for the model, the reason and the margins."""
         reason_codes = np.asarray(self.reason_code)
         if reason_codes.ndim:
             n_paper_wheels = int(np.sum(reason_codes == 0))
@@ -141,20 +144,20 @@ class ModelChoice(AbstractPrintable):
         return [("model", type(self.model).__name__), ("reason", self.why), *margin_rows]
 
     def model_selection(self) -> dict[str, Array]:
-        """Return the codes of model and reason, see `AbstractStep.model_selection`."""
+        """Return the codes of the model and of the reason, see `AbstractStep.model_selection`."""
         return {"rung": self.model_code, "reason": self.reason_code}
 
     @property
     def model(self) -> AbstractWheel:
-        """Return the selected model, for one wheel."""
+        """Return the selected model. The choice must be for one wheel."""
         if int(self.model_code) == ModelCode.VISCOELASTIC:
             return ViscoelasticWheel(friction=float(self.friction))
         return UnilateralWheel(friction=self.friction)
 
     @property
     def why(self) -> Any:
-        """Return a sentence with the reason of the selection, or an array of sentences for a
-        batch.
+        """Return a sentence that states why the model was selected; a batch has an array of
+        sentences.
         """
         return map_text_of_elements(describe_selection_reason, self.reason_code)
 
@@ -174,12 +177,13 @@ def describe_selection_reason(reason_code: int) -> str:
 def find_selection_reason(
     step_measures: Mapping[str, Any], friction_difference: Any
 ) -> tuple[Array, Array]:
-    """Return `ModelChoice.reason_code` of viscoelastic steps, and the margins of the steps.
+    """Return the reason code for steps computed with the viscoelastic model, and their margins.
 
-    The margins are on the last axis, and include the effect of `friction_difference`.
+    The codes are those of `ModelChoice.reason_code`. The margins are on the last axis and include
+    the effect of `friction_difference`.
 
-    - `step_measures`: measures and outcomes of the steps;
-    - `friction_difference`: friction of the ground minus the friction in `step_measures`.
+    - `step_measures`: measures and outcome codes of the steps, by name;
+    - `friction_difference`: friction coefficient of the ground minus that in `step_measures`.
     """
     selection_margins = [
         step_measures[margin_name] + (friction_difference if "friction" in margin_name else 0.0)
@@ -194,19 +198,19 @@ def find_selection_reason(
 
 
 class LadderStep(AbstractContactStep):
-    """One step by the simplest valid model. Under `vmap` each field has a batch axis.
+    """One step, computed with the simplest valid model. Under `vmap`, each field has a batch axis.
 
-    - `choice`: the chosen model, and the reason;
-    - `section_state`: just before the next landing; zeros if there was none;
+    - `choice`: selected model and reason, a `ModelChoice`;
+    - `section_state`: section state just before the next landing; zeros if there was no landing;
     - `post_impact`: (theta, dtheta) just after the opening landing, rad, rad/s;
-    - `durations`: with two feet loaded, with one, with none, s;
-    - `step_length`: m;
-    - `energy_impacts`: lost in impacts, J;
-    - `energy_damping`: lost in the dampers, J;
-    - `energy_friction`: lost by sliding between impacts, J;
+    - `durations`: times with two, one and no loaded feet, s;
+    - `step_length`: distance between the places of the two landings, m;
+    - `energy_impacts`: energy lost in impacts, J;
+    - `energy_damping`: energy lost in the dampers, J;
+    - `energy_friction`: energy lost by sliding between impacts, J;
     - `slip`: path length of sliding feet, m;
-    - `outcome`: an Outcome;
-    - `solver_steps`: attempted solver steps, of both models.
+    - `outcome`: code of the `Outcome`;
+    - `solver_steps`: number of attempted solver steps, summed over the two models.
 
     Examples:
         >>> x = vrw.limit_cycle(vrw.WheelParams()).section_state
@@ -228,17 +232,18 @@ class LadderStep(AbstractContactStep):
     solver_steps: Int[Array, ""]
 
     def model_selection(self) -> dict[str, Array]:
-        """Return the codes of model and reason, see `AbstractStep.model_selection`."""
+        """Return the codes of the model and of the reason, see `AbstractStep.model_selection`."""
         return self.choice.model_selection()
 
 
 class LadderWheel(AbstractWheel):
-    """Viscoelastic model if that model is valid for the step, otherwise the unilateral model with
-    `friction`.
+    """Ladder of models: the viscoelastic model where it is valid, and else the unilateral model.
 
-    Section states are those of `UnilateralWheel`; three-number states of the paper are accepted.
+    A step is computed with the viscoelastic model if that model is valid for the step. Otherwise it
+    is computed with the unilateral model and the coefficient `friction`. Section states are those
+    of `UnilateralWheel`; section states of the paper, which have three entries, are also accepted.
 
-    - `friction`: coefficient of the ground, `inf` for feet that never slide.
+    - `friction`: friction coefficient of the ground, `inf` for feet that never slide.
 
     Examples:
         >>> wheel = vrw.LadderWheel(friction=50.0)
@@ -265,7 +270,7 @@ class LadderWheel(AbstractWheel):
 
     @property
     def unilateral_model(self) -> UnilateralWheel:
-        """Return the model that takes the steps for which the viscoelastic model is not valid."""
+        """Return the model for steps for which the viscoelastic model is not valid."""
         return UnilateralWheel(friction=self.friction)
 
     @property
@@ -294,7 +299,7 @@ class LadderWheel(AbstractWheel):
     def choose_model(
         self, params: WheelParams, x: FullState, options: StepOptions
     ) -> tuple[ModelChoice, StepResult]:
-        """Return the selected model, and the step of the viscoelastic model."""
+        """Return the selected model, and the step computed with the viscoelastic model."""
         paper_model, ground_friction = ViscoelasticWheel(), self.friction.astype(x.dtype)
         # Leg 1 alone must be loaded and at rest, with all other legs on their stoppers.
         is_leg_1 = jnp.arange(params.n_legs) == 0
@@ -375,7 +380,7 @@ class LadderWheel(AbstractWheel):
     def sample_step(
         self, params: WheelParams, x: FullState, options: StepOptions, n_samples: int
     ) -> UnilateralTrajectory:
-        """Return the motion of a step in the form of the unilateral model.
+        """Return the motion during a step, in the form that the unilateral model returns.
 
         If the viscoelastic model is selected, no foot slips, and the motion is that of the
         viscoelastic model.
@@ -390,9 +395,9 @@ class LadderWheel(AbstractWheel):
 def _embed_paper_result(
     uses_paper_model: Array, params: WheelParams, paper_result: StepResult
 ) -> FullState:
-    """Return the full section state after a viscoelastic step.
+    """Return the full section state after a step computed with the viscoelastic model.
 
-    If the viscoelastic model is not valid, return the state of Table 1's start.
+    If this model is not valid, return the paper's start state in the form of a full section state.
     """
     fallback_state = jnp.asarray(PAPER_START_STATE, paper_result.section_state.dtype)
     params, x = replace_invalid_inputs(
@@ -402,8 +407,8 @@ def _embed_paper_result(
 
 
 def _sort_durations_by_loaded_feet(paper_result: StepResult) -> Float[Array, "3"]:
-    """Return the durations of a viscoelastic step with two loaded feet, with one and with none,
-    s.
+    """Return the durations with two, one and no loaded feet, s, for a step in the paper's
+    phases.
     """
     double_support, *single_support = paper_result.durations
     return jnp.stack(
@@ -412,9 +417,10 @@ def _sort_durations_by_loaded_feet(paper_result: StepResult) -> Float[Array, "3"
 
 
 def raise_if_ladder(model: object, use_description: str) -> None:
-    """Raise a `TypeError` for a ladder of models if a model whose gaits vary smoothly is required.
+    """Raise a `TypeError` if `model` is a ladder of models, whose gaits do not vary smoothly.
 
-    - `use_description`: use of the model in the message, such as "tuned".
+    - `use_description`: participle in the error message that states the use of the model, such as
+      "tuned".
     """
     if isinstance(model, LadderWheel | str):
         raise TypeError(

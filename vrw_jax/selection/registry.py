@@ -1,4 +1,4 @@
-"""Registry of models. A new model is added to its list and nowhere else."""
+"""Registry of models. To add a model, only the list in this module has to be extended."""
 
 from vrw_jax.contact import UnilateralWheel
 from vrw_jax.models import AbstractWheel, RigidWheel, ViscoelasticWheel
@@ -10,12 +10,13 @@ REGISTERED_MODEL_CLASSES: list[type[AbstractWheel]] = [
     UnilateralWheel,
     LadderWheel,
 ]
-"""Classes of all models, in the order in which messages list them. The first class is the default
-model."""
+"""Classes of all models, in the order in which error messages list them. The first class is the
+default model.
+"""
 
 
 def find_model_class(config_name: str) -> type[AbstractWheel]:
-    """Return the class of the model that has the name `config_name` in a configuration.
+    """Return the class of the model whose name in a configuration is `config_name`.
 
     Raise a `KeyError` if no model has this name.
     """
@@ -28,10 +29,10 @@ def find_model_class(config_name: str) -> type[AbstractWheel]:
 def list_model_config_names(
     command: str | None = None, parameter: str | None = None
 ) -> tuple[str, ...]:
-    """Return the configuration names of the models that satisfy the given conditions.
+    """Return the configuration names of all models that satisfy two optional conditions.
 
     - `command`: command that must accept the model;
-    - `parameter_name`: parameter on which the model's motion must depend.
+    - `parameter`: parameter on which the model's motion must depend.
     """
     return tuple(
         model_class.capabilities.config_name
@@ -42,7 +43,7 @@ def list_model_config_names(
 
 
 def describe_accepted_models(command: str | None = None, parameter: str | None = None) -> str:
-    """Return the models of `list_model_config_names` as a caller writes them.
+    """Return the models from `list_model_config_names` as expressions that users can write.
 
     An example is `vrw.RigidWheel() or "auto"`.
     """
