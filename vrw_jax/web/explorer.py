@@ -1,4 +1,4 @@
-"""Access to the page docs/wheel.html: its address, and a widget that shows it in a notebook."""
+"""Access to the page docs/wheel.html: its address, and a notebook widget that shows it."""
 
 import functools
 import math
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     import xarray as xr
 
 PAGE_MODEL_NAMES = list_model_config_names("explore")
-"""Names of the models that the page supports."""
+"""Names of the models with which the page can compute steps."""
 
 WIDGET_JAVASCRIPT = """
 function render({ model, el }) {
@@ -58,13 +58,13 @@ function render({ model, el }) {
 }
 export default { render };
 """
-"""JavaScript of the widget, which shows the page in a frame and exchanges changed values with
-it.
+"""JavaScript code of the widget. It shows the page in a frame and exchanges changed values with the
+page.
 """
 
 
 def find_wheel_page() -> Path:
-    """Return the path of the page docs/wheel.html, which lies in the installed package or beside
+    """Return the path of the page docs/wheel.html, which is in the installed package or next to
     it.
     """
     package_folder = Path(__file__).parents[1]
@@ -79,7 +79,10 @@ def find_wheel_page() -> Path:
 
 
 def make_page_address(params: WheelParams, model_name: str = PAGE_MODEL_NAMES[0]) -> str:
-    """Return the address of the page docs/wheel.html with the parameters of this wheel."""
+    """Return the address at which the page docs/wheel.html shows this wheel.
+
+    The address contains the parameters of the wheel that differ from their default values.
+    """
     default_values = _make_page_values(WheelParams(), 1.0, PAGE_MODEL_NAMES[0])
     page_values = _make_page_values(
         params, 1.0, check_choice("model_name", model_name, PAGE_MODEL_NAMES)
@@ -101,20 +104,20 @@ def explore(
     dataset: "xr.Dataset | None" = None,
     height: int = 900,
 ) -> Any:
-    """Return an interactive widget of the wheel for Jupyter, JupyterLab, VS Code and marimo.
+    """Return an interactive widget that shows the wheel in Jupyter, JupyterLab, VS Code or marimo.
 
-    The widget is the page docs/wheel.html, which computes in the browser with the step of this
-    library. The property `params` of the widget is the displayed wheel. An assignment to `params`
-    moves the sliders. The properties `friction` and `model_name` work likewise. `measures` contains
-    the measures of the step by the names of `vrw.MEASURES`. The package anywidget is required: `pip
-    install 'vrw-jax[explore]'`.
+    The widget shows the page docs/wheel.html, which computes steps in the browser as this library
+    does. The property `params` of the widget is the displayed wheel. An assignment to `params`
+    moves the sliders. The same holds for the properties `friction` and `model_name`. The property
+    `measures` contains the measures of the step, by the names in `vrw.MEASURES`. The package
+    anywidget is required: `pip install 'vrw-jax[explore]'`.
 
     Args:
-        params: the wheel at the start; by default that of Table 1.
+        params: wheel that is displayed first; by default that of Table 1 of the paper.
         friction: friction coefficient of the ground, for unilateral contact and for margins.
-        model_name: "viscoelastic", "rigid" for legs without springs, or "unilateral" for unilateral
-            contact.
-        dataset: dataset of `vrw.scan` over a grid of two parameters, shown as a map.
+        model_name: "viscoelastic", "rigid" for rigid legs, or "unilateral" for unilateral contact.
+        dataset: dataset that `vrw.scan` returns for a grid of two parameters; the page shows it as
+            a map.
         height: height of the widget, in pixels.
 
     Returns:
@@ -148,7 +151,9 @@ def explore(
 
 @functools.cache
 def _make_widget_class() -> type:
-    """Return the class of the widget. It is created on first use because anywidget is optional."""
+    """Return the class of the widget. The class is created on first use, because anywidget is
+    optional.
+    """
     try:
         import anywidget
         import traitlets
@@ -159,8 +164,9 @@ def _make_widget_class() -> type:
         ) from error
 
     class Explorer(anywidget.AnyWidget):
-        """Widget that shows the page in a frame and exchanges parameters and measures with the
-        page.
+        """Widget that shows the page in a frame and exchanges values with the page.
+
+        The values are the parameters of the wheel and the measures of the step.
         """
 
         _esm = WIDGET_JAVASCRIPT
@@ -172,7 +178,7 @@ def _make_widget_class() -> type:
 
         @property
         def params(self) -> WheelParams:
-            """Return the wheel that is shown."""
+            """Return the displayed wheel."""
             parameter_values = {
                 parameter_name: float(self.values[parameter_name])
                 for parameter_name in PARAMETER_DOMAINS
@@ -197,7 +203,7 @@ def _make_widget_class() -> type:
 
         @property
         def model_name(self) -> str:
-            """Return the name of the model that is shown."""
+            """Return the name of the displayed model."""
             return str(self.values["rung"])
 
         @model_name.setter
@@ -213,7 +219,7 @@ def _make_widget_class() -> type:
 def _make_page_values(
     params: WheelParams, friction: float, model_name: str
 ) -> dict[str, float | str]:
-    """Return the inputs of the page by name: parameters, friction and model."""
+    """Return the input values of the page, by name: parameters, friction and model."""
     parameter_values = {
         parameter_name: float(getattr(params, parameter_name))
         for parameter_name in PARAMETER_DOMAINS
@@ -227,10 +233,10 @@ def _make_page_values(
 
 
 def _make_page_map(dataset: "xr.Dataset") -> dict[str, Any]:
-    """Return a scan over two parameters in the format of the page's map.
+    """Return a scan over two parameters in the format that the page needs for its map.
 
-    Numbers that are not finite become None. A measure with one number per leg is replaced by the
-    smallest of these numbers.
+    Values that are not finite become None. A measure with one value per leg is replaced by the
+    smallest of these values.
     """
     import xarray
 
