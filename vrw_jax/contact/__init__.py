@@ -1,6 +1,4 @@
-"""Wheel with unilateral contact: mechanics, contact laws, impacts, batched walks and their
-tangents.
-"""
+"""Wheel with unilateral contact: mechanics, contact laws, impacts, batched walks and tangents."""
 
 from vrw_jax.contact import batch_walks
 from vrw_jax.contact.batch_walks import embed_section_states, step_batch_with_jacobian, walk_batch

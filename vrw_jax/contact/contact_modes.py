@@ -1,16 +1,17 @@
-"""Contact modes (stick, slip, lift-off) of the feet and stopper states, by enumeration.
+"""Determine the contact modes of the feet and the states of the stoppers by enumeration.
 
-Every combination of contact modes and stoppers of the two slots is solved. In an admissible
-combination, normal forces push, friction lies in Coulomb's cone and opposes the slip, and open
-constraints do not close. Of several, the one with the most sticking feet is chosen. The same table
-is used for impacts (impulses and the velocities after them) and motion (forces and accelerations).
+A contact mode is stick, slip or lift-off. Every combination of modes and stoppers for the legs in
+the two contact slots is solved. In an admissible combination, normal forces push, friction lies in
+Coulomb's cone and opposes the slip, and open constraints do not close. If several combinations are
+admissible, the one with the most sticking feet is selected. The same table applies to impacts
+(impulses and subsequent velocities) and to continuous motion (forces and accelerations).
 
-Infinite friction is the limit of large friction. In Coulomb's law |t| = mu n, a finite t requires n
-= 0. So a sliding foot is carried by friction alone, which acts against the slip. A resting foot
-begins to slide when its normal force vanishes. The paper's rule (A1)-(A4) is a different one,
-selected by a friction of minus infinity (`PAPER_RULE_SENTINEL`). With this rule, a foot sticks if
-that requires no pull, and lifts otherwise. Only if neither is possible, the foot slides without
-friction.
+Infinite friction is the limit of large friction. In Coulomb's law |t| = mu n, a finite tangential
+force t requires a normal force n = 0. A sliding foot is therefore loaded by friction alone, which
+acts against the slip. A resting foot begins to slide when its normal force vanishes. The rule
+(A1)-(A4) of the paper differs and is selected by a friction of minus infinity
+(`PAPER_RULE_SENTINEL`). By this rule, a foot sticks if that requires no pull, and lifts otherwise.
+The foot slides without friction only if neither is possible.
 """
 
 import functools
@@ -38,11 +39,11 @@ from vrw_jax.numerics import Elementwise, select_tree_leaves
 from vrw_jax.wheel import Symbols, compute_wheel_units
 
 Friction = Elementwise | SlotPair
-"""Friction coefficient of all feet, or of each slot's foot."""
+"""Friction coefficient for all feet, or a pair with one coefficient for each contact slot."""
 
 
 class ContactMode(IntEnum):
-    """Contact mode of a foot. Section states and trajectories contain these numbers."""
+    """Contact mode of a foot. Section states and trajectories contain these integers."""
 
     OFF = 0  # in the air
     STICK = 1  # at rest on the ground
@@ -51,11 +52,14 @@ class ContactMode(IntEnum):
 
 
 PAPER_RULE_SENTINEL = -np.inf
-"""Value of friction that selects the paper's rule instead of the limit of large friction."""
+"""Friction coefficient that selects the rule (A1)-(A4) of the paper."""
 
 
 class SlotForceSolution(NamedTuple):
-    """Forces (N) and resulting accelerations, or impulses (N s) and velocities after them."""
+    """Forces (N) and resulting accelerations, or impulses (N s) and velocities after the impact.
+
+    A `SlotPair` has one entry for the leg in each contact slot.
+    """
 
     tangential_forces: SlotPair  # on each slot's foot, downhill positive
     normal_forces: SlotPair  # pushing positive
@@ -69,11 +73,11 @@ class SlotForceSolution(NamedTuple):
 
 
 Matrix2x2 = tuple[tuple[Any, Any], tuple[Any, Any]]
-"""Matrix of two rows and two columns, as nested tuples."""
+"""Matrix with two rows and two columns, as nested tuples."""
 
 
 def _solve_2x2(A: Matrix2x2, b: SlotPair) -> SlotPair:
-    """Return the solution of a linear system of two equations; NaN if the matrix is singular."""
+    """Return the solution of A x = b for a 2 x 2 matrix A; NaN if A is singular."""
     determinant = A[0][0] * A[1][1] - A[0][1] * A[1][0]
     inverse_determinant = 1.0 / jnp.where(determinant == 0.0, jnp.nan, determinant)
     return (
@@ -83,17 +87,17 @@ def _solve_2x2(A: Matrix2x2, b: SlotPair) -> SlotPair:
 
 
 def _make_matrix(entry_fn: Any) -> Matrix2x2:
-    """Return the 2 x 2 matrix of the entries `entry_fn(i, j)`."""
+    """Return the 2 x 2 matrix with the entries `entry_fn(i, j)`."""
     return ((entry_fn(0, 0), entry_fn(0, 1)), (entry_fn(1, 0), entry_fn(1, 1)))
 
 
 def _make_pair(entry_fn: Any) -> SlotPair:
-    """Return the pair (`entry_fn(0)`, `entry_fn(1)`), with one entry for each slot."""
+    """Return the pair (`entry_fn(0)`, `entry_fn(1)`), with one entry for each contact slot."""
     return entry_fn(0), entry_fn(1)
 
 
 def map_friction(friction_function: Callable[[Any], Any], friction: Friction) -> Any:
-    """Return a function of the friction coefficient of all feet, or of each slot's foot."""
+    """Return `friction_function` of a friction coefficient, or of each coefficient in a pair."""
     is_friction_pair = isinstance(friction, tuple)
     return (
         (friction_function(friction[0]), friction_function(friction[1]))
@@ -103,14 +107,14 @@ def map_friction(friction_function: Callable[[Any], Any], friction: Friction) ->
 
 
 def _get_slot_friction(i: int, friction: Any) -> Any:
-    """Return the friction coefficient of slot `i`, from a pair or a common number."""
+    """Return the friction coefficient for contact slot `i`, from a pair or a common coefficient."""
     return friction[i] if isinstance(friction, tuple) else friction
 
 
 def replace_infinite_friction(friction: Friction) -> Any:
-    """Return Coulomb's coefficient of friction, with 0 in place of infinity.
+    """Return the friction coefficients of Coulomb's law, with 0 in place of infinite coefficients.
 
-    A foot that slides under infinite friction receives no friction by Coulomb's law.
+    Coulomb's law then yields no friction on a foot that slides under infinite friction.
     """
     return map_friction(
         lambda coefficient_value: jnp.where(
@@ -121,10 +125,10 @@ def replace_infinite_friction(friction: Friction) -> Any:
 
 
 class _FootEquations(NamedTuple):
-    """Coefficients of the contact equations at each slot's foot, for a combination of modes.
+    """Coefficients of the equations for the feet in contact, for one combination of modes.
 
-    The unknown c is the transverse force for a sticking foot. For a sliding foot, c is the normal
-    force, or the friction force in the limit of infinite friction. An unloaded foot has c = 0.
+    The unknown c is the transverse force on a sticking foot. For a sliding foot, c is the normal
+    force, or the friction force in the limit of infinite friction. For an unloaded foot, c = 0.
     """
 
     is_sticking: SlotPair
@@ -138,7 +142,7 @@ class _FootEquations(NamedTuple):
 def _make_foot_equations(
     s: Symbols, inverse_inertia: ContactInverseInertia, slot_modes: Array, friction: Friction
 ) -> _FootEquations:
-    """Return the coefficients of the contact equations at both slots' feet."""
+    """Return the coefficients of the contact equations for the feet in both contact slots."""
     sin, cos = inverse_inertia.sin, inverse_inertia.cos
     sliding_coefficient = map_friction(
         lambda coefficient_value: jnp.where(
@@ -200,10 +204,11 @@ def _eliminate_stoppers(
     foot_equations: _FootEquations,
     unit_divisor: Array,
 ) -> tuple[SlotPair, Matrix2x2]:
-    """Return the stopper forces without foot forces, and their change for c = 1 at each foot.
+    """Return the stopper forces without foot forces, and their change due to c = 1 at each foot.
 
-    The second result has the indices [foot][stopper]. The stopper forces s solve N s = p + P c. The
-    row of an open stopper is s = 0, so that the system is always regular.
+    The unknown c is defined in `_FootEquations`. The second result has the indices [foot][stopper].
+    The stopper forces s solve N s = p + P c. For an open stopper, the corresponding equation is s =
+    0, so the system is always regular.
     """
     sin, cos, inverse_leg_mass = inverse_inertia.sin, inverse_inertia.cos, 1.0 / s.m
     H = ((inverse_inertia.H[0], inverse_inertia.H[1]), (inverse_inertia.H[2], inverse_inertia.H[3]))
@@ -246,8 +251,10 @@ def _eliminate_stoppers(
 
 
 REFERENCE_MASS_RATIO = 18.0
-"""Ratio of total mass to leg mass at which feet at rest and sliding feet have the same scale in the
-determinant. This is the ratio of Table 1's wheel, chosen because `painleve_atol` is measured there.
+"""Ratio of total mass to leg mass that scales the determinant of the contact equations.
+
+At this ratio, resting and sliding feet have the same scale in the determinant. The value is that of
+the wheel in Table 1 of the paper, chosen because `painleve_atol` was measured for this wheel.
 """
 
 
@@ -262,8 +269,9 @@ def _solve_feet(
 ) -> tuple[SlotPair, SlotPair, SlotPair, Any]:
     """Return the stopper forces, the foot forces and the determinant of the foot equations.
 
-    The foot forces are transverse to the legs, then along the legs. The stopper forces of
-    `_eliminate_stoppers` are inserted into the equations of the feet.
+    The result is (stopper forces, foot forces transverse to the legs, foot forces along the legs,
+    determinant). The arguments `stopper_without_feet` and `stopper_response` are the results of
+    `_eliminate_stoppers`.
     """
     condition_weight_transverse = foot_equations.condition_weight_transverse
     condition_weight_radial = foot_equations.condition_weight_radial
@@ -340,13 +348,13 @@ def solve_combination(
     is_stopper_holding: Array,
     friction: Friction,
 ) -> SlotForceSolution:
-    """Return forces and motion for one combination of contact modes and stoppers of the two slots.
+    """Return forces and motion for one combination of contact modes and stoppers.
 
-    - `slot_modes`: contact mode of each slot's foot, shape (2, ...);
-    - `is_stopper_holding`: whether the stopper of each slot's leg holds the leg, shape (2, ...).
+    - `slot_modes`: contact mode of the foot in each contact slot, shape (2, ...);
+    - `is_stopper_holding`: whether the stopper holds the leg in each contact slot, shape (2, ...).
 
-    A sticking foot is at rest. A sliding foot keeps its height, with friction against the slip. A
-    held leg keeps its length. The stoppers are eliminated first.
+    A sticking foot stays at rest. A sliding foot stays on the ground, with friction against the
+    slip. A leg on its stopper has a constant length. The stopper forces are eliminated first.
     """
     sin, cos, inverse_leg_mass = inverse_inertia.sin, inverse_inertia.cos, 1.0 / s.m
     unit_divisor = 1.0 + 0.0 * lax.stop_gradient(free_motion.hub_motion[2])
@@ -414,11 +422,11 @@ def solve_combination(
 
 
 def _enumerate_combinations() -> tuple[np.ndarray, np.ndarray]:
-    """Return the contact modes and the held stoppers of all combinations, of shape (63, 2) each.
+    """Return contact modes and closed stoppers for all combinations, each of shape (63, 2).
 
-    Combinations with the most sticking feet come first, then combinations with the most sliding
-    feet. Two sticking feet on two held legs are excluded, because they constrain the hub twice and
-    their forces are not determined.
+    The combinations are sorted by decreasing number of sticking feet, then of sliding feet. Two
+    sticking feet of two legs on their stoppers are excluded. They constrain the hub twice, so their
+    forces are not unique.
     """
     mode_priority = {
         ContactMode.STICK: 0,
@@ -445,8 +453,7 @@ def _enumerate_combinations() -> tuple[np.ndarray, np.ndarray]:
 
 
 CONTACT_MODE_TABLE, HELD_STOPPER_TABLE = _enumerate_combinations()
-"""Contact modes of all combinations in order of preference, shape (63, 2). `HELD_STOPPER_TABLE` has
-the same shape and marks the held stoppers."""
+"""Contact modes and closed stoppers for all combinations in order of preference, each (63, 2)."""
 PAPER_RULE_ORDER = np.argsort(
     [
         sum(
@@ -457,19 +464,24 @@ PAPER_RULE_ORDER = np.argsort(
     ],
     kind="stable",
 )
-"""Order of the combinations by the paper's rule, in which sliding comes last."""
+"""Order of the combinations by the rule of the paper, in which sliding comes last."""
 N_COMBINATIONS_PER_ITERATION = 8
 """Number of combinations that XLA solves together, chosen because most events allow no more.
-Machine code solves combinations one after the other."""
+
+Machine code solves one combination after another.
+"""
 ALL_MODES_MASK = sum(1 << mode for mode in ContactMode)
-"""Set of all contact modes, as one bit per mode."""
+"""Set of all contact modes, with one bit per mode."""
 
 CombinationMask = tuple[Any, Any]
-"""Set of combinations, one bit each in two 32-bit integers."""
+"""Set of combinations, with one bit per combination in two 32-bit integers."""
 
 
 class _OrderedCombinationTable(NamedTuple):
-    """Combinations in one order, as bit masks of the combinations with a common mode or stopper."""
+    """Bit masks of the combinations with a given contact mode or with a closed stopper.
+
+    The bits are in one order of the combinations.
+    """
 
     masks_by_slot_mode: list[list[CombinationMask]]  # indexed by slot and mode
     masks_by_held_stopper: list[CombinationMask]  # indexed by slot
@@ -499,7 +511,7 @@ _COMBINATION_TABLES = (
 
 
 class AllowedContactModes(NamedTuple):
-    """Contact modes and stoppers that are allowed at an event, and conditions that need no test.
+    """Contact modes and stopper states that are allowed or need no test at an event.
 
     A set of modes is an integer with one bit per mode.
     """
@@ -546,12 +558,12 @@ class AllowedContactModes(NamedTuple):
 
 
 def is_mode_in_set(allowed_mode_set: Array, mode: Array | int) -> Bool[Array, "..."]:
-    """Return whether a set of modes, with one bit per mode, contains a mode."""
+    """Return whether a set of contact modes, with one bit per mode, contains `mode`."""
     return ((allowed_mode_set >> mode) & 1) > 0
 
 
 class ChosenModeCombination(NamedTuple):
-    """Combination of contact modes and stoppers that is chosen at an event."""
+    """Combination of contact modes and stoppers that is selected at an event."""
 
     slot_modes: Int[Array, "2 ..."]
     is_stopper_holding: Bool[Array, "2 ..."]
@@ -561,9 +573,11 @@ class ChosenModeCombination(NamedTuple):
 
 
 class ContactSignTolerances(NamedTuple):
-    """Tolerances of forces and motions, below which round-off decides the sign.
+    """Tolerances for the signs of forces and motions.
 
-    A sign violation is measured in these tolerances.
+    Sign violations are divided by these tolerances.
+
+    Below its tolerance, the sign of a force or motion is determined by round-off.
     """
 
     force_tolerance: Elementwise  # N, or N s in an impact
@@ -571,8 +585,10 @@ class ContactSignTolerances(NamedTuple):
 
 
 MAX_VIOLATION = 1e3
-"""Largest accepted violation, in units of `ContactSignTolerances`, if no combination has all signs
-correct."""
+"""Largest accepted sign violation in units of `ContactSignTolerances`.
+
+It applies if no combination has all signs correct.
+"""
 
 
 class _EnumerationState(NamedTuple):
@@ -594,7 +610,7 @@ def _evaluate_violation(
     slot_modes: Array,
     is_stopper_holding: Array,
 ) -> Array:
-    """Return the largest sign violation of a combination, as a multiple of its tolerance."""
+    """Return the largest sign violation of a combination, divided by its tolerance."""
     is_friction_infinite = map_friction(
         lambda coefficient_value: ~jnp.isfinite(coefficient_value), friction
     )
@@ -680,11 +696,11 @@ def _evaluate_violation(
 def _find_least_violating(
     evaluate_combination: Callable[[CombinationMask], Array], combinations: list[CombinationMask]
 ) -> tuple[CombinationMask, Array, Array]:
-    """Return the first of the least violating combinations, its violation, and the number of
-    admissible ones.
+    """Return the first of the least violating combinations, its violation, and a count.
 
-    Several combinations are compared by one reduction. If they were read one by one, XLA on a CPU
-    would duplicate the code of `evaluate_combination` for each use.
+    The count is the number of admissible combinations. Several combinations are compared by one
+    reduction. If they were read one by one, XLA on a CPU would duplicate the code of
+    `evaluate_combination` for each use.
     """
     if len(combinations) == 1:
         sign_violation = evaluate_combination(combinations[0])
@@ -733,14 +749,14 @@ def choose_combination(
     tolerances: ContactSignTolerances,
     counts_all_solutions: bool,
 ) -> ChosenModeCombination:
-    """Return the first admissible combination of the table, with the number of solutions.
+    """Return the first admissible combination in the table, with the number of solutions.
 
-    - `counts_all_solutions`: whether all admissible combinations are counted. Otherwise the search
-      ends at the first admissible combination.
+    - `counts_all_solutions`: whether the number of all admissible combinations is determined.
+      Otherwise the search ends at the first admissible combination.
 
-    Without an admissible combination, the least violating combination is returned. This combination
-    counts as a solution if its violation is at most `MAX_VIOLATION`, because round-off may close or
-    open two contacts. Otherwise the number of solutions is 0.
+    If no combination is admissible, the least violating combination is returned. It is accepted as
+    a solution if its violation is at most `MAX_VIOLATION`, because round-off may close or open two
+    contacts. Otherwise the number of solutions is 0.
     """
     evaluate_modes = functools.partial(
         _evaluate_violation,
@@ -793,7 +809,7 @@ def choose_combination(
         ) & (counts_all_solutions | (enumeration_state.n_solutions == 0))
 
     def evaluate_next_combinations(enumeration_state: _EnumerationState) -> _EnumerationState:
-        """Return the enumeration state after the next few allowed combinations are evaluated."""
+        """Return the state of the enumeration after the next few allowed combinations."""
         (untested_mask, best_combination, lowest_violation, n_solutions), combinations = (
             enumeration_state,
             [],
@@ -855,12 +871,12 @@ def is_release_consistent(
 ) -> Bool[Array, "..."]:
     """Return whether a foot that is released from its contact mode moves in the release direction.
 
-    - `slot_state`: contact modes and stoppers of both slots;
-    - `is_second_slot`: whether the foot is that of the second slot;
+    - `slot_state`: contact modes of both feet, and flags of both stoppers, in the contact slots;
+    - `is_second_slot`: whether the foot is the one in the second contact slot;
     - `release_direction`: 0 off the ground, 1 downhill, -1 uphill.
 
-    The margin of the mode must grow with the acceleration in that direction. If the margin shrinks,
-    the next mode ends at once, and the forces jump (Painlevé).
+    The margin of the new contact mode must grow with the acceleration in that direction. If the
+    margin shrinks, the new mode ends immediately, and the forces jump (Painlevé).
     """
     slot_modes, is_stopper_holding = slot_state
     slot_weights = jnp.stack([~is_second_slot, is_second_slot]).astype(inverse_inertia.sin[0].dtype)

@@ -1,6 +1,6 @@
 """Dynamics of the wheel between two events, and the guards that detect the next event.
 
-A *contact state* is the set of contact modes of all feet and of stopper flags of all legs. The
+A *contact state* consists of the contact modes of all feet and the stopper flags of all legs. The
 contact state is constant between two events.
 """
 
@@ -45,8 +45,11 @@ from vrw_jax.wheel import (
 )
 
 PackedState = Float[Array, "dim ..."]
-"""Hub (x, z, theta), their rates, leg lengths, their rates, then the accumulators: see
-`LossAccumulators`."""
+"""Motion and loss accumulators as one vector of 10 + 2 n entries.
+
+The entries are the hub coordinates (x, z, theta), their rates, the leg lengths, their rates, and
+the `LossAccumulators`.
+"""
 
 
 class LossAccumulators(NamedTuple):
@@ -59,12 +62,12 @@ class LossAccumulators(NamedTuple):
 
 
 def pack_state(motion: WheelMotion, accumulators: LossAccumulators) -> PackedState:
-    """Return motion and loss accumulators as one vector of 10 + 2 n entries."""
+    """Return the motion and the loss accumulators as one vector of 10 + 2 n entries."""
     return jnp.concatenate([jnp.stack(motion[:6]), motion.L, motion.dL, jnp.stack(accumulators)])
 
 
 def unpack_state(packed_state: PackedState) -> tuple[WheelMotion, LossAccumulators]:
-    """Return motion and loss accumulators of a packed state.
+    """Return the motion and the loss accumulators in a packed state.
 
     The function is the inverse of `pack_state`.
     """
@@ -88,7 +91,7 @@ def unpack_state(packed_state: PackedState) -> tuple[WheelMotion, LossAccumulato
 
 
 class ContactState(NamedTuple):
-    """Contact modes of the feet, stopper flags of the legs, and the changes at the last event."""
+    """Contact modes of the feet, stopper flags of the legs, and their changes at the last event."""
 
     contact_modes: Int[Array, " n_legs"]  # `ContactMode` of every foot
     is_locked: Bool[Array, " n_legs"]  # whether a leg is on its stopper
@@ -98,7 +101,7 @@ class ContactState(NamedTuple):
 
 
 class ModeDynamics(NamedTuple):
-    """Dynamics of the wheel in one contact state, from the last event to the next."""
+    """Parameters and contact state that determine the dynamics of the wheel between two events."""
 
     s: Symbols
     friction: Friction  # friction coefficient of the slots' feet
@@ -112,7 +115,7 @@ class ModeDynamics(NamedTuple):
     tilt: Elementwise | None = None  # angle by which the next line is steeper, rad
 
     def configure_contacts(self, motion: WheelMotion) -> ContactConfiguration:
-        """Return the contact configuration at this motion, from which the forces are computed."""
+        """Return the contact configuration for this motion, from which the forces are computed."""
         contact_slots = (
             self.contact_slots,
             self.slot_modes,
@@ -130,11 +133,13 @@ def make_mode_dynamics(
     has_accumulators: bool = False,
     tilt: Elementwise | None = None,
 ) -> ModeDynamics:
-    """Return the dynamics of the wheel in this contact state.
+    """Return the dynamics of the wheel in the contact state `contact_state`.
 
-    - `friction`: friction coefficient of all feet, or a pair for the foot that landed last and the
-      other feet;
-    - `tilt`: angle by which the next line is steeper, rad.
+    - `friction`: friction coefficient for all feet, or a pair for the foot that landed last and for
+      all other feet;
+    - `has_one_sided_stoppers`: whether legs in the air may leave their stoppers;
+    - `has_accumulators`: whether losses and slip are integrated together with the motion;
+    - `tilt`: angle by which the next straight line of uneven ground is steeper, rad.
     """
     contact_slots = find_contact_slots(contact_state.contact_modes != ContactMode.OFF)
     slot_modes = contact_slots.gather_slot_codes(contact_state.contact_modes)
@@ -156,10 +161,7 @@ def make_mode_dynamics(
 
 
 class ContactForces(NamedTuple):
-    """Contact forces with the resulting accelerations, and leg directions and foot velocities.
-
-    The contact forces depend on these directions and velocities.
-    """
+    """Contact forces and accelerations, with the leg directions and foot velocities."""
 
     leg_directions: LegDirections
     free_leg_acceleration: LegArray  # see `compute_free_leg_acceleration`, m/s^2
@@ -188,7 +190,7 @@ def compute_forces(mode_dynamics: ModeDynamics, motion: WheelMotion) -> ContactF
 def compute_airborne_stopper_force(
     mode_dynamics: ModeDynamics, contact_forces: ContactForces
 ) -> LegArray:
-    """Return the stopper force of each locked leg in the air, N; 0 for the other legs."""
+    """Return the stopper force on each leg in the air, N; 0 for legs that are not on a stopper."""
     sin, cos = contact_forces.leg_directions
     hub_acceleration_x, hub_acceleration_z, _ = contact_forces.force_solution.hub_motion
     # This is the acceleration of each leg's length without forces of slots and stoppers, m/s^2.
@@ -203,9 +205,9 @@ def compute_airborne_stopper_force(
 def compute_min_stopper_force(
     mode_dynamics: ModeDynamics, contact_forces: ContactForces
 ) -> Elementwise:
-    """Return the minimum of `compute_airborne_stopper_force` over the legs, N.
+    """Return the smallest stopper force on a leg that is in the air on its stopper, N.
 
-    The minimum is infinite if no leg in the air is locked.
+    The result is infinite if there is no such leg.
     """
     return jnp.min(
         jnp.where(
@@ -222,8 +224,8 @@ def compute_accumulator_rates(
 ) -> LossAccumulators:
     """Return the time derivatives of the loss accumulators.
 
-    The derivatives are 1 for the time, the powers lost by damping and sliding in W, and the slip
-    speed in m/s.
+    They are 1 for the time, the powers dissipated in dampers and by sliding in W, and the sum of
+    the slip speeds in m/s.
     """
     slip_signs = compute_slip_signs(mode_dynamics.slot_modes)
     slip_speeds = [slip_signs[i] * contact_forces.foot_velocity.along_slope[i] for i in range(2)]
@@ -239,7 +241,7 @@ def compute_accumulator_rates(
 
 
 def evaluate_vector_field(mode_dynamics: ModeDynamics, packed_state: PackedState) -> PackedState:
-    """Return the time derivative of the packed state in this contact state."""
+    """Return the time derivative of a packed state in the contact state of `mode_dynamics`."""
     motion, _ = unpack_state(packed_state)
     contact_forces = compute_forces(mode_dynamics, motion)
     rates = WheelMotion(
@@ -257,7 +259,7 @@ def evaluate_vector_field(mode_dynamics: ModeDynamics, packed_state: PackedState
 
 
 class GuardLayout(NamedTuple):
-    """Index of the first guard of each kind in the vector of `compute_guard_values`."""
+    """Index of the first guard of each kind in the result of `compute_guard_values`."""
 
     first_landing_guard: int  # height of a foot in the air, one per leg: zero at a landing
     first_stopper_guard: int  # distance to the stopper, one per leg
@@ -278,12 +280,15 @@ class GuardLayout(NamedTuple):
 
     @property
     def foremost_landing_guard(self) -> int:
-        """Return the index of the landing guard of the foremost foot, whose landing ends a step."""
+        """Return the index of the guard that detects the landing of the foremost foot.
+
+        This landing ends a step.
+        """
         return self.first_stopper_guard - 1
 
 
 def make_guard_layout(n_legs: int, has_one_sided_stoppers: bool) -> GuardLayout:
-    """Return the guard layout of a wheel with `n` legs.
+    """Return the guard layout for a wheel with `n_legs` legs.
 
     - `has_one_sided_stoppers`: whether legs in the air may leave their stoppers.
     """
@@ -304,7 +309,7 @@ def make_guard_layout(n_legs: int, has_one_sided_stoppers: bool) -> GuardLayout:
 
 
 class ContactQuantities(NamedTuple):
-    """Contact forces and slip speeds on which the guards depend, besides the motion."""
+    """Contact forces and slip speeds that the guards depend on in addition to the motion."""
 
     leg_directions: LegDirections
     normal_forces: SlotPair
@@ -320,7 +325,7 @@ class ContactQuantities(NamedTuple):
 def collect_contact_quantities(
     mode_dynamics: ModeDynamics, contact_forces: ContactForces
 ) -> ContactQuantities:
-    """Return the contact quantities that `evaluate_guards` requires."""
+    """Return contact forces and slip speeds from which `evaluate_guards` computes the guards."""
     force_solution = contact_forces.force_solution
     airborne_stopper_forces = (
         compute_airborne_stopper_force(mode_dynamics, contact_forces)
@@ -342,7 +347,7 @@ def collect_contact_quantities(
 
 
 def stack_slot_friction(friction: Friction) -> Array:
-    """Return the friction coefficients of both slots as one array (2, ...).
+    """Return the friction coefficients for both contact slots as one array (2, ...).
 
     A common coefficient is returned unchanged.
     """
@@ -355,13 +360,13 @@ def evaluate_guards(
     contact_quantities: ContactQuantities,
     is_after_start: Array,
 ) -> list[Array]:
-    """Return the values of the guards in the order of `GuardLayout`, one array for each kind.
+    """Return the values of the guards in the order of `GuardLayout`, as one array for each kind.
 
     - `is_after_start`: whether the time is after the start of the contact state.
 
-    The event that starts a contact state may leave a guard at zero: the guard of a foot that lifts
-    off, of a leg that leaves its stopper, or of a foot that starts to slide. The value of that
-    guard at the start is replaced by 1.
+    At the event that starts a contact state, a guard may be zero. It is the guard of a foot that
+    lifts off, of a leg that leaves its stopper, or of a foot that starts to slide. The value of
+    this guard at the start is replaced by 1.
     """
     s, contact_state = mode_dynamics.s, mode_dynamics.contact_state
     unit_guards = jnp.ones_like(motion.L)
@@ -425,7 +430,7 @@ def evaluate_guards(
 
 
 def compute_guard_scales(mode_dynamics: ModeDynamics) -> Array:
-    """Return the scale of each guard in the order of `GuardLayout`: m, N, m/s or rad/s."""
+    """Return the scale of each guard in the order of `GuardLayout`, in m, N, m/s or rad/s."""
     s = mode_dynamics.s
     force_scale, speed_scale = s.Mt * s.g, jnp.sqrt(s.g * s.L0)
     guard_scales = (
@@ -439,7 +444,7 @@ def compute_guard_scales(mode_dynamics: ModeDynamics) -> Array:
 
 
 def compute_state_units(s: Symbols) -> tuple[Array, Array]:
-    """Return the wheel's units of (hub x, z, theta, lengths) and of their rates."""
+    """Return the wheel's units for (hub x, hub z, theta, leg lengths) and for their rates."""
     wheel_units, angle_unit = compute_wheel_units(s), jnp.ones_like(s.L0)
     position_units = [
         wheel_units.length_unit,
@@ -459,7 +464,7 @@ def compute_state_units(s: Symbols) -> tuple[Array, Array]:
 def is_wheel_at_rest(
     s: Symbols, rates: Array, accelerations: Iterable[Array], atol: Elementwise
 ) -> Bool[Array, "..."]:
-    """Return whether the wheel is at rest, given rates and accelerations of all coordinates.
+    """Return whether the wheel is at rest, from rates and accelerations of all coordinates.
 
     - `atol`: absolute tolerance in the wheel's units.
     """
@@ -474,11 +479,12 @@ def choose_stopping_guard(
     guard_index: Int[Array, "..."],
     atol: Elementwise,
 ) -> Int[Array, "..."]:
-    """Return the index of the triggered guard, or of the guard of a slide that ends together with
-    the rolling.
+    """Return the index of the guard that ends the interval when the wheel stops rolling.
 
-    Round-off decides which of both guards vanishes first. If the slide ends first, the friction of
-    the stopped foot determines whether the wheel rests or falls back.
+    If all rates are zero to within `atol` and a foot has been sliding, the result is the index of
+    the guard for the end of the slide. Otherwise it is `guard_index`. The reason is that round-off
+    determines which of the two guards is zero first. After the slide has ended, the friction on the
+    stopped foot determines whether the wheel rests or falls back.
     """
     slip_signs = compute_slip_signs(mode_dynamics.slot_modes)
     has_just_slid = mode_dynamics.contact_slots.gather_slot_flags(
@@ -497,7 +503,7 @@ def choose_stopping_guard(
 
 
 def compute_packed_units(s: Symbols) -> PackedState:
-    """Return the wheel's unit of each entry of `pack_state`."""
+    """Return the wheel's unit for each entry of `pack_state`."""
     wheel_units, (position_units, rate_units) = compute_wheel_units(s), compute_state_units(s)
     accumulator_units = LossAccumulators(
         wheel_units.time_unit,
@@ -518,10 +524,10 @@ def compute_packed_units(s: Symbols) -> PackedState:
 def compute_guard_values(
     mode_dynamics: ModeDynamics, packed_state: PackedState
 ) -> Float[Array, " n_guards"]:
-    """Return the values of all guards at a packed state.
+    """Return the values of all guards for a packed state.
 
     A guard is positive inside the contact state and zero at its end. A guard that is not evaluated
-    is 1.
+    has the value 1.
     """
     motion, accumulators = unpack_state(packed_state)
     contact_quantities = collect_contact_quantities(

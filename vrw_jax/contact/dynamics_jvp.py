@@ -1,4 +1,4 @@
-"""Forces or impulses of a contact configuration, and their derivatives.
+"""Compute forces or impulses for a contact configuration, and their derivatives.
 
 The equations are linear in accelerations and forces, or in impulses and the velocities after an
 impact. The tangents of these unknowns solve the same equations, with the tangent of the residual on
@@ -40,7 +40,7 @@ from vrw_jax.wheel import Symbols
 
 
 class ContactConfiguration(NamedTuple):
-    """Motion, contact modes and stopper states of a wheel, from which contact forces follow."""
+    """Motion, contact modes and stopper states of a wheel, which determine the contact forces."""
 
     s: Symbols
     motion: WheelMotion
@@ -59,8 +59,9 @@ class ContactConfiguration(NamedTuple):
 
 
 class WheelForceSolution(NamedTuple):
-    """Forces of ground and stoppers, and the resulting motion of hub and legs: see
-    `contact_modes.SlotForceSolution`.
+    """Forces of ground and stoppers, and the resulting motion of the hub and of all legs.
+
+    The fields are described in `contact_modes.SlotForceSolution`.
     """
 
     tangential_forces: SlotPair
@@ -73,7 +74,7 @@ class WheelForceSolution(NamedTuple):
 
 
 def compute_slip_signs(slot_modes: Array) -> SlotPair:
-    """Return the slip direction of each slot's foot: 1 downhill, -1 uphill, 0 without slip."""
+    """Return the slip direction of each foot in contact: 1 downhill, -1 uphill, 0 for no slip."""
     select_slip_sign = lambda mode: jnp.where(
         mode == ContactMode.SLIP_DOWN, 1.0, jnp.where(mode == ContactMode.SLIP_UP, -1.0, 0.0)
     )
@@ -81,7 +82,7 @@ def compute_slip_signs(slot_modes: Array) -> SlotPair:
 
 
 class _ConstantTerms(NamedTuple):
-    """Accelerations, or velocity jumps, that are constant in the tangent of the residual."""
+    """Accelerations or velocity jumps that the tangent of the residual treats as constants."""
 
     radial_leg_motion: LegArray  # of leg masses relative to the hub, along the legs
     transverse_leg_motion: LegArray  # of leg masses relative to the hub, transverse to the legs
@@ -89,7 +90,10 @@ class _ConstantTerms(NamedTuple):
 
 
 class _EquationTangents(NamedTuple):
-    """Tangents of the equations of motion or impact at constant accelerations or velocity jumps."""
+    """Tangents of the equations of motion or impact.
+
+    Accelerations or velocity jumps are treated as constants.
+    """
 
     radial_leg_motion: LegArray
     transverse_leg_motion: LegArray
@@ -115,7 +119,7 @@ def solve_contact_forces(contact_configuration: ContactConfiguration) -> WheelFo
 
 @eqx.filter_jit
 def solve_impact(contact_configuration: ContactConfiguration) -> WheelForceSolution:
-    """Return the impulses of an impact (N s) and the velocities after it, with a JVP rule."""
+    """Return the impulses in an impact (N s) and the velocities after it, with a JVP rule."""
     return _solve_with_jvp_rule(
         compute_free_velocity, _compute_impact_equation_tangents, contact_configuration
     )
@@ -126,9 +130,9 @@ def solve_contact_configuration(
     inverse_inertia: ContactInverseInertia,
     free_motion: FreeMotion,
 ) -> WheelForceSolution:
-    """Return the contact forces or impulses of a configuration, given its free motion.
+    """Return the contact forces or impulses for a configuration with a known free motion.
 
-    - `inverse_inertia`: inverse inertia at this posture;
+    - `inverse_inertia`: inverse inertia for the posture of the configuration;
     - `free_motion`: accelerations without contact forces, or velocities without impulses.
     """
     s, _, friction, contact_slots, slot_modes, is_stopper_holding, _ = contact_configuration
@@ -159,7 +163,7 @@ def solve_contact_configuration(
 def _solve_with_free_motion(
     free_motion_fn: Callable[..., FreeMotion], contact_configuration: ContactConfiguration
 ) -> tuple[ContactInverseInertia, FreeMotion, WheelForceSolution]:
-    """Return inverse inertia, free motion, and forces or impulses of a configuration."""
+    """Return inverse inertia, free motion, and forces or impulses for a contact configuration."""
     s = contact_configuration.s
     motion = contact_configuration.motion
     unit_divisor = make_opaque_one(contact_configuration.motion)
@@ -195,7 +199,7 @@ def _solve_with_jvp_rule(
     equation_tangent_fn: _EquationTangentFn,
     contact_configuration: ContactConfiguration,
 ) -> WheelForceSolution:
-    """Return the forces or impulses of a configuration, with a JVP rule.
+    """Return the forces or impulses for a contact configuration, with a JVP rule.
 
     The JVP rule solves the contact equations with the tangent of the residual on the right-hand
     side.
@@ -257,7 +261,7 @@ def _solve_with_jvp_rule(
 
 
 class ResidualTangent(NamedTuple):
-    """Tangent of the residual of the contact equations, by leg and by slot."""
+    """Tangent of the residual of the contact equations, with one entry per leg or contact slot."""
 
     leg_length_residual: LegArray  # effect on each leg's length
     hub_residual_by_leg: tuple[
@@ -278,10 +282,11 @@ def compute_residual_tangent(
     constant_terms: _ConstantTerms,
     equation_tangents: _EquationTangents,
 ) -> ResidualTangent:
-    """Return the tangent of the residual along a tangent of the configuration.
+    """Return the tangent of the contact equations' residual for a tangent of the configuration.
 
-    - `constant_terms`: accelerations or velocity jumps that are constant;
-    - `equation_tangents`: tangents of the equations at these constant terms.
+    - `configuration_tangent`: tangent of the configuration;
+    - `constant_terms`: accelerations or velocity jumps that are treated as constants;
+    - `equation_tangents`: tangents of the equations for these constant terms.
     """
     s, ds, contact_slots, (sin, cos), slot_indices = (
         contact_configuration.s,
@@ -389,7 +394,7 @@ def compute_residual_tangent(
 
 
 class SummedResidualTangent(NamedTuple):
-    """Tangent of the residual, summed over all legs and gathered for the slots."""
+    """Tangent of the residual, with the hub's equations summed over all legs."""
 
     hub_residual: HubVector
     slot_length_residual: SlotPair
@@ -401,7 +406,10 @@ class SummedResidualTangent(NamedTuple):
 def sum_residual_tangent(
     contact_slots: ContactSlots, residual_tangent: ResidualTangent
 ) -> SummedResidualTangent:
-    """Return the tangent of the residual, summed over all legs and gathered for the slots."""
+    """Return the tangent of the residual, with the hub's equations summed over all legs.
+
+    The entries for leg lengths are gathered for the legs in the contact slots.
+    """
     x, z, hub_rotation_residual = (
         sum_over_legs(leg_forces) + other_force
         for leg_forces, other_force in zip(
@@ -424,9 +432,9 @@ def compute_free_motion_tangent(
     leg_motion: LegArray,
     summed_tangent: SummedResidualTangent,
 ) -> FreeMotion:
-    """Return the tangent of the free motion that has the same effect as the residual's tangent.
+    """Return the tangent of the free motion that is equivalent to the tangent of the residual.
 
-    - `leg_motion`: tangent of the legs' motion;
+    - `leg_motion`: tangent of the accelerations or velocities of the leg lengths;
     - `summed_tangent`: tangent of the residual, summed over all legs.
     """
     hub_motion_tangent, slot_length_tangents, (u, v) = (

@@ -1,5 +1,4 @@
-"""Effects of an event: impacts at the velocity level, then the contact modes of the following
-motion.
+"""Compute the effects of an event: the impact, and the contact modes of the subsequent motion.
 
 All functions work elementwise, for one wheel or a batch.
 """
@@ -58,7 +57,10 @@ from vrw_jax.wheel import Symbols
 
 
 class ContactEvent(NamedTuple):
-    """Kind of an event, as flags of legs and slots. One flag of one leg or slot is true."""
+    """Kind of an event, as flags for legs and contact slots.
+
+    One flag of one leg or contact slot is True. `_merge_touching_contacts` may set further flags.
+    """
 
     is_foot_landing: Bool[Array, "n_legs ..."]  # whether the foot meets the ground
     is_leg_meeting_stopper: Bool[Array, "n_legs ..."]  # whether the leg meets its stopper
@@ -78,14 +80,15 @@ class ContactEvent(NamedTuple):
 
 
 def _make_leg_indices(n_legs: int, axes_reference: Array) -> np.ndarray:
-    """Return the leg indices 0 ... n - 1 on the first of as many axes as `axes_reference` has, and
-    one more.
+    """Return the leg indices 0 ... n - 1 on the first axis, to broadcast over a batch.
+
+    The result has one axis more than `axes_reference`.
     """
     return np.arange(n_legs, dtype=np.int32).reshape(-1, *(1,) * jnp.ndim(axes_reference))
 
 
 def classify_event(guard_layout: GuardLayout, guard_index: Int[Array, "..."]) -> ContactEvent:
-    """Return the event that the zero of a guard causes, given the index of the guard."""
+    """Return the kind of the event at which the guard with the index `guard_index` is zero."""
     n_legs = guard_layout.n_legs
     select_flags = lambda first_index, n_guards: (
         guard_index == first_index + _make_leg_indices(n_guards, guard_index)
@@ -108,7 +111,7 @@ def classify_event(guard_layout: GuardLayout, guard_index: Int[Array, "..."]) ->
 
 
 class ContactLaw(NamedTuple):
-    """Parameters of wheel and ground, and options of contact, for all events of a walk."""
+    """Parameters of wheel and ground, and options of the contact law, for all events in a walk."""
 
     s: Symbols
     friction: Friction  # of all feet; or of the last landed foot and of the others
@@ -121,13 +124,13 @@ class ContactLaw(NamedTuple):
 
 @dataclass(frozen=True)
 class StopperPivotOptions:
-    """Options of the search for the stoppers that hold their legs.
+    """Options of the search for the stoppers that hold legs in the air.
 
     Few pivots suffice unless friction couples legs.
     """
 
     max_block_pivots: int = 8
-    """Number of pivots that switch all legs of the wrong sign."""
+    """Number of pivots that switch all legs with a wrong sign."""
     max_single_pivots: int = 16
     """Number of later pivots that switch one leg each."""
     max_enumerated_legs: int = 8
@@ -138,8 +141,9 @@ STOPPER_PIVOT_OPTIONS = StopperPivotOptions()
 
 
 class _KinematicLevelSolution(NamedTuple):
-    """Solution for an assumed set of held legs in the air, at the level of velocities or of
-    accelerations.
+    """Solution in terms of velocities or accelerations, for an assumed set of closed stoppers.
+
+    The stoppers are those of legs in the air.
     """
 
     chosen_combination: ChosenModeCombination
@@ -152,7 +156,11 @@ class _KinematicLevelSolution(NamedTuple):
 _LevelSolver = Callable[
     [ContactLaw, WheelMotion, Array, ChosenModeCombination | None], _KinematicLevelSolution
 ]
-"""Function of contact law, motion, held legs in the air and, if known, the chosen combination."""
+"""Function that solves for velocities or accelerations, for an assumed set of closed stoppers.
+
+The arguments are the contact law, the motion, the flags of the closed stoppers and, if it is known,
+the combination of contact modes.
+"""
 
 
 def _solve_stopper_lcp(
@@ -164,14 +172,15 @@ def _solve_stopper_lcp(
     tolerances: ContactSignTolerances,
     pivot_options: StopperPivotOptions = STOPPER_PIVOT_OPTIONS,
 ) -> tuple[_KinematicLevelSolution, Array]:
-    """Return the solution with complementary stopper forces, and whether each leg is held.
+    """Return the solution with complementary stopper forces, and whether each stopper is closed.
 
-    A tested leg at its stopper is held if the stopper pushes, or moves inwards otherwise. The first
-    pivots switch all legs of the wrong sign together. Later pivots switch only the last of these
-    legs, which prevents cycles. The method is principal pivoting, which is finite if no friction
-    couples the legs (Murty 1974, Kostreva 1978). If pivoting fails, all combinations are
-    enumerated. The solution with the smallest violation is returned. This solution is admissible if
-    its violation is at most `MAX_VIOLATION`.
+    The stopper of a tested leg is closed if it pushes. It is open if the leg moves inwards. The
+    first pivots switch all legs with a wrong sign together. Later pivots switch only the last of
+    these legs, which prevents cycles. The method is principal pivoting, which is finite if no
+    friction couples the legs (Murty 1974, Kostreva 1978).
+
+    If pivoting fails, all combinations are enumerated, and the solution with the smallest violation
+    is returned. This solution is admissible if its violation is at most `MAX_VIOLATION`.
     """
     constant_inputs = stop_gradients((contact_law, motion))
     tested_leg_rank = jnp.cumsum(is_stopper_tested.astype(jnp.int32), axis=0) - 1
@@ -283,8 +292,9 @@ def _apply_restitution(
     inverse_inertia: ContactInverseInertia,
     free_motion: FreeMotion,
 ) -> FreeMotion:
-    """Return the velocities without impulses, corrected for the rebound of striking feet by
-    Newton's law.
+    """Return the velocities without impulses, corrected for the rebound of striking feet.
+
+    The rebound speeds follow from Newton's law of restitution.
     """
     if contact_law.restitution is None:
         return free_motion
@@ -317,11 +327,12 @@ def _limit_energy_gain(
     newton_solution: _KinematicLevelSolution,
     inelastic_solution: _KinematicLevelSolution,
 ) -> _KinematicLevelSolution:
-    """Return the impact with the largest part of Newton's rebound that does not increase energy.
+    """Return the impact with the largest part of Newton's rebound that adds no energy.
 
-    With Coulomb's friction, Newton's law can increase the energy (Kane 1984). The inelastic impact
-    never increases the energy. The energy is a quadratic function along the line from the inelastic
-    impact to Newton's impact. Impulses stay in the cone of friction, because the cone is convex.
+    With Coulomb friction, Newton's law of restitution can increase the energy (Kane 1984). The
+    inelastic impact never increases the energy. The result is on the straight line from the
+    inelastic impact to Newton's impact, on which the energy is a quadratic function. Impulses stay
+    in the friction cone, because the cone is convex.
     """
     compute_energy = lambda motion_state: compute_kinetic_energy(contact_law.s, motion_state)
     energy_inelastic = compute_energy(inelastic_solution.motion_after_impact)
@@ -365,12 +376,11 @@ def _solve_velocity_level(
     contact_state: ContactState,
     contact_event: ContactEvent,
 ) -> tuple[_KinematicLevelSolution, ContactSlots, Bool[Array, "n ..."]]:
-    """Return the solution of an impact of all striking contacts at once, with Coulomb's law for
-    impulses.
+    """Return the solution of an impact in which all contacts strike at once.
 
-    The result is (solution, slots, held legs in the air). With one-sided stoppers, a leg is held if
-    its stopper need not pull. By the paper's rule, resting feet stay at rest when a leg meets its
-    stopper.
+    Coulomb's law applies to impulses. The result is (solution, contact slots, whether each leg in
+    the air is held by its stopper). A one-sided stopper holds a leg only if it does not have to
+    pull. By the rule of the paper, resting feet stay at rest when a leg reaches its stopper.
     """
     s = contact_law.s
     contact_slots = find_contact_slots(
@@ -472,12 +482,14 @@ def _solve_velocity_level(
 def _list_following_modes(
     contact_event: ContactEvent, slot_modes: Array, is_consistent: Array, follows_paper_rule: Array
 ) -> tuple[Int[Array, "2 ..."], Int[Array, "2 ..."]]:
-    """Return the modes that may follow an event in each slot, and the modes that need no test.
+    """Return the contact modes that may follow an event, and the modes that need no test.
 
-    Both are sets of modes, with one bit per mode.
+    The result contains two sets of modes for each contact slot, with one bit per mode.
 
-    - `is_consistent`: whether the released foot of a slot moves in the release direction (see
-      `is_release_consistent`).
+    - `slot_modes`: contact mode of the foot in each contact slot before the event;
+    - `is_consistent`: whether the released foot moves in the release direction (see
+      `is_release_consistent`);
+    - `follows_paper_rule`: whether the rule of the paper applies to infinite friction.
     """
     current_mode_bit, off_mode_bit = 1 << slot_modes, 1 << ContactMode.OFF
     possible_modes = jnp.where(
@@ -518,8 +530,12 @@ def _list_following_modes(
 
 
 FORCE_ROUNDOFF_FRACTION = 1e-9
-"""Fraction of the wheel's weight, and of gravity, that counts as zero, chosen because forces are
-accurate to round-off."""
+"""Fraction of the wheel's weight below which forces are round-off.
+
+The same fraction of gravity applies to accelerations.
+
+The value is chosen because forces are accurate to round-off.
+"""
 
 
 def _solve_acceleration_level(
@@ -529,12 +545,15 @@ def _solve_acceleration_level(
     is_at_stopper: Array,
     contact_event: ContactEvent,
 ) -> tuple[ChosenModeCombination, ContactSlots, Array, Bool[Array, "n ..."]]:
-    """Return the contact modes and stoppers of the motion after an event.
+    """Return the contact modes and stoppers for the motion after an event.
 
-    Contact modes and stoppers follow from the accelerations. The result is (combination, slots,
-    feet that were at rest, held legs in the air), without derivatives. The contact that the event
-    has ended is not tested again, because its force is zero up to round-off. This contact gets the
-    mode of its release if that mode is consistent (see `is_release_consistent`).
+    The accelerations determine modes and stoppers. The result is (combination, contact slots,
+    whether each foot was at rest, whether each leg in the air is held by its stopper), without
+    derivatives.
+
+    The contact that the event has ended is not tested again, because its force is zero within
+    round-off. Its new mode is the mode of its release if that mode is consistent (see
+    `is_release_consistent`).
     """
     contact_law, motion = stop_gradients((contact_law, motion))
     s, contact_slots = contact_law.s, find_contact_slots(contact_modes != ContactMode.OFF)
@@ -641,14 +660,15 @@ def _bring_slow_contacts_to_rest(
     is_at_stopper: Array,
     was_at_stopper: Array,
 ) -> tuple[WheelMotion, Array, Array]:
-    """Return the motion after an impact with slow contacts at rest, the modes of the touching feet,
-    and whether each leg is on its stopper.
+    """Return the motion after an impact with slow contacts at rest, and the new modes and stoppers.
 
-    A contact slower than `ContactLaw.rest_speed` after the impact is brought to rest. Otherwise its
-    bounces would be too small to resolve, and their number would have no bound. The forces
-    determine the contacts of the following motion.
+    The modes are those of the touching feet. A contact slower than `ContactLaw.rest_speed` after
+    the impact is brought to rest. Otherwise its bounces would be too small to resolve, and their
+    number would be unlimited. The forces then determine the contacts in the subsequent motion.
 
-    - `was_at_stopper`: whether each leg was on its stopper before the impact.
+    - `contact_modes`: contact mode of each foot after the impact;
+    - `is_at_stopper`, `was_at_stopper`: whether each leg is on its stopper after and before the
+      impact.
     """
     leg_directions = compute_leg_directions(contact_law.s, motion.theta)
     tangential_speed, normal_speed = compute_foot_velocities(motion, leg_directions)
@@ -671,8 +691,9 @@ def _bring_slow_contacts_to_rest(
     s, frozen_motion, friction = stop_gradients((contact_law.s, motion, contact_law.friction))
 
     def find_reversed_slip(_: Array) -> Array:
-        """Return whether the projection reverses the slip of each foot. Such a foot also comes to
-        rest.
+        """Return whether the projection reverses the slip of each foot.
+
+        A foot with reversed slip also comes to rest.
         """
         slip_speed_after, _ = compute_foot_velocities(
             project_motion(s, frozen_motion, modes_after_rest, is_locked, friction), leg_directions
@@ -704,7 +725,7 @@ def _merge_touching_contacts(
     contact_state: ContactState,
     contact_event: ContactEvent,
 ) -> ContactEvent:
-    """Return the event with all contacts that touch, including those whose guards are not zero.
+    """Return the event extended by all other contacts that touch.
 
     A contact touches if its distance is below the smallest resolved bounce and it does not
     separate. If such contacts were resolved one after another, each impact would cause the next one
@@ -788,7 +809,7 @@ def resolve_event(
     contact_state: ContactState,
     contact_event: ContactEvent,
 ) -> ContactEventResult:
-    """Return motion and contact state after an event, with its impulses and lost energy."""
+    """Return motion and contact state after an event, with the impulses and the lost energy."""
     contact_event = _merge_touching_contacts(
         contact_law,
         motion,
@@ -900,13 +921,13 @@ def project_motion(
     is_locked: Bool[Array, "n ..."],
     friction: Any = None,
 ) -> WheelMotion:
-    """Return the motion projected onto its contacts.
+    """Return the motion projected onto the constraints of its contacts.
 
     After the projection, loaded feet are on the slope and sticking feet are at rest. Bilateral
-    impulses without friction project the velocities. A motion that satisfies the contacts is
-    returned unchanged up to round-off.
+    impulses without friction project the velocities. A motion that satisfies the constraints is
+    returned unchanged within round-off.
 
-    - `friction`: friction coefficient of sliding feet in the projection; None means 0.
+    - `friction`: friction coefficient for sliding feet in the projection; None means 0.
     """
     leg_directions = compute_leg_directions(s, motion.theta)
     L = jnp.where(

@@ -1,12 +1,14 @@
-"""Mechanics of the free wheel: hub and legs as coordinates, and the response to contact forces.
+"""Mechanics of the free wheel in coordinates of hub and legs, and its response to forces.
 
-The coordinates are the hub (x, z), the angle theta of Leg 1 and the n leg lengths. A leg couples
-with the hub alone, so the mass matrix is an arrow matrix. Eliminating the legs of free length
-leaves a 3 x 3 system. Up to two *slots* hold the legs whose feet may be loaded. The force on a foot
-has a radial part along u (foot to hub) and a transverse part along e = du/dtheta. Only the
-transverse part acts on the hub. The same equations are used for accelerations and, with momenta in
-place of forces, for impacts. All functions work elementwise over a batch, on one more axis behind
-that of the legs.
+The coordinates are the hub position (x, z), the angle theta of Leg 1 and the n leg lengths. Each
+leg is coupled only to the hub, so the mass matrix is an arrow matrix. Eliminating the legs of free
+length leaves a 3 x 3 system. At most two feet are loaded at a time. Their legs are in two *contact
+slots*, fore leg first.
+
+The force on a foot has a radial part along u (foot to hub) and a transverse part along e =
+du/dtheta. Only the transverse part acts on the hub. The same equations apply to accelerations and,
+with momenta in place of forces, to impacts. All functions work elementwise over a batch, whose axis
+follows that of the legs.
 """
 
 import math
@@ -23,15 +25,15 @@ from vrw_jax.numerics import Elementwise, Scalar, compute_sine_cosine
 from vrw_jax.wheel import Symbols
 
 LegArray = Float[Array, "n_legs ..."]
-"""Quantity of every leg, on the first axis."""
+"""Array with one entry per leg on the first axis."""
 HubVector = tuple[Any, Any, Any]
-"""Components of a vector along hub x, hub z and theta."""
+"""Components of a generalized vector for the coordinates hub x, hub z and theta."""
 SlotPair = tuple[Any, Any]
-"""Quantity of each of the two slots."""
+"""Pair of quantities, one for the leg in each of the two contact slots."""
 
 
 class WheelMotion(NamedTuple):
-    """Coordinates and rates of the free wheel in the frame of the slope."""
+    """Coordinates and rates of the free wheel in a frame whose x axis points down the slope."""
 
     x: Scalar  # of the hub, m, downhill
     z: Scalar  # of the hub above the slope, m
@@ -51,9 +53,9 @@ class LegDirections(NamedTuple):
 
 
 def compute_leg_directions(s: Symbols, theta: Elementwise) -> LegDirections:
-    """Return the directions of all legs at the angle `theta` (rad) of Leg 1.
+    """Return the directions of all legs for the angle `theta` (rad) of Leg 1.
 
-    The angle may be of any size, with any number of turns.
+    The angle may include any number of turns.
     """
     leg_angles = (s.alpha * np.arange(s.n)).reshape(-1, *(1,) * jnp.ndim(theta))
     half_turns = lax.stop_gradient(jnp.floor(theta / math.pi + 0.5))
@@ -66,22 +68,23 @@ def compute_leg_directions(s: Symbols, theta: Elementwise) -> LegDirections:
 
 
 def sum_over_legs(leg_quantities: Array) -> Array:
-    """Return the sum of a quantity over the legs, which are on the first axis."""
+    """Return the sum over the legs, which are on the first axis."""
     return jnp.sum(leg_quantities, axis=0)
 
 
 def prevent_fusion(tree: Any, unit_divisor: Array) -> Any:
-    """Return the tree with every float divided by `unit_divisor`, which is 1 at run time.
+    """Return the tree with every float array divided by `unit_divisor`, which is 1 at run time.
 
-    Fusions of XLA on a CPU repeat chains of cheap operations for each use. Here the repetitions
-    multiply the number of operations by a hundred. XLA computes a division only once.
+    When XLA fuses operations on a CPU, it repeats chains of cheap operations for each use. Here the
+    repetitions would multiply the number of operations by a hundred. XLA computes a division only
+    once.
     """
     is_float_array = lambda leaf: jnp.issubdtype(jnp.result_type(leaf), jnp.floating)
     return jax.tree.map(lambda leaf: leaf / unit_divisor if is_float_array(leaf) else leaf, tree)
 
 
 def make_opaque_one(motion: "WheelMotion") -> Array:
-    """Return ones in the shape of `theta` that no compiler can simplify."""
+    """Return an array of ones with the shape of `theta` that no compiler can simplify."""
     return lax.stop_gradient(1.0 + 0.0 * motion.theta)
 
 
@@ -92,9 +95,9 @@ def stop_gradients(tree: Any) -> Any:
 
 
 class ContactSlots(NamedTuple):
-    """Masks of the two legs whose feet may be loaded (the contact slots), fore first.
+    """Masks of the legs in the two contact slots, fore leg first.
 
-    The mask of an empty slot is False for all legs.
+    The feet of these legs may be loaded. The mask of an empty slot is False for all legs.
     """
 
     first_slot_mask: Bool[Array, "n_legs ..."]
@@ -102,26 +105,27 @@ class ContactSlots(NamedTuple):
 
     @property
     def is_in_slot(self) -> Bool[Array, "n_legs ..."]:
-        """Return whether each leg is in one of the two contact slots, (n_legs, ...)."""
+        """Return whether each leg is in one of the two contact slots, shape (n_legs, ...)."""
         return self.first_slot_mask | self.second_slot_mask
 
     def gather_slot_codes(self, leg_quantities: Array) -> Int[Array, "2 ..."]:
-        """Return the integers of both slots' legs, (2, ...), given an integer of each leg.
+        """Return the integers of the legs in both contact slots, (2, ...), from an integer per leg.
 
-        The integer of an empty slot is 0.
+        The result for an empty slot is 0.
         """
         return jnp.stack(self.gather_slot_pair(leg_quantities))
 
     def gather_slot_flags(self, leg_quantities: Array) -> Bool[Array, "2 ..."]:
-        """Return the flags of both slots' legs, (2, ...), given a flag of each leg.
+        """Return the flags of the legs in both contact slots, (2, ...), from a flag per leg.
 
-        The flag of an empty slot is False.
+        The result for an empty slot is False.
         """
         return self.gather_slot_codes(leg_quantities.astype(jnp.int32)) > 0
 
     def gather_slot_pair(self, leg_quantities: Array) -> SlotPair:
-        """Return a quantity of both slots' legs, given the quantity of each leg; 0 for an empty
-        slot.
+        """Return the entries of `leg_quantities` for the legs in both contact slots.
+
+        The result for an empty slot is 0.
         """
         zero_slot_values = jnp.zeros_like(leg_quantities)
         return (
@@ -130,9 +134,9 @@ class ContactSlots(NamedTuple):
         )
 
     def scatter_to_legs(self, slot_pair: Any) -> LegArray:
-        """Return a quantity of each leg, given that of both slots' legs; 0 for legs in no slot.
+        """Return an array over all legs with the entries of `slot_pair` at the legs in contact.
 
-        The function is the inverse of `gather_slot_pair`.
+        Other legs have the entry 0. The function is the inverse of `gather_slot_pair`.
         """
         return jnp.where(self.first_slot_mask, slot_pair[0], 0.0) + jnp.where(
             self.second_slot_mask, slot_pair[1], 0.0
@@ -140,7 +144,7 @@ class ContactSlots(NamedTuple):
 
 
 def find_contact_slots(is_foot_touching: Bool[Array, "n_legs ..."]) -> ContactSlots:
-    """Return the contact slots of the first two legs whose feet touch the ground."""
+    """Return the contact slots for the first two legs whose feet touch the ground."""
     touching_leg_rank = jnp.cumsum(is_foot_touching.astype(jnp.int32), axis=0)
     return ContactSlots(
         is_foot_touching & (touching_leg_rank == 1), is_foot_touching & (touching_leg_rank == 2)
@@ -150,10 +154,10 @@ def find_contact_slots(is_foot_touching: Bool[Array, "n_legs ..."]) -> ContactSl
 def select_slot_friction(
     friction: Elementwise | SlotPair, contact_slots: ContactSlots
 ) -> Elementwise | SlotPair:
-    """Return the friction coefficient of the foot in each contact slot, or the common coefficient.
+    """Return the friction coefficient for the foot in each contact slot.
 
-    A pair `friction` contains the coefficient of the foot of Leg 1, which landed last, and that of
-    all other feet. A single number is the coefficient of all feet.
+    If `friction` is a pair, it contains the coefficient for the foot of Leg 1, which landed last,
+    and that for all other feet. A single coefficient applies to all feet and is returned unchanged.
     """
     if not isinstance(friction, tuple):
         return friction
@@ -164,7 +168,7 @@ def select_slot_friction(
 
 
 class ContactInverseInertia(NamedTuple):
-    """Inverse inertia of the hub, and responses of hub and slots to the slots' forces."""
+    """Inverse inertia of the hub, and responses of hub, feet and legs to contact forces."""
 
     leg_directions: LegDirections
     is_released: Bool[Array, " n_legs"]  # whether a leg is eliminated: free in length, or in a slot
@@ -182,7 +186,7 @@ class ContactInverseInertia(NamedTuple):
 def multiply_by_inverse_inertia(
     inverse_inertia: tuple[Any, ...], generalized_force: HubVector
 ) -> HubVector:
-    """Return the product of the symmetric inverse inertia and a vector."""
+    """Return the product of the symmetric inverse inertia matrix and a generalized force."""
     inverse_xx, inverse_xz, inverse_xt, inverse_zz, inverse_zt, inverse_tt = inverse_inertia
     return (
         inverse_xx * generalized_force[0]
@@ -202,7 +206,8 @@ def _invert_inertia(
 ) -> tuple[Any, ...]:
     """Return the inverse of the hub's 3 x 3 inertia matrix without the released legs.
 
-    The entries are xx, xz, x theta, zz, z theta, theta theta.
+    The entries are xx, xz, x theta, zz, z theta, theta theta. `b` contains the distances of the leg
+    masses from the hub, m.
     """
     sin = jnp.where(is_released, leg_directions.sin, 0.0)
     cos = jnp.where(is_released, leg_directions.cos, 0.0)
@@ -229,7 +234,7 @@ def _invert_inertia(
 
 
 class WheelPosture(NamedTuple):
-    """Directions of all legs, and directions and lengths of the slots' legs."""
+    """Directions of all legs, and the directions and lengths of the legs in the contact slots."""
 
     leg_directions: LegDirections
     sin: SlotPair
@@ -240,7 +245,7 @@ class WheelPosture(NamedTuple):
 def make_wheel_posture(
     s: Symbols, motion: WheelMotion, contact_slots: ContactSlots
 ) -> WheelPosture:
-    """Return the directions of all legs, and the directions and lengths of the slots' legs."""
+    """Return the directions of all legs, and the lengths of the legs in the contact slots."""
     leg_directions = compute_leg_directions(s, motion.theta)
     return WheelPosture(
         leg_directions,
@@ -253,7 +258,7 @@ def make_wheel_posture(
 def make_inverse_inertia(
     s: Symbols, motion: WheelMotion, contact_slots: ContactSlots, is_airborne_locked: Array
 ) -> ContactInverseInertia:
-    """Return the responses of hub and slots to contact forces at this posture.
+    """Return the inverse inertia of the hub and the responses to contact forces for a posture.
 
     - `is_airborne_locked`: whether a leg is in the air on its stopper.
     """
@@ -315,7 +320,7 @@ def compute_free_leg_acceleration(
 ) -> LegArray:
     """Return the acceleration of each leg's length without contact forces, m/s^2.
 
-    The acceleration of the hub along the leg is not included.
+    The acceleration of the hub in the direction of the leg is not included.
     """
     gravity_x, gravity_z = s.g * s.sin_phi, -s.g * s.cos_phi
     centrifugal_acceleration = (motion.L - s.a) * motion.dtheta * motion.dtheta
@@ -335,7 +340,7 @@ def compute_free_acceleration(
 ) -> FreeMotion:
     """Return the accelerations due to gravity, springs, dampers and rotation alone.
 
-    The slots' feet and stoppers exert no force.
+    Feet and stoppers of the legs in the contact slots exert no force.
     """
     sin, cos = inverse_inertia.leg_directions
     b, dtheta = motion.L - s.a, motion.dtheta
@@ -385,9 +390,9 @@ def compute_free_velocity(
     contact_slots: ContactSlots,
     inverse_inertia: ContactInverseInertia,
 ) -> FreeMotion:
-    """Return the velocities after an impact without impulses at feet or slots' stoppers.
+    """Return the velocities after an impact without impulses on legs in the contact slots.
 
-    An airborne leg at its stopper whose length changes strikes the stopper inelastically.
+    A leg in the air that reaches its stopper strikes it inelastically.
     """
     sin, cos = inverse_inertia.leg_directions
     b, dtheta = motion.L - s.a, motion.dtheta
@@ -424,7 +429,7 @@ def compute_free_velocity(
 
 
 class SlotFootVelocity(NamedTuple):
-    """Velocity of the slots' feet along the slope and normal to the slope, m/s."""
+    """Velocities of the feet in the contact slots, tangential and normal to the slope, m/s."""
 
     along_slope: SlotPair
     normal_to_slope: SlotPair
@@ -433,7 +438,7 @@ class SlotFootVelocity(NamedTuple):
 def compute_slot_foot_velocity(
     motion: WheelMotion, contact_slots: ContactSlots, posture: ContactInverseInertia | WheelPosture
 ) -> SlotFootVelocity:
-    """Return the velocity of the slots' feet along the slope and normal to the slope, m/s."""
+    """Return the tangential and normal velocities of the feet in the contact slots, m/s."""
     dL = contact_slots.gather_slot_pair(motion.dL)
     x = [
         motion.vx - dL[i] * posture.sin[i] - posture.L[i] * motion.dtheta * posture.cos[i]
@@ -451,8 +456,8 @@ def compute_foot_heights(
 ) -> LegArray:
     """Return the height of every foot above the slope, m.
 
-    - `next_line_tilt`: angle by which the next line is steeper, rad. The height of the foremost
-      foot is measured from the next line, which begins under the foot of Leg 1.
+    - `next_line_tilt`: angle by which the next straight line of uneven ground is steeper, rad. This
+      line begins under the foot of Leg 1, and the height of the foremost foot is measured from it.
     """
     foot_heights = motion.z - motion.L * leg_directions.cos
     if next_line_tilt is None:
@@ -468,7 +473,7 @@ def compute_foot_heights(
 def compute_foot_velocities(
     motion: WheelMotion, leg_directions: LegDirections
 ) -> tuple[LegArray, LegArray]:
-    """Return the velocity of every foot along the slope and normal to the slope, m/s."""
+    """Return the velocities of every foot tangential and normal to the slope, m/s."""
     transverse_velocity = motion.L * motion.dtheta
     tangential_speed = (
         motion.vx - motion.dL * leg_directions.sin - transverse_velocity * leg_directions.cos
@@ -485,7 +490,7 @@ def compute_foot_positions(motion: WheelMotion, leg_directions: LegDirections) -
 
 
 def compute_landing_position(n_legs: int, motion: WheelMotion) -> Elementwise:
-    """Return the downhill position of the foremost of `n` feet, m."""
+    """Return the downhill position of the foremost foot of a wheel with `n_legs` legs, m."""
     foremost_angle = motion.theta + (n_legs - 1) * 2.0 * math.pi / n_legs
     return motion.x - motion.L[n_legs - 1] * jnp.sin(foremost_angle)
 
@@ -501,8 +506,9 @@ def compute_kinetic_energy(s: Symbols, motion: WheelMotion) -> Elementwise:
 
 
 def compute_potential_energy(s: Symbols, motion: WheelMotion) -> SlotPair:
-    """Return the gravitational energy relative to the origin, and the elastic energy of all
-    springs, J.
+    """Return the gravitational energy and the elastic energy of all springs, J.
+
+    The gravitational energy is relative to the origin.
     """
     leg_directions = compute_leg_directions(s, motion.theta)
     x = s.Mt * motion.x - s.m * sum_over_legs((motion.L - s.a) * leg_directions.sin)

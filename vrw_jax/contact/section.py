@@ -1,5 +1,7 @@
-"""Full section state of the unilateral model as one vector, and its conversion to and from
-motions."""
+"""Full section state of the model with unilateral contact as one vector.
+
+The functions convert it to and from motions.
+"""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
@@ -17,26 +19,29 @@ from vrw_jax.numerics import Elementwise
 from vrw_jax.wheel import Symbols, WheelParams, WheelUnits, compute_length_at_touchdown
 
 FullState = Float[Array, "n_full ..."]
-"""State (theta-, dtheta-, vx-, vz-, L_1 ... L_n, dL_1 ... dL_n, code_1 ... code_n) just before the
-foremost foot lands, in the leg labels of the ending step. Units: rad, rad/s, hub m/s, m, m/s.
+"""State just before the foremost foot lands, as one vector of 4 + 3 n entries.
 
-The code of a leg is the contact mode of its foot: 0 in the air, 1 at rest, 2 sliding downhill, 3
-sliding uphill. A leg on its stopper has 4 more. The height of the hub follows from the landing
-foot."""
+The entries are (theta-, dtheta-, vx-, vz-, L_1 ... L_n, dL_1 ... dL_n, code_1 ... code_n), in the
+leg numbering of the step that ends. The units are rad, rad/s, m/s for the hub velocity, m and m/s.
+
+The contact code of a leg is the contact mode of its foot: 0 in the air, 1 at rest, 2 sliding
+downhill, 3 sliding uphill. The code of a leg on its stopper is larger by 4. The height of the hub
+follows from the landing foot.
+"""
 
 LOCKED_CODE_OFFSET = 4
-"""Number that the code of a leg on its stopper exceeds the contact mode of its foot by."""
+"""Difference between the contact code of a leg on its stopper and the contact mode of its foot."""
 
 
 def compute_full_section_size(n_legs: int) -> int:
-    """Return the number of entries of a full section state of a wheel with `n` legs."""
+    """Return the number of entries in a full section state of a wheel with `n_legs` legs."""
     return 4 + 3 * n_legs
 
 
 def compute_section_units(wheel_units: WheelUnits, n_legs: int) -> list[Elementwise]:
-    """Return the wheel's unit of each entry of a full section state, as a list.
+    """Return a list with the wheel's unit for each entry of a full section state.
 
-    Angles and codes have the unit 1.
+    Angles and contact codes have the unit 1.
     """
     angle_unit = wheel_units.length_unit / wheel_units.length_unit
     hub_units = [
@@ -54,7 +59,7 @@ def compute_section_units(wheel_units: WheelUnits, n_legs: int) -> list[Elementw
 
 
 def embed_section_state(s: Symbols, paper_state: Float[Array, "3 ..."]) -> FullState:
-    """Return the full section state of the paper's section state, (theta-, dtheta-, dL1-).
+    """Return the full section state for (theta-, dtheta-, dL1-), the section state of the paper.
 
     Leg 1 is at rest on the ground, and all other legs are in the air on their stoppers.
     """
@@ -82,15 +87,14 @@ def replace_invalid_start(
     section_state: FullState,
     next_line_tilt: Elementwise | None = None,
 ) -> tuple[Bool[Array, "..."], WheelParams, Elementwise, FullState]:
-    """Return whether a step can start from this input, and the input with invalid elements
-    replaced.
+    """Return which starts of a step are valid, and the input with invalid starts replaced.
 
-    An invalid element is replaced by the start of Table 1's wheel on ground with a friction
-    coefficient of 1. The result is (is_valid, parameters, friction, section state).
+    An invalid element is replaced by the start of the wheel in Table 1 of the paper, with a
+    friction coefficient of 1. The result is (is_valid, parameters, friction, section state).
 
-    - `friction`: coefficient of the ground, invalid if negative;
-    - `next_line_tilt`: angle by which the next line is steeper, rad. On such uneven ground, feet
-      may be below the line that continues the one of the last foothold.
+    - `friction`: friction coefficient of the ground, invalid if negative;
+    - `next_line_tilt`: angle by which the next straight line of uneven ground is steeper, rad. On
+      uneven ground, feet may be below the extension of the line with the last foothold.
     """
     valid_state = embed_section_state(
         WheelParams(n_legs=params.n_legs).symbols(),
@@ -108,19 +112,21 @@ def replace_invalid_start(
 
 
 PENETRATION_TOLERANCE = 1e-3
-"""Largest accepted position error of a start, as a fraction of the leg length. It is larger than
-the errors of integration and of Newton's method, and small enough for the first events to correct
-it."""
+"""Largest accepted position error in a section state, as a fraction of the leg length.
+
+The value is larger than the errors of integration and of Newton's method. It is small enough for
+the first events to correct the error.
+"""
 
 
 def _unpack_leg_posture(
     s: Symbols, section_state: FullState
 ) -> tuple[Elementwise, tuple, Array, Array, Array, Array]:
-    """Return angle (rad), hub position (m), leg lengths (m), their rates (m/s), contact modes and
-    stopper flags of a section state.
+    """Return posture, contact modes and stopper flags from a full section state.
 
-    The legs are numbered as in the step that starts. The landing foot is the origin. Lengths of
-    loaded legs are replaced so that their feet are on the slope.
+    The result is (theta in rad, hub position in m, leg lengths in m, their rates in m/s, contact
+    modes, stopper flags). The legs are numbered as in the step that starts. The landing foot is the
+    origin. Lengths of loaded legs are replaced so that their feet are on the slope.
     """
     n_legs = s.n
     theta = section_state[0] - s.alpha
@@ -142,7 +148,7 @@ def _unpack_leg_posture(
 
 
 def _has_consistent_posture(s: Symbols, section_state: FullState) -> Bool[Array, "..."]:
-    """Return whether the feet and leg lengths of a section state are consistent with the ground.
+    """Return whether the feet and leg lengths in a section state are consistent with the ground.
 
     No foot is below the ground, loaded feet are on the ground, and no leg is longer than its
     stopper allows. The tolerance is `PENETRATION_TOLERANCE`.
@@ -161,8 +167,8 @@ def unpack_section_state(s: Symbols, section_state: FullState) -> tuple[WheelMot
     """Return the motion and the contact state just before the landing that starts a step.
 
     The legs are numbered as in the step that starts, and the landing foot is the origin. Loaded
-    feet are placed on the slope, so that every vector near a section state is valid. The landing
-    brings sticking feet to rest.
+    feet are placed on the slope, so that every vector near a section state is valid. The impact at
+    landing brings sticking feet to rest.
     """
     theta, (hub_x, hub_z), L, dL, contact_modes, is_locked = _unpack_leg_posture(s, section_state)
     dtheta, vx, vz = section_state[1], section_state[2], section_state[3]
@@ -174,8 +180,9 @@ def unpack_section_state(s: Symbols, section_state: FullState) -> tuple[WheelMot
 def pack_section_state(
     motion: WheelMotion, contact_state: ContactState, next_line_tilt: Elementwise | None = None
 ) -> FullState:
-    """Return the section state of a motion just before the next landing, in the frame of that
-    landing's line.
+    """Return the section state for a motion just before the next landing.
+
+    On uneven ground, the section state is in the frame of the line on which the foot lands.
 
     - `next_line_tilt`: angle by which that line is steeper, rad; None on flat ground.
     """

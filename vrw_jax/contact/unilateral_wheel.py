@@ -58,15 +58,16 @@ from vrw_jax.wheel import (
 )
 
 STOPPERS_BILATERAL, STOPPERS_ONE_SIDED = "bilateral", "one-sided"
-"""Effect of stoppers on legs in the air: they hold with any force, or they only push."""
+"""Kinds of stoppers for legs in the air: they hold the leg with any force, or they only push."""
 FRICTION_LIMIT, FRICTION_PAPER_RULE = "limit", "paper"
-"""Meaning of infinite friction: the limit of large friction, or the paper's rule (A1)-(A4)."""
+"""Meaning of infinite friction: limit of large friction, or rule (A1)-(A4) of the paper."""
 
 
 class UnilateralTrajectory(eqx.Module):
-    """Motion of one step between its events, with axes (phase, sample).
+    """Motion during one step with unilateral contact, sampled between events.
 
-    A phase that did not happen has duration 0. The origin is the position of the opening landing.
+    The axes are (phase, sample). A phase that did not happen has duration 0. The origin is the
+    position of the landing at which the step starts.
     """
 
     time: Float[Array, "phases n"]  # time since the landing, s
@@ -83,16 +84,16 @@ class UnilateralTrajectory(eqx.Module):
 
 
 class UnevenGround(NamedTuple):
-    """Friction of earlier feet and tilt of the next line, for a step on uneven ground."""
+    """Uneven ground of one step: friction under earlier feet, and tilt of the next line."""
 
     friction: Scalar  # friction coefficient of the feet that landed earlier
     tilt: Scalar  # angle by which the next line is steeper, rad
 
 
 def _convert_restitution(value: Any) -> Array | None:
-    """Return Newton's coefficient of restitution as an array, or None for None, which means 0.
+    """Return Newton's coefficient of restitution as an array; None if it is None or 0.
 
-    Raise ValueError for a number outside [0, 1].
+    A value outside [0, 1] raises a ValueError.
     """
     if value is None or (isinstance(value, float | int) and value == 0):
         return None
@@ -108,23 +109,27 @@ def _convert_restitution(value: Any) -> Array | None:
 
 @with_renamed_arguments(infinite="infinite_friction_rule")
 class UnilateralWheel(AbstractWheel):
-    """Model of the wheel with unilateral contact: feet push on the ground and slide by Coulomb's
-    law.
+    """Model of the wheel with unilateral contact and Coulomb friction.
 
-    The order of events is free, and every leg may land, slide or lift off.
+    Feet push on the ground and slide by Coulomb's law. The events may have any order, and every
+    foot may land, slide or lift off.
 
-    - `friction`: coefficient of the ground, `inf` for feet that never slide;
-    - `max_events`: largest number of events of one step. The rest speed grows with each event after
-      a quarter of this number, or after 100 events if that is more;
-    - `stoppers`: with "bilateral", a leg in the air that has met its stopper stays there until its
-      foot is loaded. With "one-sided", the leg leaves as soon as the stopper would have to pull;
-    - `restitution`: ratio of a striking foot's speeds after and before the impact, as far as energy
-      allows. None has the effect of 0 and compiles to a smaller program;
-    - `infinite_friction_rule`: meaning of infinite friction. With "limit" it is the limit of large
-      friction, with "paper" the rule of the paper, (A1) to (A4), continued to where that rule
-      stops;
-    - `uneven`: differences between footholds, which `vrw.walk` sets from slopes and friction over
-      steps.
+    - `friction`: friction coefficient of the ground, `inf` for infinite friction (see
+      `infinite_friction_rule`);
+    - `max_events`: largest number of events in one step. A contact slower than the rest speed comes
+      to rest. The rest speed grows with each event after a quarter of this number, or after 100
+      events if that is more;
+    - `stoppers`: if "bilateral", a leg in the air that has reached its stopper stays there until
+      its foot is loaded. If "one-sided", the leg leaves the stopper as soon as the stopper would
+      have to pull;
+    - `restitution`: ratio of a striking foot's normal speeds after and before the impact. The ratio
+      is reduced if it would increase the energy. None has the effect of 0 and compiles to a smaller
+      program;
+    - `infinite_friction_rule`: meaning of infinite friction. "limit" is the limit of large
+      friction. "paper" is the rule (A1) to (A4) of the paper, extended to cases that the rule does
+      not cover;
+    - `uneven`: differences between footholds on uneven ground. `vrw.walk` sets this field from the
+      slopes and friction coefficients of the steps.
 
     Examples:
         >>> wheel = vrw.UnilateralWheel(friction=0.7)
@@ -177,18 +182,16 @@ class UnilateralWheel(AbstractWheel):
 
     @property
     def has_one_sided_stoppers(self) -> bool:
-        """Return whether stoppers of legs in the air only push, so that a leg can leave its
-        stopper.
-        """
+        """Return whether stoppers of legs in the air only push, so that legs can leave them."""
         return self.stoppers == STOPPERS_ONE_SIDED
 
     @property
     def uses_paper_rule(self) -> bool:
-        """Return whether infinite friction means the paper's rule."""
+        """Return whether infinite friction means the rule (A1)-(A4) of the paper."""
         return self.infinite_friction_rule == FRICTION_PAPER_RULE
 
     def default_start(self, params: WheelParams) -> FullState:
-        """Return a full section state close to the paper's gait of Table 1."""
+        """Return a full section state near the gait of the wheel in Table 1 of the paper."""
         return embed_section_state(
             params.symbols(), jnp.asarray(PAPER_START_STATE, params.damping.dtype)
         )
@@ -203,16 +206,17 @@ class UnilateralWheel(AbstractWheel):
         return compute_section_units(units, n_legs)
 
     def embed_section(self, params: WheelParams, x: Array) -> FullState:
-        """Return the full section state of `x`, which may be the paper's (theta-, dtheta-,
-        dL1-).
+        """Return the full section state for `x`, shape (4 + 3 n,).
+
+        `x` may be a full section state or (theta-, dtheta-, dL1-), the section state of the paper.
         """
         return _embed_section_compiled(params, x) if x.shape == (3,) else x
 
     def split_ground(self, params: WheelParams, n_steps: int) -> StepGroundValues | None:
-        """Return the ground of each step, or None on flat ground of one friction.
+        """Return the ground under each step, or None on flat ground with one friction coefficient.
 
-        The ground is (slope, friction, friction of the earlier feet, tilt of the next line), each
-        of shape (n_steps,).
+        The result is (slope in rad, friction coefficient, friction coefficient of the feet that
+        landed earlier, tilt of the next line in rad), each of shape (n_steps,).
         """
         slope, friction = params.slope, self.friction
         if slope.ndim == friction.ndim == 0:
@@ -247,7 +251,7 @@ class UnilateralWheel(AbstractWheel):
     def _compute_step(
         self, params: WheelParams, x: FullState, options: StepOptions, is_detailed: bool
     ) -> tuple[Any, str]:
-        """Return the outputs of a step, and the name of the engine that computed them."""
+        """Return the results of one step, and the name of the engine that computed them."""
         leaves, argument_structure = self._flatten_arguments(params, x, options)
         engine = "lanes" if can_use_batch_kernel(options) else "diffrax"
         return eqx.combine(*_compile_step(argument_structure, is_detailed, engine)(*leaves)), engine
@@ -288,7 +292,7 @@ _embed_section_compiled = jax.jit(lambda params, x: embed_section_state(params.s
 
 @functools.cache
 def _compile_step(argument_structure: Any, is_detailed: bool, engine: str) -> ForwardFunction:
-    """Return the step as a function of the leaves of (wheel, params, x, options).
+    """Return the function that computes a step from the leaves of (wheel, params, x, options).
 
     The function is differentiable in every AD mode.
     """
