@@ -1,11 +1,13 @@
-"""Batched integration between events: each lane has its own step size and contact state.
+"""Integrate a batch of wheels between events, with a separate step size and contact state for each.
 
-Arrays have lanes on the last axis. One Runge-Kutta step serves integration and event search: a lane
-whose step crosses a guard repeats the step with smaller sizes until the step ends at the earliest
-event. No computation in this module combines values of different lanes.
+A batch element is called a *lane*, and arrays have the lanes on the last axis. One Runge-Kutta step
+serves both the integration and the event search. If a guard crosses zero in the solver step of a
+lane, this lane repeats the step with smaller sizes until the step ends at the earliest event. No
+computation in this module combines values of different lanes.
 
-The *initiating guard* of a contact state is the guard whose zero is the event that started this
-state. The guard of a foot that has just lifted off is an example.
+Arrays of accelerations and contact forces have one row per quantity, the *dynamics rows*. The
+*initiating guard* of a contact state is the guard that was zero at the event before this state. An
+example is the guard for the normal force on a foot that has just lifted off.
 """
 
 from collections.abc import Callable
@@ -47,15 +49,18 @@ from vrw_jax.numerics import StepOptions, select_tree_leaves
 from vrw_jax.wheel import Outcome, Symbols, compute_wheel_units
 
 N_CONTACT_QUANTITY_ROWS = 9
-"""Number of dynamics rows that hold the contact quantities of the guards. They follow the
-accelerations. Stopper forces of legs in the air follow if stoppers are one-sided, then
-`N_ACCUMULATOR_ROWS` rows if these are requested."""
+"""Number of contact forces and slip speeds among the dynamics rows.
+
+The dynamics rows begin with the accelerations, followed by these quantities. If stoppers are
+one-sided, the stopper forces on legs in the air follow. If accumulators are requested, their
+`N_ACCUMULATOR_ROWS` rates are last.
+"""
 N_ACCUMULATOR_ROWS = 3
-"""Number of rows of accumulators: energy lost in dampers, energy lost by sliding, slip."""
+"""Number of accumulators: energy losses in dampers and by sliding, and slip length."""
 
 
 class LaneStatus(IntEnum):
-    """Status of a lane between two events; a non-negative status is an `Outcome`."""
+    """Status of a batch element between two events; a non-negative status is an `Outcome`."""
 
     RUNNING = -1
     EVENT = -2
@@ -63,42 +68,50 @@ class LaneStatus(IntEnum):
 
 @dataclass(frozen=True)
 class EventSearchOptions:
-    """Options of the search for events with unilateral contact, and of the loop over lanes."""
+    """Options of the event search with unilateral contact, and of the loop over solver steps."""
 
     max_attempts_with_waiting_lane: int = 8
-    """Number of attempted solver steps after which a lane at an event ends the loop for all lanes.
-    """
+    """Number of solver steps after which an element at an event ends the loop for the batch."""
     painleve_atol: float = 1e-8
-    """Absolute value below which the determinant counts as zero at Painlevé's singularity.
+    """Absolute value below which the determinant is treated as zero at Painlevé's singularity.
 
-    There, forces are a ratio of two vanishing numbers, which neither round-off nor integration
-    resolves."""
+    There, forces are a ratio of two vanishing quantities, which neither round-off nor integration
+    resolves.
+    """
     painleve_rtol_factor: float = 1e2
-    """Factor of the relative tolerance that is added to `painleve_atol`.
+    """Factor by which the relative tolerance is multiplied before it is added to `painleve_atol`.
 
-    The value is chosen because one singularity was missed with a factor of 18."""
+    The value is chosen because one singularity was missed with a factor of 18.
+    """
     n_parabola_iterations: int = 3
-    """Number of event iterations with parabolas. The later ones use secants, which converge better
-    if a guard is below zero for a short time."""
-    min_iterations_of_initiating_guard: int = 15
-    """Number of event iterations after which an initiating guard can be the event."""
-    max_roundoff_fall_duration: float = 1e-3
-    """Time in which a guard that counts as falling falls by its own round-off. The value is in the
-    wheel's unit of time: seconds for a wheel of Table 1's size."""
-    event_time_tolerance_factor: float = 30.0
-    """Largest last correction to the time of an event, in tolerances of the step.
+    """Number of event iterations with parabolas. Later iterations use secants.
 
-    The value is chosen because the error of a parabola's root is about a hundredth of the
-    correction."""
+    Secants converge better if a guard is negative only for a short time.
+    """
+    min_iterations_of_initiating_guard: int = 15
+    """Number of event iterations after which an initiating guard may be the event."""
+    max_roundoff_fall_duration: float = 1e-3
+    """Time in which a guard must fall by its own round-off to be treated as falling.
+
+    The value is in the wheel's unit of time, which is about a second for the wheel in Table 1 of
+    the paper.
+    """
+    event_time_tolerance_factor: float = 30.0
+    """Ratio of the event's time tolerance to the relative tolerance times the step size.
+
+    The time tolerance limits the last correction to the time of an event. The value is chosen
+    because the error of a parabola's root is about a hundredth of this correction.
+    """
 
 
 EVENT_SEARCH_OPTIONS = EventSearchOptions()
 
 
 class IntervalPoint(NamedTuple):
-    """Coordinates, rates and dynamics rows of all lanes at one time.
+    """Coordinates, rates and dynamics rows of all batch elements at one time.
 
-    The coordinates are the hub position x and z, the angle theta and the leg lengths.
+    The coordinates are the hub position x and z, the angle theta and the leg lengths. The dynamics
+    rows are accelerations, contact quantities and, if requested, accumulator rates.
     """
 
     q: Array  # (3 + n, lanes)
@@ -107,7 +120,7 @@ class IntervalPoint(NamedTuple):
 
 
 class EventBracket(NamedTuple):
-    """Bracket of the earliest event inside a solver step, and the last attempt of the search."""
+    """Bracket of the earliest event inside a solver step, and the last attempt to locate it."""
 
     is_search_active: Array
     is_guard_crossing: Array  # whether a guard crosses zero in the bracket, (guards, lanes)
@@ -120,7 +133,7 @@ class EventBracket(NamedTuple):
 
 
 class IntervalState(NamedTuple):
-    """State of all lanes in the interval between two events of each lane."""
+    """State of all batch elements in the interval between two events."""
 
     interval_point: IntervalPoint
     contact_state: ContactState
@@ -155,7 +168,7 @@ def unpack_motion(interval_point: IntervalPoint) -> WheelMotion:
 
 
 def make_interval_point(mode_dynamics: ModeDynamics, motion: WheelMotion) -> IntervalPoint:
-    """Return the interval point of a motion, with its dynamics rows.
+    """Return the interval point for a motion, including its dynamics rows.
 
     The function is the inverse of `unpack_motion`.
     """
@@ -170,10 +183,10 @@ def pack_coordinates(motion: WheelMotion) -> tuple[Array, Array]:
 
 
 def evaluate_dynamics(mode_dynamics: ModeDynamics, q: Array, v: Array) -> Array:
-    """Return the dynamics rows: accelerations, contact quantities, and accumulator rates if
-    requested.
+    """Return accelerations, contact quantities and, if requested, accumulator rates as one array.
 
-    The axes are (rows, lanes). Leg directions are not among the contact quantities.
+    The axes are (dynamics rows, lanes). `q` and `v` are coordinates and rates, (3 + n, lanes). Leg
+    directions are not among the contact quantities.
     """
     motion = unpack_motion(IntervalPoint(q, v, q))
     contact_forces = compute_forces(mode_dynamics, motion)
@@ -213,7 +226,8 @@ def evaluate_dynamics(mode_dynamics: ModeDynamics, q: Array, v: Array) -> Array:
 def evaluate_guards_at_point(mode_dynamics: ModeDynamics, interval_point: IntervalPoint) -> Array:
     """Return the values of all guards in the order of `GuardLayout`, (guards, lanes).
 
-    The point is after the start of the contact state, so that no guard has a placeholder value.
+    The point must be after the start of the contact state, so that no guard has a placeholder
+    value.
     """
     motion = unpack_motion(interval_point)
     contact_rows = interval_point.dynamics_rows[len(interval_point.q) :]
@@ -250,7 +264,7 @@ def evaluate_guards_at_point(mode_dynamics: ModeDynamics, interval_point: Interv
 
 
 def compute_guard_rates(mode_dynamics: ModeDynamics, interval_point: IntervalPoint) -> Array:
-    """Return the time derivatives of all guards along the motion, (guards, lanes)."""
+    """Return the time derivatives of all guards during the motion, (guards, lanes)."""
 
     def evaluate_guards_of_coordinates(q: Array, v: Array) -> Array:
         return evaluate_guards_at_point(
@@ -265,7 +279,10 @@ def compute_guard_rates(mode_dynamics: ModeDynamics, interval_point: IntervalPoi
 
 
 def find_initiating_guards(mode_dynamics: ModeDynamics) -> Array:
-    """Return whether each guard is the initiating guard of the contact state, (guards, lanes)."""
+    """Return whether each guard is an initiating guard of the contact state, (guards, lanes).
+
+    An initiating guard was zero at the event that started the contact state.
+    """
     contact_state = mode_dynamics.contact_state
     has_just_slid = mode_dynamics.contact_slots.gather_slot_flags(contact_state.has_just_slid)
     no_slot_flags = jnp.zeros((2, contact_state.contact_modes.shape[-1]), bool)
@@ -294,9 +311,9 @@ def init_interval(
     h: Array,
     search_options: EventSearchOptions = EVENT_SEARCH_OPTIONS,
 ) -> IntervalState:
-    """Return the states of the lanes at the start of a contact state.
+    """Return the state of all batch elements at the start of an interval between events.
 
-    The status of a lane is `LaneStatus.EVENT` if one of its guards falls immediately.
+    The status of an element is `LaneStatus.EVENT` if one of its guards falls immediately.
 
     - `h`: size of the first solver step, in the wheel's unit of time.
     """
@@ -359,7 +376,10 @@ def init_interval(
 
 
 DynamicsFn = Callable[[Array], ModeDynamics]
-"""Function from the input columns of the lanes to the dynamics of their contact states."""
+"""Function that returns the dynamics in the contact states of all batch elements.
+
+Its argument contains wheel parameters, friction and uneven ground, (columns, lanes).
+"""
 
 
 def integrate_interval(
@@ -370,12 +390,13 @@ def integrate_interval(
     options: StepOptions,
     tableau: ButcherTableau,
 ) -> IntervalState:
-    """Return the states of the lanes, integrated until each lane is at an event or has failed.
+    """Return the state of all batch elements at their next events or failures.
 
-    After `max_attempts_with_waiting_lane` solver steps, the loop ends as soon as a lane with an
-    unfinished walk is at an event.
+    After `max_attempts_with_waiting_lane` solver steps, the integration ends as soon as an element
+    with an unfinished walk is at an event.
 
-    - `input_columns`: parameters, friction and uneven ground, (columns, lanes).
+    - `input_columns`: parameters, friction and uneven ground, (columns, lanes);
+    - `has_unfinished_walk`: whether the walk of each element is unfinished, (lanes,).
     """
     mode_dynamics = dynamics_fn(input_columns)
     guard_scales = compute_guard_scales(mode_dynamics)
@@ -405,9 +426,9 @@ def iterate_until_stopped(
     initial_state: Any,
     max_attempts_with_waiting_lane: int = EVENT_SEARCH_OPTIONS.max_attempts_with_waiting_lane,
 ) -> Any:
-    """Return the loop state after `advance_state` has been applied until no lane is running.
+    """Return the loop state after `advance_state` was applied until no element is running.
 
-    After `max_attempts_with_waiting_lane` applications, the loop ends as soon as a lane with an
+    After `max_attempts_with_waiting_lane` applications, the loop ends as soon as an element with an
     unfinished walk has stopped.
     """
 
@@ -427,7 +448,7 @@ def iterate_until_stopped(
 
 
 class AttemptedSolverStep(NamedTuple):
-    """Result of one solver step of every lane, before the step is accepted or rejected."""
+    """Result of one solver step of every batch element, before it is accepted or rejected."""
 
     end_point: IntervalPoint
     mean_squared_error: Array  # mean square of the error over the tolerance
@@ -441,11 +462,11 @@ class AttemptedSolverStep(NamedTuple):
 def compute_stage_state(
     tableau: ButcherTableau, i: Array | int, q: Array, v: Array, stage_rows: Array, h: Array
 ) -> tuple[Array, Array]:
-    """Return coordinates and rates at Runge-Kutta stage `i`, (3 + n, lanes) each.
+    """Return coordinates and rates at Runge-Kutta stage `i`, each of shape (3 + n, lanes).
 
-    Both follow from the accelerations of the earlier stages.
+    They are computed from the accelerations at the earlier stages, the first rows of `stage_rows`.
 
-    - `h`: step size, s.
+    - `h`: size of the solver step, s.
     """
     a, b, stage_node = (
         jnp.asarray(x)[i]
@@ -463,7 +484,7 @@ def attempt_solver_step(
     options: StepOptions,
     lane_states: IntervalState,
 ) -> AttemptedSolverStep:
-    """Return the result of one attempted solver step of every lane."""
+    """Return the result of one attempted solver step of every batch element."""
     h = lane_states.h
     start_point = lane_states.interval_point
     last_stage = len(tableau.stage_nodes) - 1
@@ -488,7 +509,10 @@ def complete_solver_step(
     lane_states: IntervalState,
     stage_rows: Array,
 ) -> AttemptedSolverStep:
-    """Return the result of a solver step, given the dynamics rows `stage_rows` at all stages."""
+    """Return the result of a solver step from the dynamics rows at all stages.
+
+    - `stage_rows`: dynamics rows, (stages, rows, lanes).
+    """
     h = lane_states.h
     start_point = lane_states.interval_point
     last_stage = len(tableau.stage_nodes) - 1
@@ -554,11 +578,9 @@ def is_at_painleve_singularity(
     options: StepOptions,
     search_options: EventSearchOptions = EVENT_SEARCH_OPTIONS,
 ) -> Array:
-    """Return whether a contact determinant vanishes between two times.
+    """Return whether a contact determinant vanishes between two times, at Painlevé's singularity.
 
-    The motion is then at Painlevé's singularity.
-
-    - `determinant_before`, `determinant_after`: determinant at the two times.
+    - `determinant_before`, `determinant_after`: determinants at the two times.
     """
     painleve_atol = search_options.painleve_atol
     painleve_rtol_factor = search_options.painleve_rtol_factor
@@ -574,9 +596,9 @@ def advance_running_lanes(
     options: StepOptions,
     search_options: EventSearchOptions = EVENT_SEARCH_OPTIONS,
 ) -> IntervalState:
-    """Return the states of the lanes after one attempted solver step.
+    """Return the state of all batch elements after one attempted solver step.
 
-    Each running lane accepts the step, repeats the step with another size, or stops at an event.
+    Each running element accepts the step, repeats it with another size, or stops at an event.
     """
     start_point = lane_states.interval_point
     h = lane_states.h
@@ -686,9 +708,9 @@ def _iterate_event_search(
     options: StepOptions,
     search_options: EventSearchOptions,
 ) -> tuple[EventBracket, _LocatedEvent]:
-    """Return the event bracket after one more iteration, and the event that has been located.
+    """Return the event bracket after one more iteration, and the event if it has been located.
 
-    The next step size is the earliest zero of the guards' parabolas or secants.
+    The next step size is the earliest root of the parabolas or secants through the guards.
     """
     h, event_bracket = lane_states.h, lane_states.event_bracket
     is_guard_negative = attempted_step.guard_values <= 0.0
@@ -796,9 +818,9 @@ def _compute_squared_error(
     end_point: IntervalPoint,
     guard_values: Array,
 ) -> Array:
-    """Return the mean square of the error of a solver step, relative to its tolerance.
+    """Return the mean square of the error of a solver step, divided by the tolerance.
 
-    The result is infinite for a step whose end is not finite.
+    The result is infinite for a solver step whose end is not finite.
     """
     squared_error_sum = 0.0 * jnp.sum(guard_values, axis=0)
     state_units = compute_state_units(s)
@@ -817,20 +839,18 @@ def _compute_squared_error(
 
 
 def _flag_initiating_guards(lane_states: IntervalState) -> Array:
-    """Return whether each guard is an initiating guard of a lane at the start of its interval.
-
-    The axes are (guards, lanes).
-    """
+    """Return which guards are initiating guards at the start of their interval, (guards, lanes)."""
     return (lane_states.time_since_event == 0.0) & (lane_states.guard_offset != 0.0)
 
 
 def _find_earliest_minimum(
     tableau: ButcherTableau, guard_values: list[Array], is_initiating: Array
 ) -> Array:
-    """Return the fraction of the step to the earliest negative minimum of a guard.
+    """Return the earliest negative guard minimum as a fraction of the solver step.
 
-    The result is 1 without such a minimum. A guard that is positive at both ends of a step may be
-    negative between them: see `integrator.find_guard_minimum`. Initiating guards are excluded.
+    The result is 1 if there is no such minimum. A guard that is positive at both ends of a solver
+    step may be negative between them: see `integrator.find_guard_minimum`. Initiating guards are
+    excluded.
     """
     has_guard_minimum, guard_minimum_fraction = find_guard_minimum(tableau, guard_values)
     return jnp.min(
@@ -844,7 +864,7 @@ def _find_earliest_minimum(
 
 
 def _find_lowest_guard(guard_values: Array, is_guard_crossing: Array) -> tuple[Array, Array]:
-    """Return the index and the value of the lowest guard that crosses zero.
+    """Return the index and the value of the lowest guard among those that cross zero.
 
     The value is infinite if no guard crosses zero.
     """
@@ -864,12 +884,11 @@ def _find_lowest_guard(guard_values: Array, is_guard_crossing: Array) -> tuple[A
 def _find_earliest_secant_root(
     event_bracket: EventBracket, guard_values: Array, h: Array, is_guard_crossing: Array
 ) -> tuple[Array, Array]:
-    """Return the step size (s) to the earliest zero of the crossing guards' secants, and the index
-    of that guard.
+    """Return the step size to the earliest root of a guard's secant, s, and the guard's index.
 
-    The secants go through the ends of the last two attempts, which are more accurate than inner
-    stages. The step size is infinite if no guard falls. The step size is minus infinity if a guard
-    is negative and does not fall, because this guard fell earlier.
+    The secants pass through the guards at the ends of the last two attempts, which are more
+    accurate than guards at inner stages. The step size is infinite if no guard falls. It is minus
+    infinity if a guard is negative and does not fall, because this guard fell to zero earlier.
     """
     guard_secant_rate = (guard_values - event_bracket.guard_values) / jnp.where(
         h == event_bracket.previous_step_size, jnp.inf, h - event_bracket.previous_step_size
@@ -899,12 +918,11 @@ def _find_earliest_root(
     is_guard_crossing: Array,
     is_initiating: Array,
 ) -> tuple[Array, Array]:
-    """Return the earliest zero of the crossing guards' parabolas, as a fraction of the step, and
-    the index of that guard.
+    """Return the earliest root of the crossing guards' parabolas, and the index of the guard.
 
-    The fraction is infinite if no parabola falls to zero in the step. An initiating guard rises
-    first. If its parabola falls at once, the step is too long for parabolas. The fraction is minus
-    infinity if such a parabola ends below zero.
+    The root is a fraction of the solver step. It is infinite if no parabola falls to zero in the
+    step. An initiating guard rises first. If its parabola falls immediately, the step is too long
+    for parabolas. The root is minus infinity if such a parabola ends below zero.
     """
     discriminant = (
         parabola_linear_term * parabola_linear_term - 4.0 * parabola_curvature * start_guard_values

@@ -1,6 +1,4 @@
-"""Walks of many steps with unilateral contact for a batch of wheels, and one step with its
-Jacobian.
-"""
+"""Walks with unilateral contact for a batch of wheels, and one step with its Jacobian."""
 
 import functools
 from collections.abc import Callable, Sequence
@@ -49,13 +47,14 @@ def walk_batch(
     options: StepOptions,
     n_legs: int,
 ) -> tuple[np.ndarray, ...]:
-    """Return the results of `n_steps` steps of many wheels with `n_legs` legs.
+    """Return the results of walks of `n_steps` steps for a batch of wheels with `n_legs` legs.
 
-    The results are section states, durations (s), outcomes, numbers of completed steps, numbers of
-    solver steps, and lengths (m) of the last step. The wheels are on the leading axis.
+    The result is (section states, durations of the last step in s, outcomes, counts of completed
+    walking steps, counts of solver steps, lengths of the last step in m). The first axis of each
+    array contains the wheels.
 
-    - `input_columns`: wheel parameters and friction, shape (10, wheels). On uneven ground, a call
-      takes one step, and two more columns follow: see `N_UNEVEN_COLUMNS`;
+    - `input_columns`: wheel parameters and friction, shape (10, wheels). On uneven ground, the walk
+      has one step, and two more columns follow: see `N_UNEVEN_COLUMNS`;
     - `section_states`: full section states, shape (wheels, 4 + 3 n).
     """
     walk_config = _WalkConfig.from_model(model, options, n_legs, False, len(input_columns))
@@ -79,13 +78,15 @@ def step_batch_with_jacobian(
     n_legs: int,
     input_indices: Sequence[int] | None = None,
 ) -> tuple[UnilateralStep, UnilateralStep]:
-    """Return the results of one step of many wheels, and the Jacobian of these results.
+    """Return the results of one walking step for a batch of wheels, and their Jacobian.
 
-    The arguments are those of `walk_batch`. The wheels are on the leading axis. The Jacobian has a
-    last axis over the input columns and the entries of the section state. Derivatives are zero with
-    respect to inputs that are not in `input_indices` or cannot vary. Codes cannot vary, and neither
-    can lengths of legs on their stoppers or with loaded feet. Rates that depend on other rates need
-    no tangent (see `_IndependentStartRates`).
+    The arguments are those of `walk_batch`. The first axis of each array contains the wheels. The
+    last axis of the Jacobian contains the input columns, followed by the entries of the section
+    state.
+
+    Derivatives are zero with respect to inputs outside `input_indices` and with respect to inputs
+    that cannot vary. These are contact codes, and lengths of legs on their stoppers or with loaded
+    feet. Tangents are computed only for independent rates (see `_IndependentStartRates`).
     """
     walk_config = _WalkConfig.from_model(model, options, n_legs, True, len(input_columns))
     if len(section_states):  # The longest compilation starts first.
@@ -147,7 +148,7 @@ def step_batch_with_jacobian(
 
 
 def _append_restitution(input_columns: np.ndarray, model: UnilateralWheel) -> np.ndarray:
-    """Return the input columns, with the model's restitution as the last column if it is given."""
+    """Return the input columns, extended by the model's restitution if it is not None."""
     if model.restitution is None:
         return input_columns
     restitution_row = np.full_like(input_columns[:1], np.asarray(model.restitution))
@@ -155,11 +156,14 @@ def _append_restitution(input_columns: np.ndarray, model: UnilateralWheel) -> np
 
 
 MAX_TANGENTS_PER_LANE = 16
-"""Largest number of tangents in one lane. More tangents are distributed over several lanes."""
+"""Largest number of tangents in one batch element of the kernel.
+
+Further tangents of the same wheel are computed in additional batch elements.
+"""
 
 
 def _pack_tangents(n_tangents_by_wheel: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the lane of each tangent, its position in that lane, and the wheel of each lane.
+    """Return the batch element of each tangent, its position there, and the elements' wheels.
 
     The tangents are ordered by wheel.
     """
@@ -177,14 +181,16 @@ def _pack_tangents(n_tangents_by_wheel: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 
 RATE_RANK_TOLERANCE = 1e-10
-"""Remainder of a dependent rate that counts as round-off, as a fraction of the largest. An
-independent rate has a remainder of order one, like the projection."""
+"""Largest remainder of a dependent rate, as a fraction of the largest remainder of all rates.
+
+The value is chosen because an independent rate has a remainder of order one, like the projection.
+"""
 
 
 class _IndependentStartRates(NamedTuple):
-    """Independent rates of section states, and weights that combine them to all rates.
+    """Independent rates in section states, and weights that express all rates in terms of them.
 
-    A loaded foot constrains the wheel: a resting foot leaves two of the four rates of hub and leg
+    A loaded foot constrains the wheel. A resting foot leaves two of the four rates of hub and leg
     independent.
     """
 
@@ -196,10 +202,10 @@ class _IndependentStartRates(NamedTuple):
     def from_projection(
         cls, rate_projection: np.ndarray, is_requested: np.ndarray
     ) -> "_IndependentStartRates":
-        """Return the independent rates, given the projection of all rates at the start of a step.
+        """Return the independent rates for the projection of all rates at the start of a step.
 
         The axes of `rate_projection` are (wheels, projected rates, rates). Among the rates for
-        which `is_requested` is true, the one with the largest remainder is selected repeatedly.
+        which `is_requested` is True, the one with the largest remainder is selected repeatedly.
         """
         requested_projection = np.nan_to_num(rate_projection) * is_requested[:, None]
         projection_remainder = requested_projection.copy()
@@ -271,7 +277,10 @@ class _IndependentStartRates(NamedTuple):
         return cls(independent_rate_index_array, is_remainder_significant, combination_weights)
 
     def convert_weights_to_si(self, rate_units: np.ndarray) -> "_IndependentStartRates":
-        """Return the independent rates with weights for SI units, given the unit of each rate."""
+        """Return the independent rates with weights for SI units.
+
+        `rate_units` contains the unit of each rate, (wheels, rates).
+        """
         independent_rate_units = np.take_along_axis(rate_units, self.independent_rate_indices, 1)
         return self._replace(
             combination_weights=self.combination_weights
@@ -291,8 +300,9 @@ class _IndependentStartRates(NamedTuple):
         return independence_flags
 
     def expand_tangents_to_all_rates(self, tangents: np.ndarray) -> np.ndarray:
-        """Return the tangents of all rates, (wheels, rates, ...), given the tangents of the
-        independent rates.
+        """Return the tangents with respect to all rates, (wheels, rates, ...).
+
+        `tangents` contains the tangents with respect to the independent rates.
         """
         wheel_indices, trailing_axes = np.arange(len(tangents)), (1,) * (tangents.ndim - 2)
         all_tangents = np.zeros_like(tangents)
@@ -312,8 +322,9 @@ class _IndependentStartRates(NamedTuple):
 def _project_rates(
     input_columns: np.ndarray, section_states: np.ndarray, n_legs: int
 ) -> np.ndarray:
-    """Return the matrix from the rates of a section state to the rates after the projection onto
-    the contacts, (wheels, projected rates, rates).
+    """Return the matrix that projects the rates of a section state onto the contact constraints.
+
+    The result has the shape (wheels, projected rates, rates).
     """
     unit_rates = np.eye(3 + n_legs)
     repeated_states = np.repeat(section_states, 3 + n_legs, 0)
@@ -326,7 +337,7 @@ def _project_rates(
 
 
 def _project_section_state(s: Symbols, section_state: Array) -> WheelMotion:
-    """Return the motion of a section state, projected onto its contacts."""
+    """Return the motion for a section state, projected onto its contact constraints."""
     motion, contact_state = unpack_section_state(s, section_state)
     return project_motion(s, motion, contact_state.contact_modes, contact_state.is_locked)
 
@@ -337,16 +348,16 @@ SECTION_STATE_FUNCTIONS: dict[str, Callable[[Symbols, Array], Array]] = {
         _project_section_state(s, section_state)
     )[1],
 }
-"""Functions of wheel symbols and section states, by name; lanes are on the last axis."""
+"""Functions of wheel symbols and section states, by name, with the batch on the last axis."""
 
 
 def _evaluate_on_lane_rows(
     n_legs: int, section_function_name: str, lane_rows: list[np.ndarray]
 ) -> np.ndarray:
-    """Return a function of `SECTION_STATE_FUNCTIONS`, evaluated at wheel parameters and section
-    states of all lanes.
+    """Return the result of a function in `SECTION_STATE_FUNCTIONS` for all batch elements.
 
-    One program is compiled for any number of wheels. JAX alone would compile a new program for each
+    `lane_rows` contains the parameters and the section state, one array (batch,) per entry. One
+    program is compiled for any number of wheels. JAX alone would compile a new program for each
     number.
     """
     lane_program = _compile_section_function(
@@ -359,7 +370,7 @@ def _evaluate_on_lane_rows(
 def _compile_section_function(
     n_legs: int, section_function_name: str, n_rows: int, dtype: np.dtype
 ) -> Callable[..., Any]:
-    """Return the compiled program of a function of `SECTION_STATE_FUNCTIONS`."""
+    """Return the compiled program for a function in `SECTION_STATE_FUNCTIONS`."""
 
     def evaluate_section_function(_: tuple, lane_rows: tuple) -> tuple:
         parameter_values = lane_rows[: len(PARAMETER_NAMES)]
@@ -382,9 +393,10 @@ def _compile_section_function(
 
 
 def _compile_with_xla(lane_function: Callable[[tuple, tuple], tuple]) -> Callable[..., Any]:
-    """Return a function of lane-independent numbers and lane rows, compiled by XLA.
+    """Return `lane_function` compiled by XLA.
 
-    The function runs in blocks of lanes. It is used on platforms without machine code.
+    Its arguments are values common to the batch and arrays (batch,). The compiled function
+    evaluates blocks of batch elements. It is used on platforms without machine code.
     """
     move_result_axis = lambda result_arrays, source_axis, destination_axis: tuple(
         jnp.moveaxis(section_state, source_axis, destination_axis)
@@ -426,7 +438,7 @@ class _WalkConfig(NamedTuple):
         has_tangents: bool,
         n_columns: int,
     ) -> "_WalkConfig":
-        """Return the configuration of a batch walk of this model with these options."""
+        """Return the configuration of a batch walk for a model and options."""
         static_options = eqx.filter(options, eqx.is_array, inverse=True)
         has_uneven_ground = n_columns > N_PARAMETERS + 1
         return cls(
@@ -457,8 +469,9 @@ class _WalkConfig(NamedTuple):
         return BatchWalkSettings(self.n_legs, n_steps, self.max_events, *contact_rules)
 
     def list_input_row_counts(self) -> tuple[int, ...]:
-        """Return the numbers of rows of input columns, section states and, if requested, indices of
-        tangent inputs.
+        """Return the numbers of entries per wheel in the input columns and in the section state.
+
+        If tangents are requested, the number of indices of their inputs follows.
         """
         n_columns = (
             N_PARAMETERS + 1 + N_UNEVEN_COLUMNS * self.has_uneven_ground + self.has_restitution
@@ -467,7 +480,10 @@ class _WalkConfig(NamedTuple):
         return (*row_counts, MAX_TANGENTS_PER_LANE) if self.has_tangents else row_counts
 
     def make_result_structure(self, dtype: Any) -> Any:
-        """Return the shapes and dtypes of one lane's results, with tangents if requested."""
+        """Return shapes and dtypes of the results for one batch element, and of their tangents.
+
+        The tangents are included if they are requested.
+        """
         result_shapes: Any = jax.eval_shape(
             lambda: make_result_template(self.n_legs, dtype, self.has_tangents)
         )
@@ -485,9 +501,9 @@ class _WalkConfig(NamedTuple):
 def _run_walk(
     walk_config: _WalkConfig, input_arrays: list[np.ndarray], n_steps: int, options: StepOptions
 ) -> Any:
-    """Return the results of the walks of all lanes, with the lanes on the leading axis.
+    """Return the results of the walks of all batch elements, which are on the first axis.
 
-    The input arrays have the lanes on their last axis.
+    In `input_arrays`, the batch elements are on the last axis.
     """
     dtype = input_arrays[0].dtype
     # Neighboring lanes run as long as the slowest of them. Lanes are sorted by damping, because
@@ -516,14 +532,14 @@ def _run_walk(
 
 @functools.cache
 def _flatten_result_structure(walk_config: _WalkConfig, dtype: np.dtype) -> tuple[list[Any], Any]:
-    """Return the shapes of one lane's results as leaves, and their tree structure."""
+    """Return the shapes of one batch element's results as leaves, and their tree structure."""
     return jax.tree.flatten(walk_config.make_result_structure(dtype))
 
 
 def embed_section_states(
     input_columns: np.ndarray, section_states: np.ndarray, n_legs: int
 ) -> np.ndarray:
-    """Return the full section states, (wheels, 4 + 3 n), of section states with three entries.
+    """Return full section states, (wheels, 4 + 3 n), for section states with three entries.
 
     Full section states are returned unchanged.
     """
@@ -538,9 +554,9 @@ def embed_section_states(
 def _compile_walk(
     walk_config: _WalkConfig, dtype: np.dtype, options_structure: Any
 ) -> Callable[..., Any]:
-    """Return the compiled program of walks, a function of lane-independent numbers and lane rows.
+    """Return the compiled program for walks, a function of common values and arrays (batch,).
 
-    The number of steps is one of the lane-independent numbers.
+    The number of steps is one of the values that are common to the batch.
     """
 
     def run_compiled_walk(lane_independent: tuple, lane_rows: tuple) -> tuple:

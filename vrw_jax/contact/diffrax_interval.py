@@ -1,7 +1,8 @@
-"""Integration of a single wheel between two events by diffrax.
+"""Integrate a single wheel between two events with diffrax.
 
-diffrax replaces `batch_integrator` in the event loop of `walk_kernel`. Its search for events is
-independent, so that it is a reference for the batch kernel. diffrax also has implicit solvers.
+diffrax replaces `batch_integrator` in the event loop of `walk_kernel`. Its event search is
+independent of that in `batch_integrator`, so its results are a reference for the batch kernel.
+diffrax also provides implicit solvers.
 """
 
 from collections.abc import Callable
@@ -44,11 +45,11 @@ from vrw_jax.numerics import StepOptions
 from vrw_jax.wheel import Outcome, compute_wheel_units
 
 ROLLING_INDEX = 2
-"""Index of the rolling rate among the rates (hub x, z, theta, lengths)."""
+"""Index of the rolling rate dtheta among the rates of (hub x, hub z, theta, leg lengths)."""
 
 
 def init_diffrax_interval(mode_dynamics: ModeDynamics, motion: WheelMotion) -> IntervalState:
-    """Return the state of a single lane at the start of a contact state.
+    """Return the state of a single wheel at the start of an interval between events.
 
     The accelerations are infinite, because only the accelerations at the end of the interval are
     used. The fields for the event search of the batch integrator are None.
@@ -80,9 +81,10 @@ def integrate_by_diffrax(
     interval: IntervalState,
     options: StepOptions,
 ) -> IntervalState:
-    """Return the state of a running lane at its next event or failure.
+    """Return the state of a running wheel at its next event or failure.
 
-    The state of any other lane is returned unchanged. All arrays have one lane on their last axis.
+    A state that is not running is returned unchanged. All arrays have a last axis of length 1, the
+    batch axis.
     """
     input_columns, interval, options = jax.tree.map(
         lambda x: x[..., 0], (input_columns, interval, options)
@@ -154,8 +156,10 @@ def sample_by_diffrax(
     n_samples: int,
     options: StepOptions,
 ) -> tuple[Float[Array, "n dim"], Float[Array, "n legs"], Float[Array, "n legs"]]:
-    """Return packed states at equally spaced times of an interval, and tangential and normal forces
-    on all feet, N.
+    """Return packed states at equally spaced times of an interval, and the forces on all feet.
+
+    The result is (packed states, tangential forces in N, normal forces in N), with the samples on
+    the first axis.
 
     - `duration`: length of the interval, s.
     """

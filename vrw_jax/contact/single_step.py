@@ -1,9 +1,9 @@
-"""Steps of one wheel with unilateral contact, by machine code or by diffrax in JAX programs.
+"""Compute steps of one wheel with unilateral contact, by machine code or by diffrax.
 
-`build_contact_step_function` returns a function of one wheel that `jax.vmap` maps onto lanes. For
-derivatives, each tangent has one lane beside the lane of the motion. For samples of a step, a JAX
-program advances from event to event and records the start of each interval. Then every interval
-is integrated again, sample by sample.
+`build_contact_step_function` returns a function of one wheel, which `jax.vmap` maps to batch
+elements of the kernel. For derivatives, each tangent has its own batch element in addition to that
+of the motion. To sample a step, a JAX program advances from event to event and records the start of
+each interval. Every interval is then integrated again, from sample to sample.
 """
 
 import functools
@@ -52,7 +52,7 @@ from vrw_jax.wheel import stack_parameters
 
 
 class ContactStepConfig(NamedTuple):
-    """Static configuration of a contact step, and functions of the leaves of its arguments."""
+    """Static configuration of a step, and functions of the leaves of its arguments."""
 
     argument_tree_structure: Any  # tree structure of (wheel, params, x, options)
     is_detailed: bool
@@ -60,14 +60,19 @@ class ContactStepConfig(NamedTuple):
     engine_name: str = "lanes"  # name of the engine in the results
 
     def tighten_tolerances(self, leaves: tuple[Array, ...]) -> tuple[Array, ...]:
-        """Return the argument leaves with the tighter solver tolerances of derivatives."""
+        """Return the argument leaves with the tighter solver tolerances for derivatives."""
         *traced_settings, options = jax.tree.unflatten(self.argument_tree_structure, leaves)
         return tuple(jax.tree.leaves((*traced_settings, options.with_derivative_tolerances())))
 
     def compile_lane_function(
         self, lane_function: Callable, make_template: Callable, program_name: tuple[Any, ...]
     ) -> Callable:
-        """Return a compiled function of one wheel, given a function over lanes."""
+        """Return a compiled function of one wheel from a function of a batch.
+
+        - `lane_function`: function whose arrays have the batch on the last axis;
+        - `make_template`: function that returns zeros with the structure of one wheel's results;
+        - `program_name`: key of the program in the cache of compiled code.
+        """
 
         def evaluate_one_lane(*arrays: Any) -> Any:
             lane_outputs = lane_function(*jax.tree.map(lambda x: jnp.asarray(x)[..., None], arrays))
@@ -78,7 +83,7 @@ class ContactStepConfig(NamedTuple):
         return unbatch(compile_cached_lane_function(lane_function, make_template, program_name))
 
     def unpack_leaves(self, leaves: tuple[Array, ...]) -> tuple[Array, Array, Any]:
-        """Return input columns and section states of the lanes, and (wheel, params, options)."""
+        """Return input columns and section states of the batch, and (wheel, params, options)."""
         wheel, params, x, options = jax.tree.unflatten(self.argument_tree_structure, leaves)
         uneven_columns = () if wheel.uneven is None else wheel.uneven
         restitution = () if wheel.restitution is None else (wheel.restitution.astype(x.dtype),)
@@ -88,7 +93,7 @@ class ContactStepConfig(NamedTuple):
         return input_columns, x, (wheel, params, options)
 
     def make_walk_settings(self, step_settings: Any) -> BatchWalkSettings:
-        """Return the settings of a batch of walks of one step each."""
+        """Return the settings for a batch of walks of one step each."""
         wheel, params, options = step_settings
         tableau = None if self.uses_diffrax else load_explicit_tableau(options.solver)
         assert self.uses_diffrax or tableau is not None  # The caller has checked the solver.
@@ -104,18 +109,16 @@ class ContactStepConfig(NamedTuple):
         )
 
     def make_template(self, *leaves: Array) -> tuple:
-        """Return zeros in the structure and shapes of the results of `compute_outputs` for one
-        wheel.
-        """
+        """Return zeros with the structure of the results of `compute_outputs` for one wheel."""
         params = self.unpack_leaves(leaves)[2][1]
         return _partition_result(
             make_result_template(params.n_legs, leaves[0].dtype, self.is_detailed)
         )
 
     def compute_outputs(self, *leaves: Array) -> tuple:
-        """Return the results of one step of all lanes, split into float arrays and other arrays.
+        """Return the results of one step of all batch elements, divided by `_partition_result`.
 
-        The argument leaves have the lanes on their last axis.
+        The argument leaves have the batch on their last axis.
         """
         input_columns, x, step_settings = self.unpack_leaves(leaves)
         return _partition_result(
@@ -123,9 +126,9 @@ class ContactStepConfig(NamedTuple):
         )
 
     def compute_tangents(self, leaves: tuple[Array, ...], tangents: tuple[Array, ...]) -> tuple:
-        """Return (tangents of the float results, float results, other results) of a step.
+        """Return the tangents of a step's floating-point results, these results, and other results.
 
-        Each lane has one tangent of its argument leaves.
+        Each batch element has one tangent of its argument leaves.
         """
         input_columns, x, step_settings = self.unpack_leaves(leaves)
         input_column_tangents, section_state_tangents = (
@@ -147,7 +150,7 @@ class ContactStepConfig(NamedTuple):
 
 
 def _partition_result(walk_result: BatchWalkResult) -> tuple[Any, Any]:
-    """Return the results of a step, split into float arrays and other arrays.
+    """Return the results of a step, divided into floating-point arrays and other arrays.
 
     A detailed walk has all results of the step. Any other walk has section state, durations,
     outcome and number of solver steps.
@@ -166,8 +169,8 @@ def _partition_result(walk_result: BatchWalkResult) -> tuple[Any, Any]:
 def build_contact_step_function(step_config: ContactStepConfig) -> ForwardFunction:
     """Return a function from the leaves of (wheel, params, x, options) to the results of a step.
 
-    The results are split into float arrays and other arrays. All AD modes are built from this
-    function.
+    The results are divided into floating-point arrays and other arrays. All AD modes are built from
+    this function.
     """
     cache_key = (
         "step with unilateral contact",
@@ -184,8 +187,8 @@ def build_contact_step_jacobian(
 ) -> ForwardFunction:
     """Return a function from the leaves of a step's arguments to its Jacobian and results.
 
-    The function returns (Jacobian with respect to the leaves at `input_indices`, float results) and
-    the other results of the step of `build_contact_step_function`.
+    The function returns (Jacobian with respect to the leaves at `input_indices`, floating-point
+    results), and the other results of `build_contact_step_function`.
     """
 
     def make_template(leaves: tuple[Array, ...], _tangents: tuple[Array, ...]) -> tuple:
@@ -255,11 +258,11 @@ def sample_interval(
     options: StepOptions,
     tableau: ButcherTableau,
 ) -> Array:
-    """Return samples of one interval at equally spaced times, with the axes (sample, row, lanes).
+    """Return samples of one interval at equally spaced times, (samples, entries, batch).
 
-    The first and the last sample are at the ends of the interval. The rows are coordinates, rates,
-    loss accumulators, normal forces and tangential forces of the slots. The accumulators start at
-    `initial_accumulators`.
+    The first and the last sample are at the ends of the interval. The entries are coordinates,
+    rates, loss accumulators, normal forces and tangential forces in the contact slots. At the
+    start, the accumulators are `initial_accumulators`.
 
     - `duration`: length of the interval, s.
     """
@@ -300,8 +303,7 @@ def sample_interval(
 def build_contact_step_sampler(
     step_config: ContactStepConfig, n_samples: int
 ) -> Callable[..., SampledIntervals]:
-    """Return a function from the leaves of (wheel, params, x, options) to the sampled motion of a
-    step.
+    """Return a function that samples a step from the leaves of (wheel, params, x, options).
 
     The function has no derivatives.
     """
@@ -454,10 +456,9 @@ def build_contact_step_sampler(
 def _unpack_sample_rows(
     n_legs: int, interval_log: IntervalLog, sample_rows: Array
 ) -> tuple[Array, Array, Array]:
-    """Return packed states, tangential forces (N) and normal forces (N) of all legs, given the rows
-    of `sample_interval`.
+    """Return packed states, tangential forces (N) and normal forces (N) of all legs, from samples.
 
-    The axes are (intervals, samples, entries).
+    The axes are (intervals, samples, entries). `sample_rows` contains results of `sample_interval`.
     """
     n_samples, n_coordinates = sample_rows.shape[1], 3 + n_legs
     time_since_event = jnp.linspace(0.0, 1.0, n_samples) * interval_log.durations[:, None]

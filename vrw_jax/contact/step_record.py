@@ -1,7 +1,8 @@
-"""Record of a step with unilateral contact, for one wheel or elementwise for a batch.
+"""Record of a walking step with unilateral contact, for one wheel or elementwise for a batch.
 
-A step is a sequence of events, each followed by an interval in which no contact changes. The first
-event is the opening landing. The step is complete when the foremost foot lands.
+A walking step is a sequence of events, each followed by an interval with constant contact state.
+The first event is the landing at which the step starts. The step is complete when the foremost foot
+lands.
 """
 
 import dataclasses
@@ -33,19 +34,23 @@ from vrw_jax.wheel import Outcome, Symbols, replace_rest_outcome
 
 @dataclass(frozen=True)
 class BounceRestOptions:
-    """Options of the bounce height and number of events at which a bouncing foot comes to rest."""
+    """Options that determine when a bouncing foot comes to rest."""
 
     min_bounce_height_per_atol: float = 1e-2
-    """Smallest height of a bounce that a step resolves, as a fraction of the absolute tolerance."""
+    """Smallest height of a resolved bounce, divided by absolute tolerance and leg length."""
     min_bounce_height_in_eps: float = 4e2
-    """Smallest height of a resolved bounce in units of round-off of a leg's length: 1e-13 m in
-    float64."""
-    n_events_before_rest_speed_ramp: int = 100
-    """Number of events of a step after which each event raises the rest speed by its initial value.
+    """Smallest height of a resolved bounce, in units of the round-off of a leg's length.
 
-    A quarter of the allowed events replaces this number if that is more. It is chosen because walks
-    have 4 to 60 events, and chains of ever smaller bounces have hundreds. After 400 events, the
-    last bounce is as large as a tolerance of 1e-6 leaves from the first."""
+    The height is about 1e-13 m in float64.
+    """
+    n_events_before_rest_speed_ramp: int = 100
+    """Number of events in a step after which each event raises the rest speed by its initial value.
+
+    If a quarter of the allowed events is more, that number is used instead. The value is chosen
+    because walking steps have 4 to 60 events, and chains of ever smaller bounces have hundreds.
+    After 400 events, the smallest resolved bounce is as large as with a tolerance of 1e-6 at the
+    first event.
+    """
 
 
 BOUNCE_REST_OPTIONS = BounceRestOptions()
@@ -64,7 +69,12 @@ def compute_min_bounce_height(
 
 
 def apply_friction_rule(friction: Elementwise, uses_paper_rule: bool) -> Elementwise:
-    """Return friction with `PAPER_RULE_SENTINEL` for infinity if the paper's rule applies."""
+    """Return the friction coefficient, with infinity replaced if the rule of the paper applies.
+
+    The replacement is `PAPER_RULE_SENTINEL`.
+
+    - `uses_paper_rule`: whether the rule of the paper applies to infinite friction.
+    """
     return (
         jnp.where(friction == jnp.inf, PAPER_RULE_SENTINEL, friction)
         if uses_paper_rule
@@ -81,12 +91,13 @@ def make_contact_law(
     restitution: Elementwise | None = None,
     next_line_tilt: Elementwise | None = None,
 ) -> ContactLaw:
-    """Return the contact law of a walk.
+    """Return the contact law for a walk.
 
     The rest speed is the landing speed after the smallest resolved bounce.
 
-    - `counts_all_solutions`: whether all admissible solutions of an event are counted;
-    - `next_line_tilt`: angle by which the next line is steeper, rad.
+    - `counts_all_solutions`: whether the number of all admissible solutions of an event is
+      determined;
+    - `next_line_tilt`: angle by which the next straight line of uneven ground is steeper, rad.
     """
     rest_speed = jnp.sqrt(2.0 * s.g * compute_min_bounce_height(s.L0, options))
     return ContactLaw(
@@ -110,16 +121,15 @@ def process_event(
     max_events: int,
     rest_options: BounceRestOptions = BOUNCE_REST_OPTIONS,
 ) -> tuple[ContactEventResult, ContactEvent, Int[Array, "..."]]:
-    """Return the result of an event, its kind, and its outcome (STEPPED if it was resolved).
+    """Return the result of an event, its kind, and its outcome (STEPPED if the event is resolved).
 
-    - `guard_index`: index of the guard whose zero is the event;
+    - `guard_index`: index of the guard that is zero at the event;
+    - `n_events`: number of earlier events in this walking step;
+    - `max_events`: largest number of events in a walking step.
 
-    - `n_events`: number of earlier events in this step;
-    - `max_events`: largest number of events of a step.
-
-    The motion is projected onto its contacts first, because the integrator's error moves feet off
-    them. A foot that lifts off rises from the slope like the third power of time. Without the
-    projection, the foot would land again immediately.
+    The motion is first projected onto its contact constraints, because integration errors move feet
+    off the ground. The height of a foot that lifts off grows with the third power of time. Without
+    the projection, the foot would land again immediately.
     """
     first_ramp_event = max(rest_options.n_events_before_rest_speed_ramp, max_events // 4)
     contact_law = contact_law._replace(
@@ -139,7 +149,7 @@ def process_event(
 
 
 class UnilateralMargins(eqx.Module):
-    """Margins of bilateral stoppers over one step.
+    """Margins for bilateral stoppers during one walking step.
 
     A margin is negative if a one-sided stopper would have released a leg in the air.
     """
@@ -149,7 +159,7 @@ class UnilateralMargins(eqx.Module):
 
 
 class StepCounters(NamedTuple):
-    """Numbers of events and solver steps of a gait step, and durations by number of loaded feet."""
+    """Numbers of events and solver steps in a walking step, and durations by loaded feet."""
 
     n_events: Int[Array, "..."]  # number of changes of contacts and stoppers
     durations: Float[Array, "3 ..."]  # with two loaded feet, with one, with none, s
@@ -157,7 +167,7 @@ class StepCounters(NamedTuple):
 
 
 def init_step_counters(lane_template: Array) -> StepCounters:
-    """Return step counters of zero, in the shape and dtype of `lane_template`."""
+    """Return step counters with the value 0, with the batch shape and dtype of `lane_template`."""
     int_zeros = jnp.zeros(lane_template.shape, jnp.int32)
     return StepCounters(
         int_zeros, jnp.zeros((3, *lane_template.shape), lane_template.dtype), int_zeros
@@ -170,9 +180,10 @@ def count_interval(
     duration: Elementwise,
     n_solver_steps: Array,
 ) -> StepCounters:
-    """Return the step counters after one more interval in this contact state.
+    """Return the step counters after one more interval in the contact state `contact_state`.
 
-    - `duration`: length of the interval, s.
+    - `duration`: length of the interval, s;
+    - `n_solver_steps`: number of solver steps in the interval.
     """
     n_loaded_feet = jnp.sum(contact_state.contact_modes != ContactMode.OFF, axis=0)
     has_foot_count = jnp.stack([n_loaded_feet == n_feet for n_feet in (2, 1, 0)])
@@ -192,8 +203,9 @@ def determine_interval_outcome(
     is_resting: Array,
     max_events: int,
 ) -> Int[Array, "..."]:
-    """Return the outcome after an interval, STEPPED if the walk continues or the foremost foot has
-    landed.
+    """Return the outcome after an interval of a walk.
+
+    The result is STEPPED if the walk continues or the foremost foot has landed.
 
     If the interval did not end at an event, the result is `failure_outcome`. If the wheel is at
     rest, the result is CAME_TO_REST.
@@ -210,7 +222,7 @@ def determine_interval_outcome(
 
 
 class UnilateralStepDetails(NamedTuple):
-    """Detailed results of a step, under the names of the fields of `UnilateralStep`."""
+    """Detailed results of a walking step; the fields are described in `UnilateralStep`."""
 
     post_impact: Float[Array, "2 ..."]
     mode_durations: Float[Array, "4 4 ..."]
@@ -224,7 +236,7 @@ class UnilateralStepDetails(NamedTuple):
 
 
 def init_step_details(dtype: jnp.dtype) -> UnilateralStepDetails:
-    """Return the step details of one wheel at the start of a step, without a lane axis."""
+    """Return the step details of one wheel at the start of a walking step, without a batch axis."""
     float_zero, int_zero = jnp.zeros((), dtype), jnp.zeros((), jnp.int32)
     zero_pair = jnp.zeros((2,), dtype)
     return UnilateralStepDetails(
@@ -248,7 +260,7 @@ def record_event(
 ) -> UnilateralStepDetails:
     """Return the step details after one more event.
 
-    - `is_first_event`: whether the event is the first of the step.
+    - `is_first_event`: whether the event is the first in the walking step.
     """
     opening_quantities = (
         jnp.stack([event_result.motion.theta, event_result.motion.dtheta]),
@@ -286,12 +298,12 @@ def record_interval(
 ) -> UnilateralStepDetails:
     """Return the step details after one more interval.
 
-    The duration is added to the duration of the slots' contact modes. The stopper force is the
-    minimum over legs in the air at the ends of all intervals.
+    The duration is added to the entry of `mode_durations` for the contact modes `slot_modes`.
 
-    - `slot_modes`: contact mode of each slot's foot;
+    - `slot_modes`: contact mode of the foot in each contact slot;
     - `duration`: length of the interval, s;
-    - `stopper_force`: minimum over legs in the air at the ends of this interval, N.
+    - `stopper_force`: smallest stopper force on legs in the air at the ends of this interval, N.
+      The result contains the minimum over all intervals.
     """
     mode_codes = np.arange(4).reshape(-1, *(1,) * jnp.ndim(stopper_force))
     first_mode_indicator, second_mode_indicator = (
@@ -308,28 +320,29 @@ def record_interval(
 class UnilateralStep(AbstractContactStep):
     """One step with unilateral contact, from a landing of the foremost foot to the next landing.
 
-    Fields of a step whose outcome is not STEPPED are finite and describe the partial motion; its
-    `section_state` is all zeros, which is not a valid section state.
+    If the outcome is not STEPPED, the fields are finite and describe the motion until the failure.
+    The `section_state` is then zero in all entries, which is not a valid section state.
 
-    - `section_state`: section state just before the next landing;
-    - `post_impact`: (theta, dtheta) just after the opening landing, rad, rad/s;
-    - `durations`: durations with two loaded feet, with one, with none, s;
-    - `mode_durations`: durations by the contact modes of the first and second loaded foot, s;
-    - `step_length`: distance between the places of the two landings, m;
-    - `landing_normal`: normal impulses of fore and rear foot at the opening landing, N s;
-    - `landing_tangential`: tangential impulses of both feet at the opening landing, N s;
+    - `section_state`: full section state just before the next landing;
+    - `post_impact`: (theta, dtheta) just after the landing at which the step starts, rad, rad/s;
+    - `durations`: durations with two, one and no loaded feet, s;
+    - `mode_durations`: duration for each pair of contact modes of the first and the second loaded
+      foot, s;
+    - `step_length`: distance between the two landing positions, m;
+    - `landing_normal`: normal impulses on fore and rear foot at the first landing, N s;
+    - `landing_tangential`: tangential impulses on fore and rear foot at the first landing, N s;
     - `energy_impacts`: energy lost in impacts, J;
     - `energy_damping`: energy lost in the dampers, J;
     - `energy_friction`: energy lost by sliding between impacts, J;
-    - `slip`: path length of sliding feet, m;
-    - `events`: number of changes of contacts and stoppers;
+    - `slip`: total path length of all sliding feet, m;
+    - `events`: number of events, at which contacts or stoppers change;
     - `impacts`: number of events in which velocities jumped;
     - `fewest_solutions`, `most_solutions`: smallest and largest number of admissible combinations
       at an event; both are 1 if all events are well posed;
-    - `margins`: margins of the bilateral stoppers;
-    - `outcome`: an Outcome;
+    - `margins`: margins for bilateral stoppers, see `UnilateralMargins`;
+    - `outcome`: outcome code, an `Outcome`;
     - `solver_steps`: number of attempted solver steps;
-    - `engine`: name of the engine, see `StepOptions`.
+    - `engine`: name of the engine that computed the step, see `StepOptions`.
 
     Examples:
         >>> wheel = vrw.UnilateralWheel(friction=0.7)
@@ -359,7 +372,7 @@ class UnilateralStep(AbstractContactStep):
     engine: str = eqx.field(static=True, default="")
 
     def model_measures(self) -> dict[str, Array]:
-        """Return the measures of contact steps and the stopper margins, by name."""
+        """Return the measures of steps with contacts and the stopper margins, by name."""
         return AbstractContactStep.model_measures(self) | {
             margin_field.name: getattr(self.margins, margin_field.name)
             for margin_field in dataclasses.fields(self.margins)
@@ -372,7 +385,10 @@ def make_final_section_state(
     outcome: Array,
     next_line_tilt: Elementwise | None = None,
 ) -> FullState:
-    """Return the section state at the end of a step, or zeros if the step failed."""
+    """Return the full section state at the end of a walking step, or zeros if the step failed.
+
+    On uneven ground, `next_line_tilt` is the angle by which the next straight line is steeper, rad.
+    """
     section_state = pack_section_state(motion, contact_state, next_line_tilt)
     return jnp.where(outcome == Outcome.STEPPED, section_state, jnp.zeros_like(section_state))
 
@@ -387,10 +403,10 @@ def make_unilateral_step(
     engine_name: str,
     next_line_tilt: Elementwise | None = None,
 ) -> UnilateralStep:
-    """Return the results of a step, given its final state and its records.
+    """Return the results of a walking step from its final state and its records.
 
-    - `engine_name`: name of the engine that took the step;
-    - `next_line_tilt`: angle by which the next line is steeper, rad.
+    - `engine_name`: name of the engine that computed the step;
+    - `next_line_tilt`: angle by which the next straight line of uneven ground is steeper, rad.
     """
     landing_place = compute_landing_position(motion.L.shape[0], motion)
     replace_nonfinite = lambda record_value: jnp.where(

@@ -1,8 +1,9 @@
-"""Tangents of the dynamics along many directions, from the responses to unit coordinates.
+"""Propagate many tangents through the dynamics, using the responses to unit coordinates.
 
-The tangent at a point is linear in the direction: a unit of the angle has the same effect in every
-direction. A length and its rate affect only the same leg, the hub and the slots. So legs that do
-not move along any direction are skipped, and so are constant input columns.
+The tangent of the dynamics is linear in the direction: a unit change of the angle has the same
+effect in every direction. The length of a leg and its rate affect only the same leg, the hub and
+the legs in the contact slots. Legs that do not move in any direction are skipped, and so are
+constant inputs.
 """
 
 import operator
@@ -51,8 +52,10 @@ from vrw_jax.numerics import run_if_any
 from vrw_jax.wheel import PARAMETER_NAMES
 
 N_MOVING_LEGS = 3
-"""Number of leading legs that usually include all moving legs. The other legs are on their
-stoppers."""
+"""Number of leading legs that usually include all moving legs.
+
+The other legs are usually on their stoppers.
+"""
 _LEG_GROUP_SLICES = slice(0, N_MOVING_LEGS), slice(N_MOVING_LEGS, None)
 _MASS_PARAMETERS = "hub_mass", "leg_mass", "leg_com"
 _SPRING_PARAMETERS = "natural_length", "stiffness", "damping"
@@ -70,15 +73,18 @@ PARAMETER_GROUPS = [
         ("friction", "friction_before"),
     )
 ]
-"""Indices of the input columns in each group with a common effect. Lengths act through the position
-of stoppers alone, and the tilt of the next line acts through guards alone."""
+"""Indices of the parameters and friction in each group whose effects are computed together.
+
+The locked length acts only through the position of stoppers. The tilt of the next line of uneven
+ground acts only through guards.
+"""
 
 CoordinateTangentFn = Callable[[slice], tuple[Array, Array]]
-"""Function that returns the tangents of some coordinates and of their rates at a point."""
+"""Function that returns the tangents of a slice of coordinates and of their rates at a point."""
 
 
 class UnitInputResponse(NamedTuple):
-    """Tangent of the contact equations by a unit input, at constant forces and accelerations."""
+    """Tangent of the contact equations for a unit input, at constant forces and accelerations."""
 
     leg_length_residual: LegArray  # acceleration of each leg's length
     summed_residual_tangent: SummedResidualTangent
@@ -87,10 +93,10 @@ class UnitInputResponse(NamedTuple):
 
 
 class _UnitLegLengthResponse(NamedTuple):
-    """Tangent of the contact equations by a unit length of each leg, or by a unit length rate.
+    """Tangent of the contact equations for a unit length of each leg, or for a unit length rate.
 
-    - `slot_responses`: responses of the slots' lengths, of the feet's motions transverse to and
-      along their legs, and of the foot speeds.
+    - `slot_responses`: responses for the legs in the contact slots: lengths, motions of the feet
+      transverse to the legs, motions along the legs, and foot speeds.
     """
 
     leg_length_residual: LegArray  # acceleration of the leg's length
@@ -99,7 +105,7 @@ class _UnitLegLengthResponse(NamedTuple):
 
 
 class _LegLengthResponse(NamedTuple):
-    """Tangent of the contact equations by lengths and length rates of a group of legs."""
+    """Tangent of the contact equations for lengths and length rates of a group of legs."""
 
     hub_residual: HubVector
     slot_length_residual: SlotPair  # length of the slots' legs
@@ -122,7 +128,7 @@ class _DynamicsLinearization(NamedTuple):
     def from_motion(
         cls, mode_dynamics: ModeDynamics, motion: WheelMotion
     ) -> "_DynamicsLinearization":
-        """Return the linearization of the dynamics at this motion."""
+        """Return the linearization of the dynamics at a motion."""
         contact_configuration = mode_dynamics.configure_contacts(motion)
         force_solution = solve_forces_with_free_motion(contact_configuration)
         float_leaves = eqx.filter(contact_configuration, eqx.is_inexact_array)
@@ -132,8 +138,10 @@ class _DynamicsLinearization(NamedTuple):
     def make_leg_residual_function(
         self, leg_slice: slice
     ) -> Callable[[ContactConfiguration], tuple[ResidualTangent, ContactSlots]]:
-        """Return a function from a tangent to the residual tangent of the legs in `leg_slice`, and
-        to the slots of these legs.
+        """Return a function that computes the residual tangent of the legs in `leg_slice`.
+
+        Its argument is a tangent of the contact configuration. Its result also contains the contact
+        slots of these legs.
         """
         static_leaves = eqx.filter(self.configuration, eqx.is_inexact_array, inverse=True)
         contact_configuration = _restrict_configuration_to_legs(self.configuration, leg_slice)
@@ -162,7 +170,7 @@ class _DynamicsLinearization(NamedTuple):
         return lambda tangent: (compute_residual(tangent), contact_configuration.contact_slots)
 
     def compute_foot_speed_tangent(self, tangent: WheelMotion) -> SlotPair:
-        """Return the tangent of the foot speeds along the slope of both slots, m/s."""
+        """Return the tangents of the tangential speeds of the feet in contact, m/s."""
         s, contact_slots = self.dynamics.s, self.dynamics.contact_slots
         compute_speeds = lambda motion: (
             compute_slot_foot_velocity(
@@ -176,8 +184,10 @@ class _DynamicsLinearization(NamedTuple):
         motion: WheelMotion,
         leg_residual: Callable[[ContactConfiguration], tuple[ResidualTangent, ContactSlots]],
     ) -> tuple:
-        """Return residual tangent, slots and foot speeds of a group of legs along a tangent of the
-        motion.
+        """Return residual tangent, contact slots and foot-speed tangents of a group of legs.
+
+        - `motion`: tangent of the motion of a group of legs;
+        - `leg_residual`: result of `make_leg_residual_function` for these legs.
         """
         return *leg_residual(
             self.zero_tangent._replace(motion=motion)
@@ -186,9 +196,7 @@ class _DynamicsLinearization(NamedTuple):
     def compute_unit_length_responses(
         self, leg_slice: slice
     ) -> tuple[_UnitLegLengthResponse, _UnitLegLengthResponse]:
-        """Return the responses to unit lengths of the legs in `leg_slice`, and to unit length
-        rates.
-        """
+        """Return the responses to unit lengths and unit length rates of the legs in `leg_slice`."""
         leg_residual = self.make_leg_residual_function(leg_slice)
 
         def respond_to_coordinate(coordinate_name: str) -> _UnitLegLengthResponse:
@@ -213,8 +221,9 @@ class _DynamicsLinearization(NamedTuple):
         return respond_to_coordinate("L"), respond_to_coordinate("dL")
 
     def linearize_solution(self) -> Callable[[FreeMotion], tuple[HubVector, SlotPair, SlotPair]]:
-        """Return the linear map from tangents of the free motion to tangents of hub acceleration,
-        leg pull forces and tangential forces.
+        """Return the linear map from tangents of the free motion to tangents of the solution.
+
+        The map returns the tangents of hub acceleration, leg pull forces and tangential forces.
         """
         s, friction = self.configuration.s, self.configuration.friction
         slot_modes, is_held = self.configuration.slot_modes, self.configuration.is_stopper_holding
@@ -235,7 +244,7 @@ class _DynamicsLinearization(NamedTuple):
 def _restrict_configuration_to_legs(
     contact_configuration: ContactConfiguration, leg_slice: slice
 ) -> ContactConfiguration:
-    """Return the contact configuration of the legs in `leg_slice` alone."""
+    """Return the contact configuration restricted to the legs in `leg_slice`."""
     motion, contact_slots = contact_configuration.motion, contact_configuration.contact_slots
     return contact_configuration._replace(
         motion=motion._replace(L=motion.L[leg_slice], dL=motion.dL[leg_slice]),
@@ -249,8 +258,10 @@ def _restrict_configuration_to_legs(
 class TangentBasis(NamedTuple):
     """Responses to unit coordinates at one motion, which are common to all tangents.
 
-    - `compute_all_leg_residual`: function from a tangent to the residual tangent of all legs;
-    - `length_responses`: responses to lengths and length rates of the first legs and of the others;
+    - `compute_all_leg_residual`: function that computes the residual tangent of all legs for a
+      tangent of the configuration;
+    - `length_responses`: responses to lengths and length rates, for the first `N_MOVING_LEGS` legs
+      and for the other legs;
     - `slot_responses`: sums of the slot responses of both groups of legs.
     """
 
@@ -273,7 +284,7 @@ class TangentBasis(NamedTuple):
     def from_motion(
         cls, mode_dynamics: ModeDynamics, motion: WheelMotion, has_later_moving_legs: Array
     ) -> "TangentBasis":
-        """Return the tangent basis at this motion.
+        """Return the tangent basis at a motion.
 
         - `has_later_moving_legs`: whether legs after the first `N_MOVING_LEGS` move.
         """
@@ -356,7 +367,11 @@ class TangentBasis(NamedTuple):
     def compute_column_response(
         self, dynamics_fn: DynamicsFn, input_columns: Array, input_tangent: Array
     ) -> UnitInputResponse:
-        """Return the response of the contact equations to a tangent of the input columns."""
+        """Return the response of the contact equations to a tangent of the inputs.
+
+        - `input_columns`, `input_tangent`: parameters, friction and ground, and their tangent,
+          (columns, lanes).
+        """
         linearization, zero_response = self.linearization, self.make_zero_response()
 
         def configure_columns(input_columns: Array) -> tuple[ContactConfiguration, Array]:
@@ -395,7 +410,7 @@ class TangentBasis(NamedTuple):
         return total_response
 
     def make_zero_response(self) -> UnitInputResponse:
-        """Return the response to a zero tangent of the input columns."""
+        """Return the response to a zero tangent of parameters, friction and ground."""
         return jax.tree.map(jnp.zeros_like, self.angle_responses[0])
 
     def propagate_tangent(
@@ -404,13 +419,13 @@ class TangentBasis(NamedTuple):
         column_response: UnitInputResponse,
         has_later_moving_legs: Array,
     ) -> Array:
-        """Return the tangent of the dynamics rows along one direction.
+        """Return the tangents of accelerations and accumulator rates for one direction.
 
-        The dynamics rows are accelerations and, if requested, rates of the loss accumulators.
+        Accumulator rates are included if accumulators are requested.
 
-        - `coordinate_tangent_fn`: function from a slice of coordinates to the tangents of these
-          coordinates and of their rates;
-        - `column_response`: response to the direction's input columns.
+        - `coordinate_tangent_fn`: function that returns the tangents of a slice of coordinates and
+          of their rates;
+        - `column_response`: response to the tangent of parameters, friction and ground.
         """
         q, v = coordinate_tangent_fn(slice(0, 3 + N_MOVING_LEGS))
         theta, dtheta, first_length_tangents = q[2], v[2], (q[3:], v[3:])
@@ -497,7 +512,7 @@ class TangentBasis(NamedTuple):
         return jnp.concatenate(row_tangents)
 
     def _respond_to_leg_lengths(self, group_index: int, L: Any, dL: Any) -> _LegLengthResponse:
-        """Return the response to tangents of lengths and length rates of one group of legs."""
+        """Return the response to tangents of lengths and length rates in a group of legs."""
         length_response, rate_response = self.length_responses[group_index]
         leg_slice = _LEG_GROUP_SLICES[group_index]
         sum_response = lambda a, b: sum_over_legs(a * L + b * dL)
@@ -523,7 +538,7 @@ class TangentBasis(NamedTuple):
         L: Any,
         dL: Any,
     ) -> Array:
-        """Return the tangents of the length accelerations of one group of legs, m/s^2."""
+        """Return the tangents of the length accelerations in one group of legs, m/s^2."""
         (length_response, rate_response), leg_slice, linearization = (
             self.length_responses[group_index],
             _LEG_GROUP_SLICES[group_index],

@@ -1,10 +1,12 @@
-"""Event loop of walks with unilateral contact, for every engine.
+"""Event loop for walks with unilateral contact, common to all engines.
 
-All laws of contact and impact are elementwise over lanes. Each iteration resolves the events of all
-lanes at an event, then integrates all lanes further. A landing of the foremost foot is an event
-like any other. The batch kernel integrates many lanes (`integrate_interval`). On a CPU, its loop is
-one machine-code program in which few lanes are idle. Elsewhere XLA compiles the same source.
-diffrax integrates a single lane (`integrate_by_diffrax`).
+All laws of contact and impact are elementwise over the batch. A batch element is called a *lane*.
+Each iteration resolves the events of all elements at an event, then integrates all elements
+further. The landing of the foremost foot is an event like any other.
+
+The batch kernel integrates many elements (`integrate_interval`). On a CPU, its loop is one
+machine-code program in which few elements are idle. On other devices, XLA compiles the same source.
+diffrax integrates a single element (`integrate_by_diffrax`).
 """
 
 from typing import Any, NamedTuple
@@ -72,16 +74,19 @@ from vrw_jax.wheel import (
 )
 
 N_PARAMETERS = len(PARAMETER_NAMES)
-"""Number of input columns that hold parameters. The column of friction follows."""
+"""Number of wheel parameters, the first input columns. The friction coefficient follows."""
 N_UNEVEN_COLUMNS = 2
-"""Number of further input columns on uneven ground: friction of the feet that landed earlier, and
-the angle by which the next line is steeper, rad. The column of restitution, if given, is last."""
+"""Number of further input columns on uneven ground.
+
+They are the friction coefficient of the feet that landed earlier, and the angle by which the next
+straight line is steeper, rad. If restitution is an input, its column is last.
+"""
 STATUS_UNFINISHED = -1
-"""Code in place of the outcome of a lane whose walk is unfinished."""
+"""Value in place of the outcome code of an unfinished walk."""
 
 
 class StepSummary(NamedTuple):
-    """Section state, durations (s) and length (m) of the last step of a walk, without details."""
+    """Section state, durations (s) and length (m) of the last step in a walk, without details."""
 
     section_state: Array
     durations: Array  # (3, lanes)
@@ -89,7 +94,7 @@ class StepSummary(NamedTuple):
 
 
 class BatchWalkResult(NamedTuple):
-    """Results of the walks of all lanes."""
+    """Results of the walks of all batch elements."""
 
     step_result: Any  # `StepSummary` or `UnilateralStep` of the last step
     outcome: Array
@@ -98,7 +103,7 @@ class BatchWalkResult(NamedTuple):
 
 
 def make_result_template(n_legs: int, dtype: Any, is_detailed: bool) -> BatchWalkResult:
-    """Return zeros in the structure of the walk result of one wheel with `n_legs` legs.
+    """Return zeros with the structure of the walk result of one wheel with `n_legs` legs.
 
     - `is_detailed`: whether the result contains a `UnilateralStep` instead of a `StepSummary`.
     """
@@ -125,7 +130,7 @@ def make_result_template(n_legs: int, dtype: Any, is_detailed: bool) -> BatchWal
 
 
 class DifferentiableLaneState(NamedTuple):
-    """Differentiable arrays of a lane's state, or tangents of these arrays."""
+    """Differentiable arrays in the state of all batch elements, or tangents of these arrays."""
 
     q: Array
     v: Array
@@ -136,7 +141,7 @@ class DifferentiableLaneState(NamedTuple):
 
 
 class LaneState(NamedTuple):
-    """State of all lanes between two iterations of the event loop."""
+    """State of all batch elements between two iterations of the event loop."""
 
     interval_state: IntervalState
     step_counters: StepCounters  # of this step, but solver steps of the walk
@@ -146,7 +151,7 @@ class LaneState(NamedTuple):
     walk_outcome: Array
 
     def get_differentiable(self) -> DifferentiableLaneState:
-        """Return the differentiable arrays of the lane state."""
+        """Return the differentiable arrays of the state."""
         interval_point = self.interval_state.interval_point
         step_details = eqx.filter(self.step_details, eqx.is_inexact_array)
         accumulators = self.step_loss_accumulators, self.interval_state.interval_accumulators
@@ -160,7 +165,7 @@ class LaneState(NamedTuple):
         )
 
     def replace_differentiable(self, differentiable_state: DifferentiableLaneState) -> "LaneState":
-        """Return the lane state with its differentiable arrays replaced."""
+        """Return the state with its differentiable arrays replaced."""
         step_accumulators, interval_accumulators = differentiable_state.loss_accumulators
         interval_point = self.interval_state.interval_point._replace(
             q=differentiable_state.q, v=differentiable_state.v
@@ -194,7 +199,7 @@ class BatchWalkSettings(NamedTuple):
     engine_name: str = "lanes"  # name of the engine in the results
 
     def make_dynamics(self, input_columns: Array, contact_state: ContactState) -> ModeDynamics:
-        """Return the dynamics of all lanes in this contact state."""
+        """Return the dynamics of all batch elements in their contact states."""
         s, friction = self.unpack_columns(input_columns)
         dynamics_arguments = (
             self.has_one_sided_stoppers,
@@ -205,7 +210,11 @@ class BatchWalkSettings(NamedTuple):
         return make_mode_dynamics(s, friction, *dynamics_arguments)
 
     def unpack_columns(self, input_columns: Array) -> tuple[Symbols, Friction]:
-        """Return wheel symbols and friction coefficients of the lanes from their input columns."""
+        """Return wheel symbols and friction coefficients from the input columns, (columns, lanes).
+
+        On uneven ground, the second result is a pair: friction of the foot that landed last, and of
+        the feet that landed earlier.
+        """
         s = compute_symbols(self.n_legs, *input_columns[:N_PARAMETERS])
         friction = apply_friction_rule(input_columns[N_PARAMETERS], self.uses_paper_rule)
         if not self.has_uneven_ground:
@@ -216,17 +225,18 @@ class BatchWalkSettings(NamedTuple):
         return s, (friction, previous_friction)
 
     def extract_next_line_tilt(self, input_columns: Array) -> Array | None:
-        """Return the angle by which the next line is steeper, rad; None on flat ground."""
+        """Return the angle by which the next straight line of the ground is steeper, rad.
+
+        The result is None on flat ground.
+        """
         return input_columns[N_PARAMETERS + 2] if self.has_uneven_ground else None
 
     def extract_restitution(self, input_columns: Array) -> Array | None:
-        """Return Newton's coefficient of restitution of the feet, None if it is 0."""
+        """Return Newton's coefficient of restitution of the feet; None if it is not an input."""
         return input_columns[-1] if self.has_restitution else None
 
     def begin_walk(self, input_columns: Array, section_state: Array) -> LaneState:
-        """Return the lane states at the first landing of their walks, before the impact is
-        resolved.
-        """
+        """Return the state of all batch elements at the first landing, before the impact."""
         motion, contact_state = unpack_section_state(
             self.unpack_columns(input_columns)[0], section_state
         )
@@ -253,9 +263,7 @@ class BatchWalkSettings(NamedTuple):
     def begin_contact_interval(
         self, mode_dynamics: ModeDynamics, motion: WheelMotion
     ) -> IntervalState:
-        """Return the interval states of the lanes at the start of a contact state, without
-        derivatives.
-        """
+        """Return the state at the start of an interval between events, without derivatives."""
         mode_dynamics, motion, dt0 = stop_gradients((mode_dynamics, motion, self.step_options.dt0))
         if self.tableau is None:
             return init_diffrax_interval(mode_dynamics, motion)
@@ -281,9 +289,9 @@ class BatchWalkSettings(NamedTuple):
         )
 
     def process_events(self, input_columns: Array, lane_state: LaneState) -> LaneState:
-        """Return the lane states with their events resolved.
+        """Return the state of all batch elements after their events are resolved.
 
-        The outcome of a lane at the end of its walk is set. Running lanes are unchanged.
+        If a walk ends, its outcome is set. Running elements are unchanged.
         """
         interval_state = lane_state.interval_state
         guard_layout = make_guard_layout(self.n_legs, self.has_one_sided_stoppers)
@@ -412,7 +420,7 @@ class BatchWalkSettings(NamedTuple):
         )
 
     def compute_step_result(self, lane_state: LaneState, next_line_tilt: Array | None) -> Any:
-        """Return the results of the last step of all lanes, whose walks have ended."""
+        """Return the results of the last step of all batch elements, whose walks have ended."""
         final_state = (
             unpack_motion(lane_state.interval_state.interval_point),
             lane_state.interval_state.contact_state,
@@ -441,7 +449,7 @@ class BatchWalkSettings(NamedTuple):
         outcome: Array,
         next_line_tilt: Array | None,
     ) -> StepSummary:
-        """Return the summary of a step that has ended."""
+        """Return the section state, durations and length of a step that has ended."""
         step_length = jnp.where(
             outcome == Outcome.STEPPED, compute_landing_position(self.n_legs, final_state[0]), 0.0
         )
@@ -454,9 +462,7 @@ class BatchWalkSettings(NamedTuple):
     def replace_invalid_lanes(
         self, input_columns: Array, section_state: Array
     ) -> tuple[Array, Array, Array]:
-        """Return input columns and section states with invalid lanes replaced, and which lanes are
-        valid.
-        """
+        """Return inputs and section states with invalid elements replaced, and validity flags."""
         start_arguments = (
             make_wheel_from_parameters(input_columns[:N_PARAMETERS], self.n_legs),
             input_columns[N_PARAMETERS],
@@ -476,7 +482,7 @@ class BatchWalkSettings(NamedTuple):
         return jnp.stack(column_rows), section_state, is_valid
 
     def deactivate_invalid_lanes(self, lane_state: LaneState, is_valid: Array) -> LaneState:
-        """Return the lane states, with the outcome BAD_INPUT for invalid lanes."""
+        """Return the state with the outcome BAD_INPUT for invalid batch elements."""
         return lane_state._replace(
             walk_outcome=jnp.where(is_valid, lane_state.walk_outcome, Outcome.BAD_INPUT)
         )
@@ -488,9 +494,9 @@ def record_end_stopper_force(
     motion: WheelMotion,
     duration: Array,
 ) -> UnilateralStepDetails:
-    """Return the step details with the stopper force at one end of an interval.
+    """Return the step details updated with the stopper force at one end of an interval.
 
-    - `duration`: duration that is added to the contact modes, s.
+    - `duration`: duration that is added to the entry for the present contact modes, s.
     """
     stopper_force = compute_min_stopper_force(mode_dynamics, compute_forces(mode_dynamics, motion))
     return record_interval(step_details, mode_dynamics.slot_modes, duration, stopper_force)
@@ -499,7 +505,10 @@ def record_end_stopper_force(
 def init_lane_states(
     walk_settings: BatchWalkSettings, input_columns: Array, section_state: Array
 ) -> tuple[Array, LaneState]:
-    """Return input columns without invalid lanes, and the lane states before the first landing."""
+    """Return valid input columns, and the state of all batch elements before the first landing.
+
+    Invalid elements are replaced and have the outcome BAD_INPUT.
+    """
     input_columns, section_state, is_valid = walk_settings.replace_invalid_lanes(
         input_columns, section_state
     )
@@ -514,9 +523,9 @@ def process_and_integrate(
     lane_state: LaneState,
     waits_for_events: bool = False,
 ) -> tuple[LaneState, LaneState]:
-    """Return the lane states after their events, and the lane states after further integration.
+    """Return the state of the batch after its events, and the state after further integration.
 
-    - `waits_for_events`: whether every lane is integrated to its next event.
+    - `waits_for_events`: whether every element is integrated to its next event.
     """
     state_after_events = walk_settings.process_events(input_columns, lane_state)
     tableau = walk_settings.tableau
@@ -547,7 +556,7 @@ def process_and_integrate(
 def run_walks(
     walk_settings: BatchWalkSettings, input_columns: Array, section_state: Array
 ) -> BatchWalkResult:
-    """Return the walk results of all lanes after `n_steps` landings of the foremost foot."""
+    """Return the results of all walks after `n_steps` landings of the foremost foot."""
     input_columns, lane_state = init_lane_states(walk_settings, input_columns, section_state)
     run_iteration = lambda lane_state: process_and_integrate(
         walk_settings, input_columns, lane_state

@@ -1,9 +1,9 @@
-"""Walks of a batch with unilateral contact, with tangents along many directions.
+"""Compute walks of a batch with unilateral contact, and their tangents in many directions.
 
-Events, contacts and step sizes determine the motion and are computed once. At each stage of a
-Runge-Kutta step and at each event, quantities common to all tangents are computed once. Each
-tangent then needs only linear operations. The derivatives are those of the discrete flow at the
-accepted step sizes, and of the times of its events: see `integrator.tangents`.
+Events, contacts and step sizes are determined by the motion and computed once. At each stage of a
+Runge-Kutta step and at each event, the quantities common to all tangents are also computed once.
+Each tangent then requires only linear operations. The derivatives are those of the discrete flow
+with the accepted step sizes, and of the event times: see `integrator.tangents`.
 """
 
 import math
@@ -47,7 +47,7 @@ from vrw_jax.wheel import compute_wheel_units
 
 
 class _IntervalTangent(NamedTuple):
-    """Tangent of a lane's state during an interval."""
+    """Tangent of the state of each batch element during an interval."""
 
     q: Array
     v: Array
@@ -57,7 +57,7 @@ class _IntervalTangent(NamedTuple):
 
 
 class _LaneTangent(NamedTuple):
-    """Tangent of the differentiable state of a lane."""
+    """Tangent of the differentiable state of each batch element."""
 
     interval_tangent: _IntervalTangent
     other_tangents: DifferentiableLaneState  # tangents of what is not in the interval
@@ -66,7 +66,10 @@ class _LaneTangent(NamedTuple):
     def from_lane_tangents(
         cls, lane_tangents: DifferentiableLaneState, dynamics_rows: Array
     ) -> "_LaneTangent":
-        """Return the lane tangent, given tangents of the lane state and of the dynamics rows."""
+        """Return the tangent from tangents of the differentiable state and of the dynamics rows.
+
+        The dynamics rows are accelerations and, if requested, accumulator rates.
+        """
         accumulators, interval_accumulators = lane_tangents.loss_accumulators
         other_tangents: Any = lane_tangents._asdict() | {
             "q": None,
@@ -86,7 +89,7 @@ class _LaneTangent(NamedTuple):
         )
 
     def to_lane_tangents(self) -> DifferentiableLaneState:
-        """Return the tangent of the differentiable lane state."""
+        """Return the tangent of the differentiable state of each batch element."""
         q, v, interval_accumulators, _, time = self.interval_tangent
         return self.other_tangents._replace(
             q=q,
@@ -97,7 +100,7 @@ class _LaneTangent(NamedTuple):
 
 
 class TangentBatch(NamedTuple):
-    """Tangents of all lanes, with the tangents on the first axis and the lanes on the last axis."""
+    """Tangents of all batch elements; the first axis contains tangents, the last the batch."""
 
     n_tangents: Array  # number of tangents of each lane
     n_column_tangents: Array  # number of leading tangents whose columns may vary
@@ -106,7 +109,7 @@ class TangentBatch(NamedTuple):
     tangent_rows: Array
 
     def allocate_rows(self, n_rows: int) -> Array:
-        """Return uninitialized rows of all tangents, (tangents, n_rows, lanes)."""
+        """Return an uninitialized array for all tangents, (tangents, n_rows, lanes)."""
         return lax.empty(
             (len(self.column_tangents), n_rows, *self.n_tangents.shape), self.column_tangents.dtype
         )
@@ -117,10 +120,12 @@ class TangentBatch(NamedTuple):
         tangent_rows: Array,
         first_row: Array | int = 0,
     ) -> Array:
-        """Return the tangent rows, in which results of a function replace the rows from `first_row`
-        on.
+        """Return the tangents after a function has been applied to each, (tangents, rows, lanes).
 
-        - `row_function`: function from the index of a tangent and its rows to a tree of new rows.
+        The results of the function replace the rows from `first_row` onward.
+
+        - `row_function`: function of the index of a tangent and its rows that returns a tree of new
+          rows.
         """
         should_continue = lambda state: jnp.any(state[0] < self.n_tangents)
 
@@ -150,7 +155,7 @@ def _pack_rows(array_tree: Any) -> Array:
 
 
 def _unpack_rows(tangent_rows: Array, tangent_template: Any) -> Any:
-    """Return the rows as a tree with the structure of `tangent_template`.
+    """Return the rows of an array as a tree with the structure of `tangent_template`.
 
     The function is the inverse of `_pack_rows`.
     """
@@ -177,10 +182,13 @@ def walk_with_tangents(
     section_state_tangents: Array,
     n_tangents: Array,
 ) -> tuple[BatchWalkResult, Any]:
-    """Return the result of `run_walks`, and the tangents of its float arrays.
+    """Return the result of `run_walks`, and the tangents of its floating-point arrays.
 
-    The tangents are on the first axis of `input_column_tangents`, `section_state_tangents` and the
-    result. A lane has `n_tangents` tangents, which come first.
+    - `n_tangents`: number of tangents of each batch element;
+    - `input_column_tangents`, `section_state_tangents`: tangents of the inputs. The first axis
+      contains the tangents, of which the first `n_tangents` are used.
+
+    The first axis of the resulting tangents also contains the tangents.
     """
     tableau = walk_settings.tableau
     assert tableau is not None  # diffrax differentiates in another way.
@@ -326,7 +334,10 @@ def _integrate_with_tangents(
     options: StepOptions,
     tableau: ButcherTableau,
 ) -> tuple[IntervalState, Array]:
-    """Return the result of `integrate_interval`, and the tangent rows at its end."""
+    """Return the result of `integrate_interval`, and the tangents at its end.
+
+    The tangents have the shape (tangents, rows, lanes).
+    """
     mode_dynamics = dynamics_fn(input_columns)
     guard_scales, last_stage = compute_guard_scales(mode_dynamics), len(tableau.stage_nodes) - 1
     options = compute_wheel_units(mode_dynamics.s).scale_times_to_seconds(options)
@@ -434,6 +445,7 @@ def _evaluate_stages(
 ) -> tuple[Array, Array]:
     """Return the dynamics rows at all stages of a solver step, and the tangents of these rows.
 
+    The dynamics rows are accelerations, contact quantities and, if requested, accumulator rates.
     The tangents are computed one after another.
     """
     interval_point, h = interval_state.interval_point, interval_state.h
@@ -516,9 +528,10 @@ def _propagate_stage_coordinates(
     h: Array,
     leg_slice: slice,
 ) -> tuple[Array, Array]:
-    """Return the tangents of coordinates and rates at stage `i`, for the coordinates `leg_slice`.
+    """Return the tangents of coordinates and rates at stage `i`.
 
-    The result is the tangent of that of `compute_stage_state`.
+    The tangents are those of the result of `compute_stage_state`, for the coordinates in
+    `leg_slice`.
     """
     flat_matrices = [
         jnp.asarray(np.reshape(section_state, -1))
@@ -548,10 +561,10 @@ def _propagate_stage_coordinates(
 def _compute_max_stable_step_size(
     mode_dynamics: ModeDynamics, tableau: ButcherTableau, stability_safety_factor: float = 0.85
 ) -> Array:
-    """Return the largest step size for which tangents of a swinging leg do not grow, s.
+    """Return the largest step size for which tangents of a leg swinging in the air do not grow, s.
 
-    The damper of such a leg stops the leg within m / c. Step-size control is based on the motion
-    alone, in which the leg may be almost at rest.
+    The damper stops such a leg within a time of order m / c (leg mass over damping). Step-size
+    control is based on the motion alone, in which the leg may be nearly at rest.
     """
     has_swing_leg = jnp.any(
         ~mode_dynamics.contact_state.is_locked
@@ -567,7 +580,7 @@ def _compute_max_stable_step_size(
 def _has_later_moving_legs(
     tangents: TangentBatch, tangent_template: _IntervalTangent, contact_state: ContactState
 ) -> Array:
-    """Return whether a leg after the first `N_MOVING_LEGS` moves, in any lane and tangent."""
+    """Return whether a leg after the first `N_MOVING_LEGS` moves in any tangent."""
 
     def update_moving_leg_flag(state: tuple[Array, Array]) -> tuple[Array, Array]:
         k, has_moving_leg = state
@@ -593,7 +606,7 @@ def _make_event_shift(
     tangents: TangentBatch,
     tangent_template: _IntervalTangent,
 ) -> Callable[[Array, Array], _IntervalTangent]:
-    """Return a function that adds the effect of the event time's tangent to a lane's tangent."""
+    """Return a function that adds the effect of the event time's tangent to a state's tangent."""
     interval_point, n = interval_state.interval_point, len(interval_state.interval_point.q)
 
     def compute_guards(input_columns: Array, q: Array, v: Array) -> Array:
