@@ -1,9 +1,9 @@
 """Integrate a batch of wheels between events, with a separate step size and contact state for each.
 
 A batch element is called a *lane*, and arrays have the lanes on the last axis. One Runge-Kutta step
-serves both the integration and the event search. If a guard crosses zero in the solver step of a
-lane, this lane repeats the step with smaller sizes until the step ends at the earliest event. No
-computation in this module combines values of different lanes.
+serves both the integration and the event search. If a guard crosses zero in a solver step, the lane
+repeats this step with smaller sizes until it ends at the earliest event. No computation in this
+module combines values of different lanes.
 
 Arrays of accelerations and contact forces have one row per quantity, the *dynamics rows*. The
 *initiating guard* of a contact state is the guard that was zero at the event before this state. An
@@ -93,8 +93,7 @@ class EventSearchOptions:
     max_roundoff_fall_duration: float = 1e-3
     """Time in which a guard must fall by its own round-off to be treated as falling.
 
-    The value is in the wheel's unit of time, which is about a second for the wheel in Table 1 of
-    the paper.
+    The value is in the wheel's unit of time, which is 1 s for the wheel in Table 1 of the paper.
     """
     event_time_tolerance_factor: float = 30.0
     """Ratio of the event's time tolerance to the relative tolerance times the step size.
@@ -114,22 +113,22 @@ class IntervalPoint(NamedTuple):
     rows are accelerations, contact quantities and, if requested, accumulator rates.
     """
 
-    q: Array  # (3 + n, lanes)
+    q: Array  # (3 + n, batch)
     v: Array
-    dynamics_rows: Array  # accelerations, contact rows: (3 + n + 9 [+ n] [+ 3], lanes)
+    dynamics_rows: Array  # accelerations, contact rows: (3 + n + 9 [+ n] [+ 3], batch)
 
 
 class EventBracket(NamedTuple):
     """Bracket of the earliest event inside a solver step, and the last attempt to locate it."""
 
     is_search_active: Array
-    is_guard_crossing: Array  # whether a guard crosses zero in the bracket, (guards, lanes)
+    is_guard_crossing: Array  # whether a guard crosses zero in the bracket, (guards, batch)
     low_step_size: Array  # bracket of the event, s from the start of the step
     high_step_size: Array
     time_tolerance: Array  # s
     n_iterations: Array
     previous_step_size: Array  # size of the previous attempt, s
-    guard_values: Array  # at the end of the previous attempt, (guards, lanes)
+    guard_values: Array  # at the end of the previous attempt, (guards, batch)
 
 
 class IntervalState(NamedTuple):
@@ -137,9 +136,9 @@ class IntervalState(NamedTuple):
 
     interval_point: IntervalPoint
     contact_state: ContactState
-    guard_values: Array  # at the point, (guards, lanes)
+    guard_values: Array  # at the point, (guards, batch)
     guard_offset: Array  # initial value of an initiating guard, minus round-off; else 0
-    # integrals since the last event, (N_ACCUMULATOR_ROWS, lanes)
+    # integrals since the last event, (N_ACCUMULATOR_ROWS, batch)
     interval_accumulators: Array | None
     h: Array  # of the next attempt, s
     time_since_event: Array  # since the last event, s
@@ -185,7 +184,7 @@ def pack_coordinates(motion: WheelMotion) -> tuple[Array, Array]:
 def evaluate_dynamics(mode_dynamics: ModeDynamics, q: Array, v: Array) -> Array:
     """Return accelerations, contact quantities and, if requested, accumulator rates as one array.
 
-    The axes are (dynamics rows, lanes). `q` and `v` are coordinates and rates, (3 + n, lanes). Leg
+    The axes are (dynamics rows, batch). `q` and `v` are coordinates and rates, (3 + n, batch). Leg
     directions are not among the contact quantities.
     """
     motion = unpack_motion(IntervalPoint(q, v, q))
@@ -224,7 +223,7 @@ def evaluate_dynamics(mode_dynamics: ModeDynamics, q: Array, v: Array) -> Array:
 
 
 def evaluate_guards_at_point(mode_dynamics: ModeDynamics, interval_point: IntervalPoint) -> Array:
-    """Return the values of all guards in the order of `GuardLayout`, (guards, lanes).
+    """Return the values of all guards in the order of `GuardLayout`, (guards, batch).
 
     The point must be after the start of the contact state, so that no guard has a placeholder
     value.
@@ -264,7 +263,7 @@ def evaluate_guards_at_point(mode_dynamics: ModeDynamics, interval_point: Interv
 
 
 def compute_guard_rates(mode_dynamics: ModeDynamics, interval_point: IntervalPoint) -> Array:
-    """Return the time derivatives of all guards during the motion, (guards, lanes)."""
+    """Return the time derivatives of all guards during the motion, (guards, batch)."""
 
     def evaluate_guards_of_coordinates(q: Array, v: Array) -> Array:
         return evaluate_guards_at_point(
@@ -279,7 +278,7 @@ def compute_guard_rates(mode_dynamics: ModeDynamics, interval_point: IntervalPoi
 
 
 def find_initiating_guards(mode_dynamics: ModeDynamics) -> Array:
-    """Return whether each guard is an initiating guard of the contact state, (guards, lanes).
+    """Return whether each guard is an initiating guard of the contact state, (guards, batch).
 
     An initiating guard was zero at the event that started the contact state.
     """
@@ -378,7 +377,7 @@ def init_interval(
 DynamicsFn = Callable[[Array], ModeDynamics]
 """Function that returns the dynamics in the contact states of all batch elements.
 
-Its argument contains wheel parameters, friction and uneven ground, (columns, lanes).
+Its argument contains wheel parameters, friction and uneven ground, (inputs, batch).
 """
 
 
@@ -395,8 +394,8 @@ def integrate_interval(
     After `max_attempts_with_waiting_lane` solver steps, the integration ends as soon as an element
     with an unfinished walk is at an event.
 
-    - `input_columns`: parameters, friction and uneven ground, (columns, lanes);
-    - `has_unfinished_walk`: whether the walk of each element is unfinished, (lanes,).
+    - `input_columns`: parameters, friction and uneven ground, (inputs, batch);
+    - `has_unfinished_walk`: whether the walk of each element is unfinished, (batch,).
     """
     mode_dynamics = dynamics_fn(input_columns)
     guard_scales = compute_guard_scales(mode_dynamics)
@@ -452,8 +451,8 @@ class AttemptedSolverStep(NamedTuple):
 
     end_point: IntervalPoint
     mean_squared_error: Array  # mean square of the error over the tolerance
-    guard_values: Array  # at the end of the step, (guards, lanes)
-    guard_parabola_curvature: Array  # of the parabola through each guard, (guards, lanes)
+    guard_values: Array  # at the end of the step, (guards, batch)
+    guard_parabola_curvature: Array  # of the parabola through each guard, (guards, batch)
     guard_parabola_linear_term: Array
     guard_minimum_fraction: Array  # fraction of the step to a negative guard minimum, else 1
     accumulator_increments: Array | None  # increment of `IntervalState.interval_accumulators`
@@ -462,9 +461,9 @@ class AttemptedSolverStep(NamedTuple):
 def compute_stage_state(
     tableau: ButcherTableau, i: Array | int, q: Array, v: Array, stage_rows: Array, h: Array
 ) -> tuple[Array, Array]:
-    """Return coordinates and rates at Runge-Kutta stage `i`, each of shape (3 + n, lanes).
+    """Return coordinates and rates at Runge-Kutta stage `i`, each of shape (3 + n, batch).
 
-    They are computed from the accelerations at the earlier stages, the first rows of `stage_rows`.
+    They are computed from the accelerations at the earlier stages in `stage_rows`.
 
     - `h`: size of the solver step, s.
     """
@@ -511,7 +510,7 @@ def complete_solver_step(
 ) -> AttemptedSolverStep:
     """Return the result of a solver step from the dynamics rows at all stages.
 
-    - `stage_rows`: dynamics rows, (stages, rows, lanes).
+    - `stage_rows`: dynamics rows, (stages, rows, batch).
     """
     h = lane_states.h
     start_point = lane_states.interval_point
@@ -839,7 +838,7 @@ def _compute_squared_error(
 
 
 def _flag_initiating_guards(lane_states: IntervalState) -> Array:
-    """Return which guards are initiating guards at the start of their interval, (guards, lanes)."""
+    """Return which guards are initiating guards at the start of their interval, (guards, batch)."""
     return (lane_states.time_since_event == 0.0) & (lane_states.guard_offset != 0.0)
 
 

@@ -49,8 +49,8 @@ def walk_batch(
 ) -> tuple[np.ndarray, ...]:
     """Return the results of walks of `n_steps` steps for a batch of wheels with `n_legs` legs.
 
-    The result is (section states, durations of the last step in s, outcomes, counts of completed
-    walking steps, counts of solver steps, lengths of the last step in m). The first axis of each
+    The result is (section states, durations in the last step, s, outcomes, numbers of completed
+    walking steps, numbers of solver steps, lengths of the last step, m). The first axis of each
     array contains the wheels.
 
     - `input_columns`: wheel parameters and friction, shape (10, wheels). On uneven ground, the walk

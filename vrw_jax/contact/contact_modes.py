@@ -478,9 +478,9 @@ CombinationMask = tuple[Any, Any]
 
 
 class _OrderedCombinationTable(NamedTuple):
-    """Bit masks of the combinations with a given contact mode or with a closed stopper.
+    """Bit masks that mark the combinations with a given contact mode or closed stopper.
 
-    The bits are in one order of the combinations.
+    The bits follow one order of the combinations.
     """
 
     masks_by_slot_mode: list[list[CombinationMask]]  # indexed by slot and mode
@@ -488,7 +488,7 @@ class _OrderedCombinationTable(NamedTuple):
 
     @classmethod
     def from_indices(cls, indices: np.ndarray) -> "_OrderedCombinationTable":
-        """Return the table of the combinations in the order `indices`."""
+        """Return the bit masks for the combinations in the order `indices`."""
 
         def pack_bits(is_member: np.ndarray) -> CombinationMask:
             combination_masks = np.packbits(np.append(is_member, False), bitorder="little").view(

@@ -481,10 +481,10 @@ def choose_stopping_guard(
 ) -> Int[Array, "..."]:
     """Return the index of the guard that ends the interval when the wheel stops rolling.
 
-    If all rates are zero to within `atol` and a foot has been sliding, the result is the index of
-    the guard for the end of the slide. Otherwise it is `guard_index`. The reason is that round-off
-    determines which of the two guards is zero first. After the slide has ended, the friction on the
-    stopped foot determines whether the wheel rests or falls back.
+    If all rates are zero to within `atol` and a foot slides, the result is the guard for the end of
+    the slide. Otherwise it is `guard_index`. The reason is that round-off determines which of the
+    two guards is zero first. After the slide has ended, the friction on the stopped foot determines
+    whether the wheel rests or falls back.
     """
     slip_signs = compute_slip_signs(mode_dynamics.slot_modes)
     has_just_slid = mode_dynamics.contact_slots.gather_slot_flags(

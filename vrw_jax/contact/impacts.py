@@ -530,11 +530,10 @@ def _list_following_modes(
 
 
 FORCE_ROUNDOFF_FRACTION = 1e-9
-"""Fraction of the wheel's weight below which forces are round-off.
+"""Fraction of the wheel's weight below which a force is treated as zero.
 
-The same fraction of gravity applies to accelerations.
-
-The value is chosen because forces are accurate to round-off.
+The same fraction of gravity applies to accelerations. The value is chosen because forces are
+accurate to round-off.
 """
 
 

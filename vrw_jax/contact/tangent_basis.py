@@ -370,7 +370,7 @@ class TangentBasis(NamedTuple):
         """Return the response of the contact equations to a tangent of the inputs.
 
         - `input_columns`, `input_tangent`: parameters, friction and ground, and their tangent,
-          (columns, lanes).
+          (inputs, batch).
         """
         linearization, zero_response = self.linearization, self.make_zero_response()
 

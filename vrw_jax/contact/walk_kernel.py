@@ -89,7 +89,7 @@ class StepSummary(NamedTuple):
     """Section state, durations (s) and length (m) of the last step in a walk, without details."""
 
     section_state: Array
-    durations: Array  # (3, lanes)
+    durations: Array  # (3, batch)
     step_length: Array
 
 
@@ -210,7 +210,7 @@ class BatchWalkSettings(NamedTuple):
         return make_mode_dynamics(s, friction, *dynamics_arguments)
 
     def unpack_columns(self, input_columns: Array) -> tuple[Symbols, Friction]:
-        """Return wheel symbols and friction coefficients from the input columns, (columns, lanes).
+        """Return wheel symbols and friction coefficients from the input columns, (inputs, batch).
 
         On uneven ground, the second result is a pair: friction of the foot that landed last, and of
         the feet that landed earlier.

@@ -105,11 +105,11 @@ class TangentBatch(NamedTuple):
     n_tangents: Array  # number of tangents of each lane
     n_column_tangents: Array  # number of leading tangents whose columns may vary
     column_tangents: Array
-    # all numbers of a `_LaneTangent`, see `_pack_rows`, (tangents, rows, lanes)
+    # all numbers of a `_LaneTangent`, see `_pack_rows`, (tangents, rows, batch)
     tangent_rows: Array
 
     def allocate_rows(self, n_rows: int) -> Array:
-        """Return an uninitialized array for all tangents, (tangents, n_rows, lanes)."""
+        """Return an uninitialized array for all tangents, (tangents, n_rows, batch)."""
         return lax.empty(
             (len(self.column_tangents), n_rows, *self.n_tangents.shape), self.column_tangents.dtype
         )
@@ -120,7 +120,7 @@ class TangentBatch(NamedTuple):
         tangent_rows: Array,
         first_row: Array | int = 0,
     ) -> Array:
-        """Return the tangents after a function has been applied to each, (tangents, rows, lanes).
+        """Return the tangents after a function has been applied to each, (tangents, rows, batch).
 
         The results of the function replace the rows from `first_row` onward.
 
@@ -145,7 +145,7 @@ class TangentBatch(NamedTuple):
 
 
 def _pack_rows(array_tree: Any) -> Array:
-    """Return all arrays of a tree, concatenated to one array (rows, lanes)."""
+    """Return all arrays of a tree, concatenated to one array (rows, batch)."""
     return jnp.concatenate(
         [
             section_state.reshape(-1, section_state.shape[-1])
@@ -336,7 +336,7 @@ def _integrate_with_tangents(
 ) -> tuple[IntervalState, Array]:
     """Return the result of `integrate_interval`, and the tangents at its end.
 
-    The tangents have the shape (tangents, rows, lanes).
+    The tangents have the shape (tangents, rows, batch).
     """
     mode_dynamics = dynamics_fn(input_columns)
     guard_scales, last_stage = compute_guard_scales(mode_dynamics), len(tableau.stage_nodes) - 1
