@@ -82,9 +82,9 @@ class EventSearchOptions:
     """Largest ratio of the lengths of successive solver steps.
 
     The error estimate for a solver step far shorter than needed is round-off. A length derived from
-    that estimate would grow without bound. The results for a system in a batch and alone would then
-    differ by 1e-12, more than a hundred times the round-off. The value is chosen to avoid this
-    difference.
+    that estimate would grow without bound. The result for a batch element would then differ by
+    1e-12 from the result for the same system alone. The value is chosen to avoid this difference,
+    which is more than a hundred times the round-off.
     """
     n_required_confirmations: int = 3
     """Number of solver steps to the located event that must confirm the event's time.

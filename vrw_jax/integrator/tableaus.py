@@ -63,7 +63,7 @@ def load_explicit_tableau(solver_name: str) -> ButcherTableau | None:
     """Return the tableau of diffrax's solver `solver_name`; None if it is not an explicit method.
 
     The tableau is read from a file in this package, because the import of diffrax takes a fifth of
-    the time of a start with cached programs.
+    the start-up time with cached programs.
     """
     tableaus = json.loads(Path(__file__).with_name("tableaus.json").read_text(encoding="utf-8"))
     if solver_name not in tableaus:
@@ -105,8 +105,8 @@ def load_explicit_tableau(solver_name: str) -> ButcherTableau | None:
 GUARD_STAGE_NODES = (0.15, 0.47, 0.92)
 """Nodes, as fractions of the solver step, near which guards are evaluated inside the step.
 
-The values are chosen nearer to the ends than equally spaced nodes, because a minimum just after the
-start or before the end is the hardest to detect.
+The values are chosen nearer to the ends than equally spaced nodes. A minimum just after the start
+or before the end is the hardest to detect.
 """
 
 

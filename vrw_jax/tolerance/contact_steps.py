@@ -118,9 +118,9 @@ class ContactWheelBatch:
     ) -> tuple[StepQuantities, np.ndarray, np.ndarray]:
         """Return the result of one walking step from full section states, and two Jacobians.
 
-        The first Jacobian is that of the next section state, (wheels, 4 + 3 n, 4 + 3 n), and the
-        second that of the step quantities, (wheels, 7, 4 + 3 n). The derivatives are with respect
-        to the full section state at the start.
+        The first Jacobian is that of the next section state, (wheels, 4 + 3 n, 4 + 3 n). The second
+        is that of the step quantities, (wheels, 7, 4 + 3 n). The derivatives are with respect to
+        the full section state at the start.
         """
         parameter_columns = self.parameter_columns[:, wheel_indices]
         n_parameter_columns = len(parameter_columns)

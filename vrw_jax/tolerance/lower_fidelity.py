@@ -92,7 +92,7 @@ def replace_gaits(
 
 
 def find_paper_gaits(params: WheelParams, step_options: StepOptions) -> LowerFidelityGaits:
-    """Return the gaits of wheels by the paper's model, computed by collocation.
+    """Return the gaits of the paper's model for a batch of wheels, computed by collocation.
 
     The Jacobians are those of one walking step from each gait's section state.
     """

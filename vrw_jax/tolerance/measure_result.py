@@ -43,9 +43,10 @@ MODEL_LABELS = ("no model", "the rigid wheel", "the paper's wheel", "unilateral 
 class MeasureResult(AbstractPrintable):
     """Measures of a gait and bounds for their errors, computed by `vrw.measure_to_tolerance`.
 
-    Each property is a dictionary whose keys are the names of the measures. If a single name was
-    requested, the property is the value of that measure. For a batch, each value is an array with
-    the batch axis. Without a gait, the measure is NaN and the error infinite.
+    The properties `value`, `error`, `model_error` and `numerical_error` are dictionaries whose keys
+    are names of measures. If a single name was requested, each property is the entry for that
+    measure. For a batch, the entries and all other properties are arrays with the batch axis.
+    Without a gait, the measure is NaN and the error infinite.
 
     - `values`, `errors`, `model_errors`, `numerical_errors`: measures, bounds for their errors,
       errors of the lower model, and bounds for the numerical errors. The last axis contains the
@@ -82,7 +83,7 @@ class MeasureResult(AbstractPrintable):
     seconds: float = eqx.field(static=True)  # wall-clock time of the whole call, s
 
     def _index_by_measure_name(self, measure_values: np.ndarray) -> Any:
-        """Return the last axis of an array as a dictionary with the names of the measures as keys.
+        """Return the entries of the last axis as a dictionary by names of measures.
 
         If a single name was requested, return the array or number for that measure.
         """
@@ -109,7 +110,7 @@ class MeasureResult(AbstractPrintable):
 
     @property
     def model_error(self) -> Any:
-        """Return the error of the measure by the lower model, in the measure's unit.
+        """Return the error of the measure computed with the lower model, in the measure's unit.
 
         It is the lower model's measure minus the measure with unilateral contact. `value` contains
         this error only if the lower model is selected. The error is NaN if the lower model has no
@@ -188,7 +189,7 @@ class MeasureResult(AbstractPrintable):
         ]
 
     def _format_measure_value(self, measure_index: int) -> str:
-        """Return a measure with its unit and its errors as text."""
+        """Return a text with one measure, its unit and its errors."""
         measure = MEASURES[self.names[measure_index]]
         if not self.found:
             return f"no {measure.name}"

@@ -1,6 +1,6 @@
 """Means over many wheels with unilateral contact, with the paper's model as a control variate.
 
-The measure by the paper's model is computed for all wheels. Only its difference from the measure
+The measure is computed with the paper's model for all wheels. Only the difference from the measure
 with unilateral contact is sampled (M. B. Giles, Acta Numerica 24, 2015; B. Peherstorfer, K. Willcox
 and M. Gunzburger, SIAM Review 60, 2018). A pilot sample of wheels determines which control variate
 reduces the total cost most, its weight, and the number of further wheels.
@@ -299,7 +299,7 @@ class _MeasuredWheels(NamedTuple):
     def evaluate_control_variate(self, wheel_indices: np.ndarray, control_index: int) -> np.ndarray:
         """Return one control variate for the selected wheels, shape (wheels,).
 
-        The value is NaN for a wheel without a gait by the paper's model. `control_index` is an
+        The value is NaN for a wheel for which the paper's model has no gait. `control_index` is an
         index in `CONTROL_VARIATES`.
         """
         control_values = np.full(len(wheel_indices), np.nan)
@@ -441,7 +441,7 @@ def _compute_unseen_wheel_variance(
 ) -> float:
     """Return the variance due to one more wheel whose control variate is wrong.
 
-    A wheel may have a gait by the paper's model and no gait with unilateral contact. A small sample
+    A wheel may have a gait in the paper's model and no gait with unilateral contact. A small sample
     may contain no such wheel. The result is zero if all wheels in the pilot sample have a gait.
     """
     return 0.0 if np.all(pilot_sample.has_gait) else float(np.var(centered_values))

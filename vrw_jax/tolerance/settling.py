@@ -1,10 +1,10 @@
 """Walk with unilateral contact until the motion settles, with extrapolation between walking steps.
 
 In a fast walk, the states of the legs decay within a few steps. The remaining motion then drifts
-slowly along one curve for hundreds of steps. A few steps determine the drift per step and its
-decay. A leap along the drift replaces the remaining steps (projective integration: C. W. Gear and
-I. G. Kevrekidis, SIAM J. Sci. Comput. 24, 2003). A leap ends at the latest at the predicted limit
-of the drift. The state at the end of a walk is not the gait but the initial guess for its
+slowly on one curve for hundreds of steps. A few steps determine the drift per step and its decay. A
+leap in the direction of the drift replaces the remaining steps (projective integration: C. W. Gear
+and I. G. Kevrekidis, SIAM J. Sci. Comput. 24, 2003). A leap ends at the latest at the predicted
+limit of the drift. The state at the end of a walk is not the gait but the initial guess for its
 refinement.
 """
 
@@ -24,7 +24,7 @@ class LeapOptions:
     - `n_warmup_steps`: number of walking steps before the first leap;
     - `max_leaps`: largest number of leaps;
     - `steps_per_leap`: number of walking steps after a leap. The value is chosen because five steps
-      miss three of 118 gaits, among 451 wheels without a gait by the paper's model;
+      miss three of 118 gaits, among 451 wheels for which the paper's model has no gait;
     - `max_leap_distance`: largest length of a leap, chosen because longer leaps skip pairs of close
       gaits;
     - `max_fade_distance_ratio`: largest ratio of the fade distance to the length of all remaining

@@ -15,8 +15,8 @@ QUANTITY_NAMES = (
 )
 """Names of the step quantities.
 
-These are durations with two feet, one foot and no foot on the ground (s), the step length (m) and
-the paper's section state (theta-, dtheta-, dL1-) after the walking step.
+The first three are durations with two feet, one foot and no foot on the ground, s. The others are
+the step length, m, and the section state (theta-, dtheta-, dL1-) of the paper after the step.
 """
 
 N_STEP_QUANTITIES = len(QUANTITY_NAMES)

@@ -1,10 +1,10 @@
 """Compute measures to within a tolerance, from the simplest model whose error can be bounded.
 
 One walking step with unilateral contact starts at the gait of the lower model. The defect of this
-step, propagated to the measure by the lower model's derivatives, is the model error to second
-order. The estimate is a dual-weighted residual (R. Becker and R. Rannacher, Acta Numerica 10,
-2001), in which the next model replaces the finer mesh. If the error is within the tolerance, the
-lower model's measure is returned. Otherwise Newton's method, starting at the end of that step,
+step, propagated to the measure by the lower model's derivatives, approximates the model error to
+second order. The estimate is a dual-weighted residual (R. Becker and R. Rannacher, Acta Numerica
+10, 2001), in which the next model replaces the finer mesh. If the error is within the tolerance,
+the lower model's measure is returned. Otherwise Newton's method, starting at the end of that step,
 finds the gait with unilateral contact. If that gait is far from the lower model's gait, a walk to
 another gait is computed.
 """
@@ -56,9 +56,9 @@ class MeasureRequestOptions:
     - `min_tol_for_tight_steps`: smallest tolerance of a measure for which walking steps are
       computed at `StepTolerances.tight_tolerance`. Below this value, they are computed at
       `very_tight_tolerance`;
-    - `n_cold_starts`: number of starts of walks, slow starts first, for wheels without a gait by
-      the lower model. It is chosen because walks from the first two starts reach a gait for 100 of
-      232 wheels, and walks from further starts reach a gait for no other wheel;
+    - `n_cold_starts`: number of starts of walks, slow starts first, for wheels for which the lower
+      model has no gait. It is chosen because walks from the first two starts reach a gait for 100
+      of 232 wheels. Walks from further starts reach a gait for no other wheel;
     - `max_gait_distance_ratio`: ratio of the largest accepted distance between the lower model's
       gait and the gait with unilateral contact to the length of the first correction. It is chosen
       because the sum of corrections that are halved each time is twice the first correction.
@@ -88,7 +88,7 @@ def measure_to_tolerance(
     """Return measures of the wheel's gait with unilateral contact, each to within `tol`.
 
     The reference model is `UnilateralWheel(friction, stoppers=stoppers)`. By default, the gait is
-    the one that Newton's method reaches from the gait by the paper's model. If that gait is too far
+    the one that Newton's method reaches from the gait of the paper's model. If that gait is too far
     away, it is the gait that a walk from the paper's gait reaches. `MeasureResult.why` names the
     method. Fields of `params` and `friction` may have one batch axis; the elements of a batch are
     independent.
@@ -262,7 +262,7 @@ class _MeasureRequest:
         self._correct_lower_gaits(wheel_indices, continues_iteration=False)
 
     def try_paper_model(self) -> None:
-        """Compute gaits by the paper's model, and store measures to within `tol`.
+        """Compute gaits of the paper's model, and store measures to within `tol`.
 
         If the error of a gait is larger, the gait with unilateral contact near it is computed and
         stored.
