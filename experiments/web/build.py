@@ -148,7 +148,7 @@ def facts() -> dict[str, Any]:
     ).stdout.strip()
     evaluate = lambda m: {
         "label": m.long_name, "symbol": m.symbol, "unit": m.display_unit,
-        "meaning": m.description, "breaks": m.violation,
+        "meaning": m.description, "breaks": m.violation_text,
     }  # fmt: skip
     default = vrw.WheelParams()
     return {
