@@ -660,7 +660,7 @@ def draw_comparisons() -> None:
         axis.set_title(comparison.replace("slope", "at slope").replace("speed", "at"))
     for axis in axes[-1]:
         axis.set_xlabel("DLS fraction")
-    figure.colorbar(points, ax=axes, label="damping [N s/m]", shrink=0.7)
+    figure.colorbar(points, ax=axes, label="damping [N·s/m]", shrink=0.7)
     handles = {
         label: handle
         for axis in axes.ravel()
