@@ -632,14 +632,23 @@ PANELS = (
 )
 
 
+def compute_marker_areas(stiffness: np.ndarray) -> np.ndarray:
+    """Return areas of dots in square points, proportional to the stiffness."""
+    return 0.012 * stiffness
+
+
 def draw_comparisons() -> None:
-    """Draw six indices over the DLS fraction, colored by damping, with the rigid wheels."""
+    """Draw six indices over the DLS fraction, with the rigid wheels.
+
+    Colors show the damping, and areas of the dots the stiffness.
+    """
     rows = group_by_comparison(read_table(GAITS_TABLE))
     figure, axes = plt.subplots(2, 3, figsize=(plots.PAGE_FIGURE_WIDTH_INCHES, 4.4), sharex=True)
     for axis, (comparison, name) in zip(axes.ravel(), PANELS, strict=True):
         gaits = select_compliant(rows[comparison])
         points = axis.scatter(
-            read_column(gaits, "dls_fraction"), read_column(gaits, name), s=8,
+            read_column(gaits, "dls_fraction"), read_column(gaits, name),
+            s=compute_marker_areas(read_column(gaits, "stiffness")),
             c=read_column(gaits, "damping"), cmap="viridis", vmin=BOX["damping"][0],
             vmax=BOX["damping"][1],
         )  # fmt: skip
@@ -666,6 +675,9 @@ def draw_comparisons() -> None:
         for axis in axes.ravel()
         for handle, label in zip(*axis.get_legend_handles_labels(), strict=True)
     }
+    for stiffness in (500.0, 1000.0, 2000.0):
+        area = float(compute_marker_areas(np.array(stiffness)))
+        handles[f"stiffness {stiffness:g} N/m"] = plt.scatter([], [], s=area, color="0.4")
     figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=4)
     plots.save(figure, FIGURES, "double_support_gaits")
 
@@ -705,7 +717,7 @@ def draw_tuned_gaits(axis: Axes) -> None:
                           label=f"{front}: {label}")  # fmt: skip
     axis.set_xlabel("DLS fraction")
     axis.set_ylabel("energy lost, J/m")
-    axis.set_title(f"at {EQUAL_SPEED:g} m/s; tuned wheels are not slower")
+    axis.set_title(f"random: {EQUAL_SPEED:g} m/s; tuned: {EQUAL_SPEED:g} m/s or more")
     axis.legend(loc="upper center", bbox_to_anchor=(0.5, -0.2), ncols=2, fontsize=7)
 
 
