@@ -48,7 +48,7 @@ class AbstractWheel(eqx.Module):
     friction.
     """
     reports_contacts: eqx.AbstractClassVar[bool]
-    """Whether trajectories report the contact of every leg instead of the paper's phases."""
+    """Whether trajectories report the contact mode of every leg instead of the paper's phases."""
     batch_kernel: ClassVar[str] = ""
     """Kind of the compiled batch kernel: "phases" for the paper's phases, "legs", or "" for no
     kernel.
@@ -78,7 +78,9 @@ class AbstractWheel(eqx.Module):
         return self
 
     def parameter_values(self, params: WheelParams) -> Float[Array, " n_values"]:
-        """Return the numbers of `parameter_names` for one wheel on the ground of this model."""
+        """Return the value of each parameter in `parameter_names`, for one wheel on this model's
+        ground.
+        """
         parameter_values_list = [
             getattr(self if parameter_name == FRICTION_NAME else params, parameter_name)
             for parameter_name in self.parameter_names
@@ -91,7 +93,7 @@ class AbstractWheel(eqx.Module):
         )
 
     def parameter_rows(self, params: WheelParams) -> Float[np.ndarray, "wheels n_values"]:
-        """Return the `parameter_values` of each wheel in a batch, computed with numpy.
+        """Return `parameter_values` for each wheel in a batch, computed with NumPy.
 
         JAX would compile a program for each batch size.
         """
@@ -131,17 +133,17 @@ class AbstractWheel(eqx.Module):
 
     @abc.abstractmethod
     def advance(self, params: WheelParams, x: SectionState, options: StepOptions) -> AdvanceResult:
-        """Return the minimal results of one walking step.
+        """Return the minimal results of one walking step from the section state `x`.
 
         The results are differentiable in any mode, to any order.
         """
 
     @abc.abstractmethod
     def take_step(self, params: WheelParams, x: SectionState, options: StepOptions) -> Any:
-        """Return all results of one walking step, including indicators, margins and energies.
+        """Return all results of one walking step from the section state `x`.
 
-        The type is `StepResult`, or the model's counterpart of it. The results are differentiable
-        in any mode.
+        They include indicators, margins and energies. The type is `StepResult`, or the model's
+        counterpart of it. The results are differentiable in any mode.
         """
 
     @abc.abstractmethod

@@ -363,8 +363,8 @@ class RigidWheel(AbstractWheel):
 class VerticalRateMap(NamedTuple):
     """Map of the squared angular rate from one vertical passage to the next on uneven ground.
 
-    The map is x' = r (x + G (1 - cos(h + slope))) - G (1 - cos(h - slope)), where slope is that of
-    the next line of the ground. Here x is the squared rate with the stance leg vertical, 1/s^2. The
+    The map is x' = r (x + G (1 - cos(h + slope))) - G (1 - cos(h - slope)). The slope is that of
+    the next line of the ground, and x is the squared rate with the stance leg vertical, 1/s^2. The
     wheel falls back if x' < 0, for a slope below h. As a function of the slope, x' = offset(x) +
     amplitude cos(slope - slope_of_maximum).
     """
