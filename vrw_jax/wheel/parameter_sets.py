@@ -27,7 +27,7 @@ class ParameterSet:
 
     @property
     def params(self) -> WheelParams:
-        """Return the wheel with the parameters of this set."""
+        """Return a wheel with the parameters of this set."""
         return WheelParams(**self.values)  # type: ignore[arg-type]
 
 
@@ -60,5 +60,6 @@ parameter_sets = MappingProxyType(
         ),
     }
 )
-"""Parameter sets by name: `vrw.parameter_sets["two_peaks"].params`, or `parameter_set =
-"two_peaks"` in the table `[wheel]` of a configuration."""
+"""Parameter sets by name, as in `vrw.parameter_sets["two_peaks"].params`. In the table `[wheel]` of
+a configuration, write `parameter_set = "two_peaks"`.
+"""

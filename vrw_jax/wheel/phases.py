@@ -1,4 +1,4 @@
-"""The three phases of the paper's step (Section 3.3 of the paper), shared by every engine.
+"""The three phases of the paper's step (Section 3.3 of the paper), which every engine uses.
 
 A phase integrates the first `n_dof` of the coordinates (theta, L1, L2). The other coordinates
 follow from these. All functions work elementwise, for one wheel, a batch, or the nodes of a
@@ -105,7 +105,7 @@ class AbstractPhase(abc.ABC):
 
     @abc.abstractmethod
     def solve_acceleration(self, motion: Motion) -> Acceleration:
-        """Return the accelerations of (theta, L1, L2) that satisfy the equations of motion."""
+        """Return the accelerations of (theta, L1, L2) that solve the equations of motion."""
 
     @abc.abstractmethod
     def compute_dynamics_residual(self, motion: Motion, phase_acceleration: Vector) -> Vector:
@@ -141,7 +141,7 @@ class AbstractPhase(abc.ABC):
 
     @abc.abstractmethod
     def compute_specific_margins(self, instant: "PhaseInstant") -> Vector:
-        """Return the margins that only this phase has."""
+        """Return the values of the margins that only this phase has."""
 
     @abc.abstractmethod
     def reset_motion(self, motion: Motion) -> Motion:
@@ -309,9 +309,9 @@ class PhaseInstant:
 
 
 class DoubleSupport(AbstractPhase):
-    """DLS, with the coordinate theta. The hub moves on a circle until the rear foot lifts off.
+    """DLS, with the coordinate theta: the hub moves on a circle until the rear foot lifts off.
 
-    See Section 3.3.1 of the paper.
+    Section 3.3.1 of the paper describes this phase.
     """
 
     name, n_dof = "DLS", 1
@@ -377,9 +377,9 @@ class DoubleSupport(AbstractPhase):
 
 
 class SingleSupport1(AbstractPhase):
-    """SLS-I, with the coordinates (theta, L1, L2). Leg 2 moves freely until it meets its stopper.
+    """SLS-I, with the coordinates (theta, L1, L2): Leg 2 moves freely until it meets its stopper.
 
-    See Section 3.3.2 of the paper.
+    Section 3.3.2 of the paper describes this phase.
     """
 
     name, n_dof = "SLS-I", 3
@@ -424,9 +424,9 @@ class SingleSupport1(AbstractPhase):
 
 
 class SingleSupport2(AbstractPhase):
-    """SLS-II, with the coordinates (theta, L1). Leg 2 is on its stopper until touchdown.
+    """SLS-II, with the coordinates (theta, L1): Leg 2 is on its stopper until touchdown.
 
-    See Section 3.3.3 of the paper.
+    Section 3.3.3 of the paper describes this phase.
     """
 
     name, n_dof = "SLS-II", 2

@@ -1,8 +1,8 @@
 """Collisions between the phases: the landing of a foot, and the collision of Leg 2 with its
 stopper.
 
-The landing follows Section 3.4.1 of the paper with the procedure of Section 5.1. The collision with
-the stopper follows Section 3.4.2.
+The landing follows Section 3.4.1 of the paper, with the procedure of its Section 5.1. The collision
+with the stopper follows Section 3.4.2 of the paper.
 """
 
 from typing import NamedTuple
