@@ -1,7 +1,7 @@
 """The commands: walk a wheel, reproduce the paper, scan parameters, tune, continue branches.
 
-Slow libraries are imported inside the commands, so that help appears quickly. A user's mistake is
-reported in one sentence on stderr, with exit code 2.
+The commands import slow libraries themselves, so that help appears quickly. A user's mistake is
+reported in one sentence on standard error, with exit code 2.
 """
 
 import gc
@@ -107,28 +107,28 @@ def configure_root_command(
 
       [cyan]vrw init[/cyan]                              write the example configs named here
 
-      [cyan]vrw gait[/cyan]                              the wheel of Table 1 on the paper's slope
+      [cyan]vrw gait[/cyan]                              the wheel of Table 1 of the paper
 
       [cyan]vrw gait --set damping=150[/cyan]            the same with weaker dampers
 
       [cyan]vrw reproduce --out paper[/cyan]             all figures and the table of facts
 
-      [cyan]vrw scan configs/quickstart.toml[/cyan]      4,096 steady gaits, a dataset and a picture
+      [cyan]vrw scan configs/quickstart.toml[/cyan]      4,096 steady gaits, a dataset and figures
 
-      [cyan]vrw robustness configs/robustness.toml[/cyan]   mean lives on random slopes
+      [cyan]vrw robustness configs/robustness.toml[/cyan]   mean steps until failure, random slopes
 
       [cyan]vrw tune configs/tune_dls.toml[/cyan]        the most double support without scuffing
 
-      [cyan]vrw continue configs/branch_damping.toml[/cyan]   a branch of gaits, special points
+      [cyan]vrw continue configs/branch_damping.toml[/cyan]   a branch of gaits with special points
 
     [bold]Files[/bold]   init: configs. gait: none. reproduce: figures and tables. scan: scan.zarr
     (open it with vrw_jax.open_scan or xarray.open_zarr) and pictures, PNG and SVG.
     tune: path.zarr, a picture, summary.md, and wheel.toml, a config of vrw gait.
     continue: branch.zarr, borders.csv, a picture and summary.md.
 
-    The first run of a command compiles for some seconds. The code is kept in a cache folder
-    (JAX_COMPILATION_CACHE_DIR names another), so later runs start quickly. Angles are in rad, all
-    other quantities in SI units.
+    The first run of a command compiles for some seconds. The compiled code is stored in a cache
+    folder (JAX_COMPILATION_CACHE_DIR names another), so later runs start quickly. Angles are in
+    rad, and all other quantities are in SI units.
     """
 
 
@@ -147,9 +147,10 @@ def run_gait_command(
 ) -> None:
     """Walk a wheel and print its gait: durations, speed, indicators, force peaks and margins.
 
-    The walk begins near the gait of Table 1, or at the start in the config. The command then
-    finds the limit cycle near the last step. With unilateral contact and no start in the config,
-    it finds the slowest attracting gait instead. It writes no file.
+    The walk begins near the gait of Table 1 of the paper, or at the start in the config. The
+    command then finds the limit cycle near the state after the last step. With unilateral contact
+    and no start in the config, it finds the slowest attracting gait instead. The command writes no
+    file.
 
     [bold]Examples[/bold]
 
@@ -214,7 +215,7 @@ def run_explore_command(
         str, typer.Option("--model", help="viscoelastic, rigid or unilateral.")
     ] = "viscoelastic",
 ) -> None:
-    """Open an interactive page of the wheel in your browser; the page computes by itself."""
+    """Open an interactive page of the wheel in your browser. The browser computes the steps."""
     with report_command_errors():
         from vrw_jax.cli.config import parse_assignment
         from vrw_jax.web import make_page_address
@@ -231,9 +232,10 @@ def run_explore_command(
 def run_init_command(
     folder: Annotated[Path, typer.Argument(help="Folder for the configs.")] = Path("configs"),
 ) -> None:
-    """Write the example configs, from which you can derive your own.
+    """Write example configs, from which you can derive your own.
 
-    Existing files are kept. If an existing file differs, the command names it and writes nothing.
+    The command does not change existing files. If an existing file differs from its example, the
+    command names the file and writes nothing.
     """
     with report_command_errors():
         example_folder = find_example_config_folder()
@@ -301,8 +303,8 @@ def run_reproduce_command(
 ) -> None:
     """Reproduce the paper: figures 6 to 10, and every published fact with the computed value.
 
-    The command prints the table of facts, and writes it with the figures, tolerances and their
-    reasons. The exit code is 1 if a fact does not hold.
+    The command prints the table of facts. It writes figures, and the table with tolerances and
+    their reasons. The exit code is 1 if a fact does not hold.
     """
     from vrw_jax.runtime import start_jax
 
@@ -360,10 +362,10 @@ def run_scan_command(
 ) -> None:
     """Find the steady gait of every sample of a design, with its outcome and margins.
 
-    The command writes scan.zarr and figures (PNG and SVG) into the folder. After an interruption
-    the same command continues where it stopped, and ends with bitwise the same data. Of a finished
-    scan only chunks with damaged files are computed again. The exit code is 1 if --verify finds
-    damage.
+    The command writes scan.zarr and figures (PNG and SVG) into the folder. After an interruption,
+    the same command continues where it stopped, and the data are bitwise the same. For a finished
+    scan, the command computes only chunks with damaged files again. The exit code is 1 if --verify
+    finds damage.
 
     [bold]Examples[/bold]
 
@@ -408,9 +410,10 @@ def run_robustness_command(
 ) -> None:
     """Compute the mean number of steps until failure on random slopes, and gait sensitivities.
 
-    Without a design in the config, prints both for one wheel and writes no file. With a grid or
-    samples, computes each sample in turn and writes scan.zarr and figures (PNG and SVG) into the
-    folder. After an interruption the same command continues where it stopped.
+    If the config has no design, the command prints the results for one wheel and writes no file. If
+    it has a grid or samples, the command computes one sample after the other, and writes scan.zarr
+    and figures (PNG and SVG) into the folder. After an interruption, the same command continues
+    where it stopped.
 
     [bold]Examples[/bold]
 
@@ -481,10 +484,10 @@ def run_tune_command(
 ) -> None:
     """Tune a wheel: find the best gait within bounds that satisfies its constraints.
 
-    The optimization follows the branch of gaits with exact gradients; then the tuned wheel walks.
-    The command writes path.zarr (every gait evaluated), summary.md, wheel.toml (the tuned wheel)
-    and figures (PNG and SVG) into the folder. The exit code is 1 if the run does not end at an
-    optimum. It is 2, and nothing is written, if the start has no gait.
+    The optimization follows the branch of gaits with exact gradients. A walk of the tuned wheel
+    then validates the result. The command writes path.zarr (every evaluated gait), summary.md,
+    wheel.toml (the tuned wheel) and figures (PNG and SVG) into the folder. The exit code is 1 if
+    the run does not end at an optimum. It is 2, and nothing is written, if the start has no gait.
 
     [bold]Examples[/bold]
 
@@ -532,8 +535,8 @@ def run_continue_command(
     """Continue a branch of stable and unstable gaits along a parameter, with its special points.
 
     The command writes branch.zarr (open it with xarray.open_zarr), borders.csv, summary.md and
-    figures (PNG and SVG) into the folder. The exit code is 1, and nothing is written, if there is
-    no gait to start from.
+    figures (PNG and SVG) into the folder. If there is no gait to start from, the exit code is 1 and
+    the command writes nothing.
 
     [bold]Examples[/bold]
 

@@ -142,8 +142,8 @@ class GaitConfig:
     """Table `[gait]`: length and start of a walk.
 
     - `steps`: number of steps;
-    - `start`: section state before the first touchdown, [rad, rad/s, m/s]; by default that of the
-      model.
+    - `start`: section state before the first touchdown, [rad, rad/s, m/s]; by default the default
+      start of the model.
     """
 
     steps: int = 30
@@ -448,7 +448,7 @@ def _parse_config_tables(
 
 
 def _get_config_table(config_tables: Mapping[str, object], table_name: str) -> dict[str, object]:
-    """Return a table of the file, or an empty table if the file does not contain it."""
+    """Return a table of the file, or an empty table if the file does not contain this table."""
     config_table = config_tables.get(table_name, {})
     assert isinstance(config_table, dict)
     return config_table
