@@ -2,7 +2,7 @@
 
 Loops of unknown length, such as adaptive solver steps until an event, have no reverse mode. The
 rule in this module computes the Jacobian in forward mode, with respect to the inputs that have
-tangents, and returns the product of the Jacobian and the tangent. The product is linear in the
+tangents. It returns the product of the Jacobian and the tangent. The product is linear in the
 tangent, so `jax.grad` transposes a small matrix instead of a loop. The Jacobian itself has the same
 rule, so Hessians work in every combination of modes.
 """
@@ -217,7 +217,7 @@ def evaluate_with_jacobian(function: Callable, *arguments: Array) -> tuple[Any, 
     """Return the outputs of `function` and the derivatives of its float outputs.
 
     One program computes both. The last axes of a derivative run over an argument. If there are
-    several arguments, the derivative of an output leaf is a tuple with one entry per argument.
+    several arguments, the derivative of each output leaf is a tuple with one entry per argument.
     """
 
     def select_float_outputs(*arguments: Array) -> tuple:
