@@ -37,10 +37,10 @@ class SettlingOptions:
 
     - `n_steps`: number of steps of a walk, chosen because the gait with the slowest convergence (c
       = 70 N s/m) converges to round-off in 30 steps;
-    - `max_state_change`: largest change of the section state per step after a walk has settled,
-      chosen because it is ten times the error of a step with the default options;
-    - `n_settled_steps`: number of last steps whose change must be below `max_state_change`, chosen
-      because the states of a gait with a longer period may agree once by chance.
+    - `max_state_change`: largest change of the section state per step after a walk has settled. The
+      value is ten times the error of a step with the default options;
+    - `n_settled_steps`: number of last steps whose change must be below `max_state_change`. It is
+      above 1 because two states of a gait with a longer period may agree by chance.
     """
 
     n_steps: int = 30

@@ -1,4 +1,4 @@
-"""Reproduction of the paper: its figures, and the table of its published and computed facts.
+"""Reproduction of the paper: its figures, and a table of published facts with computed values.
 
 All gaits are limits of walks from one start, without Newton's method for a fixed point.
 """
