@@ -128,7 +128,7 @@ class EventBracket(NamedTuple):
     time_tolerance: Array  # s
     n_iterations: Array
     previous_step_size: Array  # size of the previous attempt, s
-    guard_values: Array  # at the end of the previous attempt, (guards, batch)
+    guard_values: Array  # guards at the end of the previous attempt, (guards, batch)
 
 
 class IntervalState(NamedTuple):
@@ -136,14 +136,14 @@ class IntervalState(NamedTuple):
 
     interval_point: IntervalPoint
     contact_state: ContactState
-    guard_values: Array  # at the point, (guards, batch)
+    guard_values: Array  # guards at the interval point, (guards, batch)
     guard_offset: Array  # initial value of an initiating guard, minus round-off; else 0
     # integrals since the last event, (N_ACCUMULATOR_ROWS, batch)
     interval_accumulators: Array | None
-    h: Array  # of the next attempt, s
-    time_since_event: Array  # since the last event, s
+    h: Array  # size of the next attempted solver step, s
+    time_since_event: Array  # time since the last event, s
     event_bracket: EventBracket
-    lane_status: Array  # `LaneStatus` or `Outcome`
+    lane_status: Array  # a `LaneStatus` or an `Outcome`
     triggered_guard_index: Array  # index of the guard that has triggered
     n_solver_steps: Array  # number of attempts since the last event
 
@@ -451,10 +451,10 @@ class AttemptedSolverStep(NamedTuple):
 
     end_point: IntervalPoint
     mean_squared_error: Array  # mean square of the error over the tolerance
-    guard_values: Array  # at the end of the step, (guards, batch)
-    guard_parabola_curvature: Array  # of the parabola through each guard, (guards, batch)
+    guard_values: Array  # guards at the end of the solver step, (guards, batch)
+    guard_parabola_curvature: Array  # curvature of the parabola through each guard, (guards, batch)
     guard_parabola_linear_term: Array
-    guard_minimum_fraction: Array  # fraction of the step to a negative guard minimum, else 1
+    guard_minimum_fraction: Array  # fraction of the solver step to a negative guard minimum, else 1
     accumulator_increments: Array | None  # increment of `IntervalState.interval_accumulators`
 
 

@@ -195,8 +195,9 @@ class _IndependentStartRates(NamedTuple):
     """
 
     independent_rate_indices: np.ndarray  # index of each independent rate, (wheels, independent)
-    is_rate_used: np.ndarray  # whether each of these exists
-    combination_weights: np.ndarray  # of each in all rates, (wheels, independent, rates)
+    is_rate_used: np.ndarray  # whether each independent rate exists
+    # weights of the independent rates in all rates, (wheels, independent, rates)
+    combination_weights: np.ndarray
 
     @classmethod
     def from_projection(
@@ -501,7 +502,7 @@ class _WalkConfig(NamedTuple):
 def _run_walk(
     walk_config: _WalkConfig, input_arrays: list[np.ndarray], n_steps: int, options: StepOptions
 ) -> Any:
-    """Return the results of the walks of all batch elements, which are on the first axis.
+    """Return the results of all walks, with the batch elements on the first axis.
 
     In `input_arrays`, the batch elements are on the last axis.
     """

@@ -52,7 +52,7 @@ class ContactMode(IntEnum):
 
 
 PAPER_RULE_SENTINEL = -np.inf
-"""Friction coefficient that selects the rule (A1)-(A4) of the paper."""
+"""Friction coefficient that selects the rule (A1)-(A4) of the paper for infinite friction."""
 
 
 class SlotForceSolution(NamedTuple):
@@ -61,13 +61,13 @@ class SlotForceSolution(NamedTuple):
     A `SlotPair` has one entry for the leg in each contact slot.
     """
 
-    tangential_forces: SlotPair  # on each slot's foot, downhill positive
-    normal_forces: SlotPair  # pushing positive
-    stopper_forces: SlotPair  # of the stopper of each slot's leg, pushing positive
+    tangential_forces: SlotPair  # tangential forces on the feet, positive downhill
+    normal_forces: SlotPair  # normal forces on the feet, positive if they push
+    stopper_forces: SlotPair  # forces of the stoppers, positive if they push
     leg_pull_forces: SlotPair  # force of stopper and foot along u on the leg's mass
     hub_motion: HubVector
-    length_motion: SlotPair  # of the length of each slot's leg
-    foot_motion_x: SlotPair  # of each slot's foot
+    length_motion: SlotPair  # accelerations of the leg lengths, or rates after an impact
+    foot_motion_x: SlotPair  # accelerations of the feet, or velocities after an impact
     foot_motion_z: SlotPair
     painleve_determinant: Any  # of order 1; zero at Painlevé's singularity
 
@@ -516,14 +516,14 @@ class AllowedContactModes(NamedTuple):
     A set of modes is an integer with one bit per mode.
     """
 
-    allowed_slot_modes: Int[Array, "2 ..."]  # set of allowed modes of each slot's foot
+    allowed_slot_modes: Int[Array, "2 ..."]  # set of modes allowed for each foot
     can_hold_stopper: Bool[Array, "2 ..."]  # whether the stopper may hold, not only be open
     has_fixed_mode: Bool[Array, "2 ..."]  # whether the foot keeps its mode for any force
     untested_slot_modes: Int[Array, "2 ..."]  # set of modes that need no test
     is_open_stopper_untested: Bool[Array, "2 ..."]  # whether an open stopper needs no test
 
     def mask_allowed_combinations(self, ordered_table: _OrderedCombinationTable) -> CombinationMask:
-        """Return the bit mask of those combinations of the table that are allowed."""
+        """Return the bit mask of the combinations in `ordered_table` that are allowed."""
 
         def combine_masks(mask_index: int) -> Array:
             allowed_mask = jnp.full_like(self.allowed_slot_modes[0], -1, jnp.int32)
@@ -573,9 +573,7 @@ class ChosenModeCombination(NamedTuple):
 
 
 class ContactSignTolerances(NamedTuple):
-    """Tolerances for the signs of forces and motions.
-
-    Sign violations are divided by these tolerances.
+    """Tolerances for the signs of forces and motions, by which sign violations are divided.
 
     Below its tolerance, the sign of a force or motion is determined by round-off.
     """

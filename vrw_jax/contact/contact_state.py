@@ -104,12 +104,12 @@ class ModeDynamics(NamedTuple):
     """Parameters and contact state that determine the dynamics of the wheel between two events."""
 
     s: Symbols
-    friction: Friction  # friction coefficient of the slots' feet
+    friction: Friction  # friction coefficient of the feet in the contact slots
     has_one_sided_stoppers: bool  # whether legs in the air may leave their stoppers
     contact_state: ContactState
     contact_slots: ContactSlots
-    slot_modes: Int[Array, "2"]  # `ContactMode` of each slot's foot
-    is_stopper_holding: Bool[Array, "2"]  # whether the leg of each slot is on its stopper
+    slot_modes: Int[Array, "2"]  # `ContactMode` of the foot in each contact slot
+    is_stopper_holding: Bool[Array, "2"]  # whether the leg in each contact slot is on its stopper
     is_airborne_locked: Bool[Array, " n_legs"]  # whether a leg is in the air on its stopper
     has_accumulators: bool  # whether a batch integrates the accumulators
     tilt: Elementwise | None = None  # angle by which the next line is steeper, rad
@@ -263,11 +263,12 @@ class GuardLayout(NamedTuple):
 
     first_landing_guard: int  # height of a foot in the air, one per leg: zero at a landing
     first_stopper_guard: int  # distance to the stopper, one per leg
-    first_liftoff_guard: int  # normal force, one per slot
-    first_slip_up_guard: int  # friction margin before the foot slides uphill, one per slot
-    first_slip_down_guard: int  # friction margin before the foot slides downhill, one per slot
-    first_slip_end_guard: int  # speed of a sliding foot, one per slot
-    first_stopper_release_guard: int  # stopper force of a loaded leg, one per slot
+    first_liftoff_guard: int  # normal force, one per contact slot
+    first_slip_up_guard: int  # friction margin before the foot slides uphill, one per contact slot
+    # friction margin before the foot slides downhill, one per contact slot
+    first_slip_down_guard: int
+    first_slip_end_guard: int  # speed of a sliding foot, one per contact slot
+    first_stopper_release_guard: int  # stopper force of a loaded leg, one per contact slot
     rolling_rate_guard: int  # rate of rolling, dtheta
     collapse_guard: int  # length of the shortest leg minus a
     first_airborne_release_guard: int  # stopper force in the air, one per leg, if one-sided
@@ -315,7 +316,7 @@ class ContactQuantities(NamedTuple):
     normal_forces: SlotPair
     tangential_forces: SlotPair
     stopper_forces: SlotPair
-    slip_speeds: SlotPair  # speed of the slots' feet along the slope, m/s
+    slip_speeds: SlotPair  # tangential speeds of the feet in the contact slots, m/s
     painleve_determinant: Array  # see `contact_modes.SlotForceSolution`
     airborne_stopper_forces: (
         LegArray | None

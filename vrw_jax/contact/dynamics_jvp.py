@@ -44,10 +44,10 @@ class ContactConfiguration(NamedTuple):
 
     s: Symbols
     motion: WheelMotion
-    friction: Friction  # friction coefficient of the slots' feet
+    friction: Friction  # friction coefficient of the feet in the contact slots
     contact_slots: ContactSlots
-    slot_modes: Array  # `ContactMode` of each slot's foot
-    is_stopper_holding: Array  # whether the leg of each slot is on its stopper
+    slot_modes: Array  # `ContactMode` of the foot in each contact slot
+    is_stopper_holding: Array  # whether the leg in each contact slot is on its stopper
     is_airborne_locked: Array  # whether a leg is in the air on its stopper
 
     @property
@@ -84,9 +84,10 @@ def compute_slip_signs(slot_modes: Array) -> SlotPair:
 class _ConstantTerms(NamedTuple):
     """Accelerations or velocity jumps that the tangent of the residual treats as constants."""
 
-    radial_leg_motion: LegArray  # of leg masses relative to the hub, along the legs
-    transverse_leg_motion: LegArray  # of leg masses relative to the hub, transverse to the legs
-    hub_motion: SlotPair  # of the hub, without gravity
+    radial_leg_motion: LegArray  # motion of the leg masses relative to the hub, along the legs
+    # motion of the leg masses relative to the hub, transverse to the legs
+    transverse_leg_motion: LegArray
+    hub_motion: SlotPair  # motion of the hub without gravity
 
 
 class _EquationTangents(NamedTuple):
@@ -271,7 +272,7 @@ class ResidualTangent(NamedTuple):
     foot_transverse_motion: SlotPair
     foot_radial_motion: SlotPair
     friction_force: SlotPair  # tangent of the friction force by its coefficient
-    leg_pull_forces: SlotPair  # tangent by friction and rotation of the slots' legs
+    leg_pull_forces: SlotPair  # tangent due to friction and rotation of the legs in contact
 
 
 def compute_residual_tangent(

@@ -66,10 +66,11 @@ class ContactEvent(NamedTuple):
     is_leg_meeting_stopper: Bool[Array, "n_legs ..."]  # whether the leg meets its stopper
     # whether the stopper force of a leg in the air vanishes
     is_leg_leaving_stopper: Bool[Array, "n_legs ..."]
-    is_foot_lifting_off: Bool[Array, "2 ..."]  # whether the normal force of the slot vanishes
-    is_starting_to_slide_up: Bool[Array, "2 ..."]  # whether the slot's foot begins to slide uphill
+    is_foot_lifting_off: Bool[Array, "2 ..."]  # whether the normal force on the foot vanishes
+    # whether the foot in the slot begins to slide uphill
+    is_starting_to_slide_up: Bool[Array, "2 ..."]
     is_starting_to_slide_down: Bool[Array, "2 ..."]
-    is_stopping_to_slide: Bool[Array, "2 ..."]  # whether the slot's foot stops sliding
+    is_stopping_to_slide: Bool[Array, "2 ..."]  # whether the foot in the slot stops sliding
     # whether the stopper force of the slot's leg vanishes
     is_releasing_stopper: Bool[Array, "2 ..."]
 
@@ -114,7 +115,8 @@ class ContactLaw(NamedTuple):
     """Parameters of wheel and ground, and options of the contact law, for all events in a walk."""
 
     s: Symbols
-    friction: Friction  # of all feet; or of the last landed foot and of the others
+    # coefficient of all feet, or a pair for the foot that landed last and the others
+    friction: Friction
     has_one_sided_stoppers: bool  # whether stoppers of legs in the air only push
     counts_all_solutions: bool  # whether all admissible solutions are counted
     rest_speed: Elementwise  # speed below which a contact is at rest after an impact, m/s
@@ -149,7 +151,7 @@ class _KinematicLevelSolution(NamedTuple):
     chosen_combination: ChosenModeCombination
     force_solution: WheelForceSolution
     stopper_forces: LegArray  # force or impulse of the stoppers, N or N s
-    outward_leg_motion: LegArray  # of the leg lengths, m/s^2 or m/s
+    outward_leg_motion: LegArray  # acceleration or rate of the leg lengths, m/s^2 or m/s
     motion_after_impact: WheelMotion  # motion after the impact
 
 
@@ -268,7 +270,7 @@ class ContactEventResult(NamedTuple):
     motion: WheelMotion
     contact_state: ContactState
     energy_lost: Elementwise  # J
-    normal_impulse: SlotPair  # impulse on the slots' feet, N s
+    normal_impulse: SlotPair  # impulses on the feet in the contact slots, N s
     tangential_impulse: SlotPair
     stopper_impulse: Elementwise  # minimum over airborne locked legs, N s; inf without impact
     n_solutions: Int[Array, "..."]  # number of admissible combinations: minimum of both levels

@@ -35,14 +35,14 @@ SlotPair = tuple[Any, Any]
 class WheelMotion(NamedTuple):
     """Coordinates and rates of the free wheel in a frame whose x axis points down the slope."""
 
-    x: Scalar  # of the hub, m, downhill
-    z: Scalar  # of the hub above the slope, m
-    theta: Scalar  # of Leg 1, rad
-    vx: Scalar  # of the hub, m/s
+    x: Scalar  # downhill position of the hub, m
+    z: Scalar  # height of the hub above the slope, m
+    theta: Scalar  # angle of Leg 1, rad
+    vx: Scalar  # downhill velocity of the hub, m/s
     vz: Scalar
-    dtheta: Scalar  # rad/s
-    L: LegArray  # m
-    dL: LegArray  # m/s
+    dtheta: Scalar  # angular rate, rad/s
+    L: LegArray  # leg lengths, m
+    dL: LegArray  # rates of the leg lengths, m/s
 
 
 class LegDirections(NamedTuple):
@@ -171,16 +171,18 @@ class ContactInverseInertia(NamedTuple):
     """Inverse inertia of the hub, and responses of hub, feet and legs to contact forces."""
 
     leg_directions: LegDirections
-    is_released: Bool[Array, " n_legs"]  # whether a leg is eliminated: free in length, or in a slot
-    inverse_inertia: tuple[Any, ...]  # xx, xz, x theta, zz, z theta, theta theta
+    # whether a leg is eliminated: free in length, or in a contact slot
+    is_released: Bool[Array, " n_legs"]
+    inverse_inertia: tuple[Any, ...]  # entries xx, xz, x theta, zz, z theta, theta theta
     sin: SlotPair
     cos: SlotPair
     L: SlotPair
-    hub_response_transverse: tuple[HubVector, HubVector]  # of the hub to a unit transverse force
-    hub_response_radial: tuple[HubVector, HubVector]  # of the hub to a unit stopper force
-    G: tuple[Any, Any, Any]  # 11, 12, 22: of feet to transverse forces
-    H: tuple[Any, Any, Any, Any]  # 11, 12, 21, 22: of feet to stopper forces
-    K: tuple[Any, Any, Any]  # 11, 12, 22: of legs to stopper forces
+    # response of the hub to a unit transverse force
+    hub_response_transverse: tuple[HubVector, HubVector]
+    hub_response_radial: tuple[HubVector, HubVector]  # response of the hub to a unit stopper force
+    G: tuple[Any, Any, Any]  # entries 11, 12, 22: response of the feet to transverse forces
+    H: tuple[Any, Any, Any, Any]  # entries 11, 12, 21, 22: response of the feet to stopper forces
+    K: tuple[Any, Any, Any]  # entries 11, 12, 22: response of the legs to stopper forces
 
 
 def multiply_by_inverse_inertia(
@@ -309,10 +311,10 @@ class FreeMotion(NamedTuple):
     """Accelerations without contact forces, or velocities after an impact without impulses."""
 
     hub_motion: HubVector
-    leg_motion: LegArray  # of a released leg's length, minus the part u . hub
-    slot_leg_motion: SlotPair  # the same for the slots' legs
-    foot_transverse_motion: SlotPair  # of the slots' feet, transverse to the leg
-    foot_radial_motion: SlotPair  # of the slots' feet, along the leg
+    leg_motion: LegArray  # motion of each released leg's length, minus the part u . hub
+    slot_leg_motion: SlotPair  # the same for the legs in the contact slots
+    foot_transverse_motion: SlotPair  # motion of the feet in contact, transverse to the leg
+    foot_radial_motion: SlotPair  # motion of the feet in contact, along the leg
 
 
 def compute_free_leg_acceleration(

@@ -152,8 +152,8 @@ class ContactStepConfig(NamedTuple):
 def _partition_result(walk_result: BatchWalkResult) -> tuple[Any, Any]:
     """Return the results of a step, divided into floating-point arrays and other arrays.
 
-    A detailed walk has all results of the step. Any other walk has section state, durations,
-    outcome and number of solver steps.
+    If details are requested, the results are those in `UnilateralStep`. Otherwise they are section
+    state, durations, outcome and number of solver steps.
     """
     step_result = walk_result.step_result
     if isinstance(step_result, StepSummary):

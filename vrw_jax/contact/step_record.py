@@ -162,7 +162,7 @@ class StepCounters(NamedTuple):
     """Numbers of events and solver steps in a walking step, and durations by loaded feet."""
 
     n_events: Int[Array, "..."]  # number of changes of contacts and stoppers
-    durations: Float[Array, "3 ..."]  # with two loaded feet, with one, with none, s
+    durations: Float[Array, "3 ..."]  # durations with two, one and no loaded feet, s
     n_solver_steps: Int[Array, "..."]  # number of attempted solver steps
 
 

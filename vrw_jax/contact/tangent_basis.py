@@ -88,7 +88,7 @@ class UnitInputResponse(NamedTuple):
 
     leg_length_residual: LegArray  # acceleration of each leg's length
     summed_residual_tangent: SummedResidualTangent
-    foot_speed_tangent: SlotPair  # speed of the slots' feet along the slope
+    foot_speed_tangent: SlotPair  # tangential speeds of the feet in contact
     damping_loss_rate: Array  # W
 
 
@@ -108,7 +108,7 @@ class _LegLengthResponse(NamedTuple):
     """Tangent of the contact equations for lengths and length rates of a group of legs."""
 
     hub_residual: HubVector
-    slot_length_residual: SlotPair  # length of the slots' legs
+    slot_length_residual: SlotPair  # lengths of the legs in the contact slots
     slot_length_rate_residual: SlotPair
     damping_loss_rate: Array
 

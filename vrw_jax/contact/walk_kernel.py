@@ -134,7 +134,8 @@ class DifferentiableLaneState(NamedTuple):
 
     q: Array
     v: Array
-    loss_accumulators: tuple[Array | None, Array | None]  # of this step, and since the last event
+    # accumulators of this step, and since the last event
+    loss_accumulators: tuple[Array | None, Array | None]
     time_since_event: Array
     durations: Array
     step_details: Any  # floats of the details
@@ -144,7 +145,7 @@ class LaneState(NamedTuple):
     """State of all batch elements between two iterations of the event loop."""
 
     interval_state: IntervalState
-    step_counters: StepCounters  # of this step, but solver steps of the walk
+    step_counters: StepCounters  # counters of this step; solver steps are counted over the walk
     step_details: UnilateralStepDetails | None  # details of this step, if requested
     step_loss_accumulators: Array | None  # integrals over this step, rows as in `IntervalState`
     n_stepped: Array
@@ -274,7 +275,7 @@ class BatchWalkSettings(NamedTuple):
     ) -> tuple[StepCounters, UnilateralStepDetails | None, Array | None]:
         """Return step counters, step details and loss accumulators at the start of a step.
 
-        Details and accumulators are None for a walk without details.
+        Details and accumulators are None if no details are requested.
         """
         if not self.is_detailed:
             return init_step_counters(lane_template), None, None

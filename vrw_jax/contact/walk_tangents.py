@@ -102,7 +102,7 @@ class _LaneTangent(NamedTuple):
 class TangentBatch(NamedTuple):
     """Tangents of all batch elements; the first axis contains tangents, the last the batch."""
 
-    n_tangents: Array  # number of tangents of each lane
+    n_tangents: Array  # number of tangents of each batch element
     n_column_tangents: Array  # number of leading tangents whose columns may vary
     column_tangents: Array
     # all numbers of a `_LaneTangent`, see `_pack_rows`, (tangents, rows, batch)

@@ -53,7 +53,7 @@ VectorField = Callable[[StateArray], StateArray]
 
 
 class PhaseEnd(NamedTuple):
-    """State at the end of a phase, duration, triggered guard, and failure flags."""
+    """State at the end of a phase, duration, triggered guard, failure flags and margin minima."""
 
     state: StateArray
     duration: Scalar  # duration of the phase, s

@@ -1,6 +1,4 @@
-"""Multipliers of a periodic orbit from the Jacobians of its segments.
-
-The product of these Jacobians is not computed.
+"""Multipliers of a periodic orbit from the Jacobians of its segments, without their product.
 
 In a product of matrices, growing directions stay accurate and decaying directions do not. If one
 multiplier is 1 and another 1e-20, the product has no correct digit of the small multiplier. An

@@ -233,7 +233,7 @@ def _estimate_time_errors(
 def convert_modes_to_tuple(modes: Sequence[Mode] | Mode) -> tuple[Mode, ...]:
     """Return the modes as a tuple, with the guards of each mode as a tuple.
 
-    A single mode or guard may be passed without a tuple. An object of another type raises an error.
+    A single mode or guard may be passed without a tuple. Other types raise a TypeError.
     """
     if isinstance(modes, Mode | Guard):  # Mode and Guard are tuples themselves.
         modes = (modes,)  # type: ignore[assignment]

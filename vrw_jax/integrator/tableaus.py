@@ -38,7 +38,7 @@ class ButcherTableau(NamedTuple):
     rate_error_weights: np.ndarray
     position_error_weights: np.ndarray
     middle_stage_index: int
-    """Index of a stage well inside the step, at which parabolas through guards are fitted."""
+    """Index of a stage near the middle of the solver step, used to fit parabolas to guards."""
     guard_stage_indices: tuple[int, ...]
     """Indices of the stages at which guards are evaluated to find minima inside a solver step.
 

@@ -1,6 +1,6 @@
-"""Gaits computed with the rigid model and with the paper's model.
+"""Gaits of the rigid model and of the paper's model, with their Jacobians.
 
-The Jacobians of each gait propagate a defect of the return map to the measures.
+The Jacobians are used to propagate a defect of the return map to the measures.
 """
 
 import enum

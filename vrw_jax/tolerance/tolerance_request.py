@@ -59,9 +59,9 @@ class MeasureRequestOptions:
     - `n_cold_starts`: number of starts of walks, slow starts first, for wheels for which the lower
       model has no gait. It is chosen because walks from the first two starts reach a gait for 100
       of 232 wheels. Walks from further starts reach a gait for no other wheel;
-    - `max_gait_distance_ratio`: ratio of the largest accepted distance between the lower model's
-      gait and the gait with unilateral contact to the length of the first correction. It is chosen
-      because the sum of corrections that are halved each time is twice the first correction.
+    - `max_gait_distance_ratio`: largest accepted distance between the lower model's gait and the
+      gait with unilateral contact, in lengths of the first correction. It is chosen because the sum
+      of corrections that are halved each time is twice the first correction.
     """
 
     error_safety_factor: float = 4.0
