@@ -371,7 +371,7 @@ def _evaluate_on_lane_rows(
 def _compile_section_function(
     n_legs: int, section_function_name: str, n_rows: int, dtype: np.dtype
 ) -> Callable[..., Any]:
-    """Return the compiled program for a function in `SECTION_STATE_FUNCTIONS`."""
+    """Return the compiled program that evaluates one function in `SECTION_STATE_FUNCTIONS`."""
 
     def evaluate_section_function(_: tuple, lane_rows: tuple) -> tuple:
         parameter_values = lane_rows[: len(PARAMETER_NAMES)]

@@ -190,7 +190,10 @@ def compute_forces(mode_dynamics: ModeDynamics, motion: WheelMotion) -> ContactF
 def compute_airborne_stopper_force(
     mode_dynamics: ModeDynamics, contact_forces: ContactForces
 ) -> LegArray:
-    """Return the stopper force on each leg in the air, N; 0 for legs that are not on a stopper."""
+    """Return the stopper force on each leg in the air, N.
+
+    The force is 0 for legs with loaded feet and for legs that are not on their stoppers.
+    """
     sin, cos = contact_forces.leg_directions
     hub_acceleration_x, hub_acceleration_z, _ = contact_forces.force_solution.hub_motion
     # This is the acceleration of each leg's length without forces of slots and stoppers, m/s^2.

@@ -144,7 +144,7 @@ class ContactSlots(NamedTuple):
 
 
 def find_contact_slots(is_foot_touching: Bool[Array, "n_legs ..."]) -> ContactSlots:
-    """Return the contact slots for the first two legs whose feet touch the ground."""
+    """Return contact slots with the first two legs whose feet touch the ground."""
     touching_leg_rank = jnp.cumsum(is_foot_touching.astype(jnp.int32), axis=0)
     return ContactSlots(
         is_foot_touching & (touching_leg_rank == 1), is_foot_touching & (touching_leg_rank == 2)
@@ -475,7 +475,7 @@ def compute_foot_heights(
 def compute_foot_velocities(
     motion: WheelMotion, leg_directions: LegDirections
 ) -> tuple[LegArray, LegArray]:
-    """Return the velocities of every foot tangential and normal to the slope, m/s."""
+    """Return the tangential and the normal velocity of every foot relative to the slope, m/s."""
     transverse_velocity = motion.L * motion.dtheta
     tangential_speed = (
         motion.vx - motion.dL * leg_directions.sin - transverse_velocity * leg_directions.cos

@@ -82,7 +82,7 @@ They are the friction coefficient of the feet that landed earlier, and the angle
 straight line is steeper, rad. If restitution is an input, its column is last.
 """
 STATUS_UNFINISHED = -1
-"""Value in place of the outcome code of an unfinished walk."""
+"""Value that replaces the outcome code as long as a walk is unfinished."""
 
 
 class StepSummary(NamedTuple):

@@ -1,4 +1,4 @@
-"""Integrate phases in units of the system, in which the tolerances of the solver are expressed."""
+"""Integrate phases in scaled units, which also apply to the tolerances of the solver."""
 
 from jax import lax
 from jaxtyping import Array, Bool, Float
