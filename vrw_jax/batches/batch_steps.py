@@ -101,11 +101,11 @@ def step_batch(
     ten times the tolerance.
 
     "auto" also replaces the requested solver if the airborne leg is so stiff that another solver is
-    cheaper. `StepBatchResult.solver_index` identifies the selected solver. Tsit5 is selected if
-    stability limits the solver steps. At the default options it is selected from c/m = 1,900 1/s;
-    at a tolerance of 1e-6, from 300 1/s. Kvaerno5 in "diffrax" is selected if Tsit5 failed, or if
-    explicit solvers need too many solver steps. At the default options it is selected from
-    c/m = 4e5 1/s; at a tolerance of 1e-6, from 1.4e5 1/s.
+    cheaper. `StepBatchResult.solver_index` identifies the selected solver. The stiffness is c/m,
+    the ratio of damping to leg mass. Tsit5 is selected if stability limits the solver steps: from
+    c/m = 1,900 1/s at the default options, and from 300 1/s at a tolerance of 1e-6. Kvaerno5 in
+    "diffrax" is selected if Tsit5 failed, or if explicit solvers need too many solver steps: from
+    c/m = 4e5 1/s at the default options, and from 1.4e5 1/s at a tolerance of 1e-6.
 
     Derivatives are those of the result of all gait steps and include their events. The derivatives
     are zero for a wheel that fell, and not available by collocation. With unilateral contact
@@ -382,8 +382,8 @@ def _step_batch_without_contact(
 def _split_slopes_by_step(
     element_slopes: np.ndarray, n_steps: int, requested_engine: str
 ) -> tuple[Any, dict[str, StepwiseParameter]]:
-    """Return the slopes of the ground for all gait steps, and the `StepwiseParameter` of the slope
-    by name.
+    """Return the slopes of the ground for all gait steps, and a mapping from "slope" to its
+    `StepwiseParameter`.
 
     On flat ground, return a list with one slope, and an empty mapping.
     """
@@ -490,7 +490,7 @@ def _step_lanes_by_kernel(
     section_states: np.ndarray,
     *next_slopes: np.ndarray,
 ) -> tuple[np.ndarray, ...]:
-    """Return the results of one gait step of all lanes, computed by machine code or XLA.
+    """Return the results of one gait step for all lanes, computed by machine code or XLA.
 
     The results are those of `_BatchEngine.take_lane_steps`.
     """
@@ -564,8 +564,8 @@ def _step_lanes_by_collocation(
     section_states: np.ndarray,
     expected_phase_durations: np.ndarray,
 ) -> tuple[tuple[np.ndarray, ...], np.ndarray]:
-    """Return the results of one gait step of all lanes by collocation, and whether each lane passed
-    the checks of its accuracy.
+    """Return the results of one gait step for all lanes, computed by collocation, and whether each
+    lane passed the accuracy checks.
 
     `lane_engine` computes the step again for lanes that failed a check. The results are those of
     `_BatchEngine.take_lane_steps`.
@@ -611,7 +611,7 @@ def _step_lanes_by_diffrax(
     section_states: np.ndarray,
     *next_slopes: np.ndarray,
 ) -> tuple[np.ndarray, ...]:
-    """Return the results of one gait step of all lanes, computed by `model.advance` under
+    """Return the results of one gait step for all lanes, computed by `model.advance` under
     `jax.vmap`.
 
     The results are those of `_BatchEngine.take_lane_steps`.
@@ -641,11 +641,11 @@ def _step_lanes_by_diffrax(
         return jax.tree.map(lambda x: np.array(x).T, step_arrays)
 
     def step_elements_with_jacobian(step_input_matrix: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Return the results of the gait step of all elements with Jacobians, which are zero where
-        no derivative exists.
+        """Return the results of one gait step for all elements, with Jacobians.
 
-        diffrax raises an error for the whole batch if the implicit solver's linear equations for
-        the derivative of one element cannot be solved. Bisection isolates that element.
+        A Jacobian is zero where no derivative exists. diffrax raises an error for the whole batch
+        if the implicit solver's linear equations for the derivative of one element cannot be
+        solved. Bisection isolates that element.
         """
         try:
             step_arrays: tuple[np.ndarray, ...] = step_all_elements(
@@ -692,8 +692,10 @@ def _step_elements_by_vmap(
     input_indices: tuple[int, ...],
     step_input_matrix: Array,
 ) -> tuple[Array, ...]:
-    """Return section states, durations, outcomes and numbers of solver steps of one gait step, and
-    Jacobians if `input_indices` are given.
+    """Return section state, durations, outcome and number of solver steps of one gait step for each
+    element.
+
+    If there are `input_indices`, return also the Jacobians.
 
     - `step_input_matrix`: inputs of the step, shape (elements, inputs);
     - `input_indices`: indices of the inputs with respect to which the Jacobian is computed.

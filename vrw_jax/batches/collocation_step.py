@@ -779,11 +779,11 @@ def _find_lowest_guard(
     start_guards: Vector,
     n_event_guards: int,
 ) -> tuple[Array, Vector]:
-    """Return the lowest guard value at the middle and the end of an interval, and all guard values
-    at the end.
+    """Return the lowest of all guard values in an interval, and the value of each guard at the end.
 
-    Between start, middle and end, a guard may be lower than at these points by a quarter of its
-    second difference. If a guard may be negative between them, the lowest guard value is -1.
+    The guards are evaluated at the middle and the end. Between start, middle and end, a guard may
+    be lower by a quarter of its second difference. If a guard may be negative there, the lowest
+    guard value is -1.
 
     - `start_guards`: guard values at the start of the interval;
     - `n_event_guards`: 1 in the last interval, whose first guard is that of the event and has the
@@ -844,7 +844,7 @@ def _find_lowest_guard(
 
 
 class CollocationStep(NamedTuple):
-    """Result of one gait step of each lane by collocation."""
+    """Result of one gait step for each lane, computed by collocation."""
 
     section_state: Vector  # (theta-, dtheta-, dL1-), three arrays
     phase_durations: Vector  # of DLS, SLS-I, SLS-II, s

@@ -147,7 +147,7 @@ def step_batch_with_contact(
 
 
 class _StepwiseGround(NamedTuple):
-    """Slope and friction of the ground in each gait step."""
+    """Slope and friction of the ground in each gait step of each element."""
 
     slopes_by_step: np.ndarray  # (n_steps + 1, elements), rad
     friction_by_step: np.ndarray  # (n_steps, elements)

@@ -93,17 +93,17 @@ def basin_share(
 ) -> BasinShare:
     """Return the share of the start states in a box from which a wheel arrives at its gait.
 
-    The starts are spread evenly over `box`. A walk arrives at the gait if its section state differs
-    from that of the gait by less than 1e-6 in units of the wheel (`compute_wheel_units`). The gait
-    must be stable, so that the walk stays on it.
+    The starts are spread evenly over `box`. A walk arrives at the gait when its section state
+    differs from that of the gait by less than 1e-6. The unit is that of the wheel
+    (`compute_wheel_units`). The gait must be stable, so that the walk stays on it.
 
     The errors are standard errors of a binomial share. For the error, one start that arrives and
-    one that does not are added, so that the error is positive for a share of 0 or 1. The errors
+    one that does not are added. The error is therefore positive for a share of 0 or 1. The errors
     hold for `sampling="random"`. In most boxes, points of a scrambled Sobol' sequence have smaller
     errors.
 
     Args:
-        params: the wheel.
+        params: parameters of the wheel.
         box: bounds (lower, upper) or a number for each of "theta_touchdown", "dtheta_touchdown" and
             "dL1_touchdown", in rad, rad/s, m/s; or for each of "theta_post_impact" and
             "dtheta_post_impact", in rad, rad/s. Starts to which no landing leads count as
@@ -153,9 +153,7 @@ def compute_basin_share(
     sampling_name: str = "sobol",
     seed: int = 0,
 ) -> BasinShare:
-    """Return the `BasinShare` of a stable gait; the arguments of `basin_share` must be validated
-    before.
-    """
+    """Return the `BasinShare` for a stable gait and for valid arguments of `basin_share`."""
     n_components = len(box_bounds.component_names)
     random_generator = np.random.default_rng(seed)
     if sampling_name == "random":

@@ -101,8 +101,8 @@ class GaussianMixture:
     def make_isotropic_gaussian(
         cls, n_dimensions: int, standard_deviation: float
     ) -> "GaussianMixture":
-        """Return a mixture of one Gaussian with mean zero, and with the same standard deviation in
-        all directions.
+        """Return a mixture of one Gaussian with mean zero and covariance `standard_deviation`^2
+        times the identity.
         """
         return cls(
             np.ones(1), np.zeros((1, n_dimensions)), standard_deviation * np.eye(n_dimensions)[None]

@@ -231,7 +231,7 @@ def _estimate_differentiable_passage(
     params: WheelParams,
     slope_sd: Any,
 ) -> FirstPassage:
-    """Return first-passage times from sampled walks, such that the means have first derivatives.
+    """Return the `FirstPassage` that sampled walks estimate, with means that JAX can differentiate.
 
     Raise TypeError if the parameters of the wheel are abstract, as inside `jit` and `vmap`.
     """
@@ -245,7 +245,7 @@ def _differentiate_passage(
     primals: tuple[WheelParams, Any],
     tangents: tuple[WheelParams, Any],
 ) -> tuple[FirstPassage, FirstPassage]:
-    """Return first-passage times from sampled walks, and their tangents."""
+    """Return the `FirstPassage` that sampled walks estimate, and its tangent."""
     params, slope_sd = primals
     require_untraced_arguments("vrw.first_passage", SAMPLED_TRACING_REMEDY, params, slope_sd)
     params_tangent, slope_sd_tangent = tangents
@@ -281,7 +281,7 @@ def _differentiate_passage(
 def _solve_passage_by_quadrature(
     params: WheelParams, slope_sd: Array, model: Any, n_nodes: int, relative_tolerance: float
 ) -> FirstPassage:
-    """Return the first-passage times of the rigid wheel, computed by quadrature.
+    """Return the `FirstPassage` of the rigid wheel, computed by quadrature.
 
     The number of nodes is doubled until the error is within `relative_tolerance`. For traced
     arguments, the number is not doubled. Raise ValueError if the model stops at lift-off or the
@@ -347,11 +347,11 @@ def _estimate_passage_by_sampling(
     max_steps: int,
     differentiated_names: tuple[str, ...] = (),
 ) -> tuple[FirstPassage, dict[str, float]]:
-    """Return the first-passage times of a model, estimated by sampled walks, and derivatives of the
-    logarithm of `mean_steps` by parameter name.
+    """Return the `FirstPassage` that sampled walks estimate, and derivatives of the logarithm of
+    `mean_steps`.
 
-    The derivatives are those with respect to the parameters `differentiated_names`. Raise
-    ValueError if the wheel has no gait, or if hardly any step succeeds.
+    The derivatives are those with respect to the parameters `differentiated_names`, by the names of
+    the parameters. Raise ValueError if the wheel has no gait, or if hardly any step succeeds.
     """
     limit_cycle_result: Any = limit_cycle(params, model=model)
     if int(limit_cycle_result.outcome) != Outcome.STEPPED:

@@ -114,7 +114,7 @@ class StableGait(NamedTuple):
 
 
 class ArrivalWalkResult(NamedTuple):
-    """Results of walks toward a gait; the first axis of each array is over starts."""
+    """Results of walks toward a gait. The first axis of each array is that of the starts."""
 
     is_on_gait: np.ndarray
     walk_outcomes: np.ndarray  # `Outcome` of each walk, STEPPED if the walk continues

@@ -27,10 +27,10 @@ from vrw_jax.wheel import Outcome, WheelParams
 class GaitSensitivity(AbstractPrintable):
     """Gait sensitivity norms of several measures, each in the measure's unit per rad of slope.
 
-    The norm is the standard deviation of a measure in a long walk over independent slopes, divided
-    by the standard deviation of the slopes, in the limit of small deviations. The norm is infinite
-    if the gait is not stable. A line of the ground joins two footholds. The squares of
-    `ending_step`, `beginning_step` and `later_steps` sum to the square of the norm.
+    The norm is the ratio of two standard deviations: that of a measure in a long walk over
+    independent slopes, and that of the slopes. The ratio is taken in the limit of small deviations.
+    The norm is infinite if the gait is not stable. A line of the ground joins two footholds. The
+    squares of `ending_step`, `beginning_step` and `later_steps` sum to the square of the norm.
 
     - `norm`: norms in the order of `measures`;
     - `ending_step`: signed response of the step that ends on a line to the slope of that line;
@@ -67,7 +67,9 @@ class GaitSensitivity(AbstractPrintable):
         return "The gait is not stable: deviations grow from step to step, and no norm is finite."
 
     def summary_rows(self) -> list[LabelAndText]:
-        """Return pairs of label and text for the norms of all measures, with their parts."""
+        """Return pairs of label and text for the norm of each measure and the responses that it
+        sums.
+        """
         if self.outcome != Outcome.STEPPED:
             return [("outcome", self.ending)]
         text_rows = []
@@ -104,10 +106,10 @@ def gait_sensitivity(
     it. A discrete Lyapunov equation sums the response of all later steps. Hobbelen and Wisse (2007)
     sum over a few steps.
 
-    Norms are differentiable with respect to `params` in forward and reverse mode. The gradient of
-    the norm of a margin needs second derivatives of a step, whose compilation takes minutes,
-    because margins depend on more than durations and the first landing. With unilateral contact,
-    norms have no derivatives.
+    Norms are differentiable with respect to `params` in forward and reverse mode. The norm of a
+    margin depends on more than durations and the first landing. Its gradient needs second
+    derivatives of a gait step, whose compilation takes minutes. With unilateral contact, norms have
+    no derivatives.
 
     Args:
         params: parameters of the wheel; the slope is the mean slope.

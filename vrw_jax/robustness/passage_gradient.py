@@ -25,7 +25,7 @@ from vrw_jax.wheel import Outcome, WheelParams
 
 @dataclass(frozen=True)
 class PassageGradientOptions:
-    """Numerical options of the derivatives of sampled mean numbers of gait steps."""
+    """Numerical options for the derivatives of mean numbers of gait steps from sampled walks."""
 
     n_failing_walks: int = 1024
     """Number of failing walks whose failure radii are computed.
@@ -71,11 +71,11 @@ def differentiate_log_mean_steps(
     parameter_names: tuple[str, ...],
     gradient_options: PassageGradientOptions = PASSAGE_GRADIENT_OPTIONS,
 ) -> dict[str, float]:
-    """Return the derivatives of the logarithm of the mean number of steps, by parameter name.
+    """Return the derivatives of the logarithm of the mean number of gait steps, by parameter name.
 
     The name "slope_sd" means the standard deviation of the slopes. A derivative is NaN if a wheel
     with a slightly changed parameter has no gait. The result neglects the influence of failures on
-    the quasi-stationary distribution, which has the relative size 1/`mean_steps`.
+    the quasi-stationary distribution. The neglected terms have the relative size 1/`mean_steps`.
 
     - `walk_density`: density from which the slope deviations of walks are drawn.
     """
@@ -157,10 +157,10 @@ def _draw_failing_walks(
     walk_density: GaussianMixture,
     gradient_options: PassageGradientOptions,
 ) -> FailingWalks:
-    """Return failing walks with equal weights, resampled from walks with slopes drawn from
-    `walk_density`.
+    """Return failing walks with equal weights, resampled from many walks.
 
-    Raise ValueError if no walk fails in its last step.
+    The slopes of the many walks are drawn from `walk_density`. Raise ValueError if no walk fails in
+    its last step.
     """
     n_walks, effective_number_of_walks = gradient_options.n_failing_walks, 0.0
     sampling_rounds: list[tuple[np.ndarray, np.ndarray]] = []

@@ -32,7 +32,7 @@ only 1e-23.
 
 
 class RigidPassage(NamedTuple):
-    """First-passage times of the rigid wheel, computed with a given number of quadrature nodes."""
+    """First-passage times of the rigid wheel, computed by quadrature."""
 
     survival_analysis: SurvivalAnalysis
     mean_steps_from_gait: Scalar
@@ -43,7 +43,7 @@ class RigidPassage(NamedTuple):
 def solve_rigid_passage(
     params: WheelParams, slope_sd: Scalar, rigid_model: Any, n_nodes: int
 ) -> RigidPassage:
-    """Return the first-passage times by Gauss-Legendre quadrature with `n_nodes` nodes.
+    """Return the first-passage times, computed by Gauss-Legendre quadrature with `n_nodes` nodes.
 
     - `slope_sd`: standard deviation of the slopes, rad.
     """
@@ -57,8 +57,10 @@ def solve_rigid_passage(
     node_weights = 0.5 * largest_squared_rate * legendre_weights
 
     def evaluate_kernel_row(squared_rate: Array) -> tuple[Array, Array]:
-        """Return the kernel from a squared rate to all nodes, times the quadrature weights, and the
+        """Return the row of the survival operator for a start at `squared_rate`, and the
         probability that the step fails.
+
+        The row contains the kernel at all nodes, multiplied by the quadrature weights.
         """
         compute_slope_cosine = lambda next_squared_rate: (
             (next_squared_rate - vertical_rate_map.compute_slope_independent_part(squared_rate))

@@ -126,7 +126,7 @@ class ExtinctGroupError(ValueError):
 
 
 class SampledPassage(NamedTuple):
-    """First-passage times of a model, estimated by sampled walks."""
+    """Results of `sample_passage`: first-passage times that sampled walks estimate."""
 
     failure_probability: float  # of one step from the quasi-stationary distribution
     relative_error: float  # of the mean; half a confidence interval plus the start's effect
@@ -140,7 +140,10 @@ class SampledPassage(NamedTuple):
 
 
 class WalkerGroups:
-    """Groups of walkers on random slopes, simulated as one batch. All walkers start on the gait."""
+    """Groups of walkers (simulated wheels) on random slopes, simulated as one batch.
+
+    At first, the state of every walker is the section state of the gait.
+    """
 
     def __init__(
         self,
@@ -165,7 +168,7 @@ class WalkerGroups:
         self.weight_by_outcome: dict[int, float] = {}
 
     def run_walks(self, slope_deviations: np.ndarray) -> StepBatchResult:
-        """Return the results of walks that begin at the present states of the walkers.
+        """Return the results of walks that begin at the current states of the walkers.
 
         Walk i begins at walker i modulo the number of walkers.
 
@@ -205,18 +208,18 @@ class WalkerGroups:
     def stack_states_and_slopes(self) -> np.ndarray:
         """Return section states with the slope as last component, shape (walkers, components).
 
-        By the Markov property, the section state and the present slope determine the distribution
+        By the Markov property, the section state and the current slope determine the distribution
         of later states.
         """
         return np.concatenate([self.states, self.slopes[:, None]], 1)
 
     def step_and_replace_failures(self) -> tuple[np.ndarray, np.ndarray]:
-        """Simulate one gait step of every walker, and replace walkers that fail by copies of other
-        walkers.
+        """Simulate one gait step of every walker, and replace walkers that fail by copies of
+        survivors.
 
         Return whether each walker survived, and the standardized deviations of the slopes on which
-        the walkers landed, both of shape (walkers,). Raise `ExtinctGroupError` if no walker of a
-        group survived.
+        the walkers landed. The two arrays have the shape (walkers,). Raise `ExtinctGroupError` if
+        no walker of a group survived.
         """
         n_walkers = len(self.states)
         slope_deviations = self.random.standard_normal((n_walkers, 1))
@@ -466,7 +469,7 @@ def _has_missed_failures(
     max_failure_probability: float,
     sampling_options: PassageSamplingOptions,
 ) -> bool:
-    """Return whether some outcome ends more counted steps than importance sampling predicts.
+    """Return whether some outcome occurs in more simulated steps than importance sampling predicts.
 
     Importance sampling may miss an outcome that no large slope causes. For example, a landing may
     release the rear foot, and the wheel then falls back a step later.
@@ -523,12 +526,12 @@ def run_biased_walks(
 def _solve_failure_probability(
     last_step_failure_probability: float, n_biased_lines: int
 ) -> tuple[float, float]:
-    """Return the failure probability p of a step, and the amplification of its relative error.
+    """Return the failure probability p of a gait step, and the amplification of its relative error.
 
     Each step from the quasi-stationary distribution fails with probability p. A walk therefore
     fails in the last of `n_biased_lines` steps with probability p (1 - p)^(n_biased_lines - 1).
-    This probability is `last_step_failure_probability`. The amplification is the ratio of the
-    relative error of p to that of this probability.
+    This probability is `last_step_failure_probability`. The amplification is the relative error of
+    p, divided by the relative error of `last_step_failure_probability`.
     """
     p = last_step_failure_probability
     if n_biased_lines == 1:

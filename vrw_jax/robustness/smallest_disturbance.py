@@ -47,7 +47,7 @@ class DisturbanceSearchOptions:
     n_grid_sizes: int = 24
     """Number of disturbance sizes in the first grid.
 
-    An interval of sizes that leave the basin may be missed if the grid spacing exceeds its width.
+    An interval of sufficient sizes may be missed if the grid spacing exceeds its width.
     """
     n_bisection_sizes: int = 8
     """Number of sizes that divide a bracket, chosen because each batch then gains one digit."""
@@ -74,7 +74,7 @@ DISTURBANCE_SEARCH_OPTIONS = DisturbanceSearchOptions()
 class SmallestDisturbance(AbstractPrintable):
     """Smallest change of the angular velocity within a step that takes the state out of the basin.
 
-    - `size`: smallest change, rad/s; infinite if no change up to `max_size` leaves the basin;
+    - `size`: smallest change, rad/s; infinite if no change up to `max_size` suffices;
     - `size_error`: error estimate of `size`, rad/s;
     - `direction`: 1 if the change makes the wheel faster, -1 if slower;
     - `time`: instant of the disturbance after the landing, s;
@@ -83,8 +83,8 @@ class SmallestDisturbance(AbstractPrintable):
       continues, but not on this gait;
     - `profile_times`: instants of the profile of sizes, after the landing, s, shape (instants,);
     - `profile_phase_indices`: index of the phase at each instant of the profile, shape (instants,);
-    - `backward_sizes`, `forward_sizes`: smallest change in each direction that leaves the basin, at
-      each instant of the profile, rad/s, shape (instants,);
+    - `backward_sizes`, `forward_sizes`: smallest sufficient change in each direction at each
+      instant of the profile, rad/s, shape (instants,);
     - `max_size`: largest change that the search tried, rad/s.
 
     Examples:
@@ -142,18 +142,18 @@ def smallest_disturbance(
     """Return the smallest disturbance within a step that takes the wheel out of its gait's basin.
 
     A disturbance is a sudden change of the angular velocity dtheta at one instant of the gait's
-    step, from just after the landing to just before the next landing. Its size is the modulus of
-    the change, rad/s. Positions do not change. In double support both feet stay on the ground, so
-    that dtheta determines the rates of the two legs. In single support the rates of the legs do not
-    change. A disturbance leaves the basin if the walk after it does not arrive at the gait (see
-    `basin_share`). With the paper's model, a departure from the sequence of phases, which need not
-    be a fall, ends the walk.
+    step. The instant lies between a landing and the next landing. The size of the disturbance is
+    the modulus of the change, rad/s. Positions do not change. In double support the two feet stay
+    on the ground, so that dtheta determines the rates of the legs. In single support the rates of
+    the legs do not change. The disturbed state is outside the basin if the walk from it does not
+    arrive at the gait (see `basin_share`). With the paper's model, a departure from the sequence of
+    phases, which need not be a fall, ends the walk.
 
     The search considers 17 instants of each phase, and forward and backward disturbances. A grid of
-    sizes brackets the smallest size that leaves the basin, and bisection in batches refines the
-    bracket. Later passes refine the instants around the smallest size of each phase and direction.
-    `size_error` is the sum of the width of the last bracket and the difference between sizes at
-    neighboring instants of the last pass.
+    sizes brackets the smallest sufficient size, and bisection in batches refines the bracket. Later
+    passes refine the instants around the smallest size of each phase and direction. `size_error` is
+    the sum of the width of the last bracket and the difference between sizes at neighboring
+    instants of the last pass.
 
     Args:
         params: parameters of the wheel.
@@ -194,7 +194,7 @@ def smallest_disturbance(
 
 
 class _GaitStep(NamedTuple):
-    """Times and states sampled in one step of a gait, with axes over phases and samples."""
+    """Samples of time and state in one step of a gait, with axes over phases and samples."""
 
     sample_times: np.ndarray  # after the landing, s, (phase, sample)
     sample_states: np.ndarray  # (theta, L1, L2) and their rates, (phase, sample, 6)
@@ -208,9 +208,7 @@ def compute_smallest_disturbance(
     max_steps: int,
     search_options: DisturbanceSearchOptions = DISTURBANCE_SEARCH_OPTIONS,
 ) -> SmallestDisturbance:
-    """Return the `SmallestDisturbance` of a gait of one step, for arguments that are already
-    validated.
-    """
+    """Return the `SmallestDisturbance` for a gait of one step and for valid arguments."""
     params, model, options, section_states = stable_gait
     start_state = jnp.asarray(section_states[0])
     step_trajectory = model.sample_step(
@@ -239,7 +237,7 @@ class _DirectedInstants(NamedTuple):
 
 
 class _ExitSizeBrackets(NamedTuple):
-    """Brackets of the smallest size that leaves the basin, for each instant and direction.
+    """Brackets of the smallest disturbance size that takes the state out of the basin.
 
     Each array has the shape (instants,).
     """
@@ -261,8 +259,10 @@ def _search_disturbance_instants(
     max_steps: int,
     search_options: DisturbanceSearchOptions,
 ) -> SmallestDisturbance:
-    """Return the smallest disturbance over all instants, found in passes over increasingly close
-    instants.
+    """Return the smallest disturbance over all instants of a gait step.
+
+    Each pass of the search considers instants that are closer to each other than in the pass
+    before.
     """
     phase_directions = [
         (phase_index, disturbance_sign)
@@ -370,7 +370,8 @@ def _bracket_exit_sizes(
     size_tolerance: float,
     search_options: DisturbanceSearchOptions,
 ) -> _ExitSizeBrackets:
-    """Return a bracket of the smallest size that leaves the basin, for each instant and direction.
+    """Return, for each instant and direction, a bracket of the smallest disturbance size that takes
+    the state out of the basin.
 
     - `size_tolerance`: width of the final brackets, relative to the size.
     """
@@ -431,9 +432,10 @@ def _walk_after_disturbance(
     disturbance_sizes: np.ndarray,
     max_steps: int,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return whether each walk after a disturbance leaves the basin, and the `Outcome` of the walk.
+    """Return whether each walk after a disturbance misses the gait, and the `Outcome` of the walk.
 
-    The two arrays have the shape (instants, sizes) of `disturbance_sizes`, rad/s.
+    The two arrays have the shape of `disturbance_sizes`, (instants, sizes). The unit of the sizes
+    is rad/s.
     """
     n_sizes = disturbance_sizes.shape[1]
     disturbed_states = np.repeat(

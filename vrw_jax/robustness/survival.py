@@ -92,8 +92,9 @@ def compute_mean_steps(
     """Return the mean number of gait steps from one start, including the failing step.
 
     The mean m solves m = 1 + K m. The solution is M u + g with M = 1/(1 - kappa_1). Here u is the
-    leading eigenvector and q the quasi-stationary distribution. The remainder g solves (I - K + u
-    q) g = 1 - u and stays small.
+    leading eigenvector and q the quasi-stationary distribution. The remainder g stays small and
+    solves the equation
+    (I - K + u q) g = 1 - u.
 
     - `start_survival_row`: row of the survival operator for the start;
     - `start_failure_probability`: probability that the first step fails.

@@ -330,9 +330,10 @@ def stack_parameter_rows(
 def mask_failed_samples(
     outcome: np.ndarray, measures_by_name: Mapping[str, Any]
 ) -> dict[str, np.ndarray]:
-    """Return outcomes and measures by name, with the measures of samples without a gait replaced.
+    """Return outcomes and measures by name, where measures of samples without a gait are missing
+    values.
 
-    Such a measure is NaN, or -1 if it is an integer.
+    A missing value is NaN, or -1 for a measure that is an integer.
     """
     masked_measures = {
         variable_name: np.array(variable_values)

@@ -49,7 +49,7 @@ ProgressCallback = Callable[["ScanProgress"], None]
 
 @dataclass(frozen=True)
 class ScanProgress:
-    """Progress of a scan, in numbers of samples."""
+    """Progress of a scan, measured in samples."""
 
     n_samples: int  # samples to compute in this run
     n_done: int  # samples computed in this run

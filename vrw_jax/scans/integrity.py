@@ -61,7 +61,9 @@ def read_scan_manifest(store_attributes: Any) -> dict[str, Any]:
 
 
 def add_attribute_seal(mark_attributes: dict[str, Any]) -> dict[str, Any]:
-    """Return the attributes of the Zarr group of marks, with a digest of these attributes added."""
+    """Return the attributes of the Zarr group of marks, with their digest added under
+    `ATTRIBUTE_SEAL_KEY`.
+    """
     unsealed_attributes = {
         key: attribute_value
         for key, attribute_value in mark_attributes.items()

@@ -103,7 +103,10 @@ class ArrayEmitter:
         )
 
     def emit_constant_array(self, constant_array: np.ndarray, aval: Any) -> LlvmArray:
-        """Return an array of LLVM constants that equal the entries of `constant_array`."""
+        """Return an array of LLVM constants that equal the entries of `constant_array`.
+
+        A large array is stored in memory, unless the code is in an innermost loop.
+        """
         if LANE_AXIS_SENTINEL in aval.shape:
             raise make_lane_axis_error("A constant", aval)
         llvm_entry_type = get_llvm_number_type(aval)
@@ -494,8 +497,9 @@ class ArrayEmitter:
         return LazyArray(new_shape, array.entry_type, get_reshaped_entry)
 
     def emit_affine_index(self, i: Any, index_start: int, index_step: int = 1) -> Any:
-        """Emit the index index_start + index_step * i, and return its LLVM value, or an integer if
-        `i` is one.
+        """Emit the index index_start + index_step * i, and return its LLVM value.
+
+        If `i` is an integer, the function only computes the index and returns an integer.
         """
         if isinstance(i, int):
             return index_start + index_step * i
@@ -513,7 +517,9 @@ class ArrayEmitter:
         return builder.select(builder.icmp_signed(">", i, llvm_last_index), llvm_last_index, i)
 
     def emit_index_sum(self, entry_index: EntryIndex, offset_index: EntryIndex) -> EntryIndex:
-        """Emit the sum of two array indices for each axis, and return the resulting array index."""
+        """Emit the sum of two indices of array entries, axis by axis, and return the resulting
+        index.
+        """
 
         def add_axis_indices(i: Any, j: Any) -> Any:
             if isinstance(j, int):
@@ -523,10 +529,7 @@ class ArrayEmitter:
         return tuple(add_axis_indices(i, j) for i, j in zip(entry_index, offset_index, strict=True))
 
     def make_llvm_zero(self, entry_type: ir.Type) -> LlvmValue:
-        """Return the LLVM value 0 from which a sum starts.
-
-        Unlike other constants 0, this start value is not omitted from the sum.
-        """
+        """Return a constant 0 of type `entry_type` that is the initial value of a sum."""
         llvm_element_type = (
             entry_type.element if isinstance(entry_type, ir.VectorType) else entry_type
         )
@@ -598,7 +601,8 @@ def make_entry_array(array_shape: tuple[int, ...], llvm_entries: Sequence[LlvmVa
 def split_into_entry_arrays(
     flat_entries: Sequence[LlvmValue], avals: Sequence[Any]
 ) -> list[LlvmArray]:
-    """Return arrays of the shapes in `avals`, whose entries are those of the list `flat_entries`.
+    """Return arrays with the abstract values `avals`, whose entries are those of the list
+    `flat_entries`.
 
     This function is the inverse of `ArrayEmitter.flatten_array_entries`.
     """

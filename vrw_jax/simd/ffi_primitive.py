@@ -47,7 +47,9 @@ MACHINE_CODE_PRIMITIVE.multiple_results = True
 def _make_abstract_results(
     *call_arguments: Any, code: MachineCode, result_shapes: Sequence[jax.ShapeDtypeStruct]
 ) -> list[Any]:
-    """Return the abstract values (shapes and dtypes) of the results of a machine code call."""
+    """Return the abstract values (shapes and dtypes) of the results that a machine code call
+    returns.
+    """
     return [jax.core.ShapedArray(x.shape, x.dtype) for x in result_shapes]
 
 

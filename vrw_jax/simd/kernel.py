@@ -97,8 +97,9 @@ def write_llvm_kernel(
 
 
 def _check_lane_axes(closed_jaxpr: ClosedJaxpr) -> None:
-    """Raise a NotImplementedError unless the lane axis is the last axis of every result, and no
-    other axis of an argument or a result has its length.
+    """Raise a NotImplementedError unless the lane axis is the last axis of every result.
+
+    Raise the error also if another axis of an argument or a result has the length of the lane axis.
     """
     for array_description, checked_avals in (
         ("An argument", closed_jaxpr.in_avals),

@@ -187,8 +187,10 @@ class _LoopCarry:
         ]
 
     def choose_carried_memory(self, carried_aval: Any, initial_array: LlvmArray) -> MemoryArray:
-        """Return the memory of the initial array if the loop may overwrite it and its entry type
-        fits, else new memory.
+        """Return the memory in which the loop carries an array.
+
+        It is the memory of the initial array if the loop may overwrite it and its entry type fits,
+        else new memory.
         """
         entry_type = self.array_emitter.get_entry_type(carried_aval)
         initial_array = (

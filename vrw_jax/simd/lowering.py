@@ -224,7 +224,10 @@ def _find_overwriting_equations(jaxpr: Any) -> dict[Any, int | None]:
 
 
 def make_call_rule(jaxpr_parameter_name: str) -> PrimitiveRule:
-    """Return the rule for a primitive that calls the jaxpr in one of its parameters."""
+    """Return the rule for a primitive that calls a jaxpr.
+
+    - `jaxpr_parameter_name`: name of the primitive's parameter that contains the jaxpr.
+    """
 
     def emit_called_jaxpr(
         jaxpr_lowering: JaxprLowering, equation: Any, operands: list[LlvmArray]
