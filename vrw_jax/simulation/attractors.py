@@ -56,8 +56,8 @@ class PeriodicWalkEnds(NamedTuple):
     period: np.ndarray  # period of the orbit, in steps; 0 if not periodic
     n_steps_to_orbit: np.ndarray  # number of steps until the orbit, or until the fall
     orbit_states: np.ndarray
-    """Section states of the orbit, (start, max_period, m). The state with the lowest dtheta- comes
-    first, and the array is padded with NaN.
+    """Section states of the orbit, (start, max_period, m), where m is the number of entries of a
+    section state. The state with the lowest dtheta- comes first, and the array is padded with NaN.
     """
 
 
@@ -67,7 +67,8 @@ def _walk_round_of_block(
 ) -> tuple[Array, Array]:
     """Return the section states and outcomes after each step of one round of walking steps.
 
-    The arrays have the shapes (starts, steps, m) and (starts, steps).
+    The arrays have the shapes (starts, steps, m) and (starts, steps), where m is the number of
+    entries of a section state.
     """
     walk_one_round = lambda params, x: walk(params, x, n_steps, model=model, options=options)
     batch_walks = jax.vmap(walk_one_round)(params, x)
@@ -79,8 +80,8 @@ def _walk_round_with_contact(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the section states and outcomes of one round of walking steps with unilateral contact.
 
-    The arrays have the shapes (starts, steps, m) and (starts, steps). The batch kernel computes the
-    steps for any number of starts.
+    The arrays have the shapes (starts, steps, m) and (starts, steps), where m is the number of
+    entries of a section state. The batch kernel computes the steps for any number of starts.
     """
     n_legs, parameter_rows = params.n_legs, np.asarray(jax.vmap(model.parameter_values)(params)).T
     x = embed_section_states(parameter_rows, np.asarray(x), n_legs)
@@ -110,7 +111,7 @@ def walk_until_periodic(
     """Simulate the walk from each start until it is periodic or has failed, and return its end.
 
     - `params`: one wheel, or one wheel per start on the leading axis;
-    - `start_states`: section states, (starts, m);
+    - `start_states`: section states, (starts, entries);
     - `max_period`: longest period that is detected, in steps.
     """
     n_starts = len(start_states)
@@ -179,7 +180,7 @@ def _detect_walk_periods(
 ) -> np.ndarray:
     """Return the shortest period that the last two periods of each walk confirm, in steps, or 0.
 
-    - `state_history`: section states, (starts, steps, m).
+    - `state_history`: section states, (starts, steps, entries).
     """
     detected_periods = np.zeros(len(state_history), int)
     n_states = state_history.shape[1]
@@ -233,7 +234,7 @@ def find_distinct_orbits(
 def _measure_steps_of_block(
     model: AbstractWheel, options: StepOptions, params: WheelParams, x: Array
 ) -> dict[str, Array]:
-    """Return all measures of one step from each start of a batch, by name."""
+    """Return all measures of one step from each start in a batch, by name."""
     return jax.vmap(lambda p, x: model.take_step(p, x, options).measures())(params, x)
 
 
@@ -242,7 +243,7 @@ def measure_orbit_steps(
 ) -> dict[str, np.ndarray]:
     """Return all measures of one step from each section state, by name.
 
-    `section_states` has the shape (n, m).
+    `section_states` has the shape (states, entries).
     """
     n_states = len(section_states)
     repeated_wheels = jax.tree.map(lambda x: np.broadcast_to(np.asarray(x), n_states), params)

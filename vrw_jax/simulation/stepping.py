@@ -284,7 +284,7 @@ def return_map(
         engine: engine that computes the steps; see `StepOptions`.
 
     Returns:
-        The section state just before the next touchdown, of the shape of `x`.
+        The section state just before the next touchdown, with the shape of `x`.
 
     Raises:
         TypeError, ValueError: if an argument is invalid; the message names the remedy.

@@ -77,7 +77,7 @@ def simulate(
 
     Each phase has `n_samples` equidistant times, including both ends. A time at which a quantity
     jumps is therefore listed twice, with the values before and after the jump. A failed step ends
-    the trajectory at the event, and the attributes `outcome` and `outcome_meaning` give the cause.
+    the trajectory at the event, and the attributes `outcome` and `outcome_meaning` state the cause.
     Numerical errors are those of `vrw.step`.
 
     Args:
