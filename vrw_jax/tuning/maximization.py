@@ -58,7 +58,7 @@ class EvaluatedTrial(NamedTuple):
 
     @property
     def has_gait_on_branch(self) -> bool:
-        """Return whether the wheel has a gait on the branch of the start."""
+        """Return whether the trial wheel has a gait on the branch of the start."""
         return self.outcome == Outcome.STEPPED and self.is_on_branch
 
     @property

@@ -221,7 +221,7 @@ class TuneProblem:
 
     @property
     def free_parameter_indices(self) -> list[int]:
-        """Return the indices of the free parameters among all parameters."""
+        """Return the index of each free parameter in `PARAMETER_NAMES`."""
         return [PARAMETER_NAMES.index(parameter_name) for parameter_name in self.free_parameters]
 
     @property
@@ -542,7 +542,7 @@ class TuneProblem:
         )
 
     def _make_path_dataset(self, maximization_result: MaximizationResult) -> xr.Dataset:
-        """Return a dataset of all trials of a maximization, in order."""
+        """Return a dataset that lists all trials of a maximization in order."""
         evaluation_dimension = "evaluation"
         normalized_parameters = np.array(
             [trial.normalized_parameters for trial in maximization_result.evaluated_trials]

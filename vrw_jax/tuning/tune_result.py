@@ -26,6 +26,7 @@ class ActiveConstraint(NamedTuple):
 
     - `name`: name of the parameter, or of the constraint with its leg label if it has one;
     - `limit`: bound on the parameter or on the constrained measure;
+    - `unit`: unit of the limit;
     - `price`: gain of the objective per unit by which the limit is relaxed.
     """
 
@@ -38,6 +39,8 @@ class ActiveConstraint(NamedTuple):
 class WalkValidation(NamedTuple):
     """Validation of the tuned wheel by a walk from a slightly displaced start.
 
+    - `n_steps`: number of completed steps;
+    - `outcome`: outcome of the last step;
     - `distance`: distance from the limit cycle after the last step, rad, rad/s and m/s;
     - `is_feasible`: whether every step satisfied every constraint on a margin, to within the sum of
       1e-3 of its value and 1e-2 of its default margin.
