@@ -1,4 +1,4 @@
-"""Figures of branches with their special points, and of basins of attraction."""
+"""Figures of branches and their special points, and figures of basins of attraction."""
 
 import numpy as np
 import xarray as xr

@@ -476,8 +476,8 @@ def _find_color_limits(
 ) -> tuple[float, float]:
     """Return the color range for the panels of one measure.
 
-    The range is that of the stable gaits if there are any. Otherwise a few distant unstable gaits
-    would make the colors of all other gaits equal.
+    The range is that of the stable gaits, or of all gaits if none is stable. A few distant unstable
+    gaits would otherwise make the colors of all other gaits equal.
     """
     finite_values = [
         values_of_panel[np.isfinite(values_of_panel)] for values_of_panel in panel_values

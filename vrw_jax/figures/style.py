@@ -156,7 +156,7 @@ def save(figure: Figure, folder: str | Path, name: str) -> list[Path]:
     """Write `figure` as SVG and PNG files into `folder`, and return the paths.
 
     Args:
-        figure: a figure of matplotlib.
+        figure: a matplotlib figure.
         folder: folder for the files, created if it does not exist.
         name: name of the files without the suffix.
 

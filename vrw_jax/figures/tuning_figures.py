@@ -1,4 +1,6 @@
-"""Figure of a tuning run: its path, and the slack of each constraint at its start and end."""
+"""Figure of a tuning run: its path, and the slack of each constraint at the start and at the
+end.
+"""
 
 import numpy as np
 import xarray as xr

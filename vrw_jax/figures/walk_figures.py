@@ -106,7 +106,7 @@ def gait_panels(gait: xr.Dataset) -> Figure:
         gait: dataset that `vrw.simulate` returns for any model.
 
     Returns:
-        Figure: panels over time in s, in SI units.
+        Figure: panels over time (s), in SI units.
 
     Examples:
         >>> gait = vrw.simulate(vrw.WheelParams(), vrw.paper_start(), n_steps=1)
