@@ -494,10 +494,10 @@ def build_step_jacobian(
     friction: float | None,
     input_indices: tuple[int, ...],
 ) -> ForwardFunction:
-    """Return a function that computes the Jacobian of the results of `build_step_function`.
+    """Return a function that computes a walking step and the Jacobian of its results.
 
-    That function returns the Jacobian of the float results with respect to the leaves at
-    `input_indices`, the float results, and the other results.
+    The step is that of `build_step_function`. The returned function gives the Jacobian of the float
+    results with respect to the leaves at `input_indices`, the float results, and the other results.
     """
     trace_config = _StepTraceConfig(argument_structure, stop_at_lift_off, friction)
 

@@ -23,7 +23,7 @@ class GaitMethod(enum.StrEnum):
 
 
 class PassageMethod(enum.StrEnum):
-    """Methods that compute mean first-passage times of a model on uneven ground."""
+    """Methods that compute mean first-passage times on uneven ground with a model."""
 
     QUADRATURE = enum.auto()
     """Quadrature with the closed-form transition kernel from the model's

@@ -229,7 +229,7 @@ class AbstractStep(AbstractPrintable):
         return text_rows
 
     def model_selection(self) -> dict[str, Array]:
-        """Return two integer codes: that of the model that computed the step, and that of the
+        """Return the code of the model with which the step was computed, and the code of the
         reason.
 
         The keys are the names of the dataset variables. The result is empty for a model that does
