@@ -1,4 +1,6 @@
-"""Types, options, trigonometry, and helpers for automatic differentiation and for batches."""
+"""Types, options, trigonometry, and helper functions for automatic differentiation and for
+batches.
+"""
 
 from vrw_jax.numerics import batch_sizes
 from vrw_jax.numerics.autodiff import (

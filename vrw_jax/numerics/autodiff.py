@@ -216,8 +216,9 @@ def make_implicit_jacobian(
 def evaluate_with_jacobian(function: Callable, *arguments: Array) -> tuple[Any, Any]:
     """Return the outputs of `function` and the derivatives of its float outputs.
 
-    One program computes both. The last axes of a derivative run over an argument. If there are
-    several arguments, the derivative of each output leaf is a tuple with one entry per argument.
+    One program computes the outputs and the derivatives. The last axes of a derivative are those of
+    an argument. If there are several arguments, the derivative of each output leaf is a tuple with
+    one entry per argument.
     """
 
     def select_float_outputs(*arguments: Array) -> tuple:

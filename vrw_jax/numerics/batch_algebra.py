@@ -183,8 +183,8 @@ def evaluate_with_partials(
 ) -> tuple[Vector, list[Vector]]:
     """Return the value of an elementwise function, and the derivatives of each of its outputs.
 
-    The derivatives are with respect to all arguments. They use reverse mode, because a phase has
-    fewer equations than arguments.
+    The derivatives are with respect to all arguments. The function uses reverse mode, because a
+    phase has fewer equations than arguments.
     """
     function_values, linearized_function = jax.linearize(function, *arguments)
     partials_by_output = []

@@ -45,7 +45,7 @@ tolerance.
 
 
 REAL_OPTION_NAMES = ("rtol", "atol", "derivative_tightening", "max_phase_time", "dt0")
-"""Names of the options that are real numbers."""
+"""Names of the options whose values are real numbers."""
 
 
 def _make_positive_field(option_name: str, default_value: float) -> Any:
