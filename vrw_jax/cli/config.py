@@ -84,8 +84,8 @@ class ScanConfig:
 
     - `measures`: names of measures and derivatives; by default DLS fraction, speed and the like;
     - `chunk`: number of samples that are computed and written together; 4,096 by default;
-    - `tol`: permitted error of each measure with unilateral contact (`name = "unilateral"`), in its
-      unit. Each sample uses the simplest model that permits it;
+    - `tol`: permitted error of each measure with unilateral contact (`name = "unilateral"`), in the
+      unit of the measure. Each sample is computed with the simplest model that achieves this error;
     - `slope_sd`: standard deviation of random slopes, rad, for the measures of `vrw.first_passage`.
     """
 
