@@ -63,7 +63,7 @@ class Measure:
 
     @property
     def variable_attributes(self) -> dict[str, str]:
-        """Return the attributes of a dataset variable that contains this quantity."""
+        """Return the attributes for a dataset variable that contains this measure."""
         attributes = {
             "units": self.unit,
             "long_name": self.long_name,
@@ -337,7 +337,7 @@ TRAJECTORY_MEASURES = _index_measures_by_name(
     Measure("hub_x", "m", "x_H", "hub along the slope", "Downhill position."),
     Measure("hub_z", "m", "z_H", "hub above the slope", "Height."),
 )
-"""Coordinates and variables of a trajectory."""
+"""Measures that are coordinates or variables of a trajectory."""
 
 CONTACT_MEASURES = _index_measures_by_name(
     Measure("length", "m", "L", "length of the leg", "Distance from the hub to the foot.",
