@@ -180,7 +180,7 @@ def step_batch(
 def _check_derivative_names(
     requested_derivatives: Sequence[str], known_input_names: tuple[str, ...], requested_engine: str
 ) -> list[str]:
-    """Return the names of the requested derivatives as a list.
+    """Return the names of the inputs with respect to which derivatives are requested, as a list.
 
     Raise ValueError if a derivative is not available.
     """

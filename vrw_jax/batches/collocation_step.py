@@ -160,7 +160,7 @@ class _NewtonSweepState(NamedTuple):
 
 
 class _SolvedMeshInterval(NamedTuple):
-    """Solution of the collocation equations in one mesh interval."""
+    """Solution of the collocation equations in one mesh interval, with accuracy indicators."""
 
     newton_sweep_state: _NewtonSweepState
     interval_end_state: tuple[Vector, Vector]
@@ -601,17 +601,17 @@ ComplexNumberPair = tuple[Array, Array]
 
 
 def _multiply_complex_pairs(x: ComplexNumberPair, y: ComplexNumberPair) -> ComplexNumberPair:
-    """Return the product of two complex numbers, each a pair of real and imaginary part."""
+    """Return the product of two complex numbers as a pair (real part, imaginary part)."""
     return x[0] * y[0] - x[1] * y[1], x[0] * y[1] + x[1] * y[0]
 
 
 def _subtract_complex_pairs(x: ComplexNumberPair, y: ComplexNumberPair) -> ComplexNumberPair:
-    """Return the difference of two complex numbers, each a pair of real and imaginary part."""
+    """Return the difference x - y of two complex numbers as a pair (real part, imaginary part)."""
     return x[0] - y[0], x[1] - y[1]
 
 
 def _add_complex_pairs(complex_numbers: Sequence[ComplexNumberPair]) -> ComplexNumberPair:
-    """Return the sum of complex numbers, each a pair of real and imaginary part."""
+    """Return the sum of all `complex_numbers` as a pair (real part, imaginary part)."""
     first_complex_number, *other_complex_numbers = complex_numbers
     real_part, imaginary_part = first_complex_number
     for complex_number in other_complex_numbers:
@@ -665,7 +665,10 @@ def _invert_stage_matrix(
 def _compute_adjugate_and_determinant(
     complex_matrix: list[list[ComplexNumberPair]],
 ) -> tuple[Any, ComplexNumberPair]:
-    """Return the adjugate and the determinant of a complex matrix of size one to three."""
+    """Return the adjugate, as nested lists, and the determinant of a complex square matrix.
+
+    The matrix has one, two or three rows of complex pairs.
+    """
     n = len(complex_matrix)
     if n == 1:
         complex_one = (

@@ -201,8 +201,10 @@ class _StepwiseGround(NamedTuple):
         return parameter_matrix
 
     def make_stepwise_parameters(self) -> dict[str, StepwiseParameter]:
-        """Return the `StepwiseParameter` of the friction and, if slopes vary over steps, that of
-        the slope, by parameter name.
+        """Return a mapping from parameter names to the terms by which the parameters enter the
+        chain rule.
+
+        The mapping contains "friction" and, if the slope varies over gait steps, "slope".
         """
         previous_friction_index = len(CONTACT_PARAMETER_NAMES)
         tilt_index = previous_friction_index + 1

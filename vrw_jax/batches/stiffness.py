@@ -56,12 +56,12 @@ def select_cheapest_solver(
 ) -> np.ndarray:
     """Return the `SolverIndex` of the cheapest solver for each lane, shape (lanes,).
 
-    If legs are light, the airborne leg's fast mode decays at the rate 1.03 c/m for about 0.67
-    sqrt(L0 / g), s. Stability limits the product of solver step and decay rate. Rejected solver
-    steps add a tenth to their number. The requested solver stays selected if accuracy requires more
-    steps of the stable solver than stability does. The number that accuracy requires is about the
-    tolerance to the power of -1/5. A solver that would need more than `max_solver_steps` is
-    excluded.
+    Let c be the damping of a leg and m its mass. If legs are light, the airborne leg's fast mode
+    decays at the rate 1.03 c/m for about 0.67 sqrt(L0 / g), s. Stability limits the product of
+    solver step and decay rate. A tenth is added to the number of solver steps for rejected ones.
+    The requested solver stays selected if accuracy requires more steps of the stable solver than
+    stability does. The number that accuracy requires is about the tolerance to the power of -1/5. A
+    solver that would need more than `max_solver_steps` is excluded.
 
     - `parameter_matrix`: parameters in the order of `PARAMETER_NAMES`, shape (9, lanes).
     """

@@ -21,7 +21,7 @@ last step, and whether it fails in any step.
 
 @dataclass(frozen=True)
 class FailureDensityOptions:
-    """Numerical options of the Gaussian mixture that is fitted to failing walks."""
+    """Numerical options for fitting a Gaussian mixture to the slopes of failing walks."""
 
     max_walks_per_stage: int = 6144
     """Largest number of walks per stage.
@@ -138,8 +138,8 @@ class GaussianMixture:
         )
 
     def compute_component_log_densities(self, slope_deviations: np.ndarray) -> np.ndarray:
-        """Return the logarithm of each Gaussian's weighted density at each sample, shape
-        (components, samples).
+        """Return the logarithm of each Gaussian's density times its weight, shape (components,
+        samples).
         """
         log_densities = []
         for component_weight, component_mean, covariance_cholesky_factor in zip(
@@ -191,7 +191,7 @@ def fit_gaussian_mixture(
     random_generator: np.random.Generator,
     density_options: FailureDensityOptions,
 ) -> GaussianMixture:
-    """Return a Gaussian mixture that is fitted to samples by expectation maximization.
+    """Return a Gaussian mixture, fitted to samples by expectation maximization.
 
     The initial means are samples far from each other (Arthur and Vassilvitskii 2007).
 

@@ -45,7 +45,7 @@ SAMPLED_TRACING_REMEDY = "take jax.grad of a function that is not compiled"
 
 
 class PassageStatus(StatusCode):
-    """Status of a computation of first-passage times."""
+    """Status of the computation of first-passage times: whether its error is small enough."""
 
     CONVERGED = 0, "The error estimate is within the tolerance."
     TOLERANCE_NOT_MET = 1, "The error estimate exceeds the tolerance: allow more nodes or steps."

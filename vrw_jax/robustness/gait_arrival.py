@@ -19,7 +19,7 @@ from vrw_jax.wheel import Outcome, WheelParams, compute_wheel_units
 
 @dataclass(frozen=True)
 class ArrivalOptions:
-    """Numerical options of the test whether a walk has arrived at a gait."""
+    """Numerical options for testing whether a walk has arrived at a gait."""
 
     max_gait_distance: float = 1e-6
     """Largest distance between the section states of a walk and of the gait at which the walk has

@@ -546,7 +546,8 @@ def _solve_failure_probability(
 def _estimate_kappa_2(
     step_transitions: Sequence[tuple[np.ndarray, ...]], n_continuous: int
 ) -> float:
-    """Return the second eigenvalue of the survival operator, projected on quadratic functions.
+    """Return kappa_2, the second eigenvalue of the survival operator's projection on quadratic
+    functions.
 
     The projection is the extended dynamic mode decomposition (Williams, Kevrekidis and Rowley
     2015). Hermite polynomials of the slope deviations have a mean of zero in any state. As

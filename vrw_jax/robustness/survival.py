@@ -21,7 +21,7 @@ POWER_ITERATION_TOLERANCE = 1e-15
 
 
 class SurvivalAnalysis(NamedTuple):
-    """Leading eigenvalues and eigenvectors of a survival operator."""
+    """Leading eigenvalues of a survival operator, and its left and right leading eigenvectors."""
 
     failure_probability: Scalar  # 1 - kappa_1, without cancellation
     kappa_2: Scalar
@@ -53,10 +53,10 @@ def analyze_survival_operator(
 
 
 def _compute_leading_eigenvector(nonnegative_matrix: Array) -> Array:
-    """Return the leading eigenvector of a nonnegative matrix, scaled to a sum of 1.
+    """Return the leading eigenvector of a nonnegative matrix, scaled so that its sum is 1.
 
-    The method is power iteration. Its sums contain only positive terms and no cancellation, so that
-    small components are relatively accurate.
+    The method is power iteration. The sums contain only nonnegative terms, so that no cancellation
+    occurs and small components are relatively accurate.
     """
 
     def has_not_converged(loop_state: tuple) -> Array:

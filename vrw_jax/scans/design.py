@@ -40,7 +40,7 @@ SALTELLI_DESIGN_KIND = "saltelli"
 
 
 class AbstractSampleDesign(abc.ABC):
-    """Samples of the wheel's parameters, arranged in an array of shape `shape`."""
+    """Samples of the wheel's parameters, arranged on one or more sample axes."""
 
     design_kind: str
     values_by_parameter: Mapping[str, np.ndarray]
@@ -59,7 +59,7 @@ class AbstractSampleDesign(abc.ABC):
 
     @property
     def size(self) -> int:
-        """Return the number of samples."""
+        """Return the number of samples in the design."""
         return int(np.prod(self.shape, dtype=np.int64))
 
     @property

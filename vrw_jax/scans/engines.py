@@ -334,7 +334,8 @@ class ToleranceScanEngine:
 
 
 class PassageScanEngine:
-    """Scan engine that adds measures of walks over random slopes to the gaits of another engine.
+    """Scan engine that combines the results of another engine with measures of walks over random
+    slopes.
 
     Samples are computed one after another, each with the same random numbers.
     """

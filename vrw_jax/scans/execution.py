@@ -162,10 +162,10 @@ def run_scan(
     on_progress: ProgressCallback | None = None,
     chunk_executor: ChunkExecutor | None = None,
 ) -> xr.Dataset:
-    """Return the labeled dataset of results for a scan plan.
+    """Compute a scan plan, and return its results as a labeled dataset.
 
-    - `chunk_executor`: function that computes the chunks; if it is None, this process computes
-      them.
+    - `store`: store or folder to which the results are written; by default they stay in memory;
+    - `chunk_executor`: function that computes the chunks; by default this process computes them.
     """
     if isinstance(store, AbstractResultStore):
         result_store = store

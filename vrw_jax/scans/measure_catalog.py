@@ -142,7 +142,7 @@ def add_passage_measures(measure_catalog: MeasureCatalog) -> MeasureCatalog:
 
 
 def make_error_variable_name(measure_name: str) -> str:
-    """Return the name of the variable that contains the error of a measure."""
+    """Return the name of the dataset variable that contains the error of a measure."""
     return measure_name + ERROR_VARIABLE_SUFFIX
 
 
@@ -159,7 +159,7 @@ class MeasureDerivative(NamedTuple):
 
     @property
     def variable_name(self) -> str:
-        """Return the name of the variable that contains the derivative."""
+        """Return the name of the dataset variable that contains the derivative."""
         return f"d_{self.measure_name}_d_{self.parameter_name}"
 
     @property

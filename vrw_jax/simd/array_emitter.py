@@ -37,9 +37,9 @@ length identifies the axis. The machine code accepts any number of lanes."""
 
 @dataclass(frozen=True)
 class RegisterLimits:
-    """Largest sizes of arrays whose entries machine code keeps in registers.
+    """Largest sizes of arrays whose entries the machine code computes in registers.
 
-    Larger limits give longer code, which takes longer to compile than with smaller limits.
+    Larger limits give longer code, which takes longer to compile.
     """
 
     max_unrolled_entries: int = 8
@@ -550,7 +550,7 @@ def has_lanes(aval: Any) -> bool:
 
 
 def get_shape_without_lanes(aval: Any) -> tuple[int, ...]:
-    """Return the shape of an array of the trace without the lane axis."""
+    """Return the shape, without the lane axis, of an array of the trace."""
     return aval.shape[:-1] if has_lanes(aval) else aval.shape
 
 

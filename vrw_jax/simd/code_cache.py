@@ -39,8 +39,8 @@ class CodeStore(Protocol):
     """
 
     def load_bytes(self, record_name: str) -> bytes | None:
-        """Return the bytes saved under `record_name`, or None if no undamaged record has that
-        name.
+        """Return the bytes that are saved under `record_name`, or None if no undamaged record has
+        that name.
         """
 
     def save_bytes(self, record_name: str, record_content: bytes) -> None:
@@ -57,7 +57,7 @@ class MachineCode(NamedTuple):
     object_code_future: Future[bytes]
 
     def wait_for_object_code(self) -> bytes:
-        """Return the object code; the call blocks until LLVM has compiled it."""
+        """Return the object code. The call blocks until LLVM has compiled the code."""
         return self.object_code_future.result()
 
 
@@ -205,7 +205,7 @@ Programs that are traced for several batch sizes share the code.
 
 @contextlib.contextmanager
 def _pause_garbage_collection() -> Iterator[None]:
-    """Return a context in which garbage collection is disabled.
+    """Return a context in which Python collects no garbage.
 
     Collections take a sixth of the tracing time, because a trace creates many objects that persist.
     """

@@ -167,8 +167,8 @@ class _LoopCarry:
     """Arrays that a loop carries from one iteration to the next.
 
     Arrays of at most `max_register_entries` entries are in registers, and larger arrays in memory.
-    A larger array uses the memory of its initial value if no other array does, and new memory
-    otherwise.
+    A larger array is stored in the memory of its initial value, unless another array uses this
+    memory. In that case, new memory is allocated.
     """
 
     def __init__(

@@ -102,7 +102,7 @@ def compile_llvm_for_webassembly(
 def _emit_object_code(
     llvm_module: "llvm.ModuleRef", llvm_target_machine: "llvm.TargetMachine"
 ) -> bytes:
-    """Return the object code of an LLVM module after the passes in `LLVM_PASS_NAMES`."""
+    """Run the passes in `LLVM_PASS_NAMES` on an LLVM module, and return its object code."""
     llvm_module.triple, llvm_module.data_layout = (
         llvm_target_machine.triple,
         str(llvm_target_machine.target_data),
