@@ -144,6 +144,18 @@ def test_samples_agree_with_a_million_counted_steps(slope_sd, damping):
     assert abs(float(passage.failure_probability) - share) < error
 
 
+@pytest.mark.slow
+def test_means_with_unilateral_contact_agree_with_counted_steps():
+    """Feet that cannot slide; most walks end because the wheel falls back."""
+    params, slope_sd, model = vrw.WheelParams(), 0.2, vrw.UnilateralWheel(friction=np.inf)
+    share, standard_error, _ = count_failure_share(params, slope_sd, 1024, 40, model)
+    passage = vrw.first_passage(params, slope_sd, model=model, n_walkers=512, tol=0.1)
+    error = float(passage.error / passage.mean_steps) * share + 2.58 * standard_error
+    assert error < 0.2 * share
+    assert abs(float(passage.failure_probability) - share) < error
+    assert passage.end_names[0] == "FELL_BACK"
+
+
 def test_loose_tolerances_cause_no_failures_with_unilateral_contact():
     """At tolerances of 1e-6, 22 of 512 walks of 40 steps end with a Painlevé paradox."""
     params, model = vrw.WheelParams(), vrw.UnilateralWheel(friction=np.inf)

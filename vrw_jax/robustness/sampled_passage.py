@@ -552,7 +552,8 @@ def _estimate_kappa_2(
     The projection is the extended dynamic mode decomposition (Williams, Kevrekidis and Rowley
     2015). Hermite polynomials of the slope deviations have a mean of zero in any state. As
     regressors, they remove most of the noise. In the limit of equal slopes, the eigenvalue becomes
-    the leading multiplier of the gait.
+    the leading multiplier of the gait. With unilateral contact, sampled states have many components
+    and outliers, so that a quadratic projection may overfit. A linear projection then replaces it.
 
     - `step_transitions`: arrays for each gait step: states before the step, survival, deviations of
       the slopes on which the step ends, and states after the step;
@@ -579,33 +580,29 @@ def _estimate_kappa_2(
         / singular_values[is_direction_resolved, None]
     )
     first_coordinate_indices, second_coordinate_indices = np.triu_indices(len(principal_directions))
-
-    def evaluate_features(states: np.ndarray) -> np.ndarray:
-        z = standardize_states(states) @ principal_directions.T
-        return np.concatenate(
-            [
-                np.ones((len(z), 1)),
-                z,
-                z[:, first_coordinate_indices] * z[:, second_coordinate_indices],
-            ],
-            1,
-        )
-
-    features_after_step, features_before_step = (
-        np.where(is_alive[:, None], evaluate_features(states_after), 0.0),
-        evaluate_features(states_before),
-    )
-    linear_features = features_before_step[:, : 1 + len(principal_directions)]
     hermite_polynomials = landing_deviations[:, None], landing_deviations[:, None] ** 2 - 1.0
-    regressor_matrix = np.concatenate(
-        [
-            features_before_step,
-            *(linear_features * hermite_polynomial for hermite_polynomial in hermite_polynomials),
-        ],
-        1,
-    )
-    regression_coefficients = np.linalg.lstsq(regressor_matrix, features_after_step, rcond=None)[0]
-    eigenvalue_moduli = np.sort(
-        np.abs(np.linalg.eigvals(regression_coefficients[: features_before_step.shape[1]]))
-    )
-    return float(eigenvalue_moduli[-2])
+
+    def project_second_eigenvalue(has_quadratic_features: bool) -> float:
+        """Return the modulus of the second eigenvalue, projected on polynomials of the state."""
+
+        def evaluate_features(states: np.ndarray) -> np.ndarray:
+            z = standardize_states(states) @ principal_directions.T
+            products = z[:, first_coordinate_indices] * z[:, second_coordinate_indices]
+            return np.concatenate(
+                [np.ones((len(z), 1)), z, *([products] if has_quadratic_features else [])], 1
+            )
+
+        features_before_step = evaluate_features(states_before)
+        features_after_step = np.where(is_alive[:, None], evaluate_features(states_after), 0.0)
+        linear_features = features_before_step[:, : 1 + len(principal_directions)]
+        regressor_matrix = np.concatenate(
+            [features_before_step, *(linear_features * h for h in hermite_polynomials)], 1
+        )
+        coefficients = np.linalg.lstsq(regressor_matrix, features_after_step, rcond=None)[0]
+        eigenvalues = np.linalg.eigvals(coefficients[: features_before_step.shape[1]])
+        return float(np.sort(np.abs(eigenvalues))[-2])
+
+    kappa_2 = project_second_eigenvalue(has_quadratic_features=True)
+    # No second eigenvalue exceeds the leading one, which is near the survival probability.
+    is_overfitted = kappa_2 > np.mean(is_alive)
+    return project_second_eigenvalue(has_quadratic_features=False) if is_overfitted else kappa_2
