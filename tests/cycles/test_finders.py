@@ -144,8 +144,8 @@ def test_two_finders_agree_on_the_derivatives_of_a_gait():
     )
     expected = paper.measure_gait(values, None, names)
     solution = walking.measure_gait(values, guess, names)
-    np.testing.assert_allclose(expected.values, one(values), rtol=1e-12)
-    scale = np.max(np.abs(np.asarray(expected.jacobian)), axis=-1, keepdims=True)
+    np.testing.assert_allclose(expected.measure_values, one(values), rtol=1e-12)
+    scale = np.max(np.abs(np.asarray(expected.parameter_jacobian)), axis=-1, keepdims=True)
     np.testing.assert_allclose(
-        solution.jacobian / scale, expected.jacobian / scale, rtol=0, atol=1e-7
+        solution.parameter_jacobian / scale, expected.parameter_jacobian / scale, rtol=0, atol=1e-7
     )
