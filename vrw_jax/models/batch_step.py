@@ -97,7 +97,7 @@ class BatchAdvanceResult(NamedTuple):
     """
 
     section_state: Vector  # (theta-, dtheta-, dL1-), three arrays
-    durations: Vector  # of DLS, SLS-I, SLS-II, s
+    durations: Vector  # durations of DLS, SLS-I, SLS-II, s
     outcome: Int[Array, " lanes"]  # an Outcome
     solver_steps: Int[Array, " lanes"]
     is_unfinished: Bool[Array, " lanes"]  # lanes stopped as stragglers; no other field is valid

@@ -67,7 +67,7 @@ class PhaseResult(NamedTuple):
     guard: Int[Array, "..."]  # index of the guard that ended the phase; -1 if none did
     is_timed_out: Bool[Array, "..."]
     n_solver_steps: Int[Array, "..."]  # attempted, accepted or not
-    margin_minima: Array | None  # of the margins, on the leading axis, if recorded
+    margin_minima: Array | None  # one minimum per margin on the leading axis, if recorded
     engine_carry: Any = None  # data that the engine passes to the next phase
 
 
@@ -87,7 +87,7 @@ class PhaseSequenceResult(NamedTuple):
     phase_ends: tuple[PhaseResult, ...]
     phase_occurrences: tuple[Bool[Array, "..."], ...]
     outcome: Int[Array, "..."]  # an Outcome
-    tilt: Elementwise | None = None  # of the next line, rad; None on flat ground
+    tilt: Elementwise | None = None  # angle of the next line, rad; None on flat ground
 
 
 def run_step_phases(
@@ -270,8 +270,8 @@ def get_next_section_state(phase_sequence: PhaseSequenceResult) -> Vector:
 
 
 def make_advance_result(phase_sequence: PhaseSequenceResult, engine: str) -> AdvanceResult:
-    """Return the minimal results of a step. All entries of the section state are 0 if the step
-    failed.
+    """Return the minimal results of a step. All entries of the section state are 0 after a failed
+    step.
     """
     theta, dtheta, dL1 = get_next_section_state(phase_sequence)
     has_stepped = phase_sequence.outcome == Outcome.STEPPED

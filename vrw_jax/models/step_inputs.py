@@ -114,11 +114,11 @@ def is_valid_slope(slope: Elementwise) -> Array:
 def select_stance_line_and_tilt(
     params: WheelParams, x: SectionStateEntries
 ) -> tuple[WheelParams, Array, Elementwise | None]:
-    """Return the wheel on the present line of the ground, whether a step may start, and the next
-    tilt.
+    """Return the wheel on the present line of the ground, the validity of the step, and the tilt.
 
-    The present line is the one under both feet in double support. The tilt is the angle by which
-    the next line is steeper than the present line, rad. On flat ground the tilt is None.
+    The present line is the one under both feet in double support. A step may start only if
+    parameters, start and slopes are valid. The tilt is the angle by which the next line is steeper
+    than the present line, rad. On flat ground the tilt is None.
     """
     params, next_slope = split_slopes(params)
     is_valid = is_valid_start_state(params, x)

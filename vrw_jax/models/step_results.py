@@ -317,7 +317,7 @@ class AdvanceResult(eqx.Module):
     """
 
     section_state: AnySectionState
-    durations: Float[Array, "3 ..."]  # of DLS, SLS-I, SLS-II, s
+    durations: Float[Array, "3 ..."]  # durations of DLS, SLS-I, SLS-II, s
     outcome: Int[Array, "..."]  # an Outcome
     solver_steps: Int[Array, "..."]  # attempted solver steps
     model_code: Int[Array, "..."] | None = None  # code of the selected model

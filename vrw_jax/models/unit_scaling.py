@@ -30,8 +30,8 @@ _STEP_INPUT_UNITS = (
 class UnitScalingPowers(NamedTuple):
     """Exponents of one unit in the units of the inputs and outputs of a step."""
 
-    input_powers: tuple[int, ...]  # of parameters, start, and slope of the next line
-    output_powers: tuple[int, ...]  # of section state and durations
+    input_powers: tuple[int, ...]  # exponents for parameters, start, slope of the next line
+    output_powers: tuple[int, ...]  # exponents for section state and durations
 
     def subtract_known_columns(
         self, scaled_output: Array, step_inputs: Sequence[Array], known_columns: Mapping[int, Array]
