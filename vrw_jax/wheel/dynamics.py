@@ -156,8 +156,7 @@ def compute_takeoff_acceleration(s: Symbols, motion: Motion) -> Elementwise:
     from 0 because the tangential force of the ground vanishes. At the boundary of scuffing, the
     acceleration is smooth. The clearance, which is the smallest later height of the foot, is not
     smooth there. On one side of the boundary, the clearance vanishes with the cube of the distance
-    to the boundary. On the other
-    side, the clearance jumps.
+    to the boundary. On the other side, the clearance jumps.
     """
     L1, L2, dtheta = motion.L1, motion.L2, motion.dtheta
     ddtheta, ddL1, ddL2 = solve_single_support_1(s, motion)

@@ -16,8 +16,8 @@ from vrw_jax.wheel.params import Symbols
 class Motion(NamedTuple):
     """Posture and rates of change of (theta, L1, L2), with the foot of Leg 1 at rest."""
 
-    sin_theta: Elementwise  # of theta
-    cos_theta: Elementwise  # of theta
+    sin_theta: Elementwise  # sine of theta
+    cos_theta: Elementwise  # cosine of theta
     L1: Elementwise  # m
     L2: Elementwise  # m
     dtheta: Elementwise  # rad/s

@@ -457,8 +457,8 @@ PARAMETER_BY_SYMBOL: dict[str, str] = {
 
 
 def raise_for_parameter_symbol(given_name: Any, allowed_names: Iterable[str]) -> None:
-    """Raise a `ValueError` if `given_name` is the paper's symbol for a parameter with an allowed
-    name.
+    """Raise a `ValueError` if a name is the paper's symbol for a parameter whose name is
+    allowed.
     """
     allowed_names = tuple(allowed_names)
     parameter_name = PARAMETER_BY_SYMBOL.get(given_name) if isinstance(given_name, str) else None

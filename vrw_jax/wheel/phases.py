@@ -45,9 +45,9 @@ class PhaseMargins(NamedTuple):
     fore_foot_force: Elementwise  # N
     contraction: Elementwise  # L0 - L1, m
     friction: Elementwise  # minus the required coefficient at the fore foot
-    locked_stopper_force: Vector  # of legs 3..n, N
+    locked_stopper_force: Vector  # stopper force on legs 3 to n, N
     rear_clearance: Elementwise | None = None  # height of foot 2 in single support, m
-    rear_stopper_force: Elementwise | None = None  # of Leg 2 in single support II, N
+    rear_stopper_force: Elementwise | None = None  # stopper force on Leg 2 in SLS-II, N
 
     @classmethod
     def from_values(cls, margin_values: Vector, n_legs: int) -> "PhaseMargins":
@@ -175,8 +175,8 @@ class AbstractPhase(abc.ABC):
 
     @property
     def coordinate_units(self) -> Vector:
-        """Return the units of the phase's coordinates and then of their rates, computed from the
-        wheel.
+        """Return the wheel's own units of the phase's coordinates, and then those of their
+        rates.
         """
         wheel_units = compute_wheel_units(self.s)
         position_units = (

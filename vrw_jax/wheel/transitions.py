@@ -72,7 +72,7 @@ class _BothFeetLanding(NamedTuple):
     foot_distance: Elementwise
     landing_foot_velocity: tuple[
         Elementwise, Elementwise
-    ]  # of the landing foot before the impact, m/s
+    ]  # velocity of the landing foot just before the impact, m/s
     mass_matrix: MassMatrix  # in the leg labels of the starting step
     generalized_momentum: tuple[Elementwise, ...]  # generalized momentum about the new foot
     momentum_per_circle_rate: tuple[
@@ -237,7 +237,7 @@ class StopperCollision(NamedTuple):
 
     motion_after: Motion  # just after the impact, L2 = L0 exactly
     stopper_impulse: Elementwise  # on the mass of Leg 2, towards the hub, N s
-    foot_impulse: FootForce  # of the ground on the foot of Leg 1, N s
+    foot_impulse: FootForce  # impulse on the foot of Leg 1, N s
     energy_loss: Elementwise  # J
     hub_velocity_jump: tuple[Elementwise, Elementwise]  # m/s
 
