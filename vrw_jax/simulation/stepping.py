@@ -361,7 +361,7 @@ def _walk_by_scan(
     n_steps: int,
     stepwise_ground: StepGroundValues | None,
 ) -> Walk:
-    """Return a walk of `n_steps` steps. Steps after a failure repeat the outcome of the failed
+    """Simulate a walk of `n_steps` steps. Steps after a failure repeat the outcome of the failed
     step.
     """
 
@@ -411,12 +411,11 @@ def walk(
     On uneven ground, `params.slope` is an array with one slope per step. The ground then consists
     of straight lines between the footholds with these slopes. In the double support of step k both
     feet are on line k. The step begins at the foothold where this line ends. The step ends when the
-    next
-    foot meets line k + 1. Therefore n steps use n + 1 slopes; if n slopes are given, the last one
-    is used twice. A section state is in the frame of the line that ends at its landing; the start
-    is in the frame of line 0. Force components are tangential and normal to line k. With unilateral
-    contact, the friction of the model may also be an array with one coefficient per step. The
-    coefficient of each foot is that of the step in which it landed.
+    next foot meets line k + 1. Therefore n steps use n + 1 slopes; if n slopes are given, the last
+    one is used twice. A section state is in the frame of the line that ends at its landing; the
+    start is in the frame of line 0. Force components are tangential and normal to line k. With
+    unilateral contact, the friction of the model may also be an array with one coefficient per
+    step. The coefficient of each foot is that of the step in which it landed.
 
     Args:
         params: the wheel.

@@ -183,7 +183,7 @@ class SampledStep(NamedTuple):
     next_section_state: Array  # section state at the end of the step
     period: float  # s
     step_length: float  # distance of the landings along the step's line, m
-    landing_normal_offset: float  # the same normal to that line, m; 0 on flat ground
+    landing_normal_offset: float  # landing distance normal to that line, m; 0 on flat ground
 
 
 class TrajectorySpecification(NamedTuple):
@@ -191,15 +191,15 @@ class TrajectorySpecification(NamedTuple):
     trajectory.
     """
 
-    sample_step: Callable[[Array, int], SampledStep]  # of a section state and a step index
+    sample_step: Callable[[Array, int], SampledStep]  # arguments: section state, step index
     variable_names: tuple[str, ...]  # names of the measures over time
     slope_position_names: tuple[str, ...]  # names of the positions along the slope
-    extra_coordinates: dict[str, Any]  # coordinates besides the variables
+    extra_coordinates: dict[str, Any]  # additional coordinates of the dataset
     dataset_attributes: dict[str, object]
 
 
 class SampledWalk(NamedTuple):
-    """Samples of a walk, and the outcome of its last step."""
+    """Samples of a walk, and the outcome of the last step of the walk."""
 
     sampled_columns: dict[
         str, np.ndarray
@@ -218,11 +218,11 @@ UNEVEN_GROUND_FRAME_TEXT = (
     "positions: x downhill along line 0, z normal to it, first foot at the origin; angles and "
     "forces: along and normal to the line under both feet of the step's double support"
 )
-"""Text of the attribute `frame` of a trajectory on uneven ground."""
+"""Text for the attribute `frame` of a trajectory on uneven ground."""
 
 
 class UnevenGroundLines(NamedTuple):
-    """Slopes of the lines of uneven ground, and the weight of the wheel."""
+    """Slopes of all lines of uneven ground, and the weight of the wheel."""
 
     line_slopes: np.ndarray  # rad
     wheel_weight: float  # N
@@ -504,8 +504,8 @@ def specify_contact_trajectory(
 
     Its variables are over time and leg. Leg labels are those of the current step. Each interval
     between two events has `n_samples` times, including both ends. For a `LadderWheel`, the
-    variables `rung` and `reason` contain the codes of
-    the model and of the reason at each time (see `ModelChoice`).
+    variables `rung` and `reason` contain the codes of the model and of the reason at each time (see
+    `ModelChoice`).
     """
 
     friction_by_step = [float(model.friction) for model, _ in models_and_wheels]
