@@ -43,7 +43,7 @@ class PaperFact:
 class PaperEvidence:
     """Labeled simulation results from which all facts are computed."""
 
-    params: WheelParams  # of Table 1
+    params: WheelParams  # wheel of Table 1 of the paper
     settling_walk: xr.Dataset  # `gaits.walk_into_gait` from the start for Table 1
     table_1_trajectory: xr.Dataset  # three steps of the gait of Table 1, `simulate`
     gaits_by_damping: Sequence[xr.Dataset]  # one step at c = 50, 100, 200
