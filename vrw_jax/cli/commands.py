@@ -67,9 +67,9 @@ def main() -> None:
 
 
 def _handle_first_interrupt(_signal: int, _frame: object) -> None:
-    """Stop the command in an orderly way after the first Ctrl-C.
+    """End the command in the regular way after the first Ctrl-C.
 
-    Install the handler for a second Ctrl-C.
+    This function also installs the handler for a second Ctrl-C.
     """
     signal.signal(signal.SIGINT, _handle_second_interrupt)
     raise KeyboardInterrupt

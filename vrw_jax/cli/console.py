@@ -44,9 +44,9 @@ stderr_console = Console(stderr=True)
 def report_command_errors(
     interruption_message: str = "stopped; nothing was written.",
 ) -> Iterator[None]:
-    """Return a context manager that reports an error in one sentence and ends the command.
+    """Return a context manager that handles errors in a command.
 
-    The exit code is 2, or 130 after Ctrl-C.
+    It prints an error in one sentence and ends the command with exit code 2, or 130 after Ctrl-C.
     """
     try:
         yield
