@@ -41,8 +41,7 @@ def enable_all_ad_modes(
     which may for example use tighter tolerances. `make_jacobian(argnums)` may provide another
     function that returns (Jacobians with respect to the arguments `argnums`, float outputs), and
     the other outputs. Function and Jacobians are compiled once each: outside of `jit`, forward
-    mode, reverse mode and single
-    directions all call the same compiled Jacobian.
+    mode, reverse mode and single directions all call the same compiled Jacobian.
     """
     differentiable_function = (
         function if function_to_differentiate is None else function_to_differentiate
