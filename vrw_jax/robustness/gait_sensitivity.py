@@ -45,7 +45,7 @@ class GaitSensitivity(AbstractPrintable):
     Examples:
         >>> print(vrw.gait_sensitivity(vrw.WheelParams(), ["period"]))
         GaitSensitivity
-          step period T: 3.50861 s per rad (step that ends on a line: 0.566241, step that begins on it: -2.78338, later steps: 2.05973)
+          step period T: 3.50861 s per rad (step that ends on the disturbed line: 0.566241, step that begins on it: -2.78338, later steps: 2.05973)
           spectral radius of the gait: 0.32862
     """  # noqa: E501
 
@@ -77,7 +77,8 @@ class GaitSensitivity(AbstractPrintable):
             measure_definition = MEASURES[measure_name]
             sensitivity_unit = f"{measure_definition.display_unit} per rad".strip()
             norm_parts_text = (
-                f"step that ends on a line: {float(self.ending_step[measure_index]):.6g}, "
+                "step that ends on the disturbed line: "
+                f"{float(self.ending_step[measure_index]):.6g}, "
                 f"step that begins on it: {float(self.beginning_step[measure_index]):.6g}, "
                 f"later steps: {float(self.later_steps[measure_index]):.6g}"
             )
