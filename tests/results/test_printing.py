@@ -2,6 +2,7 @@
 
 import dataclasses
 import pydoc
+import re
 import subprocess
 import sys
 
@@ -93,21 +94,22 @@ def test_traced_results_print_their_shapes():
 
 
 @pytest.mark.parametrize(
-    ("thing", "words"),
+    ("thing", "field"),
     [
-        (vrw.WheelParams, "`damping`: c, viscous damping of each leg"),
-        (vrw.StepOptions, "`dt0`: first solver step of each phase, s"),
-        (vrw.CycleOptions, "`homotopy_steps`: number of steps of a homotopy"),
-        (vrw.StepResult, "`step_length`: distance between the feet at the opening landing, m"),
-        (vrw.Margins, "`contraction`:"),
-        (vrw.StepBatchResult, "`solver_steps`: number of attempted solver steps"),
-        (vrw.LimitCycle, "`n_newton_iterations`: number of linearized passes"),
-        (vrw.TuneResult, "`n_evaluations`: number of limit cycles"),
-        (vrw.UnilateralStep, "`slip`: path length of sliding feet, m"),
+        (vrw.WheelParams, "damping"),
+        (vrw.StepOptions, "dt0"),
+        (vrw.CycleOptions, "homotopy_steps"),
+        (vrw.StepResult, "step_length"),
+        (vrw.Margins, "contraction"),
+        (vrw.StepBatchResult, "solver_steps"),
+        (vrw.LimitCycle, "n_newton_iterations"),
+        (vrw.TuneResult, "n_evaluations"),
+        (vrw.UnilateralStep, "slip"),
     ],
 )
-def test_help_describes_the_fields(thing, words):
-    assert words in pydoc.plain(pydoc.render_doc(thing))
+def test_help_describes_the_fields(thing, field):
+    """By at least three words, since the name alone describes no quantity and unit."""
+    assert re.search(rf"`{field}`:(\s+\S+){{3}}", pydoc.plain(pydoc.render_doc(thing)))
 
 
 def test_partly_batched_wheels_are_mapped_by_their_own_axes():
