@@ -90,7 +90,7 @@ _HEADER = ("key", "default", "meaning")
 _DEFAULTS = {name: float(getattr(WheelParams(), name)) for name in PARAMETER_DOMAINS}
 _TABLES = (
     ("options", StepOptions, "The table `[options]` contains the numerical options of a step."),
-    ("gait", GaitConfig, "The table `[gait]` contains the options of the walk of `vrw gait`."),
+    ("gait", GaitConfig, "The table `[gait]` contains the options for the walk by `vrw gait`."),
     (
         "scan",
         ScanConfig,

@@ -388,9 +388,9 @@ class _BranchPointTable(NamedTuple):
     def from_results(
         cls, branch_continuation: AbstractContinuation, direction_results: ContinuationResult
     ) -> "_BranchPointTable":
-        """Collect all points of a continuation in both directions.
+        """Return the points of branches that were continued in two directions from their starts.
 
-        The two directions are joined at the start of each wheel's branch.
+        The points of the first direction are reversed and precede those of the second.
         """
         points_by_direction, wheel_indices = [], []
         for wheel_index in range(direction_results.n_points.shape[0]):

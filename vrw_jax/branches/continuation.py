@@ -621,7 +621,7 @@ def continue_map(
         options: `ArclengthOptions` of the branch.
 
     Returns:
-        A `Branch`.
+        A `Branch`: the gaits, their stability, the special points, and why the branch ends.
 
     Raises:
         TypeError, ValueError: if an argument is invalid; the message names the remedy.

@@ -56,7 +56,7 @@ def continue_special_point(
         step_options: options of the event-driven steps that evaluate margins.
 
     Returns:
-        A `SpecialPointCurve`.
+        A `SpecialPointCurve`: the points of the curve in two parameters, and why it ends.
 
     Raises:
         TypeError, ValueError: if an argument is invalid, or if the special point does not occur on

@@ -257,7 +257,7 @@ class _PiecewiseQuantityPolynomial(NamedTuple):
         )
 
     def evaluate_time_derivative(self, evaluation_times: Array, derivative_order: int) -> Array:
-        """Return the first or the second time derivative of the quantity at each evaluation time.
+        """Return the first or the second time derivative of an interpolated quantity at each time.
 
         `derivative_order` is 1 or 2. Times are in s since the start of the phase.
         """

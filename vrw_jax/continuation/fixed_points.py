@@ -119,7 +119,7 @@ def solve_fixed_point(
         max_iterations: largest number of Newton iterations.
 
     Returns:
-        A `FixedPointResult`.
+        A `FixedPointResult`: the state, its multipliers, and the status of the iteration.
 
     Raises:
         TypeError, ValueError: if an argument is invalid; the message names the remedy.

@@ -80,9 +80,10 @@ class QuantitySignChange(NamedTuple):
 
 
 def find_sign_changes(quantity_values: np.ndarray) -> list[QuantitySignChange]:
-    """Find the sign changes of each quantity between neighboring points.
+    """Return the sign changes of each quantity between neighboring points.
 
-    `quantity_values` has the shape (points, quantities). NaN and 0 have no sign. Two sign changes
+    A sign change names the two points and the quantity by their indices. `quantity_values` has the
+    shape (points, quantities). NaN and 0 have no sign. Two sign changes
     between the same neighboring points cancel, and neither is detected.
     """
     quantity_signs = np.sign(np.nan_to_num(quantity_values))

@@ -44,11 +44,11 @@ class GaitBranchPoint(NamedTuple):
 
 
 class Gait(eqx.Module):
-    """Gait that repeats after one step, its event-driven step, and the derivatives of cycle and
-    step.
+    """Limit cycle of one step, the event-driven step from its section state, and derivatives.
 
-    The derivatives describe changes of the gait on its branch, and have a leading axis over the
-    parameters. In a batch of gaits, the batch axis comes first.
+    The derivatives are those of the cycle and of the step with respect to the parameters, along
+    the branch of gaits. They have a leading axis over the parameters. In a batch of gaits, the
+    batch axis comes first.
     """
 
     cycle: AbstractCycle

@@ -88,7 +88,7 @@ STATUS_RUNNING_CODE = -1
 
 
 class HybridSolution(NamedTuple):
-    """Events of a simulation in order of time, and the final state of the simulation.
+    """Events of a simulation in chronological order, and the final state of the simulation.
 
     Entries after the first `n_events` events are zero.
     """

@@ -427,9 +427,9 @@ def make_locked_leg_coordinate(n_legs: int) -> xr.Variable:
 
 
 def describe_violation(margin_name: str) -> str:
-    """Return a text that describes the event at which a margin or indicator crosses 0.
+    """Return a clause that describes the event at which a margin or indicator crosses 0.
 
-    The name may end with a leg label, as "[5]".
+    The name of the margin may end with a leg label, such as "[5]".
     """
     name_without_leg, _, leg_suffix = margin_name.partition("[")
     if name_without_leg in STEP_MEASURES and not MEASURES[name_without_leg].violation_text:

@@ -402,8 +402,9 @@ class VerticalRateMap(NamedTuple):
         )
 
     def compute_fixed_point(self, slope: Elementwise) -> Elementwise:
-        """Return the squared rate x that repeats itself if all lines of the ground have this slope
-        (rad), 1/s^2.
+        """Return the squared angular rate that repeats after a step on even ground, in 1/s^2.
+
+        - `slope`: slope of the ground, rad.
         """
         periodic_part = self.slope_amplitude * jnp.cos(slope - self.slope_of_maximum)
         return periodic_part / (1.0 - self.retained_fraction) - self.doubled_gravity_stiffness

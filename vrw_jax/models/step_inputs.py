@@ -94,11 +94,11 @@ def check_stepwise_shape(quantity_name: str, stepwise_values: Array, n_steps: in
 
 
 def split_slopes(params: WheelParams) -> tuple[WheelParams, Elementwise | None]:
-    """Return the wheel on the present line of the ground, and the slope of the next line, rad.
+    """Return the wheel on the line of the ground under both feet, and the slope of the next line.
 
-    The present line is the one under both feet in double support. On uneven ground, `params.slope`
-    has both slopes on a leading axis that no other parameter has. On flat ground, `params.slope`
-    has no such axis and the second result is None.
+    The slope is in rad. The line joins the footholds of the two feet in double support. On uneven
+    ground, `params.slope` has both slopes on a leading axis that no other parameter has. On flat
+    ground, `params.slope` has no such axis and the second result is None.
     """
     if jnp.ndim(params.slope) == jnp.ndim(params.damping):
         return params, None

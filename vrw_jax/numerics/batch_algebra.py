@@ -114,7 +114,7 @@ def solve_node_equations(
     rhs: Float[Array, "nodes dim columns lanes"],
     barrier_values: LaneArray,
 ) -> Float[Array, "nodes dim columns lanes"]:
-    """Solve the linear equations at the collocation nodes of one mesh interval.
+    """Return the solution of the linear equations at the collocation nodes of one mesh interval.
 
     The method is block elimination without pivoting. The matrix is the mass matrix plus terms of
     order h, the length of the mesh interval, so its diagonal blocks stay regular. `barrier_values`

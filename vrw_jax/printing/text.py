@@ -71,8 +71,8 @@ def format_quantity(quantity_value: object, quantity_unit: str) -> str:
 
 
 def format_outcome_counts(outcomes: Any, status_code_class: type[enum.IntEnum]) -> str:
-    """Return a text that states how often each outcome occurs in an array, with the array's
-    shape.
+    """Return a text with the shape of an array of outcomes, and the number of times that each
+    outcome occurs in it.
     """
     n_outcomes, outcome_array_shape = np.size(outcomes), np.shape(outcomes)
     outcome_codes, outcome_counts = np.unique(np.asarray(outcomes), return_counts=True)

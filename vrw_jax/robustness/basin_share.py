@@ -118,7 +118,7 @@ def basin_share(
         seed: seed of the starts.
 
     Returns:
-        A `BasinShare`.
+        A `BasinShare`: the share of starts whose walks reach the gait, and its error.
 
     Raises:
         TypeError, ValueError: if an argument is invalid, or if the wheel has no stable gait.

@@ -151,21 +151,22 @@ def first_passage(
     The slopes of the lines that join the footholds are independent and normal, with mean
     `params.slope`. A walk ends at the first step whose outcome is not STEPPED. A landing on a slope
     outside the domain of slopes also ends the walk. In the paper's model, a failure is a departure
-    from the sequence of phases, and mostly no fall. Walks of a `UnilateralWheel` continue after
+    from the sequence of phases, and need not be a fall. Walks of a `UnilateralWheel` continue after
     such a departure.
 
     For the rigid wheel, the kernel of its one-dimensional map has a closed form. Quadrature then
-    computes means of any length. The model must be `RigidWheel(stop_at_lift_off=False)`, and
-    `mean_steps` has first derivatives with respect to `params` and `slope_sd`.
+    computes the mean, even if walks are very long. The model must be
+    `RigidWheel(stop_at_lift_off=False)`, and `mean_steps` has first derivatives with respect to
+    `params` and `slope_sd`.
 
     For other models, walks are sampled. Importance sampling makes failures frequent, so that the
     number of sampled steps does not grow with the mean. The error is then half the width of a 99 %
     confidence interval.
 
-    `jax.grad` of a sampled mean returns first derivatives with an error of some per cent. A walk
+    `jax.grad` of a sampled mean returns first derivatives with an error of a few percent. A walk
     fails beyond a radius in the space of slopes, and this radius is a smooth function of the
-    parameters. The derivatives neglect terms of the relative size 1/`mean_steps`. Their computation
-    needs concrete values, so `jit`, `vmap` and `tune` do not accept sampled means.
+    parameters. The derivatives neglect terms of the relative size 1/`mean_steps`. They are computed
+    from concrete values, so `jit`, `vmap` and `tune` do not accept sampled means.
 
     Args:
         params: parameters of the wheel; the slope is the mean slope.
@@ -182,7 +183,7 @@ def first_passage(
         max_steps: number of sampled gait steps after which no further walks begin.
 
     Returns:
-        A `FirstPassage`.
+        A `FirstPassage`: the mean number of steps, its error, and the outcomes that end walks.
 
     Raises:
         TypeError, ValueError: if an argument is invalid, if the wheel has no gait, or if the slopes

@@ -120,7 +120,7 @@ def gait_sensitivity(
         options: as in `limit_cycle`.
 
     Returns:
-        A `GaitSensitivity`.
+        A `GaitSensitivity`: the norm of each measure, and its parts.
 
     Raises:
         TypeError, ValueError: if an argument is invalid or the wheel has no gait.

@@ -30,7 +30,7 @@ class PassageGradientOptions:
     n_failing_walks: int = 1024
     """Number of failing walks whose failure radii are computed.
 
-    The value is chosen because the error of a derivative is then some per cent."""
+    The value is chosen because the error of a derivative is then a few percent."""
     max_sampling_rounds: int = 20
     """Largest number of rounds in which failing walks are drawn."""
     relative_parameter_step: float = 3e-4

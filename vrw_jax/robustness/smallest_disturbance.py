@@ -166,7 +166,7 @@ def smallest_disturbance(
         max_steps: largest number of gait steps of a walk after the disturbance.
 
     Returns:
-        A `SmallestDisturbance`.
+        A `SmallestDisturbance`: its size, its instant, and the outcome that it causes.
 
     Raises:
         TypeError, ValueError: if an argument is invalid, or if the wheel has no stable gait.
@@ -208,7 +208,7 @@ def compute_smallest_disturbance(
     max_steps: int,
     search_options: DisturbanceSearchOptions = DISTURBANCE_SEARCH_OPTIONS,
 ) -> SmallestDisturbance:
-    """Return the `SmallestDisturbance` for a gait of one step and for valid arguments."""
+    """Return the `SmallestDisturbance` for a gait of one step and for checked arguments."""
     params, model, options, section_states = stable_gait
     start_state = jnp.asarray(section_states[0])
     step_trajectory = model.sample_step(

@@ -92,7 +92,7 @@ _FUSION_EMITTERS_FLAG = "xla_cpu_use_fusion_emitters"
 def _accepts_fusion_emitters_flag() -> bool:
     """Return whether this version of XLA accepts the flag for fusion emitters.
 
-    Other versions may abort the process.
+    A version that does not accept the flag may abort the process on receiving it.
     """
     return jax.__version_info__[:2] in ((0, 9), (0, 10))
 

@@ -177,10 +177,10 @@ def describe_selection_reason(reason_code: int) -> str:
 def find_selection_reason(
     step_measures: Mapping[str, Any], friction_difference: Any
 ) -> tuple[Array, Array]:
-    """Return the reason code for steps computed with the viscoelastic model, and their margins.
+    """Return the reason for the choice of a model for each step, and the margins of each step.
 
-    The codes are those of `ModelChoice.reason_code`. The margins are on the last axis and include
-    the effect of `friction_difference`.
+    The reasons are codes of `ModelChoice.reason_code`. The margins are those of the step computed
+    with the viscoelastic model, on the last axis, corrected by `friction_difference`.
 
     - `step_measures`: measures and outcome codes of the steps, by name;
     - `friction_difference`: friction coefficient of the ground minus that in `step_measures`.

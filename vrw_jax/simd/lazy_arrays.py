@@ -73,9 +73,9 @@ class PendingArrayUpdate(LazyArray):
         )
 
     def store_update_in_memory(self) -> "PendingArrayUpdate":
-        """Return an equal update whose replacing part is stored in memory.
+        """Return the same update with its new entries computed and stored in memory.
 
-        The part may depend on the entries that it replaces, so it is computed before they change.
+        New entries may depend on the entries that they replace, so they are computed first.
         """
         if isinstance(self.update_array, np.ndarray):
             return self

@@ -130,7 +130,7 @@ def force_peaks(walk: xr.Dataset) -> xr.Dataset:
 
 
 class _ForceExtrema(NamedTuple):
-    """Extrema of a force in one step, in order of time."""
+    """Extrema of a force in one gait step, in chronological order."""
 
     time: np.ndarray  # s
     force: np.ndarray  # N

@@ -157,8 +157,9 @@ def multifidelity_mean(
 ) -> MultifidelityMean:
     """Return the mean of a measure over wheels with unilateral contact, to within `tol`.
 
-    Fields of `params` and `friction` have one axis of wheels, such as a design or samples of
-    manufacturing tolerances. The mean is over the wheels that have a gait with unilateral contact.
+    Fields of `params` and `friction` have one axis over the wheels. The wheels are, for example,
+    samples of manufacturing tolerances. The mean is over the wheels that have a gait with
+    unilateral contact. Most wheels are computed with a cheaper model of lower fidelity.
 
     Args:
         measure: name of one of the measures of `measure_to_tolerance`.
@@ -170,7 +171,7 @@ def multifidelity_mean(
         stoppers: stoppers of the wheels, "bilateral" or "one-sided".
 
     Returns:
-        A `MultifidelityMean`.
+        A `MultifidelityMean`: the mean, its error, and its cost.
 
     Raises:
         TypeError, ValueError: if an argument is invalid, or if too few wheels have a gait.

@@ -109,7 +109,7 @@ def measure_to_tolerance(
             described above.
 
     Returns:
-        A `MeasureResult`.
+        A `MeasureResult`: the value for each wheel, its error, and the models that were used.
 
     Raises:
         TypeError, ValueError: if an argument is invalid; the message names the remedy.

@@ -228,7 +228,8 @@ class TuneProblem:
     def constraint_names(self) -> tuple[str, ...]:
         """Return the name of each constrained value.
 
-        A margin of the locked legs has one value per leg.
+        A margin that each leg has for itself, such as the force of its stopper, has one name per
+        leg.
         """
         constraint_names: list[str] = []
         for measure_name in self.margins:
