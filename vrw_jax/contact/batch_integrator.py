@@ -767,7 +767,7 @@ def _iterate_event_search(
     next_step_size = jnp.where(needs_bisection, bisection_step_size, proposed_step_size)
     event_time_shift = next_step_size - h
     # If a guard is within its round-off, no other step size is better than this one.
-    lowest_guard, lowest_guard_value = _find_lowest_guard(
+    lowest_guard_value, lowest_guard = _find_lowest_guard(
         attempted_step.guard_values / guard_scales, is_guard_crossing
     )
     # An initiating guard is within twice its round-off. Without another event, the guard is the
@@ -862,22 +862,24 @@ def _find_earliest_minimum(
     )
 
 
-def _find_lowest_guard(guard_values: Array, is_guard_crossing: Array) -> tuple[Array, Array]:
-    """Return the index and the value of the lowest guard among those that cross zero.
+def _find_lowest_guard(
+    guard_values: Array, is_candidate: Array, index_without_candidate: Array | None = None
+) -> tuple[Array, Array]:
+    """Return the lowest of the candidates' values, one per guard, and the index of its guard.
 
-    The value is infinite if no guard crosses zero.
+    Without a candidate the value is infinite, and the index is `index_without_candidate`, or 0.
     """
-    lowest_guard_value = jnp.full_like(guard_values[0], jnp.inf)
-    lowest_guard = jnp.zeros(guard_values.shape[1:], jnp.int32)
+    lowest_value = jnp.full_like(guard_values[0], jnp.inf)
+    lowest_guard = (
+        jnp.zeros(guard_values.shape[1:], jnp.int32)
+        if index_without_candidate is None
+        else index_without_candidate
+    )
     for guard_index in range(len(guard_values)):
-        is_guard_lower = is_guard_crossing[guard_index] & (
-            guard_values[guard_index] < lowest_guard_value
-        )
-        lowest_guard_value = jnp.where(
-            is_guard_lower, guard_values[guard_index], lowest_guard_value
-        )
-        lowest_guard = jnp.where(is_guard_lower, guard_index, lowest_guard)
-    return lowest_guard, lowest_guard_value
+        is_lower = is_candidate[guard_index] & (guard_values[guard_index] < lowest_value)
+        lowest_value = jnp.where(is_lower, guard_values[guard_index], lowest_value)
+        lowest_guard = jnp.where(is_lower, guard_index, lowest_guard)
+    return lowest_value, lowest_guard
 
 
 def _find_earliest_secant_root(
@@ -949,16 +951,9 @@ def _find_earliest_root(
     )
     root_fraction = jnp.where(is_already_negative, -jnp.inf, root_fraction)
     has_guard_root = has_guard_root | is_already_negative
-    earliest_fraction = jnp.full_like(root_fraction[0], jnp.inf)
-    earliest_guard = jnp.zeros(root_fraction.shape[-1:], jnp.int32)
+    first_crossing_guard = jnp.zeros(root_fraction.shape[1:], jnp.int32)
     for guard_index in reversed(range(len(root_fraction))):
-        earliest_guard = jnp.where(is_guard_crossing[guard_index], guard_index, earliest_guard)
-    for guard_index in range(len(root_fraction)):
-        is_root_earlier = has_guard_root[guard_index] & (
-            root_fraction[guard_index] < earliest_fraction
+        first_crossing_guard = jnp.where(
+            is_guard_crossing[guard_index], guard_index, first_crossing_guard
         )
-        earliest_fraction = jnp.where(
-            is_root_earlier, root_fraction[guard_index], earliest_fraction
-        )
-        earliest_guard = jnp.where(is_root_earlier, guard_index, earliest_guard)
-    return earliest_fraction, earliest_guard
+    return _find_lowest_guard(root_fraction, has_guard_root, first_crossing_guard)

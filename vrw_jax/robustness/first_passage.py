@@ -208,10 +208,12 @@ def first_passage(
     require_untraced_arguments(
         "vrw.first_passage", "differentiate by the wheel only", resolved_model
     )
-    if options is None and resolved_model.reports_contacts:
-        options = StepOptions()
-    elif options is None:
-        options = StepOptions(rtol=SAMPLED_STEP_TOLERANCE, atol=SAMPLED_STEP_TOLERANCE)
+    if options is None:
+        options = (
+            StepOptions()
+            if resolved_model.reports_contacts
+            else StepOptions(rtol=SAMPLED_STEP_TOLERANCE, atol=SAMPLED_STEP_TOLERANCE)
+        )
     estimate_passage = functools.partial(
         _estimate_passage_by_sampling,
         model=resolved_model,
