@@ -30,6 +30,7 @@ from scipy import stats
 from scipy.optimize import brentq
 
 import vrw_jax as vrw
+from experiments.gaits.force_peak_wheels import GAIT_OPTIONS
 from experiments.shared.command import make_parser, parse_and_start_jax
 from experiments.shared.region_indices import RegionIndices, estimate_region_indices
 from experiments.shared.tables import (
@@ -68,9 +69,6 @@ SLOPE_GRID = np.array([0.04, 0.06, *EQUAL_SLOPES[:1], 0.15, EQUAL_SLOPES[1], 0.2
 SPEED_TOLERANCE = 1e-3
 """Largest deviation of a gait from `EQUAL_SPEED`, m/s, chosen far below differences of speed."""
 MAX_SPEED_ITERATIONS = 8
-
-CYCLE_OPTIONS = vrw.CycleOptions(mesh_intervals=(40, 32, 16))
-"""One mesh for all gaits, chosen because gaits with two force peaks need its resolution."""
 
 GAITS_TABLE = FIGURES / "double_support_gaits.csv"
 LIVES_TABLE = FIGURES / "double_support_lives.csv"
@@ -145,7 +143,7 @@ def make_wheels(columns: Mapping[str, np.ndarray]) -> vrw.WheelParams:
 
 def find_gaits(columns: Mapping[str, np.ndarray]) -> Columns:
     """Return section states and measures of the stable gaits; NaN for wheels without one."""
-    gaits = vrw.limit_cycles(make_wheels(columns), options=CYCLE_OPTIONS)
+    gaits = vrw.limit_cycles(make_wheels(columns), options=GAIT_OPTIONS)
     radius = np.abs(np.linalg.eigvals(np.asarray(gaits.monodromy_value))).max(1)
     is_stable = np.asarray(gaits.found) & (radius < 1.0)
     durations = np.where(is_stable[:, None], np.asarray(gaits.durations), np.nan)
@@ -297,7 +295,7 @@ def solve_rigid_speed(label: str, speed: float) -> float | None:
 def add_sensitivities(rows: Sequence[Row]) -> None:
     """Add the gait sensitivity norm of the period, relative to the period, to compliant wheels."""
     for row in select_compliant(rows):
-        sensitivity = vrw.gait_sensitivity(make_wheel(row), "period", options=CYCLE_OPTIONS)
+        sensitivity = vrw.gait_sensitivity(make_wheel(row), "period", options=GAIT_OPTIONS)
         row["period_sensitivity"] = f"{float(sensitivity.norm[0]) / float(row['period']):.6g}"
 
 
@@ -376,6 +374,10 @@ def compute_lives(rows: Sequence[Row], size: StudySize) -> list[Row]:
     return lines
 
 
+CONTACT_MEASURES = ("contact_dls_fraction", "contact_speed", "contact_damper_share",
+                    "contact_friction_share")  # fmt: skip
+
+
 def compute_contact(rows: Sequence[Row], size: StudySize) -> list[Row]:
     """Return measures with unilateral contact of evenly selected wheels and of the marked sets.
 
@@ -386,17 +388,21 @@ def compute_contact(rows: Sequence[Row], size: StudySize) -> list[Row]:
         row for row in select_compliant(rows) if row["comparison"] == f"slope {LIFE_SLOPE:g} rad"
     ]
     chosen = select_evenly(compliant, size.n_contact)
-    marked = [row for row in select_compliant(rows) if row["wheel"] == "table_1"][-2:-1]
+    marked_comparison = f"slope {EQUAL_SLOPES[-1]:g} rad"
+    marked = [
+        row for row in rows
+        if row["wheel"] == "table_1" and row["comparison"] == marked_comparison
+    ]  # fmt: skip
     lines = []
     for row in [*chosen, *marked]:
         params = make_wheel(row)
-        start = vrw.limit_cycle(params, options=CYCLE_OPTIONS).section_state
+        start = vrw.limit_cycle(params, options=GAIT_OPTIONS).section_state
         walk = vrw.walk(params, start, N_CONTACT_STEPS, model=CONTACT_MODEL)
         outcomes = np.asarray(walk.steps.outcome)
         line = copy_gait_columns(row) | {"friction_needed": row["friction_needed"],
                                          "speed": row["speed"]}  # fmt: skip
         is_failure = outcomes != vrw.Outcome.STEPPED
-        contact_measures = {}
+        contact_measures: dict[str, float | None] = dict.fromkeys(CONTACT_MEASURES)
         if is_failure.any():
             end = vrw.Outcome(int(outcomes[is_failure.argmax()])).name
         else:
@@ -410,11 +416,9 @@ def compute_contact(rows: Sequence[Row], size: StudySize) -> list[Row]:
                 "contact_damper_share": float(step.energy_damping) / loss,
                 "contact_friction_share": float(step.energy_friction) / loss,
             }
-        measure_names = ("contact_dls_fraction", "contact_speed", "contact_damper_share",
-                         "contact_friction_share")  # fmt: skip
         line["contact_end"] = end
-        for name in measure_names:
-            line[name] = f"{contact_measures[name]:.4g}" if contact_measures else ""
+        for name, value in contact_measures.items():
+            line[name] = "" if value is None else f"{value:.4g}"
         lines.append(line)
         print(line, flush=True)
     return lines
@@ -465,7 +469,7 @@ def compute_fronts(rows: Sequence[Row], size: StudySize) -> list[Row]:
                     tuned = vrw.tune(
                         make_wheel(row), compute_energy_gain, list(BOX), BOX,
                         {"speed": EQUAL_SPEED, "dls_fraction": level} | constraints,
-                        cycle_options=CYCLE_OPTIONS, max_evaluations=60, tolerance=1e-4,
+                        cycle_options=GAIT_OPTIONS, max_evaluations=60, tolerance=1e-4,
                     )  # fmt: skip
                 except ValueError as error:  # the single search found no gait of this wheel
                     print(error, flush=True)
@@ -653,14 +657,11 @@ def draw_comparisons() -> None:
             vmax=BOX["damping"][1],
         )  # fmt: skip
         for row in rows[comparison]:
-            if row["wheel"] in RIGID_MODELS:
-                style = "-" if "classic" in row["wheel"] else "--"
-                axis.axhline(float(row[name]), color=plots.DARK_GRAY_COLOR, linestyle=style,
-                             linewidth=0.8, label=row["wheel"])  # fmt: skip
-            elif row["wheel"] in MARKED_SETS:
+            if row["wheel"] in MARKED_SETS:
                 marker, label = MARKED_SETS[row["wheel"]]
                 axis.plot(float(row["dls_fraction"]), float(row[name]), marker, color="white",
                           markeredgecolor="black", markersize=7, label=label)  # fmt: skip
+        draw_rigid_wheels(axis, rows[comparison], name)
         if name == "period_sensitivity":
             axis.set_yscale("log")
             axis.set_yticks([4, 6, 10, 20], ["4", "6", "10", "20"])
@@ -682,6 +683,15 @@ def draw_comparisons() -> None:
     plots.save(figure, FIGURES, "double_support_gaits")
 
 
+def draw_rigid_wheels(axis: Axes, rows: Sequence[Row], column: str) -> None:
+    """Draw a horizontal line for each rigid wheel, solid for the classic landing."""
+    for row in rows:
+        if row["wheel"] in RIGID_MODELS:
+            style = "-" if "classic" in row["wheel"] else "--"
+            axis.axhline(float(row[column]), color=plots.DARK_GRAY_COLOR, linestyle=style,
+                         linewidth=0.8, label=row["wheel"])  # fmt: skip
+
+
 def draw_fronts() -> None:
     """Draw the tuned gaits beside all gaits of that speed, and the Sobol' indices."""
     figure, (front_axis, index_axis) = plt.subplots(
@@ -698,11 +708,7 @@ def draw_tuned_gaits(axis: Axes) -> None:
     rows = group_by_comparison(read_table(GAITS_TABLE))[f"speed {EQUAL_SPEED:g} m/s"]
     axis.plot(*(read_column(select_compliant(rows), name) for name in columns), ".", color="0.6",
               label="random wheels")  # fmt: skip
-    for row in rows:
-        if row["wheel"] in RIGID_MODELS:
-            style = "-" if "classic" in row["wheel"] else "--"
-            axis.axhline(float(row["energy_per_meter"]), color=plots.DARK_GRAY_COLOR,
-                         linestyle=style, linewidth=0.8, label=row["wheel"])  # fmt: skip
+    draw_rigid_wheels(axis, rows, "energy_per_meter")
     for front, marker, color in (("any foot path", "o", plots.LEG_1_COLOR),
                                  ("foot above ground", "s", plots.LEG_2_COLOR)):  # fmt: skip
         for is_converged, label in ((True, "local optimum"), (False, "search ended early")):

@@ -12,16 +12,16 @@ maps of `experiments.gaits.force_peaks`. The command writes `force_peak_curve.cs
 
 import itertools
 
-import jax
 import numpy as np
 
 import vrw_jax as vrw
 from experiments.gaits.force_peak_wheels import (
     GAIT_OPTIONS,
-    compute_damping_ratio,
+    LIGHT_DAMPING,
     compute_peak_times,
     compute_stiffness_number,
     make_wheels,
+    select_wheel,
 )
 from experiments.shared.command import make_parser, parse_and_start_jax
 from experiments.shared.tables import FIGURES, Row, read_column, read_table, write_named_rows
@@ -29,8 +29,6 @@ from experiments.shared.tables import FIGURES, Row, read_column, read_table, wri
 MAP_TABLE = FIGURES / "force_peaks.csv"
 CURVE_TABLE = FIGURES / "force_peak_curve.csv"
 BISECTION_TABLE = FIGURES / "force_peak_bisections.csv"
-TWO_PEAKS = vrw.parameter_sets["two_peaks"].params
-LIGHT_DAMPING = compute_damping_ratio(TWO_PEAKS)
 STIFFNESS_NUMBER_RANGE = (7.0, 13.0)
 SLOPE_RANGE = (0.07, 0.1)
 """Ranges of the curve, rad, chosen because its special points there are of the first kind."""
@@ -107,8 +105,7 @@ def bisect_borders() -> None:
     depth, peak_force, dls_fraction = (np.asarray(x) for x in measures.values())
     lines = []
     for i in np.flatnonzero(is_found & np.asarray(gaits.found)):
-        wheel = jax.tree.map(lambda x, i=i: np.broadcast_to(x, number.shape)[i], params)
-        times = compute_peak_times(wheel, np.asarray(gaits.section_state[i]))
+        times = compute_peak_times(select_wheel(params, i), np.asarray(gaits.section_state[i]))
         lines.append({
             "natural_length": f"{natural_length[i]:g}",
             "stiffness_number": f"{number[i]:.5g}",

@@ -7,11 +7,15 @@ parameter set `two_peaks`. The command writes `force_peak_damping.csv`, `force_p
 and `force_peak_contact.csv`.
 """
 
-import jax
 import numpy as np
 
 import vrw_jax as vrw
-from experiments.gaits.force_peak_wheels import GAIT_OPTIONS, compute_damping_ratio, make_wheels
+from experiments.gaits.force_peak_wheels import (
+    GAIT_OPTIONS,
+    LIGHT_DAMPING,
+    make_wheels,
+    select_wheel,
+)
 from experiments.shared.command import make_parser, parse_and_start_jax
 from experiments.shared.tables import FIGURES, write_named_rows
 
@@ -19,7 +23,6 @@ LEG_MASS_TABLE = FIGURES / "force_peak_leg_mass.csv"
 DAMPING_TABLE = FIGURES / "force_peak_damping.csv"
 CONTACT_TABLE = FIGURES / "force_peak_contact.csv"
 
-LIGHT_DAMPING = compute_damping_ratio(vrw.parameter_sets["two_peaks"].params)
 N_PER_AXIS = 12
 STIFFNESS_NUMBERS = np.geomspace(3.0, 24.0, N_PER_AXIS)
 SLOPES = np.geomspace(0.03, 0.2, N_PER_AXIS)
@@ -98,8 +101,9 @@ def compute_contact_gaits(
                "friction": f"{friction:.5g}", "n_force_peaks": "", "force_trough_depth": "",
                "dls_fraction": ""}  # fmt: skip
         if found:
-            wheel = jax.tree.map(lambda x, i=i: np.broadcast_to(x, number.shape)[i], params)
-            walk = vrw.simulate(wheel, gaits.section_state[i], n_steps=1, model=model)
+            walk = vrw.simulate(
+                select_wheel(params, i), gaits.section_state[i], n_steps=1, model=model
+            )
             peaks = vrw.force_peaks(walk)
             row |= {"n_force_peaks": f"{peaks.n_force_peaks.item():d}",
                     "force_trough_depth": f"{peaks.force_trough_depth.item():.4g}",

@@ -6,6 +6,7 @@ natural length in units of the locked length, and the share of all legs in the m
 
 from typing import NamedTuple
 
+import jax
 import numpy as np
 
 import vrw_jax as vrw
@@ -62,6 +63,16 @@ def make_wheels(
         natural_length=natural_length,
         slope=slope,
     )
+
+
+LIGHT_DAMPING = compute_damping_ratio(vrw.parameter_sets["two_peaks"].params)
+"""Damping ratio of the parameter set `two_peaks`."""
+
+
+def select_wheel(params: vrw.WheelParams, index: int) -> vrw.WheelParams:
+    """Return one wheel of a batch, whose parameters may also be numbers."""
+    shape = np.shape(params.stiffness)
+    return jax.tree.map(lambda x: np.broadcast_to(x, shape)[index], params)
 
 
 class ForcePeakTimes(NamedTuple):

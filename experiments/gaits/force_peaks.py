@@ -12,7 +12,6 @@ The parts are `maps` and those of `force_peak_borders`, `force_peak_comparisons`
 docs/studies/one_peak_or_two.md. It takes half an hour on one core.
 """
 
-import jax
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.lines import Line2D
@@ -51,6 +50,7 @@ from experiments.gaits.force_peak_wheels import (
     compute_peak_times,
     compute_stiffness_number,
     make_wheels,
+    select_wheel,
 )
 from experiments.shared.command import make_parser, parse_and_start_jax
 from experiments.shared.tables import (
@@ -112,8 +112,8 @@ def compute_maps() -> None:
             if np.isfinite(bounce_periods[i]):
                 durations = {"bounces": single_support[i], "step_bounces": measures["period"][i]}
                 row |= {name: f"{x / bounce_periods[i]:.4g}" for name, x in durations.items()}
-                wheel = jax.tree.map(lambda x, i=i: np.broadcast_to(x, number.shape)[i], params)
-                times = compute_peak_times(wheel, np.asarray(gaits.section_state[i]))._asdict()
+                wheel, state = select_wheel(params, i), np.asarray(gaits.section_state[i])
+                times = compute_peak_times(wheel, state)._asdict()
                 row |= {name: f"{x:.4g}" for name, x in times.items() if np.isfinite(x)}
         rows.append(row)
     header = (*list(rows[0])[:5], *MEASURE_NAMES, *BOUNCE_COLUMNS)

@@ -12,13 +12,15 @@ table to `docs/benchmarks/first_passage.md`. It continues an interrupted run. Tw
 core.
 """
 
+from typing import Any
+
 import numpy as np
 
 import vrw_jax as vrw
 from experiments.shared import tables
 from experiments.shared.command import make_parser, parse_and_start_jax
 from experiments.shared.failure_counts import NORMAL_QUANTILE, count_failures
-from vrw_jax.robustness.first_passage import PassageStatus
+from vrw_jax.robustness.first_passage import SAMPLED_STEP_TOLERANCE, PassageStatus
 from vrw_jax.robustness.sampled_passage import PassageSamplingOptions, WalkerGroups, sample_passage
 
 PAGE = tables.DOCS / "benchmarks" / "first_passage.md"
@@ -57,30 +59,34 @@ def count_reference(
 
 
 def sample_reference(
-    params: vrw.WheelParams, slope_sd: float, seed: int, radius: float
+    params: vrw.WheelParams, slope_sd: float, seed: int, gait: vrw.LimitCycle
 ) -> tuple[float, float]:
     """Return a mean number of steps from a second sampling, and its relative error."""
     walkers = WalkerGroups(
         params,
-        np.asarray(vrw.limit_cycle(params).section_state),
+        np.asarray(gait.section_state),
         slope_sd,
         vrw.ViscoelasticWheel(),
-        vrw.StepOptions(rtol=1e-6, atol=1e-6),
+        vrw.StepOptions(rtol=SAMPLED_STEP_TOLERANCE, atol=SAMPLED_STEP_TOLERANCE),
         16384,
         np.random.default_rng(seed),
         REFERENCE_OPTIONS,
     )
-    sample = sample_passage(walkers, radius, REFERENCE_ERROR, 5_000_000, REFERENCE_OPTIONS)
+    sample = sample_passage(
+        walkers, float(gait.spectral_radius), REFERENCE_ERROR, 5_000_000, REFERENCE_OPTIONS
+    )
     return 1.0 / sample.failure_probability, sample.relative_error
 
 
-def measure_wheel(params: vrw.WheelParams, slope_sd: float, seed: int) -> dict[str, float]:
+def measure_wheel(
+    params: vrw.WheelParams, slope_sd: float, seed: int, gait: vrw.LimitCycle
+) -> dict[str, float]:
     """Return the mean number of steps and its reference, with the relative error of each.
 
     The reference is NaN if the error of the mean is unknown.
     """
     passage = vrw.first_passage(params, slope_sd, seed=seed)
-    mean_steps, radius = float(passage.mean_steps), float(vrw.limit_cycle(params).spectral_radius)
+    mean_steps, radius = float(passage.mean_steps), float(gait.spectral_radius)
     is_converged = int(passage.status) == PassageStatus.CONVERGED
     max_counted_mean = MAX_COUNTED_MEAN if is_converged else MAX_COUNTED_STEPS / 100
     is_counted = mean_steps < max_counted_mean
@@ -90,7 +96,7 @@ def measure_wheel(params: vrw.WheelParams, slope_sd: float, seed: int) -> dict[s
             params, slope_sd, 1000 + seed, radius, mean_steps
         )
     elif np.isfinite(passage.error):
-        reference, reference_error = sample_reference(params, slope_sd, 1000 + seed, radius)
+        reference, reference_error = sample_reference(params, slope_sd, 1000 + seed, gait)
     return {
         "spectral_radius": radius,
         "mean_steps": mean_steps,
@@ -145,9 +151,10 @@ def main() -> None:
         wheel = vrw.WheelParams(**parameters)
         row = row_by_damping.get(parameters["damping"])
         if row is None:
-            if not vrw.limit_cycle(wheel).found:
+            gait: Any = vrw.limit_cycle(wheel)
+            if not gait.found:
                 continue
-            measured = measure_wheel(wheel, slope_sd, len(rows) + 1)
+            measured = measure_wheel(wheel, slope_sd, len(rows) + 1, gait)
             row = parameters | {"slope_sd": slope_sd} | measured
             print(row, flush=True)
         rows.append(row)

@@ -1,12 +1,12 @@
 """Plain counts of failures on random slopes, with which first passages are compared."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import numpy as np
 
 import vrw_jax as vrw
-from vrw_jax.simulation import ModelLike
+from vrw_jax.robustness.first_passage import SAMPLED_STEP_TOLERANCE
 
 NORMAL_QUANTILE = 2.576
 """Half width of a 99 % confidence interval, in standard deviations of a normal distribution."""
@@ -38,23 +38,23 @@ def count_failures(
     seed: int,
     n_forgetting_steps: int = 12,
     n_walkers: int = 16384,
-    model: ModelLike | None = None,
 ) -> FailureCount:
-    """Return the count of walks side by side, until at least `n_failures` failures are counted.
+    """Return a count for walks of the paper's model, with at least `n_failures` failures.
 
-    All walks begin at the gait. A failed walk continues as a copy of another one, so that the walks
-    have the quasi-stationary distribution after `n_forgetting_steps` steps. The count begins then.
+    The walks run side by side, and all begin at the gait. A failed walk continues as a copy of
+    another one, so that the walks have the quasi-stationary distribution after `n_forgetting_steps`
+    steps. The count begins then.
     """
     random, mean_slope = np.random.default_rng(seed), float(params.slope)
-    cycle: Any = vrw.limit_cycle(params, model=model)
-    states = np.tile(np.asarray(cycle.section_state), (n_walkers, 1))
+    gait_state = np.asarray(vrw.limit_cycle(params).section_state)
+    states = np.tile(gait_state, (n_walkers, 1))
     slopes = np.full(n_walkers, mean_slope)
-    options = vrw.StepOptions(rtol=1e-6, atol=1e-6)
+    options = vrw.StepOptions(rtol=SAMPLED_STEP_TOLERANCE, atol=SAMPLED_STEP_TOLERANCE)
     n_failed, n_rounds = 0, 0
     while n_failed < n_failures:
         next_slopes = mean_slope + slope_sd * random.standard_normal(n_walkers)
         wheels = eqx.tree_at(lambda p: p.slope, params, np.stack([slopes, next_slopes], 1))
-        result = vrw.step_batch(wheels, states, model=model, options=options)
+        result = vrw.step_batch(wheels, states, options=options)
         is_alive = result.outcome == vrw.Outcome.STEPPED
         n_failed += int(np.sum(~is_alive)) if n_rounds >= n_forgetting_steps else 0
         n_rounds += 1
