@@ -1,18 +1,24 @@
 """Pages keep the rules of their language: length, plain verbs, few numbers in a sentence.
 
-The rules are this project's own, of CONTRIBUTING.md. Each check is tried on a sentence that breaks
-it.
+These rules are of CONTRIBUTING.md. proselint adds the rules of style guides, for pages and
+docstrings. Each check is tried on a sentence that breaks it.
 """
 
+import ast
 import re
 from pathlib import Path
 
 import pytest
+from proselint import checks
+from proselint.config import DEFAULT, Config
+from proselint.registry import CheckRegistry
+from proselint.tools import LintFile
 
 from experiments.shared.tables import FIGURES, format_markdown, read_table, shorten_number
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+MODULES = sorted((ROOT / "vrw_jax").rglob("*.py"))
 MAX_PAGE_WORDS = 1500
 MAX_NUMBERS = 2
 """Numbers of a sentence beyond which a table is clearer."""
@@ -35,6 +41,9 @@ FORBIDDEN_WORDS = {
     r"aimed at|until then|no longer|mended since": "the present only; history is in the changelog",
 }
 """Words that prose avoids, with better ones."""
+
+PROSELINT_CONFIG = Config(max_errors=1000, checks={**DEFAULT["checks"], "typography": False})
+"""Typography is off, because pages and docstrings are written in ASCII quotes and dots."""
 
 BLOCK = re.compile(r"<!-- (?!end of|runs elsewhere)([^\n]*?) -->(.*?)<!-- end of \1 -->", re.DOTALL)
 UNMEASURED_BLOCKS = {"functions and models"}
@@ -69,6 +78,29 @@ def find_forbidden_words(prose):
         for pattern, better in FORBIDDEN_WORDS.items()
         for word in re.findall(rf"\b(?:{pattern})\b", prose, re.IGNORECASE)
     ]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def registered_checks():
+    """Register the checks of proselint once."""
+    CheckRegistry().register_many(checks.__register__)
+
+
+def find_disliked_phrases(prose):
+    """Return what proselint finds; repeated placeholders of formulas are no repeated words."""
+    lint_file = LintFile("prose", prose)
+    phrases = [
+        (lint_file.content[slice(*found.check_result.span)], found.check_result.message)
+        for found in lint_file.lint(PROSELINT_CONFIG)
+    ]
+    return [(phrase, message) for phrase, message in phrases if "x" not in phrase.split()]
+
+
+def read_docstrings(module):
+    """Return the docstrings of a module, of its classes and of its functions."""
+    documented = (ast.Module, ast.ClassDef, ast.FunctionDef)
+    nodes = [n for n in ast.walk(ast.parse(module.read_text())) if isinstance(n, documented)]
+    return [docstring for node in nodes if (docstring := ast.get_docstring(node))]
 
 
 def is_numeric(sentence):
@@ -108,6 +140,16 @@ def test_a_page_is_short_and_uses_plain_verbs(page):
     prose = strip_markup(page.read_text())
     assert count_words(prose) <= MAX_PAGE_WORDS
     assert not find_forbidden_words(prose)
+    assert not find_disliked_phrases(prose)
+
+
+@pytest.mark.parametrize(
+    "folder", sorted({module.parent for module in MODULES}), ids=lambda folder: folder.name
+)
+def test_docstrings_have_no_phrase_that_style_guides_reject(folder):
+    for module in folder.glob("*.py"):
+        prose = "\n\n".join(strip_markup(docstring) for docstring in read_docstrings(module))
+        assert not find_disliked_phrases(prose), module
 
 
 @pytest.mark.parametrize("page", PAGES, ids=name_of)
@@ -127,6 +169,8 @@ def test_few_sentences_are_long_or_hold_many_numbers():
 def test_prose_against_the_rules_is_found():
     assert find_forbidden_words("The step tells its time. It was asked for the truth.")
     assert not find_forbidden_words(strip_markup("`tell` and ```\nsays\n``` report their time."))
+    assert [phrase for phrase, _ in find_disliked_phrases("It has has a very unique end.")]
+    assert not find_disliked_phrases(strip_markup("The rates are `a`, `b` `c`."))
     assert is_numeric("It takes 1 s, 2 s or 3 s.")
     assert not is_numeric("It takes 1e-3 s or 2.5 s.")
     assert count_words("It takes three seconds.") == 4

@@ -208,8 +208,8 @@ def _invert_inertia(
 ) -> tuple[Any, ...]:
     """Return the inverse of the hub's 3 x 3 inertia matrix without the released legs.
 
-    The entries are xx, xz, x theta, zz, z theta, theta theta. `b` contains the distances of the leg
-    masses from the hub, m.
+    The entries are `xx, xz, x theta, zz, z theta, theta theta`. `b` contains the distances of the
+    leg masses from the hub, m.
     """
     sin = jnp.where(is_released, leg_directions.sin, 0.0)
     cos = jnp.where(is_released, leg_directions.cos, 0.0)

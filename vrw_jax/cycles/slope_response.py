@@ -92,7 +92,7 @@ def compute_sensitivity_norms(slope_response: SlopeResponse) -> SensitivityNormP
 
     The responses to the deviation of one line are D0, then C B0 + D1, then C A^j b. Here b = A B0 +
     B1 and j = 0, 1, .... The squares of C A^j b sum to C P C^T. The matrix P solves the discrete
-    Lyapunov equation P = A P A^T + b b^T. The norm is infinite if the gait is not stable.
+    Lyapunov equation `P = A P A^T + b b^T`. The norm is infinite if the gait is not stable.
     """
     A, B1, B0, C, D1, D0 = slope_response
     n = len(A)

@@ -155,7 +155,7 @@ def first_passage(
     such a departure.
 
     For the rigid wheel, the kernel of its one-dimensional map has a closed form. Quadrature then
-    computes the mean, even if walks are very long. The model must be
+    computes the mean, even if walks take billions of steps. The model must be
     `RigidWheel(stop_at_lift_off=False)`, and `mean_steps` has first derivatives with respect to
     `params` and `slope_sd`.
 

@@ -497,7 +497,7 @@ class ArrayEmitter:
         return LazyArray(new_shape, array.entry_type, get_reshaped_entry)
 
     def emit_affine_index(self, i: Any, index_start: int, index_step: int = 1) -> Any:
-        """Emit the index index_start + index_step * i, and return its LLVM value.
+        """Emit the index `index_start + index_step * i`, and return its LLVM value.
 
         If `i` is an integer, the function only computes the index and returns an integer.
         """
