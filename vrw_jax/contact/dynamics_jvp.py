@@ -114,7 +114,7 @@ _EquationTangentFn = Callable[
 def solve_contact_forces(contact_configuration: ContactConfiguration) -> WheelForceSolution:
     """Return the contact forces (N) and the resulting accelerations, with a JVP rule."""
     return _solve_with_jvp_rule(
-        compute_free_acceleration, compute_motion_equation_tangents, contact_configuration
+        compute_free_acceleration, _compute_motion_equation_tangents, contact_configuration
     )
 
 
@@ -188,13 +188,6 @@ def _solve_with_free_motion(
     )
 
 
-def solve_forces_with_free_motion(
-    contact_configuration: ContactConfiguration,
-) -> tuple[ContactInverseInertia, FreeMotion, WheelForceSolution]:
-    """Return inverse inertia, accelerations without contact forces, and contact forces (N)."""
-    return _solve_with_free_motion(compute_free_acceleration, contact_configuration)
-
-
 def _solve_with_jvp_rule(
     free_motion_fn: Callable[..., FreeMotion],
     equation_tangent_fn: _EquationTangentFn,
@@ -224,7 +217,7 @@ def _solve_with_jvp_rule(
         inverse_inertia, free_motion, force_solution = _solve_with_free_motion(
             free_motion_fn, contact_configuration
         )
-        residual_tangent = compute_residual_tangent(
+        residual_tangent = _compute_residual_tangent(
             contact_configuration,
             configuration_tangent,
             inverse_inertia,
@@ -233,10 +226,8 @@ def _solve_with_jvp_rule(
                 contact_configuration, configuration_tangent, inverse_inertia, force_solution
             ),
         )
-        free_motion_tangents = compute_free_motion_tangent(
-            inverse_inertia,
-            residual_tangent.leg_length_residual,
-            sum_residual_tangent(contact_configuration.contact_slots, residual_tangent),
+        free_motion_tangents = _compute_free_motion_tangent(
+            contact_configuration.contact_slots, inverse_inertia, residual_tangent
         )
         _, solution_tangent = jax.jvp(
             lambda free_motion: solve_contact_configuration(
@@ -261,7 +252,7 @@ def _solve_with_jvp_rule(
     return solve_from_arrays(float_leaves, other_arrays)
 
 
-class ResidualTangent(NamedTuple):
+class _ResidualTangent(NamedTuple):
     """Tangent of the residual of the contact equations, with one entry per leg or contact slot."""
 
     leg_length_residual: LegArray  # effect on each leg's length
@@ -275,14 +266,14 @@ class ResidualTangent(NamedTuple):
     leg_pull_forces: SlotPair  # tangent due to friction and rotation of the legs in contact
 
 
-def compute_residual_tangent(
+def _compute_residual_tangent(
     contact_configuration: ContactConfiguration,
     configuration_tangent: ContactConfiguration,
     inverse_inertia: ContactInverseInertia,
     force_solution: WheelForceSolution,
     constant_terms: _ConstantTerms,
     equation_tangents: _EquationTangents,
-) -> ResidualTangent:
+) -> _ResidualTangent:
     """Return the tangent of the contact equations' residual for a tangent of the configuration.
 
     - `configuration_tangent`: tangent of the configuration;
@@ -366,7 +357,7 @@ def compute_residual_tangent(
         - cos * hub_motion_tangent_x
         + sin * hub_motion_tangent_z
     )
-    return ResidualTangent(
+    return _ResidualTangent(
         leg_length_residual=length_tangent,
         hub_residual_by_leg=(
             s.m
@@ -394,24 +385,13 @@ def compute_residual_tangent(
     )
 
 
-class SummedResidualTangent(NamedTuple):
-    """Tangent of the residual, with the hub's equations summed over all legs."""
-
-    hub_residual: HubVector
-    slot_length_residual: SlotPair
-    foot_transverse_motion: SlotPair
-    foot_radial_motion: SlotPair
-    friction_force: SlotPair
-
-
-def sum_residual_tangent(
-    contact_slots: ContactSlots, residual_tangent: ResidualTangent
-) -> SummedResidualTangent:
-    """Return the tangent of the residual, with the hub's equations summed over all legs.
-
-    The entries for leg lengths are gathered for the legs in the contact slots.
-    """
-    x, z, hub_rotation_residual = (
+def _compute_free_motion_tangent(
+    contact_slots: ContactSlots,
+    inverse_inertia: ContactInverseInertia,
+    residual_tangent: _ResidualTangent,
+) -> FreeMotion:
+    """Return the tangent of the free motion that is equivalent to the tangent of the residual."""
+    x, z, rotation = (
         sum_over_legs(leg_forces) + other_force
         for leg_forces, other_force in zip(
             residual_tangent.hub_residual_by_leg,
@@ -419,47 +399,28 @@ def sum_residual_tangent(
             strict=True,
         )
     )
-    return SummedResidualTangent(
-        (x, z, hub_rotation_residual),
-        contact_slots.gather_slot_pair(residual_tangent.leg_length_residual),
-        residual_tangent.foot_transverse_motion,
-        residual_tangent.foot_radial_motion,
-        residual_tangent.friction_force,
+    hub_motion_tangent = multiply_by_inverse_inertia(
+        inverse_inertia.inverse_inertia, (x, z, rotation)
     )
-
-
-def compute_free_motion_tangent(
-    inverse_inertia: ContactInverseInertia,
-    leg_motion: LegArray,
-    summed_tangent: SummedResidualTangent,
-) -> FreeMotion:
-    """Return the tangent of the free motion that is equivalent to the tangent of the residual.
-
-    - `leg_motion`: tangent of the accelerations or velocities of the leg lengths;
-    - `summed_tangent`: tangent of the residual, summed over all legs.
-    """
-    hub_motion_tangent, slot_length_tangents, (u, v) = (
-        multiply_by_inverse_inertia(inverse_inertia.inverse_inertia, summed_tangent.hub_residual),
-        summed_tangent.slot_length_residual,
-        summed_tangent.foot_radial_motion,
-    )
+    slot_length_tangents = contact_slots.gather_slot_pair(residual_tangent.leg_length_residual)
+    u, v = residual_tangent.foot_radial_motion
     e = [
         inverse_inertia.cos[i] * hub_motion_tangent[0]
         - inverse_inertia.sin[i] * hub_motion_tangent[1]
         - inverse_inertia.L[i] * hub_motion_tangent[2]
         for i in range(2)
     ]
-    e = [e[i] + summed_tangent.foot_transverse_motion[i] for i in range(2)]
+    e = [e[i] + residual_tangent.foot_transverse_motion[i] for i in range(2)]
     return FreeMotion(
         hub_motion_tangent,
-        leg_motion,
+        residual_tangent.leg_length_residual,
         slot_length_tangents,
         (e[0], e[1]),
         (u - slot_length_tangents[0], v - slot_length_tangents[1]),
     )
 
 
-def compute_motion_equation_tangents(
+def _compute_motion_equation_tangents(
     contact_configuration: ContactConfiguration,
     configuration_tangent: ContactConfiguration,
     inverse_inertia: ContactInverseInertia,

@@ -29,11 +29,9 @@ from vrw_jax.contact.batch_integrator import (
     evaluate_dynamics,
     evaluate_guards_at_point,
     iterate_until_stopped,
-    unpack_motion,
 )
 from vrw_jax.contact.contact_modes import ContactMode
-from vrw_jax.contact.contact_state import ContactState, ModeDynamics, compute_guard_scales
-from vrw_jax.contact.tangent_basis import N_MOVING_LEGS, TangentBasis
+from vrw_jax.contact.contact_state import ModeDynamics, compute_guard_scales
 from vrw_jax.contact.walk_kernel import (
     STATUS_UNFINISHED,
     BatchWalkResult,
@@ -341,9 +339,6 @@ def _integrate_with_tangents(
     mode_dynamics = dynamics_fn(input_columns)
     guard_scales, last_stage = compute_guard_scales(mode_dynamics), len(tableau.stage_nodes) - 1
     options = compute_wheel_units(mode_dynamics.s).scale_times_to_seconds(options)
-    has_later_moving_legs = _has_later_moving_legs(
-        tangents, tangent_template, initial_state.contact_state
-    )
     max_stable_step_size = _compute_max_stable_step_size(mode_dynamics, tableau)
 
     def try_solver_step(state: tuple[IntervalState, Array]) -> tuple[IntervalState, Array]:
@@ -361,7 +356,6 @@ def _integrate_with_tangents(
             tangents._replace(tangent_rows=tangent_rows),
             tangent_template,
             tableau,
-            has_later_moving_legs,
         )
         attempted_step = complete_solver_step(
             mode_dynamics, tableau, options, interval_state, stage_rows
@@ -377,30 +371,14 @@ def _integrate_with_tangents(
             stage_tangents = lax.dynamic_index_in_dim(stage_row_tangents, k, 0, False).reshape(
                 -1, *tangent_template.dynamics_rows.shape
             )
-            combine_stages = lambda leg_slice: compute_stage_state(
+            q, v = compute_stage_state(
                 tableau,
                 last_stage,
-                start_tangent.q[leg_slice],
-                start_tangent.v[leg_slice],
-                stage_tangents[:, :n][:, leg_slice],
+                start_tangent.q,
+                start_tangent.v,
+                stage_tangents[:, :n],
                 interval_state.h,
             )
-            first_coordinates = slice(0, 3 + N_MOVING_LEGS)
-            other_coordinates = slice(3 + N_MOVING_LEGS, None)
-            unchanged_coordinates = (
-                start_tangent.q[other_coordinates],
-                start_tangent.v[other_coordinates],
-            )
-            end_coordinates = zip(
-                combine_stages(first_coordinates),
-                run_if_any(
-                    has_later_moving_legs,
-                    lambda _: combine_stages(other_coordinates),
-                    unchanged_coordinates,
-                ),
-                strict=True,
-            )
-            q, v = map(jnp.concatenate, end_coordinates)
             interval_accumulators = start_tangent.interval_accumulators
             if interval_accumulators is not None:
                 weights = tableau.stage_matrix[last_stage]
@@ -441,7 +419,6 @@ def _evaluate_stages(
     tangents: TangentBatch,
     tangent_template: _IntervalTangent,
     tableau: ButcherTableau,
-    has_later_moving_legs: Array,
 ) -> tuple[Array, Array]:
     """Return the dynamics rows at all stages of a solver step, and the tangents of these rows.
 
@@ -462,43 +439,45 @@ def _evaluate_stages(
         stage_coordinates = compute_stage_state(
             tableau, i, interval_point.q, interval_point.v, stage_rows, h
         )
-        mode_dynamics = dynamics_fn(input_columns)
-        tangent_basis = TangentBasis.from_motion(
-            mode_dynamics,
-            unpack_motion(IntervalPoint(*stage_coordinates, stage_coordinates[0])),
-            has_later_moving_legs,
+
+        def evaluate_rows(input_columns: Array, q: Array, v: Array) -> tuple[Array, Array]:
+            rows = evaluate_dynamics(dynamics_fn(input_columns), q, v)
+            n_accumulator_rows = n_dynamics_rows - len(q)
+            differentiated_rows = rows[: len(q)], rows[len(rows) - n_accumulator_rows :]
+            return jnp.concatenate(differentiated_rows), rows
+
+        _, pushforward, stage_row = jax.linearize(
+            evaluate_rows, input_columns, *stage_coordinates, has_aux=True
         )
-        zero_response = tangent_basis.make_zero_response()
-        compute_column_response = lambda k, _: tangent_basis.compute_column_response(
-            dynamics_fn, input_columns, _unpack_tangent(tangents.column_tangents, k, input_columns)
-        )
-        column_responses = tangents._replace(n_tangents=tangents.n_column_tangents).map_tangents(
-            compute_column_response, tangents.allocate_rows(len(_pack_rows(zero_response)))
+        # A second linearization removes the terms of the inputs, which most tangents keep constant.
+        zero_input_tangent = jnp.zeros_like(input_columns)
+        _, push_coordinates = jax.linearize(
+            lambda q, v: pushforward(zero_input_tangent, q, v), *stage_coordinates
         )
 
         def propagate_tangent(k: Array, known_rows: Array) -> Array:
             tangent = _unpack_tangent(tangents.tangent_rows, k, tangent_template)
             previous_rows = known_rows.reshape(-1, *tangent_template.dynamics_rows.shape)
-            coordinate_tangent_fn = lambda leg_slice: _propagate_stage_coordinates(
-                tableau, i, tangent, previous_rows, h, leg_slice
+            coordinate_tangents = _propagate_stage_coordinates(
+                tableau, i, tangent, previous_rows, h
             )
-            column_response = run_if_any(
-                jnp.any(k < tangents.n_column_tangents),
-                lambda _: _unpack_tangent(column_responses, k, zero_response),
-                zero_response,
+            input_tangent = _unpack_tangent(tangents.column_tangents, k, input_columns)
+            has_input_tangent = jnp.any(k < tangents.n_column_tangents)
+            row_tangent = run_if_any(
+                ~has_input_tangent,
+                lambda _: push_coordinates(*coordinate_tangents),
+                tangent.dynamics_rows,
             )
-            row_tangent = tangent_basis.propagate_tangent(
-                coordinate_tangent_fn, column_response, has_later_moving_legs
+            row_tangent = run_if_any(
+                has_input_tangent,
+                lambda _: pushforward(input_tangent, *coordinate_tangents),
+                row_tangent,
             )
             return jnp.where(
                 (i > 0) | is_at_interval_start, row_tangent, known_rows[:n_dynamics_rows]
             )
 
-        stage_row = jnp.where(
-            i > 0,
-            evaluate_dynamics(mode_dynamics, *stage_coordinates),
-            interval_point.dynamics_rows,
-        )
+        stage_row = jnp.where(i > 0, stage_row, interval_point.dynamics_rows)
         stage_rows = lax.dynamic_update_index_in_dim(stage_rows, stage_row, i, 0)
         return (
             i + 1,
@@ -526,13 +505,8 @@ def _propagate_stage_coordinates(
     tangent: _IntervalTangent,
     known_row_tangents: Array,
     h: Array,
-    leg_slice: slice,
 ) -> tuple[Array, Array]:
-    """Return the tangents of coordinates and rates at stage `i`.
-
-    The tangents are those of the result of `compute_stage_state`, for the coordinates in
-    `leg_slice`.
-    """
+    """Return the tangents of `compute_stage_state`, from the tangents at the earlier stages."""
     flat_matrices = [
         jnp.asarray(np.reshape(section_state, -1))
         for section_state in (tableau.stage_matrix, tableau.squared_stage_matrix)
@@ -545,12 +519,10 @@ def _propagate_stage_coordinates(
             lax.dynamic_index_in_dim(flat_matrix, i * n_stages + j, 0, False)
             for flat_matrix in flat_matrices
         )
-        row_tangent = lax.dynamic_index_in_dim(known_row_tangents, j, 0, False)[: len(tangent.q)][
-            leg_slice
-        ]
+        row_tangent = lax.dynamic_index_in_dim(known_row_tangents, j, 0, False)[: len(tangent.q)]
         return j + 1, rate_increment + a * row_tangent, coordinate_increment + b * row_tangent
 
-    q, v = tangent.q[leg_slice], tangent.v[leg_slice]
+    q, v = tangent.q, tangent.v
     initial_state = jnp.zeros((), jnp.int32), jnp.zeros_like(q), jnp.zeros_like(q)
     _, rate_increment, coordinate_increment = lax.while_loop(
         lambda state: state[0] < i, add_stage_increment, initial_state
@@ -575,27 +547,6 @@ def _compute_max_stable_step_size(
     return jnp.where(
         has_swing_leg, stable_step_factor * mode_dynamics.s.m / mode_dynamics.s.c, jnp.inf
     )
-
-
-def _has_later_moving_legs(
-    tangents: TangentBatch, tangent_template: _IntervalTangent, contact_state: ContactState
-) -> Array:
-    """Return whether a leg after the first `N_MOVING_LEGS` moves in any tangent."""
-
-    def update_moving_leg_flag(state: tuple[Array, Array]) -> tuple[Array, Array]:
-        k, has_moving_leg = state
-        tangent = _unpack_tangent(tangents.tangent_rows, k, tangent_template)
-        length_tangents = jnp.concatenate(
-            [tangent.q[3 + N_MOVING_LEGS :], tangent.v[3 + N_MOVING_LEGS :]]
-        )
-        return k + 1, has_moving_leg | jnp.any(length_tangents != 0.0, axis=0)
-
-    initial_state = (
-        jnp.zeros((), jnp.int32),
-        jnp.any(~contact_state.is_locked[N_MOVING_LEGS:], axis=0),
-    )
-    should_continue = lambda state: jnp.any(state[0] < tangents.n_tangents)
-    return jnp.any(lax.while_loop(should_continue, update_moving_leg_flag, initial_state)[1])
 
 
 def _make_event_shift(
