@@ -2,11 +2,14 @@
 
 After each tenth of the calls, resident memory, memory maps, file descriptors and threads are
 counted. The counts of a function must reach a plateau: the last half of its calls may add at most
-the limits of `MAX_GROWTH`. The counts are written as a table and drawn.
+the limits of `MAX_GROWTH`. The counts are written as a table and drawn. A later run of further
+functions keeps the counts of the others, so that each function may run in a new process.
 
     python -m experiments.hardening.resources results --calls 2000
+    python -m experiments.hardening.resources results --functions scan limit_cycles
 """
 
+import itertools
 import os
 import sys
 from collections.abc import Callable
@@ -17,7 +20,7 @@ import numpy as np
 
 import vrw_jax as vrw
 from experiments.shared.command import make_parser, require_extra
-from experiments.shared.tables import write_table
+from experiments.shared.tables import Row, group_rows, read_column, read_table, write_named_rows
 
 MAX_BATCH_SIZE = 300
 """Largest number of wheels of a call, chosen because several padded batch sizes occur below it."""
@@ -163,21 +166,26 @@ def find_growth(counts: list[ProcessResources]) -> list[str]:
     ]
 
 
-def draw_counts(counts: dict[str, list[ProcessResources]], n_calls: int, path: Path) -> None:
+def draw_counts(rows: list[Row], path: Path) -> None:
     """Draw each resource against the number of calls, one line for each function."""
     plt = require_extra("matplotlib.pyplot")
-    figure, axes = plt.subplots(2, 2, figsize=(9, 6), sharex=True, layout="constrained")
-    calls = np.linspace(n_calls / N_COUNTS, n_calls, N_COUNTS)
+    figure, axes = plt.subplots(2, 2, figsize=(9, 8), sharex=True, layout="constrained")
     labels = ("resident memory, MiB", "memory maps", "file descriptors", "threads")
-    for i, (axis, label) in enumerate(zip(axes.flat, labels, strict=True)):
-        for name, function_counts in counts.items():
-            axis.plot(calls, [count[i] for count in function_counts], marker=".", label=name)
+    styles = itertools.cycle(["-", "--", ":"])
+    for (name, function_rows), style in zip(
+        group_rows(rows, "function").items(), styles, strict=False
+    ):
+        calls = read_column(function_rows, "calls")
+        for axis, resource in zip(axes.flat, ProcessResources._fields, strict=True):
+            axis.plot(calls, read_column(function_rows, resource), style, label=name)
+    for axis, label in zip(axes.flat, labels, strict=True):
         axis.set_ylabel(label)
         axis.set_ylim(bottom=0)
     for axis in axes[1]:
         axis.set_xlabel("calls with random batch sizes")
     figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
-    figure.savefig(path, dpi=150)
+    figure.savefig(path, dpi=100)
+    plt.close(figure)
 
 
 def main() -> None:
@@ -185,30 +193,33 @@ def main() -> None:
     parser = make_parser(__doc__)
     parser.add_argument("folder", type=Path, nargs="?", default="results")
     parser.add_argument("--calls", type=int, default=2000, help="calls of each function")
-    parser.add_argument("--functions", nargs="+", default=list(BATCH_FUNCTIONS))
+    parser.add_argument(
+        "--functions", nargs="*", choices=BATCH_FUNCTIONS, default=list(BATCH_FUNCTIONS)
+    )
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--max-batch-size", type=int, default=MAX_BATCH_SIZE)
     chosen = parser.parse_args()
     if chosen.calls < N_COUNTS:
         parser.error(f"--calls is {chosen.calls}, but {N_COUNTS} counts need as many calls.")
     vrw.start_jax()
-    counts = {}
+    table = chosen.folder / "resources.csv"
+    stored_rows = read_table(table) if table.exists() else []
+    rows = [row for row in stored_rows if row["function"] not in chosen.functions]
+    has_growth = False
     for name in chosen.functions:
-        counts[name] = count_over_calls(name, chosen.calls, chosen.seed, chosen.max_batch_size)
-        growth = "; ".join(find_growth(counts[name])) or "plateau"
-        print(f"{name}: {growth} ({counts[name][-1].memory_maps} maps)", flush=True)
-    chosen.folder.mkdir(parents=True, exist_ok=True)
-    write_table(
-        chosen.folder / "resources.csv",
-        ("function", "calls", *ProcessResources._fields),
-        [
-            (name, (i + 1) * chosen.calls // N_COUNTS, *count)
-            for name, function_counts in counts.items()
-            for i, count in enumerate(function_counts)
-        ],
-    )
-    draw_counts(counts, chosen.calls, chosen.folder / "resources.png")
-    if any(map(find_growth, counts.values())):
+        counts = count_over_calls(name, chosen.calls, chosen.seed, chosen.max_batch_size)
+        growth = find_growth(counts)
+        has_growth |= bool(growth)
+        print(
+            f"{name}: {'; '.join(growth) or 'plateau'} ({counts[-1].memory_maps} maps)", flush=True
+        )
+        for i, count in enumerate(counts):
+            calls = str((i + 1) * chosen.calls // N_COUNTS)
+            numbers = {resource: str(number) for resource, number in count._asdict().items()}
+            rows.append({"function": name, "calls": calls} | numbers)
+        write_named_rows(table, rows)
+    draw_counts(rows, chosen.folder / "resources.png")
+    if has_growth:
         sys.exit("Some function has no plateau.")
 
 
