@@ -13,4 +13,8 @@ from vrw_jax.contact.mechanics import (
 )
 from vrw_jax.contact.section import LOCKED_CODE_OFFSET, FullState, embed_section_state
 from vrw_jax.contact.step_record import UnilateralStep, compute_min_bounce_height
-from vrw_jax.contact.unilateral_wheel import UnilateralTrajectory, UnilateralWheel
+from vrw_jax.contact.unilateral_wheel import (
+    AbstractContactWheel,
+    UnilateralTrajectory,
+    UnilateralWheel,
+)

@@ -107,8 +107,37 @@ def _convert_restitution(value: Any) -> Array | None:
     return restitution
 
 
+class AbstractContactWheel(AbstractWheel):
+    """Model whose section state is the full section state, with a contact mode for each leg."""
+
+    parameter_names: ClassVar[tuple[str, ...]] = (*PARAMETER_NAMES, FRICTION_NAME)
+    reports_contacts: ClassVar[bool] = True
+
+    def default_start(self, params: WheelParams) -> FullState:
+        """Return a full section state near the gait of the wheel in Table 1 of the paper."""
+        return embed_section_state(
+            params.symbols(), jnp.asarray(PAPER_START_STATE, params.damping.dtype)
+        )
+
+    def section_size(self, params: WheelParams) -> int:
+        return compute_full_section_size(params.n_legs)
+
+    def n_continuous(self, params: WheelParams) -> int:
+        return compute_full_section_size(params.n_legs) - params.n_legs
+
+    def section_units(self, units: WheelUnits, n_legs: int) -> list[Elementwise]:
+        return compute_section_units(units, n_legs)
+
+    def embed_section(self, params: WheelParams, x: Array) -> FullState:
+        """Return the full section state for `x`, shape (4 + 3 n,).
+
+        `x` may be a full section state or (theta-, dtheta-, dL1-), the section state of the paper.
+        """
+        return _embed_section_compiled(params, x) if x.shape == (3,) else x
+
+
 @with_renamed_arguments(infinite="infinite_friction_rule")
-class UnilateralWheel(AbstractWheel):
+class UnilateralWheel(AbstractContactWheel):
     """Model of the wheel with unilateral contact and Coulomb friction.
 
     Feet push on the ground and slide by Coulomb's law. The events may have any order, and every
@@ -145,8 +174,6 @@ class UnilateralWheel(AbstractWheel):
         commands=frozenset({"scan", "tune", "branch", "explore"}),
         fixed_by_tolerance=("restitution", "infinite_friction_rule", "uneven", "max_events"),
     )
-    parameter_names: ClassVar[tuple[str, ...]] = (*PARAMETER_NAMES, FRICTION_NAME)
-    reports_contacts: ClassVar[bool] = True
     batch_kernel: ClassVar[str] = "legs"
 
     friction: Scalar = eqx.field(converter=convert_friction, default=0.7)
@@ -189,28 +216,6 @@ class UnilateralWheel(AbstractWheel):
     def uses_paper_rule(self) -> bool:
         """Return whether infinite friction means the rule (A1)-(A4) of the paper."""
         return self.infinite_friction_rule == FRICTION_PAPER_RULE
-
-    def default_start(self, params: WheelParams) -> FullState:
-        """Return a full section state near the gait of the wheel in Table 1 of the paper."""
-        return embed_section_state(
-            params.symbols(), jnp.asarray(PAPER_START_STATE, params.damping.dtype)
-        )
-
-    def section_size(self, params: WheelParams) -> int:
-        return compute_full_section_size(params.n_legs)
-
-    def n_continuous(self, params: WheelParams) -> int:
-        return compute_full_section_size(params.n_legs) - params.n_legs
-
-    def section_units(self, units: WheelUnits, n_legs: int) -> list[Elementwise]:
-        return compute_section_units(units, n_legs)
-
-    def embed_section(self, params: WheelParams, x: Array) -> FullState:
-        """Return the full section state for `x`, shape (4 + 3 n,).
-
-        `x` may be a full section state or (theta-, dtheta-, dL1-), the section state of the paper.
-        """
-        return _embed_section_compiled(params, x) if x.shape == (3,) else x
 
     def split_ground(self, params: WheelParams, n_steps: int) -> StepGroundValues | None:
         """Return the ground under each step, or None on flat ground with one friction coefficient.

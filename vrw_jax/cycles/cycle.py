@@ -51,19 +51,23 @@ class AbstractCycle(AbstractPrintable):
     outcome: eqx.AbstractVar[Int[Array, ""]]  # Outcome.STEPPED or a failure
 
     @property
-    @abc.abstractmethod
     def period_n(self) -> int:
         """Return the number of gait steps after which the gait repeats."""
+        has_step_axis = self.durations.ndim > self.outcome.ndim + 1
+        return self.durations.shape[-2] if has_step_axis else 1
 
     @property
-    @abc.abstractmethod
     def monodromy(self) -> Array:
         """Return the monodromy matrix, which is the differentiable Jacobian of the return map."""
+        return self.monodromy_value
 
     @property
-    @abc.abstractmethod
     def warm_start(self) -> Any:
-        """Return a start from which the gait of a similar wheel can be searched."""
+        """Return a start from which the gait of a similar wheel can be searched.
+
+        The start is a section state, or a richer state that the search of the gait returned.
+        """
+        return self.section_state
 
     @property
     @abc.abstractmethod
@@ -316,11 +320,6 @@ def _make_sensitivity_reader(measure_name: str) -> Callable[[Any], Array]:
     return lambda cycle: cycle.gait_sensitivity(measure_name)
 
 
-def _make_force_peak_reader(measure_name: str) -> Callable[[Any], Array]:
-    """Return a function that reads one force-peak measure of a cycle."""
-    return lambda cycle: cycle.force_peaks[measure_name]
-
-
 CYCLE_MEASURE_FUNCTIONS: dict[str, Callable[[AbstractCycle], Array]] = {
     "dls_fraction": _make_property_reader("dls_fraction"),
     "period": _make_property_reader("period"),
@@ -344,7 +343,10 @@ CYCLE_MEASURE_FUNCTIONS: dict[str, Callable[[AbstractCycle], Array]] = {
     "gait_sensitivity_dls_fraction": _make_sensitivity_reader("dls_fraction"),
     "gait_sensitivity_period": _make_sensitivity_reader("period"),
     "gait_sensitivity_speed": _make_sensitivity_reader("speed"),
-    **{name: _make_force_peak_reader(name) for name in FORCE_PEAK_MEASURES},
+    **{
+        name: lambda cycle, name=name: cycle.force_peaks[name]  # type: ignore[misc]
+        for name in FORCE_PEAK_MEASURES
+    },
 }
 """Functions that map a cycle to a measure, by the name of the measure.
 

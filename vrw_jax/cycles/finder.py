@@ -193,9 +193,9 @@ class AbstractGaitFinder(eqx.Module):
         """
         return eqx.filter_vmap(self.find_gait)(parameter_values, cycle_guess)
 
-    @abc.abstractmethod
     def precompile_programs(self, params: WheelParams) -> None:
         """Compile the programs of `find_gait`, in parallel if possible."""
+        self.find_gait(self.model.parameter_values(params), self.model.default_start(params))
 
     def take_step(self, params: WheelParams, section_state: Array) -> AbstractStep:
         """Compute one event-driven step from a section state, by a program that is

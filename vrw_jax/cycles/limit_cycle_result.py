@@ -48,7 +48,6 @@ from vrw_jax.simulation import step
 from vrw_jax.wheel import (
     Motion,
     Outcome,
-    Symbols,
     WheelParams,
     make_phases,
     make_wheel_from_parameters,
@@ -97,10 +96,6 @@ class LimitCycle(AbstractCycle):
     model: ViscoelasticWheel = eqx.field(
         default_factory=ViscoelasticWheel
     )  # `margins` uses its ground.
-
-    @property
-    def period_n(self) -> int:
-        return self.system.period_n
 
     @property
     def step_ends(self) -> Array:
@@ -452,13 +447,32 @@ def guess_cycle_from_walk(
     collocation_system: CollocationSystem, params: WheelParams, walk_samples: WalkSamples
 ) -> CollocationState:
     """Compute the guess of a cycle from the samples of a walk with `period_n` gait steps."""
-    sample_accelerations = functools.partial(
-        _sample_node_accelerations, collocation_system, params.symbols()
-    )
+    s = params.symbols()
+
+    def sample_node_accelerations(foot_distance: Scalar, sample_states: Array) -> tuple[Array, ...]:
+        wheel_phases = make_phases(s, foot_distance, stop_at_lift_off=False)
+        accelerations_by_phase = []
+        sample_times = jnp.linspace(0.0, 1.0, sample_states.shape[1])
+        for wheel_phase, phase_mesh, phase_samples in zip(
+            wheel_phases, collocation_system.phase_meshes, sample_states, strict=True
+        ):
+            node_states = [
+                jnp.interp(jnp.asarray(phase_mesh.node_fractions), sample_times, coordinate_samples)
+                for coordinate_samples in phase_samples.T
+            ]
+            motion = Motion.from_angle(*node_states)
+            node_accelerations = jnp.stack(
+                wheel_phase.solve_acceleration(motion)[: wheel_phase.n_dof], axis=-1
+            )
+            accelerations_by_phase.append(
+                node_accelerations.reshape(phase_mesh.n_intervals, N_GAUSS_NODES, wheel_phase.n_dof)
+            )
+        return tuple(accelerations_by_phase)
+
     is_phase_active = (walk_samples.phase_durations > 0.0).astype(
         walk_samples.phase_durations.dtype
     )
-    phase_accelerations = jax.vmap(sample_accelerations)(
+    phase_accelerations = jax.vmap(sample_node_accelerations)(
         walk_samples.landing_distances, walk_samples.sample_states
     )
     guessed_solution = CollocationSolution(
@@ -501,32 +515,3 @@ def transfer_solution_to_mesh(
     return CollocationSolution(
         source_solution.section_state, source_solution.durations, tuple(accelerations_by_phase)
     )
-
-
-def _sample_node_accelerations(
-    collocation_system: CollocationSystem,
-    s: Symbols,
-    foot_distance: Scalar,
-    sample_states: Float[Array, "3 n_samples 6"],
-) -> tuple[Array, ...]:
-    """Return the accelerations at the nodes of each phase, computed from a sampled gait step.
-
-    The axes of each array are (interval, node, coordinate).
-    """
-    accelerations_by_phase, wheel_phases = [], make_phases(s, foot_distance, stop_at_lift_off=False)
-    sample_times = jnp.linspace(0.0, 1.0, sample_states.shape[1])
-    for wheel_phase, phase_mesh, phase_samples in zip(
-        wheel_phases, collocation_system.phase_meshes, sample_states, strict=True
-    ):
-        node_states = [
-            jnp.interp(jnp.asarray(phase_mesh.node_fractions), sample_times, coordinate_samples)
-            for coordinate_samples in phase_samples.T
-        ]
-        node_accelerations = jnp.stack(
-            wheel_phase.solve_acceleration(Motion.from_angle(*node_states))[: wheel_phase.n_dof],
-            axis=-1,
-        )
-        accelerations_by_phase.append(
-            node_accelerations.reshape(phase_mesh.n_intervals, N_GAUSS_NODES, wheel_phase.n_dof)
-        )
-    return tuple(accelerations_by_phase)

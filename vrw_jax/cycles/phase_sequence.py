@@ -90,7 +90,7 @@ def _make_collocation_phase(
         )
         return wheel_phase, wheel_phase.compute_motion(phase_point.q, phase_point.v)
 
-    def evaluate_residual(
+    def evaluate_dynamics_residual(
         phase_constants: PhaseConstants, phase_point: PhasePoint, phase_acceleration: Vector
     ) -> Vector:
         wheel_phase, wheel_motion = evaluate_phase(phase_constants, phase_point)
@@ -100,7 +100,7 @@ def _make_collocation_phase(
         wheel_phase, wheel_motion = evaluate_phase(phase_constants, phase_point)
         return wheel_phase.compute_end_guard(PhaseInstant(wheel_phase, wheel_motion, None))
 
-    def evaluate_guards(phase_constants: PhaseConstants, phase_point: PhasePoint) -> Vector:
+    def evaluate_phase_guards(phase_constants: PhaseConstants, phase_point: PhasePoint) -> Vector:
         wheel_phase, wheel_motion = evaluate_phase(phase_constants, phase_point)
         guard_values = wheel_phase.compute_guards(PhaseInstant(wheel_phase, wheel_motion, None))
         # Every guard keeps its index in ADMISSIBILITY_CHECKS, even if it is not checked.
@@ -131,33 +131,32 @@ def _make_collocation_phase(
     return CollocationPhase(
         phase_class.name,
         phase_class.n_dof,
-        evaluate_residual,
+        evaluate_dynamics_residual,
         evaluate_end_event,
         reset_function,
-        evaluate_guards,
+        evaluate_phase_guards,
         is_smooth=not phase_class.has_stiff_start,
     )
 
 
-def _list_admissibility_checks() -> tuple[str, ...]:
-    """Return a phrase for each check of the phases and of the transitions between them."""
-    check_phrases: list[str] = []
-    for phase_class in PAPER_PHASES:
-        failure_outcomes = (*phase_class.guard_outcomes[1:], *SHARED_FAILURE_OUTCOMES)
-        check_phrases += [f"{phase_class.name} lasts", f"{phase_class.name} ends only once"]
-        check_phrases += [
-            f"no {failure_outcome.name} in {phase_class.name}"
-            for failure_outcome in failure_outcomes
-        ]
-    return (
-        *check_phrases,
-        "λ4⁺ says whether there is DLS",
-        "λ_I4 holds the rear foot",
-        "Leg 2 extends",
-    )
-
-
-ADMISSIBILITY_CHECKS = (*_list_admissibility_checks(), "mesh")
+ADMISSIBILITY_CHECKS: tuple[str, ...] = (
+    *(
+        check_phrase
+        for phase_class in PAPER_PHASES
+        for check_phrase in (
+            f"{phase_class.name} lasts",
+            f"{phase_class.name} ends only once",
+            *(
+                f"no {failure_outcome.name} in {phase_class.name}"
+                for failure_outcome in (*phase_class.guard_outcomes[1:], *SHARED_FAILURE_OUTCOMES)
+            ),
+        )
+    ),
+    "λ4⁺ says whether there is DLS",
+    "λ_I4 holds the rear foot",
+    "Leg 2 extends",
+    "mesh",
+)
 """Assumptions about a gait, in the order in which they are checked.
 
 The first checks concern the duration and the guards of each phase. Checks of the transitions

@@ -83,10 +83,6 @@ class ReturnMapCycle(AbstractCycle):
     residual: Scalar
     n_iterations: Int[Array, ""]
 
-    @property
-    def period_n(self) -> int:
-        return self.steps.durations.shape[self.outcome.ndim]
-
     def _drop_single_step_axis(self, tree_over_steps: Any) -> Any:
         """Return the tree without its axis over the gait steps if the cycle has only one step."""
         step_axis, is_single_step = self.outcome.ndim, self.period_n == 1
@@ -110,14 +106,6 @@ class ReturnMapCycle(AbstractCycle):
     @property
     def step_ends(self) -> Array:
         return jnp.asarray(self.steps.section_state)
-
-    @property
-    def warm_start(self) -> Array:
-        return self.section_state
-
-    @property
-    def monodromy(self) -> Array:
-        return self.monodromy_value
 
     def model_summary_rows(self) -> list[LabelAndText]:
         return [("durations of each kind of support", f"{format_numbers(self.durations)} s")]
@@ -233,9 +221,6 @@ class AbstractReturnMapFinder(AbstractGaitFinder):
         """Return the last section state of a walk that begins at the model's default start."""
         model, params = self.model.from_values(parameter_values, self.n_legs)
         return walk_toward_gait(model, params, self.step_options).steps.section_state[-1]
-
-    def precompile_programs(self, params: WheelParams) -> None:
-        self.find_gait(self.model.parameter_values(params), self.model.default_start(params))
 
 
 class ReturnMapFinder(AbstractReturnMapFinder):

@@ -261,7 +261,7 @@ def _make_collocation_response_function(collocation_system: CollocationSystem) -
             )
             return phase_constants, end_section_state, phase_points
 
-        def evaluate_residual(
+        def evaluate_cycle_residual(
             unknown_vector: Array, state_and_slopes: Array, parameters: Array
         ) -> Array:
             durations, *accelerations = unflatten_unknowns(unknown_vector)
@@ -287,14 +287,14 @@ def _make_collocation_response_function(collocation_system: CollocationSystem) -
             return jnp.concatenate(residual_parts)
 
         state_and_slopes = jnp.concatenate([section_state, jnp.full(2, parameters[slope_index])])
-        residual_jacobian = jax.jacfwd(evaluate_residual)(
+        residual_jacobian = jax.jacfwd(evaluate_cycle_residual)(
             gait_unknown_vector, *lax.stop_gradient((state_and_slopes, parameters))
         )
         inverse_jacobian = invert_by_elimination(residual_jacobian)
 
         def evaluate_outputs(state_and_slopes: Array) -> Array:
             def refine_unknowns(unknown_vector: Array, _: None) -> tuple[Array, None]:
-                newton_correction = inverse_jacobian @ evaluate_residual(
+                newton_correction = inverse_jacobian @ evaluate_cycle_residual(
                     unknown_vector, state_and_slopes, parameters
                 )
                 return unknown_vector - newton_correction, None

@@ -27,7 +27,6 @@ from vrw_jax.cycles.finder import (
     move_derivative_axis_first,
 )
 from vrw_jax.cycles.gait_walks import stack_section_units
-from vrw_jax.cycles.options import CycleOptions
 from vrw_jax.cycles.return_map_finder import (
     AbstractReturnMapFinder,
     ReturnMapCycle,
@@ -81,17 +80,6 @@ class UnilateralFinder(AbstractReturnMapFinder):
     default_measures: ClassVar[tuple[str, ...]] = UNILATERAL_DIFFERENTIABLE_NAMES
     readable_measures: ClassVar[tuple[str, ...]] = UNILATERAL_DIFFERENTIABLE_NAMES
     is_multistable: ClassVar[bool] = True
-
-    @classmethod
-    def from_options(
-        cls,
-        model: Any,
-        n_legs: int,
-        step_options: StepOptions,
-        period_n: int,
-        cycle_options: CycleOptions,
-    ) -> AbstractReturnMapFinder:
-        return cls(model, n_legs, step_options, period_n)
 
     def find_cycle(self, params: WheelParams, cycle_guess: Any = None) -> ReturnMapCycle:
         """Find the cycle, by the batched engine if all inputs are concrete.
@@ -253,8 +241,8 @@ class PeriodMap(NamedTuple):
     parameter_values: np.ndarray  # (wheels, n_values)
 
     @property
-    def section_units(self) -> np.ndarray:
-        """Return the units of the section state for each wheel, shape (wheels, section)."""
+    def section_units_by_wheel(self) -> np.ndarray:
+        """Return the units of the section state of each wheel, shape (wheels, section)."""
         return stack_section_units(self.model, self.parameter_values, self.n_legs)
 
     def select_wheels(self, wheel_indices: np.ndarray) -> "PeriodMap":
@@ -403,7 +391,7 @@ def _find_contact_fixed_points(
     section_states = np.where(
         is_near_gait[:, None], loose_fixed_points.fixed_section_states, start_states
     )
-    section_units = period_map.section_units
+    section_units = period_map.section_units_by_wheel
     exact_period_evaluation = period_map.evaluate_period(step_options, section_states, False, False)
     newton_correction = exact_period_evaluation.compute_newton_correction(
         section_states, return_map_jacobian
@@ -458,7 +446,7 @@ def _run_contact_newton(
     section_states, last_section_states, section_units = (
         start_states.copy(),
         start_states.copy(),
-        period_map.section_units,
+        period_map.section_units_by_wheel,
     )
     newton_residuals, n_iterations = np.full(n_wheels, np.inf), np.zeros(n_wheels, np.int32)
     had_small_correction, is_gait_found, n_halvings = (

@@ -19,6 +19,7 @@ from jaxtyping import Array, Float, Int
 
 from vrw_jax.contact import (
     LOCKED_CODE_OFFSET,
+    AbstractContactWheel,
     ContactMode,
     FullState,
     UnilateralStep,
@@ -39,14 +40,11 @@ from vrw_jax.models import (
     ViscoelasticWheel,
     replace_invalid_inputs,
 )
-from vrw_jax.numerics import Elementwise, RealInput, Scalar, StepOptions
+from vrw_jax.numerics import RealInput, Scalar, StepOptions
 from vrw_jax.printing import AbstractPrintable, LabelAndText, map_text_of_elements
 from vrw_jax.wheel import (
-    FRICTION_NAME,
-    PARAMETER_NAMES,
     Outcome,
     WheelParams,
-    WheelUnits,
     convert_friction,
 )
 
@@ -236,7 +234,7 @@ class LadderStep(AbstractContactStep):
         return self.choice.model_selection()
 
 
-class LadderWheel(AbstractWheel):
+class LadderWheel(AbstractContactWheel):
     """Ladder of models: the viscoelastic model where it is valid, and else the unilateral model.
 
     A step is computed with the viscoelastic model if that model is valid for the step. Otherwise it
@@ -259,8 +257,6 @@ class LadderWheel(AbstractWheel):
         gait_method=GaitMethod.SELECTION,
         commands=frozenset({"scan"}),
     )
-    parameter_names: ClassVar[tuple[str, ...]] = (*PARAMETER_NAMES, FRICTION_NAME)
-    reports_contacts: ClassVar[bool] = True
 
     friction: Scalar = eqx.field(converter=convert_friction, default=0.7)
 
@@ -280,21 +276,6 @@ class LadderWheel(AbstractWheel):
     def split_ground(self, params: WheelParams, n_steps: int) -> None:
         """Return None, because a ladder of models does not support changing slopes."""
         return None
-
-    def default_start(self, params: WheelParams) -> FullState:
-        return self.unilateral_model.default_start(params)
-
-    def section_size(self, params: WheelParams) -> int:
-        return self.unilateral_model.section_size(params)
-
-    def n_continuous(self, params: WheelParams) -> int:
-        return self.unilateral_model.n_continuous(params)
-
-    def section_units(self, units: WheelUnits, n_legs: int) -> list[Elementwise]:
-        return self.unilateral_model.section_units(units, n_legs)
-
-    def embed_section(self, params: WheelParams, x: Array) -> FullState:
-        return self.unilateral_model.embed_section(params, x)
 
     def choose_model(
         self, params: WheelParams, x: FullState, options: StepOptions
