@@ -42,7 +42,7 @@ def wheel_on(slope, damping=250.0):
 
 def rigid_map(slope):
     model = vrw.RigidWheel()
-    start = model.default_start(vrw.WheelParams(slope=SLOPE))
+    start = model.compute_default_start(vrw.WheelParams(slope=SLOPE))
     return vrw.return_map(vrw.WheelParams(slope=slope), start, model=model)[1]
 
 

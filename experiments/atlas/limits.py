@@ -106,11 +106,11 @@ def step_with_leg(
         phase.vector_field, phase.guards, y, values_array, options
     )
     first = run(dls, jnp.stack([landing.theta_after, landing.motion_after.dtheta]))
-    m = dls.unpack_motion(first.state)
+    m = dls.motion_unpacker(first.state)
     state = jnp.stack([first.state[0], m.L1, m.L2, m.dtheta, m.dL1, m.dL2])
     if leg == "full":
         second = run(sls1, state)
-        motion = sls1.unpack_motion(second.state)
+        motion = sls1.motion_unpacker(second.state)
     else:
         rates = lambda y: (corrected_rates if leg == "corrected" else first_order_rates)(s, y)
         full = lambda y: Motion.from_angle(y[0], y[1], y[2], y[3], y[4], rates(y)[2])

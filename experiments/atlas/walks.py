@@ -32,7 +32,7 @@ def with_damping(
     The energy is a component of the state, so the solver controls its error.
     """
     s = params.symbols()
-    power = lambda y: dynamics.compute_damping_power(s, phase.unpack_motion(y))
+    power = lambda y: dynamics.compute_damping_power(s, phase.motion_unpacker(y))
     field = lambda y: jnp.append(phase.vector_field(y[:-1]), power(y[:-1]))
     watched = MonitoredFunctions(
         lambda y: phase.guards.evaluate_monitored(y[:-1]), phase.guards.n_guards
@@ -41,7 +41,7 @@ def with_damping(
     end = integrate_phase(
         field, watched, jnp.concatenate([start, zero]), jnp.asarray(True), options
     )
-    return end, end.state[-1], phase.unpack_motion(end.state[:-1])
+    return end, end.state[-1], phase.motion_unpacker(end.state[:-1])
 
 
 def accounted_step(params: vrw.WheelParams, x: jax.Array, options: vrw.StepOptions) -> tuple:

@@ -48,7 +48,7 @@ def scan_gaits(frictions: tuple[float, ...] = FRICTION) -> list[Row]:
         wheels = vrw.WheelParams(damping=jnp.asarray(DAMPING))
         wheels = jax.tree.map(lambda x: jnp.broadcast_to(x, len(DAMPING)), wheels)
         wheel_index, all_gaits = find_attracting_gaits(
-            finder, jax.vmap(finder.model.parameter_values)(wheels)
+            finder, jax.vmap(finder.model.collect_parameter_values)(wheels)
         )
         for wheel, damping in enumerate(DAMPING):
             gaits = jax.tree.map(lambda leaf, own=wheel_index == wheel: leaf[own], all_gaits)

@@ -62,9 +62,9 @@ def make_starts() -> np.ndarray:
         start = vrw.limit_cycle(params).section_state if start is None else jnp.asarray(start)
         x.append(
             np.asarray(
-                vrw.UnilateralWheel(friction=mu, infinite_friction_rule="paper").embed_section(
-                    params, start
-                )
+                vrw.UnilateralWheel(
+                    friction=mu, infinite_friction_rule="paper"
+                ).embed_section_state(params, start)
             )
         )
     return np.stack(x)

@@ -26,8 +26,8 @@ from vrw_jax.models import (
     N_STEP_INPUTS,
     RigidWheel,
     StepResult,
+    advance_gait_step,
     compute_jacobian_columns,
-    take_gait_step,
 )
 from vrw_jax.models.batch_step import make_batch_phase, run_batch_phases
 from vrw_jax.models.phase_sequence import evaluate_phase_states, make_step_result
@@ -322,7 +322,9 @@ def _numbers_of(step: StepResult) -> Array:
 def _advance(
     params: WheelParams, x: tuple[Array, ...], options: StepOptions
 ) -> tuple[tuple, tuple]:
-    step = take_gait_step(params, x, options, load_explicit_tableau(SOLVER), stop_at_lift_off=True)
+    step = advance_gait_step(
+        params, x, options, load_explicit_tableau(SOLVER), stop_at_lift_off=True
+    )
     return (*step.section_state, *step.durations), (step.outcome, step.solver_steps)
 
 

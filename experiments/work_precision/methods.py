@@ -155,10 +155,10 @@ def by_diffeqsolve(solver: diffrax.AbstractAdaptiveSolver, fixed: bool) -> Calla
         y, first_time, n1 = until(
             dls, jnp.stack([landing.theta_after, landing.motion_after.dtheta]), setting
         )
-        m = dls.unpack_motion(y)
+        m = dls.motion_unpacker(y)
         start = jnp.stack([y[0], m.L1, m.L2, m.dtheta, m.dL1, m.dL2])
         y, second, n2 = until(sls1, start, setting)
-        hit = transitions.resolve_stopper_collision(s, sls1.unpack_motion(y)).motion_after
+        hit = transitions.resolve_stopper_collision(s, sls1.motion_unpacker(y)).motion_after
         start = jnp.stack([y[0], hit.L1, hit.dtheta, hit.dL1])
         y, third, n3 = until(sls2, start, setting)
         times = first_time, second, third

@@ -75,12 +75,12 @@ def test_every_model_has_a_finder_whose_measures_are_in_the_table(model: Abstrac
 def test_values_and_from_values_of_a_model_are_inverse_to_each_other(model: AbstractWheel):
     feels = model.parameter_names == (*PARAMETER_NAMES, FRICTION_NAME)
     assert feels or model.parameter_names == PARAMETER_NAMES
-    values = model.parameter_values(TABLE_1)
+    values = model.collect_parameter_values(TABLE_1)
     assert values.shape == (9 + feels,)
     changed = values.at[6].set(150.0)
-    values_there, wheel = model.from_values(changed, 8)
+    values_there, wheel = model.from_parameter_values(changed, 8)
     assert float(wheel.damping) == 150.0
-    np.testing.assert_array_equal(values_there.parameter_values(wheel), changed)
+    np.testing.assert_array_equal(values_there.collect_parameter_values(wheel), changed)
     if feels:
         ground, _ = model.with_parameter(TABLE_1, FRICTION_NAME, jnp.asarray(1.25))
         assert float(ground.friction) == 1.25
@@ -137,7 +137,7 @@ def test_two_finders_agree_on_the_derivatives_of_a_gait():
     names = ("dls_fraction", "period", "speed", "lambda_4_plus", "dtheta_touchdown")
     paper = make_finder(None, 8, cycle_options=vrw.CycleOptions.tight())
     walking = ReturnMapFinder(vrw.ViscoelasticWheel(), 8, vrw.StepOptions.tight())
-    values = paper.model.parameter_values(TABLE_1)
+    values = paper.model.collect_parameter_values(TABLE_1)
     guess = vrw.limit_cycle(TABLE_1).section_state
     one = jax.jit(
         lambda v: jnp.stack(list(paper.find_cycle_from_values(v).measures(names).values()))

@@ -28,7 +28,7 @@ def walk_by_linear_map(monkeypatch, multiplier, last_step=10**9):
 
     monkeypatch.setattr(gait_walks, "_walk_wheels", take_steps)
     finder = SimpleNamespace(model=vrw.ViscoelasticWheel(), n_legs=8, period_n=1)
-    values = np.asarray(vrw.ViscoelasticWheel().parameter_values(vrw.WheelParams()))[None]
+    values = np.asarray(vrw.ViscoelasticWheel().collect_parameter_values(vrw.WheelParams()))[None]
     starts = (FIXED_POINT + 0.01 * np.ones(N_COORDINATES))[None, None]
     return gait_walks.walk_to_gaits(finder, values, lambda params: starts)
 

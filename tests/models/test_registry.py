@@ -18,7 +18,7 @@ class PointFeetWheel(vrw.AbstractWheel):
     capabilities: ClassVar[ModelCapabilities] = ModelCapabilities(
         config_name="point_feet",
         gait_method=GaitMethod.RETURN_MAP,
-        commands=frozenset({"branch"}),
+        accepted_commands=frozenset({"branch"}),
     )
     parameter_names: ClassVar[tuple[str, ...]] = PARAMETER_NAMES
     reports_contacts: ClassVar[bool] = False
@@ -33,8 +33,8 @@ class PointFeetWheel(vrw.AbstractWheel):
     def sample_step(self, params, x, options, n_samples):
         return vrw.RigidWheel().sample_step(params, x, options, n_samples)
 
-    def default_start(self, params):
-        return vrw.RigidWheel().default_start(params)
+    def compute_default_start(self, params):
+        return vrw.RigidWheel().compute_default_start(params)
 
 
 PARAMS = vrw.WheelParams(slope=0.15)
@@ -62,4 +62,10 @@ def test_a_new_model_in_the_registry_is_known_to_configurations_and_messages(mon
 
 @pytest.mark.parametrize("model_class", REGISTERED_MODEL_CLASSES, ids=lambda entry: entry.__name__)
 def test_each_model_declares_known_commands(model_class):
-    assert model_class.capabilities.commands <= {"scan", "map", "tune", "branch", "explore"}
+    assert model_class.capabilities.accepted_commands <= {
+        "scan",
+        "map",
+        "tune",
+        "branch",
+        "explore",
+    }

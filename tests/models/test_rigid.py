@@ -22,7 +22,7 @@ def rigid_walks(**changes):
 
 def test_the_published_fixed_point_and_multiplier():
     model = vrw.RigidWheel()
-    x = model.default_start(POINT_MASS_WHEEL)
+    x = model.compute_default_start(POINT_MASS_WHEEL)
     result = vrw.step(POINT_MASS_WHEEL, x, model=model)
     assert int(result.outcome) == vrw.Outcome.STEPPED
     assert abs(float(result.post_impact[1]) - 1.497247441300221) < 1e-12
@@ -126,11 +126,11 @@ def test_the_rigid_wheel_is_the_second_order_limit_of_the_viscoelastic_wheel():
 
 def test_the_rigid_wheel_has_the_interface_of_the_other_models():
     p = vrw.WheelParams(slope=0.15)
-    walk = vrw.walk(p, vrw.RigidWheel().default_start(p), 3, model=vrw.RigidWheel())
+    walk = vrw.walk(p, vrw.RigidWheel().compute_default_start(p), 3, model=vrw.RigidWheel())
     assert int(walk.outcome) in list(vrw.Outcome)
     data = vrw.simulate(
         POINT_MASS_WHEEL,
-        vrw.RigidWheel().default_start(POINT_MASS_WHEEL),
+        vrw.RigidWheel().compute_default_start(POINT_MASS_WHEEL),
         2,
         model=vrw.RigidWheel(),
     )

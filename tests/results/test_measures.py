@@ -9,7 +9,7 @@ from vrw_jax.printing import (
     format_markdown_table,
     format_mathtext,
 )
-from vrw_jax.selection.ladder import MODEL_SELECTION_MARGINS, describe_selection_reason
+from vrw_jax.selection.ladder import VIOLATION_TEXT_BY_SELECTION_MARGIN, describe_selection_reason
 
 INDICATORS = ("lambda_I4", "lambda_2_plus", "lambda_4_plus")
 
@@ -38,7 +38,7 @@ def test_other_measures_describe_no_violation():
 
 
 def test_reasons_of_the_ladder_come_from_the_table():
-    for reason, name in enumerate(MODEL_SELECTION_MARGINS, start=1):
+    for reason, name in enumerate(VIOLATION_TEXT_BY_SELECTION_MARGIN, start=1):
         assert MARGIN_MEASURES[name].violation_text in describe_selection_reason(reason)
 
 

@@ -98,11 +98,11 @@ def test_the_saltation_formula_agrees(forward_jacobian):
         )
 
         def lifted(y):
-            m = flows(y[2])[0].unpack_motion(y[:2])
+            m = flows(y[2])[0].motion_unpacker(y[:2])
             return jnp.stack([y[0], m.L1, m.L2, m.dtheta, m.dL1, m.dL2])
 
         def locked(y):
-            hit = transitions.resolve_stopper_collision(s, second.unpack_motion(y))
+            hit = transitions.resolve_stopper_collision(s, second.motion_unpacker(y))
             return jnp.stack(
                 [y[0], hit.motion_after.L1, hit.motion_after.dtheta, hit.motion_after.dL1]
             )

@@ -176,7 +176,7 @@ def test_an_impossible_length_is_refused_in_one_sentence(
 def test_the_rigid_wheel_is_simulated_by_the_same_function() -> None:
     model = vrw.RigidWheel()
     params = vrw.WheelParams(slope=0.1)  # at 0.30 its fore foot lifts off
-    walk = vrw.simulate(params, model.default_start(params), 2, model=model)
+    walk = vrw.simulate(params, model.compute_default_start(params), 2, model=model)
     assert walk.attrs["n_steps"] == 2
     assert np.all(walk.lambda_4 == 0.0)
     assert walk.L1.values == pytest.approx(float(params.locked_length), abs=1e-12)

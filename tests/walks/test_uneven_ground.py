@@ -88,9 +88,9 @@ def test_as_many_slopes_as_steps_use_the_last_one_twice():
     np.testing.assert_array_equal(walk.steps.durations, same.steps.durations)
     model = vrw.UnilateralWheel(friction=jnp.asarray([0.7, 0.5, 0.9]))
     wheel = lambda slopes: vrw.WheelParams(slope=jnp.asarray(slopes))
-    walk = model.split_ground(wheel(LINES[:3]), 3)
+    walk = model.split_ground_by_step(wheel(LINES[:3]), 3)
     longer = vrw.UnilateralWheel(friction=jnp.asarray([0.7, 0.5, 0.9, 0.1]))
-    same = longer.split_ground(wheel((*LINES[:3], LINES[2])), 3)
+    same = longer.split_ground_by_step(wheel((*LINES[:3], LINES[2])), 3)
     for row, other in zip(walk, same, strict=True):
         np.testing.assert_array_equal(row, other)
 
@@ -191,7 +191,7 @@ def make_uneven_ground(slopes=SLOPES, frictions=FRICTIONS):
 
 def test_each_foot_keeps_the_friction_of_its_landing():
     params, model = make_uneven_ground()
-    slope, friction, others, tilt = model.split_ground(params, 4)
+    slope, friction, others, tilt = model.split_ground_by_step(params, 4)
     np.testing.assert_allclose(slope, SLOPES)
     np.testing.assert_allclose(friction, FRICTIONS)
     np.testing.assert_allclose(others, (0.7, 0.7, 0.5, 0.9))
@@ -206,7 +206,7 @@ def test_each_foot_keeps_the_friction_of_its_landing():
 
 def test_a_landing_on_a_steeper_line_is_the_same_motion_in_another_frame():
     s, model = vrw.WheelParams().symbols(), vrw.UnilateralWheel()
-    x = model.embed_section(vrw.WheelParams(), jnp.asarray(START))
+    x = model.embed_section_state(vrw.WheelParams(), jnp.asarray(START))
     motion, stance = unpack_section_state(s, x)
     result, turned = (
         pack_section_state(motion, stance),

@@ -41,13 +41,13 @@ from vrw_jax.models import (
     N_STEP_INPUTS,
     AbstractWheel,
     AdvanceResult,
+    advance_gait_step,
     complete_jacobian_columns,
     compute_jacobian_columns,
-    take_gait_step,
 )
 from vrw_jax.numerics import StepOptions, batch_sizes, map_in_batches
 from vrw_jax.runtime import with_default_jax_settings
-from vrw_jax.simulation import check_model, check_section_state, check_step_options
+from vrw_jax.simulation import convert_model_argument, convert_section_state, convert_step_options
 from vrw_jax.validation import (
     check_choice,
     check_int,
@@ -146,11 +146,14 @@ def step_batch(
         "vrw.step_batch", "map vrw.return_map over the lanes", params, states, durations
     )
     check_type("params", params, WheelParams, "write vrw.WheelParams(damping=..., slope=...)")
-    checked_model, options = check_model(model, allows_arrays=True), check_step_options(options)
+    checked_model, options = (
+        convert_model_argument(model, allows_friction_arrays=True),
+        convert_step_options(options),
+    )
     check_choice("engine", engine, BATCH_ENGINE_NAMES)
     n_steps = check_int("n_steps", n_steps)
     derivatives = check_names("derivatives", derivatives, '"section_state", "damping"')
-    checked_states: np.ndarray = check_section_state(states, "states", check_numpy_reals)
+    checked_states: np.ndarray = convert_section_state(states, "states", check_numpy_reals)
     parameter_columns = _check_parameter_shapes(
         params, checked_states, checked_model, options, n_steps
     )
@@ -215,7 +218,7 @@ def _check_parameter_shapes(
     """
     section_sizes = [3]
     if section_states.ndim != 2 or section_states.shape[1] != 3:
-        section_sizes = sorted({3, model.section_size(params)})
+        section_sizes = sorted({3, model.count_section_entries(params)})
     if section_states.ndim != 2 or section_states.shape[1] not in section_sizes:
         raise ValueError(
             f"states have shape {section_states.shape}, but section states have the shape "
@@ -513,7 +516,7 @@ def _step_lanes_by_kernel(
                 lane_inputs[:n_parameters], n_legs, *lane_inputs[NEXT_SLOPE_INPUT_INDEX:]
             )
             x = lane_inputs[n_parameters:NEXT_SLOPE_INPUT_INDEX]
-            step_result = take_gait_step(
+            step_result = advance_gait_step(
                 params, x, traced_options, solver_tableau, stop_at_lift_off, straggler_count
             )
             step_diagnostics = (

@@ -30,7 +30,7 @@ from vrw_jax.cycles import (
 )
 from vrw_jax.models import AbstractWheel, GaitMethod
 from vrw_jax.numerics import StepOptions, select_tree_rows
-from vrw_jax.simulation import walk_toward_gait
+from vrw_jax.simulation import start_walk_toward_gait
 from vrw_jax.wheel import WheelParams
 
 
@@ -173,7 +173,7 @@ def find_return_map_starts(branch_request: BranchRequest, given_cycle: Any) -> B
 
     def walk_to_gait(params: WheelParams, p: Array) -> tuple[Array, Array]:
         model_at_p, params_at_p = model.with_parameter(params, branch_request.parameter_name, p)
-        walk_result = walk_toward_gait(model_at_p, params_at_p, step_options)
+        walk_result = start_walk_toward_gait(model_at_p, params_at_p, step_options)
         return walk_result.outcome, walk_result.steps.section_state[-1]
 
     if given_cycle is None:
@@ -185,7 +185,7 @@ def find_return_map_starts(branch_request: BranchRequest, given_cycle: Any) -> B
         step_options=step_options,
         parameter_name=branch_request.parameter_name,
         period_n=branch_request.period_n,
-        n_coordinates=model.n_continuous(params),
+        n_coordinates=model.count_continuous_entries(params),
     )
     is_phase_active = jnp.ones(
         (*branch_request.parameter_values.shape, 1, 1), branch_request.parameter_values.dtype
@@ -222,7 +222,7 @@ def find_contact_gait_starts(branch_request: BranchRequest, start_cycle: Any) ->
         step_options=step_options,
         parameter_name=branch_request.parameter_name,
         period_n=branch_request.period_n,
-        n_coordinates=model.n_continuous(params),
+        n_coordinates=model.count_continuous_entries(params),
         n_legs=params.n_legs,
     )
     parameter_values = ground_problem.stack_parameter_values(

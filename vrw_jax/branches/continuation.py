@@ -57,8 +57,13 @@ from vrw_jax.models import AbstractWheel, GaitMethod
 from vrw_jax.numerics import StepOptions, batch_sizes, map_in_numpy_batches, select_tree_rows
 from vrw_jax.runtime import with_default_jax_settings
 from vrw_jax.runtime import xarray as xr
-from vrw_jax.selection import raise_if_ladder
-from vrw_jax.simulation import ModelLike, check_model, check_single_wheel, check_step_options
+from vrw_jax.selection import raise_for_ladder
+from vrw_jax.simulation import (
+    ModelLike,
+    convert_model_argument,
+    convert_step_options,
+    require_single_wheel,
+)
 from vrw_jax.validation import (
     check_bool,
     check_callable,
@@ -268,14 +273,14 @@ def continue_branch(
         >>> print(point.name, f"{point.value:.6f}", branch.ends[1])
         lambda_4_plus 219.847688 lambda 4 plus at 219.847688 ends it.
     """
-    check_single_wheel(params, "use vrw.continue_branches for a batch")
+    require_single_wheel(params, "use vrw.continue_branches for a batch")
     if cycle is not None:
         check_type("cycle", cycle, AbstractCycle, "give vrw.limit_cycle(params)")
     require_untraced_arguments("vrw.continue_branch", DIFFERENTIATION_ADVICE, params, cycle)
     params_batch, cycle = jax.device_put(select_tree_rows((params, cycle), None))
     (branch,) = continue_branches(
         params_batch, name, bounds, cycle=cycle, period_n=period_n, options=options,
-        model=check_model(resolve_model(params, model)),
+        model=convert_model_argument(resolve_model(params, model)),
         cycle_options=cycle_options, step_options=step_options, force_peaks=force_peaks,
     )  # fmt: skip
     return branch
@@ -328,10 +333,10 @@ def continue_branches(
     require_untraced_arguments("vrw.continue_branch", DIFFERENTIATION_ADVICE, params, cycle)
     check_type("params", params, WheelParams, "write vrw.WheelParams(damping=..., slope=...)")
     model, step_options = (
-        check_model(model),
-        check_step_options(step_options or StepOptions.tight()),
+        convert_model_argument(model),
+        convert_step_options(step_options or StepOptions.tight()),
     )
-    raise_if_ladder(model, "followed")
+    raise_for_ladder(model, "followed")
     check_parameter_name(name, model.parameter_names, "parameter")
     if check_int("period_n", period_n) > 1 and cycle is None:
         raise ValueError(

@@ -295,8 +295,8 @@ class AbstractReturnMapProblem(AbstractGaitProblem):
     """Continuation problem of fixed points of the return map over `period_n` gait steps.
 
     The unknowns z are the section state. Its last components are discrete codes (see
-    `AbstractWheel.n_continuous`), which are copied from the image in every Newton iteration.
-    Newton's method converges only if the codes of state and image are equal.
+    `AbstractWheel.count_continuous_entries`), which are copied from the image in every Newton
+    iteration. Newton's method converges only if the codes of state and image are equal.
     """
 
     period_n: eqx.AbstractVar[int]
@@ -376,7 +376,7 @@ class GroundProblem(AbstractReturnMapProblem):
 
         def select_values(wheel: BranchWheel, p: Array) -> Array:
             model, params = self.model.with_parameter(wheel.params, self.parameter_name, p)
-            return model.parameter_values(params)
+            return model.collect_parameter_values(params)
 
         return jax.vmap(select_values)(wheels, p)
 

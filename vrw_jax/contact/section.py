@@ -11,7 +11,7 @@ from vrw_jax.contact.contact_state import ContactState
 from vrw_jax.contact.mechanics import WheelMotion, compute_leg_directions
 from vrw_jax.models import (
     PAPER_START_STATE,
-    is_valid_slope,
+    is_slope_in_domain,
     is_valid_start_state,
     replace_invalid_inputs,
 )
@@ -103,7 +103,7 @@ def replace_invalid_start(
     valid_column = valid_state.reshape(-1, *(1,) * (section_state.ndim - 1))
     is_valid = is_valid_start_state(params, section_state) & (friction >= 0.0)
     is_valid = is_valid & (
-        is_valid_slope(params.slope + next_line_tilt)
+        is_slope_in_domain(params.slope + next_line_tilt)
         if next_line_tilt is not None
         else _has_consistent_posture(params.symbols(), section_state)
     )

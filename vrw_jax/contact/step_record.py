@@ -371,9 +371,9 @@ class UnilateralStep(AbstractContactStep):
     solver_steps: Int[Array, "..."]
     engine: str = eqx.field(static=True, default="")
 
-    def model_measures(self) -> dict[str, Array]:
+    def collect_model_measures(self) -> dict[str, Array]:
         """Return the measures of steps with contacts and the stopper margins, by name."""
-        return AbstractContactStep.model_measures(self) | {
+        return AbstractContactStep.collect_model_measures(self) | {
             margin_field.name: getattr(self.margins, margin_field.name)
             for margin_field in dataclasses.fields(self.margins)
         }

@@ -31,8 +31,8 @@ from vrw_jax.models import (
     ModelCapabilities,
     StepGroundValues,
     can_use_batch_kernel,
-    check_stepwise_shape,
     complete_line_slopes,
+    require_stepwise_shape,
 )
 from vrw_jax.numerics import (
     Elementwise,
@@ -80,7 +80,7 @@ class UnilateralTrajectory(eqx.Module):
     section_state: FullState  # full section state after the step
     step_length: Scalar
     outcome: Int[Array, ""]
-    model_selection: dict[str, Array] = eqx.field(default_factory=dict)  # see `AbstractStep`
+    model_selection: dict[str, Array] = eqx.field(default_factory=dict)  # see `ModelChoice`
 
 
 class UnevenGround(NamedTuple):
@@ -113,22 +113,22 @@ class AbstractContactWheel(AbstractWheel):
     parameter_names: ClassVar[tuple[str, ...]] = (*PARAMETER_NAMES, FRICTION_NAME)
     reports_contacts: ClassVar[bool] = True
 
-    def default_start(self, params: WheelParams) -> FullState:
+    def compute_default_start(self, params: WheelParams) -> FullState:
         """Return a full section state near the gait of the wheel in Table 1 of the paper."""
         return embed_section_state(
             params.symbols(), jnp.asarray(PAPER_START_STATE, params.damping.dtype)
         )
 
-    def section_size(self, params: WheelParams) -> int:
+    def count_section_entries(self, params: WheelParams) -> int:
         return compute_full_section_size(params.n_legs)
 
-    def n_continuous(self, params: WheelParams) -> int:
+    def count_continuous_entries(self, params: WheelParams) -> int:
         return compute_full_section_size(params.n_legs) - params.n_legs
 
-    def section_units(self, units: WheelUnits, n_legs: int) -> list[Elementwise]:
+    def compute_section_units(self, units: WheelUnits, n_legs: int) -> list[Elementwise]:
         return compute_section_units(units, n_legs)
 
-    def embed_section(self, params: WheelParams, x: Array) -> FullState:
+    def embed_section_state(self, params: WheelParams, x: Array) -> FullState:
         """Return the full section state for `x`, shape (4 + 3 n,).
 
         `x` may be a full section state or (theta-, dtheta-, dL1-), the section state of the paper.
@@ -171,8 +171,8 @@ class UnilateralWheel(AbstractContactWheel):
     capabilities: ClassVar[ModelCapabilities] = ModelCapabilities(
         config_name="unilateral",
         gait_method=GaitMethod.CONTACT_WALKS,
-        commands=frozenset({"scan", "tune", "branch", "explore"}),
-        fixed_by_tolerance=("restitution", "infinite_friction_rule", "uneven", "max_events"),
+        accepted_commands=frozenset({"scan", "tune", "branch", "explore"}),
+        default_only_fields=("restitution", "infinite_friction_rule", "uneven", "max_events"),
     )
     batch_kernel: ClassVar[str] = "legs"
 
@@ -217,7 +217,7 @@ class UnilateralWheel(AbstractContactWheel):
         """Return whether infinite friction means the rule (A1)-(A4) of the paper."""
         return self.infinite_friction_rule == FRICTION_PAPER_RULE
 
-    def split_ground(self, params: WheelParams, n_steps: int) -> StepGroundValues | None:
+    def split_ground_by_step(self, params: WheelParams, n_steps: int) -> StepGroundValues | None:
         """Return the ground under each step, or None on flat ground with one friction coefficient.
 
         The result is (slope in rad, friction coefficient, friction coefficient of the feet that
@@ -231,12 +231,12 @@ class UnilateralWheel(AbstractContactWheel):
             jnp.full(n_steps + 1, slope) if is_flat_ground else complete_line_slopes(slope, n_steps)
         )
         if friction.ndim:
-            check_stepwise_shape(FRICTION_NAME, friction, n_steps)
+            require_stepwise_shape(FRICTION_NAME, friction, n_steps)
         friction = jnp.broadcast_to(friction[:n_steps] if friction.ndim else friction, n_steps)
         previous_friction = jnp.append(friction[:1], friction[:-1])
         return line_slopes[:-1], friction, previous_friction, line_slopes[1:] - line_slopes[:-1]
 
-    def with_ground(
+    def with_step_ground(
         self, params: WheelParams, step_ground: StepGroundValues
     ) -> tuple["UnilateralWheel", WheelParams]:
         slope, friction, previous_friction, tilt = step_ground

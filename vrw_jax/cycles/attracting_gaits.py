@@ -35,7 +35,7 @@ def find_attracting_gaits(gait_finder: Any, parameter_values: Any) -> tuple[np.n
     Args:
         gait_finder: finder of gaits with unilateral contact.
         parameter_values: parameters of each wheel, shape (wheels, n_values), in the order of
-            `AbstractWheel.parameter_values`.
+            `AbstractWheel.collect_parameter_values`.
 
     Returns:
         Index of the wheel to which each gait belongs, shape (gaits,), and the cycles, whose leading

@@ -46,7 +46,7 @@ from vrw_jax.measures import (
 from vrw_jax.models import AbstractStep, SectionState, StepResult, ViscoelasticWheel
 from vrw_jax.numerics import StepOptions, evaluate_with_jacobian
 from vrw_jax.runtime import with_default_jax_settings
-from vrw_jax.simulation import validate_arguments
+from vrw_jax.simulation import convert_step_arguments
 from vrw_jax.wheel import (
     PARAMETER_NAMES,
     WheelParams,
@@ -137,7 +137,9 @@ class CollocationFinder(AbstractGaitFinder):
                 if isinstance(search_guess, AbstractCycle)
                 else search_guess
             )
-            params, collocation_state, _, _ = validate_arguments(params, section_state, None, None)
+            params, collocation_state, _, _ = convert_step_arguments(
+                params, section_state, None, None
+            )
             search_guess = self.guess_cycle_from_state(
                 *lax.stop_gradient((params, collocation_state))
             )
@@ -258,7 +260,9 @@ class CollocationFinder(AbstractGaitFinder):
 
     def precompile_programs(self, params: WheelParams) -> None:
         parameter_values = stack_parameters(params)
-        section_state = jnp.asarray(self.model.default_start(params), parameter_values.dtype)
+        section_state = jnp.asarray(
+            self.model.compute_default_start(params), parameter_values.dtype
+        )
         section_state_derivatives = jnp.zeros(
             (len(PARAMETER_NAMES), section_state.shape[0]), section_state.dtype
         )

@@ -195,7 +195,9 @@ class AbstractGaitFinder(eqx.Module):
 
     def precompile_programs(self, params: WheelParams) -> None:
         """Compile the programs of `find_gait`, in parallel if possible."""
-        self.find_gait(self.model.parameter_values(params), self.model.default_start(params))
+        self.find_gait(
+            self.model.collect_parameter_values(params), self.model.compute_default_start(params)
+        )
 
     def take_step(self, params: WheelParams, section_state: Array) -> AbstractStep:
         """Compute one event-driven step from a section state, by a program that is
@@ -210,7 +212,7 @@ class AbstractGaitFinder(eqx.Module):
         self, parameter_values: ParameterValues, cycle_guess: Any = None
     ) -> AbstractCycle:
         """Find the cycle near `cycle_guess` for the wheel that `parameter_values` describes."""
-        model, params = self.model.from_values(parameter_values, self.n_legs)
+        model, params = self.model.from_parameter_values(parameter_values, self.n_legs)
         return eqx.tree_at(lambda gait_finder: gait_finder.model, self, model).find_cycle(
             params, cycle_guess
         )

@@ -21,10 +21,10 @@ from vrw_jax.numerics import StepOptions
 from vrw_jax.printing import format_numbers
 from vrw_jax.simulation import (
     ModelLike,
-    check_model,
-    check_section_state,
-    check_single_wheel,
-    check_step_options,
+    convert_model_argument,
+    convert_section_state,
+    convert_step_options,
+    require_single_wheel,
 )
 from vrw_jax.validation import check_type, has_traced_leaf
 from vrw_jax.wheel import WheelParams
@@ -52,12 +52,12 @@ def make_finder(
     """Return the gait finder for a model."""
     if cycle_options is not None:
         check_type("cycle_options", cycle_options, CycleOptions, "give vrw.CycleOptions()")
-    resolved_model = check_model(model)
+    resolved_model = convert_model_argument(model)
     make_finder_from_options = FINDER_CLASS_BY_METHOD[
         resolved_model.capabilities.gait_method
     ].from_options
     return make_finder_from_options(
-        resolved_model, n_legs, check_step_options(step_options), period_n,
+        resolved_model, n_legs, convert_step_options(step_options), period_n,
         CycleOptions() if cycle_options is None else cycle_options)  # fmt: skip
 
 
@@ -78,7 +78,7 @@ def resolve_model_with_reason(
     """Return the model to which a wheel's gait belongs and, for the ladder, the reason in one
     sentence.
     """
-    selected_model: Any = check_model(model)
+    selected_model: Any = convert_model_argument(model)
     if selected_model.fallback_model is selected_model or not isinstance(params, WheelParams):
         return model, None
     if has_traced_leaf(params, model) or params.damping.ndim:
@@ -86,7 +86,7 @@ def resolve_model_with_reason(
     paper_cycle: Any = make_finder(None, params.n_legs).find_cycle(params)
     if not bool(paper_cycle.found):
         return selected_model.fallback_model, f"The paper's wheel has no gait: {paper_cycle.why}"
-    section_state = selected_model.embed_section(params, paper_cycle.section_state)
+    section_state = selected_model.embed_section_state(params, paper_cycle.section_state)
     model_choice = selected_model.choose_model(params, section_state, StepOptions())[0]
     return model_choice.model, model_choice.why
 
@@ -98,7 +98,7 @@ def check_cycle_guess(cycle_guess: Any) -> Any:
     """
     if cycle_guess is None or isinstance(cycle_guess, AbstractCycle | CollocationState):
         return cycle_guess
-    section_state = check_section_state(cycle_guess, "guess")
+    section_state = convert_section_state(cycle_guess, "guess")
     if not has_traced_leaf(section_state) and not np.isfinite(section_state).all():
         raise ValueError(
             f"guess is {format_numbers(section_state)}, but a search can begin at finite numbers "
@@ -117,7 +117,7 @@ def resolve_finder(
 
     Raise TypeError or ValueError if the arguments do not fit the model.
     """
-    check_single_wheel(
+    require_single_wheel(
         params, "map over batches with jax.vmap, in_axes=(params.in_axes,), or use vrw.scan"
     )
     if options is not None:

@@ -233,7 +233,7 @@ def limit_cycles(
         if gait_finder.is_multistable:
             require_untraced_arguments("vrw.limit_cycles", "give vrw.limit_cycle a guess", params)
             return find_attracting_gaits(
-                gait_finder, gait_finder.model.parameter_values(params)[None]
+                gait_finder, gait_finder.model.collect_parameter_values(params)[None]
             )[1]
     if len(batch_shape) != 1:
         raise ValueError(f"the wheels' batch has shape {batch_shape}, but it must have one axis.")
@@ -272,7 +272,7 @@ def _find_chosen_gaits(gait_finder: Any, params: WheelParams, gait_choice: GaitC
     """Find for each wheel the attracting gait that `gait_choice` selects."""
     n_wheels, gait_rank = params.damping.shape[0], parse_gait_choice(gait_choice)
     gait_wheel_indices, attracting_gaits = find_attracting_gaits(
-        gait_finder, gait_finder.model.parameter_rows(params)
+        gait_finder, gait_finder.model.collect_batch_parameter_values(params)
     )
     n_gaits_per_wheel = np.bincount(gait_wheel_indices, minlength=n_wheels)
     insufficient_gait_counts = n_gaits_per_wheel[

@@ -151,7 +151,8 @@ def _make_section_states(
 def stack_section_units(model: Any, parameter_values: np.ndarray, n_legs: int) -> np.ndarray:
     """Return the units of the section state for each wheel, shape (wheels, section)."""
     return np.stack(
-        model.section_units(compute_wheel_units_of_rows(parameter_values, n_legs), n_legs), -1
+        model.compute_section_units(compute_wheel_units_of_rows(parameter_values, n_legs), n_legs),
+        -1,
     )
 
 
@@ -160,7 +161,7 @@ def count_section_coordinates(gait_finder: Any) -> int:
 
     The remaining components are discrete codes.
     """
-    return int(gait_finder.model.n_continuous(WheelParams(n_legs=gait_finder.n_legs)))
+    return int(gait_finder.model.count_continuous_entries(WheelParams(n_legs=gait_finder.n_legs)))
 
 
 class DistinctWalkEnds(NamedTuple):
@@ -186,7 +187,7 @@ def walk_to_gaits(
     Args:
         gait_finder: finder of gaits, whose model computes the gait steps.
         parameter_values: parameters of each wheel, shape (wheels, n_values), in the order of
-            `AbstractWheel.parameter_values`.
+            `AbstractWheel.collect_parameter_values`.
         compute_start_states: function that maps wheels to section states, shape (starts, wheels,
             3).
         walk_options: numerical options of the walks.
@@ -297,7 +298,7 @@ def _split_parameter_values(
     """Return the model and the wheels that `parameter_values` of shape (wheels,
     n_values) describe.
     """
-    model, params = gait_finder.model.from_values(
+    model, params = gait_finder.model.from_parameter_values(
         tuple(jax.device_put(list(parameter_values.T))), gait_finder.n_legs
     )
     return model, params

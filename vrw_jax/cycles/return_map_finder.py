@@ -34,7 +34,7 @@ from vrw_jax.measures import (
 from vrw_jax.models import AbstractWheel
 from vrw_jax.numerics import Scalar, StepOptions, evaluate_with_jacobian
 from vrw_jax.printing import LabelAndText, format_numbers
-from vrw_jax.simulation import validate_arguments, walk_toward_gait
+from vrw_jax.simulation import convert_step_arguments, start_walk_toward_gait
 from vrw_jax.wheel import Outcome, WheelParams, compute_wheel_units
 
 MIN_NEWTON_TOLERANCE = 1e-12
@@ -132,7 +132,7 @@ def find_return_map_cycle(
         else (model.advance, solve_fixed_point)
     )
     section_units = jnp.stack(
-        model.section_units(compute_wheel_units(params.symbols()), params.n_legs)
+        model.compute_section_units(compute_wheel_units(params.symbols()), params.n_legs)
     )
     return_map = lambda section_state: (
         evaluate_step(params, section_state * section_units, options).section_state / section_units
@@ -219,8 +219,8 @@ class AbstractReturnMapFinder(AbstractGaitFinder):
 
     def make_initial_guess(self, parameter_values: ParameterValues) -> Array:
         """Return the last section state of a walk that begins at the model's default start."""
-        model, params = self.model.from_values(parameter_values, self.n_legs)
-        return walk_toward_gait(model, params, self.step_options).steps.section_state[-1]
+        model, params = self.model.from_parameter_values(parameter_values, self.n_legs)
+        return start_walk_toward_gait(model, params, self.step_options).steps.section_state[-1]
 
 
 class ReturnMapFinder(AbstractReturnMapFinder):
@@ -284,8 +284,12 @@ def prepare_search(
     guess_state = (
         cycle_guess.section_state if isinstance(cycle_guess, AbstractCycle) else cycle_guess
     )
-    section_state = gait_finder.model.default_start(params) if guess_state is None else guess_state
-    return validate_arguments(params, section_state, gait_finder.model, gait_finder.step_options)
+    section_state = (
+        gait_finder.model.compute_default_start(params) if guess_state is None else guess_state
+    )
+    return convert_step_arguments(
+        params, section_state, gait_finder.model, gait_finder.step_options
+    )
 
 
 def make_return_map_gait(
@@ -301,7 +305,7 @@ def make_return_map_gait(
     The active phases do not identify a branch. With unilateral contact the order of events may
     change on a branch.
     """
-    n_coordinates = model.n_continuous(WheelParams(n_legs=n_legs))
+    n_coordinates = model.count_continuous_entries(WheelParams(n_legs=n_legs))
     gait_coordinates = lambda cycle, event_driven_step: jnp.concatenate(
         [cycle.section_state[:n_coordinates], event_driven_step.durations]
     )

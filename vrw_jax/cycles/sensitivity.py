@@ -71,7 +71,7 @@ def sensitivities(
             "but the measures of a cycle are "
             f"{', '.join(gait_finder.differentiable_measures)}: choose among these."
         )
-    parameter_values = gait_finder.model.parameter_values(params)
+    parameter_values = gait_finder.model.collect_parameter_values(params)
     gait_measures = gait_finder.measure_gait(
         parameter_values, check_cycle_guess(guess), measure_names
     )

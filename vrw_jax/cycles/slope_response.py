@@ -165,14 +165,14 @@ def compute_step_slope_response(
 
     The discrete codes in the section state do not vary.
     """
-    n_states = model.n_continuous(params)
+    n_states = model.count_continuous_entries(params)
     section_state_codes = section_state[n_states:]
 
     def evaluate_step(state_and_slopes: Array) -> Array:
-        line_slopes: Any = model.split_ground(
+        line_slopes: Any = model.split_ground_by_step(
             eqx.tree_at(lambda p: p.slope, params, state_and_slopes[n_states:]), 1
         )
-        step_model, step_params = model.with_ground(
+        step_model, step_params = model.with_step_ground(
             params, tuple(line_values[0] for line_values in line_slopes)
         )
         gait_step = step_model.take_step(

@@ -40,7 +40,7 @@ from vrw_jax.cycles.return_map_finder import (
 from vrw_jax.measures import UNILATERAL_DIFFERENTIABLE_NAMES
 from vrw_jax.models import AbstractStep, AbstractWheel
 from vrw_jax.numerics import StepOptions, batch_sizes, map_in_batches, select_tree_rows
-from vrw_jax.simulation import validate_arguments
+from vrw_jax.simulation import convert_step_arguments
 from vrw_jax.validation import has_traced_leaf
 from vrw_jax.wheel import Outcome, WheelParams
 
@@ -94,18 +94,22 @@ class UnilateralFinder(AbstractReturnMapFinder):
             )
         return jax.tree.map(
             lambda section_state: section_state[0],
-            self.find_cycles_near(model.parameter_values(params)[None], section_state[None]),
+            self.find_cycles_near(
+                model.collect_parameter_values(params)[None], section_state[None]
+            ),
         )
 
     def find_cycles(self, params: WheelParams, cycle_guess: Any = None) -> Any:
         if has_traced_leaf(params, cycle_guess):
             return eqx.filter_vmap(self.find_cycle)(params, cycle_guess)
-        parameter_values = jax.vmap(self.model.parameter_values)(params)
+        parameter_values = jax.vmap(self.model.collect_parameter_values)(params)
         section_states = getattr(cycle_guess, "section_state", cycle_guess)
         if section_states is None:
-            section_states = jax.vmap(self.model.default_start)(params)
+            section_states = jax.vmap(self.model.compute_default_start)(params)
         else:
-            section_states = jax.vmap(self.model.embed_section)(params, jnp.asarray(section_states))
+            section_states = jax.vmap(self.model.embed_section_state)(
+                params, jnp.asarray(section_states)
+            )
         return self.find_cycles_near(parameter_values, section_states)
 
     def find_cycles_near(self, parameter_values: Any, section_states: Any) -> ReturnMapCycle:
@@ -118,7 +122,7 @@ class UnilateralFinder(AbstractReturnMapFinder):
         """Compile the programs of Newton's method while another thread computes walks toward its
         start.
         """
-        n_section = self.model.section_size(WheelParams(n_legs=self.n_legs))
+        n_section = self.model.count_section_entries(WheelParams(n_legs=self.n_legs))
         period_map = PeriodMap(self.model, self.n_legs, self.period_n, parameter_values)
         section_states = np.zeros((len(parameter_values), n_section))
         period_map.evaluate_period(self.step_options, section_states, False)
@@ -172,7 +176,7 @@ class UnilateralFinder(AbstractReturnMapFinder):
 
     def take_step(self, params: WheelParams, section_state: Array) -> AbstractStep:
         parameter_value_columns, model = (
-            np.asarray(self.model.parameter_values(params))[:, None],
+            np.asarray(self.model.collect_parameter_values(params))[:, None],
             self.model,
         )
         step_arguments = (
@@ -190,7 +194,7 @@ class UnilateralFinder(AbstractReturnMapFinder):
         """Return measures of a gait and their derivatives, computed from one Jacobian of the gait
         step.
         """
-        model, params = self.model.from_values(
+        model, params = self.model.from_parameter_values(
             tuple(jax.device_put(list(np.asarray(parameter_values)))), self.n_legs
         )
         start_state = (
@@ -199,7 +203,9 @@ class UnilateralFinder(AbstractReturnMapFinder):
         start_state = (
             self.make_initial_guess(parameter_values) if start_state is None else start_state
         )
-        _, section_state, _, _ = validate_arguments(params, start_state, model, self.step_options)
+        _, section_state, _, _ = convert_step_arguments(
+            params, start_state, model, self.step_options
+        )
         return compute_gait_measures(
             self.find_gait(parameter_values, section_state), type(self).read_measure, measure_names
         )
@@ -562,7 +568,7 @@ def _make_contact_cycle(
         fixed_points.is_gait_found,
         fixed_points.n_newton_iterations,
     )
-    params = model.from_values(parameter_values, n_legs)[1]
+    params = model.from_parameter_values(parameter_values, n_legs)[1]
     fixed_point = FixedPointResult(
         fixed_points.fixed_section_states,
         _compute_return_map_jacobian_of_steps(fixed_points, len(parameter_values)),

@@ -3,10 +3,10 @@
 from vrw_jax.models import batch_step, unit_scaling
 from vrw_jax.models.batch_step import (
     N_STEP_INPUTS,
+    advance_gait_step,
     can_use_batch_kernel,
     compute_jacobian_columns,
     split_jacobian_by_leaf,
-    take_gait_step,
 )
 from vrw_jax.models.capabilities import GaitMethod, ModelCapabilities, PassageMethod
 from vrw_jax.models.interface import AbstractWheel, StepGroundValues
@@ -15,12 +15,12 @@ from vrw_jax.models.step_inputs import (
     PAPER_START_STATE,
     AnySectionState,
     SectionState,
-    check_stepwise_shape,
     complete_line_slopes,
-    is_valid_slope,
+    is_slope_in_domain,
     is_valid_start_state,
     replace_invalid_inputs,
-    split_slopes,
+    require_stepwise_shape,
+    separate_next_slope,
 )
 from vrw_jax.models.step_results import (
     AbstractContactStep,

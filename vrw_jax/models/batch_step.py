@@ -33,11 +33,11 @@ from vrw_jax.models.phase_sequence import (
     PhaseRunner,
     PhaseSequenceResult,
     finish_step,
-    get_next_section_state,
     make_advance_result,
     make_step_result,
     make_trajectory,
     run_step_phases,
+    select_next_section_state,
 )
 from vrw_jax.models.step_results import (
     AdvanceResult,
@@ -106,8 +106,8 @@ class BatchAdvanceResult(NamedTuple):
 class _PhaseCarry(NamedTuple):
     """Data that the integration of a phase passes to the integration of the next phase."""
 
-    next_dt: Array  # step size that the controller proposes next, s
-    has_phase_run: Bool[Array, " lanes"]  # whether the phase took place
+    next_solver_dt: Array  # step size that the controller proposes next, s
+    has_phase_occurred: Bool[Array, " lanes"]  # whether the phase took place
     is_unfinished: Bool[Array, " lanes"]
 
 
@@ -120,9 +120,13 @@ def make_batch_phase(
     """
 
     def evaluate_acceleration(q: Vector, v: Vector) -> StageAccelerations:
-        sin, cos = compute_sine_cosine(q[0])
+        sin_theta, cos_theta = compute_sine_cosine(q[0])
         return StageAccelerations(
-            sin, cos, phase.solve_acceleration(phase.complete_motion(sin, cos, q, v))[: phase.n_dof]
+            sin_theta,
+            cos_theta,
+            phase.solve_acceleration(phase.complete_motion(sin_theta, cos_theta, q, v))[
+                : phase.n_dof
+            ],
         )
 
     def complete_stage_motion(stage: StageState) -> Motion:
@@ -158,7 +162,7 @@ def make_batch_phase(
     )
 
 
-def take_gait_step(
+def advance_gait_step(
     params: WheelParams,
     x: Vector,
     options: StepOptions,
@@ -182,7 +186,7 @@ def take_gait_step(
         straggler_count=straggler_count,
     )
     phase_ends, has_stepped = phase_sequence.phase_ends, phase_sequence.outcome == Outcome.STEPPED
-    next_state = get_next_section_state(phase_sequence)
+    next_state = select_next_section_state(phase_sequence)
     return BatchAdvanceResult(
         section_state=tuple(
             jnp.where(has_stepped, state_component, 0.0) for state_component in next_state
@@ -214,7 +218,7 @@ def run_batch_phases(
     - `straggler_count`: see `integrate_batch_phase`;
     - `is_compiled_separately`: see `BatchPhase`.
     """
-    run_phase = _make_phase_runner(
+    phase_runner = _make_phase_runner(
         options,
         tableau,
         records_margins,
@@ -222,8 +226,8 @@ def run_batch_phases(
         is_compiled_separately,
         stiff_start_options,
     )
-    land = with_batched_jvp(transitions.resolve_landing)
-    return run_step_phases(run_phase, params, x, options, stop_at_lift_off, land)
+    landing_function = with_batched_jvp(transitions.resolve_landing)
+    return run_step_phases(phase_runner, params, x, options, stop_at_lift_off, landing_function)
 
 
 def _make_phase_runner(
@@ -247,24 +251,24 @@ def _make_phase_runner(
         dt0 = scaled_options.dt0 + jnp.zeros_like(q[0])
         if previous_end is not None:
             engine_carry: _PhaseCarry = previous_end.engine_carry
-            dt0 = engine_carry.next_dt
+            dt0 = engine_carry.next_solver_dt
             if phase.has_stiff_start:
-                rooted_tolerance = jnp.exp(
+                tolerance_root = jnp.exp(
                     jnp.log(options.rtol.astype(jnp.float32)) / tableau.convergence_order
                 )
-                transient_dt_in_transient_times = (
+                max_dt_in_transient_times = (
                     stiff_start_options.max_first_step_in_transient_times
-                    * rooted_tolerance.astype(dt0.dtype)
+                    * tolerance_root.astype(dt0.dtype)
                 )
-                max_transient_dt = transient_dt_in_transient_times * phase.s.m / phase.s.c
+                max_transient_dt = max_dt_in_transient_times * phase.s.m / phase.s.c
                 dt0 = jnp.minimum(stiff_start_options.max_first_step_ratio * dt0, max_transient_dt)
-                dt0 = jnp.where(engine_carry.has_phase_run, dt0, engine_carry.next_dt)
+                dt0 = jnp.where(engine_carry.has_phase_occurred, dt0, engine_carry.next_solver_dt)
         float_leaves, static_leaves = eqx.partition((phase.s, phase.tilt_sine_cosine), eqx.is_array)
 
-        def make_phase(float_leaves: Any, constants: Vector) -> BatchPhase:
-            s, tilt_sin_cos = eqx.combine(float_leaves, static_leaves)
+        def make_phase(float_leaves: Any, phase_constants: Vector) -> BatchPhase:
+            s, tilt_sine_cosine = eqx.combine(float_leaves, static_leaves)
             rebuilt_phase = dataclasses.replace(
-                phase, s=s, phase_constants=constants, tilt_sine_cosine=tilt_sin_cos
+                phase, s=s, phase_constants=phase_constants, tilt_sine_cosine=tilt_sine_cosine
             )
             return make_batch_phase(rebuilt_phase, records_margins, is_compiled_separately)
 
@@ -299,13 +303,13 @@ def can_use_batch_kernel(options: StepOptions) -> bool:
     The kernel requires machine code and an explicit solver. Raise a `ValueError` if the options
     require the batch kernel and it is not available.
     """
-    is_explicit = load_explicit_tableau(options.solver) is not None
-    if options.engine == "lanes" and not (is_explicit and simd.is_machine_code_available()):
+    is_solver_explicit = load_explicit_tableau(options.solver) is not None
+    if options.engine == "lanes" and not (is_solver_explicit and simd.is_machine_code_available()):
         raise ValueError(
             "engine is 'lanes', which needs a CPU, llvmlite and an explicit solver, but the solver "
             f"is {options.solver} on a {jax.default_backend()}: take engine='diffrax'."
         )
-    return is_explicit and simd.is_machine_code_available() and options.engine != "diffrax"
+    return is_solver_explicit and simd.is_machine_code_available() and options.engine != "diffrax"
 
 
 class _StepTraceConfig(NamedTuple):
@@ -316,13 +320,13 @@ class _StepTraceConfig(NamedTuple):
     friction: float | None  # friction of the margins; None for the minimal results
 
     @property
-    def cache_key(self) -> tuple:
+    def trace_key(self) -> tuple:
         """Return the key under which caches store the trace; caches compare keys by their
         `repr`.
         """
         return str(self.argument_structure), self.stop_at_lift_off, self.friction
 
-    def run_phases_of_lanes(
+    def run_lane_phases(
         self, *argument_leaves: Array
     ) -> tuple[PhaseSequenceResult, ButcherTableau, StepOptions]:
         """Integrate the phases of a batch of walking steps.
@@ -341,18 +345,18 @@ class _StepTraceConfig(NamedTuple):
         """Return the results of a batch of walking steps, split into float arrays and other
         arrays.
         """
-        phase_sequence, friction = self.run_phases_of_lanes(*argument_leaves)[0], self.friction
+        phase_sequence, friction = self.run_lane_phases(*argument_leaves)[0], self.friction
         if friction is None:
             return eqx.partition(make_advance_result(phase_sequence, "lanes"), eqx.is_inexact_array)
         phase_ends = tuple(
             phase_end._replace(engine_carry=None) for phase_end in phase_sequence.phase_ends
         )
-        float_sequence = phase_sequence._replace(
+        float_phase_sequence = phase_sequence._replace(
             phases=(), phase_starts=(), phase_ends=phase_ends
         )  # only floats
         step_result = with_batched_jvp(
             lambda phase_sequence: make_step_result(phase_sequence, friction, "lanes")
-        )(float_sequence)
+        )(float_phase_sequence)
         return eqx.partition(step_result, eqx.is_inexact_array)
 
     def make_output_template(self, *argument_leaves: Array) -> tuple:
@@ -361,15 +365,15 @@ class _StepTraceConfig(NamedTuple):
         """
         x = argument_leaves[0]
         int_zeros = jnp.zeros_like(x, jnp.int32)
-        two_rows, three_rows = (jnp.broadcast_to(x, (n, *x.shape)) for n in (2, 3))
-        template_result: Any = AdvanceResult(
-            three_rows, three_rows, int_zeros, int_zeros, engine="lanes"
+        two_row_template, three_row_template = (jnp.broadcast_to(x, (n, *x.shape)) for n in (2, 3))
+        step_result_template: Any = AdvanceResult(
+            three_row_template, three_row_template, int_zeros, int_zeros, engine="lanes"
         )
         if self.friction is not None:
-            template_result = StepResult(
-                section_state=three_rows,
-                post_impact=two_rows,
-                durations=three_rows,
+            step_result_template = StepResult(
+                section_state=three_row_template,
+                post_impact=two_row_template,
+                durations=three_row_template,
                 step_length=x,
                 indicators=_fill_all_fields(DoubleSupportIndicators, x),
                 margins=_fill_all_fields(Margins, x),
@@ -378,12 +382,12 @@ class _StepTraceConfig(NamedTuple):
                 solver_steps=int_zeros,
                 engine="lanes",
             )
-        return eqx.partition(template_result, eqx.is_inexact_array)
+        return eqx.partition(step_result_template, eqx.is_inexact_array)
 
 
-def _fill_all_fields(record_type: Any, x: Array) -> Any:
-    """Return a record of the class `record_type` whose fields all equal `x`."""
-    return record_type(*(x for _ in dataclasses.fields(record_type)))
+def _fill_all_fields(record_type: Any, field_value: Array) -> Any:
+    """Return a record of the class `record_type` whose fields all equal `field_value`."""
+    return record_type(*(field_value for _ in dataclasses.fields(record_type)))
 
 
 def build_step_function(
@@ -396,10 +400,10 @@ def build_step_function(
     function, because it serves as a forward rule.
     """
     trace_config = _StepTraceConfig(argument_structure, stop_at_lift_off, friction)
-    cache_key = ("gait step", *trace_config.cache_key)
+    trace_key = ("gait step", *trace_config.trace_key)
     return unbatch(
         compile_cached_lane_function(
-            trace_config.compute_step_outputs, trace_config.make_output_template, cache_key
+            trace_config.compute_step_outputs, trace_config.make_output_template, trace_key
         )
     )
 
@@ -419,20 +423,20 @@ def build_step_finisher(
         )
         tableau = load_explicit_tableau(options.solver)
         assert tableau is not None  # checked by `can_use_batch_kernel`
-        run_phase = _make_phase_runner(
+        phase_runner = _make_phase_runner(
             options, tableau, False, None, True, DEFAULT_STIFF_START_OPTIONS
         )
         step_settings = options, stop_at_lift_off, "lanes"
-        finish_result = finish_step(
-            run_phase, params, phase_index, foot_distance, tuple(phase_state), *step_settings
+        remaining_step_result = finish_step(
+            phase_runner, params, phase_index, foot_distance, tuple(phase_state), *step_settings
         )
-        return eqx.partition(finish_result, eqx.is_inexact_array)
+        return eqx.partition(remaining_step_result, eqx.is_inexact_array)
 
     trace_config = _StepTraceConfig(argument_structure, stop_at_lift_off, None)
-    cache_key = ("end of a step", phase_index, *trace_config.cache_key)
+    trace_key = ("end of a step", phase_index, *trace_config.trace_key)
     return unbatch(
         compile_cached_lane_function(
-            compute_finish_outputs, trace_config.make_output_template, cache_key
+            compute_finish_outputs, trace_config.make_output_template, trace_key
         )
     )
 
@@ -446,8 +450,8 @@ def build_step_sampler(
     """
     trace_config = _StepTraceConfig(argument_structure, stop_at_lift_off, None)
 
-    def sample_step_of_lanes(*argument_leaves: Array) -> Trajectory:
-        phase_sequence, tableau, options = trace_config.run_phases_of_lanes(*argument_leaves)
+    def sample_lane_steps(*argument_leaves: Array) -> Trajectory:
+        phase_sequence, tableau, options = trace_config.run_lane_phases(*argument_leaves)
         phase_samples = [
             sample_batch_phase(
                 make_batch_phase(phase, False),
@@ -467,23 +471,23 @@ def build_step_sampler(
         return make_trajectory(phase_sequence, phase_samples)
 
     def make_trajectory_template(x: Array, *_: Array) -> Trajectory:
-        make_sample_array = lambda *n: jnp.broadcast_to(x, (3, *n, *x.shape))
+        sample_array_maker = lambda *n: jnp.broadcast_to(x, (3, *n, *x.shape))
         n = n_samples
         sample_arrays = (
-            make_sample_array(n),
-            make_sample_array(n, 6),
-            make_sample_array(n, 4),
-            make_sample_array(n, 3),
+            sample_array_maker(n),
+            sample_array_maker(n, 6),
+            sample_array_maker(n, 4),
+            sample_array_maker(n, 3),
         )
         return Trajectory(
-            *sample_arrays, make_sample_array(), make_sample_array(), jnp.zeros_like(x, jnp.int32)
+            *sample_arrays, sample_array_maker(), sample_array_maker(), jnp.zeros_like(x, jnp.int32)
         )
 
     return unbatch(
         compile_cached_lane_function(
-            sample_step_of_lanes,
+            sample_lane_steps,
             make_trajectory_template,
-            ("samples", *trace_config.cache_key, n_samples),
+            ("samples", *trace_config.trace_key, n_samples),
         )
     )
 
@@ -509,28 +513,28 @@ def build_step_jacobian(
         float_outputs, other_outputs = trace_config.make_output_template(*argument_leaves)
         return float_outputs, float_outputs, other_outputs
 
-    evaluate_jacobian_of_lanes = lambda *leaves: compute_jacobian_columns(
+    lane_jacobian_function = lambda *leaves: compute_jacobian_columns(
         trace_config.compute_step_outputs, leaves, input_indices
     )
-    cache_key = ("gait step with derivatives", *trace_config.cache_key, input_indices)
+    trace_key = ("gait step with derivatives", *trace_config.trace_key, input_indices)
     jacobian_functions_by_size = {
         n: unbatch(
             compile_cached_lane_function(
-                evaluate_jacobian_of_lanes,
+                lane_jacobian_function,
                 make_jacobian_template,
-                cache_key,
+                trace_key,
                 simd.RegisterLimits(n),
             )
         )
         for n in (N_STEP_INPUTS, N_STEP_INPUTS + 1)
     }
 
-    def evaluate_jacobian(*argument_leaves: Array) -> tuple:
+    def evaluate_step_jacobian(*argument_leaves: Array) -> tuple:
         n_jacobian_columns = sum(int(np.prod(jnp.shape(argument_leaves[i]))) for i in input_indices)
-        evaluate_jacobian_columns = jacobian_functions_by_size[
+        jacobian_column_function = jacobian_functions_by_size[
             N_STEP_INPUTS + (n_jacobian_columns > N_STEP_INPUTS)
         ]
-        jacobian_columns, float_outputs, other_outputs = evaluate_jacobian_columns(
+        jacobian_columns, float_outputs, other_outputs = jacobian_column_function(
             *tighten_tolerances(*argument_leaves)
         )
         return (
@@ -538,7 +542,7 @@ def build_step_jacobian(
             float_outputs,
         ), other_outputs
 
-    return evaluate_jacobian
+    return evaluate_step_jacobian
 
 
 def split_jacobian_by_leaf(
@@ -548,15 +552,15 @@ def split_jacobian_by_leaf(
 
     The leading axis of `jacobian_columns` runs over all entries of the selected leaves.
     """
-    jacobian_by_leaf, column_offset = [], 0
+    jacobian_by_leaf, first_column = [], 0
     for i in input_indices:
         leaf_shape = jnp.shape(argument_leaves[i])
-        column_range = slice(column_offset, column_offset + int(np.prod(leaf_shape)))
-        select_columns = lambda x, column_range=column_range, leaf_shape=leaf_shape: jnp.moveaxis(
+        column_range = slice(first_column, first_column + int(np.prod(leaf_shape)))
+        column_selector = lambda x, column_range=column_range, leaf_shape=leaf_shape: jnp.moveaxis(
             x[column_range], 0, -1
         ).reshape(*x.shape[1:], *leaf_shape)
-        jacobian_by_leaf.append(jax.tree.map(select_columns, jacobian_columns))
-        column_offset = column_range.stop
+        jacobian_by_leaf.append(jax.tree.map(column_selector, jacobian_columns))
+        first_column = column_range.stop
     return tuple(jacobian_by_leaf)
 
 
@@ -578,18 +582,18 @@ def compute_jacobian_columns(
     the last axis, and auxiliary outputs.
     """
 
-    def evaluate_at_selected_leaves(*varied_leaves: Array) -> tuple:
+    def evaluate_at_selected_leaves(*selected_leaf_values: Array) -> tuple:
         all_leaves = list(argument_leaves)
-        for i, varied_leaf in zip(input_indices, varied_leaves, strict=True):
-            all_leaves[i] = varied_leaf
+        for i, selected_leaf_value in zip(input_indices, selected_leaf_values, strict=True):
+            all_leaves[i] = selected_leaf_value
         return batch_function(*all_leaves)
 
     selected_leaves = [argument_leaves[i] for i in input_indices]
-    compute_directional_derivative = lambda tangents: jax.jvp(
+    directional_derivative_function = lambda tangents: jax.jvp(
         evaluate_at_selected_leaves, selected_leaves, tangents, has_aux=True
     )
     float_outputs, jacobian_columns, other_outputs = jax.vmap(
-        compute_directional_derivative, out_axes=(None, 0, None)
+        directional_derivative_function, out_axes=(None, 0, None)
     )(_make_unit_tangents(selected_leaves))
     return jacobian_columns, float_outputs, other_outputs
 
@@ -601,11 +605,11 @@ def _make_unit_tangents(selected_leaves: Sequence[Array]) -> list[Array]:
     with 0.
     """
     entries_per_leaf = [int(np.prod(selected_leaf.shape[:-1])) for selected_leaf in selected_leaves]
-    unit_vectors, leaf_tangents, entry_offset = np.eye(sum(entries_per_leaf)), [], 0
+    unit_vectors, leaf_tangents, n_previous_entries = np.eye(sum(entries_per_leaf)), [], 0
     for selected_leaf, n_entries in zip(selected_leaves, entries_per_leaf, strict=True):
         entry_tangents = [
             jnp.asarray(unit_vectors[:, i], selected_leaf.dtype)[:, None]
-            for i in range(entry_offset, entry_offset + n_entries)
+            for i in range(n_previous_entries, n_previous_entries + n_entries)
         ]
         lane_tangents = [
             jnp.broadcast_to(entry_tangent, (len(unit_vectors), selected_leaf.shape[-1]))
@@ -614,5 +618,5 @@ def _make_unit_tangents(selected_leaves: Sequence[Array]) -> list[Array]:
         leaf_tangents.append(
             lane_tangents[0] if selected_leaf.ndim == 1 else jnp.stack(lane_tangents, 1)
         )
-        entry_offset += n_entries
+        n_previous_entries += n_entries
     return leaf_tangents

@@ -43,15 +43,15 @@ class ModelCapabilities:
     """Method of the gait search with this model; it determines the methods of branches and
     scans.
     """
-    commands: frozenset[str]
+    accepted_commands: frozenset[str]
     """Commands that accept the model: "scan", "map", "tune", "branch" and "explore"."""
-    fixed_by_tolerance: tuple[str, ...] | None = None
+    default_only_fields: tuple[str, ...] | None = None
     """Fields that must have their default values for a measure requested to a tolerance. None means
     that the model does not support measures to a tolerance.
     """
     passage_method: PassageMethod = PassageMethod.SAMPLING
     """Method that `first_passage` uses with this model."""
-    begins_within_step: bool = False
+    can_begin_within_step: bool = False
     """Whether the model implements `finish_step`, so that a step can be disturbed at any
     instant.
     """

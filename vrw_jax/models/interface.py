@@ -23,7 +23,7 @@ from vrw_jax.wheel import (
 )
 
 StepGroundValues = tuple[Array, ...]
-"""Ground of one step or of all steps, in the form of the argument of `with_ground`."""
+"""Ground of one step or of all steps, in the form of the argument of `with_step_ground`."""
 
 
 class AbstractWheel(eqx.Module):
@@ -61,10 +61,10 @@ class AbstractWheel(eqx.Module):
     def __repr__(self) -> str:
         if has_traced_leaf(self):
             return eqx.tree_pformat(self)
-        format_number = lambda x: repr(float(x)) if x.ndim == 0 else format_quantity(x, "")
-        format_field_value = lambda x: format_number(x) if eqx.is_array(x) else repr(x)
+        number_formatter = lambda x: repr(float(x)) if x.ndim == 0 else format_quantity(x, "")
+        field_value_formatter = lambda x: number_formatter(x) if eqx.is_array(x) else repr(x)
         field_texts = ", ".join(
-            f"{field_name}={format_field_value(field_value)}"
+            f"{field_name}={field_value_formatter(field_value)}"
             for field_name, field_value in vars(self).items()
         )
         return f"{type(self).__name__}({field_texts})"
@@ -77,38 +77,40 @@ class AbstractWheel(eqx.Module):
         """
         return self
 
-    def parameter_values(self, params: WheelParams) -> Float[Array, " n_values"]:
+    def collect_parameter_values(self, params: WheelParams) -> Float[Array, " n_values"]:
         """Return the value of each parameter in `parameter_names`, for one wheel on this model's
         ground.
         """
-        parameter_values_list = [
+        parameter_values = [
             getattr(self if parameter_name == FRICTION_NAME else params, parameter_name)
             for parameter_name in self.parameter_names
         ]
         return jnp.stack(
             [
                 jnp.asarray(parameter_value, params.damping.dtype)
-                for parameter_value in parameter_values_list
+                for parameter_value in parameter_values
             ]
         )
 
-    def parameter_rows(self, params: WheelParams) -> Float[np.ndarray, "wheels n_values"]:
-        """Return `parameter_values` for each wheel in a batch, computed with NumPy.
+    def collect_batch_parameter_values(
+        self, params: WheelParams
+    ) -> Float[np.ndarray, "wheels n_values"]:
+        """Return `collect_parameter_values` for each wheel in a batch, computed with NumPy.
 
         JAX would compile a program for each batch size.
         """
-        columns = [
-            np.asarray(getattr(self if name == FRICTION_NAME else params, name))
-            for name in self.parameter_names
+        parameter_columns = [
+            np.asarray(getattr(self if parameter_name == FRICTION_NAME else params, parameter_name))
+            for parameter_name in self.parameter_names
         ]
-        return np.stack(np.broadcast_arrays(*columns), -1)
+        return np.stack(np.broadcast_arrays(*parameter_columns), -1)
 
-    def from_values(
+    def from_parameter_values(
         self, parameter_values: Array | tuple[Array, ...], n_legs: int
     ) -> tuple["AbstractWheel", WheelParams]:
         """Return a model and a wheel with these values of `parameter_names`.
 
-        This function is the inverse of `parameter_values`. The values may be tracers.
+        This function is the inverse of `collect_parameter_values`. The values may be tracers.
         """
         n = len(PARAMETER_NAMES)
         model_with_friction = self
@@ -170,15 +172,15 @@ class AbstractWheel(eqx.Module):
         - `distance`: distance between the two feet in the double support of this step, m;
         - `state`: (theta, L1, L2) and their rates, rad, m, rad/s, m/s.
 
-        Only models whose capabilities have `begins_within_step` implement this method.
+        Only models whose capabilities have `can_begin_within_step` implement this method.
         """
         raise NotImplementedError(f"{type(self).__name__} cannot begin within a step.")
 
     @abc.abstractmethod
-    def default_start(self, params: WheelParams) -> SectionState:
+    def compute_default_start(self, params: WheelParams) -> SectionState:
         """Return a section state from which a walk can start."""
 
-    def split_ground(self, params: WheelParams, n_steps: int) -> StepGroundValues | None:
+    def split_ground_by_step(self, params: WheelParams, n_steps: int) -> StepGroundValues | None:
         """Return the ground of each step if slope or friction are arrays with one entry per step.
 
         Return None otherwise.
@@ -188,31 +190,31 @@ class AbstractWheel(eqx.Module):
         line_slopes = complete_line_slopes(params.slope, n_steps)
         return (jnp.stack([line_slopes[:-1], line_slopes[1:]], axis=-1),)
 
-    def with_ground(
+    def with_step_ground(
         self, params: WheelParams, step_ground: StepGroundValues
     ) -> tuple["AbstractWheel", WheelParams]:
         """Return the model and the wheel on the ground of one step.
 
-        `step_ground` contains the slopes of two lines of the ground, see `split_slopes`.
+        `step_ground` contains the slopes of two lines of the ground, see `separate_next_slope`.
         """
         return self, eqx.tree_at(lambda wheel: wheel.slope, params, step_ground[0])
 
-    def section_size(self, params: WheelParams) -> int:
+    def count_section_entries(self, params: WheelParams) -> int:
         """Return the number of entries of a section state."""
         return 3
 
-    def n_continuous(self, params: WheelParams) -> int:
+    def count_continuous_entries(self, params: WheelParams) -> int:
         """Return the number of entries of a section state that vary continuously.
 
         These entries come first. The other entries are integer codes.
         """
-        return self.section_size(params)
+        return self.count_section_entries(params)
 
-    def section_units(self, units: WheelUnits, n_legs: int) -> list[Elementwise]:
+    def compute_section_units(self, units: WheelUnits, n_legs: int) -> list[Elementwise]:
         """Return the unit of each entry of a section state, computed from the wheel's own units."""
         return [units.length_unit / units.length_unit, units.rate_unit, units.velocity_unit]
 
-    def embed_section(self, params: WheelParams, x: Array) -> Array:
+    def embed_section_state(self, params: WheelParams, x: Array) -> Array:
         """Return `x` as a section state of this model.
 
         `x` may be the paper's section state, which has three entries.

@@ -50,7 +50,7 @@ from vrw_jax.wheel import (
     transitions,
 )
 
-SAFE_SINGLE_SUPPORT_STATE = (-0.3, 0.9, 0.95, 1.0, 0.0, 0.0)
+FALLBACK_SINGLE_SUPPORT_STATE = (-0.3, 0.9, 0.95, 1.0, 0.0, 0.0)
 """Regular posture (theta, L1, L2 and their rates) that replaces the state of a wheel after a failed
 step. This state is never integrated.
 """
@@ -81,42 +81,42 @@ class PhaseSequenceResult(NamedTuple):
     """Starts and ends of all phases of a step, and the outcome of the step."""
 
     s: Symbols
-    landing: Landing
+    opening_landing: Landing
     phases: tuple[AbstractPhase, ...]
     phase_starts: tuple[tuple[Vector, Vector], ...]
     phase_ends: tuple[PhaseResult, ...]
-    phase_occurrences: tuple[Bool[Array, "..."], ...]
+    has_phase_occurred: tuple[Bool[Array, "..."], ...]
     outcome: Int[Array, "..."]  # an Outcome
-    tilt: Elementwise | None = None  # angle of the next line, rad; None on flat ground
+    next_line_tilt: Elementwise | None = None  # angle of the next line, rad; None on flat ground
 
 
 def run_step_phases(
-    integrate_phase: PhaseRunner,
+    phase_runner: PhaseRunner,
     params: WheelParams,
     x: SectionStateEntries,
     options: StepOptions,
     stop_at_lift_off: bool,
-    evaluate_landing: Callable[..., Landing] = transitions.resolve_landing,
+    landing_function: Callable[..., Landing] = transitions.resolve_landing,
 ) -> PhaseSequenceResult:
     """Integrate all phases of one walking step from the section state `x`, and return the results.
 
     `x` contains one array per entry. The motion is in the frame of the line of the ground under
-    both feet in double support. On uneven ground (see `split_slopes`), the touchdown and the
+    both feet in double support. On uneven ground (see `separate_next_slope`), the touchdown and the
     section state at the end refer to the next line of the ground.
 
-    - `integrate_phase`: engine that integrates a phase;
-    - `evaluate_landing`: function that computes the landing at the beginning of the step.
+    - `phase_runner`: engine that integrates a phase;
+    - `landing_function`: function that computes the landing at the beginning of the step.
     """
     params, is_valid_step, next_line_tilt = select_stance_line_and_tilt(params, x)
     params, x = replace_invalid_inputs(is_valid_step, params, x, PAPER_START_STATE)
     s = params.symbols()
-    landing_result = evaluate_landing(s, *x)
-    tilt_sin_cos = () if next_line_tilt is None else compute_sine_cosine(next_line_tilt)
-    step_phases = make_phases(s, landing_result.foot_distance, stop_at_lift_off, tilt_sin_cos)
+    landing_result = landing_function(s, *x)
+    tilt_sine_cosine = () if next_line_tilt is None else compute_sine_cosine(next_line_tilt)
+    step_phases = make_phases(s, landing_result.foot_distance, stop_at_lift_off, tilt_sine_cosine)
     # A landing that releases the rear foot continues in SLS-I.
     is_double_support_active = is_valid_step & landing_result.is_rear_foot_planted
     remaining_phases = _run_remaining_phases(
-        integrate_phase,
+        phase_runner,
         step_phases,
         landing_result.theta_after,
         landing_result.motion_after,
@@ -132,12 +132,12 @@ class _RemainingPhases(NamedTuple):
 
     phase_starts: tuple[tuple[Vector, Vector], ...]
     phase_ends: tuple[PhaseResult, ...]
-    phase_occurrences: tuple[Bool[Array, "..."], ...]
+    has_phase_occurred: tuple[Bool[Array, "..."], ...]
     outcome: Int[Array, "..."]
 
 
 def _run_remaining_phases(
-    integrate_phase: PhaseRunner,
+    phase_runner: PhaseRunner,
     remaining_phases: tuple[AbstractPhase, ...],
     wheel_angle: Elementwise,
     wheel_motion: Motion,
@@ -154,7 +154,7 @@ def _run_remaining_phases(
     step_outcome = jnp.where(
         is_valid_step, jnp.int32(Outcome.STEPPED), jnp.int32(Outcome.BAD_INPUT)
     )
-    phase_starts, phase_occurrences = [], []
+    phase_starts, has_phase_occurred = [], []
     phase_ends: list[PhaseResult] = []
     for previous_phase, phase in zip((None, *remaining_phases), remaining_phases, strict=False):
         if previous_phase is not None:
@@ -166,20 +166,20 @@ def _run_remaining_phases(
                 is_phase_active, end_state, (wheel_angle, wheel_motion)
             )
             is_phase_active = step_outcome == Outcome.STEPPED
-            safe_theta, *safe_lengths_and_rates = (
+            fallback_theta, *fallback_lengths_and_rates = (
                 jnp.asarray(state_component, jnp.result_type(wheel_angle))
-                for state_component in SAFE_SINGLE_SUPPORT_STATE
+                for state_component in FALLBACK_SINGLE_SUPPORT_STATE
             )
-            safe_state = (
-                safe_theta,
-                Motion(*compute_sine_cosine(safe_theta), *safe_lengths_and_rates),
+            replaced_state = (
+                fallback_theta,
+                Motion(*compute_sine_cosine(fallback_theta), *fallback_lengths_and_rates),
             )
             wheel_angle, wheel_motion = select_tree_leaves(
-                is_phase_active, (wheel_angle, wheel_motion), safe_state
+                is_phase_active, (wheel_angle, wheel_motion), replaced_state
             )
             wheel_motion = previous_phase.reset_motion(wheel_motion)
         start_state = phase.select_coordinates(wheel_angle, wheel_motion)
-        phase_end = integrate_phase(
+        phase_end = phase_runner(
             phase, *start_state, is_phase_active, phase_ends[-1] if phase_ends else None
         )
         phase_outcome = phase.select_guard_outcome(phase_end.guard, phase_end.is_timed_out)
@@ -190,18 +190,18 @@ def _run_remaining_phases(
         phase_starts.append(start_state)
         phase_ends.append(phase_end)
         # The start of the last phase is itself an event: Leg 2 hits its stopper.
-        phase_occurrences.append(
+        has_phase_occurred.append(
             is_phase_active
             if phase is remaining_phases[-1]
             else is_phase_active & (phase_end.duration > 0.0)
         )
     return _RemainingPhases(
-        tuple(phase_starts), tuple(phase_ends), tuple(phase_occurrences), step_outcome
+        tuple(phase_starts), tuple(phase_ends), tuple(has_phase_occurred), step_outcome
     )
 
 
 def finish_step(
-    integrate_phase: PhaseRunner,
+    phase_runner: PhaseRunner,
     params: WheelParams,
     phase_index: int,
     foot_distance: Elementwise,
@@ -217,18 +217,18 @@ def finish_step(
     - `phase_state`: (theta, L1, L2) and their rates. Entries that the constraints of the phase
       determine are ignored.
     """
-    bounded_inputs = [
+    are_inputs_bounded = [
         jnp.abs(input_value) < MAX_SI_VALUE for input_value in (*phase_state, foot_distance)
     ]
-    is_valid_state = params.is_in_domain() & functools.reduce(operator.and_, bounded_inputs)
+    is_valid_state = params.is_in_domain() & functools.reduce(operator.and_, are_inputs_bounded)
     is_valid_state = is_valid_state & (jnp.abs(phase_state[0]) < 0.5 * jnp.pi)
     params, (wheel_angle, *lengths_and_rates) = replace_invalid_inputs(
-        is_valid_state, params, phase_state, SAFE_SINGLE_SUPPORT_STATE
+        is_valid_state, params, phase_state, FALLBACK_SINGLE_SUPPORT_STATE
     )
     remaining_phases = make_phases(params.symbols(), foot_distance, stop_at_lift_off)[phase_index:]
     wheel_motion = Motion.from_angle(wheel_angle, *lengths_and_rates)
     remaining_results = _run_remaining_phases(
-        integrate_phase,
+        phase_runner,
         remaining_phases,
         wheel_angle,
         wheel_motion,
@@ -255,7 +255,7 @@ def finish_step(
     )
 
 
-def get_next_section_state(phase_sequence: PhaseSequenceResult) -> Vector:
+def select_next_section_state(phase_sequence: PhaseSequenceResult) -> Vector:
     """Return (theta-, dtheta-, dL1-) at the end of the step in rad, rad/s and m/s.
 
     The angle theta- is measured in the frame of the line of the ground at the next landing.
@@ -265,7 +265,9 @@ def get_next_section_state(phase_sequence: PhaseSequenceResult) -> Vector:
         phase_sequence.phase_ends[2].v,
     )
     return (
-        touchdown_angle if phase_sequence.tilt is None else touchdown_angle - phase_sequence.tilt
+        touchdown_angle
+        if phase_sequence.next_line_tilt is None
+        else touchdown_angle - phase_sequence.next_line_tilt
     ), *touchdown_rates
 
 
@@ -273,7 +275,7 @@ def make_advance_result(phase_sequence: PhaseSequenceResult, engine: str) -> Adv
     """Return the minimal results of a step. All entries of the section state are 0 after a failed
     step.
     """
-    theta, dtheta, dL1 = get_next_section_state(phase_sequence)
+    theta, dtheta, dL1 = select_next_section_state(phase_sequence)
     has_stepped = phase_sequence.outcome == Outcome.STEPPED
     solver_steps = [phase_end.n_solver_steps for phase_end in phase_sequence.phase_ends]
     return AdvanceResult(
@@ -294,12 +296,12 @@ def make_step_result(
     """
     s, landing_result, phase_ends = (
         phase_sequence.s,
-        phase_sequence.landing,
+        phase_sequence.opening_landing,
         phase_sequence.phase_ends,
     )
-    has_begun = phase_sequence.outcome != Outcome.BAD_INPUT
-    hits_stopper, has_stepped = (
-        phase_sequence.phase_occurrences[2],
+    has_step_begun = phase_sequence.outcome != Outcome.BAD_INPUT
+    has_stopper_collision, has_stepped = (
+        phase_sequence.has_phase_occurred[2],
         phase_sequence.outcome == Outcome.STEPPED,
     )
     double_support, single_support_1, single_support_2 = make_phases(
@@ -307,12 +309,12 @@ def make_step_result(
     )
     liftoff_motion = double_support.compute_motion(phase_ends[0].q, phase_ends[0].v)
     stopper_state = [
-        jnp.where(hits_stopper, x, jnp.asarray(safe_value, x.dtype))
-        for x, safe_value in zip(
-            (*phase_ends[1].q, *phase_ends[1].v), SAFE_SINGLE_SUPPORT_STATE, strict=True
+        jnp.where(has_stopper_collision, x, jnp.asarray(fallback_value, x.dtype))
+        for x, fallback_value in zip(
+            (*phase_ends[1].q, *phase_ends[1].v), FALLBACK_SINGLE_SUPPORT_STATE, strict=True
         )
     ]
-    stopper_hit = transitions.resolve_stopper_collision(
+    stopper_collision = transitions.resolve_stopper_collision(
         s, single_support_1.compute_motion(tuple(stopper_state[:3]), tuple(stopper_state[3:]))
     )
     last_motion = single_support_2.compute_motion(phase_ends[2].q, phase_ends[2].v)
@@ -326,25 +328,25 @@ def make_step_result(
         section_state=advance_result.section_state,
         post_impact=jnp.stack(
             [
-                jnp.where(has_begun, x, 0.0)
+                jnp.where(has_step_begun, x, 0.0)
                 for x in (landing_result.theta_after, landing_result.motion_after.dtheta)
             ]
         ),
         durations=advance_result.durations,
-        step_length=jnp.where(has_begun, landing_result.foot_distance, 0.0),
+        step_length=jnp.where(has_step_begun, landing_result.foot_distance, 0.0),
         indicators=DoubleSupportIndicators(
-            lambda_I4=jnp.where(has_begun, landing_result.rear_impulse.normal, 0.0),
-            lambda_2=jnp.where(has_begun, fore_force.normal, 0.0),
-            lambda_4=jnp.where(has_begun, rear_force.normal, 0.0),
+            lambda_I4=jnp.where(has_step_begun, landing_result.rear_impulse.normal, 0.0),
+            lambda_2=jnp.where(has_step_begun, fore_force.normal, 0.0),
+            lambda_4=jnp.where(has_step_begun, rear_force.normal, 0.0),
         ),
         margins=_make_step_margins(
-            phase_sequence, rear_force, liftoff_motion, stopper_hit, friction
+            phase_sequence, rear_force, liftoff_motion, stopper_collision, friction
         ),
         energy=EnergyLoss(
-            landing=jnp.where(has_begun, landing_result.energy_loss, 0.0),
-            stopper=jnp.where(hits_stopper, stopper_hit.energy_loss, 0.0),
+            landing=jnp.where(has_step_begun, landing_result.energy_loss, 0.0),
+            stopper=jnp.where(has_stopper_collision, stopper_collision.energy_loss, 0.0),
             damping=jnp.where(
-                has_stepped, initial_energy - final_energy - stopper_hit.energy_loss, 0.0
+                has_stepped, initial_energy - final_energy - stopper_collision.energy_loss, 0.0
             ),
         ),
         outcome=advance_result.outcome,
@@ -368,34 +370,34 @@ def make_trajectory(
     time_fractions = jnp.linspace(0.0, 1.0, n_samples).reshape(
         -1, *(1 for _ in phase_durations.shape[1:])
     )
-    phase_arrays = [
+    arrays_by_phase_sample = [
         evaluate_phase_states(phase, jnp.moveaxis(phase_states, 1, 0))
         for phase, phase_states in zip(phase_sequence.phases, phase_samples, strict=True)
     ]
     phase_states, foot_forces, phase_energies = (
         jnp.stack([jnp.moveaxis(phase_array, 0, 1) for phase_array in arrays_by_phase])
-        for arrays_by_phase in zip(*phase_arrays, strict=True)
+        for arrays_by_phase in zip(*arrays_by_phase_sample, strict=True)
     )
     sample_times = start_times[:, None] + time_fractions * phase_durations[:, None]
     end_state = advance_result.section_state, phase_durations, advance_result.outcome
     return Trajectory(sample_times, phase_states, foot_forces, phase_energies, *end_state)
 
 
-def evaluate_phase_states(phase: AbstractPhase, y: Array) -> tuple[Array, Array, Array]:
+def evaluate_phase_states(phase: AbstractPhase, phase_states: Array) -> tuple[Array, Array, Array]:
     """Return coordinates and rates, ground forces (N) and energies (J) for given states of a phase.
 
-    - `y`: coordinates of the phase, then their rates, on the first axis. The first axis of each
-      result holds its components; the other axes are those of `y`.
+    - `phase_states`: coordinates of the phase, then their rates, on the first axis. The first axis
+      of each result holds its components; the other axes are those of `phase_states`.
     """
-    coordinates = tuple(y)
+    coordinates = tuple(phase_states)
     wheel_motion = phase.compute_motion(coordinates[: phase.n_dof], coordinates[phase.n_dof :])
     phase_instant = PhaseInstant(phase, wheel_motion, None)
-    zero = 0.0 * wheel_motion.L1
-    rear_force = phase_instant.rear_force or dynamics.FootForce(zero, zero)
+    zero_force = 0.0 * wheel_motion.L1
+    rear_force = phase_instant.rear_force or dynamics.FootForce(zero_force, zero_force)
     return (
         jnp.stack(
             [
-                y[0],
+                phase_states[0],
                 wheel_motion.L1,
                 wheel_motion.L2,
                 wheel_motion.dtheta,
@@ -412,21 +414,24 @@ def _make_step_margins(
     phase_sequence: PhaseSequenceResult,
     rear_force: dynamics.FootForce,
     liftoff_motion: Motion,
-    stopper_hit: transitions.StopperCollision,
+    stopper_collision: transitions.StopperCollision,
     friction: Elementwise | float,
 ) -> Margins:
     """Return the margins for one step.
 
     - `rear_force`: force on the rear foot just after the landing, N;
     - `liftoff_motion`: motion at the end of double support;
-    - `stopper_hit`: collision of Leg 2 with its stopper.
+    - `stopper_collision`: collision of Leg 2 with its stopper.
     """
-    s, landing_result, phase_occurrences = (
+    s, landing_result, has_phase_occurred = (
         phase_sequence.s,
-        phase_sequence.landing,
-        phase_sequence.phase_occurrences,
+        phase_sequence.opening_landing,
+        phase_sequence.has_phase_occurred,
     )
-    has_begun, hits_stopper = phase_sequence.outcome != Outcome.BAD_INPUT, phase_occurrences[2]
+    has_step_begun, has_stopper_collision = (
+        phase_sequence.outcome != Outcome.BAD_INPUT,
+        has_phase_occurred[2],
+    )
     recorded_minima = [
         phase_end.margin_minima
         for phase_end in phase_sequence.phase_ends
@@ -440,32 +445,32 @@ def _make_step_margins(
         """Return the lowest minimum of a margin over the phases that occurred, or 0 if none
         occurred.
         """
-        lowest_value: Any = jnp.inf
+        lowest_margin: Any = jnp.inf
         for phase_index in phase_indices:
             phase_minimum = jnp.asarray(getattr(phase_minima[phase_index], margin_name))
-            lowest_value = jnp.minimum(
-                lowest_value, jnp.where(phase_occurrences[phase_index], phase_minimum, jnp.inf)
+            lowest_margin = jnp.minimum(
+                lowest_margin, jnp.where(has_phase_occurred[phase_index], phase_minimum, jnp.inf)
             )
-        return jnp.where(jnp.isfinite(lowest_value), lowest_value, 0.0)
+        return jnp.where(jnp.isfinite(lowest_margin), lowest_margin, 0.0)
 
     def compute_friction_margin(foot_force: dynamics.FootForce, is_loaded: Array) -> Array:
         required_friction = jnp.where(
             is_loaded, dynamics.compute_required_friction(foot_force), 0.0
         )
-        return jnp.where(has_begun, friction - required_friction, 0.0)
+        return jnp.where(has_step_begun, friction - required_friction, 0.0)
 
-    def compute_stopper_impulses(
-        motion_after: Motion, hub_jump: tuple, has_collision: Array
+    def compute_locked_stopper_impulses(
+        motion_after: Motion, hub_velocity_jump: tuple, has_collision: Array
     ) -> Array:
         leg_impulses = transitions.compute_locked_leg_impulses(
-            s, motion_after, hub_jump, range(3, s.n + 1)
+            s, motion_after, hub_velocity_jump, range(3, s.n + 1)
         )
         return jnp.where(has_collision, leg_impulses, 0.0)
 
     return Margins(
         fore_foot_force=find_lowest_margin("fore_foot_force", 0, 1, 2),
         takeoff_acceleration=jnp.where(
-            phase_occurrences[1] & landing_result.is_rear_foot_planted,
+            has_phase_occurred[1] & landing_result.is_rear_foot_planted,
             dynamics.compute_takeoff_acceleration(s, liftoff_motion),
             0.0,
         ),
@@ -474,17 +479,23 @@ def _make_step_margins(
         locked_stopper_force=find_lowest_margin("locked_stopper_force", 0, 1, 2),
         rear_stopper_force=find_lowest_margin("rear_stopper_force", 2),
         contraction=find_lowest_margin("contraction", 0, 1, 2),
-        friction_fore=jnp.where(has_begun, friction + find_lowest_margin("friction", 0, 1, 2), 0.0),
-        friction_rear=compute_friction_margin(rear_force, phase_occurrences[0]),
-        landing_stopper_impulse=compute_stopper_impulses(
-            landing_result.motion_after, landing_result.hub_velocity_jump, has_begun
+        friction_fore=jnp.where(
+            has_step_begun, friction + find_lowest_margin("friction", 0, 1, 2), 0.0
         ),
-        hit_stopper_impulse=compute_stopper_impulses(
-            stopper_hit.motion_after, stopper_hit.hub_velocity_jump, hits_stopper
+        friction_rear=compute_friction_margin(rear_force, has_phase_occurred[0]),
+        landing_stopper_impulse=compute_locked_stopper_impulses(
+            landing_result.motion_after, landing_result.hub_velocity_jump, has_step_begun
         ),
-        hit_planted_impulse=jnp.where(hits_stopper, stopper_hit.foot_impulse.normal, 0.0),
-        landing_friction_fore=compute_friction_margin(landing_result.fore_impulse, has_begun),
+        hit_stopper_impulse=compute_locked_stopper_impulses(
+            stopper_collision.motion_after,
+            stopper_collision.hub_velocity_jump,
+            has_stopper_collision,
+        ),
+        hit_planted_impulse=jnp.where(
+            has_stopper_collision, stopper_collision.foot_impulse.normal, 0.0
+        ),
+        landing_friction_fore=compute_friction_margin(landing_result.fore_impulse, has_step_begun),
         landing_friction_rear=compute_friction_margin(
-            landing_result.rear_impulse, has_begun & landing_result.is_rear_foot_planted
+            landing_result.rear_impulse, has_step_begun & landing_result.is_rear_foot_planted
         ),
     )

@@ -16,7 +16,7 @@ from vrw_jax.models.step_inputs import (
     SectionStateEntries,
     replace_invalid_inputs,
     select_stance_line_and_tilt,
-    split_slopes,
+    separate_next_slope,
 )
 from vrw_jax.models.step_results import (
     AdvanceResult,
@@ -49,7 +49,7 @@ class MarginMinimumSearchOptions:
     sample.
     """
 
-    n_angles_per_round: int = 33
+    n_angles_per_zoom_round: int = 33
     """Number of angles that each round samples.
 
     The value is chosen because forces are smooth over the 45 degrees of a step.
@@ -92,9 +92,9 @@ class RigidWheel(AbstractWheel):
     capabilities: ClassVar[ModelCapabilities] = ModelCapabilities(
         config_name="rigid",
         gait_method=GaitMethod.RETURN_MAP,
-        commands=frozenset({"branch", "explore"}),
+        accepted_commands=frozenset({"branch", "explore"}),
         passage_method=PassageMethod.QUADRATURE,
-        begins_within_step=True,
+        can_begin_within_step=True,
     )
     parameter_names: ClassVar[tuple[str, ...]] = PARAMETER_NAMES
     reports_contacts: ClassVar[bool] = False
@@ -108,15 +108,15 @@ class RigidWheel(AbstractWheel):
         static=True, converter=partial(check_bool, "held_landing"), default=False
     )
 
-    def default_start(self, params: WheelParams) -> SectionState:
+    def compute_default_start(self, params: WheelParams) -> SectionState:
         """Return the section state at the rolling fixed point, or a fast start if there is no fixed
         point.
         """
         s = params.symbols()
         landing_rate_ratio = self._compute_landing_rate_ratio(s)
-        rate_squared_gain = 4.0 * _compute_gravity_stiffness(s) * jnp.sin(0.5 * s.alpha) * s.sin_phi
+        squared_rate_gain = 4.0 * _compute_gravity_stiffness(s) * jnp.sin(0.5 * s.alpha) * s.sin_phi
         rolling_rate = jnp.sqrt(
-            jnp.maximum(rate_squared_gain, 0.1) / (1.0 - landing_rate_ratio * landing_rate_ratio)
+            jnp.maximum(squared_rate_gain, 0.1) / (1.0 - landing_rate_ratio * landing_rate_ratio)
         )
         return jnp.stack([0.5 * s.alpha + 0.0 * rolling_rate, rolling_rate, 0.0 * rolling_rate])
 
@@ -177,23 +177,25 @@ class RigidWheel(AbstractWheel):
         )
 
         apex_angle = jnp.where(s.sin_phi < jnp.sin(half_angle), -params.slope, -half_angle)
-        passes_apex = rolling_motion.compute_squared_rate(apex_angle) > 0.0
+        has_passed_apex = rolling_motion.compute_squared_rate(apex_angle) > 0.0
         margin_minima = rolling_motion.find_margin_minima()
-        has_lifted_off = (margin_minima[0] <= 0.0) & passes_apex & self.stop_at_lift_off
-        step_outcome = jnp.where(passes_apex, Outcome.STEPPED, Outcome.FELL_BACK).astype(jnp.int32)
+        has_lifted_off = (margin_minima[0] <= 0.0) & has_passed_apex & self.stop_at_lift_off
+        step_outcome = jnp.where(has_passed_apex, Outcome.STEPPED, Outcome.FELL_BACK).astype(
+            jnp.int32
+        )
         step_outcome = jnp.where(has_lifted_off, jnp.int32(Outcome.LEG_1_LIFTED_OFF), step_outcome)
         step_outcome = jnp.where(is_valid_step, step_outcome, jnp.int32(Outcome.BAD_INPUT))
         has_stepped = step_outcome == Outcome.STEPPED
-        safe_rolling_motion = RollingMotion(
-            s, params.slope, jnp.where(passes_apex, rate_after, 10.0)
+        fallback_rolling_motion = RollingMotion(
+            s, params.slope, jnp.where(has_passed_apex, rate_after, 10.0)
         )
         end_rate, rolling_duration = (
-            jnp.sqrt(safe_rolling_motion.compute_squared_rate(end_angle)),
-            safe_rolling_motion.compute_time_to_angle(end_angle),
+            jnp.sqrt(fallback_rolling_motion.compute_squared_rate(end_angle)),
+            fallback_rolling_motion.compute_time_to_angle(end_angle),
         )
 
-        zero = jnp.zeros_like(rate_before)
-        zero_if_invalid = lambda step_quantity: jnp.where(
+        zero_like_rate = jnp.zeros_like(rate_before)
+        zero_invalid_steps = lambda step_quantity: jnp.where(
             is_valid_step, step_quantity, jnp.zeros_like(step_quantity)
         )
         zero_unless_stepped = lambda step_quantity: jnp.where(
@@ -203,45 +205,49 @@ class RigidWheel(AbstractWheel):
             s, x, rolling_motion, friction
         )
         return StepResult(
-            section_state=zero_unless_stepped(jnp.stack([half_angle + zero, end_rate, zero])),
-            post_impact=zero_if_invalid(jnp.stack([-half_angle + zero, rate_after])),
-            durations=zero_unless_stepped(jnp.stack([zero, zero, rolling_duration])),
-            step_length=zero_if_invalid(2.0 * s.L0 * jnp.sin(half_angle)),
+            section_state=zero_unless_stepped(
+                jnp.stack([half_angle + zero_like_rate, end_rate, zero_like_rate])
+            ),
+            post_impact=zero_invalid_steps(jnp.stack([-half_angle + zero_like_rate, rate_after])),
+            durations=zero_unless_stepped(
+                jnp.stack([zero_like_rate, zero_like_rate, rolling_duration])
+            ),
+            step_length=zero_invalid_steps(2.0 * s.L0 * jnp.sin(half_angle)),
             indicators=DoubleSupportIndicators(
-                lambda_I4=zero_if_invalid(rear_impulse.normal),
-                lambda_2=zero_if_invalid(
-                    rolling_motion.compute_foot_force_at_angle(-half_angle + zero).normal
+                lambda_I4=zero_invalid_steps(rear_impulse.normal),
+                lambda_2=zero_invalid_steps(
+                    rolling_motion.compute_foot_force_at_angle(-half_angle + zero_like_rate).normal
                 ),
-                lambda_4=zero,
+                lambda_4=zero_like_rate,
             ),
             margins=Margins(
                 fore_foot_force=zero_unless_stepped(margin_minima[0]),
-                takeoff_acceleration=zero,
-                clearance_sls1=zero,
+                takeoff_acceleration=zero_like_rate,
+                clearance_sls1=zero_like_rate,
                 clearance_sls2=zero_unless_stepped(
                     compute_rear_foot_height(
-                        s, rolling_motion.compute_motion_at_angle(end_angle + zero)
+                        s, rolling_motion.compute_motion_at_angle(end_angle + zero_like_rate)
                     )
                 ),
                 locked_stopper_force=zero_unless_stepped(margin_minima[3:]),
                 rear_stopper_force=zero_unless_stepped(margin_minima[2]),
-                contraction=zero,
+                contraction=zero_like_rate,
                 friction_fore=zero_unless_stepped(friction + margin_minima[1]),
-                friction_rear=zero_if_invalid(friction + zero),
-                landing_stopper_impulse=zero_if_invalid(stopper_impulse),
+                friction_rear=zero_invalid_steps(friction + zero_like_rate),
+                landing_stopper_impulse=zero_invalid_steps(stopper_impulse),
                 hit_stopper_impulse=jnp.zeros_like(stopper_impulse),
-                hit_planted_impulse=zero,
-                landing_friction_fore=zero_if_invalid(friction_margins[0]),
-                landing_friction_rear=zero_if_invalid(friction_margins[1]),
+                hit_planted_impulse=zero_like_rate,
+                landing_friction_fore=zero_invalid_steps(friction_margins[0]),
+                landing_friction_rear=zero_invalid_steps(friction_margins[1]),
             ),
             energy=EnergyLoss(
-                landing=zero_if_invalid(
+                landing=zero_invalid_steps(
                     0.5
                     * _compute_foot_inertia(s)
                     * (rate_before * rate_before - rate_after * rate_after)
                 ),
-                stopper=zero,
-                damping=zero,
+                stopper=zero_like_rate,
+                damping=zero_like_rate,
             ),
             outcome=step_outcome,
             solver_steps=jnp.zeros_like(step_outcome),
@@ -262,25 +268,33 @@ class RigidWheel(AbstractWheel):
         s, half_angle = params.symbols(), jnp.asarray(0.5 * params.leg_angle, wheel_angle.dtype)
         rolling_motion = RollingMotion(s, params.slope, angular_rate, given_first_angle=wheel_angle)
         apex_angle = jnp.maximum(wheel_angle, -params.slope)
-        passes_apex = (angular_rate > 0.0) & (rolling_motion.compute_squared_rate(apex_angle) > 0.0)
+        has_passed_apex = (angular_rate > 0.0) & (
+            rolling_motion.compute_squared_rate(apex_angle) > 0.0
+        )
         sampled_angles = wheel_angle + (half_angle - wheel_angle) * jnp.linspace(
-            0.0, 1.0, MARGIN_MINIMUM_SEARCH_OPTIONS.n_angles_per_round
+            0.0, 1.0, MARGIN_MINIMUM_SEARCH_OPTIONS.n_angles_per_zoom_round
         )
         lowest_normal_force = jnp.min(
             rolling_motion.compute_foot_force_at_angle(sampled_angles).normal
         )
-        has_lifted_off = passes_apex & (lowest_normal_force <= 0.0) & self.stop_at_lift_off
-        step_outcome = jnp.where(passes_apex, Outcome.STEPPED, Outcome.FELL_BACK).astype(jnp.int32)
-        step_outcome = jnp.where(has_lifted_off, jnp.int32(Outcome.LEG_1_LIFTED_OFF), step_outcome)
-        has_stepped, zero = step_outcome == Outcome.STEPPED, jnp.zeros_like(angular_rate)
-        safe_rate = jnp.where(has_stepped, angular_rate, 10.0)
-        safe_rolling_motion = RollingMotion(
-            s, params.slope, safe_rate, given_first_angle=wheel_angle
+        has_lifted_off = has_passed_apex & (lowest_normal_force <= 0.0) & self.stop_at_lift_off
+        step_outcome = jnp.where(has_passed_apex, Outcome.STEPPED, Outcome.FELL_BACK).astype(
+            jnp.int32
         )
-        end_rate = jnp.sqrt(safe_rolling_motion.compute_squared_rate(half_angle))
-        section_state = jnp.stack([half_angle + zero, end_rate, zero])
+        step_outcome = jnp.where(has_lifted_off, jnp.int32(Outcome.LEG_1_LIFTED_OFF), step_outcome)
+        has_stepped, zero_like_angle = step_outcome == Outcome.STEPPED, jnp.zeros_like(angular_rate)
+        fallback_rate = jnp.where(has_stepped, angular_rate, 10.0)
+        fallback_rolling_motion = RollingMotion(
+            s, params.slope, fallback_rate, given_first_angle=wheel_angle
+        )
+        end_rate = jnp.sqrt(fallback_rolling_motion.compute_squared_rate(half_angle))
+        section_state = jnp.stack([half_angle + zero_like_angle, end_rate, zero_like_angle])
         phase_durations = jnp.stack(
-            [zero, zero, safe_rolling_motion.compute_time_to_angle(half_angle)]
+            [
+                zero_like_angle,
+                zero_like_angle,
+                fallback_rolling_motion.compute_time_to_angle(half_angle),
+            ]
         )
         return AdvanceResult(
             section_state=jnp.where(has_stepped, section_state, 0.0),
@@ -302,30 +316,31 @@ class RigidWheel(AbstractWheel):
         The impulses are in N s. The friction margins are those of the fore foot and of the rear
         foot. The stopper impulses are those of legs 3 to n.
         """
-        zero = jnp.zeros_like(x[1])
+        zero_like_rate = jnp.zeros_like(x[1])
         motion_after = rolling_motion.compute_motion_at_angle(
-            -jnp.asarray(0.5 * s.alpha, zero.dtype) + zero
+            -jnp.asarray(0.5 * s.alpha, zero_like_rate.dtype) + zero_like_rate
         )
-        hub_jump = transitions.compute_hub_velocity_jump(
+        hub_velocity_jump = transitions.compute_hub_velocity_jump(
             transitions.compute_motion_before_landing(s, *x), motion_after
         )
-        holds_rear_foot = self.held_landing
+        is_rear_foot_held = self.held_landing
         rear_impulse = (
             transitions.resolve_landing(s, *x).rear_impulse
-            if holds_rear_foot
-            else dynamics.FootForce(zero, zero)
+            if is_rear_foot_held
+            else dynamics.FootForce(zero_like_rate, zero_like_rate)
         )
         # The impulse at the fore foot is the jump of total momentum, Mt v_hub (the mass centre),
         # minus that at the rear foot.
         fore_impulse = dynamics.FootForce(
-            s.Mt * hub_jump[0] - rear_impulse.tangential, s.Mt * hub_jump[1] - rear_impulse.normal
+            s.Mt * hub_velocity_jump[0] - rear_impulse.tangential,
+            s.Mt * hub_velocity_jump[1] - rear_impulse.normal,
         )
         friction_margins = tuple(
             friction - dynamics.compute_required_friction(foot_impulse)
             for foot_impulse in (fore_impulse, rear_impulse)
         )
         stopper_impulses = transitions.compute_locked_leg_impulses(
-            s, motion_after, hub_jump, range(3, s.n + 1)
+            s, motion_after, hub_velocity_jump, range(3, s.n + 1)
         )
         return rear_impulse, friction_margins, stopper_impulses
 
@@ -334,7 +349,7 @@ class RigidWheel(AbstractWheel):
     ) -> Trajectory:
         """Return the motion during a step at equidistant angles, not at equidistant times."""
         step_result = self.take_step(params, x, options)
-        params, next_slope = split_slopes(params)
+        params, next_slope = separate_next_slope(params)
         s, half_angle = params.symbols(), 0.5 * params.leg_angle
         end_angle = half_angle if next_slope is None else half_angle + next_slope - params.slope
         rolling_motion = RollingMotion(s, params.slope, step_result.post_impact[1])
@@ -369,14 +384,16 @@ class VerticalRateMap(NamedTuple):
     amplitude cos(slope - slope_of_maximum).
     """
 
-    retained_fraction: Elementwise  # r, retained fraction of the squared rate in a landing
+    retained_squared_rate_fraction: (
+        Elementwise  # r, retained fraction of the squared rate in a landing
+    )
     doubled_gravity_stiffness: Elementwise  # G, twice the gravity stiffness, 1/s^2
     half_angle: float  # h, half of the angle between two legs, rad
 
     @property
     def _cosine_and_sine_coefficients(self) -> tuple[Elementwise, Elementwise]:
         """Return the coefficients with which cos(slope) and sin(slope) enter x', divided by G."""
-        r, h = self.retained_fraction, self.half_angle
+        r, h = self.retained_squared_rate_fraction, self.half_angle
         return (1.0 - r) * jnp.cos(h), (1.0 + r) * jnp.sin(h)
 
     @property
@@ -397,8 +414,8 @@ class VerticalRateMap(NamedTuple):
 
     def compute_slope_independent_part(self, x: Elementwise) -> Elementwise:
         """Return the part of x' that does not depend on the slope, 1/s^2."""
-        return self.retained_fraction * x - self.doubled_gravity_stiffness * (
-            1.0 - self.retained_fraction
+        return self.retained_squared_rate_fraction * x - self.doubled_gravity_stiffness * (
+            1.0 - self.retained_squared_rate_fraction
         )
 
     def compute_fixed_point(self, slope: Elementwise) -> Elementwise:
@@ -407,7 +424,10 @@ class VerticalRateMap(NamedTuple):
         - `slope`: slope of the ground, rad.
         """
         periodic_part = self.slope_amplitude * jnp.cos(slope - self.slope_of_maximum)
-        return periodic_part / (1.0 - self.retained_fraction) - self.doubled_gravity_stiffness
+        return (
+            periodic_part / (1.0 - self.retained_squared_rate_fraction)
+            - self.doubled_gravity_stiffness
+        )
 
 
 class RollingMotion(eqx.Module):
@@ -436,9 +456,9 @@ class RollingMotion(eqx.Module):
         The value is negative if the wheel does not reach theta.
         """
         s = self.s
-        height_drop = _compute_cosine_from_vertical(
+        height_drop = _compute_cos_theta_plus_phi(
             s, self.first_angle
-        ) - _compute_cosine_from_vertical(s, theta)
+        ) - _compute_cos_theta_plus_phi(s, theta)
         return self.initial_rate**2 + 2.0 * _compute_gravity_stiffness(s) * height_drop
 
     def compute_time_to_angle(self, theta: Elementwise) -> Elementwise:
@@ -449,31 +469,31 @@ class RollingMotion(eqx.Module):
         """
         s = self.s
         kappa = 2.0 * _compute_gravity_stiffness(s)
-        begin_half_angle, end_half_angle = (
+        first_half_angle, last_half_angle = (
             0.5 * (self.phi + self.first_angle),
             0.5 * (self.phi + theta),
         )
         # This is the squared rate at the vertical.
-        min_rate_squared = self.initial_rate**2 + kappa * (jnp.cos(2.0 * begin_half_angle) - 1.0)
-        is_across_vertical = begin_half_angle * end_half_angle < 0.0
-        zero_squared = jnp.zeros_like(end_half_angle)
+        min_rate_squared = self.initial_rate**2 + kappa * (jnp.cos(2.0 * first_half_angle) - 1.0)
+        has_passed_vertical = first_half_angle * last_half_angle < 0.0
+        zero_squared_angle = jnp.zeros_like(last_half_angle)
         time_to_end = _compute_rolling_time(
             jnp.where(
-                is_across_vertical,
-                zero_squared,
-                jnp.minimum(begin_half_angle**2, end_half_angle**2),
+                has_passed_vertical,
+                zero_squared_angle,
+                jnp.minimum(first_half_angle**2, last_half_angle**2),
             ),
             jnp.where(
-                is_across_vertical,
-                end_half_angle**2,
-                jnp.maximum(begin_half_angle**2, end_half_angle**2),
+                has_passed_vertical,
+                last_half_angle**2,
+                jnp.maximum(first_half_angle**2, last_half_angle**2),
             ),
             min_rate_squared,
             kappa,
         )
         time_to_vertical = _compute_rolling_time(
-            zero_squared,
-            jnp.where(is_across_vertical, begin_half_angle**2, 0.0),
+            zero_squared_angle,
+            jnp.where(has_passed_vertical, first_half_angle**2, 0.0),
             min_rate_squared,
             kappa,
         )
@@ -483,21 +503,27 @@ class RollingMotion(eqx.Module):
         """Return the motion at the angle theta. Its angular rate is 0 if the wheel does not reach
         theta.
         """
-        zero = 0.0 * theta
+        zero_like_theta = 0.0 * theta
         squared_rate = self.compute_squared_rate(theta)
         is_moving = squared_rate > 0.0
         angular_rate = jnp.where(is_moving, jnp.sqrt(jnp.where(is_moving, squared_rate, 1.0)), 0.0)
-        leg_length = self.s.L0 + zero
-        return Motion.from_angle(theta, leg_length, leg_length, angular_rate, zero, zero)
+        leg_length = self.s.L0 + zero_like_theta
+        return Motion.from_angle(
+            theta, leg_length, leg_length, angular_rate, zero_like_theta, zero_like_theta
+        )
 
     def compute_acceleration_at_angle(self, theta: Elementwise) -> dynamics.Acceleration:
         """Return the accelerations at the angle theta, for legs of constant length.
 
         Only the angular acceleration (rad/s^2) due to gravity differs from 0.
         """
-        zero = 0.0 * theta
-        sin_p = jnp.sin(theta) * self.s.cos_phi + jnp.cos(theta) * self.s.sin_phi
-        return dynamics.Acceleration(_compute_gravity_stiffness(self.s) * sin_p, zero, zero)
+        zero_like_theta = 0.0 * theta
+        sin_theta_plus_phi = jnp.sin(theta) * self.s.cos_phi + jnp.cos(theta) * self.s.sin_phi
+        return dynamics.Acceleration(
+            _compute_gravity_stiffness(self.s) * sin_theta_plus_phi,
+            zero_like_theta,
+            zero_like_theta,
+        )
 
     def compute_foot_force_at_angle(self, theta: Elementwise) -> dynamics.FootForce:
         """Return the force that the ground exerts on the stance foot at the angle theta, N."""
@@ -506,14 +532,14 @@ class RollingMotion(eqx.Module):
         )
 
     def compute_stopper_force_at_angle(
-        self, theta: Elementwise, legs: range
+        self, theta: Elementwise, leg_numbers: range
     ) -> Float[Array, "n ..."]:
-        """Return the forces on the stoppers of `legs` at the angle theta, N."""
+        """Return the forces on the stoppers of the legs `leg_numbers` at the angle theta, N."""
         return dynamics.compute_stopper_force(
             self.s,
             self.compute_motion_at_angle(theta),
             self.compute_acceleration_at_angle(theta),
-            legs,
+            leg_numbers,
         )
 
     def evaluate_states_at_angles(self, theta: Elementwise) -> tuple[Array, Array, Array]:
@@ -522,7 +548,7 @@ class RollingMotion(eqx.Module):
 
         The first axis of each result holds its components.
         """
-        wheel_motion, foot_force, zero = (
+        wheel_motion, foot_force, zero_like_theta = (
             self.compute_motion_at_angle(theta),
             self.compute_foot_force_at_angle(theta),
             0.0 * theta,
@@ -537,7 +563,9 @@ class RollingMotion(eqx.Module):
                 wheel_motion.dL2,
             ]
         )
-        foot_forces = jnp.stack([foot_force.tangential, foot_force.normal, zero, zero])
+        foot_forces = jnp.stack(
+            [foot_force.tangential, foot_force.normal, zero_like_theta, zero_like_theta]
+        )
         return (
             coordinates_and_rates,
             foot_forces,
@@ -551,8 +579,10 @@ class RollingMotion(eqx.Module):
         forces of legs 2 to n (N).
         """
         stopper_forces = [
-            self.compute_stopper_force_at_angle(theta[leg], range(leg, leg + 1))[0]
-            for leg in range(2, self.s.n + 1)
+            self.compute_stopper_force_at_angle(
+                theta[leg_number], range(leg_number, leg_number + 1)
+            )[0]
+            for leg_number in range(2, self.s.n + 1)
         ]
         required_friction = dynamics.compute_required_friction(
             self.compute_foot_force_at_angle(theta[1])
@@ -584,7 +614,7 @@ class RollingMotion(eqx.Module):
                 i: Array, lowest_angles_and_margins: tuple[Array, Array]
             ) -> tuple[Array, Array]:
                 angle_offset = half_bracket_width * (
-                    i * (2.0 / (search_options.n_angles_per_round - 1)) - 1.0
+                    i * (2.0 / (search_options.n_angles_per_zoom_round - 1)) - 1.0
                 )
                 candidate_angles = jnp.clip(bracket_centers + angle_offset, -half_angle, end_angle)
                 candidate_margins = self.evaluate_margins_at_angles(candidate_angles)
@@ -594,11 +624,16 @@ class RollingMotion(eqx.Module):
                     lowest_angles_and_margins,
                 )
 
-            initial_minimum = bracket_centers, jnp.full_like(bracket_centers, jnp.inf)
+            initial_angles_and_margins = bracket_centers, jnp.full_like(bracket_centers, jnp.inf)
             minimum_angles, _ = lax.fori_loop(
-                0, search_options.n_angles_per_round, compare_with_lowest, initial_minimum
+                0,
+                search_options.n_angles_per_zoom_round,
+                compare_with_lowest,
+                initial_angles_and_margins,
             )
-            return minimum_angles, half_bracket_width * (2.5 / search_options.n_angles_per_round)
+            return minimum_angles, half_bracket_width * (
+                2.5 / search_options.n_angles_per_zoom_round
+            )
 
         bracket_centers = jnp.stack([middle_angle] * (1 + self.s.n))
         half_bracket_width = (
@@ -628,7 +663,7 @@ def _compute_gravity_stiffness(s: Symbols) -> Elementwise:
     return s.Mt * s.g * s.L0 / _compute_foot_inertia(s)
 
 
-def _compute_cosine_from_vertical(s: Symbols, theta: Elementwise | float) -> Elementwise:
+def _compute_cos_theta_plus_phi(s: Symbols, theta: Elementwise | float) -> Elementwise:
     """Return the cosine of the angle between the stance leg and the vertical, theta + phi."""
     return jnp.cos(theta) * s.cos_phi - jnp.sin(theta) * s.sin_phi
 
@@ -645,12 +680,12 @@ def _compute_rolling_time(
     the integral of dt / sqrt(t (1 - t) (min_rate_squared + 2 kappa t)). Its closed form is 2 R_F
     (DLMF 19.29.4). The result is 0 if the two half-angles are equal.
     """
-    is_nonempty = end_angle_squared > begin_angle_squared
-    lower_squared = jnp.where(is_nonempty, begin_angle_squared, 0.0)
-    upper_squared = jnp.where(is_nonempty, end_angle_squared, 1.0)
-    is_off_vertical = lower_squared > 0.0  # The square root has no derivative at 0.
+    has_nonzero_range = end_angle_squared > begin_angle_squared
+    lower_squared = jnp.where(has_nonzero_range, begin_angle_squared, 0.0)
+    upper_squared = jnp.where(has_nonzero_range, end_angle_squared, 1.0)
+    has_nonzero_lower_end = lower_squared > 0.0  # The square root has no derivative at 0.
     smaller_half_angle = jnp.where(
-        is_off_vertical, jnp.sqrt(jnp.where(is_off_vertical, lower_squared, 1.0)), 0.0
+        has_nonzero_lower_end, jnp.sqrt(jnp.where(has_nonzero_lower_end, lower_squared, 1.0)), 0.0
     )
     larger_half_angle = jnp.sqrt(upper_squared)
     y1, y2 = jnp.sin(smaller_half_angle), jnp.cos(smaller_half_angle)
@@ -661,7 +696,7 @@ def _compute_rolling_time(
     u12 = (x1 * x2 * y3 + y1 * y2 * x3) / squared_sine_difference
     u13 = (x1 * x3 * y2 + y1 * y3 * x2) / squared_sine_difference
     u23 = (x2 * x3 * y1 + y2 * y3 * x1) / squared_sine_difference
-    return jnp.where(is_nonempty, 2.0 * evaluate_carlson_rf(u12**2, u13**2, u23**2), 0.0)
+    return jnp.where(has_nonzero_range, 2.0 * evaluate_carlson_rf(u12**2, u13**2, u23**2), 0.0)
 
 
 def evaluate_carlson_rf(x: Elementwise, y: Elementwise, z: Elementwise) -> Elementwise:
@@ -677,11 +712,11 @@ def evaluate_carlson_rf(x: Elementwise, y: Elementwise, z: Elementwise) -> Eleme
     ) -> tuple[Array, Array, Array]:
         x, y, z = xyz
         sqrt_x, sqrt_y, sqrt_z = jnp.sqrt(x), jnp.sqrt(y), jnp.sqrt(z)
-        duplication_shift = sqrt_x * sqrt_y + sqrt_y * sqrt_z + sqrt_z * sqrt_x
+        argument_shift = sqrt_x * sqrt_y + sqrt_y * sqrt_z + sqrt_z * sqrt_x
         return (
-            0.25 * (x + duplication_shift),
-            0.25 * (y + duplication_shift),
-            0.25 * (z + duplication_shift),
+            0.25 * (x + argument_shift),
+            0.25 * (y + argument_shift),
+            0.25 * (z + argument_shift),
         )
 
     x, y, z = lax.fori_loop(0, 12, duplicate_arguments, (x, y, z))

@@ -43,13 +43,13 @@ def is_valid_start_state(params: WheelParams, x: SectionStateEntries) -> Array:
     forward. NaN gives False.
     """
     wheel_angle, angular_rate = x[0], x[1]
-    is_upright = (jnp.abs(wheel_angle) < 0.5 * jnp.pi) & (
+    is_angle_in_range = (jnp.abs(wheel_angle) < 0.5 * jnp.pi) & (
         jnp.abs(wheel_angle - params.leg_angle) < 0.5 * jnp.pi
     )
-    is_bounded = functools.reduce(
+    are_entries_bounded = functools.reduce(
         operator.and_, [jnp.abs(state_entry) < MAX_SI_VALUE for state_entry in x]
     )
-    return params.is_in_domain() & is_bounded & is_upright & (angular_rate > 0.0)
+    return params.is_in_domain() & are_entries_bounded & is_angle_in_range & (angular_rate > 0.0)
 
 
 def replace_invalid_inputs(
@@ -77,23 +77,23 @@ def complete_line_slopes(slope: Array, n_steps: int) -> Array:
 
     If `slope` has n entries, the last slope is repeated.
     """
-    check_stepwise_shape("slope", slope, n_steps)
+    require_stepwise_shape("slope", slope, n_steps)
     return slope if len(slope) > n_steps else jnp.append(slope, slope[-1:])
 
 
-def check_stepwise_shape(quantity_name: str, stepwise_values: Array, n_steps: int) -> None:
+def require_stepwise_shape(quantity_name: str, stepwise_values: Array, n_steps: int) -> None:
     """Raise a `ValueError` unless an array has n or n + 1 entries for n steps."""
     if jnp.shape(stepwise_values) not in ((n_steps,), (n_steps + 1,)):
-        steps_text = "a step" if n_steps == 1 else f"a walk of {n_steps} steps"
+        n_steps_text = "a step" if n_steps == 1 else f"a walk of {n_steps} steps"
         raise ValueError(
-            f"{quantity_name} has shape {jnp.shape(stepwise_values)}, but {steps_text} of one "
+            f"{quantity_name} has shape {jnp.shape(stepwise_values)}, but {n_steps_text} of one "
             "wheel "
             f"takes one number, or an array of {n_steps} or {n_steps + 1} over its steps: map "
             "over batches of wheels with jax.vmap."
         )
 
 
-def split_slopes(params: WheelParams) -> tuple[WheelParams, Elementwise | None]:
+def separate_next_slope(params: WheelParams) -> tuple[WheelParams, Elementwise | None]:
     """Return the wheel on the line of the ground under both feet, and the slope of the next line.
 
     The slope is in rad. The line joins the footholds of the two feet in double support. On uneven
@@ -106,7 +106,7 @@ def split_slopes(params: WheelParams) -> tuple[WheelParams, Elementwise | None]:
     return eqx.tree_at(lambda wheel: wheel.slope, params, slope), next_slope
 
 
-def is_valid_slope(slope: Elementwise) -> Array:
+def is_slope_in_domain(slope: Elementwise) -> Array:
     """Return whether a slope (rad) lies in the allowed domain. NaN gives False."""
     return jnp.asarray(PARAMETER_DOMAINS["slope"].contains_value(slope))
 
@@ -120,9 +120,9 @@ def select_stance_line_and_tilt(
     parameters, start and slopes are valid. The tilt is the angle by which the next line is steeper
     than the present line, rad. On flat ground the tilt is None.
     """
-    params, next_slope = split_slopes(params)
-    is_valid = is_valid_start_state(params, x)
+    params, next_slope = separate_next_slope(params)
+    is_valid_step = is_valid_start_state(params, x)
     if next_slope is None:
-        return params, is_valid, None
-    is_valid = is_valid & is_valid_slope(next_slope)
-    return params, is_valid, jnp.where(is_valid, next_slope - params.slope, 0.0)
+        return params, is_valid_step, None
+    is_valid_step = is_valid_step & is_slope_in_domain(next_slope)
+    return params, is_valid_step, jnp.where(is_valid_step, next_slope - params.slope, 0.0)

@@ -27,13 +27,13 @@ MeasureValue = Float[Array, "..."]
 class AbstractMeasureGroup(AbstractPrintable):
     """Group of measures. Each field is one of the measures in `measures.MEASURES`."""
 
-    measure_names: eqx.AbstractClassVar[Mapping[str, str]]
+    measure_name_by_field: eqx.AbstractClassVar[Mapping[str, str]]
     """Names of the measures in `measures.MEASURES`, by field, for the fields whose names differ."""
 
     def measures(self) -> dict[str, Array]:
         """Return the value of each field, by the name of its measure in `measures.MEASURES`."""
         return {
-            self.measure_names.get(field_name, field_name): field_value
+            self.measure_name_by_field.get(field_name, field_name): field_value
             for field_name, field_value in vars(self).items()
         }
 
@@ -64,7 +64,7 @@ class DoubleSupportIndicators(AbstractMeasureGroup):
         9.47 N
     """
 
-    measure_names: ClassVar = {"lambda_2": "lambda_2_plus", "lambda_4": "lambda_4_plus"}
+    measure_name_by_field: ClassVar = {"lambda_2": "lambda_2_plus", "lambda_4": "lambda_4_plus"}
 
     lambda_I4: MeasureValue
     lambda_2: MeasureValue
@@ -83,7 +83,7 @@ class EnergyLoss(AbstractMeasureGroup):
         7.4 J, 26.2 J
     """
 
-    measure_names: ClassVar = {
+    measure_name_by_field: ClassVar = {
         name: f"energy_lost_{name}" for name in ("landing", "stopper", "damping")
     }
 
@@ -128,7 +128,7 @@ class Margins(AbstractMeasureGroup):
         -13.22
     """
 
-    measure_names: ClassVar = {}
+    measure_name_by_field: ClassVar = {}
 
     fore_foot_force: MeasureValue
     takeoff_acceleration: MeasureValue
@@ -200,7 +200,7 @@ class AbstractStep(AbstractPrintable):
             "outcome": self.outcome,
             "solver_steps": self.solver_steps,
         }
-        return shared_measures | self.model_measures()
+        return shared_measures | self.collect_model_measures()
 
     def summary_rows(self) -> list[LabelAndText]:
         """Return labels and printed values: first measures, then margins and whether each of them
@@ -214,31 +214,25 @@ class AbstractStep(AbstractPrintable):
         for measure_name, measure_value in measure_values.items():
             if measure_name == "outcome":
                 continue
-            measure_description, lowest_value = (
+            measure_description, lowest_margin = (
                 MEASURES[measure_name],
                 float(np.min(np.asarray(measure_value))),
             )
-            verdict_text = ", holds" if lowest_value >= 0.0 else ", broken"
-            value_text = measure_description.format_with_unit(lowest_value)
+            margin_verdict = ", holds" if lowest_margin >= 0.0 else ", broken"
+            value_text = measure_description.format_with_unit(lowest_margin)
             if measure_name in MARGIN_MEASURES:
                 text_rows.append(
-                    (f"margin: {measure_description.label_with_symbol}", value_text + verdict_text)
+                    (
+                        f"margin: {measure_description.label_with_symbol}",
+                        value_text + margin_verdict,
+                    )
                 )
             else:
                 text_rows.append((measure_description.label_with_symbol, value_text))
         return text_rows
 
-    def model_selection(self) -> dict[str, Array]:
-        """Return the code of the model with which the step was computed, and the code of the
-        reason.
-
-        The keys are the names of the dataset variables. The result is empty for a model that does
-        not select another model.
-        """
-        return {}
-
     @abc.abstractmethod
-    def model_measures(self) -> dict[str, Array]:
+    def collect_model_measures(self) -> dict[str, Array]:
         """Return the values of the measures that only some models have, by name."""
 
 
@@ -253,7 +247,7 @@ class AbstractContactStep(AbstractStep):
     energy_friction: eqx.AbstractVar[MeasureValue]  # lost by sliding between impacts, J
     slip: eqx.AbstractVar[MeasureValue]  # path length of sliding feet, m
 
-    def model_measures(self) -> dict[str, Array]:
+    def collect_model_measures(self) -> dict[str, Array]:
         """Return the values of the measures that only contact steps have, by name."""
         return {
             "energy_lost_damping": self.energy_damping,
@@ -297,7 +291,7 @@ class StepResult(AbstractStep):
     solver_steps: Int[Array, "..."]
     engine: str = eqx.field(static=True, default="")
 
-    def model_measures(self) -> dict[str, Array]:
+    def collect_model_measures(self) -> dict[str, Array]:
         """Return the values of the measures that only models with the paper's phases have, by
         name.
         """

@@ -82,10 +82,10 @@ def complete_jacobian_by_scaling(
     """
     known_columns = dict(known_columns)
     for parameter_index, unit_scaling in UNIT_SCALING_BY_PARAMETER_INDEX.items():
-        remaining_sum = unit_scaling.subtract_known_columns(
+        unknown_column_product = unit_scaling.subtract_known_columns(
             scaled_outputs[parameter_index], step_inputs, known_columns
         )
-        known_columns[parameter_index] = remaining_sum / (
+        known_columns[parameter_index] = unknown_column_product / (
             unit_scaling.input_powers[parameter_index] * step_inputs[parameter_index]
         )
     return known_columns

@@ -59,7 +59,7 @@ class DiffraxPhaseFunctions(NamedTuple):
     vector.
     """
 
-    unpack_motion: Callable[[StateArray], Motion]
+    motion_unpacker: Callable[[StateArray], Motion]
     vector_field: VectorField
     guards: MonitoredFunctions
 
@@ -88,12 +88,12 @@ def make_diffrax_phase(phase: AbstractPhase, records_margins: bool) -> DiffraxPh
             ]
         )
 
-    counted_margins = phase.margins_counted_at_start if records_margins else ()
+    is_margin_counted = phase.margins_counted_at_start if records_margins else ()
     return DiffraxPhaseFunctions(
         unpack_motion,
         evaluate_vector_field,
         MonitoredFunctions(
-            evaluate_guards_and_margins, len(phase.all_guard_outcomes), counted_margins
+            evaluate_guards_and_margins, len(phase.all_guard_outcomes), is_margin_counted
         ),
     )
 
@@ -119,8 +119,8 @@ class ViscoelasticWheel(AbstractWheel):
     capabilities: ClassVar[ModelCapabilities] = ModelCapabilities(
         config_name="viscoelastic",
         gait_method=GaitMethod.COLLOCATION,
-        commands=frozenset({"scan", "map", "tune", "branch", "explore"}),
-        begins_within_step=True,
+        accepted_commands=frozenset({"scan", "map", "tune", "branch", "explore"}),
+        can_begin_within_step=True,
     )
     parameter_names: ClassVar[tuple[str, ...]] = PARAMETER_NAMES
     reports_contacts: ClassVar[bool] = False
@@ -131,25 +131,25 @@ class ViscoelasticWheel(AbstractWheel):
         static=True, converter=functools.partial(check_bool, "stop_at_lift_off"), default=True
     )
 
-    def default_start(self, params: WheelParams) -> SectionState:
+    def compute_default_start(self, params: WheelParams) -> SectionState:
         """Return a section state near the gait of Table 1 of the paper, inside its basin of
         attraction.
         """
         return jnp.asarray(PAPER_START_STATE, params.damping.dtype)
 
     def advance(self, params: WheelParams, x: SectionState, options: StepOptions) -> AdvanceResult:
-        return self._compute_step(params, x, options, is_detailed=False)
+        return self._compute_step(params, x, options, has_margins=False)
 
     def take_step(self, params: WheelParams, x: SectionState, options: StepOptions) -> StepResult:
-        return self._compute_step(params, x, options, is_detailed=True)
+        return self._compute_step(params, x, options, has_margins=True)
 
     def _compute_step(
-        self, params: WheelParams, x: SectionState, options: StepOptions, is_detailed: bool
+        self, params: WheelParams, x: SectionState, options: StepOptions, has_margins: bool
     ) -> Any:
         """Return the results of a step, computed with the compiled function."""
         argument_leaves, argument_structure = jax.tree.flatten((params, x, options))
         return eqx.combine(
-            *_compile_step_function(self, argument_structure, is_detailed)(*argument_leaves)
+            *_compile_step_function(self, argument_structure, has_margins)(*argument_leaves)
         )
 
     def sample_step(
@@ -157,14 +157,12 @@ class ViscoelasticWheel(AbstractWheel):
     ) -> Trajectory:
         argument_leaves, argument_structure = jax.tree.flatten((params, x, options))
         if can_use_batch_kernel(options):
-            sample_step_from_leaves = build_step_sampler(
-                argument_structure, self.stop_at_lift_off, n_samples
-            )
+            step_sampler = build_step_sampler(argument_structure, self.stop_at_lift_off, n_samples)
         else:
-            sample_step_from_leaves = functools.partial(
+            step_sampler = functools.partial(
                 self._sample_with_diffrax, argument_structure, n_samples
             )
-        return sample_step_from_leaves(*argument_leaves)
+        return step_sampler(*argument_leaves)
 
     def _sample_with_diffrax(
         self, argument_structure: Any, n_samples: int, *argument_leaves: Array
@@ -203,8 +201,8 @@ class ViscoelasticWheel(AbstractWheel):
         self, params: WheelParams, x: SectionState, options: StepOptions, records_margins: bool
     ) -> PhaseSequenceResult:
         """Integrate all phases of a step with diffrax and return their starts and ends."""
-        integrate_phase = _make_diffrax_phase_runner(options, records_margins)
-        return run_step_phases(integrate_phase, params, tuple(x), options, self.stop_at_lift_off)
+        phase_runner = _make_diffrax_phase_runner(options, records_margins)
+        return run_step_phases(phase_runner, params, tuple(x), options, self.stop_at_lift_off)
 
     def finish_step(
         self,
@@ -218,14 +216,14 @@ class ViscoelasticWheel(AbstractWheel):
             (params, jnp.asarray(distance), state, options)
         )
         if can_use_batch_kernel(options):
-            finish_step_from_leaves = build_step_finisher(
+            step_finisher = build_step_finisher(
                 argument_structure, phase_index, self.stop_at_lift_off
             )
-            return eqx.combine(*finish_step_from_leaves(*argument_leaves))
-        integrate_phase = _make_diffrax_phase_runner(options, records_margins=False)
+            return eqx.combine(*step_finisher(*argument_leaves))
+        phase_runner = _make_diffrax_phase_runner(options, records_margins=False)
         step_settings = options, self.stop_at_lift_off, "diffrax"
         return finish_step(
-            integrate_phase, params, phase_index, distance, tuple(state), *step_settings
+            phase_runner, params, phase_index, distance, tuple(state), *step_settings
         )
 
 
@@ -261,19 +259,19 @@ def _make_diffrax_phase_runner(options: StepOptions, records_margins: bool) -> P
 
 @functools.cache
 def _compile_step_function(
-    model: ViscoelasticWheel, argument_structure: Any, is_detailed: bool
+    model: ViscoelasticWheel, argument_structure: Any, has_margins: bool
 ) -> ForwardFunction:
     """Return a function that computes a step from the leaves of (params, x, options).
 
     The function is differentiable in any mode.
     """
 
-    static_options = jax.tree.unflatten(argument_structure, [0.0] * argument_structure.num_leaves)[
-        2
-    ]
-    engine_name = "lanes" if can_use_batch_kernel(static_options) else "diffrax"
+    options_without_numbers = jax.tree.unflatten(
+        argument_structure, [0.0] * argument_structure.num_leaves
+    )[2]
+    engine_name = "lanes" if can_use_batch_kernel(options_without_numbers) else "diffrax"
 
-    def compute_with_diffrax(tightens_tolerances: bool, *argument_leaves: Array) -> tuple:
+    def compute_with_diffrax(has_tight_tolerances: bool, *argument_leaves: Array) -> tuple:
         """Compute a step with diffrax and return its results, split into float arrays and other
         arrays.
 
@@ -281,28 +279,28 @@ def _compile_step_function(
         derivatives. The results still report the name of the batch kernel's engine.
         """
         params, x, options = jax.tree.unflatten(argument_structure, argument_leaves)
-        options = options.with_derivative_tolerances() if tightens_tolerances else options
-        phase_sequence = model._run_phases(params, x, options, records_margins=is_detailed)
+        options = options.with_derivative_tolerances() if has_tight_tolerances else options
+        phase_sequence = model._run_phases(params, x, options, records_margins=has_margins)
         step_result: AdvanceResult | StepResult = (
             make_step_result(phase_sequence, model.friction, engine_name)
-            if is_detailed
+            if has_margins
             else make_advance_result(phase_sequence, engine_name)
         )
         return eqx.partition(step_result, eqx.is_inexact_array)
 
-    diffrax_step, tight_diffrax_step = (
-        functools.partial(compute_with_diffrax, tightens_tolerances)
-        for tightens_tolerances in (False, True)
+    diffrax_step_function, tight_diffrax_step_function = (
+        functools.partial(compute_with_diffrax, has_tight_tolerances)
+        for has_tight_tolerances in (False, True)
     )
     if engine_name == "diffrax":
-        return enable_all_ad_modes(diffrax_step, tight_diffrax_step)
+        return enable_all_ad_modes(diffrax_step_function, tight_diffrax_step_function)
     trace_config = (
         argument_structure,
         model.stop_at_lift_off,
-        model.friction if is_detailed else None,
+        model.friction if has_margins else None,
     )
     return enable_all_ad_modes(
         build_step_function(*trace_config),
-        tight_diffrax_step,
+        tight_diffrax_step_function,
         functools.partial(build_step_jacobian, *trace_config),
     )

@@ -99,7 +99,7 @@ def _make_forward_jacobian_function(
         float_outputs, other_outputs = function(*arrays)
         return float_outputs, (float_outputs, other_outputs)
 
-    def evaluate_jacobian(*arrays: Any) -> tuple[PyTree, PyTree]:
+    def evaluate_argument_jacobians(*arrays: Any) -> tuple[PyTree, PyTree]:
         output_jacobians, (float_outputs, other_outputs) = jax.jacfwd(
             evaluate_with_aux, argnums=argnums, has_aux=True
         )(*arrays)
@@ -115,7 +115,7 @@ def _make_forward_jacobian_function(
         )
         return (jacobians_by_argument, float_outputs), other_outputs
 
-    return evaluate_jacobian
+    return evaluate_argument_jacobians
 
 
 @jax.jit

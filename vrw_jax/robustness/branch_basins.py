@@ -15,7 +15,7 @@ from vrw_jax.robustness.gait_arrival import StableGait
 from vrw_jax.robustness.smallest_disturbance import compute_smallest_disturbance
 from vrw_jax.runtime import with_default_jax_settings
 from vrw_jax.runtime import xarray as xr
-from vrw_jax.simulation import ModelLike, check_model, check_step_options
+from vrw_jax.simulation import ModelLike, convert_model_argument, convert_step_options
 from vrw_jax.validation import check_int, check_type
 from vrw_jax.wheel import PARAMETER_NAMES, WheelParams
 
@@ -68,7 +68,7 @@ def measure_basins(
         [0.126, 0.109]
     """
     check_type("branch", branch, Branch, "give the result of vrw.continue_branch")
-    checked_model, checked_options = check_model(model), check_step_options(options)
+    checked_model, checked_options = convert_model_argument(model), convert_step_options(options)
     n_points, n_starts = check_int("n_points", n_points), check_int("n_starts", n_starts)
     max_steps = check_int("max_steps", max_steps)
     box_bounds = None if box is None else parse_start_box(box)
@@ -102,7 +102,7 @@ def measure_basins(
             basin_share_result = compute_basin_share(stable_gait, box_bounds, n_starts, max_steps)
             store_value("basin_share", result_index, basin_share_result.share)
             store_value("basin_share_error", result_index, basin_share_result.share_error)
-        if checked_model.capabilities.begins_within_step:
+        if checked_model.capabilities.can_begin_within_step:
             disturbance_result = compute_smallest_disturbance(stable_gait, None, max_steps)
             store_value("smallest_disturbance", result_index, disturbance_result.size)
             store_value("smallest_disturbance_error", result_index, disturbance_result.size_error)

@@ -20,7 +20,12 @@ from vrw_jax.robustness.passage_gradient import differentiate_log_mean_steps
 from vrw_jax.robustness.rigid_passage import solve_rigid_passage
 from vrw_jax.robustness.sampled_passage import ExtinctGroupError, WalkerGroups, sample_passage
 from vrw_jax.runtime import with_default_jax_settings
-from vrw_jax.simulation import ModelLike, check_model, check_single_wheel, check_step_options
+from vrw_jax.simulation import (
+    ModelLike,
+    convert_model_argument,
+    convert_step_options,
+    require_single_wheel,
+)
 from vrw_jax.validation import (
     check_int,
     check_positive,
@@ -194,13 +199,13 @@ def first_passage(
         >>> passage.end_names
         ('TOUCHDOWN_BEFORE_STOPPER',)
     """
-    check_single_wheel(params, "take one after the other")
+    require_single_wheel(params, "take one after the other")
     if not has_traced_leaf(slope_sd):
         slope_sd = check_positive("slope_sd", slope_sd)
     seed, n_nodes = check_int("seed", seed, 0), check_int("n_nodes", n_nodes, 8)
     n_walkers, max_steps = check_int("n_walkers", n_walkers), check_int("max_steps", max_steps)
     tol = None if tol is None else check_positive("tol", tol)
-    resolved_model: Any = check_model(resolve_model(params, model))
+    resolved_model: Any = convert_model_argument(resolve_model(params, model))
     if resolved_model.capabilities.passage_method == PassageMethod.QUADRATURE:
         return _solve_passage_by_quadrature(
             params, jnp.asarray(slope_sd), resolved_model, n_nodes, tol or 1e-8
@@ -217,7 +222,7 @@ def first_passage(
     estimate_passage = functools.partial(
         _estimate_passage_by_sampling,
         model=resolved_model,
-        options=check_step_options(options),
+        options=convert_step_options(options),
         seed=seed,
         n_walkers=n_walkers,
         relative_tolerance=tol or 0.02,

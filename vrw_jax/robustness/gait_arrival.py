@@ -12,7 +12,12 @@ from vrw_jax.batches import step_batch
 from vrw_jax.cycles import AbstractCycle, limit_cycle
 from vrw_jax.models import AbstractWheel
 from vrw_jax.numerics import StepOptions
-from vrw_jax.simulation import ModelLike, check_model, check_single_wheel, check_step_options
+from vrw_jax.simulation import (
+    ModelLike,
+    convert_model_argument,
+    convert_step_options,
+    require_single_wheel,
+)
 from vrw_jax.validation import check_type, require_untraced_arguments
 from vrw_jax.wheel import Outcome, WheelParams, compute_wheel_units
 
@@ -61,9 +66,9 @@ class StableGait(NamedTuple):
         require_untraced_arguments(
             caller_name, "map vrw.walk over the starts", params, options, cycle
         )
-        check_single_wheel(params, f"call {caller_name} for one wheel after the other")
-        checked_model = check_model(model).fallback_model  # valid for any start
-        checked_options = check_step_options(options)
+        require_single_wheel(params, f"call {caller_name} for one wheel after the other")
+        checked_model = convert_model_argument(model).fallback_model  # valid for any start
+        checked_options = convert_step_options(options)
         checked_options.check_tolerances(np.dtype(params.damping.dtype))
         if cycle is None:
             cycle = limit_cycle(params, model=checked_model)
@@ -103,10 +108,10 @@ class StableGait(NamedTuple):
 
         Two states agree if their distance is at most `max_gait_distance`.
         """
-        state_units = self.model.section_units(
+        state_units = self.model.compute_section_units(
             compute_wheel_units(self.params.symbols()), self.params.n_legs
         )
-        n_continuous = self.model.n_continuous(self.params)
+        n_continuous = self.model.count_continuous_entries(self.params)
         scaled_differences = (
             section_states[:, None, :n_continuous] - self.section_states[:, :n_continuous]
         ) / np.asarray(state_units)[:n_continuous]
@@ -135,7 +140,7 @@ def walk_until_on_gait(
     is_on_gait, walk_outcomes = np.zeros(n_starts, bool), np.full(n_starts, int(Outcome.STEPPED))
     n_steps_by_walk = np.zeros(n_starts, int)
     embed_section_states: Any = jax.vmap(
-        functools.partial(stable_gait.model.embed_section, stable_gait.params)
+        functools.partial(stable_gait.model.embed_section_state, stable_gait.params)
     )
     section_states = np.array(embed_section_states(jnp.asarray(start_states)))
     walking_indices, n_steps_walked = np.arange(n_starts), 0

@@ -158,7 +158,10 @@ class WalkerGroups:
     ) -> None:
         self.params, self.model, self.step_options = params, model, step_options
         self.mean_slope, self.slope_sd, self.random = float(params.slope), slope_sd, generator
-        self.n_groups, self.n_continuous = options.n_walker_groups, int(model.n_continuous(params))
+        self.n_groups, self.n_continuous = (
+            options.n_walker_groups,
+            int(model.count_continuous_entries(params)),
+        )
         walkers_per_group = -(-n_walkers // self.n_groups)
         self.states = self.gait_states = np.tile(
             section_state, (self.n_groups * walkers_per_group, 1)

@@ -312,7 +312,7 @@ def stack_parameter_rows(
     Parameters that are not swept are those of `base_wheel` and `wheel_model`.
     """
     n_samples = len(next(iter(sample_columns.values())))
-    base_parameter_values = np.asarray(wheel_model.parameter_values(base_wheel))
+    base_parameter_values = np.asarray(wheel_model.collect_parameter_values(base_wheel))
     return np.stack(
         [
             np.asarray(

@@ -38,7 +38,7 @@ from vrw_jax.scans.collocation_engine import (
     stack_parameter_rows,
 )
 from vrw_jax.scans.measure_catalog import make_error_variable_name, parse_derivative
-from vrw_jax.selection import MODEL_SELECTION_MARGINS, ModelCode, find_selection_reason
+from vrw_jax.selection import VIOLATION_TEXT_BY_SELECTION_MARGIN, ModelCode, find_selection_reason
 from vrw_jax.tolerance import ModelIndex, measure_to_tolerance
 from vrw_jax.wheel import FRICTION_NAME, PARAMETER_NAMES, Outcome, make_wheel_from_parameters
 
@@ -274,7 +274,7 @@ class ModelSelectionScanEngine:
         """Return `ModelChoice.reason_code` for each sample, computed from the margins of its gait
         with the paper's model.
         """
-        variable_names = (*MODEL_SELECTION_MARGINS, "outcome")
+        variable_names = (*VIOLATION_TEXT_BY_SELECTION_MARGIN, "outcome")
         selection_reasons = map_in_numpy_batches(
             _find_batch_selection_reasons,
             (batch_sizes.GAIT_READ_BATCH_SIZE,),

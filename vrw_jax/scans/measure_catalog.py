@@ -16,7 +16,7 @@ from vrw_jax.measures import (
     make_measure_attributes,
 )
 from vrw_jax.models import AbstractWheel, GaitMethod
-from vrw_jax.selection import MODEL_SELECTION_ATTRIBUTES
+from vrw_jax.selection import SELECTION_VARIABLE_ATTRIBUTES
 from vrw_jax.tolerance import MEASURE_FUNCTIONS
 from vrw_jax.validation import format_name_suggestion
 from vrw_jax.wheel import FRICTION_NAME, PARAMETER_NAMES
@@ -88,7 +88,7 @@ UNILATERAL_MEASURE_CATALOG = MeasureCatalog(
 )
 MODEL_SELECTION_MEASURE_CATALOG = MeasureCatalog(
     (*UNILATERAL_DIFFERENTIABLE_NAMES, "spectral_margin"),
-    ("outcome", "spectral_radius", *MODEL_SELECTION_ATTRIBUTES),
+    ("outcome", "spectral_radius", *SELECTION_VARIABLE_ATTRIBUTES),
     tuple(name for name in UNILATERAL_DIFFERENTIABLE_NAMES if name in DIFFERENTIABLE_MEASURES),
     PARAMETER_NAMES,
     _CONTACT_DEFAULT_MEASURES,
@@ -263,8 +263,8 @@ def check_measure_names(
 
 def get_variable_attributes(variable_name: str) -> dict[str, object]:
     """Return unit, long name and description of a variable of a scan, by attribute name."""
-    if variable_name in MODEL_SELECTION_ATTRIBUTES:
-        return dict(MODEL_SELECTION_ATTRIBUTES[variable_name])
+    if variable_name in SELECTION_VARIABLE_ATTRIBUTES:
+        return dict(SELECTION_VARIABLE_ATTRIBUTES[variable_name])
     if variable_name.removesuffix(
         ERROR_VARIABLE_SUFFIX
     ) in MEASURE_FUNCTIONS and variable_name.endswith(ERROR_VARIABLE_SUFFIX):

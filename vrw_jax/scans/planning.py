@@ -44,7 +44,7 @@ from vrw_jax.scans.store import (
     find_first_settings_difference,
 )
 from vrw_jax.selection import describe_accepted_models
-from vrw_jax.simulation import ModelLike, check_model, check_step_options
+from vrw_jax.simulation import ModelLike, convert_model_argument, convert_step_options
 from vrw_jax.validation import check_int, check_names, check_positive, check_type
 from vrw_jax.wheel import FRICTION_NAME, PARAMETER_NAMES, WheelParams
 
@@ -200,7 +200,7 @@ def plan_scan(
     base = WheelParams() if base is None else base
     check_type("base", base, WheelParams, "write vrw.WheelParams(slope=...)")
     base.require_single_wheel("give numbers, and what varies in the design")
-    options, model = check_step_options(options), check_model(model)
+    options, model = convert_step_options(options), convert_model_argument(model)
     options.check_tolerances(np.dtype(base.damping.dtype))
     gait_finder = make_finder(model, base.n_legs, cycle_options=cycle_options, step_options=options)
     gait_finder.search_options.check_tolerances(np.dtype(base.damping.dtype))
@@ -262,7 +262,7 @@ def _require_reference_model(wheel_model: AbstractWheel, error_tolerance: float)
     errors.
     """
     model_fields: dict[str, Any] = type(wheel_model).__dataclass_fields__
-    default_only_fields = wheel_model.capabilities.fixed_by_tolerance
+    default_only_fields = wheel_model.capabilities.default_only_fields
     if default_only_fields is None or any(
         getattr(wheel_model, field_name) != model_fields[field_name].default
         for field_name in default_only_fields

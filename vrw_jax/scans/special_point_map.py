@@ -19,7 +19,7 @@ from vrw_jax.runtime import xarray as xr
 from vrw_jax.scans.design import AbstractSampleDesign
 from vrw_jax.scans.execution import ProgressCallback, scan
 from vrw_jax.selection import describe_accepted_models
-from vrw_jax.simulation import ModelLike, check_model
+from vrw_jax.simulation import ModelLike, convert_model_argument
 from vrw_jax.validation import check_callable, check_names, check_type
 from vrw_jax.wheel import Outcome, WheelParams
 
@@ -112,8 +112,8 @@ def map_special_points(
     require_map_grid(design)
     if on_stage is not None:
         check_callable("on_stage", on_stage, "that takes a sentence")
-    wheel_model: Any = check_model(model)
-    if "map" not in wheel_model.capabilities.commands:
+    wheel_model: Any = convert_model_argument(model)
+    if "map" not in wheel_model.capabilities.accepted_commands:
         raise ValueError(
             f"model is {type(wheel_model).__name__}, but special points are mapped for "
             f"{describe_accepted_models('map')}: give that."

@@ -1,14 +1,14 @@
 """Selection of the simplest model whose assumptions hold for a step."""
 
 from vrw_jax.selection.ladder import (
-    MODEL_SELECTION_ATTRIBUTES,
-    MODEL_SELECTION_MARGINS,
+    SELECTION_VARIABLE_ATTRIBUTES,
+    VIOLATION_TEXT_BY_SELECTION_MARGIN,
     LadderStep,
     LadderWheel,
     ModelChoice,
     ModelCode,
     find_selection_reason,
-    raise_if_ladder,
+    raise_for_ladder,
 )
 from vrw_jax.selection.registry import (
     REGISTERED_MODEL_CLASSES,

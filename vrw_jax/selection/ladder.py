@@ -57,7 +57,7 @@ class ModelCode(enum.IntEnum):
     UNILATERAL = 2
 
 
-MODEL_SELECTION_MARGINS: dict[str, str] = {
+VIOLATION_TEXT_BY_SELECTION_MARGIN: dict[str, str] = {
     name: MARGIN_MEASURES[name].violation_text
     for name in (
         "fore_foot_force",
@@ -74,11 +74,11 @@ MODEL_SELECTION_MARGINS: dict[str, str] = {
 and the values are texts that describe a violation.
 """
 
-START_NOT_EMBEDDABLE_REASON_CODE = 1 + len(MODEL_SELECTION_MARGINS)
+START_NOT_EMBEDDABLE_REASON_CODE = 1 + len(VIOLATION_TEXT_BY_SELECTION_MARGIN)
 """Reason code for a start that is not a section state of the viscoelastic model."""
 
 
-MODEL_SELECTION_ATTRIBUTES: dict[str, dict[str, object]] = {
+SELECTION_VARIABLE_ATTRIBUTES: dict[str, dict[str, object]] = {
     "rung": {
         "long_name": "model that was used",
         "flag_values": [int(code) for code in ModelCode],
@@ -90,10 +90,10 @@ MODEL_SELECTION_ATTRIBUTES: dict[str, dict[str, object]] = {
         "long_name": "why that model was used",
         "units": "1",
         "description": "0: all margins of the paper's wheel hold; above: the first that breaks, "
-        f"of {', '.join(MODEL_SELECTION_MARGINS)}; below: minus that wheel's outcome.",
+        f"of {', '.join(VIOLATION_TEXT_BY_SELECTION_MARGIN)}; below: minus that wheel's outcome.",
     },
 }
-"""Attributes of the dataset variables that `model_selection` returns."""
+"""Attributes of the dataset variables that `ModelChoice.collect_selection_codes` returns."""
 
 
 class ModelChoice(AbstractPrintable):
@@ -101,11 +101,12 @@ class ModelChoice(AbstractPrintable):
 
     - `model_code`: code of the model, `ModelCode.VISCOELASTIC` or `ModelCode.UNILATERAL`;
     - `reason_code`: 0 if the viscoelastic model is valid. If a margin is violated, the code is 1 +
-      the index of the first such margin in `MODEL_SELECTION_MARGINS`. If a leg other than Leg 1 is
-      loaded or off its stopper at the start, the code is `START_NOT_EMBEDDABLE_REASON_CODE`. If the
-      step computed with the viscoelastic model does not reach a touchdown, the code is the negative
-      of the outcome code;
-    - `margins`: values of the margins in `MODEL_SELECTION_MARGINS`, negative for a violation;
+      the index of the first such margin in `VIOLATION_TEXT_BY_SELECTION_MARGIN`. If a leg other
+      than Leg 1 is loaded or off its stopper at the start, the code is
+      `START_NOT_EMBEDDABLE_REASON_CODE`. If the step computed with the viscoelastic model does not
+      reach a touchdown, the code is the negative of the outcome code;
+    - `margins`: values of the margins in `VIOLATION_TEXT_BY_SELECTION_MARGIN`, negative for a
+      violation;
     - `friction`: friction coefficient of the ground.
 
     Examples:
@@ -123,26 +124,31 @@ class ModelChoice(AbstractPrintable):
         """Return labels and printed texts for the model, the reason and the margins."""
         reason_codes = np.asarray(self.reason_code)
         if reason_codes.ndim:
-            n_paper_wheels = int(np.sum(reason_codes == 0))
+            n_viscoelastic_choices = int(np.sum(reason_codes == 0))
             return [
                 (
                     "wheels",
-                    f"{reason_codes.size} in shape {reason_codes.shape}, {n_paper_wheels} served "
-                    "by the paper's",
+                    f"{reason_codes.size} in shape {reason_codes.shape}, "
+                    f"{n_viscoelastic_choices} served by the paper's",
                 )
             ]
-        named_margins = zip(MODEL_SELECTION_MARGINS, np.asarray(self.margins), strict=True)
+        name_margin_pairs = zip(
+            VIOLATION_TEXT_BY_SELECTION_MARGIN, np.asarray(self.margins), strict=True
+        )
         margin_rows = [
             (
                 MARGIN_MEASURES[n].label_with_symbol,
                 MARGIN_MEASURES[n].format_with_unit(margin_value),
             )
-            for n, margin_value in named_margins
+            for n, margin_value in name_margin_pairs
         ]
         return [("model", type(self.model).__name__), ("reason", self.why), *margin_rows]
 
-    def model_selection(self) -> dict[str, Array]:
-        """Return the codes of the model and of the reason, see `AbstractStep.model_selection`."""
+    def collect_selection_codes(self) -> dict[str, Array]:
+        """Return the code of the model and the code of the reason.
+
+        The keys are the names of the dataset variables.
+        """
         return {"rung": self.model_code, "reason": self.reason_code}
 
     @property
@@ -168,7 +174,7 @@ def describe_selection_reason(reason_code: int) -> str:
         return f"The step of the paper's model fails: {Outcome(-reason_code).meaning}"
     if reason_code == START_NOT_EMBEDDABLE_REASON_CODE:
         return "The start is not the paper's: another leg is loaded or off its stopper."
-    violation_text = list(MODEL_SELECTION_MARGINS.values())[reason_code - 1]
+    violation_text = list(VIOLATION_TEXT_BY_SELECTION_MARGIN.values())[reason_code - 1]
     return f"The paper's model is not valid: {violation_text}."
 
 
@@ -185,10 +191,12 @@ def find_selection_reason(
     """
     selection_margins = [
         step_measures[margin_name] + (friction_difference if "friction" in margin_name else 0.0)
-        for margin_name in MODEL_SELECTION_MARGINS
+        for margin_name in VIOLATION_TEXT_BY_SELECTION_MARGIN
     ]
-    is_violated = ~(jnp.stack(selection_margins, -1) >= 0.0)
-    violated_margin_code = jnp.where(jnp.any(is_violated, -1), 1 + jnp.argmax(is_violated, -1), 0)
+    is_margin_violated = ~(jnp.stack(selection_margins, -1) >= 0.0)
+    violated_margin_code = jnp.where(
+        jnp.any(is_margin_violated, -1), 1 + jnp.argmax(is_margin_violated, -1), 0
+    )
     step_outcome = jnp.asarray(step_measures["outcome"], violated_margin_code.dtype)
     return jnp.where(
         step_outcome == Outcome.STEPPED, violated_margin_code, -step_outcome
@@ -229,10 +237,6 @@ class LadderStep(AbstractContactStep):
     outcome: Int[Array, ""]
     solver_steps: Int[Array, ""]
 
-    def model_selection(self) -> dict[str, Array]:
-        """Return the codes of the model and of the reason, see `AbstractStep.model_selection`."""
-        return self.choice.model_selection()
-
 
 class LadderWheel(AbstractContactWheel):
     """Ladder of models: the viscoelastic model where it is valid, and else the unilateral model.
@@ -255,7 +259,7 @@ class LadderWheel(AbstractContactWheel):
     capabilities: ClassVar[ModelCapabilities] = ModelCapabilities(
         config_name="auto",
         gait_method=GaitMethod.SELECTION,
-        commands=frozenset({"scan"}),
+        accepted_commands=frozenset({"scan"}),
     )
 
     friction: Scalar = eqx.field(converter=convert_friction, default=0.7)
@@ -273,7 +277,7 @@ class LadderWheel(AbstractContactWheel):
     def fallback_model(self) -> UnilateralWheel:
         return self.unilateral_model
 
-    def split_ground(self, params: WheelParams, n_steps: int) -> None:
+    def split_ground_by_step(self, params: WheelParams, n_steps: int) -> None:
         """Return None, because a ladder of models does not support changing slopes."""
         return None
 
@@ -281,81 +285,89 @@ class LadderWheel(AbstractContactWheel):
         self, params: WheelParams, x: FullState, options: StepOptions
     ) -> tuple[ModelChoice, StepResult]:
         """Return the selected model, and the step computed with the viscoelastic model."""
-        paper_model, ground_friction = ViscoelasticWheel(), self.friction.astype(x.dtype)
+        viscoelastic_model, ground_friction = ViscoelasticWheel(), self.friction.astype(x.dtype)
         # Leg 1 alone must be loaded and at rest, with all other legs on their stoppers.
-        is_leg_1 = jnp.arange(params.n_legs) == 0
-        locked_code = float(LOCKED_CODE_OFFSET + ContactMode.OFF)
-        paper_contact_codes = jnp.where(is_leg_1, float(ContactMode.STICK), locked_code)
-        is_embeddable = jnp.all(jnp.round(x[4 + 2 * params.n_legs :]) == paper_contact_codes)
-        paper_section_state = jnp.stack([x[0], x[1], x[4 + params.n_legs]])
-        paper_result = paper_model.take_step(
-            params, jnp.where(is_embeddable, paper_section_state, jnp.nan), options
+        leg_1_mask = jnp.arange(params.n_legs) == 0
+        locked_leg_code = float(LOCKED_CODE_OFFSET + ContactMode.OFF)
+        embedded_contact_codes = jnp.where(leg_1_mask, float(ContactMode.STICK), locked_leg_code)
+        is_start_embeddable = jnp.all(
+            jnp.round(x[4 + 2 * params.n_legs :]) == embedded_contact_codes
+        )
+        viscoelastic_section_state = jnp.stack([x[0], x[1], x[4 + params.n_legs]])
+        viscoelastic_result = viscoelastic_model.take_step(
+            params, jnp.where(is_start_embeddable, viscoelastic_section_state, jnp.nan), options
         )
         reason_code, margins = find_selection_reason(
-            paper_result.measures(), ground_friction - paper_model.friction
+            viscoelastic_result.measures(), ground_friction - viscoelastic_model.friction
         )
         reason_code = jnp.where(
-            is_embeddable, reason_code, START_NOT_EMBEDDABLE_REASON_CODE
+            is_start_embeddable, reason_code, START_NOT_EMBEDDABLE_REASON_CODE
         ).astype(jnp.int32)
         model_code = jnp.where(
             reason_code == 0, ModelCode.VISCOELASTIC, ModelCode.UNILATERAL
         ).astype(jnp.int32)
-        return ModelChoice(model_code, reason_code, margins, ground_friction), paper_result
+        return ModelChoice(model_code, reason_code, margins, ground_friction), viscoelastic_result
 
     def advance(self, params: WheelParams, x: FullState, options: StepOptions) -> AdvanceResult:
-        choice, paper_result = self.choose_model(params, x, options)
-        uses_paper_model = choice.model_code == ModelCode.VISCOELASTIC
-        contact_result = self.unilateral_model.advance(
-            params, jnp.where(uses_paper_model, jnp.nan, x), options
+        model_choice, viscoelastic_result = self.choose_model(params, x, options)
+        is_viscoelastic_valid = model_choice.model_code == ModelCode.VISCOELASTIC
+        unilateral_result = self.unilateral_model.advance(
+            params, jnp.where(is_viscoelastic_valid, jnp.nan, x), options
         )
         return AdvanceResult(
             section_state=jnp.where(
-                uses_paper_model,
-                _embed_paper_result(uses_paper_model, params, paper_result),
-                contact_result.section_state,
+                is_viscoelastic_valid,
+                _embed_viscoelastic_result(is_viscoelastic_valid, params, viscoelastic_result),
+                unilateral_result.section_state,
             ),
             durations=jnp.where(
-                uses_paper_model,
-                _sort_durations_by_loaded_feet(paper_result),
-                contact_result.durations,
+                is_viscoelastic_valid,
+                _sort_durations_by_loaded_feet(viscoelastic_result),
+                unilateral_result.durations,
             ),
-            outcome=jnp.where(uses_paper_model, paper_result.outcome, contact_result.outcome),
-            solver_steps=paper_result.solver_steps + contact_result.solver_steps,
-            model_code=choice.model_code,
-            reason_code=choice.reason_code,
+            outcome=jnp.where(
+                is_viscoelastic_valid, viscoelastic_result.outcome, unilateral_result.outcome
+            ),
+            solver_steps=viscoelastic_result.solver_steps + unilateral_result.solver_steps,
+            model_code=model_choice.model_code,
+            reason_code=model_choice.reason_code,
         )
 
     def take_step(self, params: WheelParams, x: FullState, options: StepOptions) -> LadderStep:
-        choice, paper_result = self.choose_model(params, x, options)
-        uses_paper_model = choice.model_code == ModelCode.VISCOELASTIC
-        contact_result: UnilateralStep = self.unilateral_model.take_step(
-            params, jnp.where(uses_paper_model, jnp.nan, x), options
+        model_choice, viscoelastic_result = self.choose_model(params, x, options)
+        is_viscoelastic_valid = model_choice.model_code == ModelCode.VISCOELASTIC
+        unilateral_result: UnilateralStep = self.unilateral_model.take_step(
+            params, jnp.where(is_viscoelastic_valid, jnp.nan, x), options
         )
-        select_by_model = lambda paper_value, contact_value: jnp.where(
-            uses_paper_model, paper_value, contact_value
+        leaf_selector = lambda paper_value, contact_value: jnp.where(
+            is_viscoelastic_valid, paper_value, contact_value
         )
         return LadderStep(
-            choice=choice,
-            section_state=select_by_model(
-                _embed_paper_result(uses_paper_model, params, paper_result),
-                contact_result.section_state,
+            choice=model_choice,
+            section_state=leaf_selector(
+                _embed_viscoelastic_result(is_viscoelastic_valid, params, viscoelastic_result),
+                unilateral_result.section_state,
             ),
-            post_impact=select_by_model(paper_result.post_impact, contact_result.post_impact),
-            durations=select_by_model(
-                _sort_durations_by_loaded_feet(paper_result), contact_result.durations
+            post_impact=leaf_selector(
+                viscoelastic_result.post_impact, unilateral_result.post_impact
             ),
-            step_length=select_by_model(paper_result.step_length, contact_result.step_length),
-            energy_impacts=select_by_model(
-                paper_result.energy.landing + paper_result.energy.stopper,
-                contact_result.energy_impacts,
+            durations=leaf_selector(
+                _sort_durations_by_loaded_feet(viscoelastic_result), unilateral_result.durations
             ),
-            energy_damping=select_by_model(
-                paper_result.energy.damping, contact_result.energy_damping
+            step_length=leaf_selector(
+                viscoelastic_result.step_length, unilateral_result.step_length
             ),
-            energy_friction=select_by_model(0.0, contact_result.energy_friction),
-            slip=select_by_model(0.0, contact_result.slip),
-            outcome=select_by_model(paper_result.outcome, contact_result.outcome),
-            solver_steps=paper_result.solver_steps + contact_result.solver_steps,
+            energy_impacts=leaf_selector(
+                viscoelastic_result.energy.landing + viscoelastic_result.energy.stopper,
+                unilateral_result.energy_impacts,
+            ),
+            energy_damping=leaf_selector(
+                viscoelastic_result.energy.damping, unilateral_result.energy_damping
+            ),
+            energy_friction=leaf_selector(0.0, unilateral_result.energy_friction),
+            slip=leaf_selector(0.0, unilateral_result.slip),
+            outcome=leaf_selector(viscoelastic_result.outcome, unilateral_result.outcome),
+            solver_steps=viscoelastic_result.solver_steps + unilateral_result.solver_steps,
         )
 
     def sample_step(
@@ -366,38 +378,42 @@ class LadderWheel(AbstractContactWheel):
         If the viscoelastic model is selected, no foot slips, and the motion is that of the
         viscoelastic model.
         """
-        choice, _ = self.choose_model(params, x, options)
-        friction = jnp.where(choice.model_code == ModelCode.VISCOELASTIC, jnp.inf, self.friction)
+        model_choice, _ = self.choose_model(params, x, options)
+        friction = jnp.where(
+            model_choice.model_code == ModelCode.VISCOELASTIC, jnp.inf, self.friction
+        )
         unilateral_wheel = UnilateralWheel(friction=friction, infinite_friction_rule="paper")
         trajectory = unilateral_wheel.sample_step(params, x, options, n_samples)
-        return dataclasses.replace(trajectory, model_selection=choice.model_selection())
+        return dataclasses.replace(
+            trajectory, model_selection=model_choice.collect_selection_codes()
+        )
 
 
-def _embed_paper_result(
-    uses_paper_model: Array, params: WheelParams, paper_result: StepResult
+def _embed_viscoelastic_result(
+    is_viscoelastic_valid: Array, params: WheelParams, viscoelastic_result: StepResult
 ) -> FullState:
     """Return the full section state after a step computed with the viscoelastic model.
 
     If this model is not valid, return the paper's start state in the form of a full section state.
     """
-    fallback_state = jnp.asarray(PAPER_START_STATE, paper_result.section_state.dtype)
+    fallback_state = jnp.asarray(PAPER_START_STATE, viscoelastic_result.section_state.dtype)
     params, x = replace_invalid_inputs(
-        uses_paper_model, params, paper_result.section_state, fallback_state
+        is_viscoelastic_valid, params, viscoelastic_result.section_state, fallback_state
     )
     return embed_section_state(params.symbols(), x)
 
 
-def _sort_durations_by_loaded_feet(paper_result: StepResult) -> Float[Array, "3"]:
+def _sort_durations_by_loaded_feet(viscoelastic_result: StepResult) -> Float[Array, "3"]:
     """Return the durations with two, one and no loaded feet, s, for a step in the paper's
     phases.
     """
-    double_support, *single_support = paper_result.durations
+    double_support, *single_support = viscoelastic_result.durations
     return jnp.stack(
         [double_support, single_support[0] + single_support[1], jnp.zeros_like(double_support)]
     )
 
 
-def raise_if_ladder(model: object, use_description: str) -> None:
+def raise_for_ladder(model: object, use_description: str) -> None:
     """Raise a `TypeError` if `model` is a ladder of models, whose gaits do not vary smoothly.
 
     - `use_description`: participle in the error message that states the use of the model, such as

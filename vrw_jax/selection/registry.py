@@ -27,22 +27,24 @@ def find_model_class(config_name: str) -> type[AbstractWheel]:
 
 
 def list_model_config_names(
-    command: str | None = None, parameter: str | None = None
+    command_name: str | None = None, parameter_name: str | None = None
 ) -> tuple[str, ...]:
     """Return the configuration names of all models that satisfy two optional conditions.
 
-    - `command`: command that must accept the model;
-    - `parameter`: parameter on which the model's motion must depend.
+    - `command_name`: command that must accept the model;
+    - `parameter_name`: parameter on which the model's motion must depend.
     """
     return tuple(
         model_class.capabilities.config_name
         for model_class in REGISTERED_MODEL_CLASSES
-        if (command is None or command in model_class.capabilities.commands)
-        and (parameter is None or parameter in model_class.parameter_names)
+        if (command_name is None or command_name in model_class.capabilities.accepted_commands)
+        and (parameter_name is None or parameter_name in model_class.parameter_names)
     )
 
 
-def describe_accepted_models(command: str | None = None, parameter: str | None = None) -> str:
+def describe_accepted_models(
+    command_name: str | None = None, parameter_name: str | None = None
+) -> str:
     """Return the models from `list_model_config_names` as expressions that users can write.
 
     An example is `vrw.RigidWheel() or "auto"`.
@@ -51,7 +53,7 @@ def describe_accepted_models(command: str | None = None, parameter: str | None =
         f'"{config_name}"'
         if config_name == "auto"
         else f"vrw.{find_model_class(config_name).__name__}()"
-        for config_name in list_model_config_names(command, parameter)
+        for config_name in list_model_config_names(command_name, parameter_name)
     ]
     return " or ".join(
         [", ".join(model_expressions[:-1]), model_expressions[-1]][not model_expressions[1:] :]

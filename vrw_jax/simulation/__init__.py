@@ -5,16 +5,16 @@ from vrw_jax.simulation.force_peaks import SAMPLED_FORCE_PEAK_MEASURES, force_pe
 from vrw_jax.simulation.stepping import (
     ModelLike,
     Walk,
-    check_model,
-    check_section_state,
-    check_single_wheel,
-    check_step_options,
     choose_model,
+    convert_model_argument,
+    convert_section_state,
+    convert_step_arguments,
+    convert_step_options,
     paper_start,
+    require_single_wheel,
     return_map,
+    start_walk_toward_gait,
     step,
-    validate_arguments,
     walk,
-    walk_toward_gait,
 )
 from vrw_jax.simulation.trajectory import simulate

@@ -70,9 +70,9 @@ def _walk_round_of_block(
     The arrays have the shapes (starts, steps, m) and (starts, steps), where m is the number of
     entries of a section state.
     """
-    walk_one_round = lambda params, x: walk(params, x, n_steps, model=model, options=options)
-    batch_walks = jax.vmap(walk_one_round)(params, x)
-    return batch_walks.steps.section_state, batch_walks.steps.outcome
+    single_start_walk = lambda params, x: walk(params, x, n_steps, model=model, options=options)
+    batched_walk = jax.vmap(single_start_walk)(params, x)
+    return batched_walk.steps.section_state, batched_walk.steps.outcome
 
 
 def _walk_round_with_contact(
@@ -83,7 +83,10 @@ def _walk_round_with_contact(
     The arrays have the shapes (starts, steps, m) and (starts, steps), where m is the number of
     entries of a section state. The batch kernel computes the steps for any number of starts.
     """
-    n_legs, parameter_rows = params.n_legs, np.asarray(jax.vmap(model.parameter_values)(params)).T
+    n_legs, parameter_rows = (
+        params.n_legs,
+        np.asarray(jax.vmap(model.collect_parameter_values)(params)).T,
+    )
     x = embed_section_states(parameter_rows, np.asarray(x), n_legs)
     states_by_step, outcomes_by_step = list[np.ndarray](), list[np.ndarray]()
     for _ in range(n_steps):
@@ -115,49 +118,60 @@ def walk_until_periodic(
     - `max_period`: longest period that is detected, in steps.
     """
     n_starts = len(start_states)
-    repeat_over_starts = lambda x: np.broadcast_to(np.asarray(x), n_starts)
-    repeated_wheels = jax.tree.map(repeat_over_starts, params)
-    n_round_steps = attractor_options.n_steps_per_round
-    n_rounds = -(-max_steps // n_round_steps)
-    state_history = np.full((n_starts, 1 + n_rounds * n_round_steps, start_states.shape[1]), np.nan)
+    start_repeater = lambda x: np.broadcast_to(np.asarray(x), n_starts)
+    repeated_wheels = jax.tree.map(start_repeater, params)
+    n_steps_of_round = attractor_options.n_steps_per_round
+    n_rounds = -(-max_steps // n_steps_of_round)
+    state_history = np.full(
+        (n_starts, 1 + n_rounds * n_steps_of_round, start_states.shape[1]), np.nan
+    )
     state_history[:, 0] = start_states
     walk_outcomes = np.full(n_starts, int(Outcome.STEPPED))
     orbit_periods, n_steps_to_orbit = np.zeros(n_starts, int), np.zeros(n_starts, int)
-    unsettled_walks = np.arange(n_starts)
-    walk_one_round: Callable[..., tuple]
+    unsettled_walk_indices = np.arange(n_starts)
+    walk_round_function: Callable[..., tuple]
     if model.batch_kernel == "legs":
-        walk_one_round = functools.partial(_walk_round_with_contact, model, options, n_round_steps)
+        walk_round_function = functools.partial(
+            _walk_round_with_contact, model, options, n_steps_of_round
+        )
     else:
-        walk_round_of_block = functools.partial(_walk_round_of_block, model, options, n_round_steps)
-        walk_one_round = functools.partial(
-            map_in_batches, walk_round_of_block, (batch_sizes.ATTRACTOR_BATCH_SIZE,)
+        block_walk_function = functools.partial(
+            _walk_round_of_block, model, options, n_steps_of_round
+        )
+        walk_round_function = functools.partial(
+            map_in_batches, block_walk_function, (batch_sizes.ATTRACTOR_BATCH_SIZE,)
         )
     for k in range(n_rounds):
-        round_slice = slice(1 + k * n_round_steps, 1 + (k + 1) * n_round_steps)
-        round_arguments = (
-            select_tree_rows(repeated_wheels, unsettled_walks),
-            state_history[unsettled_walks, k * n_round_steps],
+        step_slice_of_round = slice(1 + k * n_steps_of_round, 1 + (k + 1) * n_steps_of_round)
+        walk_arguments_of_round = (
+            select_tree_rows(repeated_wheels, unsettled_walk_indices),
+            state_history[unsettled_walk_indices, k * n_steps_of_round],
         )
-        round_states, step_outcomes = map(np.asarray, walk_one_round(*round_arguments))
-        state_history[unsettled_walks, round_slice], walk_outcomes[unsettled_walks] = (
-            round_states,
+        section_states_of_round, step_outcomes = map(
+            np.asarray, walk_round_function(*walk_arguments_of_round)
+        )
+        (
+            state_history[unsettled_walk_indices, step_slice_of_round],
+            walk_outcomes[unsettled_walk_indices],
+        ) = (
+            section_states_of_round,
             step_outcomes[:, -1],
         )
-        n_steps_to_orbit[unsettled_walks] = k * n_round_steps + np.sum(
+        n_steps_to_orbit[unsettled_walk_indices] = k * n_steps_of_round + np.sum(
             step_outcomes == Outcome.STEPPED, 1
         )
-        n_known_steps = (k + 1) * n_round_steps
-        orbit_periods[unsettled_walks] = _detect_walk_periods(
-            state_history[unsettled_walks, : n_known_steps + 1],
+        n_steps_taken = (k + 1) * n_steps_of_round
+        orbit_periods[unsettled_walk_indices] = _detect_walk_periods(
+            state_history[unsettled_walk_indices, : n_steps_taken + 1],
             max_period,
             attractor_options.periodicity_tolerance,
         )
         orbit_periods[walk_outcomes != Outcome.STEPPED] = 0
-        unsettled_walks = unsettled_walks[
-            (walk_outcomes[unsettled_walks] == Outcome.STEPPED)
-            & (orbit_periods[unsettled_walks] == 0)
+        unsettled_walk_indices = unsettled_walk_indices[
+            (walk_outcomes[unsettled_walk_indices] == Outcome.STEPPED)
+            & (orbit_periods[unsettled_walk_indices] == 0)
         ]
-        if not len(unsettled_walks):
+        if not len(unsettled_walk_indices):
             break
     orbit_states = np.full((n_starts, max_period, start_states.shape[1]), np.nan)
     for i in np.flatnonzero(orbit_periods):
@@ -170,8 +184,8 @@ def walk_until_periodic(
         orbit_distances = np.linalg.norm(
             state_history[i, : n_steps_to_orbit[i] + 1, None] - last_period_states[None], axis=-1
         ).min(1)
-        distant_steps = np.flatnonzero(orbit_distances > attractor_options.arrival_distance)
-        n_steps_to_orbit[i] = distant_steps[-1] + 1 if len(distant_steps) else 0
+        is_step_distant = np.flatnonzero(orbit_distances > attractor_options.arrival_distance)
+        n_steps_to_orbit[i] = is_step_distant[-1] + 1 if len(is_step_distant) else 0
     return PeriodicWalkEnds(walk_outcomes, orbit_periods, n_steps_to_orbit, orbit_states)
 
 
@@ -183,13 +197,15 @@ def _detect_walk_periods(
     - `state_history`: section states, (starts, steps, entries).
     """
     detected_periods = np.zeros(len(state_history), int)
-    n_states = state_history.shape[1]
-    for candidate_period in range(min(max_period, (n_states - 1) // 3), 0, -1):
-        entry_changes = np.abs(
-            state_history[:, n_states - 2 * candidate_period :]
-            - state_history[:, n_states - 3 * candidate_period : n_states - candidate_period]
+    n_walked_states = state_history.shape[1]
+    for candidate_period in range(min(max_period, (n_walked_states - 1) // 3), 0, -1):
+        state_changes = np.abs(
+            state_history[:, n_walked_states - 2 * candidate_period :]
+            - state_history[
+                :, n_walked_states - 3 * candidate_period : n_walked_states - candidate_period
+            ]
         )
-        detected_periods[entry_changes.max((1, 2)) < periodicity_tolerance] = candidate_period
+        detected_periods[state_changes.max((1, 2)) < periodicity_tolerance] = candidate_period
     return detected_periods
 
 
@@ -213,10 +229,11 @@ def find_distinct_orbits(
     distinct_orbits: list[np.ndarray] = []
     for i in np.flatnonzero(walk_ends.period):
         orbit_states = walk_ends.orbit_states[i, : walk_ends.period[i]]
-        for j, known_orbit in enumerate(distinct_orbits):
+        for j, known_orbit_states in enumerate(distinct_orbits):
             if (
-                len(known_orbit) == len(orbit_states)
-                and np.abs(known_orbit - orbit_states).max() < attractor_options.same_orbit_distance
+                len(known_orbit_states) == len(orbit_states)
+                and np.abs(known_orbit_states - orbit_states).max()
+                < attractor_options.same_orbit_distance
             ):
                 orbit_indices[i] = j
                 break
@@ -248,17 +265,17 @@ def measure_orbit_steps(
     n_states = len(section_states)
     repeated_wheels = jax.tree.map(lambda x: np.broadcast_to(np.asarray(x), n_states), params)
     if model.batch_kernel == "legs":
-        parameter_rows = np.asarray(jax.vmap(model.parameter_values)(repeated_wheels)).T
+        parameter_rows = np.asarray(jax.vmap(model.collect_parameter_values)(repeated_wheels)).T
         unilateral_model = cast(UnilateralWheel, model)
         step_results, _ = step_batch_with_jacobian(
             parameter_rows, section_states, unilateral_model, options, params.n_legs, ()
         )
         return jax.tree.map(np.asarray, jax.tree.map(jnp.asarray, step_results).measures())
-    measure_steps_of_block = functools.partial(_measure_steps_of_block, model, options)
+    block_measure_function = functools.partial(_measure_steps_of_block, model, options)
     return jax.tree.map(
         np.asarray,
         map_in_batches(
-            measure_steps_of_block,
+            block_measure_function,
             (batch_sizes.ATTRACTOR_BATCH_SIZE,),
             repeated_wheels,
             section_states,

@@ -28,9 +28,9 @@ from vrw_jax.simulation.attractors import (
 )
 from vrw_jax.simulation.stepping import (
     ModelLike,
-    check_model,
-    check_single_wheel,
-    check_step_options,
+    convert_model_argument,
+    convert_step_options,
+    require_single_wheel,
 )
 from vrw_jax.validation import (
     check_int,
@@ -99,9 +99,11 @@ def basin(
         [0, 0]
     """
     require_untraced_arguments("vrw.basin", "map vrw.walk over the starts", params, options)
-    check_single_wheel(params, "compute one basin after the other")
-    model = check_model(model).fallback_model  # The fallback model is valid for any start.
-    options = check_step_options(options)
+    require_single_wheel(params, "compute one basin after the other")
+    model = convert_model_argument(
+        model
+    ).fallback_model  # The fallback model is valid for any start.
+    options = convert_step_options(options)
     options.check_tolerances(np.dtype(params.damping.dtype))
     options = options.with_engine(engine)
     max_steps = check_int("max_steps", max_steps)
@@ -121,8 +123,8 @@ def basin(
     )
     is_reachable = np.isfinite(start_states).all(-1)
     start_states = np.where(is_reachable[:, None], start_states, np.nan)
-    embed_start_state = functools.partial(model.embed_section, params)
-    start_states = np.asarray(jax.vmap(embed_start_state)(jnp.asarray(start_states)))
+    start_embedder = functools.partial(model.embed_section_state, params)
+    start_states = np.asarray(jax.vmap(start_embedder)(jnp.asarray(start_states)))
     walk_ends = walk_until_periodic(params, start_states, model, options, max_steps, max_period)
     distinct_orbits = find_distinct_orbits(walk_ends)
 
@@ -156,7 +158,7 @@ def basin(
     orbit_variables = _make_orbit_variables(
         params, distinct_orbits.orbit_states, max_period, model, options
     )
-    dataset_attributes = {
+    basin_attributes = {
         "title": "Basins of attraction",
         "most_steps": max_steps,
         "starts": "before touchdown"
@@ -166,7 +168,7 @@ def basin(
     return xr.Dataset(
         walk_variables | orbit_variables,
         start_coordinates,
-        dataset_attributes | collect_provenance_attributes(params, model, options),
+        basin_attributes | collect_provenance_attributes(params, model, options),
     )
 
 
@@ -218,9 +220,9 @@ def invert_landing_map(params: WheelParams, post_landing_states: np.ndarray) -> 
             s, touchdown_angle, jnp.ones_like(post_landing_rate), jnp.zeros_like(post_landing_rate)
         )
         touchdown_rate = post_landing_rate / unit_rate_landing.motion_after.dtheta
-        is_admissible = unit_rate_landing.is_rear_foot_planted & (touchdown_rate > 0.0)
+        is_landing_admissible = unit_rate_landing.is_rear_foot_planted & (touchdown_rate > 0.0)
         return jnp.where(
-            is_admissible,
+            is_landing_admissible,
             jnp.stack([touchdown_angle, touchdown_rate, 0.0 * touchdown_rate]),
             jnp.nan,
         )
@@ -239,15 +241,17 @@ def _make_orbit_variables(
     margins.
     """
     n_orbits = len(orbit_states)
-    padded_orbit_states = np.full((n_orbits, max_period, model.section_size(params)), np.nan)
-    margin_names = MARGIN_MEASURES if model.section_size(params) == 3 else ()
+    padded_orbit_states = np.full(
+        (n_orbits, max_period, model.count_section_entries(params)), np.nan
+    )
+    margin_names = MARGIN_MEASURES if model.count_section_entries(params) == 3 else ()
     dls_fractions, min_margins = (
         np.zeros(n_orbits),
         {margin_name: np.zeros(n_orbits) for margin_name in margin_names},
     )
-    for i, states_of_orbit in enumerate(orbit_states):
-        padded_orbit_states[i, : len(states_of_orbit)] = states_of_orbit
-        step_measures = measure_orbit_steps(params, states_of_orbit, model, options)
+    for i, states_of_one_orbit in enumerate(orbit_states):
+        padded_orbit_states[i, : len(states_of_one_orbit)] = states_of_one_orbit
+        step_measures = measure_orbit_steps(params, states_of_one_orbit, model, options)
         dls_fractions[i] = step_measures["duration_dls"].sum() / step_measures["period"].sum()
         for margin_name in margin_names:
             min_margins[margin_name][i] = step_measures[margin_name].min()
@@ -259,7 +263,7 @@ def _make_orbit_variables(
         ),
         "orbit_period": xr.Variable(
             "attractor_index",
-            np.array([len(states_of_orbit) for states_of_orbit in orbit_states], int),
+            np.array([len(states_of_one_orbit) for states_of_one_orbit in orbit_states], int),
             {"units": "1", "long_name": "steps until the orbit repeats"},
         ),
         "orbit_dls_fraction": xr.Variable(
@@ -283,12 +287,13 @@ def compute_walk_end_fractions(basins: xr.Dataset) -> dict[str, float]:
     """
     attractor_indices = basins.attractor.values.ravel()
     outcome_codes = basins.outcome.values.ravel()
-    end_names = [
+    walk_end_names = [
         f"attractor {a}"
         if a >= 0
         else ("unsettled" if c == Outcome.STEPPED else Outcome(int(c)).name)
         for a, c in zip(attractor_indices, outcome_codes, strict=True)
     ]
     return {
-        end_name: end_names.count(end_name) / len(end_names) for end_name in sorted(set(end_names))
+        walk_end_name: walk_end_names.count(walk_end_name) / len(walk_end_names)
+        for walk_end_name in sorted(set(walk_end_names))
     }

@@ -62,8 +62,8 @@ def force_peaks(walk: xr.Dataset) -> xr.Dataset:
     """
     check_type("walk", walk, xr.Dataset, "give the result of vrw.simulate")
     if "lambda_2" in walk:
-        fore_force, rear = walk.lambda_2.values, walk.lambda_4.values
-        total_force = fore_force + rear
+        fore_force, rear_force = walk.lambda_2.values, walk.lambda_4.values
+        total_force = fore_force + rear_force
     elif "normal" in walk:
         fore_force, total_force = walk.normal.values[:, 0], walk.normal.values.sum(1)
     else:
@@ -73,8 +73,8 @@ def force_peaks(walk: xr.Dataset) -> xr.Dataset:
         )
     sample_times = walk.time.values
     # The time of an event is listed twice, up to round-off.
-    roundoff = 4.0 * np.finfo(float).eps * np.max(sample_times)
-    is_interval_end = (np.diff(sample_times) <= roundoff) | (np.diff(walk.step.values) != 0)
+    time_roundoff = 4.0 * np.finfo(float).eps * np.max(sample_times)
+    is_interval_end = (np.diff(sample_times) <= time_roundoff) | (np.diff(walk.step.values) != 0)
     interval_starts = np.flatnonzero(is_interval_end) + 1
     sampled_intervals = np.split(np.arange(len(sample_times)), interval_starts)
     min_samples_per_phase, n_samples = (
@@ -98,10 +98,10 @@ def force_peaks(walk: xr.Dataset) -> xr.Dataset:
     ]
     fore_extrema, total_extrema = (
         [
-            _find_force_extrema(walk.time.values, force, sampled_intervals)
+            _find_force_extrema(walk.time.values, normal_force, sampled_intervals)
             for sampled_intervals in intervals_by_step
         ]
-        for force in (fore_force, total_force)
+        for normal_force in (fore_force, total_force)
     )
     measures_by_step = [
         _summarize_force_extrema(fore_force, total_force)
@@ -115,7 +115,9 @@ def force_peaks(walk: xr.Dataset) -> xr.Dataset:
         )
         for measure_name in SAMPLED_FORCE_PEAK_MEASURES
     }
-    joined_extrema = [np.concatenate(step_parts) for step_parts in zip(*fore_extrema, strict=True)]
+    joined_extrema = [
+        np.concatenate(extrema_parts) for extrema_parts in zip(*fore_extrema, strict=True)
+    ]
     all_extrema = _ForceExtrema(*joined_extrema)
     extremum_steps = np.repeat(
         step_indices, [len(step_extrema.time) for step_extrema in fore_extrema]
@@ -124,7 +126,11 @@ def force_peaks(walk: xr.Dataset) -> xr.Dataset:
         "force": ("extremum", all_extrema.force, make_measure_attributes("lambda_2")),
         "force_time": ("extremum", all_extrema.time, make_measure_attributes("time")),
         "force_step": ("extremum", extremum_steps, make_measure_attributes("step")),
-        "is_maximum": ("extremum", all_extrema.is_maximum, {"long_name": "whether a maximum"}),
+        "is_maximum": (
+            "extremum",
+            all_extrema.is_extremum_maximum,
+            {"long_name": "whether a maximum"},
+        ),
     }
     return xr.Dataset(dataset_variables, {"step": step_indices}, dict(walk.attrs))
 
@@ -134,7 +140,7 @@ class _ForceExtrema(NamedTuple):
 
     time: np.ndarray  # s
     force: np.ndarray  # N
-    is_maximum: np.ndarray
+    is_extremum_maximum: np.ndarray
     # largest maximum of the rate after the first peak, N/s; one number
     max_rate_after_first_peak: np.ndarray
 
@@ -148,7 +154,13 @@ def _find_force_extrema(
     """
     from scipy.interpolate import PPoly, make_interp_spline  # This import is slow.
 
-    times_by_interval, forces_by_interval, maximum_flags, rate_maximum_times, rate_maxima = (
+    (
+        times_by_interval,
+        forces_by_interval,
+        are_maxima_by_interval,
+        force_rate_maximum_times,
+        force_rate_maxima,
+    ) = (
         [],
         [],
         [],
@@ -167,10 +179,10 @@ def _find_force_extrema(
         force_spline = make_interp_spline(
             time_fractions, sampled_forces[sample_indices], FORCE_PEAK_OPTIONS.spline_degree
         )
-        select_inside_interval = lambda extremum_fractions: extremum_fractions[
+        interior_selector = lambda extremum_fractions: extremum_fractions[
             (extremum_fractions > 0.0) & (extremum_fractions < 1.0)
         ]
-        extremum_fractions = select_inside_interval(
+        extremum_fractions = interior_selector(
             PPoly.from_spline(force_spline.derivative(1)).roots()
         )
         boundary_forces = force_spline(np.concatenate([[0.0], extremum_fractions, [1.0]]))
@@ -180,23 +192,23 @@ def _find_force_extrema(
         ]
         times_by_interval.append(interval_start + interval_duration * extremum_fractions)
         forces_by_interval.append(force_spline(extremum_fractions))
-        maximum_flags.append(force_spline(extremum_fractions, 2) < 0.0)
-        rate_maximum_fractions = select_inside_interval(
+        are_maxima_by_interval.append(force_spline(extremum_fractions, 2) < 0.0)
+        rate_maximum_fractions = interior_selector(
             PPoly.from_spline(force_spline.derivative(2)).roots()
         )
         rate_maximum_fractions = rate_maximum_fractions[
             force_spline(rate_maximum_fractions, 3) < 0.0
         ]
-        rate_maximum_times.append(interval_start + interval_duration * rate_maximum_fractions)
-        rate_maxima.append(force_spline(rate_maximum_fractions, 1) / interval_duration)
-    concatenate_parts = lambda interval_parts: np.concatenate([np.zeros(0), *interval_parts])
+        force_rate_maximum_times.append(interval_start + interval_duration * rate_maximum_fractions)
+        force_rate_maxima.append(force_spline(rate_maximum_fractions, 1) / interval_duration)
+    part_concatenator = lambda interval_parts: np.concatenate([np.zeros(0), *interval_parts])
     sorted_extremum_times, are_maxima = (
-        concatenate_parts(times_by_interval),
-        concatenate_parts(maximum_flags).astype(bool),
+        part_concatenator(times_by_interval),
+        part_concatenator(are_maxima_by_interval).astype(bool),
     )
     first_peak_time = np.min(sorted_extremum_times[are_maxima], initial=np.inf)
-    rates_after_first_peak = concatenate_parts(rate_maxima)[
-        concatenate_parts(rate_maximum_times) > first_peak_time
+    rates_after_first_peak = part_concatenator(force_rate_maxima)[
+        part_concatenator(force_rate_maximum_times) > first_peak_time
     ]
     max_rate_after_first_peak = (
         np.array([np.max(rates_after_first_peak)])
@@ -205,7 +217,7 @@ def _find_force_extrema(
     )
     return _ForceExtrema(
         sorted_extremum_times,
-        concatenate_parts(forces_by_interval),
+        part_concatenator(forces_by_interval),
         are_maxima,
         max_rate_after_first_peak,
     )
@@ -219,12 +231,12 @@ def _summarize_force_extrema(
     These are the normal force on the fore foot and the total normal force.
     """
     trough_depth = 0.0
-    for i in np.flatnonzero(~fore_extrema.is_maximum):
+    for i in np.flatnonzero(~fore_extrema.is_extremum_maximum):
         earlier_peak_forces, later_peak_forces = (
-            extremum_forces[maximum_flags]
-            for extremum_forces, maximum_flags in (
-                (fore_extrema.force[:i], fore_extrema.is_maximum[:i]),
-                (fore_extrema.force[i:], fore_extrema.is_maximum[i:]),
+            extremum_forces[is_maximum]
+            for extremum_forces, is_maximum in (
+                (fore_extrema.force[:i], fore_extrema.is_extremum_maximum[:i]),
+                (fore_extrema.force[i:], fore_extrema.is_extremum_maximum[i:]),
             )
         )
         if earlier_peak_forces.size and later_peak_forces.size:
@@ -233,10 +245,12 @@ def _summarize_force_extrema(
                 min(earlier_peak_forces.max(), later_peak_forces.max()) - fore_extrema.force[i],
             )
     return {
-        "n_force_peaks": int(np.sum(fore_extrema.is_maximum)),
-        "peak_force": np.max(fore_extrema.force[fore_extrema.is_maximum], initial=0.0),
+        "n_force_peaks": int(np.sum(fore_extrema.is_extremum_maximum)),
+        "peak_force": np.max(fore_extrema.force[fore_extrema.is_extremum_maximum], initial=0.0),
         "force_trough_depth": trough_depth,
         "second_peak_rate": fore_extrema.max_rate_after_first_peak[0],
-        "n_total_force_peaks": int(np.sum(total_extrema.is_maximum)),
-        "peak_total_force": np.max(total_extrema.force[total_extrema.is_maximum], initial=0.0),
+        "n_total_force_peaks": int(np.sum(total_extrema.is_extremum_maximum)),
+        "peak_total_force": np.max(
+            total_extrema.force[total_extrema.is_extremum_maximum], initial=0.0
+        ),
     }

@@ -40,7 +40,10 @@ from vrw_jax.validation import check_int, check_reals, check_type, format_value
 from vrw_jax.wheel import Outcome, WheelParams
 
 SectionStateLike = Array | np.ndarray | Sequence[float]
-"""Section state in any form that users may pass; `validate_arguments` converts it to an array."""
+"""Section state in any form that users may pass.
+
+`convert_step_arguments` converts it to an array.
+"""
 ModelLike = AbstractWheel | Literal["auto"]
 """Model in any form that users may pass. "auto" means `LadderWheel()`, which uses the simplest
 valid model.
@@ -58,14 +61,16 @@ def paper_start() -> SectionState:
         >>> vrw.paper_start().round(4).tolist()
         [0.1, 1.6, -0.1]
     """
-    return ViscoelasticWheel().default_start(WheelParams())
+    return ViscoelasticWheel().compute_default_start(WheelParams())
 
 
-def check_model(model: ModelLike | None, allows_arrays: bool = False) -> AbstractWheel:
+def convert_model_argument(
+    model: ModelLike | None, allows_friction_arrays: bool = False
+) -> AbstractWheel:
     """Return the given model, the paper's model for None, or a `LadderWheel` for "auto".
 
     Raise a `TypeError` if the argument is not a model. Raise a `ValueError` if the model's friction
-    is an array although `allows_arrays` is False.
+    is an array although `allows_friction_arrays` is False.
     """
     if model is None:
         return _make_default_model()
@@ -76,11 +81,13 @@ def check_model(model: ModelLike | None, allows_arrays: bool = False) -> Abstrac
             f"model is {format_value(model)}, but a model of the wheel is needed: give "
             f"{describe_accepted_models()}."
         )
-    if not allows_arrays and (shape := jnp.shape(getattr(model, "friction", 0.0))):
+    if not allows_friction_arrays and (
+        friction_shape := jnp.shape(getattr(model, "friction", 0.0))
+    ):
         raise ValueError(
-            f"friction has shape {shape}, but this call is for one ground: give one number, or "
-            "vary it in a design of vrw.scan; vrw.step_batch takes one for each element, vrw.walk "
-            "one for each of its steps."
+            f"friction has shape {friction_shape}, but this call is for one ground: give one "
+            "number, or vary it in a design of vrw.scan; vrw.step_batch takes one for each "
+            "element, vrw.walk one for each of its steps."
         )
     return model
 
@@ -88,16 +95,16 @@ def check_model(model: ModelLike | None, allows_arrays: bool = False) -> Abstrac
 _make_default_model = functools.cache(ViscoelasticWheel)
 
 
-def check_single_wheel(params: Any, remedy: str) -> None:
+def require_single_wheel(params: Any, remedy_text: str) -> None:
     """Raise a `TypeError` or a `ValueError` if `params` is not a single wheel.
 
-    - `remedy`: advice with which the error message ends.
+    - `remedy_text`: advice with which the error message ends.
     """
     check_type("params", params, WheelParams, "write vrw.WheelParams(damping=..., slope=...)")
-    WheelParams.require_single_wheel(params, remedy)  # An unbound call is much faster.
+    WheelParams.require_single_wheel(params, remedy_text)  # An unbound call is much faster.
 
 
-def check_step_options(options: StepOptions | None) -> StepOptions:
+def convert_step_options(options: StepOptions | None) -> StepOptions:
     """Return the given step options, or `StepOptions()` for None.
 
     Raise a `TypeError` if the argument has another type.
@@ -122,14 +129,14 @@ def _make_default_step_options(dtype: np.dtype) -> StepOptions:
         return StepOptions()
 
 
-def check_section_state(
-    x: Any, argument_description: str = "the section state", convert_state: Callable = check_reals
+def convert_section_state(
+    x: Any, argument_description: str = "the section state", state_converter: Callable = check_reals
 ) -> Any:
-    """Return the section state as an array, converted by `convert_state`.
+    """Return the section state as an array, converted by `state_converter`.
 
-    `convert_state` raises an error if the state is invalid.
+    `state_converter` raises an error if the state is invalid.
     """
-    return convert_state(
+    return state_converter(
         argument_description,
         x,
         "give (theta-, dtheta-, dL1-), as vrw.paper_start(), or that of a cycle, "
@@ -137,7 +144,7 @@ def check_section_state(
     )
 
 
-def validate_arguments(
+def convert_step_arguments(
     params: WheelParams,
     x: object,
     model: ModelLike | None,
@@ -148,22 +155,22 @@ def validate_arguments(
 
     Raise a `TypeError` or a `ValueError` if an argument is invalid.
     """
-    check_single_wheel(params, "map over batches of parameters with jax.vmap, or use vrw.scan")
+    require_single_wheel(params, "map over batches of parameters with jax.vmap, or use vrw.scan")
     model, options = (
-        check_model(model),
-        StepOptions.with_engine(check_step_options(options), engine),
+        convert_model_argument(model),
+        StepOptions.with_engine(convert_step_options(options), engine),
     )
-    state = check_section_state(x)
-    section_size = model.section_size(params)
+    state = convert_section_state(x)
+    section_size = model.count_section_entries(params)
     if state.shape == (3,) and section_size != 3:
-        state = model.embed_section(params, state)
+        state = model.embed_section_state(params, state)
     if state.shape != (section_size,):
-        longer_shape_text = (
+        full_state_shape_text = (
             "" if section_size == 3 else f", or this model’s own of shape ({section_size},)"
         )
         raise ValueError(
             f"the section state has shape {state.shape}, but it is (theta-, dtheta-, dL1-), shape "
-            f"(3,){longer_shape_text}: "
+            f"(3,){full_state_shape_text}: "
             "for batches map over it with jax.vmap."
         )
     # Parameters made in single precision stay inaccurate after a conversion to double precision.
@@ -173,9 +180,9 @@ def validate_arguments(
 
     def convert_to_common_dtype(array_tree: Any) -> Any:
         """Return the tree with all leaves converted to the common floating-point type."""
-        if all(leaf.dtype == common_dtype for leaf in jax.tree.leaves(array_tree)):
+        if all(tree_leaf.dtype == common_dtype for tree_leaf in jax.tree.leaves(array_tree)):
             return array_tree
-        return jax.tree.map(lambda leaf: leaf.astype(common_dtype), array_tree)
+        return jax.tree.map(lambda tree_leaf: tree_leaf.astype(common_dtype), array_tree)
 
     return (
         convert_to_common_dtype(params),
@@ -253,9 +260,9 @@ def step(
         0.714 s, STEPPED
     """
     model, params, stepwise_ground = split_stepwise_ground(params, model, 1)
-    params, state, model, options = validate_arguments(params, x, model, options, engine)
+    params, state, model, options = convert_step_arguments(params, x, model, options, engine)
     if stepwise_ground is not None:
-        model, params = model.with_ground(
+        model, params = model.with_step_ground(
             params, _get_first_step_ground(stepwise_ground, state.dtype)
         )
     return model.take_step(params, state, options)
@@ -297,9 +304,9 @@ def return_map(
         (3, 3)
     """
     model, params, stepwise_ground = split_stepwise_ground(params, model, 1)
-    params, state, model, options = validate_arguments(params, x, model, options, engine)
+    params, state, model, options = convert_step_arguments(params, x, model, options, engine)
     if stepwise_ground is not None:
-        model, params = model.with_ground(
+        model, params = model.with_step_ground(
             params, _get_first_step_ground(stepwise_ground, state.dtype)
         )
     return model.advance(params, state, options).section_state
@@ -325,9 +332,9 @@ class Walk(AbstractPrintable):
     @property
     def outcome(self) -> Array:
         """Return the outcome of the first failed step, or STEPPED if no step failed."""
-        last_index = self.steps.outcome.shape[-1] - 1
+        last_step_index = self.steps.outcome.shape[-1] - 1
         return jnp.take_along_axis(
-            self.steps.outcome, jnp.minimum(self.n_stepped, last_index)[..., None], axis=-1
+            self.steps.outcome, jnp.minimum(self.n_stepped, last_step_index)[..., None], axis=-1
         )[..., 0]
 
     @property
@@ -342,12 +349,12 @@ class Walk(AbstractPrintable):
         walk_outcome = np.asarray(self.outcome)
         if walk_outcome.ndim:
             return [("walks", format_outcome_counts(walk_outcome, Outcome))]
-        last_index = max(int(self.n_stepped) - 1, 0)
+        last_step_index = max(int(self.n_stepped) - 1, 0)
         return [
             ("outcome", Outcome(int(walk_outcome)).meaning),
             ("steps", f"{int(self.n_stepped)} of {self.steps.outcome.shape[-1]}"),
             ("start", f"{format_numbers(self.start)} (rad, rad/s, m/s)"),
-            ("last section state", format_numbers(self.steps.section_state[last_index])),
+            ("last section state", format_numbers(self.steps.section_state[last_step_index])),
             ("time", format_quantity(np.sum(self.steps.durations), "s")),
         ]
 
@@ -371,19 +378,19 @@ def _walk_by_scan(
         After a failure, the state and the outcome do not change.
         """
         x, outcome = state_and_outcome
-        is_unfinished = outcome == Outcome.STEPPED
+        is_walking = outcome == Outcome.STEPPED
         model_and_params = (
-            (model, params) if step_ground is None else model.with_ground(params, step_ground)
+            (model, params) if step_ground is None else model.with_step_ground(params, step_ground)
         )
         step_result = model_and_params[0].advance(
-            model_and_params[1], jnp.where(is_unfinished, x, jnp.nan), options
+            model_and_params[1], jnp.where(is_walking, x, jnp.nan), options
         )
-        outcome = jnp.where(is_unfinished, step_result.outcome, outcome)
+        outcome = jnp.where(is_walking, step_result.outcome, outcome)
         step_result = dataclasses.replace(
             step_result,
-            durations=jnp.where(is_unfinished, step_result.durations, 0.0),
+            durations=jnp.where(is_walking, step_result.durations, 0.0),
             outcome=outcome,
-            solver_steps=jnp.where(is_unfinished, step_result.solver_steps, 0),
+            solver_steps=jnp.where(is_walking, step_result.solver_steps, 0),
         )
         return (step_result.section_state, outcome), step_result
 
@@ -439,12 +446,12 @@ def walk(
     """
     n_steps = check_int("n_steps", n_steps)
     checked_model, params, stepwise_ground = split_stepwise_ground(params, model, n_steps)
-    params, state, checked_model, options = validate_arguments(
+    params, state, checked_model, options = convert_step_arguments(
         params, x, checked_model, options, engine
     )
     if stepwise_ground is not None:
         stepwise_ground = tuple(
-            ground_values.astype(state.dtype) for ground_values in stepwise_ground
+            ground_by_step.astype(state.dtype) for ground_by_step in stepwise_ground
         )
     return _walk_by_scan(checked_model, params, state, options, n_steps, stepwise_ground)
 
@@ -456,13 +463,13 @@ def split_stepwise_ground(
 
     On flat ground, model and wheel do not change and the third result is None.
     """
-    checked_model = check_model(model, allows_arrays=True)
+    checked_model = convert_model_argument(model, allows_friction_arrays=True)
     if not isinstance(params, WheelParams):
         return checked_model, params, None
-    stepwise_ground = checked_model.split_ground(params, n_steps)
+    stepwise_ground = checked_model.split_ground_by_step(params, n_steps)
     if stepwise_ground is None:
         return checked_model, params, None
-    first_model, _ = checked_model.with_ground(
+    first_model, _ = checked_model.with_step_ground(
         params, tuple(ground_values[0] for ground_values in stepwise_ground)
     )
     first_slope = jnp.reshape(params.slope, -1)[0]
@@ -477,7 +484,7 @@ def _get_first_step_ground(
     return tuple(ground_values[0].astype(ground_dtype) for ground_values in stepwise_ground)
 
 
-def walk_toward_gait(
+def start_walk_toward_gait(
     model: AbstractWheel, params: WheelParams, options: StepOptions, n_steps: int = 100
 ) -> Walk:
     """Simulate a walk from the default start of the model toward an attracting gait.
@@ -485,7 +492,7 @@ def walk_toward_gait(
     - `n_steps`: number of steps. The walk need not reach the gait, because a search from its last
       state follows.
     """
-    return walk(params, model.default_start(params), n_steps, model=model, options=options)
+    return walk(params, model.compute_default_start(params), n_steps, model=model, options=options)
 
 
 @with_default_jax_settings
@@ -519,5 +526,5 @@ def choose_model(
         'UnilateralWheel'
     """
     model = LadderWheel(friction=friction)
-    params, x, _, options = validate_arguments(params, start, model, options)
+    params, x, _, options = convert_step_arguments(params, start, model, options)
     return model.choose_model(params, x, options)[0]

@@ -33,17 +33,17 @@ from vrw_jax.measures import (
     collect_provenance_attributes,
     make_labeled_variables,
 )
-from vrw_jax.models import AbstractWheel, Trajectory, complete_line_slopes, split_slopes
+from vrw_jax.models import AbstractWheel, Trajectory, complete_line_slopes, separate_next_slope
 from vrw_jax.numerics import EngineName, StepOptions
 from vrw_jax.runtime import with_default_jax_settings
 from vrw_jax.runtime import xarray as xr
-from vrw_jax.selection import MODEL_SELECTION_ATTRIBUTES
+from vrw_jax.selection import SELECTION_VARIABLE_ATTRIBUTES
 from vrw_jax.simulation.stepping import (
     ModelLike,
     SectionStateLike,
-    check_single_wheel,
+    convert_step_arguments,
+    require_single_wheel,
     split_stepwise_ground,
-    validate_arguments,
 )
 from vrw_jax.validation import check_int, require_untraced_arguments
 from vrw_jax.wheel import (
@@ -106,12 +106,12 @@ def simulate(
     n_steps, n_samples = check_int("n_steps", n_steps), check_int("n_samples", n_samples, 2)
     params_with_all_slopes = params
     checked_model, params, stepwise_ground = split_stepwise_ground(params, model, n_steps)
-    check_single_wheel(params, "simulate one at a time")
-    start_state = checked_model.default_start(params) if x is None else x
-    params, x, model, options = validate_arguments(
+    require_single_wheel(params, "simulate one at a time")
+    start_state = checked_model.compute_default_start(params) if x is None else x
+    params, x, model, options = convert_step_arguments(
         params, start_state, checked_model, options, engine
     )
-    specify_trajectory = (
+    trajectory_specifier = (
         specify_contact_trajectory if model.reports_contacts else specify_phase_trajectory
     )
     s, models_and_wheels, ground_lines = (
@@ -124,13 +124,13 @@ def simulate(
             *(step_ground.astype(x.dtype) for step_ground in stepwise_ground), strict=True
         )
         models_and_wheels = [
-            model.with_ground(params, step_ground) for step_ground in ground_of_steps
+            model.with_step_ground(params, step_ground) for step_ground in ground_of_steps
         ]
         line_slopes = params_with_all_slopes.slope
         line_slopes = line_slopes if line_slopes.ndim else jnp.full(n_steps, line_slopes)
         line_slopes = complete_line_slopes(line_slopes, n_steps)
         ground_lines = UnevenGroundLines(np.asarray(line_slopes, float), float(s.Mt * s.g))
-    trajectory_spec = specify_trajectory(models_and_wheels, options, n_samples)
+    trajectory_spec = trajectory_specifier(models_and_wheels, options, n_samples)
     sampled_walk = sample_walk_steps(
         trajectory_spec, x, n_steps, float(s.Mt * s.g * s.sin_phi), ground_lines
     )
@@ -142,9 +142,9 @@ def simulate(
         },
         "time",
     )
-    for variable_name in filter(sampled_columns.__contains__, MODEL_SELECTION_ATTRIBUTES):
+    for variable_name in filter(sampled_columns.__contains__, SELECTION_VARIABLE_ATTRIBUTES):
         dataset_variables[variable_name] = xr.Variable(
-            "time", sampled_columns[variable_name], MODEL_SELECTION_ATTRIBUTES[variable_name]
+            "time", sampled_columns[variable_name], SELECTION_VARIABLE_ATTRIBUTES[variable_name]
         )
     walk_attributes = {
         "title": f"Walk of the {type(model).__name__}",
@@ -162,14 +162,14 @@ def simulate(
             "slopes": ground_lines.line_slopes.tolist(),
         }
         del provenance_attributes["parameter_slope"]
-    step_and_phase_coordinates = {
+    index_coordinates = {
         variable_name: dataset_variables.pop(variable_name)
         for variable_name in ("step", "phase")
         if variable_name in dataset_variables
     }
     return xr.Dataset(
         dataset_variables,
-        trajectory_spec.extra_coordinates | step_and_phase_coordinates,
+        trajectory_spec.extra_coordinates | index_coordinates,
         walk_attributes | provenance_attributes,
     )
 
@@ -191,7 +191,7 @@ class TrajectorySpecification(NamedTuple):
     trajectory.
     """
 
-    sample_step: Callable[[Array, int], SampledStep]  # arguments: section state, step index
+    step_sampler: Callable[[Array, int], SampledStep]  # arguments: section state, step index
     variable_names: tuple[str, ...]  # names of the measures over time
     slope_position_names: tuple[str, ...]  # names of the positions along the slope
     extra_coordinates: dict[str, Any]  # additional coordinates of the dataset
@@ -266,8 +266,8 @@ class UnevenGroundLines(NamedTuple):
         x and z are its components in the frame of line k.
         """
         line_angle = self.line_slopes[k] - self.line_slopes[0]
-        sine, cosine = np.sin(line_angle), np.cos(line_angle)
-        return x * cosine + z * sine, z * cosine - x * sine
+        sine_of_angle, cosine_of_angle = np.sin(line_angle), np.cos(line_angle)
+        return x * cosine_of_angle + z * sine_of_angle, z * cosine_of_angle - x * sine_of_angle
 
 
 def sample_walk_steps(
@@ -288,12 +288,12 @@ def sample_walk_steps(
     walk_outcome, n_stepped, step_start_time, traveled_distance = Outcome.STEPPED, 0, 0.0, 0.0
     foothold = np.zeros(2)
     while walk_outcome == Outcome.STEPPED and n_stepped < n_steps:
-        sampled_step = trajectory_spec.sample_step(x, n_stepped)
-        has_occurred, step_columns = sampled_step.durations > 0.0, dict[str, np.ndarray]()
+        sampled_step = trajectory_spec.step_sampler(x, n_stepped)
+        has_interval_occurred, step_columns = sampled_step.durations > 0.0, dict[str, np.ndarray]()
         # A full slice copies nothing.
-        occurred_selection = slice(None) if has_occurred.all() else has_occurred
+        interval_selection = slice(None) if has_interval_occurred.all() else has_interval_occurred
         for column_name, sampled_values in sampled_step.sampled_columns.items():
-            step_columns[column_name] = sampled_values[occurred_selection].reshape(
+            step_columns[column_name] = sampled_values[interval_selection].reshape(
                 -1, *sampled_values.shape[2:]
             )
         if ground_lines is None:
@@ -336,8 +336,8 @@ def _compile_step_sampler(
     Its arguments are the section state and the leaves of (params, options).
     """
 
-    def sample_paper_step(x: Array, *leaves: Array) -> Trajectory:
-        params, options = jax.tree.unflatten(argument_structure, leaves)
+    def sample_paper_step(x: Array, *argument_leaves: Array) -> Trajectory:
+        params, options = jax.tree.unflatten(argument_structure, argument_leaves)
         return model.sample_step(params, x, options, n_samples)
 
     return jax.jit(sample_paper_step)
@@ -357,7 +357,7 @@ def _make_phase_columns(s: Symbols, trajectory: Trajectory) -> dict[str, np.ndar
     foot_forces = np.moveaxis(np.asarray(trajectory.forces), -1, 0)
     wheel_motion = Motion.from_angle(theta, L1, L2, dtheta, dL1, dL2)
     rear_leg_direction = rotate_to_rear_leg(s, wheel_motion.sin_theta, wheel_motion.cos_theta)
-    hub_x, hub_z, zeros = (
+    hub_x, hub_z, zero_column = (
         L1 * wheel_motion.sin_theta,
         L1 * wheel_motion.cos_theta,
         np.zeros_like(L1),
@@ -365,13 +365,13 @@ def _make_phase_columns(s: Symbols, trajectory: Trajectory) -> dict[str, np.ndar
     landing_leg_direction = rotate_to_landing_leg(s, wheel_motion.sin_theta, wheel_motion.cos_theta)
     return {
         "time": np.array(trajectory.time),
-        "x": zeros,
-        "z": zeros,
+        "x": zero_column,
+        "z": zero_column,
         "theta": theta,
         "L1": L1,
         "L2": L2,
-        "dx": zeros,
-        "dz": zeros,
+        "dx": zero_column,
+        "dz": zero_column,
         "dtheta": dtheta,
         "dL1": dL1,
         "dL2": dL2,
@@ -381,8 +381,8 @@ def _make_phase_columns(s: Symbols, trajectory: Trajectory) -> dict[str, np.ndar
         "elastic_energy": elastic_energy,
         "total_energy": kinetic_energy + gravitational_energy + elastic_energy,
         "damping_power": compute_damping_power(s, wheel_motion),
-        "foot_1_x": zeros,
-        "foot_1_z": zeros,
+        "foot_1_x": zero_column,
+        "foot_1_z": zero_column,
         "foot_2_x": hub_x - L2 * rear_leg_direction.sin,
         "foot_2_z": hub_z - L2 * rear_leg_direction.cos,
         "hub_x": hub_x,
@@ -403,16 +403,16 @@ def specify_phase_trajectory(
 
     def prepare_step_sampler(model: AbstractWheel, params: WheelParams) -> tuple:
         argument_leaves, argument_structure = jax.tree.flatten((params, options))
-        s = jax.tree.map(float, split_slopes(params)[0]).symbols()
+        s = jax.tree.map(float, separate_next_slope(params)[0]).symbols()
         return s, _compile_step_sampler(model, argument_structure, n_samples), argument_leaves
 
-    prepared_steps = [
+    prepared_samplers = [
         prepare_step_sampler(*model_and_wheel) for model_and_wheel in models_and_wheels
     ]
 
     def sample_phase_step(x: Array, k: int) -> SampledStep:
-        s, sample_step_states, argument_leaves = prepared_steps[k if len(prepared_steps) > 1 else 0]
-        trajectory = sample_step_states(x, *argument_leaves)
+        s, step_sampler, argument_leaves = prepared_samplers[k if len(prepared_samplers) > 1 else 0]
+        trajectory = step_sampler(x, *argument_leaves)
         step_columns, phase_durations = (
             _make_phase_columns(s, trajectory),
             np.asarray(trajectory.durations),
@@ -422,11 +422,11 @@ def specify_phase_trajectory(
             step_columns.pop("landing_foot_z"),
         )
         step_columns["phase"] = np.tile(np.arange(len(phase_durations))[:, None], (1, n_samples))
-        occurred_phases = np.flatnonzero(phase_durations > 0.0)
+        occurred_phase_indices = np.flatnonzero(phase_durations > 0.0)
         step_length, landing_normal_offset = 0.0, 0.0
-        if occurred_phases.size:
+        if occurred_phase_indices.size:
             step_length, landing_normal_offset = (
-                float(x[occurred_phases[-1], -1]) for x in landing_foot_columns
+                float(x[occurred_phase_indices[-1], -1]) for x in landing_foot_columns
             )
         return SampledStep(
             step_columns,
@@ -517,22 +517,22 @@ def specify_contact_trajectory(
             np.array, _compute_contact_columns(*model_and_wheel, x, options, n_samples)
         )
         sample_shape = (len(trajectory.duration), n_samples)
-        repeat_over_samples = lambda values_by_leg: np.repeat(
-            values_by_leg[:, None], n_samples, axis=1
-        )
+        sample_repeater = lambda values_by_leg: np.repeat(values_by_leg[:, None], n_samples, axis=1)
         step_columns |= {
             "time": trajectory.time,
-            "contact": repeat_over_samples(trajectory.contact),
+            "contact": sample_repeater(trajectory.contact),
         }
         step_columns |= {
             variable_name: np.full(sample_shape, int(selection_code))
             for variable_name, selection_code in trajectory.model_selection.items()
         }
-        step_columns["on_stopper"] = repeat_over_samples(trajectory.locked)
-        occurred_intervals = np.flatnonzero(trajectory.duration > 0.0)
+        step_columns["on_stopper"] = sample_repeater(trajectory.locked)
+        occurred_interval_indices = np.flatnonzero(trajectory.duration > 0.0)
         landing_normal_offset = 0.0
-        if occurred_intervals.size:  # The foremost foot has landed.
-            landing_normal_offset = float(step_columns["foot_z"][occurred_intervals[-1], -1, -1])
+        if occurred_interval_indices.size:  # The foremost foot has landed.
+            landing_normal_offset = float(
+                step_columns["foot_z"][occurred_interval_indices[-1], -1, -1]
+            )
         return SampledStep(
             step_columns,
             trajectory.duration,

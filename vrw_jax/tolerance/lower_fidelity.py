@@ -257,7 +257,7 @@ def _compute_rigid_gaits(params: WheelParams) -> tuple:
             gait_step = rigid_model.take_step(params, x, step_options)
             return gait_step.section_state, gait_step.step_length, jnp.sum(gait_step.durations)
 
-        section_state = rigid_model.default_start(params)
+        section_state = rigid_model.compute_default_start(params)
         (
             (next_section_state, step_length, step_duration),
             (return_map_jacobian, _, duration_jacobian),

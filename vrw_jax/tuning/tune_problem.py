@@ -39,8 +39,8 @@ from vrw_jax.measures import (
 from vrw_jax.numerics import StepOptions
 from vrw_jax.runtime import with_default_jax_settings
 from vrw_jax.runtime import xarray as xr
-from vrw_jax.selection import MODEL_SELECTION_MARGINS, describe_accepted_models
-from vrw_jax.simulation import ModelLike, check_model, check_single_wheel
+from vrw_jax.selection import VIOLATION_TEXT_BY_SELECTION_MARGIN, describe_accepted_models
+from vrw_jax.simulation import ModelLike, convert_model_argument, require_single_wheel
 from vrw_jax.tuning.exploration import ExplorationResult, explore_starts
 from vrw_jax.tuning.maximization import (
     EvaluatedTrial,
@@ -260,7 +260,7 @@ class TuneProblem:
         A normalized parameter is its distance from the lower bound divided by the width between the
         bounds.
         """
-        parameter_values = np.array(self.gait_finder.model.parameter_values(self.params))
+        parameter_values = np.array(self.gait_finder.model.collect_parameter_values(self.params))
         parameter_values[self.free_parameter_indices] = (
             self.lower_bounds + normalized_parameters * self.bound_widths
         )
@@ -268,7 +268,7 @@ class TuneProblem:
 
     def make_wheel(self, normalized_parameters: np.ndarray) -> WheelParams:
         """Return the wheel with these normalized free parameters."""
-        return self.gait_finder.model.from_values(
+        return self.gait_finder.model.from_parameter_values(
             jnp.asarray(self.denormalize_parameters(normalized_parameters)), self.params.n_legs
         )[1]
 
@@ -650,11 +650,11 @@ def make_tune_problem(
     Raises:
         TypeError, ValueError: if an argument is invalid; the message names the remedy.
     """
-    check_single_wheel(params, "tune one after the other")
+    require_single_wheel(params, "tune one after the other")
     free_parameters, lower_bounds, upper_bounds = _check_parameter_bounds(params, free, bounds)
-    checked_model = check_model(model)
+    checked_model = convert_model_argument(model)
     gait_finder = make_finder(
-        check_model(resolve_model(params, checked_model)),
+        convert_model_argument(resolve_model(params, checked_model)),
         params.n_legs,
         cycle_options=cycle_options,
         step_options=options,
@@ -671,7 +671,7 @@ def make_tune_problem(
         and checked_model.fallback_model is not checked_model
         and gait_finder.supports_cold_start
     ):
-        constraints = tuple(MODEL_SELECTION_MARGINS)
+        constraints = tuple(VIOLATION_TEXT_BY_SELECTION_MARGIN)
     constraint_margins = parse_constraint_margins(params, constraints, gait_finder)
     objective_and_constraints = ObjectiveAndConstraints(
         objective_function, type(gait_finder).read_measure, tuple(constraint_margins)
@@ -679,7 +679,7 @@ def make_tune_problem(
     if callable(objective):  # Errors of the objective are raised here, before compilation.
         abstract_cycle = jax.eval_shape(gait_finder.find_cycle, params)
         abstract_section_state = jax.ShapeDtypeStruct(
-            (gait_finder.model.section_size(params),), params.damping.dtype
+            (gait_finder.model.count_section_entries(params),), params.damping.dtype
         )
         abstract_step = jax.eval_shape(
             gait_finder.model.take_step, params, abstract_section_state, gait_finder.step_options
