@@ -243,7 +243,7 @@ def _continue_in_both_directions(
 
     The result has the axes (wheel, direction). The first direction decreases the parameter.
     """
-    repeat_for_both_directions = lambda tree_over_wheels: jax.device_put(
+    direction_repeater = lambda tree_over_wheels: jax.device_put(
         select_tree_rows(tree_over_wheels, np.repeat(np.arange(len(parameter_values)), 2))
     )
     parameter_bounds = jnp.asarray(branch_continuation.parameter_bounds)
@@ -251,12 +251,12 @@ def _continue_in_both_directions(
         jnp.asarray([-1.0, 1.0], parameter_bounds.dtype), parameter_values.shape[0]
     )
     continuation_arguments = (
-        repeat_for_both_directions(branch_continuation.wheels),
-        repeat_for_both_directions(z),
-        repeat_for_both_directions(parameter_values),
+        direction_repeater(branch_continuation.wheels),
+        direction_repeater(z),
+        direction_repeater(parameter_values),
         parameter_bounds,
         direction_signs,
-        repeat_for_both_directions(is_branch_requested),
+        direction_repeater(is_branch_requested),
     )
     continue_all_branches = (
         arclength.continue_from
@@ -591,13 +591,13 @@ def _locate_requested_zeros(
     )
     wheel_indices = point_table.wheel_indices[left_indices]
     bracket_wheels = select_tree_rows(branch_continuation.wheels, wheel_indices)
-    solve_on_chords = (
+    chord_solver = (
         _solve_for_points_on_chords
         if branch_continuation.continuation_problem.is_traceable
         else _solve_for_points_on_chords_untraced
     )
-    solve_chord_points = functools.partial(
-        solve_on_chords,
+    chord_point_solver = functools.partial(
+        chord_solver,
         branch_continuation.continuation_problem,
         branch_continuation.arclength_options,
         jnp.asarray(branch_continuation.parameter_bounds),
@@ -616,7 +616,7 @@ def _locate_requested_zeros(
             (bracket_wheels, left_points, right_points), bracket_indices
         )
         solved_points, is_found = branch_continuation.map_over_points(
-            solve_chord_points,
+            chord_point_solver,
             batch_sizes.LOCATION_BATCH_SIZES[-1],
             *selected_brackets,
             chord_fractions,
@@ -836,13 +836,15 @@ def _locate_inner_special_points(
         for left_index, right_index, _ in zero_requests
     ]
     zero_requests = [
-        request_or_name
-        for request_or_name, is_selected in zip(zero_requests, is_without_jump, strict=True)
+        zero_request
+        for zero_request, is_selected in zip(zero_requests, is_without_jump, strict=True)
         if is_selected
     ]
     special_point_names = [
-        request_or_name
-        for request_or_name, is_selected in zip(special_point_names, is_without_jump, strict=True)
+        special_point_name
+        for special_point_name, is_selected in zip(
+            special_point_names, is_without_jump, strict=True
+        )
         if is_selected
     ]
     located_zeros = _locate_requested_zeros(branch_continuation, point_table, zero_requests)
@@ -871,15 +873,13 @@ def _locate_inner_special_points(
     off_circle_pairs = [
         point_pair for point_pair in off_circle_pairs if not has_jump_between(*point_pair)
     ]
-    locate_zeros_between = functools.partial(
-        _locate_requested_zeros, branch_continuation, point_table
-    )
+    zero_locator = functools.partial(_locate_requested_zeros, branch_continuation, point_table)
     return add_multiple_bifurcations(
         quantity_table,
         fraction_rates,
         off_circle_pairs,
         drop_duplicate_order_changes(named_zeros),
-        locate_zeros_between,
+        zero_locator,
     )
 
 

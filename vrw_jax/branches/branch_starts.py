@@ -16,7 +16,7 @@ from vrw_jax.branches.continuation_problems import (
     AbstractGaitProblem,
     BranchWheel,
     CollocationProblem,
-    GroundProblem,
+    ContactGaitProblem,
     ReturnMapProblem,
 )
 from vrw_jax.collocation import CollocationSolution
@@ -121,8 +121,12 @@ def find_collocation_starts(branch_request: BranchRequest, given_cycle: Any) -> 
     if cycle_options is None:
         cycle_options = CycleOptions.tight()
         start_mesh = start_cycle.system.cycle_options.mesh_intervals
-        dls, sls1_points, sls2 = map(max, cycle_options.mesh_intervals, start_mesh)
-        cycle_options = dataclasses.replace(cycle_options, mesh_intervals=(dls, sls1_points, sls2))
+        n_dls_intervals, n_sls1_intervals, n_sls2_intervals = map(
+            max, cycle_options.mesh_intervals, start_mesh
+        )
+        cycle_options = dataclasses.replace(
+            cycle_options, mesh_intervals=(n_dls_intervals, n_sls1_intervals, n_sls2_intervals)
+        )
     gait_finder: Any = make_finder(
         branch_request.model, params.n_legs, period_n=period_n, cycle_options=cycle_options
     )
@@ -144,7 +148,7 @@ def find_collocation_starts(branch_request: BranchRequest, given_cycle: Any) -> 
         CollocationProblem(
             collocation_system=collocation_system,
             parameter_name=parameter_name,
-            compute_additional_quantities=None,
+            additional_quantity_function=None,
             measures_force_peaks=branch_request.measures_force_peaks,
         ),
         BranchWheel(params, start_cycle.collocation_state.is_phase_active),
@@ -217,7 +221,7 @@ def find_contact_gait_starts(branch_request: BranchRequest, start_cycle: Any) ->
             (*branch_request.parameter_values.shape, 1, 1), branch_request.parameter_values.dtype
         ),
     )
-    ground_problem = GroundProblem(
+    contact_gait_problem = ContactGaitProblem(
         model=model,
         step_options=step_options,
         parameter_name=branch_request.parameter_name,
@@ -225,7 +229,7 @@ def find_contact_gait_starts(branch_request: BranchRequest, start_cycle: Any) ->
         n_coordinates=model.count_continuous_entries(params),
         n_legs=params.n_legs,
     )
-    parameter_values = ground_problem.stack_parameter_values(
+    parameter_values = contact_gait_problem.stack_parameter_values(
         wheels, branch_request.parameter_values
     )
     if start_cycle is None:
@@ -235,7 +239,7 @@ def find_contact_gait_starts(branch_request: BranchRequest, start_cycle: Any) ->
 
     outcomes = np.asarray(start_cycle.outcome)
     return BranchStart(
-        ground_problem,
+        contact_gait_problem,
         wheels,
         start_cycle.section_state,
         outcomes,

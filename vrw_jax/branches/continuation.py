@@ -368,12 +368,12 @@ def continue_branches(
     # The batch is padded to a power of two, because each size compiles programs.
     padded_batch_size = 1 << (n_wheels - 1).bit_length()
     wheel_indices = np.minimum(np.arange(padded_batch_size), n_wheels - 1)
-    pad_batch = lambda parameter_values_of_field: np.broadcast_to(
+    batch_padder = lambda parameter_values_of_field: np.broadcast_to(
         np.asarray(parameter_values_of_field), batch_shape
     )[wheel_indices]
-    start_values = pad_batch(getattr(model if name == FRICTION_NAME else params, name))
+    start_values = batch_padder(getattr(model if name == FRICTION_NAME else params, name))
     params, parameter_values = jax.device_put(
-        (jax.tree.map(pad_batch, params), np.clip(start_values, lower_bound, upper_bound))
+        (jax.tree.map(batch_padder, params), np.clip(start_values, lower_bound, upper_bound))
     )
     if isinstance(cycle, AbstractCycle) and padded_batch_size > n_wheels:
         cycle = jax.device_put(select_tree_rows(cycle, wheel_indices))
@@ -646,7 +646,9 @@ def continue_map(
             f"[{lower_bound:g}, {upper_bound:g}]."
         )
     options, x = _check_arclength_options(options), check_reals("x", x)
-    add_batch_axis = lambda tree: jax.tree.map(lambda a: jnp.asarray(a, float)[None], tree)
+    add_batch_axis = lambda tree: jax.tree.map(
+        lambda constant_leaf: jnp.asarray(constant_leaf, float)[None], tree
+    )
     branch_continuation = MapContinuation(
         FixedPointProblem(function),
         options,

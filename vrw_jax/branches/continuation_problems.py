@@ -1,9 +1,9 @@
 """Define continuation problems of gaits, and measure the gaits at points of their branches.
 
 `CollocationProblem` is the fastest problem. It solves the collocation equations of the paper's
-sequence of phases, with one linearization per Newton iteration. `GroundProblem` uses batches of
-gait steps with unilateral contact. `ReturnMapProblem` applies to every model. It iterates the gait
-step of the model and differentiates it in forward mode.
+sequence of phases, with one linearization per Newton iteration. `ContactGaitProblem` uses batches
+of gait steps with unilateral contact. `ReturnMapProblem` applies to every model. It iterates the
+gait step of the model and differentiates it in forward mode.
 """
 
 import abc
@@ -122,14 +122,14 @@ class CollocationProblem(AbstractGaitProblem):
     `CollocationSolution`.
 
     If an indicator changes its sign, the solution still exists, but the event-driven step does not
-    confirm it as a gait. `compute_additional_quantities` is a function of the wheel's symbols, the
+    confirm it as a gait. `additional_quantity_function` is a function of the wheel's symbols, the
     phase points of the first gait step and z. If `measures_force_peaks` is true, the points also
     have the measures of the gait's force.
     """
 
     collocation_system: CollocationSystem = eqx.field(static=True)
     parameter_name: str = eqx.field(static=True)
-    compute_additional_quantities: Callable | None = eqx.field(static=True)
+    additional_quantity_function: Callable | None = eqx.field(static=True)
     measures_force_peaks: bool = eqx.field(static=True, default=False)
 
     @property
@@ -141,7 +141,9 @@ class CollocationProblem(AbstractGaitProblem):
         has the value p.
         """
         return stack_parameters(
-            eqx.tree_at(lambda w: getattr(w, self.parameter_name), wheel.params, p)
+            eqx.tree_at(
+                lambda wheel_params: getattr(wheel_params, self.parameter_name), wheel.params, p
+            )
         )
 
     def linearize(self, wheel: BranchWheel, z: ProblemUnknowns, p: Scalar) -> NewtonStep:
@@ -203,8 +205,8 @@ class CollocationProblem(AbstractGaitProblem):
             "takeoff_acceleration": jnp.min(jnp.stack(takeoff_accelerations)),
             "mesh_error": mesh_error,
         }
-        if self.compute_additional_quantities is not None:
-            continued_quantities |= self.compute_additional_quantities(
+        if self.additional_quantity_function is not None:
+            continued_quantities |= self.additional_quantity_function(
                 wheel_symbols, phase_points_by_step[0], z
             )
         if self.measures_force_peaks:
@@ -212,7 +214,7 @@ class CollocationProblem(AbstractGaitProblem):
         return jnp.stack([last_end_point.q[0], *last_end_point.v]), continued_quantities
 
 
-ComputeGaitQuantities = Callable[[CollocationSystem, Array, Array, CollocationSolution], Array]
+GaitQuantityFunction = Callable[[CollocationSystem, Array, Array, CollocationSolution], Array]
 """Function that computes quantities of collocated gaits, with the batch elements on the last axis.
 
 Its arguments are the collocation system, the parameters, `is_phase_active` and the solution.
@@ -222,14 +224,14 @@ Its arguments are the collocation system, the parameters, `is_phase_active` and 
 def make_trial_linearizer(
     collocation_system: CollocationSystem,
     parameter_indices: tuple[int, ...],
-    compute_quantities: ComputeGaitQuantities | None = None,
+    gait_quantity_function: GaitQuantityFunction | None = None,
 ) -> Any:
     """Return a function that linearizes the collocation equations of one wheel at a trial solution.
 
     The arguments of the function are (parameters, is_phase_active, solution), and `jax.vmap` can
     map it over wheels. It returns Newton's correction, the tangents with respect to the selected
-    parameters and the monodromy matrix. If `compute_quantities` is not None, it also returns the
-    computed quantities and their JVPs. The directions of the JVPs are the correction and each
+    parameters and the monodromy matrix. If `gait_quantity_function` is not None, it also returns
+    the computed quantities and their JVPs. The directions of the JVPs are the correction and each
     tangent.
     """
 
@@ -245,7 +247,7 @@ def make_trial_linearizer(
             cycle_linearization.parameter_tangents,
             cycle_linearization.monodromy,
         )
-        if compute_quantities is None:
+        if gait_quantity_function is None:
             return newton_results
         parameter_rows = np.eye(parameters.shape[0], dtype=parameters.dtype)[
             list(parameter_indices)
@@ -253,9 +255,11 @@ def make_trial_linearizer(
         parameter_tangents = np.concatenate([np.zeros_like(parameter_rows[:1]), parameter_rows])[
             :, :, None
         ]
-        prepend_correction = lambda a, b: jnp.concatenate([a[None], b])
+        correction_stacker = lambda correction_leaf, tangent_leaf: jnp.concatenate(
+            [correction_leaf[None], tangent_leaf]
+        )
         solution_tangents = jax.tree.map(
-            prepend_correction,
+            correction_stacker,
             cycle_linearization.newton_correction,
             cycle_linearization.parameter_tangents,
         )
@@ -263,7 +267,7 @@ def make_trial_linearizer(
             jnp.broadcast_to(parameter_tangents, (len(parameter_tangents), *parameters.shape)),
             solution_tangents,
         )
-        evaluate_quantities = lambda parameters, z: compute_quantities(
+        evaluate_quantities = lambda parameters, z: gait_quantity_function(
             collocation_system, parameters, is_phase_active, z
         )
         compute_quantity_tangent = lambda tangent_direction: jax.jvp(
@@ -278,13 +282,13 @@ def make_trial_linearizer(
     make_output_template = lambda parameters, is_phase_active, z: (
         z,
         z,
-        *(parameters,) * (1 if compute_quantities is None else 3),
+        *(parameters,) * (1 if gait_quantity_function is None else 3),
     )
     cache_key = (
         "followed",
         collocation_system,
         parameter_indices,
-        compute_quantities.__name__ if compute_quantities else "",
+        gait_quantity_function.__name__ if gait_quantity_function else "",
     )
     return unbatch(
         compile_batch_function(linearize_trial, make_output_template, cache_key, batch_size=0)
@@ -356,7 +360,7 @@ class ReturnMapProblem(AbstractReturnMapProblem):
         return arclength.compute_fixed_point_newton_step(return_map, z, p, self.n_coordinates)
 
 
-class GroundProblem(AbstractReturnMapProblem):
+class ContactGaitProblem(AbstractReturnMapProblem):
     """Continuation problem of gaits with unilateral contact, solved by batches of gait steps."""
 
     model: UnilateralWheel

@@ -459,7 +459,7 @@ class CurveTracer(NamedTuple):
         test_function = GaitTestFunction(
             collocation_system, self.parameter_names, quantity_group, self.model, self.step_options
         )
-        stack_trees = lambda *trees_of_seeds: jax.tree.map(lambda *x: np.stack(x), *trees_of_seeds)
+        tree_stacker = lambda *trees_of_seeds: jax.tree.map(lambda *x: np.stack(x), *trees_of_seeds)
         quantity_names = [
             select_test_quantity(
                 curve_seed.special_point_name,
@@ -470,7 +470,7 @@ class CurveTracer(NamedTuple):
         quantity_indices = [
             jnp.asarray(quantity_group.index(quantity_name)) for quantity_name in quantity_names
         ]
-        test_function_arguments = stack_trees(
+        test_function_arguments = tree_stacker(
             *(
                 TestFunctionWheel(curve_seed.branch_wheel, quantity_index)
                 for curve_seed, quantity_index in zip(padded_seeds, quantity_indices, strict=True)
@@ -480,7 +480,7 @@ class CurveTracer(NamedTuple):
         compute_second_fraction = lambda curve_seed: jnp.asarray(
             (curve_seed.parameter_values[1] - lower_bound) / (upper_bound - lower_bound)
         )
-        z = stack_trees(
+        z = tree_stacker(
             *(
                 TestFunctionPoint(curve_seed.z, compute_second_fraction(curve_seed))
                 for curve_seed in padded_seeds

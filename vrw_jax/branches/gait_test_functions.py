@@ -296,7 +296,7 @@ class GaitTestFunction(AbstractTestFunction):
         return CollocationProblem(
             collocation_system=self.collocation_system,
             parameter_name=self.parameter_names[0],
-            compute_additional_quantities=_compute_continued_quantities,
+            additional_quantity_function=_compute_continued_quantities,
         )
 
     def measure_step(self, branch_wheel: BranchWheel, z: CollocationSolution, p: Array) -> Array:

@@ -43,7 +43,7 @@ DEFAULT_JUMP_OPTIONS = JumpOptions()
 
 def continue_beyond_jumps(
     branch_continuation: Any,
-    continue_branches: Callable[..., Any],
+    branch_continuer: Callable[..., Any],
     wheels: Any,
     direction_results: ContinuationResult,
     jump_options: JumpOptions = DEFAULT_JUMP_OPTIONS,
@@ -51,7 +51,7 @@ def continue_beyond_jumps(
     """Continue stalled branches beyond jumps, and return the points of all branches.
 
     The search for the gait beyond a jump starts from the last gait. It uses the smallest change of
-    the parameter that leads to a similar gait. `continue_branches` is the function that continues
+    the parameter that leads to a similar gait. `branch_continuer` is the function that continues
     branches of `branch_continuation`.
     """
     branch_indices, parameter_bounds = (
@@ -94,7 +94,7 @@ def continue_beyond_jumps(
                     is_requested,
                 )
             )
-            new_results = jax.tree.map(np.asarray, continue_branches(*continuation_arguments))
+            new_results = jax.tree.map(np.asarray, branch_continuer(*continuation_arguments))
             first_points = select_tree_rows(new_results.points, (branch_indices, 0))
             is_gait_found = is_requested & (np.asarray(new_results.n_points) > 1)
             first_quantities = branch_continuation.make_quantity_table(first_points, wheel_indices)

@@ -158,7 +158,7 @@ def find_unexplained_ranks(
 def classify_crossing_ranks(
     return_map_jacobian: np.ndarray,
     crossing_ranks: range,
-    has_turning_parameter: bool,
+    has_parameter_turned: bool,
     multiplier_tolerances: MultiplierTolerances = MULTIPLIER_TOLERANCES,
 ) -> dict[str, int]:
     """Return the number of multipliers for each bifurcation, by the name of the bifurcation.
@@ -168,7 +168,7 @@ def classify_crossing_ranks(
     multipliers = np.linalg.eigvals(return_map_jacobian)
     multipliers = multipliers[np.argsort(-np.abs(multipliers), kind="stable")][list(crossing_ranks)]
     is_complex_pair = np.abs(multipliers.imag) > multiplier_tolerances.min_imaginary_part
-    bifurcation_at_one = "fold" if has_turning_parameter else BRANCH_POINT_KIND
+    bifurcation_at_one = "fold" if has_parameter_turned else BRANCH_POINT_KIND
     n_multipliers_by_name = {
         bifurcation_at_one: int(np.sum(~is_complex_pair & (multipliers.real > 0.0))),
         "period_doubling": int(np.sum(~is_complex_pair & (multipliers.real < 0.0))),
@@ -236,16 +236,16 @@ def add_multiple_bifurcations(
     fraction_rates: np.ndarray,
     neighbor_pairs: list[tuple[int, int]],
     named_zeros: list[NamedLocatedZero],
-    locate_requested_zeros: Callable[[list[tuple[int, int, str]]], list[Any]],
+    zero_locator: Callable[[list[tuple[int, int, str]]], list[Any]],
     zero_tolerances: LocatedZeroTolerances = LOCATED_ZERO_TOLERANCES,
     multiplier_tolerances: MultiplierTolerances = MULTIPLIER_TOLERANCES,
 ) -> list[NamedLocatedZero]:
     """Replace incomplete bifurcations by complete bifurcations of several multipliers.
 
     Return all roots. `neighbor_pairs` contains pairs of neighboring points on a branch.
-    `locate_requested_zeros` is the function that locates roots of quantities between these points.
+    `zero_locator` is the function that locates roots of quantities between these points.
     """
-    is_zero_within = lambda located_zero, point_pair: (
+    zero_pair_test = lambda located_zero, point_pair: (
         point_pair[0] <= located_zero.bracket_and_quantity[0]
         and located_zero.bracket_and_quantity[1] <= point_pair[1]
     )
@@ -255,7 +255,7 @@ def add_multiple_bifurcations(
             quantity_name
             for quantity_name, located_zero, _ in named_zeros
             if quantity_name in CROSSING_MULTIPLIER_COUNTS
-            and is_zero_within(located_zero, (left_index, right_index))
+            and zero_pair_test(located_zero, (left_index, right_index))
         ]
         for multiplier_rank in find_unexplained_ranks(
             multiplier_moduli[left_index], multiplier_moduli[right_index], explaining_names
@@ -272,7 +272,7 @@ def add_multiple_bifurcations(
     groups_of_zeros: list[
         list[Any]
     ] = []  # Each group contains the roots for ranks that may cross the unit circle together.
-    for located_zero in locate_requested_zeros(rank_zero_requests):
+    for located_zero in zero_locator(rank_zero_requests):
         if not vanishes_at_zero(quantity_table, located_zero, zero_tolerances):
             continue
         last_located_zero = groups_of_zeros[-1][-1] if groups_of_zeros else located_zero
@@ -287,20 +287,21 @@ def add_multiple_bifurcations(
         ):
             groups_of_zeros.append([])
         groups_of_zeros[-1].append(located_zero)
-    get_first_rank = lambda group_of_zeros: int(
+    first_rank_getter = lambda group_of_zeros: int(
         group_of_zeros[0].bracket_and_quantity[2].split(":")[1]
     )
     mean_rank_requests = []
     for group_of_zeros in groups_of_zeros:
         quantity_name = format_rank_quantity_name(
-            get_first_rank(group_of_zeros), get_first_rank(group_of_zeros) + len(group_of_zeros)
+            first_rank_getter(group_of_zeros),
+            first_rank_getter(group_of_zeros) + len(group_of_zeros),
         )
         mean_rank_requests.append((*group_of_zeros[0].bracket_and_quantity[:2], quantity_name))
     multiple_bifurcation_zeros = []
     for group_of_zeros, located_mean_zero in zip(
-        groups_of_zeros, locate_requested_zeros(mean_rank_requests), strict=True
+        groups_of_zeros, zero_locator(mean_rank_requests), strict=True
     ):
-        first_rank, n_ranks = get_first_rank(group_of_zeros), len(group_of_zeros)
+        first_rank, n_ranks = first_rank_getter(group_of_zeros), len(group_of_zeros)
         unit_circle_distances = np.abs(
             located_mean_zero.quantities_beside_zero[MULTIPLIER_MODULI_COLUMN][
                 0, first_rank : first_rank + n_ranks
@@ -334,7 +335,7 @@ def add_multiple_bifurcations(
     }
     is_replaced = lambda quantity_name, located_zero: (
         quantity_name in CROSSING_MULTIPLIER_COUNTS
-        and any(is_zero_within(located_zero, point_pair) for point_pair in replaced_pairs)
+        and any(zero_pair_test(located_zero, point_pair) for point_pair in replaced_pairs)
     )
     return [
         located_zero

@@ -288,8 +288,12 @@ def find_sign_changes_in_scan(
             np.moveaxis(x, parameter_index, 0)[:-1],
             np.moveaxis(x, parameter_index, 0)[1:],
         )
-        order_by_parameter = lambda a, b, parameter_index=parameter_index: (
-            (a, b) if parameter_index == 0 else (b, a)
+        axis_mover = (
+            lambda first_neighbor_values, second_neighbor_values, parameter_index=parameter_index: (
+                (first_neighbor_values, second_neighbor_values)
+                if parameter_index == 0
+                else (second_neighbor_values, first_neighbor_values)
+            )
         )
         has_first_sample_gait, has_second_sample_gait = get_neighbor_values(has_gait)
         has_same_double_support = np.equal(
@@ -308,7 +312,7 @@ def find_sign_changes_in_scan(
                 zero_location_fraction = first_values[i, j] / (
                     first_values[i, j] - second_values[i, j]
                 )
-                sample_indices = order_by_parameter(
+                sample_indices = axis_mover(
                     int(i if has_first_sample_gait[i, j] else i + 1), int(j)
                 )
                 sign_changes.append(
@@ -316,7 +320,7 @@ def find_sign_changes_in_scan(
                         quantity_name,
                         parameter_index,
                         sample_indices,
-                        order_by_parameter(float(i + zero_location_fraction), float(j)),
+                        axis_mover(float(i + zero_location_fraction), float(j)),
                     )
                 )
     return sign_changes

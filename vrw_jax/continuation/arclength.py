@@ -80,10 +80,12 @@ class ArclengthOptions:
     jacobian_reuse_fraction: float = 1e-2
 
     def __post_init__(self) -> None:
-        integer_names = ("max_points", "max_newton_iterations")
-        for name in self.__dataclass_fields__:
-            check_option = check_int if name in integer_names else check_positive
-            object.__setattr__(self, name, check_option(name, getattr(self, name)))
+        integer_option_names = ("max_points", "max_newton_iterations")
+        for option_name in self.__dataclass_fields__:
+            check_option = check_int if option_name in integer_option_names else check_positive
+            object.__setattr__(
+                self, option_name, check_option(option_name, getattr(self, option_name))
+            )
         if not self.min_ds <= self.initial_ds <= self.max_ds:
             raise ValueError(
                 f"the steps are {self.min_ds:g} (smallest), {self.initial_ds:g} (first) and "
@@ -139,7 +141,11 @@ class AbstractContinuationProblem(eqx.Module):
         `location_fraction` is 0 at `left_point` and 1 at `right_point`. The result is the initial
         guess of Newton's method.
         """
-        return jax.tree.map(lambda a, b: a + location_fraction * (b - a), left_point, right_point)
+        return jax.tree.map(
+            lambda left_leaf, right_leaf: left_leaf + location_fraction * (right_leaf - left_leaf),
+            left_point,
+            right_point,
+        )
 
     def is_smooth_between(
         self, left_point: ProblemUnknowns, right_point: ProblemUnknowns
@@ -287,7 +293,7 @@ def correct_trial_point(
     """Apply one Newton iteration within the corrector plane, and return the new corrector state."""
     parameter_range = parameter_bounds[1] - parameter_bounds[0]
     fraction_tangent = jax.tree.map(
-        lambda section_state: parameter_range * section_state, newton_step.branch_tangent
+        lambda tangent_leaf: parameter_range * tangent_leaf, newton_step.branch_tangent
     )
     section_state = problem.section_state(z) + problem.section_state(newton_step.newton_correction)
     plane_residual = corrector_plane.normal_section_part @ (
@@ -298,7 +304,9 @@ def correct_trial_point(
         + corrector_plane.normal_fraction_part
     )
     dz = jax.tree.map(
-        lambda a, b: a + d_fraction * b, newton_step.newton_correction, fraction_tangent
+        lambda unknown_leaf, tangent_leaf: unknown_leaf + d_fraction * tangent_leaf,
+        newton_step.newton_correction,
+        fraction_tangent,
     )
     correction_norm = jnp.maximum(problem.correction_norm(z, dz), jnp.abs(d_fraction))
     return CorrectorState(
@@ -503,7 +511,7 @@ def _is_jump_suspicious(
     problem: AbstractContinuationProblem,
     options: ArclengthOptions,
     continuation_state: ContinuationState,
-    trial_assessment: _TrialVerdict,
+    trial_verdict: _TrialVerdict,
     new_point: ContinuationPoint,
 ) -> Bool[Array, ""]:
     """Return whether an accepted trial may lie on another branch.
@@ -518,7 +526,7 @@ def _is_jump_suspicious(
         current_point.return_map_jacobian, new_point.return_map_jacobian, has_turned_back
     )
     can_be_suspicious = (
-        trial_assessment.is_accepted
+        trial_verdict.is_accepted
         & (continuation_state.n_points > 0)
         & ~continuation_state.jump_suspicion.accepts_any_multipliers
         & new_point.is_admissible
@@ -529,7 +537,7 @@ def _is_jump_suspicious(
 def _choose_next_step_length(
     options: ArclengthOptions,
     continuation_state: ContinuationState,
-    trial_assessment: _TrialVerdict,
+    trial_verdict: _TrialVerdict,
 ) -> Scalar:
     """Return the length of the next continuation step.
 
@@ -543,9 +551,9 @@ def _choose_next_step_length(
     growth_factor = jnp.where(has_converged_quickly, 1.4, jnp.where(has_converged_slowly, 0.6, 1.0))
     longer_ds = jnp.minimum(continuation_state.ds * growth_factor, options.max_ds)
     shorter_ds = jnp.where(
-        trial_assessment.has_failed, 0.5 * continuation_state.ds, continuation_state.ds
+        trial_verdict.has_failed, 0.5 * continuation_state.ds, continuation_state.ds
     )
-    chosen_ds = jnp.where(trial_assessment.is_accepted, longer_ds, shorter_ds)
+    chosen_ds = jnp.where(trial_verdict.is_accepted, longer_ds, shorter_ds)
     return jnp.where(continuation_state.n_points == 0, options.initial_ds, chosen_ds)
 
 
@@ -579,7 +587,7 @@ def _is_curve_closed(
 def _update_continuation_status(
     options: ArclengthOptions,
     continuation_state: ContinuationState,
-    trial_assessment: _TrialVerdict,
+    trial_verdict: _TrialVerdict,
     new_point: ContinuationPoint,
     ds: Scalar,
     next_arc_length: Scalar,
@@ -590,8 +598,8 @@ def _update_continuation_status(
     `ds` is the proposed length of the next continuation step. `next_arc_length` is its predicted
     arc length, which is shorter at the end of the range.
     """
-    is_accepted, has_failed = trial_assessment.is_accepted, trial_assessment.has_failed
-    n_points, reasons_and_statuses = (
+    is_accepted, has_failed = trial_verdict.is_accepted, trial_verdict.has_failed
+    n_points, branch_status_code = (
         continuation_state.n_points + is_accepted,
         continuation_state.status_code,
     )
@@ -610,10 +618,10 @@ def _update_continuation_status(
             ContinuationStatus.CURVE_CLOSED,
         ),
     ):
-        reasons_and_statuses = jnp.where(
-            has_ending_reason_occurred, int(status_code), reasons_and_statuses
+        branch_status_code = jnp.where(
+            has_ending_reason_occurred, int(status_code), branch_status_code
         )
-    return reasons_and_statuses.astype(jnp.int32)
+    return branch_status_code.astype(jnp.int32)
 
 
 def _init_continuation_state(
@@ -742,7 +750,7 @@ def iterate_branches(
         trial_verdict = _assess_trial(
             problem, options, continuation_state, corrector_state, direction_sign
         )
-        accepted_p = compute_parameter_from_fraction(
+        accepted_parameter = compute_parameter_from_fraction(
             jnp.where(
                 trial_point.is_range_end,
                 trial_point.corrector_plane.plane_fraction,
@@ -750,13 +758,13 @@ def iterate_branches(
             ),
             parameter_bounds,
         )
-        is_admissible = problem.is_admissible(args, corrector_state.z, accepted_p)
+        is_admissible = problem.is_admissible(args, corrector_state.z, accepted_parameter)
         arclength_tangent = jax.tree.map(
             lambda x: trial_verdict.fraction_rate * x, corrector_state.fraction_tangent
         )
         new_point = ContinuationPoint(
             corrector_state.z,
-            accepted_p,
+            accepted_parameter,
             arclength_tangent,
             trial_verdict.fraction_rate,
             corrector_state.return_map_jacobian,
@@ -885,7 +893,9 @@ def continue_from(
     and iteration. When a branch of the group ends, the next branch starts.
     """
     if p.ndim == 0:
-        add_branch_axis = lambda tree: jax.tree.map(lambda x: x[None], tree)
+        add_branch_axis = lambda tree_over_branches: jax.tree.map(
+            lambda x: x[None], tree_over_branches
+        )
         result = continue_from(
             problem,
             options,

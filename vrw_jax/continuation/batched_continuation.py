@@ -39,7 +39,7 @@ class PlaneNewtonState(NamedTuple):
 
     corrector_state: CorrectorState
     n_iterations: Int[Array, ""]
-    n_converged: Int[Array, ""]
+    n_converged_iterations: Int[Array, ""]
 
 
 def init_plane_newton(z: ProblemUnknowns, corrector_plane: CorrectorPlane) -> PlaneNewtonState:
@@ -62,7 +62,7 @@ def needs_newton_iteration(
 ) -> Array:
     """Return whether Newton's method in a plane needs another iteration."""
     return (
-        (plane_newton_state.n_converged < 2)
+        (plane_newton_state.n_converged_iterations < 2)
         & (plane_newton_state.n_iterations < options.max_newton_iterations)
         & jnp.isfinite(plane_newton_state.corrector_state.correction_norm)
     )
@@ -93,13 +93,17 @@ def iterate_plane_newton(
     )
     # If the correction is negligible, the last Jacobian is exact and no other iteration follows.
     negligible_correction = options.jacobian_reuse_fraction * options.tolerance
-    n_converged_before = jnp.where(next_corrector.correction_norm < negligible_correction, 2, 1)
-    n_converged = jnp.where(
+    n_converged_iterations_before = jnp.where(
+        next_corrector.correction_norm < negligible_correction, 2, 1
+    )
+    n_converged_iterations = jnp.where(
         next_corrector.correction_norm < options.tolerance,
-        plane_newton_state.n_converged + n_converged_before,
+        plane_newton_state.n_converged_iterations + n_converged_iterations_before,
         0,
     )
-    return PlaneNewtonState(next_corrector, plane_newton_state.n_iterations + 1, n_converged)
+    return PlaneNewtonState(
+        next_corrector, plane_newton_state.n_iterations + 1, n_converged_iterations
+    )
 
 
 def make_plane_newton_point(
@@ -129,7 +133,7 @@ def make_plane_newton_point(
     continuation_point = ContinuationPoint(
         corrector_state.z, p, (), fraction_rate, corrector_state.return_map_jacobian, is_admissible
     )
-    return continuation_point, plane_newton_state.n_converged >= 1
+    return continuation_point, plane_newton_state.n_converged_iterations >= 1
 
 
 @eqx.filter_jit
@@ -309,12 +313,12 @@ def _iterate_unfinished_plane_newton(
         plane_newton_state: PlaneNewtonState,
         newton_step: NewtonStep,
     ) -> PlaneNewtonState:
-        next_continuation_state = iterate_plane_newton(
+        next_plane_newton_state = iterate_plane_newton(
             problem, options, parameter_bounds, corrector_plane, plane_newton_state, newton_step
         )
         return select_tree_leaves(
             needs_newton_iteration(options, plane_newton_state),
-            next_continuation_state,
+            next_plane_newton_state,
             plane_newton_state,
         )
 

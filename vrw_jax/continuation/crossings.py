@@ -44,7 +44,7 @@ def is_multiplier_change_explained(
         2 * has_margin_sign_change[2] if len(has_margin_sign_change) > 2 else 0
     )
 
-    def count_outside(jacobian: Array) -> tuple[Array, Array]:
+    def count_multipliers_outside(jacobian: Array) -> tuple[Array, Array]:
         """Return the least and the largest possible number of multipliers outside the
         unit circle.
         """
@@ -56,10 +56,10 @@ def is_multiplier_change_explained(
             multiplier_moduli > 1.0 - tolerance
         )
 
-    min_outside_before, max_outside_before = count_outside(jacobian_before)
-    min_outside_after, max_outside_after = count_outside(jacobian_after)
+    min_n_outside_before, max_n_outside_before = count_multipliers_outside(jacobian_before)
+    min_n_outside_after, max_n_outside_after = count_multipliers_outside(jacobian_after)
     n_changed_multipliers = jnp.maximum(
-        min_outside_after - max_outside_before, min_outside_before - max_outside_after
+        min_n_outside_after - max_n_outside_before, min_n_outside_before - max_n_outside_after
     )
     return ~crosses_other_branch & (n_changed_multipliers <= n_explained_multipliers)
 

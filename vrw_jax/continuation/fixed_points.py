@@ -187,23 +187,23 @@ def _solve_checked_fixed_point(
             "must give an array of that shape: take a map of a state to the next state."
         )
     tolerance = lax.stop_gradient(jnp.asarray(tolerance, start.dtype))
-    map_and_iterations = (newton_method, function, period_n, max_iterations)
+    newton_configuration = (newton_method, function, period_n, max_iterations)
     newton_arguments = start, tolerance
     uses_program_cache = isinstance(function, ReturnMap)
     solver_program = (
-        find_program(_find_fixed_point_of_iterate, map_and_iterations, *newton_arguments)
+        find_program(_find_fixed_point_of_iterate, newton_configuration, *newton_arguments)
         if uses_program_cache
         else None
     )
-    return (solver_program or functools.partial(_find_fixed_point_of_iterate, map_and_iterations))(
-        *newton_arguments
-    )
+    return (
+        solver_program or functools.partial(_find_fixed_point_of_iterate, newton_configuration)
+    )(*newton_arguments)
 
 
 def _find_fixed_point_of_iterate(
-    map_and_iterations: tuple, start: Array, tolerance: Array
+    newton_configuration: tuple, start: Array, tolerance: Array
 ) -> FixedPointResult:
-    newton_method, function, period_n, max_iterations = map_and_iterations
+    newton_method, function, period_n, max_iterations = newton_configuration
 
     def apply_map_repeatedly(x: Array) -> Array:
         for _ in range(period_n):
@@ -241,7 +241,7 @@ provides only first derivatives of the fixed point.
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0, 1))
 def _run_newton_loop(
     converted_map: ClosureConvertedMap,
-    iterations: int,
+    max_iterations: int,
     start: Array,
     tolerance: Array,
     *closed_over_values: Any,
@@ -254,7 +254,7 @@ def _run_newton_loop(
     def is_newton_searching(correction_norm: Array, n_iterations: Array) -> Array:
         return (
             (correction_norm > tolerance)
-            & (n_iterations < iterations)
+            & (n_iterations < max_iterations)
             & jnp.isfinite(correction_norm)
         )
 
@@ -266,7 +266,9 @@ def _run_newton_loop(
 
     def iterate_newton(loop_state: tuple) -> tuple:
         x, correction_norm, n_iterations, n_derivative_iterations, *_ = loop_state
-        n_searching = is_newton_searching(correction_norm, n_iterations).astype(n_iterations.dtype)
+        is_searching_iteration = is_newton_searching(correction_norm, n_iterations).astype(
+            n_iterations.dtype
+        )
         correction, jacobian, map_defect = _compute_newton_correction(
             converted_map, x, closed_over_values
         )
@@ -277,18 +279,18 @@ def _run_newton_loop(
         return (
             next_x,
             correction_norm,
-            n_iterations + n_searching,
-            n_derivative_iterations + 1 - n_searching,
+            n_iterations + is_searching_iteration,
+            n_derivative_iterations + 1 - is_searching_iteration,
             jacobian,
             jnp.max(jnp.abs(map_defect)),
         )
 
-    zero_count, unit_norm = jnp.zeros((), jnp.int32), jnp.ones((), start.dtype)
+    zero_iterations, unit_norm = jnp.zeros((), jnp.int32), jnp.ones((), start.dtype)
     initial_state = (
         start,
         unit_norm,
-        zero_count,
-        zero_count,
+        zero_iterations,
+        zero_iterations,
         jnp.zeros((start.size,) * 2, start.dtype),
         unit_norm,
     )
@@ -304,14 +306,14 @@ def _run_newton_loop(
 @_run_newton_loop.defjvp
 @with_default_jax_settings
 def _run_newton_jvp(
-    converted_map: ClosureConvertedMap, iterations: int, primals: tuple, tangents: tuple
+    converted_map: ClosureConvertedMap, max_iterations: int, primals: tuple, tangents: tuple
 ) -> tuple[FixedPointResult, FixedPointResult]:
     """Return the fixed point and its tangent, by Newton iterations with derivatives.
 
     The iterations start at the fixed point.
     """
     start, _, *closed_over_values = primals
-    newton_result = _run_newton_loop(converted_map, iterations, *lax.stop_gradient(primals))
+    newton_result = _run_newton_loop(converted_map, max_iterations, *lax.stop_gradient(primals))
 
     def solve_from_fixed_point(*closed_over_values: Any) -> FixedPointResult:
         def iterate_with_derivatives(point: Array, _: None) -> tuple[Array, tuple[Array, Array]]:
@@ -335,7 +337,7 @@ def _run_newton_jvp(
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0, 1))
 def _run_newton_implicit(
     converted_map: ClosureConvertedMap,
-    iterations: int,
+    max_iterations: int,
     start: Array,
     tolerance: Array,
     *closed_over_values: Any,
@@ -343,19 +345,19 @@ def _run_newton_implicit(
     """Find the fixed point by Newton's method, with derivatives by the implicit
     function theorem.
     """
-    return _run_newton_loop(converted_map, iterations, start, tolerance, *closed_over_values)
+    return _run_newton_loop(converted_map, max_iterations, start, tolerance, *closed_over_values)
 
 
 @_run_newton_implicit.defjvp
 @with_default_jax_settings
 def _run_newton_implicit_jvp(
-    converted_map: ClosureConvertedMap, iterations: int, primals: tuple, tangents: tuple
+    converted_map: ClosureConvertedMap, max_iterations: int, primals: tuple, tangents: tuple
 ) -> tuple[FixedPointResult, FixedPointResult]:
     """Return the fixed point and its tangent by the implicit function theorem.
 
     The tangent depends on the fixed point. Derivatives of the tangent therefore use the same rule.
     """
-    newton_result = _run_newton_implicit(converted_map, iterations, *primals)
+    newton_result = _run_newton_implicit(converted_map, max_iterations, *primals)
     closed_over_values, closed_over_tangents = tuple(primals[2:]), tuple(tangents[2:])
     _, map_tangent = jax.jvp(
         lambda *arguments: converted_map(newton_result.x, *arguments),

@@ -115,10 +115,12 @@ class _EigenvaluePair(NamedTuple):
 
 def _solve_quadratic_pair(a0: Array, a1: Array) -> _EigenvaluePair:
     """Return the two roots of z^2 + a1 z + a0."""
-    mean = -0.5 * a1
-    discriminant = mean * mean - a0
+    pair_mean = -0.5 * a1
+    discriminant = pair_mean * pair_mean - a0
     return _EigenvaluePair(
-        mean, _differentiable_square_root(discriminant), _differentiable_square_root(-discriminant)
+        pair_mean,
+        _differentiable_square_root(discriminant),
+        _differentiable_square_root(-discriminant),
     )
 
 
@@ -197,9 +199,10 @@ def floquet_multipliers(matrix: RealSquareMatrix) -> Complex[Array, "... n"]:
     isolated_eigenvalues, remaining_pair = _split_into_isolated_and_pair(matrix)
     eigenvalues = [lax.complex(x, jnp.zeros_like(x)) for x in isolated_eigenvalues]
     if remaining_pair is not None:
-        mean, real_offset, imaginary_offset = remaining_pair
+        pair_mean, real_offset, imaginary_offset = remaining_pair
         eigenvalues += [
-            lax.complex(mean + sign * real_offset, sign * imaginary_offset) for sign in (1.0, -1.0)
+            lax.complex(pair_mean + offset_sign * real_offset, offset_sign * imaginary_offset)
+            for offset_sign in (1.0, -1.0)
         ]
     return _sort_eigenvalues_by_modulus(jnp.stack(eigenvalues, -1))
 
@@ -300,8 +303,8 @@ def has_double_multiplier(
     isolated_eigenvalues, remaining_pair = _split_into_isolated_and_pair(matrix)
     if remaining_pair is None:
         return jnp.zeros(matrix.shape[:-2], bool)
-    mean, real_offset, imaginary_offset = remaining_pair
-    real_eigenvalues = [*isolated_eigenvalues, mean + real_offset, mean - real_offset]
+    pair_mean, real_offset, imaginary_offset = remaining_pair
+    real_eigenvalues = [*isolated_eigenvalues, pair_mean + real_offset, pair_mean - real_offset]
     is_complex_pair = imaginary_offset > 0.0
     eigenvalue_moduli = jnp.sort(jnp.abs(jnp.stack(real_eigenvalues, -1)), -1)
     has_equal_real_moduli = (

@@ -120,11 +120,11 @@ def locate_function_zeros(
     search ends when every bracket is narrower than `max_bracket_width` or has an exact root. If the
     function is NaN at a location, that location is treated as having the sign of location 1.
     """
-    values_at_zero, values_at_one = end_values
+    values_at_fraction_0, values_at_fraction_1 = end_values
     # The rows are the newest location, the end with the other sign, and the location replaced by
     # the newest one.
     locations = np.outer((0.0, 1.0, 1.0), np.ones_like(max_bracket_width))
-    function_values = np.stack([values_at_zero, values_at_one, values_at_one])
+    function_values = np.stack([values_at_fraction_0, values_at_fraction_1, values_at_fraction_1])
     is_sign_jump, n_rounds, n_sections = (
         np.zeros(len(max_bracket_width), bool),
         0,
@@ -152,7 +152,7 @@ def locate_function_zeros(
         )
         is_undefined = np.isnan(section_values_matrix)
         section_values_matrix = np.where(
-            is_undefined, values_at_one[bracket_indices], section_values_matrix
+            is_undefined, values_at_fraction_1[bracket_indices], section_values_matrix
         )
         proposal_values = section_values_matrix[: len(smooth_brackets)]
         section_values = section_values_matrix[len(smooth_brackets) :].reshape(-1, n_sections - 1)
@@ -170,7 +170,9 @@ def locate_function_zeros(
         locations[1, smooth_brackets[proposal_values == 0.0]] = proposed_locations[
             proposal_values == 0.0
         ]
-        is_left_side = np.sign(section_values) != np.sign(values_at_one[jump_brackets])[:, None]
+        is_left_side = (
+            np.sign(section_values) != np.sign(values_at_fraction_1[jump_brackets])[:, None]
+        )
         # The root lies between the last location with the sign of location 0 and the next location.
         last_left_index = np.sum(np.cumprod(is_left_side, 1), 1)
         locations[:2, jump_brackets] = section_ends[

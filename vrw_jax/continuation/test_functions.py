@@ -98,15 +98,17 @@ class TestFunctionCurve(AbstractContinuationProblem):
         fraction_change = -newton_step.test_function_value / derivative_by_fraction
         fraction_tangent = -derivative_by_first_parameter / derivative_by_fraction
         first_tangent, second_tangent = newton_step.tangents_by_parameter
-        add_second_tangent = lambda parameter_change: (
+        combine_tangent_leaves = lambda parameter_change: (
             lambda first_leaf, second_leaf: (
                 first_leaf + parameter_range * parameter_change * second_leaf
             )
         )
         correction = jax.tree.map(
-            add_second_tangent(fraction_change), newton_step.newton_correction, second_tangent
+            combine_tangent_leaves(fraction_change), newton_step.newton_correction, second_tangent
         )
-        tangent = jax.tree.map(add_second_tangent(fraction_tangent), first_tangent, second_tangent)
+        tangent = jax.tree.map(
+            combine_tangent_leaves(fraction_tangent), first_tangent, second_tangent
+        )
         # The fraction adds a multiplier of zero, which has no effect.
         jacobian = jnp.pad(newton_step.return_map_jacobian, (0, 1))
         return NewtonStep(

@@ -67,12 +67,12 @@ def find_attracting_gaits(gait_finder: Any, parameter_values: Any) -> tuple[np.n
 def _find_gaits_from_starts(
     gait_finder: Any,
     parameter_values: np.ndarray,
-    compute_start_states: Callable[[WheelParams], np.ndarray],
+    start_state_function: Callable[[WheelParams], np.ndarray],
 ) -> tuple[np.ndarray, Any]:
     """Find the attracting gaits that walks from given starts reach.
 
     Return the index of the wheel to which each gait belongs, and the gaits. The walks begin at the
-    states that `compute_start_states` returns. The gaits of a wheel are in the order of increasing
+    states that `start_state_function` returns. The gaits of a wheel are in the order of increasing
     speed.
     """
     n_wheels = len(parameter_values)
@@ -81,7 +81,7 @@ def _find_gaits_from_starts(
             with_default_jax_settings(gait_finder.precompile_newton_programs), parameter_values[:1]
         )
         candidate_wheel_indices, walk_states, _ = walk_to_gaits(
-            gait_finder, parameter_values, compute_start_states
+            gait_finder, parameter_values, start_state_function
         )
     candidate_gaits = gait_finder.find_cycles_near(
         parameter_values[candidate_wheel_indices], walk_states
@@ -156,8 +156,8 @@ def find_slow_gaits(gait_finder: Any, parameter_values: Any) -> Any:
     for each of 1,200 random wheels.
     """
     parameter_values = np.asarray(parameter_values)
-    compute_slow_start = lambda params: compute_walk_starts(params)[:1]
-    _, slow_gaits = _find_gaits_from_starts(gait_finder, parameter_values, compute_slow_start)
+    slow_start_function = lambda params: compute_walk_starts(params)[:1]
+    _, slow_gaits = _find_gaits_from_starts(gait_finder, parameter_values, slow_start_function)
     missing_wheels = np.flatnonzero(np.asarray(slow_gaits.outcome) != Outcome.STEPPED)
     if len(missing_wheels):
         other_wheel_indices, other_gaits = find_attracting_gaits(

@@ -128,23 +128,21 @@ class CollocationFinder(AbstractGaitFinder):
             return jnp.where(is_scuffing, step.measures()["clearance_sls2"], measure_value)
         return measure_value
 
-    def find_cycle(self, params: WheelParams, search_guess: Any = None) -> LimitCycle:
-        if isinstance(search_guess, LimitCycle) and search_guess.system == self.collocation_system:
-            search_guess = search_guess.collocation_state
-        elif search_guess is not None and not isinstance(search_guess, CollocationState):
+    def find_cycle(self, params: WheelParams, cycle_guess: Any = None) -> LimitCycle:
+        if isinstance(cycle_guess, LimitCycle) and cycle_guess.system == self.collocation_system:
+            cycle_guess = cycle_guess.collocation_state
+        elif cycle_guess is not None and not isinstance(cycle_guess, CollocationState):
             section_state = (
-                search_guess.section_state
-                if isinstance(search_guess, AbstractCycle)
-                else search_guess
+                cycle_guess.section_state if isinstance(cycle_guess, AbstractCycle) else cycle_guess
             )
             params, collocation_state, _, _ = convert_step_arguments(
                 params, section_state, None, None
             )
-            search_guess = self.guess_cycle_from_state(
+            cycle_guess = self.guess_cycle_from_state(
                 *lax.stop_gradient((params, collocation_state))
             )
         return dataclasses.replace(
-            solve_limit_cycle(params, self.collocation_system, search_guess), model=self.model
+            solve_limit_cycle(params, self.collocation_system, cycle_guess), model=self.model
         )
 
     def guess_cycle_from_state(
@@ -197,9 +195,9 @@ class CollocationFinder(AbstractGaitFinder):
         )
         return jax.tree.map(lambda x: x[..., 0], predicted_start)
 
-    def find_gait(self, parameter_values: ParameterValues, start_state: CollocationState) -> Gait:
+    def find_gait(self, parameter_values: ParameterValues, cycle_guess: CollocationState) -> Gait:
         cycle, cycle_derivatives = compute_cycle_and_derivatives(
-            self.collocation_system, parameter_values, start_state
+            self.collocation_system, parameter_values, cycle_guess
         )
         section_state, section_state_derivatives = (
             cycle.section_state,

@@ -117,7 +117,7 @@ def _compute_monodromy_tangents(
     identity_matrix = jnp.eye(len(parameters), dtype=parameters.dtype)[..., None]
     parameter_tangents = jnp.broadcast_to(identity_matrix, (len(parameters), *parameters.shape))
 
-    def monodromy_tangent(indices_and_weights: tuple) -> tuple[Array, Array]:
+    def compute_monodromy_tangent(indices_and_weights: tuple) -> tuple[Array, Array]:
         (
             first_parameter_index,
             second_parameter_index,
@@ -141,7 +141,8 @@ def _compute_monodromy_tangents(
         )
 
     monodromy_matrices, monodromy_tangents = lax.map(
-        monodromy_tangent, (first_parameter_indices, second_parameter_indices, *direction_weights)
+        compute_monodromy_tangent,
+        (first_parameter_indices, second_parameter_indices, *direction_weights),
     )
     tangent_by_parameter = dict(
         zip(unscaled_parameter_indices, monodromy_tangents[:-1], strict=True)
@@ -308,10 +309,10 @@ def solve_cycle_with_derivatives(
 
     The state is differentiable with respect to the parameters. The guess has no derivatives.
     """
-    search_function = functools.partial(run_search_attempts, collocation_system)
+    derivative_free_search = functools.partial(run_search_attempts, collocation_system)
     make_output_template = lambda parameters, search_start, *_: search_start
     batched_search = compile_batch_function(
-        search_function,
+        derivative_free_search,
         make_output_template,
         ("search", collocation_system),
         collocation_system.cycle_options.batch_size,

@@ -30,32 +30,34 @@ from vrw_jax.wheel import (
 
 @functools.partial(jax.jit, static_argnums=0)
 def compute_force_peaks(
-    system: CollocationSystem, parameters: Array, solution: CollocationSolution
+    collocation_system: CollocationSystem,
+    parameters: Array,
+    collocation_solution: CollocationSolution,
 ) -> dict[str, Scalar]:
     """Return the `measures.FORCE_PEAK_MEASURES` of a cycle by name.
 
     Each measure is the largest value over the gait steps of the cycle.
     """
-    wheel_symbols = make_wheel_from_parameters(parameters, system.n_legs).symbols()
+    wheel_symbols = make_wheel_from_parameters(parameters, collocation_system.n_legs).symbols()
     peaks_by_step, (_, phase_points_by_step) = (
         [],
-        system.evaluate_phase_points(parameters, solution),
+        collocation_system.evaluate_phase_points(parameters, collocation_solution),
     )
     for step_index, phase_points in enumerate(phase_points_by_step):
-        phases = make_phases(
+        wheel_phases = make_phases(
             wheel_symbols, phase_points[0].start_point.held_constants[0], stop_at_lift_off=False
         )
-        phase_durations = solution.durations[step_index]
+        phase_durations = collocation_solution.durations[step_index]
         fore_force_extrema, total_force_extrema = [], []
         for phase_index, (phase, points_of_phase) in enumerate(
-            zip(phases, phase_points, strict=True)
+            zip(wheel_phases, phase_points, strict=True)
         ):
             collocated_phase = CollocatedPhaseMotion.from_node_accelerations(
-                system.phase_meshes[phase_index],
+                collocation_system.phase_meshes[phase_index],
                 jnp.stack(points_of_phase.start_point.q),
                 jnp.stack(points_of_phase.start_point.v),
                 phase_durations[phase_index],
-                solution.accelerations[phase_index][step_index],
+                collocation_solution.accelerations[phase_index][step_index],
             )
             fore_force_extrema.append(
                 _find_force_extrema(phase, collocated_phase, with_rear_foot=False)
@@ -71,7 +73,7 @@ def compute_force_peaks(
             for force_extrema in (fore_force_extrema, total_force_extrema)
         )
         end_point = phase_points[-1].end_point
-        landing = transitions.resolve_landing(wheel_symbols, end_point.q[0], *end_point.v)
+        landing_result = transitions.resolve_landing(wheel_symbols, end_point.q[0], *end_point.v)
         peaks_by_step.append(
             {
                 "n_force_peaks": fore_peaks.n_peaks,
@@ -80,7 +82,7 @@ def compute_force_peaks(
                 "second_peak_rate": fore_peaks.second_peak_rate,
                 "n_total_force_peaks": total_peaks.n_peaks,
                 "peak_total_force": total_peaks.peak_force,
-                "landing_impulse": landing.fore_impulse.normal,
+                "landing_impulse": landing_result.fore_impulse.normal,
             }
         )
     return jax.tree.map(
@@ -124,10 +126,10 @@ def _summarize_force_extrema(
     phase_start_times = jnp.cumsum(phase_durations) - phase_durations
     shifted_extrema = [
         step_extrema._replace(
-            extremum_times=step_extrema.extremum_times + start,
-            rate_extremum_times=step_extrema.rate_extremum_times + start,
+            extremum_times=step_extrema.extremum_times + phase_start_time,
+            rate_extremum_times=step_extrema.rate_extremum_times + phase_start_time,
         )
-        for step_extrema, start in zip(extrema_of_phases, phase_start_times, strict=True)
+        for step_extrema, phase_start_time in zip(extrema_of_phases, phase_start_times, strict=True)
     ]
     step_extrema = jax.tree.map(lambda *phase_parts: jnp.concatenate(phase_parts), *shifted_extrema)
     peak_forces = jnp.where(

@@ -458,10 +458,12 @@ def _find_walk_end_states(
         )
         walk_end_states[unsettled_wheels[is_guess_usable]] = guess_section_states[is_guess_usable]
         unsettled_wheels = unsettled_wheels[~is_guess_usable]
-    for compute_starts in (compute_walk_starts, compute_fallback_walk_starts):
+    for start_state_function in (compute_walk_starts, compute_fallback_walk_starts):
         if not len(unsettled_wheels):
             break
-        walk_ends = walk_to_gaits(gait_finder, parameter_values[unsettled_wheels], compute_starts)
+        walk_ends = walk_to_gaits(
+            gait_finder, parameter_values[unsettled_wheels], start_state_function
+        )
         for wheel_index, walk_end_state, period_defect in zip(
             unsettled_wheels[walk_ends.wheel_indices], *walk_ends[1:], strict=True
         ):

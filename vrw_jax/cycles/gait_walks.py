@@ -175,7 +175,7 @@ class DistinctWalkEnds(NamedTuple):
 def walk_to_gaits(
     gait_finder: Any,
     parameter_values: np.ndarray,
-    compute_start_states: Callable[[WheelParams], np.ndarray],
+    start_state_function: Callable[[WheelParams], np.ndarray],
     walk_options: GaitWalkOptions = GAIT_WALK_OPTIONS,
 ) -> DistinctWalkEnds:
     """Simulate walks of each wheel, and return the distinct states at their ends.
@@ -188,11 +188,11 @@ def walk_to_gaits(
         gait_finder: finder of gaits, whose model computes the gait steps.
         parameter_values: parameters of each wheel, shape (wheels, n_values), in the order of
             `AbstractWheel.collect_parameter_values`.
-        compute_start_states: function that maps wheels to section states, shape (starts, wheels,
+        start_state_function: function that maps wheels to section states, shape (starts, wheels,
             3).
         walk_options: numerical options of the walks.
     """
-    start_section_states = compute_start_states(
+    start_section_states = start_state_function(
         _split_parameter_values(gait_finder, parameter_values)[1]
     )
     n_wheels, n_coordinates = len(parameter_values), count_section_coordinates(gait_finder)
@@ -208,7 +208,7 @@ def walk_to_gaits(
     period_defects = np.full(len(walk_wheel_indices), np.inf)
     is_walk_duplicate = np.zeros(len(walk_wheel_indices), bool)
     section_units = stack_section_units(gait_finder.model, values_by_walk, gait_finder.n_legs)
-    scale_states = lambda section_states: (section_states / section_units)[:, :n_coordinates]
+    state_scaler = lambda section_states: (section_states / section_units)[:, :n_coordinates]
     active_walks = np.arange(len(walk_wheel_indices))
     for n_steps in walk_options.steps_by_round:
         end_states, walk_outcomes = _walk_wheels(
@@ -225,7 +225,7 @@ def walk_to_gaits(
             gait_finder, values_by_walk[active_walks], section_states[active_walks], walk_options
         )
         is_walk_duplicate |= _find_duplicate_walks(
-            scale_states(section_states),
+            state_scaler(section_states),
             period_defects,
             n_wheels,
             walk_options.max_settled_defect,
@@ -236,7 +236,7 @@ def walk_to_gaits(
         if not len(active_walks):
             break
     is_walk_duplicate = _find_duplicate_walks(
-        scale_states(section_states),
+        state_scaler(section_states),
         period_defects,
         n_wheels,
         walk_options.max_newton_start_defect,

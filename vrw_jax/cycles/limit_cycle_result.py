@@ -309,15 +309,15 @@ _attach_monodromy_compiled = jax.jit(attach_monodromy_derivatives, static_argnum
 
 
 def solve_limit_cycle(
-    params: WheelParams, collocation_system: CollocationSystem, guess: CollocationState | None
+    params: WheelParams, collocation_system: CollocationSystem, cycle_guess: CollocationState | None
 ) -> LimitCycle:
     """Find the cycle of one wheel by the search, without fallbacks."""
-    find_cycle = _solve_limit_cycle if is_inside_jit() else _solve_limit_cycle_compiled
-    return find_cycle(params, collocation_system, guess)
+    cycle_solver = _solve_limit_cycle if is_inside_jit() else _solve_limit_cycle_compiled
+    return cycle_solver(params, collocation_system, cycle_guess)
 
 
 def _solve_limit_cycle(
-    params: WheelParams, collocation_system: CollocationSystem, guess: CollocationState | None
+    params: WheelParams, collocation_system: CollocationSystem, cycle_guess: CollocationState | None
 ) -> LimitCycle:
     """Find the cycle of one wheel by the search, outside compiled code."""
     is_in_domain = params.is_in_domain()
@@ -333,7 +333,7 @@ def _solve_limit_cycle(
     )
     parameters = stack_parameters(in_domain_params)
     collocation_state, (monodromy_value, newton_residual, n_newton_iterations) = (
-        solve_cycle_with_derivatives(collocation_system, parameters, guess)
+        solve_cycle_with_derivatives(collocation_system, parameters, cycle_guess)
     )
     has_cycle = is_in_domain & (collocation_state.has_cycle > 0.5)
     # Inputs and outputs are masked, so that measures and derivatives are zero if there is no cycle.
@@ -447,10 +447,10 @@ def guess_cycle_from_walk(
     collocation_system: CollocationSystem, params: WheelParams, walk_samples: WalkSamples
 ) -> CollocationState:
     """Compute the guess of a cycle from the samples of a walk with `period_n` gait steps."""
-    s = params.symbols()
+    wheel_symbols = params.symbols()
 
     def sample_node_accelerations(foot_distance: Scalar, sample_states: Array) -> tuple[Array, ...]:
-        wheel_phases = make_phases(s, foot_distance, stop_at_lift_off=False)
+        wheel_phases = make_phases(wheel_symbols, foot_distance, stop_at_lift_off=False)
         accelerations_by_phase = []
         sample_times = jnp.linspace(0.0, 1.0, sample_states.shape[1])
         for wheel_phase, phase_mesh, phase_samples in zip(

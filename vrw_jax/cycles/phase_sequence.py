@@ -33,7 +33,7 @@ from vrw_jax.wheel import (
     transitions,
 )
 
-N_LANE_SYMBOLS = 12
+N_SYMBOL_CONSTANTS = 12
 """Number of those fields of `Symbols` that vary between wheels.
 
 The other fields follow from the number of legs.
@@ -46,14 +46,14 @@ def compute_phase_constants(n_legs: int, *parameters: Elementwise) -> PhaseConst
     The arguments are the parameters in the order of PARAMETER_NAMES.
     """
     wheel_symbols: tuple[Any, ...] = compute_symbols(n_legs, *parameters)
-    return wheel_symbols[:N_LANE_SYMBOLS]
+    return wheel_symbols[:N_SYMBOL_CONSTANTS]
 
 
 def _restore_symbols(n_legs: int, phase_constants: PhaseConstants) -> Symbols:
     """Return all symbols of a wheel, computed from the symbols that vary between wheels."""
     leg_angle = 2.0 * math.pi / n_legs
     symbol_values: tuple[Any, ...] = (
-        *phase_constants[:N_LANE_SYMBOLS],
+        *phase_constants[:N_SYMBOL_CONSTANTS],
         n_legs,
         math.sin(leg_angle),
         math.cos(leg_angle),
@@ -68,7 +68,7 @@ def _has_line_turn(phase_constants: PhaseConstants) -> bool:
 
     The unit of the angle is rad.
     """
-    return len(phase_constants) > N_LANE_SYMBOLS
+    return len(phase_constants) > N_SYMBOL_CONSTANTS
 
 
 def _make_collocation_phase(
@@ -81,7 +81,7 @@ def _make_collocation_phase(
         phase_constants: PhaseConstants, phase_point: PhasePoint
     ) -> tuple[AbstractPhase, Motion]:
         line_turn = (
-            compute_sine_cosine(phase_constants[N_LANE_SYMBOLS])
+            compute_sine_cosine(phase_constants[N_SYMBOL_CONSTANTS])
             if _has_line_turn(phase_constants)
             else ()
         )
@@ -123,7 +123,9 @@ def _make_collocation_phase(
         (theta, _), (dtheta, dL1) = phase_point.q, phase_point.v
         s = _restore_symbols(n_legs, phase_constants)
         theta = (
-            theta - phase_constants[N_LANE_SYMBOLS] if _has_line_turn(phase_constants) else theta
+            theta - phase_constants[N_SYMBOL_CONSTANTS]
+            if _has_line_turn(phase_constants)
+            else theta
         )
         return PhasePoint((), transitions.resolve_two_foot_landing(s, theta, dtheta, dL1), ())
 

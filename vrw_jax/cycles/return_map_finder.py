@@ -262,9 +262,9 @@ class ReturnMapFinder(AbstractReturnMapFinder):
         )
 
     @eqx.filter_jit
-    def find_gait(self, parameter_values: ParameterValues, start_state: Array) -> Gait:
+    def find_gait(self, parameter_values: ParameterValues, cycle_guess: Array) -> Gait:
         cycle, parameter_jacobian = evaluate_with_jacobian(
-            lambda parameter_values: self.find_cycle_from_values(parameter_values, start_state),
+            lambda parameter_values: self.find_cycle_from_values(parameter_values, cycle_guess),
             parameter_values,
         )
         cycle_derivatives: Any = move_derivative_axis_first(parameter_jacobian)

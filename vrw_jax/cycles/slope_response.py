@@ -111,7 +111,9 @@ def compute_sensitivity_norms(slope_response: SlopeResponse) -> SensitivityNormP
     later_steps_squared = jnp.einsum("mi,ij,mj->m", C, P, C)
     beginning_step_response = C @ B0 + D1
     sensitivity_norm = _safe_square_root(D0**2 + beginning_step_response**2 + later_steps_squared)
-    infinite_if_unstable = lambda sensitivity: jnp.where(is_stable, sensitivity, jnp.inf)
+    infinite_if_unstable = lambda unbounded_sensitivity: jnp.where(
+        is_stable, unbounded_sensitivity, jnp.inf
+    )
     return SensitivityNormParts(
         infinite_if_unstable(sensitivity_norm),
         D0,
@@ -126,14 +128,16 @@ def invert_by_elimination(square_matrix: Float[Array, "n n"]) -> Float[Array, "n
     LAPACK's batched solver uses threads of the pool on which XLA runs the program. If two such
     programs run at a time, as in a scan on two cores, they block each other (jaxlib 0.10).
     """
-    n = len(square_matrix)
+    matrix_size = len(square_matrix)
     augmented_matrix = jnp.concatenate(
-        [square_matrix, jnp.eye(n, dtype=square_matrix.dtype)], axis=1
+        [square_matrix, jnp.eye(matrix_size, dtype=square_matrix.dtype)], axis=1
     )
 
     def eliminate_column(column_index: Array, augmented_matrix: Array) -> Array:
         pivot_candidates = jnp.where(
-            jnp.arange(n) >= column_index, jnp.abs(augmented_matrix[:, column_index]), -1.0
+            jnp.arange(matrix_size) >= column_index,
+            jnp.abs(augmented_matrix[:, column_index]),
+            -1.0,
         )
         pivot_row_index = jnp.argmax(pivot_candidates)
         pivot_row, row_at_pivot_position = (
@@ -145,13 +149,15 @@ def invert_by_elimination(square_matrix: Float[Array, "n n"]) -> Float[Array, "n
         eliminated_matrix = augmented_matrix - augmented_matrix[:, column_index, None] * pivot_row
         return eliminated_matrix.at[column_index].set(pivot_row)
 
-    return lax.fori_loop(0, n, eliminate_column, augmented_matrix)[:, n:]
+    return lax.fori_loop(0, matrix_size, eliminate_column, augmented_matrix)[:, matrix_size:]
 
 
 def _safe_square_root(squared_value: Array) -> Array:
     """Return the square root of max(squared_value, 0). Its derivative at zero is zero."""
-    is_positive = squared_value > 0.0
-    return jnp.where(is_positive, jnp.sqrt(jnp.where(is_positive, squared_value, 1.0)), 0.0)
+    is_value_positive = squared_value > 0.0
+    return jnp.where(
+        is_value_positive, jnp.sqrt(jnp.where(is_value_positive, squared_value, 1.0)), 0.0
+    )
 
 
 def compute_step_slope_response(

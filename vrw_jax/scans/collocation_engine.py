@@ -54,17 +54,20 @@ class CollocationScanEngine:
     cycle. The two functions are compiled in parallel.
     """
 
-    def __init__(self, request: EvaluationRequest, n_threads: int | None = None) -> None:
-        """Initialize the engine for the measures and options of `request`.
+    def __init__(self, evaluation_request: EvaluationRequest, n_threads: int | None = None) -> None:
+        """Initialize the engine for the measures and options of `evaluation_request`.
 
         - `n_threads`: number of CPU threads, by default one per core.
         """
         variable_names, base_wheel, wheel_model = (
-            request.measure_names,
-            request.base_wheel,
-            request.wheel_model,
+            evaluation_request.measure_names,
+            evaluation_request.base_wheel,
+            evaluation_request.wheel_model,
         )
-        step_options, cycle_options = request.step_options, request.cycle_options
+        step_options, cycle_options = (
+            evaluation_request.step_options,
+            evaluation_request.cycle_options,
+        )
         self._n_threads = count_available_cores() if n_threads is None else n_threads
         self._base_wheel, self._wheel_model, self._step_options = (
             base_wheel,

@@ -51,9 +51,9 @@ VariableColumns = dict[str, np.ndarray]
 class UnilateralScanEngine:
     """Scan engine for unilateral contact and a fixed set of measures."""
 
-    def __init__(self, request: EvaluationRequest, n_threads: int | None = None) -> None:
-        variable_names, base_wheel = request.measure_names, request.base_wheel
-        wheel_model, step_options = request.wheel_model, request.step_options
+    def __init__(self, evaluation_request: EvaluationRequest, n_threads: int | None = None) -> None:
+        variable_names, base_wheel = evaluation_request.measure_names, evaluation_request.base_wheel
+        wheel_model, step_options = evaluation_request.wheel_model, evaluation_request.step_options
         self._base_wheel, self._wheel_model = base_wheel, wheel_model
         self._n_threads = count_available_cores() if n_threads is None else n_threads
         requested_derivatives = tuple(
@@ -197,26 +197,27 @@ The keys are names of measures with unilateral contact.
 class ModelSelectionScanEngine:
     """Scan engine that evaluates each sample with the simplest model valid for it."""
 
-    def __init__(self, request: EvaluationRequest, n_threads: int | None = None) -> None:
+    def __init__(self, evaluation_request: EvaluationRequest, n_threads: int | None = None) -> None:
         self._measure_names, self._base_wheel, self._wheel_model = (
-            request.measure_names,
-            request.base_wheel,
-            request.wheel_model,
+            evaluation_request.measure_names,
+            evaluation_request.base_wheel,
+            evaluation_request.wheel_model,
         )
         self._paper_model = ViscoelasticWheel()
         paper_measure_names = (
             paper_measure
-            for measure_name in request.measure_names
+            for measure_name in evaluation_request.measure_names
             for paper_measure in PAPER_MEASURES_BY_CONTACT_MEASURE.get(
                 measure_name, (measure_name,)
             )
         )
-        paper_request = request._replace(
+        paper_request = evaluation_request._replace(
             measure_names=tuple(dict.fromkeys(paper_measure_names)), wheel_model=self._paper_model
         )
         self._paper_engine = CollocationScanEngine(paper_request, n_threads)
         self._unilateral_engine = UnilateralScanEngine(
-            request._replace(wheel_model=request.wheel_model.fallback_model), n_threads
+            evaluation_request._replace(wheel_model=evaluation_request.wheel_model.fallback_model),
+            n_threads,
         )
 
     def __call__(self, sample_columns: SampleColumnMapping) -> VariableColumns:
@@ -285,22 +286,24 @@ class ModelSelectionScanEngine:
 
 
 @jax.jit
-def _find_batch_selection_reasons(measures: dict[str, Array], friction_difference: Array) -> Array:
+def _find_batch_selection_reasons(
+    step_measures: dict[str, Array], friction_difference: Array
+) -> Array:
     """Return `ModelChoice.reason_code` for each viscoelastic gait step of a batch."""
-    return find_selection_reason(measures, friction_difference)[0]
+    return find_selection_reason(step_measures, friction_difference)[0]
 
 
 class ToleranceScanEngine:
     """Scan engine that computes measures to a tolerance. See `vrw.measure_to_tolerance`."""
 
-    def __init__(self, request: EvaluationRequest) -> None:
-        assert request.error_tolerance is not None
+    def __init__(self, evaluation_request: EvaluationRequest) -> None:
+        assert evaluation_request.error_tolerance is not None
         self._measure_names, self._base_wheel, self._wheel_model = (
-            request.measure_names,
-            request.base_wheel,
-            request.wheel_model,
+            evaluation_request.measure_names,
+            evaluation_request.base_wheel,
+            evaluation_request.wheel_model,
         )
-        self._error_tolerance = request.error_tolerance
+        self._error_tolerance = evaluation_request.error_tolerance
 
     def __call__(self, sample_columns: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
         """Return the value of each variable for all samples, by the name of the variable.
@@ -341,16 +344,19 @@ class PassageScanEngine:
     """
 
     def __init__(
-        self, request: EvaluationRequest, slope_standard_deviation: float, gait_engine: Any
+        self,
+        evaluation_request: EvaluationRequest,
+        slope_standard_deviation: float,
+        gait_engine: Any,
     ) -> None:
         self._base_wheel, self._wheel_model, self._slope_standard_deviation = (
-            request.base_wheel,
-            request.wheel_model,
+            evaluation_request.base_wheel,
+            evaluation_request.wheel_model,
             slope_standard_deviation,
         )
         self._passage_measure_names = tuple(
             measure_name
-            for measure_name in request.measure_names
+            for measure_name in evaluation_request.measure_names
             if measure_name in PASSAGE_MEASURES
         )
         self._gait_engine = gait_engine
@@ -409,7 +415,7 @@ class PassageScanEngine:
 
 
 def make_scan_engine(
-    request: EvaluationRequest, n_threads: int | None = None
+    evaluation_request: EvaluationRequest, n_threads: int | None = None
 ) -> (
     CollocationScanEngine
     | UnilateralScanEngine
@@ -418,18 +424,24 @@ def make_scan_engine(
     | PassageScanEngine
 ):
     """Return the engine that computes the measures of an `EvaluationRequest`."""
-    if request.error_tolerance is not None:
-        return ToleranceScanEngine(request)
-    scan_engine_class: Any = SCAN_ENGINE_CLASSES[request.wheel_model.capabilities.gait_method]
-    if request.slope_standard_deviation is None:
-        return scan_engine_class(request, n_threads)
+    if evaluation_request.error_tolerance is not None:
+        return ToleranceScanEngine(evaluation_request)
+    scan_engine_class: Any = SCAN_ENGINE_CLASSES[
+        evaluation_request.wheel_model.capabilities.gait_method
+    ]
+    if evaluation_request.slope_standard_deviation is None:
+        return scan_engine_class(evaluation_request, n_threads)
     gait_measure_names = tuple(
         measure_name
-        for measure_name in request.measure_names
+        for measure_name in evaluation_request.measure_names
         if measure_name not in PASSAGE_MEASURES
     )
-    gait_engine = scan_engine_class(request._replace(measure_names=gait_measure_names), n_threads)
-    return PassageScanEngine(request, request.slope_standard_deviation, gait_engine)
+    gait_engine = scan_engine_class(
+        evaluation_request._replace(measure_names=gait_measure_names), n_threads
+    )
+    return PassageScanEngine(
+        evaluation_request, evaluation_request.slope_standard_deviation, gait_engine
+    )
 
 
 SCAN_ENGINE_CLASSES = {

@@ -138,7 +138,7 @@ def sobol_indices(
             stacklevel=2,
         )
     index_variables: dict[str, tuple] = {}
-    for i, (measure_name, index_label) in enumerate(
+    for measure_index, (measure_name, index_label) in enumerate(
         (("first_order", "first-order"), ("total", "total"))
     ):
         index_attributes = {"units": "1", "long_name": f"{index_label} Sobol' index"}
@@ -149,7 +149,7 @@ def sobol_indices(
         ):
             index_variables[measure_name + index_suffix] = (
                 ("measure", "parameter"),
-                interval_bound_values[i],
+                interval_bound_values[measure_index],
                 index_attributes,
             )
     index_variables["is_constant_measure"] = (
@@ -179,10 +179,10 @@ class _SobolIndexEstimator:
         """Return whether each measure varies only by round-off between the samples, shape
         (measures,).
         """
-        has_small_spread: np.ndarray = (
+        is_spread_small: np.ndarray = (
             np.ptp(sample_values[:2], axis=(0, 2)) <= self.roundoff_spreads
         )
-        return has_small_spread
+        return is_spread_small
 
     def __call__(self, row_indices: np.ndarray) -> np.ndarray:
         """Return the indices, estimated from the rows at `row_indices`, shape (2, measures,

@@ -437,23 +437,23 @@ def _open_zarr_group(
     raise AssertionError
 
 
-def _arrange_requested_variables(dataset: xr.Dataset) -> xr.Dataset:
+def _arrange_requested_variables(stored_dataset: xr.Dataset) -> xr.Dataset:
     """Return the dataset with the requested variables first, in the requested order and with the
     requested names.
 
     A file name cannot be "d speed / d damping", so the array of such a variable has another name in
     a store.
     """
-    requested_text = dataset.attrs.get(REQUESTED_MEASURES_ATTRIBUTE)
+    requested_text = stored_dataset.attrs.get(REQUESTED_MEASURES_ATTRIBUTE)
     requested_measures = (
         str(requested_text).split(", ")
         if requested_text
-        else read_scan_manifest(dataset.attrs).get("measures", [])
+        else read_scan_manifest(stored_dataset.attrs).get("measures", [])
     )
     requested_name_by_variable = {
         canonicalize_variable_name(variable_name): variable_name
         for variable_name in reversed(requested_measures)
-        if canonicalize_variable_name(variable_name) in dataset
+        if canonicalize_variable_name(variable_name) in stored_dataset
     }
     variables_in_order = list(dict.fromkeys(map(canonicalize_variable_name, requested_measures)))
     ordered_variables = dict.fromkeys(
@@ -463,10 +463,10 @@ def _arrange_requested_variables(dataset: xr.Dataset) -> xr.Dataset:
                 for variable_name in variables_in_order
                 if variable_name in requested_name_by_variable
             ),
-            *map(str, dataset.data_vars),
+            *map(str, stored_dataset.data_vars),
         ]
     )
-    return dataset[list(ordered_variables)].rename(
+    return stored_dataset[list(ordered_variables)].rename(
         {
             variable_name: requested_name_by_variable[variable_name]
             for variable_name in requested_name_by_variable

@@ -160,8 +160,10 @@ def explore_starts(
         normalized_parameters = np.where(
             is_trial_accepted[:, None], trial_parameters, normalized_parameters
         )
-        accepted_leaf_selector = lambda new_leaf, old_leaf, accepted=is_trial_accepted: jnp.where(
-            accepted.reshape(-1, *(1,) * (jnp.ndim(new_leaf) - 1)), new_leaf, old_leaf
+        accepted_leaf_selector = lambda new_leaf, old_leaf, is_start_accepted=is_trial_accepted: (
+            jnp.where(
+                is_start_accepted.reshape(-1, *(1,) * (jnp.ndim(new_leaf) - 1)), new_leaf, old_leaf
+            )
         )
         current_evaluation = jax.tree.map(
             accepted_leaf_selector, trial_evaluation, current_evaluation
@@ -169,7 +171,11 @@ def explore_starts(
     constraint_slacks, _ = _compute_slacks_and_jacobians(
         current_evaluation, free_indices, bound_widths, min_constraint_values
     )
-    end_objectives = np.where(has_active_gait, np.asarray(current_evaluation.values)[:, 0], np.nan)
+    end_objectives = np.where(
+        has_active_gait,
+        np.asarray(current_evaluation.objective_and_constraint_values)[:, 0],
+        np.nan,
+    )
     max_violations = compute_max_violation(constraint_slacks, slack_scales)
     penalized_objectives = (
         end_objectives
@@ -194,8 +200,10 @@ def are_starts_on_gait(gait_evaluation: GaitEvaluation) -> np.ndarray:
 
 def _are_evaluations_finite(gait_evaluation: GaitEvaluation, free_indices: list[int]) -> np.ndarray:
     """Return, for each start, whether objective, constraints and their derivatives are finite."""
-    free_jacobian = np.asarray(gait_evaluation.jacobian)[:, free_indices]
-    return np.isfinite(gait_evaluation.values).all(-1) & np.isfinite(free_jacobian).all((-1, -2))
+    free_jacobian = np.asarray(gait_evaluation.parameter_jacobian)[:, free_indices]
+    return np.isfinite(gait_evaluation.objective_and_constraint_values).all(-1) & np.isfinite(
+        free_jacobian
+    ).all((-1, -2))
 
 
 def _compute_objective_gradients(
@@ -205,7 +213,7 @@ def _compute_objective_gradients(
 
     Its shape is (starts, free).
     """
-    return np.asarray(gait_evaluation.jacobian)[:, free_indices, 0] * bound_widths
+    return np.asarray(gait_evaluation.parameter_jacobian)[:, free_indices, 0] * bound_widths
 
 
 def _compute_slacks_and_jacobians(
@@ -220,9 +228,12 @@ def _compute_slacks_and_jacobians(
     The shapes are (starts, constraints) and (starts, constraints, free).
     """
     slack_jacobians = (
-        np.swapaxes(np.asarray(gait_evaluation.jacobian)[:, free_indices, 1:], 1, 2) * bound_widths
+        np.swapaxes(np.asarray(gait_evaluation.parameter_jacobian)[:, free_indices, 1:], 1, 2)
+        * bound_widths
     )
-    return np.asarray(gait_evaluation.values)[:, 1:] - min_constraint_values, slack_jacobians
+    return np.asarray(gait_evaluation.objective_and_constraint_values)[
+        :, 1:
+    ] - min_constraint_values, slack_jacobians
 
 
 def _are_trials_on_branch(

@@ -235,7 +235,7 @@ def maximize_objective(
         if (
             compute_max_violation(trial.constraint_slacks, slack_scales)
             <= maximization_options.active_bound_tolerance
-            and compute_optimality_conditions(trial, maximization_options).residual <= tolerance
+            and compute_optimality_conditions(trial, maximization_options).kkt_residual <= tolerance
         ):
             raise _OptimumReachedError(trial)
         return trial
@@ -245,16 +245,16 @@ def maximize_objective(
         maximization_options.full_box_radius,
         maximization_options.full_box_radius,
     )
-    tune_status, n_known_trials = TuneStatus.CONVERGED, 0
+    tune_status, n_trials_before_box = TuneStatus.CONVERGED, 0
     while True:
         # If this box had no new evaluation, the next box is smaller, because the search would be
         # repeated.
         max_box_radius = (
             max_box_radius
-            if len(trial_record.evaluated_trials) > n_known_trials
+            if len(trial_record.evaluated_trials) > n_trials_before_box
             else 0.5 * max_box_radius
         )
-        n_known_trials, box_radius = (
+        n_trials_before_box, box_radius = (
             len(trial_record.evaluated_trials),
             min(box_radius, max_box_radius),
         )
@@ -266,19 +266,24 @@ def maximize_objective(
         box_iterates = [center_trial]
         try:
             slsqp_result = minimize(
-                lambda u: -trial_record.evaluate_trial_once(u).objective / gradient_norm,
+                lambda trial_parameters: (
+                    -trial_record.evaluate_trial_once(trial_parameters).objective / gradient_norm
+                ),
                 center_trial.normalized_parameters,
-                jac=lambda u: (
-                    -trial_record.evaluate_trial_once(u).objective_gradient / gradient_norm
+                jac=lambda trial_parameters: (
+                    -trial_record.evaluate_trial_once(trial_parameters).objective_gradient
+                    / gradient_norm
                 ),
                 bounds=list(zip(lower_box_side, upper_box_side, strict=True)),
                 constraints={
                     "type": "ineq",
-                    "fun": lambda u: (
-                        trial_record.evaluate_trial_once(u).constraint_slacks / slack_scales
+                    "fun": lambda trial_parameters: (
+                        trial_record.evaluate_trial_once(trial_parameters).constraint_slacks
+                        / slack_scales
                     ),
-                    "jac": lambda u: (
-                        trial_record.evaluate_trial_once(u).slack_jacobian / slack_scales[:, None]
+                    "jac": lambda trial_parameters: (
+                        trial_record.evaluate_trial_once(trial_parameters).slack_jacobian
+                        / slack_scales[:, None]
                     ),
                 },
                 method="SLSQP",
@@ -288,8 +293,8 @@ def maximize_objective(
                     else maximization_options.coarse_objective_tolerance,
                     "maxiter": 100,
                 },
-                callback=lambda u, box_iterates=box_iterates: box_iterates.append(
-                    stop_at_optimum(trial_record.evaluate_iterate_once(u))
+                callback=lambda trial_parameters, box_iterates=box_iterates: box_iterates.append(
+                    stop_at_optimum(trial_record.evaluate_iterate_once(trial_parameters))
                 ),
             )
             end_trial = trial_record.evaluate_iterate_once(
@@ -376,7 +381,9 @@ class OptimalityConditions(NamedTuple):
     constraint_prices: np.ndarray  # gain of the objective per unit of a relaxed margin
     lower_bound_prices: np.ndarray  # gain of the objective per width of a relaxed lower bound
     upper_bound_prices: np.ndarray
-    residual: float  # residual of the first-order condition, relative to the objective's gradient
+    kkt_residual: (
+        float  # residual of the first-order condition, relative to the objective's gradient
+    )
 
 
 def compute_optimality_conditions(

@@ -80,8 +80,10 @@ class GaitEvaluation(NamedTuple):
     """Gait with its objective and constraints. In a batch, the batch axis comes first."""
 
     gait: Gait
-    values: Array  # (1 + n_constraints,): the objective, then the constraints
-    jacobian: Array  # (n_parameters, 1 + n_constraints)
+    objective_and_constraint_values: (
+        Array  # (1 + n_constraints,): the objective, then the constraints
+    )
+    parameter_jacobian: Array  # (n_parameters, 1 + n_constraints)
 
 
 def parse_constraint_margins(

@@ -208,7 +208,7 @@ class TuneProblem:
     free_parameters: tuple[str, ...]
     lower_bounds: np.ndarray
     upper_bounds: np.ndarray
-    margins: dict[str, float]
+    constraint_margins: dict[str, float]
     objective_label: str
     objective_and_constraints: ObjectiveAndConstraints
     gait_finder: AbstractGaitFinder
@@ -232,7 +232,7 @@ class TuneProblem:
         leg.
         """
         constraint_names: list[str] = []
-        for measure_name in self.margins:
+        for measure_name in self.constraint_margins:
             if get_measure(measure_name).leg_dimension:
                 constraint_names += [
                     f"{measure_name}[leg {leg_number}]"
@@ -249,7 +249,7 @@ class TuneProblem:
         """
         return np.array(
             [
-                self.margins[constraint_name.partition("[")[0]]
+                self.constraint_margins[constraint_name.partition("[")[0]]
                 for constraint_name in self.constraint_names
             ]
         )
@@ -280,13 +280,13 @@ class TuneProblem:
         )
         return np.clip((start_values - self.lower_bounds) / self.bound_widths, 0.0, 1.0)
 
-    def evaluate_start_trial(self, u: np.ndarray) -> EvaluatedTrial:
-        """Evaluate the trial with the normalized parameters `u`, from which the maximization
-        starts.
+    def evaluate_start_trial(self, normalized_parameters: np.ndarray) -> EvaluatedTrial:
+        """Evaluate the trial with the parameters `normalized_parameters`, from which the
+        maximization starts.
 
         Raise a ValueError if the trial is unusable.
         """
-        start_trial = self.evaluate_trial(u, None)
+        start_trial = self.evaluate_trial(normalized_parameters, None)
         if not start_trial.has_gait_on_branch:
             raise ValueError(
                 f"the start has no gait to tune ({start_trial.outcome.name}: "
@@ -348,9 +348,10 @@ class TuneProblem:
         is_on_branch: bool,
     ) -> EvaluatedTrial:
         """Return the trial for a gait whose objective and constraints have been evaluated."""
-        objective_and_constraint_values = np.array(gait_evaluation.values)
+        objective_and_constraint_values = np.array(gait_evaluation.objective_and_constraint_values)
         free_jacobian = (
-            np.array(gait_evaluation.jacobian)[self.free_parameter_indices].T * self.bound_widths
+            np.array(gait_evaluation.parameter_jacobian)[self.free_parameter_indices].T
+            * self.bound_widths
         )
         if gait_outcome != Outcome.STEPPED:
             objective_and_constraint_values, free_jacobian = (
@@ -484,9 +485,11 @@ class TuneProblem:
             cycle=best_gait.cycle,
             step=best_gait.step,
             active=tuple(active_constraints),
-            kkt_residual=optimality_conditions.residual,
+            kkt_residual=optimality_conditions.kkt_residual,
             violated_margins=tuple(
-                measure_name for measure_name in violated_names if measure_name not in self.margins
+                measure_name
+                for measure_name in violated_names
+                if measure_name not in self.constraint_margins
             ),
             validation=walk_validation,
             path=self._make_path_dataset(maximization_result),
@@ -520,7 +523,7 @@ class TuneProblem:
                 constraint_name: np.asarray(constraint_value)
                 for constraint_name, constraint_value in step_result.measures().items()
             }
-            for constraint_name, min_value in self.margins.items():
+            for constraint_name, min_value in self.constraint_margins.items():
                 if (
                     measure_name := constraint_name.removeprefix(UPPER_BOUND_PREFIX)
                 ) in step_measures:
@@ -677,14 +680,14 @@ def make_tune_problem(
         objective_function, type(gait_finder).read_measure, tuple(constraint_margins)
     )
     if callable(objective):  # Errors of the objective are raised here, before compilation.
-        abstract_cycle = jax.eval_shape(gait_finder.find_cycle, params)
-        abstract_section_state = jax.ShapeDtypeStruct(
+        cycle_template = jax.eval_shape(gait_finder.find_cycle, params)
+        section_state_template = jax.ShapeDtypeStruct(
             (gait_finder.model.count_section_entries(params),), params.damping.dtype
         )
-        abstract_step = jax.eval_shape(
-            gait_finder.model.take_step, params, abstract_section_state, gait_finder.step_options
+        abstract_step_result = jax.eval_shape(
+            gait_finder.model.take_step, params, section_state_template, gait_finder.step_options
         )
-        jax.eval_shape(objective_and_constraints, abstract_cycle, abstract_step)
+        jax.eval_shape(objective_and_constraints, cycle_template, abstract_step_result)
     return TuneProblem(
         params,
         free_parameters,
