@@ -61,7 +61,7 @@ def format_facts_page(paper_facts: Sequence[PaperFact]) -> str:
         "# The paper's facts",
         "",
         "This page compares every number that the paper publishes with the computed number. "
-        "`vrw reproduce --out results` computes this page and the figures.",
+        "`vrw reproduce --out results` writes this page and the figures.",
         "",
         f"{summarize_paper_facts(paper_facts)}."
         + (
