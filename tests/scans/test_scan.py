@@ -611,7 +611,7 @@ def test_workers_with_another_environment_are_refused(
     monkeypatch.setattr(
         scan_dask, "describe_computing_environment", lambda: next(environments, {"code": "theirs"})
     )
-    monkeypatch.setattr(scan_dask, "_make_worker_engine", lambda _: evaluate_arithmetically)
+    monkeypatch.setattr(scan_dask, "make_worker_engine", lambda _: evaluate_arithmetically)
     with (
         LocalCluster(n_workers=1, processes=False, dashboard_address=None) as cluster,
         connect_dask_workers(cluster.scheduler_address) as executor,
@@ -639,7 +639,7 @@ def test_a_cluster_without_workers_is_reported_and_continues_with_the_first_one(
     from distributed import LocalCluster
 
     monkeypatch.setattr(dask, "MAX_SECONDS_WITHOUT_RESULT", 0.5)
-    monkeypatch.setattr(dask, "_make_worker_engine", lambda _: evaluate_arithmetically)
+    monkeypatch.setattr(dask, "make_worker_engine", lambda _: evaluate_arithmetically)
     run_plan(make_plan(), tmp_path / "alone.zarr", evaluate=evaluate_arithmetically)
     with LocalCluster(n_workers=0, processes=False, dashboard_address=None) as cluster:
         messages: list[str] = []
@@ -661,7 +661,7 @@ def test_a_lost_cluster_gets_one_sentence_and_the_scan_continues_without_it(
 ) -> None:
     from distributed import LocalCluster
 
-    monkeypatch.setattr(dask, "_make_worker_engine", lambda _: evaluate_arithmetically)
+    monkeypatch.setattr(dask, "make_worker_engine", lambda _: evaluate_arithmetically)
     cluster = LocalCluster(n_workers=1, processes=False, dashboard_address=None)
     n_done_at_loss: list[int] = []
 

@@ -422,6 +422,19 @@ def _predict_trial_point(
     return _TrialPoint(corrector_plane, z, fraction, predicted_arc_length, is_range_end)
 
 
+class _TrialVerdict(NamedTuple):
+    """Verdict on a trial point after one Newton iteration.
+
+    If the trial is neither accepted nor failed, another Newton iteration follows.
+    """
+
+    is_accepted: Bool[Array, ""]
+    has_failed: Bool[Array, ""]
+    # whether the trial is accepted despite a turn of more than `max_turn_angle`
+    is_kink: Bool[Array, ""]
+    fraction_rate: Scalar  # derivative of the parameter fraction in the direction of continuation
+
+
 class ContinuationState(NamedTuple):
     """State of the continuation of one branch in one direction."""
 
@@ -436,125 +449,188 @@ class ContinuationState(NamedTuple):
     status_code: Int[Array, ""]
     n_linearizations: Int[Array, ""]
 
+    @classmethod
+    def from_start(
+        cls,
+        problem: AbstractContinuationProblem,
+        options: ArclengthOptions,
+        parameter_bounds: Array,
+        z: ProblemUnknowns,
+        p: Scalar,
+        direction_sign: Scalar,
+    ) -> "ContinuationState":
+        """Return the initial state of one branch, whose first trial point is (z, p)."""
+        section_state = problem.section_state(z)
+        n_section, float_dtype = section_state.shape[0], section_state.dtype
+        zero_step_length, zero_count = jnp.zeros((), float_dtype), jnp.zeros((), jnp.int32)
+        false_flag = jnp.asarray(False)
+        zero_tangent = jax.tree.map(jnp.zeros_like, z)
+        fraction = _compute_parameter_fraction(p, parameter_bounds)
+        initial_point = ContinuationPoint(
+            z,
+            p,
+            zero_tangent,
+            zero_step_length + direction_sign,
+            jnp.zeros((n_section, n_section), float_dtype),
+            false_flag,
+        )
+        trial_point = _TrialPoint(
+            CorrectorPlane(
+                section_state, fraction, jnp.zeros_like(section_state), zero_step_length + 1.0
+            ),
+            z,
+            fraction,
+            zero_step_length,
+            false_flag,
+        )
+        running_status = zero_count + int(ContinuationStatus.RUNNING)
+        jump_suspicion = BranchJumpSuspicion(zero_step_length, false_flag)
+        initial_ds = zero_step_length + options.initial_ds
+        return cls(
+            initial_point,
+            initial_point,
+            initial_point,
+            initial_ds,
+            trial_point,
+            jump_suspicion,
+            zero_count,
+            zero_count,
+            running_status,
+            zero_count,
+        )
 
-class _TrialVerdict(NamedTuple):
-    """Verdict on a trial point after one Newton iteration.
-
-    If the trial is neither accepted nor failed, another Newton iteration follows.
-    """
-
-    is_accepted: Bool[Array, ""]
-    has_failed: Bool[Array, ""]
-    # whether the trial is accepted despite a turn of more than `max_turn_angle`
-    is_kink: Bool[Array, ""]
-    fraction_rate: Scalar  # derivative of the parameter fraction in the direction of continuation
-
-
-def _assess_trial(
-    problem: AbstractContinuationProblem,
-    options: ArclengthOptions,
-    continuation_state: ContinuationState,
-    corrector_state: CorrectorState,
-    direction_sign: Scalar,
-) -> _TrialVerdict:
-    """Assess a trial point after one Newton iteration, and return the verdict."""
-    current_point, trial_point, is_first_point = (
-        continuation_state.current_point,
-        continuation_state.trial_point,
-        continuation_state.n_points == 0,
-    )
-    trial_distance = jnp.maximum(
-        jnp.max(
+    def assess_trial(
+        self,
+        problem: AbstractContinuationProblem,
+        options: ArclengthOptions,
+        corrector_state: CorrectorState,
+        direction_sign: Scalar,
+    ) -> _TrialVerdict:
+        """Assess a trial point after one Newton iteration, and return the verdict."""
+        current_point, trial_point = self.current_point, self.trial_point
+        is_first_point = self.n_points == 0
+        trial_distance = jnp.maximum(
+            jnp.max(
+                jnp.abs(
+                    problem.section_state(corrector_state.z)
+                    - trial_point.corrector_plane.plane_section_state
+                )
+            ),
             jnp.abs(
-                problem.section_state(corrector_state.z)
-                - trial_point.corrector_plane.plane_section_state
+                corrector_state.parameter_fraction - trial_point.corrector_plane.plane_fraction
+            ),
+        )
+        is_valid = jnp.isfinite(corrector_state.correction_norm) & (
+            is_first_point | (trial_distance <= self.ds)
+        )
+        is_converged = is_valid & (corrector_state.correction_norm < options.tolerance)
+        section_tangent = problem.section_state(corrector_state.fraction_tangent)
+        tangent_alignment = (
+            problem.section_state(current_point.arclength_tangent) @ section_tangent
+            + current_point.fraction_rate
+        )
+        tangent_alignment = jnp.where(is_first_point, direction_sign, tangent_alignment)
+        tangent_norm = jnp.sqrt(1.0 + section_tangent @ section_tangent)
+        is_turn_small = is_first_point | (
+            jnp.abs(tangent_alignment) >= tangent_norm * jnp.cos(options.max_turn_angle)
+        )
+        # At a kink a branch turns by more than the limit, even if the continuation step is short.
+        is_kink = (
+            is_converged & ~is_turn_small & (self.ds < options.kink_step_factor * options.min_ds)
+        )
+        is_kink = is_kink & problem.has_kinks
+        is_accepted = is_converged & (is_turn_small | is_kink)
+        has_failed = ~is_accepted & (
+            ~is_valid
+            | is_converged
+            | (self.n_newton_iterations + 1 >= options.max_newton_iterations)
+        )
+        return _TrialVerdict(
+            is_accepted,
+            has_failed,
+            is_kink,
+            jnp.where(tangent_alignment >= 0.0, 1.0, -1.0) / tangent_norm,
+        )
+
+    def is_jump_suspicious(
+        self,
+        problem: AbstractContinuationProblem,
+        trial_verdict: _TrialVerdict,
+        new_point: ContinuationPoint,
+    ) -> Bool[Array, ""]:
+        """Return whether an accepted trial may lie on another branch.
+
+        A shorter continuation step may then avoid the jump.
+        """
+        if not problem.has_multipliers:
+            return jnp.asarray(False)
+        current_point = self.current_point
+        has_turned_back = current_point.fraction_rate * new_point.fraction_rate < 0.0
+        is_multiplier_change_explained_by_bifurcations = is_multiplier_change_explained(
+            current_point.return_map_jacobian, new_point.return_map_jacobian, has_turned_back
+        )
+        can_be_suspicious = (
+            trial_verdict.is_accepted
+            & (self.n_points > 0)
+            & ~self.jump_suspicion.accepts_any_multipliers
+            & new_point.is_admissible
+        )
+        return can_be_suspicious & ~is_multiplier_change_explained_by_bifurcations
+
+    def choose_next_ds(
+        self,
+        options: ArclengthOptions,
+        trial_verdict: _TrialVerdict,
+    ) -> Scalar:
+        """Return the length of the next continuation step.
+
+        The continuation step is lengthened after few Newton iterations, shortened after many, and
+        halved after a failure.
+        """
+        has_converged_quickly = self.n_newton_iterations < 4
+        has_converged_slowly = self.n_newton_iterations >= 6
+        growth_factor = jnp.where(
+            has_converged_quickly, 1.4, jnp.where(has_converged_slowly, 0.6, 1.0)
+        )
+        longer_ds = jnp.minimum(self.ds * growth_factor, options.max_ds)
+        shorter_ds = jnp.where(trial_verdict.has_failed, 0.5 * self.ds, self.ds)
+        chosen_ds = jnp.where(trial_verdict.is_accepted, longer_ds, shorter_ds)
+        return jnp.where(self.n_points == 0, options.initial_ds, chosen_ds)
+
+    def compute_next_status_code(
+        self,
+        options: ArclengthOptions,
+        trial_verdict: _TrialVerdict,
+        new_point: ContinuationPoint,
+        ds: Scalar,
+        next_arc_length: Scalar,
+        is_closed: Bool[Array, ""],
+    ) -> Int[Array, ""]:
+        """Return the `ContinuationStatus` of a branch after a trial.
+
+        `ds` is the proposed length of the next continuation step. `next_arc_length` is its
+        predicted arc length, which is shorter at the end of the range.
+        """
+        is_accepted, has_failed = trial_verdict.is_accepted, trial_verdict.has_failed
+        n_points, branch_status_code = self.n_points + is_accepted, self.status_code
+        for has_ending_reason_occurred, status_code in (
+            (ds < options.min_ds, ContinuationStatus.STEP_SIZE_UNDERFLOW),
+            (has_failed & (self.n_points == 0), ContinuationStatus.START_NOT_FOUND),
+            (is_accepted & (n_points >= options.max_points), ContinuationStatus.MAX_POINTS_REACHED),
+            (
+                is_accepted & (self.trial_point.is_range_end | (next_arc_length <= 1e-12)),
+                ContinuationStatus.RANGE_END_REACHED,
+            ),
+            (is_accepted & ~new_point.is_admissible, ContinuationStatus.POINT_NOT_ADMISSIBLE),
+            (
+                is_accepted & is_closed & (self.n_points > 2),
+                ContinuationStatus.CURVE_CLOSED,
+            ),
+        ):
+            branch_status_code = jnp.where(
+                has_ending_reason_occurred, int(status_code), branch_status_code
             )
-        ),
-        jnp.abs(corrector_state.parameter_fraction - trial_point.corrector_plane.plane_fraction),
-    )
-    is_valid = jnp.isfinite(corrector_state.correction_norm) & (
-        is_first_point | (trial_distance <= continuation_state.ds)
-    )
-    is_converged = is_valid & (corrector_state.correction_norm < options.tolerance)
-    section_tangent = problem.section_state(corrector_state.fraction_tangent)
-    tangent_alignment = (
-        problem.section_state(current_point.arclength_tangent) @ section_tangent
-        + current_point.fraction_rate
-    )
-    tangent_alignment = jnp.where(is_first_point, direction_sign, tangent_alignment)
-    tangent_norm = jnp.sqrt(1.0 + section_tangent @ section_tangent)
-    is_turn_small = is_first_point | (
-        jnp.abs(tangent_alignment) >= tangent_norm * jnp.cos(options.max_turn_angle)
-    )
-    # At a kink a branch turns by more than the limit, even if the continuation step is short.
-    is_kink = (
-        is_converged
-        & ~is_turn_small
-        & (continuation_state.ds < options.kink_step_factor * options.min_ds)
-    )
-    is_kink = is_kink & problem.has_kinks
-    is_accepted = is_converged & (is_turn_small | is_kink)
-    has_failed = ~is_accepted & (
-        ~is_valid
-        | is_converged
-        | (continuation_state.n_newton_iterations + 1 >= options.max_newton_iterations)
-    )
-    return _TrialVerdict(
-        is_accepted,
-        has_failed,
-        is_kink,
-        jnp.where(tangent_alignment >= 0.0, 1.0, -1.0) / tangent_norm,
-    )
-
-
-def _is_jump_suspicious(
-    problem: AbstractContinuationProblem,
-    options: ArclengthOptions,
-    continuation_state: ContinuationState,
-    trial_verdict: _TrialVerdict,
-    new_point: ContinuationPoint,
-) -> Bool[Array, ""]:
-    """Return whether an accepted trial may lie on another branch.
-
-    A shorter continuation step may then avoid the jump.
-    """
-    if not problem.has_multipliers:
-        return jnp.asarray(False)
-    current_point = continuation_state.current_point
-    has_turned_back = current_point.fraction_rate * new_point.fraction_rate < 0.0
-    is_multiplier_change_explained_by_bifurcations = is_multiplier_change_explained(
-        current_point.return_map_jacobian, new_point.return_map_jacobian, has_turned_back
-    )
-    can_be_suspicious = (
-        trial_verdict.is_accepted
-        & (continuation_state.n_points > 0)
-        & ~continuation_state.jump_suspicion.accepts_any_multipliers
-        & new_point.is_admissible
-    )
-    return can_be_suspicious & ~is_multiplier_change_explained_by_bifurcations
-
-
-def _choose_next_step_length(
-    options: ArclengthOptions,
-    continuation_state: ContinuationState,
-    trial_verdict: _TrialVerdict,
-) -> Scalar:
-    """Return the length of the next continuation step.
-
-    The continuation step is lengthened after few Newton iterations, shortened after many, and
-    halved after a failure.
-    """
-    has_converged_quickly, has_converged_slowly = (
-        continuation_state.n_newton_iterations < 4,
-        continuation_state.n_newton_iterations >= 6,
-    )
-    growth_factor = jnp.where(has_converged_quickly, 1.4, jnp.where(has_converged_slowly, 0.6, 1.0))
-    longer_ds = jnp.minimum(continuation_state.ds * growth_factor, options.max_ds)
-    shorter_ds = jnp.where(
-        trial_verdict.has_failed, 0.5 * continuation_state.ds, continuation_state.ds
-    )
-    chosen_ds = jnp.where(trial_verdict.is_accepted, longer_ds, shorter_ds)
-    return jnp.where(continuation_state.n_points == 0, options.initial_ds, chosen_ds)
+        return branch_status_code.astype(jnp.int32)
 
 
 def _is_curve_closed(
@@ -584,102 +660,6 @@ def _is_curve_closed(
     )
 
 
-def _update_continuation_status(
-    options: ArclengthOptions,
-    continuation_state: ContinuationState,
-    trial_verdict: _TrialVerdict,
-    new_point: ContinuationPoint,
-    ds: Scalar,
-    next_arc_length: Scalar,
-    is_closed: Bool[Array, ""],
-) -> Int[Array, ""]:
-    """Return the `ContinuationStatus` of a branch after a trial.
-
-    `ds` is the proposed length of the next continuation step. `next_arc_length` is its predicted
-    arc length, which is shorter at the end of the range.
-    """
-    is_accepted, has_failed = trial_verdict.is_accepted, trial_verdict.has_failed
-    n_points, branch_status_code = (
-        continuation_state.n_points + is_accepted,
-        continuation_state.status_code,
-    )
-    for has_ending_reason_occurred, status_code in (
-        (ds < options.min_ds, ContinuationStatus.STEP_SIZE_UNDERFLOW),
-        (has_failed & (continuation_state.n_points == 0), ContinuationStatus.START_NOT_FOUND),
-        (is_accepted & (n_points >= options.max_points), ContinuationStatus.MAX_POINTS_REACHED),
-        (
-            is_accepted
-            & (continuation_state.trial_point.is_range_end | (next_arc_length <= 1e-12)),
-            ContinuationStatus.RANGE_END_REACHED,
-        ),
-        (is_accepted & ~new_point.is_admissible, ContinuationStatus.POINT_NOT_ADMISSIBLE),
-        (
-            is_accepted & is_closed & (continuation_state.n_points > 2),
-            ContinuationStatus.CURVE_CLOSED,
-        ),
-    ):
-        branch_status_code = jnp.where(
-            has_ending_reason_occurred, int(status_code), branch_status_code
-        )
-    return branch_status_code.astype(jnp.int32)
-
-
-def _init_continuation_state(
-    problem: AbstractContinuationProblem,
-    options: ArclengthOptions,
-    parameter_bounds: Array,
-    z: ProblemUnknowns,
-    p: Scalar,
-    direction_sign: Scalar,
-) -> ContinuationState:
-    """Return the initial state of one branch, whose first trial point is (z, p)."""
-    section_state = problem.section_state(z)
-    n_section, float_dtype = section_state.shape[0], section_state.dtype
-    zero_step_length, zero_count, false_flag = (
-        jnp.zeros((), float_dtype),
-        jnp.zeros((), jnp.int32),
-        jnp.asarray(False),
-    )
-    make_zero_tangent, fraction = (
-        jax.tree.map(jnp.zeros_like, z),
-        _compute_parameter_fraction(p, parameter_bounds),
-    )
-    initial_point = ContinuationPoint(
-        z,
-        p,
-        make_zero_tangent,
-        zero_step_length + direction_sign,
-        jnp.zeros((n_section, n_section), float_dtype),
-        false_flag,
-    )
-    trial_point = _TrialPoint(
-        CorrectorPlane(
-            section_state, fraction, jnp.zeros_like(section_state), zero_step_length + 1.0
-        ),
-        z,
-        fraction,
-        zero_step_length,
-        false_flag,
-    )
-    running_status = zero_count + int(ContinuationStatus.RUNNING)
-    jump_suspicion, initial_ds = (
-        BranchJumpSuspicion(zero_step_length, false_flag),
-        zero_step_length + options.initial_ds,
-    )
-    return ContinuationState(
-        initial_point,
-        initial_point,
-        initial_point,
-        initial_ds,
-        trial_point,
-        jump_suspicion,
-        zero_count,
-        zero_count,
-        running_status,
-        zero_count,
-    )
-
-
 BranchBatch = tuple[ContinuationState, ContinuationPoint]
 """States of the concurrent branches, and the buffers that store the points of the branches."""
 
@@ -698,7 +678,7 @@ def init_branches(
     A branch starts only if its element of `is_branch_requested` is true.
     """
     continuation_states = jax.vmap(
-        functools.partial(_init_continuation_state, problem, options, parameter_bounds)
+        functools.partial(ContinuationState.from_start, problem, options, parameter_bounds)
     )(z, p, direction_signs)
     initial_status = jnp.where(
         is_branch_requested,
@@ -747,8 +727,8 @@ def iterate_branches(
             trial_point.z,
             trial_point.parameter_fraction,
         )
-        trial_verdict = _assess_trial(
-            problem, options, continuation_state, corrector_state, direction_sign
+        trial_verdict = continuation_state.assess_trial(
+            problem, options, corrector_state, direction_sign
         )
         accepted_parameter = compute_parameter_from_fraction(
             jnp.where(
@@ -770,9 +750,7 @@ def iterate_branches(
             corrector_state.return_map_jacobian,
             is_admissible,
         )
-        is_suspicious = _is_jump_suspicious(
-            problem, options, continuation_state, trial_verdict, new_point
-        )
+        is_suspicious = continuation_state.is_jump_suspicious(problem, trial_verdict, new_point)
         trial_verdict = trial_verdict._replace(
             is_accepted=trial_verdict.is_accepted & ~is_suspicious,
             has_failed=trial_verdict.has_failed | is_suspicious,
@@ -793,7 +771,7 @@ def iterate_branches(
             trial_verdict.is_accepted, previous_point, continuation_state.previous_point
         )
         n_points = continuation_state.n_points + trial_verdict.is_accepted
-        ds = _choose_next_step_length(options, continuation_state, trial_verdict)
+        ds = continuation_state.choose_next_ds(options, trial_verdict)
         jump_suspicion = continuation_state.jump_suspicion.update_after_trial(
             is_suspicious, continuation_state.ds
         )
@@ -814,9 +792,8 @@ def iterate_branches(
         is_closed = _is_curve_closed(
             problem, first_point, continuation_state.current_point, new_point, parameter_bounds
         )
-        next_status = _update_continuation_status(
+        next_status = continuation_state.compute_next_status_code(
             options,
-            continuation_state,
             trial_verdict,
             new_point,
             ds,

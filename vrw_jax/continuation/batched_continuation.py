@@ -45,13 +45,13 @@ class PlaneNewtonState(NamedTuple):
 def init_plane_newton(z: ProblemUnknowns, corrector_plane: CorrectorPlane) -> PlaneNewtonState:
     """Return the initial state of Newton's method in a plane, with the initial guess z."""
     n_section = corrector_plane.plane_section_state.shape[0]
-    make_zero_tangent, zero_count = jax.tree.map(jnp.zeros_like, z), jnp.zeros((), jnp.int32)
+    zero_tangent, zero_count = jax.tree.map(jnp.zeros_like, z), jnp.zeros((), jnp.int32)
     zero_jacobian = jnp.zeros((n_section, n_section), corrector_plane.plane_section_state.dtype)
     initial_corrector = CorrectorState(
         z,
         corrector_plane.plane_fraction,
         jnp.ones_like(corrector_plane.plane_fraction),
-        make_zero_tangent,
+        zero_tangent,
         zero_jacobian,
     )
     return PlaneNewtonState(initial_corrector, zero_count, zero_count)
@@ -267,32 +267,21 @@ def solve_on_many_planes(
         plane_newton_states = _iterate_unfinished_plane_newton(
             problem, options, parameter_bounds, corrector_planes, plane_newton_states, newton_step
         )
-    return _make_plane_newton_points(
-        problem, args_by_branch, parameter_bounds, corrector_planes, plane_newton_states
+    points_and_convergence: tuple[ContinuationPoint, Bool[Array, " many"]] = (
+        _make_plane_newton_points_jit(
+            problem, args_by_branch, parameter_bounds, corrector_planes, plane_newton_states
+        )
     )
+    return points_and_convergence
 
 
 _are_branches_active_jit: Any = eqx.filter_jit(are_branches_active)
 _iterate_branches_jit: Any = eqx.filter_jit(iterate_branches)
 _init_plane_newton_jit: Any = eqx.filter_jit(jax.vmap(init_plane_newton))
 _needs_newton_iteration_jit: Any = eqx.filter_jit(needs_newton_iteration)
-
-
-@eqx.filter_jit
-def _make_plane_newton_points(
-    problem: AbstractContinuationProblem,
-    args_by_branch: Any,
-    parameter_bounds: Array,
-    corrector_planes: CorrectorPlane,
-    plane_newton_states: PlaneNewtonState,
-) -> tuple[ContinuationPoint, Bool[Array, " many"]]:
-    """Return the points at which many branches cross planes, and whether Newton's
-    method converged.
-    """
-    finish_plane_newton = lambda args, corrector_plane, plane_newton_state: make_plane_newton_point(
-        problem, args, parameter_bounds, corrector_plane, plane_newton_state
-    )
-    return jax.vmap(finish_plane_newton)(args_by_branch, corrector_planes, plane_newton_states)
+_make_plane_newton_points_jit: Any = eqx.filter_jit(
+    eqx.filter_vmap(make_plane_newton_point, in_axes=(None, 0, None, 0, 0))
+)
 
 
 @eqx.filter_jit

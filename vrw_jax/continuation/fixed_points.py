@@ -58,7 +58,16 @@ class FixedPointResult(NamedTuple):
 
         For a batch the result is an array of such sentences.
         """
-        return map_text_of_elements(_describe_newton_convergence, self.converged, self.n_iterations)
+
+        def describe_convergence(converged: bool, n_iterations: int) -> str:
+            if converged:
+                return f"Newton's method converged after {n_iterations} iterations."
+            return (
+                f"Newton's method did not converge after {n_iterations} iterations: start nearer "
+                "to the fixed point."
+            )
+
+        return map_text_of_elements(describe_convergence, self.converged, self.n_iterations)
 
     def __repr__(self) -> str:
         if isinstance(self.x, jax.core.Tracer) or np.ndim(self.x) != 1:
@@ -75,16 +84,6 @@ class FixedPointResult(NamedTuple):
         if self.termination is not None:
             text_rows.append(("simulation", Termination(int(self.termination)).meaning))
         return format_heading_and_rows("FixedPointResult", text_rows)
-
-
-def _describe_newton_convergence(converged: bool, n_iterations: int) -> str:
-    """Return a sentence that describes whether Newton's method converged to one fixed point."""
-    if converged:
-        return f"Newton's method converged after {n_iterations} iterations."
-    return (
-        f"Newton's method did not converge after {n_iterations} iterations: start nearer to the "
-        "fixed point."
-    )
 
 
 MAX_NEWTON_ITERATIONS = 30

@@ -164,7 +164,7 @@ class UnilateralFinder(AbstractReturnMapFinder):
             np.asarray(section_states),
             with_parameter_derivatives,
         )
-        fixed_points = _find_contact_fixed_points(
+        fixed_points = find_contact_fixed_points(
             self.model, self.n_legs, self.step_options, self.period_n, *newton_arguments
         )
         evaluate_batch = functools.partial(
@@ -352,7 +352,7 @@ def solve_linear_systems(system_matrices: np.ndarray, right_sides: np.ndarray) -
         )
 
 
-def _find_contact_fixed_points(
+def find_contact_fixed_points(
     model: Any,
     n_legs: int,
     step_options: StepOptions,

@@ -248,11 +248,11 @@ def _compute_chunk_in_worker(
     chunk, by variable.
     """
     start_jax()
-    return describe_computing_environment(), _make_worker_engine(pickled_request)(sample_columns)
+    return describe_computing_environment(), make_worker_engine(pickled_request)(sample_columns)
 
 
 @functools.cache
-def _make_worker_engine(pickled_request: bytes) -> SampleEvaluator:
+def make_worker_engine(pickled_request: bytes) -> SampleEvaluator:
     """Return the scan engine for a pickled `EvaluationRequest`. Each worker creates the engine
     once.
     """

@@ -145,15 +145,22 @@ def explore_starts(
             normalized_parameters + trial_step_lengths * np.asarray(adam_update), 0.0, 1.0
         )
         trial_evaluation = gait_batch_evaluator(trial_parameters, current_evaluation)
+        previous_points = current_evaluation.gait.branch_point
+        trial_points = trial_evaluation.gait.branch_point
+        parameter_changes = parameter_change_function(trial_parameters - normalized_parameters)
+        are_trials_on_branch = [
+            is_same_branch(
+                select_tree_rows(previous_points, start_index),
+                select_tree_rows(trial_points, start_index),
+                parameter_change,
+            )
+            for start_index, parameter_change in enumerate(parameter_changes)
+        ]
         is_trial_accepted = (
             are_starts_on_gait(trial_evaluation)
             & _are_evaluations_finite(trial_evaluation, free_indices)
             & has_active_gait
-            & _are_trials_on_branch(
-                current_evaluation,
-                trial_evaluation,
-                parameter_change_function(trial_parameters - normalized_parameters),
-            )
+            & np.array(are_trials_on_branch)
         )
         n_lost_trials += has_active_gait & ~is_trial_accepted
         step_lengths = np.where(is_trial_accepted[:, None], step_lengths, 0.5 * step_lengths)
@@ -234,30 +241,3 @@ def _compute_slacks_and_jacobians(
     return np.asarray(gait_evaluation.objective_and_constraint_values)[
         :, 1:
     ] - min_constraint_values, slack_jacobians
-
-
-def _are_trials_on_branch(
-    previous_evaluation: GaitEvaluation,
-    trial_evaluation: GaitEvaluation,
-    parameter_changes: np.ndarray,
-) -> np.ndarray:
-    """Return, for each start, whether the trial's gait is on the branch of the start's previous
-    gait.
-    """
-    previous_points, trial_points = (
-        previous_evaluation.gait.branch_point,
-        trial_evaluation.gait.branch_point,
-    )
-    previous_and_trial_points = (
-        (
-            *select_tree_rows((previous_points, trial_points), start_index),
-            parameter_changes_of_start,
-        )
-        for start_index, parameter_changes_of_start in enumerate(parameter_changes)
-    )
-    return np.array(
-        [
-            is_same_branch(*previous_and_trial_point)
-            for previous_and_trial_point in previous_and_trial_points
-        ]
-    )
