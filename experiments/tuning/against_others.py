@@ -182,7 +182,7 @@ def by_tune(problem: TuneProblem, u: np.ndarray, scales: np.ndarray) -> MethodHi
                 strict=True,
             )
         ),
-        problem.margins,
+        problem.constraint_margins,
         max_evaluations=MAX_EVALUATIONS,
     )
     slack = (tuned.path.constraint_value.values - problem.min_constraint_values) / scales

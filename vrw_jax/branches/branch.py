@@ -156,11 +156,11 @@ class Branch:
         parameter_unit = (
             f" {MEASURES[self.parameter].display_unit}".rstrip() if has_known_unit else ""
         )
-        is_stable = self.stable
+        is_gait_stable = self.stable
         text_lines = [
             f"Branch along {self.parameter}: {self.values.size} gaits from "
             f"{self.values.min():.6g} to {self.values.max():.6g}{parameter_unit}, "
-            f"{int(is_stable.sum())} stable, {int((~is_stable).sum())} unstable.",
+            f"{int(is_gait_stable.sum())} stable, {int((~is_gait_stable).sum())} unstable.",
             f"  at {self.values[0]:.6g}: {self.ends[0]}",
             f"  at {self.values[-1]:.6g}: {self.ends[1]}",
             f"  special points: {len(self.special_points)}",

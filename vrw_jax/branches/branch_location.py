@@ -615,7 +615,7 @@ def _locate_requested_zeros(
         selected_brackets = select_tree_rows(
             (bracket_wheels, left_points, right_points), bracket_indices
         )
-        solved_points, is_found = branch_continuation.map_over_points(
+        solved_points, is_solve_successful = branch_continuation.map_over_points(
             chord_point_solver,
             batch_sizes.LOCATION_BATCH_SIZES[-1],
             *selected_brackets,
@@ -624,7 +624,9 @@ def _locate_requested_zeros(
         parameter_by_location.update(
             zip(zip(bracket_indices, chord_fractions, strict=True), solved_points.p, strict=True)
         )
-        solved_points = solved_points._replace(is_admissible=solved_points.is_admissible & is_found)
+        solved_points = solved_points._replace(
+            is_admissible=solved_points.is_admissible & is_solve_successful
+        )
         quantity_table = branch_continuation.make_quantity_table(
             solved_points, wheel_indices[bracket_indices]
         )
@@ -633,7 +635,7 @@ def _locate_requested_zeros(
         )
         return solved_points, {
             quantity_name: np.where(
-                broadcast_flags(is_found, quantity_values), quantity_values, np.nan
+                broadcast_flags(is_solve_successful, quantity_values), quantity_values, np.nan
             )
             for quantity_name, quantity_values in quantity_table.items()
         }
@@ -837,15 +839,15 @@ def _locate_inner_special_points(
     ]
     zero_requests = [
         zero_request
-        for zero_request, is_selected in zip(zero_requests, is_without_jump, strict=True)
-        if is_selected
+        for zero_request, has_no_jump in zip(zero_requests, is_without_jump, strict=True)
+        if has_no_jump
     ]
     special_point_names = [
         special_point_name
-        for special_point_name, is_selected in zip(
+        for special_point_name, has_no_jump in zip(
             special_point_names, is_without_jump, strict=True
         )
-        if is_selected
+        if has_no_jump
     ]
     located_zeros = _locate_requested_zeros(branch_continuation, point_table, zero_requests)
     named_zeros = []
@@ -969,7 +971,7 @@ def continue_and_locate_special_points(
     branch_continuation: AbstractContinuation,
     z: Any,
     parameter_values: Array,
-    has_start: np.ndarray,
+    has_branch_start: np.ndarray,
     make_cycle_finder: CycleFinderFactory,
     is_finest_mesh: bool = True,
 ) -> list[BranchData | None]:
@@ -980,7 +982,7 @@ def continue_and_locate_special_points(
     located only if `is_finest_mesh` is true.
     """
     direction_results = _continue_in_both_directions(
-        branch_continuation, z, parameter_values, has_start
+        branch_continuation, z, parameter_values, has_branch_start
     )
     # In the first direction, a closed curve is complete.
     is_curve_closed = (direction_results.status == int(ContinuationStatus.CURVE_CLOSED)).all(
@@ -990,7 +992,7 @@ def continue_and_locate_special_points(
     direction_results = direction_results._replace(n_points=n_points_by_direction)
     point_table = _BranchPointTable.from_results(branch_continuation, direction_results)
     n_wheels, n_points_before_start = (
-        len(has_start),
+        len(has_branch_start),
         np.maximum(direction_results.n_points[:, 0] - 1, 0),
     )
     start_indices = {

@@ -93,8 +93,8 @@ class LimitCycleFinder:
         _, params = self.model.with_parameter(
             params, self.parameter_name, jnp.asarray(self.parameter_value_beside)
         )
-        cycle: LimitCycle = self.gait_finder.find_cycle(params, guess_cycle)
-        return cycle
+        limit_cycle: LimitCycle = self.gait_finder.find_cycle(params, guess_cycle)
+        return limit_cycle
 
 
 def find_collocation_starts(branch_request: BranchRequest, given_cycle: Any) -> BranchStart:

@@ -347,8 +347,8 @@ def continue_branches(
         check_range("bounds", bounds),
         _check_arclength_options(options),
     )
-    has_collocation = model.capabilities.gait_method == GaitMethod.COLLOCATION
-    if check_bool("force_peaks", force_peaks) and not has_collocation:
+    uses_collocation = model.capabilities.gait_method == GaitMethod.COLLOCATION
+    if check_bool("force_peaks", force_peaks) and not uses_collocation:
         raise ValueError(
             f"force_peaks is True, but the branch of a {type(model).__name__} has no measures of "
             "the force: take vrw.force_peaks(vrw.simulate(...)) of its gaits."
@@ -427,8 +427,8 @@ def _continue_gait_branches(
             branch_request.params.n_legs,
             continuation_options,
         )
-        has_start = branch_start.start_outcomes == Outcome.STEPPED
-        has_start &= np.arange(len(has_start)) < n_wheels
+        has_branch_start = branch_start.start_outcomes == Outcome.STEPPED
+        has_branch_start &= np.arange(len(has_branch_start)) < n_wheels
         is_finest_mesh = (
             not can_refine_mesh
             or branch_start.finer_cycle_options is None
@@ -438,14 +438,14 @@ def _continue_gait_branches(
             branch_continuation,
             branch_start.start_unknowns,
             branch_request.parameter_values,
-            has_start,
+            has_branch_start,
             branch_start.make_cycle_finder,
             is_finest_mesh,
         )
         # If a gait exists but no branch starts from it, its step does not repeat on this mesh.
         needs_finer_mesh = (
             gait_exists if branch_data is None else branch_data.is_mesh_limited
-            for gait_exists, branch_data in zip(has_start, branch_data_by_wheel, strict=True)
+            for gait_exists, branch_data in zip(has_branch_start, branch_data_by_wheel, strict=True)
         )
         if is_finest_mesh or not any(needs_finer_mesh):
             break

@@ -396,7 +396,7 @@ class ContactGaitProblem(AbstractReturnMapProblem):
         period_evaluation = self._make_period_map(wheel, p).evaluate_period(
             self.step_options, section_states, is_continued_parameter
         )
-        nan_if_incomplete = np.where(period_evaluation.is_complete, 0.0, np.nan)[:, None]
+        nan_if_incomplete = np.where(period_evaluation.is_period_complete, 0.0, np.nan)[:, None]
         period_defects = period_evaluation.end_states - section_states + nan_if_incomplete
         return_map_jacobian = period_evaluation.return_map_jacobian[
             :, :n_coordinates, :n_coordinates

@@ -149,7 +149,9 @@ class CurveContinuation(AbstractContinuation):
         """Replace each quantity that is zero or undefined on the whole curve by NaN."""
         point_names = np.array(self.special_point_names)[wheel_indices]
         is_dls_vanishing = point_names == DLS_VANISHING_NAME
-        is_discontinuous = np.isin(point_names, (*DISCONTINUOUS_QUANTITIES, DLS_VANISHING_NAME))
+        is_quantity_discontinuous = np.isin(
+            point_names, (*DISCONTINUOUS_QUANTITIES, DLS_VANISHING_NAME)
+        )
         step_measure_names = {
             quantity_name
             for quantity_name in quantity_table
@@ -164,7 +166,8 @@ class CurveContinuation(AbstractContinuation):
             for quantity_name, substitute_name in LINEAR_MARGIN_SUBSTITUTES.items()
         }
         is_undefined_by_name |= {
-            quantity_name: is_discontinuous | is_undefined_by_name.get(quantity_name, False)
+            quantity_name: is_quantity_discontinuous
+            | is_undefined_by_name.get(quantity_name, False)
             for quantity_name in step_measure_names
         }
         is_rear_force_undefined = (
@@ -184,21 +187,25 @@ class CurveContinuation(AbstractContinuation):
             )
             for quantity_name, is_undefined_by_quantity in is_undefined_by_name.items()
         }
-        step_outcomes = np.where(is_discontinuous, Outcome.STEPPED, quantity_table["outcome"])
+        step_outcomes = np.where(
+            is_quantity_discontinuous, Outcome.STEPPED, quantity_table["outcome"]
+        )
         return quantity_table | {
             "outcome": step_outcomes,
-            "closure": np.where(is_discontinuous, 0.0, quantity_table["closure"]),
+            "closure": np.where(is_quantity_discontinuous, 0.0, quantity_table["closure"]),
         }
 
     def are_points_admissible(self, quantity_table: QuantitiesByName) -> np.ndarray:
-        is_positive = np.all(
+        are_quantities_positive = np.all(
             [
                 ~(quantity_table[quantity_name] <= 0.0)
                 for quantity_name in self.branch_ending_quantities
             ],
             axis=0,
         )
-        return is_positive & self.gait_continuation.are_points_admissible(quantity_table)
+        return are_quantities_positive & self.gait_continuation.are_points_admissible(
+            quantity_table
+        )
 
     def is_mesh_limited(self, quantity_table: QuantitiesByName, end_names: tuple[str, ...]) -> bool:
         return self.gait_continuation.is_mesh_limited(quantity_table, end_names)
@@ -306,18 +313,20 @@ class CurveTracer(NamedTuple):
         )
 
     def trace_curves(
-        self, seeds: Sequence[CurveSeed], known_curves: Sequence[TracedCurve]
+        self, curve_seeds: Sequence[CurveSeed], known_curves: Sequence[TracedCurve]
     ) -> list[TracedCurve]:
         """Trace the curves through all seeds that lie on no known curve."""
         new_curves: list[TracedCurve] = []
         new_seeds = [
-            seed
-            for seed in seeds
-            if not any(self._is_on_curve(seed, curve) for curve in known_curves)
+            curve_seed
+            for curve_seed in curve_seeds
+            if not any(self._is_on_curve(curve_seed, curve) for curve in known_curves)
         ]
         quantity_groups = {
-            find_test_quantity_group(seed.special_point_name, seed.collocation_system.n_legs)
-            for seed in new_seeds
+            find_test_quantity_group(
+                curve_seed.special_point_name, curve_seed.collocation_system.n_legs
+            )
+            for curve_seed in new_seeds
         }
         for quantity_group in sorted(quantity_groups):
             remaining_seeds = [
@@ -331,13 +340,13 @@ class CurveTracer(NamedTuple):
             while remaining_seeds:
                 batch_seeds: list[CurveSeed] = []
                 # A batch has one seed per name, because seeds of one name may lie on one curve.
-                for seed in remaining_seeds:
+                for curve_seed in remaining_seeds:
                     if (
-                        seed.special_point_name
+                        curve_seed.special_point_name
                         not in {curve_seed.special_point_name for curve_seed in batch_seeds}
                         and len(batch_seeds) < batch_sizes.CURVE_BATCH_SIZE
                     ):
-                        batch_seeds.append(seed)
+                        batch_seeds.append(curve_seed)
                 accepted_curves: list[TracedCurve] = []
                 for curve in self._trace_curves_of_batch(quantity_group, batch_seeds):
                     if not any(
@@ -347,10 +356,10 @@ class CurveTracer(NamedTuple):
                         accepted_curves.append(curve)
                 new_curves += accepted_curves
                 remaining_seeds = [
-                    seed
-                    for seed in remaining_seeds
-                    if not any(seed is batch_seed for batch_seed in batch_seeds)
-                    and not any(self._is_on_curve(seed, curve) for curve in accepted_curves)
+                    curve_seed
+                    for curve_seed in remaining_seeds
+                    if not any(curve_seed is batch_seed for batch_seed in batch_seeds)
+                    and not any(self._is_on_curve(curve_seed, curve) for curve in accepted_curves)
                 ]
         return new_curves
 

@@ -333,8 +333,8 @@ class GaitTestFunction(AbstractTestFunction):
         return unbatch(compute_correction_norm)(z, newton_correction)
 
     def is_admissible(self, wheel: TestFunctionWheel, z: CollocationSolution, p: Array) -> Array:
-        is_nonnegative = z.durations > -self.test_function_options.max_duration_roundoff
-        return jnp.all(is_nonnegative | (wheel.branch_wheel.is_phase_active < 0.5))
+        are_durations_nonnegative = z.durations > -self.test_function_options.max_duration_roundoff
+        return jnp.all(are_durations_nonnegative | (wheel.branch_wheel.is_phase_active < 0.5))
 
 
 @eqx.filter_jit

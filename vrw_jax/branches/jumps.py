@@ -77,12 +77,12 @@ def continue_beyond_jumps(
             parameter_values = end_points.p + direction_signs * parameter_change_fraction * (
                 parameter_bounds[1] - parameter_bounds[0]
             )
-            is_requested = (
+            is_branch_requested = (
                 is_branch_stalled
                 & (parameter_values > parameter_bounds[0])
                 & (parameter_values < parameter_bounds[1])
             )
-            if not is_requested.any():
+            if not is_branch_requested.any():
                 continue
             continuation_arguments = jax.device_put(
                 (
@@ -91,12 +91,12 @@ def continue_beyond_jumps(
                     parameter_values,
                     parameter_bounds,
                     direction_signs,
-                    is_requested,
+                    is_branch_requested,
                 )
             )
             new_results = jax.tree.map(np.asarray, branch_continuer(*continuation_arguments))
             first_points = select_tree_rows(new_results.points, (branch_indices, 0))
-            is_gait_found = is_requested & (np.asarray(new_results.n_points) > 1)
+            is_gait_found = is_branch_requested & (np.asarray(new_results.n_points) > 1)
             first_quantities = branch_continuation.make_quantity_table(first_points, wheel_indices)
             is_gait_found = is_gait_found & branch_continuation.is_same_gait(
                 end_quantities, first_quantities
@@ -108,25 +108,27 @@ def continue_beyond_jumps(
 
 
 def append_results(
-    direction_results: ContinuationResult, new_results: ContinuationResult, is_appended: np.ndarray
+    direction_results: ContinuationResult,
+    new_results: ContinuationResult,
+    is_result_appended: np.ndarray,
 ) -> ContinuationResult:
     """Append the points in `new_results` to the selected branches, and return all results."""
-    if not is_appended.any():
+    if not is_result_appended.any():
         return direction_results
-    n_points = direction_results.n_points + np.where(is_appended, new_results.n_points, 0)
+    n_points = direction_results.n_points + np.where(is_result_appended, new_results.n_points, 0)
     n_buffer_points = max(int(np.max(n_points)), direction_results.points.p.shape[1])
 
     def append_points(points: np.ndarray, new_points: np.ndarray) -> np.ndarray:
         point_buffer = np.zeros((len(points), n_buffer_points, *points.shape[2:]), points.dtype)
         point_buffer[:, : points.shape[1]] = points
-        for branch_index in np.flatnonzero(is_appended):
+        for branch_index in np.flatnonzero(is_result_appended):
             point_buffer[
                 branch_index, direction_results.n_points[branch_index] : n_points[branch_index]
             ] = new_points[branch_index, : new_results.n_points[branch_index]]
         return point_buffer
 
     appended_points: Any = jax.tree.map(append_points, direction_results.points, new_results.points)
-    branch_status: Any = np.where(is_appended, new_results.status, direction_results.status)
+    branch_status: Any = np.where(is_result_appended, new_results.status, direction_results.status)
     point_counts: Any = n_points
     n_linearizations = direction_results.n_linearizations + new_results.n_linearizations
     return ContinuationResult(appended_points, point_counts, branch_status, n_linearizations)
@@ -145,7 +147,7 @@ def find_state_jumps(
     `fraction_rates` contains the derivative of that fraction with respect to arc length.
     """
 
-    def has_jump(left_index: int, right_index: int) -> bool:
+    def is_state_jump_between(left_index: int, right_index: int) -> bool:
         fraction_change = parameter_fractions[right_index] - parameter_fractions[left_index]
         chord_length = np.hypot(
             np.linalg.norm(section_states[right_index] - section_states[left_index]),
@@ -161,4 +163,4 @@ def find_state_jumps(
         )
         return bool(has_one_direction and is_chord_steeper)
 
-    return [point_pair for point_pair in point_pairs if has_jump(*point_pair)]
+    return [point_pair for point_pair in point_pairs if is_state_jump_between(*point_pair)]

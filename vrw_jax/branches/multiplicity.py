@@ -333,12 +333,12 @@ def add_multiple_bifurcations(
     replaced_pairs = {
         located_zero.bracket_and_quantity[:2] for _, located_zero, _ in multiple_bifurcation_zeros
     }
-    is_replaced = lambda quantity_name, located_zero: (
+    is_zero_replaced = lambda quantity_name, located_zero: (
         quantity_name in CROSSING_MULTIPLIER_COUNTS
         and any(zero_pair_test(located_zero, point_pair) for point_pair in replaced_pairs)
     )
     return [
         located_zero
         for located_zero in named_zeros
-        if not is_replaced(located_zero[0], located_zero[1])
+        if not is_zero_replaced(located_zero[0], located_zero[1])
     ] + multiple_bifurcation_zeros

@@ -272,16 +272,16 @@ def find_sign_changes_in_scan(
     A sign change of a measure is ignored if exactly one of the two samples has double support.
     """
     outcome_codes = scan_dataset.outcome.transpose(*parameter_names).values
-    has_gait, has_coarse_mesh = (
+    has_gait_at_sample, has_coarse_mesh_at_sample = (
         outcome_codes == Outcome.STEPPED,
         outcome_codes == Outcome.MESH_TOO_COARSE,
     )
     signed_quantities, sign_changes = _collect_signed_quantities(scan_dataset, parameter_names), []
     signed_quantities[GAIT_CHANGE_NAME] = np.where(
-        has_gait, 1.0, np.where(has_coarse_mesh, np.nan, -1.0)
+        has_gait_at_sample, 1.0, np.where(has_coarse_mesh_at_sample, np.nan, -1.0)
     )
     signed_quantities[COARSE_MESH_END_NAME] = np.where(
-        has_gait, 1.0, np.where(has_coarse_mesh, -1.0, np.nan)
+        has_gait_at_sample, 1.0, np.where(has_coarse_mesh_at_sample, -1.0, np.nan)
     )
     for parameter_index in range(2):
         get_neighbor_values = lambda x, parameter_index=parameter_index: (
@@ -295,7 +295,7 @@ def find_sign_changes_in_scan(
                 else (second_neighbor_values, first_neighbor_values)
             )
         )
-        has_first_sample_gait, has_second_sample_gait = get_neighbor_values(has_gait)
+        has_first_sample_gait, has_second_sample_gait = get_neighbor_values(has_gait_at_sample)
         has_same_double_support = np.equal(
             *get_neighbor_values(signed_quantities["lambda_4_plus"] > 0.0)
         )

@@ -125,8 +125,8 @@ class AbstractContactWheel(AbstractWheel):
     def count_continuous_entries(self, params: WheelParams) -> int:
         return compute_full_section_size(params.n_legs) - params.n_legs
 
-    def compute_section_units(self, units: WheelUnits, n_legs: int) -> list[Elementwise]:
-        return compute_section_units(units, n_legs)
+    def compute_section_units(self, wheel_units: WheelUnits, n_legs: int) -> list[Elementwise]:
+        return compute_section_units(wheel_units, n_legs)
 
     def embed_section_state(self, params: WheelParams, x: Array) -> FullState:
         """Return the full section state for `x`, shape (4 + 3 n,).

@@ -360,11 +360,11 @@ def _predict_trial_point(
     fraction = _compute_parameter_fraction(current_point.p, parameter_bounds)
     fraction_rate = current_point.fraction_rate
     range_end = jnp.where(fraction_rate > 0.0, 1.0, 0.0)
-    is_stationary = fraction_rate == 0.0
+    is_parameter_stationary = fraction_rate == 0.0
     bound_distance = jnp.where(
-        is_stationary,
+        is_parameter_stationary,
         jnp.inf,
-        (range_end - fraction) / jnp.where(is_stationary, 1.0, fraction_rate),
+        (range_end - fraction) / jnp.where(is_parameter_stationary, 1.0, fraction_rate),
     )
     is_range_end = bound_distance <= ds
     predicted_arc_length = jnp.where(is_range_end, bound_distance, ds)
@@ -520,10 +520,10 @@ class ContinuationState(NamedTuple):
                 corrector_state.parameter_fraction - trial_point.corrector_plane.plane_fraction
             ),
         )
-        is_valid = jnp.isfinite(corrector_state.correction_norm) & (
+        is_trial_valid = jnp.isfinite(corrector_state.correction_norm) & (
             is_first_point | (trial_distance <= self.ds)
         )
-        is_converged = is_valid & (corrector_state.correction_norm < options.tolerance)
+        has_trial_converged = is_trial_valid & (corrector_state.correction_norm < options.tolerance)
         section_tangent = problem.section_state(corrector_state.fraction_tangent)
         tangent_alignment = (
             problem.section_state(current_point.arclength_tangent) @ section_tangent
@@ -536,13 +536,15 @@ class ContinuationState(NamedTuple):
         )
         # At a kink a branch turns by more than the limit, even if the continuation step is short.
         is_kink = (
-            is_converged & ~is_turn_small & (self.ds < options.kink_step_factor * options.min_ds)
+            has_trial_converged
+            & ~is_turn_small
+            & (self.ds < options.kink_step_factor * options.min_ds)
         )
         is_kink = is_kink & problem.has_kinks
-        is_accepted = is_converged & (is_turn_small | is_kink)
+        is_accepted = has_trial_converged & (is_turn_small | is_kink)
         has_failed = ~is_accepted & (
-            ~is_valid
-            | is_converged
+            ~is_trial_valid
+            | has_trial_converged
             | (self.n_newton_iterations + 1 >= options.max_newton_iterations)
         )
         return _TrialVerdict(
@@ -604,7 +606,7 @@ class ContinuationState(NamedTuple):
         new_point: ContinuationPoint,
         ds: Scalar,
         next_arc_length: Scalar,
-        is_closed: Bool[Array, ""],
+        is_curve_closed: Bool[Array, ""],
     ) -> Int[Array, ""]:
         """Return the `ContinuationStatus` of a branch after a trial.
 
@@ -623,7 +625,7 @@ class ContinuationState(NamedTuple):
             ),
             (is_accepted & ~new_point.is_admissible, ContinuationStatus.POINT_NOT_ADMISSIBLE),
             (
-                is_accepted & is_closed & (self.n_points > 2),
+                is_accepted & is_curve_closed & (self.n_points > 2),
                 ContinuationStatus.CURVE_CLOSED,
             ),
         ):
@@ -750,10 +752,12 @@ def iterate_branches(
             corrector_state.return_map_jacobian,
             is_admissible,
         )
-        is_suspicious = continuation_state.is_jump_suspicious(problem, trial_verdict, new_point)
+        is_trial_suspicious = continuation_state.is_jump_suspicious(
+            problem, trial_verdict, new_point
+        )
         trial_verdict = trial_verdict._replace(
-            is_accepted=trial_verdict.is_accepted & ~is_suspicious,
-            has_failed=trial_verdict.has_failed | is_suspicious,
+            is_accepted=trial_verdict.is_accepted & ~is_trial_suspicious,
+            has_failed=trial_verdict.has_failed | is_trial_suspicious,
         )
         current_point = select_tree_leaves(
             trial_verdict.is_accepted, new_point, continuation_state.current_point
@@ -773,7 +777,7 @@ def iterate_branches(
         n_points = continuation_state.n_points + trial_verdict.is_accepted
         ds = continuation_state.choose_next_ds(options, trial_verdict)
         jump_suspicion = continuation_state.jump_suspicion.update_after_trial(
-            is_suspicious, continuation_state.ds
+            is_trial_suspicious, continuation_state.ds
         )
         jump_suspicion, ds = jump_suspicion.choose_trial_ds(
             trial_verdict.is_accepted, ds, options.min_ds
@@ -781,15 +785,15 @@ def iterate_branches(
         next_trial_point = _predict_trial_point(
             problem, previous_point, current_point, n_points > 1, ds, parameter_bounds
         )
-        is_finished = trial_verdict.is_accepted | trial_verdict.has_failed
+        is_trial_finished = trial_verdict.is_accepted | trial_verdict.has_failed
         next_trial_point = select_tree_leaves(
-            is_finished,
+            is_trial_finished,
             next_trial_point,
             trial_point._replace(
                 z=corrector_state.z, parameter_fraction=corrector_state.parameter_fraction
             ),
         )
-        is_closed = _is_curve_closed(
+        is_curve_closed = _is_curve_closed(
             problem, first_point, continuation_state.current_point, new_point, parameter_bounds
         )
         next_status = continuation_state.compute_next_status_code(
@@ -798,10 +802,10 @@ def iterate_branches(
             new_point,
             ds,
             next_trial_point.predicted_arc_length,
-            is_closed,
+            is_curve_closed,
         )
         next_n_newton_iterations = jnp.where(
-            is_finished, 0, continuation_state.n_newton_iterations + 1
+            is_trial_finished, 0, continuation_state.n_newton_iterations + 1
         )
         next_counters = n_points, next_status, continuation_state.n_linearizations + 1
         next_continuation_state = ContinuationState(
@@ -826,9 +830,9 @@ def iterate_branches(
         continuation_state.n_points,
         options.max_points,
     )
-    write_point = lambda buffer, new_points: buffer.at[buffer_indices, buffer_index].set(
-        new_points, mode="drop"
-    )
+    write_point = lambda point_buffer, new_points: point_buffer.at[
+        buffer_indices, buffer_index
+    ].set(new_points, mode="drop")
     branch_points = jax.tree.map(
         write_point, branch_points, new_points._replace(arclength_tangent=())
     )
@@ -873,7 +877,7 @@ def continue_from(
         add_branch_axis = lambda tree_over_branches: jax.tree.map(
             lambda x: x[None], tree_over_branches
         )
-        result = continue_from(
+        branch_data = continue_from(
             problem,
             options,
             add_branch_axis(args_by_branch),
@@ -882,7 +886,7 @@ def continue_from(
             parameter_bounds,
             direction_signs[None],
         )
-        return jax.tree.map(lambda x: x[0], result)
+        return jax.tree.map(lambda x: x[0], branch_data)
     is_branch_requested = (
         jnp.ones(p.shape, bool) if is_branch_requested is None else is_branch_requested
     )

@@ -87,10 +87,10 @@ def iterate_plane_newton(
         corrector_state.parameter_fraction,
     )
     # A trial that is not finite leaves the state unchanged. NaN reaches no other batch element.
-    is_valid = jnp.isfinite(next_corrector.correction_norm)
-    next_corrector = select_tree_leaves(is_valid, next_corrector, corrector_state)._replace(
-        correction_norm=next_corrector.correction_norm
-    )
+    is_correction_valid = jnp.isfinite(next_corrector.correction_norm)
+    next_corrector = select_tree_leaves(
+        is_correction_valid, next_corrector, corrector_state
+    )._replace(correction_norm=next_corrector.correction_norm)
     # If the correction is negligible, the last Jacobian is exact and no other iteration follows.
     negligible_correction = options.jacobian_reuse_fraction * options.tolerance
     n_converged_iterations_before = jnp.where(
@@ -191,7 +191,7 @@ def continue_branches_uncompiled(
         problem, options, z, p, parameter_bounds, direction_signs, is_branch_requested
     )
     buffer_indices = jnp.arange(len(p))
-    while np.any(is_unfinished := np.asarray(_are_branches_active_jit(branch_batch))):
+    while np.any(is_branch_unfinished := np.asarray(_are_branches_active_jit(branch_batch))):
         trial_point = branch_batch[0].trial_point
         newton_steps = _linearize_selected_branches(
             problem,
@@ -199,7 +199,7 @@ def continue_branches_uncompiled(
             parameter_bounds,
             trial_point.z,
             trial_point.parameter_fraction,
-            is_unfinished,
+            is_branch_unfinished,
         )
         branch_batch = _iterate_branches_jit(
             problem,
@@ -220,22 +220,22 @@ def _linearize_selected_branches(
     parameter_bounds: Array,
     z: ProblemUnknowns,
     parameter_fractions: Array,
-    is_selected: Any,
+    is_branch_selected: Any,
 ) -> NewtonStep:
     """Return the Newton steps for the selected branches. All other branches receive NaN."""
     lower_bound, upper_bound = np.asarray(parameter_bounds)
     parameter_values = lower_bound + (upper_bound - lower_bound) * np.asarray(parameter_fractions)
     selected_steps = problem.linearize(
-        *jax.device_put(select_tree_rows((args_by_branch, z, parameter_values), is_selected))
+        *jax.device_put(select_tree_rows((args_by_branch, z, parameter_values), is_branch_selected))
     )
     fill_with_nan = lambda selected_values: np.full(
-        (len(is_selected), *selected_values.shape[1:]), np.nan
+        (len(is_branch_selected), *selected_values.shape[1:]), np.nan
     )
     all_steps = jax.tree.map(fill_with_nan, selected_steps)
     for all_values, selected_values in zip(
         jax.tree.leaves(all_steps), jax.tree.leaves(selected_steps), strict=True
     ):
-        all_values[is_selected] = selected_values
+        all_values[is_branch_selected] = selected_values
     return jax.device_put(all_steps)
 
 
@@ -254,7 +254,7 @@ def solve_on_many_planes(
     """
     plane_newton_states = _init_plane_newton_jit(z, corrector_planes)
     while np.any(
-        is_unfinished := np.asarray(_needs_newton_iteration_jit(options, plane_newton_states))
+        is_solve_unfinished := np.asarray(_needs_newton_iteration_jit(options, plane_newton_states))
     ):
         newton_step = _linearize_selected_branches(
             problem,
@@ -262,7 +262,7 @@ def solve_on_many_planes(
             parameter_bounds,
             plane_newton_states.corrector_state.z,
             plane_newton_states.corrector_state.parameter_fraction,
-            is_unfinished,
+            is_solve_unfinished,
         )
         plane_newton_states = _iterate_unfinished_plane_newton(
             problem, options, parameter_bounds, corrector_planes, plane_newton_states, newton_step

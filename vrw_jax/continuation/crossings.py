@@ -44,16 +44,16 @@ def is_multiplier_change_explained(
         2 * has_margin_sign_change[2] if len(has_margin_sign_change) > 2 else 0
     )
 
-    def count_multipliers_outside(jacobian: Array) -> tuple[Array, Array]:
+    def count_multipliers_outside(return_map_jacobian: Array) -> tuple[Array, Array]:
         """Return the least and the largest possible number of multipliers outside the
         unit circle.
         """
-        multiplier_moduli, tolerance = (
-            jnp.abs(floquet_multipliers(jacobian)),
+        multiplier_moduli, circle_distance_tolerance = (
+            jnp.abs(floquet_multipliers(return_map_jacobian)),
             multiplier_tolerances.unit_circle_distance,
         )
-        return jnp.sum(multiplier_moduli > 1.0 + tolerance), jnp.sum(
-            multiplier_moduli > 1.0 - tolerance
+        return jnp.sum(multiplier_moduli > 1.0 + circle_distance_tolerance), jnp.sum(
+            multiplier_moduli > 1.0 - circle_distance_tolerance
         )
 
     min_n_outside_before, max_n_outside_before = count_multipliers_outside(jacobian_before)
@@ -78,16 +78,16 @@ class BranchJumpSuspicion(NamedTuple):
     accepts_any_multipliers: Bool[Array, ""]
 
     def update_after_trial(
-        self, is_suspicious: Bool[Array, ""], trial_ds: Scalar
+        self, is_trial_suspicious: Bool[Array, ""], trial_ds: Scalar
     ) -> "BranchJumpSuspicion":
         """Return the suspicion after a trial whose continuation step has the length `trial_ds`."""
-        is_first_suspicion = is_suspicious & (self.suspicious_ds == 0.0)
+        is_first_suspicion = is_trial_suspicious & (self.suspicious_ds == 0.0)
         return self._replace(
             suspicious_ds=jnp.where(is_first_suspicion, trial_ds, self.suspicious_ds)
         )
 
     def choose_trial_ds(
-        self, is_accepted: Bool[Array, ""], proposed_ds: Scalar, min_ds: float
+        self, is_trial_accepted: Bool[Array, ""], proposed_ds: Scalar, min_ds: float
     ) -> tuple["BranchJumpSuspicion", Scalar]:
         """Return the suspicion before the next trial, and the length of the next continuation step.
 
@@ -97,11 +97,11 @@ class BranchJumpSuspicion(NamedTuple):
             (self.suspicious_ds > 0.0) & ~self.accepts_any_multipliers & (proposed_ds < min_ds)
         )
         trial_ds = jnp.where(is_below_min_ds, self.suspicious_ds, proposed_ds)
-        has_passed_suspicious_ds = is_accepted & (
+        has_passed_suspicious_ds = is_trial_accepted & (
             self.accepts_any_multipliers | (trial_ds >= self.suspicious_ds)
         )
         accepts_any_multipliers = jnp.where(
-            is_accepted, False, self.accepts_any_multipliers | is_below_min_ds
+            is_trial_accepted, False, self.accepts_any_multipliers | is_below_min_ds
         )
         return BranchJumpSuspicion(
             jnp.where(has_passed_suspicious_ds, 0.0, self.suspicious_ds), accepts_any_multipliers

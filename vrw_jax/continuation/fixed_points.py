@@ -268,13 +268,13 @@ def _run_newton_loop(
         is_searching_iteration = is_newton_searching(correction_norm, n_iterations).astype(
             n_iterations.dtype
         )
-        correction, jacobian, map_defect = _compute_newton_correction(
+        newton_correction, jacobian, map_defect = _compute_newton_correction(
             converted_map, x, closed_over_values
         )
         # The correction is also checked in the last iterations, because the map may jump near the
         # point.
-        correction_norm = jnp.max(jnp.abs(correction))
-        next_x = jnp.where(jnp.all(jnp.isfinite(correction)), x + correction, x)
+        correction_norm = jnp.max(jnp.abs(newton_correction))
+        next_x = jnp.where(jnp.all(jnp.isfinite(newton_correction)), x + newton_correction, x)
         return (
             next_x,
             correction_norm,
@@ -296,9 +296,13 @@ def _run_newton_loop(
     x, correction_norm, n_iterations, _, jacobian, residual = lax.while_loop(
         needs_newton_iteration, iterate_newton, initial_state
     )
-    is_converged = correction_norm <= tolerance
+    has_newton_converged = correction_norm <= tolerance
     return FixedPointResult(
-        jnp.where(is_converged, x, start), jacobian, residual, is_converged, n_iterations
+        jnp.where(has_newton_converged, x, start),
+        jacobian,
+        residual,
+        has_newton_converged,
+        n_iterations,
     )
 
 
@@ -316,10 +320,10 @@ def _run_newton_jvp(
 
     def solve_from_fixed_point(*closed_over_values: Any) -> FixedPointResult:
         def iterate_with_derivatives(point: Array, _: None) -> tuple[Array, tuple[Array, Array]]:
-            correction, jacobian, map_defect = _compute_newton_correction(
+            newton_correction, jacobian, map_defect = _compute_newton_correction(
                 converted_map, point, closed_over_values
             )
-            next_point = point + jnp.where(newton_result.converged, correction, 0.0)
+            next_point = point + jnp.where(newton_result.converged, newton_correction, 0.0)
             return next_point, (jacobian, jnp.max(jnp.abs(map_defect)))
 
         point, (jacobians, residuals) = lax.scan(

@@ -90,8 +90,8 @@ def compute_characteristic_polynomial(matrix: RealSquareMatrix) -> tuple[Array, 
 
 def _differentiable_square_root(x: Array) -> Array:
     """Return the square root of max(x, 0). Its derivative is zero for x <= 0."""
-    is_positive = x > 0.0
-    return jnp.where(is_positive, jnp.sqrt(jnp.where(is_positive, x, 1.0)), 0.0)
+    is_argument_positive = x > 0.0
+    return jnp.where(is_argument_positive, jnp.sqrt(jnp.where(is_argument_positive, x, 1.0)), 0.0)
 
 
 class _EigenvaluePair(NamedTuple):
@@ -175,12 +175,12 @@ def _split_into_isolated_and_pair(
 
     The pair is None for a 1x1 matrix.
     """
-    coefficients = compute_characteristic_polynomial(matrix)
-    if len(coefficients) == 1:
-        return [-coefficients[0]], None
-    if len(coefficients) == 2:
-        return [], _solve_quadratic_pair(*coefficients)
-    a0, a1, a2 = coefficients
+    polynomial_coefficients = compute_characteristic_polynomial(matrix)
+    if len(polynomial_coefficients) == 1:
+        return [-polynomial_coefficients[0]], None
+    if len(polynomial_coefficients) == 2:
+        return [], _solve_quadratic_pair(*polynomial_coefficients)
+    a0, a1, a2 = polynomial_coefficients
     isolated_root = _solve_cubic_real_root(a0, a1, a2)
     linear_coefficient = a2 + isolated_root
     return [isolated_root], _solve_quadratic_pair(

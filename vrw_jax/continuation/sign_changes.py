@@ -40,13 +40,15 @@ ZERO_SEARCH_OPTIONS = ZeroSearchOptions()
 """Default options of `locate_function_zeros`."""
 
 
-def evaluate_bifurcation_functions(jacobians: np.ndarray) -> np.ndarray:
+def evaluate_bifurcation_functions(return_map_jacobians: np.ndarray) -> np.ndarray:
     """Evaluate the test functions of the bifurcations in `BIFURCATION_NAMES`, shape (..., 3).
 
-    `jacobians` has the shape (..., n, n). A value is NaN if a matrix of size n cannot have that
-    bifurcation.
+    `return_map_jacobians` has the shape (..., n, n). A value is NaN if a matrix of size n cannot
+    have that bifurcation.
     """
-    bifurcation_margin_values = np.asarray(compute_bifurcation_margins(jnp.asarray(jacobians)))
+    bifurcation_margin_values = np.asarray(
+        compute_bifurcation_margins(jnp.asarray(return_map_jacobians))
+    )
     bifurcation_values = np.full(
         (*bifurcation_margin_values.shape[:-1], len(BIFURCATION_NAMES)), np.nan
     )
@@ -56,14 +58,15 @@ def evaluate_bifurcation_functions(jacobians: np.ndarray) -> np.ndarray:
 
 
 def has_unit_circle_pair(
-    jacobian: np.ndarray, multiplier_tolerances: MultiplierTolerances = MULTIPLIER_TOLERANCES
+    return_map_jacobian: np.ndarray,
+    multiplier_tolerances: MultiplierTolerances = MULTIPLIER_TOLERANCES,
 ) -> bool:
     """Return whether a complex pair of multipliers lies on the unit circle.
 
     The test function of the Neimark-Sacker bifurcation also vanishes for two real reciprocal
     multipliers. Such multipliers are no bifurcation.
     """
-    multipliers = np.asarray(floquet_multipliers(jnp.asarray(jacobian)))
+    multipliers = np.asarray(floquet_multipliers(jnp.asarray(return_map_jacobian)))
     is_complex_pair = np.abs(multipliers.imag) > multiplier_tolerances.min_imaginary_part
     is_on_circle = (
         np.abs(np.abs(multipliers) - 1.0) < multiplier_tolerances.located_pair_circle_distance
@@ -123,7 +126,7 @@ def locate_function_zeros(
     values_at_fraction_0, values_at_fraction_1 = end_values
     # The rows are the newest location, the end with the other sign, and the location replaced by
     # the newest one.
-    locations = np.outer((0.0, 1.0, 1.0), np.ones_like(max_bracket_width))
+    bracket_locations = np.outer((0.0, 1.0, 1.0), np.ones_like(max_bracket_width))
     function_values = np.stack([values_at_fraction_0, values_at_fraction_1, values_at_fraction_1])
     is_sign_jump, n_rounds, n_sections = (
         np.zeros(len(max_bracket_width), bool),
@@ -132,17 +135,17 @@ def locate_function_zeros(
     )
     while len(
         unresolved_indices := np.flatnonzero(
-            np.abs(locations[0] - locations[1]) > max_bracket_width
+            np.abs(bracket_locations[0] - bracket_locations[1]) > max_bracket_width
         )
     ):
         smooth_brackets = unresolved_indices[~is_sign_jump[unresolved_indices]]
         jump_brackets = unresolved_indices[is_sign_jump[unresolved_indices]]
         proposed_locations = _propose_zero_location(
-            locations[:, smooth_brackets],
+            bracket_locations[:, smooth_brackets],
             function_values[:, smooth_brackets],
             max_bracket_width[smooth_brackets],
         )
-        bracket_lower_ends, bracket_upper_ends = np.sort(locations[:2, jump_brackets], 0)
+        bracket_lower_ends, bracket_upper_ends = np.sort(bracket_locations[:2, jump_brackets], 0)
         section_ends = np.linspace(bracket_lower_ends, bracket_upper_ends, n_sections + 1, axis=-1)
         bracket_indices = np.concatenate(
             [smooth_brackets, np.repeat(jump_brackets, n_sections - 1)]
@@ -150,15 +153,15 @@ def locate_function_zeros(
         section_values_matrix = function(
             np.concatenate([proposed_locations, section_ends[:, 1:-1].ravel()]), bracket_indices
         )
-        is_undefined = np.isnan(section_values_matrix)
+        is_function_undefined = np.isnan(section_values_matrix)
         section_values_matrix = np.where(
-            is_undefined, values_at_fraction_1[bracket_indices], section_values_matrix
+            is_function_undefined, values_at_fraction_1[bracket_indices], section_values_matrix
         )
         proposal_values = section_values_matrix[: len(smooth_brackets)]
         section_values = section_values_matrix[len(smooth_brackets) :].reshape(-1, n_sections - 1)
         has_same_sign = np.sign(proposal_values) == np.sign(function_values[0, smooth_brackets])
         for stored_values, proposed_values in (
-            (locations, proposed_locations),
+            (bracket_locations, proposed_locations),
             (function_values, proposal_values),
         ):
             newest_values, opposite_values, _ = stored_values[:, smooth_brackets]
@@ -167,7 +170,7 @@ def locate_function_zeros(
                 np.where(has_same_sign, opposite_values, newest_values),
                 np.where(has_same_sign, newest_values, opposite_values),
             )
-        locations[1, smooth_brackets[proposal_values == 0.0]] = proposed_locations[
+        bracket_locations[1, smooth_brackets[proposal_values == 0.0]] = proposed_locations[
             proposal_values == 0.0
         ]
         is_left_side = (
@@ -175,23 +178,25 @@ def locate_function_zeros(
         )
         # The root lies between the last location with the sign of location 0 and the next location.
         last_left_index = np.sum(np.cumprod(is_left_side, 1), 1)
-        locations[:2, jump_brackets] = section_ends[
+        bracket_locations[:2, jump_brackets] = section_ends[
             np.arange(len(jump_brackets)), np.stack([last_left_index, last_left_index + 1])
         ]
         n_rounds += 1
         is_sign_jump[smooth_brackets] = (
-            is_undefined[: len(smooth_brackets)]
+            is_function_undefined[: len(smooth_brackets)]
             | (proposal_values == function_values[2, smooth_brackets])
             | (n_rounds >= options.max_smooth_rounds)
         )
     best_locations = np.where(
         is_sign_jump,
-        np.min(locations[:2], 0),
+        np.min(bracket_locations[:2], 0),
         np.where(
-            np.abs(function_values[0]) < np.abs(function_values[1]), locations[0], locations[1]
+            np.abs(function_values[0]) < np.abs(function_values[1]),
+            bracket_locations[0],
+            bracket_locations[1],
         ),
     )
-    return ZeroLocations(best_locations, *np.sort(locations[:2], 0))
+    return ZeroLocations(best_locations, *np.sort(bracket_locations[:2], 0))
 
 
 def _propose_zero_location(
@@ -206,7 +211,7 @@ def _propose_zero_location(
             / (bracket_locations[2] - bracket_locations[1]),
             (function_values[0] - function_values[1]) / (function_values[2] - function_values[1]),
         )
-        is_trusted = (1.0 - np.sqrt(1.0 - location_ratio) < value_ratio) & (
+        is_interpolation_trusted = (1.0 - np.sqrt(1.0 - location_ratio) < value_ratio) & (
             value_ratio < np.sqrt(location_ratio)
         )
         interpolated_fraction = (
@@ -228,7 +233,9 @@ def _propose_zero_location(
     return (
         bracket_locations[0]
         + np.clip(
-            np.where(is_trusted, interpolated_fraction, 0.5), min_fraction, 1.0 - min_fraction
+            np.where(is_interpolation_trusted, interpolated_fraction, 0.5),
+            min_fraction,
+            1.0 - min_fraction,
         )
         * bracket_length
     )

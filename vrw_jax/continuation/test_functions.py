@@ -103,18 +103,18 @@ class TestFunctionCurve(AbstractContinuationProblem):
                 first_leaf + parameter_range * parameter_change * second_leaf
             )
         )
-        correction = jax.tree.map(
+        correction_leaf = jax.tree.map(
             combine_tangent_leaves(fraction_change), newton_step.newton_correction, second_tangent
         )
-        tangent = jax.tree.map(
+        tangent_leaf = jax.tree.map(
             combine_tangent_leaves(fraction_tangent), first_tangent, second_tangent
         )
         # The fraction adds a multiplier of zero, which has no effect.
-        jacobian = jnp.pad(newton_step.return_map_jacobian, (0, 1))
+        jacobian_row = jnp.pad(newton_step.return_map_jacobian, (0, 1))
         return NewtonStep(
-            TestFunctionPoint(correction, fraction_change),
-            TestFunctionPoint(tangent, fraction_tangent),
-            jacobian,
+            TestFunctionPoint(correction_leaf, fraction_change),
+            TestFunctionPoint(tangent_leaf, fraction_tangent),
+            jacobian_row,
         )
 
     def section_state(self, z: TestFunctionPoint) -> SectionStateVector:
@@ -143,8 +143,8 @@ error of the parameters is the square of the value.
 """
 
 
-def compute_offset_bifurcation_margins(jacobian: Float[Array, "n n"]) -> Array:
+def compute_offset_bifurcation_margins(return_map_jacobian: Float[Array, "n n"]) -> Array:
     """Return the bifurcation margins, with the margin to the fold reduced by
     `JURY_MARGIN_OFFSET`.
     """
-    return compute_bifurcation_margins(jacobian).at[0].add(-JURY_MARGIN_OFFSET)
+    return compute_bifurcation_margins(return_map_jacobian).at[0].add(-JURY_MARGIN_OFFSET)

@@ -87,8 +87,8 @@ def _find_gaits_from_starts(
         parameter_values[candidate_wheel_indices], walk_states
     )
     # NumPy is used, because JAX would compile each operation for every number of wheels.
-    is_attracting = np.abs(np.linalg.eigvals(candidate_gaits.monodromy_value)).max(-1) < 1.0
-    is_gait_valid = (np.asarray(candidate_gaits.outcome) == Outcome.STEPPED) & is_attracting
+    is_gait_attracting = np.abs(np.linalg.eigvals(candidate_gaits.monodromy_value)).max(-1) < 1.0
+    is_gait_valid = (np.asarray(candidate_gaits.outcome) == Outcome.STEPPED) & is_gait_attracting
     step_end_states = np.asarray(
         candidate_gaits.steps.section_state
     )  # section states at the ends of all gait steps
@@ -131,8 +131,10 @@ def _find_gaits_from_starts(
         )
     # The cycle of a wheel without a valid candidate contains zeros and has a failure as outcome.
     selected_gaits = select_tree_rows(candidate_gaits, selected_indices)
-    is_missing = ~is_gait_valid[selected_indices]
-    broadcast_mask = lambda gait_array: is_missing.reshape(-1, *[1] * (gait_array.ndim - 1))
+    is_selected_gait_missing = ~is_gait_valid[selected_indices]
+    broadcast_mask = lambda gait_array: is_selected_gait_missing.reshape(
+        -1, *[1] * (gait_array.ndim - 1)
+    )
     masked_gaits = jax.tree.map(
         lambda gait_array: np.where(
             broadcast_mask(gait_array), np.zeros_like(gait_array), gait_array
@@ -142,7 +144,9 @@ def _find_gaits_from_starts(
     outcome_codes = np.where(
         selected_gaits.outcome == Outcome.STEPPED, Outcome.NO_CYCLE_FOUND, selected_gaits.outcome
     )
-    outcome_codes = np.where(is_missing, outcome_codes, selected_gaits.outcome).astype(np.int32)
+    outcome_codes = np.where(
+        is_selected_gait_missing, outcome_codes, selected_gaits.outcome
+    ).astype(np.int32)
     masked_gaits = eqx.tree_at(
         lambda gaits_of_candidates: gaits_of_candidates.outcome, masked_gaits, outcome_codes
     )

@@ -124,8 +124,8 @@ class CollocationFinder(AbstractGaitFinder):
             else step.measures()[measure_name]
         )
         if measure_name == "clearance_sls1":
-            is_scuffing = cycle.measure("takeoff_acceleration") < 0.0
-            return jnp.where(is_scuffing, step.measures()["clearance_sls2"], measure_value)
+            is_takeoff_scuffing = cycle.measure("takeoff_acceleration") < 0.0
+            return jnp.where(is_takeoff_scuffing, step.measures()["clearance_sls2"], measure_value)
         return measure_value
 
     def find_cycle(self, params: WheelParams, cycle_guess: Any = None) -> LimitCycle:
@@ -164,7 +164,7 @@ class CollocationFinder(AbstractGaitFinder):
         landing_result = transitions.resolve_landing(
             params.symbols(), previous_end_state[0], *previous_end_state[2:]
         )
-        collocation_solution, is_active, step_ends = jax.tree.map(
+        collocation_solution, is_phase_active, step_ends = jax.tree.map(
             lambda x: jnp.roll(x, -first_step_index, 0),
             (
                 collocation_state.solution,
@@ -175,7 +175,7 @@ class CollocationFinder(AbstractGaitFinder):
         section_state = jnp.stack([landing_result.theta_after, landing_result.motion_after.dtheta])
         return collocation_state._replace(
             solution=collocation_solution._replace(section_state=section_state),
-            is_phase_active=is_active,
+            is_phase_active=is_phase_active,
             step_end_states=step_ends,
         )
 

@@ -386,8 +386,8 @@ class _NewtonState(NamedTuple):
     collocation_state: CollocationState
     monodromy_matrix: LaneArray
     correction_norm: LaneArray
-    is_converged: Bool[Array, " lanes"]
-    is_running: Bool[Array, " lanes"]
+    has_lane_converged: Bool[Array, " lanes"]
+    is_lane_running: Bool[Array, " lanes"]
     n_newton_iterations: Int[Array, " lanes"]
 
 
@@ -430,9 +430,9 @@ def run_newton_iterations(
         )
         newton_correction = cycle_linearization.newton_correction
         correction_norm = compute_correction_norm(collocation_solution, newton_correction)
-        is_finite = jnp.isfinite(correction_norm)
+        is_correction_finite = jnp.isfinite(correction_norm)
         step_fraction = _compute_correction_fraction(collocation_solution, newton_correction)
-        is_lane_moving = newton_state.is_running & is_finite
+        is_lane_moving = newton_state.is_lane_running & is_correction_finite
         update_moving_lanes = lambda new_value, old_value: jnp.where(
             is_lane_moving, new_value, old_value
         )
@@ -453,7 +453,7 @@ def run_newton_iterations(
             if tight_tolerance < loose_tolerance
             else tight_tolerance
         )
-        is_converged = is_lane_moving & is_at_target & (correction_norm < newton_tolerance)
+        has_lane_converged = is_lane_moving & is_at_target & (correction_norm < newton_tolerance)
         collocation_state = newton_state.collocation_state._replace(
             solution=jax.tree.map(apply_correction, collocation_solution, newton_correction),
             step_end_states=update_moving_lanes(
@@ -467,13 +467,13 @@ def run_newton_iterations(
                 cycle_linearization.monodromy, newton_state.monodromy_matrix
             ),
             correction_norm=update_moving_lanes(correction_norm, newton_state.correction_norm),
-            is_converged=newton_state.is_converged | is_converged,
-            is_running=is_lane_moving & ~is_converged,
-            n_newton_iterations=newton_state.n_newton_iterations + newton_state.is_running,
+            has_lane_converged=newton_state.has_lane_converged | has_lane_converged,
+            is_lane_running=is_lane_moving & ~has_lane_converged,
+            n_newton_iterations=newton_state.n_newton_iterations + newton_state.is_lane_running,
         )
 
     has_running_lanes = lambda newton_state: (
-        jnp.any(newton_state.is_running)
+        jnp.any(newton_state.is_lane_running)
         & (newton_state.iteration_index < max_iterations + homotopy_steps)
     )
     section_size, float_dtype, n_lanes = (
@@ -486,16 +486,18 @@ def run_newton_iterations(
         collocation_state=start_state,
         monodromy_matrix=jnp.zeros((section_size, section_size, n_lanes), float_dtype),
         correction_norm=jnp.ones((n_lanes,), float_dtype),
-        is_converged=jnp.zeros((n_lanes,), bool),
-        is_running=is_lane_requested,
+        has_lane_converged=jnp.zeros((n_lanes,), bool),
+        is_lane_running=is_lane_requested,
         n_newton_iterations=jnp.zeros((n_lanes,), jnp.int32),
     )
     last_newton_state = lax.while_loop(has_running_lanes, run_newton_iteration, first_newton_state)
     failed_check = find_first_failed_check(
         collocation_system, parameters, last_newton_state.collocation_state
     )
-    has_cycle = (last_newton_state.is_converged & (failed_check == 0.0)).astype(parameters.dtype)
-    failed_check = jnp.where(last_newton_state.is_converged, failed_check, 0.0)
+    has_cycle = (last_newton_state.has_lane_converged & (failed_check == 0.0)).astype(
+        parameters.dtype
+    )
+    failed_check = jnp.where(last_newton_state.has_lane_converged, failed_check, 0.0)
     collocation_state = last_newton_state.collocation_state._replace(
         has_cycle=has_cycle, failed_check=failed_check
     )
@@ -584,9 +586,9 @@ def find_first_failed_check(
                 phase_constants, phase_points, is_phase_active
             )
         ]
-        for check_index, is_satisfied in enumerate(is_check_satisfied):
+        for check_index, has_check_passed in enumerate(is_check_satisfied):
             failed_check = jnp.where(
-                (failed_check == 0.0) & ~is_satisfied, 1.0 + check_index, failed_check
+                (failed_check == 0.0) & ~has_check_passed, 1.0 + check_index, failed_check
             )
         return (jnp.stack(next_section_state), failed_check), None
 

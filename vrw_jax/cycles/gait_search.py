@@ -299,9 +299,9 @@ def _search_with_fallbacks(
     gait_choice: GaitChoice,
 ) -> Any:
     """Find the cycle of one wheel or of each wheel in a batch, by the search and all fallbacks."""
-    is_batch = params.damping.ndim > 0
+    has_batch_axis = params.damping.ndim > 0
     params_without_tangents = lax.stop_gradient(params)
-    has_no_values, is_concrete = (
+    has_no_values, are_params_concrete = (
         has_traced_leaf(params_without_tangents),
         not has_traced_leaf(params),
     )
@@ -309,14 +309,14 @@ def _search_with_fallbacks(
         cycle = _find_chosen_gaits(
             gait_finder,
             params_without_tangents
-            if is_batch
+            if has_batch_axis
             else _take_wheels_on_device(params_without_tangents, None),
             gait_choice,
         )
-        cycle = cycle if is_batch else _take_wheels_on_device(cycle, 0)
+        cycle = cycle if has_batch_axis else _take_wheels_on_device(cycle, 0)
         return (
             cycle
-            if is_concrete
+            if are_params_concrete
             else _search_without_fallbacks(gait_finder, params, cycle.section_state)
         )
     cycle = _search_without_fallbacks(gait_finder, params, cycle_guess)
@@ -325,7 +325,7 @@ def _search_with_fallbacks(
     )  # Differentiated arrays also have concrete values.
     if not gait_finder.supports_cold_start or has_traced_leaf(params_and_cycle):
         return cycle
-    if not is_batch:
+    if not has_batch_axis:
         params_and_cycle = _take_wheels_on_device(params_and_cycle, None)
     section_state = None
     if cycle_guess is not None:
@@ -348,20 +348,22 @@ def _search_with_fallbacks(
     if finder_and_starts is None:
         return cycle
     gait_finder, collocation_state = finder_and_starts
-    if is_concrete:
+    if are_params_concrete:
         retried_cycle = map_in_batches(
             gait_finder.find_cycles,
             batch_sizes.GAIT_BATCH_SIZES,
             params_and_cycle[0],
             collocation_state,
         )  # a compiled program
-        retried_cycle = retried_cycle if is_batch else _take_wheels_on_device(retried_cycle, 0)
+        retried_cycle = (
+            retried_cycle if has_batch_axis else _take_wheels_on_device(retried_cycle, 0)
+        )
     else:
         retried_cycle = _search_without_fallbacks(
             gait_finder,
             params,
             jax.device_put(collocation_state)
-            if is_batch
+            if has_batch_axis
             else _take_wheels_on_device(collocation_state, 0),
         )
     return _keep_first_failure_reason(cycle, retried_cycle)
@@ -374,26 +376,26 @@ def _keep_first_failure_reason(cycle: LimitCycle, retried_cycle: LimitCycle) -> 
     All functions therefore report the same reason, whether fallbacks are used or not, and for any
     batch.
     """
-    get_failure_reason = lambda cycle: (cycle.outcome, cycle.collocation_state.failed_check)
+    failure_reason_getter = lambda cycle: (cycle.outcome, cycle.collocation_state.failed_check)
     first_failure_reason, last_failure_reason = (
-        get_failure_reason(cycle),
-        get_failure_reason(retried_cycle),
+        failure_reason_getter(cycle),
+        failure_reason_getter(retried_cycle),
     )
-    select_values: Any = jnp.where
+    value_selector: Any = jnp.where
     # NumPy compiles nothing for a new batch size.
     if not has_traced_leaf((first_failure_reason, last_failure_reason)):
         first_failure_reason, last_failure_reason = jax.tree.map(
             np.asarray, (first_failure_reason, last_failure_reason)
         )
-        select_values = lambda *arrays: jax.device_put(np.where(*arrays))
-    is_missing = (first_failure_reason[0] != Outcome.STEPPED) & (
+        value_selector = lambda *arrays: jax.device_put(np.where(*arrays))
+    is_gait_missing = (first_failure_reason[0] != Outcome.STEPPED) & (
         last_failure_reason[0] != Outcome.STEPPED
     )
     failure_reason = [
-        select_values(is_missing, *reason_pair)
+        value_selector(is_gait_missing, *reason_pair)
         for reason_pair in zip(first_failure_reason, last_failure_reason, strict=True)
     ]
-    return eqx.tree_at(get_failure_reason, retried_cycle, tuple(failure_reason))
+    return eqx.tree_at(failure_reason_getter, retried_cycle, tuple(failure_reason))
 
 
 def _search_without_fallbacks(

@@ -99,8 +99,8 @@ def predict_gait(params: WheelParams, phase_meshes: tuple[PhaseMesh, ...]) -> Co
     # Python floats do not change the dtype of the parameters.
     coordinate_ranges = (surface_coordinate.tolist() for surface_coordinate in gait_surface[:4])
     centered_coordinates = tuple(
-        (jnp.clip(surface_coordinate, lower_bound, upper_bound) - center) / half_range
-        for surface_coordinate, center, half_range, lower_bound, upper_bound in zip(
+        (jnp.clip(surface_coordinate, lower_bound, upper_bound) - coordinate_center) / half_range
+        for surface_coordinate, coordinate_center, half_range, lower_bound, upper_bound in zip(
             compute_surface_coordinates(params), *coordinate_ranges, strict=True
         )
     )

@@ -275,13 +275,13 @@ class LimitCycle(AbstractCycle):
 @functools.partial(jax.jit, static_argnums=0)
 def _estimate_found_mesh_error(
     collocation_system: CollocationSystem,
-    is_found: Array,
+    is_gait_found: Array,
     collocation_solution: CollocationSolution,
 ) -> Array:
     """Return the estimated mesh error of a cycle, or 0 if no cycle was found."""
     solution_with_lane = jax.tree.map(lambda x: x[..., None], collocation_solution)
     return jnp.where(
-        is_found,
+        is_gait_found,
         estimate_mesh_error(
             collocation_system.phase_sequence, collocation_system.phase_meshes, solution_with_lane
         )[0],
@@ -460,9 +460,9 @@ def guess_cycle_from_walk(
                 jnp.interp(jnp.asarray(phase_mesh.node_fractions), sample_times, coordinate_samples)
                 for coordinate_samples in phase_samples.T
             ]
-            motion = Motion.from_angle(*node_states)
+            node_motion = Motion.from_angle(*node_states)
             node_accelerations = jnp.stack(
-                wheel_phase.solve_acceleration(motion)[: wheel_phase.n_dof], axis=-1
+                wheel_phase.solve_acceleration(node_motion)[: wheel_phase.n_dof], axis=-1
             )
             accelerations_by_phase.append(
                 node_accelerations.reshape(phase_mesh.n_intervals, N_GAUSS_NODES, wheel_phase.n_dof)

@@ -96,8 +96,8 @@ def compute_sensitivity_norms(slope_response: SlopeResponse) -> SensitivityNormP
     """
     A, B1, B0, C, D1, D0 = slope_response
     n = len(A)
-    is_stable = floquet.compute_spectral_radius(lax.stop_gradient(A)) < 1.0
-    A = jnp.where(is_stable, A, 0.0)
+    is_gait_stable = floquet.compute_spectral_radius(lax.stop_gradient(A)) < 1.0
+    A = jnp.where(is_gait_stable, A, 0.0)
     b = A @ B0 + B1
     lyapunov_matrix = jnp.eye(n * n, dtype=A.dtype) - jnp.kron(A, A)
     approximate_inverse = invert_by_elimination(lax.stop_gradient(lyapunov_matrix))
@@ -112,7 +112,7 @@ def compute_sensitivity_norms(slope_response: SlopeResponse) -> SensitivityNormP
     beginning_step_response = C @ B0 + D1
     sensitivity_norm = _safe_square_root(D0**2 + beginning_step_response**2 + later_steps_squared)
     infinite_if_unstable = lambda unbounded_sensitivity: jnp.where(
-        is_stable, unbounded_sensitivity, jnp.inf
+        is_gait_stable, unbounded_sensitivity, jnp.inf
     )
     return SensitivityNormParts(
         infinite_if_unstable(sensitivity_norm),
@@ -217,7 +217,7 @@ def compute_collocation_slope_response(
     landing, in the frame of the line of the ground under both feet. The response is differentiable
     on the branch of gaits in every mode, up to second order.
     """
-    collocation_solution, is_active = (
+    collocation_solution, is_phase_active = (
         collocation_state.solution,
         collocation_state.is_phase_active[0],
     )
@@ -229,7 +229,10 @@ def compute_collocation_slope_response(
     )
     compute_response = _make_collocation_response_function(collocation_system)
     return compute_response(
-        parameters, collocation_solution.section_state, lax.stop_gradient(is_active), *gait_unknowns
+        parameters,
+        collocation_solution.section_state,
+        lax.stop_gradient(is_phase_active),
+        *gait_unknowns,
     )[0]
 
 

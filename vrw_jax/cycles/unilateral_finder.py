@@ -135,8 +135,8 @@ class UnilateralFinder(AbstractReturnMapFinder):
         there is none.
         """
         slow_gaits = find_slow_gaits(self, parameter_values)
-        is_found = np.asarray(slow_gaits.outcome) == Outcome.STEPPED
-        return jax.device_put(np.where(is_found[:, None], slow_gaits.section_state, np.nan))
+        is_gait_found = np.asarray(slow_gaits.outcome) == Outcome.STEPPED
+        return jax.device_put(np.where(is_gait_found[:, None], slow_gaits.section_state, np.nan))
 
     def find_gait(self, parameter_values: ParameterValues, cycle_guess: Array) -> Gait:
         return _remove_batch_axis(
@@ -322,7 +322,7 @@ class PeriodEvaluation(NamedTuple):
     end_states: np.ndarray
     parameter_jacobian: np.ndarray
     return_map_jacobian: np.ndarray
-    is_complete: np.ndarray
+    is_period_complete: np.ndarray
 
     def compute_newton_correction(
         self, section_states: np.ndarray, return_map_jacobian: np.ndarray
@@ -330,7 +330,7 @@ class PeriodEvaluation(NamedTuple):
         """Return Newton's correction of the section states, which is zero if a period
         is not complete.
         """
-        newton_correction, is_complete = np.zeros_like(section_states), self.is_complete
+        newton_correction, is_complete = np.zeros_like(section_states), self.is_period_complete
         newton_matrix = np.eye(section_states.shape[1]) - return_map_jacobian[is_complete]
         newton_correction[is_complete] = solve_linear_systems(
             newton_matrix, (self.end_states - section_states)[is_complete][..., None]
@@ -407,7 +407,7 @@ def find_contact_fixed_points(
         < newton_options.max_near_correction
     )
     is_near_gait = is_near_gait | (
-        exact_period_evaluation.is_complete
+        exact_period_evaluation.is_period_complete
         & (
             np.abs((exact_period_evaluation.end_states - section_states) / section_units).max(-1)
             < newton_options.max_near_correction
@@ -478,7 +478,9 @@ def _run_contact_newton(
             section_states[active_wheels], period_evaluation.return_map_jacobian
         )
         correction_size = np.abs(newton_correction / section_units[active_wheels]).max(-1)
-        is_correction_valid = period_evaluation.is_complete & np.isfinite(newton_correction).all(-1)
+        is_correction_valid = period_evaluation.is_period_complete & np.isfinite(
+            newton_correction
+        ).all(-1)
         newton_residuals[active_wheels] = np.abs(
             (period_evaluation.end_states - section_states[active_wheels])
             / section_units[active_wheels]

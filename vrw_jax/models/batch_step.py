@@ -32,7 +32,7 @@ from vrw_jax.models.phase_sequence import (
     PhaseResult,
     PhaseRunner,
     PhaseSequenceResult,
-    finish_step,
+    finish_gait_step,
     make_advance_result,
     make_step_result,
     make_trajectory,
@@ -129,13 +129,15 @@ def make_batch_phase(
             ],
         )
 
-    def complete_stage_motion(stage: StageState) -> Motion:
+    def complete_stage_motion(stage_state: StageState) -> Motion:
         return phase.complete_motion(
-            stage.acceleration.sin, stage.acceleration.cos, stage.q, stage.v
+            stage_state.acceleration.sin, stage_state.acceleration.cos, stage_state.q, stage_state.v
         )
 
-    def make_phase_instant(stage: StageState) -> PhaseInstant:
-        return PhaseInstant(phase, complete_stage_motion(stage), stage.acceleration.acceleration)
+    def make_phase_instant(stage_state: StageState) -> PhaseInstant:
+        return PhaseInstant(
+            phase, complete_stage_motion(stage_state), stage_state.acceleration.acceleration
+        )
 
     implicit_dynamics = ImplicitDynamics(
         lambda stage: phase.compute_dynamics_residual(
@@ -411,7 +413,7 @@ def build_step_function(
 def build_step_finisher(
     argument_structure: Any, phase_index: int, stop_at_lift_off: bool
 ) -> BatchFunction:
-    """Return a function that computes the results of `finish_step` from a list of leaves.
+    """Return a function that computes the results of `finish_gait_step` from a list of leaves.
 
     The leaves are those of (params, distance, state, options). The results are split into float
     arrays and other arrays.
@@ -427,7 +429,7 @@ def build_step_finisher(
             options, tableau, False, None, True, DEFAULT_STIFF_START_OPTIONS
         )
         step_settings = options, stop_at_lift_off, "lanes"
-        remaining_step_result = finish_step(
+        remaining_step_result = finish_gait_step(
             phase_runner, params, phase_index, foot_distance, tuple(phase_state), *step_settings
         )
         return eqx.partition(remaining_step_result, eqx.is_inexact_array)

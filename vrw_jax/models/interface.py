@@ -161,16 +161,16 @@ class AbstractWheel(eqx.Module):
         self,
         params: WheelParams,
         phase_index: int,
-        distance: Elementwise,
-        state: Float[Array, " 6"],
+        foot_distance: Elementwise,
+        phase_state: Float[Array, " 6"],
         options: StepOptions,
     ) -> AdvanceResult:
         """Compute the rest of a step on flat ground, starting from a state within one of its
         phases.
 
         - `phase_index`: index of the phase (0 for DLS, 1 for SLS-I, 2 for SLS-II);
-        - `distance`: distance between the two feet in the double support of this step, m;
-        - `state`: (theta, L1, L2) and their rates, rad, m, rad/s, m/s.
+        - `foot_distance`: distance between the two feet in the double support of this step, m;
+        - `phase_state`: (theta, L1, L2) and their rates, rad, m, rad/s, m/s.
 
         Only models whose capabilities have `can_begin_within_step` implement this method.
         """
@@ -210,9 +210,13 @@ class AbstractWheel(eqx.Module):
         """
         return self.count_section_entries(params)
 
-    def compute_section_units(self, units: WheelUnits, n_legs: int) -> list[Elementwise]:
+    def compute_section_units(self, wheel_units: WheelUnits, n_legs: int) -> list[Elementwise]:
         """Return the unit of each entry of a section state, computed from the wheel's own units."""
-        return [units.length_unit / units.length_unit, units.rate_unit, units.velocity_unit]
+        return [
+            wheel_units.length_unit / wheel_units.length_unit,
+            wheel_units.rate_unit,
+            wheel_units.velocity_unit,
+        ]
 
     def embed_section_state(self, params: WheelParams, x: Array) -> Array:
         """Return `x` as a section state of this model.

@@ -200,7 +200,7 @@ def _run_remaining_phases(
     )
 
 
-def finish_step(
+def finish_gait_step(
     phase_runner: PhaseRunner,
     params: WheelParams,
     phase_index: int,
@@ -453,19 +453,19 @@ def _make_step_margins(
             )
         return jnp.where(jnp.isfinite(lowest_margin), lowest_margin, 0.0)
 
-    def compute_friction_margin(foot_force: dynamics.FootForce, is_loaded: Array) -> Array:
+    def compute_friction_margin(foot_force: dynamics.FootForce, is_foot_loaded: Array) -> Array:
         required_friction = jnp.where(
-            is_loaded, dynamics.compute_required_friction(foot_force), 0.0
+            is_foot_loaded, dynamics.compute_required_friction(foot_force), 0.0
         )
         return jnp.where(has_step_begun, friction - required_friction, 0.0)
 
     def compute_locked_stopper_impulses(
-        motion_after: Motion, hub_velocity_jump: tuple, has_collision: Array
+        motion_after: Motion, hub_velocity_jump: tuple, has_impact_occurred: Array
     ) -> Array:
         leg_impulses = transitions.compute_locked_leg_impulses(
             s, motion_after, hub_velocity_jump, range(3, s.n + 1)
         )
-        return jnp.where(has_collision, leg_impulses, 0.0)
+        return jnp.where(has_impact_occurred, leg_impulses, 0.0)
 
     return Margins(
         fore_foot_force=find_lowest_margin("fore_foot_force", 0, 1, 2),

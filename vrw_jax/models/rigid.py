@@ -257,14 +257,14 @@ class RigidWheel(AbstractWheel):
         self,
         params: WheelParams,
         phase_index: int,
-        distance: Elementwise,
-        state: Float[Array, " 6"],
+        foot_distance: Elementwise,
+        phase_state: Float[Array, " 6"],
         options: StepOptions,
     ) -> AdvanceResult:
         """Compute the rest of the step from theta and its rate. The other arguments have no
         effect.
         """
-        wheel_angle, angular_rate = state[0], state[3]
+        wheel_angle, angular_rate = phase_state[0], phase_state[3]
         s, half_angle = params.symbols(), jnp.asarray(0.5 * params.leg_angle, wheel_angle.dtype)
         rolling_motion = RollingMotion(s, params.slope, angular_rate, given_first_angle=wheel_angle)
         apex_angle = jnp.maximum(wheel_angle, -params.slope)
@@ -505,8 +505,10 @@ class RollingMotion(eqx.Module):
         """
         zero_like_theta = 0.0 * theta
         squared_rate = self.compute_squared_rate(theta)
-        is_moving = squared_rate > 0.0
-        angular_rate = jnp.where(is_moving, jnp.sqrt(jnp.where(is_moving, squared_rate, 1.0)), 0.0)
+        is_wheel_moving = squared_rate > 0.0
+        angular_rate = jnp.where(
+            is_wheel_moving, jnp.sqrt(jnp.where(is_wheel_moving, squared_rate, 1.0)), 0.0
+        )
         leg_length = self.s.L0 + zero_like_theta
         return Motion.from_angle(
             theta, leg_length, leg_length, angular_rate, zero_like_theta, zero_like_theta
@@ -606,7 +608,7 @@ class RollingMotion(eqx.Module):
         )
 
         def zoom_to_minima(
-            _round: Array, centers_and_half_width: tuple[Array, Array]
+            round_index: Array, centers_and_half_width: tuple[Array, Array]
         ) -> tuple[Array, Array]:
             bracket_centers, half_bracket_width = centers_and_half_width
 

@@ -33,7 +33,7 @@ from vrw_jax.models.phase_sequence import (
     PhaseResult,
     PhaseRunner,
     PhaseSequenceResult,
-    finish_step,
+    finish_gait_step,
     make_advance_result,
     make_step_result,
     make_trajectory,
@@ -138,18 +138,18 @@ class ViscoelasticWheel(AbstractWheel):
         return jnp.asarray(PAPER_START_STATE, params.damping.dtype)
 
     def advance(self, params: WheelParams, x: SectionState, options: StepOptions) -> AdvanceResult:
-        return self._compute_step(params, x, options, has_margins=False)
+        return self._compute_step(params, x, options, records_margins=False)
 
     def take_step(self, params: WheelParams, x: SectionState, options: StepOptions) -> StepResult:
-        return self._compute_step(params, x, options, has_margins=True)
+        return self._compute_step(params, x, options, records_margins=True)
 
     def _compute_step(
-        self, params: WheelParams, x: SectionState, options: StepOptions, has_margins: bool
+        self, params: WheelParams, x: SectionState, options: StepOptions, records_margins: bool
     ) -> Any:
         """Return the results of a step, computed with the compiled function."""
         argument_leaves, argument_structure = jax.tree.flatten((params, x, options))
         return eqx.combine(
-            *_compile_step_function(self, argument_structure, has_margins)(*argument_leaves)
+            *_compile_step_function(self, argument_structure, records_margins)(*argument_leaves)
         )
 
     def sample_step(
@@ -208,12 +208,12 @@ class ViscoelasticWheel(AbstractWheel):
         self,
         params: WheelParams,
         phase_index: int,
-        distance: Elementwise,
-        state: Float[Array, " 6"],
+        foot_distance: Elementwise,
+        phase_state: Float[Array, " 6"],
         options: StepOptions,
     ) -> AdvanceResult:
         argument_leaves, argument_structure = jax.tree.flatten(
-            (params, jnp.asarray(distance), state, options)
+            (params, jnp.asarray(foot_distance), phase_state, options)
         )
         if can_use_batch_kernel(options):
             step_finisher = build_step_finisher(
@@ -222,8 +222,8 @@ class ViscoelasticWheel(AbstractWheel):
             return eqx.combine(*step_finisher(*argument_leaves))
         phase_runner = _make_diffrax_phase_runner(options, records_margins=False)
         step_settings = options, self.stop_at_lift_off, "diffrax"
-        return finish_step(
-            phase_runner, params, phase_index, distance, tuple(state), *step_settings
+        return finish_gait_step(
+            phase_runner, params, phase_index, foot_distance, tuple(phase_state), *step_settings
         )
 
 
@@ -231,14 +231,14 @@ def _make_diffrax_phase_runner(options: StepOptions, records_margins: bool) -> P
     """Return a function that integrates one phase to its end with diffrax."""
 
     def run_phase(
-        phase: AbstractPhase, q: Vector, v: Vector, is_active: Array, _: PhaseResult | None
+        phase: AbstractPhase, q: Vector, v: Vector, is_phase_active: Array, _: PhaseResult | None
     ) -> PhaseResult:
         diffrax_phase = make_diffrax_phase(phase, records_margins)
         phase_end = integrate_in_units(
             diffrax_phase.vector_field,
             diffrax_phase.guards,
             jnp.stack([*q, *v]),
-            is_active,
+            is_phase_active,
             options,
             jnp.stack(phase.coordinate_units),
             compute_wheel_units(phase.s).time_unit,
@@ -259,7 +259,7 @@ def _make_diffrax_phase_runner(options: StepOptions, records_margins: bool) -> P
 
 @functools.cache
 def _compile_step_function(
-    model: ViscoelasticWheel, argument_structure: Any, has_margins: bool
+    model: ViscoelasticWheel, argument_structure: Any, records_margins: bool
 ) -> ForwardFunction:
     """Return a function that computes a step from the leaves of (params, x, options).
 
@@ -280,10 +280,10 @@ def _compile_step_function(
         """
         params, x, options = jax.tree.unflatten(argument_structure, argument_leaves)
         options = options.with_derivative_tolerances() if has_tight_tolerances else options
-        phase_sequence = model._run_phases(params, x, options, records_margins=has_margins)
+        phase_sequence = model._run_phases(params, x, options, records_margins=records_margins)
         step_result: AdvanceResult | StepResult = (
             make_step_result(phase_sequence, model.friction, engine_name)
-            if has_margins
+            if records_margins
             else make_advance_result(phase_sequence, engine_name)
         )
         return eqx.partition(step_result, eqx.is_inexact_array)
@@ -297,7 +297,7 @@ def _compile_step_function(
     trace_config = (
         argument_structure,
         model.stop_at_lift_off,
-        model.friction if has_margins else None,
+        model.friction if records_margins else None,
     )
     return enable_all_ad_modes(
         build_step_function(*trace_config),

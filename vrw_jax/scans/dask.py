@@ -116,12 +116,13 @@ def _require_scheduler_response(scheduler_address: str) -> None:
     from distributed.security import Security
 
     async def connect_to_scheduler() -> None:
-        arguments = Security().get_connection_args("client")
+        connection_arguments = Security().get_connection_args("client")
         timeout_seconds = parse_timedelta(DASK_SCHEDULER_TIMEOUT)
-        connection = await asyncio.wait_for(
-            connect(scheduler_address, timeout=timeout_seconds, **arguments), 2 * timeout_seconds
+        scheduler_connection = await asyncio.wait_for(
+            connect(scheduler_address, timeout=timeout_seconds, **connection_arguments),
+            2 * timeout_seconds,
         )
-        connection.abort()
+        scheduler_connection.abort()
 
     with ThreadPoolExecutor(
         1

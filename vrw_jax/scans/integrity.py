@@ -65,9 +65,9 @@ def add_attribute_seal(mark_attributes: dict[str, Any]) -> dict[str, Any]:
     `ATTRIBUTE_SEAL_KEY`.
     """
     unsealed_attributes = {
-        key: attribute_value
-        for key, attribute_value in mark_attributes.items()
-        if key != ATTRIBUTE_SEAL_KEY
+        attribute_key: attribute_value
+        for attribute_key, attribute_value in mark_attributes.items()
+        if attribute_key != ATTRIBUTE_SEAL_KEY
     }
     return unsealed_attributes | {
         ATTRIBUTE_SEAL_KEY: _compute_hex_digest(
@@ -202,8 +202,8 @@ class StoredMetadata:
             damaged_names.append(CHECKSUM_GROUP_NAME)
         sealed_attributes = self.mark_attributes.get(STORE_ATTRIBUTES_KEY, {})
         if any(
-            self._root_attributes.get(key, attribute_value) != attribute_value
-            for key, attribute_value in sealed_attributes.items()
+            self._root_attributes.get(attribute_key, attribute_value) != attribute_value
+            for attribute_key, attribute_value in sealed_attributes.items()
         ):
             damaged_names.append("attributes")
         return damaged_names

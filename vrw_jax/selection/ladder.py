@@ -137,10 +137,10 @@ class ModelChoice(AbstractPrintable):
         )
         margin_rows = [
             (
-                MARGIN_MEASURES[n].label_with_symbol,
-                MARGIN_MEASURES[n].format_with_unit(margin_value),
+                MARGIN_MEASURES[margin_name].label_with_symbol,
+                MARGIN_MEASURES[margin_name].format_with_unit(margin_value),
             )
-            for n, margin_value in name_margin_pairs
+            for margin_name, margin_value in name_margin_pairs
         ]
         return [("model", type(self.model).__name__), ("reason", self.why), *margin_rows]
 

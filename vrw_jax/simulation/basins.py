@@ -115,14 +115,16 @@ def basin(
     ]
     grid_shape = tuple(len(component_values[component_name]) for component_name in grid_axis_names)
     grid_coordinates = np.meshgrid(*component_values.values(), indexing="ij")
-    grid_points = np.stack([m.ravel() for m in grid_coordinates], -1)
+    grid_points = np.stack(
+        [n_section_entries.ravel() for n_section_entries in grid_coordinates], -1
+    )
     start_states = (
         grid_points
         if component_names == PRE_TOUCHDOWN_COMPONENT_NAMES
         else invert_landing_map(params, grid_points)
     )
-    is_reachable = np.isfinite(start_states).all(-1)
-    start_states = np.where(is_reachable[:, None], start_states, np.nan)
+    is_start_reachable = np.isfinite(start_states).all(-1)
+    start_states = np.where(is_start_reachable[:, None], start_states, np.nan)
     start_embedder = functools.partial(model.embed_section_state, params)
     start_states = np.asarray(jax.vmap(start_embedder)(jnp.asarray(start_states)))
     walk_ends = walk_until_periodic(params, start_states, model, options, max_steps, max_period)
@@ -288,10 +290,10 @@ def compute_walk_end_fractions(basins: xr.Dataset) -> dict[str, float]:
     attractor_indices = basins.attractor.values.ravel()
     outcome_codes = basins.outcome.values.ravel()
     walk_end_names = [
-        f"attractor {a}"
-        if a >= 0
-        else ("unsettled" if c == Outcome.STEPPED else Outcome(int(c)).name)
-        for a, c in zip(attractor_indices, outcome_codes, strict=True)
+        f"attractor {attractor_code}"
+        if attractor_code >= 0
+        else ("unsettled" if outcome_code == Outcome.STEPPED else Outcome(int(outcome_code)).name)
+        for attractor_code, outcome_code in zip(attractor_indices, outcome_codes, strict=True)
     ]
     return {
         walk_end_name: walk_end_names.count(walk_end_name) / len(walk_end_names)

@@ -160,22 +160,21 @@ def convert_step_arguments(
         convert_model_argument(model),
         StepOptions.with_engine(convert_step_options(options), engine),
     )
-    state = convert_section_state(x)
+    section_state = convert_section_state(x)
     section_size = model.count_section_entries(params)
-    if state.shape == (3,) and section_size != 3:
-        state = model.embed_section_state(params, state)
-    if state.shape != (section_size,):
+    if section_state.shape == (3,) and section_size != 3:
+        section_state = model.embed_section_state(params, section_state)
+    if section_state.shape != (section_size,):
         full_state_shape_text = (
             "" if section_size == 3 else f", or this model’s own of shape ({section_size},)"
         )
         raise ValueError(
-            f"the section state has shape {state.shape}, but it is (theta-, dtheta-, dL1-), shape "
-            f"(3,){full_state_shape_text}: "
-            "for batches map over it with jax.vmap."
+            f"the section state has shape {section_state.shape}, but it is (theta-, dtheta-, "
+            f"dL1-), shape (3,){full_state_shape_text}: for batches map over it with jax.vmap."
         )
     # Parameters made in single precision stay inaccurate after a conversion to double precision.
     StepOptions.check_tolerances(options, jnp.result_type(*jax.tree.leaves(params)))
-    common_dtype = jnp.result_type(state, params.damping)
+    common_dtype = jnp.result_type(section_state, params.damping)
     StepOptions.check_tolerances(options, common_dtype)
 
     def convert_to_common_dtype(array_tree: Any) -> Any:
@@ -186,7 +185,7 @@ def convert_step_arguments(
 
     return (
         convert_to_common_dtype(params),
-        convert_to_common_dtype(state),
+        convert_to_common_dtype(section_state),
         model,
         convert_to_common_dtype(options),
     )
@@ -260,12 +259,14 @@ def step(
         0.714 s, STEPPED
     """
     model, params, stepwise_ground = split_stepwise_ground(params, model, 1)
-    params, state, model, options = convert_step_arguments(params, x, model, options, engine)
+    params, section_state, model, options = convert_step_arguments(
+        params, x, model, options, engine
+    )
     if stepwise_ground is not None:
         model, params = model.with_step_ground(
-            params, _get_first_step_ground(stepwise_ground, state.dtype)
+            params, _get_first_step_ground(stepwise_ground, section_state.dtype)
         )
-    return model.take_step(params, state, options)
+    return model.take_step(params, section_state, options)
 
 
 @with_default_jax_settings
@@ -304,12 +305,14 @@ def return_map(
         (3, 3)
     """
     model, params, stepwise_ground = split_stepwise_ground(params, model, 1)
-    params, state, model, options = convert_step_arguments(params, x, model, options, engine)
+    params, section_state, model, options = convert_step_arguments(
+        params, x, model, options, engine
+    )
     if stepwise_ground is not None:
         model, params = model.with_step_ground(
-            params, _get_first_step_ground(stepwise_ground, state.dtype)
+            params, _get_first_step_ground(stepwise_ground, section_state.dtype)
         )
-    return model.advance(params, state, options).section_state
+    return model.advance(params, section_state, options).section_state
 
 
 class Walk(AbstractPrintable):
@@ -446,14 +449,14 @@ def walk(
     """
     n_steps = check_int("n_steps", n_steps)
     checked_model, params, stepwise_ground = split_stepwise_ground(params, model, n_steps)
-    params, state, checked_model, options = convert_step_arguments(
+    params, section_state, checked_model, options = convert_step_arguments(
         params, x, checked_model, options, engine
     )
     if stepwise_ground is not None:
         stepwise_ground = tuple(
-            ground_by_step.astype(state.dtype) for ground_by_step in stepwise_ground
+            ground_by_step.astype(section_state.dtype) for ground_by_step in stepwise_ground
         )
-    return _walk_by_scan(checked_model, params, state, options, n_steps, stepwise_ground)
+    return _walk_by_scan(checked_model, params, section_state, options, n_steps, stepwise_ground)
 
 
 def split_stepwise_ground(

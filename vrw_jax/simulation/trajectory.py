@@ -240,7 +240,7 @@ class UnevenGroundLines(NamedTuple):
         Before the conversion they are in the frame of the step's own line.
 
         - `position_names`: names of the columns that are positions along the slope;
-        - `foothold`: position of the first foot of step k in the frame of line 0, m.
+        - `foothold_position`: position of the first foot of step k in the frame of line 0, m.
         """
         for column_name in position_names:
             normal_column_name = f"{column_name[:-1]}z"
@@ -286,7 +286,7 @@ def sample_walk_steps(
     """
     columns_by_step: list[dict[str, np.ndarray]] = []
     walk_outcome, n_stepped, step_start_time, traveled_distance = Outcome.STEPPED, 0, 0.0, 0.0
-    foothold = np.zeros(2)
+    foothold_position = np.zeros(2)
     while walk_outcome == Outcome.STEPPED and n_stepped < n_steps:
         sampled_step = trajectory_spec.step_sampler(x, n_stepped)
         has_interval_occurred, step_columns = sampled_step.durations > 0.0, dict[str, np.ndarray]()
@@ -305,12 +305,12 @@ def sample_walk_steps(
                 )
         else:
             ground_lines.convert_to_walk_frame(
-                step_columns, trajectory_spec.slope_position_names, n_stepped, foothold
+                step_columns, trajectory_spec.slope_position_names, n_stepped, foothold_position
             )
             foothold_displacement = ground_lines.rotate_to_line_0(
                 n_stepped, sampled_step.step_length, sampled_step.landing_normal_offset
             )
-            foothold = foothold + foothold_displacement
+            foothold_position = foothold_position + foothold_displacement
         step_columns["time"] = step_columns["time"] + step_start_time
         step_columns["step"] = np.full(len(step_columns["time"]), n_stepped)
         columns_by_step.append(step_columns)

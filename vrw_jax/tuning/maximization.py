@@ -360,17 +360,17 @@ def _find_best_trial(
     If there is none, return the trial with the smallest violation.
     """
     usable_trials = [trial for trial in trial_record.evaluated_trials if trial.is_usable_trial]
-    is_feasible = lambda trial: (
+    is_trial_feasible = lambda trial: (
         compute_max_violation(trial.constraint_slacks, slack_scales)
         <= maximization_options.active_bound_tolerance
     )
-    feasible_gaits = [trial for trial in usable_trials if is_feasible(trial)]
+    feasible_gaits = [trial for trial in usable_trials if is_trial_feasible(trial)]
     if not feasible_gaits:
         return min(
             usable_trials,
             key=lambda trial: compute_max_violation(trial.constraint_slacks, slack_scales),
         )
-    if is_feasible(last_trial):
+    if is_trial_feasible(last_trial):
         feasible_gaits.append(last_trial)
     return max(feasible_gaits, key=lambda trial: trial.objective)
 

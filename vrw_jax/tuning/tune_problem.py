@@ -511,7 +511,7 @@ class TuneProblem:
         cycle_state, walk_options = np.array(gait.cycle.section_state), self.validation_options
         # The state is scaled down, not up, because no leg may be beyond its stopper.
         section_state = cycle_state * (1.0 - walk_options.relative_start_displacement)
-        is_feasible, walk_outcome, n_walked = True, Outcome.STEPPED, 0
+        is_gait_feasible, walk_outcome, n_walked = True, Outcome.STEPPED, 0
         margins_by_default = default_margins(params)
         for _ in range(walk_options.n_steps_of_walk):
             step_result = self.gait_finder.take_step(params, jnp.asarray(section_state))
@@ -537,12 +537,15 @@ class TuneProblem:
                         np.abs(constraint_value)
                     )
                     violation_tolerance += walk_options.default_margin_tolerance * default_margin
-                    is_feasible &= bool(
+                    is_gait_feasible &= bool(
                         np.all(constraint_value >= min_value - violation_tolerance - 1e-9)
                     )
         final_distance = float(np.max(np.abs(section_state - cycle_state)))
         return WalkValidation(
-            n_walked, walk_outcome, final_distance, is_feasible and walk_outcome == Outcome.STEPPED
+            n_walked,
+            walk_outcome,
+            final_distance,
+            is_gait_feasible and walk_outcome == Outcome.STEPPED,
         )
 
     def _make_path_dataset(self, maximization_result: MaximizationResult) -> xr.Dataset:
