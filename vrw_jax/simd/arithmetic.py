@@ -1,12 +1,12 @@
 """Rules that emit LLVM instructions for elementwise JAX primitives, in the table
 `ELEMENTWISE_RULES`.
 
-A rule takes the value emitter, the primitive's parameters, the dtypes of the first operand and of
-the result, and the LLVM values of the operands. It returns the LLVM value of the result.
+A rule takes an `ElementwiseOperation` and the LLVM values of its operands. It returns the LLVM
+value of the result.
 """
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -26,6 +26,15 @@ The flags apply only to float64, because processors approximate the inverse in f
 """
 
 ElementwiseRule = Callable[..., LlvmValue]
+
+
+class ElementwiseOperation(NamedTuple):
+    """JAX primitive that acts on each number, and the emitter of its LLVM instructions."""
+
+    value_emitter: ValueEmitter
+    primitive_params: Any
+    operand_dtype: Any  # dtype of the first operand
+    result_dtype: Any
 
 
 def emit_llvm_elementwise(
@@ -51,7 +60,8 @@ def emit_llvm_elementwise(
     return value_emitter.emit_value_once(
         instruction_key,
         lambda: emit_primitive(
-            value_emitter, primitive_params, operand_dtype, result_dtype, *operands
+            ElementwiseOperation(value_emitter, primitive_params, operand_dtype, result_dtype),
+            *operands,
         ),
     )
 
@@ -59,50 +69,29 @@ def emit_llvm_elementwise(
 # The rules of sums and products drop terms known to be zero and factors known to be one.
 
 
-def _emit_llvm_sum(
-    value_emitter: ValueEmitter,
-    primitive_params: Any,
-    operand_dtype: Any,
-    result_dtype: Any,
-    x: LlvmValue,
-    y: LlvmValue,
-) -> LlvmValue:
+def _emit_llvm_sum(operation: ElementwiseOperation, x: LlvmValue, y: LlvmValue) -> LlvmValue:
     """Emit the sum x + y and return its LLVM value. A constant operand 0 needs no instruction."""
     if _equals_llvm_constant(y, 0):
         return x
     return (
         y
         if _equals_llvm_constant(x, 0)
-        else _emit_binary_instruction(value_emitter, operand_dtype, ("fadd", "add"), x, y)
+        else _emit_binary_instruction(operation, ("fadd", "add"), x, y)
     )
 
 
-def _emit_llvm_difference(
-    value_emitter: ValueEmitter,
-    primitive_params: Any,
-    operand_dtype: Any,
-    result_dtype: Any,
-    x: LlvmValue,
-    y: LlvmValue,
-) -> LlvmValue:
+def _emit_llvm_difference(operation: ElementwiseOperation, x: LlvmValue, y: LlvmValue) -> LlvmValue:
     """Emit the difference x - y and return its LLVM value. A constant operand y = 0 needs no
     instruction.
     """
     return (
         x
         if _equals_llvm_constant(y, 0)
-        else _emit_binary_instruction(value_emitter, operand_dtype, ("fsub", "sub"), x, y)
+        else _emit_binary_instruction(operation, ("fsub", "sub"), x, y)
     )
 
 
-def _emit_llvm_product(
-    value_emitter: ValueEmitter,
-    primitive_params: Any,
-    operand_dtype: Any,
-    result_dtype: Any,
-    x: LlvmValue,
-    y: LlvmValue,
-) -> LlvmValue:
+def _emit_llvm_product(operation: ElementwiseOperation, x: LlvmValue, y: LlvmValue) -> LlvmValue:
     """Emit the product x * y and return its LLVM value. A constant factor 0 or 1 needs no
     instruction.
     """
@@ -111,47 +100,36 @@ def _emit_llvm_product(
     return (
         y
         if _equals_llvm_constant(x, 1) or _equals_llvm_constant(y, 0)
-        else _emit_binary_instruction(value_emitter, operand_dtype, ("fmul", "mul"), x, y)
+        else _emit_binary_instruction(operation, ("fmul", "mul"), x, y)
     )
 
 
-def _emit_llvm_quotient(
-    value_emitter: ValueEmitter,
-    primitive_params: Any,
-    operand_dtype: Any,
-    result_dtype: Any,
-    x: LlvmValue,
-    y: LlvmValue,
-) -> LlvmValue:
+def _emit_llvm_quotient(operation: ElementwiseOperation, x: LlvmValue, y: LlvmValue) -> LlvmValue:
     """Emit the quotient x / y of two floats and return its LLVM value."""
     # An integer division by zero would stop the process.
-    _require_float_dtype("div", operand_dtype)
+    _require_float_dtype("div", operation.operand_dtype)
     if _equals_llvm_constant(y, 1):
         return x
-    x, y = value_emitter.to_scalars_or_vectors(x, y)
-    return value_emitter.builder.fdiv(
+    x, y = operation.value_emitter.to_scalars_or_vectors(x, y)
+    return operation.value_emitter.builder.fdiv(
         x,
         y,
         flags=RECIPROCAL_DIVISION_FLAGS
-        if operand_dtype == np.float64
+        if operation.operand_dtype == np.float64
         else FUSED_MULTIPLY_ADD_FLAGS,
     )
 
 
-def _emit_llvm_integer_power(
-    value_emitter: ValueEmitter,
-    primitive_params: Any,
-    operand_dtype: Any,
-    result_dtype: Any,
-    x: LlvmValue,
-) -> LlvmValue:
+def _emit_llvm_integer_power(operation: ElementwiseOperation, x: LlvmValue) -> LlvmValue:
     """Emit the power of `x` with a constant integer exponent by repeated squaring, and return its
     LLVM value.
     """
-    emit_product = lambda x, y: _emit_binary_instruction(
-        value_emitter, operand_dtype, ("fmul", "mul"), x, y
+    emit_product = lambda x, y: _emit_binary_instruction(operation, ("fmul", "mul"), x, y)
+    partial_power, repeated_square, remaining_exponent = (
+        None,
+        x,
+        abs(operation.primitive_params["y"]),
     )
-    partial_power, repeated_square, remaining_exponent = None, x, abs(primitive_params["y"])
     while remaining_exponent:
         if remaining_exponent & 1:
             partial_power = (
@@ -165,51 +143,43 @@ def _emit_llvm_integer_power(
             if remaining_exponent
             else repeated_square
         )
-    one_constant = value_emitter.make_llvm_constant(x.type, 1)
+    one_constant = operation.value_emitter.make_llvm_constant(x.type, 1)
     partial_power = one_constant if partial_power is None else partial_power
     return (
-        value_emitter.builder.fdiv(one_constant, partial_power, flags=FUSED_MULTIPLY_ADD_FLAGS)
-        if primitive_params["y"] < 0
+        operation.value_emitter.builder.fdiv(
+            one_constant, partial_power, flags=FUSED_MULTIPLY_ADD_FLAGS
+        )
+        if operation.primitive_params["y"] < 0
         else partial_power
     )
 
 
-def _emit_llvm_negation(
-    value_emitter: ValueEmitter,
-    primitive_params: Any,
-    operand_dtype: Any,
-    result_dtype: Any,
-    x: LlvmValue,
-) -> LlvmValue:
+def _emit_llvm_negation(operation: ElementwiseOperation, x: LlvmValue) -> LlvmValue:
     """Emit the negation -x and return its LLVM value."""
     return (
-        value_emitter.builder.fneg(x) if operand_dtype.kind == "f" else value_emitter.builder.neg(x)
+        operation.value_emitter.builder.fneg(x)
+        if operation.operand_dtype.kind == "f"
+        else operation.value_emitter.builder.neg(x)
     )
 
 
-def _emit_llvm_absolute_value(
-    value_emitter: ValueEmitter,
-    primitive_params: Any,
-    operand_dtype: Any,
-    result_dtype: Any,
-    x: LlvmValue,
-) -> LlvmValue:
+def _emit_llvm_absolute_value(operation: ElementwiseOperation, x: LlvmValue) -> LlvmValue:
     """Emit the absolute value of `x` and return its LLVM value."""
-    if operand_dtype.kind == "f":
-        return _emit_llvm_intrinsic_call(value_emitter, "fabs", x)
+    if operation.operand_dtype.kind == "f":
+        return _emit_llvm_intrinsic_call(operation.value_emitter, "fabs", x)
     is_negative_value = _emit_llvm_comparison(
-        value_emitter, "<", operand_dtype, x, value_emitter.make_llvm_constant(x.type, 0)
+        operation.value_emitter,
+        "<",
+        operation.operand_dtype,
+        x,
+        operation.value_emitter.make_llvm_constant(x.type, 0),
     )
-    return value_emitter.builder.select(is_negative_value, value_emitter.builder.neg(x), x)
+    return operation.value_emitter.builder.select(
+        is_negative_value, operation.value_emitter.builder.neg(x), x
+    )
 
 
-def _return_operand(
-    value_emitter: ValueEmitter,
-    primitive_params: Any,
-    operand_dtype: Any,
-    result_dtype: Any,
-    x: LlvmValue,
-) -> LlvmValue:
+def _return_operand(operation: ElementwiseOperation, x: LlvmValue) -> LlvmValue:
     """Return the operand unchanged."""
     return x
 
@@ -221,16 +191,9 @@ def _make_bitwise_rule(builder_method_name: str) -> ElementwiseRule:
       instruction.
     """
 
-    def emit_llvm_bitwise(
-        value_emitter: ValueEmitter,
-        primitive_params: Any,
-        operand_dtype: Any,
-        result_dtype: Any,
-        x: LlvmValue,
-        y: LlvmValue,
-    ) -> LlvmValue:
-        return getattr(value_emitter.builder, builder_method_name)(
-            *value_emitter.to_scalars_or_vectors(x, y)
+    def emit_llvm_bitwise(operation: ElementwiseOperation, x: LlvmValue, y: LlvmValue) -> LlvmValue:
+        return getattr(operation.value_emitter.builder, builder_method_name)(
+            *operation.value_emitter.to_scalars_or_vectors(x, y)
         )
 
     return emit_llvm_bitwise
@@ -240,18 +203,13 @@ def _make_comparison_rule(comparison_operator: str) -> ElementwiseRule:
     """Return an elementwise rule that compares two numbers by an operator such as "<"."""
 
     def emit_llvm_comparison(
-        value_emitter: ValueEmitter,
-        primitive_params: Any,
-        operand_dtype: Any,
-        result_dtype: Any,
-        x: LlvmValue,
-        y: LlvmValue,
+        operation: ElementwiseOperation, x: LlvmValue, y: LlvmValue
     ) -> LlvmValue:
         return _emit_llvm_comparison(
-            value_emitter,
+            operation.value_emitter,
             comparison_operator,
-            operand_dtype,
-            *value_emitter.to_scalars_or_vectors(x, y),
+            operation.operand_dtype,
+            *operation.value_emitter.to_scalars_or_vectors(x, y),
         )
 
     return emit_llvm_comparison
@@ -263,33 +221,28 @@ def _make_extremum_rule(comparison_operator: str) -> ElementwiseRule:
     """
 
     def emit_llvm_extremum(
-        value_emitter: ValueEmitter,
-        primitive_params: Any,
-        operand_dtype: Any,
-        result_dtype: Any,
-        x: LlvmValue,
-        y: LlvmValue,
+        operation: ElementwiseOperation, x: LlvmValue, y: LlvmValue
     ) -> LlvmValue:
-        x, y = value_emitter.to_scalars_or_vectors(x, y)
-        selected_value = value_emitter.builder.select(
-            _emit_llvm_comparison(value_emitter, comparison_operator, operand_dtype, x, y), x, y
+        x, y = operation.value_emitter.to_scalars_or_vectors(x, y)
+        selected_value = operation.value_emitter.builder.select(
+            _emit_llvm_comparison(
+                operation.value_emitter, comparison_operator, operation.operand_dtype, x, y
+            ),
+            x,
+            y,
         )
-        if operand_dtype.kind != "f":
+        if operation.operand_dtype.kind != "f":
             return selected_value
         # The result is NaN if either operand is NaN.
-        return value_emitter.builder.select(
-            value_emitter.builder.fcmp_unordered("uno", x, x), x, selected_value
+        return operation.value_emitter.builder.select(
+            operation.value_emitter.builder.fcmp_unordered("uno", x, x), x, selected_value
         )
 
     return emit_llvm_extremum
 
 
 def _emit_llvm_select(
-    value_emitter: ValueEmitter,
-    primitive_params: Any,
-    operand_dtype: Any,
-    result_dtype: Any,
-    *condition_and_cases: LlvmValue,
+    operation: ElementwiseOperation, *condition_and_cases: LlvmValue
 ) -> LlvmValue:
     """Emit the selection of the first case where the condition is false, and of the second where it
     is true.
@@ -303,22 +256,18 @@ def _emit_llvm_select(
     ):
         return case_values[0]
     if isinstance(lane_condition.type, ir.VectorType):
-        case_values = [value_emitter.to_lane_vector(case_value) for case_value in case_values]
-    false_case, true_case = value_emitter.to_scalars_or_vectors(*case_values)
-    return value_emitter.builder.select(lane_condition, true_case, false_case)
+        case_values = [
+            operation.value_emitter.to_lane_vector(case_value) for case_value in case_values
+        ]
+    false_case, true_case = operation.value_emitter.to_scalars_or_vectors(*case_values)
+    return operation.value_emitter.builder.select(lane_condition, true_case, false_case)
 
 
-def _emit_llvm_finiteness_test(
-    value_emitter: ValueEmitter,
-    primitive_params: Any,
-    operand_dtype: Any,
-    result_dtype: Any,
-    x: LlvmValue,
-) -> LlvmValue:
+def _emit_llvm_finiteness_test(operation: ElementwiseOperation, x: LlvmValue) -> LlvmValue:
     """Emit the test whether the float `x` is finite, and return its LLVM truth value."""
-    absolute_value = _emit_llvm_intrinsic_call(value_emitter, "fabs", x)
-    return value_emitter.builder.fcmp_ordered(
-        "<", absolute_value, value_emitter.make_llvm_constant(absolute_value.type, np.inf)
+    absolute_value = _emit_llvm_intrinsic_call(operation.value_emitter, "fabs", x)
+    return operation.value_emitter.builder.fcmp_ordered(
+        "<", absolute_value, operation.value_emitter.make_llvm_constant(absolute_value.type, np.inf)
     )
 
 
@@ -331,18 +280,12 @@ def _make_intrinsic_rule(
     For float32 operands, `emit_float32_value` emits the instructions instead, if it is given.
     """
 
-    def emit_llvm_intrinsic(
-        value_emitter: ValueEmitter,
-        primitive_params: Any,
-        operand_dtype: Any,
-        result_dtype: Any,
-        x: LlvmValue,
-    ) -> LlvmValue:
-        _require_float_dtype(intrinsic_function_name, operand_dtype)
+    def emit_llvm_intrinsic(operation: ElementwiseOperation, x: LlvmValue) -> LlvmValue:
+        _require_float_dtype(intrinsic_function_name, operation.operand_dtype)
         return (
-            emit_float32_value(value_emitter, x)
-            if emit_float32_value and operand_dtype == np.float32
-            else _emit_llvm_intrinsic_call(value_emitter, intrinsic_function_name, x)
+            emit_float32_value(operation.value_emitter, x)
+            if emit_float32_value and operation.operand_dtype == np.float32
+            else _emit_llvm_intrinsic_call(operation.value_emitter, intrinsic_function_name, x)
         )
 
     return emit_llvm_intrinsic
@@ -357,21 +300,20 @@ def _require_float_dtype(primitive_name: str, operand_dtype: Any) -> None:
 
 
 def _emit_binary_instruction(
-    value_emitter: ValueEmitter,
-    operand_dtype: Any,
+    operation: ElementwiseOperation,
     float_and_integer_opcodes: tuple[str, str],
     x: LlvmValue,
     y: LlvmValue,
 ) -> LlvmValue:
     """Emit an instruction with two operands and return its LLVM value.
 
-    The opcode is the first of `float_and_integer_opcodes` if `operand_dtype` is a float type, else
+    The opcode is the first of `float_and_integer_opcodes` if the operands are floats, else
     the second.
     """
-    x, y = value_emitter.to_scalars_or_vectors(x, y)
-    return value_emitter.emit_binary_instruction(
+    x, y = operation.value_emitter.to_scalars_or_vectors(x, y)
+    return operation.value_emitter.emit_binary_instruction(
         f"{float_and_integer_opcodes[0]} {' '.join(FUSED_MULTIPLY_ADD_FLAGS)}"
-        if operand_dtype.kind == "f"
+        if operation.operand_dtype.kind == "f"
         else float_and_integer_opcodes[1],
         x,
         y,
@@ -579,8 +521,8 @@ ELEMENTWISE_RULES: dict[str, ElementwiseRule] = {
     "add": _emit_llvm_sum,
     "add_any": _emit_llvm_sum,
     "and": _make_bitwise_rule("and_"),
-    "convert_element_type": lambda value_emitter, _, operand_dtype, result_dtype, x: (
-        convert_llvm_value(value_emitter, x, operand_dtype, result_dtype)
+    "convert_element_type": lambda operation, x: convert_llvm_value(
+        operation.value_emitter, x, operation.operand_dtype, operation.result_dtype
     ),
     "copy": _return_operand,
     "cos": _make_intrinsic_rule("cos"),
@@ -600,9 +542,7 @@ ELEMENTWISE_RULES: dict[str, ElementwiseRule] = {
     "mul": _emit_llvm_product,
     "ne": _make_comparison_rule("!="),
     "neg": _emit_llvm_negation,
-    "not": lambda value_emitter, params, operand_dtype, result_dtype, x: value_emitter.builder.not_(
-        x
-    ),
+    "not": lambda operation, x: operation.value_emitter.builder.not_(x),
     "or": _make_bitwise_rule("or_"),
     "select_n": _emit_llvm_select,
     "shift_left": _make_bitwise_rule("shl"),
@@ -610,9 +550,7 @@ ELEMENTWISE_RULES: dict[str, ElementwiseRule] = {
     "shift_right_logical": _make_bitwise_rule("lshr"),
     "sin": _make_intrinsic_rule("sin"),
     "sqrt": _make_intrinsic_rule("sqrt"),
-    "square": lambda value_emitter, params, operand_dtype, result_dtype, x: (
-        _emit_binary_instruction(value_emitter, operand_dtype, ("fmul", "mul"), x, x)
-    ),
+    "square": lambda operation, x: _emit_binary_instruction(operation, ("fmul", "mul"), x, x),
     "stop_gradient": _return_operand,
     "sub": _emit_llvm_difference,
     "xor": _make_bitwise_rule("xor"),
