@@ -25,7 +25,6 @@ from vrw_jax.wheel.geometry import (
     compute_double_support_circle,
     compute_landing_foot_height,
     compute_rear_foot_height,
-    rotate_to_landing_leg,
 )
 from vrw_jax.wheel.outcomes import Outcome
 from vrw_jax.wheel.params import Symbols
@@ -154,15 +153,6 @@ class AbstractPhase(abc.ABC):
         form as on flat ground.
         """
         return compute_landing_foot_height(self.s, self._rotate_to_next_line(motion))
-
-    def compute_landing_rate(self, motion: Motion) -> Elementwise:
-        """Return the time derivative of the height from `compute_landing_height`, m/s."""
-        rotated_motion = self._rotate_to_next_line(motion)
-        landing_leg = rotate_to_landing_leg(
-            self.s, rotated_motion.sin_theta, rotated_motion.cos_theta
-        )
-        lever_arm = self.s.L0 * landing_leg.sin - rotated_motion.L1 * rotated_motion.sin_theta
-        return rotated_motion.dL1 * rotated_motion.cos_theta + lever_arm * rotated_motion.dtheta
 
     def _rotate_to_next_line(self, motion: Motion) -> Motion:
         """Return the motion, expressed in the frame of the next line of the ground."""
