@@ -16,7 +16,6 @@ from support.batched import (
 import vrw_jax as vrw
 from vrw_jax import Outcome, simd
 from vrw_jax.batches import batch_steps as lane_batch
-from vrw_jax.batches import programs
 from vrw_jax.batches.stiffness import select_cheapest_solver
 from vrw_jax.integrator.integrate import BatchPhase, integrate_batch_phase
 from vrw_jax.integrator.tableaus import (
@@ -26,7 +25,7 @@ from vrw_jax.integrator.tableaus import (
     load_explicit_tableau,
     take_rk_step,
 )
-from vrw_jax.numerics import batch_sizes
+from vrw_jax.numerics import batch_programs, batch_sizes
 from vrw_jax.numerics.trigonometry import compute_sine_cosine
 
 STARTS = reference_values.stack_quantity("step", "start")
@@ -178,12 +177,12 @@ def test_xla_blocks_agree_with_machine_code(monkeypatch):
     solution, codes = compute_values(vectors, states, COARSE_OPTIONS)
     monkeypatch.setattr(simd, "is_machine_code_available", lambda: False)
     monkeypatch.setattr(batch_sizes, "XLA_LANE_BATCH_SIZE", 64)
-    monkeypatch.setattr(programs, "STRAGGLER_COUNT_DIVISOR", 10**9)  # no block stops early
+    monkeypatch.setattr(batch_programs, "STRAGGLER_COUNT_DIVISOR", 10**9)  # no block stops early
     patient, code = compute_values(vectors, states, COARSE_OPTIONS)
     np.testing.assert_array_equal(code, codes)
     # Their step control takes powers that differ in the sixth digit: both keep their tolerance.
     np.testing.assert_allclose(patient, solution, rtol=1e-4, atol=1e-4)
-    monkeypatch.setattr(programs, "STRAGGLER_COUNT_DIVISOR", 2)  # stragglers run again
+    monkeypatch.setattr(batch_programs, "STRAGGLER_COUNT_DIVISOR", 2)  # stragglers run again
     second_result, code = compute_values(vectors, states, COARSE_OPTIONS)
     np.testing.assert_array_equal(second_result, patient)
     np.testing.assert_array_equal(code, codes)

@@ -392,9 +392,7 @@ def test_integration_by_xla_agrees_with_machine_code(unilateral_batch, monkeypat
     *_, walk_result = unilateral_batch
     solution = walk_result(slice(None))
     monkeypatch.setattr(simd, "is_machine_code_available", lambda: False)
-    ground_lanes._compile_walk.cache_clear()
     by_xla = walk_result(slice(None))
-    ground_lanes._compile_walk.cache_clear()
     np.testing.assert_array_equal(by_xla.outcome, solution.outcome)
     # Rounding alone tells them apart, grown by the events of three steps.
     np.testing.assert_allclose(by_xla.section_state, solution.section_state, rtol=0, atol=1e-9)

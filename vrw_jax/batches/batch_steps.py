@@ -21,7 +21,6 @@ from jaxtyping import Array
 from vrw_jax import simd
 from vrw_jax.batches.collocation_step import take_collocation_step
 from vrw_jax.batches.contact_step import CONTACT_STEP_INPUT_NAMES, step_batch_with_contact
-from vrw_jax.batches.programs import run_compiled_lane_function
 from vrw_jax.batches.stiffness import (
     SOLVER_SELECTION_OPTIONS,
     SolverIndex,
@@ -45,7 +44,7 @@ from vrw_jax.models import (
     complete_jacobian_columns,
     compute_jacobian_columns,
 )
-from vrw_jax.numerics import StepOptions, batch_sizes, map_in_batches
+from vrw_jax.numerics import StepOptions, batch_sizes, compile_batch_program, map_in_batches
 from vrw_jax.runtime import with_default_jax_settings
 from vrw_jax.simulation import convert_model_argument, convert_section_state, convert_step_options
 from vrw_jax.validation import (
@@ -552,9 +551,17 @@ def _step_lanes_by_kernel(
         simd.RegisterLimits(n_inputs) if input_indices else simd.DEFAULT_REGISTER_LIMITS
     )
     lane_arrays = [*parameter_matrix, *section_states, *next_slopes]
-    kernel_results = run_compiled_lane_function(
-        step_lanes, scalar_arguments, lane_arrays, cache_key, register_limits
+    batch_program = compile_batch_program(
+        step_lanes,
+        [x.dtype for x in scalar_arguments],
+        len(lane_arrays),
+        parameter_matrix.dtype,
+        cache_key,
+        batch_sizes.XLA_LANE_BATCH_SIZE,
+        register_limits,
+        can_stop_early=True,
     )
+    kernel_results = batch_program(scalar_arguments, lane_arrays)
     _, outcomes, n_solver_steps, step_values, *step_jacobian = kernel_results
     return step_values[:3], step_values[3:], outcomes, n_solver_steps, *step_jacobian
 
@@ -575,22 +582,25 @@ def _step_lanes_by_collocation(
     """
     stop_at_lift_off, n_parameters = model.stop_at_lift_off, len(PARAMETER_NAMES)
 
-    def step_lanes(
-        scalar_arguments: Any, lane_inputs: Any, straggler_count: Array | None = None
-    ) -> tuple:
+    def step_lanes(_: Any, lane_inputs: Any) -> tuple:
         params = make_wheel_from_parameters(lane_inputs[:n_parameters], n_legs)
         x, expected_durations = tuple(lane_inputs[n_parameters:-3]), tuple(lane_inputs[-3:])
         collocation_step = take_collocation_step(params, x, expected_durations, stop_at_lift_off)
-        is_unfinished = jnp.zeros_like(collocation_step.is_trusted)
         step_values = jnp.stack(
             [*collocation_step.section_state, *collocation_step.phase_durations]
         )
-        return is_unfinished, collocation_step.is_trusted, step_values
+        return collocation_step.is_trusted, step_values
 
-    cache_key = ("gait step by collocation", n_legs, stop_at_lift_off)
-    _, is_trusted, step_values = run_compiled_lane_function(
-        step_lanes, [], [*parameter_matrix, *section_states, *expected_phase_durations], cache_key
+    lane_arrays = [*parameter_matrix, *section_states, *expected_phase_durations]
+    batch_program = compile_batch_program(
+        step_lanes,
+        [],
+        len(lane_arrays),
+        parameter_matrix.dtype,
+        ("gait step by collocation", n_legs, stop_at_lift_off),
+        batch_sizes.XLA_LANE_BATCH_SIZE,
     )
+    is_trusted, step_values = batch_program([], lane_arrays)
     outcomes, n_solver_steps = np.zeros((2, len(is_trusted)), np.int32)
     collocated_values = step_values[:3], step_values[3:], outcomes, n_solver_steps
     untrusted_lanes = np.flatnonzero(~is_trusted)

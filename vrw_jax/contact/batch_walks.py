@@ -11,7 +11,6 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
-from vrw_jax import simd
 from vrw_jax.contact.batch_integrator import pack_coordinates
 from vrw_jax.contact.contact_modes import ContactMode
 from vrw_jax.contact.impacts import project_motion
@@ -34,8 +33,7 @@ from vrw_jax.contact.walk_kernel import (
 )
 from vrw_jax.contact.walk_tangents import walk_with_tangents
 from vrw_jax.integrator import load_explicit_tableau
-from vrw_jax.numerics import StepOptions, batch_sizes, map_in_batches
-from vrw_jax.runtime import compile_cached_lane_program
+from vrw_jax.numerics import StepOptions, batch_sizes, compile_batch_program
 from vrw_jax.wheel import PARAMETER_NAMES, Symbols, compute_symbols, compute_wheel_units_of_rows
 
 
@@ -57,9 +55,9 @@ def walk_batch(
       has one step, and two more columns follow: see `N_UNEVEN_COLUMNS`;
     - `section_states`: full section states, shape (wheels, 4 + 3 n).
     """
-    walk_config = _WalkConfig.from_model(model, options, n_legs, False, len(input_columns))
+    static_settings = _make_static_settings(model, options, n_legs, False, len(input_columns))
     walk_arguments = [_append_restitution(input_columns, model), section_states.T]
-    walk_result = _run_walk(walk_config, walk_arguments, n_steps, options)
+    walk_result = _run_walk(static_settings, walk_arguments, n_steps, options)
     step_summary = walk_result.step_result
     result_counts = walk_result.outcome, walk_result.n_stepped, walk_result.n_solver_steps
     return (
@@ -88,10 +86,10 @@ def step_batch_with_jacobian(
     that cannot vary. These are contact codes, and lengths of legs on their stoppers or with loaded
     feet. Tangents are computed only for independent rates (see `_IndependentStartRates`).
     """
-    walk_config = _WalkConfig.from_model(model, options, n_legs, True, len(input_columns))
+    static_settings = _make_static_settings(model, options, n_legs, True, len(input_columns))
     if len(section_states):  # The longest compilation starts first.
         _compile_walk(
-            walk_config,
+            static_settings,
             input_columns.dtype,
             jax.tree.structure(eqx.filter(options, eqx.is_array)),
         )
@@ -130,7 +128,7 @@ def step_batch_with_jacobian(
         tangent_input_indices,
     ]
     walk_result, tangents = _run_walk(
-        walk_config, walk_arguments, 1, options.with_derivative_tolerances()
+        static_settings, walk_arguments, 1, options.with_derivative_tolerances()
     )
     first_lane = np.searchsorted(lane_wheels, np.arange(len(section_states)))
 
@@ -361,17 +359,6 @@ def _evaluate_on_lane_rows(
     program is compiled for any number of wheels. JAX alone would compile a new program for each
     number.
     """
-    lane_program = _compile_section_function(
-        n_legs, section_function_name, len(lane_rows), lane_rows[0].dtype
-    )
-    return np.stack(lane_program([], [np.ascontiguousarray(lane_row) for lane_row in lane_rows]))
-
-
-@functools.cache
-def _compile_section_function(
-    n_legs: int, section_function_name: str, n_rows: int, dtype: np.dtype
-) -> Callable[..., Any]:
-    """Return the compiled program that evaluates one function in `SECTION_STATE_FUNCTIONS`."""
 
     def evaluate_section_function(_: tuple, lane_rows: tuple) -> tuple:
         parameter_values = lane_rows[: len(PARAMETER_NAMES)]
@@ -382,125 +369,58 @@ def _compile_section_function(
             )
         )
 
-    if simd.is_machine_code_available():
-        return compile_cached_lane_program(
-            evaluate_section_function,
-            [],
-            n_rows,
-            dtype,
-            ("with unilateral contact", section_function_name, n_legs),
-        )
-    return _compile_with_xla(evaluate_section_function)
+    lane_program = compile_batch_program(
+        evaluate_section_function,
+        [],
+        len(lane_rows),
+        lane_rows[0].dtype,
+        ("with unilateral contact", section_function_name, n_legs),
+        batch_sizes.CONTACT_XLA_BATCH_SIZE,
+    )
+    return np.stack(lane_program([], [np.ascontiguousarray(lane_row) for lane_row in lane_rows]))
 
 
-def _compile_with_xla(lane_function: Callable[[tuple, tuple], tuple]) -> Callable[..., Any]:
-    """Return `lane_function` compiled by XLA.
+def _make_static_settings(
+    model: UnilateralWheel, options: StepOptions, n_legs: int, has_tangents: bool, n_columns: int
+) -> BatchWalkSettings:
+    """Return the walk settings without traced options and number of steps, as a hashable key.
 
-    Its arguments are values common to the batch and arrays (batch,). The compiled function
-    evaluates blocks of batch elements. It is used on platforms without machine code.
+    If tangents are requested, the step is detailed.
     """
-    move_result_axis = lambda result_arrays, source_axis, destination_axis: tuple(
-        jnp.moveaxis(section_state, source_axis, destination_axis)
-        for section_state in result_arrays
+    return BatchWalkSettings(
+        n_legs,
+        0,
+        model.max_events,
+        model.has_one_sided_stoppers,
+        model.uses_paper_rule,
+        has_tangents,
+        eqx.filter(options, eqx.is_array, inverse=True),
+        None,
+        n_columns > N_PARAMETERS + 1,
+        model.restitution is not None,
     )
-    compiled_function = jax.jit(
-        lambda lane_independent, lane_rows: move_result_axis(
-            lane_function(lane_independent, lane_rows), -1, 0
-        )
+
+
+def _list_input_row_counts(static_settings: BatchWalkSettings) -> tuple[int, ...]:
+    """Return the numbers of entries per wheel in the input columns and in the section state.
+
+    If tangents are requested, the number of indices of their inputs follows.
+    """
+    n_columns = (
+        N_PARAMETERS
+        + 1
+        + N_UNEVEN_COLUMNS * static_settings.has_uneven_ground
+        + static_settings.has_restitution
     )
-
-    def run_in_blocks(lane_independent: list, lane_rows: list) -> tuple:
-        run_block = lambda *block_rows: compiled_function(tuple(lane_independent), block_rows)
-        return move_result_axis(
-            map_in_batches(run_block, (batch_sizes.CONTACT_XLA_BATCH_SIZE,), *lane_rows), 0, -1
-        )
-
-    return run_in_blocks
-
-
-class _WalkConfig(NamedTuple):
-    """Static configuration of a batch walk."""
-
-    static_options: StepOptions
-    n_legs: int
-    max_events: int
-    has_one_sided_stoppers: bool
-    uses_paper_rule: bool
-    has_tangents: bool  # whether the detailed step and its tangents are computed
-    has_uneven_ground: bool
-    has_restitution: bool
-
-    @classmethod
-    def from_model(
-        cls,
-        model: UnilateralWheel,
-        options: StepOptions,
-        n_legs: int,
-        has_tangents: bool,
-        n_columns: int,
-    ) -> "_WalkConfig":
-        """Return the configuration of a batch walk for a model and options."""
-        static_options = eqx.filter(options, eqx.is_array, inverse=True)
-        has_uneven_ground = n_columns > N_PARAMETERS + 1
-        return cls(
-            static_options,
-            n_legs,
-            model.max_events,
-            model.has_one_sided_stoppers,
-            model.uses_paper_rule,
-            has_tangents,
-            has_uneven_ground,
-            model.restitution is not None,
-        )
-
-    def make_walk_settings(self, traced_options: StepOptions, n_steps: Array) -> BatchWalkSettings:
-        """Return the walk settings with traced options and a traced number of steps."""
-        options = eqx.combine(traced_options, self.static_options)
-        tableau = load_explicit_tableau(options.solver)
-        assert tableau is not None  # The caller has checked the solver.
-        contact_rules = (
-            self.has_one_sided_stoppers,
-            self.uses_paper_rule,
-            self.has_tangents,
-            options,
-            tableau,
-            self.has_uneven_ground,
-            self.has_restitution,
-        )
-        return BatchWalkSettings(self.n_legs, n_steps, self.max_events, *contact_rules)
-
-    def list_input_row_counts(self) -> tuple[int, ...]:
-        """Return the numbers of entries per wheel in the input columns and in the section state.
-
-        If tangents are requested, the number of indices of their inputs follows.
-        """
-        n_columns = (
-            N_PARAMETERS + 1 + N_UNEVEN_COLUMNS * self.has_uneven_ground + self.has_restitution
-        )
-        row_counts = n_columns, compute_full_section_size(self.n_legs)
-        return (*row_counts, MAX_TANGENTS_PER_LANE) if self.has_tangents else row_counts
-
-    def make_result_structure(self, dtype: Any) -> Any:
-        """Return shapes and dtypes of the results for one batch element, and of their tangents.
-
-        The tangents are included if they are requested.
-        """
-        result_shapes: Any = jax.eval_shape(
-            lambda: make_result_template(self.n_legs, dtype, self.has_tangents)
-        )
-        if not self.has_tangents:
-            return result_shapes
-        float_leaves = eqx.filter(
-            result_shapes.step_result, lambda leaf: jnp.issubdtype(leaf.dtype, jnp.inexact)
-        )
-        add_tangent_axis = lambda leaf: jax.ShapeDtypeStruct(
-            (MAX_TANGENTS_PER_LANE, *leaf.shape), leaf.dtype
-        )
-        return result_shapes, jax.tree.map(add_tangent_axis, float_leaves)
+    row_counts = n_columns, compute_full_section_size(static_settings.n_legs)
+    return (*row_counts, MAX_TANGENTS_PER_LANE) if static_settings.is_detailed else row_counts
 
 
 def _run_walk(
-    walk_config: _WalkConfig, input_arrays: list[np.ndarray], n_steps: int, options: StepOptions
+    static_settings: BatchWalkSettings,
+    input_arrays: list[np.ndarray],
+    n_steps: int,
+    options: StepOptions,
 ) -> Any:
     """Return the results of all walks, with the batch elements on the first axis.
 
@@ -514,12 +434,12 @@ def _run_walk(
     lane_independent = [np.int32(n_steps), *(np.asarray(leaf, dtype) for leaf in traced_options)]
     lane_rows = [input_row[lane_order] for input_array in input_arrays for input_row in input_array]
     result_rows = (
-        _compile_walk(walk_config, dtype, options_structure)(lane_independent, lane_rows)
+        _compile_walk(static_settings, dtype, options_structure)(lane_independent, lane_rows)
         if len(lane_order)
         else None
     )
     inverse_lane_order = np.argsort(lane_order, kind="stable")
-    result_leaves, result_tree_structure = _flatten_result_structure(walk_config, dtype)
+    result_leaves, result_tree_structure = _flatten_result_structure(static_settings, dtype)
     if result_rows is None:
         result_rows = [np.zeros((*leaf.shape, 0), leaf.dtype) for leaf in result_leaves]
     return jax.tree.unflatten(
@@ -532,9 +452,25 @@ def _run_walk(
 
 
 @functools.cache
-def _flatten_result_structure(walk_config: _WalkConfig, dtype: np.dtype) -> tuple[list[Any], Any]:
-    """Return the shapes of one batch element's results as leaves, and their tree structure."""
-    return jax.tree.flatten(walk_config.make_result_structure(dtype))
+def _flatten_result_structure(
+    static_settings: BatchWalkSettings, dtype: np.dtype
+) -> tuple[list[Any], Any]:
+    """Return the shapes of one batch element's results as leaves, and their tree structure.
+
+    If tangents are requested, the tangents of the results follow.
+    """
+    result_shapes: Any = jax.eval_shape(
+        lambda: make_result_template(static_settings.n_legs, dtype, static_settings.is_detailed)
+    )
+    if not static_settings.is_detailed:
+        return jax.tree.flatten(result_shapes)
+    float_leaves = eqx.filter(
+        result_shapes.step_result, lambda leaf: jnp.issubdtype(leaf.dtype, jnp.inexact)
+    )
+    add_tangent_axis = lambda leaf: jax.ShapeDtypeStruct(
+        (MAX_TANGENTS_PER_LANE, *leaf.shape), leaf.dtype
+    )
+    return jax.tree.flatten((result_shapes, jax.tree.map(add_tangent_axis, float_leaves)))
 
 
 def embed_section_states(
@@ -551,9 +487,8 @@ def embed_section_states(
     ).T
 
 
-@functools.cache
 def _compile_walk(
-    walk_config: _WalkConfig, dtype: np.dtype, options_structure: Any
+    static_settings: BatchWalkSettings, dtype: np.dtype, options_structure: Any
 ) -> Callable[..., Any]:
     """Return the compiled program for walks, a function of common values and arrays (batch,).
 
@@ -562,20 +497,25 @@ def _compile_walk(
 
     def run_compiled_walk(lane_independent: tuple, lane_rows: tuple) -> tuple:
         n_steps, *traced_options = lane_independent
-        walk_settings = walk_config.make_walk_settings(
-            jax.tree.unflatten(options_structure, traced_options), n_steps
+        options = eqx.combine(
+            jax.tree.unflatten(options_structure, traced_options), static_settings.step_options
+        )
+        tableau = load_explicit_tableau(options.solver)
+        assert tableau is not None  # The caller has checked the solver.
+        walk_settings = static_settings._replace(
+            n_steps=n_steps, step_options=options, tableau=tableau
         )
         row_iterator = iter(lane_rows)
         walk_inputs = [
             jnp.stack([next(row_iterator) for _ in range(n_rows)])
-            for n_rows in walk_config.list_input_row_counts()
+            for n_rows in _list_input_row_counts(static_settings)
         ]
-        if not walk_config.has_tangents:
+        if not static_settings.is_detailed:
             return tuple(jax.tree.leaves(run_walks(walk_settings, *walk_inputs)))
         input_columns, section_state, tangent_input_indices = walk_inputs
         # Batches have no tangent of restitution, which is the last column.
-        n_columns = len(input_columns) - walk_config.has_restitution
-        column_index = [*range(n_columns), *[-2] * walk_config.has_restitution]
+        n_columns = len(input_columns) - static_settings.has_restitution
+        column_index = [*range(n_columns), *[-2] * static_settings.has_restitution]
         input_index = np.array(
             [*column_index, *n_columns + np.arange(len(section_state))], np.int32
         )[:, None]
@@ -591,13 +531,11 @@ def _compile_walk(
             )
         )
 
-    if simd.is_machine_code_available():
-        scalar_dtypes = [np.dtype(np.int32), *[dtype] * options_structure.num_leaves]
-        return compile_cached_lane_program(
-            run_compiled_walk,
-            scalar_dtypes,
-            sum(walk_config.list_input_row_counts()),
-            dtype,
-            ("walk with unilateral contact", walk_config),
-        )
-    return _compile_with_xla(run_compiled_walk)
+    return compile_batch_program(
+        run_compiled_walk,
+        [np.dtype(np.int32), *[dtype] * options_structure.num_leaves],
+        sum(_list_input_row_counts(static_settings)),
+        dtype,
+        ("walk with unilateral contact", static_settings),
+        batch_sizes.CONTACT_XLA_BATCH_SIZE,
+    )

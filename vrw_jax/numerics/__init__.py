@@ -25,6 +25,7 @@ from vrw_jax.numerics.batch_algebra import (
     solve_node_equations,
     sum_with_weights,
 )
+from vrw_jax.numerics.batch_programs import compile_batch_program
 from vrw_jax.numerics.batching import (
     BatchFunction,
     apply_in_blocks,

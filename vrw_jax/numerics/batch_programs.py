@@ -1,0 +1,103 @@
+"""Compiled functions over lanes that take NumPy arrays: machine code, or XLA programs for blocks of
+lanes.
+"""
+
+import functools
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import numpy as np
+
+from vrw_jax import simd
+from vrw_jax.runtime import compile_cached_lane_program
+
+STRAGGLER_COUNT_DIVISOR = 8
+"""Ratio of the block size to the number of unfinished lanes at which an XLA program stops.
+
+The program then runs again for the unfinished lanes of all blocks together. The value is chosen
+because a block with fewer unfinished lanes wastes most of its work.
+"""
+
+BatchProgram = Callable[[Sequence[Any], Sequence[np.ndarray]], list[np.ndarray]]
+"""Compiled function of scalars, which are the same for all lanes, and of one array per input."""
+
+_compiled_batch_programs: dict[Any, BatchProgram] = {}
+"""Compiled functions over lanes, by all settings on which their traces depend."""
+
+
+def compile_batch_program(
+    lane_function: Callable[..., tuple],
+    scalar_dtypes: Sequence[np.dtype],
+    n_lane_arrays: int,
+    lane_dtype: np.dtype,
+    trace_key_settings: Any,
+    xla_block_size: int,
+    register_limits: simd.RegisterLimits = simd.DEFAULT_REGISTER_LIMITS,
+    can_stop_early: bool = False,
+) -> BatchProgram:
+    """Compile `lane_function(scalars, lanes)` to machine code, or with XLA if machine code is not
+    available.
+
+    A process compiles each function once. The arguments are those of `simd.compile_lane_program`,
+    and:
+
+    - `trace_key_settings`: all settings on which `lane_function` depends, besides its arguments;
+    - `xla_block_size`: number of lanes that one call of an XLA program computes;
+    - `can_stop_early`: whether an XLA program may stop while a few lanes are unfinished. The
+      function then takes the number of these lanes as a third argument, and its first result is a
+      boolean array that marks them.
+    """
+    uses_machine_code = simd.is_machine_code_available()
+    call_format = tuple(scalar_dtypes), n_lane_arrays, lane_dtype
+    program_key = (trace_key_settings, call_format, uses_machine_code, xla_block_size)
+    if program_key not in _compiled_batch_programs:
+        _compiled_batch_programs[program_key] = (
+            compile_cached_lane_program(
+                lane_function, *call_format, trace_key_settings, register_limits
+            )
+            if uses_machine_code
+            else functools.partial(
+                _run_xla_program_by_blocks, jax.jit(lane_function), xla_block_size, can_stop_early
+            )
+        )
+    return _compiled_batch_programs[program_key]
+
+
+def _run_xla_program_by_blocks(
+    xla_program: Callable,
+    block_size: int,
+    can_stop_early: bool,
+    scalar_arguments: Sequence[Any],
+    lane_arrays: Sequence[np.ndarray],
+) -> list[np.ndarray]:
+    """Return the results of an XLA program that runs for one block of `block_size` lanes after
+    another.
+
+    The program then runs again for the unfinished lanes of all blocks together.
+    """
+    result_arrays: list[np.ndarray] = []
+    unfinished_lanes = np.arange(len(lane_arrays[0]))
+    while len(unfinished_lanes) > 0:
+        is_last_round = len(unfinished_lanes) <= block_size
+        straggler_count = np.int32(0 if is_last_round else block_size // STRAGGLER_COUNT_DIVISOR)
+        straggler_lanes = []
+        for block_start in range(0, len(unfinished_lanes), block_size):
+            block_lanes = unfinished_lanes[block_start : block_start + block_size]
+            padded_lanes = np.concatenate(
+                [block_lanes, np.repeat(block_lanes[-1:], block_size - len(block_lanes))]
+            )
+            block_arguments = tuple(scalar_arguments), tuple(x[padded_lanes] for x in lane_arrays)
+            block_outputs = [
+                np.asarray(x)[..., : len(block_lanes)]
+                for x in xla_program(*block_arguments, *[straggler_count] * can_stop_early)
+            ]
+            result_arrays = result_arrays or [
+                np.empty((*x.shape[:-1], len(lane_arrays[0])), x.dtype) for x in block_outputs
+            ]
+            is_finished = ~block_outputs[0] if can_stop_early else np.ones(len(block_lanes), bool)
+            for result_array, block_output in zip(result_arrays, block_outputs, strict=True):
+                result_array[..., block_lanes[is_finished]] = block_output[..., is_finished]
+            straggler_lanes.append(block_lanes[~is_finished])
+        unfinished_lanes = np.concatenate(straggler_lanes)
+    return result_arrays
