@@ -51,8 +51,9 @@ def compile_batch_program(
     uses_machine_code = simd.is_machine_code_available()
     call_format = tuple(scalar_dtypes), n_lane_arrays, lane_dtype
     program_key = (trace_key_settings, call_format, uses_machine_code, xla_block_size)
-    if program_key not in _compiled_batch_programs:
-        _compiled_batch_programs[program_key] = (
+    batch_program = _compiled_batch_programs.get(program_key)  # one hash of a large key
+    if batch_program is None:
+        batch_program = (
             compile_cached_lane_program(
                 lane_function, *call_format, trace_key_settings, register_limits
             )
@@ -61,7 +62,8 @@ def compile_batch_program(
                 _run_xla_program_by_blocks, jax.jit(lane_function), xla_block_size, can_stop_early
             )
         )
-    return _compiled_batch_programs[program_key]
+        _compiled_batch_programs[program_key] = batch_program
+    return batch_program
 
 
 def _run_xla_program_by_blocks(
