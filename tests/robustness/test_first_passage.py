@@ -8,7 +8,13 @@ from scipy.special import ndtr
 
 import vrw_jax as vrw
 from vrw_jax.robustness.passage_gradient import differentiate_log_mean_steps
-from vrw_jax.robustness.sampled_passage import PassageSamplingOptions, WalkerGroups, sample_passage
+from vrw_jax.robustness.sampled_passage import (
+    PASSAGE_SAMPLING_OPTIONS,
+    PassageSamplingOptions,
+    WalkerGroups,
+    _estimate_failure_probability,
+    sample_passage,
+)
 
 DEGREE = np.pi / 180.0
 BYL = vrw.WheelParams(hub_mass=1.0, leg_mass=1e-15, gravity=1.0, slope=8.0 * DEGREE)
@@ -181,6 +187,35 @@ def test_a_life_of_millions_of_steps_depends_on_no_choice_of_the_sampling():
     assert 5e7 < mean < 8e7
     assert abs(sample.failure_probability * mean - 1.0) < error
     assert float(passage.kappa_2) == pytest.approx(float(gait.spectral_radius), abs=0.02)
+
+
+def test_the_error_keeps_its_level_although_the_error_ends_the_sampling():
+    """Normal group means with known mean: an error test after each round covers only 98.6 %."""
+    random, n_estimates, probability, tol = np.random.default_rng(0), 2000, 1e-6, 0.02
+    groups = WalkerGroups(BYL, np.zeros(1), 0.01, RIGID, vrw.StepOptions(), 32, random)
+
+    def draw_weights():
+        groups.n_steps += 1
+        return probability * (1.0 + 0.2 * random.standard_normal(groups.n_groups))
+
+    n_covered, n_rounds = 0, 0
+    for _ in range(n_estimates):
+        groups.n_steps = 0
+        estimate, error = _estimate_failure_probability(
+            groups,
+            draw_weights,
+            1,
+            start_effect_decay=(0.0, 1),
+            relative_tolerance=tol,
+            max_steps=10_000,
+            sampling_options=PASSAGE_SAMPLING_OPTIONS,
+        )
+        assert error <= tol
+        n_covered += abs(estimate / probability - 1.0) <= error
+        n_rounds += groups.n_steps
+    assert n_covered >= 0.99 * n_estimates
+    # With a known variance, (2.576 * 0.2 / tol)^2 / 32 = 21 rounds have this error.
+    assert n_rounds < 2.5 * 21 * n_estimates
 
 
 def test_a_mean_that_few_walks_dominate_has_no_error_estimate():

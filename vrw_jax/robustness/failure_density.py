@@ -51,6 +51,11 @@ class FailureDensityOptions:
 
     The value is chosen because the second fit uses failures of walks that the first fit proposes.
     """
+    max_inflation_test_walks: int = 1024
+    """Largest number of walks with which an inflation factor of the slopes is tested.
+
+    The value is chosen because the standard error of the fraction of failing walks is then 0.01.
+    """
     min_failure_fraction: float = 0.15
     """Smallest fraction of failing walks at which the inflation of the slopes is not increased
     further.
@@ -264,13 +269,15 @@ def fit_failure_density(
     - `n_dimensions`: number of slopes per walk.
     """
     nominal_density = GaussianMixture.make_isotropic_gaussian(n_dimensions, 1.0)
+    n_inflation_test_walks = min(
+        density_options.max_inflation_test_walks, density_options.max_walks_per_stage
+    )
     slope_inflation = 1.0
     while True:
         proposal_density = GaussianMixture.make_isotropic_gaussian(n_dimensions, slope_inflation)
-        slope_deviations = proposal_density.draw_samples(
-            density_options.max_walks_per_stage, random_generator
+        _, has_walk_failed = run_walks(
+            proposal_density.draw_samples(n_inflation_test_walks, random_generator)
         )
-        has_failed_last, has_walk_failed = run_walks(slope_deviations)
         if np.mean(has_walk_failed) >= density_options.min_failure_fraction:
             break
         slope_inflation *= density_options.slope_inflation_factor
@@ -278,6 +285,10 @@ def fit_failure_density(
             return None
     n_finished_fits = 0
     while True:
+        slope_deviations = proposal_density.draw_samples(
+            density_options.max_walks_per_stage, random_generator
+        )
+        has_failed_last, _ = run_walks(slope_deviations)
         if not np.any(has_failed_last):
             return None
         failing_deviations = slope_deviations[has_failed_last]
@@ -305,10 +316,6 @@ def fit_failure_density(
             GaussianMixture.make_isotropic_gaussian(n_dimensions, slope_inflation),
             density_options.nominal_walk_fraction,
         )
-        slope_deviations = proposal_density.draw_samples(
-            density_options.max_walks_per_stage, random_generator
-        )
-        has_failed_last, _ = run_walks(slope_deviations)
 
 
 def _find_next_slope_inflation(

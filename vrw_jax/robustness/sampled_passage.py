@@ -66,7 +66,7 @@ class PassageSamplingOptions:
     The value is chosen because gaits with slower decay are almost unstable.
     """
     max_gait_rounds: int = 40
-    """Largest number of rounds of walks that start on the gait.
+    """Largest number of rounds in which all walkers start on the gait.
 
     The value is chosen because more rounds are needed only if most walks fail within three steps.
     """
@@ -76,6 +76,17 @@ class PassageSamplingOptions:
     """Smallest number of rounds, each with one walk per walker.
 
     The value is chosen because the error estimate of fewer rounds is uncertain.
+    """
+    round_number_margin: float = 1.2
+    """Ratio of the number of rounds before the next error test to the number that is expected to
+    suffice.
+
+    The value is chosen because three of four wheels then pass the next error test.
+    """
+    min_round_number_growth: float = 1.25
+    """Smallest ratio of the numbers of rounds at two successive error tests.
+
+    The value is chosen because later error tests need wider confidence intervals.
     """
     max_start_effect_per_tol: float = 0.1
     """Largest remaining fraction of the effect of the start, divided by the tolerance."""
@@ -102,7 +113,12 @@ class PassageSamplingOptions:
     The value is chosen because a wrong alarm is then rare among some thousands of wheels.
     """
     confidence_level: float = 0.99
-    """Confidence level of the error estimate."""
+    """Confidence level of the error estimate.
+
+    An error test compares the error with the tolerance. The interval of error test k misses the
+    mean with the probability (1 - `confidence_level`)/2^k. These probabilities sum to
+    1 - `confidence_level`, so that the level holds although the error decides when sampling ends.
+    """
 
 
 PASSAGE_SAMPLING_OPTIONS = PassageSamplingOptions()
@@ -264,11 +280,6 @@ def sample_passage(
     Raises:
         ExtinctGroupError: if no walker of a group survives a step.
     """
-    from scipy import stats  # This import is slow.
-
-    student_t_quantile = float(
-        stats.t.ppf(0.5 * (1.0 + sampling_options.confidence_level), walker_groups.n_groups - 1)
-    )
     count_decay_steps = lambda remaining_fraction: int(
         np.ceil(np.log(remaining_fraction) / np.log(np.clip(spectral_radius, 0.01, 0.99)))
     )
@@ -282,17 +293,10 @@ def sample_passage(
             *forgetting_step_limits,
         )
     )
-    surviving_fractions = _estimate_survival_from_gait(
-        walker_groups, n_forgetting_steps, relative_tolerance / student_t_quantile, sampling_options
+    surviving_fractions, step_transitions = _step_until_start_is_forgotten(
+        walker_groups, n_forgetting_steps, relative_tolerance, sampling_options
     )
-    walker_groups.restart_at_gait()
-    step_transitions = []
-    for _ in range(n_forgetting_steps):
-        states_before = walker_groups.stack_states_and_slopes()
-        is_alive, slope_deviations = walker_groups.step_and_replace_failures()
-        step_transitions.append(
-            (states_before, is_alive, slope_deviations, walker_groups.stack_states_and_slopes())
-        )
+    is_alive = step_transitions[-1][1]
     kappa_2 = _estimate_kappa_2(
         step_transitions[-sampling_options.n_kappa_2_steps :], walker_groups.n_continuous
     )
@@ -305,7 +309,6 @@ def sample_passage(
     estimate_probability = functools.partial(
         _estimate_failure_probability,
         walker_groups,
-        student_t_quantile=student_t_quantile,
         start_effect_decay=(max(kappa_2, spectral_radius), n_forgetting_steps - 1),
         relative_tolerance=relative_tolerance,
         max_steps=max_steps,
@@ -364,7 +367,6 @@ def _estimate_failure_probability(
     failure_weight_sampler: Callable[[], np.ndarray],
     n_lines: int,
     *,
-    student_t_quantile: float,
     start_effect_decay: tuple[float, int],
     relative_tolerance: float,
     max_steps: int,
@@ -372,8 +374,9 @@ def _estimate_failure_probability(
 ) -> tuple[float, float]:
     """Return the failure probability of a gait step, and the relative error of that probability.
 
-    Rounds with one walk per walker are repeated until the relative error is within the tolerance.
-    The error is infinite if a few walks dominate the probability.
+    A round samples one walk per walker. After the first rounds, and after each further number of
+    rounds that is expected to suffice, the error is compared with the tolerance. The error is
+    infinite if a few walks dominate the probability.
 
     - `failure_weight_sampler`: function that returns the weight of each walk of a round, which is 0
       unless the walk fails in its last step;
@@ -381,70 +384,114 @@ def _estimate_failure_probability(
     - `start_effect_decay`: factor per step by which the effect of the start decays, and number of
       steps before the walks.
     """
+    from scipy import stats  # This import is slow.
+
+    def compute_student_t_quantile(error_test_number: int) -> float:
+        miss_probability = (1.0 - sampling_options.confidence_level) / 2.0**error_test_number
+        return float(stats.t.isf(0.5 * miss_probability, walker_groups.n_groups - 1))
+
     group_weight_sums, n_rounds = np.zeros(walker_groups.n_groups), 0
     failure_weight_sum, squared_weight_sum, n_failing_walks = 0.0, 0.0, 0
     failure_probability, relative_error = 0.0, np.inf
     remaining_start_effect = start_effect_decay[0] ** (start_effect_decay[1] + n_lines)
-    while n_rounds < sampling_options.min_sampling_rounds or (
+    n_error_tests, n_rounds_at_error_test = 0, sampling_options.min_sampling_rounds
+    while n_error_tests == 0 or (
         relative_error > relative_tolerance and walker_groups.n_steps < max_steps
     ):
-        failure_weights = failure_weight_sampler()
-        group_weight_sums += failure_weights.reshape(walker_groups.n_groups, -1).mean(1)
-        failure_weight_sum += float(np.sum(failure_weights))
-        squared_weight_sum += float(np.sum(failure_weights**2))
-        n_failing_walks += int(np.sum(failure_weights > 0.0))
-        n_rounds += 1
+        while n_rounds < n_rounds_at_error_test and (
+            n_error_tests == 0 or walker_groups.n_steps < max_steps
+        ):
+            failure_weights = failure_weight_sampler()
+            group_weight_sums += failure_weights.reshape(walker_groups.n_groups, -1).mean(1)
+            failure_weight_sum += float(np.sum(failure_weights))
+            squared_weight_sum += float(np.sum(failure_weights**2))
+            n_failing_walks += int(np.sum(failure_weights > 0.0))
+            n_rounds += 1
+        n_error_tests += 1
+        n_rounds_at_error_test = 2 * n_rounds
         if failure_weight_sum == 0.0:
             continue
         last_step_failure_probability = float(np.mean(group_weight_sums)) / n_rounds
         failure_probability, error_amplification = _solve_failure_probability(
             last_step_failure_probability, n_lines
         )
-        standard_error = (
-            np.std(group_weight_sums, ddof=1) / np.sqrt(walker_groups.n_groups) / n_rounds
-        )
-        sampling_error = (
-            student_t_quantile
-            * error_amplification
-            * standard_error
-            / last_step_failure_probability
-        )
-        relative_error = float(sampling_error + remaining_start_effect)
         n_effective_failures = failure_weight_sum**2 / squared_weight_sum
-        if n_effective_failures < sampling_options.min_effective_failures:
-            relative_error = np.inf
-        min_effective_fraction = sampling_options.min_effective_failure_fraction
-        if (
-            n_rounds >= sampling_options.min_sampling_rounds
-            and n_effective_failures < min_effective_fraction * n_failing_walks
+        if n_effective_failures < (
+            sampling_options.min_effective_failure_fraction * n_failing_walks
         ):
             return failure_probability, np.inf
+        if n_effective_failures < sampling_options.min_effective_failures:
+            continue
+        relative_standard_error = (
+            error_amplification
+            * np.std(group_weight_sums, ddof=1)
+            / np.sqrt(walker_groups.n_groups)
+            / np.mean(group_weight_sums)
+        )
+        relative_error = float(
+            compute_student_t_quantile(n_error_tests) * relative_standard_error
+            + remaining_start_effect
+        )
+        tolerated_sampling_error = relative_tolerance - remaining_start_effect
+        if tolerated_sampling_error > 0.0:
+            error_ratio = (
+                compute_student_t_quantile(n_error_tests + 1)
+                * relative_standard_error
+                / tolerated_sampling_error
+            )
+            n_rounds_at_error_test = int(
+                np.ceil(
+                    n_rounds
+                    * max(
+                        sampling_options.round_number_margin * error_ratio**2,
+                        sampling_options.min_round_number_growth,
+                    )
+                )
+            )
     return failure_probability, relative_error
 
 
-def _estimate_survival_from_gait(
+def _step_until_start_is_forgotten(
     walker_groups: WalkerGroups,
     n_steps: int,
     relative_tolerance: float,
     sampling_options: PassageSamplingOptions,
-) -> np.ndarray:
-    """Return the fractions of walks from the gait that survive 0, 1, ..., `n_steps` gait steps.
+) -> tuple[np.ndarray, list[tuple[np.ndarray, ...]]]:
+    """Return the fractions of walks from the gait that survive 0, 1, ..., `n_steps` gait steps, and
+    the transitions of the walkers.
 
-    The result has the shape (n_steps + 1,). Rounds with one walk per walker are repeated until the
-    last fraction has the relative standard error `relative_tolerance`.
+    The fractions have the shape (n_steps + 1,). The transitions are those that `_estimate_kappa_2`
+    describes. All walkers start on the gait and take `n_steps` steps. These rounds are repeated
+    until the last fraction is accurate. The walkers then have the quasi-stationary distribution.
+    The product of the surviving fractions of successive steps has no bias, although survivors
+    replace failed walkers (Del Moral 2004).
     """
-    n_survivors, n_walks = np.zeros(n_steps + 1), 0
-    for _ in range(sampling_options.max_gait_rounds):
+    from scipy import stats  # This import is slow.
+
+    max_relative_variance = (
+        relative_tolerance / stats.norm.isf(0.5 * (1.0 - sampling_options.confidence_level))
+    ) ** 2
+    surviving_fractions_by_round: list[np.ndarray] = []
+    step_transitions: list[tuple[np.ndarray, ...]] = []
+    relative_variance_sum = 0.0
+    while len(surviving_fractions_by_round) < sampling_options.max_gait_rounds and (
+        not surviving_fractions_by_round
+        or relative_variance_sum > max_relative_variance * len(surviving_fractions_by_round) ** 2
+    ):
         walker_groups.restart_at_gait()
-        walk_results = walker_groups.run_walks(
-            walker_groups.random.standard_normal((len(walker_groups.gait_states), n_steps))
+        step_transitions.clear()
+        for _ in range(n_steps):
+            states_before = walker_groups.stack_states_and_slopes()
+            is_alive, slope_deviations = walker_groups.step_and_replace_failures()
+            step_transitions.append(
+                (states_before, is_alive, slope_deviations, walker_groups.stack_states_and_slopes())
+            )
+        alive_fractions = np.array([np.mean(transition[1]) for transition in step_transitions])
+        surviving_fractions_by_round.append(np.cumprod([1.0, *alive_fractions]))
+        relative_variance_sum += float(
+            np.sum((1.0 - alive_fractions) / alive_fractions) / len(walker_groups.states)
         )
-        n_walks += len(walker_groups.gait_states)
-        n_walks_by_length = np.bincount(walk_results.n_stepped, minlength=n_steps + 1)
-        n_survivors += np.cumsum(n_walks_by_length[::-1])[::-1]
-        if n_walks - n_survivors[-1] < relative_tolerance**2 * n_walks * n_survivors[-1]:
-            break
-    return n_survivors / n_walks
+    return np.mean(surviving_fractions_by_round, 0), step_transitions
 
 
 def _fit_density_of_failures(walker_groups: WalkerGroups, n_lines: int) -> GaussianMixture | None:
