@@ -64,6 +64,7 @@ SLOW_FUNCTIONS = {
     "first_passage",
     "basin_share",
     "measure_basins",
+    "measure_gait_sensitivity",
     "smallest_disturbance",
     "sensitivities",
     "continue_branch",
@@ -183,6 +184,14 @@ GAITS = {
             n_starts=2,
         )
     ),
+    "measure_gait_sensitivity": lambda m: is_successful(
+        lambda: vrw.measure_gait_sensitivity(
+            vrw.continue_branch(PULLED_WHEEL, "stiffness", STIFFNESS_BOUNDS, model=m),
+            "period",
+            model=m,
+            n_points=1,
+        )
+    ),
     "continue_branch": lambda m: is_branch_found(
         vrw.continue_branch(PULLED_WHEEL, "stiffness", STIFFNESS_BOUNDS, model=m)
     ),
@@ -228,6 +237,7 @@ def test_every_function_with_a_model_argument_is_tested_with_both_options():
     # These report no margin of friction, or only how it varies.
     measured = {"step_batch", "walk", "simulate", "return_map", "gait_sensitivity"}
     measured |= {"first_passage", "basin_share", "smallest_disturbance", "measure_basins"}
+    measured |= {"measure_gait_sensitivity"}
     assert taking - measured == set(FRICTION)
 
 

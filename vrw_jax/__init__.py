@@ -45,6 +45,7 @@ from vrw_jax.robustness import (
     first_passage,
     gait_sensitivity,
     measure_basins,
+    measure_gait_sensitivity,
     smallest_disturbance,
 )
 from vrw_jax.runtime import start_jax
@@ -140,6 +141,7 @@ __all__ = (
     "limit_cycles",
     "map_special_points",
     "measure_basins",
+    "measure_gait_sensitivity",
     "measure_to_tolerance",
     "multifidelity_mean",
     "open_scan",

@@ -61,6 +61,33 @@ def test_a_long_walk_on_slightly_uneven_ground_has_that_standard_deviation(sensi
     assert abs(deviation / float(sensitivity.norm[0]) - 1.0) < 0.01
 
 
+def test_norms_along_a_branch_are_those_of_its_wheels():
+    branch = vrw.continue_branch(TABLE_1, "damping", (198.0, 202.0))
+    norms = vrw.measure_gait_sensitivity(branch, ("period", "speed"), n_points=3)
+    assert norms.damping.values[[0, -1]].tolist() == branch.values[[0, -1]].tolist()
+    assert norms.gait_sensitivity_period.attrs["units"] == "s per rad"
+    for i in range(3):
+        params = vrw.WheelParams(damping=float(norms.damping[i]))
+        expected = vrw.gait_sensitivity(params, ("period", "speed")).norm
+        along_branch = [norms.gait_sensitivity_period[i], norms.gait_sensitivity_speed[i]]
+        np.testing.assert_allclose(along_branch, expected, rtol=1e-8)
+    with pytest.raises(ValueError, match="give the model of the branch"):
+        vrw.measure_gait_sensitivity(branch, "period", model=HELD)
+    with pytest.raises(ValueError, match="measure of a step"):
+        vrw.measure_gait_sensitivity(branch, "spectral_radius")
+
+
+def test_norms_are_infinite_at_unstable_gaits_of_a_branch():
+    # A fold near 0.319 rad separates the stable gaits from the unstable ones.
+    params = vrw.WheelParams(damping=105.0, stiffness=530.0, slope=0.318)
+    branch = vrw.continue_branch(params, "slope", (0.3175, 0.325))
+    norms = vrw.measure_gait_sensitivity(branch, "period", n_points=2)
+    assert branch.stable[[0, -1]].tolist() == [True, False]
+    norm_values = norms.gait_sensitivity_period.values
+    assert np.isfinite(norm_values).tolist() == [True, False]
+    assert np.isinf(norm_values[-1])
+
+
 def test_the_linear_map_is_that_of_differences_of_walks():
     # Central differences with steps of 1e-4 have errors near 1e-9 of derivatives near 1.
     cycle, h = vrw.limit_cycle(TABLE_1), 1e-4

@@ -774,6 +774,12 @@ def register_wrong_calls() -> None:
         "TypeError",
         "continue_branch",
     )
+    add_wrong_call(
+        "gait sensitivity along no branch",
+        lambda: vrw.measure_gait_sensitivity(table_1, "period"),
+        "TypeError",
+        "continue_branch",
+    )
 
     # Tuning
     tune = lambda **changes: vrw.tune(

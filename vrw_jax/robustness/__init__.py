@@ -3,7 +3,7 @@ of the state.
 """
 
 from vrw_jax.robustness.basin_share import BasinShare, basin_share
-from vrw_jax.robustness.branch_basins import measure_basins
+from vrw_jax.robustness.branch_robustness import measure_basins, measure_gait_sensitivity
 from vrw_jax.robustness.first_passage import FirstPassage, first_passage
 from vrw_jax.robustness.gait_sensitivity import GaitSensitivity, gait_sensitivity
 from vrw_jax.robustness.smallest_disturbance import SmallestDisturbance, smallest_disturbance
