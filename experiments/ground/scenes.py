@@ -64,7 +64,7 @@ def make_starts() -> np.ndarray:
             np.asarray(
                 vrw.UnilateralWheel(
                     friction=mu, infinite_friction_rule="paper"
-                ).embed_section_state(params, start)
+                ).complete_section_state(params, start)
             )
         )
     return np.stack(x)

@@ -320,7 +320,9 @@ def test_an_impossible_start_has_the_outcome_bad_input():
     """By geometry: Leg 1 at an angle below 0 leaves the next foot in the ground, above half of that
     between legs Leg 1 would be longer than its stopper lets it be."""
     starts = [(0.1, 1.6, -0.1), (-0.05, 1.6, -0.1), (0.4, 1.6, -0.1)]
-    full = np.array([GROUND_MODEL.embed_section_state(SLOW_WHEEL, jnp.asarray(x)) for x in starts])
+    full = np.array(
+        [GROUND_MODEL.complete_section_state(SLOW_WHEEL, jnp.asarray(x)) for x in starts]
+    )
     free, held_values, near = (full[0].copy() for _ in range(3))
     free[4 + 2 * 8 + 2], free[4 + 2] = 0.0, 1.01  # a leg in the air off its stopper, too long
     held_values[4 + 2 * 8] = 5.0  # the loaded leg on its stopper: its foot is in the ground
@@ -493,7 +495,7 @@ def test_a_batched_step_has_measures_and_derivatives_of_a_single_wheel(scene, st
     friction, damping, rate = scene
     params = vrw.WheelParams(damping=damping)
     ground = vrw.UnilateralWheel(friction=friction, stoppers=stoppers)
-    x = np.asarray(ground.embed_section_state(params, jnp.asarray([0.1, rate, -0.1])))
+    x = np.asarray(ground.complete_section_state(params, jnp.asarray([0.1, rate, -0.1])))
     values = np.asarray(ground.collect_parameter_values(params))
     step, shifted = step_batch_with_jacobian(values[:, None], x[None], ground, TIGHT_OPTIONS, 8)
     is_same, only_value = step_batch_with_jacobian(

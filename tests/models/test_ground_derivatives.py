@@ -60,7 +60,9 @@ def classify_events(trace, first_locked):
 def compute_step(mu, c, dtheta, stoppers):
     params = vrw.WheelParams(damping=c)
     wheel = vrw.UnilateralWheel(friction=mu, stoppers=stoppers)
-    x = wheel.embed_section_state(params, jnp.stack([jnp.asarray(0.1), dtheta, jnp.asarray(-0.1)]))
+    x = wheel.complete_section_state(
+        params, jnp.stack([jnp.asarray(0.1), dtheta, jnp.asarray(-0.1)])
+    )
     advance = wheel.advance(params, x, TIGHT_OPTIONS)
     times = advance.durations
     if stoppers == "one-sided":  # rounding says in which mode the least dips are spent
@@ -74,7 +76,7 @@ def test_derivatives_through_the_events_of_a_step_match_differences(name):
     (mu, c, dtheta, stoppers), kinds = STEP_SCENES[name]
     params = vrw.WheelParams(damping=c)
     wheel = vrw.UnilateralWheel(friction=mu, stoppers=stoppers)
-    x = wheel.embed_section_state(params, jnp.asarray([0.1, dtheta, -0.1]))
+    x = wheel.complete_section_state(params, jnp.asarray([0.1, dtheta, -0.1]))
     trace = wheel.sample_step(params, x, vrw.StepOptions(), 2)
     assert kinds <= classify_events(trace, bool(x[3 + 3 * params.n_legs] >= 4))
     value_at = [jnp.asarray(v) for v in (mu, c, dtheta)]

@@ -92,7 +92,7 @@ def test_no_stopper_pulls_and_energy_losses_are_reported_by_cause(friction, damp
     total = lambda motion: float(
         compute_kinetic_energy(s, motion) + sum(compute_potential_energy(s, motion))
     )
-    x = wheel.embed_section_state(params, jnp.asarray(START))
+    x = wheel.complete_section_state(params, jnp.asarray(START))
     for _ in range(3):
         step = vrw.step(params, x, model=wheel, options=TIGHT_OPTIONS)
         assert int(step.outcome) == vrw.Outcome.STEPPED

@@ -64,7 +64,7 @@ def scene_traces():
     result_by_name = {}
     for name, (friction, damping, dtheta) in STEP_SCENES.items():
         wheel, params = vrw.UnilateralWheel(friction=friction), vrw.WheelParams(damping=damping)
-        x = wheel.embed_section_state(params, jnp.asarray([START[0], dtheta, START[2]]))
+        x = wheel.complete_section_state(params, jnp.asarray([START[0], dtheta, START[2]]))
         result_by_name[name] = (params, friction, wheel.sample_step(params, x, TIGHT_OPTIONS, 12))
     return result_by_name
 
@@ -147,7 +147,7 @@ def test_energy_lost_in_a_step_is_reported_by_cause(scene_traces):
     params, friction, trace = scene_traces["lands sliding"]
     s = params.symbols()
     wheel = vrw.UnilateralWheel(friction=friction)
-    before, _ = unpack_section_state(s, wheel.embed_section_state(params, jnp.asarray(START)))
+    before, _ = unpack_section_state(s, wheel.complete_section_state(params, jnp.asarray(START)))
     begin = float(compute_kinetic_energy(s, before) + sum(compute_potential_energy(s, before)))
     *_, (_, motion, _) = iterate_phases(params, trace)
     step = compute_step(friction)
@@ -407,7 +407,7 @@ def test_situations_outside_the_model_end_a_step_with_an_outcome(friction, dampi
 def test_infinite_event_sequences_end_with_an_outcome():
     enough = int(compute_step(0.7).events)
     wheel = vrw.UnilateralWheel(friction=0.7, max_events=enough - 1)
-    x = wheel.embed_section_state(TABLE_1, jnp.asarray(START))
+    x = wheel.complete_section_state(TABLE_1, jnp.asarray(START))
     cut_short = wheel.advance(TABLE_1, x, TIGHT_OPTIONS)
     assert int(cut_short.outcome) == vrw.Outcome.TOO_MANY_EVENTS
     assert not np.any(np.asarray(cut_short.section_state))

@@ -121,7 +121,7 @@ def test_forces_match_the_contact_mode(sampled_walk: xr.Dataset) -> None:
 
 def test_machine_code_samples_the_motion_of_the_definition() -> None:
     params, wheel = vrw.WheelParams(damping=100.0), vrw.UnilateralWheel(friction=0.5)
-    start = wheel.embed_section_state(params, jnp.asarray(START))
+    start = wheel.complete_section_state(params, jnp.asarray(START))
     lanes, definition = (
         wheel.sample_step(
             params, start, dataclasses.replace(vrw.StepOptions.tight(), engine=engine), 9

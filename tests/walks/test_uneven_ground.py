@@ -206,7 +206,7 @@ def test_each_foot_keeps_the_friction_of_its_landing():
 
 def test_a_landing_on_a_steeper_line_is_the_same_motion_in_another_frame():
     s, model = vrw.WheelParams().symbols(), vrw.UnilateralWheel()
-    x = model.embed_section_state(vrw.WheelParams(), jnp.asarray(START))
+    x = model.complete_section_state(vrw.WheelParams(), jnp.asarray(START))
     motion, stance = unpack_section_state(s, x)
     result, turned = (
         pack_section_state(motion, stance),

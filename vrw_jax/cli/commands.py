@@ -175,7 +175,7 @@ def run_gait_command(
         options = gait_config.make_options()
         start = gait_config.gait.start
         section_state = model.compute_default_start(params) if start is None else jnp.asarray(start)
-        section_state = model.embed_section_state(params, section_state)
+        section_state = model.complete_section_state(params, section_state)
         n_walked, n_steps = 0, steps or gait_config.gait.steps
         with show_computation_stages("walking (the first time compiles for a while)"):
             while True:

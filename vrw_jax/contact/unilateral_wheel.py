@@ -125,10 +125,10 @@ class AbstractContactWheel(AbstractWheel):
     def count_continuous_entries(self, params: WheelParams) -> int:
         return compute_full_section_size(params.n_legs) - params.n_legs
 
-    def compute_section_units(self, wheel_units: WheelUnits, n_legs: int) -> list[Elementwise]:
+    def collect_section_units(self, wheel_units: WheelUnits, n_legs: int) -> list[Elementwise]:
         return compute_section_units(wheel_units, n_legs)
 
-    def embed_section_state(self, params: WheelParams, x: Array) -> FullState:
+    def complete_section_state(self, params: WheelParams, x: Array) -> FullState:
         """Return the full section state for `x`, shape (4 + 3 n,).
 
         `x` may be a full section state or (theta-, dtheta-, dL1-), the section state of the paper.

@@ -151,7 +151,7 @@ def _make_section_states(
 def stack_section_units(model: Any, parameter_values: np.ndarray, n_legs: int) -> np.ndarray:
     """Return the units of the section state for each wheel, shape (wheels, section)."""
     return np.stack(
-        model.compute_section_units(compute_wheel_units_of_rows(parameter_values, n_legs), n_legs),
+        model.collect_section_units(compute_wheel_units_of_rows(parameter_values, n_legs), n_legs),
         -1,
     )
 

@@ -132,7 +132,7 @@ def find_return_map_cycle(
         else (model.advance, solve_fixed_point)
     )
     section_units = jnp.stack(
-        model.compute_section_units(compute_wheel_units(params.symbols()), params.n_legs)
+        model.collect_section_units(compute_wheel_units(params.symbols()), params.n_legs)
     )
     return_map = lambda section_state: (
         evaluate_step(params, section_state * section_units, options).section_state / section_units

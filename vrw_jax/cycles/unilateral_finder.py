@@ -107,7 +107,7 @@ class UnilateralFinder(AbstractReturnMapFinder):
         if section_states is None:
             section_states = jax.vmap(self.model.compute_default_start)(params)
         else:
-            section_states = jax.vmap(self.model.embed_section_state)(
+            section_states = jax.vmap(self.model.complete_section_state)(
                 params, jnp.asarray(section_states)
             )
         return self.find_cycles_near(parameter_values, section_states)

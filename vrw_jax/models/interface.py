@@ -210,7 +210,7 @@ class AbstractWheel(eqx.Module):
         """
         return self.count_section_entries(params)
 
-    def compute_section_units(self, wheel_units: WheelUnits, n_legs: int) -> list[Elementwise]:
+    def collect_section_units(self, wheel_units: WheelUnits, n_legs: int) -> list[Elementwise]:
         """Return the unit of each entry of a section state, computed from the wheel's own units."""
         return [
             wheel_units.length_unit / wheel_units.length_unit,
@@ -218,7 +218,7 @@ class AbstractWheel(eqx.Module):
             wheel_units.velocity_unit,
         ]
 
-    def embed_section_state(self, params: WheelParams, x: Array) -> Array:
+    def complete_section_state(self, params: WheelParams, x: Array) -> Array:
         """Return `x` as a section state of this model.
 
         `x` may be the paper's section state, which has three entries.

@@ -108,7 +108,7 @@ class StableGait(NamedTuple):
 
         Two states agree if their distance is at most `max_gait_distance`.
         """
-        state_units = self.model.compute_section_units(
+        state_units = self.model.collect_section_units(
             compute_wheel_units(self.params.symbols()), self.params.n_legs
         )
         n_continuous = self.model.count_continuous_entries(self.params)
@@ -140,7 +140,7 @@ def walk_until_on_gait(
     is_on_gait, walk_outcomes = np.zeros(n_starts, bool), np.full(n_starts, int(Outcome.STEPPED))
     n_steps_by_walk = np.zeros(n_starts, int)
     embed_section_states: Any = jax.vmap(
-        functools.partial(stable_gait.model.embed_section_state, stable_gait.params)
+        functools.partial(stable_gait.model.complete_section_state, stable_gait.params)
     )
     section_states = np.array(embed_section_states(jnp.asarray(start_states)))
     walking_indices, n_steps_walked = np.arange(n_starts), 0

@@ -125,7 +125,7 @@ def basin(
     )
     is_start_reachable = np.isfinite(start_states).all(-1)
     start_states = np.where(is_start_reachable[:, None], start_states, np.nan)
-    start_embedder = functools.partial(model.embed_section_state, params)
+    start_embedder = functools.partial(model.complete_section_state, params)
     start_states = np.asarray(jax.vmap(start_embedder)(jnp.asarray(start_states)))
     walk_ends = walk_until_periodic(params, start_states, model, options, max_steps, max_period)
     distinct_orbits = find_distinct_orbits(walk_ends)

@@ -163,7 +163,7 @@ def convert_step_arguments(
     section_state = convert_section_state(x)
     section_size = model.count_section_entries(params)
     if section_state.shape == (3,) and section_size != 3:
-        section_state = model.embed_section_state(params, section_state)
+        section_state = model.complete_section_state(params, section_state)
     if section_state.shape != (section_size,):
         full_state_shape_text = (
             "" if section_size == 3 else f", or this model’s own of shape ({section_size},)"
