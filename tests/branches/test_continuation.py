@@ -18,7 +18,7 @@ from vrw_jax.continuation.arclength import (
     FixedPointProblem,
     continue_from,
 )
-from vrw_jax.continuation.sign_changes import locate_function_zeros
+from vrw_jax.continuation.sign_changes import locate_function_roots
 from vrw_jax.figures.branch_figures import branch_figure
 from vrw_jax.hybrid.minima import MonitoredFunctions
 from vrw_jax.hybrid.phase_integration import integrate_phase
@@ -264,7 +264,7 @@ def test_a_zero_is_located_to_its_width_even_at_a_jump():
     functions = lambda x, which: np.array([kinds[k](y) for k, y in zip(which, x, strict=True)])
     every = np.arange(3)
     ends = np.array([-0.3, -1.0, -19.0]), np.array([0.7, 1e-3, 128.4])
-    solution = locate_function_zeros(functions, ends, np.full(3, 1e-12))
+    solution = locate_function_roots(functions, ends, np.full(3, 1e-12))
     exact = np.array([0.3 ** (1 / 3), 0.777, np.log(20.0) / 5.0])
     np.testing.assert_allclose(solution.best_locations, exact, atol=1e-12)
     assert np.all(functions(solution.left_bracket_ends, every) <= 0.0)

@@ -35,7 +35,7 @@ def walk_by_linear_map(monkeypatch, multiplier, last_step=10**9):
 
 def test_a_walk_stops_after_the_round_in_which_it_settles(monkeypatch):
     walk_ends = walk_by_linear_map(monkeypatch, 0.5)
-    first_round = gait_walks.GAIT_WALK_OPTIONS.steps_by_round[0]
+    first_round = gait_walks.GAIT_WALK_OPTIONS.n_steps_by_round[0]
     np.testing.assert_allclose(walk_ends.section_states[0], FIXED_POINT + 0.5**first_round * 0.01)
     assert walk_ends.period_defects[0] < gait_walks.GAIT_WALK_OPTIONS.max_settled_defect
 

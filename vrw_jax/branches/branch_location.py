@@ -24,16 +24,16 @@ from vrw_jax.branches.multiplicity import (
     CONTACT_ORDER_CHANGE,
     CONTACT_ORDER_COLUMN,
     CROSSING_MULTIPLIER_COUNTS,
-    LOCATED_ZERO_TOLERANCES,
+    LOCATED_ROOT_TOLERANCES,
     MULTIPLIER_MODULI_COLUMN,
-    NamedLocatedZero,
+    NamedLocatedRoot,
     add_multiple_bifurcations,
     are_multipliers_off_circle,
     drop_duplicate_order_changes,
     evaluate_named_quantity,
     format_contact_order_quantity_name,
     sort_multiplier_moduli,
-    vanishes_at_zero,
+    vanishes_at_root,
 )
 from vrw_jax.continuation import (
     BIFURCATION_NAMES,
@@ -48,7 +48,7 @@ from vrw_jax.continuation import (
     evaluate_bifurcation_functions,
     find_sign_changes,
     has_unit_circle_pair,
-    locate_function_zeros,
+    locate_function_roots,
     solve_on_many_planes,
     solve_on_plane,
 )
@@ -476,7 +476,7 @@ class _BranchPointTable(NamedTuple):
     def join_located_ends(
         self,
         admissible_ranges: list[_AdmissibleRange],
-        located_ends: Mapping[tuple[int, int], "_LocatedZero"],
+        located_ends: Mapping[tuple[int, int], "_LocatedRoot"],
     ) -> "_BranchPointTable":
         """Return a table with the admissible points of all ranges and the points next to the
         located ends.
@@ -496,15 +496,15 @@ class _BranchPointTable(NamedTuple):
             )
             if (
                 lower_end is not None
-                and lower_end.quantities_beside_zero[ADMISSIBILITY_COLUMN][0] > 0.0
+                and lower_end.quantities_beside_root[ADMISSIBILITY_COLUMN][0] > 0.0
             ):
                 # The end was located in the opposite direction, so signs of rates are reversed.
-                end_point = lower_end.point_beside_zero
+                end_point = lower_end.point_beside_root
                 append_points(
                     end_point._replace(fraction_rate=-end_point.fraction_rate),
                     admissible_range.wheel_index,
-                    lower_end.quantities_beside_zero
-                    | {BRANCH_POINT_KIND: -lower_end.quantities_beside_zero[BRANCH_POINT_KIND]},
+                    lower_end.quantities_beside_root
+                    | {BRANCH_POINT_KIND: -lower_end.quantities_beside_root[BRANCH_POINT_KIND]},
                 )
             append_points(
                 select_tree_rows(self.all_points, admissible_range.admissible_point_indices),
@@ -513,12 +513,12 @@ class _BranchPointTable(NamedTuple):
             )
             if (
                 upper_end is not None
-                and upper_end.quantities_beside_zero[ADMISSIBILITY_COLUMN][0] > 0.0
+                and upper_end.quantities_beside_root[ADMISSIBILITY_COLUMN][0] > 0.0
             ):
                 append_points(
-                    upper_end.point_beside_zero,
+                    upper_end.point_beside_root,
                     admissible_range.wheel_index,
-                    upper_end.quantities_beside_zero,
+                    upper_end.quantities_beside_root,
                 )
         return _BranchPointTable(
             concatenate_tree_rows(*point_groups),
@@ -527,7 +527,7 @@ class _BranchPointTable(NamedTuple):
         )
 
 
-class _LocatedZero(NamedTuple):
+class _LocatedRoot(NamedTuple):
     """Located root of a quantity between two points of a branch."""
 
     bracket_and_quantity: tuple[
@@ -535,13 +535,13 @@ class _LocatedZero(NamedTuple):
     ]  # index of the left point, index of the right point, name of the quantity
     parameter_value: float  # value of the continued parameter at the root
     chord_fraction: float  # location of the root on the chord from the left to the right point
-    point_beside_zero: ContinuationPoint  # on the side of the left point; leading axis of length 1
-    quantities_beside_zero: QuantitiesByName  # at `point_beside_zero`
+    point_beside_root: ContinuationPoint  # on the side of the left point; leading axis of length 1
+    quantities_beside_root: QuantitiesByName  # at `point_beside_root`
 
     @classmethod
     def from_jump(
         cls, point_table: _BranchPointTable, jump_pair: tuple[int, int]
-    ) -> "_LocatedZero":
+    ) -> "_LocatedRoot":
         """Represent a jump as a located root, at that point of the pair where the continuation
         stalled.
         """
@@ -550,12 +550,12 @@ class _LocatedZero(NamedTuple):
             point_table.all_points.p,
             len(point_table.all_points.p) - 1,
         )
-        is_zero_at_left = abs(
+        is_root_at_left = abs(
             jump_parameter_values[i] - jump_parameter_values[max(i - 1, 0)]
         ) <= abs(jump_parameter_values[min(j + 1, last_index)] - jump_parameter_values[j])
-        chord_fraction = 0.0 if is_zero_at_left else 1.0
-        point_index = i if is_zero_at_left else j
-        point_beside_zero, quantities_beside_zero = select_tree_rows(
+        chord_fraction = 0.0 if is_root_at_left else 1.0
+        point_index = i if is_root_at_left else j
+        point_beside_root, quantities_beside_root = select_tree_rows(
             (point_table.all_points, point_table.quantity_table),
             slice(point_index, point_index + 1),
         )
@@ -563,28 +563,28 @@ class _LocatedZero(NamedTuple):
             (i, j, CONTACT_ORDER_CHANGE),
             float(jump_parameter_values[point_index]),
             chord_fraction,
-            point_beside_zero,
-            quantities_beside_zero,
+            point_beside_root,
+            quantities_beside_root,
         )
 
 
-def _locate_requested_zeros(
+def _locate_requested_roots(
     branch_continuation: AbstractContinuation,
     point_table: _BranchPointTable,
-    zero_requests: list[tuple[int, int, str]],
+    root_requests: list[tuple[int, int, str]],
     location_options: SpecialPointLocationOptions = DEFAULT_LOCATION_OPTIONS,
-) -> list[_LocatedZero]:
+) -> list[_LocatedRoot]:
     """Locate the root that each request (left point, right point, name of the quantity) describes.
 
     The quantity has opposite signs at the two points.
     """
-    if not zero_requests:
+    if not root_requests:
         return []
     left_indices, right_indices = (
-        np.array([zero_request[bracket_end_index] for zero_request in zero_requests])
+        np.array([root_request[bracket_end_index] for root_request in root_requests])
         for bracket_end_index in (0, 1)
     )
-    quantity_names = [zero_request[2] for zero_request in zero_requests]
+    quantity_names = [root_request[2] for root_request in root_requests]
     left_points, right_points = (
         select_tree_rows(point_table.all_points, left_indices),
         select_tree_rows(point_table.all_points, right_indices),
@@ -606,7 +606,7 @@ def _locate_requested_zeros(
     parameter_by_location = {
         (bracket_end_index, 1.0 * chord_end_fraction): end_points.p[bracket_end_index]
         for chord_end_fraction, end_points in enumerate((left_points, right_points))
-        for bracket_end_index in range(len(zero_requests))
+        for bracket_end_index in range(len(root_requests))
     }
 
     def solve_at_fractions(
@@ -630,12 +630,12 @@ def _locate_requested_zeros(
         quantity_table = branch_continuation.make_quantity_table(
             solved_points, wheel_indices[bracket_indices]
         )
-        broadcast_flags = lambda is_point_found, quantity_values: is_point_found.reshape(
+        flag_broadcaster = lambda is_point_found, quantity_values: is_point_found.reshape(
             -1, *(1,) * (quantity_values.ndim - 1)
         )
         return solved_points, {
             quantity_name: np.where(
-                broadcast_flags(is_solve_successful, quantity_values), quantity_values, np.nan
+                flag_broadcaster(is_solve_successful, quantity_values), quantity_values, np.nan
             )
             for quantity_name, quantity_values in quantity_table.items()
         }
@@ -666,50 +666,50 @@ def _locate_requested_zeros(
         location_options.parameter_accuracy / parameter_distances,
         location_options.min_bracket_fraction,
     )
-    zero_locations = locate_function_zeros(
+    root_locations = locate_function_roots(
         evaluate_at_fractions,
         (evaluate_at_points(left_indices), evaluate_at_points(right_indices)),
         bracket_tolerances,
     )
-    request_indices = np.arange(len(zero_requests))
+    request_indices = np.arange(len(root_requests))
     # Even for an exact root, the point next to it lies to the left, where the gaits are admissible.
-    points_beside_zeros, quantities_beside_zeros = solve_at_fractions(
-        np.maximum(zero_locations.left_bracket_ends - bracket_tolerances, 0.0), request_indices
+    points_beside_roots, quantities_beside_roots = solve_at_fractions(
+        np.maximum(root_locations.left_bracket_ends - bracket_tolerances, 0.0), request_indices
     )
     for retry_fraction in location_options.retry_chord_fractions:
         inadmissible_requests = np.flatnonzero(
-            ~(quantities_beside_zeros[ADMISSIBILITY_COLUMN] > 0.0)
+            ~(quantities_beside_roots[ADMISSIBILITY_COLUMN] > 0.0)
         )
-        point_indices = np.arange(len(zero_requests))
+        point_indices = np.arange(len(root_requests))
         if len(inadmissible_requests):
             retried_points_and_quantities = solve_at_fractions(
-                retry_fraction * zero_locations.left_bracket_ends[inadmissible_requests],
+                retry_fraction * root_locations.left_bracket_ends[inadmissible_requests],
                 inadmissible_requests,
             )
             point_indices[inadmissible_requests] = len(point_indices) + np.arange(
                 len(inadmissible_requests)
             )
-            points_beside_zeros, quantities_beside_zeros = select_tree_rows(
+            points_beside_roots, quantities_beside_roots = select_tree_rows(
                 concatenate_tree_rows(
-                    (points_beside_zeros, quantities_beside_zeros), retried_points_and_quantities
+                    (points_beside_roots, quantities_beside_roots), retried_points_and_quantities
                 ),
                 point_indices,
             )
     return [
-        _LocatedZero(
-            zero_requests[bracket_end_index],
+        _LocatedRoot(
+            root_requests[bracket_end_index],
             float(
                 parameter_by_location[
-                    bracket_end_index, zero_locations.best_locations[bracket_end_index]
+                    bracket_end_index, root_locations.best_locations[bracket_end_index]
                 ]
             ),
-            float(zero_locations.best_locations[bracket_end_index]),
-            select_tree_rows(points_beside_zeros, slice(bracket_end_index, bracket_end_index + 1)),
+            float(root_locations.best_locations[bracket_end_index]),
+            select_tree_rows(points_beside_roots, slice(bracket_end_index, bracket_end_index + 1)),
             select_tree_rows(
-                quantities_beside_zeros, slice(bracket_end_index, bracket_end_index + 1)
+                quantities_beside_roots, slice(bracket_end_index, bracket_end_index + 1)
             ),
         )
-        for bracket_end_index in range(len(zero_requests))
+        for bracket_end_index in range(len(root_requests))
     ]
 
 
@@ -765,12 +765,12 @@ def _locate_branch_ends(
     branch_continuation: AbstractContinuation,
     point_table: _BranchPointTable,
     admissible_ranges: list[_AdmissibleRange],
-) -> dict[tuple[int, int], _LocatedZero]:
+) -> dict[tuple[int, int], _LocatedRoot]:
     """Locate the nearest root beyond each end of each branch.
 
     The keys of the result are (wheel index, end), where the end is 0 or 1.
     """
-    zero_requests, wheel_and_end_keys = [], []
+    root_requests, wheel_and_end_keys = [], []
     for admissible_range in admissible_ranges:
         for end_index, point_index_beyond in enumerate(admissible_range.indices_of_points_beyond):
             if point_index_beyond < 0:
@@ -781,27 +781,27 @@ def _locate_branch_ends(
             for quantity_name in _find_crossed_quantities(
                 branch_continuation, point_table, admissible_range, point_index_beyond
             ) or [ADMISSIBILITY_COLUMN]:
-                zero_requests.append((last_point_index, point_index_beyond, quantity_name))
+                root_requests.append((last_point_index, point_index_beyond, quantity_name))
                 wheel_and_end_keys.append((admissible_range.wheel_index, end_index))
-    nearest_zeros: dict[tuple[int, int], _LocatedZero] = {}
-    for wheel_and_end_key, located_zero in zip(
+    nearest_roots: dict[tuple[int, int], _LocatedRoot] = {}
+    for wheel_and_end_key, located_root in zip(
         wheel_and_end_keys,
-        _locate_requested_zeros(branch_continuation, point_table, zero_requests),
+        _locate_requested_roots(branch_continuation, point_table, root_requests),
         strict=True,
     ):
         if (
-            wheel_and_end_key not in nearest_zeros
-            or located_zero.chord_fraction < nearest_zeros[wheel_and_end_key].chord_fraction
+            wheel_and_end_key not in nearest_roots
+            or located_root.chord_fraction < nearest_roots[wheel_and_end_key].chord_fraction
         ):
-            nearest_zeros[wheel_and_end_key] = located_zero
-    return nearest_zeros
+            nearest_roots[wheel_and_end_key] = located_root
+    return nearest_roots
 
 
 def _locate_inner_special_points(
     branch_continuation: AbstractContinuation, point_table: _BranchPointTable
-) -> list[NamedLocatedZero]:
+) -> list[NamedLocatedRoot]:
     """Locate all special points of the branches except their ends."""
-    zero_requests, special_point_names = _list_zero_requests(branch_continuation, point_table)
+    root_requests, special_point_names = _list_root_requests(branch_continuation, point_table)
     quantity_table, all_point_indices = (
         point_table.quantity_table,
         np.arange(len(point_table.wheel_indices)),
@@ -825,7 +825,7 @@ def _locate_inner_special_points(
     for left_index, right_index in point_table.find_neighbor_pairs(all_point_indices):
         if contact_orders[left_index] != contact_orders[right_index]:
             # Between the two orders of contacts there may be further orders.
-            zero_requests += [
+            root_requests += [
                 (left_index, right_index, format_contact_order_quantity_name(contact_orders[i]))
                 for i in (left_index, right_index)
             ]
@@ -835,11 +835,11 @@ def _locate_inner_special_points(
     )
     is_without_jump = [
         not has_jump_between(left_index, right_index)
-        for left_index, right_index, _ in zero_requests
+        for left_index, right_index, _ in root_requests
     ]
-    zero_requests = [
-        zero_request
-        for zero_request, has_no_jump in zip(zero_requests, is_without_jump, strict=True)
+    root_requests = [
+        root_request
+        for root_request, has_no_jump in zip(root_requests, is_without_jump, strict=True)
         if has_no_jump
     ]
     special_point_names = [
@@ -849,24 +849,24 @@ def _locate_inner_special_points(
         )
         if has_no_jump
     ]
-    located_zeros = _locate_requested_zeros(branch_continuation, point_table, zero_requests)
-    named_zeros = []
-    for special_point_name, located_zero in zip(special_point_names, located_zeros, strict=True):
-        if special_point_name in CROSSING_MULTIPLIER_COUNTS and not vanishes_at_zero(
-            quantity_table, located_zero
+    located_roots = _locate_requested_roots(branch_continuation, point_table, root_requests)
+    named_roots = []
+    for special_point_name, located_root in zip(special_point_names, located_roots, strict=True):
+        if special_point_name in CROSSING_MULTIPLIER_COUNTS and not vanishes_at_root(
+            quantity_table, located_root
         ):
             continue
-        return_map_jacobian = np.asarray(located_zero.point_beside_zero.return_map_jacobian[0])
+        return_map_jacobian = np.asarray(located_root.point_beside_root.return_map_jacobian[0])
         if special_point_name != "neimark_sacker" or has_unit_circle_pair(return_map_jacobian):
-            named_zeros.append(
+            named_roots.append(
                 (
                     special_point_name,
-                    located_zero,
+                    located_root,
                     CROSSING_MULTIPLIER_COUNTS.get(special_point_name, 0),
                 )
             )
-    named_zeros += [
-        (CONTACT_ORDER_CHANGE, _LocatedZero.from_jump(point_table, point_pair), 0)
+    named_roots += [
+        (CONTACT_ORDER_CHANGE, _LocatedRoot.from_jump(point_table, point_pair), 0)
         for point_pair in jump_pairs
     ]
     off_circle_pairs = point_table.find_neighbor_pairs(
@@ -875,17 +875,17 @@ def _locate_inner_special_points(
     off_circle_pairs = [
         point_pair for point_pair in off_circle_pairs if not has_jump_between(*point_pair)
     ]
-    zero_locator = functools.partial(_locate_requested_zeros, branch_continuation, point_table)
+    root_locator = functools.partial(_locate_requested_roots, branch_continuation, point_table)
     return add_multiple_bifurcations(
         quantity_table,
         fraction_rates,
         off_circle_pairs,
-        drop_duplicate_order_changes(named_zeros),
-        zero_locator,
+        drop_duplicate_order_changes(named_roots),
+        root_locator,
     )
 
 
-def _list_zero_requests(
+def _list_root_requests(
     branch_continuation: AbstractContinuation, point_table: _BranchPointTable
 ) -> tuple[list[tuple[int, int, str]], list[str]]:
     """List the roots of bifurcation functions and margins that are to be located.
@@ -917,10 +917,10 @@ def _list_zero_requests(
     ]
     # At a branch point the sign of the fold's margin is determined by round-off.
     regular_point_indices = np.flatnonzero(
-        ~(np.abs(quantity_table["fold"]) < LOCATED_ZERO_TOLERANCES.max_zero_margin)
+        ~(np.abs(quantity_table["fold"]) < LOCATED_ROOT_TOLERANCES.max_zero_margin)
     )
     fraction_rates = np.asarray(point_table.all_points.fraction_rate)
-    zero_requests, special_point_names = [], []
+    root_requests, special_point_names = [], []
     for i, j, column_index in find_sign_changes(
         np.stack([quantity_table[quantity_name] for quantity_name in column_names], 1)[
             regular_point_indices
@@ -937,7 +937,7 @@ def _list_zero_requests(
                 and fraction_rates[left_index] * fraction_rates[right_index] > 0.0
             ):
                 quantity_name = BRANCH_POINT_KIND
-            zero_requests.append((left_index, right_index, column_names[column_index]))
+            root_requests.append((left_index, right_index, column_names[column_index]))
             special_point_names.append(quantity_name)
     for left_index, right_index in point_table.find_neighbor_pairs(regular_point_indices):
         # On the side branch of a pitchfork, the margin touches zero where the parameter turns.
@@ -945,9 +945,9 @@ def _list_zero_requests(
             quantity_table["fold"][left_index] * quantity_table["fold"][right_index] > 0.0
         )
         if has_same_fold_sign and fraction_rates[left_index] * fraction_rates[right_index] < 0.0:
-            zero_requests.append((left_index, right_index, BRANCH_POINT_KIND))
+            root_requests.append((left_index, right_index, BRANCH_POINT_KIND))
             special_point_names.append(BRANCH_POINT_KIND)
-    return zero_requests, special_point_names
+    return root_requests, special_point_names
 
 
 class BranchData(NamedTuple):
@@ -1025,24 +1025,24 @@ def continue_and_locate_special_points(
 
     def make_special_point(
         special_point_name: str,
-        located_zero: _LocatedZero,
+        located_root: _LocatedRoot,
         wheel_index: int,
         ends_branch: bool,
         n_multipliers: int = 0,
     ) -> SpecialPoint:
         """Build the special point at a located root."""
-        point_beside_zero = select_tree_rows(located_zero.point_beside_zero, 0)
+        point_beside_root = select_tree_rows(located_root.point_beside_root, 0)
         section_state = np.asarray(
             branch_continuation.continuation_problem.section_state(
-                jax.device_put(point_beside_zero.z)
+                jax.device_put(point_beside_root.z)
             )
         )
         fixed_point = FixedPoint(
-            section_state, float(point_beside_zero.p), point_beside_zero.return_map_jacobian
+            section_state, float(point_beside_root.p), point_beside_root.return_map_jacobian
         )
         if special_point_name == ADMISSIBILITY_COLUMN:
             special_point_name = branch_continuation.name_branch_end(
-                point_table.quantity_table, located_zero.bracket_and_quantity[1]
+                point_table.quantity_table, located_root.bracket_and_quantity[1]
             )
         special_point_kind = (
             "border_collision" if branch_continuation.is_margin_name(special_point_name) else "lost"
@@ -1055,10 +1055,10 @@ def continue_and_locate_special_points(
         return SpecialPoint(
             special_point_kind,
             special_point_name,
-            located_zero.parameter_value,
+            located_root.parameter_value,
             fixed_point,
             ends_branch,
-            make_cycle_finder(wheel_index, point_beside_zero),
+            make_cycle_finder(wheel_index, point_beside_root),
             n_multipliers,
         )
 
@@ -1068,22 +1068,22 @@ def continue_and_locate_special_points(
         )
         points_with_position = [
             (
-                located_zero.bracket_and_quantity[0] + located_zero.chord_fraction,
+                located_root.bracket_and_quantity[0] + located_root.chord_fraction,
                 make_special_point(
                     special_point_name,
-                    located_zero,
+                    located_root,
                     admissible_range.wheel_index,
                     False,
                     n_multipliers,
                 ),
             )
-            for special_point_name, located_zero, n_multipliers in inner_special_points
-            if located_zero.bracket_and_quantity[0] in point_indices
+            for special_point_name, located_root, n_multipliers in inner_special_points
+            if located_root.bracket_and_quantity[0] in point_indices
         ]
         end_reasons = []
         for end_index in (0, 1):
-            located_zero = located_ends.get((admissible_range.wheel_index, end_index))
-            if located_zero is None:
+            located_root = located_ends.get((admissible_range.wheel_index, end_index))
+            if located_root is None:
                 end_reasons.append(
                     ContinuationStatus(
                         int(direction_results.status[admissible_range.wheel_index, end_index])
@@ -1091,8 +1091,8 @@ def continue_and_locate_special_points(
                 )
                 continue
             end_point = make_special_point(
-                located_zero.bracket_and_quantity[2],
-                located_zero,
+                located_root.bracket_and_quantity[2],
+                located_root,
                 admissible_range.wheel_index,
                 True,
             )

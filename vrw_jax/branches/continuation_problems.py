@@ -410,9 +410,9 @@ class ContactGaitProblem(AbstractReturnMapProblem):
         solved_columns = solve_linear_systems(
             np.eye(n_coordinates) - return_map_jacobian, right_sides
         )
-        code_changes = period_defects[:, n_coordinates:]
-        newton_corrections = np.concatenate([solved_columns[..., 0], code_changes], 1)
-        parameter_tangents = np.concatenate([solved_columns[..., 1], 0.0 * code_changes], 1)
+        contact_code_changes = period_defects[:, n_coordinates:]
+        newton_corrections = np.concatenate([solved_columns[..., 0], contact_code_changes], 1)
+        parameter_tangents = np.concatenate([solved_columns[..., 1], 0.0 * contact_code_changes], 1)
         return NewtonStep(newton_corrections, parameter_tangents, jnp.asarray(return_map_jacobian))
 
     def measure_gaits(
@@ -498,9 +498,12 @@ def interpolate_section_states(
 
     The discrete codes are those of the nearer state.
     """
-    nearer_codes = jnp.where(state_fraction < 0.5, left_state, right_state)[n_coordinates:]
+    nearer_contact_codes = jnp.where(state_fraction < 0.5, left_state, right_state)[n_coordinates:]
     return jnp.concatenate(
-        [(left_state + state_fraction * (right_state - left_state))[:n_coordinates], nearer_codes]
+        [
+            (left_state + state_fraction * (right_state - left_state))[:n_coordinates],
+            nearer_contact_codes,
+        ]
     )
 
 

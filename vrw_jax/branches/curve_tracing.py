@@ -410,12 +410,12 @@ class CurveTracer(NamedTuple):
         max_mesh_refinements = DEFAULT_GAIT_CONTINUATION_OPTIONS.max_mesh_refinements
         for refinement_index in range(1 + max_mesh_refinements):
             is_finest_mesh = refinement_index == max_mesh_refinements
-            data_and_systems = self._continue_curves_of_batch(
+            branch_data_and_systems = self._continue_curves_of_batch(
                 quantity_group, curve_seeds, is_finest_mesh
             )
             mesh_limited_seeds = []
             for curve_seed, (branch_data, collocation_system) in zip(
-                curve_seeds, data_and_systems, strict=True
+                curve_seeds, branch_data_and_systems, strict=True
             ):
                 if branch_data is not None and branch_data.is_mesh_limited and not is_finest_mesh:
                     options = collocation_system.cycle_options.refine_mesh()
@@ -543,19 +543,19 @@ class CurveTracer(NamedTuple):
         for special_point in branch_data.special_points:
             if special_point.name == RANGE_EDGE_COLUMN:
                 continue
-            point_beside_zero = special_point.cycle
+            point_beside_root = special_point.cycle
             meeting_values = (
                 special_point.value,
                 float(
                     self.parameter_ranges[1, 0]
                     + np.ptp(self.parameter_ranges[1])
-                    * point_beside_zero.z.second_parameter_fraction
+                    * point_beside_root.z.second_parameter_fraction
                 ),
             )
             special_point_name = choose_continued_special_point_name(
                 special_point.name,
                 curve_seed.branch_wheel,
-                point_beside_zero.z.z,
+                point_beside_root.z.z,
                 self.tracing_options,
             )
             if {special_point_name, curve_seed.special_point_name} == {
@@ -563,7 +563,7 @@ class CurveTracer(NamedTuple):
                 DLS_VANISHING_NAME,
             }:
                 meeting_values = self._locate_jump_onset(
-                    curve_seed, point_beside_zero.z.z, meeting_values
+                    curve_seed, point_beside_root.z.z, meeting_values
                 )
                 new_seeds.append(
                     self._seed_beyond_meeting(
@@ -581,14 +581,14 @@ class CurveTracer(NamedTuple):
                     end_reasons[1].replace(*text_replacement),
                 )
             elif can_continue_special_point(special_point_name):
-                seed_values = float(point_beside_zero.p), meeting_values[1]
+                seed_values = float(point_beside_root.p), meeting_values[1]
                 new_seeds.append(
                     CurveSeed(
                         special_point_name,
                         seed_values,
                         curve_seed.collocation_system,
                         curve_seed.branch_wheel,
-                        point_beside_zero.z.z,
+                        point_beside_root.z.z,
                     )
                 )
             codim2_points.append(

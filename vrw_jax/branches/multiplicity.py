@@ -30,7 +30,7 @@ CONTACT_ORDER_COLUMN = "contact_order"
 CONTACT_ORDER_CHANGE = "order_of_contacts_changes"
 """Name of the special point at which the order of contacts changes."""
 
-NamedLocatedZero = tuple[str, Any, int]
+NamedLocatedRoot = tuple[str, Any, int]
 """Name of a special point, its located root, and the number of multipliers on the unit circle."""
 
 CROSSING_MULTIPLIER_COUNTS = {
@@ -43,7 +43,7 @@ CROSSING_MULTIPLIER_COUNTS = {
 
 
 @dataclass(frozen=True)
-class LocatedZeroTolerances:
+class LocatedRootTolerances:
     """Tolerances that decide whether two located roots are equal, and whether a located root is
     valid.
 
@@ -53,7 +53,7 @@ class LocatedZeroTolerances:
     - `max_equal_location_distance`: fraction of a bracket within which ranks are treated as
       crossing together. The value is chosen because three equal multipliers are computed to 1e-5,
       which is 1e-4 of a bracket;
-    - `max_value_beside_zero`: largest ratio of the quantity next to its root to the quantity at an
+    - `max_value_beside_root`: largest ratio of the quantity next to its root to the quantity at an
       end of the bracket; at a jump the ratio is larger. The value is chosen because the point next
       to the root may be at nine tenths of the distance to the root;
     - `max_equal_parameter_distance`: relative distance below which two changes of the order of
@@ -63,11 +63,11 @@ class LocatedZeroTolerances:
 
     max_zero_margin: float = 1e-11
     max_equal_location_distance: float = 1e-3
-    max_value_beside_zero: float = 0.2
+    max_value_beside_root: float = 0.2
     max_equal_parameter_distance: float = 1e-7
 
 
-LOCATED_ZERO_TOLERANCES = LocatedZeroTolerances()
+LOCATED_ROOT_TOLERANCES = LocatedRootTolerances()
 """Tolerances for located roots on all branches."""
 
 
@@ -181,164 +181,164 @@ def classify_crossing_ranks(
     }
 
 
-def vanishes_at_zero(
+def vanishes_at_root(
     quantity_table: dict[str, np.ndarray],
-    located_zero: Any,
-    zero_tolerances: LocatedZeroTolerances = LOCATED_ZERO_TOLERANCES,
+    located_root: Any,
+    root_tolerances: LocatedRootTolerances = LOCATED_ROOT_TOLERANCES,
 ) -> bool:
     """Return whether a quantity vanishes at its located root. Otherwise it jumps there."""
-    left_index, right_index, quantity_name = located_zero.bracket_and_quantity
+    left_index, right_index, quantity_name = located_root.bracket_and_quantity
     values_at_bracket_ends = evaluate_named_quantity(quantity_table, quantity_name)[
         [left_index, right_index]
     ]
     quantity_value_beside = float(
-        np.abs(evaluate_named_quantity(located_zero.quantities_beside_zero, quantity_name)[0])
+        np.abs(evaluate_named_quantity(located_root.quantities_beside_root, quantity_name)[0])
     )
-    return not quantity_value_beside > zero_tolerances.max_value_beside_zero * float(
+    return not quantity_value_beside > root_tolerances.max_value_beside_root * float(
         np.max(np.abs(values_at_bracket_ends))
     )
 
 
 def drop_duplicate_order_changes(
-    named_zeros: list[NamedLocatedZero],
-    zero_tolerances: LocatedZeroTolerances = LOCATED_ZERO_TOLERANCES,
-) -> list[NamedLocatedZero]:
+    named_roots: list[NamedLocatedRoot],
+    root_tolerances: LocatedRootTolerances = LOCATED_ROOT_TOLERANCES,
+) -> list[NamedLocatedRoot]:
     """Return the roots, in which every change of the order of contacts occurs only once.
 
     Each change is located twice, as the end of one order and as the start of the next order.
     """
-    distinct_zeros: list[NamedLocatedZero] = []
-    for special_point_name, located_zero, n_multipliers in named_zeros:
-        zeros_of_same_change = [
-            other_located_zero
-            for other_special_point_name, other_located_zero, _ in distinct_zeros
+    distinct_roots: list[NamedLocatedRoot] = []
+    for special_point_name, located_root, n_multipliers in named_roots:
+        roots_of_same_change = [
+            other_located_root
+            for other_special_point_name, other_located_root, _ in distinct_roots
             if other_special_point_name == special_point_name == CONTACT_ORDER_CHANGE
         ]
-        zeros_of_same_change = [
-            other_located_zero
-            for other_located_zero in zeros_of_same_change
-            if other_located_zero.bracket_and_quantity[:2] == located_zero.bracket_and_quantity[:2]
+        roots_of_same_change = [
+            other_located_root
+            for other_located_root in roots_of_same_change
+            if other_located_root.bracket_and_quantity[:2] == located_root.bracket_and_quantity[:2]
         ]
-        compute_max_distance = lambda other_located_zero: (
-            zero_tolerances.max_equal_parameter_distance * abs(other_located_zero.parameter_value)
+        compute_max_distance = lambda other_located_root: (
+            root_tolerances.max_equal_parameter_distance * abs(other_located_root.parameter_value)
         )
         if not any(
-            abs(located_zero.parameter_value - other_located_zero.parameter_value)
-            <= compute_max_distance(other_located_zero)
-            for other_located_zero in zeros_of_same_change
+            abs(located_root.parameter_value - other_located_root.parameter_value)
+            <= compute_max_distance(other_located_root)
+            for other_located_root in roots_of_same_change
         ):
-            distinct_zeros.append((special_point_name, located_zero, n_multipliers))
-    return distinct_zeros
+            distinct_roots.append((special_point_name, located_root, n_multipliers))
+    return distinct_roots
 
 
 def add_multiple_bifurcations(
     quantity_table: dict[str, np.ndarray],
     fraction_rates: np.ndarray,
     neighbor_pairs: list[tuple[int, int]],
-    named_zeros: list[NamedLocatedZero],
-    zero_locator: Callable[[list[tuple[int, int, str]]], list[Any]],
-    zero_tolerances: LocatedZeroTolerances = LOCATED_ZERO_TOLERANCES,
+    named_roots: list[NamedLocatedRoot],
+    root_locator: Callable[[list[tuple[int, int, str]]], list[Any]],
+    root_tolerances: LocatedRootTolerances = LOCATED_ROOT_TOLERANCES,
     multiplier_tolerances: MultiplierTolerances = MULTIPLIER_TOLERANCES,
-) -> list[NamedLocatedZero]:
+) -> list[NamedLocatedRoot]:
     """Replace incomplete bifurcations by complete bifurcations of several multipliers.
 
     Return all roots. `neighbor_pairs` contains pairs of neighboring points on a branch.
-    `zero_locator` is the function that locates roots of quantities between these points.
+    `root_locator` is the function that locates roots of quantities between these points.
     """
-    zero_pair_test = lambda located_zero, point_pair: (
-        point_pair[0] <= located_zero.bracket_and_quantity[0]
-        and located_zero.bracket_and_quantity[1] <= point_pair[1]
+    root_pair_test = lambda located_root, point_pair: (
+        point_pair[0] <= located_root.bracket_and_quantity[0]
+        and located_root.bracket_and_quantity[1] <= point_pair[1]
     )
-    multiplier_moduli, rank_zero_requests = quantity_table[MULTIPLIER_MODULI_COLUMN], []
+    multiplier_moduli, rank_root_requests = quantity_table[MULTIPLIER_MODULI_COLUMN], []
     for left_index, right_index in neighbor_pairs:
         explaining_names = [
             quantity_name
-            for quantity_name, located_zero, _ in named_zeros
+            for quantity_name, located_root, _ in named_roots
             if quantity_name in CROSSING_MULTIPLIER_COUNTS
-            and zero_pair_test(located_zero, (left_index, right_index))
+            and root_pair_test(located_root, (left_index, right_index))
         ]
         for multiplier_rank in find_unexplained_ranks(
             multiplier_moduli[left_index], multiplier_moduli[right_index], explaining_names
         ):
-            rank_zero_requests.append(
+            rank_root_requests.append(
                 (
                     left_index,
                     right_index,
                     format_rank_quantity_name(multiplier_rank, multiplier_rank + 1),
                 )
             )
-    if not rank_zero_requests:
-        return named_zeros
-    groups_of_zeros: list[
+    if not rank_root_requests:
+        return named_roots
+    groups_of_roots: list[
         list[Any]
     ] = []  # Each group contains the roots for ranks that may cross the unit circle together.
-    for located_zero in zero_locator(rank_zero_requests):
-        if not vanishes_at_zero(quantity_table, located_zero, zero_tolerances):
+    for located_root in root_locator(rank_root_requests):
+        if not vanishes_at_root(quantity_table, located_root, root_tolerances):
             continue
-        last_located_zero = groups_of_zeros[-1][-1] if groups_of_zeros else located_zero
+        last_located_root = groups_of_roots[-1][-1] if groups_of_roots else located_root
         is_in_new_group = (
-            abs(located_zero.chord_fraction - last_located_zero.chord_fraction)
-            > zero_tolerances.max_equal_location_distance
+            abs(located_root.chord_fraction - last_located_root.chord_fraction)
+            > root_tolerances.max_equal_location_distance
         )
         if (
-            not groups_of_zeros
-            or last_located_zero.bracket_and_quantity[:2] != located_zero.bracket_and_quantity[:2]
+            not groups_of_roots
+            or last_located_root.bracket_and_quantity[:2] != located_root.bracket_and_quantity[:2]
             or is_in_new_group
         ):
-            groups_of_zeros.append([])
-        groups_of_zeros[-1].append(located_zero)
-    first_rank_getter = lambda group_of_zeros: int(
-        group_of_zeros[0].bracket_and_quantity[2].split(":")[1]
+            groups_of_roots.append([])
+        groups_of_roots[-1].append(located_root)
+    first_rank_getter = lambda group_of_roots: int(
+        group_of_roots[0].bracket_and_quantity[2].split(":")[1]
     )
     mean_rank_requests = []
-    for group_of_zeros in groups_of_zeros:
+    for group_of_roots in groups_of_roots:
         quantity_name = format_rank_quantity_name(
-            first_rank_getter(group_of_zeros),
-            first_rank_getter(group_of_zeros) + len(group_of_zeros),
+            first_rank_getter(group_of_roots),
+            first_rank_getter(group_of_roots) + len(group_of_roots),
         )
-        mean_rank_requests.append((*group_of_zeros[0].bracket_and_quantity[:2], quantity_name))
-    multiple_bifurcation_zeros = []
-    for group_of_zeros, located_mean_zero in zip(
-        groups_of_zeros, zero_locator(mean_rank_requests), strict=True
+        mean_rank_requests.append((*group_of_roots[0].bracket_and_quantity[:2], quantity_name))
+    multiple_bifurcation_roots = []
+    for group_of_roots, located_mean_root in zip(
+        groups_of_roots, root_locator(mean_rank_requests), strict=True
     ):
-        first_rank, n_ranks = first_rank_getter(group_of_zeros), len(group_of_zeros)
+        first_rank, n_ranks = first_rank_getter(group_of_roots), len(group_of_roots)
         unit_circle_distances = np.abs(
-            located_mean_zero.quantities_beside_zero[MULTIPLIER_MODULI_COLUMN][
+            located_mean_root.quantities_beside_root[MULTIPLIER_MODULI_COLUMN][
                 0, first_rank : first_rank + n_ranks
             ]
             - 1.0
         )
-        zeros_and_their_ranks = [(located_mean_zero, range(first_rank, first_rank + n_ranks))]
+        roots_and_their_ranks = [(located_mean_root, range(first_rank, first_rank + n_ranks))]
         if (
             n_ranks > 1
             and not np.max(unit_circle_distances) <= multiplier_tolerances.equal_moduli_distance
         ):
-            zeros_and_their_ranks = [
-                (located_zero, range(first_rank + zero_position, first_rank + zero_position + 1))
-                for zero_position, located_zero in enumerate(group_of_zeros)
+            roots_and_their_ranks = [
+                (located_root, range(first_rank + root_position, first_rank + root_position + 1))
+                for root_position, located_root in enumerate(group_of_roots)
             ]
-        for located_zero, crossing_ranks in zeros_and_their_ranks:
+        for located_root, crossing_ranks in roots_and_their_ranks:
             left_fraction_rate, right_fraction_rate = fraction_rates[
-                list(located_zero.bracket_and_quantity[:2])
+                list(located_root.bracket_and_quantity[:2])
             ]
-            names_and_counts = classify_crossing_ranks(
-                np.asarray(located_zero.point_beside_zero.return_map_jacobian[0]),
+            names_and_multiplier_counts = classify_crossing_ranks(
+                np.asarray(located_root.point_beside_root.return_map_jacobian[0]),
                 crossing_ranks,
                 bool(left_fraction_rate * right_fraction_rate < 0.0),
             )
-            multiple_bifurcation_zeros += [
-                (quantity_name, located_zero, n_multipliers)
-                for quantity_name, n_multipliers in names_and_counts.items()
+            multiple_bifurcation_roots += [
+                (quantity_name, located_root, n_multipliers)
+                for quantity_name, n_multipliers in names_and_multiplier_counts.items()
             ]
     replaced_pairs = {
-        located_zero.bracket_and_quantity[:2] for _, located_zero, _ in multiple_bifurcation_zeros
+        located_root.bracket_and_quantity[:2] for _, located_root, _ in multiple_bifurcation_roots
     }
-    is_zero_replaced = lambda quantity_name, located_zero: (
+    is_root_replaced = lambda quantity_name, located_root: (
         quantity_name in CROSSING_MULTIPLIER_COUNTS
-        and any(zero_pair_test(located_zero, point_pair) for point_pair in replaced_pairs)
+        and any(root_pair_test(located_root, point_pair) for point_pair in replaced_pairs)
     )
     return [
-        located_zero
-        for located_zero in named_zeros
-        if not is_zero_replaced(located_zero[0], located_zero[1])
-    ] + multiple_bifurcation_zeros
+        located_root
+        for located_root in named_roots
+        if not is_root_replaced(located_root[0], located_root[1])
+    ] + multiple_bifurcation_roots

@@ -141,7 +141,7 @@ def continue_special_points(
                 parameter_index, *select_tree_rows((params, cycle), None)
             )
             start_parameter_value = float(getattr(params, parameter_name))
-            distance_order = np.argsort(
+            seed_order_by_distance = np.argsort(
                 [
                     -abs(curve_seed.parameter_values[parameter_index] - start_parameter_value)
                     for curve_seed in curve_seeds
@@ -149,7 +149,7 @@ def continue_special_points(
             )
             seeds_by_name = {
                 curve_seeds[seed_index].special_point_name: curve_seeds[seed_index]
-                for seed_index in distance_order
+                for seed_index in seed_order_by_distance
             } | seeds_by_name
     missing_names = sorted(set(names) - set(seeds_by_name))
     if missing_names:

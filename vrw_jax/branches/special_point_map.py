@@ -207,7 +207,7 @@ def find_seeds_on_parallel_lines(
             upper_bound - lower_bound
         )
         other_parameter = curve_tracer.parameter_names[1 - parameter_index]
-        line_wheels = [
+        wheels_on_line = [
             curve_tracer.with_parameters(
                 params,
                 {
@@ -217,7 +217,9 @@ def find_seeds_on_parallel_lines(
             )
             for line_parameter_value in line_parameter_values
         ]
-        curve_seeds += _find_seeds_in_batches(curve_tracer, parameter_index, line_wheels, n_lines)
+        curve_seeds += _find_seeds_in_batches(
+            curve_tracer, parameter_index, wheels_on_line, n_lines
+        )
     return curve_seeds
 
 
@@ -230,8 +232,11 @@ def _find_seeds_in_batches(
     """
     curve_seeds = []
     for first_wheel_index in range(0, len(wheels), batch_size):
-        wheel_group = wheels[first_wheel_index : first_wheel_index + batch_size]
-        padded_wheels = [*wheel_group, *wheel_group[-1:] * (batch_size - len(wheel_group))]
+        wheels_of_batch = wheels[first_wheel_index : first_wheel_index + batch_size]
+        padded_wheels = [
+            *wheels_of_batch,
+            *wheels_of_batch[-1:] * (batch_size - len(wheels_of_batch)),
+        ]
         curve_seeds += curve_tracer.find_seeds(
             parameter_index, jax.tree.map(lambda *x: jnp.stack(x), *padded_wheels)
         )
@@ -309,7 +314,7 @@ def find_sign_changes_in_scan(
                     & (has_same_double_support | (quantity_name == "lambda_4_plus"))
                 )
             for i, j in np.argwhere(has_sign_change):
-                zero_location_fraction = first_values[i, j] / (
+                sign_change_fraction = first_values[i, j] / (
                     first_values[i, j] - second_values[i, j]
                 )
                 sample_indices = axis_mover(
@@ -320,7 +325,7 @@ def find_sign_changes_in_scan(
                         quantity_name,
                         parameter_index,
                         sample_indices,
-                        axis_mover(float(i + zero_location_fraction), float(j)),
+                        axis_mover(float(i + sign_change_fraction), float(j)),
                     )
                 )
     return sign_changes

@@ -35,7 +35,7 @@ from vrw_jax.continuation.sign_changes import (
     evaluate_bifurcation_functions,
     find_sign_changes,
     has_unit_circle_pair,
-    locate_function_zeros,
+    locate_function_roots,
 )
 from vrw_jax.continuation.test_functions import (
     AbstractTestFunction,

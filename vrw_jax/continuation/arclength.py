@@ -180,10 +180,14 @@ def compute_fixed_point_newton_step(
     solved_columns = jnp.linalg.solve(
         jnp.eye(n_continuous, dtype=z.dtype) - jacobian_by_z, right_hand_sides
     )
-    code_corrections = map_defect[n_continuous:]
-    branch_tangent = jnp.concatenate([solved_columns[:, 1], jnp.zeros_like(code_corrections)])
+    discrete_code_corrections = map_defect[n_continuous:]
+    branch_tangent = jnp.concatenate(
+        [solved_columns[:, 1], jnp.zeros_like(discrete_code_corrections)]
+    )
     return NewtonStep(
-        jnp.concatenate([solved_columns[:, 0], code_corrections]), branch_tangent, jacobian_by_z
+        jnp.concatenate([solved_columns[:, 0], discrete_code_corrections]),
+        branch_tangent,
+        jacobian_by_z,
     )
 
 
@@ -463,7 +467,7 @@ class ContinuationState(NamedTuple):
         section_state = problem.section_state(z)
         n_section, float_dtype = section_state.shape[0], section_state.dtype
         zero_step_length, zero_count = jnp.zeros((), float_dtype), jnp.zeros((), jnp.int32)
-        false_flag = jnp.asarray(False)
+        false_scalar = jnp.asarray(False)
         zero_tangent = jax.tree.map(jnp.zeros_like, z)
         fraction = _compute_parameter_fraction(p, parameter_bounds)
         initial_point = ContinuationPoint(
@@ -472,7 +476,7 @@ class ContinuationState(NamedTuple):
             zero_tangent,
             zero_step_length + direction_sign,
             jnp.zeros((n_section, n_section), float_dtype),
-            false_flag,
+            false_scalar,
         )
         trial_point = _TrialPoint(
             CorrectorPlane(
@@ -481,10 +485,10 @@ class ContinuationState(NamedTuple):
             z,
             fraction,
             zero_step_length,
-            false_flag,
+            false_scalar,
         )
         running_status = zero_count + int(ContinuationStatus.RUNNING)
-        jump_suspicion = BranchJumpSuspicion(zero_step_length, false_flag)
+        jump_suspicion = BranchJumpSuspicion(zero_step_length, false_scalar)
         initial_ds = zero_step_length + options.initial_ds
         return cls(
             initial_point,
@@ -891,27 +895,32 @@ def continue_from(
         jnp.ones(p.shape, bool) if is_branch_requested is None else is_branch_requested
     )
 
-    def advance_group(branch_batch: BranchBatch) -> BranchBatch:
-        group_indices = jnp.argsort(~are_branches_active(branch_batch), stable=True)[
+    def advance_concurrent_branches(branch_batch: BranchBatch) -> BranchBatch:
+        concurrent_branch_indices = jnp.argsort(~are_branches_active(branch_batch), stable=True)[
             : batch_sizes.BRANCH_BATCH_SIZE
         ]
-        group_args, group_directions, branch_queue_state = jax.tree.map(
-            lambda x: x[group_indices], (args_by_branch, direction_signs, branch_batch[0])
+        concurrent_branch_args, concurrent_directions, branch_queue_state = jax.tree.map(
+            lambda x: x[concurrent_branch_indices],
+            (args_by_branch, direction_signs, branch_batch[0]),
         )
-        has_waiting_branch = jnp.sum(are_branches_active(branch_batch)) > len(group_indices)
+        has_waiting_branch = jnp.sum(are_branches_active(branch_batch)) > len(
+            concurrent_branch_indices
+        )
 
         def advance_once(branch_batch: BranchBatch) -> BranchBatch:
             linearize_trial = lambda args, trial_point: evaluate_newton_step_at_fraction(
                 problem, args, parameter_bounds, trial_point.z, trial_point.parameter_fraction
             )
-            newton_steps = jax.vmap(linearize_trial)(group_args, branch_batch[0].trial_point)
+            newton_steps = jax.vmap(linearize_trial)(
+                concurrent_branch_args, branch_batch[0].trial_point
+            )
             return iterate_branches(
                 problem,
                 options,
-                group_args,
+                concurrent_branch_args,
                 parameter_bounds,
-                group_directions,
-                group_indices,
+                concurrent_directions,
+                concurrent_branch_indices,
                 branch_batch,
                 newton_steps,
             )
@@ -925,7 +934,7 @@ def continue_from(
             has_active_branch, advance_once, (branch_queue_state, branch_batch[1])
         )
         return jax.tree.map(
-            lambda x, new_point: x.at[group_indices].set(new_point),
+            lambda x, new_point: x.at[concurrent_branch_indices].set(new_point),
             branch_batch[0],
             branch_queue_state,
         ), branch_points
@@ -936,7 +945,7 @@ def continue_from(
     return make_continuation_result(
         lax.while_loop(
             lambda branch_batch: jnp.any(are_branches_active(branch_batch)),
-            advance_group,
+            advance_concurrent_branches,
             branch_batch,
         )
     )

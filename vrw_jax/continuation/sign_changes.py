@@ -24,8 +24,8 @@ multipliers has modulus 1 at a Neimark-Sacker bifurcation.
 
 
 @dataclass(frozen=True)
-class ZeroSearchOptions:
-    """Numerical options of `locate_function_zeros`.
+class RootSearchOptions:
+    """Numerical options of `locate_function_roots`.
 
     - `max_smooth_rounds`: number of rounds after which an unresolved bracket is treated as a jump;
     - `n_sections_per_jump_bracket`: number of equal sections into which each round divides a
@@ -36,8 +36,8 @@ class ZeroSearchOptions:
     n_sections_per_jump_bracket: int = 9
 
 
-ZERO_SEARCH_OPTIONS = ZeroSearchOptions()
-"""Default options of `locate_function_zeros`."""
+ROOT_SEARCH_OPTIONS = RootSearchOptions()
+"""Default options of `locate_function_roots`."""
 
 
 def evaluate_bifurcation_functions(return_map_jacobians: np.ndarray) -> np.ndarray:
@@ -97,7 +97,7 @@ def find_sign_changes(quantity_values: np.ndarray) -> list[QuantitySignChange]:
     ]
 
 
-class ZeroLocations(NamedTuple):
+class RootLocations(NamedTuple):
     """Locations of roots in [0, 1], and the ends of the brackets that enclose them.
 
     Each array has the shape (brackets,).
@@ -108,12 +108,12 @@ class ZeroLocations(NamedTuple):
     right_bracket_ends: np.ndarray  # bracket end with the sign of location 1
 
 
-def locate_function_zeros(
+def locate_function_roots(
     function: Callable[[np.ndarray, np.ndarray], np.ndarray],
     end_values: tuple[np.ndarray, np.ndarray],
     max_bracket_width: np.ndarray,
-    options: ZeroSearchOptions = ZERO_SEARCH_OPTIONS,
-) -> ZeroLocations:
+    options: RootSearchOptions = ROOT_SEARCH_OPTIONS,
+) -> RootLocations:
     """Locate the roots of functions that have opposite signs at 0 and 1, by Chandrupatla's method.
 
     `function` maps locations and the indices of their brackets to function values. `end_values`
@@ -140,7 +140,7 @@ def locate_function_zeros(
     ):
         smooth_brackets = unresolved_indices[~is_sign_jump[unresolved_indices]]
         jump_brackets = unresolved_indices[is_sign_jump[unresolved_indices]]
-        proposed_locations = _propose_zero_location(
+        proposed_locations = _propose_root_location(
             bracket_locations[:, smooth_brackets],
             function_values[:, smooth_brackets],
             max_bracket_width[smooth_brackets],
@@ -196,10 +196,10 @@ def locate_function_zeros(
             bracket_locations[1],
         ),
     )
-    return ZeroLocations(best_locations, *np.sort(bracket_locations[:2], 0))
+    return RootLocations(best_locations, *np.sort(bracket_locations[:2], 0))
 
 
-def _propose_zero_location(
+def _propose_root_location(
     bracket_locations: np.ndarray, function_values: np.ndarray, max_bracket_width: np.ndarray
 ) -> np.ndarray:
     """Return the next trial location in each bracket by Chandrupatla's method (1997,

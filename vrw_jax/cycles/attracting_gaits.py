@@ -60,8 +60,10 @@ def find_attracting_gaits(gait_finder: Any, parameter_values: Any) -> tuple[np.n
         select_tree_rows(fallback_gaits, is_fallback_found),
     )
     gait_wheel_indices = np.concatenate([gait_wheel_indices[keeps_first_gaits], wheels_with_gait])
-    gait_order = np.argsort(gait_wheel_indices, kind="stable")
-    return gait_wheel_indices[gait_order], jax.device_put(select_tree_rows(all_gaits, gait_order))
+    gait_sort_order = np.argsort(gait_wheel_indices, kind="stable")
+    return gait_wheel_indices[gait_sort_order], jax.device_put(
+        select_tree_rows(all_gaits, gait_sort_order)
+    )
 
 
 def _find_gaits_from_starts(
@@ -124,7 +126,7 @@ def _find_gaits_from_starts(
                 < DUPLICATE_GAIT_DISTANCE
                 for selected_index in selected_indices[n_selected_before:]
             )
-            if not any(matching_step_flags.any() for matching_step_flags in step_matches):
+            if not any(is_step_matching.any() for is_step_matching in step_matches):
                 selected_indices.append(int(candidate_index))
         selected_indices += (
             [] if len(selected_indices) > n_selected_before else [int(candidate_indices[0])]

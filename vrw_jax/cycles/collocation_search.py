@@ -820,11 +820,11 @@ def search_all_attempts(
 
     def run_stage(loop_carry: tuple) -> tuple:
         attempt_index, lane_indices, *lane_arrays = loop_carry
-        pending_first_order = jnp.argsort(
+        lane_order_pending_first = jnp.argsort(
             ~_can_attempt_change_result(attempt_index, lane_arrays[0]), stable=True
         )
         lane_indices, search_result, parameters_and_guess = jax.tree.map(
-            lambda x: x[..., pending_first_order], (lane_indices, *lane_arrays)
+            lambda x: x[..., lane_order_pending_first], (lane_indices, *lane_arrays)
         )
         end_attempt_index = jnp.where(
             attempt_index < len(SEARCH_ATTEMPTS), attempt_index + 1, n_attempts
@@ -846,8 +846,8 @@ def search_all_attempts(
     _, lane_indices, gathered_search_result, _ = lax.while_loop(
         has_next_stage, run_stage, initial_carry
     )
-    original_order = jnp.argsort(lane_indices)
-    return jax.tree.map(lambda x: x[..., original_order], gathered_search_result)
+    original_lane_order = jnp.argsort(lane_indices)
+    return jax.tree.map(lambda x: x[..., original_lane_order], gathered_search_result)
 
 
 def _can_attempt_change_result(

@@ -22,7 +22,7 @@ class GaitWalkOptions:
     Distances are distances between section states, in units of the wheel.
     """
 
-    steps_by_round: tuple[int, ...] = (8, 12, 30, 50, 100)
+    n_steps_by_round: tuple[int, ...] = (8, 12, 30, 50, 100)
     """Number of gait steps in each round.
 
     After a round, settled walks stop, and walks to the same gait are merged.
@@ -94,7 +94,7 @@ def compute_walk_starts(params: WheelParams) -> np.ndarray:
         np.arctan((leg_length - slope_cosine) / slope_sine) for leg_length in leg_lengths
     ]
     return _make_section_states(
-        params, touchdown_angles, [rate_share for _, rate_share in WALK_STARTS]
+        params, touchdown_angles, [rolling_rate_share for _, rolling_rate_share in WALK_STARTS]
     )
 
 
@@ -108,7 +108,9 @@ def compute_fallback_walk_starts(params: WheelParams) -> np.ndarray:
         for touchdown_angle_share, _ in FALLBACK_WALK_STARTS
     ]
     return _make_section_states(
-        params, touchdown_angles, [rate_share for _, rate_share in FALLBACK_WALK_STARTS]
+        params,
+        touchdown_angles,
+        [rolling_rate_share for _, rolling_rate_share in FALLBACK_WALK_STARTS],
     )
 
 
@@ -142,8 +144,8 @@ def _make_section_states(
     angles_and_shares = zip(touchdown_angles, rolling_rate_shares, strict=True)
     return np.stack(
         [
-            np.stack([theta, rate_share * rolling_rate, leg_rate], -1)
-            for theta, rate_share in angles_and_shares
+            np.stack([theta, rolling_rate_share * rolling_rate, leg_rate], -1)
+            for theta, rolling_rate_share in angles_and_shares
         ]
     )
 
@@ -210,7 +212,7 @@ def walk_to_gaits(
     section_units = stack_section_units(gait_finder.model, values_by_walk, gait_finder.n_legs)
     state_scaler = lambda section_states: (section_states / section_units)[:, :n_coordinates]
     active_walks = np.arange(len(walk_wheel_indices))
-    for n_steps in walk_options.steps_by_round:
+    for n_steps in walk_options.n_steps_by_round:
         end_states, walk_outcomes = _walk_wheels(
             gait_finder,
             values_by_walk[active_walks],

@@ -62,7 +62,7 @@ def _restore_symbols(n_legs: int, phase_constants: PhaseConstants) -> Symbols:
     return Symbols(*symbol_values)
 
 
-def _has_line_turn(phase_constants: PhaseConstants) -> bool:
+def _has_next_line_tilt(phase_constants: PhaseConstants) -> bool:
     """Return whether the constants contain the angle by which the next line of the ground is
     steeper.
 
@@ -80,13 +80,16 @@ def _make_collocation_phase(
     def evaluate_phase(
         phase_constants: PhaseConstants, phase_point: PhasePoint
     ) -> tuple[AbstractPhase, Motion]:
-        line_turn = (
+        next_line_tilt = (
             compute_sine_cosine(phase_constants[N_SYMBOL_CONSTANTS])
-            if _has_line_turn(phase_constants)
+            if _has_next_line_tilt(phase_constants)
             else ()
         )
         wheel_phase = phase_class(
-            _restore_symbols(n_legs, phase_constants), phase_point.held_constants, True, line_turn
+            _restore_symbols(n_legs, phase_constants),
+            phase_point.held_constants,
+            True,
+            next_line_tilt,
         )
         return wheel_phase, wheel_phase.compute_motion(phase_point.q, phase_point.v)
 
@@ -124,7 +127,7 @@ def _make_collocation_phase(
         s = _restore_symbols(n_legs, phase_constants)
         theta = (
             theta - phase_constants[N_SYMBOL_CONSTANTS]
-            if _has_line_turn(phase_constants)
+            if _has_next_line_tilt(phase_constants)
             else theta
         )
         return PhasePoint((), transitions.resolve_two_foot_landing(s, theta, dtheta, dL1), ())

@@ -95,27 +95,29 @@ class UnilateralScanEngine:
         - `sample_columns`: value of each swept parameter for each sample.
         """
         parameter_rows = stack_parameter_rows(sample_columns, self._wheel_model, self._base_wheel)
-        parameter_row_parts = np.array_split(
+        parameter_row_subsets = np.array_split(
             parameter_rows,
             max(self._n_threads, -(-len(parameter_rows) // batch_sizes.SCAN_TASK_SIZE)),
         )
         first_parameter_rows, *other_parameter_rows = (
-            results_of_part for results_of_part in parameter_row_parts if len(results_of_part)
+            results_of_subset
+            for results_of_subset in parameter_row_subsets
+            if len(results_of_subset)
         )
-        part_results = [
-            self._evaluate_sample_part(first_parameter_rows)
+        subset_results = [
+            self._evaluate_sample_subset(first_parameter_rows)
         ]  # The first call compiles for all threads.
         with ThreadPoolExecutor(self._n_threads) as n_threads:
-            part_results += n_threads.map(self._evaluate_sample_part, other_parameter_rows)
+            subset_results += n_threads.map(self._evaluate_sample_subset, other_parameter_rows)
         return {
             variable_name: np.concatenate(
-                [results_of_part[variable_name] for results_of_part in part_results]
+                [results_of_subset[variable_name] for results_of_subset in subset_results]
             )
-            for variable_name in part_results[0]
+            for variable_name in subset_results[0]
         }
 
     @with_default_jax_settings  # It runs in a thread of its own.
-    def _evaluate_sample_part(self, parameter_rows: np.ndarray) -> VariableColumns:
+    def _evaluate_sample_subset(self, parameter_rows: np.ndarray) -> VariableColumns:
         """Return the value of each variable for some samples, by the name of the variable.
 
         The values are those of the gait to which a walk from a slow start converges.

@@ -81,9 +81,9 @@ START_NOT_EMBEDDABLE_REASON_CODE = 1 + len(VIOLATION_TEXT_BY_SELECTION_MARGIN)
 SELECTION_VARIABLE_ATTRIBUTES: dict[str, dict[str, object]] = {
     "rung": {
         "long_name": "model that was used",
-        "flag_values": [int(code) for code in ModelCode],
+        "flag_values": [int(model_code) for model_code in ModelCode],
         "flag_meanings": " ".join(
-            entry.__name__ for entry in (RigidWheel, ViscoelasticWheel, UnilateralWheel)
+            model_class.__name__ for model_class in (RigidWheel, ViscoelasticWheel, UnilateralWheel)
         ),
     },
     "reason": {

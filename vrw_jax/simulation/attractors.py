@@ -62,7 +62,7 @@ class PeriodicWalkEnds(NamedTuple):
 
 
 @eqx.filter_jit
-def _walk_round_of_block(
+def _walk_block_of_starts(
     model: AbstractWheel, options: StepOptions, n_steps: int, params: WheelParams, x: Array
 ) -> tuple[Array, Array]:
     """Return the section states and outcomes after each step of one round of walking steps.
@@ -75,7 +75,7 @@ def _walk_round_of_block(
     return batched_walk.steps.section_state, batched_walk.steps.outcome
 
 
-def _walk_round_with_contact(
+def _walk_starts_with_contact(
     model: Any, options: StepOptions, n_steps: int, params: WheelParams, x: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the section states and outcomes of one round of walking steps with unilateral contact.
@@ -132,11 +132,11 @@ def walk_until_periodic(
     walk_round_function: Callable[..., tuple]
     if model.batch_kernel == "legs":
         walk_round_function = functools.partial(
-            _walk_round_with_contact, model, options, n_steps_of_round
+            _walk_starts_with_contact, model, options, n_steps_of_round
         )
     else:
         block_walk_function = functools.partial(
-            _walk_round_of_block, model, options, n_steps_of_round
+            _walk_block_of_starts, model, options, n_steps_of_round
         )
         walk_round_function = functools.partial(
             map_in_batches, block_walk_function, (batch_sizes.ATTRACTOR_BATCH_SIZE,)
@@ -241,10 +241,12 @@ def find_distinct_orbits(
             orbit_indices[i] = len(distinct_orbits)
             distinct_orbits.append(orbit_states)
     n_starts_by_orbit = [int(np.sum(orbit_indices == j)) for j in range(len(distinct_orbits))]
-    orbit_order = np.argsort(n_starts_by_orbit)[::-1]
+    orbit_sort_order = np.argsort(n_starts_by_orbit)[::-1]
     rank_by_orbit = np.full(len(distinct_orbits) + 1, -1)
-    rank_by_orbit[orbit_order] = np.arange(len(distinct_orbits))
-    return DistinctOrbits(rank_by_orbit[orbit_indices], [distinct_orbits[j] for j in orbit_order])
+    rank_by_orbit[orbit_sort_order] = np.arange(len(distinct_orbits))
+    return DistinctOrbits(
+        rank_by_orbit[orbit_indices], [distinct_orbits[j] for j in orbit_sort_order]
+    )
 
 
 @eqx.filter_jit
