@@ -699,8 +699,10 @@ class CurveTracer(NamedTuple):
         start_wheel = collect_provenance_attributes(
             curve_seed.branch_wheel.params, self.model, self.step_options
         )
-        axes_text = " and ".join(self.parameter_names)
-        dataset_attrs = {"title": f"Curve of {curve_seed.special_point_name} over {axes_text}"}
+        axes_description = " and ".join(self.parameter_names)
+        dataset_attrs = {
+            "title": f"Curve of {curve_seed.special_point_name} over {axes_description}"
+        }
         curve_dataset = xr.Dataset(curve_variables, curve_coordinates, dataset_attrs | start_wheel)
         return SpecialPointCurve(
             curve_seed.special_point_name,

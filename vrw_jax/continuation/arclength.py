@@ -399,14 +399,14 @@ def _predict_trial_point(
     )
 
     def extrapolate(
-        previous_value: Array, previous_rate: Array, current_value: Array, current_rate: Array
+        previous_leaf: Array, previous_rate: Array, current_leaf: Array, current_rate: Array
     ) -> Array:
-        mean_rate = (current_value - previous_value) / chord_length
+        mean_rate = (current_leaf - previous_leaf) / chord_length
         cubic_coefficient = (current_rate - mean_rate) / chord_length + (
             predicted_arc_length + chord_length
         ) * (previous_rate + current_rate - 2.0 * mean_rate) / chord_length**2
         return (
-            current_value
+            current_leaf
             + predicted_arc_length * current_rate
             + jnp.where(has_previous_point, predicted_arc_length**2 * cubic_coefficient, 0.0)
         )

@@ -225,18 +225,18 @@ def _linearize_selected_branches(
     """Return the Newton steps for the selected branches. All other branches receive NaN."""
     lower_bound, upper_bound = np.asarray(parameter_bounds)
     parameter_values = lower_bound + (upper_bound - lower_bound) * np.asarray(parameter_fractions)
-    selected_steps = problem.linearize(
+    selected_newton_steps = problem.linearize(
         *jax.device_put(select_tree_rows((args_by_branch, z, parameter_values), is_branch_selected))
     )
-    fill_with_nan = lambda selected_values: np.full(
-        (len(is_branch_selected), *selected_values.shape[1:]), np.nan
+    fill_with_nan = lambda selected_leaf: np.full(
+        (len(is_branch_selected), *selected_leaf.shape[1:]), np.nan
     )
-    all_steps = jax.tree.map(fill_with_nan, selected_steps)
-    for all_values, selected_values in zip(
-        jax.tree.leaves(all_steps), jax.tree.leaves(selected_steps), strict=True
+    newton_steps_of_all = jax.tree.map(fill_with_nan, selected_newton_steps)
+    for leaf_of_all, selected_leaf in zip(
+        jax.tree.leaves(newton_steps_of_all), jax.tree.leaves(selected_newton_steps), strict=True
     ):
-        all_values[is_branch_selected] = selected_values
-    return jax.device_put(all_steps)
+        leaf_of_all[is_branch_selected] = selected_leaf
+    return jax.device_put(newton_steps_of_all)
 
 
 def solve_on_many_planes(

@@ -27,12 +27,13 @@ multipliers has modulus 1 at a Neimark-Sacker bifurcation.
 class RootSearchOptions:
     """Numerical options of `locate_function_roots`.
 
-    - `max_smooth_rounds`: number of rounds after which an unresolved bracket is treated as a jump;
+    - `max_rounds_in_smooth_brackets`: number of rounds after which an unresolved bracket is
+      treated as a jump;
     - `n_sections_per_jump_bracket`: number of equal sections into which each round divides a
       bracket that contains a jump.
     """
 
-    max_smooth_rounds: int = 12
+    max_rounds_in_smooth_brackets: int = 12
     n_sections_per_jump_bracket: int = 9
 
 
@@ -157,12 +158,12 @@ def locate_function_roots(
         section_values_matrix = np.where(
             is_function_undefined, values_at_fraction_1[bracket_indices], section_values_matrix
         )
-        proposal_values = section_values_matrix[: len(smooth_brackets)]
+        values_at_proposals = section_values_matrix[: len(smooth_brackets)]
         section_values = section_values_matrix[len(smooth_brackets) :].reshape(-1, n_sections - 1)
-        has_same_sign = np.sign(proposal_values) == np.sign(function_values[0, smooth_brackets])
+        has_same_sign = np.sign(values_at_proposals) == np.sign(function_values[0, smooth_brackets])
         for stored_values, proposed_values in (
             (bracket_locations, proposed_locations),
-            (function_values, proposal_values),
+            (function_values, values_at_proposals),
         ):
             newest_values, opposite_values, _ = stored_values[:, smooth_brackets]
             stored_values[:, smooth_brackets] = (
@@ -170,8 +171,8 @@ def locate_function_roots(
                 np.where(has_same_sign, opposite_values, newest_values),
                 np.where(has_same_sign, newest_values, opposite_values),
             )
-        bracket_locations[1, smooth_brackets[proposal_values == 0.0]] = proposed_locations[
-            proposal_values == 0.0
+        bracket_locations[1, smooth_brackets[values_at_proposals == 0.0]] = proposed_locations[
+            values_at_proposals == 0.0
         ]
         is_left_side = (
             np.sign(section_values) != np.sign(values_at_fraction_1[jump_brackets])[:, None]
@@ -184,8 +185,8 @@ def locate_function_roots(
         n_rounds += 1
         is_sign_jump[smooth_brackets] = (
             is_function_undefined[: len(smooth_brackets)]
-            | (proposal_values == function_values[2, smooth_brackets])
-            | (n_rounds >= options.max_smooth_rounds)
+            | (values_at_proposals == function_values[2, smooth_brackets])
+            | (n_rounds >= options.max_rounds_in_smooth_brackets)
         )
     best_locations = np.where(
         is_sign_jump,

@@ -292,14 +292,14 @@ def reduce_over_non_lane_axes(
     lane_rows = lane_values.reshape(-1, lane_values.shape[-1])
     while lane_rows.shape[0] > 1:
         half_array_length = lane_rows.shape[0] // 2
-        unpaired_row = lane_rows[2 * half_array_length :]
+        unpaired_lane_row = lane_rows[2 * half_array_length :]
         lane_rows = jnp.concatenate(
             [
                 combine_two_arrays(
                     lane_rows[:half_array_length],
                     lane_rows[half_array_length : 2 * half_array_length],
                 ),
-                unpaired_row,
+                unpaired_lane_row,
             ]
         )
     return lane_rows[0]
@@ -607,7 +607,7 @@ def find_first_failed_check(
         < collocation_system.search_limits.max_accepted_mesh_error
     )
     return jnp.where(
-        (failed_check == 0.0) & ~is_mesh_fine_enough, float(MESH_CHECK_CODE), failed_check
+        (failed_check == 0.0) & ~is_mesh_fine_enough, float(FAILED_MESH_CHECK_CODE), failed_check
     )
 
 
@@ -710,7 +710,7 @@ def _run_search_attempt(
         )
         has_cycle, failed_check = collocation_state.has_cycle, collocation_state.failed_check
         continues_homotopy = ~is_last_segment & (
-            (has_cycle > 0.5) | (failed_check == MESH_CHECK_CODE)
+            (has_cycle > 0.5) | (failed_check == FAILED_MESH_CHECK_CODE)
         )
         final_failed_check = jnp.where(
             is_last_segment, failed_check, failed_check + HOMOTOPY_OFFSET
@@ -739,7 +739,7 @@ def _run_search_attempt(
         merged_search_result.collocation_state.failed_check,
     )
     failed_check = jnp.where(
-        (failed_check_before <= 0.0) | (failed_check_after == MESH_CHECK_CODE),
+        (failed_check_before <= 0.0) | (failed_check_after == FAILED_MESH_CHECK_CODE),
         failed_check_after,
         failed_check_before,
     )
@@ -883,7 +883,7 @@ def init_search_result(
     )
 
 
-MESH_CHECK_CODE = len(ADMISSIBILITY_CHECKS)
+FAILED_MESH_CHECK_CODE = len(ADMISSIBILITY_CHECKS)
 """Value of `CollocationState.failed_check` for a root whose mesh is too coarse."""
 
 HOMOTOPY_OFFSET = float(len(ADMISSIBILITY_CHECKS))

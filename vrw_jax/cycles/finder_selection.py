@@ -53,10 +53,8 @@ def make_finder(
     if cycle_options is not None:
         check_type("cycle_options", cycle_options, CycleOptions, "give vrw.CycleOptions()")
     resolved_model = convert_model_argument(model)
-    make_finder_from_options = FINDER_CLASS_BY_METHOD[
-        resolved_model.capabilities.gait_method
-    ].from_options
-    return make_finder_from_options(
+    finder_factory = FINDER_CLASS_BY_METHOD[resolved_model.capabilities.gait_method].from_options
+    return finder_factory(
         resolved_model, n_legs, convert_step_options(step_options), period_n,
         CycleOptions() if cycle_options is None else cycle_options)  # fmt: skip
 

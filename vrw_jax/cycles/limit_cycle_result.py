@@ -23,7 +23,7 @@ from vrw_jax.collocation import (
 )
 from vrw_jax.continuation import floquet
 from vrw_jax.cycles.collocation_search import (
-    MESH_CHECK_CODE,
+    FAILED_MESH_CHECK_CODE,
     CollocationState,
     CollocationSystem,
     init_search_flags,
@@ -371,10 +371,12 @@ def _solve_limit_cycle(
         collocation_state.failed_check > 0.0, Outcome.EVENT_ORDER_MISMATCH, Outcome.NO_CYCLE_FOUND
     )
     outcome_code = jnp.where(
-        collocation_state.failed_check == MESH_CHECK_CODE, Outcome.MESH_TOO_COARSE, outcome_code
+        collocation_state.failed_check == FAILED_MESH_CHECK_CODE,
+        Outcome.MESH_TOO_COARSE,
+        outcome_code,
     )
     outcome_code = jnp.where(
-        collocation_state.failed_check > MESH_CHECK_CODE,
+        collocation_state.failed_check > FAILED_MESH_CHECK_CODE,
         Outcome.BRANCH_ENDS_BEFORE_TARGET,
         outcome_code,
     )

@@ -304,10 +304,10 @@ def make_step_result(
         phase_sequence.has_phase_occurred[2],
         phase_sequence.outcome == Outcome.STEPPED,
     )
-    double_support, single_support_1, single_support_2 = make_phases(
+    dls_phase, sls1_phase, sls2_phase = make_phases(
         s, landing_result.foot_distance, stop_at_lift_off=True
     )
-    liftoff_motion = double_support.compute_motion(phase_ends[0].q, phase_ends[0].v)
+    liftoff_motion = dls_phase.compute_motion(phase_ends[0].q, phase_ends[0].v)
     stopper_state = [
         jnp.where(has_stopper_collision, x, jnp.asarray(fallback_value, x.dtype))
         for x, fallback_value in zip(
@@ -315,9 +315,9 @@ def make_step_result(
         )
     ]
     stopper_collision = transitions.resolve_stopper_collision(
-        s, single_support_1.compute_motion(tuple(stopper_state[:3]), tuple(stopper_state[3:]))
+        s, sls1_phase.compute_motion(tuple(stopper_state[:3]), tuple(stopper_state[3:]))
     )
-    last_motion = single_support_2.compute_motion(phase_ends[2].q, phase_ends[2].v)
+    last_motion = sls2_phase.compute_motion(phase_ends[2].q, phase_ends[2].v)
     initial_energy, final_energy = (
         dynamics.compute_mechanical_energy(s, m).total_energy
         for m in (landing_result.motion_after, last_motion)

@@ -683,13 +683,15 @@ def _compute_rolling_time(
     (DLMF 19.29.4). The result is 0 if the two half-angles are equal.
     """
     has_nonzero_range = end_angle_squared > begin_angle_squared
-    lower_squared = jnp.where(has_nonzero_range, begin_angle_squared, 0.0)
-    upper_squared = jnp.where(has_nonzero_range, end_angle_squared, 1.0)
-    has_nonzero_lower_end = lower_squared > 0.0  # The square root has no derivative at 0.
+    lower_angle_squared = jnp.where(has_nonzero_range, begin_angle_squared, 0.0)
+    upper_angle_squared = jnp.where(has_nonzero_range, end_angle_squared, 1.0)
+    has_nonzero_lower_end = lower_angle_squared > 0.0  # The square root has no derivative at 0.
     smaller_half_angle = jnp.where(
-        has_nonzero_lower_end, jnp.sqrt(jnp.where(has_nonzero_lower_end, lower_squared, 1.0)), 0.0
+        has_nonzero_lower_end,
+        jnp.sqrt(jnp.where(has_nonzero_lower_end, lower_angle_squared, 1.0)),
+        0.0,
     )
-    larger_half_angle = jnp.sqrt(upper_squared)
+    larger_half_angle = jnp.sqrt(upper_angle_squared)
     y1, y2 = jnp.sin(smaller_half_angle), jnp.cos(smaller_half_angle)
     x1, x2 = jnp.sin(larger_half_angle), jnp.cos(larger_half_angle)
     y3 = jnp.sqrt(jnp.maximum(min_rate_squared + 2.0 * kappa * y1**2, 1e-300))

@@ -30,8 +30,8 @@ _STEP_INPUT_UNITS = (
 class UnitScalingPowers(NamedTuple):
     """Exponents of one unit in the units of the inputs and outputs of a step."""
 
-    input_powers: tuple[int, ...]  # exponents for parameters, start, slope of the next line
-    output_powers: tuple[int, ...]  # exponents for section state and durations
+    step_input_powers: tuple[int, ...]  # exponents for parameters, start, slope of the next line
+    step_output_powers: tuple[int, ...]  # exponents for section state and durations
 
     def subtract_known_columns(
         self, scaled_output: Array, step_inputs: Sequence[Array], known_columns: Mapping[int, Array]
@@ -43,9 +43,9 @@ class UnitScalingPowers(NamedTuple):
         the contributions of the unknown columns.
         """
         for i, known_column in known_columns.items():
-            if self.input_powers[i]:
+            if self.step_input_powers[i]:
                 scaled_output = (
-                    scaled_output - (self.input_powers[i] * step_inputs[i]) * known_column
+                    scaled_output - (self.step_input_powers[i] * step_inputs[i]) * known_column
                 )
         return scaled_output
 
@@ -86,7 +86,7 @@ def complete_jacobian_by_scaling(
             scaled_outputs[parameter_index], step_inputs, known_columns
         )
         known_columns[parameter_index] = unknown_column_product / (
-            unit_scaling.input_powers[parameter_index] * step_inputs[parameter_index]
+            unit_scaling.step_input_powers[parameter_index] * step_inputs[parameter_index]
         )
     return known_columns
 
@@ -111,7 +111,7 @@ def complete_jacobian_columns(
         batch_function, step_inputs, computed_indices
     )
     scaled_outputs = {
-        i: jnp.asarray(unit_scaling.output_powers, step_outputs.dtype)[:, None] * step_outputs
+        i: jnp.asarray(unit_scaling.step_output_powers, step_outputs.dtype)[:, None] * step_outputs
         for i, unit_scaling in UNIT_SCALING_BY_PARAMETER_INDEX.items()
     }
     columns_by_input = complete_jacobian_by_scaling(

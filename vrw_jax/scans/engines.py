@@ -179,8 +179,8 @@ def _read_gait_measures(
     measure_reader: MeasureReader, gait_batch: ReturnMapCycle
 ) -> dict[str, Array]:
     """Return the requested measures of a batch of gaits, by name."""
-    first_step = jax.tree.map(lambda step_values: step_values[:, 0], gait_batch.steps)
-    return eqx.filter_vmap(measure_reader)(gait_batch, first_step)
+    first_gait_step = jax.tree.map(lambda step_values: step_values[:, 0], gait_batch.steps)
+    return eqx.filter_vmap(measure_reader)(gait_batch, first_gait_step)
 
 
 PAPER_MEASURES_BY_CONTACT_MEASURE: dict[str, tuple[str, ...]] = {

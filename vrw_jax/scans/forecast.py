@@ -53,14 +53,14 @@ def forecast_scan(scan_plan: ScanPlan, store_path: str | Path | None = None) -> 
         for chunk_index in missing_chunks
     )
     chunk_size = math.prod(result_layout.chunk_shape)
-    axes_text = " x ".join(
+    axes_description = " x ".join(
         f"{n_measured_samples} {axis_name}"
         for axis_name, n_measured_samples in zip(
             result_layout.sample_dimension_names, result_layout.sample_shape, strict=True
         )
     )
     forecast_texts = {
-        "samples": f"{n_samples:,} ({axes_text})",
+        "samples": f"{n_samples:,} ({axes_description})",
         "measures": ", ".join(scan_plan.requested_measures),
         "always included": ", ".join(measure_catalog.always_included_variables),
         "chunks": f"{result_layout.n_chunks:,} of up to {chunk_size:,} samples, "

@@ -60,13 +60,13 @@ def read_scan_manifest(store_attributes: Any) -> dict[str, Any]:
     )
 
 
-def add_attribute_seal(mark_attributes: dict[str, Any]) -> dict[str, Any]:
+def add_attribute_seal(chunk_mark_attributes: dict[str, Any]) -> dict[str, Any]:
     """Return the attributes of the Zarr group of marks, with their digest added under
     `ATTRIBUTE_SEAL_KEY`.
     """
     unsealed_attributes = {
         attribute_key: attribute_value
-        for attribute_key, attribute_value in mark_attributes.items()
+        for attribute_key, attribute_value in chunk_mark_attributes.items()
         if attribute_key != ATTRIBUTE_SEAL_KEY
     }
     return unsealed_attributes | {

@@ -619,8 +619,8 @@ def _create_zarr_arrays(
             compressors=compressors,
             attributes=dict(variable_layout.variable_attributes),
         )
-    mark_array_shape = (result_layout.n_chunks, DIGEST_SIZE_BYTES)
-    mark_attributes = add_attribute_seal(
+    chunk_mark_array_shape = (result_layout.n_chunks, DIGEST_SIZE_BYTES)
+    chunk_mark_attributes = add_attribute_seal(
         {
             SCAN_VARIABLES_KEY: [
                 variable_layout.variable_name for variable_layout in result_layout.variable_layouts
@@ -636,8 +636,12 @@ def _create_zarr_arrays(
             STORE_ATTRIBUTES_KEY: dict(group_attributes),
         }
     )
-    zarr_group.create_group(CHECKSUM_GROUP_NAME, attributes=mark_attributes).create_array(
-        "digest", shape=mark_array_shape, chunks=(1, DIGEST_SIZE_BYTES), dtype="u1", fill_value=0
+    zarr_group.create_group(CHECKSUM_GROUP_NAME, attributes=chunk_mark_attributes).create_array(
+        "digest",
+        shape=chunk_mark_array_shape,
+        chunks=(1, DIGEST_SIZE_BYTES),
+        dtype="u1",
+        fill_value=0,
     )
     # All metadata are written into one file in this order, because zarr's function sorts them and
     # warns.

@@ -407,9 +407,13 @@ def _sort_durations_by_loaded_feet(viscoelastic_result: StepResult) -> Float[Arr
     """Return the durations with two, one and no loaded feet, s, for a step in the paper's
     phases.
     """
-    double_support, *single_support = viscoelastic_result.durations
+    double_support_duration, *single_support_durations = viscoelastic_result.durations
     return jnp.stack(
-        [double_support, single_support[0] + single_support[1], jnp.zeros_like(double_support)]
+        [
+            double_support_duration,
+            single_support_durations[0] + single_support_durations[1],
+            jnp.zeros_like(double_support_duration),
+        ]
     )
 
 

@@ -438,11 +438,11 @@ class TuneProblem:
         active_constraints = [
             ActiveConstraint(
                 measure_name.removeprefix(UPPER_BOUND_PREFIX),
-                restore_sign_of_bound(measure_name, limit_value),
+                restore_sign_of_bound(measure_name, constraint_limit),
                 get_measure(measure_name).unit,
                 objective_price,
             )
-            for measure_name, limit_value, objective_price in zip(
+            for measure_name, constraint_limit, objective_price in zip(
                 self.constraint_names,
                 self.min_constraint_values,
                 map(float, optimality_conditions.constraint_prices),
@@ -455,7 +455,7 @@ class TuneProblem:
             (self.upper_bounds, optimality_conditions.upper_bound_prices),
         )
         for bound_values, bound_prices in bound_sides:
-            for measure_name, limit_value, objective_price, bound_width in zip(
+            for measure_name, constraint_limit, objective_price, bound_width in zip(
                 self.free_parameters, bound_values, bound_prices, self.bound_widths, strict=True
             ):
                 if objective_price > 0.0:
@@ -465,7 +465,7 @@ class TuneProblem:
                     )
                     active_constraints.append(
                         ActiveConstraint(
-                            measure_name, float(limit_value), limit_unit, price_per_unit
+                            measure_name, float(constraint_limit), limit_unit, price_per_unit
                         )
                     )
         end_seconds = time.perf_counter()
@@ -570,7 +570,7 @@ class TuneProblem:
             trial.outcome if trial.is_on_branch else Outcome.NO_CYCLE_FOUND
             for trial in maximization_result.evaluated_trials
         ]
-        path_variables: dict[str, Any] = {
+        path_dataset_variables: dict[str, Any] = {
             parameter_name: (
                 evaluation_dimension,
                 parameter_values[:, parameter_index],
@@ -578,7 +578,7 @@ class TuneProblem:
             )
             for parameter_index, parameter_name in enumerate(self.free_parameters)
         }
-        path_variables |= {
+        path_dataset_variables |= {
             "objective": (
                 evaluation_dimension,
                 [trial.objective for trial in maximization_result.evaluated_trials],
@@ -617,12 +617,12 @@ class TuneProblem:
         constraint_units = [
             get_measure(parameter_name).unit for parameter_name in self.constraint_names
         ]
-        path_coordinates = {
+        path_dataset_coordinates = {
             evaluation_dimension: np.arange(len(normalized_parameters)),
             "constraint": list(self.constraint_names),
             "constraint_unit": ("constraint", constraint_units),
         }
-        path_attributes = {
+        path_dataset_attributes = {
             "title": f"Path of tuning {self.objective_label} over "
             "{', '.join(self.free_parameters)}",
             "free": " ".join(
@@ -635,7 +635,11 @@ class TuneProblem:
         provenance_attributes = collect_provenance_attributes(
             self.params, self.gait_finder.model, self.gait_finder.step_options
         )
-        return xr.Dataset(path_variables, path_coordinates, path_attributes | provenance_attributes)
+        return xr.Dataset(
+            path_dataset_variables,
+            path_dataset_coordinates,
+            path_dataset_attributes | provenance_attributes,
+        )
 
 
 def make_tune_problem(
@@ -687,10 +691,10 @@ def make_tune_problem(
         section_state_template = jax.ShapeDtypeStruct(
             (gait_finder.model.count_section_entries(params),), params.damping.dtype
         )
-        abstract_step_result = jax.eval_shape(
+        step_result_template = jax.eval_shape(
             gait_finder.model.take_step, params, section_state_template, gait_finder.step_options
         )
-        jax.eval_shape(objective_and_constraints, cycle_template, abstract_step_result)
+        jax.eval_shape(objective_and_constraints, cycle_template, step_result_template)
     return TuneProblem(
         params,
         free_parameters,

@@ -124,8 +124,8 @@ class TuneResult:
             feasibility_text if self.path.sizes["constraint"] else "no constraint to keep"
         )
         active_texts = [
-            f"{parameter_name} at {get_measure(parameter_name).format_with_unit(limit_value)}"
-            for parameter_name, limit_value, *_ in self.active
+            f"{parameter_name} at {get_measure(parameter_name).format_with_unit(constraint_limit)}"
+            for parameter_name, constraint_limit, *_ in self.active
         ]
         return {
             "objective": f"{self.objective}: {self.start_value:.6g} at the start, {self.value:.6g}",
