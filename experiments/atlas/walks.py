@@ -66,7 +66,7 @@ def accounted_step(params: vrw.WheelParams, x: jax.Array, options: vrw.StepOptio
     third, lost_3, m = with_damping(sls2, start, params, options)
     ends = first, second, third
     outcomes = [
-        p.select_guard_outcome(e.guard, e.timed_out) for p, e in zip(phases, ends, strict=True)
+        p.select_guard_outcome(e.guard, e.is_timed_out) for p, e in zip(phases, ends, strict=True)
     ]
     step_result = jnp.all(jnp.stack(outcomes) == Outcome.STEPPED)
     theta, _, dtheta, dL1, _ = third.state

@@ -148,7 +148,7 @@ def test_a_margin_has_its_minimum_to_the_accuracy_of_the_integrator():
     end = find_phase_end(
         (lambda y: 8.0 - y[0],), monitors=(lambda y: y[1] + y[0] / 10.0,), count_start=(True,)
     )
-    assert abs(float(end.minima[0]) - reference) < 1e-12
+    assert abs(float(end.margin_minima[0]) - reference) < 1e-12
 
 
 def test_a_margin_that_starts_at_zero_counts_from_its_next_minimum():
@@ -157,21 +157,21 @@ def test_a_margin_that_starts_at_zero_counts_from_its_next_minimum():
     stop = lambda y: 2.0 - y[0]
     counted = find_phase_end((stop,), monitors=(height,), count_start=(True,))
     ignored = find_phase_end((stop,), monitors=(height,), count_start=(False,))
-    assert float(counted.minima[0]) == 0.0
-    assert abs(float(ignored.minima[0]) - (1.0 - np.cos(2.0))) < 1e-12
+    assert float(counted.margin_minima[0]) == 0.0
+    assert abs(float(ignored.margin_minima[0]) - (1.0 - np.cos(2.0))) < 1e-12
 
 
 def test_reaching_the_time_limit_is_a_code():
     options = vrw.StepOptions(max_phase_time=0.5)
     end = find_phase_end((lambda y: 1.0 - y[0],), options=options)
-    assert bool(end.timed_out)
+    assert bool(end.is_timed_out)
     assert int(end.guard) == -1
 
 
 def test_a_divergent_flow_fails_with_finite_values():
     explode = lambda y: y * y
     end = find_phase_end((lambda y: 1e30 - y[0],), start=(1.0, 1.0), field=explode)
-    assert bool(end.gave_up) or int(end.guard) == 0
+    assert bool(end.has_given_up) or int(end.guard) == 0
     assert np.all(np.isfinite(np.asarray(end.state)))
 
 

@@ -109,7 +109,7 @@ class CollocatedPhaseMotion(NamedTuple):
     @classmethod
     def from_node_accelerations(
         cls,
-        mesh: PhaseMesh,
+        phase_mesh: PhaseMesh,
         start_q: Array,
         start_v: Array,
         phase_duration: Scalar,
@@ -121,7 +121,8 @@ class CollocatedPhaseMotion(NamedTuple):
         `node_accelerations` has the shape (intervals, nodes, coordinates).
         """
         interval_lengths = (
-            jnp.asarray(mesh.interval_fractions, phase_duration.dtype)[:, None] * phase_duration
+            jnp.asarray(phase_mesh.interval_fractions, phase_duration.dtype)[:, None]
+            * phase_duration
         )
         rate_increments, position_increments = (
             jnp.einsum("n,ind->id", end_weights, node_accelerations)
@@ -273,11 +274,16 @@ class _PiecewiseQuantityPolynomial(NamedTuple):
             evaluation_times - self.boundary_times[interval_indices]
         ) / interval_lengths
         scaled_derivatives = jnp.zeros_like(evaluation_times)
-        for power in range(self.interval_coefficients.shape[1] - 1, derivative_order - 1, -1):
-            power_derivative_factor = power if derivative_order == 1 else power * (power - 1)
+        for monomial_power in range(
+            self.interval_coefficients.shape[1] - 1, derivative_order - 1, -1
+        ):
+            power_derivative_factor = (
+                monomial_power if derivative_order == 1 else monomial_power * (monomial_power - 1)
+            )
             scaled_derivatives = (
                 scaled_derivatives * locations_in_intervals
-                + power_derivative_factor * self.interval_coefficients[interval_indices, power]
+                + power_derivative_factor
+                * self.interval_coefficients[interval_indices, monomial_power]
             )
         return scaled_derivatives / interval_lengths**derivative_order
 
@@ -452,16 +458,16 @@ def evaluate_quantity_time_derivatives(
 
 
 def _find_bracketed_zeros(
-    function: Callable[[Array], Array],
+    bracketed_function: Callable[[Array], Array],
     bracket_end_points: tuple[Array, Array],
     bracket_values: tuple[Array, Array],
     n_iterations: int,
 ) -> Array:
-    """Return one root of `function` in each bracket. The roots carry no derivatives.
+    """Return one root of `bracketed_function` in each bracket. The roots carry no derivatives.
 
-    `bracket_values` contains the values of `function` at the two ends of each bracket. If the two
-    values of a bracket have the same sign, the start of the bracket is returned. The method is
-    Chandrupatla's (Adv. Eng. Softw. 28, 145-149, 1997).
+    `bracket_values` contains the values of `bracketed_function` at the two ends of each bracket. If
+    the two values of a bracket have the same sign, the start of the bracket is returned. The method
+    is Chandrupatla's (Adv. Eng. Softw. 28, 145-149, 1997).
     """
     bracket_starts, bracket_ends, bracket_start_values, bracket_end_values = lax.stop_gradient(
         (*bracket_end_points, *bracket_values)
@@ -470,26 +476,34 @@ def _find_bracketed_zeros(
     avoid_zero_division = lambda x: jnp.where(x == 0.0, 1.0, x)
 
     def shrink_brackets(loop_carry: tuple, _: None) -> tuple[tuple, None]:
-        a, fa, b, fb, c, fc, next_fraction = loop_carry
-        x = a + next_fraction * (b - a)
-        fx = function(x)
-        is_same_side = jnp.sign(fx) == jnp.sign(fa)
-        c, fc = jnp.where(is_same_side, a, b), jnp.where(is_same_side, fa, fb)
-        b, fb = jnp.where(is_same_side, b, a), jnp.where(is_same_side, fb, fa)
-        a, fa = x, fx
+        a, value_at_a, b, value_at_b, c, value_at_c, next_bracket_fraction = loop_carry
+        x = a + next_bracket_fraction * (b - a)
+        value_at_x = bracketed_function(x)
+        has_same_sign = jnp.sign(value_at_x) == jnp.sign(value_at_a)
+        c, value_at_c = (
+            jnp.where(has_same_sign, a, b),
+            jnp.where(has_same_sign, value_at_a, value_at_b),
+        )
+        b, value_at_b = (
+            jnp.where(has_same_sign, b, a),
+            jnp.where(has_same_sign, value_at_b, value_at_a),
+        )
+        a, value_at_a = x, value_at_x
         xi = (a - b) / avoid_zero_division(c - b)
-        phi = (fa - fb) / avoid_zero_division(fc - fb)
+        phi = (value_at_a - value_at_b) / avoid_zero_division(value_at_c - value_at_b)
         is_interpolation_trusted = (phi * phi < xi) & ((1.0 - phi) * (1.0 - phi) < 1.0 - xi)
-        interpolated_fraction = fa / avoid_zero_division(fb - fa) * fc / avoid_zero_division(
-            fb - fc
-        ) + (c - a) / avoid_zero_division(b - a) * fa / avoid_zero_division(
-            fc - fa
-        ) * fb / avoid_zero_division(fc - fb)
-        next_fraction = jnp.where(
+        interpolated_fraction = value_at_a / avoid_zero_division(
+            value_at_b - value_at_a
+        ) * value_at_c / avoid_zero_division(value_at_b - value_at_c) + (
+            c - a
+        ) / avoid_zero_division(b - a) * value_at_a / avoid_zero_division(
+            value_at_c - value_at_a
+        ) * value_at_b / avoid_zero_division(value_at_c - value_at_b)
+        next_bracket_fraction = jnp.where(
             is_interpolation_trusted, jnp.clip(interpolated_fraction, 0.0, 1.0), 0.5
         )
-        next_fraction = jnp.where(fa == 0.0, 0.0, next_fraction)
-        return (a, fa, b, fb, c, fc, next_fraction), None
+        next_bracket_fraction = jnp.where(value_at_a == 0.0, 0.0, next_bracket_fraction)
+        return (a, value_at_a, b, value_at_b, c, value_at_c, next_bracket_fraction), None
 
     initial_carry = (
         bracket_ends,
@@ -500,5 +514,9 @@ def _find_bracketed_zeros(
         bracket_start_values,
         jnp.full_like(bracket_starts, 0.5),
     )
-    a, fa, b, fb, *_ = lax.scan(shrink_brackets, initial_carry, None, length=n_iterations)[0]
-    return jnp.where(has_sign_change, jnp.where(jnp.abs(fa) <= jnp.abs(fb), a, b), bracket_starts)
+    a, value_at_a, b, value_at_b, *_ = lax.scan(
+        shrink_brackets, initial_carry, None, length=n_iterations
+    )[0]
+    return jnp.where(
+        has_sign_change, jnp.where(jnp.abs(value_at_a) <= jnp.abs(value_at_b), a, b), bracket_starts
+    )

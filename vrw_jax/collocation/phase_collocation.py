@@ -84,19 +84,20 @@ class CollocationPhase(NamedTuple):
     end_event_function: Callable[[PhaseConstants, PhasePoint], Elementwise]
     reset_map: Callable[[PhaseConstants, PhasePoint], PhasePoint]
     guards_function: Callable[[PhaseConstants, PhasePoint], Vector]
-    is_smooth: bool = True  # False if the first interval does not resolve a rapidly decaying mode
+    # False if the first interval does not resolve a rapidly decaying mode
+    is_motion_smooth: bool = True
 
 
 class PhaseSequence(NamedTuple):
     """Sequence of the phases between two crossings of the section.
 
-    `section_size` is the number of section coordinates. `start_map` maps (constants, section state)
-    to the start point of the first phase. `margins_function` maps (constants, points of all phases,
-    flags of active phases) to the margins, which are positive if the gait is admissible.
+    `section_size` is the number of section coordinates. `step_start_map` maps (constants, section
+    state) to the start point of the first phase. `margins_function` maps (constants, points of all
+    phases, flags of active phases) to the margins, which are positive if the gait is admissible.
     """
 
     section_size: int
-    start_map: Callable[[PhaseConstants, Vector], PhasePoint]
+    step_start_map: Callable[[PhaseConstants, Vector], PhasePoint]
     phases: tuple[CollocationPhase, ...]
     margins_function: Callable[[PhaseConstants, "tuple[PhasePoints, ...]", Array], Vector]
 
@@ -159,13 +160,13 @@ class _LinearizationContext(NamedTuple):
         return slice(1, 1 + self.section_size)
 
     def evaluate_with_tangents(
-        self, function_of_point: Callable, point: tuple, point_tangents: tuple
+        self, function_of_point: Callable, phase_point: tuple, point_tangents: tuple
     ) -> tuple:
         """Evaluate `function_of_point(*point, *phase_constants)` and its tangents."""
         if not self.parameter_indices:
             return evaluate_with_jvps(
-                lambda *point: function_of_point(*point, *self.phase_constants),
-                point,
+                lambda *phase_point: function_of_point(*phase_point, *self.phase_constants),
+                phase_point,
                 point_tangents,
             )
         n_trailing_axes = point_tangents[0].shape[0] - self.n_tangents
@@ -179,7 +180,7 @@ class _LinearizationContext(NamedTuple):
         )
         return evaluate_with_jvps(
             function_of_point,
-            (*point, *self.phase_constants),
+            (*phase_point, *self.phase_constants),
             (*point_tangents, *padded_constant_tangents),
         )
 
@@ -326,7 +327,7 @@ def _linearize_residual(
     """
     n_coordinates, n_held_constants = phase.n_coordinates, tangent_state.held_constants.shape[0]
 
-    def evaluate_residual(*arguments: Array) -> Vector:
+    def evaluate_residual_of_arguments(*arguments: Array) -> Vector:
         q, v, a = (arguments[i * n_coordinates : (i + 1) * n_coordinates] for i in range(3))
         held_constants = arguments[3 * n_coordinates :][:n_held_constants]
         parameters = arguments[3 * n_coordinates :][n_held_constants:]
@@ -354,8 +355,8 @@ def _linearize_residual(
         ]
     # The partial derivatives are stacked only after they are computed, because each is a small
     # kernel and stacking copies it.
-    residual_value, partials_by_output = linearization_context.prevent_fusion(
-        evaluate_with_partials(evaluate_residual, residual_arguments)
+    dynamics_residual, partials_by_output = linearization_context.prevent_fusion(
+        evaluate_with_partials(evaluate_residual_of_arguments, residual_arguments)
     )
     partials_by_argument = list(zip(*partials_by_output, strict=True))
     residual_jacobian = jnp.stack(
@@ -371,7 +372,7 @@ def _linearize_residual(
     ]
     return linearization_context.prevent_fusion(
         (
-            jnp.stack(residual_value, 1),
+            jnp.stack(dynamics_residual, 1),
             residual_jacobian,
             jnp.stack(parameter_partials) if parameter_partials else (),
         )
@@ -389,10 +390,10 @@ def _assemble_node_system(
 
     Return the matrix and the right-hand sides. Each tangent has one right-hand side.
     """
-    residual_value, residual_jacobian, parameter_partials = linearized_residual
+    dynamics_residual, residual_jacobian, parameter_partials = linearized_residual
     n_tangents, n_coordinates, float_dtype = (
         state_tangents.shape[0],
-        residual_value.shape[1],
+        dynamics_residual.shape[1],
         h.dtype,
     )
     tangent_terms = [
@@ -405,7 +406,7 @@ def _assemble_node_system(
         for argument_index in range(tangent_state.held_constants.shape[0])
     ]
     right_hand_sides = sum(
-        tangent_terms, start=_make_unit_tangent(n_tangents, 0, float_dtype) * residual_value
+        tangent_terms, start=_make_unit_tangent(n_tangents, 0, float_dtype) * dynamics_residual
     )
     if linearization_context.parameter_indices:
         n_other_tangents = linearization_context.n_tangents - len(
@@ -479,10 +480,14 @@ def _linearize_phase(
             solve_node_equations(*node_system, linearization_context.parameters)
         )
         end_state = _evaluate_interval_end(start_state, mesh_interval, acceleration_tangents)
-        end_field_values = tuple(getattr(end_state, name) for name in PROPAGATED_STATE_FIELDS)
+        end_field_values = tuple(
+            getattr(end_state, field_name) for field_name in PROPAGATED_STATE_FIELDS
+        )
         return end_field_values, jnp.moveaxis(acceleration_tangents, 2, 0)
 
-    start_fields = tuple(getattr(tangent_state, name) for name in PROPAGATED_STATE_FIELDS)
+    start_fields = tuple(
+        getattr(tangent_state, field_name) for field_name in PROPAGATED_STATE_FIELDS
+    )
     length_fractions = jnp.asarray(phase_mesh.interval_fractions, phase_duration.dtype)
     end_field_values, acceleration_tangents = lax.scan(
         linearize_interval, start_fields, (phase_accelerations, length_fractions)
@@ -509,10 +514,10 @@ def _eliminate_duration(
     phase is 0 s.
     """
 
-    def evaluate_end(held_constants: Array, q: Array, v: Array, *constants: Array) -> tuple:
-        point = PhasePoint(tuple(held_constants), tuple(q), tuple(v))
-        return phase.end_event_function(constants, point), _stack_phase_point(
-            phase.reset_map(constants, point), q
+    def evaluate_phase_end(held_constants: Array, q: Array, v: Array, *constants: Array) -> tuple:
+        phase_end_point = PhasePoint(tuple(held_constants), tuple(q), tuple(v))
+        return phase.end_event_function(constants, phase_end_point), _stack_phase_point(
+            phase.reset_map(constants, phase_end_point), q
         )
 
     end_point = tangent_state.held_constants, tangent_state.q, tangent_state.v
@@ -522,7 +527,7 @@ def _eliminate_duration(
         tangent_state.v_tangents,
     )
     (event_value, next_phase_point), (event_tangents, next_point_tangents) = (
-        linearization_context.evaluate_with_tangents(evaluate_end, end_point, point_tangents)
+        linearization_context.evaluate_with_tangents(evaluate_phase_end, end_point, point_tangents)
     )
     correction_unit_tangent, duration_unit_tangent = (
         _make_unit_tangent(event_tangents.shape[0], i, phase_duration.dtype)[:, 0, 0]
@@ -550,7 +555,7 @@ def _linearize_gait_step(
     linearization_context: _LinearizationContext,
     phase_sequence: PhaseSequence,
     phase_meshes: tuple[PhaseMesh, ...],
-    section_and_tangents: tuple,
+    section_state_and_tangents: tuple,
     step_inputs: tuple,
 ) -> tuple:
     """Linearize one gait step, and return the section state after it, its tangents and the outputs.
@@ -558,16 +563,16 @@ def _linearize_gait_step(
     The outputs are the state at the end of the gait step and its tangents. Further outputs are the
     tangents of the phase durations and of the node accelerations.
     """
-    section_state, section_tangents = section_and_tangents
+    section_state, section_tangents = section_state_and_tangents
     phase_durations, accelerations_by_phase, is_phase_active = step_inputs
 
-    def evaluate_start(section_state: Array, *constants: Array) -> tuple:
+    def evaluate_step_start(section_state: Array, *constants: Array) -> tuple:
         return _stack_phase_point(
-            phase_sequence.start_map(constants, tuple(section_state)), section_state
+            phase_sequence.step_start_map(constants, tuple(section_state)), section_state
         )
 
     start_point, start_tangents = linearization_context.evaluate_with_tangents(
-        evaluate_start, (section_state,), (section_tangents,)
+        evaluate_step_start, (section_state,), (section_tangents,)
     )
     tangent_state = _PhaseTangentState(*start_point, *start_tangents)
     duration_tangents, acceleration_tangents = [], []
@@ -633,7 +638,7 @@ def linearize_cycle(
     section_unit_tangents = np.eye(n_tangents, dtype=float_dtype)[
         :, linearization_context.section_tangent_slice, None
     ]
-    section_and_tangents = (
+    section_state_and_tangents = (
         section_state,
         jnp.broadcast_to(section_unit_tangents, (n_tangents, *section_state.shape)),
     )
@@ -643,12 +648,12 @@ def linearize_cycle(
     )
     if trial_solution.durations.shape[0] == 1:
         (state_after_cycle, tangents_after_cycle), step_outputs = linearize_one_step(
-            section_and_tangents, jax.tree.map(lambda x: x[0], step_inputs)
+            section_state_and_tangents, jax.tree.map(lambda x: x[0], step_inputs)
         )
         step_outputs = jax.tree.map(lambda x: x[None], step_outputs)
     else:
         (state_after_cycle, tangents_after_cycle), step_outputs = lax.scan(
-            linearize_one_step, section_and_tangents, step_inputs
+            linearize_one_step, section_state_and_tangents, step_inputs
         )
 
     monodromy = jnp.swapaxes(
@@ -670,20 +675,22 @@ def linearize_cycle(
         contract_inner_axis(closing_matrix, jnp.swapaxes(right_hand_sides, 0, 1)), 0, 1
     )
 
-    def close_cycle(open_tangents: Array) -> Array:
+    def close_cycle(tangents_of_open_cycle: Array) -> Array:
         """Return the tangents of the closed cycle, whose section state is an unknown.
 
         The axes (n, tangent, ...) of the argument become (tangent, n, ...).
         """
-        open_tangents = jnp.swapaxes(open_tangents, 0, 1)
-        broadcast_shape = (-1, *(1,) * (open_tangents.ndim - 2), *section_state.shape[1:])
-        section_tangents = open_tangents[linearization_context.section_tangent_slice]
-        section_terms = [
-            closed_section_tangents[:, section_index].reshape(broadcast_shape)
-            * section_tangents[section_index]
-            for section_index in range(len(section_state))
+        tangents_of_open_cycle = jnp.swapaxes(tangents_of_open_cycle, 0, 1)
+        broadcast_shape = (-1, *(1,) * (tangents_of_open_cycle.ndim - 2), *section_state.shape[1:])
+        section_tangents = tangents_of_open_cycle[linearization_context.section_tangent_slice]
+        section_state_terms = [
+            closed_section_tangents[:, section_coordinate].reshape(broadcast_shape)
+            * section_tangents[section_coordinate]
+            for section_coordinate in range(len(section_state))
         ]
-        return drop_section_tangents(open_tangents) + sum(section_terms[1:], start=section_terms[0])
+        return drop_section_tangents(tangents_of_open_cycle) + sum(
+            section_state_terms[1:], start=section_state_terms[0]
+        )
 
     step_end_states, *uncorrected_tangents = linearization_context.prevent_fusion(step_outputs)
     step_end_tangents, duration_tangents, acceleration_tangents = jax.tree.map(
@@ -727,7 +734,7 @@ def reconstruct_step(
     Return the section state at the end of the gait step, and the points of each phase. No equation
     is solved. Arrays may have additional trailing axes.
     """
-    start_point = phase_sequence.start_map(phase_constants, section_state)
+    start_point = phase_sequence.step_start_map(phase_constants, section_state)
     phase_points = []
     for i, collocation_phase in enumerate(phase_sequence.phases):
         node_times, rate_matrix, position_matrix = (
@@ -757,7 +764,7 @@ def estimate_mesh_error(
     phase_sequence: PhaseSequence,
     phase_meshes: tuple[PhaseMesh, ...],
     solution: CollocationSolution,
-    error_per_jump: float = 0.05,
+    error_per_acceleration_jump: float = 0.05,
 ) -> LaneArray:
     """Estimate the discretization error of a cycle for each batch element, shape (batch,).
 
@@ -765,28 +772,28 @@ def estimate_mesh_error(
     accelerations are a separate polynomial in each mesh interval. At the boundary between two
     intervals, the two polynomials differ by their errors. Each such jump is multiplied by the
     square of the longer interval. The estimate is the largest product, multiplied by
-    `error_per_jump`. Phases whose `is_smooth` is False are ignored, because their error in one
-    interval hardly affects the next phase.
+    `error_per_acceleration_jump`. Phases whose `is_motion_smooth` is False are ignored, because
+    their error in one interval hardly affects the next phase.
 
-    - `error_per_jump`: dimensionless factor. The value is chosen because, except for round-off, the
-      estimate bounds the error in tests with random gaits that have periods up to 10 s. For most
-      gaits the estimate is far above the error.
+    - `error_per_acceleration_jump`: dimensionless factor. The value is chosen because, except for
+      round-off, the estimate bounds the error in tests with random gaits that have periods up to
+      10 s. For most gaits the estimate is far above the error.
     """
     largest_acceleration_jump = jnp.zeros(
         solution.section_state.shape[-1], solution.section_state.dtype
     )
     for i, phase_mesh in enumerate(phase_meshes):
-        if phase_mesh.n_intervals == 1 or not phase_sequence.phases[i].is_smooth:
+        if phase_mesh.n_intervals == 1 or not phase_sequence.phases[i].is_motion_smooth:
             continue
-        left_limits, right_limits = (
+        accelerations_before_boundary, accelerations_after_boundary = (
             jnp.tensordot(
                 jnp.asarray(
-                    compute_lagrange_weights(interval_location), largest_acceleration_jump.dtype
+                    compute_lagrange_weights(location_in_interval), largest_acceleration_jump.dtype
                 ),
                 node_accelerations,
                 (0, 2),
             )
-            for interval_location, node_accelerations in (
+            for location_in_interval, node_accelerations in (
                 (1.0, solution.accelerations[i][:, :-1]),
                 (0.0, solution.accelerations[i][:, 1:]),
             )
@@ -799,9 +806,11 @@ def estimate_mesh_error(
             * solution.durations[:, None, None, i]
         )
         acceleration_jump = (
-            jnp.abs(left_limits - right_limits) * longer_interval_length * longer_interval_length
+            jnp.abs(accelerations_before_boundary - accelerations_after_boundary)
+            * longer_interval_length
+            * longer_interval_length
         )
         largest_acceleration_jump = jnp.maximum(
             largest_acceleration_jump, jnp.max(acceleration_jump, axis=(0, 1, 2))
         )
-    return error_per_jump * largest_acceleration_jump
+    return error_per_acceleration_jump * largest_acceleration_jump

@@ -129,7 +129,7 @@ def integrate_by_diffrax(
         start_rows[n_dynamics_rows - 1], end_rows[n_dynamics_rows - 1], options
     )
     failure_outcome = jnp.where(
-        end_result.timed_out, Outcome.NO_TOUCHDOWN_IN_TIME, Outcome.SOLVER_FAILED
+        end_result.is_timed_out, Outcome.NO_TOUCHDOWN_IN_TIME, Outcome.SOLVER_FAILED
     )
     lane_status = jnp.where(end_result.guard >= 0, LaneStatus.EVENT, failure_outcome)
     lane_status = jnp.where(is_singular, Outcome.PAINLEVE_PARADOX, lane_status)

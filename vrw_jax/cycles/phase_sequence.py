@@ -140,7 +140,7 @@ def _make_collocation_phase(
         evaluate_end_event,
         reset_function,
         evaluate_phase_guards,
-        is_smooth=not phase_class.has_stiff_start,
+        is_motion_smooth=not phase_class.has_stiff_start,
     )
 
 

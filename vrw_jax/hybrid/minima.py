@@ -55,7 +55,7 @@ The value is chosen because a guard is a sum of several terms, each with its own
 
 def is_guard_at_roundoff(
     monitored_functions: MonitoredFunctions,
-    is_crossing: Bool[Array, " n_guards"],
+    is_guard_crossing: Bool[Array, " n_guards"],
     guard_values: Float[Array, " n_guards"],
 ) -> tuple[Bool[Array, ""], Int[Array, ""]]:
     """Return whether the lowest crossing guard is zero within round-off, and its index.
@@ -67,13 +67,13 @@ def is_guard_at_roundoff(
         if monitored_functions.guard_scales is None
         else monitored_functions.guard_scales
     )
-    scaled_guards = jnp.where(is_crossing, guard_values / guard_scales, jnp.inf)
+    scaled_guard_values = jnp.where(is_guard_crossing, guard_values / guard_scales, jnp.inf)
     is_guard_near_zero = (
-        jnp.abs(jnp.min(scaled_guards))
-        <= GUARD_ROUNDOFF_IN_EPS * jnp.finfo(scaled_guards.dtype).eps
+        jnp.abs(jnp.min(scaled_guard_values))
+        <= GUARD_ROUNDOFF_IN_EPS * jnp.finfo(scaled_guard_values.dtype).eps
     )
     has_guard_scales = monitored_functions.guard_scales is not None
-    return is_guard_near_zero & has_guard_scales, jnp.argmin(scaled_guards).astype(jnp.int32)
+    return is_guard_near_zero & has_guard_scales, jnp.argmin(scaled_guard_values).astype(jnp.int32)
 
 
 def find_guards_met_at_start(
@@ -88,7 +88,7 @@ def find_guards_met_at_start(
     derivative. Only then does the event time depend on the start state. `guard_rates` are the time
     derivatives of the guards.
     """
-    ends_phase = (guard_values < 0.0) | ((guard_values == 0.0) & (guard_rates <= 0.0))
+    is_guard_met = (guard_values < 0.0) | ((guard_values == 0.0) & (guard_rates <= 0.0))
     is_guard_zero = guard_values == 0.0
     if monitored_functions.guard_scales is not None:
         guard_roundoff = GUARD_ROUNDOFF_IN_EPS * jnp.finfo(guard_values.dtype).eps
@@ -97,8 +97,8 @@ def find_guards_met_at_start(
         )
     if monitored_functions.is_zero_at_start is not None:
         is_guard_zero = monitored_functions.is_zero_at_start
-        ends_phase = jnp.where(is_guard_zero, guard_rates <= 0.0, ends_phase)
-    return ends_phase, ends_phase & is_guard_zero & (guard_rates < 0.0)
+        is_guard_met = jnp.where(is_guard_zero, guard_rates <= 0.0, is_guard_met)
+    return is_guard_met, is_guard_met & is_guard_zero & (guard_rates < 0.0)
 
 
 class AcceptedPhaseStep(NamedTuple):
@@ -142,14 +142,14 @@ class MinimumRefinement(NamedTuple):
 
 
 def make_empty_interior_minimum(
-    monitored_functions: MonitoredFunctions, start: StateArray
+    monitored_functions: MonitoredFunctions, start_state: StateArray
 ) -> InteriorMinimum:
     """Return an `InteriorMinimum` in which no margin has a minimum yet."""
     n_margins = len(monitored_functions.includes_start)
-    zero_margins = jnp.zeros((n_margins,), start.dtype)
+    zero_margins = jnp.zeros((n_margins,), start_state.dtype)
     return InteriorMinimum(
         zero_margins + jnp.inf,
-        jnp.tile(start, (n_margins, 1)),
+        jnp.tile(start_state, (n_margins, 1)),
         zero_margins,
         zero_margins,
         zero_margins,
@@ -161,12 +161,12 @@ def update_interior_minimum(
     interior_minimum: InteriorMinimum,
     step_start: AcceptedPhaseStep,
     step_end: AcceptedPhaseStep,
-    length: Scalar,
+    step_length: Scalar,
     is_step_counted: Bool[Array, ""],
 ) -> InteriorMinimum:
     """Return the lowest interior minima after one more solver step from `step_start` to `step_end`.
 
-    - `length`: duration of the solver step, s;
+    - `step_length`: duration of the solver step, s;
     - `is_step_counted`: whether the step is part of the phase. If False, nothing changes.
 
     A margin has a minimum inside the step if its time derivative changes from negative to positive.
@@ -188,9 +188,9 @@ def update_interior_minimum(
         monitored_functions.includes_start
     )
     start_rates = jnp.where(is_zero_at_phase_start, jnp.maximum(start_rates, 0.0), start_rates)
-    length = lax.stop_gradient(length)
+    step_length = lax.stop_gradient(step_length)
     minimum_fraction, minimum_margins = find_cubic_minimum(
-        start_margins, start_rates * length, end_margins, end_rates * length
+        start_margins, start_rates * step_length, end_margins, end_rates * step_length
     )
     minimum_margins = jnp.where(
         jnp.isfinite(minimum_margins), minimum_margins, jnp.minimum(start_margins, end_margins)
@@ -204,8 +204,10 @@ def update_interior_minimum(
     return InteriorMinimum(
         jnp.where(is_minimum_lower, minimum_margins, interior_minimum.minimum_values),
         jnp.where(is_minimum_lower[:, None], step_start.state, interior_minimum.start_state),
-        jnp.where(is_minimum_lower, length, interior_minimum.step_length),
-        jnp.where(is_minimum_lower, minimum_fraction * length, interior_minimum.time_to_minimum),
+        jnp.where(is_minimum_lower, step_length, interior_minimum.step_length),
+        jnp.where(
+            is_minimum_lower, minimum_fraction * step_length, interior_minimum.time_to_minimum
+        ),
         jnp.where(is_minimum_lower, start_rates, interior_minimum.start_margin_rates),
     )
 
@@ -229,25 +231,25 @@ def advance_minimum_refinement(
     monitored_functions: MonitoredFunctions,
     interior_minimum: InteriorMinimum,
     tried_step: AcceptedPhaseStep,
-    length: Scalar,
+    step_length: Scalar,
     is_refining: Bool[Array, ""],
-    begins_refinement: Bool[Array, ""],
+    is_phase_start: Bool[Array, ""],
     is_phase_end: Bool[Array, ""],
     max_iterations: int,
-    min_tries: int = 3,
+    min_iterations: int = 3,
 ) -> tuple[MinimumRefinement, Bool[Array, ""], Scalar]:
     """Return the next refinement state, whether another solver step is needed, and its length, s.
 
     After the integration, a secant iteration finds the time at which the time derivative of each
-    margin is zero. Each iteration takes a solver step of `length` from the start of the solver step
-    that contains the minimum.
+    margin is zero. Each iteration takes a solver step of `step_length` from the start of the solver
+    step that contains the minimum.
 
     - `tried_step`: end of the last solver step;
     - `is_refining`: whether `tried_step` was such an iteration;
-    - `begins_refinement`: whether `tried_step` is the start of the phase, where the margins are
+    - `is_phase_start`: whether `tried_step` is the start of the phase, where the margins are
       stored;
     - `is_phase_end`: whether the integration has ended, so that the first margin is refined next;
-    - `max_iterations`, `min_tries`: largest and smallest number of iterations per margin. The
+    - `max_iterations`, `min_iterations`: largest and smallest number of iterations per margin. The
       smallest number is required because each iteration makes the derivatives of the minimum's time
       accurate to more digits.
     """
@@ -255,25 +257,28 @@ def advance_minimum_refinement(
     margin_rates = tried_step.monitored_rates[monitored_functions.n_guards :]
     margin_index = minimum_refinement.margin_index
     n_iterations = minimum_refinement.n_iterations + is_refining
-    margin_value, margin_rate, step_length = (
+    margin_value, margin_rate, original_step_length = (
         select_entry_by_mask(margin_index, x)
         for x in (margin_values, margin_rates, interior_minimum.step_length)
     )
-    margin_rate_value, step_length_value = lax.stop_gradient((margin_rate, length))
+    margin_rate_value, step_length_value = lax.stop_gradient((margin_rate, step_length))
     length_change = step_length_value - minimum_refinement.best_step_length
     margin_rate_slope = (margin_rate_value - minimum_refinement.best_margin_rate) / jnp.where(
         length_change == 0.0, 1.0, length_change
     )
     is_secant_usable = (length_change != 0.0) & (margin_rate_slope > 0.0)
-    proposed_step_length = length - jnp.where(
+    proposed_step_length = step_length - jnp.where(
         is_secant_usable, margin_rate / jnp.where(is_secant_usable, margin_rate_slope, 1.0), 0.0
     )
-    proposed_step_length = jnp.clip(proposed_step_length, 0.0, lax.stop_gradient(step_length))
+    proposed_step_length = jnp.clip(
+        proposed_step_length, 0.0, lax.stop_gradient(original_step_length)
+    )
     has_secant_converged = (
-        jnp.abs(proposed_step_length - length) <= MINIMUM_LOCATION_TOLERANCE * step_length
+        jnp.abs(proposed_step_length - step_length)
+        <= MINIMUM_LOCATION_TOLERANCE * original_step_length
     )
     is_margin_done = is_refining & (
-        (n_iterations == max_iterations) | (has_secant_converged & (n_iterations >= min_tries))
+        (n_iterations == max_iterations) | (has_secant_converged & (n_iterations >= min_iterations))
     )
     has_smaller_margin_rate = jnp.abs(margin_rate_value) < jnp.abs(
         minimum_refinement.best_margin_rate
@@ -291,11 +296,11 @@ def advance_minimum_refinement(
     needs_refinement = interior_minimum.has_minimum & (
         is_phase_end | (margin_indices > margin_index)
     )
-    begins_next_margin = is_phase_end | is_margin_done
+    is_next_margin_selected = is_phase_end | is_margin_done
     margin_index = jnp.where(
-        begins_next_margin, jnp.argmax(needs_refinement).astype(jnp.int32), margin_index
+        is_next_margin_selected, jnp.argmax(needs_refinement).astype(jnp.int32), margin_index
     )
-    minimum_offset, start_rate = lax.stop_gradient(
+    time_to_minimum, start_rate = lax.stop_gradient(
         (
             select_entry_by_mask(margin_index, interior_minimum.time_to_minimum),
             select_entry_by_mask(margin_index, interior_minimum.start_margin_rates),
@@ -303,27 +308,25 @@ def advance_minimum_refinement(
     )
     next_refinement = MinimumRefinement(
         margin_index=margin_index,
-        n_iterations=jnp.where(begins_next_margin, 0, n_iterations),
+        n_iterations=jnp.where(is_next_margin_selected, 0, n_iterations),
         best_step_length=jnp.where(
-            begins_next_margin,
+            is_next_margin_selected,
             0.0,
             jnp.where(
                 has_smaller_margin_rate, step_length_value, minimum_refinement.best_step_length
             ),
         ),
         best_margin_rate=jnp.where(
-            begins_next_margin,
+            is_next_margin_selected,
             start_rate,
             jnp.where(
                 has_smaller_margin_rate, margin_rate_value, minimum_refinement.best_margin_rate
             ),
         ),
-        lowest_margin_values=jnp.where(
-            begins_refinement, start_margin_values, lowest_margin_values
-        ),
+        lowest_margin_values=jnp.where(is_phase_start, start_margin_values, lowest_margin_values),
     )
     return (
         next_refinement,
-        jnp.where(begins_next_margin, jnp.any(needs_refinement), is_refining),
-        jnp.where(begins_next_margin, minimum_offset, proposed_step_length),
+        jnp.where(is_next_margin_selected, jnp.any(needs_refinement), is_refining),
+        jnp.where(is_next_margin_selected, time_to_minimum, proposed_step_length),
     )

@@ -58,10 +58,10 @@ class PhaseEnd(NamedTuple):
     state: StateArray
     duration: Scalar  # duration of the phase, s
     guard: Int[Array, ""]  # index of the guard that ended the phase; -1 if none did
-    timed_out: Bool[Array, ""]
-    gave_up: Bool[Array, ""]
+    is_timed_out: Bool[Array, ""]
+    has_given_up: Bool[Array, ""]
     solver_steps: Int[Array, ""]  # number of tried solver steps, accepted or not
-    minima: Float[Array, " n_monitors"]  # minima of the margins, empty if there are none
+    margin_minima: Float[Array, " n_monitors"]  # minima of the margins, empty if there are none
 
 
 class StepPurpose(IntEnum):
@@ -133,7 +133,7 @@ class _PhaseState(NamedTuple):
     interior_minimum: InteriorMinimum
     minimum_refinement: MinimumRefinement
     triggered_guard: Int[Array, ""]
-    has_timed_out: Bool[Array, ""]
+    is_timed_out: Bool[Array, ""]
     has_given_up: Bool[Array, ""]
     n_tried_steps: Int[Array, ""]
 
@@ -169,15 +169,15 @@ class _SolverStepper(NamedTuple):
         return self.diffrax_solver.init(self.ode_term, zero_time, options.dt0, state, None)
 
     def take_solver_step(
-        self, state: StateArray, solver_state: Any, length: Scalar
+        self, state: StateArray, solver_state: Any, step_length: Scalar
     ) -> tuple[StateArray, StateArray, Any]:
-        """Return the state after a solver step of `length`, s, and its error estimate.
+        """Return the state after a solver step of `step_length`, s, and its error estimate.
 
         The third result is the new internal state of the solver.
         """
-        zero_time = jnp.zeros_like(length)
+        zero_time = jnp.zeros_like(step_length)
         end_state, error_estimate, _, solver_state, solver_result = self.diffrax_solver.step(
-            self.ode_term, zero_time, length, state, None, solver_state, jnp.asarray(False)
+            self.ode_term, zero_time, step_length, state, None, solver_state, jnp.asarray(False)
         )
         if error_estimate is None:
             raise ValueError(
@@ -194,7 +194,7 @@ class _SolverStepper(NamedTuple):
         start_state: StateArray,
         end_state: StateArray,
         error_estimate: StateArray,
-        length: Scalar,
+        step_length: Scalar,
         controller_state: Any,
     ) -> tuple[Bool[Array, ""], Scalar, Any]:
         """Return whether the error of a solver step is acceptable, and the next step length, s.
@@ -205,38 +205,38 @@ class _SolverStepper(NamedTuple):
         start_state, end_state, error_estimate = lax.stop_gradient(
             (start_state, end_state, error_estimate)
         )
-        is_finite = jnp.all(jnp.isfinite(end_state))
-        is_within_tolerance, next_start, next_end, _, controller_state, _ = (
+        is_end_state_finite = jnp.all(jnp.isfinite(end_state))
+        is_within_tolerance, next_step_start, next_step_end, _, controller_state, _ = (
             self.step_size_controller.adapt_step_size(
-                jnp.zeros_like(length),
-                length,
+                jnp.zeros_like(step_length),
+                step_length,
                 start_state,
-                jnp.where(is_finite, end_state, start_state),
+                jnp.where(is_end_state_finite, end_state, start_state),
                 None,
-                jnp.where(is_finite, error_estimate, jnp.inf),
+                jnp.where(is_end_state_finite, error_estimate, jnp.inf),
                 self.diffrax_solver.error_order(self.ode_term),  # type: ignore[arg-type]
                 controller_state,
             )
         )
         return (
             jnp.asarray(is_within_tolerance),
-            jnp.asarray(next_end - next_start),
+            jnp.asarray(next_step_end - next_step_start),
             controller_state,
         )
 
 
-def make_solver(name: str, options: StepOptions) -> diffrax.AbstractAdaptiveSolver:
-    """Return the diffrax solver called `name`, configured for forward-mode derivatives.
+def make_solver(solver_name: str, options: StepOptions) -> diffrax.AbstractAdaptiveSolver:
+    """Return the diffrax solver called `solver_name`, configured for forward-mode derivatives.
 
     An unknown name, or a solver without an error estimate, raises a ValueError.
     """
-    diffrax_solver_class = getattr(diffrax, name, None)
+    diffrax_solver_class = getattr(diffrax, solver_name, None)
     if not (
         isinstance(diffrax_solver_class, type)
         and issubclass(diffrax_solver_class, diffrax.AbstractAdaptiveSolver)
     ):
         raise ValueError(
-            f"solver is {name!r}, but it must name a diffrax solver with an error estimate: "
+            f"solver is {solver_name!r}, but it must name a diffrax solver with an error estimate: "
             "take 'Dopri8', 'Tsit5', 'Dopri5', 'Kvaerno3' or 'Kvaerno5'."
         )
     field_names = getattr(diffrax_solver_class, "__dataclass_fields__", {})
@@ -249,30 +249,32 @@ def make_solver(name: str, options: StepOptions) -> diffrax.AbstractAdaptiveSolv
     return diffrax_solver_class(**solver_arguments)
 
 
-def _make_stepper(field: VectorField, options: StepOptions, max_growth: float) -> _SolverStepper:
+def _make_stepper(
+    vector_field: VectorField, options: StepOptions, max_step_growth: float
+) -> _SolverStepper:
     """Return the solver and step-size controller that `options` select for a vector field.
 
-    `max_growth` is the largest ratio of successive step lengths.
+    `max_step_growth` is the largest ratio of successive step lengths.
     """
     return _SolverStepper(
-        vector_field=field,
+        vector_field=vector_field,
         diffrax_solver=make_solver(options.solver, options),
         step_size_controller=diffrax.PIDController(
-            rtol=options.rtol, atol=options.atol, factormax=max_growth
+            rtol=options.rtol, atol=options.atol, factormax=max_step_growth
         ),
-        ode_term=diffrax.ODETerm(lambda t, y, args: field(y)),
+        ode_term=diffrax.ODETerm(lambda t, y, args: vector_field(y)),
     )
 
 
 def integrate_phase(
-    field: VectorField,
+    vector_field: VectorField,
     monitored_functions: MonitoredFunctions,
-    start: StateArray,
+    start_state: StateArray,
     is_active: Bool[Array, ""],
     options: StepOptions,
     event_options: EventSearchOptions = EVENT_SEARCH_OPTIONS,
 ) -> PhaseEnd:
-    """Return the end of the phase that begins at `start` and ends when a guard first falls to zero.
+    """Return the end of the phase that begins at `start_state`, where a guard first falls to zero.
 
     A guard that is negative at the start, or zero and not rising, ends the phase immediately with
     duration 0. A guard that is zero and rising does not end the phase. If a guard falls through
@@ -285,16 +287,16 @@ def integrate_phase(
     the phase. If `is_active` is False, nothing is integrated. Errors are those of the solver for
     the tolerances of `options`.
     """
-    solver_stepper = _make_stepper(field, options, event_options.max_step_growth)
+    solver_stepper = _make_stepper(vector_field, options, event_options.max_step_growth)
     phase_context = _PhaseContext(solver_stepper, monitored_functions, options, event_options)
     phase_state = lax.while_loop(
         lambda phase_state: make_opaque_condition(
             phase_state.step_purpose != StepPurpose.DONE, phase_state.n_tried_steps
         ),
         functools.partial(_advance_phase_state, phase_context),
-        _init_phase_state(phase_context, start, is_active),
+        _init_phase_state(phase_context, start_state, is_active),
     )
-    minima = jnp.minimum(
+    margin_minima = jnp.minimum(
         phase_state.minimum_refinement.lowest_margin_values,
         phase_state.accepted_step.monitored_values[monitored_functions.n_guards :],
     )
@@ -302,10 +304,10 @@ def integrate_phase(
         state=phase_state.accepted_step.state,
         duration=phase_state.accepted_step.end_time,
         guard=phase_state.triggered_guard,
-        timed_out=phase_state.has_timed_out,
-        gave_up=phase_state.has_given_up,
+        is_timed_out=phase_state.is_timed_out,
+        has_given_up=phase_state.has_given_up,
         solver_steps=phase_state.n_tried_steps,
-        minima=minima,
+        margin_minima=margin_minima,
     )
 
 
@@ -365,7 +367,7 @@ def _init_phase_state(
             zero_values[monitored_functions.n_guards :] + jnp.inf,
         ),
         triggered_guard=zero_count - 1,
-        has_timed_out=false_array,
+        is_timed_out=false_array,
         has_given_up=false_array,
         n_tried_steps=zero_count,
     )
@@ -378,26 +380,28 @@ def _advance_phase_state(phase_context: _PhaseContext, phase_state: _PhaseState)
     """
     _, monitored_functions, options, event_options = phase_context
     n_guards, event_search = monitored_functions.n_guards, phase_state.event_search
-    previous_step, length = phase_state.accepted_step, phase_state.next_step_length
-    is_starting = phase_state.step_purpose == StepPurpose.START
+    previous_step, step_length = phase_state.accepted_step, phase_state.next_step_length
+    is_phase_start = phase_state.step_purpose == StepPurpose.START
     is_searching_event = phase_state.step_purpose == StepPurpose.EVENT_SEARCH
     accepted_step, error_estimate = _try_solver_step(phase_context, phase_state)
     guard_values = accepted_step.monitored_values[:n_guards]
     guard_rates = accepted_step.monitored_rates[:n_guards]
-    ends_phase, is_guard_falling = find_guards_met_at_start(
+    is_guard_met, is_guard_falling = find_guards_met_at_start(
         monitored_functions, guard_values, guard_rates
     )
-    first_met_guard = jnp.argmax(ends_phase).astype(jnp.int32)
+    first_met_guard = jnp.argmax(is_guard_met).astype(jnp.int32)
     # An event at time zero is searched for like any other, because its time depends on the start.
-    begins_search_at_start = is_starting & is_guard_falling[first_met_guard]
-    has_immediate_event = is_starting & jnp.any(ends_phase) & ~is_guard_falling[first_met_guard]
+    is_start_event_searched = is_phase_start & is_guard_falling[first_met_guard]
+    has_immediate_event = (
+        is_phase_start & jnp.any(is_guard_met) & ~is_guard_falling[first_met_guard]
+    )
     step_assessment = _assess_solver_step(phase_context, phase_state, accepted_step, error_estimate)
-    event_proposal = _propose_event_time(event_search, guard_values, guard_rates, length)
+    event_proposal = _propose_event_time(event_search, guard_values, guard_rates, step_length)
     # A try confirms the event if it changes the event's time by little compared with the step. For
     # an event much earlier than the step's end, the change is also compared with the time since the
     # phase began. The comparison is skipped if the change is only the guard's round-off.
     proposed_length_value, constant_length, start_time = lax.stop_gradient(
-        (event_proposal.proposed_step_length, length, previous_step.end_time)
+        (event_proposal.proposed_step_length, step_length, previous_step.end_time)
     )
     event_time_change = jnp.abs(proposed_length_value - constant_length)
     is_length_change_small = event_time_change <= event_options.max_confirmed_length_change * (
@@ -423,22 +427,20 @@ def _advance_phase_state(phase_context: _PhaseContext, phase_state: _PhaseState)
         n_confirmed_proposals >= event_options.n_required_confirmations
     )
 
-    has_timed_out = step_assessment.is_accepted & (accepted_step.end_time >= options.max_phase_time)
-    has_timed_out = has_timed_out | (
-        is_at_event & (accepted_step.end_time > options.max_phase_time)
-    )
+    is_timed_out = step_assessment.is_accepted & (accepted_step.end_time >= options.max_phase_time)
+    is_timed_out = is_timed_out | (is_at_event & (accepted_step.end_time > options.max_phase_time))
     is_step_too_short = step_assessment.is_step_too_short | (
         is_searching_event
         & ~is_at_event
         & (event_search.n_iterations >= options.max_event_iterations)
     )
-    is_phase_end = has_immediate_event | is_at_event | has_timed_out | is_step_too_short
-    begins_event_search = step_assessment.has_guard_crossed | begins_search_at_start
-    step_purpose = jnp.where(is_starting, StepPurpose.INTEGRATION, phase_state.step_purpose)
-    step_purpose = jnp.where(begins_event_search, StepPurpose.EVENT_SEARCH, step_purpose)
+    is_phase_end = has_immediate_event | is_at_event | is_timed_out | is_step_too_short
+    is_event_search_started = step_assessment.has_guard_crossed | is_start_event_searched
+    step_purpose = jnp.where(is_phase_start, StepPurpose.INTEGRATION, phase_state.step_purpose)
+    step_purpose = jnp.where(is_event_search_started, StepPurpose.EVENT_SEARCH, step_purpose)
     step_purpose = jnp.where(is_phase_end, StepPurpose.DONE, step_purpose).astype(jnp.int32)
     following_step_length = jnp.where(
-        begins_search_at_start, 0.0, lax.stop_gradient(step_assessment.following_step_length)
+        is_start_event_searched, 0.0, lax.stop_gradient(step_assessment.following_step_length)
     )
     following_step_length = jnp.where(
         is_searching_event, event_proposal.proposed_step_length, following_step_length
@@ -448,31 +450,31 @@ def _advance_phase_state(phase_context: _PhaseContext, phase_state: _PhaseState)
         step_assessment.is_guard_crossing,
         event_search.is_guard_crossing,
     )
-    is_first_met_guard = begins_search_at_start & (jnp.arange(n_guards) == first_met_guard)
-    counts_at_start = (step_assessment.is_accepted & ~is_starting) | is_at_event
+    is_first_met_guard = is_start_event_searched & (jnp.arange(n_guards) == first_met_guard)
+    is_step_counted = (step_assessment.is_accepted & ~is_phase_start) | is_at_event
     interior_minimum = update_interior_minimum(
         monitored_functions,
         phase_state.interior_minimum,
         previous_step,
         accepted_step,
-        length,
-        counts_at_start,
+        step_length,
+        is_step_counted,
     )
     minimum_refinement = phase_state.minimum_refinement
     if monitored_functions.includes_start:
-        was_refining = phase_state.step_purpose == StepPurpose.REFINEMENT
+        was_refining_minimum = phase_state.step_purpose == StepPurpose.REFINEMENT
         minimum_refinement, is_refining, length_to_minimum = advance_minimum_refinement(
             minimum_refinement,
             monitored_functions,
             interior_minimum,
             accepted_step,
-            length,
-            was_refining,
-            is_starting,
+            step_length,
+            was_refining_minimum,
+            is_phase_start,
             is_phase_end,
             options.max_margin_search_iterations,
         )
-        step_purpose = jnp.where(was_refining, StepPurpose.DONE, step_purpose)
+        step_purpose = jnp.where(was_refining_minimum, StepPurpose.DONE, step_purpose)
         step_purpose = jnp.where(is_refining, StepPurpose.REFINEMENT, step_purpose)
         following_step_length = jnp.where(is_refining, length_to_minimum, following_step_length)
     return _PhaseState(
@@ -484,13 +486,15 @@ def _advance_phase_state(phase_context: _PhaseContext, phase_state: _PhaseState)
         controller_state=step_assessment.controller_state,
         event_search=_EventSearch(
             is_guard_crossing=jnp.where(
-                begins_search_at_start, is_first_met_guard, is_guard_crossing
+                is_start_event_searched, is_first_met_guard, is_guard_crossing
             ),
             lower_length_bound=jnp.where(
-                begins_event_search, 0.0, event_proposal.lower_length_bound
+                is_event_search_started, 0.0, event_proposal.lower_length_bound
             ),
             upper_length_bound=jnp.where(
-                begins_event_search, lax.stop_gradient(length), event_proposal.upper_length_bound
+                is_event_search_started,
+                lax.stop_gradient(step_length),
+                event_proposal.upper_length_bound,
             ),
             time_tolerance=jnp.where(
                 step_assessment.has_guard_crossed,
@@ -499,7 +503,7 @@ def _advance_phase_state(phase_context: _PhaseContext, phase_state: _PhaseState)
             ),
             n_iterations=event_search.n_iterations + is_searching_event,
             n_confirmed_proposals=n_confirmed_proposals,
-            last_length_change=jnp.where(begins_event_search, jnp.inf, event_time_change),
+            last_length_change=jnp.where(is_event_search_started, jnp.inf, event_time_change),
         ),
         interior_minimum=interior_minimum,
         minimum_refinement=minimum_refinement,
@@ -507,12 +511,12 @@ def _advance_phase_state(phase_context: _PhaseContext, phase_state: _PhaseState)
             has_immediate_event,
             first_met_guard,
             jnp.where(
-                is_at_event & ~has_timed_out,
+                is_at_event & ~is_timed_out,
                 event_proposal.proposing_guard,
                 phase_state.triggered_guard,
             ),
         ),
-        has_timed_out=has_timed_out | phase_state.has_timed_out,
+        is_timed_out=is_timed_out | phase_state.is_timed_out,
         has_given_up=is_step_too_short | phase_state.has_given_up,
         n_tried_steps=step_assessment.n_tried_steps,
     )
@@ -529,12 +533,12 @@ def _try_solver_step(
     solver_stepper, monitored_functions, options, _ = phase_context
     start_state = phase_state.accepted_step.state, phase_state.accepted_step.solver_state
     if monitored_functions.includes_start:
-        minimum_start = select_entry_by_mask(
+        state_before_minimum = select_entry_by_mask(
             phase_state.minimum_refinement.margin_index, phase_state.interior_minimum.start_state
         )
         starts_at_minimum_step = (
-            minimum_start,
-            solver_stepper.init_solver_state(minimum_start, options),
+            state_before_minimum,
+            solver_stepper.init_solver_state(state_before_minimum, options),
         )
         start_state = select_tree_leaves(
             phase_state.step_purpose == StepPurpose.REFINEMENT, starts_at_minimum_step, start_state
@@ -584,10 +588,10 @@ def _assess_solver_step(
     solver_stepper, monitored_functions, options, _ = phase_context
     n_guards = monitored_functions.n_guards
     previous_step = phase_state.accepted_step
-    length = phase_state.next_step_length
-    is_starting = phase_state.step_purpose == StepPurpose.START
+    step_length = phase_state.next_step_length
+    is_phase_start = phase_state.step_purpose == StepPurpose.START
     is_integrating = phase_state.step_purpose == StepPurpose.INTEGRATION
-    uninterrupted_step_length = jnp.where(is_starting, options.dt0, length)
+    uninterrupted_step_length = jnp.where(is_phase_start, options.dt0, step_length)
     is_within_tolerance, next_step_length, controller_state = solver_stepper.control_step_size(
         previous_step.state,
         tried_step.state,
@@ -598,20 +602,24 @@ def _assess_solver_step(
     is_within_tolerance = is_within_tolerance & is_integrating
     is_guard_crossing = tried_step.monitored_values[:n_guards] <= 0.0
     minimum_fractions, may_have_minimum = _find_guard_minima(
-        previous_step, tried_step.monitored_values, tried_step.monitored_rates, length, n_guards
+        previous_step,
+        tried_step.monitored_values,
+        tried_step.monitored_rates,
+        step_length,
+        n_guards,
     )
-    length_to_minimum = length * jnp.min(
+    length_to_minimum = step_length * jnp.min(
         jnp.where(may_have_minimum & ~is_guard_crossing, minimum_fractions, 1.0)
     )
-    must_shorten_step = is_within_tolerance & (length_to_minimum < length)
+    must_shorten_step = is_within_tolerance & (length_to_minimum < step_length)
     has_guard_crossed = is_within_tolerance & jnp.any(is_guard_crossing) & ~must_shorten_step
     n_tried_steps = phase_state.n_tried_steps + (phase_state.step_purpose != StepPurpose.REFINEMENT)
     has_step_failed = (n_tried_steps >= options.max_solver_steps) | (
         previous_step.end_time + next_step_length == previous_step.end_time
     )
-    following_step_length = jnp.where(is_starting, options.dt0, next_step_length)
+    following_step_length = jnp.where(is_phase_start, options.dt0, next_step_length)
     following_step_length = jnp.where(must_shorten_step, length_to_minimum, following_step_length)
-    is_accepted = is_starting | (is_within_tolerance & ~has_guard_crossed & ~must_shorten_step)
+    is_accepted = is_phase_start | (is_within_tolerance & ~has_guard_crossed & ~must_shorten_step)
     end_time = jnp.where(is_accepted, tried_step.end_time, previous_step.end_time)
     # The last step ends at the time limit.
     remaining_phase_time = lax.stop_gradient(options.max_phase_time - end_time)
@@ -620,11 +628,11 @@ def _assess_solver_step(
         previous_step,
         tried_step.monitored_values,
         tried_step.monitored_rates,
-        length,
+        step_length,
         n_guards,
         is_guard_crossing,
     )
-    time_resolution = 1e3 * jnp.finfo(length.dtype).eps * tried_step.end_time
+    time_resolution = 1e3 * jnp.finfo(step_length.dtype).eps * tried_step.end_time
     return _StepAssessment(
         is_accepted=is_accepted,
         has_guard_crossed=has_guard_crossed,
@@ -633,7 +641,7 @@ def _assess_solver_step(
         following_step_length=jnp.where(
             has_guard_crossed, event_length_guess, following_step_length
         ),
-        time_tolerance=lax.stop_gradient(jnp.maximum(options.rtol * length, time_resolution)),
+        time_tolerance=lax.stop_gradient(jnp.maximum(options.rtol * step_length, time_resolution)),
         controller_state=select_tree_leaves(
             is_integrating & ~must_shorten_step, controller_state, phase_state.controller_state
         ),
@@ -645,7 +653,7 @@ def _find_guard_minima(
     previous_step: AcceptedPhaseStep,
     guard_values: Array,
     guard_rates: Array,
-    length: Scalar,
+    step_length: Scalar,
     n_guards: int,
 ) -> tuple[Array, Array]:
     """Return each guard's minimum as a fraction of the solver step, and a flag per guard.
@@ -664,16 +672,18 @@ def _find_guard_minima(
     start_rates = start_rates[:n_guards]
     end_guards = end_guards[:n_guards]
     end_rates = end_rates[:n_guards]
-    length = lax.stop_gradient(length)
-    first_bernstein_coefficient = start_guards + start_rates * length / 3.0
-    second_bernstein_coefficient = end_guards - end_rates * length / 3.0
+    step_length = lax.stop_gradient(step_length)
+    first_bernstein_coefficient = start_guards + start_rates * step_length / 3.0
+    second_bernstein_coefficient = end_guards - end_rates * step_length / 3.0
     minimum_fractions = jnp.clip(
-        find_cubic_minimum(start_guards, start_rates * length, end_guards, end_rates * length)[0],
+        find_cubic_minimum(
+            start_guards, start_rates * step_length, end_guards, end_rates * step_length
+        )[0],
         0.1,
         0.9,
     )
     does_step_advance_time = (
-        previous_step.end_time + minimum_fractions * length > previous_step.end_time
+        previous_step.end_time + minimum_fractions * step_length > previous_step.end_time
     )
     may_be_negative = (
         jnp.minimum(first_bernstein_coefficient, second_bernstein_coefficient) <= 0.0
@@ -685,7 +695,7 @@ def _guess_event_length(
     previous_step: AcceptedPhaseStep,
     guard_values: Array,
     guard_rates: Array,
-    length: Scalar,
+    step_length: Scalar,
     n_guards: int,
     is_guard_crossing: Array,
 ) -> Scalar:
@@ -697,9 +707,9 @@ def _guess_event_length(
     start_guards, start_rates, end_guards, end_rates = lax.stop_gradient(
         (
             previous_step.monitored_values,
-            previous_step.monitored_rates * length,
+            previous_step.monitored_rates * step_length,
             guard_values,
-            guard_rates * length,
+            guard_rates * step_length,
         )
     )
     start_guards = start_guards[:n_guards]
@@ -709,7 +719,7 @@ def _guess_event_length(
     guard_decrease = jnp.where(
         is_guard_crossing & (start_guards > end_guards), start_guards - end_guards, 1.0
     )
-    zero_fraction = jnp.where(
+    fraction_to_zero = jnp.where(
         is_guard_crossing, jnp.clip(start_guards / guard_decrease, 0.0, 1.0), 1.0
     )
     # A guard that rises from zero, or from round-off above it, has its other zero where the cubic
@@ -728,28 +738,30 @@ def _guess_event_length(
     other_parabola_zero = jnp.clip(
         2.0 * start_rates / jnp.where(root_denominator > 0.0, root_denominator, 1.0), 0.0, 1.0
     )
-    cubic_rate_function = lambda zero_fraction: (
-        6.0 * zero_fraction * (zero_fraction - 1.0) * (start_guards - end_guards)
-        + (1.0 - zero_fraction) * (1.0 - 3.0 * zero_fraction) * start_rates
-        + zero_fraction * (3.0 * zero_fraction - 2.0) * end_rates
+    cubic_rate_function = lambda fraction_to_zero: (
+        6.0 * fraction_to_zero * (fraction_to_zero - 1.0) * (start_guards - end_guards)
+        + (1.0 - fraction_to_zero) * (1.0 - 3.0 * fraction_to_zero) * start_rates
+        + fraction_to_zero * (3.0 * fraction_to_zero - 2.0) * end_rates
     )
     does_guard_rise_from_zero = (
         is_guard_crossing
         & (start_rates > 0.0)
-        & ((start_guards == 0.0) | (cubic_rate_function(zero_fraction) >= 0.0))
+        & ((start_guards == 0.0) | (cubic_rate_function(fraction_to_zero) >= 0.0))
     )
-    zero_fraction = jnp.where(does_guard_rise_from_zero, other_parabola_zero, zero_fraction)
+    fraction_to_zero = jnp.where(does_guard_rise_from_zero, other_parabola_zero, fraction_to_zero)
     for _ in range(3):
-        is_guard_falling = (cubic_rate_value := cubic_rate_function(zero_fraction)) < 0.0
+        is_guard_falling = (cubic_rate_value := cubic_rate_function(fraction_to_zero)) < 0.0
         fraction_change = evaluate_cubic(
-            zero_fraction, start_guards, start_rates, end_guards, end_rates
+            fraction_to_zero, start_guards, start_rates, end_guards, end_rates
         ) / jnp.where(is_guard_falling, cubic_rate_value, 1.0)
-        zero_fraction = jnp.where(
+        fraction_to_zero = jnp.where(
             is_guard_crossing & is_guard_falling,
-            jnp.clip(zero_fraction - fraction_change, 0.0, 1.0),
-            zero_fraction,
+            jnp.clip(fraction_to_zero - fraction_change, 0.0, 1.0),
+            fraction_to_zero,
         )
-    return lax.stop_gradient(length) * jnp.min(jnp.where(is_guard_crossing, zero_fraction, 1.0))
+    return lax.stop_gradient(step_length) * jnp.min(
+        jnp.where(is_guard_crossing, fraction_to_zero, 1.0)
+    )
 
 
 class _EventProposal(NamedTuple):
@@ -765,7 +777,7 @@ class _EventProposal(NamedTuple):
 
 
 def _propose_event_time(
-    event_search: _EventSearch, guard_values: Array, guard_rates: Array, length: Scalar
+    event_search: _EventSearch, guard_values: Array, guard_rates: Array, step_length: Scalar
 ) -> _EventProposal:
     """Return the earliest event time that Newton's method proposes for the crossing guards.
 
@@ -779,10 +791,12 @@ def _propose_event_time(
     missed_event_time = jnp.where(
         event_search.is_guard_crossing & (guard_values < 0.0), -jnp.inf, jnp.inf
     )
-    proposed_step_lengths = jnp.where(is_guard_falling, length + time_to_zero, missed_event_time)
+    proposed_step_lengths = jnp.where(
+        is_guard_falling, step_length + time_to_zero, missed_event_time
+    )
     # If no crossing guard falls here, the lowest of the crossing guards is taken.
     lowest_guard = jnp.argmin(jnp.where(event_search.is_guard_crossing, guard_values, jnp.inf))
-    guard = jnp.where(
+    proposing_guard = jnp.where(
         jnp.any(proposed_step_lengths < jnp.inf), jnp.argmin(proposed_step_lengths), lowest_guard
     ).astype(jnp.int32)
     # This happens at the start of the step.
@@ -791,12 +805,12 @@ def _propose_event_time(
         jnp.where(event_search.is_guard_crossing, (guard_values > 0.0) | is_guard_rising, True)
     )
     lower_length_bound = jnp.where(
-        is_step_before_event, lax.stop_gradient(length), event_search.lower_length_bound
+        is_step_before_event, lax.stop_gradient(step_length), event_search.lower_length_bound
     )
     upper_length_bound = jnp.where(
-        is_step_before_event, event_search.upper_length_bound, lax.stop_gradient(length)
+        is_step_before_event, event_search.upper_length_bound, lax.stop_gradient(step_length)
     )
-    earliest_proposed_length = proposed_step_lengths[guard]
+    earliest_proposed_length = proposed_step_lengths[proposing_guard]
     # A proposal within round-off of a collapsed bracket counts as inside.
     is_proposal_inside = (
         earliest_proposed_length >= lower_length_bound - event_search.time_tolerance
@@ -809,66 +823,59 @@ def _propose_event_time(
         finite_proposed_length - lax.stop_gradient(finite_proposed_length)
     )
     next_step_length = jnp.where(is_proposal_inside, finite_proposed_length, bisected_step_length)
-    return _EventProposal(next_step_length, guard, lower_length_bound, upper_length_bound)
+    return _EventProposal(next_step_length, proposing_guard, lower_length_bound, upper_length_bound)
 
 
 def sample_phase(
-    field: VectorField, start: StateArray, duration: Scalar, n_samples: int, options: StepOptions
+    vector_field: VectorField,
+    start_state: StateArray,
+    duration: Scalar,
+    n_samples: int,
+    options: StepOptions,
 ) -> Float[Array, "n_samples dim"]:
     """Return the states at `n_samples` equally spaced times of a phase, as accurate as the solver.
 
-    The first sample is `start` and the last is the state after `duration`, s.
+    The first sample is `start_state` and the last is the state after `duration`, s. Each interval
+    between two samples is integrated with adaptive solver steps. The last of these solver steps
+    ends exactly at the time of the sample.
     """
-    solver_stepper = _make_stepper(field, options, EVENT_SEARCH_OPTIONS.max_step_growth)
+    solver_stepper = _make_stepper(vector_field, options, EVENT_SEARCH_OPTIONS.max_step_growth)
     sample_interval = duration / (n_samples - 1)
 
-    def integrate_to_next(state: StateArray, _sample: None) -> tuple[StateArray, StateArray]:
-        next_state = _integrate_sample_interval(solver_stepper, state, sample_interval, options)
-        return next_state, next_state
-
-    _, states = lax.scan(integrate_to_next, start, None, length=n_samples - 1)
-    return jnp.concatenate([start[None], states])
-
-
-def _integrate_sample_interval(
-    solver_stepper: _SolverStepper,
-    state: StateArray,
-    sampled_duration: Scalar,
-    options: StepOptions,
-) -> StateArray:
-    """Return the state after `sampled_duration`, s, integrated with adaptive solver steps.
-
-    The last solver step ends exactly at this time.
-    """
-
-    def take_interval_step(loop_carry: tuple) -> tuple:
-        time, state, solver_state, length, controller_state, n_tried_steps = loop_carry
-        step_length = jnp.minimum(length, sampled_duration - time)
+    def take_adaptive_step(loop_carry: tuple) -> tuple:
+        time, state, solver_state, step_length, controller_state, n_tried_steps = loop_carry
+        step_length = jnp.minimum(step_length, sample_interval - time)
         end_state, error_estimate, end_solver_state = solver_stepper.take_solver_step(
             state, solver_state, step_length
         )
         is_within_tolerance, next_step_length, controller_state = solver_stepper.control_step_size(
             state, end_state, error_estimate, step_length, controller_state
         )
-        is_last_step = is_within_tolerance & (step_length >= sampled_duration - time)
+        is_last_step = is_within_tolerance & (step_length >= sample_interval - time)
         time = jnp.where(
-            is_last_step, sampled_duration, jnp.where(is_within_tolerance, time + step_length, time)
+            is_last_step, sample_interval, jnp.where(is_within_tolerance, time + step_length, time)
         )
         state, solver_state = select_tree_leaves(
             is_within_tolerance, (end_state, end_solver_state), (state, solver_state)
         )
         return time, state, solver_state, next_step_length, controller_state, n_tried_steps + 1
 
-    needs_step = lambda c: (c[0] < sampled_duration) & (c[-1] < options.max_solver_steps)
-    zero_count = jnp.zeros((), jnp.int32)
-    solver_state, controller_state = solver_stepper.init_solver_and_controller(state, options)
-    zero_time = jnp.zeros_like(sampled_duration)
-    loop_carry = (
-        zero_time,
-        state,
-        solver_state,
-        zero_time + options.dt0,
-        controller_state,
-        zero_count,
-    )
-    return lax.while_loop(needs_step, take_interval_step, loop_carry)[1]
+    needs_step = lambda c: (c[0] < sample_interval) & (c[-1] < options.max_solver_steps)
+
+    def integrate_to_next(state: StateArray, _sample: None) -> tuple[StateArray, StateArray]:
+        zero_count = jnp.zeros((), jnp.int32)
+        solver_state, controller_state = solver_stepper.init_solver_and_controller(state, options)
+        zero_time = jnp.zeros_like(sample_interval)
+        loop_carry = (
+            zero_time,
+            state,
+            solver_state,
+            zero_time + options.dt0,
+            controller_state,
+            zero_count,
+        )
+        next_state = lax.while_loop(needs_step, take_adaptive_step, loop_carry)[1]
+        return next_state, next_state
+
+    _, states = lax.scan(integrate_to_next, start_state, None, length=n_samples - 1)
+    return jnp.concatenate([start_state[None], states])

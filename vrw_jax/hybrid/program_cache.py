@@ -91,10 +91,10 @@ def find_program(function: Callable, constants: Any, *arguments: Any) -> Callabl
     """
     if is_inside_jit():
         return None
-    leaves, tree_structure = jax.tree.flatten(arguments)
+    argument_leaves, tree_structure = jax.tree.flatten(arguments)
     try:
-        argument_type_keys = tree_structure, tuple(map(jax.typeof, leaves))
-        program_key = (function, argument_type_keys, _make_key(constants, frozenset()))
+        argument_type_keys = tree_structure, tuple(map(jax.typeof, argument_leaves))
+        program_key = (function, argument_type_keys, _make_cache_key(constants, frozenset()))
     except _UncacheableFunctionError:
         return None
     if program_key not in _program_by_key:
@@ -105,15 +105,15 @@ def find_program(function: Callable, constants: Any, *arguments: Any) -> Callabl
     return _program_by_key[program_key]
 
 
-def _make_key(keyed_value: Any, enclosing_ids: frozenset) -> Hashable:
+def _make_cache_key(keyed_value: Any, ids_of_enclosing_objects: frozenset) -> Hashable:
     """Return a hashable key for a value. Values with equal keys lead to the same program.
 
-    - `enclosing_ids`: identities of the objects that contain the value. A reference to one of these
-      objects raises `_UncacheableFunctionError`.
+    - `ids_of_enclosing_objects`: identities of the objects that contain the value. A reference to
+      one of these objects raises `_UncacheableFunctionError`.
     """
-    if isinstance(keyed_value, jax.core.Tracer) or id(keyed_value) in enclosing_ids:
+    if isinstance(keyed_value, jax.core.Tracer) or id(keyed_value) in ids_of_enclosing_objects:
         raise _UncacheableFunctionError
-    make_inner_key = lambda x: _make_key(x, enclosing_ids | {id(keyed_value)})
+    make_inner_key = lambda x: _make_cache_key(x, ids_of_enclosing_objects | {id(keyed_value)})
     value_type = type(keyed_value)
     if keyed_value is None or isinstance(
         keyed_value, str | bytes | bool | int | complex | types.CodeType
@@ -140,9 +140,11 @@ def _make_key(keyed_value: Any, enclosing_ids: frozenset) -> Hashable:
             for dictionary_key, x in keyed_value.items()
         )
     if isinstance(keyed_value, types.FunctionType):
-        return value_type, _make_function_key(keyed_value, enclosing_ids | {id(keyed_value)})
+        return value_type, _make_function_key(
+            keyed_value, ids_of_enclosing_objects | {id(keyed_value)}
+        )
     if isinstance(keyed_value, type):
-        return _make_class_key(keyed_value, enclosing_ids | {id(keyed_value)})
+        return _make_class_key(keyed_value, ids_of_enclosing_objects | {id(keyed_value)})
     if isinstance(keyed_value, types.ModuleType) and _is_in_unchanging_package(
         keyed_value.__name__
     ):
@@ -177,30 +179,32 @@ def _is_in_unchanging_package(module_name: str | None) -> bool:
     return (module_name or "").split(".")[0] in UNCHANGING_PACKAGES
 
 
-def _make_class_key(value_type: type, enclosing_ids: frozenset) -> Hashable:
+def _make_class_key(value_type: type, ids_of_enclosing_objects: frozenset) -> Hashable:
     """Return the key for a class. The key for a user's class contains its methods and constants."""
     if _is_in_unchanging_package(value_type.__module__):
         return _IdentityKey(value_type)
     class_attributes = {
-        name: class_attribute
-        for name, class_attribute in vars(value_type).items()
-        if not name.startswith("__") or name == "__call__"
+        attribute_name: class_attribute
+        for attribute_name, class_attribute in vars(value_type).items()
+        if not attribute_name.startswith("__") or attribute_name == "__call__"
     }
-    return _IdentityKey(value_type), _make_key(
-        (class_attributes, value_type.__bases__), enclosing_ids
+    return _IdentityKey(value_type), _make_cache_key(
+        (class_attributes, value_type.__bases__), ids_of_enclosing_objects
     )
 
 
-def _make_function_key(function: types.FunctionType, enclosing_ids: frozenset) -> Hashable:
+def _make_function_key(
+    function: types.FunctionType, ids_of_enclosing_objects: frozenset
+) -> Hashable:
     """Return the key for a function: its code, and the keys for all values to which it refers."""
     if _is_in_unchanging_package(function.__module__) and not function.__closure__:
         return _IdentityKey(function)
     global_names = {
-        name
+        global_name
         for code_object in _iterate_code_objects(function.__code__)
-        for name in code_object.co_names
+        for global_name in code_object.co_names
     }
-    global_keys = _make_scope_key(function.__globals__, global_names, enclosing_ids)
+    global_keys = _make_scope_key(function.__globals__, global_names, ids_of_enclosing_objects)
     try:
         cell_values = tuple(
             closure_cell.cell_contents for closure_cell in function.__closure__ or ()
@@ -208,26 +212,36 @@ def _make_function_key(function: types.FunctionType, enclosing_ids: frozenset) -
     except ValueError:  # A cell of the closure has no value yet.
         raise _UncacheableFunctionError from None
     bound_argument_values = (cell_values, function.__defaults__, function.__kwdefaults__)
-    return function.__code__, global_keys, _make_key(bound_argument_values, enclosing_ids)
+    return (
+        function.__code__,
+        global_keys,
+        _make_cache_key(bound_argument_values, ids_of_enclosing_objects),
+    )
 
 
-def _make_scope_key(objects_by_name: dict, names: set[str], enclosing_ids: frozenset) -> Hashable:
-    """Return pairs of name and key for those `names` that occur in `objects_by_name`.
+def _make_scope_key(
+    objects_by_name: dict, object_names: set[str], ids_of_enclosing_objects: frozenset
+) -> Hashable:
+    """Return pairs of name and key for those `object_names` that occur in `objects_by_name`.
 
     The key for a user's module contains the module's objects with these names.
     """
 
-    def make_entry_key(value: Any) -> Hashable:
-        if not isinstance(value, types.ModuleType) or _is_in_unchanging_package(value.__name__):
-            return _make_key(value, enclosing_ids)
-        if id(value) in enclosing_ids:
-            return _IdentityKey(value)
-        return _IdentityKey(value), _make_scope_key(vars(value), names, enclosing_ids | {id(value)})
+    def make_entry_key(entry_value: Any) -> Hashable:
+        if not isinstance(entry_value, types.ModuleType) or _is_in_unchanging_package(
+            entry_value.__name__
+        ):
+            return _make_cache_key(entry_value, ids_of_enclosing_objects)
+        if id(entry_value) in ids_of_enclosing_objects:
+            return _IdentityKey(entry_value)
+        return _IdentityKey(entry_value), _make_scope_key(
+            vars(entry_value), object_names, ids_of_enclosing_objects | {id(entry_value)}
+        )
 
     return tuple(
-        (name, make_entry_key(objects_by_name[name]))
-        for name in sorted(names)
-        if name in objects_by_name
+        (object_name, make_entry_key(objects_by_name[object_name]))
+        for object_name in sorted(object_names)
+        if object_name in objects_by_name
     )
 
 

@@ -109,10 +109,12 @@ def _make_event_determinant_function(mode: Mode, guard: Guard, options: StepOpti
     The factor is that of one phase in `mode` and of the event of `guard` that ends the phase.
     """
 
-    def evaluate_flow_and_divergence(z: Array) -> Array:
-        y = z[:-2]
-        divergence = jnp.trace(jax.jacfwd(mode.field)(y))
-        return jnp.concatenate([mode.field(y), jnp.stack([divergence, jnp.ones_like(divergence)])])
+    def evaluate_flow_and_divergence(augmented_state: Array) -> Array:
+        state = augmented_state[:-2]
+        divergence = jnp.trace(jax.jacfwd(mode.field)(state))
+        return jnp.concatenate(
+            [mode.field(state), jnp.stack([divergence, jnp.ones_like(divergence)])]
+        )
 
     def evaluate_determinant_factor(
         start: Array, state_before_event: Array, field_after_event: Array, mode_duration: Array

@@ -9,10 +9,10 @@ from vrw_jax.numerics import Scalar, StepOptions
 
 
 def integrate_in_units(
-    field: VectorField,
+    vector_field: VectorField,
     monitored_functions: MonitoredFunctions,
-    start: StateArray,
-    active: Bool[Array, ""],
+    start_state: StateArray,
+    is_active: Bool[Array, ""],
     options: StepOptions,
     state_units: StateArray,
     time_unit: Scalar,
@@ -28,10 +28,10 @@ def integrate_in_units(
     state_units, time_unit = lax.stop_gradient((state_units, time_unit))
     evaluate_in_si = lambda y: monitored_functions.evaluate_monitored(y * state_units)
     phase_end = integrate_phase(
-        _make_scaled_field(field, state_units, time_unit),
+        _make_scaled_field(vector_field, state_units, time_unit),
         monitored_functions._replace(evaluate_monitored=evaluate_in_si),
-        start / state_units,
-        active,
+        start_state / state_units,
+        is_active,
         options,
     )
     return phase_end._replace(
@@ -40,8 +40,8 @@ def integrate_in_units(
 
 
 def sample_in_units(
-    field: VectorField,
-    start: StateArray,
+    vector_field: VectorField,
+    start_state: StateArray,
     duration: Scalar,
     n_samples: int,
     options: StepOptions,
@@ -53,13 +53,13 @@ def sample_in_units(
     The arguments are those of `integrate_in_units`.
     """
     state_units, time_unit = lax.stop_gradient((state_units, time_unit))
-    scaled_field = _make_scaled_field(field, state_units, time_unit)
-    start, duration = start / state_units, duration / time_unit
-    return sample_phase(scaled_field, start, duration, n_samples, options) * state_units
+    scaled_field = _make_scaled_field(vector_field, state_units, time_unit)
+    start_state, duration = start_state / state_units, duration / time_unit
+    return sample_phase(scaled_field, start_state, duration, n_samples, options) * state_units
 
 
 def _make_scaled_field(
-    field: VectorField, state_units: StateArray, time_unit: Scalar
+    vector_field: VectorField, state_units: StateArray, time_unit: Scalar
 ) -> VectorField:
     rate_factors = time_unit / state_units
-    return lambda y: field(y * state_units) * rate_factors
+    return lambda y: vector_field(y * state_units) * rate_factors

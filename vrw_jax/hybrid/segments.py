@@ -56,11 +56,11 @@ def segment_maps(
             computed, by default all.
     """
     start = jnp.asarray(start, float)
-    output_shape = jax.eval_shape(field, start)
+    field_output_shape = jax.eval_shape(field, start)
     n_tangents = start.size if n_directions is None else n_directions
-    if start.ndim != 1 or output_shape.shape != start.shape:
+    if start.ndim != 1 or field_output_shape.shape != start.shape:
         raise ValueError(
-            f"the field gives shape {output_shape.shape} for a start of shape {start.shape}, "
+            f"the field gives shape {field_output_shape.shape} for a start of shape {start.shape}, "
             f"but both must "
             "be one row of the same length."
         )
@@ -72,8 +72,10 @@ def segment_maps(
         )
     constants = (field, n_segments, n_tangents)
     duration = jnp.asarray(duration, start.dtype)
-    segments = call_compiled_program(_integrate_flow_segments, constants, start, duration, options)
-    return forbid_reverse_mode("segment_maps", segments)
+    flow_segments = call_compiled_program(
+        _integrate_flow_segments, constants, start, duration, options
+    )
+    return forbid_reverse_mode("segment_maps", flow_segments)
 
 
 def _integrate_flow_segments(
@@ -83,23 +85,25 @@ def _integrate_flow_segments(
     n_coordinates, n_state_and_tangents = start.size, start.size * (1 + n_tangents)
     segment_duration = duration / n_segments
 
-    def evaluate_flow_and_tangents(z: Array) -> Array:
-        y = z[:n_coordinates]
-        tangents = z[n_coordinates:n_state_and_tangents].reshape(n_tangents, n_coordinates)
-        jvp_of_field = lambda tangent: jax.jvp(field, (y,), (tangent,))[1]
+    def evaluate_flow_and_tangents(augmented_state: Array) -> Array:
+        state = augmented_state[:n_coordinates]
+        tangents = augmented_state[n_coordinates:n_state_and_tangents].reshape(
+            n_tangents, n_coordinates
+        )
+        jvp_of_field = lambda tangent: jax.jvp(field, (state,), (tangent,))[1]
         tangent_rates = jax.vmap(jvp_of_field)(tangents)
         tangent_growth_rates = jnp.sum(tangents * tangent_rates, axis=1) / jnp.sum(
             tangents * tangents, axis=1
         )
-        normalized_rates = tangent_rates - tangent_growth_rates[:, None] * tangents
+        normalized_tangent_rates = tangent_rates - tangent_growth_rates[:, None] * tangents
         unit_direction_rates = jax.vmap(jvp_of_field)(
-            jnp.eye(n_tangents, n_coordinates, dtype=z.dtype)
+            jnp.eye(n_tangents, n_coordinates, dtype=augmented_state.dtype)
         )
-        clock_rate = jnp.ones_like(y[:1])
+        clock_rate = jnp.ones_like(state[:1])
         return jnp.concatenate(
             [
-                field(y),
-                normalized_rates.ravel(),
+                field(state),
+                normalized_tangent_rates.ravel(),
                 tangent_growth_rates,
                 jnp.trace(unit_direction_rates)[None],
                 clock_rate,
@@ -119,10 +123,14 @@ def _integrate_flow_segments(
         tangent_growth_factors = jnp.exp(
             end_state[n_state_and_tangents : n_state_and_tangents + n_tangents]
         )
-        jacobian = jnp.where(
+        segment_jacobian = jnp.where(
             is_segment_completed, tangents[:, :n_tangents].T * tangent_growth_factors, jnp.nan
         )
-        return end_state[:n_coordinates], (end_state[:n_coordinates], jacobian, end_state[-2])
+        return end_state[:n_coordinates], (
+            end_state[:n_coordinates],
+            segment_jacobian,
+            end_state[-2],
+        )
 
     _, (end_states, jacobians, divergences) = lax.scan(
         integrate_segment, start, None, length=n_segments
@@ -217,10 +225,12 @@ def _compute_block_multipliers(
     """Return the multipliers of one diagonal block, logarithms of moduli, and relative errors."""
     diagonal_blocks = triangular_factors[:, block_slice, block_slice]
     block_size = block_slice.stop - block_slice.start
-    diagonal = np.abs(np.diagonal(diagonal_blocks, axis1=1, axis2=2))
+    diagonal_moduli = np.abs(np.diagonal(diagonal_blocks, axis1=1, axis2=2))
     with np.errstate(divide="ignore", invalid="ignore"):
-        log_diagonal = np.log(diagonal)
-        error_amplification = np.where(diagonal > 0.0, jacobian_norms[:, None] / diagonal, 0.0)
+        log_diagonal = np.log(diagonal_moduli)
+        error_amplification = np.where(
+            diagonal_moduli > 0.0, jacobian_norms[:, None] / diagonal_moduli, 0.0
+        )
         relative_error = tolerance * np.max(np.sum(error_amplification, axis=0))
         scaled_product = np.eye(block_size)
         log_block_scale = 0.0
@@ -230,11 +240,15 @@ def _compute_block_multipliers(
             largest_block_entry = np.max(np.abs(scaled_product)) or 1.0
             scaled_product = scaled_product / largest_block_entry
             log_block_scale = log_block_scale + np.log(largest_block_entry)
-        values = np.linalg.eigvals(closing_matrix[block_slice, block_slice] @ scaled_product)
-        logarithms = np.log(np.abs(values)) + log_block_scale
+        scaled_eigenvalues = np.linalg.eigvals(
+            closing_matrix[block_slice, block_slice] @ scaled_product
+        )
+        logarithms = np.log(np.abs(scaled_eigenvalues)) + log_block_scale
         if block_size == 1:
             logarithms = np.sum(log_diagonal, axis=0)
-        multiplier_phases = np.where(values == 0.0, 1.0, values / np.abs(values))
+        multiplier_phases = np.where(
+            scaled_eigenvalues == 0.0, 1.0, scaled_eigenvalues / np.abs(scaled_eigenvalues)
+        )
         block_multipliers = multiplier_phases * np.exp(logarithms)
     return (
         block_multipliers,

@@ -271,31 +271,33 @@ def _check_simulation_arguments(
             )
         _check_output_shape(f"the field of mode {mode_number}", field, start, start.shape)
         for guard_number, guard in enumerate(guards):
-            name = f"guard {guard_number} of mode {mode_number}"
-            _check_output_shape(name, guard.value, start, ())
-            _check_output_shape(f"the reset of {name}", guard.reset, start, start.shape)
+            guard_name = f"guard {guard_number} of mode {mode_number}"
+            _check_output_shape(guard_name, guard.value, start, ())
+            _check_output_shape(f"the reset of {guard_name}", guard.reset, start, start.shape)
             if guard.target_mode is not None and not 0 <= guard.target_mode < len(modes):
                 raise ValueError(
-                    f"{name} leads to mode {guard.target_mode}, but there are {len(modes)}: "
+                    f"{guard_name} leads to mode {guard.target_mode}, but there are {len(modes)}: "
                     "count from 0."
                 )
 
 
-def _check_output_shape(name: str, function: Callable, start: Array, shape: tuple) -> None:
-    """Raise a ValueError unless `function(start)` returns floats of the shape `shape`."""
-    check_callable(name, function, "of the state")
-    output: Any = jax.eval_shape(function, start)
-    output_shape = getattr(output, "shape", None)
-    if output_shape != shape or not jnp.issubdtype(output.dtype, jnp.floating):
-        description = (
-            f"{output.dtype} of shape {output_shape}"
+def _check_output_shape(
+    function_name: str, function: Callable, start: Array, expected_shape: tuple
+) -> None:
+    """Raise a ValueError unless `function(start)` returns floats of the shape `expected_shape`."""
+    check_callable(function_name, function, "of the state")
+    function_output: Any = jax.eval_shape(function, start)
+    output_shape = getattr(function_output, "shape", None)
+    if output_shape != expected_shape or not jnp.issubdtype(function_output.dtype, jnp.floating):
+        output_description = (
+            f"{function_output.dtype} of shape {output_shape}"
             if output_shape is not None
-            else type(output).__name__
+            else type(function_output).__name__
         )
         raise ValueError(
-            f"{name} gives {description} for a state of shape {start.shape}, but it must give "
-            f"floats of "
-            f"shape {shape}: fields and resets give the state's shape, guards one number."
+            f"{function_name} gives {output_description} for a state of shape {start.shape}, but "
+            f"it must give floats of shape {expected_shape}: fields and resets give the state's "
+            "shape, guards one number."
         )
 
 
@@ -352,15 +354,6 @@ def _compute_event_time_errors(
     return lax.stop_gradient((time_scales[0], time_scales[1]))
 
 
-def _add_with_roundoff(first_time: Scalar, second_time: Scalar) -> tuple[Scalar, Scalar]:
-    """Return the rounded sum of two times and its rounding error (D. E. Knuth's two-sum)."""
-    rounded_time_sum = first_time + second_time
-    effective_duration = rounded_time_sum - first_time
-    return rounded_time_sum, (first_time - (rounded_time_sum - effective_duration)) + (
-        second_time - effective_duration
-    )
-
-
 def _simulate_modes(
     modes_and_events: tuple[tuple[Mode, ...], int], options: StepOptions, start: Array, mode: Array
 ) -> HybridSolution:
@@ -392,8 +385,12 @@ def _simulate_modes(
             solution.mode, mode_branches, solution.state, solution.time
         )
         has_event = ~is_guard_violated & (phase_end.guard >= 0)
-        time, time_roundoff_remainder = _add_with_roundoff(
-            solution.time, phase_end.duration + time_roundoff_remainder
+        # D. E. Knuth's two-sum returns the rounded sum of two times and its rounding error.
+        duration = phase_end.duration + time_roundoff_remainder
+        time = solution.time + duration
+        rounded_duration = time - solution.time
+        time_roundoff_remainder = (solution.time - (time - rounded_duration)) + (
+            duration - rounded_duration
         )
         n_events_without_progress = jnp.where(
             time > solution.time, 0, n_events_without_progress + 1
@@ -408,12 +405,12 @@ def _simulate_modes(
             n_events_without_progress > max_simultaneous_events, int(Termination.ZENO), termination
         )
         failure_code = jnp.where(
-            phase_end.timed_out,
+            phase_end.is_timed_out,
             int(Termination.MAX_TIME_REACHED),
             int(Termination.STEP_SIZE_UNDERFLOW),
         )
         failure_code = jnp.where(
-            phase_end.gave_up & has_exhausted_steps,
+            phase_end.has_given_up & has_exhausted_steps,
             int(Termination.MAX_STEPS_REACHED),
             failure_code,
         )
@@ -423,16 +420,18 @@ def _simulate_modes(
             jnp.where(is_guard_violated, int(Termination.GUARD_VIOLATED_AT_ENTRY), failure_code),
         )
         event_index = jnp.where(has_event, solution.n_events, events)
-        write_event_row = lambda row, value: row.at[event_index].set(value, mode="drop")
+        write_event_entry = lambda event_array, event_entry: event_array.at[event_index].set(
+            event_entry, mode="drop"
+        )
         return (
             HybridSolution(
-                times=write_event_row(solution.times, time),
-                time_tolerance=write_event_row(solution.time_tolerance, time_scales[0]),
-                time_roundoff=write_event_row(solution.time_roundoff, time_scales[1]),
-                states_before=write_event_row(solution.states_before, phase_end.state),
-                states_after=write_event_row(solution.states_after, next_state),
-                modes=write_event_row(solution.modes, solution.mode),
-                guards=write_event_row(solution.guards, phase_end.guard),
+                times=write_event_entry(solution.times, time),
+                time_tolerance=write_event_entry(solution.time_tolerance, time_scales[0]),
+                time_roundoff=write_event_entry(solution.time_roundoff, time_scales[1]),
+                states_before=write_event_entry(solution.states_before, phase_end.state),
+                states_after=write_event_entry(solution.states_after, next_state),
+                modes=write_event_entry(solution.modes, solution.mode),
+                guards=write_event_entry(solution.guards, phase_end.guard),
                 n_events=solution.n_events + has_event,
                 time=time,
                 state=jnp.where(has_event, next_state, phase_end.state),
@@ -456,8 +455,8 @@ def _simulate_modes(
         mode=zero_count + mode,
         solver_steps=zero_count, termination=zero_count + STATUS_RUNNING_CODE,
     )  # fmt: skip
-    is_running = lambda carry: make_opaque_condition(
-        carry[0].termination == STATUS_RUNNING_CODE, carry[0].n_events
+    is_running = lambda loop_carry: make_opaque_condition(
+        loop_carry[0].termination == STATUS_RUNNING_CODE, loop_carry[0].n_events
     )
     return lax.while_loop(
         is_running, simulate_next_event, (initial_solution, zero_count, int_zero)

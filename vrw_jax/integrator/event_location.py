@@ -87,11 +87,11 @@ def locate_event(
         )
         is_before_event = jnp.ones(step_length.shape, bool)
         is_guard_straight = jnp.ones(step_length.shape, bool)
-        for earliest_start_value, earliest_value, earliest_rate, is_crossing_guard in zip(
+        for start_guard_value, guard_value, guard_rate, is_crossing_guard in zip(
             crossing_step.start_guard_values, guard_values, guard_rates, is_crossing, strict=True
         ):
             has_crossed, is_guard_curved = _classify_guard_crossing(
-                earliest_start_value, earliest_value, earliest_rate, event_search.event_step_length
+                start_guard_value, guard_value, guard_rate, event_search.event_step_length
             )
             is_before_event = is_before_event & ~(is_crossing_guard & has_crossed)
             is_guard_straight = is_guard_straight & ~(is_crossing_guard & is_guard_curved)
@@ -105,7 +105,7 @@ def locate_event(
         is_proposal_inside = (proposed_length >= lower_length_bound - max_extrapolation_time) & (
             proposed_length <= upper_length_bound + max_extrapolation_time
         )
-        length = jnp.where(
+        next_event_step_length = jnp.where(
             is_proposal_inside, proposed_length, 0.5 * (lower_length_bound + upper_length_bound)
         )
         is_at_event = (
@@ -118,7 +118,7 @@ def locate_event(
         )
         return EventSearch(
             event_step_length=jnp.where(
-                event_search.is_unresolved, length, event_search.event_step_length
+                event_search.is_unresolved, next_event_step_length, event_search.event_step_length
             ),
             lower_length_bound=lower_length_bound,
             upper_length_bound=upper_length_bound,
@@ -138,10 +138,10 @@ def locate_event(
         strict=True,
     )
     for is_crossing_guard, crossing_values in zip(is_crossing, values_by_guard, strict=True):
-        zero_fraction = _find_parabola_zero(tableau, is_crossing_guard, *crossing_values)
+        fraction_to_zero = _find_parabola_zero(tableau, is_crossing_guard, *crossing_values)
         first_crossing_fraction = jnp.where(
             is_crossing_guard,
-            jnp.minimum(first_crossing_fraction, zero_fraction),
+            jnp.minimum(first_crossing_fraction, fraction_to_zero),
             first_crossing_fraction,
         )
     zero_indices, zero_time = jnp.zeros(step_length.shape, jnp.int32), jnp.zeros_like(step_length)
@@ -198,12 +198,18 @@ def _refine_event_location(
         return is_event_distant & (jnp.abs(remaining_time) <= max_short_step_time)
 
     def take_short_step(loop_carry: tuple) -> tuple:
-        step_end, remaining_time, length, guard_index, is_event_distant, n_iterations = loop_carry
+        step_end, remaining_time, short_step_length, guard_index, is_event_distant, n_iterations = (
+            loop_carry
+        )
         takes_short_step = can_take_short_step(is_event_distant, remaining_time)
         step_end = select_tree_leaves(
             takes_short_step,
             take_rk_step(
-                low_order_tableau, evaluate_acceleration, step_end, remaining_time, with_error=False
+                low_order_tableau,
+                evaluate_acceleration,
+                step_end,
+                remaining_time,
+                computes_error_estimate=False,
             ).end_state,
             step_end,
         )
@@ -212,16 +218,16 @@ def _refine_event_location(
             crossing_step.crossing_bits,
         )
         remaining_time = jnp.where(takes_short_step, new_remaining_time, remaining_time)
-        length = jnp.where(
+        short_step_length = jnp.where(
             can_take_short_step(takes_short_step, new_remaining_time),
-            length + new_remaining_time,
-            length,
+            short_step_length + new_remaining_time,
+            short_step_length,
         )
         guard_index = jnp.where(takes_short_step, earliest_guard, guard_index)
         return (
             step_end,
             remaining_time,
-            length,
+            short_step_length,
             guard_index,
             is_event_distant & (jnp.abs(remaining_time) > max_extrapolation_time),
             n_iterations + 1,
@@ -244,34 +250,37 @@ def _refine_event_location(
         jnp.any(can_take_short_step(loop_carry[4], loop_carry[1]))
         & (loop_carry[5] < options.max_event_iterations)
     )
-    end, remaining_time, length, guard_index, is_event_distant, _ = lax.while_loop(
-        needs_iteration, take_short_step, initial_loop_carry
+    event_state, remaining_time, short_step_length, guard_index, is_event_distant, _ = (
+        lax.while_loop(needs_iteration, take_short_step, initial_loop_carry)
     )
-    q = tuple(x + remaining_time * y for x, y in zip(end.q, end.v, strict=True))
+    q = tuple(x + remaining_time * y for x, y in zip(event_state.q, event_state.v, strict=True))
     v = tuple(
-        x + remaining_time * y for x, y in zip(end.v, end.acceleration.acceleration, strict=False)
+        x + remaining_time * y
+        for x, y in zip(event_state.v, event_state.acceleration.acceleration, strict=False)
     )
-    end = select_tree_leaves(is_event_distant, crossing_step.start_state, end._replace(q=q, v=v))
+    event_state = select_tree_leaves(
+        is_event_distant, crossing_step.start_state, event_state._replace(q=q, v=v)
+    )
     return event_search._replace(
-        event_step_length=length,
+        event_step_length=short_step_length,
         is_unresolved=event_search.is_unresolved | is_event_distant,
-        end_state=end,
+        end_state=event_state,
         guard_index=guard_index,
     )
 
 
 @jax.jit  # The function is traced once for all guards.
 def _classify_guard_crossing(
-    start_guard_value: Array, guard_value: Array, guard_rate: Array, length: Array
+    start_guard_value: Array, guard_value: Array, guard_rate: Array, step_length: Array
 ) -> tuple[Array, Array]:
     """Return whether a guard has crossed zero, and whether it is too curved for Newton's method.
 
     - `start_guard_value`: value of the guard at the start of the solver step;
-    - `guard_value`, `guard_rate`: value and time derivative of the guard after `length`, s.
+    - `guard_value`, `guard_rate`: value and time derivative of the guard after `step_length`, s.
     """
     # A guard that rises from zero has not crossed.
     has_crossed = (guard_value < 0.0) | ((guard_value == 0.0) & (guard_rate <= 0.0))
-    linear_decrease = guard_rate * length
+    linear_decrease = guard_rate * step_length
     return has_crossed, jnp.abs(
         2.0 * (start_guard_value - guard_value + linear_decrease) * guard_value
     ) > 0.25 * linear_decrease * linear_decrease
@@ -328,7 +337,7 @@ def _find_parabola_zero(
     The parabola passes through the guard's values at the start, at the middle stage and at the end.
     The secant method, followed by Newton's method, locates the root.
     """
-    curvature, linear_rate = fit_guard_parabola(
+    quadratic_coefficient, linear_coefficient = fit_guard_parabola(
         tableau, start_guard_value, middle_guard_value, end_guard_value
     )
     guard_decrease = jnp.where(
@@ -336,21 +345,26 @@ def _find_parabola_zero(
         start_guard_value - end_guard_value,
         1.0,
     )
-    zero_fraction = jnp.clip(start_guard_value / guard_decrease, 0.0, 1.0)
+    fraction_to_zero = jnp.clip(start_guard_value / guard_decrease, 0.0, 1.0)
     # A guard that rises from zero vanishes at the start of the step, so the other root is returned.
-    is_guard_rising = is_crossing & (start_guard_value == 0.0) & (linear_rate > 0.0)
-    zero_fraction = jnp.where(
+    is_guard_rising = is_crossing & (start_guard_value == 0.0) & (linear_coefficient > 0.0)
+    fraction_to_zero = jnp.where(
         is_guard_rising,
-        jnp.clip(-linear_rate / jnp.where(is_guard_rising, curvature, -1.0), 0.0, 1.0),
-        zero_fraction,
+        jnp.clip(
+            -linear_coefficient / jnp.where(is_guard_rising, quadratic_coefficient, -1.0), 0.0, 1.0
+        ),
+        fraction_to_zero,
     )
     for _ in range(3):
-        parabola_rate = linear_rate + 2.0 * curvature * zero_fraction
+        parabola_rate = linear_coefficient + 2.0 * quadratic_coefficient * fraction_to_zero
         is_guard_falling = parabola_rate < 0.0
         fraction_change = (
-            start_guard_value + zero_fraction * (linear_rate + curvature * zero_fraction)
+            start_guard_value
+            + fraction_to_zero * (linear_coefficient + quadratic_coefficient * fraction_to_zero)
         ) / jnp.where(is_guard_falling, parabola_rate, 1.0)
-        zero_fraction = jnp.where(
-            is_guard_falling, jnp.clip(zero_fraction - fraction_change, 0.0, 1.0), zero_fraction
+        fraction_to_zero = jnp.where(
+            is_guard_falling,
+            jnp.clip(fraction_to_zero - fraction_change, 0.0, 1.0),
+            fraction_to_zero,
         )
-    return zero_fraction
+    return fraction_to_zero

@@ -62,7 +62,7 @@ class BatchPhase(NamedTuple):
     margin_functions: MarginFunctions | None = None  # margins whose minima are computed
     # equations of motion in implicit form, for derivatives
     implicit_dynamics: ImplicitDynamics | None = None
-    is_noinline: bool = False
+    is_compiled_separately: bool = False
     """Whether machine code calls the phase's functions instead of inlining them at each use.
 
     With calls, the code compiles in half of the time and runs a sixth slower than with inlining.
@@ -80,12 +80,12 @@ class BatchPhaseEnd(NamedTuple):
     state: StageState
     duration: Array  # s
     guard: Array  # index of the guard that ended the phase; -1 if none did
-    timed_out: Array
+    is_timed_out: Array
     # whether the element is a straggler, see `integrate_batch_phase`
     is_unfinished: Array
     n_tried_steps: Array  # number of solver steps, accepted or not
-    next_dt: Array  # next step length that the controller proposes, s
-    minima: Array | None  # minima of the margins, (margins, batch)
+    next_solver_dt: Array  # next step length that the controller proposes, s
+    margin_minima: Array | None  # minima of the margins, (margins, batch)
 
 
 class _IntegratorState(NamedTuple):
@@ -193,7 +193,7 @@ def integrate_batch_phase(
         zero_phase_end = make_zero_tangent(phase_end)
         state_tangent = zero_phase_end.state._replace(q=q, v=v)
         return phase_end, zero_phase_end._replace(
-            state=state_tangent, duration=event_time_tangent, minima=minima_tangents
+            state=state_tangent, duration=event_time_tangent, margin_minima=minima_tangents
         )
 
     return integrate_with_rule(
@@ -273,7 +273,7 @@ def _compute_event_time_jvp(
     end_state: StageState,
     state_tangents: Array,
     integrator_state: _IntegratorState,
-    event_guard: Array,
+    event_guard_index: Array,
 ) -> Array:
     """Return the tangent of the event's time, s, shape (directions, batch).
 
@@ -281,7 +281,9 @@ def _compute_event_time_jvp(
     motion.
     """
 
-    def evaluate_guards(constants: Any, held_constants: Vector, q: Vector, v: Vector) -> Vector:
+    def evaluate_perturbed_guards(
+        constants: Any, held_constants: Vector, q: Vector, v: Vector
+    ) -> Vector:
         phase = make_phase(constants, held_constants)
         return phase.evaluate_guards(StageState(q, v, phase.evaluate_acceleration(q, v)))
 
@@ -289,13 +291,17 @@ def _compute_event_time_jvp(
     _, guard_rates = evaluate_with_rates(
         phase.evaluate_guards, phase.evaluate_acceleration, end_state
     )
-    guard_tangents = phase_tangents.evaluate_tangents(evaluate_guards, end_state, state_tangents)
+    guard_tangents = phase_tangents.evaluate_tangents(
+        evaluate_perturbed_guards, end_state, state_tangents
+    )
     has_guard_crossed = integrator_state.integration_status == IntegrationStatus.CROSSED
     time_tangent = jnp.zeros_like(integrator_state.next_step_length)
     for guard_number, (guard_rate, guard_tangent) in enumerate(
         zip(guard_rates, guard_tangents, strict=True)
     ):
-        is_event_guard = has_guard_crossed & (event_guard == guard_number) & (guard_rate < 0.0)
+        is_event_guard = (
+            has_guard_crossed & (event_guard_index == guard_number) & (guard_rate < 0.0)
+        )
         time_tangent = jnp.where(
             is_event_guard,
             -guard_tangent / jnp.where(is_event_guard, guard_rate, -1.0),
@@ -319,7 +325,9 @@ def _integrate_to_event(
 ) -> _PhaseRun:
     """Return the end of a phase with all intermediate results, for each batch element."""
     phase = make_phase(constants, held_constants)
-    phase = _wrap_each_phase_function(phase, mark_noinline if phase.is_noinline else jax.jit)
+    phase = _wrap_each_phase_function(
+        phase, mark_noinline if phase.is_compiled_separately else jax.jit
+    )
     step_function = _make_step_function(phase, tableau)
     start_state = StageState(q, v, phase.evaluate_acceleration(q, v))
     guard_values, guard_rates = evaluate_with_rates(
@@ -333,7 +341,7 @@ def _integrate_to_event(
     start_guard = jnp.full(is_guard_met_at_start[0].shape, -1, jnp.int32)
     for guard_index in range(len(is_guard_met_at_start) - 1, -1, -1):
         start_guard = jnp.where(is_guard_met_at_start[guard_index], guard_index, start_guard)
-    is_started = is_active & (start_guard < 0)
+    is_phase_started = is_active & (start_guard < 0)
 
     integrator_state = _integrate_until_crossing(
         phase,
@@ -341,7 +349,7 @@ def _integrate_to_event(
         tableau,
         start_state,
         guard_values,
-        is_started,
+        is_phase_started,
         initial_dt,
         options,
         straggler_count,
@@ -398,7 +406,7 @@ def _integrate_to_event(
     is_straggler = (
         has_guard_crossed & ~event_search.is_unresolved & (duration > options.max_phase_time)
     )
-    event_guard = jnp.where(
+    event_guard_index = jnp.where(
         is_active & (start_guard >= 0),
         start_guard,
         jnp.where(has_guard_crossed, event_search.guard_index, -1),
@@ -406,14 +414,14 @@ def _integrate_to_event(
     phase_end = BatchPhaseEnd(
         state=end_state,
         duration=duration,
-        guard=jnp.where(is_event_unresolved | is_straggler, -1, event_guard),
-        timed_out=(integrator_state.integration_status == IntegrationStatus.TIMED_OUT)
+        guard=jnp.where(is_event_unresolved | is_straggler, -1, event_guard_index),
+        is_timed_out=(integrator_state.integration_status == IntegrationStatus.TIMED_OUT)
         | is_straggler,
         is_unfinished=integrator_state.integration_status == IntegrationStatus.RUNNING,
         n_tried_steps=integrator_state.n_tried_steps
         + jnp.where(has_guard_crossed, event_search.n_tried_steps, 0),
-        next_dt=integrator_state.next_step_length,
-        minima=None if minima_result is None else minima_result.phase_minima,
+        next_solver_dt=integrator_state.next_step_length,
+        margin_minima=None if minima_result is None else minima_result.phase_minima,
     )
     return _PhaseRun(
         step_function, start_state, phase_end, integrator_state, minima_state, minima_result
@@ -430,13 +438,15 @@ def _make_step_function(phase: BatchPhase, tableau: ButcherTableau) -> TakeStep:
 
 def _wrap_each_phase_function(phase: BatchPhase, wrap_function: Callable) -> BatchPhase:
     """Return a copy of the phase in which `wrap_function` has been applied to each function."""
-    margins = phase.margin_functions
-    if margins is not None:
-        margins = margins._replace(evaluate_margins=wrap_function(margins.evaluate_margins))
+    margin_functions = phase.margin_functions
+    if margin_functions is not None:
+        margin_functions = margin_functions._replace(
+            evaluate_margins=wrap_function(margin_functions.evaluate_margins)
+        )
     return phase._replace(
         evaluate_acceleration=wrap_function(phase.evaluate_acceleration),
         evaluate_guards=wrap_function(phase.evaluate_guards),
-        margin_functions=margins,
+        margin_functions=margin_functions,
     )
 
 
@@ -446,7 +456,7 @@ def _integrate_until_crossing(
     tableau: ButcherTableau,
     start_state: StageState,
     guard_values: Vector,
-    is_started: Array,
+    is_phase_started: Array,
     initial_dt: Array,
     options: StepOptions,
     straggler_count: Array | None,
@@ -477,9 +487,11 @@ def _integrate_until_crossing(
         controller_factor = compute_step_size_factor(
             tableau, squared_error, guard_minimum_fraction.dtype
         )
-        length_factor = jnp.where(may_cross_inside, guard_minimum_fraction, controller_factor)
+        step_length_factor = jnp.where(may_cross_inside, guard_minimum_fraction, controller_factor)
         integration_status, crossing_bits, is_accepted, elapsed_time, next_step_length = (
-            _classify_step(options, integrator_state, length_factor, is_rejected, end_guard_values)
+            _classify_step(
+                options, integrator_state, step_length_factor, is_rejected, end_guard_values
+            )
         )
         state, guard_values = select_tree_leaves(
             is_accepted,
@@ -567,7 +579,7 @@ def _integrate_until_crossing(
         next_step_length=initial_dt,
         elapsed_time=jnp.zeros_like(initial_dt),
         integration_status=jnp.where(
-            is_started, IntegrationStatus.RUNNING, IntegrationStatus.IDLE
+            is_phase_started, IntegrationStatus.RUNNING, IntegrationStatus.IDLE
         ).astype(jnp.int32),
         crossing_bits=zero_counts,
         middle_guard_values=guard_values,
@@ -584,7 +596,7 @@ def _integrate_until_crossing(
 def _classify_step(
     options: StepOptions,
     integrator_state: _IntegratorState,
-    length_factor: Array,
+    step_length_factor: Array,
     is_rejected: Array,
     end_guard_values: Vector,
 ) -> tuple[Array, Array, Array, Array, Array]:
@@ -610,7 +622,9 @@ def _classify_step(
         step_length == time_limit - elapsed_time, time_limit, elapsed_time + step_length
     )
     elapsed_time = jnp.where(is_accepted, end_time, elapsed_time)
-    next_step_length_limit = jnp.minimum(step_length * length_factor, time_limit - elapsed_time)
+    next_step_length_limit = jnp.minimum(
+        step_length * step_length_factor, time_limit - elapsed_time
+    )
     has_timed_out = is_accepted & (elapsed_time >= time_limit)
     is_step_too_short = (integrator_state.n_tried_steps + 1 >= options.max_solver_steps) | (
         elapsed_time + next_step_length_limit == elapsed_time
@@ -650,22 +664,30 @@ def _compute_mean_squared_error(
     - `state_units`: units of the coordinates and rates for the absolute tolerance; None for SI
       units.
     """
-    start_numbers = (*start_state.q, *start_state.v)
-    end_numbers = (*rk_step.end_state.q, *rk_step.end_state.v)
+    start_state_components = (*start_state.q, *start_state.v)
+    end_state_components = (*rk_step.end_state.q, *rk_step.end_state.v)
     convert_to_float32 = lambda x: x.astype(jnp.float32)
     sum_of_squares: Any = 0.0
-    units_of_state: Any = (1.0,) * len(start_numbers) if state_units is None else state_units
+    units_of_state: Any = (
+        (1.0,) * len(start_state_components) if state_units is None else state_units
+    )
     for coordinate_error, start_coordinate, end_coordinate, state_unit in zip(
-        rk_step.error_estimate, start_numbers, end_numbers, units_of_state, strict=True
+        rk_step.error_estimate,
+        start_state_components,
+        end_state_components,
+        units_of_state,
+        strict=True,
     ):
         error_tolerance = options.atol * state_unit + options.rtol * jnp.maximum(
             jnp.abs(start_coordinate), jnp.abs(end_coordinate)
         )
         relative_error = convert_to_float32(coordinate_error) / convert_to_float32(error_tolerance)
         sum_of_squares = sum_of_squares + relative_error * relative_error
-    for coordinate_value in weighted_guards:
-        sum_of_squares = sum_of_squares + convert_to_float32(0.0 * coordinate_value)
-    return jnp.where(jnp.isfinite(sum_of_squares), sum_of_squares / len(start_numbers), jnp.inf)
+    for weighted_guard in weighted_guards:
+        sum_of_squares = sum_of_squares + convert_to_float32(0.0 * weighted_guard)
+    return jnp.where(
+        jnp.isfinite(sum_of_squares), sum_of_squares / len(start_state_components), jnp.inf
+    )
 
 
 def sample_batch_phase(
@@ -715,25 +737,29 @@ def sample_at_equal_times(
     zero_count = jnp.zeros((), jnp.int32)
 
     def take_sample_step(loop_carry: tuple) -> tuple:
-        sample_state, h, time_left, n_tried_steps = loop_carry
-        taken_length = jnp.minimum(h, time_left)
-        step_end, squared_error = step_function(sample_state, taken_length)
-        length_factor = compute_step_size_factor(tableau, squared_error, taken_length.dtype)
+        sample_state, h, remaining_time, n_tried_steps = loop_carry
+        sampled_step_length = jnp.minimum(h, remaining_time)
+        step_end, squared_error = step_function(sample_state, sampled_step_length)
+        step_length_factor = compute_step_size_factor(
+            tableau, squared_error, sampled_step_length.dtype
+        )
         is_within_tolerance = squared_error <= 1.0
         # A step that was shortened to end at a sample does not reduce the next step's length.
         h = jnp.where(
-            is_within_tolerance & (taken_length < h),
-            jnp.maximum(h, taken_length * length_factor),
-            taken_length * length_factor,
+            is_within_tolerance & (sampled_step_length < h),
+            jnp.maximum(h, sampled_step_length * step_length_factor),
+            sampled_step_length * step_length_factor,
         )
-        is_running = time_left > 0.0
+        is_running = remaining_time > 0.0
         return (
             select_tree_leaves(is_running & is_within_tolerance, step_end, sample_state),
             jnp.where(is_running, h, loop_carry[1]),
             jnp.where(
                 is_running & is_within_tolerance,
-                jnp.where(taken_length == time_left, 0.0, time_left - taken_length),
-                time_left,
+                jnp.where(
+                    sampled_step_length == remaining_time, 0.0, remaining_time - sampled_step_length
+                ),
+                remaining_time,
             ),
             n_tried_steps + 1,
         )

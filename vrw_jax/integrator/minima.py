@@ -87,7 +87,7 @@ def init_minima_state(
     )
     includes_start = jnp.asarray(margin_functions.includes_start)[:, None]
     infinite_minima = jnp.zeros_like(margin_values)
-    zero_starts = jnp.zeros(
+    zero_start_coordinates = jnp.zeros(
         (len(margin_values), len(start_state.q), margin_values.shape[-1]), margin_values.dtype
     )
     margin_rates = jnp.where(includes_start, margin_rates, jnp.maximum(margin_rates, 0.0))
@@ -100,8 +100,8 @@ def init_minima_state(
         margin_values,
         margin_rates,
         infinite_minima + jnp.inf,
-        zero_starts,
-        zero_starts,
+        zero_start_coordinates,
+        zero_start_coordinates,
         infinite_minima,
         infinite_minima,
         infinite_minima,
@@ -146,11 +146,11 @@ def update_minima_state(
     is_minimum_lower = (
         is_accepted & has_interior_minimum & (minimum_value < minima_state.lowest_margin_values)
     )
-    replace_if_lower = lambda new_value, old_value: jnp.where(
-        is_minimum_lower, new_value, old_value
+    replace_if_lower = lambda new_minimum, old_minimum: jnp.where(
+        is_minimum_lower, new_minimum, old_minimum
     )
-    replace_start_if_lower = lambda new_value, old_value: jnp.where(
-        is_minimum_lower[:, None], jnp.stack(new_value), old_value
+    replace_start_if_lower = lambda new_minimum, old_minimum: jnp.where(
+        is_minimum_lower[:, None], jnp.stack(new_minimum), old_minimum
     )
     start_tangents = minima_state.start_tangents
     if start_tangents is not None and accepted_step.start_tangents is not None:
@@ -247,7 +247,7 @@ def refine_minima(
                 <= MINIMUM_LOCATION_TOLERANCE * minima_state_of_margin.step_length
             )
             has_smaller_rate = jnp.abs(margin_rate) < jnp.abs(minimum_search.best_margin_rate)
-            improved_search = _MinimumSearch(
+            improved_minimum_search = _MinimumSearch(
                 step_length=step_length,
                 best_step_length=jnp.where(
                     has_smaller_rate, minimum_search.step_length, minimum_search.best_step_length
@@ -260,7 +260,7 @@ def refine_minima(
                 n_iterations=minimum_search.n_iterations,
             )
             return select_tree_leaves(
-                minimum_search.is_unresolved, improved_search, minimum_search
+                minimum_search.is_unresolved, improved_minimum_search, minimum_search
             )._replace(n_iterations=minimum_search.n_iterations + 1)
 
         has_minimum = jnp.isfinite(minima_state_of_margin.lowest_margin_values)
@@ -278,8 +278,10 @@ def refine_minima(
             jnp.any(minimum_search.is_unresolved)
             & (minimum_search.n_iterations < options.max_margin_search_iterations)
         )
-        final_search = lax.while_loop(needs_iteration, improve_minimum_search, minimum_search)
-        return None, (final_search.margin_value, final_search.step_length)
+        final_minimum_search = lax.while_loop(
+            needs_iteration, improve_minimum_search, minimum_search
+        )
+        return None, (final_minimum_search.margin_value, final_minimum_search.step_length)
 
     includes_start = np.asarray(margin_functions.includes_start)[:, None]
     end_minima = jnp.minimum(

@@ -82,10 +82,12 @@ def load_explicit_tableau(solver_name: str) -> ButcherTableau | None:
     stage_nodes = stage_matrix.sum(axis=1)
     guard_stage_indices = _choose_guard_stages(stage_nodes)
     guard_nodes = np.array([0.0, *stage_nodes[list(guard_stage_indices)], 1.0])
-    degree = len(guard_nodes) - 1
+    polynomial_degree = len(guard_nodes) - 1
     bernstein_basis = [
-        math.comb(degree, i) * guard_nodes**i * (1.0 - guard_nodes) ** (degree - i)
-        for i in range(degree + 1)
+        math.comb(polynomial_degree, i)
+        * guard_nodes**i
+        * (1.0 - guard_nodes) ** (polynomial_degree - i)
+        for i in range(polynomial_degree + 1)
     ]
     return ButcherTableau(
         convergence_order=tableau_entry["order"],
@@ -134,18 +136,21 @@ def _choose_guard_stages(stage_nodes: np.ndarray) -> tuple[int, ...]:
 
 
 def fit_guard_parabola(
-    tableau: ButcherTableau, start_value: Array, middle_value: Array, end_value: Array
+    tableau: ButcherTableau,
+    start_guard_value: Array,
+    middle_guard_value: Array,
+    end_guard_value: Array,
 ) -> tuple[Array, Array]:
     """Return the quadratic and linear coefficients of the parabola through three values of a guard.
 
-    The variable of the parabola is the fraction of the solver step. `middle_value` is the guard at
-    the stage `middle_stage_index`.
+    The variable of the parabola is the fraction of the solver step. `middle_guard_value` is the
+    guard at the stage `middle_stage_index`.
     """
     middle_node = float(tableau.stage_nodes[tableau.middle_stage_index])
-    curvature = (end_value - start_value - (middle_value - start_value) / middle_node) / (
-        1.0 - middle_node
-    )
-    return curvature, end_value - start_value - curvature
+    quadratic_coefficient = (
+        end_guard_value - start_guard_value - (middle_guard_value - start_guard_value) / middle_node
+    ) / (1.0 - middle_node)
+    return quadratic_coefficient, end_guard_value - start_guard_value - quadratic_coefficient
 
 
 def _compute_bernstein_coefficients(
@@ -177,18 +182,20 @@ def find_guard_minimum(tableau: ButcherTableau, guard_values: list[Array]) -> tu
     that only decreases has no minimum. `guard_values` are the values of the guard at the start, at
     the stages `guard_stage_indices`, and at the end.
     """
-    min_bernstein_coefficient, *inner_coefficients = _compute_bernstein_coefficients(
+    min_bernstein_coefficient, *inner_bernstein_coefficients = _compute_bernstein_coefficients(
         tableau, guard_values
     )
     minimum_fraction = jnp.zeros_like(min_bernstein_coefficient)
-    for i, inner_coefficient in enumerate(inner_coefficients):
+    for i, inner_bernstein_coefficient in enumerate(inner_bernstein_coefficients):
         minimum_fraction = jnp.where(
-            inner_coefficient < min_bernstein_coefficient,
+            inner_bernstein_coefficient < min_bernstein_coefficient,
             (i + 1) / len(guard_values[1:]),
             minimum_fraction,
         )
-        min_bernstein_coefficient = jnp.minimum(inner_coefficient, min_bernstein_coefficient)
-    has_guard_risen = inner_coefficients[-1] < guard_values[-1]
+        min_bernstein_coefficient = jnp.minimum(
+            inner_bernstein_coefficient, min_bernstein_coefficient
+        )
+    has_guard_risen = inner_bernstein_coefficients[-1] < guard_values[-1]
     for preceding_coefficient, following_coefficient in itertools.pairwise(guard_values):
         has_guard_risen = has_guard_risen | (preceding_coefficient < following_coefficient)
     has_guard_minimum = (
@@ -215,15 +222,15 @@ def find_earliest_guard_minimum_fraction(
         (_may_cross_inside_step(tableau, guard_values) for guard_values in values_by_guard),
     )
 
-    def find_first_minimum(earliest_fraction: Array) -> Array:
+    def find_first_minimum(earliest_minimum_fraction: Array) -> Array:
         for guard_values in values_by_guard:
             has_guard_minimum, minimum_fraction = find_guard_minimum(tableau, guard_values)
-            earliest_fraction = jnp.where(
+            earliest_minimum_fraction = jnp.where(
                 has_guard_minimum,
-                jnp.minimum(earliest_fraction, minimum_fraction),
-                earliest_fraction,
+                jnp.minimum(earliest_minimum_fraction, minimum_fraction),
+                earliest_minimum_fraction,
             )
-        return earliest_fraction
+        return earliest_minimum_fraction
 
     whole_step_fraction = jnp.ones_like(guard_values[0][0])
     return run_if_any(jnp.any(may_cross_inside), find_first_minimum, whole_step_fraction)
@@ -281,6 +288,7 @@ class StageAccelerations(NamedTuple):
     acceleration: Vector  # accelerations of all three coordinates, those of the phase first
 
 
+@functools.cache
 def compute_real_stability_limit(tableau: ButcherTableau) -> float:
     """Return the largest z with |R(-z)| <= 1, where R is the stability function of the method.
 
@@ -323,11 +331,11 @@ def take_rk_step(
     evaluate_acceleration: EvaluateAcceleration,
     start_state: StageState,
     h: Array,
-    with_error: bool = True,
+    computes_error_estimate: bool = True,
 ) -> RKStep:
     """Return the result of one Runge-Kutta step of length `h`, s.
 
-    If `with_error` is False, the error estimate is empty.
+    If `computes_error_estimate` is False, the error estimate is empty.
     """
     n = len(start_state.q)
     stage_states, stage_accelerations = [start_state], [start_state.acceleration.acceleration[:n]]
@@ -338,10 +346,10 @@ def take_rk_step(
         stage_accelerations.append(stage_acceleration.acceleration[:n])
 
     error_estimate: Vector = ()
-    if with_error:
+    if computes_error_estimate:
         accelerations_by_coordinate = [
-            [stage_acceleration[coordinate] for stage_acceleration in stage_accelerations]
-            for coordinate in range(n)
+            [stage_acceleration[coordinate_index] for stage_acceleration in stage_accelerations]
+            for coordinate_index in range(n)
         ]
         position_errors = [
             h * h * _sum_weighted_terms(tableau.position_error_weights, accelerations)
@@ -395,12 +403,12 @@ def evaluate_stage(
     return tuple(stage_positions), tuple(stage_rates)
 
 
-def _sum_weighted_terms(weights: np.ndarray, summed_terms: list[Array]) -> Any:
-    """Return the sum of `weights` times `summed_terms`, or None if all weights are zero.
+def _sum_weighted_terms(term_weights: np.ndarray, summed_terms: list[Array]) -> Any:
+    """Return the sum of `term_weights` times `summed_terms`, or None if all weights are zero.
 
     Half of the operations in a solver step are such sums. The sum uses functions of `lax`, because
     they are traced in a third of the time of Python's operators.
     """
-    weights_and_terms = zip(weights, summed_terms, strict=False)
+    weights_and_terms = zip(term_weights, summed_terms, strict=False)
     weighted_terms = [lax.mul(x.dtype.type(w), x) for w, x in weights_and_terms if w != 0.0]
     return functools.reduce(lax.add, weighted_terms) if weighted_terms else None

@@ -65,10 +65,10 @@ def apply_batched_jvp_rule(
     n_primal_leaves = len(jax.tree.leaves(primals))
     n_directions = len(_count_vmapped_directions(tangents))
     if n_directions == 0:
-        rule_values, output_tangents = evaluate_rule(
+        function_values, output_tangents = evaluate_rule(
             primals, jax.tree.map(lambda x: x[None], tangents)
         )
-        return rule_values, jax.tree.map(lambda x: x[0], output_tangents)
+        return function_values, jax.tree.map(lambda x: x[0], output_tangents)
     output_structure: Any = None
 
     def evaluate_batched(leaves: Any, axes: Any) -> tuple[list, list]:
@@ -83,17 +83,19 @@ def apply_batched_jvp_rule(
             x[None] if leaf_axis is None else jnp.moveaxis(x, leaf_axis, 0)
             for x, leaf_axis in leaves_and_axes
         ]
-        rule_values, output_tangents = evaluate_rule(
+        function_values, output_tangents = evaluate_rule(
             *jax.tree.unflatten(tree_structure, [*leaves[:n_primal_leaves], *direction_leaves])
         )
         output_tangents = jax.tree.map(
             lambda x: jnp.broadcast_to(x, (n_directions, *x.shape[1:])), output_tangents
         )
-        flat_results, output_structure = jax.tree.flatten((rule_values, output_tangents))
-        n_rule_values = len(jax.tree.leaves(rule_values))
-        return flat_results, [None] * n_rule_values + [0] * (len(flat_results) - n_rule_values)
+        flat_results, output_structure = jax.tree.flatten((function_values, output_tangents))
+        n_function_values = len(jax.tree.leaves(function_values))
+        return flat_results, [None] * n_function_values + [0] * (
+            len(flat_results) - n_function_values
+        )
 
-    flat_results = _HOIST_OUT_OF_VMAP_PRIMITIVE.bind(*leaves, mapped=evaluate_batched)
+    flat_results = _HOIST_OUT_OF_VMAP_PRIMITIVE.bind(*leaves, map_over_axes=evaluate_batched)
     return jax.tree.unflatten(output_structure, flat_results)
 
 
@@ -114,8 +116,8 @@ def _count_vmapped_directions_rule(n_directions: int, _: list, _tangent: Any) ->
 
 _HOIST_OUT_OF_VMAP_PRIMITIVE = Primitive("beyond")
 _HOIST_OUT_OF_VMAP_PRIMITIVE.multiple_results = True
-batching.primitive_batchers[_HOIST_OUT_OF_VMAP_PRIMITIVE] = lambda values, axes, mapped: mapped(
-    values, axes
+batching.primitive_batchers[_HOIST_OUT_OF_VMAP_PRIMITIVE] = lambda values, axes, map_over_axes: (
+    map_over_axes(values, axes)
 )
 """Primitive whose function is traced outside of the enclosing `jax.vmap`, which would trace its
 loops again.
@@ -203,9 +205,9 @@ def _compute_stage_jacobians(
             compute_acceleration_along((constants, held_constants), (zero_constants, unit_vector))
             for unit_vector in _make_unit_vectors(held_constants)
         ]
-        zero_held = tuple(jnp.zeros_like(x) for x in held_constants)
+        zero_held_constants = tuple(jnp.zeros_like(x) for x in held_constants)
         acceleration_by_constants = lambda constants_direction: compute_acceleration_along(
-            (constants, held_constants), (constants_direction, zero_held)
+            (constants, held_constants), (constants_direction, zero_held_constants)
         )
         return jnp.stack(jacobian_columns, 1), _map_unrolled(
             acceleration_by_constants, constants_directions
@@ -300,10 +302,10 @@ def _propagate_tangents(
     state_jacobian, n = stage_jacobians.state_jacobians, stage_jacobians.state_jacobians.shape[1]
 
     def propagate_direction(tangent_direction: tuple[Array, Array]) -> Array:
-        constants_tangent, start = tangent_direction
-        start_position_tangents = tuple(start[:n])
-        start_rate_tangents = tuple(start[n : 2 * n])
-        held_tangents = tuple(start[2 * n :])
+        constants_tangent, start_tangent = tangent_direction
+        start_position_tangents = tuple(start_tangent[:n])
+        start_rate_tangents = tuple(start_tangent[n : 2 * n])
+        held_tangents = tuple(start_tangent[2 * n :])
         stage_tangents: list[Vector] = []
         for i in range(len(tableau.stage_nodes) - 1):
             q, v = (
@@ -316,10 +318,10 @@ def _propagate_tangents(
             state_tangents = (*q, *v, *held_tangents)
             acceleration_terms = [
                 [
-                    constants_tangent[i, coordinate],
-                    *map(lax.mul, state_jacobian[i, coordinate], state_tangents),
+                    constants_tangent[i, coordinate_index],
+                    *map(lax.mul, state_jacobian[i, coordinate_index], state_tangents),
                 ]
-                for coordinate in range(n)
+                for coordinate_index in range(n)
             ]
             stage_tangents.append(
                 tuple(
@@ -359,25 +361,27 @@ def with_batched_jvp(function: Callable[..., Any]) -> Callable[..., Any]:
 
     def call_with_batched_jvp(*arguments: Any) -> Any:
         float_arguments, other_arguments = eqx.partition(arguments, eqx.is_inexact_array)
-        evaluate_combined = lambda *float_arguments: function(
+        evaluate_with_float_arguments = lambda *float_arguments: function(
             *eqx.combine(float_arguments, other_arguments)
         )
         evaluate_floats = lambda *float_arguments: eqx.filter(
-            evaluate_combined(*float_arguments), eqx.is_inexact_array
+            evaluate_with_float_arguments(*float_arguments), eqx.is_inexact_array
         )
-        differentiable_function = jax.custom_jvp(evaluate_combined)
+        differentiable_function = jax.custom_jvp(evaluate_with_float_arguments)
 
         @differentiable_function.defjvp
         @with_default_jax_settings
         def evaluate_jvp_of_floats(primals: tuple, tangent: tuple) -> tuple:
             evaluate_with_tangents = lambda primals, directions: (
-                evaluate_combined(*primals),
+                evaluate_with_float_arguments(*primals),
                 compute_each_jvp(evaluate_floats, primals, directions),
             )
-            outputs, float_tangents = apply_batched_jvp_rule(
+            function_outputs, float_tangents = apply_batched_jvp_rule(
                 evaluate_with_tangents, primals, tangent
             )
-            return outputs, eqx.combine(float_tangents, make_zero_tangent(outputs))
+            return function_outputs, eqx.combine(
+                float_tangents, make_zero_tangent(function_outputs)
+            )
 
         return differentiable_function(*float_arguments)
 

@@ -290,10 +290,12 @@ def _make_phase_runner(
             *phase_end.state[:2],
             duration=phase_end.duration,
             guard=phase_end.guard,
-            is_timed_out=phase_end.timed_out,
+            is_timed_out=phase_end.is_timed_out,
             n_solver_steps=phase_end.n_tried_steps,
-            margin_minima=phase_end.minima,
-            engine_carry=_PhaseCarry(phase_end.next_dt, is_active_lane, phase_end.is_unfinished),
+            margin_minima=phase_end.margin_minima,
+            engine_carry=_PhaseCarry(
+                phase_end.next_solver_dt, is_active_lane, phase_end.is_unfinished
+            ),
         )
 
     return run_phase

@@ -249,9 +249,9 @@ def _make_diffrax_phase_runner(options: StepOptions, records_margins: bool) -> P
             end_state[phase.n_dof :],
             phase_end.duration,
             phase_end.guard,
-            phase_end.timed_out,
+            phase_end.is_timed_out,
             phase_end.solver_steps,
-            phase_end.minima if records_margins else None,
+            phase_end.margin_minima if records_margins else None,
         )
 
     return run_phase
