@@ -390,8 +390,8 @@ class ArrayEmitter:
             entry_operands,
         )
         if any(isinstance(x, LazyArray) for x in operand_arrays):
-            emit_entry_at_index = lambda index: emit_result_entry(
-                [self.get_array_entry(x, index) for x in operand_arrays]
+            emit_entry_at_index = lambda entry_index: emit_result_entry(
+                [self.get_array_entry(x, entry_index) for x in operand_arrays]
             )
             return LazyArray(result_shape, self.get_entry_type(result_aval), emit_entry_at_index)
         # Along an axis on which no operand varies, the entry is computed once and repeated.
@@ -454,7 +454,7 @@ class ArrayEmitter:
             return MemoryArray(
                 self, new_shape, array.entry_type, array.base_pointer, array.is_overwritable
             )
-        old_shape = array.shape
+        shape_before_reshape = array.shape
 
         def get_reshaped_entry(reshaped_index: EntryIndex) -> LlvmValue:
             memory_offset = self.emit_memory_offset(reshaped_index, new_shape)
@@ -463,12 +463,12 @@ class ArrayEmitter:
             )
             if constant_offset is not None:
                 return self.get_array_entry(
-                    array, tuple(map(int, np.unravel_index(constant_offset, old_shape)))
+                    array, tuple(map(int, np.unravel_index(constant_offset, shape_before_reshape)))
                 )
-            old_index: list[Any] = []
-            for axis_length in old_shape[:0:-1]:
+            index_before_reshape: list[Any] = []
+            for axis_length in shape_before_reshape[:0:-1]:
                 llvm_axis_length = ir.Constant(I64, axis_length)
-                old_index.append(
+                index_before_reshape.append(
                     0 if axis_length == 1 else self.builder.urem(memory_offset, llvm_axis_length)
                 )
                 memory_offset = (
@@ -477,12 +477,13 @@ class ArrayEmitter:
                     else self.builder.udiv(memory_offset, llvm_axis_length)
                 )
             return self.get_array_entry(
-                array, (0 if old_shape[0] == 1 else memory_offset, *old_index[::-1])
+                array,
+                (0 if shape_before_reshape[0] == 1 else memory_offset, *index_before_reshape[::-1]),
             )
 
-        long_old_axes = [i for i, length in enumerate(old_shape) if length > 1]
-        long_new_axes = [i for i, length in enumerate(new_shape) if length > 1]
-        if [old_shape[i] for i in long_old_axes] == [
+        long_old_axes = [i for i, axis_length in enumerate(shape_before_reshape) if axis_length > 1]
+        long_new_axes = [i for i, axis_length in enumerate(new_shape) if axis_length > 1]
+        if [shape_before_reshape[i] for i in long_old_axes] == [
             new_shape[i] for i in long_new_axes
         ]:  # The shapes differ only by axes of length 1.
 
@@ -491,7 +492,7 @@ class ArrayEmitter:
                     zip(long_old_axes, (reshaped_index[i] for i in long_new_axes), strict=True)
                 )
                 return self.get_array_entry(
-                    array, tuple(index_by_axis.get(i, 0) for i in range(len(old_shape)))
+                    array, tuple(index_by_axis.get(i, 0) for i in range(len(shape_before_reshape)))
                 )
 
         return LazyArray(new_shape, array.entry_type, get_reshaped_entry)

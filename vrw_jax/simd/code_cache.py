@@ -129,37 +129,23 @@ def _trace_and_compile_function(
     code_name = f"lanes_code_{_compute_sha256_digest(digested_text.encode())}"
     machine_code = load_machine_code(code_name, code_store)
     if machine_code is None:
-        object_code_future = _llvm_compiler_pool.submit(
-            _compile_and_save_code,
-            llvm_text,
-            encoded_result_types,
-            code_name,
-            index_record_name,
-            code_store,
-        )
+
+        def compile_and_save_code() -> bytes:
+            object_code = compile_llvm_for_processor(llvm_text)
+            if code_store is not None:
+                encoded_code = encoded_result_types.encode() + b"\n" + object_code
+                code_store.save_bytes(code_name, encoded_code)
+                code_store.save_bytes(index_record_name, code_name.encode())
+            return object_code
+
         machine_code = _machine_code_by_name[code_name] = MachineCode(
-            code_name, _parse_result_shapes_and_dtypes(encoded_result_types), object_code_future
+            code_name,
+            _parse_result_shapes_and_dtypes(encoded_result_types),
+            _llvm_compiler_pool.submit(compile_and_save_code),
         )
     elif code_store is not None:
         code_store.save_bytes(index_record_name, code_name.encode())
     return machine_code
-
-
-def _compile_and_save_code(
-    llvm_text: str,
-    encoded_result_types: str,
-    code_name: str,
-    index_record_name: str,
-    code_store: CodeStore | None,
-) -> bytes:
-    """Compile LLVM text, save the object code and its index record in `code_store`, and return the
-    object code.
-    """
-    object_code = compile_llvm_for_processor(llvm_text)
-    if code_store is not None:
-        code_store.save_bytes(code_name, encoded_result_types.encode() + b"\n" + object_code)
-        code_store.save_bytes(index_record_name, code_name.encode())
-    return object_code
 
 
 def load_machine_code(code_name: str, code_store: CodeStore | None) -> MachineCode | None:

@@ -80,8 +80,8 @@ def emit_transposed_array(
     if isinstance(array, np.ndarray):
         return array.transpose(axis_order)
     inverse_axis_order = np.argsort(axis_order)
-    get_transposed_entry = lambda index: array_emitter.get_array_entry(
-        array, tuple(index[i] for i in inverse_axis_order)
+    get_transposed_entry = lambda entry_index: array_emitter.get_array_entry(
+        array, tuple(entry_index[i] for i in inverse_axis_order)
     )
     array_class = (
         TransposedMemoryView if isinstance(array, MemoryArray | TransposedMemoryView) else LazyArray
@@ -162,8 +162,8 @@ def emit_unstacked_arrays(
         slice_shape = (*array.shape[:split_axis], *array.shape[split_axis + 1 :])
         if isinstance(array, np.ndarray):
             return array.take([slice_position], split_axis).reshape(slice_shape)
-        get_slice_entry = lambda index: array_emitter.get_array_entry(
-            array, (*index[:split_axis], slice_position, *index[split_axis:])
+        get_slice_entry = lambda entry_index: array_emitter.get_array_entry(
+            array, (*entry_index[:split_axis], slice_position, *entry_index[split_axis:])
         )
         return LazyArray(slice_shape, array.entry_type, get_slice_entry)
 
@@ -209,14 +209,18 @@ def _concatenate_along_axis(
                 part_array,
                 (*result_index[:join_axis], index_in_part, *result_index[join_axis + 1 :]),
             )
-            is_inside = array_emitter.builder.icmp_signed(">=", i, ir.Constant(I64, part_start))
+            is_index_in_part = array_emitter.builder.icmp_signed(
+                ">=", i, ir.Constant(I64, part_start)
+            )
             if selected_entry is None:
                 selected_entry = part_entry
             else:
                 part_entry, selected_entry = array_emitter.value_emitter.to_scalars_or_vectors(
                     part_entry, selected_entry
                 )
-                selected_entry = array_emitter.builder.select(is_inside, part_entry, selected_entry)
+                selected_entry = array_emitter.builder.select(
+                    is_index_in_part, part_entry, selected_entry
+                )
         return selected_entry
 
     return LazyArray(
@@ -241,11 +245,11 @@ def emit_padded_array(
         array_emitter.get_array_entries(padding_value).reshape(()),
         get_shape_without_lanes(primitive_call.result_aval),
     ).copy()
-    interior_slices = tuple(
+    unpadded_slices = tuple(
         slice(n_entries_before, n_entries_before + n)
         for (n_entries_before, _, _), n in zip(padding_widths, array.shape, strict=False)
     )
-    padded_array[interior_slices] = array_emitter.get_array_entries(array)
+    padded_array[unpadded_slices] = array_emitter.get_array_entries(array)
     return padded_array
 
 
@@ -285,8 +289,8 @@ def emit_dynamic_slice(
         get_shape_without_lanes(primitive_call.result_aval),
         axis_starts,
     )
-    get_sliced_entry = lambda index: array_emitter.get_array_entry(
-        array, array_emitter.emit_index_sum(index, start_index)
+    get_sliced_entry = lambda entry_index: array_emitter.get_array_entry(
+        array, array_emitter.emit_index_sum(entry_index, start_index)
     )
     return LazyArray(
         get_shape_without_lanes(primitive_call.result_aval),
@@ -335,17 +339,20 @@ def _clamp_start_index(
     array.
     """
     clamped_start_index: list[Any] = []
-    for start_aval, n, m, axis_start in zip(
+    for start_index_aval, n, m, axis_start in zip(
         operand_avals[1:], array_shape, part_shape, axis_starts, strict=False
     ):
-        start_value = array_emitter.get_array_entries(axis_start).item()
+        start_index_value = array_emitter.get_array_entries(axis_start).item()
         if n == m:
             clamped_start_index.append(0)
-        elif isinstance(start_value, ir.Constant):
-            clamped_start_index.append(min(max(int(start_value.constant), 0), n - m))
+        elif isinstance(start_index_value, ir.Constant):
+            clamped_start_index.append(min(max(int(start_index_value.constant), 0), n - m))
         else:
-            start_value = convert_llvm_value(
-                array_emitter.value_emitter, start_value, start_aval.dtype, np.dtype(np.int64)
+            start_index_value = convert_llvm_value(
+                array_emitter.value_emitter,
+                start_index_value,
+                start_index_aval.dtype,
+                np.dtype(np.int64),
             )
-            clamped_start_index.append(array_emitter.emit_clamped_index(start_value, n - m))
+            clamped_start_index.append(array_emitter.emit_clamped_index(start_index_value, n - m))
     return tuple(clamped_start_index)

@@ -47,7 +47,7 @@ def write_llvm_kernel(
     llvm_kernel.attributes.add("nounwind")
     builder = ir.IRBuilder(llvm_kernel.append_basic_block("entry"))
     array_emitter = ArrayEmitter(ValueEmitter(builder, max(group_width, 2)), register_limits)
-    input_pointer_table, output_pointer_table, n_lanes, first_group, end_group = llvm_kernel.args
+    input_pointer_table, output_pointer_table, n_lanes, first_group, group_limit = llvm_kernel.args
     argument_avals, result_avals = closed_jaxpr.in_avals, closed_jaxpr.out_avals
 
     def emit_table_pointer_load(pointer_table: LlvmValue, table_index: int) -> LlvmValue:
@@ -83,7 +83,7 @@ def write_llvm_kernel(
             group_access.write_result_array(output_pointer, aval, result_array)
         return []
 
-    array_emitter.emit_range_loop(first_group, end_group, emit_group_of_lanes)
+    array_emitter.emit_range_loop(first_group, group_limit, emit_group_of_lanes)
     builder.ret_void()
     add_ffi_handler(
         llvm_module,

@@ -170,7 +170,7 @@ class TransposedMemoryView(LazyArray):
         return LazyArray(
             self.shape[1:],
             self.entry_type,
-            lambda index: self.get_entry_at((first_axis_index, *index)),
+            lambda entry_index: self.get_entry_at((first_axis_index, *entry_index)),
         )
 
 

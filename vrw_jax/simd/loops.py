@@ -128,20 +128,24 @@ def emit_scan_loop(
     )
 
     def get_scanned_slice(
-        scanned_array: MemoryArray | TransposedMemoryView, iteration: LlvmValue
+        scanned_array: MemoryArray | TransposedMemoryView, iteration_index: LlvmValue
     ) -> LlvmArray:
-        scanned_slice = scanned_array.get_subarray(iteration)
+        scanned_slice = scanned_array.get_subarray(iteration_index)
         fits_registers = (
             array_emitter.is_in_innermost_loop
             or math.prod(scanned_slice.shape) <= register_limits.max_register_entries
         )
         return array_emitter.get_array_entries(scanned_slice) if fits_registers else scanned_slice
 
-    def emit_scan_body(iteration: LlvmValue, register_values: list[LlvmValue]) -> list[LlvmValue]:
+    def emit_scan_body(
+        iteration_index: LlvmValue, register_values: list[LlvmValue]
+    ) -> list[LlvmValue]:
         if equation_params["reverse"]:
-            iteration = array_emitter.builder.sub(ir.Constant(I64, n_iterations - 1), iteration)
+            iteration_index = array_emitter.builder.sub(
+                ir.Constant(I64, n_iterations - 1), iteration_index
+            )
         scanned_slices = [
-            get_scanned_slice(stacked_array, iteration) for stacked_array in scanned_arrays
+            get_scanned_slice(stacked_array, iteration_index) for stacked_array in scanned_arrays
         ]
         body_results = jaxpr_lowering.lower_jaxpr(
             body_jaxpr,
@@ -151,7 +155,7 @@ def emit_scan_loop(
             stacked_arrays, body_results[n_carried_arrays:], strict=True
         ):
             array_emitter.store_array_into_memory(
-                stacked_array.get_subarray(iteration), stacked_output
+                stacked_array.get_subarray(iteration_index), stacked_output
             )
         return loop_carry.get_next_register_values(body_results[:n_carried_arrays])
 
@@ -280,11 +284,11 @@ class _LoopCarry:
                 )
                 self.array_emitter.store_array_into_memory(copied_array, next_array)
                 pending_copies.append((memory_array, copied_array))
-        for memory_array, next_content in pending_copies:
-            if isinstance(next_content, PendingArrayUpdate):
-                next_content.emit_update_stores(memory_array)
+        for memory_array, next_memory_content in pending_copies:
+            if isinstance(next_memory_content, PendingArrayUpdate):
+                next_memory_content.emit_update_stores(memory_array)
             else:
-                self.array_emitter.store_array_into_memory(memory_array, next_content)
+                self.array_emitter.store_array_into_memory(memory_array, next_memory_content)
         return register_values
 
     def _uses_separate_memory(self, array: MemoryArray) -> bool:

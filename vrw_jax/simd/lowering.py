@@ -181,11 +181,11 @@ class JaxprLowering:
         for llvm_attribute in ("noinline", "nounwind"):
             llvm_function.attributes.add(llvm_attribute)
         builder = ir.IRBuilder(llvm_function.append_basic_block("entry"))
-        caller_emitter = self.array_emitter
+        array_emitter_of_caller = self.array_emitter
         function_emitter = ArrayEmitter(
-            ValueEmitter(builder, caller_emitter.value_emitter.n_vector_lanes),
-            caller_emitter.register_limits,
-            caller_emitter.is_in_innermost_loop,
+            ValueEmitter(builder, array_emitter_of_caller.value_emitter.n_vector_lanes),
+            array_emitter_of_caller.register_limits,
+            array_emitter_of_caller.is_in_innermost_loop,
         )
         result_arrays = JaxprLowering(
             function_emitter, self.primitive_rules, self.separate_functions
@@ -209,10 +209,10 @@ def _find_overwriting_equations(jaxpr: Any) -> dict[Any, int | None]:
     """
     overwriting_equations: dict[Any, int | None] = {}
     is_loop_equation = [equation.primitive.name in LOOP_PRIMITIVE_NAMES for equation in jaxpr.eqns]
-    for equation_index, read_atoms in enumerate(
+    for equation_index, atoms_of_equation in enumerate(
         [*(equation.invars for equation in jaxpr.eqns), jaxpr.outvars]
     ):
-        for jaxpr_atom in read_atoms:
+        for jaxpr_atom in atoms_of_equation:
             if not isinstance(jaxpr_atom, Literal):
                 previous_equation_index = overwriting_equations.get(jaxpr_atom, -1)
                 may_overwrite = previous_equation_index == -1 or (

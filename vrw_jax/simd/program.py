@@ -126,7 +126,9 @@ def compile_lane_program(
     except Exception as compilation_error:
         _reraise_on_tested_release(compilation_error)
     xla_program = jax.jit(lane_function)
-    return lambda scalars, lanes: [np.asarray(x) for x in xla_program(tuple(scalars), tuple(lanes))]
+    return lambda scalar_arguments, lane_arrays: [
+        np.asarray(x) for x in xla_program(tuple(scalar_arguments), tuple(lane_arrays))
+    ]
 
 
 def compile_wasm_object(
@@ -278,17 +280,21 @@ class _LoadedLaneProgram:
     ) -> list[np.ndarray]:
         n_lanes = len(lane_arrays[0])
         n_groups = -(-n_lanes // self.lanes_per_group)
+        n_padded_lanes = n_groups * self.lanes_per_group
+        # The last lane is repeated until the last group is full.
         padded_lane_arrays = [
-            _pad_lane_array(x, n_groups * self.lanes_per_group) for x in lane_arrays
+            np.concatenate([x, np.full(n_padded_lanes - n_lanes, x[-1])])
+            if n_padded_lanes > n_lanes
+            else np.ascontiguousarray(x)
+            for x in lane_arrays
         ]
         scalar_arrays = [np.asarray(x) for x in scalar_arguments]
         padded_results = [
-            np.empty((*leading_shape, n_groups * self.lanes_per_group), result_dtype)
+            np.empty((*leading_shape, n_padded_lanes), result_dtype)
             for leading_shape, result_dtype in self.result_shapes_and_dtypes
         ]
         input_pointer_table = _make_pointer_table([*scalar_arrays, *padded_lane_arrays])
         output_pointer_table = _make_pointer_table(padded_results)
-        n_padded_lanes = n_groups * self.lanes_per_group
         run_groups_of_task = lambda first_group: self._run_lane_kernel(
             input_pointer_table,
             output_pointer_table,
@@ -304,15 +310,6 @@ class _LoadedLaneProgram:
             for first_group in first_groups_of_tasks:
                 run_groups_of_task(first_group)
         return [x[..., :n_lanes] for x in padded_results]
-
-
-def _pad_lane_array(x: np.ndarray, n_padded_lanes: int) -> np.ndarray:
-    """Return `x` as a contiguous array of length `n_padded_lanes`, padded with its last entry."""
-    if len(x) == n_padded_lanes:
-        return np.ascontiguousarray(x)
-    padded_array = np.full(n_padded_lanes, x[-1])
-    padded_array[: len(x)] = x
-    return padded_array
 
 
 def _make_pointer_table(numpy_arrays: Sequence[np.ndarray]) -> Any:

@@ -98,13 +98,14 @@ def emit_array_product(
         n_terms <= array_emitter.register_limits.max_unrolled_reduction_terms
         or array_emitter.is_in_innermost_loop
     ):
-        emit_product_entry = lambda index: functools.reduce(
-            emit_sum, [emit_product_term(index, k) for k in range(n_terms)]
+        emit_product_entry = lambda entry_index: functools.reduce(
+            emit_sum, [emit_product_term(entry_index, k) for k in range(n_terms)]
         )
         if isinstance(left_array, LazyArray) or isinstance(right_array, LazyArray):
             return LazyArray(product_shape, entry_type, emit_product_entry)
         return make_entry_array(
-            product_shape, [emit_product_entry(index) for index in np.ndindex(product_shape)]
+            product_shape,
+            [emit_product_entry(entry_index) for entry_index in np.ndindex(product_shape)],
         )
     left_array, right_array = (
         array_emitter.store_in_memory(left_array),
@@ -113,7 +114,9 @@ def emit_array_product(
     product_memory = array_emitter.allocate_memory_array(product_shape, entry_type)
 
     def store_product_entry(product_index: EntryIndex, _: Any) -> list[LlvmValue]:
-        add_term = lambda k, sums: [emit_sum(sums[0], emit_product_term(product_index, k))]
+        add_term = lambda k, partial_sums: [
+            emit_sum(partial_sums[0], emit_product_term(product_index, k))
+        ]
         product_memory.emit_entry_store(
             product_index,
             array_emitter.emit_counted_loop(
@@ -162,7 +165,7 @@ def make_reduction_rule(combining_primitive: str) -> Callable[..., LlvmArray]:
             )
 
         def emit_reduced_entry(kept_index: EntryIndex) -> LlvmValue:
-            get_term_at = lambda reduced_index: array_emitter.get_array_entry(
+            get_reduced_term = lambda reduced_index: array_emitter.get_array_entry(
                 array, merge_indices(kept_index, reduced_index)
             )
             n_terms = math.prod(reduced_lengths)
@@ -171,17 +174,19 @@ def make_reduction_rule(combining_primitive: str) -> Callable[..., LlvmArray]:
                 or n_terms <= array_emitter.register_limits.max_unrolled_reduction_terms
             ):
                 return functools.reduce(
-                    emit_combination, map(get_term_at, np.ndindex(*reduced_lengths))
+                    emit_combination, map(get_reduced_term, np.ndindex(*reduced_lengths))
                 )
             # The first entry is counted twice, which changes no reduction except a sum.
-            initial_value = get_term_at((0,) * len(reduced_lengths))
+            initial_value = get_reduced_term((0,) * len(reduced_lengths))
             if combining_primitive == "add":
                 initial_value = array_emitter.make_llvm_zero(array.entry_type)
             elif isinstance(array.entry_type, ir.VectorType):
                 initial_value = array_emitter.value_emitter.to_lane_vector(initial_value)
             return array_emitter.emit_index_loops(
                 reduced_lengths,
-                lambda i, partial: [emit_combination(partial[0], get_term_at(i))],
+                lambda i, combined_entries: [
+                    emit_combination(combined_entries[0], get_reduced_term(i))
+                ],
                 [initial_value],
             )[0]
 

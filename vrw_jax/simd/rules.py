@@ -6,9 +6,7 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-from vrw_jax.simd import data_movement as movement
-from vrw_jax.simd import loops
-from vrw_jax.simd import reductions as sums
+from vrw_jax.simd import data_movement, loops, reductions
 from vrw_jax.simd.arithmetic import ELEMENTWISE_RULES
 from vrw_jax.simd.array_emitter import (
     PrimitiveCall,
@@ -37,7 +35,7 @@ def _make_single_result_rule(emit_single_result: Callable[..., LlvmArray]) -> Pr
         jaxpr_lowering: JaxprLowering, equation: Any, operands: list[LlvmArray]
     ) -> list[LlvmArray]:
         primitive_name, result_aval = equation.primitive.name, equation.outvars[0].aval
-        operand_avals = [atom.aval for atom in equation.invars]
+        operand_avals = [input_atom.aval for input_atom in equation.invars]
         result_has_lanes, operand_has_lanes = (
             has_lanes(result_aval),
             any(map(has_lanes, operand_avals)),
@@ -92,29 +90,35 @@ def _emit_optimization_barrier(
 
 
 PRIMITIVE_RULES: dict[str, PrimitiveRule] = {
-    **{name: _make_single_result_rule(_emit_elementwise_result) for name in ELEMENTWISE_RULES},
-    "broadcast_in_dim": _make_single_result_rule(movement.emit_broadcast_array),
-    "concatenate": _make_single_result_rule(movement.emit_concatenated_array),
-    "dynamic_slice": _make_single_result_rule(movement.emit_dynamic_slice),
-    "dynamic_update_slice": _make_single_result_rule(movement.emit_dynamic_slice_update),
-    "empty": _make_single_result_rule(movement.emit_uninitialized_array),
-    "expand_dims": _make_single_result_rule(movement.emit_reshaped_array),
-    "iota": _make_single_result_rule(movement.emit_index_array),
-    "pad": _make_single_result_rule(movement.emit_padded_array),
-    "reshape": _make_single_result_rule(movement.emit_reshaped_array),
-    "slice": _make_single_result_rule(movement.emit_static_slice),
-    "squeeze": _make_single_result_rule(movement.emit_reshaped_array),
-    "stack": _make_single_result_rule(movement.emit_stacked_array),
-    "unstack": movement.emit_unstacked_arrays,
-    "transpose": _make_single_result_rule(movement.emit_transposed_array),
-    "cumsum": _make_single_result_rule(sums.emit_cumulative_sum),
-    "dot_general": _make_single_result_rule(sums.emit_array_product),
-    "reduce_and": _make_single_result_rule(sums.make_reduction_rule("and")),
-    "reduce_max": _make_single_result_rule(sums.make_reduction_rule("max")),
-    "reduce_min": _make_single_result_rule(sums.make_reduction_rule("min")),
-    "reduce_or": _make_single_result_rule(sums.make_reduction_rule("or")),
-    "reduce_sum": _make_single_result_rule(sums.make_reduction_rule("add")),
-    **{name: make_call_rule(parameter) for name, parameter in CALLED_JAXPR_PARAMETERS.items()},
+    **{
+        primitive_name: _make_single_result_rule(_emit_elementwise_result)
+        for primitive_name in ELEMENTWISE_RULES
+    },
+    "broadcast_in_dim": _make_single_result_rule(data_movement.emit_broadcast_array),
+    "concatenate": _make_single_result_rule(data_movement.emit_concatenated_array),
+    "dynamic_slice": _make_single_result_rule(data_movement.emit_dynamic_slice),
+    "dynamic_update_slice": _make_single_result_rule(data_movement.emit_dynamic_slice_update),
+    "empty": _make_single_result_rule(data_movement.emit_uninitialized_array),
+    "expand_dims": _make_single_result_rule(data_movement.emit_reshaped_array),
+    "iota": _make_single_result_rule(data_movement.emit_index_array),
+    "pad": _make_single_result_rule(data_movement.emit_padded_array),
+    "reshape": _make_single_result_rule(data_movement.emit_reshaped_array),
+    "slice": _make_single_result_rule(data_movement.emit_static_slice),
+    "squeeze": _make_single_result_rule(data_movement.emit_reshaped_array),
+    "stack": _make_single_result_rule(data_movement.emit_stacked_array),
+    "unstack": data_movement.emit_unstacked_arrays,
+    "transpose": _make_single_result_rule(data_movement.emit_transposed_array),
+    "cumsum": _make_single_result_rule(reductions.emit_cumulative_sum),
+    "dot_general": _make_single_result_rule(reductions.emit_array_product),
+    "reduce_and": _make_single_result_rule(reductions.make_reduction_rule("and")),
+    "reduce_max": _make_single_result_rule(reductions.make_reduction_rule("max")),
+    "reduce_min": _make_single_result_rule(reductions.make_reduction_rule("min")),
+    "reduce_or": _make_single_result_rule(reductions.make_reduction_rule("or")),
+    "reduce_sum": _make_single_result_rule(reductions.make_reduction_rule("add")),
+    **{
+        primitive_name: make_call_rule(jaxpr_parameter_name)
+        for primitive_name, jaxpr_parameter_name in CALLED_JAXPR_PARAMETERS.items()
+    },
     "optimization_barrier": _emit_optimization_barrier,
     "scan": loops.emit_scan_loop,
     "while": loops.emit_while_loop,
@@ -127,7 +131,7 @@ def describe_supported_primitives() -> dict[str, str]:
 
     A description is the first paragraph of the rule's docstring.
     """
-    get_first_paragraph = lambda text: " ".join(text.partition("\n\n")[0].split())
+    get_first_paragraph = lambda docstring: " ".join(docstring.partition("\n\n")[0].split())
     return {
         primitive_name: get_first_paragraph(primitive_rule.__doc__ or "")
         for primitive_name, primitive_rule in PRIMITIVE_RULES.items()

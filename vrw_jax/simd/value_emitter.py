@@ -12,7 +12,7 @@ from vrw_jax.simd.llvm_library import ir
 LlvmValue = Any
 """An LLVM value: a scalar, or a vector with one entry per lane."""
 
-I1, I8, I32, I64 = (ir.IntType(bits) for bits in (1, 8, 32, 64))
+I1, I8, I32, I64 = (ir.IntType(n_bits) for n_bits in (1, 8, 32, 64))
 LLVM_NUMBER_TYPES = {
     "bool": I1,
     "int32": I32,
@@ -151,8 +151,8 @@ class ValueEmitter:
         """
         outer_keys, self.recent_value_keys = self.recent_value_keys, []
         yield
-        for key in self.recent_value_keys:
-            del self.emitted_values[key]
+        for inner_value_key in self.recent_value_keys:
+            del self.emitted_values[inner_value_key]
         self.recent_value_keys = outer_keys
 
     def emit_llvm_loop(
@@ -167,7 +167,8 @@ class ValueEmitter:
         """
         builder, entry_basic_block = self.builder, self.builder.block
         head_basic_block, body_basic_block, exit_basic_block = (
-            builder.append_basic_block(name) for name in ("head", "body", "after")
+            builder.append_basic_block(basic_block_name)
+            for basic_block_name in ("head", "body", "after")
         )
         builder.branch(head_basic_block)
         builder.position_at_end(head_basic_block)
