@@ -224,7 +224,7 @@ def _check_parameter_shapes(
             f"(elements, "
             f"{' or '.join(map(str, section_sizes))}): write states[None] for a single one."
         )
-    n_section_states, parameter_columns = (
+    n_given_states, parameter_columns = (
         len(section_states),
         [getattr(params, parameter_name) for parameter_name in PARAMETER_NAMES],
     )
@@ -232,24 +232,22 @@ def _check_parameter_shapes(
         *(parameter_values.dtype for parameter_values in parameter_columns)
     )
     StepOptions.check_tolerances(options, parameter_dtype)  # a bound method takes 0.1 ms
-    friction = getattr(model, FRICTION_NAME, np.zeros(()))
+    friction_coefficients = getattr(model, FRICTION_NAME, np.zeros(()))
     for parameter_name, parameter_values in zip(
-        (*PARAMETER_NAMES, FRICTION_NAME), (*parameter_columns, friction), strict=True
+        (*PARAMETER_NAMES, FRICTION_NAME), (*parameter_columns, friction_coefficients), strict=True
     ):
-        varies_by_step = (
-            parameter_name in ("slope", FRICTION_NAME) and np.ndim(parameter_values) == 2
-        )
+        is_stepwise = parameter_name in ("slope", FRICTION_NAME) and np.ndim(parameter_values) == 2
         shapes_over_steps = [
-            (n_section_states, n_steps),
-            (n_section_states, n_steps + 1),
-        ] * varies_by_step
-        if np.shape(parameter_values) not in ((), (n_section_states,), *shapes_over_steps):
+            (n_given_states, n_steps),
+            (n_given_states, n_steps + 1),
+        ] * is_stepwise
+        if np.shape(parameter_values) not in ((), (n_given_states,), *shapes_over_steps):
             raise ValueError(
                 f"{parameter_name} has shape {np.shape(parameter_values)}, but there are "
-                f"{n_section_states} states"
-                f"{f' and {n_steps} steps' * varies_by_step}: give one value for all, or one for "
+                f"{n_given_states} states"
+                f"{f' and {n_steps} steps' * is_stepwise}: give one value for all, or one for "
                 "each"
-                f"{f' and {n_steps} or {n_steps + 1} of each over its steps' * varies_by_step}."
+                f"{f' and {n_steps} or {n_steps + 1} of each over its steps' * is_stepwise}."
             )
     common_dtype = np.promote_types(parameter_dtype, section_states.dtype)
     return [np.asarray(parameter_values, common_dtype) for parameter_values in parameter_columns]
@@ -282,8 +280,8 @@ def _step_batch_without_contact(
         active_lane_parameters[:] = (
             parameter_values[work_order] if parameter_values.ndim else parameter_values
         )
-    is_uneven = bool(stepwise_parameters)
-    ground_slopes = ground_slopes.take(work_order, -1) if is_uneven else ground_slopes
+    is_ground_uneven = bool(stepwise_parameters)
+    ground_slopes = ground_slopes.take(work_order, -1) if is_ground_uneven else ground_slopes
     walk_batch = WalkBatch(
         section_states.T.take(work_order, -1),
         derivative_names,
@@ -342,7 +340,7 @@ def _step_batch_without_contact(
         )
     for k in range(n_steps):
         active_lanes = walk_batch.find_walking_lanes()
-        if is_uneven:
+        if is_ground_uneven:
             parameter_matrix[SLOPE_INPUT_INDEX] = ground_slopes[k]
         if requested_engine == "collocation" and len(active_lanes):
             lane_selection = select_lanes(active_lanes, walk_batch)
@@ -360,8 +358,8 @@ def _step_batch_without_contact(
             lane_indices = active_lanes[solver_indices[active_lanes] == engine_index]
             if len(lane_indices) > 0:
                 lane_selection = select_lanes(lane_indices, walk_batch)
-                next_slopes = (ground_slopes[k + 1][lane_selection],) if is_uneven else ()
-                step_values = selected_engine.take_lane_steps(
+                next_slopes = (ground_slopes[k + 1][lane_selection],) if is_ground_uneven else ()
+                step_outputs = selected_engine.take_lane_steps(
                     parameter_matrix[:, lane_selection],
                     walk_batch.section_state[:, lane_selection],
                     *next_slopes,
@@ -369,14 +367,14 @@ def _step_batch_without_contact(
                 if engine_index == SolverIndex.STABLE_SOLVER:
                     # A phase may last longer than `select_cheapest_solver` assumes. The implicit
                     # solver, which is next, then repeats the step.
-                    has_solver_failed = step_values[2] == Outcome.SOLVER_FAILED
+                    has_solver_failed = step_outputs[2] == Outcome.SOLVER_FAILED
                     solver_indices[lane_indices[has_solver_failed]] = SolverIndex.IMPLICIT_SOLVER
                     lane_indices = lane_indices[~has_solver_failed]
-                    step_values = tuple(
-                        step_value[..., ~has_solver_failed] for step_value in step_values
+                    step_outputs = tuple(
+                        step_output[..., ~has_solver_failed] for step_output in step_outputs
                     )
                 walk_batch.store_lane_steps(
-                    lane_indices, step_values, np.zeros(len(lane_indices), bool)
+                    lane_indices, step_outputs, np.zeros(len(lane_indices), bool)
                 )
     return walk_batch.make_batch_result(work_order, solver_indices, engine_name, solver_names)
 
@@ -526,17 +524,17 @@ def _step_lanes_by_kernel(
             return jnp.stack([*step_result.section_state, *step_result.durations]), step_diagnostics
 
         if not input_indices:
-            step_values, step_diagnostics = compute_step_outputs(*lane_inputs)
-            return (*step_diagnostics, step_values)
+            step_outputs, step_diagnostics = compute_step_outputs(*lane_inputs)
+            return (*step_diagnostics, step_outputs)
         # With respect to all inputs, two columns follow from the units.
-        needs_all_inputs = len(input_indices) == len(lane_inputs)
+        differentiates_all_inputs = len(input_indices) == len(lane_inputs)
         compute_jacobian_of_columns = (
-            complete_jacobian_columns if needs_all_inputs else compute_jacobian_columns
+            complete_jacobian_columns if differentiates_all_inputs else compute_jacobian_columns
         )
-        step_jacobian, step_values, step_diagnostics = compute_jacobian_of_columns(
+        step_jacobian, step_outputs, step_diagnostics = compute_jacobian_of_columns(
             compute_step_outputs, lane_inputs, input_indices
         )
-        return (*step_diagnostics, step_values, step_jacobian)
+        return (*step_diagnostics, step_outputs, step_jacobian)
 
     cache_key = (
         "gait step",
@@ -546,9 +544,9 @@ def _step_lanes_by_kernel(
         input_indices,
         *("uneven" for _ in next_slopes),
     )
-    n_inputs = N_STEP_INPUTS + len(next_slopes)
+    n_kernel_inputs = N_STEP_INPUTS + len(next_slopes)
     register_limits = (
-        simd.RegisterLimits(n_inputs) if input_indices else simd.DEFAULT_REGISTER_LIMITS
+        simd.RegisterLimits(n_kernel_inputs) if input_indices else simd.DEFAULT_REGISTER_LIMITS
     )
     lane_arrays = [*parameter_matrix, *section_states, *next_slopes]
     batch_program = compile_batch_program(
@@ -562,8 +560,8 @@ def _step_lanes_by_kernel(
         can_stop_early=True,
     )
     kernel_results = batch_program(scalar_arguments, lane_arrays)
-    _, outcomes, n_solver_steps, step_values, *step_jacobian = kernel_results
-    return step_values[:3], step_values[3:], outcomes, n_solver_steps, *step_jacobian
+    _, step_outcomes, n_solver_steps, step_outputs, *step_jacobian = kernel_results
+    return step_outputs[:3], step_outputs[3:], step_outcomes, n_solver_steps, *step_jacobian
 
 
 def _step_lanes_by_collocation(
@@ -586,10 +584,10 @@ def _step_lanes_by_collocation(
         params = make_wheel_from_parameters(lane_inputs[:n_parameters], n_legs)
         x, expected_durations = tuple(lane_inputs[n_parameters:-3]), tuple(lane_inputs[-3:])
         collocation_step = take_collocation_step(params, x, expected_durations, stop_at_lift_off)
-        step_values = jnp.stack(
+        step_outputs = jnp.stack(
             [*collocation_step.section_state, *collocation_step.phase_durations]
         )
-        return collocation_step.is_trusted, step_values
+        return collocation_step.is_collocation_trusted, step_outputs
 
     lane_arrays = [*parameter_matrix, *section_states, *expected_phase_durations]
     batch_program = compile_batch_program(
@@ -600,19 +598,19 @@ def _step_lanes_by_collocation(
         ("gait step by collocation", n_legs, stop_at_lift_off),
         batch_sizes.XLA_LANE_BATCH_SIZE,
     )
-    is_trusted, step_values = batch_program([], lane_arrays)
-    outcomes, n_solver_steps = np.zeros((2, len(is_trusted)), np.int32)
-    collocated_values = step_values[:3], step_values[3:], outcomes, n_solver_steps
-    untrusted_lanes = np.flatnonzero(~is_trusted)
+    is_collocation_trusted, step_outputs = batch_program([], lane_arrays)
+    step_outcomes, n_solver_steps = np.zeros((2, len(is_collocation_trusted)), np.int32)
+    collocated_values = step_outputs[:3], step_outputs[3:], step_outcomes, n_solver_steps
+    untrusted_lanes = np.flatnonzero(~is_collocation_trusted)
     if len(untrusted_lanes) > 0:
-        repeated_values = lane_engine.take_lane_steps(
+        recomputed_values = lane_engine.take_lane_steps(
             parameter_matrix[:, untrusted_lanes], section_states[:, untrusted_lanes]
         )
-        for collocated_value, repeated_value in zip(
-            collocated_values, repeated_values, strict=True
+        for collocated_value, recomputed_value in zip(
+            collocated_values, recomputed_values, strict=True
         ):
-            collocated_value[..., untrusted_lanes] = repeated_value
-    return collocated_values, is_trusted
+            collocated_value[..., untrusted_lanes] = recomputed_value
+    return collocated_values, is_collocation_trusted
 
 
 def _step_lanes_by_diffrax(
@@ -632,7 +630,7 @@ def _step_lanes_by_diffrax(
     convert_option_leaves = functools.partial(
         jax.tree.map, lambda option_leaf: np.asarray(option_leaf, parameter_matrix.dtype)
     )
-    derivative_options = convert_option_leaves(options.with_derivative_tolerances())
+    derivative_step_options = convert_option_leaves(options.with_derivative_tolerances())
     options = convert_option_leaves(options)
     step_input_matrix = np.concatenate(
         [
@@ -648,10 +646,10 @@ def _step_lanes_by_diffrax(
         step_element_block = functools.partial(
             _step_elements_by_vmap, model, options, n_legs, input_indices
         )
-        step_arrays = map_in_batches(
+        step_result_arrays = map_in_batches(
             step_element_block, (batch_sizes.DIFFRAX_BATCH_SIZE,), step_input_matrix
         )
-        return jax.tree.map(lambda x: np.array(x).T, step_arrays)
+        return jax.tree.map(lambda x: np.array(x).T, step_result_arrays)
 
     def step_elements_with_jacobian(step_input_matrix: np.ndarray) -> tuple[np.ndarray, ...]:
         """Return the results of one gait step for all elements, with Jacobians.
@@ -661,34 +659,34 @@ def _step_lanes_by_diffrax(
         solved. Bisection isolates that element.
         """
         try:
-            step_arrays: tuple[np.ndarray, ...] = step_all_elements(
+            step_result_arrays: tuple[np.ndarray, ...] = step_all_elements(
                 step_input_matrix, options, input_indices
             )
         except eqx.EquinoxRuntimeError:
-            *step_values, n_solver_steps = step_all_elements(
-                step_input_matrix, derivative_options, ()
+            *step_outputs, n_solver_steps = step_all_elements(
+                step_input_matrix, derivative_step_options, ()
             )
-            outcomes = step_values[2]
+            step_outcomes = step_outputs[2]
             step_jacobian = np.zeros(
                 (len(input_indices), 6, len(step_input_matrix)), parameter_matrix.dtype
             )
-            step_arrays = (*step_values, n_solver_steps, step_jacobian)
-            stepped_elements = np.flatnonzero(outcomes == Outcome.STEPPED)
+            step_result_arrays = (*step_outputs, n_solver_steps, step_jacobian)
+            stepped_elements = np.flatnonzero(step_outcomes == Outcome.STEPPED)
             if len(stepped_elements) < len(step_input_matrix):
-                element_index_parts = [stepped_elements]
+                retried_index_blocks = [stepped_elements]
             elif len(step_input_matrix) > 1:
-                element_index_parts = np.array_split(stepped_elements, 2)
+                retried_index_blocks = np.array_split(stepped_elements, 2)
             else:
-                element_index_parts, outcomes[:] = [], Outcome.SOLVER_FAILED
+                retried_index_blocks, step_outcomes[:] = [], Outcome.SOLVER_FAILED
             for element_indices in (
-                element_indices for element_indices in element_index_parts if len(element_indices)
+                element_indices for element_indices in retried_index_blocks if len(element_indices)
             ):
-                partial_results = step_elements_with_jacobian(step_input_matrix[element_indices])
-                for full_result_array, partial_result_array in zip(
-                    step_arrays, partial_results, strict=True
+                block_results = step_elements_with_jacobian(step_input_matrix[element_indices])
+                for full_result_array, block_result_array in zip(
+                    step_result_arrays, block_results, strict=True
                 ):
-                    full_result_array[..., element_indices] = partial_result_array
-        return step_arrays
+                    full_result_array[..., element_indices] = block_result_array
+        return step_result_arrays
 
     return (
         step_elements_with_jacobian(step_input_matrix)
@@ -740,12 +738,12 @@ def _step_elements_by_vmap(
         step_jacobian, step_result = jax.jacfwd(step_from_varied_inputs, has_aux=True)(
             varied_inputs
         )
-        step_values = (
+        step_outputs = (
             step_result.section_state,
             step_result.durations,
             step_result.outcome,
             step_result.solver_steps,
         )
-        return *step_values, step_jacobian
+        return *step_outputs, step_jacobian
 
     return jax.vmap(step_one_element)(step_input_matrix)

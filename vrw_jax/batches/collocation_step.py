@@ -181,7 +181,7 @@ def solve_phase_by_collocation(
 
     The phase ends at the root of its event guard that is near `expected_duration`.
     """
-    interval_fractions, zero_indicators = (
+    interval_fractions, lane_zeros = (
         phase_mesh.interval_fractions,
         jnp.zeros_like(expected_duration),
     )
@@ -197,15 +197,15 @@ def solve_phase_by_collocation(
             rate_correction,
             start_rate_error,
             lowest_guard,
-            end_guards,
+            end_guard_values,
             nonlinear_accelerations,
         ) = interval_carry
         h = interval_fraction * expected_duration
         solved_mesh_interval = _solve_mesh_interval(
             phase, q, v, h, nonlinear_accelerations, options
         )
-        interval_lowest_guard, end_guards = _find_lowest_guard(
-            phase, q, v, solved_mesh_interval, end_guards, 0
+        interval_lowest_guard, end_guard_values = _find_lowest_guard(
+            phase, q, v, solved_mesh_interval, end_guard_values, 0
         )
         interval_carry = (
             *solved_mesh_interval.interval_end_state,
@@ -214,7 +214,7 @@ def solve_phase_by_collocation(
             ),
             jnp.maximum(start_rate_error, solved_mesh_interval.largest_start_rate_error),
             jnp.minimum(lowest_guard, interval_lowest_guard),
-            end_guards,
+            end_guard_values,
             tuple(
                 tuple(nonlinear_growth_factor * x for x in node_acceleration)
                 for node_acceleration in solved_mesh_interval.nonlinear_accelerations
@@ -222,15 +222,15 @@ def solve_phase_by_collocation(
         )
         return interval_carry, None
 
-    start_guards = phase.compute_guards(PhaseInstant(phase, phase.compute_motion(q, v), None))
+    start_guard_values = phase.compute_guards(PhaseInstant(phase, phase.compute_motion(q, v), None))
     interval_carry = (
         q,
         v,
-        zero_indicators,
-        zero_indicators,
-        zero_indicators + jnp.inf,
-        start_guards,
-        ((zero_indicators,) * len(q),) * N_GAUSS_NODES,
+        lane_zeros,
+        lane_zeros,
+        lane_zeros + jnp.inf,
+        start_guard_values,
+        ((lane_zeros,) * len(q),) * N_GAUSS_NODES,
     )
     if len(interval_fractions) > 1:
         interval_carry, _ = lax.scan(
@@ -244,14 +244,14 @@ def solve_phase_by_collocation(
         estimated_rate_correction,
         largest_start_rate_error,
         lowest_guard_value,
-        start_guards,
+        start_guard_values,
         nonlinear_accelerations,
     ) = interval_carry
     h = float(interval_fractions[-1]) * expected_duration
     last_interval = _solve_mesh_interval(
         phase, q, v, h, nonlinear_accelerations, options, ends_at_event=True
     )
-    interval_lowest_guard, _ = _find_lowest_guard(phase, q, v, last_interval, start_guards, 1)
+    interval_lowest_guard, _ = _find_lowest_guard(phase, q, v, last_interval, start_guard_values, 1)
     return CollocatedPhaseEnd(
         *last_interval.interval_end_state,
         phase_duration=float(1.0 - interval_fractions[-1]) * expected_duration
@@ -282,12 +282,16 @@ def _estimate_next_correction(newton_sweep_state: _NewtonSweepState) -> Array:
 
 
 def _sum_weighted_accelerations(
-    node_weights: np.ndarray, node_accelerations: NodeAccelerations, coordinate_index: int
+    acceleration_weights: np.ndarray, node_accelerations: NodeAccelerations, coordinate_index: int
 ) -> Any:
-    """Return the sum of one coordinate's accelerations at all nodes, weighted by `node_weights`."""
+    """Return the sum of one coordinate's accelerations at all nodes, weighted by
+    `acceleration_weights`.
+    """
     return sum(
         float(node_weight) * node_acceleration[coordinate_index]
-        for node_weight, node_acceleration in zip(node_weights, node_accelerations, strict=True)
+        for node_weight, node_acceleration in zip(
+            acceleration_weights, node_accelerations, strict=True
+        )
     )
 
 
@@ -446,12 +450,14 @@ def _solve_mesh_interval(
         """Return the time from the end of the interval to the event, estimated by one Newton step,
         in the unit of `h`.
         """
-        end_q, end_v = _compute_interval_end_state(
+        interval_end_q, interval_end_v = _compute_interval_end_state(
             q, v, newton_sweep_state.interval_length, newton_sweep_state.node_accelerations
         )
-        _, end_acceleration = evaluate_event_guard(end_q, end_v)
+        _, end_acceleration = evaluate_event_guard(interval_end_q, interval_end_v)
         (guard_value, _), (guard_rate, _) = jax.jvp(
-            evaluate_event_guard, (end_q, end_v), (end_v, end_acceleration)
+            evaluate_event_guard,
+            (interval_end_q, interval_end_v),
+            (interval_end_v, end_acceleration),
         )
         time_to_event = -guard_value / jnp.where(guard_rate < 0.0, guard_rate, -jnp.inf)
         return jnp.clip(
@@ -612,9 +618,9 @@ def _subtract_complex_pairs(x: ComplexNumberPair, y: ComplexNumberPair) -> Compl
 
 def _add_complex_pairs(complex_numbers: Sequence[ComplexNumberPair]) -> ComplexNumberPair:
     """Return the sum of all `complex_numbers` as a pair (real part, imaginary part)."""
-    first_complex_number, *other_complex_numbers = complex_numbers
+    first_complex_number, *remaining_complex_numbers = complex_numbers
     real_part, imaginary_part = first_complex_number
-    for complex_number in other_complex_numbers:
+    for complex_number in remaining_complex_numbers:
         real_part, imaginary_part = (
             real_part + complex_number[0],
             imaginary_part + complex_number[1],
@@ -719,7 +725,7 @@ def _project_linearized_residuals(
     stiffness_acceleration_term = multiply_by_columns(residual_by_q, a)
     residual_projections = []
     for eigenvector_weights in EIGENVECTOR_PROJECTION_MATRIX:
-        constant_weight, linear_weight, quadratic_weight = (
+        weight_of_constant_term, weight_of_linear_term, weight_of_quadratic_term = (
             -complex(np.sum(eigenvector_weights * node_powers))
             for node_powers in (
                 np.ones(N_GAUSS_NODES),
@@ -730,12 +736,12 @@ def _project_linearized_residuals(
         residual_projections.append(
             [
                 tuple(
-                    take_real_or_imaginary_part(constant_weight) * middle_residual[i]
+                    take_real_or_imaginary_part(weight_of_constant_term) * middle_residual[i]
                     + h
                     * (
-                        take_real_or_imaginary_part(linear_weight)
+                        take_real_or_imaginary_part(weight_of_linear_term)
                         * (stiffness_rate_term[i] + damping_term[i])
-                        + take_real_or_imaginary_part(quadratic_weight)
+                        + take_real_or_imaginary_part(weight_of_quadratic_term)
                         * h
                         * stiffness_acceleration_term[i]
                     )
@@ -779,7 +785,7 @@ def _find_lowest_guard(
     q: Vector,
     v: Vector,
     solved_mesh_interval: _SolvedMeshInterval,
-    start_guards: Vector,
+    start_guard_values: Vector,
     n_event_guards: int,
 ) -> tuple[Array, Vector]:
     """Return the lowest of all guard values in an interval, and the value of each guard at the end.
@@ -788,7 +794,7 @@ def _find_lowest_guard(
     be lower by a quarter of its second difference. If a guard may be negative there, the lowest
     guard value is -1.
 
-    - `start_guards`: guard values at the start of the interval;
+    - `start_guard_values`: guard values at the start of the interval;
     - `n_event_guards`: 1 in the last interval, whose first guard is that of the event and has the
       value 0 at the end; otherwise 0.
     """
@@ -827,11 +833,13 @@ def _find_lowest_guard(
     evaluate_phase_guards = lambda q, v, a: phase.compute_guards(
         PhaseInstant(phase, phase.compute_motion(q, v), a)
     )
-    middle_guards = evaluate_phase_guards(*interval_middle_state, middle_acceleration)
-    end_guards = evaluate_phase_guards(*solved_mesh_interval.interval_end_state, end_acceleration)
+    middle_guard_values = evaluate_phase_guards(*interval_middle_state, middle_acceleration)
+    end_guard_values = evaluate_phase_guards(
+        *solved_mesh_interval.interval_end_state, end_acceleration
+    )
     lowest_guard_of_all = jnp.full_like(newton_sweep_state.interval_length, jnp.inf)
     for i, (start_guard_value, middle_guard_value, end_guard_value) in enumerate(
-        zip(start_guards, middle_guards, end_guards, strict=True)
+        zip(start_guard_values, middle_guard_values, end_guard_values, strict=True)
     ):
         lowest_guard_value = jnp.minimum(start_guard_value, middle_guard_value)
         if i >= n_event_guards:
@@ -843,7 +851,7 @@ def _find_lowest_guard(
                 lowest_guard_value > guard_decrease_bound, lowest_guard_value, -1.0
             )
         lowest_guard_of_all = jnp.minimum(lowest_guard_of_all, lowest_guard_value)
-    return lowest_guard_of_all, end_guards
+    return lowest_guard_of_all, end_guard_values
 
 
 class CollocationStep(NamedTuple):
@@ -851,7 +859,7 @@ class CollocationStep(NamedTuple):
 
     section_state: Vector  # (theta-, dtheta-, dL1-), three arrays
     phase_durations: Vector  # of DLS, SLS-I, SLS-II, s
-    is_trusted: Bool[Array, " lanes"]  # whether the lane passes all checks
+    is_collocation_trusted: Bool[Array, " lanes"]  # whether the lane passes all checks
 
 
 def take_collocation_step(
@@ -872,7 +880,10 @@ def take_collocation_step(
     wheel_units = compute_wheel_units(params.symbols())
     state_units: tuple[Any, ...] = (1.0, wheel_units.rate_unit, wheel_units.velocity_unit)
     params = convert_to_wheel_units(params)
-    x = tuple(state_component / unit for state_component, unit in zip(x, state_units, strict=True))
+    x = tuple(
+        state_component / state_unit
+        for state_component, state_unit in zip(x, state_units, strict=True)
+    )
     expected_durations = tuple(
         expected_duration / wheel_units.time_unit for expected_duration in expected_durations
     )
@@ -886,7 +897,7 @@ def take_collocation_step(
     )
     s = params.symbols()
     landing_result = transitions.resolve_landing(s, *x)
-    is_trusted = is_lane_valid & landing_result.is_rear_foot_planted
+    is_collocation_trusted = is_lane_valid & landing_result.is_rear_foot_planted
     wheel_angle, wheel_motion = landing_result.theta_after, landing_result.motion_after
     step_phases = make_phases(s, landing_result.foot_distance, stop_at_lift_off)
     phase_durations = []
@@ -901,8 +912,8 @@ def take_collocation_step(
         phase_end = solve_phase_by_collocation(
             collocated_phase, *phase_start_state, expected_duration, phase_mesh, options
         )
-        is_trusted = (
-            is_trusted
+        is_collocation_trusted = (
+            is_collocation_trusted
             & (phase_end.estimated_rate_correction <= options.max_rate_correction)
             & (phase_end.last_duration_correction <= options.max_duration_correction)
             & (phase_end.largest_start_rate_error <= max_start_rate_error)
@@ -916,15 +927,21 @@ def take_collocation_step(
         )
         phase_durations.append(phase_end.phase_duration)
 
-    def convert_trusted_to_si(lane_arrays: Iterable[Array], si_units: Iterable[Any]) -> Vector:
+    def convert_trusted_lanes_to_si(
+        lane_arrays: Iterable[Array], si_units: Iterable[Any]
+    ) -> Vector:
         """Return the arrays in SI units, with the value 0 in lanes that failed a check."""
         return tuple(
-            jnp.where(is_trusted, lane_array * si_unit, 0.0)
-            for lane_array, si_unit in zip(lane_arrays, si_units, strict=True)
+            jnp.where(is_collocation_trusted, dimensionless_lanes * si_unit, 0.0)
+            for dimensionless_lanes, si_unit in zip(lane_arrays, si_units, strict=True)
         )
 
     return CollocationStep(
-        convert_trusted_to_si((wheel_angle, wheel_motion.dtheta, wheel_motion.dL1), state_units),
-        convert_trusted_to_si(phase_durations, [wheel_units.time_unit] * len(phase_durations)),
-        is_trusted,
+        convert_trusted_lanes_to_si(
+            (wheel_angle, wheel_motion.dtheta, wheel_motion.dL1), state_units
+        ),
+        convert_trusted_lanes_to_si(
+            phase_durations, [wheel_units.time_unit] * len(phase_durations)
+        ),
+        is_collocation_trusted,
     )

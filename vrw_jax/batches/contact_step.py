@@ -45,7 +45,7 @@ def step_batch_with_contact(
     Without derivatives on flat ground, one call of the kernel computes all gait steps.
     """
     element_friction = np.asarray(model.friction, section_states.dtype)
-    is_uneven = any(np.ndim(x) == 2 for x in (*parameter_columns, element_friction))
+    is_ground_uneven = any(np.ndim(x) == 2 for x in (*parameter_columns, element_friction))
     if requested_engine not in ("auto", "lanes") or load_explicit_tableau(options.solver) is None:
         raise ValueError(
             f"engine is {requested_engine!r} and solver {options.solver}, but batches with contact "
@@ -71,17 +71,17 @@ def step_batch_with_contact(
     )
     section_states = embed_section_states(parameter_matrix, section_states, n_legs)
     integer_zeros = np.zeros(len(section_states), np.int32)
-    if not derivative_names and not is_uneven:
+    if not derivative_names and not is_ground_uneven:
         kernel_walk_result = walk_batch(
             parameter_matrix, section_states, n_steps, model, options, n_legs
         )
-        x, phase_durations, outcomes, n_stepped, n_solver_steps, _ = map(
+        x, phase_durations, step_outcomes, n_stepped, n_solver_steps, _ = map(
             np.asarray, kernel_walk_result
         )
         result_arrays = (
             x,
             phase_durations,
-            outcomes,
+            step_outcomes,
             n_stepped,
             n_solver_steps,
             integer_zeros > 0,
@@ -90,7 +90,7 @@ def step_batch_with_contact(
         return StepBatchResult(*result_arrays, engine="lanes", solver_names=(options.solver,))
     parameter_names: tuple[str, ...] = CONTACT_PARAMETER_NAMES
     stepwise_parameters: dict[str, StepwiseParameter] = {}
-    if is_uneven:
+    if is_ground_uneven:
         parameter_names = (*CONTACT_PARAMETER_NAMES, *UNEVEN_GROUND_PARAMETER_NAMES)
         stepwise_parameters = stepwise_ground.make_stepwise_parameters()
     active_walks = WalkBatch(
@@ -102,7 +102,7 @@ def step_batch_with_contact(
             break
         parameter_matrix = (
             stepwise_ground.make_step_parameters(k, parameter_matrix)
-            if is_uneven
+            if is_ground_uneven
             else parameter_matrix
         )
         step_arguments = (
@@ -116,10 +116,12 @@ def step_batch_with_contact(
             kernel_walk_result = walk_batch(
                 step_arguments[0], step_arguments[1], 1, *step_arguments[2:]
             )
-            x, phase_durations, outcomes, _, n_solver_steps, _ = map(np.asarray, kernel_walk_result)
+            x, phase_durations, step_outcomes, _, n_solver_steps, _ = map(
+                np.asarray, kernel_walk_result
+            )
             active_walks.store_lane_steps(
                 active_lanes,
-                (x.T, phase_durations.T, outcomes, n_solver_steps),
+                (x.T, phase_durations.T, step_outcomes, n_solver_steps),
                 integer_zeros[active_lanes] > 0,
             )
             continue
@@ -130,7 +132,7 @@ def step_batch_with_contact(
             [step_jacobian.section_state, step_jacobian.durations], 1
         )
         input_jacobian = complete_step_jacobian[:, :, list(active_walks.input_indices)]
-        step_values = (
+        step_outputs = (
             contact_step_result.section_state,
             contact_step_result.durations,
             contact_step_result.outcome,
@@ -138,7 +140,7 @@ def step_batch_with_contact(
         )
         active_walks.store_lane_steps(
             active_lanes,
-            tuple(np.asarray(x).T for x in (*step_values, input_jacobian)),
+            tuple(np.asarray(x).T for x in (*step_outputs, input_jacobian)),
             integer_zeros[active_lanes] > 0,
         )
     return active_walks.make_batch_result(

@@ -1,6 +1,5 @@
 """Selection of the cheapest solver for each wheel, based on the stiffness of its airborne leg."""
 
-import functools
 from dataclasses import dataclass
 from enum import IntEnum
 
@@ -76,10 +75,14 @@ def select_cheapest_solver(
         )
 
         def estimate_solver_cost(solver_name: str) -> tuple[np.ndarray, np.ndarray]:
-            n_stages, stability_limit = _get_stages_and_stability_limit(solver_name)
-            n_solver_steps = n_decay_times / stability_limit
+            solver_tableau = load_explicit_tableau(solver_name)
+            assert solver_tableau is not None  # The caller has checked the solver.
+            n_evaluations_per_step = len(solver_tableau.stage_nodes) - 1
+            n_solver_steps = n_decay_times / compute_real_stability_limit(solver_tableau)
             return n_solver_steps, np.where(
-                n_solver_steps > options.max_solver_steps, np.inf, n_solver_steps * n_stages
+                n_solver_steps > options.max_solver_steps,
+                np.inf,
+                n_solver_steps * n_evaluations_per_step,
             )
 
         _, requested_solver_cost = estimate_solver_cost(options.solver)
@@ -97,14 +100,3 @@ def select_cheapest_solver(
             np.full_like(n_decay_times, implicit_solver_cost),
         )
         return np.argmin(solver_costs, axis=0).astype(np.int32)  # 0 for an invalid wheel
-
-
-@functools.cache
-def _get_stages_and_stability_limit(solver_name: str) -> tuple[int, float]:
-    """Return an explicit solver's number of evaluations per solver step, and its stability limit.
-
-    The limit is the largest stable product of solver step and decay rate.
-    """
-    solver_tableau = load_explicit_tableau(solver_name)
-    assert solver_tableau is not None  # The caller has checked the solver.
-    return len(solver_tableau.stage_nodes) - 1, compute_real_stability_limit(solver_tableau)

@@ -74,10 +74,12 @@ class StepBatchResult(AbstractPrintable):
 
     def summary_rows(self) -> list[LabelAndText]:
         """Return pairs of label and text for outcomes, numbers of gait steps, engine and time."""
-        n_by_solver = np.bincount(np.ravel(self.solver_index), minlength=len(self.solver_names))
+        n_lanes_by_solver = np.bincount(
+            np.ravel(self.solver_index), minlength=len(self.solver_names)
+        )
         solver_texts = (
             f"{n_elements:,} by {solver_name}"
-            for n_elements, solver_name in zip(n_by_solver, self.solver_names, strict=True)
+            for n_elements, solver_name in zip(n_lanes_by_solver, self.solver_names, strict=True)
             if n_elements
         )
         return [
@@ -250,15 +252,15 @@ class WalkBatch:
     def store_lane_steps(
         self,
         lane_indices: np.ndarray,
-        step_values: tuple[np.ndarray, ...],
+        step_outputs: tuple[np.ndarray, ...],
         is_collocated: np.ndarray,
     ) -> None:
         """Store the results of one gait step of the lanes at `lane_indices`.
 
-        `step_values` contains section states, durations, outcomes, numbers of solver steps and, if
+        `step_outputs` contains section states, durations, outcomes, numbers of solver steps and, if
         derivatives are requested, Jacobians.
         """
-        section_state, phase_durations, outcome, n_solver_steps, *step_jacobian = step_values
+        section_state, phase_durations, outcome, n_solver_steps, *step_jacobian = step_outputs
         lane_selection = select_lanes(lane_indices, self)
         if step_jacobian:
             self.walk_jacobian = _replace_lane_values(
@@ -301,26 +303,31 @@ class WalkBatch:
         Axis 0 has one index for each value of such a parameter. The derivatives with respect to
         values of later steps are still 0.
         """
-        state_size, first_start_row = len(self.section_state), self.first_jacobian_rows[-1]
-        n_inputs = len(step_jacobian) - state_size
+        state_size, first_start_state_row = len(self.section_state), self.first_jacobian_rows[-1]
+        n_step_inputs = len(step_jacobian) - state_size
         k = int(np.max(self.n_stepped[lane_selection], initial=0))
         jacobian_shape = len(self.walk_jacobian), *step_jacobian.shape[1:]
         chained_jacobian = np.zeros(jacobian_shape, step_jacobian.dtype)
         if k == 0:
-            chained_jacobian[first_start_row:] = step_jacobian[n_inputs:]
+            chained_jacobian[first_start_state_row:] = step_jacobian[n_step_inputs:]
         else:
-            used_row_ranges = [
-                range(first_jacobian_row, min(first_jacobian_row + k + 1, end_row))
-                for first_jacobian_row, end_row in itertools.pairwise(self.first_jacobian_rows)
+            used_jacobian_row_ranges = [
+                range(first_jacobian_row, min(first_jacobian_row + k + 1, end_jacobian_row))
+                for first_jacobian_row, end_jacobian_row in itertools.pairwise(
+                    self.first_jacobian_rows
+                )
             ]
             used_jacobian_rows = np.array(
-                [*itertools.chain(*used_row_ranges), *range(first_start_row, len(chained_jacobian))]
+                [
+                    *itertools.chain(*used_jacobian_row_ranges),
+                    *range(first_start_state_row, len(chained_jacobian)),
+                ]
             )
             previous_jacobian = self.walk_jacobian[used_jacobian_rows, :state_size][
                 ..., lane_selection
             ]
             chained_jacobian[used_jacobian_rows] = sum(
-                step_jacobian[n_inputs + i] * previous_jacobian[:, i, None]
+                step_jacobian[n_step_inputs + i] * previous_jacobian[:, i, None]
                 for i in range(state_size)
             )
         first_input_row = 0
@@ -328,12 +335,12 @@ class WalkBatch:
             self.differentiated_parameters, self.first_jacobian_rows[:-1], strict=True
         ):
             for (
-                input_position,
-                value_index,
+                position_in_inputs,
+                stepwise_value_index,
                 input_derivative,
             ) in stepwise_parameter.list_chain_rule_terms(k):
-                chained_jacobian[first_jacobian_row + value_index] += (
-                    input_derivative * step_jacobian[first_input_row + input_position]
+                chained_jacobian[first_jacobian_row + stepwise_value_index] += (
+                    input_derivative * step_jacobian[first_input_row + position_in_inputs]
                 )
             first_input_row += len(stepwise_parameter.input_indices)
         return chained_jacobian
