@@ -137,7 +137,7 @@ def test_double_support_is_the_three_equations_restricted_to_its_circle(n_legs):
     turning = np.sum(w * np.stack(force), 0)
     turning += dtheta**2 * (circle.L1 * restricted[1] + circle.L2 * restricted[2])
     result = dynamics.compute_double_support_equation(s, distance, motion)
-    np.testing.assert_allclose(result.inertia_factor, inertia, rtol=1e-14)
+    np.testing.assert_allclose(result.generalized_inertia, inertia, rtol=1e-14)
     size = np.sum(np.abs(w * np.stack(force)), 0)  # of what cancels in the sum
     assert np.max(np.abs(result.generalized_force - turning) / size) < 1e-13
 

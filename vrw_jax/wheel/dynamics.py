@@ -89,7 +89,7 @@ def compute_equation_terms(s: Symbols, motion: Motion) -> EquationTerms:
     inertial forces.
     """
     sin, cos, L1, L2, dtheta, dL1, dL2 = motion
-    mass = compute_mass_matrix(s, L1, L2)
+    mass_matrix = compute_mass_matrix(s, L1, L2)
     sin_theta_plus_phi = sin * s.cos_phi + cos * s.sin_phi  # angle theta + phi
     cos_theta_plus_phi = cos * s.cos_phi - sin * s.sin_phi
     sin_rear_leg_plus_phi = (
@@ -105,7 +105,7 @@ def compute_equation_terms(s: Symbols, motion: Motion) -> EquationTerms:
     )
     spring_preload = s.k * s.Ls
     return EquationTerms(
-        mass_matrix=mass,
+        mass_matrix=mass_matrix,
         applied_moment_theta=fore_gravity_moment * sin_theta_plus_phi
         + rear_gravity_moment * sin_rear_leg_plus_phi
         - 2.0 * (half_dM11_dL1 * dL1 + half_dM11_dL2 * dL2) * dtheta,
@@ -130,11 +130,13 @@ def solve_single_support_1(s: Symbols, motion: Motion) -> Acceleration:
     return solve_unconstrained_dynamics(s, motion.L1, compute_equation_terms(s, motion))
 
 
-def solve_unconstrained_dynamics(s: Symbols, L1: Elementwise, terms: EquationTerms) -> Acceleration:
+def solve_unconstrained_dynamics(
+    s: Symbols, L1: Elementwise, equation_terms: EquationTerms
+) -> Acceleration:
     """Solve M q'' = f for the accelerations q''. The only constraint is that foot 1 stays at
     rest.
     """
-    M, f1, f2, f3 = terms
+    M, f1, f2, f3 = equation_terms
     q = s.sin_alpha * L1  # L2 is eliminated: its row of M is m (-q, -cos alpha, 1).
     A11 = M.M11 + M.M13 * q
     A12 = M.M12 + M.M13 * s.cos_alpha
@@ -188,7 +190,7 @@ class SingleDofEquation(NamedTuple):
     generalized_force.
     """
 
-    inertia_factor: Elementwise  # kg m^2
+    generalized_inertia: Elementwise  # kg m^2
     generalized_force: Elementwise  # N m
 
 
@@ -247,9 +249,13 @@ def solve_double_support(s: Symbols, foot_distance: Elementwise, motion: Motion)
 
     They solve the equation of `compute_double_support_equation`.
     """
-    inertia, force = compute_double_support_equation(s, foot_distance, motion)
+    generalized_inertia, generalized_force = compute_double_support_equation(
+        s, foot_distance, motion
+    )
     hub_circle = compute_double_support_circle(s, foot_distance, motion.sin_theta, motion.cos_theta)
-    return complete_accelerations_on_hub_circle(hub_circle, motion.dtheta, force / inertia)
+    return complete_accelerations_on_hub_circle(
+        hub_circle, motion.dtheta, generalized_force / generalized_inertia
+    )
 
 
 def complete_accelerations_on_hub_circle(

@@ -26,19 +26,21 @@ class ParameterDomain(NamedTuple):
     lower_is_allowed: bool
     description: str
 
-    def contains_value(self, value: Any) -> Any:
+    def contains_value(self, parameter_value: Any) -> Any:
         """Return whether a value lies in the allowed range. NaN gives False."""
-        is_above_lower = (
-            value >= self.lower_bound if self.lower_is_allowed else value > self.lower_bound
+        is_above_lower_bound = (
+            parameter_value >= self.lower_bound
+            if self.lower_is_allowed
+            else parameter_value > self.lower_bound
         )
-        return is_above_lower & (value < self.upper_bound)
+        return is_above_lower_bound & (parameter_value < self.upper_bound)
 
-    def require_value_in_domain(self, parameter_name: str, value: float) -> None:
+    def require_value_in_domain(self, parameter_name: str, parameter_value: float) -> None:
         """Raise a `ValueError` if the value of a parameter lies outside the allowed range."""
-        if not self.contains_value(value):
+        if not self.contains_value(parameter_value):
             raise ValueError(
-                f"{parameter_name} is {value:g}, but {self.description} must lie in {self}: "
-                "give a value in that range."
+                f"{parameter_name} is {parameter_value:g}, but {self.description} must lie in "
+                f"{self}: give a value in that range."
             )
 
     def __str__(self) -> str:
@@ -216,7 +218,18 @@ class WheelParams(AbstractPrintable):
                 parameter_name, parameter_value
             )
         if len(known_parameter_values) == len(PARAMETER_DOMAINS):
-            _require_small_relative_values(known_parameter_values, self.n_legs)
+            for parameter_name, squared_relative_value in _square_relative_values(
+                known_parameter_values, self.n_legs
+            ).items():
+                if not squared_relative_value < MAX_RELATIVE_VALUE**2:
+                    raise ValueError(
+                        f"{parameter_name} is {known_parameter_values[parameter_name]:g} "
+                        f"{PARAMETER_DOMAINS[parameter_name].unit}, which is "
+                        f"{math.sqrt(squared_relative_value):.1e} in units of the wheel's mass, "
+                        "locked length and gravity, "
+                        f"but it must be below {MAX_RELATIVE_VALUE:g} in them: give a smaller "
+                        "value."
+                    )
         leg_com, locked_length = (
             known_parameter_values.get(parameter_name)
             for parameter_name in ("leg_com", "locked_length")
@@ -272,8 +285,10 @@ class WheelParams(AbstractPrintable):
             parameter_name: getattr(self, parameter_name) for parameter_name in PARAMETER_DOMAINS
         }
         if not np.all(self.is_in_domain()):
-            denominator_formatter = lambda domain: (
-                f"{domain.symbol}, {domain.unit}" if domain.unit else domain.symbol
+            denominator_formatter = lambda parameter_domain: (
+                f"{parameter_domain.symbol}, {parameter_domain.unit}"
+                if parameter_domain.unit
+                else parameter_domain.symbol
             )
             return [
                 (
@@ -346,25 +361,26 @@ class WheelParams(AbstractPrintable):
             0.20 m, 9.81 m/s^2
         """
         factor_by_dimension = {"length": length, "time": time, "mass": mass}
-        for dimension_name, given_factor in factor_by_dimension.items():
-            checked_factor = check_reals(dimension_name, given_factor)
-            if not isinstance(checked_factor, jax.core.Tracer) and not np.all(checked_factor > 0.0):
+        for dimension_name, given_scale_factor in factor_by_dimension.items():
+            checked_scale_factor = check_reals(dimension_name, given_scale_factor)
+            if not isinstance(checked_scale_factor, jax.core.Tracer) and not np.all(
+                checked_scale_factor > 0.0
+            ):
                 raise ValueError(
-                    f"{dimension_name} is {format_value(given_factor)}, but a factor of scale is "
-                    "positive: give 2, "
-                    "say, for twice as much."
+                    f"{dimension_name} is {format_value(given_scale_factor)}, but a factor of "
+                    "scale is positive: give 2, say, for twice as much."
                 )
-        scaled_values = {}
-        for dimension_name, domain in PARAMETER_DOMAINS.items():
-            unit_powers = UNIT_POWERS[domain.unit]
+        scaled_parameter_values = {}
+        for parameter_name, parameter_domain in PARAMETER_DOMAINS.items():
+            unit_powers = UNIT_POWERS[parameter_domain.unit]
             scale_factor = math.prod(
-                checked_factor**unit_power
-                for checked_factor, unit_power in zip(
+                checked_scale_factor**unit_power
+                for checked_scale_factor, unit_power in zip(
                     factor_by_dimension.values(), unit_powers, strict=True
                 )
             )
-            scaled_values[dimension_name] = getattr(self, dimension_name) * scale_factor
-        return WheelParams(**scaled_values, n_legs=self.n_legs)
+            scaled_parameter_values[parameter_name] = getattr(self, parameter_name) * scale_factor
+        return WheelParams(**scaled_parameter_values, n_legs=self.n_legs)
 
     def symbols(self) -> Symbols:
         """Return the parameters by their symbols in the paper, and quantities that several formulas
@@ -390,23 +406,6 @@ def _square_relative_values(value_by_parameter: Mapping[str, Any], n_legs: int) 
         "stiffness": relative_stiffness**2,
         "damping": (value_by_parameter["damping"] / total_mass) ** 2 * locked_length / gravity,
     }
-
-
-def _require_small_relative_values(value_by_parameter: Mapping[str, float], n_legs: int) -> None:
-    """Raise a `ValueError` if a parameter is too large relative to the wheel's mass, length and
-    gravity.
-    """
-    for parameter_name, squared_relative_value in _square_relative_values(
-        value_by_parameter, n_legs
-    ).items():
-        if not squared_relative_value < MAX_RELATIVE_VALUE**2:
-            raise ValueError(
-                f"{parameter_name} is {value_by_parameter[parameter_name]:g} "
-                f"{PARAMETER_DOMAINS[parameter_name].unit}, which is "
-                f"{math.sqrt(squared_relative_value):.1e} in units of the wheel's mass, locked "
-                "length and gravity, "
-                f"but it must be below {MAX_RELATIVE_VALUE:g} in them: give a smaller value."
-            )
 
 
 def compute_symbols(
@@ -481,10 +480,10 @@ def convert_friction(given_friction: object) -> Array:
     Raise a `ValueError` for a negative number or NaN.
     """
     friction_coefficient = check_reals(FRICTION_NAME, given_friction)
-    is_concrete = (
+    is_friction_concrete = (
         not isinstance(friction_coefficient, jax.core.Tracer) and friction_coefficient.ndim == 0
     )
-    if is_concrete and not float(friction_coefficient) >= 0.0:
+    if is_friction_concrete and not float(friction_coefficient) >= 0.0:
         raise ValueError(
             f"friction is {float(friction_coefficient):g}, but a coefficient of friction is at "
             "least 0: give 0.7, say, or math.inf for feet that never slide."
@@ -523,7 +522,13 @@ def make_wheel_from_parameters(
     - `next_slope`: slope of the next line of uneven ground, rad. If it is given, the parameter
       `slope` has both slopes on a leading axis.
     """
-    wheel = WheelParams(**dict(zip(PARAMETER_NAMES, parameter_values, strict=True)), n_legs=n_legs)
+    wheel_params = WheelParams(
+        **dict(zip(PARAMETER_NAMES, parameter_values, strict=True)), n_legs=n_legs
+    )
     if next_slope is None:
-        return wheel
-    return eqx.tree_at(lambda wheel: wheel.slope, wheel, jnp.stack([wheel.slope, next_slope]))
+        return wheel_params
+    return eqx.tree_at(
+        lambda wheel_params: wheel_params.slope,
+        wheel_params,
+        jnp.stack([wheel_params.slope, next_slope]),
+    )

@@ -128,18 +128,18 @@ class AbstractPhase(abc.ABC):
         """
 
     @abc.abstractmethod
-    def compute_end_guard(self, instant: "PhaseInstant") -> Elementwise:
+    def compute_end_guard(self, phase_instant: "PhaseInstant") -> Elementwise:
         """Return the guard whose root is the regular end of the phase, m or N.
 
         The guard is positive before the end.
         """
 
     @abc.abstractmethod
-    def compute_specific_guards(self, instant: "PhaseInstant") -> Vector:
+    def compute_specific_guards(self, phase_instant: "PhaseInstant") -> Vector:
         """Return the guards that only this phase has, except that of its regular end."""
 
     @abc.abstractmethod
-    def compute_specific_margins(self, instant: "PhaseInstant") -> Vector:
+    def compute_specific_margins(self, phase_instant: "PhaseInstant") -> Vector:
         """Return the values of the margins that only this phase has."""
 
     @abc.abstractmethod
@@ -185,19 +185,23 @@ class AbstractPhase(abc.ABC):
         """Return the force of the ground on the rear foot, N, or None if the foot is in the air."""
         return None
 
-    def compute_guards(self, instant: "PhaseInstant") -> Vector:
+    def compute_guards(self, phase_instant: "PhaseInstant") -> Vector:
         """Return the values of all guards.
 
         The guards of this phase come first, those of `SHARED_FAILURE_OUTCOMES` last.
         """
-        m = instant.motion
+        m = phase_instant.motion
         guard_values = (
-            self.compute_end_guard(instant),
-            *self.compute_specific_guards(instant),
+            self.compute_end_guard(phase_instant),
+            *self.compute_specific_guards(phase_instant),
             m.dtheta,
             jnp.minimum(m.L1, m.L2) - self.s.a,
         )
-        return (*guard_values, instant.fore_force.normal) if self.stop_at_lift_off else guard_values
+        return (
+            (*guard_values, phase_instant.fore_force.normal)
+            if self.stop_at_lift_off
+            else guard_values
+        )
 
     @property
     def all_guard_outcomes(self) -> tuple[Outcome, ...]:
@@ -206,21 +210,21 @@ class AbstractPhase(abc.ABC):
             SHARED_FAILURE_OUTCOMES if self.stop_at_lift_off else SHARED_FAILURE_OUTCOMES[:-1]
         )
 
-    def compute_margins(self, instant: "PhaseInstant") -> Vector:
+    def compute_margins(self, phase_instant: "PhaseInstant") -> Vector:
         """Return the values of all margins, in the order of `PhaseMargins`."""
-        s, m = self.s, instant.motion
+        s, m = self.s, phase_instant.motion
         locked_stopper_force = dynamics.compute_stopper_force(
-            s, m, instant.acceleration, range(3, s.n + 1)
+            s, m, phase_instant.acceleration, range(3, s.n + 1)
         )
         shared_margin_values = (
-            instant.fore_force.normal,
+            phase_instant.fore_force.normal,
             s.L0 - m.L1,
-            -dynamics.compute_required_friction(instant.fore_force),
+            -dynamics.compute_required_friction(phase_instant.fore_force),
         )
         return (
             *shared_margin_values,
             *locked_stopper_force,
-            *self.compute_specific_margins(instant),
+            *self.compute_specific_margins(phase_instant),
         )
 
     @property
@@ -340,23 +344,25 @@ class DoubleSupport(AbstractPhase):
         )
 
     def compute_dynamics_residual(self, motion: Motion, phase_acceleration: Vector) -> Vector:
-        inertia, force = self._compute_equation(motion)
-        return (inertia * phase_acceleration[0] - force,)
+        generalized_inertia, generalized_force = self._compute_equation(motion)
+        return (generalized_inertia * phase_acceleration[0] - generalized_force,)
 
     def solve_dynamics(self, motion: Motion, right_hand_side: Vector) -> Vector:
-        return (right_hand_side[0] / self._compute_equation(motion).inertia_factor,)
+        return (right_hand_side[0] / self._compute_equation(motion).generalized_inertia,)
 
     def compute_rear_force(self, motion: Motion, acceleration: Acceleration) -> FootForce:
         return dynamics.compute_rear_foot_force(self.s, motion, acceleration)
 
-    def compute_end_guard(self, instant: PhaseInstant) -> Elementwise:
-        assert instant.rear_force is not None
-        return instant.rear_force.normal
+    def compute_end_guard(self, phase_instant: PhaseInstant) -> Elementwise:
+        assert phase_instant.rear_force is not None
+        return phase_instant.rear_force.normal
 
-    def compute_specific_guards(self, instant: PhaseInstant) -> Vector:
-        return self.s.L0 - instant.motion.L2, self.compute_landing_height(instant.motion)
+    def compute_specific_guards(self, phase_instant: PhaseInstant) -> Vector:
+        return self.s.L0 - phase_instant.motion.L2, self.compute_landing_height(
+            phase_instant.motion
+        )
 
-    def compute_specific_margins(self, instant: PhaseInstant) -> Vector:
+    def compute_specific_margins(self, phase_instant: PhaseInstant) -> Vector:
         return ()
 
     def reset_motion(self, motion: Motion) -> Motion:
@@ -399,14 +405,14 @@ class SingleSupport1(AbstractPhase):
             self.s, motion.L1, dynamics.EquationTerms(M, *right_hand_side)
         )
 
-    def compute_end_guard(self, instant: PhaseInstant) -> Elementwise:
-        return self.s.L0 - instant.motion.L2
+    def compute_end_guard(self, phase_instant: PhaseInstant) -> Elementwise:
+        return self.s.L0 - phase_instant.motion.L2
 
-    def compute_specific_guards(self, instant: PhaseInstant) -> Vector:
-        return (self.compute_landing_height(instant.motion),)
+    def compute_specific_guards(self, phase_instant: PhaseInstant) -> Vector:
+        return (self.compute_landing_height(phase_instant.motion),)
 
-    def compute_specific_margins(self, instant: PhaseInstant) -> Vector:
-        return (compute_rear_foot_height(self.s, instant.motion),)
+    def compute_specific_margins(self, phase_instant: PhaseInstant) -> Vector:
+        return (compute_rear_foot_height(self.s, phase_instant.motion),)
 
     def reset_motion(self, motion: Motion) -> Motion:
         """Return the motion after the collision of Leg 2 with its stopper, with L2 = L0 exactly."""
@@ -444,15 +450,17 @@ class SingleSupport2(AbstractPhase):
         M = dynamics.compute_mass_matrix(self.s, motion.L1, motion.L2)
         return (1.0 / M.M11) * right_hand_side[0], (1.0 / M.M22) * right_hand_side[1]
 
-    def compute_end_guard(self, instant: PhaseInstant) -> Elementwise:
-        return self.compute_landing_height(instant.motion)
+    def compute_end_guard(self, phase_instant: PhaseInstant) -> Elementwise:
+        return self.compute_landing_height(phase_instant.motion)
 
-    def compute_specific_guards(self, instant: PhaseInstant) -> Vector:
+    def compute_specific_guards(self, phase_instant: PhaseInstant) -> Vector:
         return ()
 
-    def compute_specific_margins(self, instant: PhaseInstant) -> Vector:
-        s, m = self.s, instant.motion
-        rear_stopper_force = dynamics.compute_stopper_force(s, m, instant.acceleration, range(2, 3))
+    def compute_specific_margins(self, phase_instant: PhaseInstant) -> Vector:
+        s, m = self.s, phase_instant.motion
+        rear_stopper_force = dynamics.compute_stopper_force(
+            s, m, phase_instant.acceleration, range(2, 3)
+        )
         return compute_rear_foot_height(s, m), *rear_stopper_force
 
     def reset_motion(self, motion: Motion) -> Motion:

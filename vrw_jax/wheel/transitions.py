@@ -194,8 +194,8 @@ def resolve_landing(
     )
     # The impulse at the fore foot is the jump of total momentum minus the impulse at the rear foot.
     momentum_after_x, momentum_after_z = compute_momentum(s, motion_after)
-    relabeled_motion = Motion(sin_theta, cos_theta, s.L0, L1_before, dtheta, 0.0 * dtheta, dL1)
-    momentum_before_x, momentum_before_z = compute_momentum(s, relabeled_motion)
+    motion_of_new_legs = Motion(sin_theta, cos_theta, s.L0, L1_before, dtheta, 0.0 * dtheta, dL1)
+    momentum_before_x, momentum_before_z = compute_momentum(s, motion_of_new_legs)
     applied_rear_impulse = FootForce(
         jnp.where(is_rear_foot_planted, rear_impulse.tangential, 0.0),
         jnp.where(is_rear_foot_planted, rear_impulse.normal, 0.0),
@@ -250,20 +250,24 @@ def resolve_stopper_collision(s: Symbols, motion: Motion) -> StopperCollision:
     """
     motion_before = motion._replace(L2=s.L0 + 0.0 * motion.L2)
     motion_after = lock_leg_2(s, motion_before)
-    hub_jump = compute_hub_velocity_jump(motion_before, motion_after)
+    hub_velocity_jump = compute_hub_velocity_jump(motion_before, motion_after)
     rear_leg = rotate_to_rear_leg(s, motion_before.sin_theta, motion_before.cos_theta)
     momentum_before_x, momentum_before_z = compute_momentum(s, motion_before)
     momentum_after_x, momentum_after_z = compute_momentum(s, motion_after)
     return StopperCollision(
         motion_after=motion_after,
         stopper_impulse=s.m
-        * (motion_before.dL2 + hub_jump[0] * rear_leg.sin + hub_jump[1] * rear_leg.cos),
+        * (
+            motion_before.dL2
+            + hub_velocity_jump[0] * rear_leg.sin
+            + hub_velocity_jump[1] * rear_leg.cos
+        ),
         foot_impulse=FootForce(
             momentum_after_x - momentum_before_x, momentum_after_z - momentum_before_z
         ),
         energy_loss=compute_kinetic_energy(s, motion_before)
         - compute_kinetic_energy(s, motion_after),
-        hub_velocity_jump=hub_jump,
+        hub_velocity_jump=hub_velocity_jump,
     )
 
 
@@ -292,7 +296,7 @@ def compute_hub_velocity_jump(
 def compute_locked_leg_impulses(
     s: Symbols,
     motion: Motion,
-    hub_jump: tuple[Elementwise, Elementwise],
+    hub_velocity_jump: tuple[Elementwise, Elementwise],
     leg_numbers: range,
 ) -> Float[Array, "n_legs_asked ..."]:
     """Return the impulse that the stopper exerts on the mass of each leg of `leg_numbers`, N s.
@@ -303,8 +307,12 @@ def compute_locked_leg_impulses(
     leg_angles = s.alpha * (
         np.asarray(leg_numbers).reshape(-1, *(1,) * jnp.ndim(motion.sin_theta)) - 1
     )
-    radial_velocity_jump = hub_jump[0] * motion.sin_theta + hub_jump[1] * motion.cos_theta
-    transverse_velocity_jump = hub_jump[0] * motion.cos_theta - hub_jump[1] * motion.sin_theta
+    radial_velocity_jump = (
+        hub_velocity_jump[0] * motion.sin_theta + hub_velocity_jump[1] * motion.cos_theta
+    )
+    transverse_velocity_jump = (
+        hub_velocity_jump[0] * motion.cos_theta - hub_velocity_jump[1] * motion.sin_theta
+    )
     return s.m * (
         radial_velocity_jump * np.cos(leg_angles) + transverse_velocity_jump * np.sin(leg_angles)
     )

@@ -71,9 +71,11 @@ class WheelUnits(NamedTuple):
 
     def scale_times_to_seconds(self, options: StepOptions) -> StepOptions:
         """Convert the times in step options from the wheel's own unit to seconds."""
-        time_selector = lambda o: (o.max_phase_time, o.dt0)
+        select_time_options = lambda o: (o.max_phase_time, o.dt0)
         return eqx.tree_at(
-            time_selector, options, tuple(self.time_unit * x for x in time_selector(options))
+            select_time_options,
+            options,
+            tuple(self.time_unit * x for x in select_time_options(options)),
         )
 
 
@@ -96,8 +98,8 @@ def convert_to_wheel_units(params: WheelParams) -> WheelParams:
     return WheelParams(
         **{
             parameter_name: getattr(params, parameter_name)
-            / wheel_units.compute_unit_in_si(domain.unit)
-            for parameter_name, domain in PARAMETER_DOMAINS.items()
+            / wheel_units.compute_unit_in_si(parameter_domain.unit)
+            for parameter_name, parameter_domain in PARAMETER_DOMAINS.items()
         },
         n_legs=params.n_legs,
     )
