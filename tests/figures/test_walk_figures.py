@@ -101,7 +101,7 @@ def test_a_walk_of_every_model_is_drawn(name, request):
 
 def test_feet_between_two_samples_are_interpolated(sliding_walk):
     motion = contact_figures.compute_foot_motion(sliding_walk)
-    middle = 0.5 * (motion.time[7] + motion.time[8])
+    middle = 0.5 * (motion.sample_times[7] + motion.sample_times[8])
     hub, feet, sample = motion.interpolate_at_time(middle)
     np.testing.assert_allclose(hub, motion.hub_positions[7:9].mean(0), atol=1e-14)  # round-off
     np.testing.assert_allclose(feet, motion.foot_positions[7:9].mean(0), atol=1e-14)

@@ -91,17 +91,17 @@ def branch_figure(branch: Branch) -> Figure:
     # A piece of equal stability ends at the point where the next piece starts.
     stability_pieces = [
         (
-            np.append(piece, piece[-1:] + 1)[: branch.values.size - piece[0]],
-            bool(branch.stable[piece[0]]),
+            np.append(index_piece, index_piece[-1:] + 1)[: branch.values.size - index_piece[0]],
+            bool(branch.stable[index_piece[0]]),
         )
-        for piece in np.split(np.arange(branch.values.size), change_indices)
+        for index_piece in np.split(np.arange(branch.values.size), change_indices)
     ]
-    shown_panels = PAPER_BRANCH_PANELS if has_indicators else OTHER_MODEL_BRANCH_PANELS
-    for axes, (panel_label, panel_series), panel_letter in zip(
-        panel_axes.ravel(), shown_panels, "abcd", strict=True
+    drawn_panels = PAPER_BRANCH_PANELS if has_indicators else OTHER_MODEL_BRANCH_PANELS
+    for axes, (panel_label, panel_measure_names), panel_letter in zip(
+        panel_axes.ravel(), drawn_panels, "abcd", strict=True
     ):
         draw_panel_letter(axes, panel_letter)
-        for measure_name, line_color in panel_series.items():
+        for measure_name, line_color in panel_measure_names.items():
             plotted_columns = [branch_dataset[measure_name].values]
             if measure_name == "clearance_sls1":
                 # The clearance is in mm. The line has a gap where the clearance jumps because a
@@ -112,11 +112,11 @@ def branch_figure(branch: Branch) -> Figure:
             if measure_name == "spectral_radius":
                 plotted_columns = list(np.abs(branch.multipliers).T)
             for plotted_measure_values in plotted_columns:
-                for piece_of_indices, is_stable in stability_pieces:
+                for index_piece, is_stable in stability_pieces:
                     line_style = "-" if is_stable else "--"
                     axes.plot(
-                        parameter_values[piece_of_indices],
-                        plotted_measure_values[piece_of_indices],
+                        parameter_values[index_piece],
+                        plotted_measure_values[index_piece],
                         line_style,
                         color=line_color,
                     )
@@ -237,7 +237,7 @@ def basin_figure(results: list[xr.Dataset], titles: list[str]) -> Figure:
     )
     figure = Figure(figsize=(PAGE_FIGURE_WIDTH_INCHES, 3.3))
     panel_axes = figure.subplots(1, len(results), sharey=True, squeeze=False)[0]
-    max_steps = max(
+    max_step_count = max(
         float(basin_dataset.steps.where(basin_dataset.attractor >= 0).max())
         for basin_dataset in results
     )
@@ -246,15 +246,15 @@ def basin_figure(results: list[xr.Dataset], titles: list[str]) -> Figure:
             str(axis_name) for axis_name in basin_dataset.attractor.dims
         )
         steps_to_gait = basin_dataset.steps.where(basin_dataset.attractor >= 0)
-        step_image = axes.pcolormesh(
+        step_count_image = axes.pcolormesh(
             basin_dataset[horizontal_name],
             basin_dataset[vertical_name],
             steps_to_gait,
             cmap="Greys_r",
             vmin=0.0,
-            vmax=2.2 * max_steps,
+            vmax=2.2 * max_step_count,
         )
-        step_image.set_rasterized(True)
+        step_count_image.set_rasterized(True)
         if fall_codes:
             draw_outcome_cells(
                 axes,
@@ -264,7 +264,7 @@ def basin_figure(results: list[xr.Dataset], titles: list[str]) -> Figure:
                 fall_codes,
             )
         if {horizontal_name, vertical_name} <= set(PRE_TOUCHDOWN_COMPONENT_NAMES):
-            orbit_states = basin_dataset.orbit_state.values.reshape(
+            orbit_section_states = basin_dataset.orbit_state.values.reshape(
                 -1, len(PRE_TOUCHDOWN_COMPONENT_NAMES)
             )
             shown_columns = [
@@ -272,7 +272,7 @@ def basin_figure(results: list[xr.Dataset], titles: list[str]) -> Figure:
                 PRE_TOUCHDOWN_COMPONENT_NAMES.index(vertical_name),
             ]
             axes.plot(
-                *orbit_states[:, shown_columns].T,
+                *orbit_section_states[:, shown_columns].T,
                 "+",
                 color=OKABE_ITO_YELLOW,
                 markersize=7.0,
@@ -281,9 +281,9 @@ def basin_figure(results: list[xr.Dataset], titles: list[str]) -> Figure:
         axes.set_title(panel_title)
         axes.set_xlabel(format_axis_label(horizontal_name, "{symbol}"))
     panel_axes[0].set_ylabel(format_axis_label(str(results[0].attractor.dims[0]), "{symbol}"))
-    color_bar = figure.colorbar(step_image, ax=list(panel_axes), aspect=25, pad=0.01)
+    color_bar = figure.colorbar(step_count_image, ax=list(panel_axes), aspect=25, pad=0.01)
     color_bar.set_label("steps until the gait is reached")
-    color_bar.ax.set_ylim(0.0, max_steps)
+    color_bar.ax.set_ylim(0.0, max_step_count)
     figure.legend(
         handles=make_outcome_patches(fall_codes), loc="outside lower center", ncols=4, fontsize=7.5
     )

@@ -54,12 +54,12 @@ class HubAndFootMotion(NamedTuple):
     behind Leg 1.
     """
 
-    time: np.ndarray  # (time,), s
+    sample_times: np.ndarray  # (time,), s
     hub_positions: np.ndarray  # (time, 2), x downhill and z normal to the slope, m
     foot_positions: np.ndarray  # (time, leg, 2), in the same coordinates, m
     foot_forces: np.ndarray  # (time, leg, 2), tangential and normal force, N
     contact_modes: np.ndarray  # (time, leg), contact mode
-    step: np.ndarray  # (time,), number of the step
+    step_numbers: np.ndarray  # (time,), number of the gait step of each sample
 
     def interpolate_at_time(self, t: float) -> tuple[np.ndarray, np.ndarray, int]:
         """Return the positions of hub and feet at the time `t` (s), and the index of the next
@@ -67,20 +67,26 @@ class HubAndFootMotion(NamedTuple):
 
         Contact modes and forces at this time are those of the next sample.
         """
-        index_after = min(int(np.searchsorted(self.time, t, side="right")), self.time.size - 1)
-        index_before = max(index_after - 1, 0)
-        sample_interval = self.time[index_after] - self.time[index_before]
-        interval_fraction = (
-            (t - self.time[index_before]) / sample_interval if sample_interval > 0.0 else 1.0
+        sample_index_after = min(
+            int(np.searchsorted(self.sample_times, t, side="right")), self.sample_times.size - 1
         )
-        sample_interpolator = lambda sampled_values: (
-            (1.0 - interval_fraction) * sampled_values[index_before]
-            + interval_fraction * sampled_values[index_after]
+        sample_index_before = max(sample_index_after - 1, 0)
+        sample_interval = (
+            self.sample_times[sample_index_after] - self.sample_times[sample_index_before]
+        )
+        interval_fraction = (
+            (t - self.sample_times[sample_index_before]) / sample_interval
+            if sample_interval > 0.0
+            else 1.0
+        )
+        interpolate_samples = lambda sampled_values: (
+            (1.0 - interval_fraction) * sampled_values[sample_index_before]
+            + interval_fraction * sampled_values[sample_index_after]
         )
         return (
-            sample_interpolator(self.hub_positions),
-            sample_interpolator(self.foot_positions),
-            index_after,
+            interpolate_samples(self.hub_positions),
+            interpolate_samples(self.foot_positions),
+            sample_index_after,
         )
 
 
@@ -167,8 +173,8 @@ def _select_marked_legs(is_leg_marked: np.ndarray) -> list[int]:
     """
     return [
         leg_number
-        for leg_number, is_ever_marked in enumerate(np.any(is_leg_marked, axis=0).tolist(), 1)
-        if is_ever_marked or leg_number < 3
+        for leg_number, is_leg_ever_marked in enumerate(np.any(is_leg_marked, axis=0).tolist(), 1)
+        if is_leg_ever_marked or leg_number < 3
     ]
 
 
@@ -182,14 +188,14 @@ def make_contact_panels(walk: xr.Dataset) -> Figure:
     touching_legs = _select_marked_legs(is_foot_touching)
     moving_legs = _select_marked_legs(is_foot_touching | ~walk.on_stopper.values.astype(bool))
     # At landings the legs are relabeled.
-    landing_indices = np.flatnonzero(np.diff(foot_motion.step)) + 1
-    gap_inserter = lambda leg_values: np.insert(
+    landing_indices = np.flatnonzero(np.diff(foot_motion.step_numbers)) + 1
+    insert_gaps = lambda leg_values: np.insert(
         np.asarray(leg_values, float), landing_indices, np.nan
     )
-    times_with_gaps = gap_inserter(foot_motion.time)
-    other_leg_lines = iter(OTHER_LEG_LINE_STYLES * len(moving_legs))
+    times_with_gaps = insert_gaps(foot_motion.sample_times)
+    other_leg_line_styles = iter(OTHER_LEG_LINE_STYLES * len(moving_legs))
     line_style_by_leg = {
-        leg_number: LEG_LINE_STYLES.get(leg_number) or next(other_leg_lines)
+        leg_number: LEG_LINE_STYLES.get(leg_number) or next(other_leg_line_styles)
         for leg_number in moving_legs
     }
     figure = Figure(figsize=(0.8 * PAGE_FIGURE_WIDTH_INCHES, 8.0))
@@ -197,7 +203,7 @@ def make_contact_panels(walk: xr.Dataset) -> Figure:
     panel_axes = figure.subplots(6, 1, sharex=True, height_ratios=height_ratios)
     for axes, panel_letter in zip(panel_axes, "abcdef", strict=True):
         draw_panel_letter(axes, panel_letter)
-    panel_axes[0].plot(times_with_gaps, gap_inserter(walk.theta), color="black")
+    panel_axes[0].plot(times_with_gaps, insert_gaps(walk.theta), color="black")
     panel_axes[0].set_ylabel(format_axis_label("theta", "{symbol}"))
     leg_panels = (
         (panel_axes[1], moving_legs, walk.length.values, "$L$ [m]"),
@@ -208,7 +214,7 @@ def make_contact_panels(walk: xr.Dataset) -> Figure:
     for axes, drawn_legs, leg_values, panel_label in leg_panels:
         for leg_number in drawn_legs:
             line_color, line_style = line_style_by_leg[leg_number]
-            values_with_gaps = gap_inserter(leg_values[:, leg_number - 1])
+            values_with_gaps = insert_gaps(leg_values[:, leg_number - 1])
             axes.plot(
                 times_with_gaps,
                 values_with_gaps,
@@ -221,7 +227,7 @@ def make_contact_panels(walk: xr.Dataset) -> Figure:
         axes.axhline(0.0, color=DARK_GRAY_COLOR, linewidth=0.4, zorder=0)
     _draw_contact_mode_bars(panel_axes[2], foot_motion, touching_legs)
     panel_axes[5].set_xlabel("time [s]")
-    panel_axes[5].set_xlim(foot_motion.time[0], foot_motion.time[-1])
+    panel_axes[5].set_xlim(foot_motion.sample_times[0], foot_motion.sample_times[-1])
     panel_axes[1].legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
     figure.align_ylabels(panel_axes)
     return figure
@@ -233,14 +239,16 @@ def _draw_contact_mode_bars(
     """Draw the contact modes of each leg as colored bars over time."""
     for bar_row_index, leg_number in enumerate(drawn_legs):
         contact_modes = foot_motion.contact_modes[:, leg_number - 1]
-        change_indices = np.flatnonzero(np.diff(contact_modes) | np.diff(foot_motion.step)) + 1
+        change_indices = (
+            np.flatnonzero(np.diff(contact_modes) | np.diff(foot_motion.step_numbers)) + 1
+        )
         for start_index, end_index in zip(
             np.r_[0, change_indices], np.r_[change_indices, len(contact_modes)], strict=True
         ):
             if contact_modes[start_index] != ContactMode.OFF:
                 bar_start_and_duration = (
-                    foot_motion.time[start_index],
-                    foot_motion.time[end_index - 1] - foot_motion.time[start_index],
+                    foot_motion.sample_times[start_index],
+                    foot_motion.sample_times[end_index - 1] - foot_motion.sample_times[start_index],
                 )
                 axes.broken_barh(
                     [bar_start_and_duration],
@@ -266,7 +274,7 @@ def draw_contact_sticks(axes: Axes, walk: xr.Dataset, stick_interval: float) -> 
     """
     foot_motion = compute_foot_motion(walk)
     sample_indices = np.searchsorted(
-        foot_motion.time, np.arange(0.0, foot_motion.time[-1], stick_interval)
+        foot_motion.sample_times, np.arange(0.0, foot_motion.sample_times[-1], stick_interval)
     )
     is_leg_drawn = foot_motion.contact_modes != ContactMode.OFF
     is_leg_drawn[:, :2] = True

@@ -118,19 +118,21 @@ def scan_figures(scan: xr.Dataset) -> dict[str, Figure]:
                 sobol_indices(scan, measure_names)
             )
         return figures_by_name
-    long_axis_names = [
+    multivalued_axis_names = [
         parameter_name for parameter_name in swept_axes if scan.sizes[parameter_name] > 1
     ] or swept_axes
-    if len(long_axis_names) == 1:
-        return {"scan": draw_measure_curves(scan, long_axis_names[0])}
-    further_axis_names = long_axis_names[2:]
-    if not further_axis_names:
-        return {"scan": draw_scan_slices(scan, long_axis_names[0], long_axis_names[1])}
+    if len(multivalued_axis_names) == 1:
+        return {"scan": draw_measure_curves(scan, multivalued_axis_names[0])}
+    remaining_axis_names = multivalued_axis_names[2:]
+    if not remaining_axis_names:
+        return {
+            "scan": draw_scan_slices(scan, multivalued_axis_names[0], multivalued_axis_names[1])
+        }
     return {
         f"scan_over_{parameter_name}": draw_scan_slices(
-            scan, long_axis_names[0], long_axis_names[1], parameter_name
+            scan, multivalued_axis_names[0], multivalued_axis_names[1], parameter_name
         )
-        for parameter_name in further_axis_names
+        for parameter_name in remaining_axis_names
     }
 
 
@@ -145,17 +147,17 @@ def draw_scan_slices(
     `SHOWN_MEASURE_NAMES`. Every other parameter has the middle one of its values, which the title
     states. Cells without a gait are gray.
     """
-    cut_indices = {
+    slice_indices = {
         n_column_values: scan.sizes[n_column_values] // 2
         for n_column_values in SWEEPABLE_PARAMETERS
         if n_column_values in scan.dims
     }
-    cut_indices = {
+    slice_indices = {
         measure_name: axis_index
-        for measure_name, axis_index in cut_indices.items()
+        for measure_name, axis_index in slice_indices.items()
         if measure_name not in (x, y, column_parameter)
     }
-    scan_slice = scan.isel(cut_indices)
+    scan_slice = scan.isel(slice_indices)
     column_datasets = [scan_slice]
     if column_parameter is not None:
         n_column_values = scan.sizes[column_parameter]
@@ -233,10 +235,10 @@ def draw_scan_slices(
     for axes in panel_axes[:, 0]:
         axes.set_ylabel(format_axis_label(y, "{symbol}"))
     _add_scan_legend(figure, outcome_codes, legend_lines, len(column_datasets))
-    if cut_indices:
+    if slice_indices:
         fixed_values_text = ", ".join(
             format_value_label(n_column_values, scan[n_column_values].values[axis_index])
-            for n_column_values, axis_index in cut_indices.items()
+            for n_column_values, axis_index in slice_indices.items()
         )
         figure.suptitle(f"at {fixed_values_text}", fontsize=9.0)
     return figure
@@ -317,9 +319,9 @@ def draw_parameter_pairs(scan: xr.Dataset, parameter_names: Sequence[str]) -> Fi
         extended_ends = _find_extended_color_bar_ends(
             [drawn_samples[measure_name].values], point_collection.get_clim()
         )
-        all_panels = panel_axes.ravel().tolist()
+        axes_of_all_panels = panel_axes.ravel().tolist()
         color_bar = figure.colorbar(
-            point_collection, ax=all_panels, aspect=40, pad=0.01, extend=extended_ends
+            point_collection, ax=axes_of_all_panels, aspect=40, pad=0.01, extend=extended_ends
         )
         color_bar.set_label(format_axis_label(measure_name, "{name}"))
     _add_scan_legend(figure, np.unique(outcome_codes), {}, 3)
@@ -333,19 +335,19 @@ def _draw_measure_samples(
 
     Samples without a gait are gray.
     """
-    dot_style: dict[str, Any] = {"s": marker_size, "linewidths": 0.0, "rasterized": True}
+    marker_style: dict[str, Any] = {"s": marker_size, "linewidths": 0.0, "rasterized": True}
     has_gait, measure_values = scan.outcome.values == Outcome.STEPPED, scan[measure_name].values
     color_limits = _find_color_limits(
         [measure_values], [_compute_displayed_outcome_codes(scan).values == Outcome.STEPPED]
     )
     x_values, y_values = scan[x].values, scan[y].values
-    axes.scatter(x_values[~has_gait], y_values[~has_gait], color=LIGHT_GRAY_COLOR, **dot_style)
+    axes.scatter(x_values[~has_gait], y_values[~has_gait], color=LIGHT_GRAY_COLOR, **marker_style)
     return axes.scatter(
         x_values[has_gait],
         y_values[has_gait],
         c=measure_values[has_gait],
         norm=_make_color_scale(measure_name, color_limits),
-        **dot_style,
+        **marker_style,
     )
 
 
@@ -390,22 +392,26 @@ def draw_sobol_indices(indices: xr.Dataset) -> Figure:
         axes.set_axis_off()
     for axes, measure_name in zip(panel_axes.ravel(), measure_names, strict=False):
         measure_indices = indices.sel(measure=measure_name)
-        for index_kind, legend_text, bar_shift, bar_color in (
+        for sobol_index_name, legend_text, bar_offset, bar_color in (
             ("first_order", "by itself (first order)", -0.19, OKABE_ITO_BLUE),
             ("total", "with all it meets (total)", 0.19, OKABE_ITO_AMBER),
         ):
-            index_values = measure_indices[index_kind].values
-            lower_ends, upper_ends = (
-                measure_indices[f"{index_kind}_lower"].values,
-                measure_indices[f"{index_kind}_upper"].values,
+            sobol_index_values = measure_indices[sobol_index_name].values
+            lower_interval_ends, upper_interval_ends = (
+                measure_indices[f"{sobol_index_name}_lower"].values,
+                measure_indices[f"{sobol_index_name}_upper"].values,
             )
             interval_lengths = np.maximum(
-                [index_values - lower_ends, upper_ends - index_values], 0.0
+                [
+                    sobol_index_values - lower_interval_ends,
+                    upper_interval_ends - sobol_index_values,
+                ],
+                0.0,
             )
             bar_style = {"height": 0.36, "color": bar_color, "label": legend_text}
             axes.barh(
-                bar_positions + bar_shift,
-                index_values,
+                bar_positions + bar_offset,
+                sobol_index_values,
                 xerr=interval_lengths,
                 error_kw={"elinewidth": 0.7},
                 **bar_style,
@@ -424,9 +430,9 @@ def draw_sobol_indices(indices: xr.Dataset) -> Figure:
         axes.tick_params(labelbottom=True)
     legend_handles, legend_texts = panel_axes[0, 0].get_legend_handles_labels()
     figure.legend(legend_handles, legend_texts, loc="outside lower center", ncols=2)
-    left_out_fraction = 100.0 * indices.attrs["left_out"]
+    omitted_samples_percent = 100.0 * indices.attrs["left_out"]
     omitted_rows_note = (
-        f"{indices.attrs['rows']:,} rows; {left_out_fraction:.1f} % left out, without a gait"
+        f"{indices.attrs['rows']:,} rows; {omitted_samples_percent:.1f} % left out, without a gait"
     )
     figure.suptitle(omitted_rows_note, fontsize=8.0)
     return figure
@@ -449,15 +455,15 @@ def draw_measure_curves(scan: xr.Dataset, x: str) -> Figure:
     figure = Figure(figsize=(COLUMN_FIGURE_WIDTH_INCHES, 1.6 * len(measure_names) + 0.6))
     panel_axes = figure.subplots(len(measure_names), 1, sharex=True, squeeze=False)[:, 0]
     cell_edges = _find_cell_edges(scan[x].values)
-    has_failed = scan.outcome.values != Outcome.STEPPED
+    is_gait_missing = scan.outcome.values != Outcome.STEPPED
     for axes, measure_name in zip(panel_axes, measure_names, strict=True):
         axes.plot(scan[x].values, scan[measure_name].values, marker=".", color=OKABE_ITO_BLUE)
         axes.set_yscale("log" if measure_name in LOGARITHMIC_MEASURE_NAMES else "linear")
         axes.set_ylabel(textwrap.fill(format_axis_label(measure_name, "{name}"), 24))
-        for cell_index in np.flatnonzero(has_failed):
+        for sample_index in np.flatnonzero(is_gait_missing):
             axes.axvspan(
-                cell_edges[cell_index],
-                cell_edges[cell_index + 1],
+                cell_edges[sample_index],
+                cell_edges[sample_index + 1],
                 color=LIGHT_GRAY_COLOR,
                 linewidth=0.0,
                 zorder=0,
@@ -472,7 +478,7 @@ def _list_shown_measures(scan: xr.Dataset) -> list[str]:
 
 
 def _find_color_limits(
-    panel_values: Sequence[np.ndarray], stable_masks: Sequence[np.ndarray]
+    panel_values: Sequence[np.ndarray], is_stable_by_panel: Sequence[np.ndarray]
 ) -> tuple[float, float]:
     """Return the color range for the panels of one measure.
 
@@ -482,7 +488,9 @@ def _find_color_limits(
     finite_values = [
         values_of_panel[np.isfinite(values_of_panel)] for values_of_panel in panel_values
     ]
-    stable_values = [v[s & np.isfinite(v)] for v, s in zip(panel_values, stable_masks, strict=True)]
+    stable_values = [
+        v[s & np.isfinite(v)] for v, s in zip(panel_values, is_stable_by_panel, strict=True)
+    ]
     values_in_range = np.concatenate(
         stable_values if any(map(len, stable_values)) else finite_values
     )
@@ -507,14 +515,14 @@ def _find_extended_color_bar_ends(
     finite_values = np.concatenate(
         [values_of_panel[np.isfinite(values_of_panel)] for values_of_panel in panel_values]
     )
-    is_any_below, is_any_above = (
+    has_values_below, has_values_above = (
         np.any(finite_values < color_limits[0]),
         np.any(finite_values > color_limits[1]),
     )
     return (
-        ("both" if is_any_above else "min")
-        if is_any_below
-        else ("max" if is_any_above else "neither")
+        ("both" if has_values_above else "min")
+        if has_values_below
+        else ("max" if has_values_above else "neither")
     )
 
 
@@ -545,12 +553,12 @@ def _find_cell_edges(sample_positions: np.ndarray) -> np.ndarray:
         return sample_positions[0] + np.array([-0.5, 0.5]) * max(
             abs(sample_positions[0]) * 0.01, 1e-6
         )
-    inner_edges = 0.5 * (sample_positions[1:] + sample_positions[:-1])
-    first_edge, last_edge = (
-        2.0 * sample_positions[0] - inner_edges[0],
-        2.0 * sample_positions[-1] - inner_edges[-1],
+    inner_cell_edges = 0.5 * (sample_positions[1:] + sample_positions[:-1])
+    first_cell_edge, last_cell_edge = (
+        2.0 * sample_positions[0] - inner_cell_edges[0],
+        2.0 * sample_positions[-1] - inner_cell_edges[-1],
     )
-    return np.concatenate([[first_edge], inner_edges, [last_edge]])
+    return np.concatenate([[first_cell_edge], inner_cell_edges, [last_cell_edge]])
 
 
 def _compute_displayed_outcome_codes(scan: xr.Dataset) -> xr.DataArray:
@@ -664,12 +672,14 @@ def map_figure(scan: xr.Dataset, measure: str, curves: Sequence[SpecialPointCurv
     for special_point_curve in curves:
         curve_color, line_style = select_special_point_style(special_point_curve.name)
         is_stable = special_point_curve.dataset.spectral_radius.values < 1.0
-        for is_drawn, line_width in ((is_stable, 1.2), (~is_stable, 0.5)):
+        for is_point_drawn, line_width in ((is_stable, 1.2), (~is_stable, 0.5)):
             # Each piece includes the first point of the next piece. The curve has one legend entry.
-            is_drawn_or_next = is_drawn | np.append(False, is_drawn[:-1])
-            curve_points = np.where(is_drawn_or_next[:, None], special_point_curve.values, np.nan)
+            is_point_or_next_drawn = is_point_drawn | np.append(False, is_point_drawn[:-1])
+            curve_points = np.where(
+                is_point_or_next_drawn[:, None], special_point_curve.values, np.nan
+            )
             legend_text = (
-                legend_texts.pop(special_point_curve.name, None) if is_drawn.any() else None
+                legend_texts.pop(special_point_curve.name, None) if is_point_drawn.any() else None
             )
             line_outline = [Stroke(linewidth=line_width + 1.0, foreground="white"), Normal()]
             axes.plot(

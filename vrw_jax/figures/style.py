@@ -176,11 +176,11 @@ def save(figure: Figure, folder: str | Path, name: str) -> list[Path]:
     check_type("folder", folder, (str, Path), 'give a folder, such as "figures"')
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    paths = [folder / f"{name}.svg", folder / f"{name}.png"]
+    figure_paths = [folder / f"{name}.svg", folder / f"{name}.png"]
     with figure_style():
-        figure.savefig(paths[0], metadata={"Date": None})
-        figure.savefig(paths[1], metadata={"Software": None})
-    return paths
+        figure.savefig(figure_paths[0], metadata={"Date": None})
+        figure.savefig(figure_paths[1], metadata={"Software": None})
+    return figure_paths
 
 
 def require_dataset_variables(
@@ -209,18 +209,20 @@ def require_variables_of_datasets(
     check_type(argument_name, datasets, (list, tuple), f"{remedy_text}, several in a list")
     if not datasets:
         raise ValueError(f"{argument_name} is empty, but something is to be drawn: {remedy_text}.")
-    for dataset_index, dataset in enumerate(datasets):
+    for dataset_index, labeled_dataset in enumerate(datasets):
         require_dataset_variables(
-            f"{argument_name}[{dataset_index}]", dataset, needed_names, remedy_text
+            f"{argument_name}[{dataset_index}]", labeled_dataset, needed_names, remedy_text
         )
 
 
-def typeset_greek_symbols(text: str) -> str:
+def typeset_greek_symbols(symbol_text: str) -> str:
     """Return a text in which symbols such as "λ2⁺" are written as mathtext formulas.
 
     The text font lacks some of these symbols.
     """
-    return re.sub(r"[θλ]\S*", lambda match: f"${format_mathtext(match[0])}$", text)
+    return re.sub(
+        r"[θλ]\S*", lambda symbol_match: f"${format_mathtext(symbol_match[0])}$", symbol_text
+    )
 
 
 def _format_figure_unit(quantity_name: str) -> str:
@@ -292,9 +294,9 @@ def select_special_point_style(special_point_name: str) -> tuple[str, Any]:
                 special_point_names.index(special_point_name)
             ]
     leg_suffix = special_point_name.partition("[")[2]
-    style_index = int(leg_suffix[:-1]) - 3 if leg_suffix else len(special_point_name)
+    line_style_index = int(leg_suffix[:-1]) - 3 if leg_suffix else len(special_point_name)
     return OKABE_ITO_SKY_BLUE, SPECIAL_POINT_LINE_STYLES[
-        style_index % len(SPECIAL_POINT_LINE_STYLES)
+        line_style_index % len(SPECIAL_POINT_LINE_STYLES)
     ]
 
 
@@ -317,21 +319,25 @@ def draw_outcome_cells(
     x: np.ndarray,
     y: np.ndarray,
     outcome_codes: np.ndarray,
-    drawn_codes: Sequence[int] | np.ndarray,
+    drawn_outcome_codes: Sequence[int] | np.ndarray,
 ) -> None:
     """Draw cells over (x, y) in the colors of their outcomes.
 
-    Cells with codes that are not in `drawn_codes` are omitted.
+    Cells with codes that are not in `drawn_outcome_codes` are omitted.
     """
     outcome_color_map = ListedColormap(
-        [select_outcome_style(int(drawn_code))[1] for drawn_code in drawn_codes]
+        [
+            select_outcome_style(int(drawn_outcome_code))[1]
+            for drawn_outcome_code in drawn_outcome_codes
+        ]
     )
     code_indices = np.ma.masked_where(
-        ~np.isin(outcome_codes, drawn_codes), np.searchsorted(drawn_codes, outcome_codes)
+        ~np.isin(outcome_codes, drawn_outcome_codes),
+        np.searchsorted(drawn_outcome_codes, outcome_codes),
     )
     outcome_color_norm = (
-        BoundaryNorm(np.arange(len(drawn_codes) + 1) - 0.5, len(drawn_codes))
-        if len(drawn_codes) > 1
+        BoundaryNorm(np.arange(len(drawn_outcome_codes) + 1) - 0.5, len(drawn_outcome_codes))
+        if len(drawn_outcome_codes) > 1
         else None
     )
     axes.pcolormesh(

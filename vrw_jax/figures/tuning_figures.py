@@ -66,7 +66,7 @@ def _draw_objective_path(axes: Axes, path_dataset: xr.Dataset) -> None:
         path_dataset.objective.values,
     )
     is_gait_lost = np.isin(path_dataset.kind.values, (TrialKind.LOST, TrialKind.NOT_FINITE))
-    keeps_constraints = (
+    are_constraints_satisfied = (
         path_dataset.breach.values <= DEFAULT_MAXIMIZATION_OPTIONS.active_bound_tolerance
     )
     axes.plot(
@@ -80,7 +80,7 @@ def _draw_objective_path(axes: Axes, path_dataset: xr.Dataset) -> None:
         (True, OKABE_ITO_BLUE, "keeps the constraints"),
         (False, "white", "breaks one"),
     ):
-        is_marker_drawn = ~is_gait_lost & (keeps_constraints == is_feasible)
+        is_marker_drawn = ~is_gait_lost & (are_constraints_satisfied == is_feasible)
         draw_markers(
             axes,
             evaluation_numbers[is_marker_drawn],
@@ -92,9 +92,9 @@ def _draw_objective_path(axes: Axes, path_dataset: xr.Dataset) -> None:
             label=marker_text,
         )
     if is_gait_lost.any():
-        for evaluation_index, evaluation_number in enumerate(evaluation_numbers[is_gait_lost]):
+        for lost_gait_index, evaluation_number in enumerate(evaluation_numbers[is_gait_lost]):
             legend_text = (
-                "gait or finite value lost, step shortened" if evaluation_index == 0 else None
+                "gait or finite value lost, step shortened" if lost_gait_index == 0 else None
             )
             axes.axvline(
                 evaluation_number,
@@ -151,20 +151,20 @@ def _draw_constraint_slacks(axes: Axes, tune_result: TuneResult) -> None:
         )
     )
     with np.errstate(invalid="ignore"):
-        slack_scale = np.maximum(
+        slack_units = np.maximum(
             np.nanmax(np.abs(constraint_values - min_constraint_values), axis=0), 1e-12
         )
     bar_positions = np.arange(len(constraint_names))[::-1]
     active_names = {active_constraint.name for active_constraint in tune_result.active}
     for slack_fraction, vertical_offset, bar_color, legend_text in (
         (
-            (constraint_values[0] - min_constraint_values) / slack_scale,
+            (constraint_values[0] - min_constraint_values) / slack_units,
             0.19,
             LIGHT_GRAY_COLOR,
             "at the start",
         ),
         (
-            (constraint_values[tuned_index] - min_constraint_values) / slack_scale,
+            (constraint_values[tuned_index] - min_constraint_values) / slack_units,
             -0.19,
             OKABE_ITO_BLUE,
             "tuned",

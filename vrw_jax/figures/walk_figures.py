@@ -72,8 +72,8 @@ def find_phase_spans(gait: xr.Dataset) -> list[tuple[float, float, int]]:
     """Return the start time (s), the end time (s) and the phase code for every phase of a
     trajectory.
     """
-    step_and_phase = 3 * gait.step.values + gait.phase.values
-    change_indices = np.flatnonzero(np.diff(step_and_phase)) + 1
+    step_phase_codes = 3 * gait.step.values + gait.phase.values
+    change_indices = np.flatnonzero(np.diff(step_phase_codes)) + 1
     times_by_phase = np.split(gait.time.values, change_indices)
     phase_codes = gait.phase.values[np.r_[0, change_indices]]
     return [
@@ -118,7 +118,7 @@ def gait_panels(gait: xr.Dataset) -> Figure:
     times_with_gaps, theta, L1, L2, rear_foot_height, *ground_forces = insert_landing_gaps(
         gait, "theta", "L1", "L2", "foot_2_z", *GROUND_FORCE_NAMES
     )
-    load_share = 100.0 * ground_forces[3] / (ground_forces[1] + ground_forces[3])
+    rear_load_percent = 100.0 * ground_forces[3] / (ground_forces[1] + ground_forces[3])
     figure = Figure(figsize=(0.8 * PAGE_FIGURE_WIDTH_INCHES, 7.4))
     panel_axes = figure.subplots(5, 1, sharex=True, height_ratios=[1, 1, 1, 1, 1.5])
     for axes, panel_letter in zip(panel_axes, "abcde", strict=True):
@@ -149,9 +149,11 @@ def gait_panels(gait: xr.Dataset) -> Figure:
     panel_axes[1].plot(times_with_gaps, L1, color=LEG_1_COLOR, label="Leg 1, $L_1$")
     panel_axes[1].plot(times_with_gaps, L2, color=LEG_2_COLOR, linestyle="--", label="Leg 2, $L_2$")
     panel_axes[1].set_ylabel("$L_1,\\ L_2$ [m]")
-    panel_axes[2].plot(times_with_gaps, 100.0 - load_share, color=LEG_1_COLOR, label="foot 1")
     panel_axes[2].plot(
-        times_with_gaps, load_share, color=LEG_2_COLOR, linestyle="--", label="foot 2"
+        times_with_gaps, 100.0 - rear_load_percent, color=LEG_1_COLOR, label="foot 1"
+    )
+    panel_axes[2].plot(
+        times_with_gaps, rear_load_percent, color=LEG_2_COLOR, linestyle="--", label="foot 2"
     )
     panel_axes[2].set_ylabel("share of the\nnormal force [%]")
     panel_axes[3].plot(times_with_gaps, rear_foot_height, color=LEG_2_COLOR, linestyle="--")
@@ -200,8 +202,8 @@ def sticks(gait: xr.Dataset, interval: float = 0.05) -> Figure:
     check_positive("interval", interval)
     figure = Figure(figsize=(PAGE_FIGURE_WIDTH_INCHES, 2.8))
     axes = figure.subplots()
-    stick_drawer = draw_contact_sticks if reports_contact_modes(gait) else _draw_phase_sticks
-    stick_drawer(axes, gait, interval)
+    draw_sticks = draw_contact_sticks if reports_contact_modes(gait) else _draw_phase_sticks
+    draw_sticks(axes, gait, interval)
     axes.plot(gait.hub_x, gait.hub_z, color=LEG_2_COLOR, linewidth=1.0)
     axes.axhline(0.0, color="black", linewidth=0.8, zorder=1)
     last_hub_x = float(gait.hub_x[-1])
@@ -473,10 +475,10 @@ def walk_frames(
     _require_nonempty_walk("step", step)
     n_frames, slow = check_int("n_frames", n_frames), check_positive("slow", slow)
     ground_slope, foot_motion = step.attrs["parameter_slope"], compute_foot_motion(step)
-    walk_duration = foot_motion.time[-1]
+    walk_duration = foot_motion.sample_times[-1]
     hub_distance = float(foot_motion.hub_positions[-1, 0] - foot_motion.hub_positions[0, 0])
     hub_distance_per_step = hub_distance / max(
-        int(foot_motion.step[-1] - foot_motion.step[0]) + 1, 1
+        int(foot_motion.step_numbers[-1] - foot_motion.step_numbers[0]) + 1, 1
     )
     frame_images = []
     for t in np.linspace(0.0, walk_duration, n_frames, endpoint=False):
@@ -513,27 +515,27 @@ def _draw_wheel_at_time(
     Return the index of the sample whose contact modes are drawn.
     """
     hub_position, foot_positions, sample_index = foot_motion.interpolate_at_time(time)
-    view_rotation = lambda slope_points: np.array(
+    rotate_to_view = lambda slope_points: np.array(
         _rotate_to_gravity_frame(slope_points[..., 0], slope_points[..., 1], slope)
     )
     for leg_number, foot_position in enumerate(foot_positions, 1):
         axes.plot(
-            *view_rotation(np.stack([hub_position, foot_position])),
+            *rotate_to_view(np.stack([hub_position, foot_position])),
             color=select_leg_color(leg_number),
             linewidth=3.0 if leg_number < 3 else 1.5,
             solid_capstyle="round",
             zorder=5 if leg_number < 3 else 3,
         )
-    axes.plot(*view_rotation(hub_position), "o", color="black", markersize=9, zorder=6)
-    draw_feet(axes, view_rotation(foot_positions), foot_motion.contact_modes[sample_index], 6.0)
+    axes.plot(*rotate_to_view(hub_position), "o", color="black", markersize=9, zorder=6)
+    draw_feet(axes, rotate_to_view(foot_positions), foot_motion.contact_modes[sample_index], 6.0)
     for foot_position, foot_force in zip(
         foot_positions, foot_motion.foot_forces[sample_index], strict=True
     ):
         if foot_force[1] != 0.0:
             axes.annotate(
                 "",
-                tuple(view_rotation(foot_position + foot_force / 300.0)),
-                tuple(view_rotation(foot_position)),
+                tuple(rotate_to_view(foot_position + foot_force / 300.0)),
+                tuple(rotate_to_view(foot_position)),
                 zorder=7,
                 arrowprops={"arrowstyle": "-|>", "linewidth": 1.2, "color": "black"},
             )
@@ -541,7 +543,7 @@ def _draw_wheel_at_time(
 
 
 def _draw_ground_with_marks(
-    axes: Axes, slope: float, camera_position: float, stride: float
+    axes: Axes, slope: float, camera_position: float, mark_period: float
 ) -> None:
     """Draw the sloping ground with two marks per step, so that the animation loops without a
     jump.
@@ -552,10 +554,10 @@ def _draw_ground_with_marks(
         color="black",
         linewidth=1.2,
     )
-    mark_spacing = 0.5 * stride
-    first_mark = np.ceil((camera_position - 2.0) / mark_spacing)
+    mark_spacing = 0.5 * mark_period
+    first_mark_number = np.ceil((camera_position - 2.0) / mark_spacing)
     for mark_number in range(int(4.0 / mark_spacing)):
-        x = np.array([0.0, -0.06]) + (first_mark + mark_number) * mark_spacing
+        x = np.array([0.0, -0.06]) + (first_mark_number + mark_number) * mark_spacing
         axes.plot(
             *_rotate_to_gravity_frame(x, np.array([0.0, -0.06]), slope),
             color="black",
@@ -591,7 +593,8 @@ def save_animation(frames: Sequence[Image.Image], milliseconds: int, path: str |
     path.parent.mkdir(parents=True, exist_ok=True)
     shared_palette = frames[0].quantize(32)
     paletted_frames = [
-        frame.quantize(palette=shared_palette, dither=Image.Dither.NONE) for frame in frames
+        frame_image.quantize(palette=shared_palette, dither=Image.Dither.NONE)
+        for frame_image in frames
     ]
     paletted_frames[0].save(
         path,
