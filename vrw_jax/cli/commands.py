@@ -69,16 +69,15 @@ def main() -> None:
 def _handle_first_interrupt(_signal: int, _frame: object) -> None:
     """End the command in the regular way after the first Ctrl-C.
 
-    This function also installs the handler for a second Ctrl-C.
+    A second Ctrl-C ends the process immediately.
     """
-    signal.signal(signal.SIGINT, _handle_second_interrupt)
+
+    def end_process(_signal: int, _frame: object) -> None:
+        os.write(2, b"vrw: stopped at once; run the same to go on.\n")
+        os._exit(ExitCode.INTERRUPTED)
+
+    signal.signal(signal.SIGINT, end_process)
     raise KeyboardInterrupt
-
-
-def _handle_second_interrupt(_signal: int, _frame: object) -> None:
-    """End the process immediately after a second Ctrl-C."""
-    os.write(2, b"vrw: stopped at once; run the same to go on.\n")
-    os._exit(ExitCode.INTERRUPTED)
 
 
 def _print_version_and_exit(is_version_requested: bool) -> None:
@@ -434,11 +433,11 @@ def run_robustness_command(
             with show_computation_stages(
                 "walking over random slopes (the first time compiles for a while)"
             ):
-                passage_result = first_passage(params, slope_sd, model=wheel_model)
+                first_passage_result = first_passage(params, slope_sd, model=wheel_model)
                 sensitivity_result = gait_sensitivity(
                     params, SENSITIVITY_NORM_MEASURES, model=wheel_model
                 )
-            print(passage_result)
+            print(first_passage_result)
             print(sensitivity_result)
             return
     run_scan_command(config, folder, picture=picture)

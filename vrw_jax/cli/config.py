@@ -376,12 +376,12 @@ def _parse_config_tables(
 ) -> Config:
     """Validate the parsed tables of a file. Raise a ValueError if a table is invalid."""
     _require_known_keys(config_tables, CONFIG_TABLE_NAMES, "the file", "tables")
-    for table_key, config_table in config_tables.items():
+    for table_name, config_table in config_tables.items():
         if not isinstance(config_table, dict):
             requirement_text = (
-                f"a table: write [{table_key}] on a line of its own and its settings below"
+                f"a table: write [{table_name}] on a line of its own and its settings below"
             )
-            raise _make_value_error(f"[{table_key}]", config_table, requirement_text)
+            raise _make_value_error(f"[{table_name}]", config_table, requirement_text)
     design_kinds = [
         design_kind for design_kind in DESIGN_TABLE_NAMES if design_kind in config_tables
     ]
@@ -401,21 +401,21 @@ def _parse_config_tables(
         else None
     )
     wheel_values = _parse_wheel_table(_get_config_table(config_tables, "wheel"))
-    doubly_given_names = [
-        table_key
-        for table_key in _get_config_table(config_tables, "wheel")
-        if sample_design is not None and table_key in sample_design.swept_parameters
+    duplicate_parameter_names = [
+        parameter_name
+        for parameter_name in _get_config_table(config_tables, "wheel")
+        if sample_design is not None and parameter_name in sample_design.swept_parameters
     ]
-    if doubly_given_names:
+    if duplicate_parameter_names:
         raise ValueError(
-            f"{doubly_given_names[0]} is fixed in [wheel] and swept in [{design_kinds[0]}], but it "
-            "can only be one: drop one of the two."
+            f"{duplicate_parameter_names[0]} is fixed in [wheel] and swept in "
+            f"[{design_kinds[0]}], but it can only be one: drop one of the two."
         )
     options_table = _get_config_table(config_tables, "options")
     _raise_for_renamed_keys(options_table, "[options]")
     _require_known_keys(options_table, _STEP_OPTION_KEYS, "[options]", "options")
     default_options = {
-        table_key: getattr(StepOptions(), table_key) for table_key in _STEP_OPTION_KEYS
+        option_name: getattr(StepOptions(), option_name) for option_name in _STEP_OPTION_KEYS
     }
     option_values = _parse_with_default_types(options_table, default_options)
     checked_config = Config(
@@ -457,7 +457,7 @@ def _get_config_table(config_tables: Mapping[str, object], table_name: str) -> d
 def parse_assignment(assignment_text: str) -> tuple[str, float | int]:
     """Return the parameter name and the number in a text such as "damping=150"."""
     parameter_name, equals_separator, value_text = (
-        text_part.strip() for text_part in assignment_text.partition("=")
+        assignment_part.strip() for assignment_part in assignment_text.partition("=")
     )
     if not equals_separator:
         raise ValueError(
@@ -519,26 +519,27 @@ def _parse_with_default_types(
     """Return the settings, converted to the types of their default values. Numbers must be
     positive.
     """
-    parsed_values: dict[str, float | int | str | bool] = {}
+    parsed_settings: dict[str, float | int | str | bool] = {}
     for setting_name, given_value in config_table.items():
         default_value = default_values[setting_name]
         if isinstance(default_value, bool):
             if not isinstance(given_value, bool):
                 raise _make_value_error(setting_name, given_value, "true or false")
-            parsed_values[setting_name] = given_value
+            parsed_settings[setting_name] = given_value
         elif isinstance(default_value, str):
             if not isinstance(given_value, str):
                 raise _make_value_error(setting_name, given_value, f'a name, "{default_value}"')
-            parsed_values[setting_name] = given_value
+            parsed_settings[setting_name] = given_value
         elif isinstance(default_value, int):
-            parsed_values[setting_name] = _parse_whole_number(given_value, setting_name, 1)
+            parsed_settings[setting_name] = _parse_whole_number(given_value, setting_name, 1)
         elif setting_name == FRICTION_NAME and given_value == math.inf:
-            parsed_values[setting_name] = math.inf  # Infinite friction means that feet do not slip.
+            # Infinite friction means that feet do not slip.
+            parsed_settings[setting_name] = math.inf
         else:
-            parsed_values[setting_name] = _parse_finite_number(
+            parsed_settings[setting_name] = _parse_finite_number(
                 given_value, setting_name, must_be_positive=True
             )
-    return parsed_values
+    return parsed_settings
 
 
 def _parse_design_table(
@@ -609,7 +610,7 @@ def _parse_grid_axis(parameter_name: str, axis_setting: object) -> np.ndarray:
             f"the axis of {parameter_name} has no '{missing_keys[0]}': "
             f"write {parameter_name} = {{ from = ..., to = ..., count = ... }}."
         )
-    first_value, last_value = (
+    first_axis_value, last_axis_value = (
         _parse_parameter_value(parameter_name, axis_setting[axis_key])
         for axis_key in ("from", "to")
     )
@@ -620,7 +621,7 @@ def _parse_grid_axis(parameter_name: str, axis_setting: object) -> np.ndarray:
             f"{MAX_LISTED_SAMPLES:,} is the most: "
             "give fewer."
         )
-    return np.linspace(first_value, last_value, n_axis_values)
+    return np.linspace(first_axis_value, last_axis_value, n_axis_values)
 
 
 def _parse_value_list(
@@ -702,12 +703,12 @@ def _require_known_keys(
 ) -> None:
     """Raise a ValueError if a table contains a key that is not allowed."""
     allowed_keys = tuple(allowed_keys)
-    for key in config_table:
-        raise_for_parameter_symbol(key, allowed_keys)
-        if key not in allowed_keys:
+    for given_key in config_table:
+        raise_for_parameter_symbol(given_key, allowed_keys)
+        if given_key not in allowed_keys:
             raise ValueError(
                 f"{table_location} has the unknown key "
-                f"'{key}'{format_name_suggestion(key, allowed_keys)}: "
+                f"'{given_key}'{format_name_suggestion(given_key, allowed_keys)}: "
                 f"its {key_kind} are {', '.join(allowed_keys)}."
             )
 

@@ -149,8 +149,8 @@ def show_computation_stages(first_stage_name: str) -> Iterator[Callable[[str], N
 
 def print_written_paths(paths: Iterable[Path]) -> None:
     """Print the paths of written files."""
-    for path in paths:
-        stdout_console.print(f"written: {path}", highlight=False, soft_wrap=True)
+    for written_path in paths:
+        stdout_console.print(f"written: {written_path}", highlight=False, soft_wrap=True)
 
 
 def print_text_table(
@@ -171,10 +171,10 @@ def print_text_table(
         rich_table.add_column(
             column_heading, justify="right" if column_heading in right_aligned_headings else "left"
         )
-    for text_row in text_rows:
+    for table_row_cells in text_rows:
         encodable_texts = [
             replace_unencodable_characters(cell_text, stdout_console.encoding)
-            for cell_text in text_row
+            for cell_text in table_row_cells
         ]
         cell_texts = [
             cell_text if column_heading == "" else escape(cell_text)
@@ -229,7 +229,7 @@ def make_progress_bar(task_name: str) -> "Bar":
 
 
 def make_scan_progress_reporter(
-    update_bar: Callable, progress_task: int
+    update_progress_bar: Callable, progress_task: int
 ) -> Callable[["ScanProgress"], None]:
     """Return a function that shows the progress of a scan.
 
@@ -257,12 +257,12 @@ def make_scan_progress_reporter(
                 samples_per_second = (n_samples_done - n_samples_at_first_report) / (
                     present_seconds - first_report_seconds
                 )
-                seconds_left = (scan_progress.n_samples - n_samples_done) / samples_per_second
+                remaining_seconds = (scan_progress.n_samples - n_samples_done) / samples_per_second
                 bar_note = (
                     f"{samples_per_second:,.0f} per s, {bar_note}, "
-                    f"{format_duration(seconds_left)} left"
+                    f"{format_duration(remaining_seconds)} left"
                 )
-        update_bar(
+        update_progress_bar(
             progress_task,
             total=scan_progress.n_reused + scan_progress.n_samples,
             completed=scan_progress.n_reused + n_samples_done,
@@ -322,11 +322,12 @@ def print_wheel_and_gait(
     )
     step_outcome = Outcome(int(step_result.outcome))
     if step_outcome == Outcome.STEPPED:
-        state_change = float(
+        last_state_change = float(
             np.abs(np.asarray(step_result.section_state) - np.asarray(start_state)).max()
         )
         stdout_console.print(
-            f"Walked {n_walked} steps; the last changed the section state by {state_change:.1e}."
+            f"Walked {n_walked} steps; the last changed the section state by "
+            f"{last_state_change:.1e}."
         )
         from vrw_jax.measures import MARGIN_MEASURES
 

@@ -27,10 +27,10 @@ def replace_unencodable_output() -> None:
             output_stream.reconfigure(errors=ENCODING_ERROR_HANDLER_NAME)
 
 
-def replace_unencodable_characters(text: str, encoding_name: str) -> str:
+def replace_unencodable_characters(printed_text: str, encoding_name: str) -> str:
     """Return a text in which all characters that the encoding lacks are replaced."""
     codecs.register_error(ENCODING_ERROR_HANDLER_NAME, _handle_encoding_error)
-    return text.encode(encoding_name, ENCODING_ERROR_HANDLER_NAME).decode(encoding_name)
+    return printed_text.encode(encoding_name, ENCODING_ERROR_HANDLER_NAME).decode(encoding_name)
 
 
 def _handle_encoding_error(encoding_error: UnicodeError) -> tuple[str, int]:
@@ -42,11 +42,11 @@ def _handle_encoding_error(encoding_error: UnicodeError) -> tuple[str, int]:
     ), encoding_error.end
 
 
-def _replace_with_ascii(character: str) -> str:
+def _replace_with_ascii(unencodable_character: str) -> str:
     """Return an ASCII text for a character: its replacement, or replacements of its components."""
-    if character.isascii() or character in ASCII_REPLACEMENTS:
-        return ASCII_REPLACEMENTS.get(character, character)
-    decomposed_characters = unicodedata.normalize("NFKD", character)
-    if decomposed_characters == character:
-        return "" if unicodedata.combining(character) else "?"
+    if unencodable_character.isascii() or unencodable_character in ASCII_REPLACEMENTS:
+        return ASCII_REPLACEMENTS.get(unencodable_character, unencodable_character)
+    decomposed_characters = unicodedata.normalize("NFKD", unencodable_character)
+    if decomposed_characters == unencodable_character:
+        return "" if unicodedata.combining(unencodable_character) else "?"
     return "".join(map(_replace_with_ascii, decomposed_characters))

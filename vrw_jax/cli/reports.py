@@ -60,8 +60,21 @@ def write_branch_report(branch: Branch, folder: Path, draws_figure: bool = True)
     """Write the data, table, summary and figure for a branch into `folder`, and return the
     paths.
     """
+    csv_buffer = io.StringIO(newline="")
+    csv_writer = csv.writer(csv_buffer)
+    csv_writer.writerow([branch.parameter, "kind", "name", "ends_branch", "spectral_radius"])
+    for special_point in branch.special_points:
+        csv_writer.writerow(
+            [
+                f"{special_point.value:.12g}",
+                special_point.kind,
+                special_point.name,
+                special_point.ends_branch,
+                f"{special_point.point.spectral_radius:.9g}",
+            ]
+        )
     text_by_file_name = {
-        "borders.csv": _format_special_points_csv(branch),
+        "borders.csv": csv_buffer.getvalue(),
         "summary.md": format_branch_summary(branch),
     }
     written_paths = _write_dataset_and_texts(
@@ -115,7 +128,7 @@ def _write_dataset_and_texts(
 
 def format_tuning_summary(tune_result: TuneResult) -> str:
     """Return a Markdown summary of a tuning run."""
-    active_rows = [
+    active_constraint_rows = [
         (
             active_constraint.name,
             get_measure(active_constraint.name).format_with_unit(active_constraint.limit),
@@ -124,19 +137,19 @@ def format_tuning_summary(tune_result: TuneResult) -> str:
         for active_constraint in tune_result.active
     ]
     parameter_rows = [
-        (label_or_parameter, f"{float(tune_result.path[label_or_parameter][0]):.6g}",
-        f"{float(getattr(tune_result.params, label_or_parameter)):.6g}",
-         MEASURES[label_or_parameter].display_unit)
-        for label_or_parameter in tune_result.path.attrs["free"].split()
+        (parameter_name, f"{float(tune_result.path[parameter_name][0]):.6g}",
+        f"{float(getattr(tune_result.params, parameter_name)):.6g}",
+         MEASURES[parameter_name].display_unit)
+        for parameter_name in tune_result.path.attrs["free"].split()
     ]  # fmt: skip
     return "\n".join([
         f"# Tuned: {tune_result.objective}",
         "",
-        *(f"- **{label_or_parameter}**: {described_text}" for label_or_parameter,
+        *(f"- **{summary_label}**: {described_text}" for summary_label,
         described_text in tune_result.describe().items()),
         "",
         *format_markdown_table(("held by", "limit", "objective gained per unit given up"),
-                     active_rows or [("nothing", "", "")]),
+                     active_constraint_rows or [("nothing", "", "")]),
         "",
         f"First-order condition met to {tune_result.kkt_residual:.1e} of the objective's gradient.",
         "",
@@ -145,29 +158,10 @@ def format_tuning_summary(tune_result: TuneResult) -> str:
     ])  # fmt: skip
 
 
-def _format_special_points_csv(branch: Branch) -> str:
-    """Return a CSV table of the special points on a branch."""
-    csv_buffer = io.StringIO(newline="")
-    csv_writer = csv.writer(csv_buffer)
-    csv_writer.writerow([branch.parameter, "kind", "name", "ends_branch", "spectral_radius"])
-    for special_point in branch.special_points:
-        spectral_radius = f"{special_point.point.spectral_radius:.9g}"
-        csv_writer.writerow(
-            [
-                f"{special_point.value:.12g}",
-                special_point.kind,
-                special_point.name,
-                special_point.ends_branch,
-                spectral_radius,
-            ]
-        )
-    return csv_buffer.getvalue()
-
-
 def format_branch_summary(branch: Branch) -> str:
     """Return a Markdown summary of a branch."""
-    first_line, *_ = str(branch).split("\n")
-    summary_lines = [f"# Branch along {branch.parameter}", "", first_line, ""]
+    heading_line, *_ = str(branch).split("\n")
+    summary_lines = [f"# Branch along {branch.parameter}", "", heading_line, ""]
     if not branch.values.size:
         return "\n".join(summary_lines)
     spectral_radius, dls_fraction = (
