@@ -61,8 +61,8 @@ def replace_wheel_parameter(
     params: WheelParams, parameter_name: str, parameter_value: float
 ) -> WheelParams:
     """Return the wheel with a new value of one parameter."""
-    replaced_fields: dict[str, Any] = {parameter_name: parameter_value}
-    return dataclasses.replace(params, **replaced_fields)
+    value_by_parameter: dict[str, Any] = {parameter_name: parameter_value}
+    return dataclasses.replace(params, **value_by_parameter)
 
 
 def walk_into_gait(
@@ -120,7 +120,15 @@ def walk_along_parameter(
     settled_values: list[float] = []
     settled_states: list[np.ndarray] = []
     for parameter_value in parameter_values:
-        start_state = _extrapolate_start_state(settled_values, settled_states, parameter_value, x)
+        start_state = jnp.asarray(settled_states[-1]) if settled_states else x
+        if len(settled_states) > 1:
+            extrapolation_factor = (parameter_value - settled_values[-1]) / (
+                settled_values[-1] - settled_values[-2]
+            )
+            start_state = jnp.asarray(
+                settled_states[-1]
+                + extrapolation_factor * (settled_states[-1] - settled_states[-2])
+            )
         gait_walk = walk_into_gait(
             replace_wheel_parameter(params, parameter_name, parameter_value), start_state
         )
@@ -144,7 +152,7 @@ def measure_gaits_along_parameter(
 
     - `on_progress`: function that is called with the completed fraction of the work.
     """
-    measures_by_value: list[dict[str, np.ndarray]] = []
+    measures_of_gaits: list[dict[str, np.ndarray]] = []
     for parameter_value, gait_walk in zip(
         parameter_values,
         walk_along_parameter(params, parameter_name, parameter_values, x),
@@ -165,38 +173,17 @@ def measure_gaits_along_parameter(
         gait_measures["section_state"] = last_state
         gait_measures["change"] = np.asarray(gait_walk.attrs["last_change"])
         gait_measures["settled"] = np.asarray(bool(gait_walk.settled))
-        measures_by_value.append(gait_measures)
+        measures_of_gaits.append(gait_measures)
         if on_progress is not None:
-            on_progress(len(measures_by_value) / len(parameter_values))
+            on_progress(len(measures_of_gaits) / len(parameter_values))
     return _make_gait_dataset(
         params,
         parameter_name,
         parameter_values,
         {
-            measure_name: np.stack([r[measure_name] for r in measures_by_value])
-            for measure_name in measures_by_value[0]
+            measure_name: np.stack([r[measure_name] for r in measures_of_gaits])
+            for measure_name in measures_of_gaits[0]
         },
-    )
-
-
-def _extrapolate_start_state(
-    settled_values: list[float],
-    settled_states: list[np.ndarray],
-    parameter_value: float,
-    x: SectionState,
-) -> SectionState:
-    """Return a start for a parameter value, extrapolated linearly from the last two settled
-    gaits.
-    """
-    if not settled_states:
-        return x
-    if len(settled_states) == 1:
-        return jnp.asarray(settled_states[0])
-    extrapolation_factor = (parameter_value - settled_values[-1]) / (
-        settled_values[-1] - settled_values[-2]
-    )
-    return jnp.asarray(
-        settled_states[-1] + extrapolation_factor * (settled_states[-1] - settled_states[-2])
     )
 
 
@@ -214,14 +201,14 @@ def _make_gait_dataset(
         },
         parameter_name,
     )
-    change_attributes = {"units": "1", "long_name": "largest change of the last five steps"}
+    state_change_attributes = {"units": "1", "long_name": "largest change of the last five steps"}
     dataset_variables |= {
         "section_state": xr.Variable(
             (parameter_name, "component"),
             measure_columns["section_state"],
             {"long_name": "section state"},
         ),
-        "change": xr.Variable(parameter_name, measure_columns["change"], change_attributes),
+        "change": xr.Variable(parameter_name, measure_columns["change"], state_change_attributes),
         "settled": xr.Variable(
             parameter_name,
             measure_columns["settled"],

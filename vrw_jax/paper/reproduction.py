@@ -145,24 +145,24 @@ def collect_paper_evidence(
     )
 
 
-def write_paper_figures(evidence: PaperEvidence, folder: Path) -> list[Path]:
+def write_paper_figures(paper_evidence: PaperEvidence, folder: Path) -> list[Path]:
     """Write Figs 6 to 10 as SVG and PNG files, and the walk as a GIF file, and return the paths."""
-    two_step_trajectory = evidence.table_1_trajectory.isel(
-        time=evidence.table_1_trajectory.step.values < 2
+    two_step_trajectory = paper_evidence.table_1_trajectory.isel(
+        time=paper_evidence.table_1_trajectory.step.values < 2
     )
     figure_by_name = {
-        "fig06_gait": plots.gait_panels(evidence.table_1_trajectory),
+        "fig06_gait": plots.gait_panels(paper_evidence.table_1_trajectory),
         "fig07_sticks": plots.sticks(two_step_trajectory),
-        "fig08_scuffing": plots.foot_height(evidence.gaits_by_damping),
-        "fig09_rear_force": plots.rear_force(evidence.gaits_by_damping),
-        "fig10_indicators": plots.indicators(evidence.damping_branch),
+        "fig08_scuffing": plots.foot_height(paper_evidence.gaits_by_damping),
+        "fig09_rear_force": plots.rear_force(paper_evidence.gaits_by_damping),
+        "fig10_indicators": plots.indicators(paper_evidence.damping_branch),
     }
     figure_paths = [
-        path
+        figure_path
         for figure_name, figure in figure_by_name.items()
-        for path in plots.save(figure, folder, figure_name)
+        for figure_path in plots.save(figure, folder, figure_name)
     ]
-    frame_images, milliseconds = plots.walk_frames(evidence.gaits_by_damping[-1])
+    frame_images, milliseconds = plots.walk_frames(paper_evidence.gaits_by_damping[-1])
     return [*figure_paths, plots.save_animation(frame_images, milliseconds, folder / "walk.gif")]
 
 
@@ -178,13 +178,13 @@ def reproduce_paper(
       task.
     """
     folder = Path(folder)
-    evidence = collect_paper_evidence(on_progress)
+    paper_evidence = collect_paper_evidence(on_progress)
     on_progress(0.8, "figures")
-    write_paper_figures(evidence, folder)
+    write_paper_figures(paper_evidence, folder)
     on_progress(0.98, "table of facts")
-    paper_facts = facts.compute_paper_facts(evidence)
+    paper_facts = facts.compute_paper_facts(paper_evidence)
     facts.write_facts_files(paper_facts, folder)
-    indicator_table = evidence.damping_branch.drop_dims(["leg", "component"]).to_dataframe()
+    indicator_table = paper_evidence.damping_branch.drop_dims(["leg", "component"]).to_dataframe()
     indicator_table.to_csv(folder / "indicators.csv", float_format="%.10g")
     on_progress(1.0, "done")
     return paper_facts

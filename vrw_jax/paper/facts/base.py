@@ -85,8 +85,8 @@ class PaperClaim:
     claim: str
     source: str
     published_value: str
-    computed: str  # format string of the numbers of the group
-    holds: Callable[[Any], bool]  # takes the numbers of the group as attributes
+    computed_value_format: str  # format string of the numbers of the group
+    agreement_test: Callable[[Any], bool]  # takes the numbers of the group as attributes
     tolerance_reason: str = LAST_DIGIT_TOLERANCE_REASON
 
 
@@ -94,25 +94,25 @@ class PaperClaim:
 class PaperClaimGroup:
     """Claims under one heading that are computed from the same values."""
 
-    title: str
+    group_title: str
     number_function: Callable[[PaperEvidence], ClaimNumbers]
     claims: tuple[PaperClaim, ...]
 
-    def make_facts(self, evidence: PaperEvidence) -> list[PaperFact]:
+    def make_facts(self, paper_evidence: PaperEvidence) -> list[PaperFact]:
         """Return the facts for the group's claims, computed from the evidence."""
-        numbers_by_name = self.number_function(evidence)
+        numbers_by_name = self.number_function(paper_evidence)
         number_namespace = SimpleNamespace(**numbers_by_name)
         return [
             PaperFact(
-                group=self.title,
-                claim=c.claim,
-                source=c.source,
-                published_value=c.published_value,
-                computed=c.computed.format(**numbers_by_name),
-                holds=bool(c.holds(number_namespace)),
-                tolerance_reason=c.tolerance_reason,
+                group=self.group_title,
+                claim=paper_claim.claim,
+                source=paper_claim.source,
+                published_value=paper_claim.published_value,
+                computed=paper_claim.computed_value_format.format(**numbers_by_name),
+                holds=bool(paper_claim.agreement_test(number_namespace)),
+                tolerance_reason=paper_claim.tolerance_reason,
             )
-            for c in self.claims
+            for paper_claim in self.claims
         ]
 
 

@@ -37,7 +37,7 @@ def _compute_typical_gait_numbers(paper_evidence: PaperEvidence) -> ClaimNumbers
     )
     step_period = float(first_step.time[-1] - first_step.time[0])
     total_energies = first_step.total_energy.values
-    local_maximum_counter = lambda x: int(np.sum((x[1:-1] > x[:-2]) & (x[1:-1] >= x[2:])))
+    count_local_maxima = lambda x: int(np.sum((x[1:-1] > x[:-2]) & (x[1:-1] >= x[2:])))
     return {
         "shrink": convergence_ratio,
         "change": state_changes[-1],
@@ -69,7 +69,7 @@ def _compute_typical_gait_numbers(paper_evidence: PaperEvidence) -> ClaimNumbers
         "jump": (float(double_support.lambda_2[-1]), float(single_support_1.lambda_2[0])),
         "tangential": (float(double_support.lambda_3[-1]), float(single_support_1.lambda_3[0])),
         "peaks": sum(
-            local_maximum_counter(phase_trajectory.lambda_2.values)
+            count_local_maxima(phase_trajectory.lambda_2.values)
             for phase_trajectory in phase_trajectories
         ),
         "peak": float(first_step.lambda_2.max()),
@@ -195,7 +195,7 @@ def _compute_indicator_numbers(paper_evidence: PaperEvidence) -> ClaimNumbers:
     damping_branch = paper_evidence.damping_branch
     gaits_to_damping_219 = damping_branch.sel(damping=slice(1.0, 219.0))
     gaits_from_damping_220 = damping_branch.sel(damping=slice(220.0, None))
-    branch_value_reader = lambda c, indicator_name: float(
+    read_branch_value = lambda c, indicator_name: float(
         damping_branch[indicator_name].sel(damping=c)
     )
     branch_impulses = gaits_to_damping_219.lambda_I4.values
@@ -205,8 +205,8 @@ def _compute_indicator_numbers(paper_evidence: PaperEvidence) -> ClaimNumbers:
             for x in gaits_to_damping_219.section_state.values
         ]
     )
-    rear_forces = {c: branch_value_reader(c, "lambda_4_plus") for c in (1.0, 218.0, 219.0)}
-    continues_walking = bool((gaits_from_damping_220.outcome == Outcome.STEPPED).all())
+    rear_forces = {c: read_branch_value(c, "lambda_4_plus") for c in (1.0, 218.0, 219.0)}
+    do_walks_continue = bool((gaits_from_damping_220.outcome == Outcome.STEPPED).all())
     return {
         "n_settled": int(gaits_to_damping_219.settled.sum()),
         "n": gaits_to_damping_219.sizes["damping"],
@@ -214,28 +214,28 @@ def _compute_indicator_numbers(paper_evidence: PaperEvidence) -> ClaimNumbers:
         "last_rear": rear_forces[219.0],
         "rear_falls": bool((np.diff(gaits_to_damping_219.lambda_4_plus) < 0.0).all()),
         "fore": (
-            branch_value_reader(219.0, "lambda_2_plus"),
-            branch_value_reader(1.0, "lambda_2_plus"),
+            read_branch_value(219.0, "lambda_2_plus"),
+            read_branch_value(1.0, "lambda_2_plus"),
         ),
-        "fore_5": branch_value_reader(5.0, "lambda_2_plus"),
-        "fore_4": branch_value_reader(4.0, "lambda_2_plus"),
+        "fore_5": read_branch_value(5.0, "lambda_2_plus"),
+        "fore_4": read_branch_value(4.0, "lambda_2_plus"),
         "fore_grows": bool((np.diff(gaits_to_damping_219.lambda_2_plus) > 0.0).all()),
         "least": branch_impulses.min(),
         "most": branch_impulses.max(),
         "fore_impulse": (landing_impulses[:, 1].min(), landing_impulses[:, 1].max()),
         "smallest": [
             min(
-                branch_value_reader(c, indicator_name)
+                read_branch_value(c, indicator_name)
                 for indicator_name in ("lambda_I4", "lambda_2_plus", "lambda_4_plus")
             )
             for c in (50.0, 100.0, 200.0)
         ],
-        "walks_on": continues_walking,
-        "yes_or_no": "yes" if continues_walking else "no",
+        "walks_on": do_walks_continue,
+        "yes_or_no": "yes" if do_walks_continue else "no",
         "never_settles": not bool(gaits_from_damping_220.settled.any()),
         "change": float(gaits_from_damping_220.change.min()),
         "end": float(gaits_from_damping_220.damping.max()),
-        "share": 100 * branch_value_reader(219.0, "dls_fraction"),
+        "share": 100 * read_branch_value(219.0, "dls_fraction"),
         "too_fast": paper_evidence.fast_start_walk.outcome,
         "too_fast_ends": str(paper_evidence.fast_start_walk.outcome).lower().replace("_", " "),
     }

@@ -43,15 +43,21 @@ def compute_double_support_jacobian(
 
     - `is_as_printed`: whether the entry J43 has the printed sign.
     """
-    zeros, ones = np.zeros_like(theta), np.ones_like(theta)
+    zero_column, one_column = np.zeros_like(theta), np.ones_like(theta)
     fore_sine, fore_cosine = np.sin(theta), np.cos(theta)
     rear_sine, rear_cosine = np.sin(theta + alpha), np.cos(theta + alpha)
-    j43_sign = -1.0 if is_as_printed else 1.0
+    printed_entry_sign = -1.0 if is_as_printed else 1.0
     jacobian_rows = (
-        (ones, zeros, zeros, zeros, zeros),
-        (zeros, ones, zeros, zeros, zeros),
-        (ones, zeros, L1 * fore_cosine - L2 * rear_cosine, fore_sine, -rear_sine),
-        (zeros, ones, -L1 * fore_sine + j43_sign * L2 * rear_sine, fore_cosine, -rear_cosine),
+        (one_column, zero_column, zero_column, zero_column, zero_column),
+        (zero_column, one_column, zero_column, zero_column, zero_column),
+        (one_column, zero_column, L1 * fore_cosine - L2 * rear_cosine, fore_sine, -rear_sine),
+        (
+            zero_column,
+            one_column,
+            -L1 * fore_sine + printed_entry_sign * L2 * rear_sine,
+            fore_cosine,
+            -rear_cosine,
+        ),
     )
     return np.stack([np.stack(jacobian_row, axis=-1) for jacobian_row in jacobian_rows], axis=-2)
 
@@ -97,8 +103,10 @@ def compute_printed_landing(params: WheelParams, section_state: np.ndarray) -> P
     foot_velocity = compute_landing_foot_velocity(params, section_state, leg_1_rate=dL1)
     velocity_before = np.array([*foot_velocity, touchdown_rate, 0.0, dL1])
     theta_after = np.asarray(touchdown_angle - s.alpha)
-    coordinates_after = (theta_after, np.asarray(s.L0), np.asarray(touchdown_length))
-    J = compute_double_support_jacobian(*coordinates_after, float(s.alpha), is_as_printed=False)
+    coordinates_after_landing = (theta_after, np.asarray(s.L0), np.asarray(touchdown_length))
+    J = compute_double_support_jacobian(
+        *coordinates_after_landing, float(s.alpha), is_as_printed=False
+    )
     M = np.asarray(
         compute_five_coordinate_mass_matrix(
             s, jnp.asarray(theta_after), s.L0, jnp.asarray(touchdown_length)
@@ -127,7 +135,7 @@ def compute_five_coordinate_mass_matrix(s: Symbols, theta: Scalar, L1: Scalar, L
     """
     planted_mass_matrix = compute_mass_matrix(s, L1, L2)
     unit_vectors = jnp.eye(3)
-    angular_block = jnp.stack(
+    internal_mass_block = jnp.stack(
         [
             jnp.stack(planted_mass_matrix.multiply_vector(tuple(unit_vector)))
             for unit_vector in unit_vectors
@@ -140,7 +148,7 @@ def compute_five_coordinate_mass_matrix(s: Symbols, theta: Scalar, L1: Scalar, L
         ],
         axis=-1,
     )
-    return jnp.block([[s.Mt * jnp.eye(2), foot_momentum], [foot_momentum.T, angular_block]])
+    return jnp.block([[s.Mt * jnp.eye(2), foot_momentum], [foot_momentum.T, internal_mass_block]])
 
 
 def compute_landing_foot_velocity(

@@ -34,9 +34,13 @@ PAPER_CLAIM_GROUPS = (
 )
 
 
-def compute_paper_facts(evidence: PaperEvidence) -> list[PaperFact]:
+def compute_paper_facts(paper_evidence: PaperEvidence) -> list[PaperFact]:
     """Return the facts for all groups of claims."""
-    return [fact for claim_group in PAPER_CLAIM_GROUPS for fact in claim_group.make_facts(evidence)]
+    return [
+        paper_fact
+        for claim_group in PAPER_CLAIM_GROUPS
+        for paper_fact in claim_group.make_facts(paper_evidence)
+    ]
 
 
 def summarize_paper_facts(paper_facts: Sequence[PaperFact]) -> str:
