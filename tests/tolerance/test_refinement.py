@@ -55,7 +55,7 @@ def refine_fixed_point(start_offset, tol, add_terms, slopes=SLOPES):
         start,
         ("theta_touchdown",),
         error_goal,
-        always_compares_tolerances=False,
+        is_every_gait_compared=False,
     )
 
 

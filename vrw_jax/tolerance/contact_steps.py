@@ -84,15 +84,15 @@ class ContactWheelBatch:
 
         `wheel_indices` selects the wheels. Leg 1 is on its stopper where `has_rigid_legs` is True.
         """
-        full_section_states = np.array(
+        contact_section_states = np.array(
             embed_section_states(
                 self.parameter_columns[:, wheel_indices], section_states, self.n_legs
             )
         )
-        full_section_states[:, 4 + 2 * self.n_legs] += np.where(
+        contact_section_states[:, 4 + 2 * self.n_legs] += np.where(
             has_rigid_legs, LOCKED_CODE_OFFSET, 0
         )
-        return full_section_states
+        return contact_section_states
 
     def take_steps(
         self, wheel_indices: np.ndarray, section_states: np.ndarray, n_steps: int = 1
@@ -182,13 +182,13 @@ class ContactWheelBatch:
 
         It is the flight time of the smallest bounce that the solver resolves.
         """
-        select_parameter = lambda parameter_name: self.parameter_columns[
+        get_parameter_column = lambda parameter_name: self.parameter_columns[
             PARAMETER_NAMES.index(parameter_name)
         ]
         # A scalar is used because JAX would compile a program for each batch size.
         relative_bounce_height = float(compute_min_bounce_height(jnp.ones(()), self.step_options))
-        bounce_height = relative_bounce_height * select_parameter("locked_length")
-        return np.sqrt(8.0 * bounce_height / select_parameter("gravity"))[wheel_indices]
+        bounce_height = relative_bounce_height * get_parameter_column("locked_length")
+        return np.sqrt(8.0 * bounce_height / get_parameter_column("gravity"))[wheel_indices]
 
     def list_paper_state_indices(self) -> np.ndarray:
         """Return the indices of theta-, dtheta- and dL1- in a full section state."""

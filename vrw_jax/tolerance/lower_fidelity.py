@@ -100,25 +100,25 @@ def find_paper_gaits(params: WheelParams, step_options: StepOptions) -> LowerFid
     limit_cycles = map_in_batches(cycle_finder.find_cycles, batch_sizes.GAIT_BATCH_SIZES, params)
     section_states = np.array(limit_cycles.section_state)
     search_outcomes = np.array(limit_cycles.outcome)
-    (unsolved_indices,) = np.nonzero(~np.isin(search_outcomes, FINAL_OUTCOMES))
+    (unsolved_wheel_indices,) = np.nonzero(~np.isin(search_outcomes, FINAL_OUTCOMES))
     if len(
-        unsolved_indices
+        unsolved_wheel_indices
     ):  # One mesh for all elements makes the digits independent of the batch.
         limit_cycles = retry_from_walks(
             cycle_finder,
-            *jax.device_put(select_tree_rows((params, limit_cycles), unsolved_indices)),
+            *jax.device_put(select_tree_rows((params, limit_cycles), unsolved_wheel_indices)),
         )
-        section_states[unsolved_indices] = limit_cycles.section_state
-        search_outcomes[unsolved_indices] = limit_cycles.outcome
-    all_gaits = make_empty_gaits(len(section_states))
-    all_gaits.search_outcomes[:] = search_outcomes
-    (found_indices,) = np.nonzero(search_outcomes == Outcome.STEPPED)
-    if not len(found_indices):
-        return all_gaits
-    found_params = jax.device_put(select_tree_rows(params, found_indices))
+        section_states[unsolved_wheel_indices] = limit_cycles.section_state
+        search_outcomes[unsolved_wheel_indices] = limit_cycles.outcome
+    gaits_of_all_wheels = make_empty_gaits(len(section_states))
+    gaits_of_all_wheels.search_outcomes[:] = search_outcomes
+    (found_wheel_indices,) = np.nonzero(search_outcomes == Outcome.STEPPED)
+    if not len(found_wheel_indices):
+        return gaits_of_all_wheels
+    params_with_gait = jax.device_put(select_tree_rows(params, found_wheel_indices))
     gait_step = step_batch(
-        found_params,
-        section_states[found_indices],
+        params_with_gait,
+        section_states[found_wheel_indices],
         options=step_options,
         derivatives=[SECTION_STATE_NAME],
     )
@@ -127,9 +127,9 @@ def find_paper_gaits(params: WheelParams, step_options: StepOptions) -> LowerFid
     step_durations = np.asarray(gait_step.durations)
     has_stepped = np.asarray(gait_step.outcome) == Outcome.STEPPED
     # The feet's distance at touchdown is L0 sin(alpha) / cos(theta-), m.
-    leg_span = np.asarray(found_params.locked_length) * np.sin(found_params.leg_angle)
+    leg_span = np.asarray(params_with_gait.locked_length) * np.sin(params_with_gait.leg_angle)
     foot_distance = leg_span / np.cos(step_end_states[:, 0])
-    zero_durations = np.zeros(len(found_indices))
+    zero_durations = np.zeros(len(found_wheel_indices))
     step_quantities = np.column_stack(
         [
             step_durations[:, 0],
@@ -154,21 +154,21 @@ def find_paper_gaits(params: WheelParams, step_options: StepOptions) -> LowerFid
     )
     gaits_with_steps = _make_lower_fidelity_gaits(
         ModelIndex.VISCOELASTIC,
-        section_states[found_indices],
+        section_states[found_wheel_indices],
         step_end_states,
         step_quantities,
         step_jacobian.section_state,
         step_quantity_jacobian,
     )
     replace_gaits(
-        all_gaits,
-        found_indices[has_stepped],
+        gaits_of_all_wheels,
+        found_wheel_indices[has_stepped],
         LowerFidelityGaits(*(gait_array[has_stepped] for gait_array in gaits_with_steps)),
     )
-    all_gaits.search_outcomes[found_indices[~has_stepped]] = np.asarray(gait_step.outcome)[
-        ~has_stepped
-    ]
-    return all_gaits
+    gaits_of_all_wheels.search_outcomes[found_wheel_indices[~has_stepped]] = np.asarray(
+        gait_step.outcome
+    )[~has_stepped]
+    return gaits_of_all_wheels
 
 
 def find_rigid_gaits(params: WheelParams) -> LowerFidelityGaits:

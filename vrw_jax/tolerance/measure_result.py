@@ -145,8 +145,23 @@ class MeasureResult(AbstractPrintable):
     @property
     def why(self) -> Any:
         """Return a sentence on why the model was selected; for a batch, an array of sentences."""
+
+        def describe_selection(
+            model_index: int, status: int, n_steps: int, search_outcome: int, n_gaits: int
+        ) -> str:
+            status_meaning = MeasureStatus(int(status)).meaning
+            if status == MeasureStatus.NO_GAIT:
+                outcome_meaning = Outcome(int(search_outcome)).meaning[:-1]
+                gait_count_text = f"; gaits that attract: {n_gaits}" if n_gaits else ""
+                return f"{status_meaning}: {outcome_meaning}{gait_count_text}"
+            if status == MeasureStatus.SELECTED_BY_RANK:
+                status_meaning = f"{status_meaning}, {n_gaits} in all"
+            if status == MeasureStatus.CHECKED_BY_ONE_STEP:
+                return f"{MODEL_LABELS[int(model_index)]}, {status_meaning}"
+            return f"{MODEL_LABELS[int(model_index)]}, {n_steps} steps, {status_meaning}"
+
         return map_text_of_elements(
-            _describe_selection,
+            describe_selection,
             self.models,
             self.statuses,
             self.n_steps,
@@ -204,21 +219,6 @@ class MeasureResult(AbstractPrintable):
             model_error_text = _format_rounded_number(abs(self.model_errors[measure_index]))
             error_parts_text = f"model {model_error_text}, {error_parts_text}"
         return f"{value_text} ± {_format_rounded_number(error_bound)} ({error_parts_text})"
-
-
-def _describe_selection(
-    model_index: int, status: int, n_steps: int, search_outcome: int, n_gaits: int
-) -> str:
-    """Return a sentence on the model and the method that were selected for one batch element."""
-    status_meaning = MeasureStatus(int(status)).meaning
-    if status == MeasureStatus.NO_GAIT:
-        gait_count_text = f"; gaits that attract: {n_gaits}" if n_gaits else ""
-        return f"{status_meaning}: {Outcome(int(search_outcome)).meaning[:-1]}{gait_count_text}"
-    if status == MeasureStatus.SELECTED_BY_RANK:
-        status_meaning = f"{status_meaning}, {n_gaits} in all"
-    if status == MeasureStatus.CHECKED_BY_ONE_STEP:
-        return f"{MODEL_LABELS[int(model_index)]}, {status_meaning}"
-    return f"{MODEL_LABELS[int(model_index)]}, {n_steps} steps, {status_meaning}"
 
 
 def _format_rounded_number(measure_value: float) -> str:

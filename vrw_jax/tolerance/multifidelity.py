@@ -123,9 +123,9 @@ class MultifidelityMean(AbstractPrintable):
         )
 
     def summary_rows(self) -> list[LabelAndText]:
-        unit = MEASURES[self.measure].display_unit
+        measure_unit = MEASURES[self.measure].display_unit
         return [
-            (f"mean {self.measure}", f"{self.value:.6g} ± {self.error:.1g} {unit}".strip()),
+            (f"mean {self.measure}", f"{self.value:.6g} ± {self.error:.1g} {measure_unit}".strip()),
             (
                 "with unilateral contact",
                 f"{self.n_high_fidelity:.0f} wheels, {self.n_gaits:.0f} of them with a gait",
@@ -203,9 +203,9 @@ def multifidelity_mean(
         )
     measured_wheels = _MeasuredWheels(measure, params, friction_by_wheel, stoppers)
     wheel_permutation = np.random.default_rng(seed).permutation(n_wheels)
-    pilot_indices, other_indices = wheel_permutation[:pilot], wheel_permutation[pilot:]
+    pilot_wheel_indices, other_wheel_indices = wheel_permutation[:pilot], wheel_permutation[pilot:]
     gait_tolerance = sampling_options.gait_error_fraction * tol
-    pilot_results = measured_wheels.measure_selected_wheels(pilot_indices, gait_tolerance)
+    pilot_results = measured_wheels.measure_selected_wheels(pilot_wheel_indices, gait_tolerance)
     has_pilot_gait = pilot_results.found
     if np.sum(has_pilot_gait) < min_pilot_gaits:
         raise ValueError(
@@ -215,26 +215,30 @@ def multifidelity_mean(
     pilot_sample = _SampledMeasures.from_results(pilot_results)
     control_columns = [
         _stack_control_columns(
-            measured_wheels.evaluate_control_variate(pilot_indices, control_index)
+            measured_wheels.evaluate_control_variate(pilot_wheel_indices, control_index)
         )
         for control_index in range(len(CONTROL_VARIATES))
     ]
     sampling_plans = [
-        _plan_sampling(control_index, pilot_sample, x, tol, len(other_indices), sampling_options)
+        _plan_sampling(
+            control_index, pilot_sample, x, tol, len(other_wheel_indices), sampling_options
+        )
         for control_index, x in enumerate(control_columns)
     ]
     sampling_plan = min(
         sampling_plans, key=lambda sampling_plan: sampling_plan.expected_cost_in_steps
     )
     drawn_results = measured_wheels.measure_selected_wheels(
-        other_indices[: sampling_plan.n_drawn_wheels], gait_tolerance
+        other_wheel_indices[: sampling_plan.n_drawn_wheels], gait_tolerance
     )
     mean_value, standard_error = _estimate_mean(
         sampling_plan,
         pilot_sample,
         _SampledMeasures.from_results(drawn_results),
         _stack_control_columns(
-            measured_wheels.evaluate_control_variate(other_indices, sampling_plan.control_index)
+            measured_wheels.evaluate_control_variate(
+                other_wheel_indices, sampling_plan.control_index
+            )
         ),
     )
     gait_error_bounds = np.concatenate(
@@ -308,11 +312,13 @@ class _MeasuredWheels(NamedTuple):
             return control_values
         step_options = StepOptions()
         paper_gaits = find_paper_gaits(self.take_wheels(wheel_indices), step_options)
-        (found_indices,) = np.nonzero(paper_gaits.model_index != ModelIndex.NONE)
-        paper_gaits = LowerFidelityGaits(*(gait_array[found_indices] for gait_array in paper_gaits))
+        (found_wheel_indices,) = np.nonzero(paper_gaits.model_index != ModelIndex.NONE)
+        paper_gaits = LowerFidelityGaits(
+            *(gait_array[found_wheel_indices] for gait_array in paper_gaits)
+        )
         measure_values = evaluate_measures([self.measure_name], paper_gaits.step_quantities)[:, 0]
         if control_index == len(CONTROL_VARIATES) - 1:
-            wheel_indices_of_gaits = wheel_indices[found_indices]
+            wheel_indices_of_gaits = wheel_indices[found_wheel_indices]
             wheel_batch = ContactWheelBatch.from_params(
                 self.take_wheels(wheel_indices_of_gaits),
                 self.friction_coefficients[wheel_indices_of_gaits],
@@ -338,7 +344,7 @@ class _MeasuredWheels(NamedTuple):
                 measure_estimates.measure_values[:, 0],
                 measure_values,
             )
-        control_values[found_indices] = measure_values
+        control_values[found_wheel_indices] = measure_values
         return control_values
 
 
@@ -348,8 +354,8 @@ def _stack_control_columns(control_values: np.ndarray) -> np.ndarray:
     The first column is the control variate, or zero for a wheel without a finite control variate.
     The second column is 1 for a finite control variate and 0 otherwise.
     """
-    has_value = np.isfinite(control_values)
-    return np.column_stack([np.where(has_value, control_values, 0.0), has_value])
+    is_control_finite = np.isfinite(control_values)
+    return np.column_stack([np.where(is_control_finite, control_values, 0.0), is_control_finite])
 
 
 def _plan_sampling(
@@ -367,23 +373,30 @@ def _plan_sampling(
     wheel's measure minus M, or zero for a wheel without a gait. The sum of this quantity over all
     wheels is zero.
     """
-    share_with_gait = float(np.mean(pilot_sample.has_gait))
-    centered_values = (
+    fraction_of_wheels_with_gait = float(np.mean(pilot_sample.has_gait))
+    centered_measure_values = (
         pilot_sample.measure_values
-        - np.mean(pilot_sample.measure_values) / share_with_gait * pilot_sample.has_gait
+        - np.mean(pilot_sample.measure_values)
+        / fraction_of_wheels_with_gait
+        * pilot_sample.has_gait
     )
-    centered_columns = control_columns - np.mean(control_columns, axis=0)
+    centered_control_columns = control_columns - np.mean(control_columns, axis=0)
     control_weights, _, matrix_rank, _ = np.linalg.lstsq(
-        centered_columns, centered_values, rcond=sampling_options.singular_value_tolerance
+        centered_control_columns,
+        centered_measure_values,
+        rcond=sampling_options.singular_value_tolerance,
     )
     residual_sum_of_squares = float(
-        np.sum((centered_values - centered_columns @ control_weights) ** 2)
-    ) + _compute_unseen_wheel_variance(pilot_sample, centered_values)
-    residual_variance = residual_sum_of_squares / (len(centered_values) - 1 - int(matrix_rank))
+        np.sum((centered_measure_values - centered_control_columns @ control_weights) ** 2)
+    ) + _compute_unseen_wheel_variance(pilot_sample, centered_measure_values)
+    residual_variance = residual_sum_of_squares / (
+        len(centered_measure_values) - 1 - int(matrix_rank)
+    )
     sampling_tolerance = (1.0 - sampling_options.gait_error_fraction) * mean_tolerance
     n_required_wheels = (
         residual_variance
-        * (sampling_options.n_standard_errors / (sampling_tolerance * share_with_gait)) ** 2
+        * (sampling_options.n_standard_errors / (sampling_tolerance * fraction_of_wheels_with_gait))
+        ** 2
     )
     n_drawn_wheels = min(
         n_other_wheels,
@@ -438,11 +451,11 @@ def _estimate_mean(
 
 
 def _compute_unseen_wheel_variance(
-    pilot_sample: _SampledMeasures, centered_values: np.ndarray
+    pilot_sample: _SampledMeasures, centered_measure_values: np.ndarray
 ) -> float:
     """Return the variance due to one more wheel whose control variate is wrong.
 
     A wheel may have a gait in the paper's model and no gait with unilateral contact. A small sample
     may contain no such wheel. The result is zero if all wheels in the pilot sample have a gait.
     """
-    return 0.0 if np.all(pilot_sample.has_gait) else float(np.var(centered_values))
+    return 0.0 if np.all(pilot_sample.has_gait) else float(np.var(centered_measure_values))

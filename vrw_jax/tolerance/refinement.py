@@ -177,7 +177,7 @@ def refine_gaits(
     section_states: np.ndarray,
     measure_names: Sequence[str],
     compute_error_goal: Callable[[np.ndarray], np.ndarray],
-    always_compares_tolerances: bool,
+    is_every_gait_compared: bool,
     refinement_options: RefinementOptions = REFINEMENT_OPTIONS,
 ) -> RefinedGaits:
     """Return the gaits near full section states, with their measures and bounds for the errors.
@@ -185,17 +185,17 @@ def refine_gaits(
     - `wheel_indices`: index of the wheel of each gait, (gaits,);
     - `section_states`: initial guesses for the section states, (gaits, 4 + 3 n);
     - `compute_error_goal`: function that returns the allowed errors for given measures;
-    - `always_compares_tolerances`: whether the numerical error is always estimated from walking
+    - `is_every_gait_compared`: whether the numerical error is always estimated from walking
       steps at other tolerances. Otherwise it is so only for gaits whose error due to missed
       contacts is too large to be presumed.
 
     Newton's corrections of a gait end when the remaining error is below the allowed error.
     """
     n_gaits, n_coordinates = section_states.shape
-    gait_states = section_states.copy()
+    gait_section_states = section_states.copy()
     measure_values = np.full((n_gaits, len(measure_names)), np.nan)
     remaining_error_bounds, numerical_error_bounds = np.full((2, *measure_values.shape), np.inf)
-    is_found, needs_comparison = np.zeros((2, n_gaits), bool)
+    is_found, needs_tolerance_comparison = np.zeros((2, n_gaits), bool)
     walking_speed, n_steps = np.full(n_gaits, np.nan), np.zeros(n_gaits, int)
     newton_matrix = np.zeros((n_gaits, n_coordinates, n_coordinates))
     step_quantity_jacobian = np.zeros((n_gaits, N_STEP_QUANTITIES, n_coordinates))
@@ -206,7 +206,7 @@ def refine_gaits(
         return estimate_measures(
             stepping_batch,
             wheel_indices[gait_positions],
-            gait_states[gait_positions],
+            gait_section_states[gait_positions],
             contact_step,
             newton_matrix[gait_positions],
             step_quantity_jacobian[gait_positions],
@@ -219,7 +219,9 @@ def refine_gaits(
             break
         gait_positions, next_gait_positions = next_gait_positions, next_gait_positions[:0]
         contact_step, return_map_jacobian, step_quantity_jacobian[gait_positions] = (
-            wheel_batch.linearize_steps(wheel_indices[gait_positions], gait_states[gait_positions])
+            wheel_batch.linearize_steps(
+                wheel_indices[gait_positions], gait_section_states[gait_positions]
+            )
         )
         newton_matrix[gait_positions] = solve_linear_systems(
             np.eye(n_coordinates) - return_map_jacobian,
@@ -233,7 +235,7 @@ def refine_gaits(
             contraction_rate = correction_length / np.maximum(
                 previous_correction_length, np.finfo(float).tiny
             )
-            contracts_slowly = contraction_rate > refinement_options.max_contraction_rate
+            is_contraction_slow = contraction_rate > refinement_options.max_contraction_rate
             error_bound = (
                 refinement_options.error_safety_factor
                 * measure_estimates.correction_effect_on_measures
@@ -247,79 +249,81 @@ def refine_gaits(
                 ),
                 axis=1,
             )
-            is_at_stall_length = (
+            is_correction_at_stall_length = (
                 correction_length
                 <= refinement_options.stall_length_in_tolerances
                 * float(wheel_batch.step_options.rtol)
             )
-            is_finished = measure_estimates.has_same_leg_codes & np.where(
-                contracts_slowly, is_at_stall_length, is_within_goal
+            is_refinement_finished = measure_estimates.has_same_leg_codes & np.where(
+                is_contraction_slow, is_correction_at_stall_length, is_within_goal
             )
-            finished_positions = gait_positions[is_finished]
-            is_found[finished_positions] = True
-            measure_values[finished_positions] = measure_estimates.measure_values[is_finished]
-            remaining_error_bounds[finished_positions] = error_bound[is_finished]
-            numerical_error_bounds[finished_positions] = (
+            finished_gait_positions = gait_positions[is_refinement_finished]
+            is_found[finished_gait_positions] = True
+            measure_values[finished_gait_positions] = measure_estimates.measure_values[
+                is_refinement_finished
+            ]
+            remaining_error_bounds[finished_gait_positions] = error_bound[is_refinement_finished]
+            numerical_error_bounds[finished_gait_positions] = (
                 measure_estimates.numerical_error_bound
                 + measure_estimates.missed_contact_error_bound
-            )[is_finished]
-            walking_speed[finished_positions] = evaluate_measures(
-                ("speed",), contact_step.step_quantities[is_finished]
+            )[is_refinement_finished]
+            walking_speed[finished_gait_positions] = evaluate_measures(
+                ("speed",), contact_step.step_quantities[is_refinement_finished]
             )[:, 0]
-            needs_comparison[finished_positions] = (
-                always_compares_tolerances
+            needs_tolerance_comparison[finished_gait_positions] = (
+                is_every_gait_compared
                 | np.any(
                     measure_estimates.missed_contact_error_bound
                     > refinement_options.max_presumed_error_fraction * error_bound_goal,
                     axis=1,
-                )[is_finished]
+                )[is_refinement_finished]
             )
-            is_continued = (
-                ~is_finished
+            is_refinement_continued = (
+                ~is_refinement_finished
                 & (contact_step.step_outcomes == Outcome.STEPPED)
                 & (correction_length <= refinement_options.max_correction_length)
                 & (contraction_rate < 1.0)
             )
-            gait_states[gait_positions[is_continued]] = np.where(
+            gait_section_states[gait_positions[is_refinement_continued]] = np.where(
                 measure_estimates.has_same_leg_codes[:, None],
-                gait_states[gait_positions] + measure_estimates.newton_correction,
+                gait_section_states[gait_positions] + measure_estimates.newton_correction,
                 contact_step.section_states,
-            )[is_continued]
-            needs_jacobian = is_continued & (
-                contracts_slowly | ~measure_estimates.has_same_leg_codes
+            )[is_refinement_continued]
+            needs_jacobian = is_refinement_continued & (
+                is_contraction_slow | ~measure_estimates.has_same_leg_codes
             )
             next_gait_positions = np.append(next_gait_positions, gait_positions[needs_jacobian])
-            is_continued &= ~needs_jacobian
-            gait_positions = gait_positions[is_continued]
-            previous_correction_length = correction_length[is_continued]
+            is_refinement_continued &= ~needs_jacobian
+            gait_positions = gait_positions[is_refinement_continued]
+            previous_correction_length = correction_length[is_refinement_continued]
             if not len(gait_positions):
                 break
             contact_step = wheel_batch.take_steps(
-                wheel_indices[gait_positions], gait_states[gait_positions]
+                wheel_indices[gait_positions], gait_section_states[gait_positions]
             )
             n_steps[gait_positions] += 1
-    compared_positions = np.flatnonzero(needs_comparison)
-    error_bounds_by_tolerance = [np.zeros((len(compared_positions), len(measure_names)))]
+    compared_gait_positions = np.flatnonzero(needs_tolerance_comparison)
+    error_bounds_by_tolerance = [np.zeros((len(compared_gait_positions), len(measure_names)))]
     for comparison_batch in wheel_batch.make_comparison_batches():
         # The duration of the shortest resolved contact depends on the tolerance.
         contact_step = comparison_batch.take_steps(
-            wheel_indices[compared_positions], gait_states[compared_positions]
+            wheel_indices[compared_gait_positions], gait_section_states[compared_gait_positions]
         )
         measure_estimates = estimate_gait_measures(
-            comparison_batch, compared_positions, contact_step
+            comparison_batch, compared_gait_positions, contact_step
         )
         error_bound = refinement_options.error_safety_factor * np.abs(
-            measure_estimates.measure_values - measure_values[compared_positions]
+            measure_estimates.measure_values - measure_values[compared_gait_positions]
         )
         error_bound += np.minimum(
-            measure_estimates.numerical_error_bound, numerical_error_bounds[compared_positions]
+            measure_estimates.numerical_error_bound, numerical_error_bounds[compared_gait_positions]
         )
         # A step that changes the legs' codes gives no bound.
         error_bounds_by_tolerance.append(
             np.where(measure_estimates.has_same_leg_codes[:, None], error_bound, np.inf)
         )
-        n_steps[compared_positions] += 1
-    numerical_error_bounds[compared_positions] = np.max(error_bounds_by_tolerance, axis=0)
+        n_steps[compared_gait_positions] += 1
+    numerical_error_bounds[compared_gait_positions] = np.max(error_bounds_by_tolerance, axis=0)
     total_error_bounds = remaining_error_bounds + numerical_error_bounds
     is_found &= np.isfinite(total_error_bounds).all(1)
     # All multipliers are inside the unit circle if all eigenvalues of (I - DP)^-1 have real parts
@@ -332,6 +336,6 @@ def refine_gaits(
         measure_values,
         total_error_bounds,
         n_steps,
-        gait_states,
+        gait_section_states,
         walking_speed,
     )

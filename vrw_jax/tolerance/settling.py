@@ -79,64 +79,66 @@ def walk_until_settled(
         np.zeros(n_walks, int),
     )
     active_walks, start_states = np.arange(n_walks), section_states
-    n_steps_by_round = (
+    n_steps_before_leaps = (
         leap_options.n_warmup_steps,
         *leap_options.max_leaps * (leap_options.steps_per_leap,),
     )
-    for round_index, n_round_steps in enumerate(n_steps_by_round):
+    for leap_index, n_steps_before_leap in enumerate(n_steps_before_leaps):
         if not len(active_walks):
             break
-        walk_ends.n_steps[active_walks] += n_round_steps
+        walk_ends.n_steps[active_walks] += n_steps_before_leap
         active_wheel_indices = wheel_indices[active_walks]
-        earlier_step = loose_step_batch.take_steps(
-            active_wheel_indices, start_states, n_round_steps - 2
+        third_last_step = loose_step_batch.take_steps(
+            active_wheel_indices, start_states, n_steps_before_leap - 2
         )
-        failed_walks = np.flatnonzero(earlier_step.step_outcomes != Outcome.STEPPED)
+        failed_walks = np.flatnonzero(third_last_step.step_outcomes != Outcome.STEPPED)
         if len(failed_walks):
             # A leap failed, or the tolerance of the first steps is too loose.
-            retried_step = (loose_step_batch if round_index else wheel_batch).take_steps(
+            retried_step = (loose_step_batch if leap_index else wheel_batch).take_steps(
                 active_wheel_indices[failed_walks],
                 walk_ends.section_states[active_walks[failed_walks]],
-                n_round_steps - 2,
+                n_steps_before_leap - 2,
             )
-            earlier_step = StepQuantities(*map(np.array, earlier_step))
-            for step_array, retried_array in zip(earlier_step, retried_step, strict=True):
-                step_array[failed_walks] = retried_array
-        previous_step = loose_step_batch.take_steps(
-            active_wheel_indices, earlier_step.section_states
+            third_last_step = StepQuantities(*map(np.array, third_last_step))
+            for third_last_step_array, retried_step_array in zip(
+                third_last_step, retried_step, strict=True
+            ):
+                third_last_step_array[failed_walks] = retried_step_array
+        second_last_step = loose_step_batch.take_steps(
+            active_wheel_indices, third_last_step.section_states
         )
-        current_step = loose_step_batch.take_steps(
-            active_wheel_indices, previous_step.section_states
+        last_step = loose_step_batch.take_steps(
+            active_wheel_indices, second_last_step.section_states
         )
         step_outcomes = np.stack(
-            [earlier_step.step_outcomes, previous_step.step_outcomes, current_step.step_outcomes]
+            [third_last_step.step_outcomes, second_last_step.step_outcomes, last_step.step_outcomes]
         )
         has_stepped = np.all(step_outcomes == Outcome.STEPPED, axis=0)
-        first_failed_step = np.argmax(step_outcomes != Outcome.STEPPED, axis=0)
+        first_failed_step_index = np.argmax(step_outcomes != Outcome.STEPPED, axis=0)
         walk_ends.walk_outcomes[active_walks] = step_outcomes[
-            first_failed_step, np.arange(len(active_walks))
+            first_failed_step_index, np.arange(len(active_walks))
         ]
         active_walks = active_walks[has_stepped]
-        walk_ends.section_states[active_walks] = current_step.section_states[has_stepped]
+        walk_ends.section_states[active_walks] = last_step.section_states[has_stepped]
         walk_ends.has_settled[active_walks], leap_vectors, fade_distance = _extrapolate_drift(
-            earlier_step.section_states[has_stepped],
-            previous_step.section_states[has_stepped],
-            current_step.section_states[has_stepped],
+            third_last_step.section_states[has_stepped],
+            second_last_step.section_states[has_stepped],
+            last_step.section_states[has_stepped],
             n_continuous,
             leap_options,
         )
-        n_leaps_left = leap_options.max_leaps - round_index
-        is_continued = ~walk_ends.has_settled[active_walks] & (
-            (n_leaps_left > leap_options.max_leaps_left_to_give_up)
+        n_remaining_leaps = leap_options.max_leaps - leap_index
+        is_walk_continued = ~walk_ends.has_settled[active_walks] & (
+            (n_remaining_leaps > leap_options.max_leaps_left_to_give_up)
             | (
                 fade_distance
                 <= leap_options.max_fade_distance_ratio
                 * leap_options.max_leap_distance
-                * n_leaps_left
+                * n_remaining_leaps
             )
         )
         active_walks, leap_vectors = (
-            step_array[is_continued] for step_array in (active_walks, leap_vectors)
+            walk_array[is_walk_continued] for walk_array in (active_walks, leap_vectors)
         )
         start_states = walk_ends.section_states[active_walks]
         # Each walking step first places loaded feet on the slope, so a leap ends at a valid start.
@@ -145,8 +147,8 @@ def walk_until_settled(
 
 
 def _extrapolate_drift(
-    earlier_states: np.ndarray,
-    previous_states: np.ndarray,
+    states_two_steps_before: np.ndarray,
+    states_one_step_before: np.ndarray,
     current_states: np.ndarray,
     n_continuous: int,
     leap_options: LeapOptions,
@@ -159,17 +161,17 @@ def _extrapolate_drift(
     fade distance are zero if the contact codes of the legs change.
     """
     has_same_leg_codes = np.all(
-        (earlier_states[:, n_continuous:] == current_states[:, n_continuous:])
-        & (previous_states[:, n_continuous:] == current_states[:, n_continuous:]),
+        (states_two_steps_before[:, n_continuous:] == current_states[:, n_continuous:])
+        & (states_one_step_before[:, n_continuous:] == current_states[:, n_continuous:]),
         axis=1,
     )
-    earlier_change = (previous_states - earlier_states)[:, :n_continuous]
-    last_change = (current_states - previous_states)[:, :n_continuous]
-    drift_per_step = np.abs(last_change).max(1)
+    earlier_state_change = (states_one_step_before - states_two_steps_before)[:, :n_continuous]
+    last_state_change = (current_states - states_one_step_before)[:, :n_continuous]
+    drift_per_step = np.abs(last_state_change).max(1)
     with np.errstate(all="ignore"):
         decay_rate = np.nan_to_num(
-            np.sum(earlier_change * last_change, axis=1)
-            / np.sum(earlier_change * earlier_change, axis=1)
+            np.sum(earlier_state_change * last_state_change, axis=1)
+            / np.sum(earlier_state_change * earlier_state_change, axis=1)
         )
         n_steps_to_fade = np.where(decay_rate < 1.0, decay_rate / (1.0 - decay_rate), np.inf)
         fade_distance = np.where(
@@ -188,9 +190,9 @@ def _extrapolate_drift(
         & (fade_distance < leap_options.max_settled_drift)
         & (drift_per_step < leap_options.max_settled_drift)
     )
-    has_leap = has_same_leg_codes & ~has_settled & (decay_rate > 0.0)
+    has_leap_vector = has_same_leg_codes & ~has_settled & (decay_rate > 0.0)
     return (
         has_settled,
-        np.where(has_leap, n_leap_steps, 0.0)[:, None] * last_change,
+        np.where(has_leap_vector, n_leap_steps, 0.0)[:, None] * last_state_change,
         np.where(has_same_leg_codes, fade_distance, 0.0),
     )

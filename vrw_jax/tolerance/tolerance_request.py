@@ -219,12 +219,12 @@ class _MeasureRequest:
         self.wheel_batch = wheel_batch
         self.params = params
         self.lower_gaits = make_empty_gaits(n_wheels)
-        fill_measure_array = lambda fill_value: np.full((n_wheels, n_measures), fill_value)
+        make_measure_array = lambda fill_value: np.full((n_wheels, n_measures), fill_value)
         self.result_arrays = {
-            "values": fill_measure_array(np.nan),
-            "errors": fill_measure_array(np.inf),
-            "model_errors": fill_measure_array(np.nan),
-            "numerical_errors": fill_measure_array(np.inf),
+            "values": make_measure_array(np.nan),
+            "errors": make_measure_array(np.inf),
+            "model_errors": make_measure_array(np.nan),
+            "numerical_errors": make_measure_array(np.inf),
             "models": np.full(n_wheels, ModelIndex.NONE),
             "statuses": np.full(n_wheels, int(MeasureStatus.NO_GAIT)),
             "n_steps": np.zeros(n_wheels, int),
@@ -259,7 +259,7 @@ class _MeasureRequest:
         wheel_indices = wheel_indices[
             np.isfinite(self.lower_gaits.step_quantities[wheel_indices]).all(1)
         ]
-        self._correct_lower_gaits(wheel_indices, continues_iteration=False)
+        self._correct_lower_gaits(wheel_indices, are_other_gaits_refined=False)
 
     def try_paper_model(self) -> None:
         """Compute gaits of the paper's model, and store measures to within `tol`.
@@ -277,7 +277,7 @@ class _MeasureRequest:
         )
         self._correct_lower_gaits(
             wheel_indices[self.lower_gaits.model_index[wheel_indices] != ModelIndex.NONE],
-            continues_iteration=True,
+            are_other_gaits_refined=True,
         )
 
     def walk_to_gaits(self) -> None:
@@ -294,10 +294,10 @@ class _MeasureRequest:
         for walk_start in compute_walk_starts(self._take_wheels(wheel_indices))[
             : self.request_options.n_cold_starts
         ]:
-            has_no_result = self.result_arrays["models"][wheel_indices] == ModelIndex.NONE
+            is_gait_missing = self.result_arrays["models"][wheel_indices] == ModelIndex.NONE
             self._walk_and_record_gaits(
-                wheel_indices[has_no_result],
-                walk_start[has_no_result],
+                wheel_indices[is_gait_missing],
+                walk_start[is_gait_missing],
                 MeasureStatus.REACHED_FROM_START,
             )
 
@@ -330,12 +330,14 @@ class _MeasureRequest:
         """Return the parameters of the wheels with the indices `wheel_indices`."""
         return jax.device_put(select_tree_rows(self.params, wheel_indices))
 
-    def _correct_lower_gaits(self, wheel_indices: np.ndarray, continues_iteration: bool) -> None:
+    def _correct_lower_gaits(
+        self, wheel_indices: np.ndarray, are_other_gaits_refined: bool
+    ) -> None:
         """Compute one step with unilateral contact from each lower gait, and store measures.
 
         The measures of a lower gait are stored if the estimated errors are within `tol`. If
-        `continues_iteration` is True, the other lower gaits are the initial guesses for gaits with
-        unilateral contact, whose measures are stored as well.
+        `are_other_gaits_refined` is True, the other lower gaits are the initial guesses for gaits
+        with unilateral contact, whose measures are stored as well.
         """
         lower_gaits = LowerFidelityGaits(
             *(gait_array[wheel_indices] for gait_array in self.lower_gaits)
@@ -356,7 +358,7 @@ class _MeasureRequest:
         )
         lower_measure_values = evaluate_measures(self.measure_names, lower_gaits.step_quantities)
         with np.errstate(all="ignore"):
-            step_and_correction_effect = (
+            total_measure_change = (
                 np.abs(
                     evaluate_measures(self.measure_names, contact_step.step_quantities)
                     - lower_measure_values
@@ -377,7 +379,7 @@ class _MeasureRequest:
             )
             error_bound = (
                 np.abs(model_error)
-                + (self.request_options.error_safety_factor - 1.0) * step_and_correction_effect
+                + (self.request_options.error_safety_factor - 1.0) * total_measure_change
                 + numerical_error
             )
             is_accepted = measure_estimates.has_same_leg_codes & np.all(
@@ -394,29 +396,31 @@ class _MeasureRequest:
             numerical_error[is_accepted],
             section_states[is_accepted],
         )
-        rejected_positions = np.flatnonzero(
-            continues_iteration & ~is_accepted & measure_estimates.has_same_leg_codes
+        rejected_gait_positions = np.flatnonzero(
+            are_other_gaits_refined & ~is_accepted & measure_estimates.has_same_leg_codes
         )
         refined_gaits = refine_gaits(
             self.wheel_batch,
-            wheel_indices[rejected_positions],
-            contact_step.section_states[rejected_positions],
+            wheel_indices[rejected_gait_positions],
+            contact_step.section_states[rejected_gait_positions],
             self.measure_names,
             self.compute_error_goal,
-            always_compares_tolerances=False,
+            is_every_gait_compared=False,
         )
-        self.result_arrays["n_steps"][wheel_indices[rejected_positions]] += refined_gaits.n_steps
+        self.result_arrays["n_steps"][wheel_indices[rejected_gait_positions]] += (
+            refined_gaits.n_steps
+        )
         gait_distance = np.linalg.norm(
-            (refined_gaits.section_states - section_states[rejected_positions])[
+            (refined_gaits.section_states - section_states[rejected_gait_positions])[
                 :, self.wheel_batch.list_paper_state_indices()
             ],
             axis=1,
         )
         max_gait_distance = self.request_options.max_gait_distance_ratio * np.linalg.norm(
-            measure_estimates.newton_correction[rejected_positions], axis=1
+            measure_estimates.newton_correction[rejected_gait_positions], axis=1
         )
         self._record_gaits(
-            wheel_indices[rejected_positions],
+            wheel_indices[rejected_gait_positions],
             refined_gaits,
             refined_gaits.is_found & (gait_distance <= max_gait_distance),
             MeasureStatus.CONTINUES_LOWER_GAIT,
@@ -465,7 +469,7 @@ class _MeasureRequest:
             walk_ends.section_states[walk_ends.has_settled],
             self.measure_names,
             self.compute_error_goal,
-            always_compares_tolerances=True,
+            is_every_gait_compared=True,
         )
         np.add.at(self.result_arrays["n_steps"], wheel_indices_of_gaits, refined_gaits.n_steps)
         return wheel_indices_of_gaits, refined_gaits
