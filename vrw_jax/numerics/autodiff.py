@@ -225,10 +225,10 @@ def evaluate_with_jacobian(function: Callable, *arguments: Array) -> tuple[Any, 
         return float_outputs, (float_outputs, other_outputs)
 
     all_argnums = tuple(range(len(arguments))) if len(arguments) > 1 else 0
-    output_jacobian, (float_jacobians, other_outputs) = jax.jacfwd(
+    output_jacobian, (float_outputs, other_outputs) = jax.jacfwd(
         select_float_outputs, all_argnums, has_aux=True
     )(*arguments)
-    return eqx.combine(float_jacobians, other_outputs), output_jacobian
+    return eqx.combine(float_outputs, other_outputs), output_jacobian
 
 
 def apply_jacobian(jacobian: PyTree, tangent: Array) -> PyTree:
@@ -244,9 +244,9 @@ def make_zero_tangent(tree: PyTree) -> PyTree:
 
     Leaves for outputs that are not floats have the type float0.
     """
-    leaf_zero_maker = lambda x: (
+    make_zero_leaf_tangent = lambda x: (
         jnp.zeros_like(x)
         if jnp.issubdtype(jnp.result_type(x), jnp.inexact)
         else np.zeros(jnp.shape(x), jax.dtypes.float0)
     )
-    return jax.tree.map(leaf_zero_maker, tree)
+    return jax.tree.map(make_zero_leaf_tangent, tree)

@@ -139,14 +139,14 @@ def solve_node_equations(
                 - contract_inner_axis(remaining_system[1:, :, :n_coordinates], block_row_matrix)
             )
         eliminated_rows.append(block_row_matrix)
-    solution = eliminated_rows[-1]
+    node_solution = eliminated_rows[-1]
     for block_row_matrix in eliminated_rows[-2::-1]:
-        n_solved_blocks = solution.shape[0]
+        n_solved_blocks = node_solution.shape[0]
         block_solution = block_row_matrix[:, n_solved_blocks:] - contract_inner_axis(
-            block_row_matrix[:, :n_solved_blocks], solution
+            block_row_matrix[:, :n_solved_blocks], node_solution
         )
-        solution = jnp.concatenate([block_solution, solution])
-    return solution.reshape(n_nodes, n_coordinates, *solution.shape[1:])
+        node_solution = jnp.concatenate([block_solution, node_solution])
+    return node_solution.reshape(n_nodes, n_coordinates, *node_solution.shape[1:])
 
 
 @solve_node_equations.defjvp
@@ -157,15 +157,16 @@ def _solve_node_equations_jvp(primals: tuple, tangents: tuple) -> tuple:
     Differentiation of the elimination would double its work.
     """
     (matrix, _, barrier_values), (matrix_tangent, rhs_tangent, _) = primals, tangents
-    solution = solve_node_equations(*primals)
+    node_solution = solve_node_equations(*primals)
     n_nodes, n_coordinates = matrix.shape[:2]
     flat_matrix_tangent = matrix_tangent.reshape(
         n_nodes, n_coordinates, n_nodes * n_coordinates, -1
     )
     matrix_tangent_product = contract_inner_axis(
-        flat_matrix_tangent, solution.reshape(n_nodes * n_coordinates, *solution.shape[2:])
+        flat_matrix_tangent,
+        node_solution.reshape(n_nodes * n_coordinates, *node_solution.shape[2:]),
     )
-    return solution, solve_node_equations(
+    return node_solution, solve_node_equations(
         matrix, rhs_tangent - matrix_tangent_product, barrier_values
     )
 
@@ -188,9 +189,9 @@ def evaluate_with_partials(
     """
     function_values, linearized_function = jax.linearize(function, *arguments)
     partials_by_output = []
-    for i, output_value in enumerate(function_values):
+    for i, function_value in enumerate(function_values):
         transposed_function = jax.linear_transpose(
             lambda *t, i=i: linearized_function(*t)[i], *arguments
         )
-        partials_by_output.append(transposed_function(jnp.ones_like(output_value)))
+        partials_by_output.append(transposed_function(jnp.ones_like(function_value)))
     return function_values, partials_by_output

@@ -31,7 +31,9 @@ def unbatch(function: BatchFunction) -> BatchFunction:
 
     @batched_function.def_vmap
     @with_default_jax_settings
-    def merge_axis(axis_size: int, is_batched_by_argument: PyTree, *arrays: PyTree) -> tuple:
+    def merge_vmapped_axis(
+        axis_size: int, is_batched_by_argument: PyTree, *arrays: PyTree
+    ) -> tuple:
         n_lanes = jax.tree.leaves(arrays)[0].shape[-1]
 
         def merge_into_lanes(x: Array, is_batched: bool) -> Array:
@@ -119,9 +121,11 @@ def run_if_any(
     `is_any_element_active` is one flag for the whole batch. The call is a loop with at most one
     iteration, which machine code skips if the flag is false.
     """
-    guarded_call = lambda loop_carry: (jnp.zeros((), bool), function(loop_carry[1]))
+    call_function_once = lambda loop_carry: (jnp.zeros((), bool), function(loop_carry[1]))
     return lax.while_loop(
-        lambda loop_carry: loop_carry[0], guarded_call, (is_any_element_active, fallback_value)
+        lambda loop_carry: loop_carry[0],
+        call_function_once,
+        (is_any_element_active, fallback_value),
     )[1]
 
 
@@ -145,8 +149,8 @@ def make_zeros_like_output(function: Callable[..., PyTree], *arguments: PyTree) 
     """Return zeros with the structure and shapes of the output of `function`, without calling
     it.
     """
-    zero_maker = lambda leaf: jnp.zeros(leaf.shape, leaf.dtype)
-    return jax.tree.map(zero_maker, jax.eval_shape(function, *arguments))
+    make_zero_leaf = lambda leaf: jnp.zeros(leaf.shape, leaf.dtype)
+    return jax.tree.map(make_zero_leaf, jax.eval_shape(function, *arguments))
 
 
 def select_tree_rows(tree: PyTree, row_indices: Any) -> PyTree:
@@ -157,7 +161,9 @@ def select_tree_rows(tree: PyTree, row_indices: Any) -> PyTree:
 def concatenate_tree_rows(*trees: PyTree) -> PyTree:
     """Concatenate trees of arrays along their leading axes, and return NumPy arrays."""
     return jax.tree.map(
-        lambda *leaf_parts: np.concatenate([np.asarray(leaf_rows) for leaf_rows in leaf_parts]),
+        lambda *leaves_to_join: np.concatenate(
+            [np.asarray(leaf_rows) for leaf_rows in leaves_to_join]
+        ),
         *trees,
     )
 
@@ -170,8 +176,8 @@ def map_in_batches(function: Callable, batch_sizes: tuple[int, ...], *trees: PyT
     """
     if len(jax.tree.leaves(trees)[0]) in batch_sizes:
         return function(*jax.device_put(trees))
-    device_function = lambda *rows: function(*jax.device_put(rows))
-    return jax.device_put(map_in_numpy_batches(device_function, batch_sizes, *trees))
+    call_with_device_arrays = lambda *row_trees: function(*jax.device_put(row_trees))
+    return jax.device_put(map_in_numpy_batches(call_with_device_arrays, batch_sizes, *trees))
 
 
 def map_in_numpy_batches(
@@ -185,22 +191,17 @@ def map_in_numpy_batches(
     n_rows, batch_results = len(jax.tree.leaves(trees)[0]), []
     first_row = 0
     while first_row < n_rows:
-        batch_size = _choose_batch_size(n_rows - first_row, batch_sizes)
+        n_remaining_rows = n_rows - first_row
+        size_index = min(bisect.bisect_left(batch_sizes, n_remaining_rows), len(batch_sizes) - 1)
+        batch_size = batch_sizes[size_index]
+        if size_index > 0:
+            smaller_size = batch_sizes[size_index - 1]
+            # Several smaller batches replace a batch that would be at most half full.
+            if -(-n_remaining_rows // smaller_size) * smaller_size <= batch_size // 2:
+                batch_size = smaller_size
         last_row = min(first_row + batch_size, n_rows)
         row_indices = np.minimum(np.arange(first_row, first_row + batch_size), n_rows - 1)
         batch_result = function(*select_tree_rows(trees, row_indices))
         batch_results.append(select_tree_rows(batch_result, slice(0, last_row - first_row)))
         first_row = last_row
     return concatenate_tree_rows(*batch_results) if len(batch_results) > 1 else batch_results[0]
-
-
-def _choose_batch_size(n_rows: int, batch_sizes: tuple[int, ...]) -> int:
-    """Return the size of the next batch for a number of remaining elements.
-
-    It is the smallest of `batch_sizes` that can contain all elements. The next smaller size is used
-    if several batches of that size have at most half as many elements in total.
-    """
-    i = min(bisect.bisect_left(batch_sizes, n_rows), len(batch_sizes) - 1)
-    if i > 0 and -(-n_rows // batch_sizes[i - 1]) * batch_sizes[i - 1] <= batch_sizes[i] // 2:
-        return batch_sizes[i - 1]
-    return batch_sizes[i]

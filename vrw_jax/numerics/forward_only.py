@@ -12,32 +12,32 @@ _FORWARD_ONLY_PRIMITIVE = Primitive("forward_only")
 """Identity operation whose transpose raises an error."""
 
 
-def _raise_reverse_mode_error(_cotangent: Any, _value: Any, *, name: str) -> None:
+def _raise_reverse_mode_error(_cotangent: Any, _value: Any, *, function_name: str) -> None:
     """Raise a ValueError that explains why reverse mode is not available."""
     raise ValueError(
-        f"hybrid.{name} has no derivative in reverse mode, since the number of its solver steps "
-        "is not known beforehand: use forward mode, jax.jacfwd or jax.jvp, instead of jax.grad, "
-        "jax.jacrev or jax.vjp."
+        f"hybrid.{function_name} has no derivative in reverse mode, since the number of its solver "
+        "steps is not known beforehand: use forward mode, jax.jacfwd or jax.jvp, instead of "
+        "jax.grad, jax.jacrev or jax.vjp."
     )
 
 
-_FORWARD_ONLY_PRIMITIVE.def_impl(lambda x, *, name: x)
-_FORWARD_ONLY_PRIMITIVE.def_abstract_eval(lambda x, *, name: x)
+_FORWARD_ONLY_PRIMITIVE.def_impl(lambda x, *, function_name: x)
+_FORWARD_ONLY_PRIMITIVE.def_abstract_eval(lambda x, *, function_name: x)
 ad.deflinear2(_FORWARD_ONLY_PRIMITIVE, _raise_reverse_mode_error)
 batching.defvectorized(_FORWARD_ONLY_PRIMITIVE)
-mlir.register_lowering(_FORWARD_ONLY_PRIMITIVE, lambda _context, x, *, name: [x])
+mlir.register_lowering(_FORWARD_ONLY_PRIMITIVE, lambda _context, x, *, function_name: [x])
 
 
-def forbid_reverse_mode(name: str, function_result: PyTree) -> PyTree:
+def forbid_reverse_mode(function_name: str, function_result: PyTree) -> PyTree:
     """Return `function_result` unchanged, marked so that reverse-mode differentiation raises an
     error.
 
-    `name` is the function in `hybrid` that computed the result.
+    `function_name` is the function in `hybrid` that computed the result.
     """
 
-    def mark_leaf(leaf: Any) -> Any:
+    def mark_leaf_as_forward_only(leaf: Any) -> Any:
         if isinstance(leaf, jax.core.Tracer) and eqx.is_inexact_array(leaf):
-            return _FORWARD_ONLY_PRIMITIVE.bind(leaf, name=name)
+            return _FORWARD_ONLY_PRIMITIVE.bind(leaf, function_name=function_name)
         return leaf
 
-    return jax.tree.map(mark_leaf, function_result)
+    return jax.tree.map(mark_leaf_as_forward_only, function_result)

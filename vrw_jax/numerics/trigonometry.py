@@ -17,17 +17,17 @@ because it exceeds pi/2, the largest angle of a valid start.
 """
 
 
-def _compute_economized_coefficients(odd_offset: int) -> tuple[float, ...]:
+def _compute_economized_coefficients(series_order_offset: int) -> tuple[float, ...]:
     """Return nine coefficients of a polynomial in the squared angle.
 
-    The polynomial approximates the cosine if `odd_offset` is 0, and the sine divided by the angle
-    if it is 1. The coefficients are those of the Taylor series, in which Chebyshev polynomials of
-    lower degree replace the last terms. The polynomial is as accurate as a Taylor series with three
-    more terms.
+    The polynomial approximates the cosine if `series_order_offset` is 0, and the sine divided by
+    the angle if it is 1. The coefficients are those of the Taylor series, in which Chebyshev
+    polynomials of lower degree replace the last terms. The polynomial is as accurate as a Taylor
+    series with three more terms.
     """
     factorial_of_order, squared_angle_limit = math.factorial, MAX_EXACT_ANGLE * MAX_EXACT_ANGLE
     series_coefficients = [
-        (-1) ** series_order / factorial_of_order(2 * series_order + odd_offset)
+        (-1) ** series_order / factorial_of_order(2 * series_order + series_order_offset)
         for series_order in range(1, 14)
     ]
     while len(series_coefficients) > 8:
@@ -67,9 +67,11 @@ def compute_sine_cosine(angle: Elementwise) -> tuple[Elementwise, Elementwise]:
     arrays and Python numbers the results are NumPy numbers, computed in a tenth of the time of JAX
     calls.
     """
-    is_concrete = isinstance(angle, (float, np.ndarray))
+    is_angle_concrete = isinstance(angle, (float, np.ndarray))
     return (
-        _evaluate_sine_and_cosine(np, angle) if is_concrete else _differentiable_sine_cosine(angle)
+        _evaluate_sine_and_cosine(np, angle)
+        if is_angle_concrete
+        else _differentiable_sine_cosine(angle)
     )
 
 

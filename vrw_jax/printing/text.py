@@ -20,11 +20,11 @@ def has_concrete_numbers(result_tree: Any) -> bool:
 
     Inside `jit`, numbers are not concrete.
     """
-    concreteness_test = lambda tree_leaf: (
+    is_leaf_concrete = lambda tree_leaf: (
         eqx.is_array_like(tree_leaf) and not isinstance(tree_leaf, int | jax.core.Tracer)
     )
     has_all_fields = not any(field_value is None for field_value in vars(result_tree).values())
-    return has_all_fields and all(map(concreteness_test, jax.tree.leaves(result_tree)))
+    return has_all_fields and all(map(is_leaf_concrete, jax.tree.leaves(result_tree)))
 
 
 class AbstractPrintable(eqx.Module):
@@ -90,8 +90,8 @@ def map_text_of_elements(element_text_function: Callable[..., str], *element_val
 
 def describe_step_ending(status_codes: Any, status_code_class: type[enum.IntEnum]) -> Any:
     """Return the sentence that explains a status code, or an array of sentences for a batch."""
-    code_describer = lambda code: status_code_class(int(code)).meaning  # type: ignore[attr-defined]
-    return map_text_of_elements(code_describer, status_codes)
+    describe_code = lambda status_code: status_code_class(int(status_code)).meaning  # type: ignore[attr-defined]
+    return map_text_of_elements(describe_code, status_codes)
 
 
 def format_heading_and_rows(heading_text: str, text_rows: Iterable[LabelAndText]) -> str:
@@ -105,17 +105,17 @@ def format_html_table(
     table_title: str, text_rows: Iterable[Sequence[str]], header_cells: Sequence[str] = ()
 ) -> str:
     """Return an HTML table of rows of cells. The first cell of each row is a header."""
-    cell_formatter = lambda cell_tag, cell_text: (
+    format_table_cell = lambda cell_tag, cell_text: (
         f"<{cell_tag} style='text-align:left'>{escape(cell_text)}</{cell_tag}>"
     )
     html_row_lines = (
-        ["".join(cell_formatter("th", cell_text) for cell_text in header_cells)]
+        ["".join(format_table_cell("th", cell_text) for cell_text in header_cells)]
         if header_cells
         else []
     )
     html_row_lines += [
-        cell_formatter("th", row_label)
-        + "".join(cell_formatter("td", cell_text) for cell_text in row_cells)
+        format_table_cell("th", row_label)
+        + "".join(format_table_cell("td", cell_text) for cell_text in row_cells)
         for row_label, *row_cells in text_rows
     ]
     html_rows = "".join(f"<tr>{html_row_line}</tr>" for html_row_line in html_row_lines)
@@ -126,12 +126,14 @@ def format_markdown_table(
     header_cells: Sequence[str], text_rows: Iterable[Sequence[str]]
 ) -> list[str]:
     """Return a Markdown table as a list of lines."""
-    cell_formatter = lambda cell_text: " " + cell_text.replace("|", r"\|") + " " * bool(cell_text)
-    line_formatter = lambda row_cells: "|" + "|".join(map(cell_formatter, row_cells)) + "|"
+    format_table_cell = lambda cell_text: (
+        " " + cell_text.replace("|", r"\|") + " " * bool(cell_text)
+    )
+    format_table_line = lambda row_cells: "|" + "|".join(map(format_table_cell, row_cells)) + "|"
     return [
-        line_formatter(header_cells),
+        format_table_line(header_cells),
         "|" + "---|" * len(header_cells),
-        *map(line_formatter, text_rows),
+        *map(format_table_line, text_rows),
     ]
 
 
@@ -149,25 +151,22 @@ _SYMBOL_TOKEN_PATTERN = re.compile(
 
 def format_mathtext(symbol_text: str) -> str:
     r"""Convert a symbol to mathtext: "θ̇⁺" to \dot{\theta}^+, "L1" to L_1."""
-    return _SYMBOL_TOKEN_PATTERN.sub(
-        _format_symbol_token, unicodedata.normalize("NFD", symbol_text)
-    )
 
+    def format_symbol_token(token_match: re.Match[str]) -> str:
+        token_kind = token_match.lastgroup or ""
+        token_text = token_match[token_kind]
+        is_upright_text = token_kind == "word" or re.search("[A-Za-z]{3}", token_text)
+        token_mathtext = _MATHTEXT_BY_SYMBOL.get(
+            token_text, f"\\mathrm{{{token_text}}}" if is_upright_text else token_text
+        )
+        return {
+            "below": f"_{{{token_mathtext}}}",
+            "dotted": f"\\dot{{{token_mathtext}}}",
+            "twice": f"\\ddot{{{token_mathtext}}}",
+            "index": f"_{token_mathtext}",
+        }.get(token_kind, token_mathtext)
 
-def _format_symbol_token(token_match: re.Match[str]) -> str:
-    """Return the mathtext for one token of a symbol that `_SYMBOL_TOKEN_PATTERN` has matched."""
-    token_kind = token_match.lastgroup or ""
-    token_text = token_match[token_kind]
-    is_upright_text = token_kind == "word" or re.search("[A-Za-z]{3}", token_text)
-    token_mathtext = _MATHTEXT_BY_SYMBOL.get(
-        token_text, f"\\mathrm{{{token_text}}}" if is_upright_text else token_text
-    )
-    return {
-        "below": f"_{{{token_mathtext}}}",
-        "dotted": f"\\dot{{{token_mathtext}}}",
-        "twice": f"\\ddot{{{token_mathtext}}}",
-        "index": f"_{token_mathtext}",
-    }.get(token_kind, token_mathtext)
+    return _SYMBOL_TOKEN_PATTERN.sub(format_symbol_token, unicodedata.normalize("NFD", symbol_text))
 
 
 def format_numbers(printed_numbers: object) -> str:

@@ -122,14 +122,14 @@ def _load_or_export_trace(
         jax.default_backend(),
         simd.describe_processor() if simd.is_machine_code_available() else None,
     )
-    key_parts = (
+    trace_key_parts = (
         trace_key_settings,
         str(argument_structure),
         argument_shapes,
         device_platform,
         store.describe_trace_environment(),
     )
-    record_name = f"vrw_trace_{hashlib.sha256(repr(key_parts).encode()).hexdigest()}"
+    record_name = f"vrw_trace_{hashlib.sha256(repr(trace_key_parts).encode()).hexdigest()}"
     record_content = store.load_bytes(record_name)
     if record_content is not None:
         machine_code_names_bytes, _, serialized_trace = record_content.partition(b"\n")
@@ -170,14 +170,14 @@ def _find_machine_code_names(traced_program: Any) -> set[str]:
     """Return the names of all machine-code functions that a traced program calls."""
     traced_program = getattr(traced_program, "jaxpr", traced_program)
     machine_code_names = {
-        inner_equation.params["code"].code_name
-        for inner_equation in traced_program.eqns
-        if inner_equation.primitive is simd.MACHINE_CODE_PRIMITIVE
+        inner_jaxpr_equation.params["code"].code_name
+        for inner_jaxpr_equation in traced_program.eqns
+        if inner_jaxpr_equation.primitive is simd.MACHINE_CODE_PRIMITIVE
     }
-    for equation in traced_program.eqns:
-        for parameter_leaf in jax.tree.leaves(list(equation.params.values())):
-            if hasattr(getattr(parameter_leaf, "jaxpr", parameter_leaf), "eqns"):
-                machine_code_names |= _find_machine_code_names(parameter_leaf)
+    for jaxpr_equation in traced_program.eqns:
+        for equation_parameter in jax.tree.leaves(list(jaxpr_equation.params.values())):
+            if hasattr(getattr(equation_parameter, "jaxpr", equation_parameter), "eqns"):
+                machine_code_names |= _find_machine_code_names(equation_parameter)
     return machine_code_names
 
 

@@ -129,11 +129,11 @@ def load_bytes(record_name: str) -> bytes | None:
         return None
     record_path = Path(cache_folder) / f"{record_name}{CACHE_RECORD_SUFFIX}"
     # Without this flag the call would block if the file were a pipe.
-    nonblocking_opener = lambda record_path, flags: os.open(
-        record_path, flags | getattr(os, "O_NONBLOCK", 0)
+    open_nonblocking = lambda record_path, open_flags: os.open(
+        record_path, open_flags | getattr(os, "O_NONBLOCK", 0)
     )
     try:
-        with open(record_path, "rb", opener=nonblocking_opener) as record_file:
+        with open(record_path, "rb", opener=open_nonblocking) as record_file:
             file_stat_result = os.fstat(record_file.fileno())
             is_regular_file = stat.S_ISREG(file_stat_result.st_mode)
             distrust_reason = (

@@ -24,13 +24,12 @@ _process_fork_state = {"is_forked": False}
 """Flag that states whether this process was forked after JAX had been initialized."""
 
 
-def _mark_process_as_forked() -> None:
-    """Record in a forked child process whether JAX's threads are missing."""
-    _process_fork_state["is_forked"] |= bool(xla_bridge.backends_are_initialized())
-
-
 if hasattr(os, "register_at_fork"):  # Windows has no fork.
-    os.register_at_fork(after_in_child=_mark_process_as_forked)
+    os.register_at_fork(
+        after_in_child=lambda: _process_fork_state.update(
+            is_forked=_process_fork_state["is_forked"] or xla_bridge.backends_are_initialized()
+        )
+    )
 
 
 def raise_if_process_forked() -> None:

@@ -88,9 +88,9 @@ def make_page_address(params: WheelParams, model_name: str = PAGE_MODEL_NAMES[0]
         params, 1.0, check_choice("model_name", model_name, PAGE_MODEL_NAMES)
     )
     changed_values = {
-        value_name: page_value
-        for value_name, page_value in page_values.items()
-        if page_value != default_values[value_name]
+        page_value_name: page_value
+        for page_value_name, page_value in page_values.items()
+        if page_value != default_values[page_value_name]
     }
     return find_wheel_page().as_uri() + (f"#{urlencode(changed_values)}" if changed_values else "")
 
@@ -272,9 +272,9 @@ def _make_page_map(dataset: "xr.Dataset") -> dict[str, Any]:
             map_measures[str(variable_name)] = [
                 [
                     float(measure_value) if math.isfinite(measure_value) else None
-                    for measure_value in value_row
+                    for measure_value in measure_row
                 ]
-                for value_row in min_values_over_legs.tolist()
+                for measure_row in min_values_over_legs.tolist()
             ]
     return {
         "axes": [
