@@ -92,8 +92,8 @@ DEFAULT_STIFF_START_OPTIONS = StiffStartOptions()
 
 
 class BatchAdvanceResult(NamedTuple):
-    """Minimal results of one walking step per batch element: next section state, durations,
-    outcome.
+    """Results of one walking step for each batch element, without indicators, margins and
+    energies.
     """
 
     section_state: Vector  # (theta-, dtheta-, dL1-), three arrays
@@ -172,11 +172,11 @@ def advance_gait_step(
     stop_at_lift_off: bool,
     straggler_count: Array | None = None,
 ) -> BatchAdvanceResult:
-    """Return the minimal results of one walking step per batch element, from touchdown to
-    touchdown.
+    """Compute one walking step per batch element, without indicators, margins and energies.
 
-    - `x`: section state of each batch element;
-    - `straggler_count`: see `integrate_batch_phase`.
+    - `x`: section state of each batch element just before touchdown;
+    - `straggler_count`: largest number of batch elements that may remain unfinished, see
+      `integrate_batch_phase`.
     """
     phase_sequence = run_batch_phases(
         params,
@@ -217,7 +217,8 @@ def run_batch_phases(
 ) -> PhaseSequenceResult:
     """Integrate all phases of one walking step per batch element and return their starts and ends.
 
-    - `straggler_count`: see `integrate_batch_phase`;
+    - `straggler_count`: largest number of batch elements that may remain unfinished, see
+      `integrate_batch_phase`;
     - `is_compiled_separately`: see `BatchPhase`.
     """
     phase_runner = _make_phase_runner(
@@ -317,7 +318,7 @@ def can_use_batch_kernel(options: StepOptions) -> bool:
 
 
 class _StepTraceConfig(NamedTuple):
-    """Settings, other than its arrays, on which the trace of a batched step depends."""
+    """Static settings on which the traced program of a batch of walking steps depends."""
 
     argument_structure: Any  # tree structure of (params, x, options)
     stop_at_lift_off: bool
@@ -364,7 +365,7 @@ class _StepTraceConfig(NamedTuple):
         return eqx.partition(step_result, eqx.is_inexact_array)
 
     def make_output_template(self, *argument_leaves: Array) -> tuple:
-        """Return arrays for one wheel with the structure of the results of
+        """Return placeholder arrays for one wheel, with the structure of the results of
         `compute_step_outputs`.
         """
         x = argument_leaves[0]
@@ -400,8 +401,8 @@ def build_step_function(
     """Return a function that computes the results of a walking step from the leaves of (params, x,
     options).
 
-    The results are split into float arrays and other arrays. All AD modes can be built from the
-    function, because it serves as a forward rule.
+    The results are split into float arrays and other arrays. The function serves as a forward-mode
+    rule, from which all AD modes are derived.
     """
     trace_config = _StepTraceConfig(argument_structure, stop_at_lift_off, friction)
     trace_key = ("gait step", *trace_config.trace_key)
@@ -504,8 +505,9 @@ def build_step_jacobian(
 ) -> ForwardFunction:
     """Return a function that computes a walking step and the Jacobian of its results.
 
-    The step is that of `build_step_function`. The returned function gives the Jacobian of the float
-    results with respect to the leaves at `input_indices`, the float results, and the other results.
+    The walking step is that of `build_step_function`. The returned function gives the Jacobian of
+    the float results, the float results, and all other results. The Jacobian is with respect to the
+    leaves at `input_indices`.
     """
     trace_config = _StepTraceConfig(argument_structure, stop_at_lift_off, friction)
 
@@ -554,7 +556,8 @@ def split_jacobian_by_leaf(
 ) -> tuple:
     """Split a Jacobian into one tree per selected leaf.
 
-    The leading axis of `jacobian_columns` runs over all entries of the selected leaves.
+    - `jacobian_columns`: Jacobian, whose leading axis runs over all entries of the selected leaves;
+    - `input_indices`: indices of the selected leaves in `argument_leaves`.
     """
     jacobian_by_leaf, first_column = [], 0
     for i in input_indices:
@@ -583,7 +586,7 @@ def compute_jacobian_columns(
 
     The columns are derivatives with respect to the leaves at `input_indices`; their leading axis
     runs over the entries of these leaves. `batch_function` returns float arrays with the batch on
-    the last axis, and auxiliary outputs.
+    the last axis, and auxiliary results.
     """
 
     def evaluate_at_selected_leaves(*selected_leaf_values: Array) -> tuple:
@@ -603,10 +606,10 @@ def compute_jacobian_columns(
 
 
 def _make_unit_tangents(selected_leaves: Sequence[Array]) -> list[Array]:
-    """Return one unit vector per entry of the leaves, on the leading axis, split by leaf.
+    """Return the unit vectors of the space of all entries of the leaves, split by leaf.
 
-    Each entry of a unit vector is a separate constant 0 or 1, so that machine code omits products
-    with 0.
+    The leading axis runs over the unit vectors. Each entry of a unit vector is a separate constant
+    0 or 1, so that machine code omits products with 0.
     """
     entries_per_leaf = [int(np.prod(selected_leaf.shape[:-1])) for selected_leaf in selected_leaves]
     unit_vectors, leaf_tangents, n_previous_entries = np.eye(sum(entries_per_leaf)), [], 0

@@ -23,7 +23,9 @@ from vrw_jax.wheel import (
 )
 
 StepGroundValues = tuple[Array, ...]
-"""Ground of one step or of all steps, in the form of the argument of `with_step_ground`."""
+"""Arrays that describe the ground under one step or under all steps: slopes and, for some models,
+friction coefficients. `with_step_ground` takes the arrays of one step.
+"""
 
 
 class AbstractWheel(eqx.Module):
@@ -44,7 +46,7 @@ class AbstractWheel(eqx.Module):
     capabilities: eqx.AbstractClassVar[ModelCapabilities]
     """Features of the library that the model supports."""
     parameter_names: eqx.AbstractClassVar[tuple[str, ...]]
-    """Inputs of the motion: the wheel's parameters and, if the motion depends on friction,
+    """Names of the inputs on which the motion depends: the wheel's parameters and, for some models,
     friction.
     """
     reports_contacts: eqx.AbstractClassVar[bool]
@@ -95,7 +97,7 @@ class AbstractWheel(eqx.Module):
     def collect_batch_parameter_values(
         self, params: WheelParams
     ) -> Float[np.ndarray, "wheels n_values"]:
-        """Return `collect_parameter_values` for each wheel in a batch, computed with NumPy.
+        """Return the values of `parameter_names` for each wheel in a batch, computed with NumPy.
 
         JAX would compile a program for each batch size.
         """
@@ -108,7 +110,7 @@ class AbstractWheel(eqx.Module):
     def from_parameter_values(
         self, parameter_values: Array | tuple[Array, ...], n_legs: int
     ) -> tuple["AbstractWheel", WheelParams]:
-        """Return a model and a wheel with these values of `parameter_names`.
+        """Return a model and a wheel with the given values of the parameters in `parameter_names`.
 
         This function is the inverse of `collect_parameter_values`. The values may be tracers.
         """
@@ -123,9 +125,9 @@ class AbstractWheel(eqx.Module):
     def with_parameter(
         self, params: WheelParams, parameter_name: str, parameter_value: Elementwise
     ) -> tuple["AbstractWheel", WheelParams]:
-        """Return the model and the wheel with a new value of one of `parameter_names`.
+        """Return the model and the wheel with a new value of the parameter `parameter_name`.
 
-        The value may be a tracer.
+        The parameter is one of `parameter_names`, and the value may be a tracer.
         """
         if parameter_name == FRICTION_NAME:
             return eqx.tree_at(lambda ground: ground.friction, self, parameter_value), params
@@ -135,7 +137,7 @@ class AbstractWheel(eqx.Module):
 
     @abc.abstractmethod
     def advance(self, params: WheelParams, x: SectionState, options: StepOptions) -> AdvanceResult:
-        """Return the minimal results of one walking step from the section state `x`.
+        """Return the section state after one walking step from `x`, with its durations and outcome.
 
         The results are differentiable in any mode, to any order.
         """
@@ -144,8 +146,8 @@ class AbstractWheel(eqx.Module):
     def take_step(self, params: WheelParams, x: SectionState, options: StepOptions) -> Any:
         """Return all results of one walking step from the section state `x`.
 
-        They include indicators, margins and energies. The type is `StepResult`, or the model's
-        counterpart of it. The results are differentiable in any mode.
+        The results include indicators, margins and energies. The type is `StepResult`, or the
+        model's counterpart of `StepResult`. The results are differentiable in any mode.
         """
 
     @abc.abstractmethod
@@ -154,7 +156,7 @@ class AbstractWheel(eqx.Module):
     ) -> Any:
         """Return the motion during a walking step at `n_samples` times of each phase.
 
-        The type is `Trajectory`, or the model's counterpart of it.
+        The type is `Trajectory`, or the model's counterpart of `Trajectory`.
         """
 
     def finish_step(
@@ -193,9 +195,10 @@ class AbstractWheel(eqx.Module):
     def with_step_ground(
         self, params: WheelParams, step_ground: StepGroundValues
     ) -> tuple["AbstractWheel", WheelParams]:
-        """Return the model and the wheel on the ground of one step.
+        """Return the model and the wheel on the ground of one walking step.
 
-        `step_ground` contains the slopes of two lines of the ground, see `separate_next_slope`.
+        `step_ground` contains the slope under both feet in double support and the slope of the next
+        line of the ground, see `separate_next_slope`.
         """
         return self, eqx.tree_at(lambda wheel: wheel.slope, params, step_ground[0])
 
@@ -211,7 +214,7 @@ class AbstractWheel(eqx.Module):
         return self.count_section_entries(params)
 
     def collect_section_units(self, wheel_units: WheelUnits, n_legs: int) -> list[Elementwise]:
-        """Return the unit of each entry of a section state, computed from the wheel's own units."""
+        """Return the unit of each entry of a section state, computed from `wheel_units`."""
         return [
             wheel_units.length_unit / wheel_units.length_unit,
             wheel_units.rate_unit,

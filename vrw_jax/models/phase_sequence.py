@@ -145,11 +145,11 @@ def _run_remaining_phases(
     is_phase_active: Array,
     options: StepOptions,
 ) -> _RemainingPhases:
-    """Integrate the remaining phases of a step, starting from a motion in the first of these
-    phases.
+    """Integrate the remaining phases of a step, starting from a motion in the first remaining
+    phase.
 
     - `is_valid_step`: whether the inputs are valid, so that a step takes place;
-    - `is_phase_active`: whether the first of these phases takes place.
+    - `is_phase_active`: whether the first remaining phase takes place.
     """
     step_outcome = jnp.where(
         is_valid_step, jnp.int32(Outcome.STEPPED), jnp.int32(Outcome.BAD_INPUT)
@@ -272,8 +272,9 @@ def select_next_section_state(phase_sequence: PhaseSequenceResult) -> Vector:
 
 
 def make_advance_result(phase_sequence: PhaseSequenceResult, engine: str) -> AdvanceResult:
-    """Return the minimal results of a step. All entries of the section state are 0 after a failed
-    step.
+    """Return the section state after a step, the durations and the outcome.
+
+    All entries of the section state are 0 after a failed step.
     """
     theta, dtheta, dL1 = select_next_section_state(phase_sequence)
     has_stepped = phase_sequence.outcome == Outcome.STEPPED

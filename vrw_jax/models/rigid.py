@@ -392,7 +392,9 @@ class VerticalRateMap(NamedTuple):
 
     @property
     def _cosine_and_sine_coefficients(self) -> tuple[Elementwise, Elementwise]:
-        """Return the coefficients with which cos(slope) and sin(slope) enter x', divided by G."""
+        """Return the coefficients of cos(slope) and sin(slope) in the expression for x', divided by
+        G.
+        """
         r, h = self.retained_squared_rate_fraction, self.half_angle
         return (1.0 - r) * jnp.cos(h), (1.0 + r) * jnp.sin(h)
 
@@ -536,7 +538,9 @@ class RollingMotion(eqx.Module):
     def compute_stopper_force_at_angle(
         self, theta: Elementwise, leg_numbers: range
     ) -> Float[Array, "n ..."]:
-        """Return the forces on the stoppers of the legs `leg_numbers` at the angle theta, N."""
+        """Return the forces on the stoppers of the legs with labels `leg_numbers` at the angle
+        theta, N.
+        """
         return dynamics.compute_stopper_force(
             self.s,
             self.compute_motion_at_angle(theta),

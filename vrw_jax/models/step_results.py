@@ -147,7 +147,9 @@ class Margins(AbstractMeasureGroup):
 
 
 class AbstractStep(AbstractPrintable):
-    """Results that the steps of every model report. Under `vmap` each field gains a batch axis."""
+    """Results of a walking step that every model reports. Under `vmap`, each field gains a batch
+    axis.
+    """
 
     section_state: eqx.AbstractVar[Array]  # just before the next touchdown
     post_impact: eqx.AbstractVar[Float[Array, "2 ..."]]  # (theta, dtheta), rad, rad/s
@@ -203,8 +205,9 @@ class AbstractStep(AbstractPrintable):
         return shared_measures | self.collect_model_measures()
 
     def summary_rows(self) -> list[LabelAndText]:
-        """Return labels and printed values: first measures, then margins and whether each of them
-        holds.
+        """Return labels and printed values: first the measures, then the margins.
+
+        The text for a margin states whether the margin holds.
         """
         step_outcome, measure_values = np.asarray(self.outcome), self.measures()
         if step_outcome.ndim:
@@ -306,9 +309,7 @@ class StepResult(AbstractStep):
 
 
 class AdvanceResult(eqx.Module):
-    """Minimal results of a step: the section state from which the next step starts, and the
-    outcome.
-    """
+    """Section state, durations and outcome at the end of a step, without indicators and margins."""
 
     section_state: AnySectionState
     durations: Float[Array, "3 ..."]  # durations of DLS, SLS-I, SLS-II, s

@@ -36,11 +36,11 @@ class UnitScalingPowers(NamedTuple):
     def subtract_known_columns(
         self, scaled_output: Array, step_inputs: Sequence[Array], known_columns: Mapping[int, Array]
     ) -> Array:
-        """Subtract the contribution of each known Jacobian column from the Euler sum.
+        """Subtract the contribution of each known Jacobian column from the sum in Euler's theorem.
 
-        `scaled_output` is the output times its exponent. The contribution of a column is the column
-        times its input and the exponent of this input. By Euler's theorem, the result is the sum of
-        the contributions of the unknown columns.
+        `scaled_output` is an output times the exponent of the unit in that output. The contribution
+        of a column is the column times its input and the exponent of the unit in that input. By
+        Euler's theorem, the result is the sum of the contributions of the unknown columns.
         """
         for i, known_column in known_columns.items():
             if self.step_input_powers[i]:
@@ -78,7 +78,8 @@ def complete_jacobian_by_scaling(
     Euler's theorem determines the columns of `UNIT_SCALING_BY_PARAMETER_INDEX`.
 
     - `known_columns`: all other columns, by the index of the input;
-    - `scaled_outputs`: outputs times their exponents, by the index of the parameter.
+    - `scaled_outputs`: outputs times the exponents of a unit, by the index of the parameter whose
+      column the unit determines.
     """
     known_columns = dict(known_columns)
     for parameter_index, unit_scaling in UNIT_SCALING_BY_PARAMETER_INDEX.items():
@@ -96,9 +97,8 @@ def complete_jacobian_columns(
 ) -> tuple:
     """Compute the Jacobian of section state and durations with respect to all inputs of a step.
 
-    The results are those of `compute_jacobian_columns`.
-
-    Two columns follow from the other columns by unit scaling.
+    The results are those of `compute_jacobian_columns`. Two columns are computed from all other
+    columns by unit scaling.
 
     - `step_inputs`: parameters, then the start, then on uneven ground the slope of the next line of
       the ground;
