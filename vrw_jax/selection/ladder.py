@@ -2,9 +2,9 @@
 
 The step is first computed with the viscoelastic model, together with its margins. If a margin is
 violated, the step is computed again with the unilateral model. Under `vmap`, a model is selected
-for each batch element. Elements for which the viscoelastic model is valid cost no work in the
-unilateral model. The rigid model is never selected, because its assumption of rigid legs is
-violated for every finite stiffness.
+for each batch element. The unilateral model computes nothing for elements for which the
+viscoelastic model is valid. The rigid model is never selected, because its assumption of rigid legs
+is violated for every finite stiffness.
 """
 
 import dataclasses
@@ -270,7 +270,9 @@ class LadderWheel(AbstractContactWheel):
 
     @property
     def unilateral_model(self) -> UnilateralWheel:
-        """Return the model for steps for which the viscoelastic model is not valid."""
+        """Return the unilateral model, which is used if the viscoelastic model is not valid for a
+        step.
+        """
         return UnilateralWheel(friction=self.friction)
 
     @property
