@@ -1,7 +1,7 @@
 """Attractors: walks from many starts, until the motion is periodic or the wheel falls.
 
-Starts may belong to different wheels. After each round of steps, only walks that are neither
-periodic nor failed continue, so that long transients cost little.
+Starts may belong to different wheels. Walks are tested after each round of several walking steps.
+Only walks that are neither periodic nor failed continue, so that long transients cost little.
 """
 
 import functools
@@ -210,8 +210,9 @@ def _detect_walk_periods(
 
 
 class DistinctOrbits(NamedTuple):
-    """Distinct orbits that walks from many starts reach, in decreasing order of their number of
-    starts.
+    """Distinct orbits that walks from many starts reach.
+
+    The orbits are sorted by the number of starts whose walks reach them, largest first.
     """
 
     orbit_indices: np.ndarray  # index of the orbit of each start; -1 without an orbit

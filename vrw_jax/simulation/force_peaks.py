@@ -150,7 +150,7 @@ def _find_force_extrema(
 ) -> _ForceExtrema:
     """Return the extrema of a force within the intervals between the events of one step.
 
-    - `interval_indices`: sample indices of each interval between two events.
+    - `interval_indices`: indices of the samples in each interval between two events.
     """
     from scipy.interpolate import PPoly, make_interp_spline  # This import is slow.
 
@@ -226,9 +226,10 @@ def _find_force_extrema(
 def _summarize_force_extrema(
     fore_extrema: _ForceExtrema, total_extrema: _ForceExtrema
 ) -> dict[str, Any]:
-    """Return the force measures of one step, computed from the extrema of two forces.
+    """Return the force measures of one step.
 
-    These are the normal force on the fore foot and the total normal force.
+    The measures are computed from the extrema of the normal force on the fore foot and of the total
+    normal force.
     """
     trough_depth = 0.0
     for i in np.flatnonzero(~fore_extrema.is_extremum_maximum):

@@ -1,7 +1,7 @@
 """Single steps, the return map, and walks of many steps.
 
 All functions are pure and take a single wheel. They work with `jit`, `vmap` and every mode of
-differentiation. The step of a model is compiled once.
+differentiation. The function that computes a step is compiled once per model.
 """
 
 import dataclasses
@@ -134,7 +134,9 @@ def convert_section_state(
 ) -> Any:
     """Return the section state as an array, converted by `state_converter`.
 
-    `state_converter` raises an error if the state is invalid.
+    - `argument_description`: name of the argument in error messages;
+    - `state_converter`: function that checks and converts the state, and raises an error if the
+      state is invalid.
     """
     return state_converter(
         argument_description,
@@ -464,7 +466,7 @@ def split_stepwise_ground(
 ) -> tuple[AbstractWheel, Any, StepGroundValues | None]:
     """Return the model and the wheel on the ground of the first step, and the ground of each step.
 
-    On flat ground, model and wheel do not change and the third result is None.
+    On flat ground, the model and the wheel are the given ones, and the third result is None.
     """
     checked_model = convert_model_argument(model, allows_friction_arrays=True)
     if not isinstance(params, WheelParams):

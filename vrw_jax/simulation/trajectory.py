@@ -187,8 +187,8 @@ class SampledStep(NamedTuple):
 
 
 class TrajectorySpecification(NamedTuple):
-    """Function that samples a step of a model, and names and attributes of the resulting
-    trajectory.
+    """Function that samples a step of a model, and the names and attributes of trajectory
+    variables.
     """
 
     step_sampler: Callable[[Array, int], SampledStep]  # arguments: section state, step index
@@ -234,13 +234,16 @@ class UnevenGroundLines(NamedTuple):
         k: int,
         foothold: np.ndarray,
     ) -> None:
-        """Convert positions (m) and energies (J) of step k in place to the frame of line 0 of the
+        """Convert the positions (m) and energies (J) in step k to the frame of line 0 of the
         ground.
 
-        Before the conversion they are in the frame of the step's own line.
+        The arrays in `step_columns` are replaced by converted arrays. Before the conversion, they
+        are in the frame of the line of the ground under both feet in double support.
 
-        - `position_names`: names of the columns that are positions along the slope;
-        - `foothold_position`: position of the first foot of step k in the frame of line 0, m.
+        - `step_columns`: sampled variables of the step, by name;
+        - `position_names`: names of the variables that are positions along the slope;
+        - `k`: index of the step;
+        - `foothold`: position of the first foot of step k in the frame of line 0, m.
         """
         for column_name in position_names:
             normal_column_name = f"{column_name[:-1]}z"
@@ -263,7 +266,7 @@ class UnevenGroundLines(NamedTuple):
     def rotate_to_line_0(self, k: int, x: Any, z: Any) -> tuple[Any, Any]:
         """Return the components of a vector in the frame of line 0 of the ground.
 
-        x and z are its components in the frame of line k.
+        - `k`: index of the line of the ground in whose frame x and z are components of the vector.
         """
         line_angle = self.line_slopes[k] - self.line_slopes[0]
         sine_of_angle, cosine_of_angle = np.sin(line_angle), np.cos(line_angle)
@@ -277,12 +280,14 @@ def sample_walk_steps(
     downslope_weight: float,
     ground_lines: UnevenGroundLines | None = None,
 ) -> SampledWalk:
-    """Return samples of the walk from the section state x. The walk ends at the first failure.
+    """Return samples of the walk from the section state x. The walk ends at the first failed step.
 
-    Positions along the slope (m) are measured from the first foothold. The energies in
-    `HEIGHT_DEPENDENT_ENERGIES` decrease by `downslope_weight` (N) times the traveled distance. On
-    uneven ground, `UnevenGroundLines.convert_to_walk_frame` converts positions and energies
-    instead.
+    Positions along the slope (m) are measured from the first foothold.
+
+    - `downslope_weight`: component of the weight parallel to the slope, N. On flat ground, the
+      energies in `HEIGHT_DEPENDENT_ENERGIES` decrease by this weight times the traveled distance;
+    - `ground_lines`: slopes of uneven ground, or None on flat ground. On uneven ground,
+      `UnevenGroundLines.convert_to_walk_frame` converts positions and energies.
     """
     columns_by_step: list[dict[str, np.ndarray]] = []
     walk_outcome, n_stepped, step_start_time, traveled_distance = Outcome.STEPPED, 0, 0.0, 0.0
@@ -346,9 +351,9 @@ def _compile_step_sampler(
 def _make_phase_columns(s: Symbols, trajectory: Trajectory) -> dict[str, np.ndarray]:
     """Return the samples of each trajectory variable in a step, by name, shape (phase, sample).
 
-    The names are those of `TRAJECTORY_MEASURES`. Positions are relative to the foot of Leg 1. The
-    additional entries `landing_foot_x` and `landing_foot_z` contain the position of the foot that
-    lands next, m.
+    The names are those of `TRAJECTORY_MEASURES`. Positions are relative to the foot of Leg 1. Two
+    additional entries, `landing_foot_x` and `landing_foot_z`, contain the position (m) of the foot
+    that lands next.
     """
     theta, L1, L2, dtheta, dL1, dL2 = np.moveaxis(np.asarray(trajectory.state), -1, 0)
     kinetic_energy, gravitational_energy, elastic_energy = np.moveaxis(
@@ -463,7 +468,7 @@ CONTACT_ENERGY_NAMES = ("kinetic_energy", "gravitational_energy", "elastic_energ
 def _compute_contact_columns(
     model: Any, params: WheelParams, x: Array, options: StepOptions, n_samples: int
 ) -> tuple[UnilateralTrajectory, dict[str, Array]]:
-    """Return the trajectory of a step with unilateral contact, and the samples of each variable.
+    """Compute a step with unilateral contact, and return its trajectory and its sampled variables.
 
     The samples have the shape (phase, sample) or (phase, sample, leg).
     """
