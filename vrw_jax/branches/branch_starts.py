@@ -228,6 +228,7 @@ def find_contact_gait_starts(branch_request: BranchRequest, start_cycle: Any) ->
         period_n=branch_request.period_n,
         n_coordinates=model.count_continuous_entries(params),
         n_legs=params.n_legs,
+        measures_force_peaks=branch_request.measures_force_peaks,
     )
     parameter_values = contact_gait_problem.stack_parameter_values(
         wheels, branch_request.parameter_values

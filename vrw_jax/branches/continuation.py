@@ -53,7 +53,7 @@ from vrw_jax.measures import (
     make_locked_leg_coordinate,
     make_measure_attributes,
 )
-from vrw_jax.models import AbstractWheel, GaitMethod
+from vrw_jax.models import AbstractWheel
 from vrw_jax.numerics import StepOptions, batch_sizes, map_in_numpy_batches, select_tree_rows
 from vrw_jax.runtime import with_default_jax_settings
 from vrw_jax.runtime import xarray as xr
@@ -257,9 +257,10 @@ def continue_branch(
         cycle_options: options of the gaits.
         step_options: options of the event-driven steps that check gaits, and of the gaits of other
             models.
-        force_peaks: for the paper's model, add the measures of the gait's force. The branch then
-            has the special point "second_peak_rate", at which a second peak appears. There the
-            first and the second time derivative of the force are zero at the same time.
+        force_peaks: for the paper's model and for unilateral contact, add the measures of the
+            gait's force. The branch then has the special point "second_peak_rate", at which a
+            second peak appears. There the first and the second time derivative of the force are
+            zero at the same time.
 
     Returns:
         A `Branch`. If there is no gait from which to start, `outcome` is the reason.
@@ -347,15 +348,15 @@ def continue_branches(
         check_range("bounds", bounds),
         _check_arclength_options(options),
     )
-    uses_collocation = model.capabilities.gait_method == GaitMethod.COLLOCATION
-    if check_bool("force_peaks", force_peaks) and not uses_collocation:
-        raise ValueError(
-            f"force_peaks is True, but the branch of a {type(model).__name__} has no measures of "
-            "the force: take vrw.force_peaks(vrw.simulate(...)) of its gaits."
-        )
     gait_finder = make_finder(
         model, params.n_legs, cycle_options=cycle_options, step_options=step_options
     )
+    has_force_peaks = FORCE_PEAK_MEASURES.keys() <= set(gait_finder.differentiable_measures)
+    if check_bool("force_peaks", force_peaks) and not has_force_peaks:
+        raise ValueError(
+            f"force_peaks is True, but the branch of a {type(model).__name__} has no measures of "
+            "the force: take vrw.ViscoelasticWheel() or vrw.UnilateralWheel()."
+        )
     gait_finder.search_options.check_tolerances(jnp.result_type(*jax.tree.leaves(params)))
     batch_shape = np.broadcast_shapes(
         *(parameter_values_of_field.shape for parameter_values_of_field in jax.tree.leaves(params))

@@ -38,6 +38,7 @@ from vrw_jax.cycles import (
     compute_force_peaks,
     compute_takeoff_acceleration,
     init_search_flags,
+    measure_return_map_force_peaks,
     solve_linear_systems,
 )
 from vrw_jax.measures import MARGIN_MEASURES, MEASURES, STOPPER_MARGIN_MEASURES
@@ -369,6 +370,7 @@ class ContactGaitProblem(AbstractReturnMapProblem):
     period_n: int = eqx.field(static=True)
     n_coordinates: int = eqx.field(static=True)
     n_legs: int = eqx.field(static=True)
+    measures_force_peaks: bool = eqx.field(static=True, default=False)
 
     is_traceable: ClassVar[bool] = False
     has_kinks: ClassVar[bool] = True
@@ -425,8 +427,9 @@ class ContactGaitProblem(AbstractReturnMapProblem):
         period_evaluation = self._make_period_map(wheels, points.p).evaluate_period(
             step_options, np.asarray(points.z), False, False
         )
+        section_states = jnp.asarray(points.z)
         additional_quantities = {
-            "section_state": jnp.asarray(points.z),
+            "section_state": section_states,
             CONTACT_ORDER_COLUMN: compute_contact_order_numbers(
                 period_evaluation.period_steps, self.n_legs
             ),
@@ -434,10 +437,39 @@ class ContactGaitProblem(AbstractReturnMapProblem):
                 jax.vmap(self._compute_friction_surplus)(wheels, points.p)
             ),
         }
+        if self.measures_force_peaks:
+            additional_quantities |= self._measure_force_peaks(
+                step_options,
+                wheels,
+                points.p,
+                section_states,
+                jnp.asarray(period_evaluation.period_steps.section_state),
+            )
         return (
             _combine_period_measures(period_evaluation.period_steps, points.z)
             | additional_quantities
         )
+
+    @eqx.filter_jit
+    def _measure_force_peaks(
+        self,
+        step_options: StepOptions,
+        wheels: BranchWheel,
+        p: Array,
+        section_states: Array,
+        step_ends: Array,
+    ) -> dict[str, Array]:
+        """Return the `measures.FORCE_PEAK_MEASURES` of many gaits by name."""
+
+        def measure_gait_force(
+            wheel: BranchWheel, p: Array, section_state: Array, step_ends: Array
+        ) -> dict[str, Array]:
+            model, params = self.model.with_parameter(wheel.params, self.parameter_name, p)
+            return measure_return_map_force_peaks(
+                model, params, section_state, step_ends, step_options
+            )
+
+        return jax.vmap(measure_gait_force)(wheels, p, section_states, step_ends)
 
     def _compute_friction_surplus(self, wheel: BranchWheel, p: Array) -> Array:
         """Return the friction coefficient minus the slope's tangent.

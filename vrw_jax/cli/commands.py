@@ -167,7 +167,8 @@ def run_gait_command(
         import jax.numpy as jnp
 
         from vrw_jax.cycles import limit_cycle, make_finder, resolve_model_with_reason
-        from vrw_jax.simulation import SAMPLED_FORCE_PEAK_MEASURES, force_peaks, simulate, step
+        from vrw_jax.measures import FORCE_PEAK_MEASURES
+        from vrw_jax.simulation import step
         from vrw_jax.wheel import Outcome
 
         model: Any = gait_config.make_model()
@@ -191,14 +192,11 @@ def run_gait_command(
             limit_cycle_result: Any = limit_cycle(
                 params, guess=None if can_search_without_start else section_state, model=model
             )
-            force_peak_dataset = None
+            force_peaks = {}
             if model.is_compliant and bool(limit_cycle_result.found):
-                gait_step = simulate(
-                    params, limit_cycle_result.section_state, 1, model=model, options=options
-                )
-                force_peak_dataset = force_peaks(gait_step)[list(SAMPLED_FORCE_PEAK_MEASURES)]
+                force_peaks = limit_cycle_result.measures(FORCE_PEAK_MEASURES)
         printing.print_wheel_and_gait(
-            params, step_result, section_state, n_walked, limit_cycle_result, force_peak_dataset
+            params, step_result, section_state, n_walked, limit_cycle_result, force_peaks
         )
         if model_reason:
             stdout_console.print(model_reason)

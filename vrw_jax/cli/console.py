@@ -303,7 +303,7 @@ def print_wheel_and_gait(
     start_state: "ArrayLike | tuple[float, ...]",
     n_walked: int,
     limit_cycle_result: "LimitCycle | ReturnMapCycle",
-    force_peak_dataset: "xr.Dataset | None",
+    force_peaks: "Mapping[str, Any]",
 ) -> None:
     """Print a wheel, the last step of its walk, its limit cycle and the force peaks of the gait.
 
@@ -343,11 +343,8 @@ def print_wheel_and_gait(
             f"[bold]Step {n_walked + 1} ended as {step_outcome.name}:[/] {step_outcome.meaning}"
         )
     _print_limit_cycle(limit_cycle_result)
-    if force_peak_dataset is not None:
-        _print_measure_table(
-            "Force in the gait",
-            {str(parameter_name): x.item() for parameter_name, x in force_peak_dataset.items()},
-        )
+    if force_peaks:
+        _print_measure_table("Force in the gait", force_peaks)
     # This is a cycle of the paper's model.
     if step_outcome == Outcome.STEPPED and "lambda_4_plus" in step_result.measures():
         _print_step_margins(step_result)

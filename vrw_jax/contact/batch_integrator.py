@@ -24,6 +24,7 @@ from jaxtyping import Array
 from vrw_jax.contact.contact_state import (
     ContactQuantities,
     ContactState,
+    ForceRates,
     ModeDynamics,
     collect_contact_quantities,
     compute_accumulator_rates,
@@ -52,8 +53,9 @@ N_CONTACT_QUANTITY_ROWS = 9
 """Number of contact forces and slip speeds among the dynamics rows.
 
 The dynamics rows begin with the accelerations, followed by these quantities. If stoppers are
-one-sided, the stopper forces on legs in the air follow. If accumulators are requested, their
-`N_ACCUMULATOR_ROWS` rates are last.
+one-sided, the stopper forces on legs in the air follow. If force peaks are measured, the
+`contact_state.ForceRates` follow. If accumulators are requested, their `N_ACCUMULATOR_ROWS` rates
+are last.
 """
 N_ACCUMULATOR_ROWS = 3
 """Number of accumulators: energy losses in dampers and by sliding, and slip length."""
@@ -189,7 +191,7 @@ def evaluate_dynamics(mode_dynamics: ModeDynamics, q: Array, v: Array) -> Array:
     """
     motion = unpack_motion(IntervalPoint(q, v, q))
     contact_forces = compute_forces(mode_dynamics, motion)
-    contact_quantities = collect_contact_quantities(mode_dynamics, contact_forces)
+    contact_quantities = collect_contact_quantities(mode_dynamics, motion, contact_forces)
     contact_rows = [
         *contact_quantities.normal_forces,
         *contact_quantities.tangential_forces,
@@ -202,6 +204,8 @@ def evaluate_dynamics(mode_dynamics: ModeDynamics, q: Array, v: Array) -> Array:
         if contact_quantities.airborne_stopper_forces is None
         else [contact_quantities.airborne_stopper_forces]
     )
+    if contact_quantities.force_rates is not None:
+        optional_dynamics_rows.append(contact_quantities.force_rates)
     if mode_dynamics.has_accumulators:
         accumulators = compute_accumulator_rates(mode_dynamics, motion, contact_forces)
         accumulator_rows = (
@@ -246,6 +250,12 @@ def evaluate_guards_at_point(mode_dynamics: ModeDynamics, interval_point: Interv
         if mode_dynamics.has_one_sided_stoppers
         else None
     )
+    end_of_force_rates = len(contact_rows) - N_ACCUMULATOR_ROWS * mode_dynamics.has_accumulators
+    force_rates = (
+        contact_rows[end_of_force_rates - len(ForceRates._fields) : end_of_force_rates]
+        if mode_dynamics.measures_force_peaks
+        else None
+    )
     leg_directions = compute_leg_directions(mode_dynamics.s, motion.theta)
     slot_pairs = (
         (first_normal_force, second_normal_force),
@@ -254,7 +264,7 @@ def evaluate_guards_at_point(mode_dynamics: ModeDynamics, interval_point: Interv
         (first_slip_speed, second_slip_speed),
     )
     contact_quantities = ContactQuantities(
-        leg_directions, *slot_pairs, painleve_determinant, airborne_stopper
+        leg_directions, *slot_pairs, painleve_determinant, airborne_stopper, force_rates
     )
     is_after_start = jnp.ones(interval_point.q.shape[-1:], bool)
     return jnp.concatenate(
@@ -288,6 +298,11 @@ def find_initiating_guards(mode_dynamics: ModeDynamics) -> Array:
     airborne_release_flags = (
         [contact_state.is_locked & False] if mode_dynamics.has_one_sided_stoppers else []
     )
+    force_rate_flags = (
+        [jnp.zeros_like(contact_state.force_rate_signs, bool)]
+        if contact_state.force_rate_signs is not None
+        else []
+    )
     return jnp.concatenate(
         [
             contact_state.has_just_lifted,
@@ -299,6 +314,7 @@ def find_initiating_guards(mode_dynamics: ModeDynamics) -> Array:
             no_slot_flags,
             no_slot_flags,
             *airborne_release_flags,
+            *force_rate_flags,
         ]
     )
 

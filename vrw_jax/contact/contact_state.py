@@ -4,9 +4,10 @@ A *contact state* consists of the contact modes of all feet and the stopper flag
 contact state is constant between two events.
 """
 
-from collections.abc import Iterable
-from typing import NamedTuple
+from collections.abc import Callable, Iterable
+from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
@@ -34,6 +35,7 @@ from vrw_jax.contact.mechanics import (
     make_wheel_posture,
     prevent_fusion,
     select_slot_friction,
+    stop_gradients,
     sum_over_legs,
 )
 from vrw_jax.numerics import Elementwise, Scalar
@@ -98,6 +100,15 @@ class ContactState(NamedTuple):
     has_just_lifted: Bool[Array, " n_legs"]  # whether a foot has left the ground at the last event
     has_just_unlocked: Bool[Array, " n_legs"]  # whether a leg has left its stopper then
     has_just_slid: Bool[Array, " n_legs"]  # whether a foot at rest has begun to slide then
+    # sign of each of the `ForceRates` in this state; None if force peaks are not measured
+    force_rate_signs: Array | None = None
+
+    def continue_unchanged(self) -> "ContactState":
+        """Return the contact state without changes at the last event, and without signs."""
+        no_leg_flags = self.is_locked & False
+        return ContactState(
+            self.contact_modes, self.is_locked, no_leg_flags, no_leg_flags, no_leg_flags
+        )
 
 
 class ModeDynamics(NamedTuple):
@@ -113,6 +124,11 @@ class ModeDynamics(NamedTuple):
     is_airborne_locked: Bool[Array, " n_legs"]  # whether a leg is in the air on its stopper
     has_accumulators: bool  # whether a batch integrates the accumulators
     tilt: Elementwise | None = None  # angle by which the next line is steeper, rad
+
+    @property
+    def measures_force_peaks(self) -> bool:
+        """Return whether guards detect the extrema of normal forces."""
+        return self.contact_state.force_rate_signs is not None
 
     def configure_contacts(self, motion: WheelMotion) -> ContactConfiguration:
         """Return the contact configuration for this motion, from which the forces are computed."""
@@ -275,6 +291,7 @@ class GuardLayout(NamedTuple):
     rolling_rate_guard: int  # rate of rolling, dtheta
     collapse_guard: int  # length of the shortest leg minus a
     first_airborne_release_guard: int  # stopper force in the air, one per leg, if one-sided
+    first_force_rate_guard: int  # absolute value of each of the `ForceRates`, if requested
     n_guards: int
 
     @property
@@ -291,10 +308,13 @@ class GuardLayout(NamedTuple):
         return self.first_stopper_guard - 1
 
 
-def make_guard_layout(n_legs: int, has_one_sided_stoppers: bool) -> GuardLayout:
+def make_guard_layout(
+    n_legs: int, has_one_sided_stoppers: bool, measures_force_peaks: bool = False
+) -> GuardLayout:
     """Return the guard layout for a wheel with `n_legs` legs.
 
-    - `has_one_sided_stoppers`: whether legs in the air may leave their stoppers.
+    - `has_one_sided_stoppers`: whether legs in the air may leave their stoppers;
+    - `measures_force_peaks`: whether guards detect the extrema of normal forces.
     """
     guard_group_sizes = (
         n_legs,
@@ -307,9 +327,89 @@ def make_guard_layout(n_legs: int, has_one_sided_stoppers: bool) -> GuardLayout:
         1,
         1,
         n_legs if has_one_sided_stoppers else 0,
+        len(ForceRates._fields) if measures_force_peaks else 0,
     )
     guard_group_offsets = np.concatenate([[0], np.cumsum(guard_group_sizes)])
     return GuardLayout(*(int(guard_offset) for guard_offset in guard_group_offsets))
+
+
+class ForceRates(NamedTuple):
+    """Rates of normal forces on the feet; each is zero at an extremum of the step record."""
+
+    fore_force_rate: Elementwise  # rate of the force on the foot of Leg 1, N/s
+    total_force_rate: Elementwise  # rate of the sum of the forces on all feet, N/s
+    fore_force_second_rate: Elementwise  # second rate of the force on the foot of Leg 1, N/s^2
+
+
+class NormalForces(NamedTuple):
+    """Normal forces of the ground on the feet, or the rates of these forces."""
+
+    fore_force: Elementwise  # force on the foot of Leg 1, N
+    total_force: Elementwise  # sum of the forces on all feet, N
+
+
+def compute_normal_forces(mode_dynamics: ModeDynamics, motion: WheelMotion) -> NormalForces:
+    """Return the normal forces of the ground on the feet, N."""
+    first_force, second_force = solve_contact_forces(
+        mode_dynamics.configure_contacts(motion)
+    ).normal_forces
+    # A loaded fore foot is in the first contact slot.
+    is_fore_loaded = mode_dynamics.contact_state.contact_modes[0] != ContactMode.OFF
+    return NormalForces(jnp.where(is_fore_loaded, first_force, 0.0), first_force + second_force)
+
+
+def compute_normal_force_rates(
+    mode_dynamics: ModeDynamics, motion: WheelMotion
+) -> tuple[NormalForces, NormalForces]:
+    """Return the normal forces on the feet, N, and their rates between two events, N/s."""
+    return _differentiate_in_time(
+        lambda motion: compute_normal_forces(mode_dynamics, motion), mode_dynamics, motion
+    )
+
+
+def compute_force_rates(mode_dynamics: ModeDynamics, motion: WheelMotion) -> Array:
+    """Return the `ForceRates` in the motion between two events, as one array (3, ...)."""
+    (_, force_rates), (_, second_rates) = _differentiate_in_time(
+        lambda motion: compute_normal_force_rates(mode_dynamics, motion), mode_dynamics, motion
+    )
+    return jnp.stack(
+        ForceRates(force_rates.fore_force, force_rates.total_force, second_rates.fore_force)
+    )
+
+
+def _differentiate_in_time(
+    function: Callable[[WheelMotion], Any], mode_dynamics: ModeDynamics, motion: WheelMotion
+) -> tuple[Any, Any]:
+    """Return a function of the motion, and its time derivative in the motion between two events."""
+    force_solution = solve_contact_forces(mode_dynamics.configure_contacts(motion))
+    rates = motion.vx, motion.vz, motion.dtheta
+    motion_rate = WheelMotion(
+        *rates, *force_solution.hub_motion, motion.dL, force_solution.length_motion
+    )
+    return jax.jvp(function, (motion,), (motion_rate,))
+
+
+def flag_zero_force_rates(guard_layout: GuardLayout, guard_index: Int[Array, "..."]) -> Array:
+    """Return which of the `ForceRates` is zero at the event of a guard, (3, ...)."""
+    rate_indices = np.arange(len(ForceRates._fields)).reshape(-1, *(1,) * guard_index.ndim)
+    return guard_index == guard_layout.first_force_rate_guard + rate_indices
+
+
+def update_force_rate_signs(
+    mode_dynamics: ModeDynamics,
+    motion: WheelMotion,
+    previous_signs: Array,
+    is_rate_zero: Bool[Array, "3 ..."],
+) -> Array:
+    """Return the sign of each of the `ForceRates` after an event, 1.0 or -1.0, (3, ...).
+
+    The result has no derivatives.
+
+    - `previous_signs`: signs before the event;
+    - `is_rate_zero`: which rates are zero at the event, and change their sign.
+    """
+    force_rates = compute_force_rates(*stop_gradients((mode_dynamics, motion)))
+    return jnp.where(is_rate_zero, -previous_signs, jnp.where(force_rates < 0.0, -1.0, 1.0))
 
 
 class ContactQuantities(NamedTuple):
@@ -324,10 +424,11 @@ class ContactQuantities(NamedTuple):
     airborne_stopper_forces: (
         LegArray | None
     )  # stopper force of legs in the air, if stoppers are one-sided
+    force_rates: Array | None = None  # `ForceRates` as one array (3, ...), if peaks are measured
 
 
 def collect_contact_quantities(
-    mode_dynamics: ModeDynamics, contact_forces: ContactForces
+    mode_dynamics: ModeDynamics, motion: WheelMotion, contact_forces: ContactForces
 ) -> ContactQuantities:
     """Return contact forces and slip speeds from which `evaluate_guards` computes the guards."""
     force_solution = contact_forces.force_solution
@@ -347,6 +448,7 @@ def collect_contact_quantities(
         contact_forces.foot_velocity.along_slope,
         force_solution.painleve_determinant,
         airborne_stopper_forces,
+        compute_force_rates(mode_dynamics, motion) if mode_dynamics.measures_force_peaks else None,
     )
 
 
@@ -407,6 +509,16 @@ def evaluate_guards(
             )
         ]
     )
+    force_rate_guards = (
+        []
+        if contact_quantities.force_rates is None or contact_state.force_rate_signs is None
+        else [
+            replace_if_not_evaluated(
+                _flag_varying_forces(mode_dynamics),
+                contact_state.force_rate_signs * contact_quantities.force_rates,
+            )
+        ]
+    )
     return [
         jnp.where(
             is_airborne,
@@ -430,7 +542,20 @@ def evaluate_guards(
         motion.dtheta[None],
         (jnp.min(motion.L, axis=0) - s.a)[None],
         *airborne_guards,
+        *force_rate_guards,
     ]
+
+
+def _flag_varying_forces(mode_dynamics: ModeDynamics) -> Array:
+    """Return whether the guard of each of the `ForceRates` is evaluated, (3, ...).
+
+    Guards are evaluated for loaded feet. If only the fore foot is loaded, the extrema of its force
+    are those of the total force.
+    """
+    is_fore_loaded = mode_dynamics.contact_state.contact_modes[0] != ContactMode.OFF
+    is_first_loaded, is_second_loaded = mode_dynamics.slot_modes != ContactMode.OFF
+    is_total_different = is_second_loaded | (is_first_loaded & ~is_fore_loaded)
+    return jnp.stack([is_fore_loaded, is_total_different, is_fore_loaded])
 
 
 def compute_guard_scales(mode_dynamics: ModeDynamics) -> Array:
@@ -444,7 +569,11 @@ def compute_guard_scales(mode_dynamics: ModeDynamics) -> Array:
         + [force_scale] * 2
         + [speed_scale / s.L0, s.L0]
     )
-    return jnp.stack(guard_scales + [force_scale] * s.n * mode_dynamics.has_one_sided_stoppers)
+    guard_scales += [force_scale] * s.n * mode_dynamics.has_one_sided_stoppers
+    if mode_dynamics.measures_force_peaks:
+        force_rate_scale = force_scale * speed_scale / s.L0
+        guard_scales += [force_rate_scale] * 2 + [force_rate_scale * speed_scale / s.L0]
+    return jnp.stack(guard_scales)
 
 
 def compute_state_units(s: Symbols) -> tuple[Array, Array]:
@@ -535,7 +664,7 @@ def compute_guard_values(
     """
     motion, accumulators = unpack_state(packed_state)
     contact_quantities = collect_contact_quantities(
-        mode_dynamics, compute_forces(mode_dynamics, motion)
+        mode_dynamics, motion, compute_forces(mode_dynamics, motion)
     )
     guard_groups = evaluate_guards(
         mode_dynamics, motion, contact_quantities, accumulators.time_since_event > 0.0

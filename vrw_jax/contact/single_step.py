@@ -58,6 +58,7 @@ class ContactStepConfig(NamedTuple):
     is_detailed: bool
     uses_diffrax: bool = False  # whether diffrax replaces the batch kernel
     engine_name: str = "lanes"  # name of the engine in the results
+    measures_force_peaks: bool = False
 
     def tighten_tolerances(self, leaves: tuple[Array, ...]) -> tuple[Array, ...]:
         """Return the argument leaves with the tighter solver tolerances for derivatives."""
@@ -105,14 +106,17 @@ class ContactStepConfig(NamedTuple):
         )
         has_columns = wheel.uneven is not None, wheel.restitution is not None
         return BatchWalkSettings(
-            params.n_legs, 1, *contact_rules, options, tableau, *has_columns, self.engine_name
-        )
+            params.n_legs, 1, *contact_rules, options, tableau, *has_columns, self.engine_name,
+            self.measures_force_peaks,
+        )  # fmt: skip
 
     def make_template(self, *leaves: Array) -> tuple:
         """Return zeros with the structure of the results of `compute_outputs` for one wheel."""
         params = self.unpack_leaves(leaves)[2][1]
         return _partition_result(
-            make_result_template(params.n_legs, leaves[0].dtype, self.is_detailed)
+            make_result_template(
+                params.n_legs, leaves[0].dtype, self.is_detailed, self.measures_force_peaks
+            )
         )
 
     def compute_outputs(self, *leaves: Array) -> tuple:
@@ -176,6 +180,7 @@ def build_contact_step_function(step_config: ContactStepConfig) -> ForwardFuncti
         "step with unilateral contact",
         str(step_config.argument_tree_structure),
         step_config.is_detailed,
+        step_config.measures_force_peaks,
     )
     return step_config.compile_lane_function(
         step_config.compute_outputs, step_config.make_template, cache_key
@@ -200,6 +205,7 @@ def build_contact_step_jacobian(
         "step with unilateral contact along directions",
         structure_name,
         step_config.is_detailed,
+        step_config.measures_force_peaks,
     )
     compute_tangents = unbatch(
         compile_cached_lane_function(step_config.compute_tangents, make_template, cache_key)

@@ -13,10 +13,16 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from vrw_jax.contact.contact_modes import PAPER_RULE_SENTINEL, ContactMode, Friction
-from vrw_jax.contact.contact_state import ContactState, GuardLayout, LossAccumulators
+from vrw_jax.contact.contact_state import (
+    ContactState,
+    GuardLayout,
+    LossAccumulators,
+    ModeDynamics,
+    compute_normal_force_rates,
+)
 from vrw_jax.contact.impacts import (
     ContactEvent,
     ContactEventResult,
@@ -221,6 +227,101 @@ def determine_interval_outcome(
     return replace_rest_outcome(outcome, is_resting)
 
 
+class ForcePeakRecord(NamedTuple):
+    """Smooth extrema of normal forces between the events of one walking step.
+
+    The extrema are those of the force on the foot of Leg 1, except for the last two fields.
+    """
+
+    n_peaks: Int[Array, "..."]  # number of maxima
+    peak_force: Elementwise  # largest maximum, N; -inf without a maximum
+    lowest_force_after_peak: Elementwise  # smallest minimum after the largest maximum, N; else inf
+    trough_depth: Elementwise  # lower of two maxima minus a minimum between them, largest, N
+    second_peak_rate: Elementwise  # largest maximum of the rate after a maximum, N/s; else -inf
+    n_total_peaks: Int[Array, "..."]  # number of maxima of the sum of the forces on all feet
+    peak_total_force: Elementwise  # largest maximum of this sum, N; -inf without a maximum
+    n_extrema: Int[Array, "..."]  # number of recorded extrema, rates included
+
+    def measures(self) -> dict[str, Array]:
+        """Return the measures of the peaks, by their names in `measures.FORCE_PEAK_MEASURES`."""
+        has_second_rate = jnp.isfinite(self.second_peak_rate)
+        return {
+            "n_force_peaks": self.n_peaks.astype(self.trough_depth.dtype),
+            "peak_force": jnp.where(self.n_peaks > 0, self.peak_force, 0.0),
+            "force_trough_depth": self.trough_depth,
+            "second_peak_rate": jnp.where(has_second_rate, self.second_peak_rate, jnp.nan),
+            "n_total_force_peaks": self.n_total_peaks.astype(self.trough_depth.dtype),
+            "peak_total_force": jnp.where(self.n_total_peaks > 0, self.peak_total_force, 0.0),
+        }
+
+
+def init_force_peak_record(dtype: jnp.dtype) -> ForcePeakRecord:
+    """Return the record of one wheel before its first extremum, without a batch axis."""
+    float_zero, int_zero = jnp.zeros((), dtype), jnp.zeros((), jnp.int32)
+    return ForcePeakRecord(
+        n_peaks=int_zero,
+        peak_force=float_zero - jnp.inf,
+        lowest_force_after_peak=float_zero + jnp.inf,
+        trough_depth=float_zero,
+        second_peak_rate=float_zero - jnp.inf,
+        n_total_peaks=int_zero,
+        peak_total_force=float_zero - jnp.inf,
+        n_extrema=int_zero,
+    )
+
+
+def record_force_extremum(
+    record: ForcePeakRecord,
+    is_rate_zero: Bool[Array, "3 ..."],
+    mode_dynamics: ModeDynamics,
+    motion: WheelMotion,
+) -> ForcePeakRecord:
+    """Return the record after an extremum of a force or of its rate.
+
+    - `is_rate_zero`: which of the `ForceRates` is zero; if none is, the record is unchanged;
+    - `mode_dynamics`, `motion`: dynamics before the extremum, and motion at the extremum.
+    """
+    is_fore_extremum, is_total_extremum, is_rate_extremum = is_rate_zero
+    assert mode_dynamics.contact_state.force_rate_signs is not None
+    is_fore_rising, is_total_rising, is_rate_rising = (
+        mode_dynamics.contact_state.force_rate_signs > 0.0
+    )
+    (force, total_force), (rate, _) = compute_normal_force_rates(mode_dynamics, motion)
+    is_peak = is_fore_extremum & is_fore_rising
+    is_trough = is_fore_extremum & ~is_fore_rising & (record.n_peaks > 0)
+    is_after_trough = jnp.isfinite(record.lowest_force_after_peak)
+    trough_depth = jnp.where(
+        is_peak & is_after_trough,
+        jnp.minimum(force, record.peak_force)
+        - jnp.where(is_after_trough, record.lowest_force_after_peak, 0.0),
+        0.0,
+    )
+    is_highest_peak = is_peak & (force > record.peak_force)
+    lowest_force_after_peak = jnp.where(
+        is_trough & (force < record.lowest_force_after_peak), force, record.lowest_force_after_peak
+    )
+    is_second_rise = is_rate_extremum & is_rate_rising & (record.n_peaks > 0)
+    # If only the fore foot is loaded, both forces have the same extrema.
+    is_fore_foot_alone = mode_dynamics.slot_modes[1] == ContactMode.OFF
+    is_total_peak = (is_total_extremum & is_total_rising) | (is_peak & is_fore_foot_alone)
+    return ForcePeakRecord(
+        n_peaks=record.n_peaks + is_peak,
+        peak_force=jnp.where(is_highest_peak, force, record.peak_force),
+        lowest_force_after_peak=jnp.where(is_highest_peak, jnp.inf, lowest_force_after_peak),
+        trough_depth=jnp.maximum(record.trough_depth, trough_depth),
+        second_peak_rate=jnp.where(
+            is_second_rise & (rate > record.second_peak_rate), rate, record.second_peak_rate
+        ),
+        n_total_peaks=record.n_total_peaks + is_total_peak,
+        peak_total_force=jnp.where(
+            is_total_peak & (total_force > record.peak_total_force),
+            total_force,
+            record.peak_total_force,
+        ),
+        n_extrema=record.n_extrema + jnp.any(is_rate_zero, axis=0),
+    )
+
+
 class UnilateralStepDetails(NamedTuple):
     """Detailed results of a walking step; the fields are described in `UnilateralStep`."""
 
@@ -233,9 +334,10 @@ class UnilateralStepDetails(NamedTuple):
     impacts: Int[Array, "..."]
     fewest_solutions: Int[Array, "..."]
     most_solutions: Int[Array, "..."]
+    force_peaks: ForcePeakRecord | None
 
 
-def init_step_details(dtype: jnp.dtype) -> UnilateralStepDetails:
+def init_step_details(dtype: jnp.dtype, measures_force_peaks: bool) -> UnilateralStepDetails:
     """Return the step details of one wheel at the start of a walking step, without a batch axis."""
     float_zero, int_zero = jnp.zeros((), dtype), jnp.zeros((), jnp.int32)
     zero_pair = jnp.zeros((2,), dtype)
@@ -249,6 +351,7 @@ def init_step_details(dtype: jnp.dtype) -> UnilateralStepDetails:
         impacts=int_zero,
         fewest_solutions=int_zero + jnp.iinfo(jnp.int32).max,
         most_solutions=int_zero,
+        force_peaks=init_force_peak_record(dtype) if measures_force_peaks else None,
     )
 
 
@@ -342,7 +445,8 @@ class UnilateralStep(AbstractContactStep):
     - `margins`: margins for bilateral stoppers, see `UnilateralMargins`;
     - `outcome`: outcome code, an `Outcome`;
     - `solver_steps`: number of attempted solver steps;
-    - `engine`: name of the engine that computed the step, see `StepOptions`.
+    - `engine`: name of the engine that computed the step, see `StepOptions`;
+    - `force_peaks`: extrema of normal forces, or None if they are not requested.
 
     Examples:
         >>> wheel = vrw.UnilateralWheel(friction=0.7)
@@ -370,6 +474,7 @@ class UnilateralStep(AbstractContactStep):
     outcome: Int[Array, "..."]
     solver_steps: Int[Array, "..."]
     engine: str = eqx.field(static=True, default="")
+    force_peaks: ForcePeakRecord | None = None
 
     def collect_model_measures(self) -> dict[str, Array]:
         """Return the measures of steps with contacts and the stopper margins, by name."""

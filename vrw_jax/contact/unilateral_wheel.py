@@ -253,13 +253,28 @@ class UnilateralWheel(AbstractContactWheel):
     def take_step(self, params: WheelParams, x: FullState, options: StepOptions) -> UnilateralStep:
         return self._compute_step(params, x, options, is_detailed=True)[0]
 
+    def measure_force_peaks(
+        self, params: WheelParams, x: FullState, options: StepOptions
+    ) -> dict[str, Array]:
+        step_result, _ = self._compute_step(
+            params, x, options, is_detailed=True, measures_force_peaks=True
+        )
+        landing_impulse = step_result.landing_normal[..., 0]
+        return step_result.force_peaks.measures() | {"landing_impulse": landing_impulse}
+
     def _compute_step(
-        self, params: WheelParams, x: FullState, options: StepOptions, is_detailed: bool
+        self,
+        params: WheelParams,
+        x: FullState,
+        options: StepOptions,
+        is_detailed: bool,
+        measures_force_peaks: bool = False,
     ) -> tuple[Any, str]:
         """Return the results of one step, and the name of the engine that computed them."""
         leaves, argument_structure = self._flatten_arguments(params, x, options)
         engine = "lanes" if can_use_batch_kernel(options) else "diffrax"
-        return eqx.combine(*_compile_step(argument_structure, is_detailed, engine)(*leaves)), engine
+        compute_step = _compile_step(argument_structure, is_detailed, engine, measures_force_peaks)
+        return eqx.combine(*compute_step(*leaves)), engine
 
     def _flatten_arguments(
         self, params: WheelParams, x: FullState, options: StepOptions
@@ -296,18 +311,24 @@ _embed_section_compiled = jax.jit(lambda params, x: embed_section_state(params.s
 
 
 @functools.cache
-def _compile_step(argument_structure: Any, is_detailed: bool, engine: str) -> ForwardFunction:
+def _compile_step(
+    argument_structure: Any, is_detailed: bool, engine: str, measures_force_peaks: bool
+) -> ForwardFunction:
     """Return the function that computes a step from the leaves of (wheel, params, x, options).
 
     The function is differentiable in every AD mode.
     """
 
-    diffrax_config = ContactStepConfig(argument_structure, is_detailed, True, engine)
+    diffrax_config = ContactStepConfig(
+        argument_structure, is_detailed, True, engine, measures_force_peaks
+    )
     step_by_diffrax = build_contact_step_function(diffrax_config)
     tight_step = lambda *leaves: step_by_diffrax(*diffrax_config.tighten_tolerances(leaves))
     if engine == "diffrax":
         return enable_all_ad_modes(step_by_diffrax, tight_step)
-    config = ContactStepConfig(argument_structure, is_detailed)
+    config = ContactStepConfig(
+        argument_structure, is_detailed, measures_force_peaks=measures_force_peaks
+    )
     return enable_all_ad_modes(
         build_contact_step_function(config),
         tight_step,

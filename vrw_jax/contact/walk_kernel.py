@@ -30,14 +30,17 @@ from vrw_jax.contact.batch_integrator import (
 from vrw_jax.contact.contact_modes import Friction
 from vrw_jax.contact.contact_state import (
     ContactState,
+    ForceRates,
     LossAccumulators,
     ModeDynamics,
     choose_stopping_guard,
     compute_forces,
     compute_min_stopper_force,
+    flag_zero_force_rates,
     is_wheel_at_rest,
     make_guard_layout,
     make_mode_dynamics,
+    update_force_rate_signs,
 )
 from vrw_jax.contact.diffrax_interval import init_diffrax_interval, integrate_by_diffrax
 from vrw_jax.contact.mechanics import WheelMotion, compute_landing_position, stop_gradients
@@ -55,6 +58,7 @@ from vrw_jax.contact.step_record import (
     make_unilateral_step,
     process_event,
     record_event,
+    record_force_extremum,
     record_interval,
 )
 from vrw_jax.integrator import ButcherTableau
@@ -102,10 +106,13 @@ class BatchWalkResult(NamedTuple):
     n_solver_steps: Array
 
 
-def make_result_template(n_legs: int, dtype: Any, is_detailed: bool) -> BatchWalkResult:
+def make_result_template(
+    n_legs: int, dtype: Any, is_detailed: bool, measures_force_peaks: bool = False
+) -> BatchWalkResult:
     """Return zeros with the structure of the walk result of one wheel with `n_legs` legs.
 
-    - `is_detailed`: whether the result contains a `UnilateralStep` instead of a `StepSummary`.
+    - `is_detailed`: whether the result contains a `UnilateralStep` instead of a `StepSummary`;
+    - `measures_force_peaks`: whether the `UnilateralStep` contains force peaks.
     """
     float_zero, int_zero = jnp.zeros((), dtype), jnp.zeros((), jnp.int32)
     leg_zeros, airborne_modes = jnp.zeros(n_legs, dtype), jnp.zeros(n_legs, jnp.int32)
@@ -122,7 +129,7 @@ def make_result_template(n_legs: int, dtype: Any, is_detailed: bool) -> BatchWal
             *final_state,
             accumulators,
             init_step_counters(float_zero),
-            init_step_details(dtype),
+            init_step_details(dtype, measures_force_peaks),
             int_zero,
             "lanes",
         )
@@ -198,6 +205,8 @@ class BatchWalkSettings(NamedTuple):
     has_uneven_ground: bool = False  # whether the input has `N_UNEVEN_COLUMNS`; one step only
     has_restitution: bool = False  # whether the last input column is restitution
     engine_name: str = "lanes"  # name of the engine in the results
+    # whether the extrema of normal forces are located; only if details are requested
+    measures_force_peaks: bool = False
 
     def make_dynamics(self, input_columns: Array, contact_state: ContactState) -> ModeDynamics:
         """Return the dynamics of all batch elements in their contact states."""
@@ -241,6 +250,9 @@ class BatchWalkSettings(NamedTuple):
         motion, contact_state = unpack_section_state(
             self.unpack_columns(input_columns)[0], section_state
         )
+        if self.measures_force_peaks:
+            unit_signs = jnp.stack([jnp.ones_like(motion.x)] * len(ForceRates._fields))
+            contact_state = contact_state._replace(force_rate_signs=unit_signs)
         mode_dynamics = self.make_dynamics(input_columns, contact_state)
         interval_state = make_zeros_like_output(
             lambda: self.begin_contact_interval(mode_dynamics, motion)
@@ -282,7 +294,9 @@ class BatchWalkSettings(NamedTuple):
         broadcast_to_lanes = lambda leaf: jnp.broadcast_to(
             leaf[..., None], (*leaf.shape, *lane_template.shape)
         )
-        step_details = jax.tree.map(broadcast_to_lanes, init_step_details(lane_template.dtype))
+        step_details = jax.tree.map(
+            broadcast_to_lanes, init_step_details(lane_template.dtype, self.measures_force_peaks)
+        )
         return (
             init_step_counters(lane_template),
             step_details,
@@ -295,7 +309,9 @@ class BatchWalkSettings(NamedTuple):
         If a walk ends, its outcome is set. Running elements are unchanged.
         """
         interval_state = lane_state.interval_state
-        guard_layout = make_guard_layout(self.n_legs, self.has_one_sided_stoppers)
+        guard_layout = make_guard_layout(
+            self.n_legs, self.has_one_sided_stoppers, self.measures_force_peaks
+        )
         s, friction = self.unpack_columns(input_columns)
         dynamics_before = self.make_dynamics(input_columns, interval_state.contact_state)
         rates = lax.stop_gradient(interval_state.interval_point.v)
@@ -334,8 +350,11 @@ class BatchWalkSettings(NamedTuple):
         has_landed = is_at_event & (
             interval_state.triggered_guard_index == guard_layout.foremost_landing_guard
         )
+        n_events = step_counters.n_events
+        if step_details is not None and step_details.force_peaks is not None:
+            n_events = n_events + step_details.force_peaks.n_extrema
         outcome_arguments = (
-            step_counters,
+            step_counters._replace(n_events=n_events),
             guard_layout,
             is_at_event,
             interval_state.triggered_guard_index,
@@ -353,11 +372,16 @@ class BatchWalkSettings(NamedTuple):
 
         # A landing of the foremost foot opens the next step. Then every event is processed.
         begins_step, motion = has_landed & ~has_ended, unpack_motion(interval_state.interval_point)
-        opened_contact_state = unpack_section_state(
+        opened_motion, opened_contact_state = unpack_section_state(
             s, pack_section_state(motion, interval_state.contact_state)
         )
+        opened_contact_state = opened_contact_state._replace(
+            force_rate_signs=interval_state.contact_state.force_rate_signs
+        )
         motion, contact_state = select_tree_leaves(
-            begins_step, opened_contact_state, (motion, interval_state.contact_state)
+            begins_step,
+            (opened_motion, opened_contact_state),
+            (motion, interval_state.contact_state),
         )
         new_counters, *new_records = self._init_step_records(motion.x)
         new_counters = new_counters._replace(n_solver_steps=step_counters.n_solver_steps)
@@ -385,6 +409,31 @@ class BatchWalkSettings(NamedTuple):
         event_result, contact_event, event_outcome = process_event(
             contact_law, guard_layout, motion, contact_state, *event_law_arguments
         )
+        n_contact_events: Any = 1
+        if step_details is not None and step_details.force_peaks is not None:
+            is_contact_event = guard_index < guard_layout.first_force_rate_guard
+            n_contact_events = is_contact_event.astype(jnp.int32)
+            is_rate_zero = flag_zero_force_rates(guard_layout, guard_index)
+            step_details = step_details._replace(
+                force_peaks=record_force_extremum(
+                    step_details.force_peaks, is_rate_zero, dynamics_before, motion
+                )
+            )
+            event_outcome = jnp.where(is_contact_event, event_outcome, Outcome.STEPPED)
+            state_after_event = event_result.motion, event_result.contact_state
+            motion_after, contact_state_after = select_tree_leaves(
+                is_contact_event,
+                state_after_event,
+                (motion, contact_state.continue_unchanged()),
+            )
+            dynamics_after = self.make_dynamics(input_columns, contact_state_after)
+            force_rate_signs = update_force_rate_signs(
+                dynamics_after, motion_after, contact_state.force_rate_signs, is_rate_zero
+            )
+            event_result = event_result._replace(
+                motion=motion_after,
+                contact_state=contact_state_after._replace(force_rate_signs=force_rate_signs),
+            )
         mode_dynamics = self.make_dynamics(input_columns, event_result.contact_state)
         next_interval = self.begin_contact_interval(mode_dynamics, event_result.motion)
         q, v = pack_coordinates(event_result.motion)
@@ -402,7 +451,7 @@ class BatchWalkSettings(NamedTuple):
             step_details = record_end_stopper_force(
                 step_details, mode_dynamics, event_result.motion, zero_duration
             )
-        step_counters = step_counters._replace(n_events=step_counters.n_events + 1)
+        step_counters = step_counters._replace(n_events=step_counters.n_events + n_contact_events)
         continued_lane_state = LaneState(
             next_interval,
             step_counters,

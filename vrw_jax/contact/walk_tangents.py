@@ -557,11 +557,16 @@ def _make_event_shift(
     tangents: TangentBatch,
     tangent_template: _IntervalTangent,
 ) -> Callable[[Array, Array], _IntervalTangent]:
-    """Return a function that adds the effect of the event time's tangent to a state's tangent."""
+    """Return a function that adds the effect of the event time's tangent to a state's tangent.
+
+    The time of a force extremum is constant for tangents, because the force is stationary there.
+    """
     interval_point, n = interval_state.interval_point, len(interval_state.interval_point.q)
 
     def compute_guards(input_columns: Array, q: Array, v: Array) -> Array:
         mode_dynamics = dynamics_fn(input_columns)
+        contact_state = mode_dynamics.contact_state._replace(force_rate_signs=None)
+        mode_dynamics = mode_dynamics._replace(contact_state=contact_state)
         return evaluate_guards_at_point(
             mode_dynamics, IntervalPoint(q, v, evaluate_dynamics(mode_dynamics, q, v))
         )

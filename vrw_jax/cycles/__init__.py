@@ -46,7 +46,7 @@ from vrw_jax.cycles.gait_walks import compute_walk_starts
 from vrw_jax.cycles.limit_cycle_result import LimitCycle, transfer_solution_to_mesh
 from vrw_jax.cycles.margin_defaults import compute_takeoff_acceleration, default_margins
 from vrw_jax.cycles.options import CycleOptions
-from vrw_jax.cycles.return_map_finder import ReturnMapCycle
+from vrw_jax.cycles.return_map_finder import ReturnMapCycle, measure_return_map_force_peaks
 from vrw_jax.cycles.sensitivity import sensitivities
 from vrw_jax.cycles.slope_response import compute_sensitivity_norms
-from vrw_jax.cycles.unilateral_finder import PeriodMap, solve_linear_systems
+from vrw_jax.cycles.unilateral_finder import PeriodMap, UnilateralFinder, solve_linear_systems

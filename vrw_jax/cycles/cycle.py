@@ -228,7 +228,31 @@ class AbstractCycle(AbstractPrintable):
 
     def measures(self, measure_names: Iterable[str]) -> dict[str, Array]:
         """Return the requested measures by name. Only these measures are traced."""
-        return {measure_name: self.measure(measure_name) for measure_name in measure_names}
+        measure_names = tuple(measure_names)
+        force_peaks = (
+            {} if FORCE_PEAK_MEASURES.keys().isdisjoint(measure_names) else self.force_peaks
+        )
+        return {
+            measure_name: force_peaks[measure_name]
+            if measure_name in force_peaks
+            else self.measure(measure_name)
+            for measure_name in measure_names
+        }
+
+    @property
+    @abc.abstractmethod
+    def force_peaks(self) -> dict[str, Array]:
+        """Return the `measures.FORCE_PEAK_MEASURES` by name.
+
+        Each measure is the largest value over the gait steps. The measures have first derivatives.
+        The derivatives of the number of peaks are zero.
+        """
+
+    def map_over_batch_axes(self, function_of_cycle: Callable) -> Callable:
+        """Return the function of one cycle, mapped over the batch axes of this cycle."""
+        for _ in range(self.outcome.ndim):
+            function_of_cycle = jax.vmap(function_of_cycle)
+        return with_default_jax_settings(function_of_cycle)
 
     def summary_rows(self) -> list[LabelAndText]:
         """Return the labels and texts that a printed cycle contains.

@@ -17,6 +17,7 @@ from jaxtyping import Array, Float
 from vrw_jax.cycles.cycle import AbstractCycle
 from vrw_jax.cycles.options import CycleOptions
 from vrw_jax.cycles.slope_response import SlopeResponse, compute_step_slope_response
+from vrw_jax.measures import FORCE_PEAK_MEASURES
 from vrw_jax.models import AbstractStep, AbstractWheel
 from vrw_jax.numerics import StepOptions, evaluate_with_jacobian, select_tree_rows
 from vrw_jax.wheel import Outcome, WheelParams
@@ -343,8 +344,14 @@ class MeasureReader:
     measure_names: tuple[str, ...]
 
     def __call__(self, cycle: AbstractCycle, step: AbstractStep) -> dict[str, Array]:
+        # One search locates all force peaks.
+        force_peaks = cycle.measures(
+            name for name in self.measure_names if name in FORCE_PEAK_MEASURES
+        )
         return {
-            measure_name: self.read_measure(measure_name, cycle, step)
+            measure_name: force_peaks[measure_name]
+            if measure_name in force_peaks
+            else self.read_measure(measure_name, cycle, step)
             for measure_name in self.measure_names
         }
 

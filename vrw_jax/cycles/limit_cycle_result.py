@@ -6,7 +6,6 @@ cycles, in forward and reverse mode, and to any order.
 """
 
 import functools
-from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -39,11 +38,9 @@ from vrw_jax.cycles.slope_response import (
     compute_collocation_slope_response,
     compute_sensitivity_norms,
 )
-from vrw_jax.measures import FORCE_PEAK_MEASURES
 from vrw_jax.models import DoubleSupportIndicators, Margins, SectionState, ViscoelasticWheel
 from vrw_jax.numerics import Scalar, StepOptions, is_inside_jit
 from vrw_jax.printing import LabelAndText, format_numbers, map_text_of_elements
-from vrw_jax.runtime import with_default_jax_settings
 from vrw_jax.simulation import step
 from vrw_jax.wheel import (
     Motion,
@@ -105,14 +102,6 @@ class LimitCycle(AbstractCycle):
     def warm_start(self) -> CollocationState:
         return self.collocation_state
 
-    def _vmap_over_batch_axes(self, function_of_cycle: Callable) -> Callable:
-        """Map a function of one cycle over the batch axes of this cycle, and return the mapped
-        function.
-        """
-        for _ in range(self.outcome.ndim):
-            function_of_cycle = jax.vmap(function_of_cycle)
-        return with_default_jax_settings(function_of_cycle)
-
     @property
     def monodromy(self) -> Float[Array, "... 2 2"]:
         """Return the Jacobian of the return map after the impact, in the coordinates (theta+,
@@ -123,7 +112,7 @@ class LimitCycle(AbstractCycle):
         attach_derivatives = (
             attach_monodromy_derivatives if is_inside_jit() else _attach_monodromy_compiled
         )
-        attach_derivatives_to_batch = self._vmap_over_batch_axes(
+        attach_derivatives_to_batch = self.map_over_batch_axes(
             functools.partial(attach_derivatives, self.system)
         )
         return attach_derivatives_to_batch(
@@ -152,9 +141,7 @@ class LimitCycle(AbstractCycle):
         mesh intervals in `CycleOptions` reduce the error.
         """
         estimate_error = functools.partial(_estimate_found_mesh_error, self.system)
-        return self._vmap_over_batch_axes(estimate_error)(
-            self.found, self.collocation_state.solution
-        )
+        return self.map_over_batch_axes(estimate_error)(self.found, self.collocation_state.solution)
 
     @property
     def takeoff_acceleration(self) -> Array:
@@ -166,7 +153,7 @@ class LimitCycle(AbstractCycle):
             _compute_takeoff_acceleration, self.system
         )
         return self._zero_without_gait(
-            self._vmap_over_batch_axes(compute_least_takeoff_acceleration)(
+            self.map_over_batch_axes(compute_least_takeoff_acceleration)(
                 self.parameters, self.collocation_state
             )
         )
@@ -184,7 +171,7 @@ class LimitCycle(AbstractCycle):
                 "for gaits that repeat after one: give a cycle of period_n = 1."
             )
         compute_response = functools.partial(compute_collocation_slope_response, self.system)
-        return self._vmap_over_batch_axes(compute_response)(self.parameters, self.collocation_state)
+        return self.map_over_batch_axes(compute_response)(self.parameters, self.collocation_state)
 
     def gait_sensitivity(self, measure_name: str) -> Array:
         """Return the gait sensitivity norm of a measure, in the measure's unit per rad of slope.
@@ -198,37 +185,16 @@ class LimitCycle(AbstractCycle):
                 slope_response.select_measures([response_index])
             ).sensitivity_norms[0]
 
-        return self._zero_without_gait(
-            self._vmap_over_batch_axes(compute_norm)(self.slope_response)
-        )
+        return self._zero_without_gait(self.map_over_batch_axes(compute_norm)(self.slope_response))
 
     @property
     def force_peaks(self) -> dict[str, Array]:
-        """Return the `measures.FORCE_PEAK_MEASURES` by name.
-
-        Each measure is the largest value over the gait steps. The measures have first derivatives.
-        The derivatives of the number of peaks are zero.
-        """
         compute_peaks = functools.partial(compute_force_peaks, self.system)
         collocation_solution = self.collocation_state.solution
-        force_peaks = self._vmap_over_batch_axes(compute_peaks)(
-            self.parameters, collocation_solution
-        )
+        force_peaks = self.map_over_batch_axes(compute_peaks)(self.parameters, collocation_solution)
         return {
             measure_name: self._zero_without_gait(peak_value)
             for measure_name, peak_value in force_peaks.items()
-        }
-
-    def measures(self, measure_names: Iterable[str]) -> dict[str, Array]:
-        measure_names = tuple(measure_names)
-        force_peaks = (
-            {} if FORCE_PEAK_MEASURES.keys().isdisjoint(measure_names) else self.force_peaks
-        )
-        return {
-            measure_name: force_peaks[measure_name]
-            if measure_name in force_peaks
-            else self.measure(measure_name)
-            for measure_name in measure_names
         }
 
     @property
@@ -239,7 +205,7 @@ class LimitCycle(AbstractCycle):
             wheel_params = make_wheel_from_parameters(parameters, self.system.n_legs)
             return step(wheel_params, section_state, model=self.model).margins
 
-        return self._vmap_over_batch_axes(compute_step_margins)(self.parameters, self.section_state)
+        return self.map_over_batch_axes(compute_step_margins)(self.parameters, self.section_state)
 
     @property
     def ending(self) -> Any:

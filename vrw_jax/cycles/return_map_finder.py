@@ -4,6 +4,7 @@ Only the interface of models is used. For the paper's model, `collocation_finder
 method.
 """
 
+import functools
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -64,7 +65,8 @@ class ReturnMapCycle(AbstractCycle):
     - `monodromy_value`: Jacobian of the return map;
     - `outcome`: Outcome.STEPPED, or the reason of the failure;
     - `residual`: largest absolute component of map(x) - x, in units of the wheel;
-    - `n_iterations`: number of Newton iterations.
+    - `n_iterations`: number of Newton iterations;
+    - `params`, `model`: wheel and model of the gait.
 
     Examples:
         >>> wheel = vrw.RigidWheel(held_landing=True)
@@ -82,6 +84,8 @@ class ReturnMapCycle(AbstractCycle):
     outcome: Int[Array, ""]
     residual: Scalar
     n_iterations: Int[Array, ""]
+    params: WheelParams
+    model: AbstractWheel
 
     def _drop_single_step_axis(self, tree_over_steps: Any) -> Any:
         """Return the tree without its axis over the gait steps if the cycle has only one step."""
@@ -107,8 +111,41 @@ class ReturnMapCycle(AbstractCycle):
     def step_ends(self) -> Array:
         return jnp.asarray(self.steps.section_state)
 
+    @property
+    def force_peaks(self) -> dict[str, Array]:
+        measure_cycle = functools.partial(measure_return_map_force_peaks, options=StepOptions())
+        force_peaks = self.map_over_batch_axes(measure_cycle)(
+            self.model, self.params, self.section_state, self.step_ends
+        )
+        return {
+            measure_name: self._zero_without_gait(peak_value)
+            for measure_name, peak_value in force_peaks.items()
+        }
+
     def model_summary_rows(self) -> list[LabelAndText]:
         return [("durations of each kind of support", f"{format_numbers(self.durations)} s")]
+
+
+def measure_return_map_force_peaks(
+    model: AbstractWheel,
+    params: WheelParams,
+    section_state: Array,
+    step_ends: Array,
+    options: StepOptions,
+) -> dict[str, Array]:
+    """Return the `measures.FORCE_PEAK_MEASURES` of a cycle by name, the largest over its steps.
+
+    - `section_state`: section state at the start of the cycle;
+    - `step_ends`: section state at the end of each gait step, on a leading axis.
+    """
+    start_states = jnp.concatenate([section_state[None], step_ends[:-1]])
+    measures_by_step = jax.vmap(lambda x: model.measure_force_peaks(params, x, options))(
+        start_states
+    )
+    return {
+        measure_name: jnp.nanmax(step_values)
+        for measure_name, step_values in measures_by_step.items()
+    }
 
 
 @eqx.filter_jit
@@ -153,13 +190,14 @@ def find_return_map_cycle(
         section_state = step_results[-1].section_state
     return make_return_map_cycle(
         params,
+        model,
         fixed_point,
         jax.tree.map(lambda *stacked_arrays: jnp.stack(stacked_arrays), *step_results),
     )
 
 
 def make_return_map_cycle(
-    params: WheelParams, fixed_point: FixedPointResult, cycle_steps: Any
+    params: WheelParams, model: AbstractWheel, fixed_point: FixedPointResult, cycle_steps: Any
 ) -> ReturnMapCycle:
     """Build the cycle that belongs to a fixed point, from its gait steps on a leading axis."""
     # A failed step returns zeros, to which Newton's method may converge.
@@ -177,6 +215,8 @@ def make_return_map_cycle(
         outcome=jnp.where(is_gait_valid, Outcome.STEPPED, failure_outcome).astype(jnp.int32),
         residual=fixed_point.residual,
         n_iterations=fixed_point.n_iterations,
+        params=params,
+        model=model,
     )
 
 

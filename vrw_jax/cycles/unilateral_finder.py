@@ -37,7 +37,7 @@ from vrw_jax.cycles.return_map_finder import (
     prepare_search,
     summarize_cycle_steps,
 )
-from vrw_jax.measures import UNILATERAL_DIFFERENTIABLE_NAMES
+from vrw_jax.measures import FORCE_PEAK_MEASURES, UNILATERAL_DIFFERENTIABLE_NAMES
 from vrw_jax.models import AbstractStep, AbstractWheel
 from vrw_jax.numerics import StepOptions, batch_sizes, map_in_batches, select_tree_rows
 from vrw_jax.simulation import convert_step_arguments
@@ -75,10 +75,17 @@ class UnilateralFinder(AbstractReturnMapFinder):
         static=True, default=batch_sizes.CONTACT_GAIT_BATCH_SIZES
     )
 
-    cycle_measures: ClassVar[tuple[str, ...]] = ("spectral_radius", "spectral_margin")
-    differentiable_measures: ClassVar[tuple[str, ...]] = UNILATERAL_DIFFERENTIABLE_NAMES
+    cycle_measures: ClassVar[tuple[str, ...]] = (
+        "spectral_radius",
+        "spectral_margin",
+        *FORCE_PEAK_MEASURES,
+    )
+    differentiable_measures: ClassVar[tuple[str, ...]] = (
+        *UNILATERAL_DIFFERENTIABLE_NAMES,
+        *FORCE_PEAK_MEASURES,
+    )
     default_measures: ClassVar[tuple[str, ...]] = UNILATERAL_DIFFERENTIABLE_NAMES
-    readable_measures: ClassVar[tuple[str, ...]] = UNILATERAL_DIFFERENTIABLE_NAMES
+    readable_measures: ClassVar[tuple[str, ...]] = differentiable_measures
     is_multistable: ClassVar[bool] = True
 
     def find_cycle(self, params: WheelParams, cycle_guess: Any = None) -> ReturnMapCycle:
@@ -570,13 +577,13 @@ def _make_contact_cycle(
         fixed_points.is_gait_found,
         fixed_points.n_newton_iterations,
     )
-    params = model.from_parameter_values(parameter_values, n_legs)[1]
+    wheel_model, params = model.from_parameter_values(parameter_values, n_legs)
     fixed_point = FixedPointResult(
         fixed_points.fixed_section_states,
         _compute_return_map_jacobian_of_steps(fixed_points, len(parameter_values)),
         *newton_diagnostics,
     )
-    return make_return_map_cycle(params, fixed_point, fixed_points.period_steps)
+    return make_return_map_cycle(params, wheel_model, fixed_point, fixed_points.period_steps)
 
 
 def _make_contact_gait(
@@ -624,15 +631,25 @@ def _make_contact_gait(
     zero_derivatives = jax.tree.map(
         lambda x: jnp.zeros((n_values, *x.shape), x.dtype), float_fields
     )
+    make_inputs = lambda parameter_values: eqx.filter(
+        model.from_parameter_values(parameter_values, n_legs), eqx.is_inexact_array
+    )
+    model_derivatives, params_derivatives = move_derivative_axis_first(
+        jax.jacfwd(make_inputs)(parameter_values)
+    )
     cycle_derivatives = eqx.tree_at(
-        lambda c: (c.section_state, c.steps, c.post_impact, c.durations, c.step_length),
+        lambda c: (
+            c.section_state, c.steps, c.model, c.params, c.post_impact, c.durations, c.step_length
+        ),
         zero_derivatives,
         (
             section_state_derivatives.T,
             step_derivatives,
+            model_derivatives,
+            params_derivatives,
             *jax.vmap(summarize_cycle_steps)(step_derivatives),
         ),
-    )
+    )  # fmt: skip
     first_step = jax.tree.map(
         lambda array_over_steps: array_over_steps[0], fixed_points.period_steps
     )

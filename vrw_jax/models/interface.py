@@ -150,6 +150,19 @@ class AbstractWheel(eqx.Module):
         model's counterpart of `StepResult`. The results are differentiable in any mode.
         """
 
+    def measure_force_peaks(
+        self, params: WheelParams, x: SectionState, options: StepOptions
+    ) -> dict[str, Array]:
+        """Return the `measures.FORCE_PEAK_MEASURES` of one walking step from the section state `x`.
+
+        The measures have first derivatives. Raise a `ValueError` for a model without these
+        measures.
+        """
+        raise ValueError(
+            f"force peaks are measured for a {type(self).__name__}, but its steps have no such "
+            "measures: take vrw.UnilateralWheel(), or gaits of vrw.ViscoelasticWheel()."
+        )
+
     @abc.abstractmethod
     def sample_step(
         self, params: WheelParams, x: SectionState, options: StepOptions, n_samples: int

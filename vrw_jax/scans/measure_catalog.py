@@ -6,13 +6,12 @@ import re
 from collections.abc import Iterable
 from typing import NamedTuple
 
-from vrw_jax.cycles import CollocationFinder
+from vrw_jax.cycles import CollocationFinder, UnilateralFinder
 from vrw_jax.measures import (
     MARGIN_MEASURES,
     MEASURES,
     PASSAGE_MEASURES,
     STEP_MEASURES,
-    UNILATERAL_DIFFERENTIABLE_NAMES,
     make_measure_attributes,
 )
 from vrw_jax.models import AbstractWheel, GaitMethod
@@ -79,17 +78,19 @@ PAPER_MEASURE_CATALOG = MeasureCatalog(
     1024,
 )
 UNILATERAL_MEASURE_CATALOG = MeasureCatalog(
-    (*UNILATERAL_DIFFERENTIABLE_NAMES, "spectral_margin"),
+    (*UnilateralFinder.differentiable_measures, "spectral_margin"),
     ("outcome", "spectral_radius"),
-    UNILATERAL_DIFFERENTIABLE_NAMES,
+    UnilateralFinder.differentiable_measures,
     (*PARAMETER_NAMES, FRICTION_NAME),
     _CONTACT_DEFAULT_MEASURES,
     16,
 )
 MODEL_SELECTION_MEASURE_CATALOG = MeasureCatalog(
-    (*UNILATERAL_DIFFERENTIABLE_NAMES, "spectral_margin"),
+    UNILATERAL_MEASURE_CATALOG.requestable_measures,
     ("outcome", "spectral_radius", *SELECTION_VARIABLE_ATTRIBUTES),
-    tuple(name for name in UNILATERAL_DIFFERENTIABLE_NAMES if name in DIFFERENTIABLE_MEASURES),
+    tuple(
+        name for name in UnilateralFinder.differentiable_measures if name in DIFFERENTIABLE_MEASURES
+    ),
     PARAMETER_NAMES,
     _CONTACT_DEFAULT_MEASURES,
     64,
