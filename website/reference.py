@@ -173,9 +173,9 @@ _GROUPS = (
         "Steps with stoppers that hold legs in the air report the margins of this table."),
     ("Of a gait", LIMIT_CYCLE_MEASURES | GAIT_SENSITIVITY_MEASURES,
         "The table lists measures that limit cycles report."),
-    ("Of the force in a gait", FORCE_PEAK_MEASURES, "Limit cycles of the paper's model report "
-        "the measures of this table. Except for the impulse, `vrw.force_peaks` returns the same "
-        "measures for walks."),
+    ("Of the force in a gait", FORCE_PEAK_MEASURES, "Limit cycles of the paper's model and "
+        "limit cycles with unilateral contact report the measures of this table. Except for the "
+        "impulse, `vrw.force_peaks` returns the same measures for walks."),
     ("Of walks over random slopes", PASSAGE_MEASURES,
         "Scans with `slope_sd` report the measures of this table."),
     ("Of a trajectory", TRAJECTORY_MEASURES,

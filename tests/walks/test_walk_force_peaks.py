@@ -2,17 +2,14 @@
 
 import numpy as np
 import pytest
-from numpy.polynomial import Chebyshev
 from reference_code import complementarity
-from scipy.integrate import solve_ivp
+from reference_code.contact_force_extrema import find_step_extrema
 
 import vrw_jax as vrw
 from vrw_jax.simulation import SAMPLED_FORCE_PEAK_MEASURES
 
 TWO_PEAKS = vrw.WheelParams(stiffness=2500.0, damping=100.0, natural_length=1.0, slope=0.075)
 TIGHT = vrw.StepOptions.tight()
-N_COEFFICIENTS = 60
-"""Chebyshev coefficients of the force between two events: the last ones are round-off."""
 
 
 def test_peaks_of_a_sampled_step_are_those_of_its_gait():
@@ -26,43 +23,15 @@ def test_peaks_of_a_sampled_step_are_those_of_its_gait():
     np.testing.assert_array_equal(peaks.force_step, [0, 0, 0, 1, 1, 1])
 
 
-def reference_extrema(wheel, x):
-    """The fore foot's extrema over one step of the second formulation: forces, whether maxima."""
-    place, struck, forces, maxima = complementarity.paper_start(wheel, *x), ("gap", 0), [], []
-    while struck != ("gap", complementarity.N - 1):
-        name, j = struck
-        foot, leg = (j if name == "gap" else None), (j if name == "room" else None)
-        place, _ = complementarity._process_event(wheel, place, foot, leg)
-        duration, y, struck = complementarity._integrate_to_event(wheel, place)
-        solve = lambda y, place=place: complementarity._solve_contact_forces(
-            wheel, y[:11], y[11:], place.mode, place.is_locked
-        )
-        motion = solve_ivp(
-            lambda _, y, solve=solve: np.r_[y[11:], solve(y)[0]],
-            (0.0, duration), np.r_[place.q, place.v],
-            method="DOP853", rtol=1e-13, atol=1e-13, max_step=4e-3, dense_output=True,
-        ).sol  # fmt: skip
-        force = np.vectorize(lambda t, solve=solve, motion=motion: solve(motion(t))[1][0, 1])
-        polynomial = Chebyshev.interpolate(force, N_COEFFICIENTS, [0.0, duration])
-        times = polynomial.deriv().roots()
-        times = np.sort(times[(np.abs(times.imag) < 1e-9)].real)
-        times = times[(times > 0.0) & (times < duration)]
-        forces += polynomial(times).tolist()
-        maxima += (polynomial.deriv(2)(times) < 0.0).tolist()
-        place = place._replace(q=y[:11].copy(), v=y[11:].copy())
-        complementarity._project_to_constraints(wheel, place)
-    return np.array(forces), np.array(maxima)
-
-
 def test_peaks_with_unilateral_contact_are_those_of_another_code():
     x = np.asarray(vrw.limit_cycle(TWO_PEAKS).section_state)
     model = vrw.UnilateralWheel(friction=0.8)
     peaks = vrw.force_peaks(vrw.simulate(TWO_PEAKS, x, 1, model=model, options=TIGHT))
     wheel = complementarity.ComplementarityWheel(0.8, c=100.0, k=2500.0, Ls=1.0, slope=0.075)
-    forces, maxima = reference_extrema(wheel, x)
-    np.testing.assert_array_equal(peaks.is_maximum, maxima)
-    np.testing.assert_allclose(peaks.force, forces, rtol=1e-7)
-    assert peaks.n_force_peaks.values == np.sum(maxima)
+    fore, *_ = find_step_extrema(wheel, complementarity.paper_start(wheel, *x))
+    np.testing.assert_array_equal(peaks.is_maximum, fore.is_maximum)
+    np.testing.assert_allclose(peaks.force, fore.forces, rtol=1e-7)
+    assert peaks.n_force_peaks.values == np.sum(fore.is_maximum)
     assert peaks.n_force_peaks.values >= 2
 
 

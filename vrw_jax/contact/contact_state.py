@@ -334,7 +334,10 @@ def make_guard_layout(
 
 
 class ForceRates(NamedTuple):
-    """Rates of normal forces on the feet; each is zero at an extremum of the step record."""
+    """Rates of normal forces on the feet.
+
+    A rate is zero at an extremum of a force, and the second rate at an extremum of the first rate.
+    """
 
     fore_force_rate: Elementwise  # rate of the force on the foot of Leg 1, N/s
     total_force_rate: Elementwise  # rate of the sum of the forces on all feet, N/s
@@ -559,7 +562,7 @@ def _flag_varying_forces(mode_dynamics: ModeDynamics) -> Array:
 
 
 def compute_guard_scales(mode_dynamics: ModeDynamics) -> Array:
-    """Return the scale of each guard in the order of `GuardLayout`, in m, N, m/s or rad/s."""
+    """Return the scale of each guard in the order of `GuardLayout`, in the guard's unit."""
     s = mode_dynamics.s
     force_scale, speed_scale = s.Mt * s.g, jnp.sqrt(s.g * s.L0)
     guard_scales = (

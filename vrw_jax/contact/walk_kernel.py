@@ -409,6 +409,7 @@ class BatchWalkSettings(NamedTuple):
         event_result, contact_event, event_outcome = process_event(
             contact_law, guard_layout, motion, contact_state, *event_law_arguments
         )
+        # At the extremum of a force, motion and contacts continue without change.
         n_contact_events: Any = 1
         if step_details is not None and step_details.force_peaks is not None:
             is_contact_event = guard_index < guard_layout.first_force_rate_guard

@@ -40,8 +40,8 @@ def force_peaks(walk: xr.Dataset) -> xr.Dataset:
 
     A peak is a smooth maximum of the force on the fore foot, Leg 1, between two events. Impacts and
     changes of phase or contact are not peaks. Peaks are located on a spline of degree 7 through the
-    samples of each interval. For gaits of the paper's model, `LimitCycle.measure` returns the same
-    measures without samples, and with derivatives.
+    samples of each interval. For gaits, the method `measures` of the result of `vrw.limit_cycle`
+    returns the same measures without samples, and with derivatives.
 
     Args:
         walk: a trajectory with at least 9 samples per phase.
