@@ -180,5 +180,9 @@ def find_slow_gaits(gait_finder: Any, parameter_values: Any) -> Any:
 
 
 def find_slowest_gait_indices(gait_wheel_indices: np.ndarray, n_wheels: int) -> np.ndarray:
-    """Return the index of each wheel's first gait, which is its slowest gait, shape (wheels,)."""
+    """Return the index of the slowest gait of each wheel, shape (wheels,).
+
+    - `gait_wheel_indices`: index of the wheel to which each gait belongs, in ascending order. The
+      gaits of a wheel are in the order of increasing speed.
+    """
     return np.searchsorted(gait_wheel_indices, np.arange(n_wheels))

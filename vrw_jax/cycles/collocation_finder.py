@@ -148,9 +148,8 @@ class CollocationFinder(AbstractGaitFinder):
     def guess_cycle_from_state(
         self, params: WheelParams, section_state: SectionState
     ) -> CollocationState:
-        """Compute the guess of a cycle from a walk of `period_n` gait steps.
-
-        The walk starts at `section_state`.
+        """Compute a guess of the cycle from a walk of `period_n` gait steps that starts at
+        `section_state`.
         """
         walk_samples = sample_walk_in_time(self.model, params, section_state, self.period_n)
         return guess_cycle_from_walk(self.collocation_system, params, walk_samples)
@@ -159,7 +158,7 @@ class CollocationFinder(AbstractGaitFinder):
     def shift_first_step(
         self, first_step_index: int, params: WheelParams, collocation_state: CollocationState
     ) -> CollocationState:
-        """Return the same cycle with another gait step as its first step."""
+        """Return the same cycle, starting with its gait step at the index `first_step_index`."""
         previous_end_state = collocation_state.step_end_states[first_step_index - 1]
         landing_result = transitions.resolve_landing(
             params.symbols(), previous_end_state[0], *previous_end_state[2:]

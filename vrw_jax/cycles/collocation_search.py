@@ -4,7 +4,7 @@ A lane is the batch element of one wheel. Arrays of type `LaneArray` have the la
 axis.
 
 Newton's method on the collocation system also converges to solutions that are not gaits. A cycle is
-therefore accepted only if all signs that its sequence of phases assumes are true at all nodes.
+therefore accepted only if all inequalities that its sequence of phases assumes hold at all nodes.
 After each attempt, the wheels without a cycle are gathered for the next attempt.
 """
 
@@ -54,7 +54,9 @@ class CycleSearchLimits:
     """Limits in the search for limit cycles that a user cannot set."""
 
     end_guard_tolerance: float = 1e-6
-    """Largest absolute value of a negative end guard at the end of its phase, N, m or rad/s."""
+    """Largest amount by which the guard that ends a phase may be negative at the end of the phase,
+    N, m or rad/s.
+    """
     max_accepted_mesh_error: float = 1e-5
     """Largest estimated mesh error of an accepted solution.
 
@@ -159,7 +161,8 @@ class CollocationSystem(NamedTuple):
 
 
 class CollocationState(NamedTuple):
-    """Solution of the collocation system, and the flags that select it.
+    """Solution of the collocation system, its active phases, and the result of its admissibility
+    checks.
 
     All fields are floats with the wheels (lanes) on the last axis.
     """
@@ -269,7 +272,9 @@ def make_start_state(
 def init_search_flags(
     collocation_system: CollocationSystem, section_state: Array
 ) -> tuple[Array, Array, Array]:
-    """Return the initial values of `has_cycle`, `failed_check` and `step_end_states`."""
+    """Return `has_cycle`, `failed_check` and `step_end_states` before the search, which are
+    zeros.
+    """
     lane_shape, n_end_components = (
         section_state.shape[1:],
         2 * collocation_system.phase_sequence.phases[-1].n_coordinates,
@@ -359,9 +364,9 @@ def _compute_correction_fraction(
 def compute_state_tangents(
     cycle_linearization: CycleLinearization, collocation_state: CollocationState
 ) -> CollocationState:
-    """Return the tangents of a collocation state, computed from its linearization.
+    """Return the tangents of a collocation state, computed from the linearization at that state.
 
-    The flags that select the solution have zero tangents.
+    The tangents of the active phases and of the results of admissibility checks are zero.
     """
     make_zero_tangents = lambda x: jnp.zeros(
         (cycle_linearization.step_end_tangents.shape[0], *x.shape), x.dtype
@@ -612,7 +617,9 @@ def find_first_failed_check(
 
 
 def _has_attempt_name(attempt_index: Array, *attempt_names: str) -> Array:
-    """Return whether the attempt with the index `attempt_index` has one of the given names."""
+    """Return whether the attempt at `attempt_index` in the order of attempts has one of the given
+    names.
+    """
     return functools.reduce(
         operator.or_,
         [attempt_index == SEARCH_ATTEMPTS.index(attempt_name) for attempt_name in attempt_names],
@@ -887,13 +894,16 @@ FAILED_MESH_CHECK_CODE = len(ADMISSIBILITY_CHECKS)
 """Value of `CollocationState.failed_check` for a root whose mesh is too coarse."""
 
 HOMOTOPY_OFFSET = float(len(ADMISSIBILITY_CHECKS))
-"""Offset of `CollocationState.failed_check` if the failed check belongs to a wheel on
-the homotopy.
+"""Offset of `CollocationState.failed_check` if the check fails for an intermediate wheel of the
+homotopy.
 """
 
 
 class HomotopyFailure(IntEnum):
-    """Values of `CollocationState.failed_check` if Newton's method fails on the homotopy."""
+    """Values of `CollocationState.failed_check` if Newton's method fails in the homotopy.
+
+    The homotopy starts at the wheel in Table 1 of the paper.
+    """
 
     FIRST_TRY = -1
     BOTH_TRIES = -2

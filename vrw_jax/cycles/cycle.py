@@ -134,7 +134,10 @@ class AbstractCycle(AbstractPrintable):
     def reduce_over_steps(
         self, step_values: Array, reduce_values: Callable[[Array, int], Array]
     ) -> Array:
-        """Reduce the values of the gait steps, on the last axis, to one value per cycle."""
+        """Reduce the values of the gait steps, on the last axis, to one value per cycle.
+
+        `reduce_values` is a reduction of an array over an axis, such as `jnp.sum`.
+        """
         return reduce_values(step_values, -1) if self.period_n > 1 else step_values
 
     @property
@@ -321,7 +324,7 @@ FIELDS_ZERO_WITHOUT_GAIT = (
     "steps",
     "monodromy_value",
 )
-"""Names of those fields of a cycle that are zero if no gait is found."""
+"""Names of the fields of a cycle that are zero if no gait is found."""
 
 
 def _make_property_reader(property_name: str) -> Callable[[AbstractCycle], Array]:

@@ -88,7 +88,8 @@ def _compute_monodromy_tangents(
     The parameters are on a leading axis. The directions are computed one after another, so that the
     compiled program is as short as for one direction. Three of the nine derivatives follow from
     changes of units. A change of the unit of mass scales hub mass and leg mass by one factor.
-    Therefore only the orthogonal direction of the two masses is computed.
+    Therefore, of the derivatives with respect to the two masses, only the derivative in the
+    orthogonal direction is computed.
 
     - `solution_and_tangents`: the solution z and its derivatives dz/dp with respect to the
       parameters.
@@ -192,6 +193,9 @@ def compile_batch_function(
 
     On a CPU the function becomes machine code. Otherwise XLA compiles the function, which is then
     called for blocks of `batch_size` wheels (lanes).
+
+    - `make_output_template`: function that returns arrays with the structure of the outputs;
+    - `cache_key`: key under which the compiled code is cached.
     """
     if simd.is_machine_code_available():
         return compile_cached_lane_function(function_of_element, make_output_template, cache_key)
@@ -204,9 +208,10 @@ def _make_derivative_compiler(
     make_output_templates: tuple[Callable, ...],
     collocation_system: CollocationSystem,
 ) -> ExecutionWrapper:
-    """Return a function that compiles a batch function for one order of derivatives.
+    """Return a function that compiles a batch function for a given order of derivatives.
 
-    An order with an output template uses `compile_batch_function`, and higher orders use XLA.
+    If `make_output_templates` has an entry for the order, the function uses
+    `compile_batch_function`. For higher orders it uses XLA.
     """
     batch_size = collocation_system.cycle_options.batch_size
 

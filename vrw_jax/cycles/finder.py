@@ -35,7 +35,7 @@ ParameterValues = Float[Array, " n_values"]
 
 
 class GaitBranchPoint(NamedTuple):
-    """Gait as a point of a branch, described by the data that `is_same_branch` compares."""
+    """Point of a branch of gaits, with the data that `is_same_branch` compares."""
 
     gait_coordinates: Any  # section state and durations
     # derivatives of the coordinates, with a leading axis over the model's parameters
@@ -155,7 +155,10 @@ class AbstractGaitFinder(eqx.Module):
         period_n: int,
         cycle_options: CycleOptions,
     ) -> "AbstractGaitFinder":
-        """Build a finder from the options of its gait steps and, if it has any, of its search."""
+        """Build a finder from the options of the gait steps and the options of the search.
+
+        A finder whose search has no options of its own ignores `cycle_options`.
+        """
 
     @property
     def search_options(self) -> Any:
@@ -284,8 +287,9 @@ def compute_cycle_measures(
 
 
 def move_derivative_axis_first(derivative_tree: Any) -> Any:
-    """Return the tree with the last axis of each array, over the model's parameters, moved to the
-    front.
+    """Return the tree with the last axis of each array moved to the front.
+
+    The last axis is that of the model's parameters.
     """
     return jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), derivative_tree)
 

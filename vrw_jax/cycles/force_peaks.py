@@ -93,7 +93,11 @@ def compute_force_peaks(
 def _find_force_extrema(
     phase: AbstractPhase, collocated_phase: CollocatedPhaseMotion, with_rear_foot: bool
 ) -> PhaseExtrema:
-    """Return the extrema of the normal force in a phase, on the fore foot or on both feet."""
+    """Return the extrema of the normal force in a phase.
+
+    The force is that on the fore foot or, if `with_rear_foot` is true, the sum of the forces on the
+    two feet.
+    """
 
     def evaluate_acceleration(q: Array, v: Array) -> Array:
         return jnp.stack(

@@ -370,10 +370,10 @@ def _search_with_fallbacks(
 
 
 def _keep_first_failure_reason(cycle: LimitCycle, retried_cycle: LimitCycle) -> LimitCycle:
-    """Return the cycles of the second search, with the failure reason of the first if no gait
-    exists.
+    """Return the cycles of the second search, with the failure reasons of the first search.
 
-    All functions therefore report the same reason, whether fallbacks are used or not, and for any
+    The reason of the first search replaces that of the second search if no gait exists. All
+    functions therefore report the same reason, whether fallbacks are used or not, and for any
     batch.
     """
     failure_reason_getter = lambda cycle: (cycle.outcome, cycle.collocation_state.failed_check)
@@ -490,8 +490,11 @@ def _make_search_starts(
 ) -> CollocationState:
     """Return the start of the search for each wheel.
 
-    The start is a known state if there is one, and otherwise the end state of a walk. For all
-    remaining wheels the gait surface predicts the start.
+    - `collocation_state`: starts of the wheels for which `has_known_state` is true;
+    - `walk_end_states`: section states, NaN if a wheel has none. They are the starts of wheels
+      without a known state.
+
+    The gait surface predicts the starts of all remaining wheels.
     """
     start_states = map_in_batches(
         lambda batch_params: gait_finder.make_initial_guesses(stack_parameters(batch_params).T),
@@ -524,10 +527,12 @@ def _find_fallback_starts(
     can_refine_mesh: bool,
     fallback_options: SearchFallbackOptions = SEARCH_FALLBACK_OPTIONS,
 ) -> tuple[CollocationFinder, CollocationState] | None:
-    """Return a finder and starts from which it finds more gaits of a batch, or None.
+    """Return a finder and the starts from which it finds more gaits of a batch.
 
-    `guess_states` contains the section states of guesses, shape (wheels, 3). A finer mesh is used
-    only if `can_refine_mesh` is true.
+    The result is None if no more gaits are found.
+
+    - `guess_states`: section states of the user's guesses, shape (wheels, 3);
+    - `can_refine_mesh`: whether a finer mesh may be used.
     """
     search_outcomes = np.asarray(cycle.outcome)
     mesh_errors = map_in_batches(

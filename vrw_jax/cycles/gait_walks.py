@@ -313,11 +313,13 @@ def _find_duplicate_walks(
     max_settled_defect: float,
     walk_options: GaitWalkOptions,
 ) -> np.ndarray:
-    """Return whether another walk of the same wheel reaches the same state with a smaller defect.
+    """Return whether each walk is a duplicate of another walk of the same wheel.
 
-    Two states are the same if their distance is within `walk_merge_distance`. If the other walk has
-    settled to within `max_settled_defect`, a distance of three times the first walk's defect is
-    also allowed. The axes of the arguments are starts, wheels and, for states, coordinates.
+    A walk is a duplicate if the other walk reaches the same state with a smaller period defect. Two
+    states are the same if their distance is within `walk_merge_distance`. If the period defect of
+    the other walk is below `max_settled_defect`, a distance of three times the first walk's period
+    defect is also allowed. The axes of the arguments are starts, wheels and, for states,
+    coordinates.
     """
     scaled_walk_states, period_defects = (
         scaled_walk_states.reshape(-1, n_wheels, scaled_walk_states.shape[-1]),

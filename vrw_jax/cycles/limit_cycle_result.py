@@ -371,7 +371,9 @@ _solve_limit_cycle_compiled = eqx.filter_jit(_solve_limit_cycle)
 
 
 class WalkSamples(NamedTuple):
-    """Samples in time of an event-driven walk, from which a start on any mesh is computed."""
+    """Samples in time of an event-driven walk, from which a guess of a cycle is computed on any
+    mesh.
+    """
 
     post_impact: Float[Array, "2"]  # (theta, dtheta) after the first landing
     landing_distances: Float[Array, " n"]  # distance between the feet at each landing, m

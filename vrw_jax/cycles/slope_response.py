@@ -50,7 +50,8 @@ class SlopeResponse(NamedTuple):
     def from_jacobian(cls, step_jacobian: Array, n_states: int) -> "SlopeResponse":
         """Build the response from the Jacobian of (end state, measures).
 
-        The Jacobian is with respect to (start state, slope, next slope).
+        The Jacobian is with respect to (start state, slope, next slope). A state has `n_states`
+        entries.
         """
         end_state_rows, measure_rows = step_jacobian[:n_states], step_jacobian[n_states:]
         return cls(

@@ -165,7 +165,13 @@ class UnilateralFinder(AbstractReturnMapFinder):
         section_states: Any,
         with_parameter_derivatives: bool,
     ) -> Any:
-        """Evaluate `evaluate_fixed_point` at the fixed point of each wheel."""
+        """Find the fixed point of the return map for each wheel, and evaluate a function of it.
+
+        - `evaluate_fixed_point`: function of a wheel's parameters and fixed point;
+        - `section_states`: starts of Newton's method;
+        - `with_parameter_derivatives`: whether the steps are differentiated with respect to
+          parameters.
+        """
         newton_arguments = (
             np.asarray(parameter_values),
             np.asarray(section_states),
@@ -232,7 +238,9 @@ def _remove_batch_axis(batched_tree: Any) -> Any:
 
 
 class _ContactFixedPoints(NamedTuple):
-    """Fixed points of the return maps of many wheels, with a leading axis over the wheels."""
+    """Fixed points of the return maps of many wheels. The fields have a leading axis over the
+    wheels.
+    """
 
     fixed_section_states: Any
     period_steps: Any  # gait steps from the fixed point, (period_n, ...)
@@ -548,7 +556,9 @@ def _evaluate_over_wheels(
     parameter_values: Array,
     fixed_points: _ContactFixedPoints,
 ) -> Any:
-    """Evaluate `evaluate_fixed_point` for all wheels, by one program for the batch."""
+    """Evaluate `evaluate_fixed_point` at the fixed point of each wheel, by one program for the
+    batch.
+    """
     return eqx.filter_vmap(
         lambda parameter_values, fixed_points: evaluate_fixed_point(
             model, n_legs, parameter_values, fixed_points
