@@ -245,8 +245,10 @@ def _explain_lost_cluster(
 def _compute_chunk_in_worker(
     pickled_request: bytes, sample_columns: SampleColumns
 ) -> tuple[dict[str, object], Mapping[str, np.ndarray]]:
-    """Return a description of the worker's environment, and the values of each variable for a
-    chunk, by variable.
+    """Compute a chunk in a worker.
+
+    Return a description of the worker's environment, and the values of each variable in the chunk,
+    by the name of the variable.
     """
     start_jax()
     return describe_computing_environment(), make_worker_engine(pickled_request)(sample_columns)

@@ -77,19 +77,21 @@ class AbstractSampleDesign(abc.ABC):
         """Return the values of each swept parameter in a rectangular region of samples, by
         parameter.
 
-        The columns are flattened, with the last axis varying fastest.
+        Each array of values is flattened, with the last axis varying fastest.
 
         - `region_of_samples`: one slice for each axis of the design.
         """
 
     @abc.abstractmethod
     def make_result_coordinates(self) -> dict[str, tuple[str, np.ndarray]]:
-        """Return the axis and the values of each coordinate of the labeled result, by the
-        coordinate's name.
+        """Return the axis and the values of each coordinate of the labeled result, by the name of
+        the coordinate.
         """
 
     def describe_design(self) -> dict[str, object]:
-        """Return what identifies the design: kind, parameter names, shape and a digest of all
+        """Return the settings that identify the design.
+
+        The settings are the kind of the design, the parameter names, the shape, and a digest of all
         samples.
         """
         return {
@@ -182,9 +184,9 @@ class SampleListDesign(AbstractSampleDesign):
 def _merge_mapping_and_keywords(
     function_name: str, parameter_mapping: Mapping | None, parameter_keywords: Mapping
 ) -> Mapping:
-    """Return the parameters of a design as one mapping, from a mapping or from keywords.
+    """Return the parameters of a design as one mapping, given as a mapping or as keywords.
 
-    Raise a TypeError if a mapping and keywords are given.
+    Raise a TypeError if both `parameter_mapping` and `parameter_keywords` are given.
     """
     if parameter_mapping is not None and parameter_keywords:
         raise TypeError(

@@ -118,7 +118,8 @@ class UnilateralScanEngine:
 
     @with_default_jax_settings  # It runs in a thread of its own.
     def _evaluate_sample_subset(self, parameter_rows: np.ndarray) -> VariableColumns:
-        """Return the value of each variable for some samples, by the name of the variable.
+        """Return the value of each variable for a subset of the samples, by the name of the
+        variable.
 
         The values are those of the gait to which a walk from a slow start converges.
 
@@ -197,7 +198,9 @@ The keys are names of measures with unilateral contact.
 
 
 class ModelSelectionScanEngine:
-    """Scan engine that evaluates each sample with the simplest model valid for it."""
+    """Scan engine that evaluates each sample with the simplest model that is valid for the
+    sample.
+    """
 
     def __init__(self, evaluation_request: EvaluationRequest, n_threads: int | None = None) -> None:
         self._measure_names, self._base_wheel, self._wheel_model = (
@@ -226,7 +229,7 @@ class ModelSelectionScanEngine:
         """Return the value of each variable for all samples, by the name of the variable.
 
         The variables include `rung`, the code of the model, and `reason`, the code of the reason
-        for it.
+        for the choice of this model.
         """
         n_samples = len(next(iter(sample_columns.values())))
         sample_friction = sample_columns.get(
@@ -274,8 +277,11 @@ class ModelSelectionScanEngine:
     def compute_selection_reasons(
         self, paper_results: VariableColumns, sample_friction: np.ndarray
     ) -> np.ndarray:
-        """Return `ModelChoice.reason_code` for each sample, computed from the margins of its gait
-        with the paper's model.
+        """Return `ModelChoice.reason_code` for each sample.
+
+        - `paper_results`: margins and outcomes of the gaits computed with the paper's model, by
+          name;
+        - `sample_friction`: friction coefficient of the ground for each sample.
         """
         variable_names = (*VIOLATION_TEXT_BY_SELECTION_MARGIN, "outcome")
         selection_reasons = map_in_numpy_batches(
@@ -388,8 +394,9 @@ class PassageScanEngine:
         )
 
     def _measure_sample_passage(self, swept_values: Mapping[str, float]) -> list[float]:
-        """Return the first-passage measures of one sample, which are NaN if hardly any step of the
-        walks succeeds.
+        """Return the first-passage measures of one sample.
+
+        The measures are NaN if hardly any step of the walks succeeds.
 
         - `swept_values`: value of each swept parameter for the sample.
         """

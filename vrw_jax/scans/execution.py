@@ -87,8 +87,8 @@ def scan(
 
     `model` may be a `UnilateralWheel`, whose gaits are computed by walks. `model` may also be
     "auto", which selects the simplest valid model for each sample. Then the dataset also contains
-    `rung`, the code of the model, and `reason`, the code of the reason for it. With
-    `UnilateralWheel` and "auto", `friction` may be a swept parameter.
+    `rung`, the code of the model, and `reason`, the code of the reason for the choice of the model.
+    With `UnilateralWheel` and "auto", `friction` may be a swept parameter.
 
     Args:
         design: the samples, from `grid`, `samples`, `sobol`, `uniform` or `saltelli`.

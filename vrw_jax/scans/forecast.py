@@ -27,10 +27,13 @@ TYPICAL_SCAN_MEMORY_BYTES = 0.5e9
 
 @with_default_jax_settings
 def forecast_scan(scan_plan: ScanPlan, store_path: str | Path | None = None) -> dict[str, str]:
-    """Return texts, by label, that state the sizes, chunks, memory and time of a scan. No file is
-    written.
+    """Return a forecast of a scan: its size, chunks, memory and time, as texts by label.
 
-    Time and memory are measured while samples that are spread over the design are computed.
+    No file is written. Time and memory are measured while samples that are spread over the design
+    are computed.
+
+    - `store_path`: folder of the scan's store. Only chunks that are missing in the store are
+      forecast.
     """
     result_layout, n_samples = scan_plan.result_layout, scan_plan.design.size
     measure_catalog = select_measure_catalog(

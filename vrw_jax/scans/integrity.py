@@ -3,8 +3,8 @@
 The mark of a chunk is a digest of the scan's settings, of the chunk's index and of the files that
 contain its variables. A mark states that the chunk is written, and reveals a damaged, truncated,
 deleted or moved file. All marks are in one Zarr group. The attributes of this group list the scan's
-variables, so that foreign variables are ignored. They also contain a copy of the attributes of the
-store. In stores without the list of variables, a mark is a digest of the files alone.
+variables, so that variables of other origin are ignored. The attributes also contain a copy of the
+store's attributes. In stores without the list of variables, a mark is a digest of the files alone.
 """
 
 from __future__ import annotations
@@ -158,7 +158,8 @@ class StoredMetadata:
     def select_scan_variables(self, array_names: Iterable[str]) -> list[str]:
         """Return the names of the arrays that the scan wrote, without coordinates, sorted.
 
-        - `array_names`: names of all arrays in the store, including foreign ones.
+        - `array_names`: names of all arrays in the store, including arrays that the scan did not
+          write.
         """
         if SCAN_VARIABLES_KEY in self.mark_attributes:
             return sorted(self.mark_attributes[SCAN_VARIABLES_KEY])

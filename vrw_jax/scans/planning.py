@@ -258,8 +258,9 @@ def plan_scan(
 
 
 def _require_reference_model(wheel_model: AbstractWheel, error_tolerance: float) -> float:
-    """Return `error_tolerance`. Raise a ValueError if `wheel_model` cannot be the reference for
-    errors.
+    """Return `error_tolerance`, if errors can be computed with respect to `wheel_model`.
+
+    Otherwise raise a ValueError.
     """
     model_fields: dict[str, Any] = type(wheel_model).__dataclass_fields__
     default_only_fields = wheel_model.capabilities.default_only_fields

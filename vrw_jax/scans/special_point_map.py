@@ -29,7 +29,7 @@ class SpecialPointMap(NamedTuple):
 
     - `scan`: the gaits of the samples, as `vrw.scan` returns them;
     - `curves`: every curve, as `vrw.continue_special_point` returns it;
-    - `unexplained_changes`: changes of sign of a quantity between neighboring samples that no curve
+    - `unexplained_changes`: sign changes of a quantity between neighboring samples that no curve
       explains.
 
     Examples:
