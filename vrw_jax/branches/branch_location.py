@@ -90,9 +90,7 @@ QuantitiesByName = dict[str, np.ndarray]
 
 @dataclass(frozen=True)
 class AbstractContinuation(abc.ABC):
-    """Continuation of the gaits of several wheels, and of the quantities at the points of their
-    branches.
-    """
+    """Continuation of gaits of several wheels, with the quantities that locate special points."""
 
     continuation_problem: AbstractContinuationProblem
     arclength_options: ArclengthOptions
@@ -114,37 +112,43 @@ class AbstractContinuation(abc.ABC):
 
     @abc.abstractmethod
     def evaluate_point_quantities(self, wheels: Any, points: ContinuationPoint) -> QuantitiesByName:
-        """Return those quantities at the points that do not follow from the Jacobian.
+        """Return quantities at each point by name, except those computed from the Jacobian.
 
-        There is one wheel per point.
+        - `wheels`: one wheel per point.
         """
 
     @abc.abstractmethod
     def are_points_admissible(self, quantity_table: QuantitiesByName) -> np.ndarray:
-        """Return whether each point is admissible, from the table of quantities at the points."""
+        """Return whether each point is admissible, computed from the quantities at the points."""
 
     def is_margin_name(self, column_name: str) -> bool:
-        """Return whether a root of the named quantity is a border collision.
+        """Return whether a root of the quantity `column_name` is a border collision.
 
-        The name may end with a leg index in brackets.
+        The name may end with the label of a leg in brackets.
         """
         return column_name.partition("[")[0] in self.border_collision_quantities
 
     def mask_undefined_quantities(
         self, quantity_table: QuantitiesByName, wheel_indices: np.ndarray
     ) -> QuantitiesByName:
-        """Replace each quantity that is undefined for the wheel of a point by NaN."""
+        """Replace each quantity that is undefined for the wheel of a point by NaN.
+
+        - `wheel_indices`: index of the wheel of each point.
+        """
         return quantity_table
 
     def name_branch_end(self, quantity_table: QuantitiesByName, point_index: int) -> str:
-        """Return the name of a branch's end, derived from the first point beyond the end."""
+        """Return the name of the special point at the end of a branch.
+
+        - `point_index`: index of the first point beyond the end.
+        """
         return ADMISSIBILITY_COLUMN
 
     def is_same_gait(
         self, table_before: QuantitiesByName, table_after: QuantitiesByName
     ) -> np.ndarray:
-        """Return whether the two points of each pair, before and after a jump, belong to the same
-        branch.
+        """Return whether the points before and after a jump belong to the same branch, for each
+        jump.
         """
         return table_after[ADMISSIBILITY_COLUMN] > 0.0
 
@@ -166,9 +170,10 @@ class AbstractContinuation(abc.ABC):
     def map_over_points(
         self, function_of_points: Callable, batch_size: int, *point_trees: Any
     ) -> Any:
-        """Apply a compiled function of points in batches of points, and return its results.
+        """Evaluate a function of points in batches of `batch_size` points, and return its results.
 
-        Leaves of `point_trees` are NumPy arrays with a leading axis over the points.
+        Leaves of `point_trees`, the arguments of the function, are NumPy arrays with a leading axis
+        over the points.
         """
         if self.continuation_problem.is_traceable:
             return map_in_numpy_batches(function_of_points, (batch_size,), *point_trees)
@@ -183,6 +188,8 @@ class AbstractContinuation(abc.ABC):
         """Return all quantities at each point by name.
 
         The table includes the bifurcation functions and `ADMISSIBILITY_COLUMN`.
+
+        - `wheel_indices`: index of the wheel of each point.
         """
         point_wheels = select_tree_rows(self.wheels, wheel_indices)
         quantity_table = self.evaluate_point_quantities(point_wheels, points)
@@ -215,18 +222,20 @@ class AbstractContinuation(abc.ABC):
 
 
 def _format_combined_margin_name(margin_name: str) -> str:
-    """Return the name of the quantity that combines a margin with its substitute."""
+    """Return the name of the quantity that `combine_margin_with_substitute` computes for a
+    margin.
+    """
     return f"{margin_name} for certain"
 
 
 def combine_margin_with_substitute(
     margin_values: np.ndarray, substitute_values: np.ndarray
 ) -> np.ndarray:
-    """Return a quantity that is positive if and only if a margin and its substitute are both
-    positive.
+    """Return a quantity that is positive if and only if a margin and its substitute are positive.
 
-    The quantity crosses zero continuously. If the substitute is negative, the quantity equals the
-    substitute.
+    The substitute is a quantity that vanishes linearly where the margin vanishes. The combined
+    quantity crosses zero continuously. If the substitute is negative, the combined quantity equals
+    the substitute.
     """
     return np.where(
         substitute_values < 0.0, substitute_values, np.minimum(substitute_values, margin_values)
@@ -951,7 +960,7 @@ def _list_root_requests(
 
 
 class BranchData(NamedTuple):
-    """Branch of one wheel and its located special points, without labels."""
+    """Branch of one wheel and its located special points, as arrays without labels."""
 
     points: ContinuationPoint
     quantity_table: QuantitiesByName

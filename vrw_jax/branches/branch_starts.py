@@ -100,8 +100,8 @@ class LimitCycleFinder:
 def find_collocation_starts(branch_request: BranchRequest, given_cycle: Any) -> BranchStart:
     """Return the starts of branches that are continued by collocation.
 
-    The limit cycles at the starts are those in `given_cycle`, or they are found. Without cycle
-    options the mesh of the branch is not coarser than that of the limit cycles.
+    If `given_cycle` is None, the limit cycles at the starts are searched for. Without cycle
+    options, the mesh of the branch is not coarser than that of the limit cycles.
     """
     params, parameter_name, period_n = (
         branch_request.params,
@@ -167,7 +167,8 @@ def find_collocation_starts(branch_request: BranchRequest, given_cycle: Any) -> 
 def find_return_map_starts(branch_request: BranchRequest, given_cycle: Any) -> BranchStart:
     """Return the starts of branches that are continued as fixed points of a model's return map.
 
-    The fixed points are those in `given_cycle`, or they are found from the last states of walks.
+    If `given_cycle` is None, the fixed points are searched for, starting from the last states of
+    walks.
     """
     params, model, step_options = (
         branch_request.params,

@@ -123,9 +123,11 @@ class CollocationProblem(AbstractGaitProblem):
     `CollocationSolution`.
 
     If an indicator changes its sign, the solution still exists, but the event-driven step does not
-    confirm it as a gait. `additional_quantity_function` is a function of the wheel's symbols, the
-    phase points of the first gait step and z. If `measures_force_peaks` is true, the points also
-    have the measures of the gait's force.
+    confirm it as a gait.
+
+    - `additional_quantity_function`: function of the wheel's symbols, the phase points of the first
+      gait step and z, or None;
+    - `measures_force_peaks`: whether the points also have the measures of the gait's force.
     """
 
     collocation_system: CollocationSystem = eqx.field(static=True)
@@ -300,8 +302,8 @@ class AbstractReturnMapProblem(AbstractGaitProblem):
     """Continuation problem of fixed points of the return map over `period_n` gait steps.
 
     The unknowns z are the section state. Its last components are discrete codes (see
-    `AbstractWheel.count_continuous_entries`), which are copied from the image in every Newton
-    iteration. Newton's method converges only if the codes of state and image are equal.
+    `AbstractWheel.count_continuous_entries`), which are copied from the image under the return map
+    in every Newton iteration. Newton's method converges only if state and image have equal codes.
     """
 
     period_n: eqx.AbstractVar[int]
@@ -512,7 +514,7 @@ def compute_contact_order_numbers(period_steps: Any, n_legs: int) -> np.ndarray:
 def _combine_period_measures(
     step_results: AbstractStep, section_states: AnySectionState
 ) -> dict[str, Array]:
-    """Combine the measures of the gait steps in each period.
+    """Combine the measures of the gait steps in each period to measures of the period.
 
     `section_states` contains the first section state of each period.
     """

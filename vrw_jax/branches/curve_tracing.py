@@ -73,7 +73,7 @@ class CurveTracingOptions:
     - `same_curve_distance`: largest distance from a curve at which a point is treated as a point of
       the curve;
     - `codim2_overrun_distance`: distance beyond a point of codimension two at which the
-      continuation of the other curve starts;
+      continuation of the second curve through that point starts;
     - `relative_codim2_tolerance`: tolerance for Newton's last correction at a point of codimension
       two, relative to the values of the parameters;
     - `max_zero_dls_duration`: largest duration of double support that is treated as zero, s. The
@@ -261,10 +261,7 @@ class CurveTracer(NamedTuple):
         return params
 
     def compute_parameter_fractions(self, parameter_values: np.ndarray) -> np.ndarray:
-        """Return each parameter as a fraction of its range.
-
-        The two parameters are on the last axis.
-        """
+        """Return the two parameters as fractions of their ranges, on the last axis."""
         return (parameter_values - self.parameter_ranges[:, 0]) / np.ptp(self.parameter_ranges, 1)
 
     def find_seeds(
@@ -738,9 +735,10 @@ def choose_continued_special_point_name(
     z: CollocationSolution,
     tracing_options: CurveTracingOptions = DEFAULT_CURVE_TRACING_OPTIONS,
 ) -> str:
-    """Return the name of the curve on which a special point of a gait lies.
+    """Return the name under which a special point of a gait is continued as a curve.
 
-    The name is that of the special point that is continued as a curve.
+    A branch point is continued as a fold. In gaits with double support, special points of the rear
+    foot's force are continued as `DLS_VANISHING_NAME` or "lambda_4_plus".
     """
     # A curve of folds may continue in one direction at its special points.
     if special_point_name == BRANCH_POINT_KIND:

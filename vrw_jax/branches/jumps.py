@@ -52,7 +52,7 @@ def continue_beyond_jumps(
 
     The search for the gait beyond a jump starts from the last gait. It uses the smallest change of
     the parameter that leads to a similar gait. `branch_continuer` is the function that continues
-    branches of `branch_continuation`.
+    the branches of `branch_continuation` from given starts.
     """
     branch_indices, parameter_bounds = (
         np.arange(len(direction_results.n_points)),

@@ -25,7 +25,7 @@ MULTIPLIER_MODULI_COLUMN = "multiplier_moduli"
 """Name of the quantity that contains the moduli of all multipliers, largest first."""
 
 CONTACT_ORDER_COLUMN = "contact_order"
-"""Name of the quantity that contains the number by which the order of contacts is identified."""
+"""Name of the quantity whose value is a number that identifies the order of contacts."""
 
 CONTACT_ORDER_CHANGE = "order_of_contacts_changes"
 """Name of the special point at which the order of contacts changes."""
@@ -203,7 +203,7 @@ def drop_duplicate_order_changes(
     named_roots: list[NamedLocatedRoot],
     root_tolerances: LocatedRootTolerances = LOCATED_ROOT_TOLERANCES,
 ) -> list[NamedLocatedRoot]:
-    """Return the roots, in which every change of the order of contacts occurs only once.
+    """Return the roots, with each change of the order of contacts only once.
 
     Each change is located twice, as the end of one order and as the start of the next order.
     """
@@ -240,10 +240,12 @@ def add_multiple_bifurcations(
     root_tolerances: LocatedRootTolerances = LOCATED_ROOT_TOLERANCES,
     multiplier_tolerances: MultiplierTolerances = MULTIPLIER_TOLERANCES,
 ) -> list[NamedLocatedRoot]:
-    """Replace incomplete bifurcations by complete bifurcations of several multipliers.
+    """Replace bifurcations that explain only some of the crossing multipliers.
 
-    Return all roots. `neighbor_pairs` contains pairs of neighboring points on a branch.
-    `root_locator` is the function that locates roots of quantities between these points.
+    Bifurcations of several multipliers replace them. Return all roots.
+
+    - `neighbor_pairs`: pairs of neighboring points on a branch;
+    - `root_locator`: function that locates roots of quantities between two neighboring points.
     """
     root_pair_test = lambda located_root, point_pair: (
         point_pair[0] <= located_root.bracket_and_quantity[0]

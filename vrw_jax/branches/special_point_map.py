@@ -388,7 +388,7 @@ def _select_distant_changes(
 ) -> list[ScanSignChange]:
     """Select sign changes of each quantity that are distant from each other.
 
-    They must also be distant from the examined changes.
+    The selected changes are also distant from `examined_changes`.
     """
     selected_changes: list[ScanSignChange] = []
     for sign_change in unexplained_changes:
