@@ -577,386 +577,408 @@ class _LocatedRoot(NamedTuple):
         )
 
 
-def _locate_requested_roots(
-    branch_continuation: AbstractContinuation,
-    point_table: _BranchPointTable,
-    root_requests: list[tuple[int, int, str]],
-    location_options: SpecialPointLocationOptions = DEFAULT_LOCATION_OPTIONS,
-) -> list[_LocatedRoot]:
-    """Locate the root that each request (left point, right point, name of the quantity) describes.
+class _SpecialPointLocator(NamedTuple):
+    """Locator of special points and branch ends between the computed points of branches."""
 
-    The quantity has opposite signs at the two points.
-    """
-    if not root_requests:
-        return []
-    left_indices, right_indices = (
-        np.array([root_request[bracket_end_index] for root_request in root_requests])
-        for bracket_end_index in (0, 1)
-    )
-    quantity_names = [root_request[2] for root_request in root_requests]
-    left_points, right_points = (
-        select_tree_rows(point_table.all_points, left_indices),
-        select_tree_rows(point_table.all_points, right_indices),
-    )
-    wheel_indices = point_table.wheel_indices[left_indices]
-    bracket_wheels = select_tree_rows(branch_continuation.wheels, wheel_indices)
-    chord_solver = (
-        _solve_for_points_on_chords
-        if branch_continuation.continuation_problem.is_traceable
-        else _solve_for_points_on_chords_untraced
-    )
-    chord_point_solver = functools.partial(
-        chord_solver,
-        branch_continuation.continuation_problem,
-        branch_continuation.arclength_options,
-        jnp.asarray(branch_continuation.parameter_bounds),
-    )
+    branch_continuation: AbstractContinuation
+    point_table: _BranchPointTable
 
-    parameter_by_location = {
-        (bracket_end_index, 1.0 * chord_end_fraction): end_points.p[bracket_end_index]
-        for chord_end_fraction, end_points in enumerate((left_points, right_points))
-        for bracket_end_index in range(len(root_requests))
-    }
+    def locate_requested_roots(
+        self,
+        root_requests: list[tuple[int, int, str]],
+        location_options: SpecialPointLocationOptions = DEFAULT_LOCATION_OPTIONS,
+    ) -> list[_LocatedRoot]:
+        """Locate the root that each request describes.
 
-    def solve_at_fractions(
-        chord_fractions: np.ndarray, bracket_indices: np.ndarray
-    ) -> tuple[ContinuationPoint, QuantitiesByName]:
-        selected_brackets = select_tree_rows(
-            (bracket_wheels, left_points, right_points), bracket_indices
+        A request is (left point, right point, name of the quantity). The quantity has opposite
+        signs at the two points.
+        """
+        if not root_requests:
+            return []
+        left_indices, right_indices = (
+            np.array([root_request[bracket_end_index] for root_request in root_requests])
+            for bracket_end_index in (0, 1)
         )
-        solved_points, is_solve_successful = branch_continuation.map_over_points(
-            chord_point_solver,
-            batch_sizes.LOCATION_BATCH_SIZES[-1],
-            *selected_brackets,
-            chord_fractions,
+        quantity_names = [root_request[2] for root_request in root_requests]
+        left_points, right_points = (
+            select_tree_rows(self.point_table.all_points, left_indices),
+            select_tree_rows(self.point_table.all_points, right_indices),
         )
-        parameter_by_location.update(
-            zip(zip(bracket_indices, chord_fractions, strict=True), solved_points.p, strict=True)
+        wheel_indices = self.point_table.wheel_indices[left_indices]
+        bracket_wheels = select_tree_rows(self.branch_continuation.wheels, wheel_indices)
+        chord_solver = (
+            _solve_for_points_on_chords
+            if self.branch_continuation.continuation_problem.is_traceable
+            else _solve_for_points_on_chords_untraced
         )
-        solved_points = solved_points._replace(
-            is_admissible=solved_points.is_admissible & is_solve_successful
+        chord_point_solver = functools.partial(
+            chord_solver,
+            self.branch_continuation.continuation_problem,
+            self.branch_continuation.arclength_options,
+            jnp.asarray(self.branch_continuation.parameter_bounds),
         )
-        quantity_table = branch_continuation.make_quantity_table(
-            solved_points, wheel_indices[bracket_indices]
-        )
-        flag_broadcaster = lambda is_point_found, quantity_values: is_point_found.reshape(
-            -1, *(1,) * (quantity_values.ndim - 1)
-        )
-        return solved_points, {
-            quantity_name: np.where(
-                flag_broadcaster(is_solve_successful, quantity_values), quantity_values, np.nan
-            )
-            for quantity_name, quantity_values in quantity_table.items()
+
+        parameter_by_location = {
+            (bracket_end_index, 1.0 * chord_end_fraction): end_points.p[bracket_end_index]
+            for chord_end_fraction, end_points in enumerate((left_points, right_points))
+            for bracket_end_index in range(len(root_requests))
         }
 
-    def evaluate_at_fractions(
-        chord_fractions: np.ndarray, bracket_indices: np.ndarray
-    ) -> np.ndarray:
-        quantity_table = solve_at_fractions(chord_fractions, bracket_indices)[1]
-        return np.array(
-            [
-                evaluate_named_quantity(quantity_table, quantity_names[bracket_index])[
-                    point_position
-                ]
-                for point_position, bracket_index in enumerate(bracket_indices)
-            ]
-        )
-
-    evaluate_at_points = lambda point_indices: np.array(
-        [
-            evaluate_named_quantity(point_table.quantity_table, quantity_name)[bracket_end_index]
-            for quantity_name, bracket_end_index in zip(quantity_names, point_indices, strict=True)
-        ]
-    )
-    parameter_distances = np.maximum(
-        np.abs(right_points.p - left_points.p), location_options.parameter_accuracy
-    )
-    bracket_tolerances = np.minimum(
-        location_options.parameter_accuracy / parameter_distances,
-        location_options.min_bracket_fraction,
-    )
-    root_locations = locate_function_roots(
-        evaluate_at_fractions,
-        (evaluate_at_points(left_indices), evaluate_at_points(right_indices)),
-        bracket_tolerances,
-    )
-    request_indices = np.arange(len(root_requests))
-    # Even for an exact root, the point next to it lies to the left, where the gaits are admissible.
-    points_beside_roots, quantities_beside_roots = solve_at_fractions(
-        np.maximum(root_locations.left_bracket_ends - bracket_tolerances, 0.0), request_indices
-    )
-    for retry_fraction in location_options.retry_chord_fractions:
-        inadmissible_requests = np.flatnonzero(
-            ~(quantities_beside_roots[ADMISSIBILITY_COLUMN] > 0.0)
-        )
-        point_indices = np.arange(len(root_requests))
-        if len(inadmissible_requests):
-            retried_points_and_quantities = solve_at_fractions(
-                retry_fraction * root_locations.left_bracket_ends[inadmissible_requests],
-                inadmissible_requests,
+        def solve_at_fractions(
+            chord_fractions: np.ndarray, bracket_indices: np.ndarray
+        ) -> tuple[ContinuationPoint, QuantitiesByName]:
+            selected_brackets = select_tree_rows(
+                (bracket_wheels, left_points, right_points), bracket_indices
             )
-            point_indices[inadmissible_requests] = len(point_indices) + np.arange(
-                len(inadmissible_requests)
+            solved_points, is_solve_successful = self.branch_continuation.map_over_points(
+                chord_point_solver,
+                batch_sizes.LOCATION_BATCH_SIZES[-1],
+                *selected_brackets,
+                chord_fractions,
             )
-            points_beside_roots, quantities_beside_roots = select_tree_rows(
-                concatenate_tree_rows(
-                    (points_beside_roots, quantities_beside_roots), retried_points_and_quantities
-                ),
-                point_indices,
-            )
-    return [
-        _LocatedRoot(
-            root_requests[bracket_end_index],
-            float(
-                parameter_by_location[
-                    bracket_end_index, root_locations.best_locations[bracket_end_index]
-                ]
-            ),
-            float(root_locations.best_locations[bracket_end_index]),
-            select_tree_rows(points_beside_roots, slice(bracket_end_index, bracket_end_index + 1)),
-            select_tree_rows(
-                quantities_beside_roots, slice(bracket_end_index, bracket_end_index + 1)
-            ),
-        )
-        for bracket_end_index in range(len(root_requests))
-    ]
-
-
-def _is_mesh_limited(
-    branch_continuation: AbstractContinuation,
-    point_table: _BranchPointTable,
-    admissible_range: _AdmissibleRange,
-) -> bool:
-    """Return whether the mesh limits a branch, before its special points are located."""
-    unexplained_ends = [
-        i
-        for i in admissible_range.indices_of_points_beyond
-        if i >= 0
-        and not _find_crossed_quantities(branch_continuation, point_table, admissible_range, i)
-    ]
-    end_names = tuple(
-        branch_continuation.name_branch_end(point_table.quantity_table, i) for i in unexplained_ends
-    )
-    return branch_continuation.is_mesh_limited(
-        select_tree_rows(point_table.quantity_table, admissible_range.admissible_point_indices),
-        end_names,
-    )
-
-
-def _find_crossed_quantities(
-    branch_continuation: AbstractContinuation,
-    point_table: _BranchPointTable,
-    admissible_range: _AdmissibleRange,
-    point_index_beyond: int,
-) -> list[str]:
-    """Return the names of the branch-ending quantities that change sign at one end of a range.
-
-    The signs are compared between the last point of the range and the first point beyond the range.
-    """
-    last_point_index = admissible_range.admissible_point_indices[
-        0 if point_index_beyond < admissible_range.admissible_point_indices[0] else -1
-    ]
-    known_quantity_names = [
-        quantity_name
-        for quantity_name in branch_continuation.branch_ending_quantities
-        if quantity_name in point_table.quantity_table
-    ]
-    return [
-        quantity_name
-        for quantity_name in known_quantity_names
-        if point_table.quantity_table[quantity_name][last_point_index]
-        * point_table.quantity_table[quantity_name][point_index_beyond]
-        < 0.0
-    ]
-
-
-def _locate_branch_ends(
-    branch_continuation: AbstractContinuation,
-    point_table: _BranchPointTable,
-    admissible_ranges: list[_AdmissibleRange],
-) -> dict[tuple[int, int], _LocatedRoot]:
-    """Locate the nearest root beyond each end of each branch.
-
-    The keys of the result are (wheel index, end), where the end is 0 or 1.
-    """
-    root_requests, wheel_and_end_keys = [], []
-    for admissible_range in admissible_ranges:
-        for end_index, point_index_beyond in enumerate(admissible_range.indices_of_points_beyond):
-            if point_index_beyond < 0:
-                continue
-            last_point_index = int(
-                admissible_range.admissible_point_indices[0 if end_index == 0 else -1]
-            )
-            for quantity_name in _find_crossed_quantities(
-                branch_continuation, point_table, admissible_range, point_index_beyond
-            ) or [ADMISSIBILITY_COLUMN]:
-                root_requests.append((last_point_index, point_index_beyond, quantity_name))
-                wheel_and_end_keys.append((admissible_range.wheel_index, end_index))
-    nearest_roots: dict[tuple[int, int], _LocatedRoot] = {}
-    for wheel_and_end_key, located_root in zip(
-        wheel_and_end_keys,
-        _locate_requested_roots(branch_continuation, point_table, root_requests),
-        strict=True,
-    ):
-        if (
-            wheel_and_end_key not in nearest_roots
-            or located_root.chord_fraction < nearest_roots[wheel_and_end_key].chord_fraction
-        ):
-            nearest_roots[wheel_and_end_key] = located_root
-    return nearest_roots
-
-
-def _locate_inner_special_points(
-    branch_continuation: AbstractContinuation, point_table: _BranchPointTable
-) -> list[NamedLocatedRoot]:
-    """Locate all special points of the branches except their ends."""
-    root_requests, special_point_names = _list_root_requests(branch_continuation, point_table)
-    quantity_table, all_point_indices = (
-        point_table.quantity_table,
-        np.arange(len(point_table.wheel_indices)),
-    )
-    fraction_rates = np.asarray(point_table.all_points.fraction_rate)
-    jump_pairs: list[tuple[int, int]] = []
-    if branch_continuation.continuation_problem.has_kinks:
-        section_states = np.asarray(
-            jax.vmap(branch_continuation.continuation_problem.section_state)(
-                point_table.all_points.z
-            )
-        )
-        parameter_fractions = point_table.all_points.p / (
-            branch_continuation.parameter_bounds[1] - branch_continuation.parameter_bounds[0]
-        )
-        neighbor_pairs = point_table.find_neighbor_pairs(all_point_indices)
-        jump_pairs = find_state_jumps(
-            section_states, parameter_fractions, fraction_rates, neighbor_pairs
-        )
-    contact_orders = quantity_table.get(CONTACT_ORDER_COLUMN, np.zeros(len(all_point_indices)))
-    for left_index, right_index in point_table.find_neighbor_pairs(all_point_indices):
-        if contact_orders[left_index] != contact_orders[right_index]:
-            # Between the two orders of contacts there may be further orders.
-            root_requests += [
-                (left_index, right_index, format_contact_order_quantity_name(contact_orders[i]))
-                for i in (left_index, right_index)
-            ]
-            special_point_names += [CONTACT_ORDER_CHANGE] * 2
-    has_jump_between = lambda left_index, right_index: any(
-        left_index <= i and j <= right_index for i, j in jump_pairs
-    )
-    is_without_jump = [
-        not has_jump_between(left_index, right_index)
-        for left_index, right_index, _ in root_requests
-    ]
-    root_requests = [
-        root_request
-        for root_request, has_no_jump in zip(root_requests, is_without_jump, strict=True)
-        if has_no_jump
-    ]
-    special_point_names = [
-        special_point_name
-        for special_point_name, has_no_jump in zip(
-            special_point_names, is_without_jump, strict=True
-        )
-        if has_no_jump
-    ]
-    located_roots = _locate_requested_roots(branch_continuation, point_table, root_requests)
-    named_roots = []
-    for special_point_name, located_root in zip(special_point_names, located_roots, strict=True):
-        if special_point_name in CROSSING_MULTIPLIER_COUNTS and not vanishes_at_root(
-            quantity_table, located_root
-        ):
-            continue
-        return_map_jacobian = np.asarray(located_root.point_beside_root.return_map_jacobian[0])
-        if special_point_name != "neimark_sacker" or has_unit_circle_pair(return_map_jacobian):
-            named_roots.append(
-                (
-                    special_point_name,
-                    located_root,
-                    CROSSING_MULTIPLIER_COUNTS.get(special_point_name, 0),
+            parameter_by_location.update(
+                zip(
+                    zip(bracket_indices, chord_fractions, strict=True), solved_points.p, strict=True
                 )
             )
-    named_roots += [
-        (CONTACT_ORDER_CHANGE, _LocatedRoot.from_jump(point_table, point_pair), 0)
-        for point_pair in jump_pairs
-    ]
-    off_circle_pairs = point_table.find_neighbor_pairs(
-        np.flatnonzero(are_multipliers_off_circle(quantity_table[MULTIPLIER_MODULI_COLUMN]))
-    )
-    off_circle_pairs = [
-        point_pair for point_pair in off_circle_pairs if not has_jump_between(*point_pair)
-    ]
-    root_locator = functools.partial(_locate_requested_roots, branch_continuation, point_table)
-    return add_multiple_bifurcations(
-        quantity_table,
-        fraction_rates,
-        off_circle_pairs,
-        drop_duplicate_order_changes(named_roots),
-        root_locator,
-    )
+            solved_points = solved_points._replace(
+                is_admissible=solved_points.is_admissible & is_solve_successful
+            )
+            quantity_table = self.branch_continuation.make_quantity_table(
+                solved_points, wheel_indices[bracket_indices]
+            )
+            flag_broadcaster = lambda is_point_found, quantity_values: is_point_found.reshape(
+                -1, *(1,) * (quantity_values.ndim - 1)
+            )
+            return solved_points, {
+                quantity_name: np.where(
+                    flag_broadcaster(is_solve_successful, quantity_values), quantity_values, np.nan
+                )
+                for quantity_name, quantity_values in quantity_table.items()
+            }
 
+        def evaluate_at_fractions(
+            chord_fractions: np.ndarray, bracket_indices: np.ndarray
+        ) -> np.ndarray:
+            quantity_table = solve_at_fractions(chord_fractions, bracket_indices)[1]
+            return np.array(
+                [
+                    evaluate_named_quantity(quantity_table, quantity_names[bracket_index])[
+                        point_position
+                    ]
+                    for point_position, bracket_index in enumerate(bracket_indices)
+                ]
+            )
 
-def _list_root_requests(
-    branch_continuation: AbstractContinuation, point_table: _BranchPointTable
-) -> tuple[list[tuple[int, int, str]], list[str]]:
-    """List the roots of bifurcation functions and margins that are to be located.
-
-    Return requests and names. A request is (left point, right point, quantity name). The second
-    list contains the name of the special point for each request.
-    """
-    quantity_table = point_table.quantity_table
-    skipped_quantity_names = (
-        ADMISSIBILITY_COLUMN,
-        BRANCH_POINT_KIND,
-        *branch_continuation.linear_margin_substitutes.values(),
-    )
-    quantity_names = [
-        quantity_name
-        for quantity_name, quantity_values in quantity_table.items()
-        if quantity_values.ndim == 1 and quantity_name not in skipped_quantity_names
-    ]
-    quantity_names = [
-        quantity_name
-        for quantity_name in quantity_names
-        if quantity_name in BIFURCATION_NAMES or branch_continuation.is_margin_name(quantity_name)
-    ]
-    column_names = [
-        _format_combined_margin_name(quantity_name)
-        if _format_combined_margin_name(quantity_name) in quantity_table
-        else quantity_name
-        for quantity_name in quantity_names
-    ]
-    # At a branch point the sign of the fold's margin is determined by round-off.
-    regular_point_indices = np.flatnonzero(
-        ~(np.abs(quantity_table["fold"]) < LOCATED_ROOT_TOLERANCES.max_zero_margin)
-    )
-    fraction_rates = np.asarray(point_table.all_points.fraction_rate)
-    root_requests, special_point_names = [], []
-    for i, j, column_index in find_sign_changes(
-        np.stack([quantity_table[quantity_name] for quantity_name in column_names], 1)[
-            regular_point_indices
+        evaluate_at_points = lambda point_indices: np.array(
+            [
+                evaluate_named_quantity(self.point_table.quantity_table, quantity_name)[
+                    bracket_end_index
+                ]
+                for quantity_name, bracket_end_index in zip(
+                    quantity_names, point_indices, strict=True
+                )
+            ]
+        )
+        parameter_distances = np.maximum(
+            np.abs(right_points.p - left_points.p), location_options.parameter_accuracy
+        )
+        bracket_tolerances = np.minimum(
+            location_options.parameter_accuracy / parameter_distances,
+            location_options.min_bracket_fraction,
+        )
+        root_locations = locate_function_roots(
+            evaluate_at_fractions,
+            (evaluate_at_points(left_indices), evaluate_at_points(right_indices)),
+            bracket_tolerances,
+        )
+        request_indices = np.arange(len(root_requests))
+        # Even for an exact root, the point next to it lies to the left, where the gaits are
+        # admissible.
+        points_beside_roots, quantities_beside_roots = solve_at_fractions(
+            np.maximum(root_locations.left_bracket_ends - bracket_tolerances, 0.0), request_indices
+        )
+        for retry_fraction in location_options.retry_chord_fractions:
+            inadmissible_requests = np.flatnonzero(
+                ~(quantities_beside_roots[ADMISSIBILITY_COLUMN] > 0.0)
+            )
+            point_indices = np.arange(len(root_requests))
+            if len(inadmissible_requests):
+                retried_points_and_quantities = solve_at_fractions(
+                    retry_fraction * root_locations.left_bracket_ends[inadmissible_requests],
+                    inadmissible_requests,
+                )
+                point_indices[inadmissible_requests] = len(point_indices) + np.arange(
+                    len(inadmissible_requests)
+                )
+                points_beside_roots, quantities_beside_roots = select_tree_rows(
+                    concatenate_tree_rows(
+                        (points_beside_roots, quantities_beside_roots),
+                        retried_points_and_quantities,
+                    ),
+                    point_indices,
+                )
+        return [
+            _LocatedRoot(
+                root_requests[bracket_end_index],
+                float(
+                    parameter_by_location[
+                        bracket_end_index, root_locations.best_locations[bracket_end_index]
+                    ]
+                ),
+                float(root_locations.best_locations[bracket_end_index]),
+                select_tree_rows(
+                    points_beside_roots, slice(bracket_end_index, bracket_end_index + 1)
+                ),
+                select_tree_rows(
+                    quantities_beside_roots, slice(bracket_end_index, bracket_end_index + 1)
+                ),
+            )
+            for bracket_end_index in range(len(root_requests))
         ]
-    ):
-        left_index, right_index, quantity_name = (
-            int(regular_point_indices[i]),
-            int(regular_point_indices[j]),
-            quantity_names[column_index],
+
+    def is_mesh_limited(
+        self,
+        admissible_range: _AdmissibleRange,
+    ) -> bool:
+        """Return whether the mesh limits a branch, before its special points are located."""
+        unexplained_ends = [
+            i
+            for i in admissible_range.indices_of_points_beyond
+            if i >= 0 and not self.find_crossed_quantities(admissible_range, i)
+        ]
+        end_names = tuple(
+            self.branch_continuation.name_branch_end(self.point_table.quantity_table, i)
+            for i in unexplained_ends
         )
-        if point_table.wheel_indices[left_index] == point_table.wheel_indices[right_index]:
-            if (
-                quantity_name == "fold"
-                and fraction_rates[left_index] * fraction_rates[right_index] > 0.0
+        return self.branch_continuation.is_mesh_limited(
+            select_tree_rows(
+                self.point_table.quantity_table, admissible_range.admissible_point_indices
+            ),
+            end_names,
+        )
+
+    def find_crossed_quantities(
+        self,
+        admissible_range: _AdmissibleRange,
+        point_index_beyond: int,
+    ) -> list[str]:
+        """Return the names of the branch-ending quantities that change sign at one end of a range.
+
+        The signs are compared between the last point of the range and the first point beyond the
+        range.
+        """
+        last_point_index = admissible_range.admissible_point_indices[
+            0 if point_index_beyond < admissible_range.admissible_point_indices[0] else -1
+        ]
+        known_quantity_names = [
+            quantity_name
+            for quantity_name in self.branch_continuation.branch_ending_quantities
+            if quantity_name in self.point_table.quantity_table
+        ]
+        return [
+            quantity_name
+            for quantity_name in known_quantity_names
+            if self.point_table.quantity_table[quantity_name][last_point_index]
+            * self.point_table.quantity_table[quantity_name][point_index_beyond]
+            < 0.0
+        ]
+
+    def locate_branch_ends(
+        self,
+        admissible_ranges: list[_AdmissibleRange],
+    ) -> dict[tuple[int, int], _LocatedRoot]:
+        """Locate the nearest root beyond each end of each branch.
+
+        The keys of the result are (wheel index, end), where the end is 0 or 1.
+        """
+        root_requests, wheel_and_end_keys = [], []
+        for admissible_range in admissible_ranges:
+            for end_index, point_index_beyond in enumerate(
+                admissible_range.indices_of_points_beyond
             ):
-                quantity_name = BRANCH_POINT_KIND
-            root_requests.append((left_index, right_index, column_names[column_index]))
-            special_point_names.append(quantity_name)
-    for left_index, right_index in point_table.find_neighbor_pairs(regular_point_indices):
-        # On the side branch of a pitchfork, the margin touches zero where the parameter turns.
-        has_same_fold_sign = (
-            quantity_table["fold"][left_index] * quantity_table["fold"][right_index] > 0.0
+                if point_index_beyond < 0:
+                    continue
+                last_point_index = int(
+                    admissible_range.admissible_point_indices[0 if end_index == 0 else -1]
+                )
+                for quantity_name in self.find_crossed_quantities(
+                    admissible_range, point_index_beyond
+                ) or [ADMISSIBILITY_COLUMN]:
+                    root_requests.append((last_point_index, point_index_beyond, quantity_name))
+                    wheel_and_end_keys.append((admissible_range.wheel_index, end_index))
+        nearest_roots: dict[tuple[int, int], _LocatedRoot] = {}
+        for wheel_and_end_key, located_root in zip(
+            wheel_and_end_keys,
+            self.locate_requested_roots(root_requests),
+            strict=True,
+        ):
+            if (
+                wheel_and_end_key not in nearest_roots
+                or located_root.chord_fraction < nearest_roots[wheel_and_end_key].chord_fraction
+            ):
+                nearest_roots[wheel_and_end_key] = located_root
+        return nearest_roots
+
+    def locate_inner_special_points(
+        self,
+    ) -> list[NamedLocatedRoot]:
+        """Locate all special points of the branches except their ends."""
+        root_requests, special_point_names = self.list_root_requests()
+        quantity_table, all_point_indices = (
+            self.point_table.quantity_table,
+            np.arange(len(self.point_table.wheel_indices)),
         )
-        if has_same_fold_sign and fraction_rates[left_index] * fraction_rates[right_index] < 0.0:
-            root_requests.append((left_index, right_index, BRANCH_POINT_KIND))
-            special_point_names.append(BRANCH_POINT_KIND)
-    return root_requests, special_point_names
+        fraction_rates = np.asarray(self.point_table.all_points.fraction_rate)
+        jump_pairs: list[tuple[int, int]] = []
+        if self.branch_continuation.continuation_problem.has_kinks:
+            section_states = np.asarray(
+                jax.vmap(self.branch_continuation.continuation_problem.section_state)(
+                    self.point_table.all_points.z
+                )
+            )
+            parameter_fractions = self.point_table.all_points.p / (
+                self.branch_continuation.parameter_bounds[1]
+                - self.branch_continuation.parameter_bounds[0]
+            )
+            neighbor_pairs = self.point_table.find_neighbor_pairs(all_point_indices)
+            jump_pairs = find_state_jumps(
+                section_states, parameter_fractions, fraction_rates, neighbor_pairs
+            )
+        contact_orders = quantity_table.get(CONTACT_ORDER_COLUMN, np.zeros(len(all_point_indices)))
+        for left_index, right_index in self.point_table.find_neighbor_pairs(all_point_indices):
+            if contact_orders[left_index] != contact_orders[right_index]:
+                # Between the two orders of contacts there may be further orders.
+                root_requests += [
+                    (left_index, right_index, format_contact_order_quantity_name(contact_orders[i]))
+                    for i in (left_index, right_index)
+                ]
+                special_point_names += [CONTACT_ORDER_CHANGE] * 2
+        has_jump_between = lambda left_index, right_index: any(
+            left_index <= i and j <= right_index for i, j in jump_pairs
+        )
+        is_without_jump = [
+            not has_jump_between(left_index, right_index)
+            for left_index, right_index, _ in root_requests
+        ]
+        root_requests = [
+            root_request
+            for root_request, has_no_jump in zip(root_requests, is_without_jump, strict=True)
+            if has_no_jump
+        ]
+        special_point_names = [
+            special_point_name
+            for special_point_name, has_no_jump in zip(
+                special_point_names, is_without_jump, strict=True
+            )
+            if has_no_jump
+        ]
+        located_roots = self.locate_requested_roots(root_requests)
+        named_roots = []
+        for special_point_name, located_root in zip(
+            special_point_names, located_roots, strict=True
+        ):
+            if special_point_name in CROSSING_MULTIPLIER_COUNTS and not vanishes_at_root(
+                quantity_table, located_root
+            ):
+                continue
+            return_map_jacobian = np.asarray(located_root.point_beside_root.return_map_jacobian[0])
+            if special_point_name != "neimark_sacker" or has_unit_circle_pair(return_map_jacobian):
+                named_roots.append(
+                    (
+                        special_point_name,
+                        located_root,
+                        CROSSING_MULTIPLIER_COUNTS.get(special_point_name, 0),
+                    )
+                )
+        named_roots += [
+            (CONTACT_ORDER_CHANGE, _LocatedRoot.from_jump(self.point_table, point_pair), 0)
+            for point_pair in jump_pairs
+        ]
+        off_circle_pairs = self.point_table.find_neighbor_pairs(
+            np.flatnonzero(are_multipliers_off_circle(quantity_table[MULTIPLIER_MODULI_COLUMN]))
+        )
+        off_circle_pairs = [
+            point_pair for point_pair in off_circle_pairs if not has_jump_between(*point_pair)
+        ]
+        return add_multiple_bifurcations(
+            quantity_table,
+            fraction_rates,
+            off_circle_pairs,
+            drop_duplicate_order_changes(named_roots),
+            self.locate_requested_roots,
+        )
+
+    def list_root_requests(
+        self,
+    ) -> tuple[list[tuple[int, int, str]], list[str]]:
+        """List the roots of bifurcation functions and margins that are to be located.
+
+        Return requests and names. A request is (left point, right point, quantity name). The second
+        list contains the name of the special point for each request.
+        """
+        quantity_table = self.point_table.quantity_table
+        skipped_quantity_names = (
+            ADMISSIBILITY_COLUMN,
+            BRANCH_POINT_KIND,
+            *self.branch_continuation.linear_margin_substitutes.values(),
+        )
+        quantity_names = [
+            quantity_name
+            for quantity_name, quantity_values in quantity_table.items()
+            if quantity_values.ndim == 1 and quantity_name not in skipped_quantity_names
+        ]
+        quantity_names = [
+            quantity_name
+            for quantity_name in quantity_names
+            if quantity_name in BIFURCATION_NAMES
+            or self.branch_continuation.is_margin_name(quantity_name)
+        ]
+        column_names = [
+            _format_combined_margin_name(quantity_name)
+            if _format_combined_margin_name(quantity_name) in quantity_table
+            else quantity_name
+            for quantity_name in quantity_names
+        ]
+        # At a branch point the sign of the fold's margin is determined by round-off.
+        regular_point_indices = np.flatnonzero(
+            ~(np.abs(quantity_table["fold"]) < LOCATED_ROOT_TOLERANCES.max_zero_margin)
+        )
+        fraction_rates = np.asarray(self.point_table.all_points.fraction_rate)
+        root_requests, special_point_names = [], []
+        for i, j, column_index in find_sign_changes(
+            np.stack([quantity_table[quantity_name] for quantity_name in column_names], 1)[
+                regular_point_indices
+            ]
+        ):
+            left_index, right_index, quantity_name = (
+                int(regular_point_indices[i]),
+                int(regular_point_indices[j]),
+                quantity_names[column_index],
+            )
+            if (
+                self.point_table.wheel_indices[left_index]
+                == self.point_table.wheel_indices[right_index]
+            ):
+                if (
+                    quantity_name == "fold"
+                    and fraction_rates[left_index] * fraction_rates[right_index] > 0.0
+                ):
+                    quantity_name = BRANCH_POINT_KIND
+                root_requests.append((left_index, right_index, column_names[column_index]))
+                special_point_names.append(quantity_name)
+        for left_index, right_index in self.point_table.find_neighbor_pairs(regular_point_indices):
+            # On the side branch of a pitchfork, the margin touches zero where the parameter turns.
+            has_same_fold_sign = (
+                quantity_table["fold"][left_index] * quantity_table["fold"][right_index] > 0.0
+            )
+            if (
+                has_same_fold_sign
+                and fraction_rates[left_index] * fraction_rates[right_index] < 0.0
+            ):
+                root_requests.append((left_index, right_index, BRANCH_POINT_KIND))
+                special_point_names.append(BRANCH_POINT_KIND)
+        return root_requests, special_point_names
 
 
 class BranchData(NamedTuple):
@@ -1010,10 +1032,11 @@ def continue_and_locate_special_points(
         if wheel_index in point_table.wheel_indices
     }
     admissible_ranges = point_table.find_admissible_ranges(start_indices)
+    point_locator = _SpecialPointLocator(branch_continuation, point_table)
     branch_data_by_wheel: list[BranchData | None] = [None] * n_wheels
     if not is_finest_mesh:
         for admissible_range in admissible_ranges:
-            if _is_mesh_limited(branch_continuation, point_table, admissible_range):
+            if point_locator.is_mesh_limited(admissible_range):
                 admissible_points, branch_quantities = select_tree_rows(
                     (point_table.all_points, point_table.quantity_table),
                     admissible_range.admissible_point_indices,
@@ -1028,9 +1051,11 @@ def continue_and_locate_special_points(
         ]
     if not admissible_ranges:
         return branch_data_by_wheel
-    located_ends = _locate_branch_ends(branch_continuation, point_table, admissible_ranges)
+    located_ends = point_locator.locate_branch_ends(admissible_ranges)
     joined_point_table = point_table.join_located_ends(admissible_ranges, located_ends)
-    inner_special_points = _locate_inner_special_points(branch_continuation, joined_point_table)
+    inner_special_points = _SpecialPointLocator(
+        branch_continuation, joined_point_table
+    ).locate_inner_special_points()
 
     def make_special_point(
         special_point_name: str,
