@@ -116,7 +116,9 @@ def make_batch_phase(
 ) -> BatchPhase:
     """Return the functions that the batched integrator needs to integrate a phase.
 
-    - `records_margins`: whether the integrator also evaluates margins.
+    - `records_margins`: whether the integrator also evaluates margins;
+    - `is_compiled_separately`: whether machine code calls the phase's functions instead of inlining
+      them.
     """
 
     def evaluate_acceleration(q: Vector, v: Vector) -> StageAccelerations:
@@ -175,6 +177,8 @@ def advance_gait_step(
     """Compute one walking step per batch element, without indicators, margins and energies.
 
     - `x`: section state of each batch element just before touchdown;
+    - `tableau`: Butcher tableau of the explicit solver;
+    - `stop_at_lift_off`: see `ViscoelasticWheel`;
     - `straggler_count`: largest number of batch elements that may remain unfinished, see
       `integrate_batch_phase`.
     """
@@ -217,6 +221,9 @@ def run_batch_phases(
 ) -> PhaseSequenceResult:
     """Integrate all phases of one walking step per batch element and return their starts and ends.
 
+    - `tableau`: Butcher tableau of the explicit solver;
+    - `stop_at_lift_off`: see `ViscoelasticWheel`;
+    - `records_margins`: whether the minima of the margins are computed;
     - `straggler_count`: largest number of batch elements that may remain unfinished, see
       `integrate_batch_phase`;
     - `is_compiled_separately`: see `BatchPhase`.
@@ -241,7 +248,10 @@ def _make_phase_runner(
     is_compiled_separately: bool,
     stiff_start_options: StiffStartOptions,
 ) -> PhaseRunner:
-    """Return a function that integrates one phase to its end, for all batch elements."""
+    """Return a function that integrates one phase to its end, for all batch elements.
+
+    The arguments are those of `run_batch_phases`.
+    """
 
     def run_phase(
         phase: AbstractPhase,
@@ -334,10 +344,10 @@ class _StepTraceConfig(NamedTuple):
     def run_lane_phases(
         self, *argument_leaves: Array
     ) -> tuple[PhaseSequenceResult, ButcherTableau, StepOptions]:
-        """Integrate the phases of a batch of walking steps.
+        """Integrate the phases of one walking step for each batch element.
 
-        The leaves have the batch on their last axis. Returns the starts and ends of all phases, the
-        Butcher tableau and the solver options.
+        The arrays in `argument_leaves` have the batch on their last axis. Return the starts and
+        ends of all phases, the Butcher tableau and the solver options.
         """
         params, x, options = jax.tree.unflatten(self.argument_structure, argument_leaves)
         tableau = load_explicit_tableau(options.solver)
@@ -403,6 +413,10 @@ def build_step_function(
 
     The results are split into float arrays and other arrays. The function serves as a forward-mode
     rule, from which all AD modes are derived.
+
+    - `argument_structure`: pytree structure of (params, x, options);
+    - `stop_at_lift_off`: see `ViscoelasticWheel`;
+    - `friction`: friction coefficient for the margins, or None for results without margins.
     """
     trace_config = _StepTraceConfig(argument_structure, stop_at_lift_off, friction)
     trace_key = ("gait step", *trace_config.trace_key)
@@ -451,7 +465,8 @@ def build_step_sampler(
 ) -> BatchFunction:
     """Return a function that samples a walking step at `n_samples` equidistant times of each phase.
 
-    The arguments of the function are the leaves of (params, x, options).
+    The arguments of the function are the leaves of (params, x, options), whose pytree structure is
+    `argument_structure`.
     """
     trace_config = _StepTraceConfig(argument_structure, stop_at_lift_off, None)
 

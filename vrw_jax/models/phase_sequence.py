@@ -212,10 +212,12 @@ def finish_gait_step(
 ) -> AdvanceResult:
     """Compute the rest of a step on flat ground, starting from a state within one of its phases.
 
+    - `phase_runner`: function that integrates a phase;
     - `phase_index`: index of the phase in the step;
     - `foot_distance`: distance between the two feet in the double support of this step, m;
     - `phase_state`: (theta, L1, L2) and their rates. Entries that the constraints of the phase
-      determine are ignored.
+      determine are ignored;
+    - `engine`: name of the engine, which the result reports.
     """
     are_inputs_bounded = [
         jnp.abs(input_value) < MAX_SI_VALUE for input_value in (*phase_state, foot_distance)
@@ -274,7 +276,8 @@ def select_next_section_state(phase_sequence: PhaseSequenceResult) -> Vector:
 def make_advance_result(phase_sequence: PhaseSequenceResult, engine: str) -> AdvanceResult:
     """Return the section state after a step, the durations and the outcome.
 
-    All entries of the section state are 0 after a failed step.
+    All entries of the section state are 0 after a failed step. The result reports the name
+    `engine`.
     """
     theta, dtheta, dL1 = select_next_section_state(phase_sequence)
     has_stepped = phase_sequence.outcome == Outcome.STEPPED
@@ -293,7 +296,9 @@ def make_step_result(
 ) -> StepResult:
     """Return all results of a step, for one wheel or for a batch.
 
-    The phase results must contain the minima of the margins.
+    The phase results must contain the minima of the margins. The result reports the name `engine`.
+
+    - `friction`: friction coefficient of the ground, for the friction margins.
     """
     s, landing_result, phase_ends = (
         phase_sequence.s,

@@ -100,6 +100,7 @@ def complete_jacobian_columns(
     The results are those of `compute_jacobian_columns`. Two columns are computed from all other
     columns by unit scaling.
 
+    - `batch_function`: function that computes the step for a batch;
     - `step_inputs`: parameters, then the start, then on uneven ground the slope of the next line of
       the ground;
     - `input_indices`: indices of all inputs, in the order of the returned columns.

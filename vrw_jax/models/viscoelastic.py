@@ -146,7 +146,10 @@ class ViscoelasticWheel(AbstractWheel):
     def _compute_step(
         self, params: WheelParams, x: SectionState, options: StepOptions, records_margins: bool
     ) -> Any:
-        """Return the results of a step, computed with the compiled function."""
+        """Return the results of a step, computed with the compiled function.
+
+        - `records_margins`: whether the results include indicators, margins and energies.
+        """
         argument_leaves, argument_structure = jax.tree.flatten((params, x, options))
         return eqx.combine(
             *_compile_step_function(self, argument_structure, records_margins)(*argument_leaves)
@@ -263,7 +266,8 @@ def _compile_step_function(
 ) -> ForwardFunction:
     """Return a function that computes a step from the leaves of (params, x, options).
 
-    The function is differentiable in any mode.
+    The function is differentiable in any mode. The pytree structure of (params, x, options) is
+    `argument_structure`.
     """
 
     options_without_numbers = jax.tree.unflatten(
