@@ -194,7 +194,8 @@ def _detect_walk_periods(
 ) -> np.ndarray:
     """Return the shortest period that the last two periods of each walk confirm, in steps, or 0.
 
-    - `state_history`: section states, (starts, steps, entries).
+    - `state_history`: section states, (starts, steps, entries);
+    - `periodicity_tolerance`: see `AttractorOptions`.
     """
     detected_periods = np.zeros(len(state_history), int)
     n_walked_states = state_history.shape[1]

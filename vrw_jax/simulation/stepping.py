@@ -375,6 +375,8 @@ def _walk_by_scan(
 ) -> Walk:
     """Simulate a walk of `n_steps` steps. Steps after a failure repeat the outcome of the failed
     step.
+
+    - `stepwise_ground`: ground of each step, see `split_stepwise_ground`; None for flat ground.
     """
 
     def advance_one_step(state_and_outcome: tuple, step_ground: StepGroundValues | None) -> tuple:

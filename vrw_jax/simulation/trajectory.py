@@ -338,7 +338,8 @@ def _compile_step_sampler(
 ) -> Callable[..., Trajectory]:
     """Return a compiled function that samples a step.
 
-    Its arguments are the section state and the leaves of (params, options).
+    Its arguments are the section state and the leaves of (params, options), whose pytree structure
+    is `argument_structure`.
     """
 
     def sample_paper_step(x: Array, *argument_leaves: Array) -> Trajectory:
