@@ -633,8 +633,10 @@ def _run_search_attempt(
     search_result: CycleSearchResult,
     search_guess: CollocationState | None,
 ) -> CycleSearchResult:
-    """Run one attempt on the wheels (lanes) without a cycle, and return the merged
-    search result.
+    """Run one attempt on the wheels (lanes) without a cycle, and return the merged search result.
+
+    - `attempt_index`: index of the attempt in the order of attempts;
+    - `search_guess`: guess of the user, or None.
     """
     cycle_options, n_segments = (
         collocation_system.cycle_options,

@@ -62,8 +62,8 @@ def make_finder(
 def resolve_model(params: WheelParams, model: ModelLike | None) -> ModelLike | None:
     """Return the model to which a wheel's gait belongs.
 
-    The ladder is a model that selects the simplest of several models whose margins are positive.
-    The gait of the paper's model is computed first. If it is not found or violates a margin on its
+    A ladder of models is replaced by the simplest model that is valid for the gait. The gait is
+    first computed with the paper's model. If this gait is not found or violates a margin on its
     ground, a more general model is returned. If the parameters have no concrete values, the ladder
     is returned unchanged. Any other model is also returned unchanged.
     """

@@ -298,7 +298,11 @@ def _search_with_fallbacks(
     can_refine_mesh: bool,
     gait_choice: GaitChoice,
 ) -> Any:
-    """Find the cycle of one wheel or of each wheel in a batch, by the search and all fallbacks."""
+    """Find the cycle of one wheel or of each wheel in a batch, by the search and all fallbacks.
+
+    - `can_refine_mesh`: whether a finer mesh may be used;
+    - `gait_choice`: choice among several attracting gaits.
+    """
     has_batch_axis = params.damping.ndim > 0
     params_without_tangents = lax.stop_gradient(params)
     has_no_values, are_params_concrete = (

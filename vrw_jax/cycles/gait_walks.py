@@ -125,9 +125,10 @@ def _convert_params_to_numpy(params: WheelParams) -> Any:
 def _make_section_states(
     params: WheelParams, touchdown_angles: list[np.ndarray], rolling_rate_shares: list[float]
 ) -> np.ndarray:
-    """Build section states from touchdown angles, rad, and rates, shape (starts, wheels, 3).
+    """Build section states from touchdown angles (rad) and rates, shape (starts, wheels, 3).
 
-    The rate of the hub is a fraction of its rate in the rigid rolling gait.
+    - `rolling_rate_shares`: rate of the hub as a fraction of its rate in the rigid rolling gait,
+      for each start.
     """
     numpy_params, leg_angle = _convert_params_to_numpy(params), params.leg_angle
     rigid_leg_rate = np.sqrt(

@@ -74,7 +74,10 @@ def _has_next_line_tilt(phase_constants: PhaseConstants) -> bool:
 def _make_collocation_phase(
     n_legs: int, stop_at_lift_off: bool, phase_index: int
 ) -> CollocationPhase:
-    """Describe a phase by functions of the constants that `compute_phase_constants` returns."""
+    """Describe the phase with index `phase_index` by functions.
+
+    The functions take the constants that `compute_phase_constants` returns.
+    """
     phase_class = PAPER_PHASES[phase_index]
 
     def evaluate_phase(

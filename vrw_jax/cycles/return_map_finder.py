@@ -344,6 +344,10 @@ def make_return_map_gait(
 
     The active phases do not identify a branch. With unilateral contact the order of events may
     change on a branch.
+
+    - `event_driven_step`: first gait step of the cycle;
+    - `cycle_derivatives`, `step_derivatives`: derivatives of cycle and step with respect to the
+      parameters on the branch, with a leading axis over the parameters.
     """
     n_coordinates = model.count_continuous_entries(WheelParams(n_legs=n_legs))
     gait_coordinates = lambda cycle, event_driven_step: jnp.concatenate(

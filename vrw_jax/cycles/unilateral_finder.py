@@ -354,7 +354,11 @@ class PeriodEvaluation(NamedTuple):
 
 
 def solve_linear_systems(system_matrices: np.ndarray, right_sides: np.ndarray) -> np.ndarray:
-    """Solve many linear systems. The solution of a singular system is NaN."""
+    """Solve many linear systems.
+
+    The solution of a singular system is NaN. The first axis of matrices and right sides is that of
+    the systems.
+    """
     try:
         return np.linalg.solve(system_matrices, right_sides)
     except np.linalg.LinAlgError:
@@ -569,7 +573,11 @@ def _evaluate_over_wheels(
 def _compute_return_map_jacobian_of_steps(
     fixed_points: _ContactFixedPoints, n_values: int
 ) -> Array:
-    """Return the Jacobian of the return map over one period, a product of step Jacobians."""
+    """Return the Jacobian of the return map over one period, as a product of the Jacobians of its
+    steps.
+
+    - `n_values`: number of parameter values, whose columns precede those of the section state.
+    """
     return_map_jacobian = jnp.eye(
         fixed_points.fixed_section_states.shape[0], dtype=fixed_points.fixed_section_states.dtype
     )
