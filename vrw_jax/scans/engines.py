@@ -432,7 +432,10 @@ def make_scan_engine(
     | ToleranceScanEngine
     | PassageScanEngine
 ):
-    """Return the engine that computes the measures of an `EvaluationRequest`."""
+    """Return the engine that computes the measures of an `EvaluationRequest`.
+
+    - `n_threads`: number of CPU threads, by default one per core.
+    """
     if evaluation_request.error_tolerance is not None:
         return ToleranceScanEngine(evaluation_request)
     scan_engine_class: Any = SCAN_ENGINE_CLASSES[

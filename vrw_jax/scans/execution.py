@@ -303,6 +303,8 @@ def find_matching_store(
     """Return the store at `store_path`, or None if it does not exist.
 
     Raise a ValueError if the store contains another scan.
+
+    - `verifies_files`: whether damaged chunks are searched for.
     """
     stored_manifest = read_stored_manifest(store_path)
     if stored_manifest is None:

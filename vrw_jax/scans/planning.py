@@ -191,7 +191,10 @@ def plan_scan(
     tol: float | None = None,
     slope_sd: float | None = None,
 ) -> ScanPlan:
-    """Return the checked plan of a scan, with the layout of its result. No gait is computed."""
+    """Return the checked plan of a scan, with the layout of its result. No gait is computed.
+
+    The arguments are those of `scan`. `config_text` is the text of the configuration file, if any.
+    """
     if not isinstance(design, AbstractSampleDesign):
         raise TypeError(
             f"design is a {type(design).__name__}, but it must say which samples: write "
