@@ -461,7 +461,10 @@ class ContactGaitProblem(AbstractReturnMapProblem):
         section_states: Array,
         step_ends: Array,
     ) -> dict[str, Array]:
-        """Return the `measures.FORCE_PEAK_MEASURES` of many gaits by name."""
+        """Return the `measures.FORCE_PEAK_MEASURES` of many gaits by name.
+
+        The first axis of all arguments except the options is that of the gaits.
+        """
 
         def measure_gait_force(
             wheel: BranchWheel, p: Array, section_state: Array, step_ends: Array
@@ -528,9 +531,10 @@ def _combine_period_measures(
 def interpolate_section_states(
     left_state: Array, right_state: Array, state_fraction: Scalar, n_coordinates: int
 ) -> Array:
-    """Interpolate linearly between two section states.
+    """Interpolate linearly between two section states, at the fraction `state_fraction`.
 
-    The discrete codes are those of the nearer state.
+    The first `n_coordinates` components are interpolated. The remaining components are discrete
+    codes, which are those of the nearer state.
     """
     nearer_contact_codes = jnp.where(state_fraction < 0.5, left_state, right_state)[n_coordinates:]
     return jnp.concatenate(

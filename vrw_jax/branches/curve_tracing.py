@@ -146,7 +146,10 @@ class CurveContinuation(AbstractContinuation):
     def mask_undefined_quantities(
         self, quantity_table: QuantitiesByName, wheel_indices: np.ndarray
     ) -> QuantitiesByName:
-        """Replace each quantity that is zero or undefined on the whole curve by NaN."""
+        """Replace each quantity that is zero or undefined on the whole curve by NaN.
+
+        - `wheel_indices`: index of the curve to which each point belongs.
+        """
         point_names = np.array(self.special_point_names)[wheel_indices]
         is_dls_vanishing = point_names == DLS_VANISHING_NAME
         is_quantity_discontinuous = np.isin(
@@ -398,6 +401,8 @@ class CurveTracer(NamedTuple):
         """Trace the curves through the seeds of one batch, on a sufficiently fine mesh.
 
         A seed is omitted if there is no curve through it.
+
+        - `quantity_group`: names of the quantities that are evaluated together.
         """
         traced_curves: list[TracedCurve] = []
         special_point_names = ", ".join(

@@ -162,9 +162,10 @@ class TestFunctionWheel(NamedTuple):
 
 
 class GaitTestFunction(AbstractTestFunction):
-    """Test function in two parameters: one of several quantities of collocated gaits.
+    """Test function in two parameters, whose roots are special points of gaits found by
+    collocation.
 
-    `quantity_names` lists the quantities that are evaluated together.
+    Its value is one of the quantities in `quantity_names`, which are evaluated together.
     """
 
     collocation_system: CollocationSystem = eqx.field(static=True)

@@ -112,7 +112,10 @@ def append_results(
     new_results: ContinuationResult,
     is_result_appended: np.ndarray,
 ) -> ContinuationResult:
-    """Append the points in `new_results` to the selected branches, and return all results."""
+    """Append the points in `new_results` to the branches, and return all results.
+
+    - `is_result_appended`: whether the points of each branch are appended.
+    """
     if not is_result_appended.any():
         return direction_results
     n_points = direction_results.n_points + np.where(is_result_appended, new_results.n_points, 0)

@@ -139,7 +139,8 @@ def find_unexplained_ranks(
 ) -> range:
     """Return the ranks whose moduli cross 1 between two points.
 
-    The result is empty if the bifurcations in `bifurcation_names` explain all crossings.
+    The moduli are in decreasing order. The result is empty if the bifurcations in
+    `bifurcation_names` explain all crossings.
     """
     first_rank, last_rank = sorted(
         int(np.sum(multiplier_moduli > 1.0))
@@ -163,7 +164,9 @@ def classify_crossing_ranks(
 ) -> dict[str, int]:
     """Return the number of multipliers for each bifurcation, by the name of the bifurcation.
 
-    The multipliers are those of the ranks in `crossing_ranks`, which are on the unit circle.
+    - `crossing_ranks`: ranks of the multipliers on the unit circle;
+    - `has_parameter_turned`: whether the parameter changes its direction at the point. A multiplier
+      of 1 is then that of a fold, and otherwise that of a branch point.
     """
     multipliers = np.linalg.eigvals(return_map_jacobian)
     multipliers = multipliers[np.argsort(-np.abs(multipliers), kind="stable")][list(crossing_ranks)]
