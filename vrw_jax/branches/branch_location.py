@@ -147,8 +147,8 @@ class AbstractContinuation(abc.ABC):
     def is_same_gait(
         self, table_before: QuantitiesByName, table_after: QuantitiesByName
     ) -> np.ndarray:
-        """Return whether the points before and after a jump belong to the same branch, for each
-        jump.
+        """Return for each jump whether the points before and after the jump belong to the same
+        branch.
         """
         return table_after[ADMISSIBILITY_COLUMN] > 0.0
 
@@ -251,6 +251,9 @@ def _continue_in_both_directions(
     """Continue the branches of all wheels in both directions, and return all points.
 
     The result has the axes (wheel, direction). The first direction decreases the parameter.
+
+    - `z`, `parameter_values`: unknowns and parameter at the start of each branch;
+    - `is_branch_requested`: whether each branch is continued.
     """
     direction_repeater = lambda tree_over_wheels: jax.device_put(
         select_tree_rows(tree_over_wheels, np.repeat(np.arange(len(parameter_values)), 2))
@@ -331,8 +334,10 @@ def _guess_point_on_chord(
     right_point: ContinuationPoint,
     chord_fraction: Array,
 ) -> tuple[Any, CorrectorPlane]:
-    """Return the initial guess for a point between neighboring points, and the plane of
-    that point.
+    """Return the initial guess for a point between two neighboring points, and the plane of the
+    point.
+
+    The plane divides the chord between the neighboring points at the fraction `chord_fraction`.
     """
     z = continuation_problem.interpolate_unknowns(left_point.z, right_point.z, chord_fraction)
     parameter_range = parameter_bounds[1] - parameter_bounds[0]
@@ -375,7 +380,7 @@ def _solve_for_points_on_chords_untraced(
 
 
 class _AdmissibleRange(NamedTuple):
-    """Admissible points of one wheel's branch, and the first points beyond the two ends of this
+    """Admissible points of one wheel's branch, and the first points beyond the two ends of their
     range.
 
     An index is -1 if the branch has no point beyond that end.
@@ -551,7 +556,7 @@ class _LocatedRoot(NamedTuple):
     def from_jump(
         cls, point_table: _BranchPointTable, jump_pair: tuple[int, int]
     ) -> "_LocatedRoot":
-        """Represent a jump as a located root, at that point of the pair where the continuation
+        """Represent a jump as a located root, at the point of `jump_pair` where the continuation
         stalled.
         """
         i, j = jump_pair
@@ -741,7 +746,9 @@ class _SpecialPointLocator(NamedTuple):
         self,
         admissible_range: _AdmissibleRange,
     ) -> bool:
-        """Return whether the mesh limits a branch, before its special points are located."""
+        """Return whether the mesh limits a branch in `admissible_range`, before its special points
+        are located.
+        """
         unexplained_ends = [
             i
             for i in admissible_range.indices_of_points_beyond
@@ -788,7 +795,7 @@ class _SpecialPointLocator(NamedTuple):
         self,
         admissible_ranges: list[_AdmissibleRange],
     ) -> dict[tuple[int, int], _LocatedRoot]:
-        """Locate the nearest root beyond each end of each branch.
+        """Locate the nearest root of a quantity beyond each end of each branch.
 
         The keys of the result are (wheel index, end), where the end is 0 or 1.
         """
@@ -914,8 +921,8 @@ class _SpecialPointLocator(NamedTuple):
     ) -> tuple[list[tuple[int, int, str]], list[str]]:
         """List the roots of bifurcation functions and margins that are to be located.
 
-        Return requests and names. A request is (left point, right point, quantity name). The second
-        list contains the name of the special point for each request.
+        Return requests and names. A request is (left point, right point, name of the quantity). The
+        list of names contains the name of the special point for each request.
         """
         quantity_table = self.point_table.quantity_table
         skipped_quantity_names = (
@@ -1008,9 +1015,12 @@ def continue_and_locate_special_points(
 ) -> list[BranchData | None]:
     """Continue branches, and return them with their located special points.
 
-    The result is None for a wheel without a start. `z` and `parameter_values` are the starts. A
-    branch that the mesh limits is later continued again on a finer mesh. Its special points are
-    located only if `is_finest_mesh` is true.
+    The result is None for a wheel without a start. A branch that the mesh limits is later continued
+    again on a finer mesh. Its special points are located only if `is_finest_mesh` is true.
+
+    - `z`, `parameter_values`: unknowns and parameter at the start of each branch;
+    - `has_branch_start`: whether each wheel has a start;
+    - `make_cycle_finder`: function that returns finders of the limit cycles at special points.
     """
     direction_results = _continue_in_both_directions(
         branch_continuation, z, parameter_values, has_branch_start
@@ -1064,7 +1074,11 @@ def continue_and_locate_special_points(
         ends_branch: bool,
         n_multipliers: int = 0,
     ) -> SpecialPoint:
-        """Build the special point at a located root."""
+        """Build the special point at a located root.
+
+        - `special_point_name`: name of the bifurcation or of the quantity that vanishes;
+        - `n_multipliers`: number of multipliers that cross the unit circle, 0 for other kinds.
+        """
         point_beside_root = select_tree_rows(located_root.point_beside_root, 0)
         section_state = np.asarray(
             branch_continuation.continuation_problem.section_state(

@@ -272,7 +272,7 @@ def _collect_signed_quantities(
 def find_sign_changes_in_scan(
     scan_dataset: xr.Dataset, parameter_names: tuple[str, str]
 ) -> list[ScanSignChange]:
-    """Return the sign changes between all neighboring samples.
+    """Return the sign changes of all quantities between neighboring samples.
 
     A sign change of a measure is ignored if exactly one of the two samples has double support.
     """
