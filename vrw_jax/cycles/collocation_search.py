@@ -238,7 +238,8 @@ def make_start_state(
 ) -> CollocationState:
     """Build a start of the search in which all accelerations are zero.
 
-    The section state and the phase durations are the same in all gait steps.
+    The section state and the phase durations are the same in all gait steps. `has_dls` determines
+    whether double support is an active phase.
     """
     period_n, n_phases = collocation_system.period_n, len(collocation_system.phase_sequence.phases)
     n_lanes = section_state.shape[-1]

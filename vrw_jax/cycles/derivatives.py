@@ -272,7 +272,7 @@ def _search_in_scaled_units(
     def convert_units(
         collocation_state: CollocationState, apply_unit: Callable[[Array, Array], Array]
     ) -> CollocationState:
-        """Convert each number of a collocation state by `apply_unit(number, unit)`."""
+        """Convert each array of a collocation state by `apply_unit(array, unit)`."""
         collocation_solution = collocation_state.solution
         accelerations = tuple(
             apply_unit(x, position_units[: x.shape[-2]] / (time_unit * time_unit))

@@ -168,7 +168,7 @@ def count_section_coordinates(gait_finder: Any) -> int:
 
 
 class DistinctWalkEnds(NamedTuple):
-    """Distinct end states of walks in the order of the wheels, at least one for each wheel."""
+    """Distinct end states of walks, sorted by wheel. Each wheel has at least one end state."""
 
     wheel_indices: np.ndarray  # (ends,)
     section_states: np.ndarray  # (ends, section)

@@ -89,10 +89,11 @@ class UnilateralFinder(AbstractReturnMapFinder):
     is_multistable: ClassVar[bool] = True
 
     def find_cycle(self, params: WheelParams, cycle_guess: Any = None) -> ReturnMapCycle:
-        """Find the cycle, by the batched engine if all inputs are concrete.
+        """Find the cycle of one wheel.
 
-        With traced inputs, the derivatives are those of a single gait step, by the implicit
-        function theorem.
+        If all inputs are concrete, the batched engine computes the gait steps. If an input is
+        traced, the cycle has derivatives by the implicit function theorem, computed from a single
+        gait step.
         """
         params, section_state, model, options = prepare_search(self, params, cycle_guess)
         if has_traced_leaf(params, section_state, model):
