@@ -597,11 +597,11 @@ derivative in registers.
 def compute_jacobian_columns(
     batch_function: BatchFunction, argument_leaves: Sequence[Array], input_indices: Sequence[int]
 ) -> tuple:
-    """Return the Jacobian columns, the float results and the other results of a batched function.
+    """Return the Jacobian columns, the float results and all other results of a batched function.
 
-    The columns are derivatives with respect to the leaves at `input_indices`; their leading axis
-    runs over the entries of these leaves. `batch_function` returns float arrays with the batch on
-    the last axis, and auxiliary results.
+    The columns are derivatives with respect to the leaves at `input_indices`. The leading axis of
+    the columns runs over the entries of the leaves. `batch_function` returns float arrays with the
+    batch on the last axis, and auxiliary results.
     """
 
     def evaluate_at_selected_leaves(*selected_leaf_values: Array) -> tuple:
