@@ -281,8 +281,9 @@ def _require_reference_model(wheel_model: AbstractWheel, error_tolerance: float)
 
 
 def describe_computing_environment() -> dict[str, object]:
-    """Return the digest of the source, the versions of the libraries and the device of this
-    process.
+    """Return a description of the environment in which this process computes.
+
+    It consists of the digest of the source code, the versions of the libraries and the device.
     """
     provenance_record = collect_provenance_attributes(
         WheelParams(), ViscoelasticWheel(), StepOptions()
