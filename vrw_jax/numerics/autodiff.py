@@ -81,9 +81,19 @@ def enable_all_ad_modes(
     def call_function(*arrays: Any) -> tuple:
         has_traced_argument = any(isinstance(x, jax.core.Tracer) for x in arrays)
         # The rule costs as much as a solver step, so it is applied only to traced arguments.
-        return wrapped_function(*arrays) if has_traced_argument else compiled_function(*arrays)
+        if not has_traced_argument:
+            return compiled_function(*arrays)
+        return wrapped_function(*map(_convert_mapped_numpy_array, arrays))
 
     return call_function
+
+
+def _convert_mapped_numpy_array(array: Any) -> Any:
+    """Return a copy as a JAX array of a NumPy array that `vmap` maps, and other arrays unchanged.
+
+    Inside `jit`, JAX 0.10 rejects a mapped NumPy array as argument of a function with a rule.
+    """
+    return jnp.array(array) if isinstance(getattr(array, "val", None), np.ndarray) else array
 
 
 def _make_forward_jacobian_function(
