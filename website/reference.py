@@ -159,7 +159,8 @@ _ON_MEASURES = """# Measures
 
 Every quantity has one name, symbol and unit in steps, cycles, trajectories, scans, branches and
 figures: `vrw.MEASURES["speed"].unit`. Scans and tuning accept the names of measures of steps and
-cycles, and of margins. Scans also accept derivatives, as in `"d speed / d damping"`.
+cycles, and of margins. Scans also accept derivatives of measures of cycles, as in
+`"d speed / d damping"`.
 `python -m website --pages` generates this page from the sources.
 """
 _GROUPS = (
