@@ -105,6 +105,20 @@ def test_a_scan_with_unilateral_contact_has_the_peaks_of_each_gait():
     assert scan.peak_force.attrs["units"] == "N"
 
 
+@pytest.mark.slow  # a branch compiles for more than a minute on a busy machine
+def test_a_branch_with_unilateral_contact_has_the_peaks_of_each_gait(gaits):
+    branch = vrw.continue_branch(
+        TWO_PEAKS, "slope", (0.075, 0.0752), cycle=gaits["two peaks"], model=MODEL,
+        force_peaks=True,
+    )  # fmt: skip
+    for i in (0, -1):
+        wheel = dataclasses.replace(TWO_PEAKS, slope=jnp.asarray(branch.values[i]))
+        guess = branch.dataset.section_state.values[i]
+        for name, value in read_peaks(vrw.limit_cycle(wheel, model=MODEL, guess=guess)).items():
+            np.testing.assert_allclose(branch.dataset[name][i], value, rtol=1e-8, err_msg=name)
+    assert branch.values[-1] == 0.0752
+
+
 def test_a_model_without_force_peaks_raises_one_sentence():
     wheel = vrw.WheelParams(slope=0.1)
     model = vrw.RigidWheel(held_landing=True)
