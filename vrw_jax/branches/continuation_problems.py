@@ -588,7 +588,7 @@ def combine_step_measures(
             period_measures[measure_name] = step_values[0]
         elif measure_name == "outcome":
             period_measures[measure_name] = step_values[jnp.argmax(step_values != Outcome.STEPPED)]
-        elif MEASURES[measure_name].is_ratio:
+        elif MEASURES[measure_name].is_averaged_over_steps:
             period_measures[measure_name] = jnp.mean(step_values, 0)
         else:
             period_measures[measure_name] = jnp.sum(step_values, 0)

@@ -27,8 +27,9 @@ class Measure:
       for the locked legs 3 to n, `CONTACT_MEASURES` for every leg;
     - `violation_text`: clause that states what a negative margin means, otherwise "";
     - `is_shared`: whether the steps of every model have the measure;
-    - `is_code`: whether the measure is an integer code or count without derivatives;
-    - `is_ratio`: whether the measure of several steps is their mean instead of their sum.
+    - `is_integer_code`: whether the measure is an integer code or count without derivatives;
+    - `is_averaged_over_steps`: whether the measure of several steps is their mean instead of their
+      sum.
     """
 
     name: str
@@ -40,8 +41,8 @@ class Measure:
     leg_dimension: str = ""
     violation_text: str = ""
     is_shared: bool = False
-    is_code: bool = False
-    is_ratio: bool = False
+    is_integer_code: bool = False
+    is_averaged_over_steps: bool = False
 
     @property
     def mathtext(self) -> str:
@@ -64,13 +65,13 @@ class Measure:
     @property
     def variable_attributes(self) -> dict[str, str]:
         """Return the attributes for a dataset variable that contains this measure."""
-        attributes = {
+        measure_attributes = {
             "units": self.unit,
             "long_name": self.long_name,
             "symbol": self.symbol,
             "description": self.description,
         }
-        return attributes | ({"equation": self.equation} if self.equation else {})
+        return measure_attributes | ({"equation": self.equation} if self.equation else {})
 
     def format_with_unit(self, measured_value: object) -> str:
         """Return a value as text with the unit of this measure and six significant digits."""
@@ -91,11 +92,12 @@ def _index_measures_by_name(*measures: Measure) -> dict[str, Measure]:
 # fmt: off
 STEP_MEASURES = _index_measures_by_name(
     Measure("dls_fraction", "1", "T_DLS/T", "DLS fraction",
-            "Share of the step spent in double-limb support.", is_shared=True, is_ratio=True),
+            "Share of the step spent in double-limb support.", is_shared=True,
+            is_averaged_over_steps=True),
     Measure("period", "s", "T", "step period", "Duration of the step from touchdown to touchdown.",
             is_shared=True),
     Measure("speed", "m/s", "v", "walking speed", "Step length divided by the period.",
-            is_shared=True, is_ratio=True),
+            is_shared=True, is_averaged_over_steps=True),
     Measure("step_length", "m", "D", "step length",
             "Distance between the feet at the landing at the start of the step.", is_shared=True),
     Measure("duration_dls", "s", "T_DLS", "duration of DLS",
@@ -134,10 +136,10 @@ STEP_MEASURES = _index_measures_by_name(
             "Mechanical energy lost in the dampers of the legs during the step.", "(29)",
             is_shared=True),
     Measure("outcome", "1", "outcome", "outcome", "Code of the end of the step.",
-            is_shared=True, is_code=True),
+            is_shared=True, is_integer_code=True),
     Measure("solver_steps", "1", "N", "solver steps",
             "Number of solver steps that the integrator tries.",
-            is_shared=True, is_code=True),
+            is_shared=True, is_integer_code=True),
 )
 """Measures of one step."""
 
@@ -226,14 +228,14 @@ SHARED_STEP_MEASURE_NAMES = tuple(name for name,
 """Names of the `STEP_MEASURES` that the steps of every model have."""
 
 DIFFERENTIABLE_STEP_NAMES = tuple(
-    name for name, measure in STEP_MEASURES.items() if not measure.is_code
+    name for name, measure in STEP_MEASURES.items() if not measure.is_integer_code
 )
 """Names of the `STEP_MEASURES` that have derivatives with respect to the parameter of a branch."""
 
 UNILATERAL_DIFFERENTIABLE_NAMES = tuple(
     name
     for name, measure in (STEP_MEASURES | UNILATERAL_STEP_MEASURES).items()
-    if (measure.is_shared or name in UNILATERAL_STEP_MEASURES) and not measure.is_code
+    if (measure.is_shared or name in UNILATERAL_STEP_MEASURES) and not measure.is_integer_code
         and name != "friction"
 )
 """Names of the measures of a step with unilateral contact that have derivatives."""
@@ -409,21 +411,23 @@ def make_labeled_variables(
 
     Measures with one value per leg also have the dimension `leg`.
     """
-    dimension_selector = lambda name: (
-        (row_dimension, MEASURES[name].leg_dimension)
-        if MEASURES[name].leg_dimension
+    dimension_selector = lambda variable_name: (
+        (row_dimension, MEASURES[variable_name].leg_dimension)
+        if MEASURES[variable_name].leg_dimension
         else row_dimension
     )
     return {
-        name: xr.Variable(dimension_selector(name), x, make_measure_attributes(name))
-        for name, x in columns_by_name.items()
+        variable_name: xr.Variable(
+            dimension_selector(variable_name), x, make_measure_attributes(variable_name)
+        )
+        for variable_name, x in columns_by_name.items()
     }
 
 
 def make_locked_leg_coordinate(n_legs: int) -> xr.Variable:
     """Return the dataset coordinate `leg` for margins of the locked legs 3 to n."""
-    attributes = {"long_name": "locked leg", "units": "1"}
-    return xr.Variable("leg", np.arange(3, n_legs + 1), attributes)
+    leg_attributes = {"long_name": "locked leg", "units": "1"}
+    return xr.Variable("leg", np.arange(3, n_legs + 1), leg_attributes)
 
 
 def describe_violation(margin_name: str) -> str:
@@ -451,11 +455,13 @@ def make_measure_attributes(variable_name: str) -> dict[str, object]:
 
     For integer codes, they include the names of the codes.
     """
-    attributes: dict[str, object] = dict(MEASURES[variable_name].variable_attributes)
+    measure_attributes: dict[str, object] = dict(MEASURES[variable_name].variable_attributes)
     if variable_name == "phase":
-        attributes |= make_flag_attributes(PHASE_NAMES)
+        measure_attributes |= make_flag_attributes(PHASE_NAMES)
     if variable_name == "contact":
-        attributes |= make_flag_attributes(CONTACT_MODE_NAMES)
+        measure_attributes |= make_flag_attributes(CONTACT_MODE_NAMES)
     if variable_name == "outcome":
-        attributes |= make_flag_attributes(outcome_member.name for outcome_member in Outcome)
-    return attributes
+        measure_attributes |= make_flag_attributes(
+            outcome_member.name for outcome_member in Outcome
+        )
+    return measure_attributes
