@@ -539,11 +539,11 @@ def _eliminate_duration(
         -(event_tangents[:-1] + correction_unit_tangent[:-1] * event_value) / event_tangents[-1]
     )
 
-    def eliminate_duration(tangents: Array) -> Array:
+    def eliminate_duration(tangents_with_duration: Array) -> Array:
         duration_factor = duration_tangents.reshape(
-            duration_tangents.shape[:1] + (1,) * (tangents.ndim - 2) + (-1,)
+            duration_tangents.shape[:1] + (1,) * (tangents_with_duration.ndim - 2) + (-1,)
         )
-        return tangents[:-1] + duration_factor * tangents[-1:]
+        return tangents_with_duration[:-1] + duration_factor * tangents_with_duration[-1:]
 
     next_state = _PhaseTangentState(
         *next_phase_point, *(eliminate_duration(x) for x in next_point_tangents)

@@ -394,11 +394,11 @@ def indicators(gaits: xr.Dataset, every: int = 4) -> Figure:
     )
     figure = Figure(figsize=(PAGE_FIGURE_WIDTH_INCHES, 2.7))
     panel_axes = figure.subplots(1, 2)
-    for axes, panel_letter, (panel_series, axis_label) in zip(
+    for axes, panel_letter, (panel_indicators, axis_label) in zip(
         panel_axes, "ab", panel_rows, strict=True
     ):
         draw_panel_letter(axes, panel_letter)
-        for indicator_name, line_color, marker_symbol in panel_series:
+        for indicator_name, line_color, marker_symbol in panel_indicators:
             indicator_values, indicator_symbol = (
                 valid_gaits[indicator_name].values,
                 f"${MEASURES[indicator_name].mathtext}$",
@@ -422,12 +422,14 @@ def indicators(gaits: xr.Dataset, every: int = 4) -> Figure:
         axes.set_ylim(
             0.0,
             1.18
-            * max(float(valid_gaits[indicator_name].max()) for indicator_name, *_ in panel_series),
+            * max(
+                float(valid_gaits[indicator_name].max()) for indicator_name, *_ in panel_indicators
+            ),
         )
         axes.set_xlabel(format_axis_label(varied_parameter, "{symbol}"))
         axes.set_ylabel(axis_label)
         axes.legend(
-            loc="lower right" if panel_letter == "a" else "upper right", ncols=len(panel_series)
+            loc="lower right" if panel_letter == "a" else "upper right", ncols=len(panel_indicators)
         )
     ground_slope = gaits.attrs["parameter_slope"]  # The slope in the paper's caption is a misprint.
     panel_axes[0].text(

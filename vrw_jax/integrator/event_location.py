@@ -201,9 +201,9 @@ def _refine_event_location(
         step_end, remaining_time, short_step_length, guard_index, is_event_distant, n_iterations = (
             loop_carry
         )
-        takes_short_step = can_take_short_step(is_event_distant, remaining_time)
+        is_short_step_taken = can_take_short_step(is_event_distant, remaining_time)
         step_end = select_tree_leaves(
-            takes_short_step,
+            is_short_step_taken,
             take_rk_step(
                 low_order_tableau,
                 evaluate_acceleration,
@@ -213,17 +213,17 @@ def _refine_event_location(
             ).end_state,
             step_end,
         )
-        new_remaining_time, earliest_guard = _propose_earliest_event(
+        new_remaining_time, earliest_guard_index = _propose_earliest_event(
             *evaluate_with_rates(evaluate_guards, evaluate_acceleration, step_end),
             crossing_step.crossing_bits,
         )
-        remaining_time = jnp.where(takes_short_step, new_remaining_time, remaining_time)
+        remaining_time = jnp.where(is_short_step_taken, new_remaining_time, remaining_time)
         short_step_length = jnp.where(
-            can_take_short_step(takes_short_step, new_remaining_time),
+            can_take_short_step(is_short_step_taken, new_remaining_time),
             short_step_length + new_remaining_time,
             short_step_length,
         )
-        guard_index = jnp.where(takes_short_step, earliest_guard, guard_index)
+        guard_index = jnp.where(is_short_step_taken, earliest_guard_index, guard_index)
         return (
             step_end,
             remaining_time,

@@ -483,14 +483,14 @@ def _integrate_until_crossing(
         is_within_tolerance = squared_error <= 1.0
         # A step inside which a guard may be negative is repeated up to the guard's minimum.
         may_cross_inside = is_within_tolerance & (guard_minimum_fraction < 1.0)
-        is_rejected = may_cross_inside | ~is_within_tolerance
+        is_step_rejected = may_cross_inside | ~is_within_tolerance
         controller_factor = compute_step_size_factor(
             tableau, squared_error, guard_minimum_fraction.dtype
         )
         step_length_factor = jnp.where(may_cross_inside, guard_minimum_fraction, controller_factor)
         integration_status, crossing_bits, is_accepted, elapsed_time, next_step_length = (
             _classify_step(
-                options, integrator_state, step_length_factor, is_rejected, end_guard_values
+                options, integrator_state, step_length_factor, is_step_rejected, end_guard_values
             )
         )
         state, guard_values = select_tree_leaves(
@@ -564,9 +564,9 @@ def _integrate_until_crossing(
         max_iterations = (
             STRAGGLER_ITERATION_FACTOR * integrator_state.n_iterations_until_half_ended + 8
         )
-        exceeds_iteration_limit = integrator_state.n_iterations > max_iterations
+        is_iteration_limit_exceeded = integrator_state.n_iterations > max_iterations
         return (n_running_elements > 0) & ~(
-            (n_running_elements <= straggler_count) & exceeds_iteration_limit
+            (n_running_elements <= straggler_count) & is_iteration_limit_exceeded
         )
 
     initial_minima = phase.margin_functions and init_minima_state(
@@ -597,7 +597,7 @@ def _classify_step(
     options: StepOptions,
     integrator_state: _IntegratorState,
     step_length_factor: Array,
-    is_rejected: Array,
+    is_step_rejected: Array,
     end_guard_values: Vector,
 ) -> tuple[Array, Array, Array, Array, Array]:
     """Return the outcome of the last solver step for each batch element.
@@ -609,7 +609,7 @@ def _classify_step(
     limit.
     """
     is_running = integrator_state.integration_status == IntegrationStatus.RUNNING
-    is_valid_step = is_running & ~is_rejected
+    is_valid_step = is_running & ~is_step_rejected
     crossing_bits = jnp.zeros_like(integrator_state.crossing_bits)
     for guard_number, end_guard_value in enumerate(end_guard_values):
         crossing_bits = crossing_bits | jnp.where(end_guard_value <= 0.0, 1 << guard_number, 0)

@@ -83,8 +83,8 @@ def _evaluate_sine_and_cosine(array_module: ModuleType, angle: Any) -> tuple[Any
 
     def evaluate_polynomial(coefficients: tuple[float, ...]) -> Any:
         polynomial_value = array_module.full_like(squared_angle, coefficients[-1])
-        for coefficient in coefficients[-2::-1]:
-            polynomial_value = polynomial_value * squared_angle + coefficient
+        for polynomial_coefficient in coefficients[-2::-1]:
+            polynomial_value = polynomial_value * squared_angle + polynomial_coefficient
         return polynomial_value
 
     return angle * evaluate_polynomial(_SINE_COEFFICIENTS), evaluate_polynomial(

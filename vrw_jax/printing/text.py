@@ -171,4 +171,6 @@ def format_mathtext(symbol_text: str) -> str:
 
 def format_numbers(printed_numbers: object) -> str:
     """Return numbers as text with five significant digits, separated by commas."""
-    return ", ".join(f"{number:.5g}" for number in np.ravel(np.asarray(printed_numbers)))
+    return ", ".join(
+        f"{printed_number:.5g}" for printed_number in np.ravel(np.asarray(printed_numbers))
+    )
