@@ -80,17 +80,6 @@ def _emit_llvm_sum(operation: ElementwiseOperation, x: LlvmValue, y: LlvmValue) 
     )
 
 
-def _emit_llvm_difference(operation: ElementwiseOperation, x: LlvmValue, y: LlvmValue) -> LlvmValue:
-    """Emit the difference x - y and return its LLVM value. A constant operand y = 0 needs no
-    instruction.
-    """
-    return (
-        x
-        if _equals_llvm_constant(y, 0)
-        else _emit_binary_instruction(operation, ("fsub", "sub"), x, y)
-    )
-
-
 def _emit_llvm_product(operation: ElementwiseOperation, x: LlvmValue, y: LlvmValue) -> LlvmValue:
     """Emit the product x * y and return its LLVM value. A constant factor 0 or 1 needs no
     instruction.
@@ -151,15 +140,6 @@ def _emit_llvm_integer_power(operation: ElementwiseOperation, x: LlvmValue) -> L
         )
         if operation.primitive_params["y"] < 0
         else partial_power
-    )
-
-
-def _emit_llvm_negation(operation: ElementwiseOperation, x: LlvmValue) -> LlvmValue:
-    """Emit the negation -x and return its LLVM value."""
-    return (
-        operation.value_emitter.builder.fneg(x)
-        if operation.operand_dtype.kind == "f"
-        else operation.value_emitter.builder.neg(x)
     )
 
 
@@ -261,14 +241,6 @@ def _emit_llvm_select(
         ]
     false_case, true_case = operation.value_emitter.to_scalars_or_vectors(*case_values)
     return operation.value_emitter.builder.select(lane_condition, true_case, false_case)
-
-
-def _emit_llvm_finiteness_test(operation: ElementwiseOperation, x: LlvmValue) -> LlvmValue:
-    """Emit the test whether the float `x` is finite, and return its LLVM truth value."""
-    absolute_value = _emit_llvm_intrinsic_call(operation.value_emitter, "fabs", x)
-    return operation.value_emitter.builder.fcmp_ordered(
-        "<", absolute_value, operation.value_emitter.make_llvm_constant(absolute_value.type, np.inf)
-    )
 
 
 def _make_intrinsic_rule(
@@ -533,7 +505,11 @@ ELEMENTWISE_RULES: dict[str, ElementwiseRule] = {
     "ge": _make_comparison_rule(">="),
     "gt": _make_comparison_rule(">"),
     "integer_pow": _emit_llvm_integer_power,
-    "is_finite": _emit_llvm_finiteness_test,
+    "is_finite": lambda operation, x: operation.value_emitter.builder.fcmp_ordered(
+        "<",
+        _emit_llvm_intrinsic_call(operation.value_emitter, "fabs", x),
+        operation.value_emitter.make_llvm_constant(x.type, np.inf),
+    ),
     "le": _make_comparison_rule("<="),
     "log": _make_intrinsic_rule("log", _emit_float32_logarithm),
     "lt": _make_comparison_rule("<"),
@@ -541,7 +517,11 @@ ELEMENTWISE_RULES: dict[str, ElementwiseRule] = {
     "min": _make_extremum_rule("<"),
     "mul": _emit_llvm_product,
     "ne": _make_comparison_rule("!="),
-    "neg": _emit_llvm_negation,
+    "neg": lambda operation, x: (
+        operation.value_emitter.builder.fneg(x)
+        if operation.operand_dtype.kind == "f"
+        else operation.value_emitter.builder.neg(x)
+    ),
     "not": lambda operation, x: operation.value_emitter.builder.not_(x),
     "or": _make_bitwise_rule("or_"),
     "select_n": _emit_llvm_select,
@@ -552,6 +532,11 @@ ELEMENTWISE_RULES: dict[str, ElementwiseRule] = {
     "sqrt": _make_intrinsic_rule("sqrt"),
     "square": lambda operation, x: _emit_binary_instruction(operation, ("fmul", "mul"), x, x),
     "stop_gradient": _return_operand,
-    "sub": _emit_llvm_difference,
+    # A constant operand y = 0 needs no instruction.
+    "sub": lambda operation, x, y: (
+        x
+        if _equals_llvm_constant(y, 0)
+        else _emit_binary_instruction(operation, ("fsub", "sub"), x, y)
+    ),
     "xor": _make_bitwise_rule("xor"),
 }
