@@ -297,8 +297,8 @@ def test_a_new_primitive_needs_one_row_of_the_table(monkeypatch):
         make_program(tangent, lanes)
     monkeypatch.setitem(
         ELEMENTWISE_RULES, "tan",
-        lambda n, params, before, after, x: n.builder.fdiv(
-            *(ELEMENTWISE_RULES[name](n, params, before, after, x) for name in ("sin", "cos"))
+        lambda operation, x: operation.value_emitter.builder.fdiv(
+            *(ELEMENTWISE_RULES[name](operation, x) for name in ("sin", "cos"))
         ),
     )  # fmt: skip
     monkeypatch.setitem(PRIMITIVE_RULES, "tan", PRIMITIVE_RULES["sin"])
