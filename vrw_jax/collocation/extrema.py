@@ -182,8 +182,8 @@ class CollocatedPhaseMotion(NamedTuple):
 
         `time_in_phase` is the time since the start of the phase, in s. It is the end of an
         additional mesh interval, which begins at the last mesh boundary before that time. Newton's
-        method solves for the node accelerations of the additional interval. The state has
-        derivatives with respect to the motion but not with respect to the time.
+        method solves for the node accelerations of the additional interval. The result is
+        differentiable with respect to the motion, but not with respect to the time.
         """
         interval_index = self.find_interval_at_time(time_in_phase)
         interval_start_time, interval_start_q, interval_start_v = (

@@ -128,7 +128,8 @@ class _FootEquations(NamedTuple):
     """Coefficients of the equations for the feet in contact, for one combination of modes.
 
     The unknown c is the transverse force on a sticking foot. For a sliding foot, c is the normal
-    force, or the friction force in the limit of infinite friction. For an unloaded foot, c = 0.
+    force. In the limit of infinite friction, c is the friction force instead. For an unloaded foot,
+    c = 0.
     """
 
     is_sticking: SlotPair

@@ -329,8 +329,8 @@ class PeriodMap(NamedTuple):
 
 
 class PeriodEvaluation(NamedTuple):
-    """Gait steps of one period and their Jacobians, the end states, and flags of
-    complete periods.
+    """Gait steps of one period with their Jacobians and end states, and whether each period is
+    complete.
     """
 
     period_steps: Any

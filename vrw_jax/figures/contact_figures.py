@@ -135,7 +135,7 @@ def compute_foot_motion(walk: xr.Dataset) -> HubAndFootMotion:
 
 
 def select_leg_color(leg_number: int) -> str:
-    """Return the color of the leg with the label `leg_number`, which starts from 1."""
+    """Return the color of the leg with the label `leg_number`. Labels start from 1."""
     return {1: LEG_1_COLOR, 2: LEG_2_COLOR}.get(leg_number, OTHER_LEG_COLOR)
 
 

@@ -656,14 +656,14 @@ def _find_guard_minima(
     step_length: Scalar,
     n_guards: int,
 ) -> tuple[Array, Array]:
-    """Return each guard's minimum as a fraction of the solver step, and a flag per guard.
+    """Return the location of each guard's minimum, and whether the guard may be negative there.
 
-    The flag is True if the guard may be negative inside the step. The cubic through the guard's
-    values and time derivatives is nowhere below the smallest of its Bernstein coefficients. A guard
-    with positive coefficients therefore stays positive. Otherwise the solver step is repeated up to
-    the minimum of the cubic, at most nine tenths of the step. In shorter steps, the coefficients
-    are closer to the guard. The repetition ends when the coefficients are positive or the guard is
-    negative at the end of a step.
+    The location is a fraction of the solver step, at most nine tenths. It is the minimum of the
+    cubic through the guard's values and time derivatives at both ends of the step. The cubic is
+    nowhere below the smallest of its Bernstein coefficients, so a guard with positive coefficients
+    stays positive. For any other guard, the caller repeats the solver step up to the location. In
+    shorter steps, the coefficients are closer to the guard. The caller stops when the coefficients
+    are positive or the guard is negative at the end of a step.
     """
     start_guards, start_rates, end_guards, end_rates = lax.stop_gradient(
         (previous_step.monitored_values, previous_step.monitored_rates, guard_values, guard_rates)

@@ -600,13 +600,13 @@ def _classify_step(
     is_step_rejected: Array,
     end_guard_values: Vector,
 ) -> tuple[Array, Array, Array, Array, Array]:
-    """Return the outcome of the last solver step for each batch element.
+    """Return the outcome of the solver step just taken, for each batch element.
 
     The result contains the status, the bits of the crossing guards, whether the step is accepted,
-    the elapsed time, s, and the next step length, s. For a crossing solver step, the length is that
-    of the step itself. The last solver step ends at the time limit. An element fails if its next
-    step is too short for the time to advance, or if the number of its solver steps reaches the
-    limit.
+    the elapsed time, s, and the length of the next solver step, s. If a guard crosses zero within
+    the solver step, the returned length is instead that of the step just taken. A step that would
+    end after the time limit is shortened to end there. An element fails if its next step is too
+    short for the time to advance, or if the number of its solver steps reaches the limit.
     """
     is_running = integrator_state.integration_status == IntegrationStatus.RUNNING
     is_valid_step = is_running & ~is_step_rejected

@@ -57,8 +57,8 @@ def apply_batched_jvp_rule(
     """Return the values and tangents of a JVP rule that computes all directions of a vmap together.
 
     - `evaluate_rule`: function of primals and tangents that returns the values and their tangents.
-      The first axis of its tangents contains the directions. Its length is 1 if all directions
-      agree;
+      The first axis of its tangents contains the directions. The length of this axis is 1 if all
+      directions have the same tangents;
     - `primals`, `tangents`: arguments of the JVP rule, without an axis of directions.
     """
     leaves, tree_structure = jax.tree.flatten((primals, tangents))

@@ -171,8 +171,8 @@ def concatenate_tree_rows(*trees: PyTree) -> PyTree:
 def map_in_batches(function: Callable, batch_sizes: tuple[int, ...], *trees: PyTree) -> PyTree:
     """Apply `function` to trees of arrays in batches along the leading axis, and join the results.
 
-    Each batch is padded to one of `batch_sizes`, which limits the number of shapes for which the
-    function is compiled. Inputs and outputs are JAX arrays.
+    Each batch is padded to a size in `batch_sizes`, so that the function is compiled for few shapes
+    only. Inputs and outputs are JAX arrays.
     """
     if len(jax.tree.leaves(trees)[0]) in batch_sizes:
         return function(*jax.device_put(trees))

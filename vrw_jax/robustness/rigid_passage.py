@@ -43,7 +43,7 @@ class RigidPassage(NamedTuple):
 def solve_rigid_passage(
     params: WheelParams, slope_sd: Scalar, rigid_model: Any, n_nodes: int
 ) -> RigidPassage:
-    """Return the first-passage times, computed by Gauss-Legendre quadrature with `n_nodes` nodes.
+    """Return mean numbers of steps until the rigid wheel fails, by quadrature with `n_nodes` nodes.
 
     - `slope_sd`: standard deviation of the slopes, rad.
     """

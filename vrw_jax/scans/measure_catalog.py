@@ -133,7 +133,7 @@ def select_measure_catalog(
 def add_passage_measures(measure_catalog: MeasureCatalog) -> MeasureCatalog:
     """Return `measure_catalog` with the measures of walks over random slopes added.
 
-    These measures take a second per sample.
+    Their computation takes about one second per sample.
     """
     return measure_catalog._replace(
         requestable_measures=(*measure_catalog.requestable_measures, *PASSAGE_MEASURES),

@@ -281,7 +281,7 @@ def emit_dynamic_slice(
     array: LlvmArray,
     *axis_starts: LlvmArray,
 ) -> LlvmArray:
-    """Return a part of the array that begins at a computed index, the same for all lanes."""
+    """Return a part of the array that begins at a computed index, which all lanes share."""
     start_index = _clamp_start_index(
         array_emitter,
         primitive_call.operand_avals,

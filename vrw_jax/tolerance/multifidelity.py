@@ -349,7 +349,7 @@ class _MeasuredWheels(NamedTuple):
 
 
 def _stack_control_columns(control_values: np.ndarray) -> np.ndarray:
-    """Return the two regressors of a control variate, (wheels, 2).
+    """Return the two regressors for the regression on a control variate, shape (wheels, 2).
 
     The first column is the control variate, or zero for a wheel without a finite control variate.
     The second column is 1 for a finite control variate and 0 otherwise.

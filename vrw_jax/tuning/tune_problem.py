@@ -228,7 +228,7 @@ class TuneProblem:
     def constraint_names(self) -> tuple[str, ...]:
         """Return the name of each constrained value.
 
-        A margin that each leg has for itself, such as the force of its stopper, has one name per
+        A margin that is defined for each leg, such as the force of its stopper, has one name per
         leg.
         """
         constraint_names: list[str] = []

@@ -311,7 +311,7 @@ class WheelParams(AbstractPrintable):
     def is_in_domain(self) -> Bool[Array, "..."]:
         """Return whether all parameters of each wheel are finite and in their domains.
 
-        Products of four parameters must also be finite in their floating-point type.
+        The product of any four parameters must also be finite in their floating-point type.
         """
         is_in_all_domains = self.leg_com < self.locked_length
         value_by_parameter = {
