@@ -293,7 +293,7 @@ class CurveTracer(NamedTuple):
         return curve_seeds
 
     def _make_seed(self, special_point: SpecialPoint) -> CurveSeed:
-        """Build the seed at a special point of a branch."""
+        """Return the seed from which the curve of a special point is traced."""
         limit_cycle = special_point.cycle
         params = make_wheel_from_parameters(limit_cycle.parameters, limit_cycle.system.n_legs)
         first_parameter_value, second_parameter_value = (

@@ -439,7 +439,8 @@ def _linearize_phase(
 ) -> tuple[_PhaseTangentState, LaneArray]:
     """Return the state at the end of a phase, and the tangents of the phase's node accelerations.
 
-    Within the phase, the last tangent belongs to the duration of the phase.
+    Both have the directions of `tangent_state`, and after them one further direction, that of the
+    phase's duration.
     """
     append_duration_tangent = lambda x: jnp.concatenate([x, jnp.zeros_like(x[:1])])
     tangent_state = tangent_state._replace(

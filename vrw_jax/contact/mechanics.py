@@ -342,7 +342,7 @@ def compute_free_acceleration(
 ) -> FreeMotion:
     """Return the accelerations due to gravity, springs, dampers and rotation alone.
 
-    Feet and stoppers of the legs in the contact slots exert no force.
+    The computation assumes that feet and stoppers of the legs in `contact_slots` exert no force.
     """
     sin, cos = inverse_inertia.leg_directions
     b, dtheta = motion.L - s.a, motion.dtheta

@@ -60,10 +60,9 @@ def compute_time_unit(params: WheelParams) -> Elementwise:
 
 
 def compute_surface_coordinates(params: WheelParams) -> tuple[Elementwise, ...]:
-    """Return the dimensionless coordinates of a wheel on the gait surface.
+    """Return the four dimensionless coordinates of a wheel on the gait surface.
 
-    The coordinates depend on the square root of the damping, and on stiffness, natural length and
-    slope.
+    They are the square root of the damping, the stiffness, the natural length and the slope.
     """
     total_mass = params.hub_mass + params.n_legs * params.leg_mass
     leg_length, gravity = params.locked_length, params.gravity

@@ -80,7 +80,9 @@ each other.
 
 
 def scan_figures(scan: xr.Dataset) -> dict[str, Figure]:
-    """Return the figures of a scan, by name. A grid has one figure for each axis beyond the second.
+    """Return the figures of a scan, by name.
+
+    A grid with one or two axes leads to one figure. Further axes add one figure each.
 
     Args:
         scan: dataset that `vrw.scan` returns for a grid or for samples.

@@ -256,7 +256,10 @@ def emit_padded_array(
 def emit_uninitialized_array(
     array_emitter: ArrayEmitter, primitive_call: PrimitiveCall
 ) -> LlvmArray:
-    """Return an uninitialized array. Its entries read as 0, except in memory of a loop."""
+    """Return an array without assigned entries.
+
+    Entries read as 0. If a loop stores the array in memory, they read as the content of the memory.
+    """
     entry_type = array_emitter.get_entry_type(primitive_call.result_aval)
     return UninitializedArray(
         get_shape_without_lanes(primitive_call.result_aval),
