@@ -119,6 +119,12 @@ def test_a_branch_with_unilateral_contact_has_the_peaks_of_each_gait(gaits):
     assert branch.values[-1] == 0.0752
 
 
+def test_force_peaks_by_diffrax_raise_one_sentence(gaits):
+    options = vrw.StepOptions(engine="diffrax")
+    with pytest.raises(ValueError, match="only machine code locates them"):
+        MODEL.measure_force_peaks(TWO_PEAKS, gaits["two peaks"].section_state, options)
+
+
 def test_a_model_without_force_peaks_raises_one_sentence():
     wheel = vrw.WheelParams(slope=0.1)
     model = vrw.RigidWheel(held_landing=True)

@@ -4,6 +4,7 @@ The commands import slow libraries themselves, so that help appears quickly. A u
 reported in one sentence on standard error, with exit code 2.
 """
 
+import contextlib
 import gc
 import importlib
 import importlib.metadata
@@ -194,7 +195,9 @@ def run_gait_command(
             )
             force_peaks = {}
             if model.is_compliant and bool(limit_cycle_result.found):
-                force_peaks = limit_cycle_result.measures(FORCE_PEAK_MEASURES)
+                # Without machine code, unilateral contact has no measures of force peaks.
+                with contextlib.suppress(ValueError):
+                    force_peaks = limit_cycle_result.measures(FORCE_PEAK_MEASURES)
         printing.print_wheel_and_gait(
             params, step_result, section_state, n_walked, limit_cycle_result, force_peaks
         )

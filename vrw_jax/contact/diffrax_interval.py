@@ -21,7 +21,6 @@ from vrw_jax.contact.batch_integrator import (
     IntervalState,
     LaneStatus,
     evaluate_dynamics,
-    evaluate_guards_at_point,
     is_at_painleve_singularity,
     pack_coordinates,
     unpack_motion,
@@ -98,12 +97,14 @@ def integrate_by_diffrax(
     start_accumulators = LossAccumulators(
         jnp.zeros_like(interval.time_since_event), *interval.interval_accumulators
     )
-    guard_layout = make_guard_layout(
-        mode_dynamics.s.n, mode_dynamics.has_one_sided_stoppers, mode_dynamics.measures_force_peaks
-    )
+    if mode_dynamics.measures_force_peaks:
+        raise ValueError(
+            "force peaks with unilateral contact are computed by diffrax, but only machine code "
+            "locates them, with first derivatives: take StepOptions() on a CPU with llvmlite."
+        )
+    guard_layout = make_guard_layout(mode_dynamics.s.n, mode_dynamics.has_one_sided_stoppers)
     q, v = interval.interval_point[:2]
-    fixed_arguments = stop_gradients((mode_dynamics, q, v))
-    start_rows = evaluate_dynamics(*fixed_arguments)
+    start_rows = evaluate_dynamics(*stop_gradients((mode_dynamics, q, v)))
     # As in `init_interval`, a wheel that an event leaves rolling backward continues if it
     # accelerates forward. The guard is then the rise of the rate.
     end_rates, end_acceleration = lax.stop_gradient(v[ROLLING_INDEX]), start_rows[ROLLING_INDEX]
@@ -111,13 +112,6 @@ def integrate_by_diffrax(
     guard_offset = guard_offset.at[guard_layout.rolling_rate_guard].set(
         jnp.where((end_rates < 0.0) & (end_acceleration > 0.0), end_rates, 0.0)
     )
-    if mode_dynamics.measures_force_peaks:
-        # After an extremum, round-off determines the sign of the guard that rises from zero.
-        start_guards = evaluate_guards_at_point(fixed_arguments[0], IntervalPoint(q, v, start_rows))
-        force_guards = slice(guard_layout.first_force_rate_guard, None)
-        guard_offset = guard_offset.at[force_guards].set(
-            jnp.minimum(lax.stop_gradient(start_guards[force_guards]), 0.0)
-        )
     end_result = integrate_in_units(
         partial(evaluate_vector_field, mode_dynamics),
         MonitoredFunctions(
