@@ -10,13 +10,16 @@ import numpy as np
 
 from vrw_jax.batches import step_batch
 from vrw_jax.branches import Branch
-from vrw_jax.cycles import CycleOptions, limit_cycle
+from vrw_jax.cycles import CycleOptions, limit_cycle, resolve_finder
 from vrw_jax.measures import MEASURES, make_measure_attributes
 from vrw_jax.models import AbstractWheel
 from vrw_jax.numerics import StepOptions
 from vrw_jax.robustness.basin_share import StartBox, compute_basin_share, parse_start_box
 from vrw_jax.robustness.gait_arrival import StableGait
-from vrw_jax.robustness.gait_sensitivity import gait_sensitivity
+from vrw_jax.robustness.gait_sensitivity import (
+    compute_gait_sensitivity,
+    parse_sensitivity_measures,
+)
 from vrw_jax.robustness.smallest_disturbance import compute_smallest_disturbance
 from vrw_jax.runtime import with_default_jax_settings
 from vrw_jax.runtime import xarray as xr
@@ -146,6 +149,8 @@ def measure_gait_sensitivity(
     norms = np.full((len(point_indices), len(measure_names)), np.nan)
     for result_index, point_index in enumerate(point_indices):
         branch_gait = _load_branch_gait(branch, int(point_index), checked_model, StepOptions())
+        cycle_finder = resolve_finder(branch_gait.params, branch_gait.model, options)
+        parse_sensitivity_measures(cycle_finder, measure_names)
         point_cycle: Any = limit_cycle(
             branch_gait.params,
             guess=branch_gait.section_states[0],
@@ -156,12 +161,8 @@ def measure_gait_sensitivity(
             int(point_cycle.outcome) == Outcome.STEPPED
             and branch_gait.is_on_gait(np.asarray(point_cycle.section_state)[None])[0]
         ):
-            norms[result_index] = gait_sensitivity(
-                branch_gait.params,
-                measure_names,
-                guess=point_cycle,
-                model=branch_gait.model,
-                options=options,
+            norms[result_index] = compute_gait_sensitivity(
+                cycle_finder, branch_gait.params, point_cycle, measure_names
             ).norm
     variable_attrs = {
         f"gait_sensitivity_{measure_name}": (

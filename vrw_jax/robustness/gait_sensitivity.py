@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from vrw_jax.cycles import (
+    AbstractGaitFinder,
     CycleOptions,
     UserCycleGuess,
     compute_sensitivity_norms,
@@ -132,9 +133,26 @@ def gait_sensitivity(
         >>> print(f"{jax.grad(norm)(vrw.WheelParams()).damping:.5f} s/rad per N s/m")
         0.01431 s/rad per N s/m
     """
-    measure_names = check_names("measures", measures)
     model = resolve_model(params, model)
     cycle_finder = resolve_finder(params, model, options)
+    measure_names = parse_sensitivity_measures(cycle_finder, measures)
+    limit_cycle_result: Any = limit_cycle(params, guess=guess, model=model, options=options)
+    if (
+        not has_traced_leaf(limit_cycle_result)
+        and int(limit_cycle_result.outcome) != Outcome.STEPPED
+    ):
+        raise ValueError(
+            "this wheel has no gait whose sensitivity could be computed: "
+            f"{limit_cycle_result.why} Take a wheel for which vrw.limit_cycle finds a gait."
+        )
+    return compute_gait_sensitivity(cycle_finder, params, limit_cycle_result, measure_names)
+
+
+def parse_sensitivity_measures(
+    cycle_finder: AbstractGaitFinder, measures: str | Sequence[str]
+) -> tuple[str, ...]:
+    """Return the names of measures of a gait step; raise an error for names of other kinds."""
+    measure_names = check_names("measures", measures)
     step_measures = STEP_MEASURES | MARGIN_MEASURES | UNILATERAL_STEP_MEASURES
     known_measure_names = tuple(
         measure_name
@@ -147,15 +165,16 @@ def gait_sensitivity(
             known_measure_names,
             f"measure of a step of {cycle_finder.model.model_name} wheels",
         )
-    limit_cycle_result: Any = limit_cycle(params, guess=guess, model=model, options=options)
-    if (
-        not has_traced_leaf(limit_cycle_result)
-        and int(limit_cycle_result.outcome) != Outcome.STEPPED
-    ):
-        raise ValueError(
-            "this wheel has no gait whose sensitivity could be computed: "
-            f"{limit_cycle_result.why} Take a wheel for which vrw.limit_cycle finds a gait."
-        )
+    return measure_names
+
+
+def compute_gait_sensitivity(
+    cycle_finder: AbstractGaitFinder,
+    params: WheelParams,
+    limit_cycle_result: Any,
+    measure_names: tuple[str, ...],
+) -> GaitSensitivity:
+    """Return the `GaitSensitivity` of a gait and for checked arguments, zero without a gait."""
     sensitivity_norms = compute_sensitivity_norms(
         cycle_finder.compute_slope_response(params, limit_cycle_result, measure_names)
     )
