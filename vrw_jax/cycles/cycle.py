@@ -243,13 +243,20 @@ class AbstractCycle(AbstractPrintable):
         }
 
     @property
-    @abc.abstractmethod
     def force_peaks(self) -> dict[str, Array]:
         """Return the `measures.FORCE_PEAK_MEASURES` by name.
 
         Each measure is the largest value over the gait steps. The measures have first derivatives.
         The derivatives of the number of peaks are zero.
         """
+        return {
+            measure_name: self._zero_without_gait(peak_value)
+            for measure_name, peak_value in self._locate_force_peaks().items()
+        }
+
+    @abc.abstractmethod
+    def _locate_force_peaks(self) -> dict[str, Array]:
+        """Return the measures of `force_peaks`; their values are undefined without a gait."""
 
     def map_over_batch_axes(self, function_of_cycle: Callable) -> Callable:
         """Return the function of one cycle, mapped over the batch axes of this cycle."""

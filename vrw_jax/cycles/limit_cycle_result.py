@@ -187,15 +187,11 @@ class LimitCycle(AbstractCycle):
 
         return self._zero_without_gait(self.map_over_batch_axes(compute_norm)(self.slope_response))
 
-    @property
-    def force_peaks(self) -> dict[str, Array]:
+    def _locate_force_peaks(self) -> dict[str, Array]:
         compute_peaks = functools.partial(compute_force_peaks, self.system)
-        collocation_solution = self.collocation_state.solution
-        force_peaks = self.map_over_batch_axes(compute_peaks)(self.parameters, collocation_solution)
-        return {
-            measure_name: self._zero_without_gait(peak_value)
-            for measure_name, peak_value in force_peaks.items()
-        }
+        return self.map_over_batch_axes(compute_peaks)(
+            self.parameters, self.collocation_state.solution
+        )
 
     @property
     def margins(self) -> Margins:

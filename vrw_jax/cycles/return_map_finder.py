@@ -111,16 +111,11 @@ class ReturnMapCycle(AbstractCycle):
     def step_ends(self) -> Array:
         return jnp.asarray(self.steps.section_state)
 
-    @property
-    def force_peaks(self) -> dict[str, Array]:
+    def _locate_force_peaks(self) -> dict[str, Array]:
         measure_cycle = functools.partial(measure_return_map_force_peaks, options=StepOptions())
-        force_peaks = self.map_over_batch_axes(measure_cycle)(
+        return self.map_over_batch_axes(measure_cycle)(
             self.model, self.params, self.section_state, self.step_ends
         )
-        return {
-            measure_name: self._zero_without_gait(peak_value)
-            for measure_name, peak_value in force_peaks.items()
-        }
 
     def model_summary_rows(self) -> list[LabelAndText]:
         return [("durations of each kind of support", f"{format_numbers(self.durations)} s")]
