@@ -4,7 +4,6 @@ The commands import slow libraries themselves, so that help appears quickly. A u
 reported in one sentence on standard error, with exit code 2.
 """
 
-import contextlib
 import gc
 import importlib
 import importlib.metadata
@@ -193,16 +192,18 @@ def run_gait_command(
             limit_cycle_result: Any = limit_cycle(
                 params, guess=None if can_search_without_start else section_state, model=model
             )
-            force_peaks = {}
+            force_peaks: dict[str, Any] = {}
+            reason_without_peaks = ""
             if model.is_compliant and bool(limit_cycle_result.found):
-                # Without machine code, unilateral contact has no measures of force peaks.
-                with contextlib.suppress(ValueError):
+                try:
                     force_peaks = limit_cycle_result.measures(FORCE_PEAK_MEASURES)
+                except ValueError as error:  # for unilateral contact without machine code
+                    reason_without_peaks = str(error)
         printing.print_wheel_and_gait(
             params, step_result, section_state, n_walked, limit_cycle_result, force_peaks
         )
-        if model_reason:
-            stdout_console.print(model_reason)
+        for remark in filter(None, (reason_without_peaks, model_reason)):
+            stdout_console.print(remark)
 
 
 @app.command("explore")
