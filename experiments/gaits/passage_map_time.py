@@ -44,11 +44,14 @@ def main() -> None:
     table = tables.format_markdown(
         ["", "value"],
         [
-            ("wheels with a mean, of 16 in the map", len(mean_steps)),
+            (f"wheels with a mean, of {N_VALUES**2} in the map", len(mean_steps)),
             ("smallest mean number of steps", f"{np.min(mean_steps):.3g}"),
             ("largest mean number of steps", f"{np.max(mean_steps):.3g}"),
             ("processor time per wheel, s", f"{seconds_per_wheel:.2f}"),
-            ("extrapolated: 1,024 wheels on two busy cores, minutes", f"{large_map_minutes:.1f}"),
+            (
+                f"extrapolated: {N_LARGE_MAP_WHEELS:,} wheels on two busy cores, minutes",
+                f"{large_map_minutes:.1f}",
+            ),
         ],
     )
     source = tables.describe_run("experiments.gaits.passage_map_time")
