@@ -624,9 +624,9 @@ class _SpecialPointLocator(NamedTuple):
         )
 
         parameter_by_location = {
-            (bracket_end_index, 1.0 * chord_end_fraction): end_points.p[bracket_end_index]
+            (request_index, 1.0 * chord_end_fraction): end_points.p[request_index]
             for chord_end_fraction, end_points in enumerate((left_points, right_points))
-            for bracket_end_index in range(len(root_requests))
+            for request_index in range(len(root_requests))
         }
 
         def solve_at_fractions(
@@ -677,12 +677,8 @@ class _SpecialPointLocator(NamedTuple):
 
         evaluate_at_points = lambda point_indices: np.array(
             [
-                evaluate_named_quantity(self.point_table.quantity_table, quantity_name)[
-                    bracket_end_index
-                ]
-                for quantity_name, bracket_end_index in zip(
-                    quantity_names, point_indices, strict=True
-                )
+                evaluate_named_quantity(self.point_table.quantity_table, quantity_name)[point_index]
+                for quantity_name, point_index in zip(quantity_names, point_indices, strict=True)
             ]
         )
         parameter_distances = np.maximum(
@@ -725,21 +721,17 @@ class _SpecialPointLocator(NamedTuple):
                 )
         return [
             _LocatedRoot(
-                root_requests[bracket_end_index],
+                root_requests[request_index],
                 float(
                     parameter_by_location[
-                        bracket_end_index, root_locations.best_locations[bracket_end_index]
+                        request_index, root_locations.best_locations[request_index]
                     ]
                 ),
-                float(root_locations.best_locations[bracket_end_index]),
-                select_tree_rows(
-                    points_beside_roots, slice(bracket_end_index, bracket_end_index + 1)
-                ),
-                select_tree_rows(
-                    quantities_beside_roots, slice(bracket_end_index, bracket_end_index + 1)
-                ),
+                float(root_locations.best_locations[request_index]),
+                select_tree_rows(points_beside_roots, slice(request_index, request_index + 1)),
+                select_tree_rows(quantities_beside_roots, slice(request_index, request_index + 1)),
             )
-            for bracket_end_index in range(len(root_requests))
+            for request_index in range(len(root_requests))
         ]
 
     def is_mesh_limited(

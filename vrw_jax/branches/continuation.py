@@ -494,12 +494,12 @@ def _make_labeled_gait_branch(
         )
         return Branch(parameter_name, empty_dataset, (), ("", ""), branch_outcome)
     measure_names = (
-        parameter_name
-        for parameter_name in STEP_MEASURES
+        measure_name
+        for measure_name in STEP_MEASURES
         | MARGIN_MEASURES
         | UNILATERAL_STEP_MEASURES
         | FORCE_PEAK_MEASURES
-        if parameter_name not in MEASURES_OUTSIDE_BRANCHES
+        if measure_name not in MEASURES_OUTSIDE_BRANCHES
     )
     branch_variables = make_labeled_variables(
         {
@@ -523,8 +523,8 @@ def _make_labeled_gait_branch(
     if branch_data.quantity_table["section_state"].shape[-1] != len(component_names):
         leg_numbers = range(1, params.n_legs + 1)
         leg_names = [
-            f"{parameter_name}{leg_number}"
-            for parameter_name in ("L", "dL", "code")
+            f"{quantity_name}{leg_number}"
+            for quantity_name in ("L", "dL", "code")
             for leg_number in leg_numbers
         ]
         component_names = ["theta", "dtheta", "vx", "vz", *leg_names]

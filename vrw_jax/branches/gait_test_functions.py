@@ -131,9 +131,9 @@ def find_test_quantity_group(quantity_name: str, n_legs: int) -> tuple[str, ...]
     """Return the names of all quantities that are evaluated together with `quantity_name`."""
     leg_suffixes = [f"[{leg_number}]" for leg_number in range(3, n_legs + 1)]
     step_quantities = [
-        quantity_name + leg_number
-        for quantity_name, margin_name in MARGIN_MEASURES.items()
-        for leg_number in (leg_suffixes if margin_name.leg_dimension else [""])
+        quantity_name + leg_suffix
+        for quantity_name, margin_measure in MARGIN_MEASURES.items()
+        for leg_suffix in (leg_suffixes if margin_measure.leg_dimension else [""])
     ]
     quantity_groups = (
         BIFURCATION_NAMES,

@@ -333,9 +333,9 @@ def print_wheel_and_gait(
 
         excluded_names = ("outcome", "solver_steps", *MARGIN_MEASURES)
         shown_measures = {
-            parameter_name: measure_value
-            for parameter_name, measure_value in step_result.measures().items()
-            if parameter_name not in excluded_names
+            measure_name: measure_value
+            for measure_name, measure_value in step_result.measures().items()
+            if measure_name not in excluded_names
         }
         _print_measure_table("Last step", shown_measures)
     else:

@@ -106,7 +106,7 @@ def sensitivities(
             ),
             "parameter_unit": (
                 "parameter",
-                [MEASURES[measure_name].unit for measure_name in parameter_names],
+                [MEASURES[parameter_name].unit for parameter_name in parameter_names],
             ),
             "parameter_value": ("parameter", np.asarray(parameter_values)),
         },

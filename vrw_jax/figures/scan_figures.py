@@ -150,14 +150,14 @@ def draw_scan_slices(
     states. Cells without a gait are gray.
     """
     slice_indices = {
-        n_column_values: scan.sizes[n_column_values] // 2
-        for n_column_values in SWEEPABLE_PARAMETERS
-        if n_column_values in scan.dims
+        parameter_name: scan.sizes[parameter_name] // 2
+        for parameter_name in SWEEPABLE_PARAMETERS
+        if parameter_name in scan.dims
     }
     slice_indices = {
-        measure_name: axis_index
-        for measure_name, axis_index in slice_indices.items()
-        if measure_name not in (x, y, column_parameter)
+        parameter_name: slice_index
+        for parameter_name, slice_index in slice_indices.items()
+        if parameter_name not in (x, y, column_parameter)
     }
     scan_slice = scan.isel(slice_indices)
     column_datasets = [scan_slice]
@@ -169,7 +169,8 @@ def draw_scan_slices(
             .astype(int)
         )
         column_datasets = [
-            scan_slice.isel({column_parameter: int(axis_index)}) for axis_index in column_indices
+            scan_slice.isel({column_parameter: int(column_index)})
+            for column_index in column_indices
         ]
     panel_measures = _list_shown_measures(scan)
     figure_width = (
@@ -239,8 +240,8 @@ def draw_scan_slices(
     _add_scan_legend(figure, outcome_codes, legend_lines, len(column_datasets))
     if slice_indices:
         fixed_values_text = ", ".join(
-            format_value_label(n_column_values, scan[n_column_values].values[axis_index])
-            for n_column_values, axis_index in slice_indices.items()
+            format_value_label(parameter_name, scan[parameter_name].values[slice_index])
+            for parameter_name, slice_index in slice_indices.items()
         )
         figure.suptitle(f"at {fixed_values_text}", fontsize=9.0)
     return figure

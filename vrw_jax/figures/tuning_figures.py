@@ -141,11 +141,11 @@ def _draw_constraint_slacks(axes: Axes, tune_result: TuneResult) -> None:
         np.sum(
             [
                 np.abs(
-                    path_dataset[constraint_name].values
-                    / float(getattr(tune_result.params, constraint_name))
+                    path_dataset[parameter_name].values
+                    / float(getattr(tune_result.params, parameter_name))
                     - 1.0
                 )
-                for constraint_name in path_dataset.attrs["free"].split()
+                for parameter_name in path_dataset.attrs["free"].split()
             ],
             axis=0,
         )

@@ -19,9 +19,9 @@ def collect_provenance_attributes(
     """
     library_names = ("vrw-jax", "jax", "diffrax", "numpy")
     parameter_attributes: dict[str, str | float | int] = {
-        f"parameter_{library_name}": float(getattr(params, library_name))
-        for library_name in PARAMETER_NAMES
-        if getattr(params, library_name).ndim == 0
+        f"parameter_{parameter_name}": float(getattr(params, parameter_name))
+        for parameter_name in PARAMETER_NAMES
+        if getattr(params, parameter_name).ndim == 0
     }
     return parameter_attributes | {
         "parameter_n_legs": params.n_legs,

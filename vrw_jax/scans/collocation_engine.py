@@ -76,13 +76,13 @@ class CollocationScanEngine:
         )
         requested_derivatives = tuple(
             requested_derivative
-            for measure_name in variable_names
-            if (requested_derivative := parse_derivative(measure_name)) is not None
+            for variable_name in variable_names
+            if (requested_derivative := parse_derivative(variable_name)) is not None
         )
         measure_names = tuple(
-            measure_name
-            for measure_name in variable_names
-            if parse_derivative(measure_name) is None
+            variable_name
+            for variable_name in variable_names
+            if parse_derivative(variable_name) is None
         )
         differentiation_parameters = tuple(
             dict.fromkeys(
@@ -91,7 +91,10 @@ class CollocationScanEngine:
             )
         )
         differentiated_parameter_indices = np.asarray(
-            [PARAMETER_NAMES.index(measure_name) for measure_name in differentiation_parameters],
+            [
+                PARAMETER_NAMES.index(parameter_name)
+                for parameter_name in differentiation_parameters
+            ],
             int,
         )
 

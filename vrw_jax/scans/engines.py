@@ -418,8 +418,7 @@ class PassageScanEngine:
             "failure_probability": passage_result.failure_probability,
         }
         return [
-            float(measures_by_name[parameter_name])
-            for parameter_name in self._passage_measure_names
+            float(measures_by_name[measure_name]) for measure_name in self._passage_measure_names
         ]
 
 

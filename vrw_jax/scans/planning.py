@@ -134,15 +134,15 @@ class ScanPlan:
             slope_standard_deviation,
         ) = self.evaluation_request
         fixed_parameters = (
-            setting_name
-            for setting_name in PARAMETER_NAMES
-            if setting_name not in self.design.swept_parameters
+            parameter_name
+            for parameter_name in PARAMETER_NAMES
+            if parameter_name not in self.design.swept_parameters
         )
         return {
             "design": self.design.describe_design(),
             "wheel": {
-                setting_name: float(getattr(base_wheel, setting_name))
-                for setting_name in fixed_parameters
+                parameter_name: float(getattr(base_wheel, parameter_name))
+                for parameter_name in fixed_parameters
             }
             | {"n_legs": base_wheel.n_legs},
             "measures": list(measure_names),
@@ -372,7 +372,7 @@ def _make_result_layout(
         sample_shape=design.shape,
         chunk_shape=choose_chunk_shape(design.shape, chunk_size),
         variable_layouts=tuple(
-            make_variable_layout(coordinate_name) for coordinate_name in variable_names
+            make_variable_layout(variable_name) for variable_name in variable_names
         ),
         result_coordinates=result_coordinates,
     )

@@ -650,8 +650,8 @@ def _create_zarr_arrays(
         *(variable_layout.variable_name for variable_layout in result_layout.variable_layouts),
     ]
     metadata_by_name = {
-        coordinate_name: json.loads((store_path / coordinate_name / METADATA_FILE_NAME).read_text())
-        for coordinate_name in (*array_names, CHECKSUM_GROUP_NAME, CHECKSUM_ARRAY_NAME)
+        array_name: json.loads((store_path / array_name / METADATA_FILE_NAME).read_text())
+        for array_name in (*array_names, CHECKSUM_GROUP_NAME, CHECKSUM_ARRAY_NAME)
     }
     root_metadata_path = store_path / METADATA_FILE_NAME
     root_metadata = json.loads(root_metadata_path.read_text())

@@ -182,10 +182,10 @@ class MeasureResult(AbstractPrintable):
     def summary_rows(self) -> list[LabelAndText]:
         if not self.models.ndim:
             return []
-        model_names = [str(measure_name) for measure_name in self.model]
+        model_names = [str(model_name) for model_name in self.model]
         model_counts_text = ", ".join(
-            f"{model_names.count(measure_name)} {MODEL_LABELS[measure_index]}"
-            for measure_index, measure_name in enumerate(MODEL_NAMES)
+            f"{model_names.count(model_name)} {MODEL_LABELS[model_index]}"
+            for model_index, model_name in enumerate(MODEL_NAMES)
         )
         compute_max_error = lambda measure_index: np.max(
             self.errors[self.found][:, measure_index], initial=0.0

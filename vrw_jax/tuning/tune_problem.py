@@ -437,12 +437,12 @@ class TuneProblem:
         optimality_conditions = compute_optimality_conditions(best_trial)
         active_constraints = [
             ActiveConstraint(
-                measure_name.removeprefix(UPPER_BOUND_PREFIX),
-                restore_sign_of_bound(measure_name, constraint_limit),
-                get_measure(measure_name).unit,
+                constraint_name.removeprefix(UPPER_BOUND_PREFIX),
+                restore_sign_of_bound(constraint_name, constraint_limit),
+                get_measure(constraint_name).unit,
                 objective_price,
             )
-            for measure_name, constraint_limit, objective_price in zip(
+            for constraint_name, constraint_limit, objective_price in zip(
                 self.constraint_names,
                 self.min_constraint_values,
                 map(float, optimality_conditions.constraint_prices),
@@ -455,17 +455,17 @@ class TuneProblem:
             (self.upper_bounds, optimality_conditions.upper_bound_prices),
         )
         for bound_values, bound_prices in bound_sides:
-            for measure_name, constraint_limit, objective_price, bound_width in zip(
+            for parameter_name, constraint_limit, objective_price, bound_width in zip(
                 self.free_parameters, bound_values, bound_prices, self.bound_widths, strict=True
             ):
                 if objective_price > 0.0:
                     limit_unit, price_per_unit = (
-                        get_measure(measure_name).unit,
+                        get_measure(parameter_name).unit,
                         float(objective_price / bound_width),
                     )
                     active_constraints.append(
                         ActiveConstraint(
-                            measure_name, float(constraint_limit), limit_unit, price_per_unit
+                            parameter_name, float(constraint_limit), limit_unit, price_per_unit
                         )
                     )
         end_seconds = time.perf_counter()
@@ -520,8 +520,8 @@ class TuneProblem:
                 break
             n_walked, section_state = n_walked + 1, np.array(step_result.section_state)
             step_measures = {
-                constraint_name: np.asarray(constraint_value)
-                for constraint_name, constraint_value in step_result.measures().items()
+                measure_name: np.asarray(measure_value)
+                for measure_name, measure_value in step_result.measures().items()
             }
             for constraint_name, min_value in self.constraint_margins.items():
                 if (
@@ -615,7 +615,7 @@ class TuneProblem:
             ),
         }
         constraint_units = [
-            get_measure(parameter_name).unit for parameter_name in self.constraint_names
+            get_measure(constraint_name).unit for constraint_name in self.constraint_names
         ]
         path_dataset_coordinates = {
             evaluation_dimension: np.arange(len(normalized_parameters)),

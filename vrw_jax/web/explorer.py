@@ -242,9 +242,9 @@ def _make_page_map(dataset: "xr.Dataset") -> dict[str, Any]:
 
     check_type("dataset", dataset, xarray.Dataset, "give a scan of vrw.grid over two parameters")
     map_axes = [
-        str(variable_name)
-        for variable_name in dataset.sizes
-        if variable_name in PARAMETER_DOMAINS and dataset.sizes[variable_name] > 1
+        str(dimension_name)
+        for dimension_name in dataset.sizes
+        if dimension_name in PARAMETER_DOMAINS and dataset.sizes[dimension_name] > 1
     ]
     if len(map_axes) != 2:
         raise ValueError(
@@ -253,9 +253,9 @@ def _make_page_map(dataset: "xr.Dataset") -> dict[str, Any]:
         )
     measure_values = dataset.isel(
         {
-            variable_name: 0
-            for variable_name in dataset.sizes
-            if variable_name in PARAMETER_DOMAINS and variable_name not in map_axes
+            dimension_name: 0
+            for dimension_name in dataset.sizes
+            if dimension_name in PARAMETER_DOMAINS and dimension_name not in map_axes
         }
     )
     map_measures: dict[str, Any] = {}
@@ -278,8 +278,8 @@ def _make_page_map(dataset: "xr.Dataset") -> dict[str, Any]:
             ]
     return {
         "axes": [
-            {"name": variable_name, "values": measure_values[variable_name].values.tolist()}
-            for variable_name in map_axes
+            {"name": axis_name, "values": measure_values[axis_name].values.tolist()}
+            for axis_name in map_axes
         ],
         "measures": map_measures,
         "outcome": measure_values["outcome"].transpose(*map_axes[::-1]).values.tolist(),
