@@ -52,6 +52,7 @@ from vrw_jax.continuation import (
     solve_on_many_planes,
     solve_on_plane,
 )
+from vrw_jax.cycles import STATE_AGREEMENT_TOLERANCE
 from vrw_jax.numerics import (
     batch_sizes,
     concatenate_tree_rows,
@@ -59,6 +60,7 @@ from vrw_jax.numerics import (
     map_in_numpy_batches,
     select_tree_rows,
 )
+from vrw_jax.wheel import Outcome
 
 
 @dataclass(frozen=True)
@@ -69,12 +71,14 @@ class SpecialPointLocationOptions:
     - `min_bracket_fraction`: smallest width of the bracket as a fraction of its initial width. The
       value is chosen because near a fold the parameter varies with the square of the distance;
     - `retry_chord_fractions`: fractions of the chord up to an ill-conditioned root, at which the
-      point next to the root is computed again.
+      point next to the root is computed again;
+    - `max_unrefined_mesh_error`: estimated mesh error above which the mesh is refined.
     """
 
     parameter_accuracy: float = 1e-10
     min_bracket_fraction: float = 1e-6
     retry_chord_fractions: tuple[float, ...] = (0.99, 0.9)
+    max_unrefined_mesh_error: float = 1e-8
 
 
 DEFAULT_LOCATION_OPTIONS = SpecialPointLocationOptions()
@@ -83,6 +87,11 @@ DEFAULT_LOCATION_OPTIONS = SpecialPointLocationOptions()
 
 ADMISSIBILITY_COLUMN = "sequence"
 """Name of the quantity that is 1 at admissible points and -1 at all other points."""
+
+COARSE_MESH_END_NAME = Outcome.MESH_TOO_COARSE.name.lower()
+"""Name of a branch end at which the mesh is too coarse. Event-driven steps that start from the
+computed gaits then do not repeat.
+"""
 
 QuantitiesByName = dict[str, np.ndarray]
 """Arrays of quantities with one element per point, by the name of the quantity."""
@@ -117,9 +126,17 @@ class AbstractContinuation(abc.ABC):
         - `wheels`: one wheel per point.
         """
 
-    @abc.abstractmethod
     def are_points_admissible(self, quantity_table: QuantitiesByName) -> np.ndarray:
-        """Return whether each point is admissible, computed from the quantities at the points."""
+        """Return whether each point is admissible, computed from the quantities at the points.
+
+        A gait is admissible if its event-driven step returns to its section state. A fixed point of
+        another map has no such step, and every finite fixed point is admissible.
+        """
+        if "outcome" not in quantity_table:
+            return np.asarray(True)
+        return (quantity_table["outcome"] == Outcome.STEPPED) & (
+            quantity_table["closure"] <= STATE_AGREEMENT_TOLERANCE
+        )
 
     def is_margin_name(self, column_name: str) -> bool:
         """Return whether a root of the quantity `column_name` is a border collision.
@@ -140,9 +157,15 @@ class AbstractContinuation(abc.ABC):
     def name_branch_end(self, quantity_table: QuantitiesByName, point_index: int) -> str:
         """Return the name of the special point at the end of a branch.
 
+        The name is that of the failure of the event-driven step, if the step fails.
+
         - `point_index`: index of the first point beyond the end.
         """
-        return ADMISSIBILITY_COLUMN
+        if "outcome" in quantity_table:
+            step_outcome = Outcome(int(quantity_table["outcome"][point_index]))
+            if step_outcome != Outcome.STEPPED:
+                return step_outcome.name.lower()
+        return COARSE_MESH_END_NAME if "mesh_error" in quantity_table else ADMISSIBILITY_COLUMN
 
     def is_same_gait(
         self, table_before: QuantitiesByName, table_after: QuantitiesByName
@@ -165,7 +188,10 @@ class AbstractContinuation(abc.ABC):
 
         `end_names` contains the names of the special points at the ends of the branch.
         """
-        return False
+        return COARSE_MESH_END_NAME in end_names or bool(
+            np.max(quantity_table.get("mesh_error", 0.0))
+            > DEFAULT_LOCATION_OPTIONS.max_unrefined_mesh_error
+        )
 
     def map_over_points(
         self, function_of_points: Callable, batch_size: int, *point_trees: Any

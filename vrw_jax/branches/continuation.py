@@ -19,7 +19,6 @@ from jaxtyping import Array
 
 from vrw_jax.branches.branch import Branch
 from vrw_jax.branches.branch_location import (
-    ADMISSIBILITY_COLUMN,
     AbstractContinuation,
     BranchData,
     QuantitiesByName,
@@ -34,7 +33,6 @@ from vrw_jax.continuation import (
     floquet_multipliers,
 )
 from vrw_jax.cycles import (
-    STATE_AGREEMENT_TOLERANCE,
     AbstractCycle,
     CycleOptions,
     LimitCycle,
@@ -91,11 +89,6 @@ SECOND_PEAK_RATE_NAME = "second_peak_rate"
 DIFFERENTIATION_ADVICE = "differentiate vrw.limit_cycle"
 """Advice in the error message for a caller who differentiates a branch."""
 
-COARSE_MESH_END_NAME = Outcome.MESH_TOO_COARSE.name.lower()
-"""Name of a branch end at which the mesh is too coarse. Event-driven steps that start from the
-computed gaits then do not repeat.
-"""
-
 
 @dataclass(frozen=True)
 class GaitContinuationOptions:
@@ -104,12 +97,10 @@ class GaitContinuationOptions:
     - `max_measure_change_at_jump`: largest relative change of period and step length at a jump of
       the section state within one branch. The value is chosen because a change in the order of two
       impacts changes period and step length by 1e-4;
-    - `max_unrefined_mesh_error`: estimated mesh error above which the mesh is refined;
     - `max_mesh_refinements`: largest number of mesh refinements.
     """
 
     max_measure_change_at_jump: float = 0.01
-    max_unrefined_mesh_error: float = 1e-8
     max_mesh_refinements: int = 3
 
 
@@ -119,10 +110,7 @@ DEFAULT_GAIT_CONTINUATION_OPTIONS = GaitContinuationOptions()
 
 @dataclass(frozen=True)
 class GaitContinuation(AbstractContinuation):
-    """Continuation of gaits.
-
-    A gait is admissible if its event-driven step returns to its section state.
-    """
+    """Continuation of gaits."""
 
     model: AbstractWheel
     step_options: StepOptions
@@ -169,11 +157,6 @@ class GaitContinuation(AbstractContinuation):
                 }
         return quantity_table
 
-    def are_points_admissible(self, quantity_table: QuantitiesByName) -> np.ndarray:
-        return (quantity_table["outcome"] == Outcome.STEPPED) & (
-            quantity_table["closure"] <= STATE_AGREEMENT_TOLERANCE
-        )
-
     def is_same_gait(
         self, table_before: QuantitiesByName, table_after: QuantitiesByName
     ) -> np.ndarray:
@@ -194,18 +177,6 @@ class GaitContinuation(AbstractContinuation):
         return (
             f"At {parameter_value:.9g} the friction coefficient is the tangent of the slope: "
             "with less no contact carries the weight along the slope, and no gait repeats."
-        )
-
-    def name_branch_end(self, quantity_table: QuantitiesByName, point_index: int) -> str:
-        step_outcome = Outcome(int(quantity_table["outcome"][point_index]))
-        if step_outcome != Outcome.STEPPED:
-            return step_outcome.name.lower()
-        return COARSE_MESH_END_NAME if "mesh_error" in quantity_table else ADMISSIBILITY_COLUMN
-
-    def is_mesh_limited(self, quantity_table: QuantitiesByName, end_names: tuple[str, ...]) -> bool:
-        return COARSE_MESH_END_NAME in end_names or bool(
-            np.max(quantity_table.get("mesh_error", 0.0))
-            > self.continuation_options.max_unrefined_mesh_error
         )
 
 
@@ -595,9 +566,6 @@ class MapContinuation(AbstractContinuation):
                 points.z,
             )
         }
-
-    def are_points_admissible(self, quantity_table: QuantitiesByName) -> np.ndarray:
-        return np.asarray(np.isfinite(quantity_table["x"]).all(-1))
 
 
 @with_default_jax_settings

@@ -110,7 +110,7 @@ class AbstractGaitProblem(AbstractContinuationProblem):
         def measure_point(wheel: BranchWheel, z: Any, p: Array) -> dict[str, Array]:
             section_state, continued_quantities = self.read_gait_state(wheel, z, p)
             model_at_point, params = model.with_parameter(wheel.params, self.parameter_name, p)
-            gait_measures = measure_gait(
+            gait_measures = measure_gait_period(
                 model_at_point, params, section_state, step_options, self.n_steps
             )
             return gait_measures | continued_quantities | {"section_state": section_state}
@@ -545,7 +545,7 @@ def interpolate_section_states(
     )
 
 
-def measure_gait(
+def measure_gait_period(
     model: AbstractWheel,
     params: WheelParams,
     section_state: AnySectionState,
@@ -573,7 +573,7 @@ def measure_gait(
 def combine_step_measures(
     end_state: AnySectionState, step_measures: dict[str, Array], section_state: AnySectionState
 ) -> dict[str, Array]:
-    """Return the result of `measure_gait`, computed from the measures of each step and
+    """Return the result of `measure_gait_period`, computed from the measures of each step and
     the end state.
     """
     period_measures = {}

@@ -206,15 +206,7 @@ class CurveContinuation(AbstractContinuation):
             ],
             axis=0,
         )
-        return are_quantities_positive & self.gait_continuation.are_points_admissible(
-            quantity_table
-        )
-
-    def is_mesh_limited(self, quantity_table: QuantitiesByName, end_names: tuple[str, ...]) -> bool:
-        return self.gait_continuation.is_mesh_limited(quantity_table, end_names)
-
-    def name_branch_end(self, quantity_table: QuantitiesByName, point_index: int) -> str:
-        return self.gait_continuation.name_branch_end(quantity_table, point_index)
+        return are_quantities_positive & super().are_points_admissible(quantity_table)
 
 
 class CurveSeed(NamedTuple):

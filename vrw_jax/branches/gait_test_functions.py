@@ -24,7 +24,7 @@ from vrw_jax.branches.continuation_problems import (
     BranchWheel,
     CollocationProblem,
     make_trial_linearizer,
-    measure_gait,
+    measure_gait_period,
 )
 from vrw_jax.collocation import CollocationSolution, PhasePoints
 from vrw_jax.continuation import (
@@ -313,7 +313,7 @@ class GaitTestFunction(AbstractTestFunction):
         section_state = self.gait_problem.read_gait_state(
             branch_wheel._replace(params=params), z, p[0]
         )[0]
-        gait_measures = measure_gait(self.model, params, section_state, self.step_options, 1)
+        gait_measures = measure_gait_period(self.model, params, section_state, self.step_options, 1)
         measures_and_legs = [
             (gait_measures[quantity_name.partition("[")[0]], quantity_name.partition("[")[2])
             for quantity_name in self.quantity_names

@@ -15,7 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from vrw_jax.branches.branch import SpecialPointCurve
-from vrw_jax.branches.continuation import BRANCH_ENDING_QUANTITIES, COARSE_MESH_END_NAME
+from vrw_jax.branches.branch_location import COARSE_MESH_END_NAME
+from vrw_jax.branches.continuation import BRANCH_ENDING_QUANTITIES
 from vrw_jax.branches.curve_tracing import (
     DEFAULT_CURVE_OPTIONS,
     CurveSeed,

@@ -242,7 +242,7 @@ class ForcePeakRecord(NamedTuple):
     peak_total_force: Elementwise  # largest maximum of this sum, N; -inf without a maximum
     n_extrema: Int[Array, "..."]  # number of recorded extrema, rates included
 
-    def measures(self) -> dict[str, Array]:
+    def compute_force_measures(self) -> dict[str, Array]:
         """Return the measures of the peaks, by their names in `measures.FORCE_PEAK_MEASURES`."""
         has_second_rate = jnp.isfinite(self.second_peak_rate)
         return {

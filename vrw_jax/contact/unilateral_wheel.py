@@ -260,7 +260,9 @@ class UnilateralWheel(AbstractContactWheel):
             params, x, options, is_detailed=True, measures_force_peaks=True
         )
         landing_impulse = step_result.landing_normal[..., 0]
-        return step_result.force_peaks.measures() | {"landing_impulse": landing_impulse}
+        return step_result.force_peaks.compute_force_measures() | {
+            "landing_impulse": landing_impulse
+        }
 
     def _compute_step(
         self,

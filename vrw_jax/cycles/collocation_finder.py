@@ -21,10 +21,7 @@ from vrw_jax.cycles.finder import (
     AbstractGaitFinder,
     Gait,
     GaitBranchPoint,
-    GaitMeasures,
     ParameterValues,
-    compute_cycle_measures,
-    compute_gait_measures,
     move_derivative_axis_first,
 )
 from vrw_jax.cycles.limit_cycle_result import (
@@ -221,22 +218,12 @@ class CollocationFinder(AbstractGaitFinder):
             cycle, step, cycle_derivatives, step_derivatives, GaitBranchPoint(*branch_point_fields)
         )
 
-    def measure_gait(
-        self, parameter_values: ParameterValues, cycle_guess: Any, measure_names: tuple[str, ...]
-    ) -> GaitMeasures:
-        if set(measure_names) <= set(self.cycle_measures):
-            return compute_cycle_measures(self, parameter_values, cycle_guess, measure_names)
-        cycle: Any = (
-            None
-            if cycle_guess is None
-            else self.find_cycle_from_values(parameter_values, cycle_guess)
-        )
-        start_state = (
-            self.make_initial_guess(parameter_values) if cycle is None else cycle.collocation_state
-        )
-        return compute_gait_measures(
-            self.find_gait(parameter_values, start_state), type(self).read_measure, measure_names
-        )
+    def refine_cycle_guess(
+        self, parameter_values: ParameterValues, cycle_guess: Any
+    ) -> CollocationState:
+        cycle: Any = self.find_cycle_from_values(parameter_values, cycle_guess)
+        collocation_state: CollocationState = cycle.collocation_state
+        return collocation_state
 
     def compute_slope_response(
         self, params: WheelParams, cycle: Any, measure_names: Sequence[str]

@@ -291,9 +291,9 @@ class AbstractCycle(AbstractPrintable):
             ("multipliers", f"{multipliers_text}; spectral radius {spectral_radius:.6f}"),
         ]
 
-    @abc.abstractmethod
     def model_summary_rows(self) -> list[LabelAndText]:
-        """Return the labels and texts that are printed only for cycles of this model."""
+        """Return the labels and texts that depend on the class of the cycle."""
+        return [("durations of each kind of support", f"{format_numbers(self.durations)} s")]
 
 
 def format_floquet_multipliers(monodromy_matrix: np.ndarray) -> tuple[float, str]:

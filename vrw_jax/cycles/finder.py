@@ -146,7 +146,6 @@ class AbstractGaitFinder(eqx.Module):
     """
 
     @classmethod
-    @abc.abstractmethod
     def from_options(
         cls,
         model: Any,
@@ -159,6 +158,9 @@ class AbstractGaitFinder(eqx.Module):
 
         A finder whose search has no options of its own ignores `cycle_options`.
         """
+        finder_class: Any = cls
+        finder: AbstractGaitFinder = finder_class(model, n_legs, step_options, period_n)
+        return finder
 
     @property
     def search_options(self) -> Any:
@@ -203,7 +205,7 @@ class AbstractGaitFinder(eqx.Module):
             self.model.collect_parameter_values(params), self.model.compute_default_start(params)
         )
 
-    def take_step(self, params: WheelParams, section_state: Array) -> AbstractStep:
+    def take_gait_step(self, params: WheelParams, section_state: Array) -> AbstractStep:
         """Compute one event-driven step from a section state, by a program that is
         already compiled.
         """
@@ -221,6 +223,10 @@ class AbstractGaitFinder(eqx.Module):
             params, cycle_guess
         )
 
+    def refine_cycle_guess(self, parameter_values: ParameterValues, cycle_guess: Any) -> Any:
+        """Return a start of `find_gait`, computed from a user's guess of the cycle."""
+        return cycle_guess
+
     def measure_gait(
         self, parameter_values: ParameterValues, cycle_guess: Any, measure_names: tuple[str, ...]
     ) -> "GaitMeasures":
@@ -229,7 +235,16 @@ class AbstractGaitFinder(eqx.Module):
         `measure_names` is a selection of `differentiable_measures`. Derivatives of stability
         measures are second derivatives of the motion.
         """
-        return compute_cycle_measures(self, parameter_values, cycle_guess, measure_names)
+        if set(measure_names) <= set(self.cycle_measures):
+            return compute_cycle_measures(self, parameter_values, cycle_guess, measure_names)
+        start_state = (
+            self.make_initial_guess(parameter_values)
+            if cycle_guess is None
+            else self.refine_cycle_guess(parameter_values, cycle_guess)
+        )
+        return compute_gait_measures(
+            self.find_gait(parameter_values, start_state), type(self).read_measure, measure_names
+        )
 
     def compute_slope_response(
         self, params: WheelParams, cycle: Any, measure_names: Sequence[str]

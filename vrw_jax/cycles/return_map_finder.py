@@ -18,14 +18,10 @@ from vrw_jax.cycles.finder import (
     AbstractGaitFinder,
     Gait,
     GaitBranchPoint,
-    GaitMeasures,
     ParameterValues,
-    compute_cycle_measures,
-    compute_gait_measures,
     compute_value_and_tangents,
     move_derivative_axis_first,
 )
-from vrw_jax.cycles.options import CycleOptions
 from vrw_jax.measures import (
     DIFFERENTIABLE_STEP_NAMES,
     FORCE_PEAK_MEASURES,
@@ -34,7 +30,6 @@ from vrw_jax.measures import (
 )
 from vrw_jax.models import AbstractWheel
 from vrw_jax.numerics import Scalar, StepOptions, evaluate_with_jacobian
-from vrw_jax.printing import LabelAndText, format_numbers
 from vrw_jax.simulation import convert_step_arguments, start_walk_toward_gait
 from vrw_jax.wheel import Outcome, WheelParams, compute_wheel_units
 
@@ -116,9 +111,6 @@ class ReturnMapCycle(AbstractCycle):
         return self.map_over_batch_axes(measure_cycle)(
             self.model, self.params, self.section_state, self.step_ends
         )
-
-    def model_summary_rows(self) -> list[LabelAndText]:
-        return [("durations of each kind of support", f"{format_numbers(self.durations)} s")]
 
 
 def measure_return_map_force_peaks(
@@ -237,17 +229,6 @@ class AbstractReturnMapFinder(AbstractGaitFinder):
     options_type: ClassVar[type] = StepOptions
     supports_cold_start: ClassVar[bool] = False
 
-    @classmethod
-    def from_options(
-        cls,
-        model: AbstractWheel,
-        n_legs: int,
-        step_options: StepOptions,
-        period_n: int,
-        cycle_options: CycleOptions,
-    ) -> "AbstractReturnMapFinder":
-        return cls(model, n_legs, step_options, period_n)
-
     def find_cycle(self, params: WheelParams, cycle_guess: Any = None) -> ReturnMapCycle:
         search_arguments = prepare_search(self, params, cycle_guess)
         return find_return_map_cycle(*search_arguments, self.period_n, uses_implicit_jvp=False)
@@ -283,18 +264,6 @@ class ReturnMapFinder(AbstractReturnMapFinder):
         measure_name for measure_name in cycle_measures if measure_name != "spectral_margin"
     )
     readable_measures: ClassVar[tuple[str, ...]] = differentiable_measures
-
-    def measure_gait(
-        self, parameter_values: ParameterValues, cycle_guess: Any, measure_names: tuple[str, ...]
-    ) -> GaitMeasures:
-        if set(measure_names) <= set(self.cycle_measures):
-            return compute_cycle_measures(self, parameter_values, cycle_guess, measure_names)
-        start_state = (
-            self.make_initial_guess(parameter_values) if cycle_guess is None else cycle_guess
-        )
-        return compute_gait_measures(
-            self.find_gait(parameter_values, start_state), type(self).read_measure, measure_names
-        )
 
     @eqx.filter_jit
     def find_gait(self, parameter_values: ParameterValues, cycle_guess: Array) -> Gait:

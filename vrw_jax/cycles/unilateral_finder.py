@@ -188,7 +188,7 @@ class UnilateralFinder(AbstractReturnMapFinder):
             evaluate_batch, self.gait_batch_sizes, newton_arguments[0], fixed_points
         )
 
-    def take_step(self, params: WheelParams, section_state: Array) -> AbstractStep:
+    def take_gait_step(self, params: WheelParams, section_state: Array) -> AbstractStep:
         parameter_value_columns, model = (
             np.asarray(self.model.collect_parameter_values(params))[:, None],
             self.model,

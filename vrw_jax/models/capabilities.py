@@ -51,6 +51,8 @@ class ModelCapabilities:
     """
     passage_method: PassageMethod = PassageMethod.SAMPLING
     """Method that `first_passage` uses with this model."""
+    supports_uneven_ground: bool = True
+    """Whether the slope may change from step to step of a walk."""
     can_begin_within_step: bool = False
     """Whether the model implements `finish_step`, so that a step can be disturbed at any
     instant.

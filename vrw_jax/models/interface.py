@@ -198,9 +198,9 @@ class AbstractWheel(eqx.Module):
     def split_ground_by_step(self, params: WheelParams, n_steps: int) -> StepGroundValues | None:
         """Return the ground of each step if slope or friction are arrays with one entry per step.
 
-        Return None otherwise.
+        Return None otherwise, and for models that do not support uneven ground.
         """
-        if jnp.ndim(params.slope) == 0:
+        if jnp.ndim(params.slope) == 0 or not self.capabilities.supports_uneven_ground:
             return None
         line_slopes = complete_line_slopes(params.slope, n_steps)
         return (jnp.stack([line_slopes[:-1], line_slopes[1:]], axis=-1),)

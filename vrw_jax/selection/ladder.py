@@ -260,6 +260,7 @@ class LadderWheel(AbstractContactWheel):
         config_name="auto",
         gait_method=GaitMethod.SELECTION,
         accepted_commands=frozenset({"scan"}),
+        supports_uneven_ground=False,
     )
 
     friction: Scalar = eqx.field(converter=convert_friction, default=0.7)
@@ -278,10 +279,6 @@ class LadderWheel(AbstractContactWheel):
     @property
     def fallback_model(self) -> UnilateralWheel:
         return self.unilateral_model
-
-    def split_ground_by_step(self, params: WheelParams, n_steps: int) -> None:
-        """Return None, because a ladder of models does not support changing slopes."""
-        return None
 
     def choose_model(
         self, params: WheelParams, x: FullState, options: StepOptions

@@ -514,7 +514,7 @@ class TuneProblem:
         is_gait_feasible, walk_outcome, n_walked = True, Outcome.STEPPED, 0
         margins_by_default = default_margins(params)
         for _ in range(walk_options.n_steps_of_walk):
-            step_result = self.gait_finder.take_step(params, jnp.asarray(section_state))
+            step_result = self.gait_finder.take_gait_step(params, jnp.asarray(section_state))
             walk_outcome = Outcome(int(step_result.outcome))
             if walk_outcome != Outcome.STEPPED:
                 break
