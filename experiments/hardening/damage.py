@@ -170,7 +170,7 @@ def compute() -> list[list[float]]:
     import jax
     import jax.numpy as jnp
 
-    from vrw_jax.runtime import (
+    from vrw_jax.numerics import (
         compile_cached_lane_function,
         compile_cached_lane_program,
         compile_exported_function,

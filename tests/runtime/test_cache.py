@@ -14,14 +14,12 @@ from jax.experimental.compilation_cache import compilation_cache
 from support.machine_code import CodeRegistrySpy
 
 import vrw_jax as vrw
-from vrw_jax.runtime import (
+from vrw_jax.numerics import (
     compile_cached_lane_function,
     compile_cached_lane_program,
     compile_exported_function,
 )
-from vrw_jax.runtime import (
-    disk_cache as store,
-)
+from vrw_jax.runtime import disk_cache as store
 
 X = np.arange(4.0)
 FACTORS = (2.0, 3.0)
@@ -208,7 +206,7 @@ def started(code="", **environment):
 def test_folders_of_code_are_the_users_alone_whatever_the_umask(tmp_path):
     code = (
         "vrw.start_jax(); import numpy as np; "
-        "from vrw_jax.runtime import compile_cached_lane_program; "
+        "from vrw_jax.numerics import compile_cached_lane_program; "
         "compile_cached_lane_program(lambda _, x: (2.0 * x[0],), [], 1, np.dtype(float), 'd')([], "
         "[np.ones(4)])"
     )

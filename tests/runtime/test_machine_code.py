@@ -8,14 +8,12 @@ from jax.experimental.compilation_cache import compilation_cache
 from support.machine_code import CodeRegistrySpy
 
 from vrw_jax import simd
-from vrw_jax.runtime import (
+from vrw_jax.numerics import (
     compile_cached_lane_function,
     compile_cached_lane_program,
     compile_exported_function,
 )
-from vrw_jax.runtime import (
-    disk_cache as store,
-)
+from vrw_jax.runtime import disk_cache as store
 from vrw_jax.simd import code_cache as code
 
 X = jnp.asarray(np.random.default_rng(0).normal(size=(2, 9)))

@@ -9,7 +9,7 @@ import pytest
 
 import vrw_jax as vrw
 from vrw_jax.hybrid import Guard, Mode, simulate_hybrid
-from vrw_jax.runtime import with_default_jax_settings
+from vrw_jax.numerics import with_default_jax_settings
 
 STRICT_SETTINGS = (
     ("jax_disable_jit", True),

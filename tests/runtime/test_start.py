@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import vrw_jax as vrw
-from vrw_jax.runtime.cached_programs import call_through_saved_trace
+from vrw_jax.numerics.cached_programs import call_through_saved_trace
 from vrw_jax.runtime.start import make_fusion_emitter_options
 
 

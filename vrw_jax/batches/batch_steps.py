@@ -44,8 +44,13 @@ from vrw_jax.models import (
     complete_jacobian_columns,
     compute_jacobian_columns,
 )
-from vrw_jax.numerics import StepOptions, batch_sizes, compile_batch_program, map_in_batches
-from vrw_jax.runtime import with_default_jax_settings
+from vrw_jax.numerics import (
+    StepOptions,
+    batch_sizes,
+    compile_batch_program,
+    map_in_batches,
+    with_default_jax_settings,
+)
 from vrw_jax.simulation import convert_model_argument, convert_section_state, convert_step_options
 from vrw_jax.validation import (
     check_choice,

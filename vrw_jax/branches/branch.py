@@ -14,8 +14,8 @@ import numpy as np
 
 from vrw_jax.continuation import floquet
 from vrw_jax.measures import MEASURES
+from vrw_jax.measures import xarray as xr
 from vrw_jax.printing import format_html_table
-from vrw_jax.runtime import xarray as xr
 from vrw_jax.wheel import Outcome
 
 MAX_PRINTED_SPECIAL_POINTS = 20

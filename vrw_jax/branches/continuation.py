@@ -51,10 +51,15 @@ from vrw_jax.measures import (
     make_locked_leg_coordinate,
     make_measure_attributes,
 )
+from vrw_jax.measures import xarray as xr
 from vrw_jax.models import AbstractWheel
-from vrw_jax.numerics import StepOptions, batch_sizes, map_in_numpy_batches, select_tree_rows
-from vrw_jax.runtime import with_default_jax_settings
-from vrw_jax.runtime import xarray as xr
+from vrw_jax.numerics import (
+    StepOptions,
+    batch_sizes,
+    map_in_numpy_batches,
+    select_tree_rows,
+    with_default_jax_settings,
+)
 from vrw_jax.selection import raise_for_ladder
 from vrw_jax.simulation import (
     ModelLike,

@@ -10,8 +10,7 @@ from vrw_jax.branches.curve_tracing import DEFAULT_CURVE_OPTIONS, CurveSeed, Cur
 from vrw_jax.branches.gait_test_functions import FORCE_QUANTITY_NAMES
 from vrw_jax.continuation import ArclengthOptions
 from vrw_jax.cycles import LimitCycle
-from vrw_jax.numerics import StepOptions, select_tree_rows
-from vrw_jax.runtime import with_default_jax_settings
+from vrw_jax.numerics import StepOptions, select_tree_rows, with_default_jax_settings
 from vrw_jax.validation import check_names, check_range, check_type
 from vrw_jax.wheel import PARAMETER_DOMAINS, check_parameter_name, make_wheel_from_parameters
 

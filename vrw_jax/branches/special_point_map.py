@@ -27,10 +27,9 @@ from vrw_jax.branches.curve_tracing import (
 from vrw_jax.branches.gait_test_functions import DLS_VANISHING_NAME, LINEAR_MARGIN_SUBSTITUTES
 from vrw_jax.continuation import BIFURCATION_NAMES
 from vrw_jax.measures import MARGIN_MEASURES
+from vrw_jax.measures import xarray as xr
 from vrw_jax.models import ViscoelasticWheel
-from vrw_jax.numerics import StepOptions
-from vrw_jax.runtime import with_default_jax_settings
-from vrw_jax.runtime import xarray as xr
+from vrw_jax.numerics import StepOptions, with_default_jax_settings
 from vrw_jax.wheel import Outcome, WheelParams
 
 

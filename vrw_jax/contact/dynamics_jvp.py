@@ -35,7 +35,7 @@ from vrw_jax.contact.mechanics import (
     prevent_fusion,
     sum_over_legs,
 )
-from vrw_jax.runtime import with_default_jax_settings
+from vrw_jax.numerics import with_default_jax_settings
 from vrw_jax.wheel import Symbols
 
 

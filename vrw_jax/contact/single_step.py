@@ -46,8 +46,13 @@ from vrw_jax.contact.walk_kernel import (
 from vrw_jax.contact.walk_tangents import walk_with_tangents
 from vrw_jax.integrator import ButcherTableau, load_explicit_tableau, sample_at_equal_times
 from vrw_jax.models import split_jacobian_by_leaf
-from vrw_jax.numerics import ForwardFunction, StepOptions, make_opaque_condition, unbatch
-from vrw_jax.runtime import compile_cached_lane_function
+from vrw_jax.numerics import (
+    ForwardFunction,
+    StepOptions,
+    compile_cached_lane_function,
+    make_opaque_condition,
+    unbatch,
+)
 from vrw_jax.wheel import stack_parameters
 
 

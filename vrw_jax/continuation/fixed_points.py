@@ -11,14 +11,18 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from vrw_jax.hybrid import ReturnMap, Termination, find_program
-from vrw_jax.numerics import Scalar, evaluate_with_jacobian, make_zero_tangent
+from vrw_jax.numerics import (
+    Scalar,
+    evaluate_with_jacobian,
+    make_zero_tangent,
+    with_default_jax_settings,
+)
 from vrw_jax.printing import (
     format_heading_and_rows,
     format_numbers,
     format_quantity,
     map_text_of_elements,
 )
-from vrw_jax.runtime import with_default_jax_settings
 from vrw_jax.validation import (
     check_callable,
     check_int,

@@ -15,8 +15,7 @@ from vrw_jax.cycles.gait_walks import (
     stack_section_units,
     walk_to_gaits,
 )
-from vrw_jax.numerics import concatenate_tree_rows, select_tree_rows
-from vrw_jax.runtime import with_default_jax_settings
+from vrw_jax.numerics import concatenate_tree_rows, select_tree_rows, with_default_jax_settings
 from vrw_jax.wheel import Outcome, WheelParams
 
 DUPLICATE_GAIT_DISTANCE = 1e-5

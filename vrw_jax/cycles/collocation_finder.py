@@ -41,8 +41,7 @@ from vrw_jax.measures import (
     MEASURES,
 )
 from vrw_jax.models import AbstractStep, SectionState, StepResult, ViscoelasticWheel
-from vrw_jax.numerics import StepOptions, evaluate_with_jacobian
-from vrw_jax.runtime import with_default_jax_settings
+from vrw_jax.numerics import StepOptions, evaluate_with_jacobian, with_default_jax_settings
 from vrw_jax.simulation import convert_step_arguments
 from vrw_jax.wheel import (
     PARAMETER_NAMES,

@@ -14,6 +14,7 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 
 from vrw_jax.continuation import floquet
 from vrw_jax.measures import FORCE_PEAK_MEASURES
+from vrw_jax.numerics import with_default_jax_settings
 from vrw_jax.printing import (
     AbstractPrintable,
     LabelAndText,
@@ -21,7 +22,6 @@ from vrw_jax.printing import (
     format_numbers,
     format_outcome_counts,
 )
-from vrw_jax.runtime import with_default_jax_settings
 from vrw_jax.validation import check_choice
 from vrw_jax.wheel import Outcome, WheelParams
 

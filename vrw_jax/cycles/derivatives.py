@@ -34,15 +34,13 @@ from vrw_jax.numerics import (
     ExecutionWrapper,
     apply_in_blocks,
     apply_jacobian,
+    call_through_saved_trace,
+    compile_cached_lane_function,
     make_implicit_jacobian,
     make_zero_tangent,
     unbatch,
-    with_implicit_derivative,
-)
-from vrw_jax.runtime import (
-    call_through_saved_trace,
-    compile_cached_lane_function,
     with_default_jax_settings,
+    with_implicit_derivative,
 )
 from vrw_jax.wheel import PARAMETER_DOMAINS, PARAMETER_NAMES, compute_symbols, compute_wheel_units
 

@@ -38,8 +38,13 @@ from vrw_jax.cycles.gait_walks import (
 from vrw_jax.cycles.limit_cycle_result import LimitCycle
 from vrw_jax.cycles.options import CycleOptions
 from vrw_jax.cycles.return_map_finder import ReturnMapCycle
-from vrw_jax.numerics import StepOptions, batch_sizes, map_in_batches, select_tree_rows
-from vrw_jax.runtime import with_default_jax_settings
+from vrw_jax.numerics import (
+    StepOptions,
+    batch_sizes,
+    map_in_batches,
+    select_tree_rows,
+    with_default_jax_settings,
+)
 from vrw_jax.simulation import ModelLike
 from vrw_jax.validation import (
     check_choice,

@@ -6,8 +6,7 @@ from collections.abc import Mapping
 
 from vrw_jax.collocation import PhasePoints
 from vrw_jax.measures import MEASURES
-from vrw_jax.numerics import Elementwise
-from vrw_jax.runtime import with_default_jax_settings
+from vrw_jax.numerics import Elementwise, with_default_jax_settings
 from vrw_jax.validation import check_type
 from vrw_jax.wheel import Motion, Symbols, WheelParams, dynamics
 

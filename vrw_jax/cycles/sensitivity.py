@@ -14,9 +14,8 @@ from vrw_jax.cycles.finder_selection import (
 )
 from vrw_jax.cycles.options import CycleOptions
 from vrw_jax.measures import MEASURES
-from vrw_jax.numerics import StepOptions
-from vrw_jax.runtime import with_default_jax_settings
-from vrw_jax.runtime import xarray as xr
+from vrw_jax.measures import xarray as xr
+from vrw_jax.numerics import StepOptions, with_default_jax_settings
 from vrw_jax.simulation import ModelLike
 from vrw_jax.validation import check_names, format_name_suggestion, require_untraced_arguments
 from vrw_jax.wheel import Outcome, WheelParams

@@ -43,8 +43,13 @@ from vrw_jax.integrator.tangents import (
     apply_batched_jvp_rule,
     stack_directions,
 )
-from vrw_jax.numerics import StepOptions, Vector, make_zero_tangent, select_tree_leaves
-from vrw_jax.runtime import with_default_jax_settings
+from vrw_jax.numerics import (
+    StepOptions,
+    Vector,
+    make_zero_tangent,
+    select_tree_leaves,
+    with_default_jax_settings,
+)
 from vrw_jax.simd import mark_noinline
 
 

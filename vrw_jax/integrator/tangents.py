@@ -29,8 +29,7 @@ from vrw_jax.integrator.tableaus import (
     StageState,
     evaluate_stage,
 )
-from vrw_jax.numerics import Vector, make_zero_tangent, run_if_any
-from vrw_jax.runtime import with_default_jax_settings
+from vrw_jax.numerics import Vector, make_zero_tangent, run_if_any, with_default_jax_settings
 
 
 class ImplicitDynamics(NamedTuple):

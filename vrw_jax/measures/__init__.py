@@ -1,5 +1,6 @@
-"""Table of measures and margins: names, symbols, units and descriptions."""
+"""Table of measures and margins: names, symbols, units and descriptions; labeled datasets."""
 
+from vrw_jax.measures.lazy_xarray import xarray
 from vrw_jax.measures.provenance import collect_provenance_attributes
 from vrw_jax.measures.table import (
     CONTACT_MEASURES,

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from vrw_jax.measures.lazy_xarray import xarray as xr
 from vrw_jax.printing import format_mathtext
-from vrw_jax.runtime import xarray as xr
 from vrw_jax.wheel import PAPER_PHASES, PARAMETER_DOMAINS, Outcome
 
 

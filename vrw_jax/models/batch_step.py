@@ -52,10 +52,10 @@ from vrw_jax.numerics import (
     ForwardFunction,
     StepOptions,
     Vector,
+    compile_cached_lane_function,
     compute_sine_cosine,
     unbatch,
 )
-from vrw_jax.runtime import compile_cached_lane_function
 from vrw_jax.wheel import (
     PARAMETER_NAMES,
     AbstractPhase,

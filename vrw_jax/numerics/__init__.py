@@ -1,5 +1,5 @@
-"""Types, options, trigonometry, and helper functions for automatic differentiation and for
-batches.
+"""Types, options, trigonometry, settings of JAX, compiled programs, and helper functions for
+automatic differentiation and for batches.
 """
 
 from vrw_jax.numerics import batch_sizes
@@ -40,6 +40,12 @@ from vrw_jax.numerics.batching import (
     select_tree_rows,
     unbatch,
 )
+from vrw_jax.numerics.cached_programs import (
+    call_through_saved_trace,
+    compile_cached_lane_function,
+    compile_cached_lane_program,
+    compile_exported_function,
+)
 from vrw_jax.numerics.cubic_minima import (
     MINIMUM_LOCATION_TOLERANCE,
     evaluate_cubic,
@@ -47,6 +53,7 @@ from vrw_jax.numerics.cubic_minima import (
 )
 from vrw_jax.numerics.forward_only import forbid_reverse_mode
 from vrw_jax.numerics.options import EngineName, SolverName, StepOptions
+from vrw_jax.numerics.settings import with_default_jax_settings
 from vrw_jax.numerics.status_codes import StatusCode
 from vrw_jax.numerics.trigonometry import compute_sine_cosine
 from vrw_jax.numerics.types import Elementwise, RealInput, Scalar, Vector

@@ -20,7 +20,7 @@ from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, PyTree
 
 from vrw_jax.numerics.batching import BatchFunction, unbatch
-from vrw_jax.runtime import with_default_jax_settings
+from vrw_jax.numerics.settings import with_default_jax_settings
 
 ForwardFunction = Callable[..., tuple[PyTree[Array], PyTree[Array]]]
 """Function of floating-point arrays that returns (float outputs, other outputs without

@@ -10,7 +10,7 @@ import jax
 import numpy as np
 
 from vrw_jax import simd
-from vrw_jax.runtime import compile_cached_lane_program
+from vrw_jax.numerics.cached_programs import compile_cached_lane_program
 
 STRAGGLER_COUNT_DIVISOR = 8
 """Ratio of the block size to the number of unfinished lanes at which an XLA program stops.

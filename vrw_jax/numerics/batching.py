@@ -16,7 +16,7 @@ from jax import lax
 from jax.custom_batching import custom_vmap
 from jaxtyping import Array, PyTree
 
-from vrw_jax.runtime import with_default_jax_settings
+from vrw_jax.numerics.settings import with_default_jax_settings
 
 BatchFunction = Callable[..., PyTree[Array]]
 """Function of arrays whose last axis is the batch."""

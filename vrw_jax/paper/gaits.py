@@ -24,9 +24,9 @@ from vrw_jax.measures import (
     make_locked_leg_coordinate,
     make_measure_attributes,
 )
+from vrw_jax.measures import xarray as xr
 from vrw_jax.models import SectionState, ViscoelasticWheel
 from vrw_jax.numerics import StepOptions
-from vrw_jax.runtime import xarray as xr
 from vrw_jax.simulation import step, walk
 from vrw_jax.wheel import Outcome, WheelParams
 

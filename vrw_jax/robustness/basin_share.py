@@ -9,10 +9,9 @@ from jaxtyping import Float
 
 from vrw_jax.cycles import AbstractCycle
 from vrw_jax.measures import POST_LANDING_COMPONENT_NAMES, PRE_TOUCHDOWN_COMPONENT_NAMES
-from vrw_jax.numerics import StepOptions
+from vrw_jax.numerics import StepOptions, with_default_jax_settings
 from vrw_jax.printing import AbstractPrintable, LabelAndText
 from vrw_jax.robustness.gait_arrival import StableGait, walk_until_on_gait
-from vrw_jax.runtime import with_default_jax_settings
 from vrw_jax.simulation import ModelLike, invert_landing_map
 from vrw_jax.validation import check_choice, check_int, check_range, check_real, check_type
 from vrw_jax.wheel import Outcome, WheelParams

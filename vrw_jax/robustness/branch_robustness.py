@@ -12,8 +12,9 @@ from vrw_jax.batches import step_batch
 from vrw_jax.branches import Branch
 from vrw_jax.cycles import CycleOptions, limit_cycle, resolve_finder
 from vrw_jax.measures import MEASURES, make_measure_attributes
+from vrw_jax.measures import xarray as xr
 from vrw_jax.models import AbstractWheel
-from vrw_jax.numerics import StepOptions
+from vrw_jax.numerics import StepOptions, with_default_jax_settings
 from vrw_jax.robustness.basin_share import StartBox, compute_basin_share, parse_start_box
 from vrw_jax.robustness.gait_arrival import StableGait
 from vrw_jax.robustness.gait_sensitivity import (
@@ -21,8 +22,6 @@ from vrw_jax.robustness.gait_sensitivity import (
     parse_sensitivity_measures,
 )
 from vrw_jax.robustness.smallest_disturbance import compute_smallest_disturbance
-from vrw_jax.runtime import with_default_jax_settings
-from vrw_jax.runtime import xarray as xr
 from vrw_jax.simulation import ModelLike, convert_model_argument, convert_step_options
 from vrw_jax.validation import check_int, check_names, check_type
 from vrw_jax.wheel import PARAMETER_NAMES, Outcome, WheelParams

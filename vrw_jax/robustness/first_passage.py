@@ -14,12 +14,17 @@ from jaxtyping import Array, Float, Int
 
 from vrw_jax.cycles import limit_cycle, resolve_model
 from vrw_jax.models import PassageMethod
-from vrw_jax.numerics import Scalar, StatusCode, StepOptions, make_zero_tangent
+from vrw_jax.numerics import (
+    Scalar,
+    StatusCode,
+    StepOptions,
+    make_zero_tangent,
+    with_default_jax_settings,
+)
 from vrw_jax.printing import AbstractPrintable, LabelAndText, describe_step_ending
 from vrw_jax.robustness.passage_gradient import differentiate_log_mean_steps
 from vrw_jax.robustness.rigid_passage import solve_rigid_passage
 from vrw_jax.robustness.sampled_passage import ExtinctGroupError, WalkerGroups, sample_passage
-from vrw_jax.runtime import with_default_jax_settings
 from vrw_jax.simulation import (
     ModelLike,
     convert_model_argument,

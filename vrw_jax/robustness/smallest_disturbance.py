@@ -12,10 +12,9 @@ from jaxtyping import Array, Float, Int
 
 from vrw_jax.cycles import AbstractCycle
 from vrw_jax.models import AbstractWheel, AdvanceResult
-from vrw_jax.numerics import StepOptions, batch_sizes, map_in_batches
+from vrw_jax.numerics import StepOptions, batch_sizes, map_in_batches, with_default_jax_settings
 from vrw_jax.printing import AbstractPrintable, LabelAndText
 from vrw_jax.robustness.gait_arrival import StableGait, walk_until_on_gait
-from vrw_jax.runtime import with_default_jax_settings
 from vrw_jax.simulation import ModelLike
 from vrw_jax.validation import check_int, check_positive
 from vrw_jax.wheel import Outcome, WheelParams

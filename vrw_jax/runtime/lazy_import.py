@@ -1,7 +1,7 @@
 """Lazy import of libraries, because importing all of them would add a second to every start."""
 
 import importlib
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 
 class _LazyLibrary:
@@ -19,9 +19,3 @@ def lazy_import(library_name: str) -> Any:
     read.
     """
     return _LazyLibrary(library_name)
-
-
-if TYPE_CHECKING:
-    import xarray as xarray
-else:
-    xarray = lazy_import("xarray")  # All labeled results are datasets of this library.

@@ -21,8 +21,12 @@ from jaxtyping import Array
 from vrw_jax.cycles import AbstractCycle, CycleOptions, confirm_outcome_by_step, make_finder
 from vrw_jax.measures import MARGIN_MEASURES
 from vrw_jax.models import AbstractWheel
-from vrw_jax.numerics import StepOptions, batch_sizes
-from vrw_jax.runtime import compile_exported_function, with_default_jax_settings
+from vrw_jax.numerics import (
+    StepOptions,
+    batch_sizes,
+    compile_exported_function,
+    with_default_jax_settings,
+)
 from vrw_jax.scans.measure_catalog import DIFFERENTIABLE_MEASURES, parse_derivative
 from vrw_jax.wheel import PARAMETER_NAMES, Outcome, WheelParams, make_wheel_from_parameters
 

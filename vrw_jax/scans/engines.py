@@ -27,9 +27,13 @@ from vrw_jax.cycles import (
 )
 from vrw_jax.measures import PASSAGE_MEASURES
 from vrw_jax.models import GaitMethod, ViscoelasticWheel
-from vrw_jax.numerics import batch_sizes, map_in_batches, map_in_numpy_batches
+from vrw_jax.numerics import (
+    batch_sizes,
+    map_in_batches,
+    map_in_numpy_batches,
+    with_default_jax_settings,
+)
 from vrw_jax.robustness import first_passage
-from vrw_jax.runtime import with_default_jax_settings
 from vrw_jax.scans.collocation_engine import (
     CollocationScanEngine,
     EvaluationRequest,

@@ -18,9 +18,8 @@ from pathlib import Path
 import numpy as np
 
 from vrw_jax.cycles import CycleOptions
-from vrw_jax.numerics import StepOptions
-from vrw_jax.runtime import with_default_jax_settings
-from vrw_jax.runtime import xarray as xr
+from vrw_jax.measures import xarray as xr
+from vrw_jax.numerics import StepOptions, with_default_jax_settings
 from vrw_jax.scans.design import AbstractSampleDesign
 from vrw_jax.scans.integrity import MANIFEST_ATTRIBUTE
 from vrw_jax.scans.planning import (

@@ -9,7 +9,7 @@ from time import perf_counter
 
 import numpy as np
 
-from vrw_jax.runtime import with_default_jax_settings
+from vrw_jax.numerics import with_default_jax_settings
 from vrw_jax.scans.collocation_engine import count_available_cores
 from vrw_jax.scans.design import AbstractSampleDesign, SampleColumns
 from vrw_jax.scans.execution import find_matching_store

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vrw_jax.runtime import xarray as xr
+from vrw_jax.measures import xarray as xr
 from vrw_jax.scans.design import SALTELLI_DESIGN_KIND
 from vrw_jax.scans.integrity import read_scan_manifest
 from vrw_jax.validation import check_names, check_type, format_name_suggestion

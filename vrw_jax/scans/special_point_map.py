@@ -14,8 +14,8 @@ from vrw_jax.branches import (
     SpecialPointCurve,
     trace_special_points,
 )
+from vrw_jax.measures import xarray as xr
 from vrw_jax.numerics import StepOptions
-from vrw_jax.runtime import xarray as xr
 from vrw_jax.scans.design import AbstractSampleDesign
 from vrw_jax.scans.execution import ProgressCallback, scan
 from vrw_jax.selection import describe_accepted_models

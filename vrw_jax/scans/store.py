@@ -22,8 +22,8 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
+from vrw_jax.measures import xarray as xr
 from vrw_jax.runtime import lazy_import
-from vrw_jax.runtime import xarray as xr
 from vrw_jax.scans.integrity import (
     CHECKSUM_ARRAY_NAME,
     CHECKSUM_GROUP_NAME,

@@ -17,10 +17,9 @@ from vrw_jax.measures import (
     collect_provenance_attributes,
     make_measure_attributes,
 )
+from vrw_jax.measures import xarray as xr
 from vrw_jax.models import AbstractWheel
-from vrw_jax.numerics import EngineName, StepOptions
-from vrw_jax.runtime import with_default_jax_settings
-from vrw_jax.runtime import xarray as xr
+from vrw_jax.numerics import EngineName, StepOptions, with_default_jax_settings
 from vrw_jax.simulation.attractors import (
     find_distinct_orbits,
     measure_orbit_steps,

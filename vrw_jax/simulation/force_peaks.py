@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from vrw_jax.measures import FORCE_PEAK_MEASURES, make_measure_attributes
-from vrw_jax.runtime import xarray as xr
+from vrw_jax.measures import xarray as xr
 from vrw_jax.validation import check_type
 
 

@@ -25,7 +25,7 @@ from vrw_jax.models import (
     StepResult,
     ViscoelasticWheel,
 )
-from vrw_jax.numerics import EngineName, StepOptions
+from vrw_jax.numerics import EngineName, StepOptions, with_default_jax_settings
 from vrw_jax.printing import (
     AbstractPrintable,
     LabelAndText,
@@ -34,7 +34,6 @@ from vrw_jax.printing import (
     format_outcome_counts,
     format_quantity,
 )
-from vrw_jax.runtime import with_default_jax_settings
 from vrw_jax.selection import LadderStep, LadderWheel, ModelChoice, describe_accepted_models
 from vrw_jax.validation import check_int, check_reals, check_type, format_value
 from vrw_jax.wheel import Outcome, WheelParams

@@ -20,9 +20,8 @@ import jax
 import numpy as np
 
 from vrw_jax.measures import MEASURES
-from vrw_jax.numerics import StepOptions, select_tree_rows
+from vrw_jax.numerics import StepOptions, select_tree_rows, with_default_jax_settings
 from vrw_jax.printing import AbstractPrintable, LabelAndText
-from vrw_jax.runtime import with_default_jax_settings
 from vrw_jax.tolerance.contact_steps import ContactWheelBatch
 from vrw_jax.tolerance.lower_fidelity import LowerFidelityGaits, ModelIndex, find_paper_gaits
 from vrw_jax.tolerance.measure_result import MeasureResult

@@ -18,8 +18,7 @@ import jax
 import numpy as np
 
 from vrw_jax.cycles import GaitChoice, compute_walk_starts, parse_gait_choice
-from vrw_jax.numerics import StepOptions, select_tree_rows
-from vrw_jax.runtime import with_default_jax_settings
+from vrw_jax.numerics import StepOptions, select_tree_rows, with_default_jax_settings
 from vrw_jax.tolerance.contact_steps import STEP_TOLERANCES, ContactWheelBatch
 from vrw_jax.tolerance.lower_fidelity import (
     LowerFidelityGaits,

@@ -36,9 +36,8 @@ from vrw_jax.measures import (
     make_flag_attributes,
     make_measure_attributes,
 )
-from vrw_jax.numerics import StepOptions
-from vrw_jax.runtime import with_default_jax_settings
-from vrw_jax.runtime import xarray as xr
+from vrw_jax.measures import xarray as xr
+from vrw_jax.numerics import StepOptions, with_default_jax_settings
 from vrw_jax.selection import VIOLATION_TEXT_BY_SELECTION_MARGIN, describe_accepted_models
 from vrw_jax.simulation import ModelLike, convert_model_argument, require_single_wheel
 from vrw_jax.tuning.exploration import ExplorationResult, explore_starts

@@ -6,8 +6,8 @@ import dataclasses
 from typing import Any, NamedTuple
 
 from vrw_jax.measures import MEASURES, get_measure
+from vrw_jax.measures import xarray as xr
 from vrw_jax.printing import format_heading_and_rows, format_html_table
-from vrw_jax.runtime import xarray as xr
 from vrw_jax.tuning.exploration import ExplorationResult
 from vrw_jax.tuning.maximization import TuneStatus
 from vrw_jax.wheel import Outcome, WheelParams

@@ -20,7 +20,7 @@ from jax.sharding import SingleDeviceSharding
 
 from vrw_jax import simd
 from vrw_jax.runtime import disk_cache as store
-from vrw_jax.runtime.start import make_fusion_emitter_options
+from vrw_jax.runtime import make_fusion_emitter_options
 
 
 def compile_exported_function(
