@@ -82,7 +82,7 @@ def _compute_one_step(_: np.ndarray) -> np.ndarray:
 
 def _compute_one_gait(_: np.ndarray) -> np.ndarray:
     gait = vrw.limit_cycle(vrw.WheelParams())
-    return np.concatenate([gait.section_state, np.abs(gait.floquet_multipliers)])[None]
+    return np.concatenate([gait.section_state, gait.durations])[None]
 
 
 def _compute_speed(parameters: jax.Array) -> jax.Array:
@@ -114,6 +114,43 @@ def _follow_branch(_: np.ndarray) -> np.ndarray:
     return branch.dataset.speed.values[[0, -1]][None]
 
 
+def _walk_over_uneven_ground(_: np.ndarray) -> np.ndarray:
+    slopes = 0.3 + 0.01 * np.sin(np.arange(10.0))
+    params = vrw.WheelParams(damping=200.0, slope=slopes)
+    return np.asarray(vrw.walk(params, vrw.paper_start(), 10).steps.section_state[-1])[None]
+
+
+def _compute_passage(_: np.ndarray) -> np.ndarray:
+    passage = vrw.first_passage(vrw.WheelParams(), 0.015, n_nodes=100, n_walkers=1024, tol=0.3)
+    return np.array([[passage.mean_steps]])
+
+
+def _compute_basin_share(_: np.ndarray) -> np.ndarray:
+    box = {"theta_touchdown": 0.1, "dtheta_touchdown": (0.8, 2.8), "dL1_touchdown": (-0.6, 0.2)}
+    return np.array([[vrw.basin_share(vrw.WheelParams(), box, n_starts=256, max_steps=50).share]])
+
+
+def _measure_to_tolerance(_: np.ndarray) -> np.ndarray:
+    result = vrw.measure_to_tolerance("speed", vrw.WheelParams(), 1e-2, friction=50.0)
+    return np.array([[float(np.asarray(result.values)[0])]])
+
+
+def _tune(_: np.ndarray) -> np.ndarray:
+    bounds = {"damping": (150.0, 210.0)}
+    result = vrw.tune(vrw.WheelParams(damping=180.0), "dls_fraction", ("damping",), bounds)
+    return np.array([[float(result.params.damping)]])
+
+
+def _find_unilateral_gait(_: np.ndarray) -> np.ndarray:
+    gait = vrw.limit_cycle(vrw.WheelParams(), model=vrw.UnilateralWheel(friction=2.0))
+    return np.array([[float(gait.speed), float(gait.period)]])
+
+
+def _compute_force_peaks(_: np.ndarray) -> np.ndarray:
+    peaks = vrw.limit_cycle(vrw.WheelParams()).force_peaks
+    return np.array([[float(peaks["n_force_peaks"]), float(peaks["peak_force"])]])
+
+
 class GpuJob(NamedTuple):
     """Function that is computed on both devices.
 
@@ -136,6 +173,13 @@ JOBS = {
     "gradient of one gait's speed": GpuJob(_compute_gradient, 0.0),
     "gait sensitivity of one gait": GpuJob(_compute_sensitivity, 0.0),
     "one branch in damping": GpuJob(_follow_branch, 0.0),
+    "one walk of ten steps over uneven ground": GpuJob(_walk_over_uneven_ground, 0.0),
+    "one gait with unilateral contact": GpuJob(_find_unilateral_gait, 0.0),
+    "force peaks of one gait": GpuJob(_compute_force_peaks, 0.0),
+    "speed to a tolerance of 1 %": GpuJob(_measure_to_tolerance, 0.0),
+    "tuning of one parameter": GpuJob(_tune, 0.0),
+    "basin share from 256 starts": GpuJob(_compute_basin_share, 0.0),
+    "mean first-passage time": GpuJob(_compute_passage, 0.0),
 }
 """Functions by their names in the table."""
 

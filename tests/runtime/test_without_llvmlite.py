@@ -23,6 +23,7 @@ results = {
     "section_state": vrw.return_map(params, start).tolist(),
     "period": float(vrw.limit_cycle(params).period),
     "section_states": vrw.step_batch(wheels, np.tile(start, (2, 1))).section_state.tolist(),
+    "branch": vrw.continue_branch(params, "damping", (199.5, 200.5)).dataset.speed.values.tolist(),
     "is_available": simd.is_machine_code_available(),
 }
 for name, call in {
@@ -64,6 +65,8 @@ def test_the_library_computes_without_llvmlite():
     assert_close(results["period"], vrw.limit_cycle(params).period)
     section_states = vrw.step_batch(wheels, np.tile(start, (2, 1))).section_state
     assert_close(results["section_states"], section_states)
+    branch = vrw.continue_branch(params, "damping", (199.5, 200.5))
+    assert_close(results["branch"], branch.dataset.speed)
     assert "llvmlite" in results["engine"]
     assert results["program"] == (
         "machine code needs llvmlite, which is not installed: pip install it."

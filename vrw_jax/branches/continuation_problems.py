@@ -294,7 +294,12 @@ def make_trial_linearizer(
         gait_quantity_function.__name__ if gait_quantity_function else "",
     )
     return unbatch(
-        compile_batch_function(linearize_trial, make_output_template, cache_key, batch_size=0)
+        compile_batch_function(
+            linearize_trial,
+            make_output_template,
+            cache_key,
+            collocation_system.cycle_options.batch_size,
+        )
     )
 
 
