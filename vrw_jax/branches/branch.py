@@ -54,8 +54,9 @@ class SpecialPoint:
     At a border collision, an indicator or a margin is zero.
 
     - `kind`: "fold", "branch_point", "period_doubling", "neimark_sacker", "border_collision",
-      "order_of_contacts_changes" (the branch continues with a kink or a jump) or "lost" (the order
-      of events changes, as `name` describes);
+      "order_of_contacts_changes" (the branch continues with a kink or a jump),
+      "number_of_force_peaks_changes" (a peak appears or disappears) or "lost" (the order of events
+      changes, as `name` describes);
     - `name`: name of the bifurcation, or of the quantity that vanishes or changes its sign;
     - `value`: value of the continued parameter at the special point;
     - `point`: fixed point next to the special point, on the side that belongs to the branch;

@@ -22,16 +22,16 @@ from vrw_jax.branches.jumps import continue_beyond_jumps, find_state_jumps
 from vrw_jax.branches.multiplicity import (
     BRANCH_POINT_KIND,
     CONTACT_ORDER_CHANGE,
-    CONTACT_ORDER_COLUMN,
     CROSSING_MULTIPLIER_COUNTS,
     LOCATED_ROOT_TOLERANCES,
     MULTIPLIER_MODULI_COLUMN,
+    STEPWISE_CHANGE_NAMES,
     NamedLocatedRoot,
     add_multiple_bifurcations,
     are_multipliers_off_circle,
-    drop_duplicate_order_changes,
+    drop_duplicate_changes,
     evaluate_named_quantity,
-    format_contact_order_quantity_name,
+    format_equality_quantity_name,
     sort_multiplier_moduli,
     vanishes_at_root,
 )
@@ -870,15 +870,22 @@ class _SpecialPointLocator(NamedTuple):
             jump_pairs = find_state_jumps(
                 section_states, parameter_fractions, fraction_rates, neighbor_pairs
             )
-        contact_orders = quantity_table.get(CONTACT_ORDER_COLUMN, np.zeros(len(all_point_indices)))
-        for left_index, right_index in self.point_table.find_neighbor_pairs(all_point_indices):
-            if contact_orders[left_index] != contact_orders[right_index]:
-                # Between the two orders of contacts there may be further orders.
-                root_requests += [
-                    (left_index, right_index, format_contact_order_quantity_name(contact_orders[i]))
-                    for i in (left_index, right_index)
-                ]
-                special_point_names += [CONTACT_ORDER_CHANGE] * 2
+        for stepwise_name, change_name in STEPWISE_CHANGE_NAMES.items():
+            integer_values = quantity_table.get(stepwise_name, np.zeros(len(all_point_indices)))
+            for left_index, right_index in self.point_table.find_neighbor_pairs(
+                np.flatnonzero(np.isfinite(integer_values))
+            ):
+                if integer_values[left_index] != integer_values[right_index]:
+                    # Between the two values of the quantity there may be further values.
+                    root_requests += [
+                        (
+                            left_index,
+                            right_index,
+                            format_equality_quantity_name(stepwise_name, integer_values[i]),
+                        )
+                        for i in (left_index, right_index)
+                    ]
+                    special_point_names += [change_name] * 2
         has_jump_between = lambda left_index, right_index: any(
             left_index <= i and j <= right_index for i, j in jump_pairs
         )
@@ -930,7 +937,7 @@ class _SpecialPointLocator(NamedTuple):
             quantity_table,
             fraction_rates,
             off_circle_pairs,
-            drop_duplicate_order_changes(named_roots),
+            drop_duplicate_changes(named_roots),
             self.locate_requested_roots,
         )
 
@@ -1115,7 +1122,7 @@ def continue_and_locate_special_points(
         )
         if (
             special_point_name in CROSSING_MULTIPLIER_COUNTS
-            or special_point_name == CONTACT_ORDER_CHANGE
+            or special_point_name in STEPWISE_CHANGE_NAMES.values()
         ):
             special_point_kind = special_point_name
         return SpecialPoint(

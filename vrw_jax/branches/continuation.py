@@ -26,6 +26,7 @@ from vrw_jax.branches.branch_location import (
 )
 from vrw_jax.branches.branch_starts import START_FUNCTION_BY_METHOD, BranchRequest
 from vrw_jax.branches.continuation_problems import FRICTION_SURPLUS_COLUMN_NAME, BranchWheel
+from vrw_jax.branches.multiplicity import SECOND_PEAK_RATE_NAME
 from vrw_jax.continuation import (
     ArclengthOptions,
     ContinuationPoint,
@@ -87,9 +88,6 @@ BRANCH_ENDING_QUANTITIES = (
     "duration_sls2",
 )
 """Names of the quantities that end a branch if they vanish, because the order of events changes."""
-
-SECOND_PEAK_RATE_NAME = "second_peak_rate"
-"""Name of a measure of the gait's force. A second force peak appears if the measure is zero."""
 
 DIFFERENTIATION_ADVICE = "differentiate vrw.limit_cycle"
 """Advice in the error message for a caller who differentiates a branch."""
@@ -236,7 +234,8 @@ def continue_branch(
         force_peaks: for the paper's model and for unilateral contact, add the measures of the
             gait's force. The branch then has the special point "second_peak_rate", at which a
             second peak appears. There the first and the second time derivative of the force are
-            zero at the same time.
+            zero at the same time. The special point "number_of_force_peaks_changes" is any other
+            change of the number of peaks, such as at a landing or at the start of slip.
 
     Returns:
         A `Branch`. If there is no gait from which to start, `outcome` is the reason.

@@ -17,7 +17,6 @@ from jaxtyping import Array
 
 from vrw_jax.branches.continuation import (
     DOUBLE_SUPPORT_INDICATOR_NAMES,
-    SECOND_PEAK_RATE_NAME,
     GaitContinuation,
 )
 from vrw_jax.branches.continuation_problems import (
@@ -26,6 +25,7 @@ from vrw_jax.branches.continuation_problems import (
     make_trial_linearizer,
     measure_gait_period,
 )
+from vrw_jax.branches.multiplicity import SECOND_PEAK_RATE_NAME
 from vrw_jax.collocation import CollocationSolution, PhasePoints
 from vrw_jax.continuation import (
     BIFURCATION_NAMES,

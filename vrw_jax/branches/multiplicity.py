@@ -30,6 +30,23 @@ CONTACT_ORDER_COLUMN = "contact_order"
 CONTACT_ORDER_CHANGE = "order_of_contacts_changes"
 """Name of the special point at which the order of contacts changes."""
 
+FORCE_PEAK_COUNT_COLUMN = "n_force_peaks"
+"""Name of the measure that counts the force peaks of a gait."""
+
+FORCE_PEAK_COUNT_CHANGE = "number_of_force_peaks_changes"
+"""Name of the special point at which a force peak appears or disappears, at an event or inside a
+phase.
+"""
+
+SECOND_PEAK_RATE_NAME = "second_peak_rate"
+"""Name of a measure of the gait's force. If it is zero, a force peak appears inside a phase."""
+
+STEPWISE_CHANGE_NAMES = {
+    CONTACT_ORDER_COLUMN: CONTACT_ORDER_CHANGE,
+    FORCE_PEAK_COUNT_COLUMN: FORCE_PEAK_COUNT_CHANGE,
+}
+"""Names of the special points at which a quantity with integer values changes, by its name."""
+
 NamedLocatedRoot = tuple[str, Any, int]
 """Name of a special point, its located root, and the number of multipliers on the unit circle."""
 
@@ -56,8 +73,8 @@ class LocatedRootTolerances:
     - `max_value_beside_root`: largest ratio of the quantity next to its root to the quantity at an
       end of the bracket; at a jump the ratio is larger. The value is chosen because the point next
       to the root may be at nine tenths of the distance to the root;
-    - `max_equal_parameter_distance`: relative distance below which two changes of the order of
-      contacts are the same change. The value is chosen because two searches may differ by the
+    - `max_equal_parameter_distance`: relative distance below which two changes of a stepwise
+      quantity are the same change. The value is chosen because two searches may differ by the
       change of the parameter over the shortest continuation step.
     """
 
@@ -92,12 +109,14 @@ def format_rank_quantity_name(first_rank: int, last_rank: int) -> str:
     return f"{MULTIPLIER_MODULI_COLUMN}:{first_rank}:{last_rank}"
 
 
-def format_contact_order_quantity_name(contact_order: float) -> str:
-    """Return the name of the quantity that is positive for only one order of contacts.
+def format_equality_quantity_name(stepwise_name: str, integer_value: float) -> str:
+    """Return the name of the quantity that is positive only where another quantity has one value.
 
-    The quantity is negative for all other orders.
+    The quantity is negative for all other values.
+
+    - `stepwise_name`: name of the other quantity, one of `STEPWISE_CHANGE_NAMES`.
     """
-    return f"{CONTACT_ORDER_COLUMN}:{int(contact_order)}"
+    return f"{stepwise_name}:{int(integer_value)}"
 
 
 def evaluate_named_quantity(
@@ -106,12 +125,13 @@ def evaluate_named_quantity(
     """Return the quantity with the given name at each point.
 
     The quantity is one of three kinds: a quantity of the table, the mean modulus of several ranks
-    minus 1, or a sign that identifies one order of contacts.
+    minus 1, or a sign that identifies one value of a stepwise quantity.
     """
-    if quantity_name.startswith(CONTACT_ORDER_COLUMN + ":"):
-        contact_orders = quantity_table[CONTACT_ORDER_COLUMN]
-        margin_sign = np.where(contact_orders == int(quantity_name.split(":")[1]), 1.0, -1.0)
-        return np.where(np.isnan(contact_orders), np.nan, margin_sign)
+    column_name, _, column_value = quantity_name.partition(":")
+    if column_name in STEPWISE_CHANGE_NAMES and column_value:
+        integer_values = quantity_table[column_name]
+        equality_sign = np.where(integer_values == int(column_value), 1.0, -1.0)
+        return np.where(np.isnan(integer_values), np.nan, equality_sign)
     if not quantity_name.startswith(MULTIPLIER_MODULI_COLUMN + ":"):
         return quantity_table[quantity_name]
     first_rank, last_rank = map(int, quantity_name.split(":")[1:])
@@ -202,20 +222,25 @@ def vanishes_at_root(
     )
 
 
-def drop_duplicate_order_changes(
+def drop_duplicate_changes(
     named_roots: list[NamedLocatedRoot],
     root_tolerances: LocatedRootTolerances = LOCATED_ROOT_TOLERANCES,
 ) -> list[NamedLocatedRoot]:
-    """Return the roots, with each change of the order of contacts only once.
+    """Return the roots, with each change of a stepwise quantity only once.
 
-    Each change is located twice, as the end of one order and as the start of the next order.
+    Each change is located twice, as the end of one value and as the start of the next value. A
+    change of the number of force peaks is omitted at a zero of the second peak's rate.
     """
+    is_same_change = lambda special_point_name, earlier_name: (
+        special_point_name == earlier_name in STEPWISE_CHANGE_NAMES.values()
+        or (special_point_name, earlier_name) == (FORCE_PEAK_COUNT_CHANGE, SECOND_PEAK_RATE_NAME)
+    )
     distinct_roots: list[NamedLocatedRoot] = []
     for special_point_name, located_root, n_multipliers in named_roots:
         roots_of_same_change = [
             other_located_root
             for other_special_point_name, other_located_root, _ in distinct_roots
-            if other_special_point_name == special_point_name == CONTACT_ORDER_CHANGE
+            if is_same_change(special_point_name, other_special_point_name)
         ]
         roots_of_same_change = [
             other_located_root

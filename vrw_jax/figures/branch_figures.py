@@ -34,7 +34,11 @@ BRANCH_END_COLOR = OKABE_ITO_PINK
 SPECIAL_POINT_LINE_STYLE = (0, (1, 1.2))
 """Dotted line style that marks a special point, chosen because no curve has this style."""
 
-SPECIAL_POINT_COLORS = {"lost": BRANCH_END_COLOR, "border_collision": OKABE_ITO_GREEN}
+SPECIAL_POINT_COLORS = {
+    "lost": BRANCH_END_COLOR,
+    "border_collision": OKABE_ITO_GREEN,
+    "number_of_force_peaks_changes": OKABE_ITO_GREEN,
+}
 """Colors of special points by kind. Other kinds, which change the stability, are black."""
 
 COMMON_BRANCH_PANELS = (
