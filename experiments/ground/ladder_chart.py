@@ -15,8 +15,8 @@ import vrw_jax as vrw
 from experiments.shared.command import make_parser, parse_and_start_jax
 from experiments.shared.tables import FIGURES, read_table, write_table
 from vrw_jax import figures as plots
+from vrw_jax.measures import MARGIN_MEASURES, SELECTION_MARGIN_NAMES
 from vrw_jax.scans import plan_scan
-from vrw_jax.selection import VIOLATION_TEXT_BY_SELECTION_MARGIN
 
 DAMPING = np.linspace(20.0, 400.0, 77)
 FRICTION = (0.7, 1.0, 2.0, 5.0, 10.0, 15.0, 20.0, 50.0, np.inf)
@@ -50,8 +50,8 @@ def draw() -> None:
     reason = np.array([int(r["reason"]) for r in read_table(REASON_TABLE)]).reshape(
         len(FRICTION), len(DAMPING)
     )
-    kinds = np.where(reason < 0, 1 + len(VIOLATION_TEXT_BY_SELECTION_MARGIN), reason)
-    margin_labels = VIOLATION_TEXT_BY_SELECTION_MARGIN.values()
+    kinds = np.where(reason < 0, 1 + len(SELECTION_MARGIN_NAMES), reason)
+    margin_labels = [MARGIN_MEASURES[name].violation_text for name in SELECTION_MARGIN_NAMES]
     labels = ["none: the paper's wheel is accurate", *margin_labels, "no gait of the paper's wheel"]
     shown_kinds = sorted({int(k) for k in kinds.ravel()})
     kind_index = np.vectorize({k: i for i, k in enumerate(shown_kinds)}.get)(kinds)

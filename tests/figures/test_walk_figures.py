@@ -6,8 +6,8 @@ import pytest
 import xarray as xr
 
 import vrw_jax as vrw
-from vrw_jax.contact.contact_modes import ContactMode
 from vrw_jax.figures import contact_figures, tornado_figure
+from vrw_jax.wheel import ContactMode
 
 
 @pytest.fixture(scope="module")

@@ -12,7 +12,6 @@ import vrw_jax as vrw
 from vrw_jax.contact.contact_modes import (
     ALL_MODES_MASK,
     AllowedContactModes,
-    ContactMode,
     ContactSignTolerances,
     choose_combination,
     solve_combination,
@@ -24,6 +23,7 @@ from vrw_jax.contact.mechanics import (
     find_contact_slots,
     make_inverse_inertia,
 )
+from vrw_jax.wheel import ContactMode
 
 N_CASES = 200
 RNG_SEED = 6

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import vrw_jax as vrw
-from vrw_jax.contact.contact_modes import ContactMode
+from vrw_jax.wheel import ContactMode
 
 TIGHT_OPTIONS = vrw.StepOptions.tight()
 SLIP_MODES = (ContactMode.SLIP_DOWN, ContactMode.SLIP_UP)

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import vrw_jax as vrw
+from vrw_jax.measures import SELECTION_MARGIN_NAMES
 from vrw_jax.selection.ladder import (
-    VIOLATION_TEXT_BY_SELECTION_MARGIN,
     ModelCode,
     describe_selection_reason,
 )
@@ -67,10 +67,7 @@ def test_each_batch_element_has_its_own_model_and_reason(ladder_steps):
     rows = [describe_selection_reason(int(reason)) for reason in step.choice.reason_code]
     assert ["all its margins are positive" in text for text in rows] == [True, False, False, True]
     assert "scuffs" in rows[1]
-    assert (
-        list(VIOLATION_TEXT_BY_SELECTION_MARGIN)[int(step.choice.reason_code[1]) - 1]
-        == "clearance_sls1"
-    )
+    assert SELECTION_MARGIN_NAMES[int(step.choice.reason_code[1]) - 1] == "clearance_sls1"
     assert "slide" in rows[2]
 
 

@@ -9,11 +9,11 @@ import pytest
 from reference_code import moreau_jean
 
 import vrw_jax as vrw
-from vrw_jax.contact.contact_modes import ContactMode
 from vrw_jax.contact.contact_state import ContactState, make_guard_layout
 from vrw_jax.contact.impacts import ContactLaw, classify_event, resolve_event
 from vrw_jax.contact.mechanics import WheelMotion, compute_kinetic_energy, compute_potential_energy
 from vrw_jax.contact.section import unpack_section_state
+from vrw_jax.wheel import ContactMode
 
 START = (0.1, 1.6, -0.1)
 SCENES = ((0.7, 200.0), (1.3, 200.0), (0.7, 300.0), (0.5, 100.0))  # friction, damping

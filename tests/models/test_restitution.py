@@ -7,10 +7,10 @@ import pytest
 from reference_code import complementarity
 
 import vrw_jax as vrw
-from vrw_jax.contact.contact_modes import ContactMode
 from vrw_jax.contact.contact_state import ContactState, make_guard_layout
 from vrw_jax.contact.impacts import ContactLaw, classify_event, project_motion, resolve_event
 from vrw_jax.contact.mechanics import WheelMotion, compute_kinetic_energy, compute_leg_directions
+from vrw_jax.wheel import ContactMode
 
 N_IMPACTS, RNG_SEED = 400, 3
 START = (0.1, 1.6, -0.1)

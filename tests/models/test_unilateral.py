@@ -12,7 +12,6 @@ from reference_code import moreau_jean
 from scipy.optimize import brentq
 
 import vrw_jax as vrw
-from vrw_jax.contact.contact_modes import ContactMode
 from vrw_jax.contact.contact_state import (
     ContactState,
     LossAccumulators,
@@ -36,6 +35,7 @@ from vrw_jax.contact.mechanics import (
 from vrw_jax.contact.section import unpack_section_state
 from vrw_jax.hybrid.minima import MonitoredFunctions
 from vrw_jax.hybrid.phase_integration import integrate_phase
+from vrw_jax.wheel import ContactMode
 
 START = (0.1, 1.6, -0.1)
 TIGHT_OPTIONS = vrw.StepOptions.tight()

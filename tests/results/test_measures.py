@@ -2,14 +2,15 @@
 
 import pytest
 
-from vrw_jax.measures import MARGIN_MEASURES, STEP_MEASURES, describe_violation
-from vrw_jax.printing import (
-    format_heading_and_rows,
-    format_html_table,
-    format_markdown_table,
+from vrw_jax.measures import (
+    MARGIN_MEASURES,
+    SELECTION_MARGIN_NAMES,
+    STEP_MEASURES,
+    describe_violation,
     format_mathtext,
 )
-from vrw_jax.selection.ladder import VIOLATION_TEXT_BY_SELECTION_MARGIN, describe_selection_reason
+from vrw_jax.printing import format_heading_and_rows, format_html_table, format_markdown_table
+from vrw_jax.selection.ladder import describe_selection_reason
 
 INDICATORS = ("lambda_I4", "lambda_2_plus", "lambda_4_plus")
 
@@ -38,7 +39,7 @@ def test_other_measures_describe_no_violation():
 
 
 def test_reasons_of_the_ladder_come_from_the_table():
-    for reason, name in enumerate(VIOLATION_TEXT_BY_SELECTION_MARGIN, start=1):
+    for reason, name in enumerate(SELECTION_MARGIN_NAMES, start=1):
         assert MARGIN_MEASURES[name].violation_text in describe_selection_reason(reason)
 
 

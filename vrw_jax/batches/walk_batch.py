@@ -8,13 +8,8 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from vrw_jax.printing import (
-    AbstractPrintable,
-    LabelAndText,
-    describe_step_ending,
-    format_outcome_counts,
-    format_quantity,
-)
+from vrw_jax.numerics import describe_step_ending
+from vrw_jax.printing import AbstractPrintable, LabelAndText, format_outcome_counts, format_quantity
 from vrw_jax.wheel import Outcome
 
 

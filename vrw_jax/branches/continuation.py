@@ -47,7 +47,6 @@ from vrw_jax.measures import (
     MARGIN_MEASURES,
     STEP_MEASURES,
     UNILATERAL_STEP_MEASURES,
-    collect_provenance_attributes,
     make_labeled_variables,
     make_locked_leg_coordinate,
     make_measure_attributes,
@@ -61,9 +60,9 @@ from vrw_jax.numerics import (
     select_tree_rows,
     with_default_jax_settings,
 )
-from vrw_jax.selection import raise_for_ladder
 from vrw_jax.simulation import (
     ModelLike,
+    collect_provenance_attributes,
     convert_model_argument,
     convert_step_options,
     require_single_wheel,
@@ -312,7 +311,11 @@ def continue_branches(
         convert_model_argument(model),
         convert_step_options(step_options or StepOptions.tight()),
     )
-    raise_for_ladder(model, "followed")
+    if model.fallback_model is not model:
+        raise TypeError(
+            "the ladder can't be followed, since its gaits jump where the model changes: give "
+            "vrw.ViscoelasticWheel() or vrw.UnilateralWheel()."
+        )
     check_parameter_name(name, model.parameter_names, "parameter")
     if check_int("period_n", period_n) > 1 and cycle is None:
         raise ValueError(

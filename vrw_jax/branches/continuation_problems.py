@@ -20,7 +20,6 @@ from jaxtyping import Array, Bool, Float
 
 from vrw_jax.branches.multiplicity import CONTACT_ORDER_COLUMN
 from vrw_jax.collocation import CollocationSolution, estimate_mesh_error
-from vrw_jax.contact import UnilateralWheel
 from vrw_jax.continuation import (
     AbstractContinuationProblem,
     ContinuationPoint,
@@ -371,7 +370,7 @@ class ReturnMapProblem(AbstractReturnMapProblem):
 class ContactGaitProblem(AbstractReturnMapProblem):
     """Continuation problem of gaits with unilateral contact, solved by batches of gait steps."""
 
-    model: UnilateralWheel
+    model: AbstractWheel
     step_options: StepOptions
     parameter_name: str = eqx.field(static=True)
     period_n: int = eqx.field(static=True)

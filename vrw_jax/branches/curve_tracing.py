@@ -51,10 +51,11 @@ from vrw_jax.continuation import (
     TestFunctionPoint,
 )
 from vrw_jax.cycles import CollocationSystem, LimitCycle, transfer_solution_to_mesh
-from vrw_jax.measures import MARGIN_MEASURES, collect_provenance_attributes, make_measure_attributes
+from vrw_jax.measures import MARGIN_MEASURES, make_measure_attributes
 from vrw_jax.measures import xarray as xr
 from vrw_jax.models import ViscoelasticWheel
 from vrw_jax.numerics import StepOptions, batch_sizes
+from vrw_jax.simulation import collect_provenance_attributes
 from vrw_jax.wheel import Outcome, WheelParams, make_wheel_from_parameters
 
 RANGE_EDGE_COLUMN = "edge of the box"

@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 
-from vrw_jax.hybrid import make_solver
 from vrw_jax.models import AbstractWheel, GaitMethod
 from vrw_jax.numerics import StepOptions
 from vrw_jax.scans import (
@@ -443,7 +442,6 @@ def _parse_config_tables(
         raise ValueError(str(model_error)) from model_error
     step_options = checked_config.make_options()
     step_options.check_tolerances(np.dtype(float))
-    make_solver(step_options.solver, step_options)
     return checked_config
 
 

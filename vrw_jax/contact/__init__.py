@@ -2,7 +2,6 @@
 
 from vrw_jax.contact import batch_walks
 from vrw_jax.contact.batch_walks import embed_section_states, step_batch_with_jacobian, walk_batch
-from vrw_jax.contact.contact_modes import ContactMode
 from vrw_jax.contact.contact_state import PackedState, unpack_state
 from vrw_jax.contact.mechanics import (
     compute_foot_heights,

@@ -12,7 +12,6 @@ from jax import lax
 from jaxtyping import Array
 
 from vrw_jax.contact.batch_integrator import pack_coordinates
-from vrw_jax.contact.contact_modes import ContactMode
 from vrw_jax.contact.impacts import project_motion
 from vrw_jax.contact.mechanics import WheelMotion
 from vrw_jax.contact.section import (
@@ -34,7 +33,13 @@ from vrw_jax.contact.walk_kernel import (
 from vrw_jax.contact.walk_tangents import walk_with_tangents
 from vrw_jax.integrator import load_explicit_tableau
 from vrw_jax.numerics import StepOptions, batch_sizes, compile_batch_program
-from vrw_jax.wheel import PARAMETER_NAMES, Symbols, compute_symbols, compute_wheel_units_of_rows
+from vrw_jax.wheel import (
+    PARAMETER_NAMES,
+    ContactMode,
+    Symbols,
+    compute_symbols,
+    compute_wheel_units_of_rows,
+)
 
 
 def walk_batch(

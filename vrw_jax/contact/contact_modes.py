@@ -17,7 +17,6 @@ The foot slides without friction only if neither is possible.
 import functools
 import itertools
 from collections.abc import Callable
-from enum import IntEnum
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -36,19 +35,10 @@ from vrw_jax.contact.mechanics import (
     prevent_fusion,
 )
 from vrw_jax.numerics import Elementwise, select_tree_leaves
-from vrw_jax.wheel import Symbols, compute_wheel_units
+from vrw_jax.wheel import ContactMode, Symbols, compute_wheel_units
 
 Friction = Elementwise | SlotPair
 """Friction coefficient for all feet, or a pair with one coefficient for each contact slot."""
-
-
-class ContactMode(IntEnum):
-    """Contact mode of a foot. Section states and trajectories contain these integers."""
-
-    OFF = 0  # in the air
-    STICK = 1  # at rest on the ground
-    SLIP_DOWN = 2  # sliding downhill
-    SLIP_UP = 3  # sliding uphill
 
 
 PAPER_RULE_SENTINEL = -np.inf

@@ -13,7 +13,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from vrw_jax.contact.contact_modes import ContactMode, Friction, replace_infinite_friction
+from vrw_jax.contact.contact_modes import Friction, replace_infinite_friction
 from vrw_jax.contact.dynamics_jvp import (
     ContactConfiguration,
     WheelForceSolution,
@@ -40,6 +40,7 @@ from vrw_jax.contact.mechanics import (
 )
 from vrw_jax.numerics import Elementwise, Scalar
 from vrw_jax.wheel import (
+    ContactMode,
     Symbols,
     are_coordinates_at_rest,
     are_rates_negligible,

@@ -13,12 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from vrw_jax.contact.contact_modes import (
-    ContactMode,
-    Friction,
-    replace_infinite_friction,
-    solve_combination,
-)
+from vrw_jax.contact.contact_modes import Friction, replace_infinite_friction, solve_combination
 from vrw_jax.contact.mechanics import (
     ContactInverseInertia,
     ContactSlots,
@@ -36,7 +31,7 @@ from vrw_jax.contact.mechanics import (
     sum_over_legs,
 )
 from vrw_jax.numerics import with_default_jax_settings
-from vrw_jax.wheel import Symbols
+from vrw_jax.wheel import ContactMode, Symbols
 
 
 class ContactConfiguration(NamedTuple):

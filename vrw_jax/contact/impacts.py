@@ -19,7 +19,6 @@ from vrw_jax.contact.contact_modes import (
     PAPER_RULE_SENTINEL,
     AllowedContactModes,
     ChosenModeCombination,
-    ContactMode,
     ContactSignTolerances,
     Friction,
     choose_combination,
@@ -53,7 +52,7 @@ from vrw_jax.contact.mechanics import (
     stop_gradients,
 )
 from vrw_jax.numerics import Elementwise, run_if_any, select_tree_leaves
-from vrw_jax.wheel import Symbols
+from vrw_jax.wheel import ContactMode, Symbols
 
 
 class ContactEvent(NamedTuple):

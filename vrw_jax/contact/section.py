@@ -6,7 +6,6 @@ The functions convert it to and from motions.
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from vrw_jax.contact.contact_modes import ContactMode
 from vrw_jax.contact.contact_state import ContactState
 from vrw_jax.contact.mechanics import WheelMotion, compute_leg_directions
 from vrw_jax.models import (
@@ -16,7 +15,7 @@ from vrw_jax.models import (
     replace_invalid_inputs,
 )
 from vrw_jax.numerics import Elementwise
-from vrw_jax.wheel import Symbols, WheelParams, WheelUnits, compute_length_at_touchdown
+from vrw_jax.wheel import ContactMode, Symbols, WheelParams, WheelUnits, compute_length_at_touchdown
 
 FullState = Float[Array, "n_full ..."]
 """State just before the foremost foot lands, as one vector of 4 + 3 n entries.

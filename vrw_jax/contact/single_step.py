@@ -23,7 +23,6 @@ from vrw_jax.contact.batch_integrator import (
     init_interval,
     unpack_motion,
 )
-from vrw_jax.contact.contact_modes import ContactMode
 from vrw_jax.contact.contact_state import (
     ContactState,
     LossAccumulators,
@@ -53,7 +52,7 @@ from vrw_jax.numerics import (
     make_opaque_condition,
     unbatch,
 )
-from vrw_jax.wheel import stack_parameters
+from vrw_jax.wheel import ContactMode, stack_parameters
 
 
 class ContactStepConfig(NamedTuple):

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from vrw_jax.contact.contact_modes import PAPER_RULE_SENTINEL, ContactMode, Friction
+from vrw_jax.contact.contact_modes import PAPER_RULE_SENTINEL, Friction
 from vrw_jax.contact.contact_state import (
     ContactState,
     GuardLayout,
@@ -35,7 +35,7 @@ from vrw_jax.contact.mechanics import WheelMotion, compute_landing_position
 from vrw_jax.contact.section import FullState, pack_section_state
 from vrw_jax.models import AbstractContactStep
 from vrw_jax.numerics import Elementwise, StepOptions, select_tree_leaves
-from vrw_jax.wheel import Outcome, Symbols, replace_rest_outcome
+from vrw_jax.wheel import ContactMode, Outcome, Symbols, replace_rest_outcome
 
 
 @dataclass(frozen=True)

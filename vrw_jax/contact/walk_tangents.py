@@ -30,7 +30,6 @@ from vrw_jax.contact.batch_integrator import (
     evaluate_guards_at_point,
     iterate_until_stopped,
 )
-from vrw_jax.contact.contact_modes import ContactMode
 from vrw_jax.contact.contact_state import ModeDynamics, compute_guard_scales
 from vrw_jax.contact.walk_kernel import (
     STATUS_UNFINISHED,
@@ -41,7 +40,7 @@ from vrw_jax.contact.walk_kernel import (
 )
 from vrw_jax.integrator import ButcherTableau, compute_real_stability_limit
 from vrw_jax.numerics import StepOptions, run_if_any, select_tree_leaves
-from vrw_jax.wheel import compute_wheel_units
+from vrw_jax.wheel import ContactMode, compute_wheel_units
 
 
 class _IntervalTangent(NamedTuple):

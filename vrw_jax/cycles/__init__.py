@@ -21,6 +21,8 @@ from vrw_jax.cycles.finder import (
     STATE_AGREEMENT_TOLERANCE,
     AbstractGaitFinder,
     Gait,
+    GaitFunction,
+    GaitMeasureReader,
     MeasureReader,
     confirm_outcome_by_step,
     evaluate_on_gait,

@@ -14,14 +14,8 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 
 from vrw_jax.continuation import floquet
 from vrw_jax.measures import FORCE_PEAK_MEASURES
-from vrw_jax.numerics import with_default_jax_settings
-from vrw_jax.printing import (
-    AbstractPrintable,
-    LabelAndText,
-    describe_step_ending,
-    format_numbers,
-    format_outcome_counts,
-)
+from vrw_jax.numerics import describe_step_ending, with_default_jax_settings
+from vrw_jax.printing import AbstractPrintable, LabelAndText, format_numbers, format_outcome_counts
 from vrw_jax.validation import check_choice
 from vrw_jax.wheel import Outcome, WheelParams
 

@@ -355,11 +355,18 @@ def evaluate_on_gaits(function_of_cycle_and_step: Callable, gait: Gait) -> tuple
     )(*cycles_and_steps)
 
 
+GaitFunction = Callable[[AbstractCycle, AbstractStep], Array]
+"""Function of a gait's cycle and of the step from its section state."""
+
+GaitMeasureReader = Callable[[str, AbstractCycle, AbstractStep], Array]
+"""Function that returns the measure with a given name of a gait's cycle and step."""
+
+
 @dataclass(frozen=True)
 class MeasureReader:
     """Function that maps a cycle and a step to the measures with the names `measure_names`."""
 
-    read_measure: Callable[[str, AbstractCycle, AbstractStep], Array]
+    read_measure: GaitMeasureReader
     measure_names: tuple[str, ...]
 
     def __call__(self, cycle: AbstractCycle, step: AbstractStep) -> dict[str, Array]:

@@ -9,7 +9,6 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from vrw_jax.contact import ContactMode
 from vrw_jax.figures.style import (
     DARK_GRAY_COLOR,
     LEG_1_COLOR,
@@ -23,6 +22,7 @@ from vrw_jax.figures.style import (
     format_axis_label,
 )
 from vrw_jax.measures import CONTACT_MODE_NAMES
+from vrw_jax.wheel import ContactMode
 
 CONTACT_MODE_COLORS = ("white", OKABE_ITO_GREEN, OKABE_ITO_AMBER, OKABE_ITO_PINK)
 """Colors of the contact modes, by contact code."""

@@ -19,8 +19,7 @@ from matplotlib.colors import BoundaryNorm, ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
-from vrw_jax.measures import MEASURES
-from vrw_jax.printing import format_mathtext
+from vrw_jax.measures import MEASURES, format_mathtext
 from vrw_jax.validation import check_type
 from vrw_jax.wheel import Outcome
 

@@ -10,7 +10,6 @@ from vrw_jax.hybrid.phase_integration import (
     PhaseEnd,
     VectorField,
     integrate_phase,
-    make_solver,
 )
 from vrw_jax.hybrid.program_cache import find_program
 from vrw_jax.hybrid.return_map import ReturnMap

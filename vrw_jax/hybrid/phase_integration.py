@@ -225,40 +225,25 @@ class _SolverStepper(NamedTuple):
         )
 
 
-def make_solver(solver_name: str, options: StepOptions) -> diffrax.AbstractAdaptiveSolver:
-    """Return the diffrax solver called `solver_name`, configured for forward-mode derivatives.
+def _make_stepper(
+    vector_field: VectorField, options: StepOptions, max_step_growth: float
+) -> _SolverStepper:
+    """Return the solver and step-size controller that `options` select for a vector field.
 
-    An unknown name, or a solver without an error estimate, raises a ValueError.
+    `max_step_growth` is the largest ratio of successive step lengths. The solver is configured for
+    forward-mode derivatives.
     """
-    diffrax_solver_class = getattr(diffrax, solver_name, None)
-    if not (
-        isinstance(diffrax_solver_class, type)
-        and issubclass(diffrax_solver_class, diffrax.AbstractAdaptiveSolver)
-    ):
-        raise ValueError(
-            f"solver is {solver_name!r}, but it must name a diffrax solver with an error estimate: "
-            "take 'Dopri8', 'Tsit5', 'Dopri5', 'Kvaerno3' or 'Kvaerno5'."
-        )
-    field_names = getattr(diffrax_solver_class, "__dataclass_fields__", {})
+    diffrax_solver_class = getattr(diffrax, options.solver)
+    field_names = diffrax_solver_class.__dataclass_fields__
     solver_arguments: dict[str, Any] = {}
     if "scan_kind" in field_names:
         solver_arguments["scan_kind"] = "lax"
     if "root_finder" in field_names:
         tolerances: dict[str, Any] = {"rtol": options.rtol, "atol": options.atol}
         solver_arguments["root_finder"] = diffrax.VeryChord(**tolerances)
-    return diffrax_solver_class(**solver_arguments)
-
-
-def _make_stepper(
-    vector_field: VectorField, options: StepOptions, max_step_growth: float
-) -> _SolverStepper:
-    """Return the solver and step-size controller that `options` select for a vector field.
-
-    `max_step_growth` is the largest ratio of successive step lengths.
-    """
     return _SolverStepper(
         vector_field=vector_field,
-        diffrax_solver=make_solver(options.solver, options),
+        diffrax_solver=diffrax_solver_class(**solver_arguments),
         step_size_controller=diffrax.PIDController(
             rtol=options.rtol, atol=options.atol, factormax=max_step_growth
         ),

@@ -24,11 +24,11 @@ from vrw_jax.numerics import (
     Scalar,
     StatusCode,
     StepOptions,
+    describe_step_ending,
     forbid_reverse_mode,
     make_opaque_condition,
     with_default_jax_settings,
 )
-from vrw_jax.printing import describe_step_ending
 from vrw_jax.validation import check_callable, check_int, check_reals, check_type
 
 MAX_STORED_NUMBERS = 100_000_000

@@ -1,7 +1,7 @@
 """Table of measures and margins: names, symbols, units and descriptions; labeled datasets."""
 
 from vrw_jax.measures.lazy_xarray import xarray
-from vrw_jax.measures.provenance import collect_provenance_attributes
+from vrw_jax.measures.mathtext import format_mathtext
 from vrw_jax.measures.table import (
     CONTACT_MEASURES,
     CONTACT_MODE_NAMES,
@@ -15,6 +15,7 @@ from vrw_jax.measures.table import (
     PHASE_NAMES,
     POST_LANDING_COMPONENT_NAMES,
     PRE_TOUCHDOWN_COMPONENT_NAMES,
+    SELECTION_MARGIN_NAMES,
     SHARED_STEP_MEASURE_NAMES,
     STEP_MEASURES,
     STOPPER_MARGIN_MEASURES,

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from vrw_jax.measures.lazy_xarray import xarray as xr
-from vrw_jax.printing import format_mathtext
+from vrw_jax.measures.mathtext import format_mathtext
 from vrw_jax.wheel import PAPER_PHASES, PARAMETER_DOMAINS, Outcome
 
 
@@ -203,6 +203,18 @@ UNILATERAL_STEP_MEASURES = _index_measures_by_name(
             "Coulomb's coefficient of friction of the ground."),
 )
 """Measures that steps with unilateral contact have in addition to shared `STEP_MEASURES`."""
+
+SELECTION_MARGIN_NAMES = (
+    "fore_foot_force",
+    "clearance_sls1",
+    "clearance_sls2",
+    "contraction",
+    "friction_fore",
+    "friction_rear",
+    "landing_friction_fore",
+    "landing_friction_rear",
+)
+"""Names of the margins of the assumptions that only the viscoelastic model makes."""
 
 STOPPER_MARGIN_MEASURES = _index_measures_by_name(
     Measure("stopper_force", "N", "min F_stop", "least force of a stopper on a leg in the air",

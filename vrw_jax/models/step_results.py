@@ -11,13 +11,8 @@ from jaxtyping import Array, Float, Int
 
 from vrw_jax.measures import MARGIN_MEASURES, MEASURES
 from vrw_jax.models.step_inputs import AnySectionState
-from vrw_jax.printing import (
-    AbstractPrintable,
-    LabelAndText,
-    describe_step_ending,
-    format_outcome_counts,
-    format_quantity,
-)
+from vrw_jax.numerics import describe_step_ending
+from vrw_jax.printing import AbstractPrintable, LabelAndText, format_outcome_counts, format_quantity
 from vrw_jax.wheel import Outcome
 
 MeasureValue = Float[Array, "..."]

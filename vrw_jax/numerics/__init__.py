@@ -54,7 +54,7 @@ from vrw_jax.numerics.cubic_minima import (
 from vrw_jax.numerics.forward_only import forbid_reverse_mode
 from vrw_jax.numerics.options import EngineName, SolverName, StepOptions
 from vrw_jax.numerics.settings import with_default_jax_settings
-from vrw_jax.numerics.status_codes import StatusCode
+from vrw_jax.numerics.status_codes import StatusCode, describe_step_ending
 from vrw_jax.numerics.trigonometry import compute_sine_cosine
 from vrw_jax.numerics.types import Elementwise, RealInput, Scalar, Vector
 from vrw_jax.validation import raise_for_missing_numerics_name as __getattr__

@@ -1,6 +1,9 @@
 """Status codes: integers for batch elements, each with a sentence that explains it."""
 
 import enum
+from typing import Any
+
+from vrw_jax.printing import map_text_of_elements
 
 
 class StatusCode(enum.IntEnum):
@@ -16,3 +19,9 @@ class StatusCode(enum.IntEnum):
         status_code = int.__new__(cls, value)
         status_code._value_, status_code.meaning = value, meaning
         return status_code
+
+
+def describe_step_ending(status_codes: Any, status_code_class: type[StatusCode]) -> Any:
+    """Return the sentence that explains a status code, or an array of sentences for a batch."""
+    describe_code = lambda status_code: status_code_class(int(status_code)).meaning
+    return map_text_of_elements(describe_code, status_codes)

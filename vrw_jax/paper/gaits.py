@@ -19,15 +19,13 @@ import numpy as np
 from vrw_jax.measures import (
     MARGIN_MEASURES,
     STEP_MEASURES,
-    collect_provenance_attributes,
     make_labeled_variables,
     make_locked_leg_coordinate,
     make_measure_attributes,
 )
 from vrw_jax.measures import xarray as xr
 from vrw_jax.models import SectionState, ViscoelasticWheel
-from vrw_jax.numerics import StepOptions
-from vrw_jax.simulation import step, walk
+from vrw_jax.simulation import collect_provenance_attributes, step, walk
 from vrw_jax.wheel import Outcome, WheelParams
 
 
@@ -105,7 +103,7 @@ def walk_into_gait(
             "last_change": last_change,
             "settled": int(is_settled),
         }
-        | collect_provenance_attributes(params, make_formally_continued_model(), StepOptions()),
+        | collect_provenance_attributes(params, make_formally_continued_model()),
     )
 
 
@@ -224,9 +222,7 @@ def _make_gait_dataset(
         "component": ["theta", "dtheta", "dL1"],
         "leg": make_locked_leg_coordinate(params.n_legs),
     }
-    provenance_attributes = collect_provenance_attributes(
-        params, make_formally_continued_model(), StepOptions()
-    )
+    provenance_attributes = collect_provenance_attributes(params, make_formally_continued_model())
     provenance_attributes.pop(f"parameter_{parameter_name}")
     dataset_attributes = {
         "title": f"Gaits walked to along {parameter_name}"

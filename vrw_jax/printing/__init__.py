@@ -3,11 +3,9 @@
 from vrw_jax.printing.text import (
     AbstractPrintable,
     LabelAndText,
-    describe_step_ending,
     format_heading_and_rows,
     format_html_table,
     format_markdown_table,
-    format_mathtext,
     format_numbers,
     format_outcome_counts,
     format_quantity,

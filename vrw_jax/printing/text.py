@@ -1,9 +1,7 @@
-"""Text for results: labeled lines, HTML and Markdown tables, and symbols as mathtext."""
+"""Text for results: labeled lines, HTML and Markdown tables."""
 
 import abc
 import enum
-import re
-import unicodedata
 from collections.abc import Callable, Iterable, Sequence
 from html import escape
 from typing import Any
@@ -88,12 +86,6 @@ def map_text_of_elements(element_text_function: Callable[..., str], *element_val
     return np.vectorize(element_text_function, otypes=[object])(*element_values)[()]
 
 
-def describe_step_ending(status_codes: Any, status_code_class: type[enum.IntEnum]) -> Any:
-    """Return the sentence that explains a status code, or an array of sentences for a batch."""
-    describe_code = lambda status_code: status_code_class(int(status_code)).meaning  # type: ignore[attr-defined]
-    return map_text_of_elements(describe_code, status_codes)
-
-
 def format_heading_and_rows(heading_text: str, text_rows: Iterable[LabelAndText]) -> str:
     """Return a text that consists of a heading and one indented line per row."""
     return "\n".join(
@@ -135,38 +127,6 @@ def format_markdown_table(
         "|" + "---|" * len(header_cells),
         *map(format_table_line, text_rows),
     ]
-
-
-_MATHTEXT_BY_SYMBOL = {
-    "θ": r"\theta ", "κ": r"\kappa ", "λ": r"\lambda ", "μ": r"\mu ", "ρ": r"\rho ",
-    "Δ": r"\Delta ", "σ": r"\sigma ", "∂": r"\partial ", "phi": r"\phi ", "min": r"\min ",
-    "⁺": "^+", "⁻": "^-", "²": "^2", "*": "^*", "₀": "_0", "₁": "_1",
-}  # fmt: skip
-_SYMBOL_TOKEN_PATTERN = re.compile(
-    r"_(?P<below>\w[\w-]*(?:, ?\w+)?)|(?P<dotted>\w)\u0307|(?P<twice>\w)\u0308"
-    r"|(?P<word>[A-Za-z]{2,}(?:-I+)?)"
-    r"|(?P<index>(?<=[^\W\d_]|\u0307|\u0308)\d)|(?P<sign>[^\s\d()|/,A-Za-z-])"
-)
-
-
-def format_mathtext(symbol_text: str) -> str:
-    r"""Convert a symbol to mathtext: "θ̇⁺" to \dot{\theta}^+, "L1" to L_1."""
-
-    def format_symbol_token(token_match: re.Match[str]) -> str:
-        token_kind = token_match.lastgroup or ""
-        token_text = token_match[token_kind]
-        is_upright_text = token_kind == "word" or re.search("[A-Za-z]{3}", token_text)
-        token_mathtext = _MATHTEXT_BY_SYMBOL.get(
-            token_text, f"\\mathrm{{{token_text}}}" if is_upright_text else token_text
-        )
-        return {
-            "below": f"_{{{token_mathtext}}}",
-            "dotted": f"\\dot{{{token_mathtext}}}",
-            "twice": f"\\ddot{{{token_mathtext}}}",
-            "index": f"_{token_mathtext}",
-        }.get(token_kind, token_mathtext)
-
-    return _SYMBOL_TOKEN_PATTERN.sub(format_symbol_token, unicodedata.normalize("NFD", symbol_text))
 
 
 def format_numbers(printed_numbers: object) -> str:

@@ -18,10 +18,11 @@ from vrw_jax.numerics import (
     Scalar,
     StatusCode,
     StepOptions,
+    describe_step_ending,
     make_zero_tangent,
     with_default_jax_settings,
 )
-from vrw_jax.printing import AbstractPrintable, LabelAndText, describe_step_ending
+from vrw_jax.printing import AbstractPrintable, LabelAndText
 from vrw_jax.robustness.passage_gradient import differentiate_log_mean_steps
 from vrw_jax.robustness.rigid_passage import solve_rigid_passage
 from vrw_jax.robustness.sampled_passage import ExtinctGroupError, WalkerGroups, sample_passage

@@ -17,8 +17,8 @@ from vrw_jax.cycles import (
     resolve_model,
 )
 from vrw_jax.measures import MARGIN_MEASURES, MEASURES, STEP_MEASURES, UNILATERAL_STEP_MEASURES
-from vrw_jax.numerics import Scalar, StepOptions, with_default_jax_settings
-from vrw_jax.printing import AbstractPrintable, LabelAndText, describe_step_ending
+from vrw_jax.numerics import Scalar, StepOptions, describe_step_ending, with_default_jax_settings
+from vrw_jax.printing import AbstractPrintable, LabelAndText
 from vrw_jax.simulation import ModelLike
 from vrw_jax.validation import check_names, has_traced_leaf, require_known_name
 from vrw_jax.wheel import Outcome, WheelParams

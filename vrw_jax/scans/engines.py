@@ -25,7 +25,7 @@ from vrw_jax.cycles import (
     find_slow_gaits,
     make_finder,
 )
-from vrw_jax.measures import PASSAGE_MEASURES
+from vrw_jax.measures import PASSAGE_MEASURES, SELECTION_MARGIN_NAMES
 from vrw_jax.models import GaitMethod, ViscoelasticWheel
 from vrw_jax.numerics import (
     batch_sizes,
@@ -42,7 +42,7 @@ from vrw_jax.scans.collocation_engine import (
     stack_parameter_rows,
 )
 from vrw_jax.scans.measure_catalog import make_error_variable_name, parse_derivative
-from vrw_jax.selection import VIOLATION_TEXT_BY_SELECTION_MARGIN, ModelCode, find_selection_reason
+from vrw_jax.selection import ModelCode, find_selection_reason
 from vrw_jax.tolerance import ModelIndex, measure_to_tolerance
 from vrw_jax.wheel import FRICTION_NAME, PARAMETER_NAMES, Outcome, make_wheel_from_parameters
 
@@ -287,7 +287,7 @@ class ModelSelectionScanEngine:
           name;
         - `sample_friction`: friction coefficient of the ground for each sample.
         """
-        variable_names = (*VIOLATION_TEXT_BY_SELECTION_MARGIN, "outcome")
+        variable_names = (*SELECTION_MARGIN_NAMES, "outcome")
         selection_reasons = map_in_numpy_batches(
             _find_batch_selection_reasons,
             (batch_sizes.GAIT_READ_BATCH_SIZE,),

@@ -15,12 +15,7 @@ import numpy as np
 
 from vrw_jax import simd
 from vrw_jax.cycles import CycleOptions, make_finder
-from vrw_jax.measures import (
-    MARGIN_MEASURES,
-    collect_provenance_attributes,
-    make_locked_leg_coordinate,
-    make_measure_attributes,
-)
+from vrw_jax.measures import MARGIN_MEASURES, make_locked_leg_coordinate, make_measure_attributes
 from vrw_jax.models import AbstractWheel, ModelCapabilities, ViscoelasticWheel
 from vrw_jax.numerics import StepOptions, batch_sizes
 from vrw_jax.runtime import compute_source_digest
@@ -44,7 +39,13 @@ from vrw_jax.scans.store import (
     find_first_settings_difference,
 )
 from vrw_jax.selection import describe_accepted_models
-from vrw_jax.simulation import ModelLike, convert_model_argument, convert_step_options
+from vrw_jax.simulation import (
+    ModelLike,
+    collect_provenance_attributes,
+    convert_model_argument,
+    convert_step_options,
+    require_compliant_model,
+)
 from vrw_jax.validation import check_int, check_names, check_positive, check_type
 from vrw_jax.wheel import FRICTION_NAME, PARAMETER_NAMES, WheelParams
 
@@ -216,11 +217,7 @@ def plan_scan(
             f"the design has {design.size:,} samples, but a scan takes {MAX_SCAN_SAMPLES:,} at "
             "most: give its axes fewer values, or draw samples with vrw.sobol."
         )
-    if not model.is_compliant:
-        raise TypeError(
-            f"model is {model!r}, but a scan is of gaits with compliant legs: give "
-            f"{describe_accepted_models('scan')}."
-        )
+    require_compliant_model(model, "a scan is of gaits with", "scan")
     if FRICTION_NAME in design.swept_parameters and FRICTION_NAME not in model.parameter_names:
         raise ValueError(
             "the design sweeps friction, which does not affect the paper's wheel: give "

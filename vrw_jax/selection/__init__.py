@@ -2,13 +2,11 @@
 
 from vrw_jax.selection.ladder import (
     SELECTION_VARIABLE_ATTRIBUTES,
-    VIOLATION_TEXT_BY_SELECTION_MARGIN,
     LadderStep,
     LadderWheel,
     ModelChoice,
     ModelCode,
     find_selection_reason,
-    raise_for_ladder,
 )
 from vrw_jax.selection.registry import (
     REGISTERED_MODEL_CLASSES,

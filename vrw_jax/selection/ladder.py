@@ -20,14 +20,13 @@ from jaxtyping import Array, Float, Int
 from vrw_jax.contact import (
     LOCKED_CODE_OFFSET,
     AbstractContactWheel,
-    ContactMode,
     FullState,
     UnilateralStep,
     UnilateralTrajectory,
     UnilateralWheel,
     embed_section_state,
 )
-from vrw_jax.measures import MARGIN_MEASURES
+from vrw_jax.measures import MARGIN_MEASURES, SELECTION_MARGIN_NAMES
 from vrw_jax.models import (
     PAPER_START_STATE,
     AbstractContactStep,
@@ -43,6 +42,7 @@ from vrw_jax.models import (
 from vrw_jax.numerics import RealInput, Scalar, StepOptions
 from vrw_jax.printing import AbstractPrintable, LabelAndText, map_text_of_elements
 from vrw_jax.wheel import (
+    ContactMode,
     Outcome,
     WheelParams,
     convert_friction,
@@ -57,24 +57,7 @@ class ModelCode(enum.IntEnum):
     UNILATERAL = 2
 
 
-VIOLATION_TEXT_BY_SELECTION_MARGIN: dict[str, str] = {
-    name: MARGIN_MEASURES[name].violation_text
-    for name in (
-        "fore_foot_force",
-        "clearance_sls1",
-        "clearance_sls2",
-        "contraction",
-        "friction_fore",
-        "friction_rear",
-        "landing_friction_fore",
-        "landing_friction_rear",
-    )
-}
-"""Margins of the assumptions that only the viscoelastic model makes. The keys are names of margins,
-and the values are texts that describe a violation.
-"""
-
-START_NOT_EMBEDDABLE_REASON_CODE = 1 + len(VIOLATION_TEXT_BY_SELECTION_MARGIN)
+START_NOT_EMBEDDABLE_REASON_CODE = 1 + len(SELECTION_MARGIN_NAMES)
 """Reason code for a start that is not a section state of the viscoelastic model."""
 
 
@@ -90,7 +73,7 @@ SELECTION_VARIABLE_ATTRIBUTES: dict[str, dict[str, object]] = {
         "long_name": "why that model was used",
         "units": "1",
         "description": "0: all margins of the paper's wheel hold; above: the first that breaks, "
-        f"of {', '.join(VIOLATION_TEXT_BY_SELECTION_MARGIN)}; below: minus that wheel's outcome.",
+        f"of {', '.join(SELECTION_MARGIN_NAMES)}; below: minus that wheel's outcome.",
     },
 }
 """Attributes of the dataset variables that `ModelChoice.collect_selection_codes` returns."""
@@ -101,11 +84,11 @@ class ModelChoice(AbstractPrintable):
 
     - `model_code`: code of the model, `ModelCode.VISCOELASTIC` or `ModelCode.UNILATERAL`;
     - `reason_code`: 0 if the viscoelastic model is valid. If a margin is violated, the code is 1 +
-      the index of the first such margin in `VIOLATION_TEXT_BY_SELECTION_MARGIN`. If a leg other
+      the index of the first such margin in `SELECTION_MARGIN_NAMES`. If a leg other
       than Leg 1 is loaded or off its stopper at the start, the code is
       `START_NOT_EMBEDDABLE_REASON_CODE`. If the step computed with the viscoelastic model does not
       reach a touchdown, the code is the negative of the outcome code;
-    - `margins`: values of the margins in `VIOLATION_TEXT_BY_SELECTION_MARGIN`, negative for a
+    - `margins`: values of the margins in `SELECTION_MARGIN_NAMES`, negative for a
       violation;
     - `friction`: friction coefficient of the ground.
 
@@ -132,9 +115,7 @@ class ModelChoice(AbstractPrintable):
                     f"{n_viscoelastic_choices} served by the paper's",
                 )
             ]
-        name_margin_pairs = zip(
-            VIOLATION_TEXT_BY_SELECTION_MARGIN, np.asarray(self.margins), strict=True
-        )
+        name_margin_pairs = zip(SELECTION_MARGIN_NAMES, np.asarray(self.margins), strict=True)
         margin_rows = [
             (
                 MARGIN_MEASURES[margin_name].label_with_symbol,
@@ -174,7 +155,7 @@ def describe_selection_reason(reason_code: int) -> str:
         return f"The step of the paper's model fails: {Outcome(-reason_code).meaning}"
     if reason_code == START_NOT_EMBEDDABLE_REASON_CODE:
         return "The start is not the paper's: another leg is loaded or off its stopper."
-    violation_text = list(VIOLATION_TEXT_BY_SELECTION_MARGIN.values())[reason_code - 1]
+    violation_text = MARGIN_MEASURES[SELECTION_MARGIN_NAMES[reason_code - 1]].violation_text
     return f"The paper's model is not valid: {violation_text}."
 
 
@@ -191,7 +172,7 @@ def find_selection_reason(
     """
     selection_margins = [
         step_measures[margin_name] + (friction_difference if "friction" in margin_name else 0.0)
-        for margin_name in VIOLATION_TEXT_BY_SELECTION_MARGIN
+        for margin_name in SELECTION_MARGIN_NAMES
     ]
     is_margin_violated = ~(jnp.stack(selection_margins, -1) >= 0.0)
     violated_margin_code = jnp.where(
@@ -414,17 +395,3 @@ def _sort_durations_by_loaded_feet(viscoelastic_result: StepResult) -> Float[Arr
             jnp.zeros_like(double_support_duration),
         ]
     )
-
-
-def raise_for_ladder(model: object, use_description: str) -> None:
-    """Raise a `TypeError` if `model` is a ladder of models, whose gaits do not vary smoothly.
-
-    - `use_description`: participle in the error message that states the use of the model, such as
-      "tuned".
-    """
-    if isinstance(model, LadderWheel | str):
-        raise TypeError(
-            f"the ladder can't be {use_description}, since its gaits jump where the model changes: "
-            "give "
-            "vrw.ViscoelasticWheel() or vrw.UnilateralWheel()."
-        )

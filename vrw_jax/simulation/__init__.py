@@ -2,6 +2,7 @@
 
 from vrw_jax.simulation.basins import basin, invert_landing_map
 from vrw_jax.simulation.force_peaks import SAMPLED_FORCE_PEAK_MEASURES, force_peaks
+from vrw_jax.simulation.provenance import collect_provenance_attributes
 from vrw_jax.simulation.stepping import (
     ModelLike,
     Walk,
@@ -11,6 +12,7 @@ from vrw_jax.simulation.stepping import (
     convert_step_arguments,
     convert_step_options,
     paper_start,
+    require_compliant_model,
     require_single_wheel,
     return_map,
     start_walk_toward_gait,

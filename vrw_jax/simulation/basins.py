@@ -14,7 +14,6 @@ from vrw_jax.measures import (
     MEASURES,
     POST_LANDING_COMPONENT_NAMES,
     PRE_TOUCHDOWN_COMPONENT_NAMES,
-    collect_provenance_attributes,
     make_measure_attributes,
 )
 from vrw_jax.measures import xarray as xr
@@ -25,6 +24,7 @@ from vrw_jax.simulation.attractors import (
     measure_orbit_steps,
     walk_until_periodic,
 )
+from vrw_jax.simulation.provenance import collect_provenance_attributes
 from vrw_jax.simulation.stepping import (
     ModelLike,
     convert_model_argument,

@@ -25,11 +25,15 @@ from vrw_jax.models import (
     StepResult,
     ViscoelasticWheel,
 )
-from vrw_jax.numerics import EngineName, StepOptions, with_default_jax_settings
+from vrw_jax.numerics import (
+    EngineName,
+    StepOptions,
+    describe_step_ending,
+    with_default_jax_settings,
+)
 from vrw_jax.printing import (
     AbstractPrintable,
     LabelAndText,
-    describe_step_ending,
     format_numbers,
     format_outcome_counts,
     format_quantity,
@@ -89,6 +93,19 @@ def convert_model_argument(
             "element, vrw.walk one for each of its steps."
         )
     return model
+
+
+def require_compliant_model(model: AbstractWheel, computation_text: str, command_name: str) -> None:
+    """Raise a `TypeError` if springs and dampers do not affect the motion of a model.
+
+    - `computation_text`: clause in the error message that states why compliant legs are required;
+    - `command_name`: command whose accepted models the error message lists.
+    """
+    if not model.is_compliant:
+        raise TypeError(
+            f"model is {model!r}, but {computation_text} compliant legs: give "
+            f"{describe_accepted_models(command_name)}."
+        )
 
 
 _make_default_model = functools.cache(ViscoelasticWheel)

@@ -27,16 +27,12 @@ from vrw_jax.contact import (
     compute_potential_energy,
     unpack_state,
 )
-from vrw_jax.measures import (
-    CONTACT_MEASURES,
-    TRAJECTORY_MEASURES,
-    collect_provenance_attributes,
-    make_labeled_variables,
-)
+from vrw_jax.measures import CONTACT_MEASURES, TRAJECTORY_MEASURES, make_labeled_variables
 from vrw_jax.measures import xarray as xr
 from vrw_jax.models import AbstractWheel, Trajectory, complete_line_slopes, separate_next_slope
 from vrw_jax.numerics import EngineName, StepOptions, with_default_jax_settings
 from vrw_jax.selection import SELECTION_VARIABLE_ATTRIBUTES
+from vrw_jax.simulation.provenance import collect_provenance_attributes
 from vrw_jax.simulation.stepping import (
     ModelLike,
     SectionStateLike,

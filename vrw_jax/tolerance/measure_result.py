@@ -7,11 +7,10 @@ import equinox as eqx
 import numpy as np
 
 from vrw_jax.measures import MEASURES
-from vrw_jax.numerics import StatusCode
+from vrw_jax.numerics import StatusCode, describe_step_ending
 from vrw_jax.printing import (
     AbstractPrintable,
     LabelAndText,
-    describe_step_ending,
     format_outcome_counts,
     map_text_of_elements,
 )

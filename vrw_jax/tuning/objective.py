@@ -8,14 +8,18 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from vrw_jax.cycles import AbstractCycle, AbstractGaitFinder, Gait, default_margins
-from vrw_jax.models import AbstractStep
+from vrw_jax.cycles import (
+    AbstractCycle,
+    AbstractGaitFinder,
+    Gait,
+    GaitFunction,
+    GaitMeasureReader,
+    default_margins,
+)
 from vrw_jax.validation import check_names, check_range, check_real, check_reals, require_known_name
 from vrw_jax.wheel import WheelParams
 
-ObjectiveFunction = Callable[[AbstractCycle, AbstractStep], Array]
 ConstraintSpecification = Mapping[str, float | tuple[float | None, float | None]] | Sequence[str]
-MeasureReaderFunction = Callable[[str, AbstractCycle, AbstractStep], Array]
 
 UPPER_BOUND_PREFIX = "-"
 """Prefix that marks an upper bound on a measure, which is a lower bound on its negative."""
@@ -25,10 +29,10 @@ UPPER_BOUND_PREFIX = "-"
 class WeightedMeasureSum:
     """Objective that is a weighted sum of measures of the cycle and the step."""
 
-    measure_reader: MeasureReaderFunction
+    measure_reader: GaitMeasureReader
     measure_weights: tuple[tuple[str, float], ...]
 
-    def __call__(self, cycle: AbstractCycle, step: AbstractStep) -> Array:
+    def __call__(self, cycle: AbstractCycle, step: Any) -> Array:
         weighted_measures = [
             measure_weight * self.measure_reader(measure_name, cycle, step)
             for measure_name, measure_weight in self.measure_weights
@@ -42,7 +46,7 @@ class CycleObjective:
 
     cycle_function: Callable[[Any], Array]
 
-    def __call__(self, cycle: AbstractCycle, step: AbstractStep) -> Array:
+    def __call__(self, cycle: AbstractCycle, step: Any) -> Array:
         return self.cycle_function(cycle)
 
 
@@ -55,11 +59,11 @@ class ObjectiveAndConstraints:
     `UPPER_BOUND_PREFIX` is a measure with an upper bound.
     """
 
-    objective_function: ObjectiveFunction
-    measure_reader: MeasureReaderFunction
+    objective_function: GaitFunction
+    measure_reader: GaitMeasureReader
     constraint_names: tuple[str, ...]
 
-    def __call__(self, cycle: AbstractCycle, step: AbstractStep) -> Array:
+    def __call__(self, cycle: AbstractCycle, step: Any) -> Array:
         objective_value = self.objective_function(cycle, step)
         if jnp.shape(check_reals("objective", objective_value, "return one number")):
             raise ValueError(

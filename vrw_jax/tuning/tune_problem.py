@@ -21,6 +21,7 @@ from vrw_jax.cycles import (
     AbstractGaitFinder,
     CycleOptions,
     Gait,
+    GaitFunction,
     default_margins,
     evaluate_on_gait,
     evaluate_on_gaits,
@@ -31,15 +32,20 @@ from vrw_jax.cycles import (
 from vrw_jax.measures import (
     MARGIN_MEASURES,
     MEASURES,
-    collect_provenance_attributes,
+    SELECTION_MARGIN_NAMES,
     get_measure,
     make_flag_attributes,
     make_measure_attributes,
 )
 from vrw_jax.measures import xarray as xr
 from vrw_jax.numerics import StepOptions, with_default_jax_settings
-from vrw_jax.selection import VIOLATION_TEXT_BY_SELECTION_MARGIN, describe_accepted_models
-from vrw_jax.simulation import ModelLike, convert_model_argument, require_single_wheel
+from vrw_jax.simulation import (
+    ModelLike,
+    collect_provenance_attributes,
+    convert_model_argument,
+    require_compliant_model,
+    require_single_wheel,
+)
 from vrw_jax.tuning.exploration import ExplorationResult, explore_starts
 from vrw_jax.tuning.maximization import (
     EvaluatedTrial,
@@ -54,7 +60,6 @@ from vrw_jax.tuning.objective import (
     CycleObjective,
     GaitEvaluation,
     ObjectiveAndConstraints,
-    ObjectiveFunction,
     WeightedMeasureSum,
     compute_max_violation,
     compute_slack_scales,
@@ -668,11 +673,7 @@ def make_tune_problem(
         cycle_options=cycle_options,
         step_options=options,
     )
-    if not gait_finder.model.is_compliant:
-        raise TypeError(
-            f"model is {model!r}, but what is tuned has compliant legs: give "
-            f"{describe_accepted_models('tune')}."
-        )
+    require_compliant_model(gait_finder.model, "what is tuned has", "tune")
     gait_finder.search_options.check_tolerances(jnp.result_type(*jax.tree.leaves(params)))
     objective_function, objective_label = _parse_objective_function(objective, gait_finder)
     if (
@@ -680,7 +681,7 @@ def make_tune_problem(
         and checked_model.fallback_model is not checked_model
         and gait_finder.supports_cold_start
     ):
-        constraints = tuple(VIOLATION_TEXT_BY_SELECTION_MARGIN)
+        constraints = SELECTION_MARGIN_NAMES
     constraint_margins = parse_constraint_margins(params, constraints, gait_finder)
     objective_and_constraints = ObjectiveAndConstraints(
         objective_function, type(gait_finder).read_measure, tuple(constraint_margins)
@@ -708,7 +709,7 @@ def make_tune_problem(
 
 def _parse_objective_function(
     objective: ObjectiveSpecification, gait_finder: AbstractGaitFinder
-) -> tuple[ObjectiveFunction, str]:
+) -> tuple[GaitFunction, str]:
     """Return the objective as a function, and its label."""
     if not (callable(objective) or isinstance(objective, str | Mapping)):
         raise TypeError(

@@ -2,6 +2,7 @@
 
 from vrw_jax.wheel import dynamics, geometry, transitions
 from vrw_jax.wheel.dynamics import compute_damping_power, compute_mass_matrix, compute_momentum
+from vrw_jax.wheel.foot_contact import ContactMode
 from vrw_jax.wheel.geometry import (
     Motion,
     compute_landing_foot_height,

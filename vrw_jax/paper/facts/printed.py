@@ -12,7 +12,6 @@ import numpy as np
 import xarray as xr
 from jaxtyping import Array
 
-from vrw_jax.numerics import Scalar
 from vrw_jax.wheel import (
     Motion,
     Symbols,
@@ -128,7 +127,7 @@ def compute_printed_landing(params: WheelParams, section_state: np.ndarray) -> P
 
 
 @jax.jit
-def compute_five_coordinate_mass_matrix(s: Symbols, theta: Scalar, L1: Scalar, L2: Scalar) -> Array:
+def compute_five_coordinate_mass_matrix(s: Symbols, theta: Array, L1: Array, L2: Array) -> Array:
     """Return the mass matrix M(q) of eq. (1) of the paper, shape (5, 5).
 
     It consists of the mass matrix for a planted foot, and of the momentum due to a moving foot.

@@ -11,12 +11,14 @@ from vrw_jax.wheel import PARAMETER_NAMES, WheelParams
 
 
 def collect_provenance_attributes(
-    params: WheelParams, model: object, options: StepOptions
+    params: WheelParams, model: object, options: StepOptions | None = None
 ) -> dict[str, str | float | int]:
     """Return dataset attributes that describe how a result was computed.
 
-    They state versions, device, floating-point type, tolerances and parameters.
+    They state versions, device, floating-point type, tolerances and parameters. The default of
+    `options` is `StepOptions()`.
     """
+    options = StepOptions() if options is None else options
     library_names = ("vrw-jax", "jax", "diffrax", "numpy")
     parameter_attributes: dict[str, str | float | int] = {
         f"parameter_{parameter_name}": float(getattr(params, parameter_name))
