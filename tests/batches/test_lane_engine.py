@@ -188,6 +188,28 @@ def test_xla_blocks_agree_with_machine_code(monkeypatch):
     np.testing.assert_array_equal(code, codes)
 
 
+def test_an_xla_program_without_lanes_returns_empty_arrays(monkeypatch):
+    monkeypatch.setattr(simd, "is_machine_code_available", lambda: False)
+    program = batch_programs.compile_batch_program(
+        lambda _, lanes: (lanes[0] + lanes[1], lanes[0] > 0.0),
+        [],
+        2,
+        np.dtype(float),
+        "no lanes",
+        4,
+    )
+    total, is_positive = program([], [np.empty(0), np.empty(0)])
+    assert total.shape == is_positive.shape == (0,)
+    assert (total.dtype, is_positive.dtype) == (np.dtype(float), np.dtype(bool))
+
+
+def test_batches_of_gaits_are_larger_on_a_gpu(monkeypatch):
+    assert batch_sizes.choose_batch_size(64, 4096) == 64
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    assert batch_sizes.choose_batch_size(64, 4096) == 4096
+    assert batch_sizes.choose_batch_size(10_000, 4096) == 10_000
+
+
 def test_a_batched_walk_equals_single_walks_and_ends_at_its_first_failure():
     vectors = make_parameter_rows(slope=[0.30, 0.09], damping=[200.0, 100.0])
     states = np.asarray([TABLE_1_SECTION_STATE, [0.1027, 2.0, -0.109]])

@@ -78,6 +78,15 @@ def _run_xla_program_by_blocks(
 
     The program then runs again for the unfinished lanes of all blocks together.
     """
+    if len(lane_arrays[0]) == 0:
+        lane_shapes = (jax.ShapeDtypeStruct((block_size,), x.dtype) for x in lane_arrays)
+        output_shapes = jax.eval_shape(
+            xla_program,
+            tuple(scalar_arguments),
+            tuple(lane_shapes),
+            *[np.int32(0)] * can_stop_early,
+        )
+        return [np.empty((*x.shape[:-1], 0), x.dtype) for x in output_shapes]
     result_arrays: list[np.ndarray] = []
     unfinished_lanes = np.arange(len(lane_arrays[0]))
     while len(unfinished_lanes) > 0:

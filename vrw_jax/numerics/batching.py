@@ -16,6 +16,7 @@ from jax import lax
 from jax.custom_batching import custom_vmap
 from jaxtyping import Array, PyTree
 
+from vrw_jax.numerics.batch_sizes import GPU_GAIT_BATCH_SIZE, choose_batch_size
 from vrw_jax.numerics.settings import with_default_jax_settings
 
 BatchFunction = Callable[..., PyTree[Array]]
@@ -63,9 +64,11 @@ def unbatch(function: BatchFunction) -> BatchFunction:
 def apply_in_blocks(function: BatchFunction, block_size: int) -> BatchFunction:
     """Return a function that applies `function` to `block_size` batch elements at a time.
 
-    Arrays then stay in the processor's cache. The first array must have the batch axis. Scalars are
-    the same for all elements.
+    The arrays of a block stay in the processor's cache. A GPU takes larger blocks, of
+    `GPU_GAIT_BATCH_SIZE` elements. The first array must have the batch axis. Scalars are the same
+    for all elements.
     """
+    block_size = choose_batch_size(block_size, GPU_GAIT_BATCH_SIZE)
 
     def evaluate_blockwise(*arrays: PyTree) -> PyTree:
         argument_leaves, tree_structure = jax.tree.flatten(arrays)

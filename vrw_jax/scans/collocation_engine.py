@@ -191,6 +191,9 @@ class CollocationScanEngine:
         # copy is another object.
         model_identity = (type(wheel_model).__name__, *vars(wheel_model).items())
         self._cache_key = (variable_names, base_wheel.n_legs, model_identity, cycle_options)
+        self._batch_size = batch_sizes.choose_batch_size(
+            batch_sizes.SCAN_BATCH_SIZE, batch_sizes.GPU_SCAN_BATCH_SIZE
+        )
         self._free_programs: SimpleQueue[_CompiledDevicePrograms] = SimpleQueue()
         self._n_workers, self._compilation_lock = 0, Lock()
 
@@ -204,8 +207,8 @@ class CollocationScanEngine:
             if not self._n_workers:
                 self._compile_programs()
         parameter_batches = (
-            parameter_rows[first_sample_index : first_sample_index + batch_sizes.SCAN_BATCH_SIZE]
-            for first_sample_index in range(0, len(parameter_rows), batch_sizes.SCAN_BATCH_SIZE)
+            parameter_rows[first_sample_index : first_sample_index + self._batch_size]
+            for first_sample_index in range(0, len(parameter_rows), self._batch_size)
         )
         with ThreadPoolExecutor(self._n_workers) as thread_pool:
             batch_results = list(thread_pool.map(self._evaluate_sample_batch, parameter_batches))
@@ -227,7 +230,7 @@ class CollocationScanEngine:
         padded_parameter_rows = np.concatenate(
             [
                 parameter_rows,
-                np.repeat(parameter_rows[:1], batch_sizes.SCAN_BATCH_SIZE - len(parameter_rows), 0),
+                np.repeat(parameter_rows[:1], self._batch_size - len(parameter_rows), 0),
             ]
         )
         device_programs = self._free_programs.get()
@@ -256,11 +259,9 @@ class CollocationScanEngine:
         local_devices = jax.local_devices()
         parameter_dtype = np.dtype(self._base_wheel.damping.dtype)
         parameter_rows_shape = jax.ShapeDtypeStruct(
-            (batch_sizes.SCAN_BATCH_SIZE, len(PARAMETER_NAMES)), parameter_dtype
+            (self._batch_size, len(PARAMETER_NAMES)), parameter_dtype
         )
-        section_states_shape = jax.ShapeDtypeStruct(
-            (batch_sizes.SCAN_BATCH_SIZE, 3), parameter_dtype
-        )
+        section_states_shape = jax.ShapeDtypeStruct((self._batch_size, 3), parameter_dtype)
         cache_key = self._cache_key
         # Threads have separate settings.
         compile_function = with_default_jax_settings(compile_exported_function)
