@@ -171,7 +171,7 @@ def compute() -> list[list[float]]:
     import jax.numpy as jnp
 
     from vrw_jax.numerics import (
-        compile_cached_lane_function,
+        compile_batch_function,
         compile_cached_lane_program,
         compile_exported_function,
     )
@@ -183,9 +183,7 @@ def compute() -> list[list[float]]:
         results.append(
             compile_cached_lane_program(lanes, [], 1, x.dtype, ("times", factor))([], [x])[0]
         )
-        inner = compile_cached_lane_function(
-            lambda y, f=factor: f * y, lambda y: y, ("inner", factor)
-        )
+        inner = compile_batch_function(lambda y, f=factor: f * y, lambda y: y, ("inner", factor))
         call = lambda y, g=inner: jnp.sin(g(y))
         results.append(
             compile_exported_function(call, (jnp.asarray(x),), ("call", factor), jax.devices()[0])(

@@ -15,7 +15,7 @@ from support.machine_code import CodeRegistrySpy
 
 import vrw_jax as vrw
 from vrw_jax.numerics import (
-    compile_cached_lane_function,
+    compile_batch_function,
     compile_cached_lane_program,
     compile_exported_function,
 )
@@ -50,9 +50,7 @@ def multiples():
         results.append(
             compile_cached_lane_program(lanes, [], 1, X.dtype, ("times", factor))([], [X])[0]
         )
-        within = compile_cached_lane_function(
-            lambda x, f=factor: f * x, lambda x: x, ("within", factor)
-        )
+        within = compile_batch_function(lambda x, f=factor: f * x, lambda x: x, ("within", factor))
         call = lambda x, g=within: g(x) + 0.0
         results.append(
             compile_exported_function(call, (jnp.asarray(X),), ("call", factor), jax.devices()[0])(

@@ -9,7 +9,7 @@ from support.machine_code import CodeRegistrySpy
 
 from vrw_jax import simd
 from vrw_jax.numerics import (
-    compile_cached_lane_function,
+    compile_batch_function,
     compile_cached_lane_program,
     compile_exported_function,
 )
@@ -37,7 +37,7 @@ def fresh_process(monkeypatch):
 
 def make_function(traced):
     """Return a JAX program that calls machine code, and appends to a list when it is traced."""
-    double = compile_cached_lane_function(lambda x: 2.0 * x, lambda x: x, "double")
+    double = compile_batch_function(lambda x: 2.0 * x, lambda x: x, "double")
 
     def run(x):
         traced.append(1)

@@ -32,7 +32,6 @@ from vrw_jax.cycles import (
     CollocationState,
     CollocationSystem,
     PeriodMap,
-    compile_batch_function,
     compute_correction_norm,
     compute_force_peaks,
     compute_takeoff_acceleration,
@@ -42,7 +41,7 @@ from vrw_jax.cycles import (
 )
 from vrw_jax.measures import MARGIN_MEASURES, MEASURES, STOPPER_MARGIN_MEASURES
 from vrw_jax.models import AbstractStep, AbstractWheel, AnySectionState
-from vrw_jax.numerics import Scalar, StepOptions, unbatch
+from vrw_jax.numerics import Scalar, StepOptions, compile_batch_function, unbatch
 from vrw_jax.wheel import (
     PARAMETER_NAMES,
     Outcome,

@@ -48,7 +48,7 @@ from vrw_jax.models import split_jacobian_by_leaf
 from vrw_jax.numerics import (
     ForwardFunction,
     StepOptions,
-    compile_cached_lane_function,
+    compile_batch_function,
     make_opaque_condition,
     unbatch,
 )
@@ -85,7 +85,7 @@ class ContactStepConfig(NamedTuple):
 
         if self.uses_diffrax:
             return evaluate_one_lane
-        return unbatch(compile_cached_lane_function(lane_function, make_template, program_name))
+        return unbatch(compile_batch_function(lane_function, make_template, program_name))
 
     def unpack_leaves(self, leaves: tuple[Array, ...]) -> tuple[Array, Array, Any]:
         """Return input columns and section states of the batch, and (wheel, params, options)."""
@@ -212,7 +212,7 @@ def build_contact_step_jacobian(
         step_config.measures_force_peaks,
     )
     compute_tangents = unbatch(
-        compile_cached_lane_function(step_config.compute_tangents, make_template, cache_key)
+        compile_batch_function(step_config.compute_tangents, make_template, cache_key)
     )
 
     def evaluate_jacobian(*leaves: Array) -> tuple:
@@ -454,7 +454,7 @@ def build_contact_step_sampler(
         advance_to_event, make_template, ("to the next event", cache_key)
     )
     compiled_sampling = unbatch(
-        compile_cached_lane_function(
+        compile_batch_function(
             sample_intervals,
             lambda leaves, interval_log: interval_log.durations,
             ("samples with unilateral contact", cache_key, n_samples),

@@ -16,7 +16,6 @@ from vrw_jax.cycles.collocation_search import (
     init_search_flags,
 )
 from vrw_jax.cycles.cycle import CYCLE_MEASURE_FUNCTIONS, AbstractCycle, format_floquet_multipliers
-from vrw_jax.cycles.derivatives import compile_batch_function
 from vrw_jax.cycles.finder import (
     STATE_AGREEMENT_TOLERANCE,
     AbstractGaitFinder,

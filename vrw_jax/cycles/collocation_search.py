@@ -186,13 +186,11 @@ class CycleSearchResult(NamedTuple):
     n_newton_iterations: Int[Array, " lanes"]  # number of linearizations of the system
 
 
-@functools.cache
-def register_export_types() -> None:
-    """Register the module's named tuples for the export of traces to disk, once per process."""
-    for namedtuple_class in (CollocationSolution, CollocationState, CycleSearchResult):
-        export.register_namedtuple_serialization(
-            namedtuple_class, serialized_name=f"vrw_jax.{namedtuple_class.__name__}"
-        )
+# Traces on disk contain these named tuples.
+for namedtuple_class in (CollocationSolution, CollocationState, CycleSearchResult):
+    export.register_namedtuple_serialization(
+        namedtuple_class, serialized_name=f"vrw_jax.{namedtuple_class.__name__}"
+    )
 
 
 def predict_start_from_gait_surface(

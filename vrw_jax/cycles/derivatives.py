@@ -16,7 +16,6 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
-from vrw_jax import simd
 from vrw_jax.collocation import CollocationSolution
 from vrw_jax.cycles.collocation_search import (
     CollocationState,
@@ -24,7 +23,6 @@ from vrw_jax.cycles.collocation_search import (
     CycleSearchResult,
     LaneParameters,
     compute_state_tangents,
-    register_export_types,
     run_search_attempts,
     search_all_attempts,
 )
@@ -34,8 +32,7 @@ from vrw_jax.numerics import (
     ExecutionWrapper,
     apply_in_blocks,
     apply_jacobian,
-    call_through_saved_trace,
-    compile_cached_lane_function,
+    compile_batch_function,
     make_implicit_jacobian,
     make_zero_tangent,
     unbatch,
@@ -179,26 +176,6 @@ def _zero_without_cycle(collocation_state: CollocationState, tree_over_lanes: An
     return jax.tree.map(
         lambda x: jnp.where(collocation_state.has_cycle > 0.5, x, 0.0), tree_over_lanes
     )
-
-
-def compile_batch_function(
-    function_of_element: BatchFunction,
-    make_output_template: Callable,
-    cache_key: tuple,
-    batch_size: int,
-) -> BatchFunction:
-    """Compile a batch function in its fastest form, and return the compiled function.
-
-    On a CPU the function becomes machine code. Otherwise XLA compiles the function, which is then
-    called for blocks of `batch_size` wheels (lanes).
-
-    - `make_output_template`: function that returns arrays with the structure of the outputs;
-    - `cache_key`: key under which the compiled code is cached.
-    """
-    if simd.is_machine_code_available():
-        return compile_cached_lane_function(function_of_element, make_output_template, cache_key)
-    register_export_types()
-    return call_through_saved_trace(apply_in_blocks(function_of_element, batch_size), cache_key)
 
 
 def _make_derivative_compiler(

@@ -52,7 +52,7 @@ from vrw_jax.numerics import (
     ForwardFunction,
     StepOptions,
     Vector,
-    compile_cached_lane_function,
+    compile_batch_function,
     compute_sine_cosine,
     unbatch,
 )
@@ -421,7 +421,7 @@ def build_step_function(
     trace_config = _StepTraceConfig(argument_structure, stop_at_lift_off, friction)
     trace_key = ("gait step", *trace_config.trace_key)
     return unbatch(
-        compile_cached_lane_function(
+        compile_batch_function(
             trace_config.compute_step_outputs, trace_config.make_output_template, trace_key
         )
     )
@@ -454,9 +454,7 @@ def build_step_finisher(
     trace_config = _StepTraceConfig(argument_structure, stop_at_lift_off, None)
     trace_key = ("end of a step", phase_index, *trace_config.trace_key)
     return unbatch(
-        compile_cached_lane_function(
-            compute_finish_outputs, trace_config.make_output_template, trace_key
-        )
+        compile_batch_function(compute_finish_outputs, trace_config.make_output_template, trace_key)
     )
 
 
@@ -504,7 +502,7 @@ def build_step_sampler(
         )
 
     return unbatch(
-        compile_cached_lane_function(
+        compile_batch_function(
             sample_lane_steps,
             make_trajectory_template,
             ("samples", *trace_config.trace_key, n_samples),
@@ -540,11 +538,11 @@ def build_step_jacobian(
     trace_key = ("gait step with derivatives", *trace_config.trace_key, input_indices)
     jacobian_functions_by_size = {
         n: unbatch(
-            compile_cached_lane_function(
+            compile_batch_function(
                 lane_jacobian_function,
                 make_jacobian_template,
                 trace_key,
-                simd.RegisterLimits(n),
+                register_limits=simd.RegisterLimits(n),
             )
         )
         for n in (N_STEP_INPUTS, N_STEP_INPUTS + 1)

@@ -41,8 +41,7 @@ from vrw_jax.numerics.batching import (
     unbatch,
 )
 from vrw_jax.numerics.cached_programs import (
-    call_through_saved_trace,
-    compile_cached_lane_function,
+    compile_batch_function,
     compile_cached_lane_program,
     compile_exported_function,
 )

@@ -19,6 +19,7 @@ from jax import export
 from jax.sharding import SingleDeviceSharding
 
 from vrw_jax import simd
+from vrw_jax.numerics.batching import BatchFunction, apply_in_blocks
 from vrw_jax.runtime import disk_cache as store
 from vrw_jax.runtime import make_fusion_emitter_options
 
@@ -87,21 +88,31 @@ def compile_cached_lane_program(
     )
 
 
-def compile_cached_lane_function(
-    lane_function: Callable,
-    result_shape_function: Callable,
+def compile_batch_function(
+    batch_function: BatchFunction,
+    make_output_template: Callable,
     trace_key_settings: object,
+    xla_block_size: int = 1,
     register_limits: simd.RegisterLimits = simd.DEFAULT_REGISTER_LIMITS,
-) -> Callable:
-    """Compile a function with `simd.compile_lane_function`, and save the machine code in the disk
-    cache.
+) -> BatchFunction:
+    """Compile a function of a batch that JAX programs can call, and return the compiled function.
+
+    If machine code is available, the function becomes machine code, which the disk cache contains.
+    Otherwise XLA compiles the function, which is then called for blocks of batch elements.
+
+    - `batch_function`: function of trees of arrays, which have the batch on the last axis;
+    - `make_output_template`: function that returns arrays with the structure of the outputs;
+    - `trace_key_settings`: as for `compile_exported_function`;
+    - `xla_block_size`: number of batch elements that one call of an XLA program computes;
+    - `register_limits`: as for `simd.compile_lane_function`.
     """
+    if not simd.is_machine_code_available():
+        return call_through_saved_trace(
+            apply_in_blocks(batch_function, xla_block_size), trace_key_settings
+        )
+    trace_key = (trace_key_settings, store.describe_trace_environment())
     return simd.compile_lane_function(
-        lane_function,
-        result_shape_function,
-        (trace_key_settings, store.describe_trace_environment()),
-        store,
-        register_limits,
+        batch_function, make_output_template, trace_key, store, register_limits
     )
 
 
