@@ -309,8 +309,11 @@ class AbstractReturnMapProblem(AbstractGaitProblem):
     in every Newton iteration. Newton's method converges only if state and image have equal codes.
     """
 
-    period_n: eqx.AbstractVar[int]
-    n_coordinates: eqx.AbstractVar[int]
+    model: AbstractWheel
+    step_options: StepOptions
+    parameter_name: str = eqx.field(static=True)
+    period_n: int = eqx.field(static=True)
+    n_coordinates: int = eqx.field(static=True)
 
     @property
     def n_steps(self) -> int:
@@ -347,12 +350,6 @@ class AbstractReturnMapProblem(AbstractGaitProblem):
 class ReturnMapProblem(AbstractReturnMapProblem):
     """Continuation problem of the gaits of a model whose gait steps JAX can differentiate."""
 
-    model: AbstractWheel
-    step_options: StepOptions
-    parameter_name: str = eqx.field(static=True)
-    period_n: int = eqx.field(static=True)
-    n_coordinates: int = eqx.field(static=True)
-
     def linearize(self, wheel: BranchWheel, z: ProblemUnknowns, p: Scalar) -> NewtonStep:
         def return_map(z: Array, p: Scalar) -> Array:
             model, params = self.model.with_parameter(wheel.params, self.parameter_name, p)
@@ -369,11 +366,6 @@ class ReturnMapProblem(AbstractReturnMapProblem):
 class ContactGaitProblem(AbstractReturnMapProblem):
     """Continuation problem of gaits with unilateral contact, solved by batches of gait steps."""
 
-    model: AbstractWheel
-    step_options: StepOptions
-    parameter_name: str = eqx.field(static=True)
-    period_n: int = eqx.field(static=True)
-    n_coordinates: int = eqx.field(static=True)
     n_legs: int = eqx.field(static=True)
     measures_force_peaks: bool = eqx.field(static=True, default=False)
 

@@ -81,17 +81,6 @@ class CollocationFinder(AbstractGaitFinder):
         if measure_name not in ("spectral_margin", *GAIT_SENSITIVITY_MEASURES, *FORCE_PEAK_MEASURES)
     )
 
-    @classmethod
-    def from_options(
-        cls,
-        model: Any,
-        n_legs: int,
-        step_options: StepOptions,
-        period_n: int,
-        cycle_options: CycleOptions,
-    ) -> "CollocationFinder":
-        return cls(model, n_legs, step_options, cycle_options, period_n)
-
     @property
     def search_options(self) -> CycleOptions:
         return self.cycle_options

@@ -15,7 +15,6 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from vrw_jax.cycles.cycle import AbstractCycle
-from vrw_jax.cycles.options import CycleOptions
 from vrw_jax.cycles.slope_response import SlopeResponse, compute_step_slope_response
 from vrw_jax.measures import FORCE_PEAK_MEASURES
 from vrw_jax.models import AbstractStep, AbstractWheel
@@ -144,23 +143,6 @@ class AbstractGaitFinder(eqx.Module):
     """Whether several gaits of a wheel may be attracting. Walks from several starts
     distinguish them.
     """
-
-    @classmethod
-    def from_options(
-        cls,
-        model: Any,
-        n_legs: int,
-        step_options: StepOptions,
-        period_n: int,
-        cycle_options: CycleOptions,
-    ) -> "AbstractGaitFinder":
-        """Build a finder from the options of the gait steps and the options of the search.
-
-        A finder whose search has no options of its own ignores `cycle_options`.
-        """
-        finder_class: Any = cls
-        finder: AbstractGaitFinder = finder_class(model, n_legs, step_options, period_n)
-        return finder
 
     @property
     def search_options(self) -> Any:

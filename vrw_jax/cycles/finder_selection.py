@@ -53,10 +53,20 @@ def make_finder(
     if cycle_options is not None:
         check_type("cycle_options", cycle_options, CycleOptions, "give vrw.CycleOptions()")
     resolved_model = convert_model_argument(model)
-    finder_factory = FINDER_CLASS_BY_METHOD[resolved_model.capabilities.gait_method].from_options
-    return finder_factory(
-        resolved_model, n_legs, convert_step_options(step_options), period_n,
-        CycleOptions() if cycle_options is None else cycle_options)  # fmt: skip
+    finder_class: Any = FINDER_CLASS_BY_METHOD[resolved_model.capabilities.gait_method]
+    search_options = (
+        {"cycle_options": CycleOptions() if cycle_options is None else cycle_options}
+        if finder_class.options_type is CycleOptions
+        else {}
+    )
+    finder: AbstractGaitFinder = finder_class(
+        model=resolved_model,
+        n_legs=n_legs,
+        step_options=convert_step_options(step_options),
+        period_n=period_n,
+        **search_options,
+    )
+    return finder
 
 
 def resolve_model(params: WheelParams, model: ModelLike | None) -> ModelLike | None:

@@ -83,17 +83,15 @@ def enable_all_ad_modes(
         # The rule costs as much as a solver step, so it is applied only to traced arguments.
         if not has_traced_argument:
             return compiled_function(*arrays)
-        return wrapped_function(*map(_convert_mapped_numpy_array, arrays))
+        # Inside `jit`, JAX 0.10 rejects a NumPy array that `vmap` maps as an argument of the rule.
+        return wrapped_function(
+            *(
+                jnp.array(array) if isinstance(getattr(array, "val", None), np.ndarray) else array
+                for array in arrays
+            )
+        )
 
     return call_function
-
-
-def _convert_mapped_numpy_array(array: Any) -> Any:
-    """Return a copy as a JAX array of a NumPy array that `vmap` maps, and other arrays unchanged.
-
-    Inside `jit`, JAX 0.10 rejects a mapped NumPy array as argument of a function with a rule.
-    """
-    return jnp.array(array) if isinstance(getattr(array, "val", None), np.ndarray) else array
 
 
 def _make_forward_jacobian_function(
