@@ -101,11 +101,24 @@ def replace_invalid_start(
     )
     valid_column = valid_state.reshape(-1, *(1,) * (section_state.ndim - 1))
     is_valid = is_valid_start_state(params, section_state) & (friction >= 0.0)
-    is_valid = is_valid & (
-        is_slope_in_domain(params.slope + next_line_tilt)
-        if next_line_tilt is not None
-        else _has_consistent_posture(params.symbols(), section_state)
-    )
+    if next_line_tilt is not None:
+        is_valid = is_valid & is_slope_in_domain(params.slope + next_line_tilt)
+    else:
+        # No foot may be below the ground, and no leg longer than its stopper allows. Loaded feet
+        # must be on the ground.
+        s = params.symbols()
+        theta, (_, z), L, _, contact_modes, _ = _unpack_leg_posture(s, section_state)
+        foot_height = z - L * compute_leg_directions(s, theta).cos
+        height_tolerance = PENETRATION_TOLERANCE * s.L0
+        is_contact_consistent = (contact_modes == ContactMode.OFF) | (
+            foot_height <= height_tolerance
+        )
+        is_leg_consistent = (
+            (foot_height >= -height_tolerance)
+            & is_contact_consistent
+            & (height_tolerance >= L - s.L0)
+        )
+        is_valid = is_valid & jnp.all(is_leg_consistent, axis=0)
     params, section_state = replace_invalid_inputs(is_valid, params, section_state, valid_column)
     return is_valid, params, jnp.where(is_valid, friction, 1.0), section_state
 
@@ -144,22 +157,6 @@ def _unpack_leg_posture(
         (contact_modes != ContactMode.OFF) & ~is_locked, hub_position[1] / leg_directions.cos, L
     )
     return theta, hub_position, L, dL, contact_modes, is_locked
-
-
-def _has_consistent_posture(s: Symbols, section_state: FullState) -> Bool[Array, "..."]:
-    """Return whether the feet and leg lengths in a section state are consistent with the ground.
-
-    No foot is below the ground, loaded feet are on the ground, and no leg is longer than its
-    stopper allows. The tolerance is `PENETRATION_TOLERANCE`.
-    """
-    theta, (_, z), L, _, contact_modes, _ = _unpack_leg_posture(s, section_state)
-    foot_height = z - L * compute_leg_directions(s, theta).cos
-    height_tolerance = PENETRATION_TOLERANCE * s.L0
-    is_contact_consistent = (contact_modes == ContactMode.OFF) | (foot_height <= height_tolerance)
-    return jnp.all(
-        (foot_height >= -height_tolerance) & is_contact_consistent & (height_tolerance >= L - s.L0),
-        axis=0,
-    )
 
 
 def unpack_section_state(s: Symbols, section_state: FullState) -> tuple[WheelMotion, ContactState]:

@@ -178,13 +178,18 @@ def _compute_stage_jacobians(
     """Return derivatives of the accelerations at all stages of a solver step except the last."""
 
     def linearize_stage(packed_state: Array) -> tuple[Array, Array]:
-        stage_state = _unpack_state(packed_state)
+        # inverse of `_pack_state`
+        n = (len(packed_state) - 2) // 3
+        state_components = tuple(packed_state)
+        acceleration = StageAccelerations(
+            state_components[2 * n], state_components[2 * n + 1], state_components[2 * n + 2 :]
+        )
+        stage_state = StageState(state_components[:n], state_components[n : 2 * n], acceleration)
         implicit_dynamics = make_dynamics(constants, held_constants)
         implicit_dynamics = ImplicitDynamics(
             jax.jit(implicit_dynamics.evaluate_residual),
             jax.jit(implicit_dynamics.solve_for_accelerations),
         )
-        n = len(stage_state.q)
         evaluate_residual = lambda constants, held_constants: make_dynamics(
             constants, held_constants
         ).evaluate_residual(stage_state)
@@ -240,16 +245,6 @@ def _pack_state(state: StageState) -> Array:
     n = len(state.q)
     sin, cos, acceleration = state.acceleration
     return jnp.stack([*state.q, *state.v, sin, cos, *acceleration[:n]])
-
-
-def _unpack_state(packed_state: Array) -> StageState:
-    """Return the state for an array from `_pack_state`."""
-    n = (len(packed_state) - 2) // 3
-    state_components = tuple(packed_state)
-    acceleration = StageAccelerations(
-        state_components[2 * n], state_components[2 * n + 1], state_components[2 * n + 2 :]
-    )
-    return StageState(state_components[:n], state_components[n : 2 * n], acceleration)
 
 
 def _make_unit_vectors(template_state: Vector) -> list[Vector]:

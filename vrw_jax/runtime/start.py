@@ -51,28 +51,19 @@ def start_jax(cache: str | Path | None = None, *, trust_shared: bool = False) ->
     if cache is not None or "JAX_COMPILATION_CACHE_DIR" not in os.environ:
         jax_cache_folder = _find_user_cache_folder() / "vrw_jax" if cache is None else cache
         jax.config.update("jax_compilation_cache_dir", str(jax_cache_folder))
-    _require_private_cache_folder()
+    cache_folder = jax.config.jax_compilation_cache_dir  # type: ignore[attr-defined]
+    if cache_folder and "://" not in cache_folder:  # A storage bucket is no folder.
+        distrust_reason = store.explain_folder_distrust(Path(cache_folder))
+        if distrust_reason:
+            jax.config.update("jax_compilation_cache_dir", None)
+            raise PermissionError(f"{distrust_reason}.")
+        with contextlib.suppress(OSError):  # Without the folder nothing is cached.
+            store.create_cache_folder(Path(cache_folder))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
     xla_flags = os.environ.get("XLA_FLAGS", "")
     # XLA reads the flags when the first array is created.
     if _accepts_fusion_emitters_flag() and _FUSION_EMITTERS_FLAG not in xla_flags:
         os.environ["XLA_FLAGS"] = f"{xla_flags} --{_FUSION_EMITTERS_FLAG}=false".strip()
-
-
-def _require_private_cache_folder() -> None:
-    """Create the cache folder for the user alone.
-
-    Raise an error if other users can write to the folder.
-    """
-    jax_cache_folder = jax.config.jax_compilation_cache_dir  # type: ignore[attr-defined]
-    if not jax_cache_folder or "://" in jax_cache_folder:
-        return
-    distrust_reason = store.explain_folder_distrust(Path(jax_cache_folder))
-    if distrust_reason:
-        jax.config.update("jax_compilation_cache_dir", None)
-        raise PermissionError(f"{distrust_reason}.")
-    with contextlib.suppress(OSError):  # Without the folder nothing is cached.
-        store.create_cache_folder(Path(jax_cache_folder))
 
 
 def make_fusion_emitter_options(are_emitters_enabled: bool) -> dict[str, str | bool]:

@@ -170,6 +170,23 @@ class RefinedGaits(NamedTuple):
     section_states: np.ndarray  # (gaits, 4 + 3 n)
     walking_speed: np.ndarray  # mean speed of the last step, m/s
 
+    def find_distinct_gaits(self, gait_indices: np.ndarray) -> list[int]:
+        """Return the indices of the different attracting gaits of one wheel, slowest first.
+
+        `gait_indices` are the indices of the wheel's gaits. Two gaits are different if a measure
+        differs by more than the sum of both error bounds.
+        """
+        distinct_indices: list[int] = []
+        is_attracting_gait = (self.is_found & self.is_attracting)[gait_indices]
+        for gait_index in gait_indices[is_attracting_gait].tolist():
+            measure_differences = np.abs(
+                self.measure_values[gait_index] - self.measure_values[distinct_indices]
+            )
+            error_bound_sums = self.error_bounds[gait_index] + self.error_bounds[distinct_indices]
+            if np.all(np.any(measure_differences > error_bound_sums, axis=1)):
+                distinct_indices.append(gait_index)
+        return sorted(distinct_indices, key=lambda gait_index: self.walking_speed[gait_index])
+
 
 def refine_gaits(
     wheel_batch: ContactWheelBatch,

@@ -312,8 +312,8 @@ class _MeasureRequest:
         )
         selected_gait_positions: list[int] = []
         for wheel_index in wheel_indices:
-            distinct_gait_positions = _find_distinct_gaits(
-                refined_gaits, np.flatnonzero(wheel_indices_of_gaits == wheel_index)
+            distinct_gait_positions = refined_gaits.find_distinct_gaits(
+                np.flatnonzero(wheel_indices_of_gaits == wheel_index)
             )
             self.result_arrays["n_gaits"][wheel_index] = len(distinct_gait_positions)
             if -len(distinct_gait_positions) <= gait_rank < len(distinct_gait_positions):
@@ -518,27 +518,3 @@ class _MeasureRequest:
         self.result_arrays["models"][wheel_indices] = model_index
         self.result_arrays["statuses"][wheel_indices] = status
         self.result_arrays["outcomes"][wheel_indices] = Outcome.STEPPED
-
-
-def _find_distinct_gaits(refined_gaits: RefinedGaits, candidate_positions: np.ndarray) -> list[int]:
-    """Return the indices of the different attracting gaits of one wheel, slowest first.
-
-    `candidate_positions` are the indices of the wheel's gaits in `refined_gaits`. Two gaits are
-    different if a measure differs by more than the sum of both error bounds.
-    """
-    distinct_positions: list[int] = []
-    is_attracting_gait = (refined_gaits.is_found & refined_gaits.is_attracting)[candidate_positions]
-    for candidate_position in candidate_positions[is_attracting_gait].tolist():
-        measure_differences = np.abs(
-            refined_gaits.measure_values[candidate_position]
-            - refined_gaits.measure_values[distinct_positions]
-        )
-        error_bound_sums = (
-            refined_gaits.error_bounds[candidate_position]
-            + refined_gaits.error_bounds[distinct_positions]
-        )
-        if np.all(np.any(measure_differences > error_bound_sums, axis=1)):
-            distinct_positions.append(candidate_position)
-    return sorted(
-        distinct_positions, key=lambda gait_position: refined_gaits.walking_speed[gait_position]
-    )
