@@ -16,6 +16,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Complex, Float
 
+from vrw_jax.numerics import compute_square_root
+
 RealSquareMatrix = Float[Array, "... n n"]
 
 MAX_CLOSED_FORM_SIZE = 3
@@ -88,12 +90,6 @@ def compute_characteristic_polynomial(matrix: RealSquareMatrix) -> tuple[Array, 
     )
 
 
-def _differentiable_square_root(x: Array) -> Array:
-    """Return the square root of max(x, 0). Its derivative is zero for x <= 0."""
-    is_argument_positive = x > 0.0
-    return jnp.where(is_argument_positive, jnp.sqrt(jnp.where(is_argument_positive, x, 1.0)), 0.0)
-
-
 class _EigenvaluePair(NamedTuple):
     """Pair of eigenvalues, which are real or complex conjugates.
 
@@ -108,7 +104,7 @@ class _EigenvaluePair(NamedTuple):
     @property
     def modulus(self) -> Array:
         """Return the common modulus of a complex pair."""
-        return _differentiable_square_root(
+        return compute_square_root(
             self.pair_mean * self.pair_mean + self.imaginary_offset * self.imaginary_offset
         )
 
@@ -119,8 +115,8 @@ def _solve_quadratic_pair(a0: Array, a1: Array) -> _EigenvaluePair:
     discriminant = pair_mean * pair_mean - a0
     return _EigenvaluePair(
         pair_mean,
-        _differentiable_square_root(discriminant),
-        _differentiable_square_root(-discriminant),
+        compute_square_root(discriminant),
+        compute_square_root(-discriminant),
     )
 
 
@@ -138,7 +134,7 @@ def _solve_cubic_real_root(a0: Array, a1: Array, a2: Array) -> Array:
     has_three_real_roots = discriminant < 0.0
     # A single real root is the sum of two cube roots, computed without cancellation.
     larger_cube_root = jnp.cbrt(
-        -0.5 * q - jnp.where(q >= 0.0, 1.0, -1.0) * _differentiable_square_root(discriminant)
+        -0.5 * q - jnp.where(q >= 0.0, 1.0, -1.0) * compute_square_root(discriminant)
     )
     unique_real_root = larger_cube_root - jnp.where(
         larger_cube_root == 0.0,
@@ -146,7 +142,7 @@ def _solve_cubic_real_root(a0: Array, a1: Array, a2: Array) -> Array:
         p / (3.0 * jnp.where(larger_cube_root == 0, 1, larger_cube_root)),
     )
     # If three roots are real, the extreme root on the isolated side is computed.
-    trigonometric_radius = 2.0 * _differentiable_square_root(-p / 3.0)
+    trigonometric_radius = 2.0 * compute_square_root(-p / 3.0)
     root_cosine = -4.0 * q / jnp.where(trigonometric_radius == 0.0, 1.0, trigonometric_radius**3)
     extreme_root = trigonometric_radius * jnp.cos(
         jnp.arccos(jnp.clip(jnp.abs(root_cosine), 0.0, 1.0)) / 3.0

@@ -20,7 +20,7 @@ from vrw_jax.collocation import reconstruct_step
 from vrw_jax.continuation import floquet
 from vrw_jax.cycles.collocation_search import CollocationState, CollocationSystem
 from vrw_jax.models import AbstractWheel
-from vrw_jax.numerics import ForwardFunction, StepOptions, enable_all_ad_modes
+from vrw_jax.numerics import ForwardFunction, StepOptions, compute_square_root, enable_all_ad_modes
 from vrw_jax.wheel import PARAMETER_NAMES, WheelParams
 
 N_CHORD_ITERATIONS = 3
@@ -111,7 +111,7 @@ def compute_sensitivity_norms(slope_response: SlopeResponse) -> SensitivityNormP
     P = response_covariance.reshape(n, n)
     later_steps_squared = jnp.einsum("mi,ij,mj->m", C, P, C)
     beginning_step_response = C @ B0 + D1
-    sensitivity_norm = _safe_square_root(D0**2 + beginning_step_response**2 + later_steps_squared)
+    sensitivity_norm = compute_square_root(D0**2 + beginning_step_response**2 + later_steps_squared)
     infinite_if_unstable = lambda unbounded_sensitivity: jnp.where(
         is_gait_stable, unbounded_sensitivity, jnp.inf
     )
@@ -119,7 +119,7 @@ def compute_sensitivity_norms(slope_response: SlopeResponse) -> SensitivityNormP
         infinite_if_unstable(sensitivity_norm),
         D0,
         beginning_step_response,
-        infinite_if_unstable(_safe_square_root(later_steps_squared)),
+        infinite_if_unstable(compute_square_root(later_steps_squared)),
     )
 
 
@@ -151,14 +151,6 @@ def invert_by_elimination(square_matrix: Float[Array, "n n"]) -> Float[Array, "n
         return eliminated_matrix.at[column_index].set(pivot_row)
 
     return lax.fori_loop(0, matrix_size, eliminate_column, augmented_matrix)[:, matrix_size:]
-
-
-def _safe_square_root(squared_value: Array) -> Array:
-    """Return the square root of max(squared_value, 0). Its derivative at zero is zero."""
-    is_value_positive = squared_value > 0.0
-    return jnp.where(
-        is_value_positive, jnp.sqrt(jnp.where(is_value_positive, squared_value, 1.0)), 0.0
-    )
 
 
 def compute_step_slope_response(

@@ -7,6 +7,7 @@ from vrw_jax.numerics.autodiff import (
     ExecutionWrapper,
     ForwardFunction,
     apply_jacobian,
+    compute_square_root,
     enable_all_ad_modes,
     evaluate_with_jacobian,
     make_implicit_jacobian,
@@ -51,7 +52,7 @@ from vrw_jax.numerics.cubic_minima import (
     find_cubic_minimum,
 )
 from vrw_jax.numerics.forward_only import forbid_reverse_mode
-from vrw_jax.numerics.options import EngineName, SolverName, StepOptions
+from vrw_jax.numerics.options import EngineName, SolverName, StepOptions, make_real_field
 from vrw_jax.numerics.settings import with_default_jax_settings
 from vrw_jax.numerics.status_codes import StatusCode, describe_step_ending
 from vrw_jax.numerics.trigonometry import compute_sine_cosine

@@ -258,3 +258,9 @@ def make_zero_tangent(tree: PyTree) -> PyTree:
         else np.zeros(jnp.shape(x), jax.dtypes.float0)
     )
     return jax.tree.map(make_zero_leaf_tangent, tree)
+
+
+def compute_square_root(x: Array) -> Array:
+    """Return the square root of max(x, 0). Its derivative is zero for x <= 0."""
+    is_argument_positive = x > 0.0
+    return jnp.where(is_argument_positive, jnp.sqrt(jnp.where(is_argument_positive, x, 1.0)), 0.0)

@@ -48,9 +48,9 @@ REAL_OPTION_NAMES = ("rtol", "atol", "derivative_tightening", "max_phase_time", 
 """Names of the options whose values are real numbers."""
 
 
-def _make_positive_field(option_name: str, default_value: float) -> Any:
-    """Return a dataclass field for an option that must be a positive number."""
-    return eqx.field(converter=functools.partial(check_reals, option_name), default=default_value)
+def make_real_field(field_name: str, default_value: float) -> Any:
+    """Return a dataclass field for an option or a parameter that is a real number."""
+    return eqx.field(converter=functools.partial(check_reals, field_name), default=default_value)
 
 
 def _make_positive_int_field(option_name: str, default_value: int) -> Any:
@@ -96,12 +96,12 @@ class StepOptions(AbstractPrintable):
 
     solver: str = eqx.field(static=True, default="Dopri8")
     engine: EngineName = eqx.field(static=True, default="auto")
-    rtol: Scalar = _make_positive_field("rtol", 1e-10)
-    atol: Scalar = _make_positive_field("atol", 1e-10)
-    derivative_tightening: Scalar = _make_positive_field("derivative_tightening", 20.0)
-    max_phase_time: Scalar = _make_positive_field("max_phase_time", 20.0)
+    rtol: Scalar = make_real_field("rtol", 1e-10)
+    atol: Scalar = make_real_field("atol", 1e-10)
+    derivative_tightening: Scalar = make_real_field("derivative_tightening", 20.0)
+    max_phase_time: Scalar = make_real_field("max_phase_time", 20.0)
     max_solver_steps: int = _make_positive_int_field("max_solver_steps", 20_000)
-    dt0: Scalar = _make_positive_field("dt0", 5e-3)
+    dt0: Scalar = make_real_field("dt0", 5e-3)
     max_event_iterations: int = _make_positive_int_field("max_event_iterations", 100)
     max_margin_search_iterations: int = _make_positive_int_field("max_margin_search_iterations", 5)
 

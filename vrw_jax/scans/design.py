@@ -197,17 +197,6 @@ def _merge_mapping_and_keywords(
     return parameter_keywords if parameter_mapping is None else parameter_mapping
 
 
-def _require_sample_count(function_name: str, n_samples: int | None) -> int:
-    """Return `n_samples`, the number of samples. Raise a TypeError if it is None, because it has no
-    default.
-    """
-    if n_samples is None:
-        raise TypeError(
-            f"n is None, but {function_name} needs a number of samples: give n=1024, say."
-        )
-    return n_samples
-
-
 def grid(
     values: Mapping[str, Sequence[float] | np.ndarray] | None = None,
     /,
@@ -313,11 +302,9 @@ def sobol(
     """
     from scipy.stats import qmc  # This import is slow.
 
-    n, ranges = (
-        _require_sample_count("sobol", n),
-        _merge_mapping_and_keywords("sobol", ranges, parameters),
+    parameter_names, lower_bounds, upper_bounds, n = _parse_sampling_box(
+        "sobol", ranges, parameters, n
     )
-    parameter_names, lower_bounds, upper_bounds, n = _parse_sampling_box(ranges, n)
     sample_count_log2 = max(int(n - 1).bit_length(), 0)
     unit_cube_points = qmc.Sobol(
         len(parameter_names), rng=_make_random_generator(seed)
@@ -351,11 +338,9 @@ def uniform(
         >>> vrw.uniform({"damping": (100.0, 200.0), "slope": (0.28, 0.32)}, 8).shape
         (8,)
     """
-    n, ranges = (
-        _require_sample_count("uniform", n),
-        _merge_mapping_and_keywords("uniform", ranges, parameters),
+    parameter_names, lower_bounds, upper_bounds, n = _parse_sampling_box(
+        "uniform", ranges, parameters, n
     )
-    parameter_names, lower_bounds, upper_bounds, n = _parse_sampling_box(ranges, n)
     unit_cube_points = _make_random_generator(seed).random((n, len(parameter_names)))
     return _scale_unit_points_to_box(
         parameter_names, lower_bounds, upper_bounds, unit_cube_points, "uniform"
@@ -393,11 +378,9 @@ def saltelli(
     """
     from scipy.stats import qmc  # This import is slow.
 
-    n, ranges = (
-        _require_sample_count("saltelli", n),
-        _merge_mapping_and_keywords("saltelli", ranges, parameters),
+    parameter_names, lower_bounds, upper_bounds, n = _parse_sampling_box(
+        "saltelli", ranges, parameters, n
     )
-    parameter_names, lower_bounds, upper_bounds, n = _parse_sampling_box(ranges, n)
     if n & (n - 1):
         raise ValueError(
             f"n is {n}, but the rows of a Sobol' sequence are balanced for powers of two: "
@@ -445,9 +428,20 @@ def _make_random_generator(seed: int) -> np.random.Generator:
 
 
 def _parse_sampling_box(
-    ranges: Mapping[str, ParameterRange], n: int
+    function_name: str,
+    ranges: Mapping[str, ParameterRange] | None,
+    parameter_keywords: Mapping[str, ParameterRange],
+    n: int | None,
 ) -> tuple[list[str], np.ndarray, np.ndarray, int]:
-    """Return parameter names, lower bounds, upper bounds and the number of samples, all checked."""
+    """Return parameter names, lower bounds, upper bounds and the number of samples, all checked.
+
+    The number of samples has no default. The ranges are a mapping or keywords.
+    """
+    if n is None:
+        raise TypeError(
+            f"n is None, but {function_name} needs a number of samples: give n=1024, say."
+        )
+    ranges = _merge_mapping_and_keywords(function_name, ranges, parameter_keywords)
     n = check_int("n", n)
     if n > MAX_LISTED_SAMPLES:
         raise ValueError(

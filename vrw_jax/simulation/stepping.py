@@ -276,14 +276,9 @@ def step(
         >>> print(f"{step.period:.3f} s, {vrw.Outcome(int(step.outcome)).name}")
         0.714 s, STEPPED
     """
-    model, params, stepwise_ground = split_stepwise_ground(params, model, 1)
-    params, section_state, model, options = convert_step_arguments(
+    params, section_state, model, options = _convert_single_step_arguments(
         params, x, model, options, engine
     )
-    if stepwise_ground is not None:
-        model, params = model.with_step_ground(
-            params, _get_first_step_ground(stepwise_ground, section_state.dtype)
-        )
     return model.take_step(params, section_state, options)
 
 
@@ -322,14 +317,9 @@ def return_map(
         >>> jax.jacfwd(vrw.return_map, argnums=1)(params, x).shape
         (3, 3)
     """
-    model, params, stepwise_ground = split_stepwise_ground(params, model, 1)
-    params, section_state, model, options = convert_step_arguments(
+    params, section_state, model, options = _convert_single_step_arguments(
         params, x, model, options, engine
     )
-    if stepwise_ground is not None:
-        model, params = model.with_step_ground(
-            params, _get_first_step_ground(stepwise_ground, section_state.dtype)
-        )
     return model.advance(params, section_state, options).section_state
 
 
@@ -479,6 +469,22 @@ def walk(
     return _walk_by_scan(checked_model, params, section_state, options, n_steps, stepwise_ground)
 
 
+def _convert_single_step_arguments(
+    params: Any, x: object, model: ModelLike | None, options: StepOptions | None, engine: EngineName
+) -> tuple[WheelParams, Array, AbstractWheel, StepOptions]:
+    """Return the wheel, the section state, the model and the options of one step on its ground."""
+    model, params, stepwise_ground = split_stepwise_ground(params, model, 1)
+    params, section_state, model, options = convert_step_arguments(
+        params, x, model, options, engine
+    )
+    if stepwise_ground is not None:
+        step_ground = tuple(
+            ground_values[0].astype(section_state.dtype) for ground_values in stepwise_ground
+        )
+        model, params = model.with_step_ground(params, step_ground)
+    return params, section_state, model, options
+
+
 def split_stepwise_ground(
     params: Any, model: ModelLike | None, n_steps: int
 ) -> tuple[AbstractWheel, Any, StepGroundValues | None]:
@@ -498,13 +504,6 @@ def split_stepwise_ground(
     first_slope = jnp.reshape(params.slope, -1)[0]
     first_wheel = eqx.tree_at(lambda wheel: wheel.slope, params, first_slope)
     return first_model, first_wheel, stepwise_ground
-
-
-def _get_first_step_ground(
-    stepwise_ground: StepGroundValues, ground_dtype: Any
-) -> StepGroundValues:
-    """Return the ground of the first step, converted to the floating-point type `ground_dtype`."""
-    return tuple(ground_values[0].astype(ground_dtype) for ground_values in stepwise_ground)
 
 
 def start_walk_toward_gait(

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool
 
-from vrw_jax.numerics import Elementwise, RealInput, Scalar, compute_sine_cosine
+from vrw_jax.numerics import Elementwise, RealInput, Scalar, compute_sine_cosine, make_real_field
 from vrw_jax.printing import AbstractPrintable, LabelAndText, format_quantity
 from vrw_jax.validation import check_int, check_reals, format_value, require_known_name
 
@@ -123,13 +123,6 @@ class Symbols(NamedTuple):
     alpha: float
 
 
-def _make_parameter_field(parameter_name: str, default_value: float) -> Any:
-    """Return a dataclass field for a floating-point parameter."""
-    return eqx.field(
-        converter=functools.partial(check_reals, parameter_name), default=default_value
-    )
-
-
 _check_n_legs = functools.partial(
     check_int,
     "n_legs",
@@ -166,15 +159,15 @@ class WheelParams(AbstractPrintable):
         (3,)
     """
 
-    hub_mass: Scalar = _make_parameter_field("hub_mass", 10.0)
-    leg_mass: Scalar = _make_parameter_field("leg_mass", 1.0)
-    leg_com: Scalar = _make_parameter_field("leg_com", 0.3)
-    locked_length: Scalar = _make_parameter_field("locked_length", 1.0)
-    natural_length: Scalar = _make_parameter_field("natural_length", 1.02)
-    stiffness: Scalar = _make_parameter_field("stiffness", 500.0)
-    damping: Scalar = _make_parameter_field("damping", 200.0)
-    slope: Scalar = _make_parameter_field("slope", 0.30)
-    gravity: Scalar = _make_parameter_field("gravity", 9.81)
+    hub_mass: Scalar = make_real_field("hub_mass", 10.0)
+    leg_mass: Scalar = make_real_field("leg_mass", 1.0)
+    leg_com: Scalar = make_real_field("leg_com", 0.3)
+    locked_length: Scalar = make_real_field("locked_length", 1.0)
+    natural_length: Scalar = make_real_field("natural_length", 1.02)
+    stiffness: Scalar = make_real_field("stiffness", 500.0)
+    damping: Scalar = make_real_field("damping", 200.0)
+    slope: Scalar = make_real_field("slope", 0.30)
+    gravity: Scalar = make_real_field("gravity", 9.81)
     n_legs: int = eqx.field(static=True, converter=_check_n_legs, default=8)
 
     def __new__(cls, *_: Any, **given_parameters: Any) -> "WheelParams":
