@@ -77,11 +77,9 @@ FRONTS_TABLE = FIGURES / "double_support_fronts.csv"
 INDICES_TABLE = FIGURES / "double_support_indices.csv"
 PAGE = DOCS / "studies/double_support.md"
 
-RIGID_MODELS = {
-    "rigid, classic landing": vrw.RigidWheel(stop_at_lift_off=True),
-    "rigid, held landing": vrw.RigidWheel(stop_at_lift_off=True, held_landing=True),
-}
-CONTACT_MODEL = vrw.UnilateralWheel(friction=0.8)
+HAS_HELD_LANDING = {"rigid, classic landing": False, "rigid, held landing": True}
+"""Whether each rigid wheel has the held landing, by the label of the wheel."""
+CONTACT_FRICTION = 0.8
 COMPARED_COLUMNS = {
     "slope": "slope, rad",
     "speed": "speed, m/s",
@@ -256,9 +254,14 @@ def format_row(comparison: str, label: str, values: Mapping[str, float]) -> Row:
     }
 
 
+def make_rigid_model(label: str, stop_at_lift_off: bool = True) -> vrw.RigidWheel:
+    """Return the model of the rigid wheel with this label, one of `HAS_HELD_LANDING`."""
+    return vrw.RigidWheel(stop_at_lift_off=stop_at_lift_off, held_landing=HAS_HELD_LANDING[label])
+
+
 def measure_rigid(label: str, slope: float, comparison: str) -> Row | None:
     """Return a row of a rigid wheel on a slope, or None if it has no gait there."""
-    model, params = RIGID_MODELS[label], vrw.WheelParams(slope=slope)
+    model, params = make_rigid_model(label), vrw.WheelParams(slope=slope)
     gait = vrw.limit_cycle(params, model=model)
     if not bool(gait.found):
         return None
@@ -282,7 +285,7 @@ def solve_rigid_speed(label: str, speed: float) -> float | None:
     """Return the slope on which a rigid wheel has this speed, rad, or None if there is none."""
 
     def compute_excess(slope: float) -> float:
-        gait = vrw.limit_cycle(vrw.WheelParams(slope=slope), model=RIGID_MODELS[label])
+        gait = vrw.limit_cycle(vrw.WheelParams(slope=slope), model=make_rigid_model(label))
         return float(gait.speed) - speed if bool(gait.found) else -speed
 
     steepest = 0.16
@@ -312,13 +315,15 @@ def compute_gaits(size: StudySize) -> list[Row]:
         rows += measure_gaits(
             labels, select(grid, is_at_slope), select(gaits, is_at_slope), comparison
         )
-        rows += filter(None, (measure_rigid(label, slope, comparison) for label in RIGID_MODELS))
+        rows += filter(
+            None, (measure_rigid(label, slope, comparison) for label in HAS_HELD_LANDING)
+        )
     comparison = f"speed {EQUAL_SPEED:g} m/s"
     columns = solve_equal_speed(wheels, gaits["speed"].reshape(n, -1))
     rows += measure_gaits(
         [labels[i] for i in columns["index"]], columns, find_gaits(columns), comparison
     )
-    for label in RIGID_MODELS:
+    for label in HAS_HELD_LANDING:
         rigid_slope = solve_rigid_speed(label, EQUAL_SPEED)
         if rigid_slope is not None:
             rows += filter(None, [measure_rigid(label, rigid_slope, comparison)])
@@ -351,13 +356,11 @@ def compute_lives(rows: Sequence[Row], size: StudySize) -> list[Row]:
     """Return mean numbers of steps on random slopes of selected wheels and of rigid wheels."""
     at_slope = [row for row in rows if row["comparison"] == f"slope {LIFE_SLOPE:g} rad"]
     chosen = select_evenly(select_compliant(at_slope), size.n_lives)
-    chosen += [row for row in at_slope if row["wheel"] in RIGID_MODELS]
+    chosen += [row for row in at_slope if row["wheel"] in HAS_HELD_LANDING]
     lines = []
     for row in chosen:
-        if row["wheel"] in RIGID_MODELS:
-            model = vrw.RigidWheel(
-                stop_at_lift_off=False, held_landing=RIGID_MODELS[row["wheel"]].held_landing
-            )
+        if row["wheel"] in HAS_HELD_LANDING:
+            model = make_rigid_model(row["wheel"], stop_at_lift_off=False)
             passage = vrw.first_passage(
                 vrw.WheelParams(slope=LIFE_SLOPE), LIFE_SLOPE_SD, model=model
             )
@@ -393,11 +396,13 @@ def compute_contact(rows: Sequence[Row], size: StudySize) -> list[Row]:
         row for row in rows
         if row["wheel"] == "table_1" and row["comparison"] == marked_comparison
     ]  # fmt: skip
+    # The model contains 64-bit numbers only if vrw.start_jax() was called.
+    contact_model = vrw.UnilateralWheel(friction=CONTACT_FRICTION)
     lines = []
     for row in [*chosen, *marked]:
         params = make_wheel(row)
         start = vrw.limit_cycle(params, options=GAIT_OPTIONS).section_state
-        walk = vrw.walk(params, start, N_CONTACT_STEPS, model=CONTACT_MODEL)
+        walk = vrw.walk(params, start, N_CONTACT_STEPS, model=contact_model)
         outcomes = np.asarray(walk.steps.outcome)
         line = copy_gait_columns(row) | {"friction_needed": row["friction_needed"],
                                          "speed": row["speed"]}  # fmt: skip
@@ -408,7 +413,7 @@ def compute_contact(rows: Sequence[Row], size: StudySize) -> list[Row]:
         else:
             periods = np.asarray(walk.steps.durations).sum(-1)
             end = "repeats" if abs(periods[-1] - periods[-2]) < 1e-6 else "varies"
-            step = vrw.step(params, walk.steps.section_state[-2], model=CONTACT_MODEL)
+            step = vrw.step(params, walk.steps.section_state[-2], model=contact_model)
             loss = float(row["energy_per_meter"]) * float(step.step_length)
             contact_measures = {
                 "contact_dls_fraction": float(step.dls_fraction),
@@ -426,7 +431,7 @@ def compute_contact(rows: Sequence[Row], size: StudySize) -> list[Row]:
 
 def select_compliant(rows: Sequence[Row]) -> list[Row]:
     """Return the rows of compliant wheels."""
-    return [row for row in rows if row["wheel"] not in RIGID_MODELS]
+    return [row for row in rows if row["wheel"] not in HAS_HELD_LANDING]
 
 
 def compute_energy_gain(cycle: Any, step: Any) -> jax.Array:
@@ -557,7 +562,7 @@ def summarize_comparisons(rows: Sequence[Row]) -> str:
     for comparison, group in group_by_comparison(rows).items():
         gaits = sorted(select_compliant(group), key=lambda row: float(row["dls_fraction"]))
         third = len(gaits) // 3
-        rigid = {row["wheel"]: row for row in group if row["wheel"] in RIGID_MODELS}
+        rigid = {row["wheel"]: row for row in group if row["wheel"] in HAS_HELD_LANDING}
         dls, damping = (read_column(gaits, name) for name in ("dls_fraction", "damping"))
         for name, label in {"dls_fraction": "DLS fraction", **COMPARED_COLUMNS}.items():
             if name == comparison.split()[0] or not gaits[0].get(name):
@@ -572,11 +577,11 @@ def summarize_comparisons(rows: Sequence[Row]) -> str:
             lines.append([
                 comparison, label, len(gaits),
                 *(shorten_number(rigid[model][name]) if model in rigid else "no gait"
-                  for model in RIGID_MODELS),
+                  for model in HAS_HELD_LANDING),
                 f"{np.median(values[:third]):.3g}", f"{np.median(values[-third:]):.3g}",
                 "–" if name == "dls_fraction" else correlations[0], correlations[1],
             ])  # fmt: skip
-    header = ("at", "index", "gaits", *RIGID_MODELS, "median, least DLS", "median, most DLS",
+    header = ("at", "index", "gaits", *HAS_HELD_LANDING, "median, least DLS", "median, most DLS",
               "rank correlation with DLS", "with damping")  # fmt: skip
     return format_markdown(header, lines)
 
@@ -686,7 +691,7 @@ def draw_comparisons() -> None:
 def draw_rigid_wheels(axis: Axes, rows: Sequence[Row], column: str) -> None:
     """Draw a horizontal line for each rigid wheel, solid for the classic landing."""
     for row in rows:
-        if row["wheel"] in RIGID_MODELS:
+        if row["wheel"] in HAS_HELD_LANDING:
             style = "-" if "classic" in row["wheel"] else "--"
             axis.axhline(float(row[column]), color=plots.DARK_GRAY_COLOR, linestyle=style,
                          linewidth=0.8, label=row["wheel"])  # fmt: skip

@@ -21,10 +21,9 @@ from experiments.gaits.force_peak_comparisons import (
 )
 from experiments.gaits.force_peak_stances import SPRING_MASS_TABLE, STANCE_TABLE
 from experiments.gaits.force_peak_wheels import (
-    TABLE_1,
     compute_damping_ratio,
+    compute_leg_share,
     compute_stiffness_number,
-    compute_total_mass,
 )
 from experiments.shared.tables import FIGURES, Row, group_rows, read_column, read_table
 from vrw_jax import figures as plots
@@ -173,7 +172,7 @@ def draw_comparisons() -> None:
     axes[0].set_yscale("log")
     axes[0].set_yticks([3, 5, 10, 20], ["3", "5", "10", "20"])
     axes[0].minorticks_off()
-    table_1_share = TABLE_1.n_legs * float(TABLE_1.leg_mass) / compute_total_mass(TABLE_1)
+    table_1_share = compute_leg_share(vrw.WheelParams())
     axes[0].axvline(table_1_share, color="black", linewidth=0.7, linestyle=":")
     axes[0].set_xlabel("mass of all legs / $M$")
     axes[0].set_ylabel(STIFFNESS_LABEL)

@@ -11,9 +11,6 @@ import numpy as np
 
 import vrw_jax as vrw
 
-TABLE_1 = vrw.WheelParams()
-"""The wheel of Table 1, from which all wheels take mass, length and gravity."""
-
 GAIT_OPTIONS = vrw.CycleOptions(mesh_intervals=(40, 32, 16))
 """One mesh for all gaits, chosen because gaits with two peaks need its resolution."""
 
@@ -21,6 +18,11 @@ GAIT_OPTIONS = vrw.CycleOptions(mesh_intervals=(40, 32, 16))
 def compute_total_mass(params: vrw.WheelParams) -> float:
     """Return the mass of the wheel, kg."""
     return float(params.hub_mass + params.n_legs * params.leg_mass)
+
+
+def compute_leg_share(params: vrw.WheelParams) -> float:
+    """Return the mass of all legs as a fraction of the mass of the wheel."""
+    return params.n_legs * float(params.leg_mass) / compute_total_mass(params)
 
 
 def compute_stiffness_number(params: vrw.WheelParams) -> float:
@@ -47,17 +49,19 @@ def make_wheels(
     `slope` is in rad and `natural_length` in m. `leg_share` is the mass of all legs as a fraction
     of the mass of the wheel, that of Table 1 by default.
     """
-    mass = compute_total_mass(TABLE_1)
+    # WheelParams contains 64-bit numbers only if vrw.start_jax() was called.
+    table_1 = vrw.WheelParams()
+    mass = compute_total_mass(table_1)
     if leg_share is None:
-        leg_share = TABLE_1.n_legs * float(TABLE_1.leg_mass) / mass
+        leg_share = compute_leg_share(table_1)
     arguments = stiffness_number, damping_ratio, slope, natural_length, leg_share
     number, ratio, slope, natural_length, leg_share = np.broadcast_arrays(
         *map(np.asarray, arguments)
     )
-    stiffness = number / compute_stiffness_number(TABLE_1) * float(TABLE_1.stiffness)
+    stiffness = number / compute_stiffness_number(table_1) * float(table_1.stiffness)
     return vrw.WheelParams(
         hub_mass=mass * (1.0 - leg_share),
-        leg_mass=mass * leg_share / TABLE_1.n_legs,
+        leg_mass=mass * leg_share / table_1.n_legs,
         stiffness=stiffness,
         damping=2.0 * ratio * np.sqrt(stiffness * mass),
         natural_length=natural_length,
@@ -65,8 +69,8 @@ def make_wheels(
     )
 
 
-LIGHT_DAMPING = compute_damping_ratio(vrw.parameter_sets["two_peaks"].params)
-"""Damping ratio of the parameter set `two_peaks`."""
+LIGHT_DAMPING = 100.0 / (2.0 * np.sqrt(2500.0 * 18.0))
+"""Damping ratio of the parameter set `two_peaks`, with 100 N s/m, 2500 N/m and 18 kg."""
 
 
 def select_wheel(params: vrw.WheelParams, index: int) -> vrw.WheelParams:
