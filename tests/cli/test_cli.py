@@ -207,6 +207,36 @@ def test_a_map_prints_its_stages_after_the_scan(
     assert (folder / "map.md").read_text().startswith("0 changes of sign")
 
 
+@pytest.mark.slow  # force peaks compile for a minute on a busy machine
+def test_a_map_of_force_peaks_has_those_of_each_gait_on_the_mesh_of_the_config(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """On the default mesh the steps of these gaits do not repeat, so the map would have none."""
+    config = tmp_path / "small.toml"
+    config.write_text(
+        "[wheel]\nnatural_length = 1.0\nslope = 0.075\n"
+        "[grid]\nstiffness = [860.0, 900.0]\ndamping = [95.0, 105.0]\n"
+        '[scan]\nmeasures = ["n_force_peaks", "peak_force", "second_peak_rate"]\n'
+        "mesh_intervals = [40, 32, 16]\n"
+    )
+    monkeypatch.setattr(
+        "vrw_jax.scans.follow_special_points", lambda scan, *_: SpecialPointMap(scan, (), ())
+    )
+    result = run_command("map", config, "--out", tmp_path)
+    assert result.exit_code == 0, result.output
+    data = open_scan(tmp_path / "scan.zarr")
+    assert set(data.n_force_peaks.values.ravel()) == {1.0, 2.0}
+    for i, j in ((0, 1), (1, 0)):
+        wheel = vrw.WheelParams(
+            stiffness=data.stiffness[i].item(), damping=data.damping[j].item(),
+            natural_length=1.0, slope=0.075,
+        )  # fmt: skip
+        gait = vrw.limit_cycle(wheel)
+        for name in ("n_force_peaks", "peak_force", "second_peak_rate"):
+            # The rate is small beside its terms, so that its relative error is larger.
+            np.testing.assert_allclose(data[name][i, j], gait.measure(name), rtol=1e-6)
+
+
 def test_a_scan_writes_data_and_figures_to_the_printed_paths(config: Path) -> None:
     result = run_command("scan", config)
     assert result.exit_code == 0, result.output
@@ -401,6 +431,7 @@ def test_a_gait_of_the_simplest_model_names_the_model_and_the_reason(
     assert result.exit_code == 0, result.output
     assert reason in result.stdout
     assert "slip per step" in result.stdout
+    assert "number of force peaks" in result.stdout
     assert "0.0000," not in result.stdout  # of 28 multipliers 24 vanish: they are counted
 
 

@@ -1,6 +1,7 @@
 """Force peaks of gaits with unilateral contact are those of the second formulation."""
 
 import dataclasses
+import math
 
 import jax.numpy as jnp
 import numpy as np
@@ -10,6 +11,7 @@ from reference_code.contact_force_extrema import find_step_extrema, make_start
 
 import vrw_jax as vrw
 from vrw_jax.measures import FORCE_PEAK_MEASURES
+from vrw_jax.selection.ladder import ModelCode
 
 TWO_PEAKS = vrw.WheelParams(stiffness=2500.0, damping=100.0, natural_length=1.0, slope=0.075)
 TABLE_1 = vrw.WheelParams()
@@ -131,3 +133,25 @@ def test_a_model_without_force_peaks_raises_one_sentence():
     cycle = vrw.limit_cycle(wheel, model=model, guess=[0.39, 1.5, 0.0])
     with pytest.raises(ValueError, match="its steps have no such measures"):
         cycle.measure("peak_force")
+
+
+@pytest.mark.slow  # scans with both models compile for more than a minute
+def test_a_scan_with_model_auto_has_the_peaks_of_each_samples_model():
+    names = ["n_force_peaks", "n_total_force_peaks", "peak_force", "peak_total_force"]
+    wheels = (dataclasses.replace(TABLE_1, damping=jnp.asarray(150.0)), TWO_PEAKS)
+    design = vrw.samples({
+        name: [float(getattr(wheel, name)) for wheel in wheels]
+        for name in ("damping", "stiffness", "natural_length", "slope")
+    } | {"friction": [math.inf, 0.8]})  # fmt: skip
+    scan = vrw.scan(design, names, model="auto")
+    np.testing.assert_array_equal(scan.rung, [ModelCode.VISCOELASTIC, ModelCode.UNILATERAL])
+    for i, model in enumerate((vrw.ViscoelasticWheel(), MODEL)):
+        peaks = read_peaks(vrw.limit_cycle(wheels[i], model=model), names)
+        assert peaks["n_total_force_peaks"] > 0.0
+        for name, value in peaks.items():
+            np.testing.assert_allclose(scan[name].values[i], value, rtol=1e-8, err_msg=name)
+
+
+def test_model_auto_has_the_peaks_of_the_selected_model(gaits):
+    gait = vrw.limit_cycle(TWO_PEAKS, model=vrw.LadderWheel(friction=0.8))
+    assert read_peaks(gait) == read_peaks(gaits["two peaks"])

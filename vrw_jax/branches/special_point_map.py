@@ -25,6 +25,7 @@ from vrw_jax.branches.curve_tracing import (
     compute_distances_to_polyline,
 )
 from vrw_jax.branches.gait_test_functions import DLS_VANISHING_NAME, LINEAR_MARGIN_SUBSTITUTES
+from vrw_jax.branches.multiplicity import SECOND_PEAK_RATE_NAME
 from vrw_jax.continuation import BIFURCATION_NAMES
 from vrw_jax.measures import MARGIN_MEASURES
 from vrw_jax.measures import xarray as xr
@@ -98,8 +99,9 @@ def trace_special_points(
     """Trace the curves of special points in the two parameters of a scan.
 
     Return the curves, and the sign changes that no curve explains. The scan contains
-    `SPECIAL_POINT_MEASURES` and margins. A sign change between two samples is unexplained if no
-    curve is near it. `on_stage` is called with a description of each stage.
+    `SPECIAL_POINT_MEASURES` and margins. If it contains "second_peak_rate", the curves on which a
+    second force peak appears are also traced. A sign change between two samples is unexplained if
+    no curve is near it. `on_stage` is called with a description of each stage.
     """
     parameter_names = tuple(map(str, scan_dataset.outcome.dims))
     parameter_ranges = np.array(
@@ -116,6 +118,7 @@ def trace_special_points(
         DEFAULT_CURVE_OPTIONS,
         StepOptions.tight(),
         on_stage,
+        measures_force_peaks=SECOND_PEAK_RATE_NAME in scan_dataset,
     )
     curve_seeds = find_seeds_on_parallel_lines(curve_tracer, params, map_options)
     traced_curves = _trace_curves_and_meetings(curve_tracer, curve_seeds, [], map_options)
@@ -253,6 +256,9 @@ def _collect_signed_quantities(
     signed_quantities[STABILITY_CHANGE_NAME] = (
         1.0 - scan_dataset[STABILITY_CHANGE_NAME].transpose(*parameter_names).values
     )
+    if SECOND_PEAK_RATE_NAME in scan_dataset:
+        second_peak_rate = scan_dataset[SECOND_PEAK_RATE_NAME].transpose(*parameter_names)
+        signed_quantities[SECOND_PEAK_RATE_NAME] = second_peak_rate.values
     for measure_name in (
         measure_name
         for measure_name in MARGIN_MEASURES

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from vrw_jax.cycles import CycleOptions
 from vrw_jax.models import AbstractWheel, GaitMethod
 from vrw_jax.numerics import StepOptions
 from vrw_jax.scans import (
@@ -85,13 +86,16 @@ class ScanConfig:
     - `chunk`: number of samples that are computed and written together; 4,096 by default;
     - `tol`: permitted error of each measure with unilateral contact (`name = "unilateral"`), in the
       unit of the measure. Each sample is computed with the simplest model that achieves this error;
-    - `slope_sd`: standard deviation of random slopes, rad, for the measures of `vrw.first_passage`.
+    - `slope_sd`: standard deviation of random slopes, rad, for the measures of `vrw.first_passage`;
+    - `mesh_intervals`: numbers of mesh intervals of DLS, SLS-I and SLS-II, for the paper's wheel.
+      Stiff legs on a gentle slope need [40, 32, 16].
     """
 
     measures: tuple[str, ...] | None = None
     chunk: int | None = None
     tol: float | None = None
     slope_sd: float | None = None
+    mesh_intervals: tuple[int, int, int] | None = None
 
     @classmethod
     def from_table(
@@ -133,7 +137,14 @@ class ScanConfig:
             None
             if slope_sd is None
             else _parse_finite_number(slope_sd, "slope_sd", must_be_positive=True),
+            None
+            if "mesh_intervals" not in config_table
+            else CycleOptions(mesh_intervals=config_table["mesh_intervals"]).mesh_intervals,  # type: ignore[arg-type]
         )
+
+    def make_cycle_options(self) -> CycleOptions | None:
+        """Return the options of the gait search with the mesh of the config, or None."""
+        return self.mesh_intervals and CycleOptions(mesh_intervals=self.mesh_intervals)
 
 
 @dataclass(frozen=True)

@@ -38,6 +38,7 @@ def plan_config_scan(
         base=command_config.make_wheel(),
         model=command_config.make_model(),
         options=command_config.make_options(),
+        cycle_options=command_config.scan.make_cycle_options(),
         chunk=chunk_size or command_config.scan.chunk,
         config_text=command_config.source_text,
         tol=command_config.scan.tol,

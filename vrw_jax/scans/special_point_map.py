@@ -14,6 +14,7 @@ from vrw_jax.branches import (
     SpecialPointCurve,
     trace_special_points,
 )
+from vrw_jax.cycles import CycleOptions
 from vrw_jax.measures import xarray as xr
 from vrw_jax.numerics import StepOptions
 from vrw_jax.scans.design import AbstractSampleDesign
@@ -74,6 +75,7 @@ def map_special_points(
     base: WheelParams | None = None,
     model: ModelLike | None = None,
     options: StepOptions | None = None,
+    cycle_options: CycleOptions | None = None,
     store: str | Path | None = None,
     on_progress: ProgressCallback | None = None,
     on_stage: Callable[[str], None] | None = None,
@@ -86,11 +88,13 @@ def map_special_points(
 
     Args:
         design: a `vrw.grid` over two parameters with ascending values.
-        measures: names of measures of the scan, in addition to those that the curves need.
+        measures: names of measures of the scan, in addition to those that the curves need. With
+            "second_peak_rate", the map contains curves on which a second force peak appears.
         base: wheel with the parameters that are not swept; by default that of Table 1 of the
             paper.
         model: a `ViscoelasticWheel`, which is the default.
         options: numerical options of the gait steps that check the gaits of the scan.
+        cycle_options: numerical options of the gait search of the scan.
         store: folder to which the scan is written.
         on_progress: function that is called with the `ScanProgress` after each chunk.
         on_stage: function that is called with a description of each stage after the scan.
@@ -124,6 +128,7 @@ def map_special_points(
         base=base,
         model=wheel_model,
         options=options,
+        cycle_options=cycle_options,
         store=store,
         on_progress=on_progress,
     )

@@ -36,7 +36,7 @@ class Outcome(StatusCode):
     )  # fmt: skip
     THREE_FEET_LOADED = 12, "Three feet would have to carry load at once."
     MESH_TOO_COARSE = (
-        13, "A cycle solves the equations, but the mesh is too coarse for it: give more steps."
+        13, "A cycle solves the equations, but the mesh is too coarse: give more intervals."
     )  # fmt: skip
     EVENT_ORDER_MISMATCH = (
         14, "A cycle solves the equations, but its events do not come in the paper's order."
