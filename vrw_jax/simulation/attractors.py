@@ -37,7 +37,7 @@ class AttractorOptions:
     """Largest change of a section state from one period to the next for which motion counts as
     periodic.
     """
-    arrival_distance: float = 1e-3
+    max_distance_on_arrival: float = 1e-3
     """Largest distance between a walk and its orbit at which the walk has arrived at the orbit."""
     same_orbit_distance: float = 1e-4
     """Largest distance between two orbits that are treated as the same orbit.
@@ -62,7 +62,7 @@ class PeriodicWalkEnds(NamedTuple):
 
 
 @eqx.filter_jit
-def _walk_block_of_starts(
+def _simulate_block_of_starts(
     model: AbstractWheel, options: StepOptions, n_steps: int, params: WheelParams, x: Array
 ) -> tuple[Array, Array]:
     """Return the section states and outcomes after each step of one round of walking steps.
@@ -70,12 +70,12 @@ def _walk_block_of_starts(
     The arrays have the shapes (starts, steps, m) and (starts, steps), where m is the number of
     entries of a section state.
     """
-    single_start_walk = lambda params, x: walk(params, x, n_steps, model=model, options=options)
-    batched_walk = jax.vmap(single_start_walk)(params, x)
-    return batched_walk.steps.section_state, batched_walk.steps.outcome
+    simulate_from_start = lambda params, x: walk(params, x, n_steps, model=model, options=options)
+    walks_of_block = jax.vmap(simulate_from_start)(params, x)
+    return walks_of_block.steps.section_state, walks_of_block.steps.outcome
 
 
-def _walk_starts_with_contact(
+def _simulate_starts_with_contact(
     model: Any, options: StepOptions, n_steps: int, params: WheelParams, x: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the section states and outcomes of one round of walking steps with unilateral contact.
@@ -118,37 +118,37 @@ def walk_until_periodic(
     - `max_period`: longest period that is detected, in steps.
     """
     n_starts = len(start_states)
-    start_repeater = lambda x: np.broadcast_to(np.asarray(x), n_starts)
-    repeated_wheels = jax.tree.map(start_repeater, params)
+    start_axis_broadcaster = lambda x: np.broadcast_to(np.asarray(x), n_starts)
+    repeated_wheels = jax.tree.map(start_axis_broadcaster, params)
     n_steps_of_round = attractor_options.n_steps_per_round
-    n_rounds = -(-max_steps // n_steps_of_round)
+    n_walk_rounds = -(-max_steps // n_steps_of_round)
     state_history = np.full(
-        (n_starts, 1 + n_rounds * n_steps_of_round, start_states.shape[1]), np.nan
+        (n_starts, 1 + n_walk_rounds * n_steps_of_round, start_states.shape[1]), np.nan
     )
     state_history[:, 0] = start_states
     walk_outcomes = np.full(n_starts, int(Outcome.STEPPED))
     orbit_periods, n_steps_to_orbit = np.zeros(n_starts, int), np.zeros(n_starts, int)
     unsettled_walk_indices = np.arange(n_starts)
-    walk_round_function: Callable[..., tuple]
+    walk_round_simulator: Callable[..., tuple]
     if model.batch_kernel == "legs":
-        walk_round_function = functools.partial(
-            _walk_starts_with_contact, model, options, n_steps_of_round
+        walk_round_simulator = functools.partial(
+            _simulate_starts_with_contact, model, options, n_steps_of_round
         )
     else:
-        block_walk_function = functools.partial(
-            _walk_block_of_starts, model, options, n_steps_of_round
+        start_block_walker = functools.partial(
+            _simulate_block_of_starts, model, options, n_steps_of_round
         )
-        walk_round_function = functools.partial(
-            map_in_batches, block_walk_function, (batch_sizes.ATTRACTOR_BATCH_SIZE,)
+        walk_round_simulator = functools.partial(
+            map_in_batches, start_block_walker, (batch_sizes.ATTRACTOR_BATCH_SIZE,)
         )
-    for k in range(n_rounds):
+    for k in range(n_walk_rounds):
         step_slice_of_round = slice(1 + k * n_steps_of_round, 1 + (k + 1) * n_steps_of_round)
         walk_arguments_of_round = (
             select_tree_rows(repeated_wheels, unsettled_walk_indices),
             state_history[unsettled_walk_indices, k * n_steps_of_round],
         )
         section_states_of_round, step_outcomes = map(
-            np.asarray, walk_round_function(*walk_arguments_of_round)
+            np.asarray, walk_round_simulator(*walk_arguments_of_round)
         )
         (
             state_history[unsettled_walk_indices, step_slice_of_round],
@@ -184,8 +184,10 @@ def walk_until_periodic(
         orbit_distances = np.linalg.norm(
             state_history[i, : n_steps_to_orbit[i] + 1, None] - last_period_states[None], axis=-1
         ).min(1)
-        is_step_distant = np.flatnonzero(orbit_distances > attractor_options.arrival_distance)
-        n_steps_to_orbit[i] = is_step_distant[-1] + 1 if len(is_step_distant) else 0
+        distant_state_indices = np.flatnonzero(
+            orbit_distances > attractor_options.max_distance_on_arrival
+        )
+        n_steps_to_orbit[i] = distant_state_indices[-1] + 1 if len(distant_state_indices) else 0
     return PeriodicWalkEnds(walk_outcomes, orbit_periods, n_steps_to_orbit, orbit_states)
 
 
@@ -200,13 +202,15 @@ def _detect_walk_periods(
     detected_periods = np.zeros(len(state_history), int)
     n_walked_states = state_history.shape[1]
     for candidate_period in range(min(max_period, (n_walked_states - 1) // 3), 0, -1):
-        state_changes = np.abs(
+        state_changes_over_period = np.abs(
             state_history[:, n_walked_states - 2 * candidate_period :]
             - state_history[
                 :, n_walked_states - 3 * candidate_period : n_walked_states - candidate_period
             ]
         )
-        detected_periods[state_changes.max((1, 2)) < periodicity_tolerance] = candidate_period
+        detected_periods[state_changes_over_period.max((1, 2)) < periodicity_tolerance] = (
+            candidate_period
+        )
     return detected_periods
 
 
@@ -231,10 +235,10 @@ def find_distinct_orbits(
     distinct_orbits: list[np.ndarray] = []
     for i in np.flatnonzero(walk_ends.period):
         orbit_states = walk_ends.orbit_states[i, : walk_ends.period[i]]
-        for j, known_orbit_states in enumerate(distinct_orbits):
+        for j, distinct_orbit_states in enumerate(distinct_orbits):
             if (
-                len(known_orbit_states) == len(orbit_states)
-                and np.abs(known_orbit_states - orbit_states).max()
+                len(distinct_orbit_states) == len(orbit_states)
+                and np.abs(distinct_orbit_states - orbit_states).max()
                 < attractor_options.same_orbit_distance
             ):
                 orbit_indices[i] = j
@@ -275,11 +279,11 @@ def measure_orbit_steps(
             parameter_rows, section_states, unilateral_model, options, params.n_legs, ()
         )
         return jax.tree.map(np.asarray, jax.tree.map(jnp.asarray, step_results).measures())
-    block_measure_function = functools.partial(_measure_steps_of_block, model, options)
+    start_block_measurer = functools.partial(_measure_steps_of_block, model, options)
     return jax.tree.map(
         np.asarray,
         map_in_batches(
-            block_measure_function,
+            start_block_measurer,
             (batch_sizes.ATTRACTOR_BATCH_SIZE,),
             repeated_wheels,
             section_states,

@@ -107,20 +107,25 @@ def basin(
     options = options.with_engine(engine)
     max_steps = check_int("max_steps", max_steps)
     max_period = check_int("max_period", max_period)
-    component_values = _parse_start_grid(grid)
-    component_names = tuple(component_values)
-    grid_axis_names = [
-        component_name for component_name in component_names if np.ndim(grid[component_name]) > 0
+    start_component_values = _parse_start_grid(grid)
+    start_component_names = tuple(start_component_values)
+    start_grid_axis_names = [
+        start_component_name
+        for start_component_name in start_component_names
+        if np.ndim(grid[start_component_name]) > 0
     ]
-    grid_shape = tuple(len(component_values[component_name]) for component_name in grid_axis_names)
-    grid_coordinates = np.meshgrid(*component_values.values(), indexing="ij")
-    grid_points = np.stack(
-        [n_section_entries.ravel() for n_section_entries in grid_coordinates], -1
+    start_grid_shape = tuple(
+        len(start_component_values[start_component_name])
+        for start_component_name in start_grid_axis_names
+    )
+    start_coordinate_grids = np.meshgrid(*start_component_values.values(), indexing="ij")
+    start_grid_points = np.stack(
+        [start_coordinate_grid.ravel() for start_coordinate_grid in start_coordinate_grids], -1
     )
     start_states = (
-        grid_points
-        if component_names == PRE_TOUCHDOWN_COMPONENT_NAMES
-        else invert_landing_map(params, grid_points)
+        start_grid_points
+        if start_component_names == PRE_TOUCHDOWN_COMPONENT_NAMES
+        else invert_landing_map(params, start_grid_points)
     )
     is_start_reachable = np.isfinite(start_states).all(-1)
     start_states = np.where(is_start_reachable[:, None], start_states, np.nan)
@@ -131,30 +136,30 @@ def basin(
 
     walk_variables = {
         "attractor": xr.Variable(
-            grid_axis_names,
-            distinct_orbits.orbit_indices.reshape(grid_shape),
+            start_grid_axis_names,
+            distinct_orbits.orbit_indices.reshape(start_grid_shape),
             {"long_name": "orbit that the walk settles on", "flag_none": -1},
         ),
         "outcome": xr.Variable(
-            grid_axis_names,
-            walk_ends.outcome.reshape(grid_shape),
+            start_grid_axis_names,
+            walk_ends.outcome.reshape(start_grid_shape),
             make_measure_attributes("outcome"),
         ),
         "steps": xr.Variable(
-            grid_axis_names,
-            walk_ends.n_steps_to_orbit.reshape(grid_shape),
+            start_grid_axis_names,
+            walk_ends.n_steps_to_orbit.reshape(start_grid_shape),
             {"units": "1", "long_name": "steps until the orbit is reached, or the fall"},
         ),
     }
-    start_coordinates = {
-        component_name: xr.Variable(
-            (component_name,) if component_name in grid_axis_names else (),
-            component_values[component_name]
-            if component_name in grid_axis_names
-            else component_values[component_name][0],
-            dict(MEASURES[component_name].variable_attributes),
+    start_dataset_coordinates = {
+        start_component_name: xr.Variable(
+            (start_component_name,) if start_component_name in start_grid_axis_names else (),
+            start_component_values[start_component_name]
+            if start_component_name in start_grid_axis_names
+            else start_component_values[start_component_name][0],
+            dict(MEASURES[start_component_name].variable_attributes),
         )
-        for component_name in component_names
+        for start_component_name in start_component_names
     }
     orbit_variables = _make_orbit_variables(
         params, distinct_orbits.orbit_states, max_period, model, options
@@ -163,12 +168,12 @@ def basin(
         "title": "Basins of attraction",
         "most_steps": max_steps,
         "starts": "before touchdown"
-        if component_names == PRE_TOUCHDOWN_COMPONENT_NAMES
+        if start_component_names == PRE_TOUCHDOWN_COMPONENT_NAMES
         else "after landing",
     }
     return xr.Dataset(
         walk_variables | orbit_variables,
-        start_coordinates,
+        start_dataset_coordinates,
         basin_attributes | collect_provenance_attributes(params, model, options),
     )
 
@@ -180,8 +185,8 @@ def _parse_start_grid(grid: StartGrid) -> dict[str, np.ndarray]:
     after landing. Each component is a number or an array with one axis.
     """
     check_type("grid", grid, Mapping, "write {'theta_touchdown': 0.09, 'dtheta_touchdown': ...}")
-    for component_names in (PRE_TOUCHDOWN_COMPONENT_NAMES, POST_LANDING_COMPONENT_NAMES):
-        if set(grid) == set(component_names):
+    for start_component_names in (PRE_TOUCHDOWN_COMPONENT_NAMES, POST_LANDING_COMPONENT_NAMES):
+        if set(grid) == set(start_component_names):
             break
     else:
         raise ValueError(
@@ -190,20 +195,21 @@ def _parse_start_grid(grid: StartGrid) -> dict[str, np.ndarray]:
             f"{', '.join(POST_LANDING_COMPONENT_NAMES)}: give "
             "each a number or an axis."
         )
-    component_values = {
-        component_name: np.asarray(check_reals(component_name, grid[component_name]), float)
-        for component_name in component_names
+    start_component_values = {
+        start_component_name: np.asarray(
+            check_reals(start_component_name, grid[start_component_name]), float
+        )
+        for start_component_name in start_component_names
     }
-    for component_name, component_array in component_values.items():
-        if component_array.ndim > 1 or not component_array.size:
+    for start_component_name, start_component_array in start_component_values.items():
+        if start_component_array.ndim > 1 or not start_component_array.size:
             raise ValueError(
-                f"{component_name} has shape {component_array.shape}, but it must be a number, or "
-                "a list "
-                "of at least one: give one axis of values."
+                f"{start_component_name} has shape {start_component_array.shape}, but it must be "
+                "a number, or a list of at least one: give one axis of values."
             )
     return {
-        component_name: np.atleast_1d(component_array)
-        for component_name, component_array in component_values.items()
+        start_component_name: np.atleast_1d(start_component_array)
+        for start_component_name, start_component_array in start_component_values.items()
     }
 
 
@@ -215,20 +221,20 @@ def invert_landing_map(params: WheelParams, post_landing_states: np.ndarray) -> 
     """
     s = params.symbols()
 
-    def invert_for_one_state(post_landing_state: jax.Array) -> jax.Array:
+    def find_section_state_before(post_landing_state: jax.Array) -> jax.Array:
         touchdown_angle, post_landing_rate = post_landing_state[0] + s.alpha, post_landing_state[1]
-        unit_rate_landing = transitions.resolve_landing(
+        landing_at_unit_rate = transitions.resolve_landing(
             s, touchdown_angle, jnp.ones_like(post_landing_rate), jnp.zeros_like(post_landing_rate)
         )
-        touchdown_rate = post_landing_rate / unit_rate_landing.motion_after.dtheta
-        is_landing_admissible = unit_rate_landing.is_rear_foot_planted & (touchdown_rate > 0.0)
+        touchdown_rate = post_landing_rate / landing_at_unit_rate.motion_after.dtheta
+        is_landing_admissible = landing_at_unit_rate.is_rear_foot_planted & (touchdown_rate > 0.0)
         return jnp.where(
             is_landing_admissible,
             jnp.stack([touchdown_angle, touchdown_rate, 0.0 * touchdown_rate]),
             jnp.nan,
         )
 
-    return np.asarray(jax.vmap(invert_for_one_state)(jnp.asarray(post_landing_states)))
+    return np.asarray(jax.vmap(find_section_state_before)(jnp.asarray(post_landing_states)))
 
 
 def _make_orbit_variables(
@@ -273,21 +279,21 @@ def _make_orbit_variables(
         **{
             f"orbit_{margin_name}": xr.Variable(
                 "attractor_index",
-                orbit_margins,
+                min_margin_by_orbit,
                 dict(MARGIN_MEASURES[margin_name].variable_attributes),
             )
-            for margin_name, orbit_margins in min_margins.items()
+            for margin_name, min_margin_by_orbit in min_margins.items()
         },
     }
 
 
-def compute_walk_end_fractions(basins: xr.Dataset) -> dict[str, float]:
+def compute_walk_end_fractions(basin_dataset: xr.Dataset) -> dict[str, float]:
     """Return the fraction of starts for each end of a walk, by the name of the end.
 
     The names are "attractor 0", "attractor 1" and so on, "unsettled", and the names of outcomes.
     """
-    attractor_indices = basins.attractor.values.ravel()
-    outcome_codes = basins.outcome.values.ravel()
+    attractor_indices = basin_dataset.attractor.values.ravel()
+    outcome_codes = basin_dataset.outcome.values.ravel()
     walk_end_names = [
         f"attractor {attractor_code}"
         if attractor_code >= 0

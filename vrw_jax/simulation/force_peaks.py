@@ -87,16 +87,17 @@ def force_peaks(walk: xr.Dataset) -> xr.Dataset:
             f"{min_samples_per_phase}: give simulate(..., n_samples={min_samples_per_phase}) or "
             "more."
         )
-    step_indices, sample_steps = np.unique(walk.step.values), walk.step.values
+    step_indices, step_index_by_sample = np.unique(walk.step.values), walk.step.values
     intervals_by_step = [
         [
             sample_indices
             for sample_indices in sampled_intervals
-            if len(sample_indices) == n_samples and sample_steps[sample_indices[0]] == step_index
+            if len(sample_indices) == n_samples
+            and step_index_by_sample[sample_indices[0]] == step_index
         ]
         for step_index in step_indices
     ]
-    fore_extrema, total_extrema = (
+    fore_force_extrema, total_force_extrema = (
         [
             _find_force_extrema(walk.time.values, normal_force, sampled_intervals)
             for sampled_intervals in intervals_by_step
@@ -104,8 +105,10 @@ def force_peaks(walk: xr.Dataset) -> xr.Dataset:
         for normal_force in (fore_force, total_force)
     )
     measures_by_step = [
-        _summarize_force_extrema(fore_force, total_force)
-        for fore_force, total_force in zip(fore_extrema, total_extrema, strict=True)
+        _summarize_force_extrema(fore_extrema_of_step, total_extrema_of_step)
+        for fore_extrema_of_step, total_extrema_of_step in zip(
+            fore_force_extrema, total_force_extrema, strict=True
+        )
     ]
     dataset_variables = {
         measure_name: (
@@ -115,20 +118,21 @@ def force_peaks(walk: xr.Dataset) -> xr.Dataset:
         )
         for measure_name in SAMPLED_FORCE_PEAK_MEASURES
     }
-    joined_extrema = [
-        np.concatenate(extrema_parts) for extrema_parts in zip(*fore_extrema, strict=True)
+    walk_extremum_arrays = [
+        np.concatenate(force_extremum_arrays)
+        for force_extremum_arrays in zip(*fore_force_extrema, strict=True)
     ]
-    all_extrema = _ForceExtrema(*joined_extrema)
-    extremum_steps = np.repeat(
-        step_indices, [len(step_extrema.time) for step_extrema in fore_extrema]
+    walk_force_extrema = _ForceExtrema(*walk_extremum_arrays)
+    step_index_by_extremum = np.repeat(
+        step_indices, [len(extrema_of_step.time) for extrema_of_step in fore_force_extrema]
     )
     dataset_variables |= {
-        "force": ("extremum", all_extrema.force, make_measure_attributes("lambda_2")),
-        "force_time": ("extremum", all_extrema.time, make_measure_attributes("time")),
-        "force_step": ("extremum", extremum_steps, make_measure_attributes("step")),
+        "force": ("extremum", walk_force_extrema.force, make_measure_attributes("lambda_2")),
+        "force_time": ("extremum", walk_force_extrema.time, make_measure_attributes("time")),
+        "force_step": ("extremum", step_index_by_extremum, make_measure_attributes("step")),
         "is_maximum": (
             "extremum",
-            all_extrema.is_extremum_maximum,
+            walk_force_extrema.is_extremum_maximum,
             {"long_name": "whether a maximum"},
         ),
     }
@@ -146,7 +150,9 @@ class _ForceExtrema(NamedTuple):
 
 
 def _find_force_extrema(
-    sample_times: np.ndarray, sampled_forces: np.ndarray, interval_indices: list[np.ndarray]
+    sample_times: np.ndarray,
+    sampled_forces: np.ndarray,
+    sample_indices_by_interval: list[np.ndarray],
 ) -> _ForceExtrema:
     """Return the extrema of a force within the intervals between the events of one step.
 
@@ -157,7 +163,7 @@ def _find_force_extrema(
     (
         times_by_interval,
         forces_by_interval,
-        are_maxima_by_interval,
+        maximum_flags_by_interval,
         force_rate_maximum_times,
         force_rate_maxima,
     ) = (
@@ -170,45 +176,52 @@ def _find_force_extrema(
     min_extremum_height = FORCE_PEAK_OPTIONS.min_extremum_height_fraction * np.max(
         np.abs(sampled_forces)
     )
-    for sample_indices in interval_indices:
+    for sample_indices in sample_indices_by_interval:
         if np.ptp(sampled_forces[sample_indices]) < min_extremum_height:
             continue
-        interval_times = sample_times[sample_indices]
-        interval_start, interval_duration = interval_times[0], np.ptp(interval_times)
-        time_fractions = (interval_times - interval_start) / interval_duration
+        interval_sample_times = sample_times[sample_indices]
+        interval_start, interval_duration = interval_sample_times[0], np.ptp(interval_sample_times)
+        time_fractions = (interval_sample_times - interval_start) / interval_duration
         force_spline = make_interp_spline(
             time_fractions, sampled_forces[sample_indices], FORCE_PEAK_OPTIONS.spline_degree
         )
-        interior_selector = lambda extremum_fractions: extremum_fractions[
-            (extremum_fractions > 0.0) & (extremum_fractions < 1.0)
+        interior_fraction_selector = lambda extremum_time_fractions: extremum_time_fractions[
+            (extremum_time_fractions > 0.0) & (extremum_time_fractions < 1.0)
         ]
-        extremum_fractions = interior_selector(
+        extremum_time_fractions = interior_fraction_selector(
             PPoly.from_spline(force_spline.derivative(1)).roots()
         )
-        boundary_forces = force_spline(np.concatenate([[0.0], extremum_fractions, [1.0]]))
-        extremum_heights = np.abs(np.diff(boundary_forces))
-        extremum_fractions = extremum_fractions[
-            np.minimum(extremum_heights[:-1], extremum_heights[1:]) > min_extremum_height
+        forces_at_extrema_and_ends = force_spline(
+            np.concatenate([[0.0], extremum_time_fractions, [1.0]])
+        )
+        force_changes_between_extrema = np.abs(np.diff(forces_at_extrema_and_ends))
+        extremum_time_fractions = extremum_time_fractions[
+            np.minimum(force_changes_between_extrema[:-1], force_changes_between_extrema[1:])
+            > min_extremum_height
         ]
-        times_by_interval.append(interval_start + interval_duration * extremum_fractions)
-        forces_by_interval.append(force_spline(extremum_fractions))
-        are_maxima_by_interval.append(force_spline(extremum_fractions, 2) < 0.0)
-        rate_maximum_fractions = interior_selector(
+        times_by_interval.append(interval_start + interval_duration * extremum_time_fractions)
+        forces_by_interval.append(force_spline(extremum_time_fractions))
+        maximum_flags_by_interval.append(force_spline(extremum_time_fractions, 2) < 0.0)
+        rate_maximum_time_fractions = interior_fraction_selector(
             PPoly.from_spline(force_spline.derivative(2)).roots()
         )
-        rate_maximum_fractions = rate_maximum_fractions[
-            force_spline(rate_maximum_fractions, 3) < 0.0
+        rate_maximum_time_fractions = rate_maximum_time_fractions[
+            force_spline(rate_maximum_time_fractions, 3) < 0.0
         ]
-        force_rate_maximum_times.append(interval_start + interval_duration * rate_maximum_fractions)
-        force_rate_maxima.append(force_spline(rate_maximum_fractions, 1) / interval_duration)
-    part_concatenator = lambda interval_parts: np.concatenate([np.zeros(0), *interval_parts])
-    sorted_extremum_times, are_maxima = (
-        part_concatenator(times_by_interval),
-        part_concatenator(are_maxima_by_interval).astype(bool),
+        force_rate_maximum_times.append(
+            interval_start + interval_duration * rate_maximum_time_fractions
+        )
+        force_rate_maxima.append(force_spline(rate_maximum_time_fractions, 1) / interval_duration)
+    interval_array_joiner = lambda arrays_by_interval: np.concatenate(
+        [np.zeros(0), *arrays_by_interval]
     )
-    first_peak_time = np.min(sorted_extremum_times[are_maxima], initial=np.inf)
-    rates_after_first_peak = part_concatenator(force_rate_maxima)[
-        part_concatenator(force_rate_maximum_times) > first_peak_time
+    sorted_extremum_times, sorted_maximum_flags = (
+        interval_array_joiner(times_by_interval),
+        interval_array_joiner(maximum_flags_by_interval).astype(bool),
+    )
+    first_peak_time = np.min(sorted_extremum_times[sorted_maximum_flags], initial=np.inf)
+    rates_after_first_peak = interval_array_joiner(force_rate_maxima)[
+        interval_array_joiner(force_rate_maximum_times) > first_peak_time
     ]
     max_rate_after_first_peak = (
         np.array([np.max(rates_after_first_peak)])
@@ -217,41 +230,44 @@ def _find_force_extrema(
     )
     return _ForceExtrema(
         sorted_extremum_times,
-        part_concatenator(forces_by_interval),
-        are_maxima,
+        interval_array_joiner(forces_by_interval),
+        sorted_maximum_flags,
         max_rate_after_first_peak,
     )
 
 
 def _summarize_force_extrema(
-    fore_extrema: _ForceExtrema, total_extrema: _ForceExtrema
+    fore_force_extrema: _ForceExtrema, total_force_extrema: _ForceExtrema
 ) -> dict[str, Any]:
     """Return the force measures of one step.
 
     The measures are computed from the extrema of the normal force on the fore foot and of the total
     normal force.
     """
-    trough_depth = 0.0
-    for i in np.flatnonzero(~fore_extrema.is_extremum_maximum):
+    force_trough_depth = 0.0
+    for i in np.flatnonzero(~fore_force_extrema.is_extremum_maximum):
         earlier_peak_forces, later_peak_forces = (
             extremum_forces[is_maximum]
             for extremum_forces, is_maximum in (
-                (fore_extrema.force[:i], fore_extrema.is_extremum_maximum[:i]),
-                (fore_extrema.force[i:], fore_extrema.is_extremum_maximum[i:]),
+                (fore_force_extrema.force[:i], fore_force_extrema.is_extremum_maximum[:i]),
+                (fore_force_extrema.force[i:], fore_force_extrema.is_extremum_maximum[i:]),
             )
         )
         if earlier_peak_forces.size and later_peak_forces.size:
-            trough_depth = max(
-                trough_depth,
-                min(earlier_peak_forces.max(), later_peak_forces.max()) - fore_extrema.force[i],
+            force_trough_depth = max(
+                force_trough_depth,
+                min(earlier_peak_forces.max(), later_peak_forces.max())
+                - fore_force_extrema.force[i],
             )
     return {
-        "n_force_peaks": int(np.sum(fore_extrema.is_extremum_maximum)),
-        "peak_force": np.max(fore_extrema.force[fore_extrema.is_extremum_maximum], initial=0.0),
-        "force_trough_depth": trough_depth,
-        "second_peak_rate": fore_extrema.max_rate_after_first_peak[0],
-        "n_total_force_peaks": int(np.sum(total_extrema.is_extremum_maximum)),
+        "n_force_peaks": int(np.sum(fore_force_extrema.is_extremum_maximum)),
+        "peak_force": np.max(
+            fore_force_extrema.force[fore_force_extrema.is_extremum_maximum], initial=0.0
+        ),
+        "force_trough_depth": force_trough_depth,
+        "second_peak_rate": fore_force_extrema.max_rate_after_first_peak[0],
+        "n_total_force_peaks": int(np.sum(total_force_extrema.is_extremum_maximum)),
         "peak_total_force": np.max(
-            total_extrema.force[total_extrema.is_extremum_maximum], initial=0.0
+            total_force_extrema.force[total_force_extrema.is_extremum_maximum], initial=0.0
         ),
     }

@@ -146,16 +146,16 @@ def _make_default_step_options(dtype: np.dtype) -> StepOptions:
 
 
 def convert_section_state(
-    x: Any, argument_description: str = "the section state", state_converter: Callable = check_reals
+    x: Any, state_argument_name: str = "the section state", state_converter: Callable = check_reals
 ) -> Any:
     """Return the section state as an array, converted by `state_converter`.
 
-    - `argument_description`: name of the argument in error messages;
+    - `state_argument_name`: name of the argument in error messages;
     - `state_converter`: function that checks and converts the state, and raises an error if the
       state is invalid.
     """
     return state_converter(
-        argument_description,
+        state_argument_name,
         x,
         "give (theta-, dtheta-, dL1-), as vrw.paper_start(), or that of a cycle, "
         "cycle.section_state",
@@ -371,7 +371,7 @@ class Walk(AbstractPrintable):
 
 
 @eqx.filter_jit
-def _walk_by_scan(
+def _simulate_walk_by_scan(
     model: AbstractWheel,
     params: WheelParams,
     x: Array,
@@ -385,7 +385,9 @@ def _walk_by_scan(
     - `stepwise_ground`: ground of each step, see `split_stepwise_ground`; None for flat ground.
     """
 
-    def advance_one_step(state_and_outcome: tuple, step_ground: StepGroundValues | None) -> tuple:
+    def advance_walk_by_one_step(
+        state_and_outcome: tuple, step_ground: StepGroundValues | None
+    ) -> tuple:
         """Return the state and the outcome after one step, and the results of this step.
 
         After a failure, the state and the outcome do not change.
@@ -410,7 +412,7 @@ def _walk_by_scan(
     initial_state_and_outcome = (x, jnp.int32(Outcome.STEPPED))
     step_results: AdvanceResult
     _, step_results = lax.scan(
-        advance_one_step, initial_state_and_outcome, stepwise_ground, length=n_steps
+        advance_walk_by_one_step, initial_state_and_outcome, stepwise_ground, length=n_steps
     )
     return Walk(x, step_results, jnp.sum(step_results.outcome == Outcome.STEPPED))
 
@@ -464,9 +466,12 @@ def walk(
     )
     if stepwise_ground is not None:
         stepwise_ground = tuple(
-            ground_by_step.astype(section_state.dtype) for ground_by_step in stepwise_ground
+            ground_quantity_by_step.astype(section_state.dtype)
+            for ground_quantity_by_step in stepwise_ground
         )
-    return _walk_by_scan(checked_model, params, section_state, options, n_steps, stepwise_ground)
+    return _simulate_walk_by_scan(
+        checked_model, params, section_state, options, n_steps, stepwise_ground
+    )
 
 
 def _convert_single_step_arguments(
@@ -479,7 +484,8 @@ def _convert_single_step_arguments(
     )
     if stepwise_ground is not None:
         step_ground = tuple(
-            ground_values[0].astype(section_state.dtype) for ground_values in stepwise_ground
+            ground_quantity_by_step[0].astype(section_state.dtype)
+            for ground_quantity_by_step in stepwise_ground
         )
         model, params = model.with_step_ground(params, step_ground)
     return params, section_state, model, options
@@ -498,12 +504,12 @@ def split_stepwise_ground(
     stepwise_ground = checked_model.split_ground_by_step(params, n_steps)
     if stepwise_ground is None:
         return checked_model, params, None
-    first_model, _ = checked_model.with_step_ground(
-        params, tuple(ground_values[0] for ground_values in stepwise_ground)
+    first_step_model, _ = checked_model.with_step_ground(
+        params, tuple(ground_quantity_by_step[0] for ground_quantity_by_step in stepwise_ground)
     )
-    first_slope = jnp.reshape(params.slope, -1)[0]
-    first_wheel = eqx.tree_at(lambda wheel: wheel.slope, params, first_slope)
-    return first_model, first_wheel, stepwise_ground
+    first_step_slope = jnp.reshape(params.slope, -1)[0]
+    first_step_wheel = eqx.tree_at(lambda wheel: wheel.slope, params, first_step_slope)
+    return first_step_model, first_step_wheel, stepwise_ground
 
 
 def start_walk_toward_gait(

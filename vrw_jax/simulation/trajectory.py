@@ -115,16 +115,18 @@ def simulate(
         None,
     )
     if stepwise_ground is not None:
-        ground_of_steps = zip(
+        ground_by_step = zip(
             *(step_ground.astype(x.dtype) for step_ground in stepwise_ground), strict=True
         )
         models_and_wheels = [
-            model.with_step_ground(params, step_ground) for step_ground in ground_of_steps
+            model.with_step_ground(params, step_ground) for step_ground in ground_by_step
         ]
-        line_slopes = params_with_all_slopes.slope
-        line_slopes = line_slopes if line_slopes.ndim else jnp.full(n_steps, line_slopes)
-        line_slopes = complete_line_slopes(line_slopes, n_steps)
-        ground_lines = UnevenGroundLines(np.asarray(line_slopes, float), float(s.Mt * s.g))
+        ground_line_slopes = params_with_all_slopes.slope
+        ground_line_slopes = (
+            ground_line_slopes if ground_line_slopes.ndim else jnp.full(n_steps, ground_line_slopes)
+        )
+        ground_line_slopes = complete_line_slopes(ground_line_slopes, n_steps)
+        ground_lines = UnevenGroundLines(np.asarray(ground_line_slopes, float), float(s.Mt * s.g))
     trajectory_spec = trajectory_specifier(models_and_wheels, options, n_samples)
     sampled_walk = sample_walk_steps(
         trajectory_spec, x, n_steps, float(s.Mt * s.g * s.sin_phi), ground_lines
@@ -154,17 +156,17 @@ def simulate(
     if ground_lines is not None:
         provenance_attributes |= {
             "frame": UNEVEN_GROUND_FRAME_TEXT,
-            "slopes": ground_lines.line_slopes.tolist(),
+            "slopes": ground_lines.ground_line_slopes.tolist(),
         }
         del provenance_attributes["parameter_slope"]
-    index_coordinates = {
+    dataset_index_coordinates = {
         variable_name: dataset_variables.pop(variable_name)
         for variable_name in ("step", "phase")
         if variable_name in dataset_variables
     }
     return xr.Dataset(
         dataset_variables,
-        trajectory_spec.extra_coordinates | index_coordinates,
+        trajectory_spec.extra_coordinates | dataset_index_coordinates,
         walk_attributes | provenance_attributes,
     )
 
@@ -219,13 +221,13 @@ UNEVEN_GROUND_FRAME_TEXT = (
 class UnevenGroundLines(NamedTuple):
     """Slopes of all lines of uneven ground, and the weight of the wheel."""
 
-    line_slopes: np.ndarray  # rad
+    ground_line_slopes: np.ndarray  # rad
     wheel_weight: float  # N
 
     def convert_to_walk_frame(
         self,
         step_columns: dict[str, np.ndarray],
-        position_names: Sequence[str],
+        position_variable_names: Sequence[str],
         k: int,
         foothold: np.ndarray,
     ) -> None:
@@ -236,26 +238,26 @@ class UnevenGroundLines(NamedTuple):
         are in the frame of the line of the ground under both feet in double support.
 
         - `step_columns`: sampled variables of the step, by name;
-        - `position_names`: names of the variables that are positions along the slope;
+        - `position_variable_names`: names of the variables that are positions along the slope;
         - `k`: index of the step;
         - `foothold`: position of the first foot of step k in the frame of line 0, m.
         """
-        for column_name in position_names:
-            normal_column_name = f"{column_name[:-1]}z"
+        for sampled_column_name in position_variable_names:
+            normal_column_name = f"{sampled_column_name[:-1]}z"
             x, z = self.rotate_to_line_0(
-                k, step_columns[column_name], step_columns[normal_column_name]
+                k, step_columns[sampled_column_name], step_columns[normal_column_name]
             )
-            step_columns[column_name], step_columns[normal_column_name] = (
+            step_columns[sampled_column_name], step_columns[normal_column_name] = (
                 x + foothold[0],
                 z + foothold[1],
             )
-        first_line_slope = self.line_slopes[0]
-        foothold_height = foothold[1] * np.cos(first_line_slope) - foothold[0] * np.sin(
-            first_line_slope
+        first_ground_line_slope = self.ground_line_slopes[0]
+        foothold_height = foothold[1] * np.cos(first_ground_line_slope) - foothold[0] * np.sin(
+            first_ground_line_slope
         )
-        for column_name in step_columns.keys() & HEIGHT_DEPENDENT_ENERGIES:
-            step_columns[column_name] = (
-                step_columns[column_name] + self.wheel_weight * foothold_height
+        for sampled_column_name in step_columns.keys() & HEIGHT_DEPENDENT_ENERGIES:
+            step_columns[sampled_column_name] = (
+                step_columns[sampled_column_name] + self.wheel_weight * foothold_height
             )
 
     def rotate_to_line_0(self, k: int, x: Any, z: Any) -> tuple[Any, Any]:
@@ -263,8 +265,8 @@ class UnevenGroundLines(NamedTuple):
 
         - `k`: index of the line of the ground in whose frame x and z are components of the vector.
         """
-        line_angle = self.line_slopes[k] - self.line_slopes[0]
-        sine_of_angle, cosine_of_angle = np.sin(line_angle), np.cos(line_angle)
+        angle_from_line_0 = self.ground_line_slopes[k] - self.ground_line_slopes[0]
+        sine_of_angle, cosine_of_angle = np.sin(angle_from_line_0), np.cos(angle_from_line_0)
         return x * cosine_of_angle + z * sine_of_angle, z * cosine_of_angle - x * sine_of_angle
 
 
@@ -284,24 +286,28 @@ def sample_walk_steps(
     - `ground_lines`: slopes of uneven ground, or None on flat ground. On uneven ground,
       `UnevenGroundLines.convert_to_walk_frame` converts positions and energies.
     """
-    columns_by_step: list[dict[str, np.ndarray]] = []
+    sampled_columns_by_step: list[dict[str, np.ndarray]] = []
     walk_outcome, n_stepped, step_start_time, traveled_distance = Outcome.STEPPED, 0, 0.0, 0.0
     foothold_position = np.zeros(2)
     while walk_outcome == Outcome.STEPPED and n_stepped < n_steps:
         sampled_step = trajectory_spec.step_sampler(x, n_stepped)
         has_interval_occurred, step_columns = sampled_step.durations > 0.0, dict[str, np.ndarray]()
         # A full slice copies nothing.
-        interval_selection = slice(None) if has_interval_occurred.all() else has_interval_occurred
-        for column_name, sampled_values in sampled_step.sampled_columns.items():
-            step_columns[column_name] = sampled_values[interval_selection].reshape(
-                -1, *sampled_values.shape[2:]
+        occurred_interval_selection = (
+            slice(None) if has_interval_occurred.all() else has_interval_occurred
+        )
+        for sampled_column_name, column_samples in sampled_step.sampled_columns.items():
+            step_columns[sampled_column_name] = column_samples[occurred_interval_selection].reshape(
+                -1, *column_samples.shape[2:]
             )
         if ground_lines is None:
-            for column_name in trajectory_spec.slope_position_names:
-                step_columns[column_name] = step_columns[column_name] + traveled_distance
-            for column_name in step_columns.keys() & HEIGHT_DEPENDENT_ENERGIES:
-                step_columns[column_name] = (
-                    step_columns[column_name] - downslope_weight * traveled_distance
+            for sampled_column_name in trajectory_spec.slope_position_names:
+                step_columns[sampled_column_name] = (
+                    step_columns[sampled_column_name] + traveled_distance
+                )
+            for sampled_column_name in step_columns.keys() & HEIGHT_DEPENDENT_ENERGIES:
+                step_columns[sampled_column_name] = (
+                    step_columns[sampled_column_name] - downslope_weight * traveled_distance
                 )
         else:
             ground_lines.convert_to_walk_frame(
@@ -313,7 +319,7 @@ def sample_walk_steps(
             foothold_position = foothold_position + foothold_displacement
         step_columns["time"] = step_columns["time"] + step_start_time
         step_columns["step"] = np.full(len(step_columns["time"]), n_stepped)
-        columns_by_step.append(step_columns)
+        sampled_columns_by_step.append(step_columns)
         walk_outcome = sampled_step.outcome
         if walk_outcome == Outcome.STEPPED:
             n_stepped += 1
@@ -321,8 +327,10 @@ def sample_walk_steps(
             traveled_distance += sampled_step.step_length
             x = sampled_step.next_section_state
     walk_columns = {
-        column_name: np.concatenate([step_columns[column_name] for step_columns in columns_by_step])
-        for column_name in columns_by_step[0]
+        sampled_column_name: np.concatenate(
+            [step_columns[sampled_column_name] for step_columns in sampled_columns_by_step]
+        )
+        for sampled_column_name in sampled_columns_by_step[0]
     }
     return SampledWalk(walk_columns, n_stepped, walk_outcome)
 
@@ -358,7 +366,7 @@ def _make_phase_columns(s: Symbols, trajectory: Trajectory) -> dict[str, np.ndar
     foot_forces = np.moveaxis(np.asarray(trajectory.forces), -1, 0)
     wheel_motion = Motion.from_angle(theta, L1, L2, dtheta, dL1, dL2)
     rear_leg_direction = rotate_to_rear_leg(s, wheel_motion.sin_theta, wheel_motion.cos_theta)
-    hub_x, hub_z, zero_column = (
+    hub_x, hub_z, zero_coordinates = (
         L1 * wheel_motion.sin_theta,
         L1 * wheel_motion.cos_theta,
         np.zeros_like(L1),
@@ -366,13 +374,13 @@ def _make_phase_columns(s: Symbols, trajectory: Trajectory) -> dict[str, np.ndar
     landing_leg_direction = rotate_to_landing_leg(s, wheel_motion.sin_theta, wheel_motion.cos_theta)
     return {
         "time": np.array(trajectory.time),
-        "x": zero_column,
-        "z": zero_column,
+        "x": zero_coordinates,
+        "z": zero_coordinates,
         "theta": theta,
         "L1": L1,
         "L2": L2,
-        "dx": zero_column,
-        "dz": zero_column,
+        "dx": zero_coordinates,
+        "dz": zero_coordinates,
         "dtheta": dtheta,
         "dL1": dL1,
         "dL2": dL2,
@@ -382,8 +390,8 @@ def _make_phase_columns(s: Symbols, trajectory: Trajectory) -> dict[str, np.ndar
         "elastic_energy": elastic_energy,
         "total_energy": kinetic_energy + gravitational_energy + elastic_energy,
         "damping_power": compute_damping_power(s, wheel_motion),
-        "foot_1_x": zero_column,
-        "foot_1_z": zero_column,
+        "foot_1_x": zero_coordinates,
+        "foot_1_z": zero_coordinates,
         "foot_2_x": hub_x - L2 * rear_leg_direction.sin,
         "foot_2_z": hub_z - L2 * rear_leg_direction.cos,
         "hub_x": hub_x,
@@ -408,7 +416,7 @@ def specify_phase_trajectory(
         return s, _compile_step_sampler(model, argument_structure, n_samples), argument_leaves
 
     prepared_samplers = [
-        prepare_step_sampler(*model_and_wheel) for model_and_wheel in models_and_wheels
+        prepare_step_sampler(*step_model_and_wheel) for step_model_and_wheel in models_and_wheels
     ]
 
     def sample_phase_step(x: Array, k: int) -> SampledStep:
@@ -491,8 +499,8 @@ def _compute_contact_columns(
             "foot_z": compute_foot_heights(wheel_motion, leg_directions_of_state),
         }
 
-    state_columns = jax.vmap(jax.vmap(compute_state_quantities))(trajectory.state)
-    return trajectory, state_columns | {
+    state_quantities = jax.vmap(jax.vmap(compute_state_quantities))(trajectory.state)
+    return trajectory, state_quantities | {
         "tangential": trajectory.tangential,
         "normal": trajectory.normal,
     }
@@ -513,21 +521,23 @@ def specify_contact_trajectory(
     n_legs = models_and_wheels[0][1].n_legs
 
     def sample_contact_step(x: Array, k: int) -> SampledStep:
-        model_and_wheel = models_and_wheels[k if len(models_and_wheels) > 1 else 0]
+        step_model_and_wheel = models_and_wheels[k if len(models_and_wheels) > 1 else 0]
         trajectory, step_columns = jax.tree.map(
-            np.array, _compute_contact_columns(*model_and_wheel, x, options, n_samples)
+            np.array, _compute_contact_columns(*step_model_and_wheel, x, options, n_samples)
         )
         sample_shape = (len(trajectory.duration), n_samples)
-        sample_repeater = lambda values_by_leg: np.repeat(values_by_leg[:, None], n_samples, axis=1)
+        leg_value_repeater = lambda values_by_leg: np.repeat(
+            values_by_leg[:, None], n_samples, axis=1
+        )
         step_columns |= {
             "time": trajectory.time,
-            "contact": sample_repeater(trajectory.contact),
+            "contact": leg_value_repeater(trajectory.contact),
         }
         step_columns |= {
-            variable_name: np.full(sample_shape, int(selection_code))
-            for variable_name, selection_code in trajectory.model_selection.items()
+            variable_name: np.full(sample_shape, int(model_selection_code))
+            for variable_name, model_selection_code in trajectory.model_selection.items()
         }
-        step_columns["on_stopper"] = sample_repeater(trajectory.locked)
+        step_columns["on_stopper"] = leg_value_repeater(trajectory.locked)
         occurred_interval_indices = np.flatnonzero(trajectory.duration > 0.0)
         landing_normal_offset = 0.0
         if occurred_interval_indices.size:  # The foremost foot has landed.
@@ -549,7 +559,11 @@ def specify_contact_trajectory(
         "friction": friction_by_step[0] if len(set(friction_by_step)) == 1 else friction_by_step,
     }
     variable_names = (*CONTACT_MOTION_NAMES, *CONTACT_ENERGY_NAMES, *CONTACT_MEASURES)
-    leg_coordinate = {"leg": np.arange(1, n_legs + 1)}
+    leg_number_coordinate = {"leg": np.arange(1, n_legs + 1)}
     return TrajectorySpecification(
-        sample_contact_step, variable_names, ("hub_x", "foot_x"), leg_coordinate, dataset_attributes
+        sample_contact_step,
+        variable_names,
+        ("hub_x", "foot_x"),
+        leg_number_coordinate,
+        dataset_attributes,
     )
