@@ -177,7 +177,7 @@ def test_resets_agree_with_the_collisions():
     np.testing.assert_array_equal(jnp.stack(sls1.reset_motion(before)), jnp.stack(hit))
     constants = sequence.compute_phase_constants(PARAMS.n_legs, *stack_parameters(PARAMS))
     following = (
-        sequence.make_held_landing_sequence(PARAMS.n_legs)
+        sequence.make_post_impact_sequence(PARAMS.n_legs)
         .phases[1]
         .reset_map(constants, PhasePoint((), q, v))
     )
@@ -227,7 +227,7 @@ def end_by_step_collocation():
 
 def end_by_cycle_collocation():
     """Apply Newton's method to the angle of the event."""
-    phase = sequence.make_held_landing_sequence(PARAMS.n_legs).phases[2]
+    phase = sequence.make_post_impact_sequence(PARAMS.n_legs).phases[2]
     constants = sequence.compute_phase_constants(PARAMS.n_legs, *stack_parameters(PARAMS))
     _, q, v = make_state_at(2)
     event = lambda theta: phase.end_event_function(constants, PhasePoint((), (theta, q[1]), v))

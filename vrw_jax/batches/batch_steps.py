@@ -157,16 +157,16 @@ def step_batch(
     check_choice("engine", engine, BATCH_ENGINE_NAMES)
     n_steps = check_int("n_steps", n_steps)
     derivatives = check_names("derivatives", derivatives, '"section_state", "damping"')
-    checked_states: np.ndarray = convert_section_state(states, "states", check_numpy_reals)
-    parameter_columns = _check_parameter_shapes(
-        params, checked_states, checked_model, options, n_steps
+    checked_section_states: np.ndarray = convert_section_state(states, "states", check_numpy_reals)
+    values_by_parameter = _check_parameter_shapes(
+        params, checked_section_states, checked_model, options, n_steps
     )
-    checked_states = checked_states.astype(parameter_columns[0].dtype, copy=False)
+    checked_section_states = checked_section_states.astype(values_by_parameter[0].dtype, copy=False)
     has_contact_kernel = checked_model.batch_kernel == "legs"
     step_arguments = (
         checked_model,
-        parameter_columns,
-        checked_states,
+        values_by_parameter,
+        checked_section_states,
         n_steps,
         options,
         engine,
@@ -220,47 +220,52 @@ def _check_parameter_shapes(
     The slope, and with unilateral contact the friction, may have a second axis over gait steps.
     Raise ValueError if the shapes of states and parameters do not fit.
     """
-    section_sizes = [3]
+    allowed_section_sizes = [3]
     if section_states.ndim != 2 or section_states.shape[1] != 3:
-        section_sizes = sorted({3, model.count_section_entries(params)})
-    if section_states.ndim != 2 or section_states.shape[1] not in section_sizes:
+        allowed_section_sizes = sorted({3, model.count_section_entries(params)})
+    if section_states.ndim != 2 or section_states.shape[1] not in allowed_section_sizes:
         raise ValueError(
             f"states have shape {section_states.shape}, but section states have the shape "
             f"(elements, "
-            f"{' or '.join(map(str, section_sizes))}): write states[None] for a single one."
+            f"{' or '.join(map(str, allowed_section_sizes))}): write states[None] for a single one."
         )
-    n_given_states, parameter_columns = (
+    n_section_states, values_by_parameter = (
         len(section_states),
         [getattr(params, parameter_name) for parameter_name in PARAMETER_NAMES],
     )
     parameter_dtype = np.result_type(
-        *(parameter_values.dtype for parameter_values in parameter_columns)
+        *(parameter_values.dtype for parameter_values in values_by_parameter)
     )
     StepOptions.check_tolerances(options, parameter_dtype)  # a bound method takes 0.1 ms
     friction_coefficients = getattr(model, FRICTION_NAME, np.zeros(()))
     for parameter_name, parameter_values in zip(
-        (*PARAMETER_NAMES, FRICTION_NAME), (*parameter_columns, friction_coefficients), strict=True
+        (*PARAMETER_NAMES, FRICTION_NAME),
+        (*values_by_parameter, friction_coefficients),
+        strict=True,
     ):
-        is_stepwise = parameter_name in ("slope", FRICTION_NAME) and np.ndim(parameter_values) == 2
-        shapes_over_steps = [
-            (n_given_states, n_steps),
-            (n_given_states, n_steps + 1),
-        ] * is_stepwise
-        if np.shape(parameter_values) not in ((), (n_given_states,), *shapes_over_steps):
+        is_parameter_stepwise = (
+            parameter_name in ("slope", FRICTION_NAME) and np.ndim(parameter_values) == 2
+        )
+        allowed_stepwise_shapes = [
+            (n_section_states, n_steps),
+            (n_section_states, n_steps + 1),
+        ] * is_parameter_stepwise
+        if np.shape(parameter_values) not in ((), (n_section_states,), *allowed_stepwise_shapes):
+            stepwise_advice = f" and {n_steps} or {n_steps + 1} of each over its steps"
             raise ValueError(
                 f"{parameter_name} has shape {np.shape(parameter_values)}, but there are "
-                f"{n_given_states} states"
-                f"{f' and {n_steps} steps' * is_stepwise}: give one value for all, or one for "
-                "each"
-                f"{f' and {n_steps} or {n_steps + 1} of each over its steps' * is_stepwise}."
+                f"{n_section_states} states"
+                f"{f' and {n_steps} steps' * is_parameter_stepwise}: give one value for all, or "
+                "one for each"
+                f"{stepwise_advice * is_parameter_stepwise}."
             )
     common_dtype = np.promote_types(parameter_dtype, section_states.dtype)
-    return [np.asarray(parameter_values, common_dtype) for parameter_values in parameter_columns]
+    return [np.asarray(parameter_values, common_dtype) for parameter_values in values_by_parameter]
 
 
 def _step_batch_without_contact(
     model: Any,
-    parameter_columns: list[np.ndarray],
+    values_by_parameter: list[np.ndarray],
     section_states: np.ndarray,
     n_steps: int,
     options: StepOptions,
@@ -272,31 +277,35 @@ def _step_batch_without_contact(
 ) -> StepBatchResult:
     """Return the result of `step_batch` for a model without unilateral contact."""
     ground_slopes, stepwise_parameters = _split_slopes_by_step(
-        parameter_columns[SLOPE_INPUT_INDEX], n_steps, requested_engine
+        values_by_parameter[SLOPE_INPUT_INDEX], n_steps, requested_engine
     )
-    parameter_columns = [
-        ground_slopes[0] if i == SLOPE_INPUT_INDEX else x for i, x in enumerate(parameter_columns)
+    values_by_parameter = [
+        ground_slopes[0] if i == SLOPE_INPUT_INDEX else x for i, x in enumerate(values_by_parameter)
     ]
-    work_order = order_wheels_by_work(parameter_columns, section_states)
-    parameter_matrix = np.empty((len(parameter_columns), len(section_states)), section_states.dtype)
-    for active_lane_parameters, parameter_values in zip(
-        parameter_matrix, parameter_columns, strict=True
+    wheel_order_by_work = order_wheels_by_work(values_by_parameter, section_states)
+    parameter_matrix = np.empty(
+        (len(values_by_parameter), len(section_states)), section_states.dtype
+    )
+    for sorted_parameter_values, parameter_values in zip(
+        parameter_matrix, values_by_parameter, strict=True
     ):
-        active_lane_parameters[:] = (
-            parameter_values[work_order] if parameter_values.ndim else parameter_values
+        sorted_parameter_values[:] = (
+            parameter_values[wheel_order_by_work] if parameter_values.ndim else parameter_values
         )
     is_ground_uneven = bool(stepwise_parameters)
-    ground_slopes = ground_slopes.take(work_order, -1) if is_ground_uneven else ground_slopes
+    ground_slopes = (
+        ground_slopes.take(wheel_order_by_work, -1) if is_ground_uneven else ground_slopes
+    )
     walk_batch = WalkBatch(
-        section_states.T.take(work_order, -1),
+        section_states.T.take(wheel_order_by_work, -1),
         derivative_names,
         PARAMETER_NAMES,
         stepwise_parameters,
     )
-    engine_arguments = n_legs, walk_batch.input_indices
+    engine_selection_arguments = n_legs, walk_batch.input_indices
     engine_by_solver = {
         SolverIndex.REQUESTED_SOLVER: _select_batch_engine(
-            requested_engine, model, options, *engine_arguments
+            requested_engine, model, options, *engine_selection_arguments
         )
     }
     solver_indices = np.full(len(section_states), SolverIndex.REQUESTED_SOLVER, np.int32)
@@ -325,23 +334,25 @@ def _step_batch_without_contact(
             selection_options.stable_solver_tightening_factor
         )
         engine_by_solver[SolverIndex.STABLE_SOLVER] = _select_batch_engine(
-            "lanes", model, tightened_step_options, *engine_arguments
+            "lanes", model, tightened_step_options, *engine_selection_arguments
         )
         engine_by_solver[SolverIndex.IMPLICIT_SOLVER] = _select_batch_engine(
-            "diffrax", model, implicit_solver_options, *engine_arguments
+            "diffrax", model, implicit_solver_options, *engine_selection_arguments
         )
     if requested_engine == "collocation":
         engine_name = requested_engine
         if phase_durations is None or np.shape(phase_durations) != section_states.shape:
-            durations_shape = None if phase_durations is None else np.shape(phase_durations)
+            expected_durations_shape = (
+                None if phase_durations is None else np.shape(phase_durations)
+            )
             raise ValueError(
-                f"durations have shape {durations_shape}, but collocation needs those of DLS, "
-                "SLS-I and SLS-II to some per cent, shape (elements, 3): give those of a limit "
-                "cycle, or take 'lanes'."
+                f"durations have shape {expected_durations_shape}, but collocation needs those of "
+                "DLS, SLS-I and SLS-II to some per cent, shape (elements, 3): give those of a "
+                "limit cycle, or take 'lanes'."
             )
         expected_durations = check_numpy_reals("durations", phase_durations)
         walk_batch.durations[:] = expected_durations.astype(parameter_matrix.dtype).T.take(
-            work_order, -1
+            wheel_order_by_work, -1
         )
     for k in range(n_steps):
         active_lanes = walk_batch.find_walking_lanes()
@@ -359,8 +370,8 @@ def _step_batch_without_contact(
             )
             walk_batch.store_lane_steps(active_lanes, *collocation_result)
             continue
-        for engine_index, selected_engine in engine_by_solver.items():
-            lane_indices = active_lanes[solver_indices[active_lanes] == engine_index]
+        for solver_index, selected_engine in engine_by_solver.items():
+            lane_indices = active_lanes[solver_indices[active_lanes] == solver_index]
             if len(lane_indices) > 0:
                 lane_selection = select_lanes(lane_indices, walk_batch)
                 next_slopes = (ground_slopes[k + 1][lane_selection],) if is_ground_uneven else ()
@@ -369,7 +380,7 @@ def _step_batch_without_contact(
                     walk_batch.section_state[:, lane_selection],
                     *next_slopes,
                 )
-                if engine_index == SolverIndex.STABLE_SOLVER:
+                if solver_index == SolverIndex.STABLE_SOLVER:
                     # A phase may last longer than `select_cheapest_solver` assumes. The implicit
                     # solver, which is next, then repeats the step.
                     has_solver_failed = step_outputs[2] == Outcome.SOLVER_FAILED
@@ -381,7 +392,9 @@ def _step_batch_without_contact(
                 walk_batch.store_lane_steps(
                     lane_indices, step_outputs, np.zeros(len(lane_indices), bool)
                 )
-    return walk_batch.make_batch_result(work_order, solver_indices, engine_name, solver_names)
+    return walk_batch.make_batch_result(
+        wheel_order_by_work, solver_indices, engine_name, solver_names
+    )
 
 
 def _split_slopes_by_step(
@@ -399,16 +412,16 @@ def _split_slopes_by_step(
             "engine is 'collocation', which takes one slope, but slope is an array over steps: "
             "take 'auto', 'lanes' or 'diffrax'."
         )
-    n_given_slopes = element_slopes.shape[1]
-    chain_rule_terms = lambda k: ((0, k, 1.0), (1, min(k + 1, n_given_slopes - 1), 1.0))
+    n_stepwise_slopes = element_slopes.shape[1]
+    slope_chain_rule_terms = lambda k: ((0, k, 1.0), (1, min(k + 1, n_stepwise_slopes - 1), 1.0))
     stepwise_slope = StepwiseParameter(
-        (SLOPE_INPUT_INDEX, NEXT_SLOPE_INPUT_INDEX), n_given_slopes, chain_rule_terms
+        (SLOPE_INPUT_INDEX, NEXT_SLOPE_INPUT_INDEX), n_stepwise_slopes, slope_chain_rule_terms
     )
     return complete_slopes_over_steps(element_slopes, n_steps), {"slope": stepwise_slope}
 
 
 def order_wheels_by_work(
-    parameter_columns: list[np.ndarray], section_states: np.ndarray
+    values_by_parameter: list[np.ndarray], section_states: np.ndarray
 ) -> np.ndarray:
     """Return the batch indices sorted by the estimated work of a gait step, shape (elements,).
 
@@ -418,7 +431,7 @@ def order_wheels_by_work(
     from a fit to measured numbers of solver steps, for states near the gaits and far from them
     (`python -m experiments.speed.straggler_steps`).
     """
-    parameters_by_name = dict(zip(PARAMETER_NAMES, parameter_columns, strict=True))
+    parameters_by_name = dict(zip(PARAMETER_NAMES, values_by_parameter, strict=True))
     get_float32_parameter = lambda parameter_name: np.asarray(
         parameters_by_name[parameter_name], np.float32
     )
@@ -500,24 +513,24 @@ def _step_lanes_by_kernel(
     The results are those of `_BatchEngine.take_lane_steps`.
     """
     option_leaves, options_structure = jax.tree.flatten(options)
-    scalar_arguments = [
+    scalar_kernel_arguments = [
         np.asarray(option_leaf, parameter_matrix.dtype) for option_leaf in option_leaves
     ]
     solver_tableau, n_parameters = load_explicit_tableau(options.solver), len(PARAMETER_NAMES)
     assert solver_tableau is not None  # `_select_batch_engine` has checked the solver.
 
     def step_lanes(
-        scalar_arguments: Any, lane_inputs: Any, straggler_count: Array | None = None
+        scalar_kernel_arguments: Any, lane_step_inputs: Any, straggler_count: Array | None = None
     ) -> tuple:
-        traced_options = jax.tree.unflatten(options_structure, scalar_arguments)
+        traced_options = jax.tree.unflatten(options_structure, scalar_kernel_arguments)
         if input_indices:
             traced_options = traced_options.with_derivative_tolerances()
 
-        def compute_step_outputs(*lane_inputs: Array) -> tuple:
+        def compute_step_outputs(*lane_step_inputs: Array) -> tuple:
             params = make_wheel_from_parameters(
-                lane_inputs[:n_parameters], n_legs, *lane_inputs[NEXT_SLOPE_INPUT_INDEX:]
+                lane_step_inputs[:n_parameters], n_legs, *lane_step_inputs[NEXT_SLOPE_INPUT_INDEX:]
             )
-            x = lane_inputs[n_parameters:NEXT_SLOPE_INPUT_INDEX]
+            x = lane_step_inputs[n_parameters:NEXT_SLOPE_INPUT_INDEX]
             step_result = advance_gait_step(
                 params, x, traced_options, solver_tableau, stop_at_lift_off, straggler_count
             )
@@ -529,19 +542,19 @@ def _step_lanes_by_kernel(
             return jnp.stack([*step_result.section_state, *step_result.durations]), step_diagnostics
 
         if not input_indices:
-            step_outputs, step_diagnostics = compute_step_outputs(*lane_inputs)
+            step_outputs, step_diagnostics = compute_step_outputs(*lane_step_inputs)
             return (*step_diagnostics, step_outputs)
         # With respect to all inputs, two columns follow from the units.
-        differentiates_all_inputs = len(input_indices) == len(lane_inputs)
+        differentiates_all_inputs = len(input_indices) == len(lane_step_inputs)
         compute_jacobian_of_columns = (
             complete_jacobian_columns if differentiates_all_inputs else compute_jacobian_columns
         )
         step_jacobian, step_outputs, step_diagnostics = compute_jacobian_of_columns(
-            compute_step_outputs, lane_inputs, input_indices
+            compute_step_outputs, lane_step_inputs, input_indices
         )
         return (*step_diagnostics, step_outputs, step_jacobian)
 
-    cache_key = (
+    program_cache_key = (
         "gait step",
         n_legs,
         stop_at_lift_off,
@@ -553,24 +566,24 @@ def _step_lanes_by_kernel(
     register_limits = (
         simd.RegisterLimits(n_kernel_inputs) if input_indices else simd.DEFAULT_REGISTER_LIMITS
     )
-    lane_arrays = [*parameter_matrix, *section_states, *next_slopes]
+    lane_input_arrays = [*parameter_matrix, *section_states, *next_slopes]
     batch_program = compile_batch_program(
         step_lanes,
-        [x.dtype for x in scalar_arguments],
-        len(lane_arrays),
+        [x.dtype for x in scalar_kernel_arguments],
+        len(lane_input_arrays),
         parameter_matrix.dtype,
-        cache_key,
+        program_cache_key,
         batch_sizes.XLA_LANE_BATCH_SIZE,
         register_limits,
         can_stop_early=True,
     )
-    kernel_results = batch_program(scalar_arguments, lane_arrays)
+    kernel_results = batch_program(scalar_kernel_arguments, lane_input_arrays)
     _, step_outcomes, n_solver_steps, step_outputs, *step_jacobian = kernel_results
     return step_outputs[:3], step_outputs[3:], step_outcomes, n_solver_steps, *step_jacobian
 
 
 def _step_lanes_by_collocation(
-    lane_engine: _BatchEngine,
+    fallback_engine: _BatchEngine,
     model: Any,
     n_legs: int,
     parameter_matrix: np.ndarray,
@@ -580,42 +593,45 @@ def _step_lanes_by_collocation(
     """Return the results of one gait step for all lanes, computed by collocation, and whether each
     lane passed the accuracy checks.
 
-    `lane_engine` computes the step again for lanes that failed a check. The results are those of
-    `_BatchEngine.take_lane_steps`.
+    `fallback_engine` computes the step again for lanes that failed a check. The results are those
+    of `_BatchEngine.take_lane_steps`.
     """
     stop_at_lift_off, n_parameters = model.stop_at_lift_off, len(PARAMETER_NAMES)
 
-    def step_lanes(_: Any, lane_inputs: Any) -> tuple:
-        params = make_wheel_from_parameters(lane_inputs[:n_parameters], n_legs)
-        x, expected_durations = tuple(lane_inputs[n_parameters:-3]), tuple(lane_inputs[-3:])
+    def step_lanes(_: Any, lane_step_inputs: Any) -> tuple:
+        params = make_wheel_from_parameters(lane_step_inputs[:n_parameters], n_legs)
+        x, expected_durations = (
+            tuple(lane_step_inputs[n_parameters:-3]),
+            tuple(lane_step_inputs[-3:]),
+        )
         collocation_step = take_collocation_step(params, x, expected_durations, stop_at_lift_off)
         step_outputs = jnp.stack(
             [*collocation_step.section_state, *collocation_step.phase_durations]
         )
         return collocation_step.is_collocation_trusted, step_outputs
 
-    lane_arrays = [*parameter_matrix, *section_states, *expected_phase_durations]
+    lane_input_arrays = [*parameter_matrix, *section_states, *expected_phase_durations]
     batch_program = compile_batch_program(
         step_lanes,
         [],
-        len(lane_arrays),
+        len(lane_input_arrays),
         parameter_matrix.dtype,
         ("gait step by collocation", n_legs, stop_at_lift_off),
         batch_sizes.XLA_LANE_BATCH_SIZE,
     )
-    is_collocation_trusted, step_outputs = batch_program([], lane_arrays)
+    is_collocation_trusted, step_outputs = batch_program([], lane_input_arrays)
     step_outcomes, n_solver_steps = np.zeros((2, len(is_collocation_trusted)), np.int32)
-    collocated_values = step_outputs[:3], step_outputs[3:], step_outcomes, n_solver_steps
+    collocated_step_outputs = step_outputs[:3], step_outputs[3:], step_outcomes, n_solver_steps
     untrusted_lanes = np.flatnonzero(~is_collocation_trusted)
     if len(untrusted_lanes) > 0:
-        recomputed_values = lane_engine.take_lane_steps(
+        recomputed_step_outputs = fallback_engine.take_lane_steps(
             parameter_matrix[:, untrusted_lanes], section_states[:, untrusted_lanes]
         )
-        for collocated_value, recomputed_value in zip(
-            collocated_values, recomputed_values, strict=True
+        for collocated_output, recomputed_output in zip(
+            collocated_step_outputs, recomputed_step_outputs, strict=True
         ):
-            collocated_value[..., untrusted_lanes] = recomputed_value
-    return collocated_values, is_collocation_trusted
+            collocated_output[..., untrusted_lanes] = recomputed_output
+    return collocated_step_outputs, is_collocation_trusted
 
 
 def _step_lanes_by_diffrax(
@@ -632,11 +648,11 @@ def _step_lanes_by_diffrax(
 
     The results are those of `_BatchEngine.take_lane_steps`.
     """
-    convert_option_leaves = functools.partial(
+    convert_options_dtype = functools.partial(
         jax.tree.map, lambda option_leaf: np.asarray(option_leaf, parameter_matrix.dtype)
     )
-    derivative_step_options = convert_option_leaves(options.with_derivative_tolerances())
-    options = convert_option_leaves(options)
+    derivative_step_options = convert_options_dtype(options.with_derivative_tolerances())
+    options = convert_options_dtype(options)
     step_input_matrix = np.concatenate(
         [
             parameter_matrix,
@@ -676,19 +692,21 @@ def _step_lanes_by_diffrax(
                 (len(input_indices), 6, len(step_input_matrix)), parameter_matrix.dtype
             )
             step_result_arrays = (*step_outputs, n_solver_steps, step_jacobian)
-            stepped_elements = np.flatnonzero(step_outcomes == Outcome.STEPPED)
-            if len(stepped_elements) < len(step_input_matrix):
-                retried_index_blocks = [stepped_elements]
+            stepped_element_indices = np.flatnonzero(step_outcomes == Outcome.STEPPED)
+            if len(stepped_element_indices) < len(step_input_matrix):
+                retried_element_blocks = [stepped_element_indices]
             elif len(step_input_matrix) > 1:
-                retried_index_blocks = np.array_split(stepped_elements, 2)
+                retried_element_blocks = np.array_split(stepped_element_indices, 2)
             else:
-                retried_index_blocks, step_outcomes[:] = [], Outcome.SOLVER_FAILED
+                retried_element_blocks, step_outcomes[:] = [], Outcome.SOLVER_FAILED
             for element_indices in (
-                element_indices for element_indices in retried_index_blocks if len(element_indices)
+                element_indices
+                for element_indices in retried_element_blocks
+                if len(element_indices)
             ):
-                block_results = step_elements_with_jacobian(step_input_matrix[element_indices])
+                block_step_results = step_elements_with_jacobian(step_input_matrix[element_indices])
                 for full_result_array, block_result_array in zip(
-                    step_result_arrays, block_results, strict=True
+                    step_result_arrays, block_step_results, strict=True
                 ):
                     full_result_array[..., element_indices] = block_result_array
         return step_result_arrays
@@ -719,28 +737,26 @@ def _step_elements_by_vmap(
     n_parameters = len(PARAMETER_NAMES)
 
     def step_one_element(step_inputs: Array) -> tuple[Array, ...]:
-        def step_from_varied_inputs(varied_inputs: Array) -> tuple[Array, AdvanceResult]:
-            step_inputs_with_varied = step_inputs.at[np.array(input_indices, int)].set(
-                varied_inputs
-            )
-            next_slope = step_inputs_with_varied[NEXT_SLOPE_INPUT_INDEX:]
+        def step_with_varied_inputs(varied_inputs: Array) -> tuple[Array, AdvanceResult]:
+            updated_step_inputs = step_inputs.at[np.array(input_indices, int)].set(varied_inputs)
+            next_slope = updated_step_inputs[NEXT_SLOPE_INPUT_INDEX:]
             params = make_wheel_from_parameters(
-                step_inputs_with_varied[:n_parameters], n_legs, *next_slope
+                updated_step_inputs[:n_parameters], n_legs, *next_slope
             )
-            x = step_inputs_with_varied[n_parameters:NEXT_SLOPE_INPUT_INDEX]
+            x = updated_step_inputs[n_parameters:NEXT_SLOPE_INPUT_INDEX]
             step_result = model.advance(params, x, options)
             return jnp.concatenate([step_result.section_state, step_result.durations]), step_result
 
         varied_inputs = step_inputs[np.array(input_indices, int)]
         if not input_indices:
-            _, step_result = step_from_varied_inputs(varied_inputs)
+            _, step_result = step_with_varied_inputs(varied_inputs)
             return (
                 step_result.section_state,
                 step_result.durations,
                 step_result.outcome,
                 step_result.solver_steps,
             )
-        step_jacobian, step_result = jax.jacfwd(step_from_varied_inputs, has_aux=True)(
+        step_jacobian, step_result = jax.jacfwd(step_with_varied_inputs, has_aux=True)(
             varied_inputs
         )
         step_outputs = (

@@ -68,11 +68,11 @@ EIGENVECTOR_COLUMNS = _INTEGRATION_MATRIX_EIGENVECTORS[:, _UPPER_HALF_PLANE_INDI
 
 START_EXTRAPOLATION_WEIGHTS = compute_lagrange_weights(0.0)
 """Weights that extrapolate node values to the start of a mesh interval."""
-MIDDLE_INTERPOLATION_WEIGHTS = compute_lagrange_weights(0.5)
+MIDPOINT_INTERPOLATION_WEIGHTS = compute_lagrange_weights(0.5)
 """Weights that interpolate node values to the middle of a mesh interval."""
 END_EXTRAPOLATION_WEIGHTS = compute_lagrange_weights(1.0)
 """Weights that extrapolate node values to the end of a mesh interval."""
-MIDDLE_INTEGRATION_WEIGHTS = compute_integration_weights(0.5)
+MIDPOINT_INTEGRATION_WEIGHTS = compute_integration_weights(0.5)
 """Weights of node values in the single and the double integral over the first half of a mesh
 interval.
 """
@@ -181,30 +181,32 @@ def solve_phase_by_collocation(
 
     The phase ends at the root of its event guard that is near `expected_duration`.
     """
-    interval_fractions, lane_zeros = (
+    interval_length_fractions, lane_zeros = (
         phase_mesh.interval_fractions,
         jnp.zeros_like(expected_duration),
     )
     # The nonlinear part scales with the squared ratio of successive interval lengths.
-    nonlinear_growth_factor = float(interval_fractions[-1] / interval_fractions[0]) ** (
-        2.0 / max(phase_mesh.n_intervals - 1, 1)
-    )
+    nonlinear_growth_factor = float(
+        interval_length_fractions[-1] / interval_length_fractions[0]
+    ) ** (2.0 / max(phase_mesh.n_intervals - 1, 1))
 
-    def advance_interval(interval_carry: tuple, interval_fraction: Array) -> tuple[tuple, None]:
+    def advance_interval(
+        interval_carry: tuple, interval_length_fraction: Array
+    ) -> tuple[tuple, None]:
         (
             q,
             v,
             rate_correction,
             start_rate_error,
-            lowest_guard,
+            lowest_guard_value,
             end_guard_values,
             nonlinear_accelerations,
         ) = interval_carry
-        h = interval_fraction * expected_duration
+        h = interval_length_fraction * expected_duration
         solved_mesh_interval = _solve_mesh_interval(
             phase, q, v, h, nonlinear_accelerations, options
         )
-        interval_lowest_guard, end_guard_values = _find_lowest_guard(
+        lowest_interval_guard_value, end_guard_values = _find_lowest_guard_value(
             phase, q, v, solved_mesh_interval, end_guard_values, 0
         )
         interval_carry = (
@@ -213,7 +215,7 @@ def solve_phase_by_collocation(
                 rate_correction, _estimate_next_correction(solved_mesh_interval.newton_sweep_state)
             ),
             jnp.maximum(start_rate_error, solved_mesh_interval.largest_start_rate_error),
-            jnp.minimum(lowest_guard, interval_lowest_guard),
+            jnp.minimum(lowest_guard_value, lowest_interval_guard_value),
             end_guard_values,
             tuple(
                 tuple(nonlinear_growth_factor * x for x in node_acceleration)
@@ -232,11 +234,11 @@ def solve_phase_by_collocation(
         start_guard_values,
         ((lane_zeros,) * len(q),) * N_GAUSS_NODES,
     )
-    if len(interval_fractions) > 1:
+    if len(interval_length_fractions) > 1:
         interval_carry, _ = lax.scan(
             advance_interval,
             interval_carry,
-            jnp.asarray(interval_fractions[:-1], expected_duration.dtype),
+            jnp.asarray(interval_length_fractions[:-1], expected_duration.dtype),
         )
     (
         q,
@@ -247,26 +249,29 @@ def solve_phase_by_collocation(
         start_guard_values,
         nonlinear_accelerations,
     ) = interval_carry
-    h = float(interval_fractions[-1]) * expected_duration
-    last_interval = _solve_mesh_interval(
+    h = float(interval_length_fractions[-1]) * expected_duration
+    last_mesh_interval = _solve_mesh_interval(
         phase, q, v, h, nonlinear_accelerations, options, ends_at_event=True
     )
-    interval_lowest_guard, _ = _find_lowest_guard(phase, q, v, last_interval, start_guard_values, 1)
+    lowest_interval_guard_value, _ = _find_lowest_guard_value(
+        phase, q, v, last_mesh_interval, start_guard_values, 1
+    )
     return CollocatedPhaseEnd(
-        *last_interval.interval_end_state,
-        phase_duration=float(1.0 - interval_fractions[-1]) * expected_duration
-        + last_interval.newton_sweep_state.interval_length
-        + last_interval.last_duration_correction,
+        *last_mesh_interval.interval_end_state,
+        phase_duration=float(1.0 - interval_length_fractions[-1]) * expected_duration
+        + last_mesh_interval.newton_sweep_state.interval_length
+        + last_mesh_interval.last_duration_correction,
         estimated_rate_correction=jnp.maximum(
-            estimated_rate_correction, _estimate_next_correction(last_interval.newton_sweep_state)
+            estimated_rate_correction,
+            _estimate_next_correction(last_mesh_interval.newton_sweep_state),
         ),
-        last_duration_correction=jnp.abs(last_interval.last_duration_correction),
+        last_duration_correction=jnp.abs(last_mesh_interval.last_duration_correction),
         largest_start_rate_error=jnp.maximum(
-            largest_start_rate_error, last_interval.largest_start_rate_error
+            largest_start_rate_error, last_mesh_interval.largest_start_rate_error
         ),
         lowest_guard_value=jnp.minimum(
-            jnp.minimum(lowest_guard_value, interval_lowest_guard),
-            last_interval.newton_sweep_state.interval_length,
+            jnp.minimum(lowest_guard_value, lowest_interval_guard_value),
+            last_mesh_interval.newton_sweep_state.interval_length,
         ),
     )
 
@@ -361,25 +366,30 @@ def _solve_mesh_interval(
     length changes, the new node accelerations are values of the polynomial through the old ones.
     """
     n_dof = len(q)
-    start_acceleration = phase.solve_acceleration(phase.compute_motion(q, v))[:n_dof]
+    interval_start_acceleration = phase.solve_acceleration(phase.compute_motion(q, v))[:n_dof]
     coordinate_indices = range(n_dof)
-    interval_middle_state = (
+    interval_midpoint_state = (
         tuple(
-            q[d] + 0.5 * h * (v[d] + 0.25 * h * start_acceleration[d]) for d in coordinate_indices
+            q[d] + 0.5 * h * (v[d] + 0.25 * h * interval_start_acceleration[d])
+            for d in coordinate_indices
         ),
-        tuple(v[d] + 0.5 * h * start_acceleration[d] for d in coordinate_indices),
+        tuple(v[d] + 0.5 * h * interval_start_acceleration[d] for d in coordinate_indices),
     )
-    dynamics_residual, residual_by_q, residual_by_v, residual_by_a = _linearize_dynamics_residual(
-        phase, *interval_middle_state, start_acceleration
+    dynamics_residual, residual_jacobian_q, residual_jacobian_v, residual_jacobian_a = (
+        _linearize_dynamics_residual(phase, *interval_midpoint_state, interval_start_acceleration)
     )
     inverse_stage_matrices = [
         _invert_stage_matrix(
-            complex(gauss_eigenvalue), h, residual_by_q, residual_by_v, residual_by_a
+            complex(gauss_eigenvalue),
+            h,
+            residual_jacobian_q,
+            residual_jacobian_v,
+            residual_jacobian_a,
         )
         for gauss_eigenvalue in INTEGRATION_MATRIX_EIGENVALUES
     ]
 
-    def correct_from_projections(
+    def apply_projected_correction(
         node_accelerations: NodeAccelerations, h: Array, residual_projections: list
     ) -> tuple[NodeAccelerations, Array]:
         eigenvector_corrections = []
@@ -430,7 +440,7 @@ def _solve_mesh_interval(
             ]
             for eigenvector_weights in EIGENVECTOR_PROJECTION_MATRIX
         ]
-        node_accelerations, largest_rate_correction = correct_from_projections(
+        node_accelerations, largest_rate_correction = apply_projected_correction(
             newton_sweep_state.node_accelerations,
             newton_sweep_state.interval_length,
             residual_projections,
@@ -453,11 +463,11 @@ def _solve_mesh_interval(
         interval_end_q, interval_end_v = _compute_interval_end_state(
             q, v, newton_sweep_state.interval_length, newton_sweep_state.node_accelerations
         )
-        _, end_acceleration = evaluate_event_guard(interval_end_q, interval_end_v)
+        _, interval_end_acceleration = evaluate_event_guard(interval_end_q, interval_end_v)
         (guard_value, _), (guard_rate, _) = jax.jvp(
             evaluate_event_guard,
             (interval_end_q, interval_end_v),
-            (interval_end_v, end_acceleration),
+            (interval_end_v, interval_end_acceleration),
         )
         time_to_event = -guard_value / jnp.where(guard_rate < 0.0, guard_rate, -jnp.inf)
         return jnp.clip(
@@ -485,11 +495,16 @@ def _solve_mesh_interval(
         )
         return (newton_sweep_state, compute_time_to_event(newton_sweep_state)), None
 
-    linearized_solution, largest_rate_correction = correct_from_projections(
-        (start_acceleration,) * N_GAUSS_NODES,
+    linearized_solution, largest_rate_correction = apply_projected_correction(
+        (interval_start_acceleration,) * N_GAUSS_NODES,
         h,
         _project_linearized_residuals(
-            dynamics_residual, residual_by_q, residual_by_v, v, start_acceleration, h
+            dynamics_residual,
+            residual_jacobian_q,
+            residual_jacobian_v,
+            v,
+            interval_start_acceleration,
+            h,
         ),
     )
     initial_node_accelerations = _add_node_accelerations(
@@ -515,7 +530,7 @@ def _solve_mesh_interval(
             _sum_weighted_accelerations(
                 START_EXTRAPOLATION_WEIGHTS, newton_sweep_state.node_accelerations, d
             )
-            - start_acceleration[d]
+            - interval_start_acceleration[d]
         )
         for d in coordinate_indices
     ]
@@ -527,7 +542,7 @@ def _solve_mesh_interval(
     Q, V = _compute_interval_end_state(
         q, v, newton_sweep_state.interval_length, newton_sweep_state.node_accelerations
     )
-    end_state = (
+    interval_end_state = (
         tuple(Q[d] + duration_correction * V[d] for d in coordinate_indices),
         tuple(
             V[d]
@@ -540,7 +555,7 @@ def _solve_mesh_interval(
     )
     return _SolvedMeshInterval(
         newton_sweep_state,
-        end_state,
+        interval_end_state,
         duration_correction,
         start_rate_error,
         _add_node_accelerations(newton_sweep_state.node_accelerations, linearized_solution, -1.0),
@@ -553,10 +568,10 @@ def _add_node_accelerations(
     acceleration_factor: float,
 ) -> NodeAccelerations:
     """Return `node_accelerations` plus `acceleration_factor` times `added_accelerations`."""
-    node_pairs = zip(node_accelerations, added_accelerations, strict=True)
+    node_acceleration_pairs = zip(node_accelerations, added_accelerations, strict=True)
     return tuple(
-        tuple(x + acceleration_factor * y for x, y in zip(*node_pair, strict=True))
-        for node_pair in node_pairs
+        tuple(x + acceleration_factor * y for x, y in zip(*node_acceleration_pair, strict=True))
+        for node_acceleration_pair in node_acceleration_pairs
     )
 
 
@@ -629,7 +644,11 @@ def _add_complex_pairs(complex_numbers: Sequence[ComplexNumberPair]) -> ComplexN
 
 
 def _invert_stage_matrix(
-    gauss_eigenvalue: complex, h: Array, residual_by_q: Any, residual_by_v: Any, residual_by_a: Any
+    gauss_eigenvalue: complex,
+    h: Array,
+    residual_jacobian_q: Any,
+    residual_jacobian_v: Any,
+    residual_jacobian_a: Any,
 ) -> Any:
     """Return the inverse of the complex stage matrix A + h e V + (h e)^2 Q as nested lists of
     complex pairs.
@@ -637,17 +656,17 @@ def _invert_stage_matrix(
     Here e is `gauss_eigenvalue`, and h is the length of the interval. A, V and Q are the
     derivatives of the residual with respect to accelerations, rates and coordinates.
     """
-    n, squared_eigenvalue = len(residual_by_q), gauss_eigenvalue * gauss_eigenvalue
+    n, squared_eigenvalue = len(residual_jacobian_q), gauss_eigenvalue * gauss_eigenvalue
     scaled_eigenvalue = (h * gauss_eigenvalue.real, h * gauss_eigenvalue.imag)
     scaled_squared_eigenvalue = (h * h * squared_eigenvalue.real, h * h * squared_eigenvalue.imag)
     stage_matrix: list[list[ComplexNumberPair]] = [
         [
             (
-                residual_by_a[j][i]
-                + scaled_eigenvalue[0] * residual_by_v[j][i]
-                + scaled_squared_eigenvalue[0] * residual_by_q[j][i],
-                scaled_eigenvalue[1] * residual_by_v[j][i]
-                + scaled_squared_eigenvalue[1] * residual_by_q[j][i],
+                residual_jacobian_a[j][i]
+                + scaled_eigenvalue[0] * residual_jacobian_v[j][i]
+                + scaled_squared_eigenvalue[0] * residual_jacobian_q[j][i],
+                scaled_eigenvalue[1] * residual_jacobian_v[j][i]
+                + scaled_squared_eigenvalue[1] * residual_jacobian_q[j][i],
             )
             for j in range(n)
         ]
@@ -708,7 +727,12 @@ def _compute_adjugate_and_determinant(
 
 
 def _project_linearized_residuals(
-    middle_residual: Vector, residual_by_q: Any, residual_by_v: Any, v: Vector, a: Vector, h: Array
+    midpoint_residual: Vector,
+    residual_jacobian_q: Any,
+    residual_jacobian_v: Any,
+    v: Vector,
+    a: Vector,
+    h: Array,
 ) -> list[list[ComplexNumberPair]]:
     """Return the projections of the negative node residuals onto all eigenvectors, as complex
     pairs.
@@ -720,14 +744,14 @@ def _project_linearized_residuals(
     multiply_by_columns = lambda derivative_columns, x: tuple(
         sum(derivative_columns[j][i] * x[j] for j in n) for i in n
     )
-    damping_term = multiply_by_columns(residual_by_v, a)
-    stiffness_rate_term = multiply_by_columns(residual_by_q, v)
-    stiffness_acceleration_term = multiply_by_columns(residual_by_q, a)
+    damping_term = multiply_by_columns(residual_jacobian_v, a)
+    stiffness_rate_term = multiply_by_columns(residual_jacobian_q, v)
+    stiffness_acceleration_term = multiply_by_columns(residual_jacobian_q, a)
     residual_projections = []
     for eigenvector_weights in EIGENVECTOR_PROJECTION_MATRIX:
         weight_of_constant_term, weight_of_linear_term, weight_of_quadratic_term = (
-            -complex(np.sum(eigenvector_weights * node_powers))
-            for node_powers in (
+            -complex(np.sum(eigenvector_weights * node_fraction_powers))
+            for node_fraction_powers in (
                 np.ones(N_GAUSS_NODES),
                 GAUSS_NODES - 0.5,
                 0.5 * GAUSS_NODES * GAUSS_NODES - 0.125,
@@ -736,7 +760,7 @@ def _project_linearized_residuals(
         residual_projections.append(
             [
                 tuple(
-                    take_real_or_imaginary_part(weight_of_constant_term) * middle_residual[i]
+                    take_real_or_imaginary_part(weight_of_constant_term) * midpoint_residual[i]
                     + h
                     * (
                         take_real_or_imaginary_part(weight_of_linear_term)
@@ -780,7 +804,7 @@ def _correct_node_accelerations(
     return tuple(corrected_accelerations), h * largest_acceleration_change
 
 
-def _find_lowest_guard(
+def _find_lowest_guard_value(
     phase: AbstractPhase,
     q: Vector,
     v: Vector,
@@ -799,13 +823,13 @@ def _find_lowest_guard(
       value 0 at the end; otherwise 0.
     """
     newton_sweep_state, coordinate_indices = solved_mesh_interval.newton_sweep_state, range(len(q))
-    middle_acceleration = tuple(
+    midpoint_acceleration = tuple(
         _sum_weighted_accelerations(
-            MIDDLE_INTERPOLATION_WEIGHTS, newton_sweep_state.node_accelerations, i
+            MIDPOINT_INTERPOLATION_WEIGHTS, newton_sweep_state.node_accelerations, i
         )
         for i in coordinate_indices
     )
-    end_acceleration = tuple(
+    interval_end_acceleration = tuple(
         _sum_weighted_accelerations(
             END_EXTRAPOLATION_WEIGHTS, newton_sweep_state.node_accelerations, i
         )
@@ -816,9 +840,9 @@ def _find_lowest_guard(
             _sum_weighted_accelerations(w, newton_sweep_state.node_accelerations, i)
             for i in coordinate_indices
         )
-        for w in MIDDLE_INTEGRATION_WEIGHTS
+        for w in MIDPOINT_INTEGRATION_WEIGHTS
     )
-    interval_middle_state = (
+    interval_midpoint_state = (
         tuple(
             q[i]
             + newton_sweep_state.interval_length
@@ -833,25 +857,25 @@ def _find_lowest_guard(
     evaluate_phase_guards = lambda q, v, a: phase.compute_guards(
         PhaseInstant(phase, phase.compute_motion(q, v), a)
     )
-    middle_guard_values = evaluate_phase_guards(*interval_middle_state, middle_acceleration)
+    midpoint_guard_values = evaluate_phase_guards(*interval_midpoint_state, midpoint_acceleration)
     end_guard_values = evaluate_phase_guards(
-        *solved_mesh_interval.interval_end_state, end_acceleration
+        *solved_mesh_interval.interval_end_state, interval_end_acceleration
     )
-    lowest_guard_of_all = jnp.full_like(newton_sweep_state.interval_length, jnp.inf)
-    for i, (start_guard_value, middle_guard_value, end_guard_value) in enumerate(
-        zip(start_guard_values, middle_guard_values, end_guard_values, strict=True)
+    lowest_of_all_guard_values = jnp.full_like(newton_sweep_state.interval_length, jnp.inf)
+    for i, (start_guard_value, midpoint_guard_value, end_guard_value) in enumerate(
+        zip(start_guard_values, midpoint_guard_values, end_guard_values, strict=True)
     ):
-        lowest_guard_value = jnp.minimum(start_guard_value, middle_guard_value)
+        lowest_guard_value = jnp.minimum(start_guard_value, midpoint_guard_value)
         if i >= n_event_guards:
             lowest_guard_value = jnp.minimum(lowest_guard_value, end_guard_value)
             guard_decrease_bound = 0.25 * jnp.abs(
-                start_guard_value - 2.0 * middle_guard_value + end_guard_value
+                start_guard_value - 2.0 * midpoint_guard_value + end_guard_value
             )
             lowest_guard_value = jnp.where(
                 lowest_guard_value > guard_decrease_bound, lowest_guard_value, -1.0
             )
-        lowest_guard_of_all = jnp.minimum(lowest_guard_of_all, lowest_guard_value)
-    return lowest_guard_of_all, end_guard_values
+        lowest_of_all_guard_values = jnp.minimum(lowest_of_all_guard_values, lowest_guard_value)
+    return lowest_of_all_guard_values, end_guard_values
 
 
 class CollocationStep(NamedTuple):
@@ -875,8 +899,8 @@ def take_collocation_step(
     - `expected_durations`: expected durations of DLS, SLS-I and SLS-II, arrays over lanes, s;
     - `options`: amount of work and limits, in units of the wheel.
     """
-    is_lane_valid = is_valid_start_state(params, x)
-    params, x = replace_invalid_inputs(is_lane_valid, params, x, PAPER_START_STATE)
+    is_start_state_valid = is_valid_start_state(params, x)
+    params, x = replace_invalid_inputs(is_start_state_valid, params, x, PAPER_START_STATE)
     wheel_units = compute_wheel_units(params.symbols())
     state_units: tuple[Any, ...] = (1.0, wheel_units.rate_unit, wheel_units.velocity_unit)
     params = convert_to_wheel_units(params)
@@ -891,18 +915,19 @@ def take_collocation_step(
         (expected_duration > 0.0) & (expected_duration < options.max_expected_duration)
         for expected_duration in expected_durations
     ]
-    is_lane_valid = functools.reduce(operator.and_, has_valid_duration, is_lane_valid)
+    is_start_state_valid = functools.reduce(operator.and_, has_valid_duration, is_start_state_valid)
     expected_durations = tuple(
-        jnp.where(is_lane_valid, expected_duration, 0.1) for expected_duration in expected_durations
+        jnp.where(is_start_state_valid, expected_duration, 0.1)
+        for expected_duration in expected_durations
     )
     s = params.symbols()
     landing_result = transitions.resolve_landing(s, *x)
-    is_collocation_trusted = is_lane_valid & landing_result.is_rear_foot_planted
+    is_collocation_trusted = is_start_state_valid & landing_result.is_rear_foot_planted
     wheel_angle, wheel_motion = landing_result.theta_after, landing_result.motion_after
-    step_phases = make_phases(s, landing_result.foot_distance, stop_at_lift_off)
+    phases_of_step = make_phases(s, landing_result.foot_distance, stop_at_lift_off)
     phase_durations = []
     for collocated_phase, expected_duration, phase_mesh, max_start_rate_error in zip(
-        step_phases,
+        phases_of_step,
         expected_durations,
         options.phase_meshes,
         options.max_start_rate_errors,
@@ -928,12 +953,12 @@ def take_collocation_step(
         phase_durations.append(phase_end.phase_duration)
 
     def convert_trusted_lanes_to_si(
-        lane_arrays: Iterable[Array], si_units: Iterable[Any]
+        lane_result_arrays: Iterable[Array], si_units: Iterable[Any]
     ) -> Vector:
         """Return the arrays in SI units, with the value 0 in lanes that failed a check."""
         return tuple(
-            jnp.where(is_collocation_trusted, dimensionless_lanes * si_unit, 0.0)
-            for dimensionless_lanes, si_unit in zip(lane_arrays, si_units, strict=True)
+            jnp.where(is_collocation_trusted, dimensionless_array * si_unit, 0.0)
+            for dimensionless_array, si_unit in zip(lane_result_arrays, si_units, strict=True)
         )
 
     return CollocationStep(

@@ -32,7 +32,7 @@ CONTACT_STEP_INPUT_NAMES = (START_INPUT_NAME, *CONTACT_PARAMETER_NAMES)
 
 def step_batch_with_contact(
     model: Any,
-    parameter_columns: list[np.ndarray],
+    values_by_parameter: list[np.ndarray],
     section_states: np.ndarray,
     n_steps: int,
     options: StepOptions,
@@ -45,7 +45,7 @@ def step_batch_with_contact(
     Without derivatives on flat ground, one call of the kernel computes all gait steps.
     """
     element_friction = np.asarray(model.friction, section_states.dtype)
-    is_ground_uneven = any(np.ndim(x) == 2 for x in (*parameter_columns, element_friction))
+    is_ground_uneven = any(np.ndim(x) == 2 for x in (*values_by_parameter, element_friction))
     if requested_engine not in ("auto", "lanes") or load_explicit_tableau(options.solver) is None:
         raise ValueError(
             f"engine is {requested_engine!r} and solver {options.solver}, but batches with contact "
@@ -57,20 +57,20 @@ def step_batch_with_contact(
             "for all elements: call vrw.step_batch for each restitution."
         )
     stepwise_ground = _StepwiseGround.repeat_over_steps(
-        parameter_columns[CONTACT_SLOPE_INDEX], element_friction, len(section_states), n_steps
+        values_by_parameter[CONTACT_SLOPE_INDEX], element_friction, len(section_states), n_steps
     )
-    parameter_columns = [
+    values_by_parameter = [
         stepwise_ground.slopes_by_step[0] if i == CONTACT_SLOPE_INDEX else x
-        for i, x in enumerate(parameter_columns)
+        for i, x in enumerate(values_by_parameter)
     ]
     parameter_matrix = np.stack(
         [
             np.broadcast_to(x, len(section_states))
-            for x in (*parameter_columns, stepwise_ground.friction_by_step[0])
+            for x in (*values_by_parameter, stepwise_ground.friction_by_step[0])
         ]
     )
     section_states = embed_section_states(parameter_matrix, section_states, n_legs)
-    integer_zeros = np.zeros(len(section_states), np.int32)
+    zeros_by_element = np.zeros(len(section_states), np.int32)
     if not derivative_names and not is_ground_uneven:
         kernel_walk_result = walk_batch(
             parameter_matrix, section_states, n_steps, model, options, n_legs
@@ -84,8 +84,8 @@ def step_batch_with_contact(
             step_outcomes,
             n_stepped,
             n_solver_steps,
-            integer_zeros > 0,
-            integer_zeros,
+            zeros_by_element > 0,
+            zeros_by_element,
         )
         return StepBatchResult(*result_arrays, engine="lanes", solver_names=(options.solver,))
     parameter_names: tuple[str, ...] = CONTACT_PARAMETER_NAMES
@@ -122,16 +122,16 @@ def step_batch_with_contact(
             active_walks.store_lane_steps(
                 active_lanes,
                 (x.T, phase_durations.T, step_outcomes, n_solver_steps),
-                integer_zeros[active_lanes] > 0,
+                zeros_by_element[active_lanes] > 0,
             )
             continue
         contact_step_result, step_jacobian = step_batch_with_jacobian(
             *step_arguments, active_walks.input_indices
         )
-        complete_step_jacobian = np.concatenate(
+        jacobian_of_all_inputs = np.concatenate(
             [step_jacobian.section_state, step_jacobian.durations], 1
         )
-        input_jacobian = complete_step_jacobian[:, :, list(active_walks.input_indices)]
+        input_jacobian = jacobian_of_all_inputs[:, :, list(active_walks.input_indices)]
         step_outputs = (
             contact_step_result.section_state,
             contact_step_result.durations,
@@ -141,10 +141,10 @@ def step_batch_with_contact(
         active_walks.store_lane_steps(
             active_lanes,
             tuple(np.asarray(x).T for x in (*step_outputs, input_jacobian)),
-            integer_zeros[active_lanes] > 0,
+            zeros_by_element[active_lanes] > 0,
         )
     return active_walks.make_batch_result(
-        np.arange(len(section_states)), integer_zeros, "lanes", (options.solver,)
+        np.arange(len(section_states)), zeros_by_element, "lanes", (options.solver,)
     )
 
 
@@ -153,8 +153,8 @@ class _StepwiseGround(NamedTuple):
 
     slopes_by_step: np.ndarray  # (n_steps + 1, elements), rad
     friction_by_step: np.ndarray  # (n_steps, elements)
-    n_given_slopes: int | None  # per element; None if slopes do not vary over steps
-    n_given_frictions: int | None
+    n_stepwise_slopes: int | None  # per element; None if slopes do not vary over steps
+    n_stepwise_frictions: int | None
 
     @classmethod
     def repeat_over_steps(
@@ -163,22 +163,22 @@ class _StepwiseGround(NamedTuple):
         """Return slope and friction for all gait steps, repeated over steps and over the batch
         where the argument has no such axis.
         """
-        n_given_values = (
+        stepwise_value_counts = (
             x.shape[1] if x.ndim == 2 else None for x in (element_slopes, element_friction)
         )
 
-        def expand_over_steps(x: np.ndarray, n_repetitions: int) -> np.ndarray:
+        def repeat_parameter_over_steps(x: np.ndarray, n_repetitions: int) -> np.ndarray:
             return (
                 x if x.ndim == 2 else np.tile(np.broadcast_to(x, n_elements), (n_repetitions, 1)).T
             )
 
         slopes_by_step = complete_slopes_over_steps(
-            expand_over_steps(element_slopes, n_steps + 1), n_steps
+            repeat_parameter_over_steps(element_slopes, n_steps + 1), n_steps
         )
         return cls(
             slopes_by_step,
-            expand_over_steps(element_friction, n_steps).T[:n_steps],
-            *n_given_values,
+            repeat_parameter_over_steps(element_friction, n_steps).T[:n_steps],
+            *stepwise_value_counts,
         )
 
     def make_step_parameters(self, k: int, parameter_matrix: np.ndarray) -> np.ndarray:
@@ -208,26 +208,26 @@ class _StepwiseGround(NamedTuple):
 
         The mapping contains "friction" and, if the slope varies over gait steps, "slope".
         """
-        previous_friction_index = len(CONTACT_PARAMETER_NAMES)
-        tilt_index = previous_friction_index + 1
-        n_given_slopes, n_given_frictions = self.n_given_slopes, self.n_given_frictions
+        previous_friction_input_index = len(CONTACT_PARAMETER_NAMES)
+        tilt_input_index = previous_friction_input_index + 1
+        n_stepwise_slopes, n_stepwise_frictions = self.n_stepwise_slopes, self.n_stepwise_frictions
 
         def list_slope_terms(k: int) -> tuple[tuple[int, int, float], ...]:
-            return (0, k, 1.0), (1, k, -1.0), (1, min(k + 1, (n_given_slopes or 1) - 1), 1.0)
+            return (0, k, 1.0), (1, k, -1.0), (1, min(k + 1, (n_stepwise_slopes or 1) - 1), 1.0)
 
         def list_friction_terms(k: int) -> tuple[tuple[int, int, float], ...]:
-            if n_given_frictions is None:
+            if n_stepwise_frictions is None:
                 return (0, 0, 1.0), (1, 0, 1.0)
             return (0, k, 1.0), (1, max(k - 1, 0), 1.0)
 
         stepwise_friction = StepwiseParameter(
-            (CONTACT_FRICTION_INDEX, previous_friction_index),
-            n_given_frictions,
+            (CONTACT_FRICTION_INDEX, previous_friction_input_index),
+            n_stepwise_frictions,
             list_friction_terms,
         )
-        if n_given_slopes is None:
+        if n_stepwise_slopes is None:
             return {"friction": stepwise_friction}
         stepwise_slope = StepwiseParameter(
-            (CONTACT_SLOPE_INDEX, tilt_index), n_given_slopes, list_slope_terms
+            (CONTACT_SLOPE_INDEX, tilt_input_index), n_stepwise_slopes, list_slope_terms
         )
         return {"slope": stepwise_slope, "friction": stepwise_friction}

@@ -72,7 +72,7 @@ class StepBatchResult(AbstractPrintable):
         n_lanes_by_solver = np.bincount(
             np.ravel(self.solver_index), minlength=len(self.solver_names)
         )
-        solver_texts = (
+        solver_count_texts = (
             f"{n_elements:,} by {solver_name}"
             for n_elements, solver_name in zip(n_lanes_by_solver, self.solver_names, strict=True)
             if n_elements
@@ -80,7 +80,7 @@ class StepBatchResult(AbstractPrintable):
         return [
             ("lanes", format_outcome_counts(self.outcome, Outcome)),
             ("steps each", format_quantity(self.n_stepped, "")),
-            ("engine", f"{self.engine}; {', '.join(solver_texts)}"),
+            ("engine", f"{self.engine}; {', '.join(solver_count_texts)}"),
             ("duration of the last step", format_quantity(self.durations.sum(-1), "s")),
         ]
 
@@ -104,15 +104,15 @@ class StepwiseParameter(NamedTuple):
     """
 
 
-def complete_slopes_over_steps(given_slopes: np.ndarray, n_steps: int) -> np.ndarray:
+def complete_slopes_over_steps(known_slopes_by_step: np.ndarray, n_steps: int) -> np.ndarray:
     """Return the slopes of the ground for `n_steps` gait steps, shape (n_steps + 1, lanes), rad.
 
-    If `given_slopes` has only `n_steps` slopes per lane, the last slope is repeated.
+    If `known_slopes_by_step` has only `n_steps` slopes per lane, the last slope is repeated.
     """
     return (
-        given_slopes.T
-        if given_slopes.shape[1] > n_steps
-        else np.concatenate([given_slopes.T, given_slopes.T[-1:]])
+        known_slopes_by_step.T
+        if known_slopes_by_step.shape[1] > n_steps
+        else np.concatenate([known_slopes_by_step.T, known_slopes_by_step.T[-1:]])
     )
 
 
@@ -165,12 +165,12 @@ class WalkBatch:
         self.input_indices = (
             (*parameter_input_indices, *state_input_indices) if derivative_names else ()
         )
-        n_rows_by_parameter = [
+        n_jacobian_rows_by_parameter = [
             stepwise_parameter.n_stepwise_values or 1
             for stepwise_parameter in self.differentiated_parameters
         ]
         # The first index of each parameter on axis 0 of the Jacobian, and then that of the start.
-        self.first_jacobian_rows = np.cumsum([0, *n_rows_by_parameter])
+        self.first_jacobian_rows = np.cumsum([0, *n_jacobian_rows_by_parameter])
         n_jacobian_rows = self.first_jacobian_rows[-1] + state_size if derivative_names else 0
         self.walk_jacobian = np.zeros(
             (n_jacobian_rows, state_size + 3, n_lanes), section_states.dtype
@@ -216,7 +216,7 @@ class WalkBatch:
         if not self.derivative_names:
             return {}
         self.walk_jacobian[..., self.outcome != Outcome.STEPPED] = 0.0
-        ordered_jacobian, state_size = (
+        jacobian_in_batch_order, state_size = (
             self.walk_jacobian.take(inverse_lane_order, -1).T,
             len(self.section_state),
         )
@@ -236,7 +236,7 @@ class WalkBatch:
                 else slice(first_jacobian_row, first_jacobian_row + n_stepwise_values)
             )
         jacobian_by_name = {
-            input_name: ordered_jacobian[:, :, jacobian_rows_by_name[input_name]]
+            input_name: jacobian_in_batch_order[:, :, jacobian_rows_by_name[input_name]]
             for input_name in self.derivative_names
         }
         return {
@@ -306,38 +306,38 @@ class WalkBatch:
         if k == 0:
             chained_jacobian[first_start_state_row:] = step_jacobian[n_step_inputs:]
         else:
-            used_jacobian_row_ranges = [
-                range(first_jacobian_row, min(first_jacobian_row + k + 1, end_jacobian_row))
-                for first_jacobian_row, end_jacobian_row in itertools.pairwise(
+            nonzero_jacobian_row_ranges = [
+                range(first_jacobian_row, min(first_jacobian_row + k + 1, next_jacobian_row))
+                for first_jacobian_row, next_jacobian_row in itertools.pairwise(
                     self.first_jacobian_rows
                 )
             ]
-            used_jacobian_rows = np.array(
+            nonzero_jacobian_rows = np.array(
                 [
-                    *itertools.chain(*used_jacobian_row_ranges),
+                    *itertools.chain(*nonzero_jacobian_row_ranges),
                     *range(first_start_state_row, len(chained_jacobian)),
                 ]
             )
-            previous_jacobian = self.walk_jacobian[used_jacobian_rows, :state_size][
+            previous_jacobian = self.walk_jacobian[nonzero_jacobian_rows, :state_size][
                 ..., lane_selection
             ]
-            chained_jacobian[used_jacobian_rows] = sum(
+            chained_jacobian[nonzero_jacobian_rows] = sum(
                 step_jacobian[n_step_inputs + i] * previous_jacobian[:, i, None]
                 for i in range(state_size)
             )
-        first_input_row = 0
+        first_parameter_input_row = 0
         for stepwise_parameter, first_jacobian_row in zip(
             self.differentiated_parameters, self.first_jacobian_rows[:-1], strict=True
         ):
             for (
-                position_in_inputs,
+                input_position,
                 stepwise_value_index,
                 input_derivative,
             ) in stepwise_parameter.list_chain_rule_terms(k):
                 chained_jacobian[first_jacobian_row + stepwise_value_index] += (
-                    input_derivative * step_jacobian[first_input_row + position_in_inputs]
+                    input_derivative * step_jacobian[first_parameter_input_row + input_position]
                 )
-            first_input_row += len(stepwise_parameter.input_indices)
+            first_parameter_input_row += len(stepwise_parameter.input_indices)
         return chained_jacobian
 
 

@@ -428,7 +428,7 @@ class ContactGaitProblem(AbstractReturnMapProblem):
         additional_quantities = {
             "section_state": section_states,
             CONTACT_ORDER_COLUMN: compute_contact_order_numbers(
-                period_evaluation.period_steps, self.n_legs
+                period_evaluation.gait_steps_of_period, self.n_legs
             ),
             FRICTION_SURPLUS_COLUMN_NAME: np.asarray(
                 jax.vmap(self._compute_friction_surplus)(wheels, points.p)
@@ -440,10 +440,10 @@ class ContactGaitProblem(AbstractReturnMapProblem):
                 wheels,
                 points.p,
                 section_states,
-                jnp.asarray(period_evaluation.period_steps.section_state),
+                jnp.asarray(period_evaluation.gait_steps_of_period.section_state),
             )
         return (
-            _combine_period_measures(period_evaluation.period_steps, points.z)
+            _combine_period_measures(period_evaluation.gait_steps_of_period, points.z)
             | additional_quantities
         )
 

@@ -41,7 +41,7 @@ from vrw_jax.cycles.gait_search import (
     limit_cycle,
     limit_cycles,
     parse_gait_choice,
-    retry_from_walks,
+    search_again_from_walks,
 )
 from vrw_jax.cycles.gait_walks import compute_walk_starts
 from vrw_jax.cycles.limit_cycle_result import LimitCycle, transfer_solution_to_mesh

@@ -33,8 +33,8 @@ def find_attracting_gaits(gait_finder: Any, parameter_values: Any) -> tuple[np.n
 
     Args:
         gait_finder: finder of gaits with unilateral contact.
-        parameter_values: parameters of each wheel, shape (wheels, n_values), in the order of
-            `AbstractWheel.collect_parameter_values`.
+        parameter_values: parameters of each wheel, shape (wheels, n_parameter_values), in the order
+            of `AbstractWheel.collect_parameter_values`.
 
     Returns:
         Index of the wheel to which each gait belongs, shape (gaits,), and the cycles, whose leading
@@ -45,23 +45,23 @@ def find_attracting_gaits(gait_finder: Any, parameter_values: Any) -> tuple[np.n
         gait_finder, parameter_values, compute_walk_starts
     )
     is_gait_missing = np.asarray(gaits_from_first_starts.outcome) != Outcome.STEPPED
-    missing_wheels = gait_wheel_indices[is_gait_missing]
-    if not len(missing_wheels):
+    wheels_without_gait = gait_wheel_indices[is_gait_missing]
+    if not len(wheels_without_gait):
         return gait_wheel_indices, gaits_from_first_starts
     fallback_wheel_indices, fallback_gaits = _find_gaits_from_starts(
-        gait_finder, parameter_values[missing_wheels], compute_fallback_walk_starts
+        gait_finder, parameter_values[wheels_without_gait], compute_fallback_walk_starts
     )
     is_fallback_found = np.asarray(fallback_gaits.outcome) == Outcome.STEPPED
-    wheels_with_gait = missing_wheels[fallback_wheel_indices[is_fallback_found]]
-    keeps_first_gaits = ~np.isin(gait_wheel_indices, wheels_with_gait)
-    all_gaits = concatenate_tree_rows(
-        select_tree_rows(gaits_from_first_starts, keeps_first_gaits),
+    wheels_with_gait = wheels_without_gait[fallback_wheel_indices[is_fallback_found]]
+    is_first_gait_kept = ~np.isin(gait_wheel_indices, wheels_with_gait)
+    merged_gaits = concatenate_tree_rows(
+        select_tree_rows(gaits_from_first_starts, is_first_gait_kept),
         select_tree_rows(fallback_gaits, is_fallback_found),
     )
-    gait_wheel_indices = np.concatenate([gait_wheel_indices[keeps_first_gaits], wheels_with_gait])
+    gait_wheel_indices = np.concatenate([gait_wheel_indices[is_first_gait_kept], wheels_with_gait])
     gait_sort_order = np.argsort(gait_wheel_indices, kind="stable")
     return gait_wheel_indices[gait_sort_order], jax.device_put(
-        select_tree_rows(all_gaits, gait_sort_order)
+        select_tree_rows(merged_gaits, gait_sort_order)
     )
 
 
@@ -96,43 +96,48 @@ def _find_gaits_from_starts(
     sum_over_steps = lambda walk_states: (
         np.asarray(walk_states).reshape(len(candidate_wheel_indices), -1).sum(-1)
     )
-    candidate_speeds = sum_over_steps(candidate_gaits.step_length) / np.where(
+    candidate_gait_speeds = sum_over_steps(candidate_gaits.step_length) / np.where(
         is_gait_valid, sum_over_steps(candidate_gaits.durations), 1.0
     )
     section_units = stack_section_units(
         gait_finder.model, np.asarray(parameter_values)[candidate_wheel_indices], gait_finder.n_legs
     )
-    scaled_step_ends = (step_end_states / section_units[:, None])[
+    scaled_step_end_states = (step_end_states / section_units[:, None])[
         :, :, : count_section_coordinates(gait_finder)
     ]
     # A gait that repeats after fewer steps is a gait of a shorter period.
-    distances_to_last_step = np.abs(scaled_step_ends[:, :-1] - scaled_step_ends[:, -1:]).max(-1)
-    is_gait_valid &= ~(distances_to_last_step < DUPLICATE_GAIT_DISTANCE).any(1)
-    selected_indices: list[int] = []
-    for candidate_indices in np.split(
+    state_distances_to_last_step = np.abs(
+        scaled_step_end_states[:, :-1] - scaled_step_end_states[:, -1:]
+    ).max(-1)
+    is_gait_valid &= ~(state_distances_to_last_step < DUPLICATE_GAIT_DISTANCE).any(1)
+    selected_gait_indices: list[int] = []
+    for candidate_gait_indices in np.split(
         np.arange(len(candidate_wheel_indices)),
         find_slowest_gait_indices(candidate_wheel_indices, n_wheels)[1:],
     ):
-        n_selected_before = len(selected_indices)
-        for candidate_index in sorted(
-            candidate_indices[is_gait_valid[candidate_indices]],
-            key=lambda candidate_index: candidate_speeds[candidate_index],
+        n_gaits_selected_before = len(selected_gait_indices)
+        for candidate_gait_index in sorted(
+            candidate_gait_indices[is_gait_valid[candidate_gait_indices]],
+            key=lambda candidate_gait_index: candidate_gait_speeds[candidate_gait_index],
         ):
-            step_matches = (
+            step_match_flags = (
                 np.abs(
-                    scaled_step_ends[selected_index] - scaled_step_ends[candidate_index, -1]
+                    scaled_step_end_states[selected_gait_index]
+                    - scaled_step_end_states[candidate_gait_index, -1]
                 ).max(-1)
                 < DUPLICATE_GAIT_DISTANCE
-                for selected_index in selected_indices[n_selected_before:]
+                for selected_gait_index in selected_gait_indices[n_gaits_selected_before:]
             )
-            if not any(is_step_matching.any() for is_step_matching in step_matches):
-                selected_indices.append(int(candidate_index))
-        selected_indices += (
-            [] if len(selected_indices) > n_selected_before else [int(candidate_indices[0])]
+            if not any(is_step_matching.any() for is_step_matching in step_match_flags):
+                selected_gait_indices.append(int(candidate_gait_index))
+        selected_gait_indices += (
+            []
+            if len(selected_gait_indices) > n_gaits_selected_before
+            else [int(candidate_gait_indices[0])]
         )
     # The cycle of a wheel without a valid candidate contains zeros and has a failure as outcome.
-    selected_gaits = select_tree_rows(candidate_gaits, selected_indices)
-    is_selected_gait_missing = ~is_gait_valid[selected_indices]
+    selected_gaits = select_tree_rows(candidate_gaits, selected_gait_indices)
+    is_selected_gait_missing = ~is_gait_valid[selected_gait_indices]
     broadcast_mask = lambda gait_array: is_selected_gait_missing.reshape(
         -1, *[1] * (gait_array.ndim - 1)
     )
@@ -151,7 +156,7 @@ def _find_gaits_from_starts(
     masked_gaits = eqx.tree_at(
         lambda gaits_of_candidates: gaits_of_candidates.outcome, masked_gaits, outcome_codes
     )
-    return candidate_wheel_indices[selected_indices], jax.device_put(masked_gaits)
+    return candidate_wheel_indices[selected_gait_indices], jax.device_put(masked_gaits)
 
 
 def find_slow_gaits(gait_finder: Any, parameter_values: Any) -> Any:
@@ -163,17 +168,17 @@ def find_slow_gaits(gait_finder: Any, parameter_values: Any) -> Any:
     parameter_values = np.asarray(parameter_values)
     slow_start_function = lambda params: compute_walk_starts(params)[:1]
     _, slow_gaits = _find_gaits_from_starts(gait_finder, parameter_values, slow_start_function)
-    missing_wheels = np.flatnonzero(np.asarray(slow_gaits.outcome) != Outcome.STEPPED)
-    if len(missing_wheels):
-        other_wheel_indices, other_gaits = find_attracting_gaits(
-            gait_finder, parameter_values[missing_wheels]
+    wheels_without_gait = np.flatnonzero(np.asarray(slow_gaits.outcome) != Outcome.STEPPED)
+    if len(wheels_without_gait):
+        attracting_gait_wheel_indices, attracting_gaits = find_attracting_gaits(
+            gait_finder, parameter_values[wheels_without_gait]
         )
         gait_indices = np.arange(len(parameter_values))
-        gait_indices[missing_wheels] = len(parameter_values) + find_slowest_gait_indices(
-            other_wheel_indices, len(missing_wheels)
+        gait_indices[wheels_without_gait] = len(parameter_values) + find_slowest_gait_indices(
+            attracting_gait_wheel_indices, len(wheels_without_gait)
         )
         slow_gaits = jax.device_put(
-            select_tree_rows(concatenate_tree_rows(slow_gaits, other_gaits), gait_indices)
+            select_tree_rows(concatenate_tree_rows(slow_gaits, attracting_gaits), gait_indices)
         )
     return slow_gaits
 

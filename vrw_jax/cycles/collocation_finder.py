@@ -174,10 +174,10 @@ class CollocationFinder(AbstractGaitFinder):
 
     @eqx.filter_jit
     def make_initial_guess(self, parameter_values: ParameterValues) -> CollocationState:
-        predicted_start = predict_start_from_gait_surface(
+        predicted_search_start = predict_start_from_gait_surface(
             self.collocation_system, parameter_values[:, None], jnp.ones((1,), bool)
         )
-        return jax.tree.map(lambda x: x[..., 0], predicted_start)
+        return jax.tree.map(lambda x: x[..., 0], predicted_search_start)
 
     def find_gait(self, parameter_values: ParameterValues, cycle_guess: CollocationState) -> Gait:
         cycle, cycle_derivatives = compute_cycle_and_derivatives(
@@ -239,13 +239,13 @@ class CollocationFinder(AbstractGaitFinder):
             (len(PARAMETER_NAMES), section_state.shape[0]), section_state.dtype
         )
         with ThreadPoolExecutor(2) as compile_pool:
-            cycle_future = compile_pool.submit(
+            cycle_program_future = compile_pool.submit(
                 with_default_jax_settings(compute_cycle_and_derivatives),
                 self.collocation_system,
                 parameter_values,
                 self.make_initial_guess(parameter_values),
             )
-            step_future = compile_pool.submit(
+            step_program_future = compile_pool.submit(
                 with_default_jax_settings(compute_step_and_derivatives),
                 self.model,
                 self.n_legs,
@@ -254,7 +254,7 @@ class CollocationFinder(AbstractGaitFinder):
                 section_state_derivatives,
                 self.step_options,
             )
-            cycle_future.result(), step_future.result()
+            cycle_program_future.result(), step_program_future.result()
 
 
 @eqx.filter_jit
@@ -291,16 +291,21 @@ def compute_step_and_derivatives(
     parameters.
     """
 
-    n_values = parameter_values.shape[0]
+    n_parameter_values = parameter_values.shape[0]
     take_step = lambda step_inputs: model.take_step(
-        make_wheel_from_parameters(step_inputs[:n_values], n_legs), step_inputs[n_values:], options
+        make_wheel_from_parameters(step_inputs[:n_parameter_values], n_legs),
+        step_inputs[n_parameter_values:],
+        options,
     )
-    step, input_jacobian = evaluate_with_jacobian(
+    step, step_input_jacobian = evaluate_with_jacobian(
         take_step, jnp.concatenate([parameter_values, section_state])
     )
-    input_tangents = jnp.concatenate(
-        [jnp.eye(n_values, dtype=section_state.dtype), section_state_derivatives], axis=1
+    step_input_tangents = jnp.concatenate(
+        [jnp.eye(n_parameter_values, dtype=section_state.dtype), section_state_derivatives], axis=1
     )
     return step, move_derivative_axis_first(
-        jax.tree.map(lambda input_derivative: input_derivative @ input_tangents.T, input_jacobian)
+        jax.tree.map(
+            lambda step_input_derivative: step_input_derivative @ step_input_tangents.T,
+            step_input_jacobian,
+        )
     )

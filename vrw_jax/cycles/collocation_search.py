@@ -40,7 +40,7 @@ from vrw_jax.cycles.options import CycleOptions
 from vrw_jax.cycles.phase_sequence import (
     ADMISSIBILITY_CHECKS,
     compute_phase_constants,
-    make_held_landing_sequence,
+    make_post_impact_sequence,
 )
 from vrw_jax.numerics import BatchFunction, LaneArray, Vector
 from vrw_jax.wheel import WheelParams, make_wheel_from_parameters, stack_parameters
@@ -91,7 +91,7 @@ class CollocationSystem(NamedTuple):
     @property
     def phase_sequence(self) -> PhaseSequence:
         """Return the phases of one gait step and the functions that describe them."""
-        return make_held_landing_sequence(self.n_legs, self.stop_at_lift_off)
+        return make_post_impact_sequence(self.n_legs, self.stop_at_lift_off)
 
     @property
     def phase_meshes(self) -> tuple[PhaseMesh, ...]:
@@ -172,7 +172,7 @@ class CollocationState(NamedTuple):
     # (lanes,): 1 for a limit cycle, 0 for a replacement of a missing cycle
     has_cycle: LaneArray
     # (lanes,): 1 + index in ADMISSIBILITY_CHECKS of the check that a root fails;
-    # plus HOMOTOPY_OFFSET for a root of a wheel on the homotopy; a HomotopyFailure; else 0
+    # plus HOMOTOPY_FAILURE_OFFSET for a root of a wheel on the homotopy; a HomotopyFailure; else 0
     failed_check: LaneArray
     step_end_states: LaneArray  # (n, 4, lanes): theta, L1 and their rates at the end of each step
 
@@ -274,12 +274,16 @@ def init_search_flags(
     """Return `has_cycle`, `failed_check` and `step_end_states` before the search, which are
     zeros.
     """
-    lane_shape, n_end_components = (
+    lane_shape, n_step_end_components = (
         section_state.shape[1:],
         2 * collocation_system.phase_sequence.phases[-1].n_coordinates,
     )
     make_zeros = lambda *array_shape: jnp.zeros((*array_shape, *lane_shape), section_state.dtype)
-    return make_zeros(), make_zeros(), make_zeros(collocation_system.period_n, n_end_components)
+    return (
+        make_zeros(),
+        make_zeros(),
+        make_zeros(collocation_system.period_n, n_step_end_components),
+    )
 
 
 def reduce_over_non_lane_axes(
@@ -293,20 +297,20 @@ def reduce_over_non_lane_axes(
     if simd.targets_machine_code():
         machine_reduction = jnp.max if combine_two_arrays is jnp.maximum else jnp.min
         return machine_reduction(lane_values, axis=tuple(range(lane_values.ndim - 1)))
-    lane_rows = lane_values.reshape(-1, lane_values.shape[-1])
-    while lane_rows.shape[0] > 1:
-        half_array_length = lane_rows.shape[0] // 2
-        unpaired_lane_row = lane_rows[2 * half_array_length :]
-        lane_rows = jnp.concatenate(
+    rows_over_lanes = lane_values.reshape(-1, lane_values.shape[-1])
+    while rows_over_lanes.shape[0] > 1:
+        half_row_count = rows_over_lanes.shape[0] // 2
+        unpaired_lane_row = rows_over_lanes[2 * half_row_count :]
+        rows_over_lanes = jnp.concatenate(
             [
                 combine_two_arrays(
-                    lane_rows[:half_array_length],
-                    lane_rows[half_array_length : 2 * half_array_length],
+                    rows_over_lanes[:half_row_count],
+                    rows_over_lanes[half_row_count : 2 * half_row_count],
                 ),
                 unpaired_lane_row,
             ]
         )
-    return lane_rows[0]
+    return rows_over_lanes[0]
 
 
 def compute_correction_norm(
@@ -338,26 +342,27 @@ def _compute_correction_fraction(
     With this fraction, the changes of the section state and of the durations are within their
     limits.
     """
-    step_time = jnp.sum(collocation_solution.durations, 1, keepdims=True)
-    change_limits = jnp.concatenate(
+    gait_step_duration = jnp.sum(collocation_solution.durations, 1, keepdims=True)
+    max_unknown_changes = jnp.concatenate(
         [
             0.15 * jnp.abs(collocation_solution.section_state) + 0.05,
-            (0.25 * jnp.abs(collocation_solution.durations) + 0.02 * jnp.abs(step_time)).reshape(
-                -1, collocation_solution.section_state.shape[-1]
-            ),
+            (
+                0.25 * jnp.abs(collocation_solution.durations) + 0.02 * jnp.abs(gait_step_duration)
+            ).reshape(-1, collocation_solution.section_state.shape[-1]),
         ]
     )
-    proposed_changes = jnp.concatenate(
+    proposed_unknown_changes = jnp.concatenate(
         [
             newton_correction.section_state,
             newton_correction.durations.reshape(-1, collocation_solution.section_state.shape[-1]),
         ]
     )
-    smallest_float = jnp.finfo(proposed_changes.dtype).tiny
-    step_fraction = reduce_over_non_lane_axes(
-        jnp.minimum, change_limits / jnp.maximum(jnp.abs(proposed_changes), smallest_float)
+    smallest_float = jnp.finfo(proposed_unknown_changes.dtype).tiny
+    correction_fraction = reduce_over_non_lane_axes(
+        jnp.minimum,
+        max_unknown_changes / jnp.maximum(jnp.abs(proposed_unknown_changes), smallest_float),
     )
-    return jnp.minimum(1.0, step_fraction)
+    return jnp.minimum(1.0, correction_fraction)
 
 
 def compute_state_tangents(
@@ -413,7 +418,7 @@ def run_newton_iterations(
     """
     cycle_options = collocation_system.cycle_options
     machine_epsilon = float(jnp.finfo(parameters.dtype).eps)
-    tight_tolerance, loose_tolerance = (
+    tight_newton_tolerance, loose_newton_tolerance = (
         max(cycle_options.tolerance, 1e3 * machine_epsilon),
         CycleOptions.tolerance,
     )
@@ -435,7 +440,7 @@ def run_newton_iterations(
         newton_correction = cycle_linearization.newton_correction
         correction_norm = compute_correction_norm(collocation_solution, newton_correction)
         is_correction_finite = jnp.isfinite(correction_norm)
-        step_fraction = _compute_correction_fraction(collocation_solution, newton_correction)
+        correction_fraction = _compute_correction_fraction(collocation_solution, newton_correction)
         is_lane_moving = newton_state.is_lane_running & is_correction_finite
         update_moving_lanes = lambda new_value, old_value: jnp.where(
             is_lane_moving, new_value, old_value
@@ -444,18 +449,19 @@ def run_newton_iterations(
         def apply_correction(unknowns: Array, newton_correction_values: Array) -> Array:
             return jnp.where(
                 is_lane_moving,
-                unknowns + step_fraction * jnp.where(is_lane_moving, newton_correction_values, 0.0),
+                unknowns
+                + correction_fraction * jnp.where(is_lane_moving, newton_correction_values, 0.0),
                 unknowns,
             )
 
         newton_tolerance = (
             jnp.where(
                 2.0 * correction_norm > newton_state.correction_norm,
-                loose_tolerance,
-                tight_tolerance,
+                loose_newton_tolerance,
+                tight_newton_tolerance,
             )
-            if tight_tolerance < loose_tolerance
-            else tight_tolerance
+            if tight_newton_tolerance < loose_newton_tolerance
+            else tight_newton_tolerance
         )
         has_lane_converged = is_lane_moving & is_at_target & (correction_norm < newton_tolerance)
         collocation_state = newton_state.collocation_state._replace(
@@ -550,7 +556,7 @@ def find_first_failed_check(
     phase_constants = collocation_system.phase_constants_function(*parameters)
     collocation_solution = collocation_state.solution
 
-    def check_step(loop_carry: tuple, step_inputs: tuple) -> tuple:
+    def check_step_admissibility(loop_carry: tuple, step_inputs: tuple) -> tuple:
         section_state, failed_check = loop_carry
         phase_durations, accelerations_by_phase, is_phase_active = step_inputs
         is_phase_active = is_phase_active > 0.5
@@ -605,7 +611,7 @@ def find_first_failed_check(
         collocation_solution.section_state,
         jnp.zeros(parameters.shape[-1:], parameters.dtype),
     )
-    (_, failed_check), _ = lax.scan(check_step, loop_carry, step_inputs)
+    (_, failed_check), _ = lax.scan(check_step_admissibility, loop_carry, step_inputs)
     is_mesh_fine_enough = (
         estimate_mesh_error(phase_sequence, collocation_system.phase_meshes, collocation_solution)
         < collocation_system.search_limits.max_accepted_mesh_error
@@ -637,48 +643,51 @@ def _run_search_attempt(
     - `attempt_index`: index of the attempt in the order of attempts;
     - `search_guess`: guess of the user, or None.
     """
-    cycle_options, n_segments = (
+    cycle_options, n_homotopy_segments = (
         collocation_system.cycle_options,
         collocation_system.search_limits.n_homotopy_segments,
     )
     table_1_values = stack_parameters(WheelParams(n_legs=collocation_system.n_legs)).astype(
         parameters.dtype
     )
-    max_iterations = dict.fromkeys(SEARCH_ATTEMPTS, cycle_options.max_newton_iterations) | {
+    max_iterations_by_name = dict.fromkeys(SEARCH_ATTEMPTS, cycle_options.max_newton_iterations) | {
         "guess": cycle_options.first_newton_iterations,
         "surface": cycle_options.first_newton_iterations,
     }
-    iteration_limits = [max_iterations[attempt_name] for attempt_name in SEARCH_ATTEMPTS] + [
-        cycle_options.max_newton_iterations
-    ] * (2 * n_segments)
-    segment_indices = [0] * len(SEARCH_ATTEMPTS) + [
-        1 + segment_try_index // 2 for segment_try_index in range(2 * n_segments)
+    max_iterations_by_attempt = [
+        max_iterations_by_name[attempt_name] for attempt_name in SEARCH_ATTEMPTS
+    ] + [cycle_options.max_newton_iterations] * (2 * n_homotopy_segments)
+    homotopy_segment_by_attempt = [0] * len(SEARCH_ATTEMPTS) + [
+        1 + homotopy_try_index // 2 for homotopy_try_index in range(2 * n_homotopy_segments)
     ]
     select_by_attempt = lambda table_by_attempt: jnp.asarray(table_by_attempt, jnp.int32)[
         attempt_index
     ]
     table_1_parameters = jnp.broadcast_to(table_1_values[:, None], parameters.shape)
     # Each segment has two tries: from the previous wheel's gait, and without double support.
-    segment_number = select_by_attempt(segment_indices)
-    is_second_try_by_attempt = [0] * len(SEARCH_ATTEMPTS) + [0, 1] * n_segments
-    is_second_try = select_by_attempt(is_second_try_by_attempt) == 1
-    is_segment_attempt = segment_number > 0
-    is_last_segment = ~is_segment_attempt | (segment_number == n_segments)
-    homotopy_fraction = segment_number.astype(parameters.dtype) / n_segments
+    homotopy_segment_number = select_by_attempt(homotopy_segment_by_attempt)
+    is_second_homotopy_try_by_attempt = [0] * len(SEARCH_ATTEMPTS) + [0, 1] * n_homotopy_segments
+    is_second_homotopy_try = select_by_attempt(is_second_homotopy_try_by_attempt) == 1
+    is_homotopy_segment_attempt = homotopy_segment_number > 0
+    is_last_homotopy_segment = ~is_homotopy_segment_attempt | (
+        homotopy_segment_number == n_homotopy_segments
+    )
+    homotopy_fraction = homotopy_segment_number.astype(parameters.dtype) / n_homotopy_segments
     target_parameters = jnp.where(
-        is_last_segment,
+        is_last_homotopy_segment,
         parameters,
         table_1_parameters + homotopy_fraction * (parameters - table_1_parameters),
     )
     is_homotopy_attempt = _has_attempt_name(attempt_index, "homotopy")
     start_parameters = jnp.where(is_homotopy_attempt, table_1_parameters, target_parameters)
     has_dls = jnp.broadcast_to(
-        ~_has_attempt_name(attempt_index, "without DLS") & ~is_second_try, parameters.shape[-1:]
+        ~_has_attempt_name(attempt_index, "without DLS") & ~is_second_homotopy_try,
+        parameters.shape[-1:],
     )
     homotopy_steps = jnp.where(is_homotopy_attempt, cycle_options.homotopy_steps, 0)
     start_state = predict_start_from_gait_surface(collocation_system, start_parameters, has_dls)
     continues_previous_segment = _has_attempt_name(attempt_index, "guess, on", "surface, on") | (
-        (segment_number > 1) & ~is_second_try
+        (homotopy_segment_number > 1) & ~is_second_homotopy_try
     )
     start_state = jax.tree.map(
         lambda surface_value, previous_value: jnp.where(
@@ -697,9 +706,9 @@ def _run_search_attempt(
             search_guess,
         )
     is_lane_pending = search_result.collocation_state.has_cycle < 0.5
-    is_lane_pending &= ~is_segment_attempt | (
+    is_lane_pending &= ~is_homotopy_segment_attempt | (
         search_result.collocation_state.failed_check
-        == jnp.where(is_second_try, float(HomotopyFailure.FIRST_TRY), 0.0)
+        == jnp.where(is_second_homotopy_try, float(HomotopyFailure.FIRST_TRY_FAILED), 0.0)
     )
     attempt_result = run_newton_iterations(
         collocation_system,
@@ -707,31 +716,36 @@ def _run_search_attempt(
         start_state,
         table_1_parameters,
         homotopy_steps,
-        select_by_attempt(iteration_limits),
+        select_by_attempt(max_iterations_by_attempt),
         is_lane_pending,
     )
     if collocation_system.period_n == 1:
         # The result for a wheel on the homotopy may decide the search for the wheel at its end.
         collocation_state = attempt_result.collocation_state
         failure_code = jnp.where(
-            is_second_try, float(HomotopyFailure.BOTH_TRIES), float(HomotopyFailure.FIRST_TRY)
+            is_second_homotopy_try,
+            float(HomotopyFailure.BOTH_TRIES_FAILED),
+            float(HomotopyFailure.FIRST_TRY_FAILED),
         )
         has_cycle, failed_check = collocation_state.has_cycle, collocation_state.failed_check
-        continues_homotopy = ~is_last_segment & (
+        continues_homotopy = ~is_last_homotopy_segment & (
             (has_cycle > 0.5) | (failed_check == FAILED_MESH_CHECK_CODE)
         )
         final_failed_check = jnp.where(
-            is_last_segment, failed_check, failed_check + HOMOTOPY_OFFSET
+            is_last_homotopy_segment, failed_check, failed_check + HOMOTOPY_FAILURE_OFFSET
         )
         failed_check_code = jnp.where(
             (has_cycle > 0.5) | (failed_check > 0.0), final_failed_check, failure_code
         )
         failed_check_code = jnp.where(continues_homotopy, 0.0, failed_check_code)
         homotopy_state = collocation_state._replace(
-            has_cycle=jnp.where(is_last_segment, has_cycle, 0.0), failed_check=failed_check_code
+            has_cycle=jnp.where(is_last_homotopy_segment, has_cycle, 0.0),
+            failed_check=failed_check_code,
         )
         collocation_state = jax.tree.map(
-            lambda new_value, old_value: jnp.where(is_segment_attempt, new_value, old_value),
+            lambda new_value, old_value: jnp.where(
+                is_homotopy_segment_attempt, new_value, old_value
+            ),
             homotopy_state,
             attempt_result.collocation_state,
         )
@@ -766,17 +780,18 @@ def run_search_attempts(
     parameters: LaneParameters,
     search_result: CycleSearchResult,
     attempt_index: Int[Array, ""],
-    end_index: Int[Array, ""],
+    end_attempt_index: Int[Array, ""],
     search_guess: CollocationState | None = None,
 ) -> CycleSearchResult:
-    """Run the attempts `attempt_index`, ..., `end_index` - 1 on the wheels (lanes) without a cycle.
+    """Run the search attempts with indices from `attempt_index` to `end_attempt_index` - 1.
 
-    Return the search result. The parameters must be in their domains.
+    Return the search result. An attempt changes only wheels (lanes) without a cycle. The parameters
+    must be in their domains.
     """
 
     def has_next_attempt(loop_carry: tuple[Array, CycleSearchResult]) -> Array:
         attempt_index, search_result = loop_carry
-        return (attempt_index < end_index) & jnp.any(
+        return (attempt_index < end_attempt_index) & jnp.any(
             _can_attempt_change_result(attempt_index, search_result)
         )
 
@@ -820,13 +835,13 @@ def search_all_attempts(
             *parameters_and_guess[1:],
         )
 
-    def has_next_stage(loop_carry: tuple) -> Array:
+    def has_next_attempt_stage(loop_carry: tuple) -> Array:
         attempt_index, _, search_result, _ = loop_carry
         return (attempt_index < n_attempts) & jnp.any(
             _can_attempt_change_result(attempt_index, search_result)
         )
 
-    def run_stage(loop_carry: tuple) -> tuple:
+    def run_attempt_stage(loop_carry: tuple) -> tuple:
         attempt_index, lane_indices, *lane_arrays = loop_carry
         lane_order_pending_first = jnp.argsort(
             ~_can_attempt_change_result(attempt_index, lane_arrays[0]), stable=True
@@ -852,7 +867,7 @@ def search_all_attempts(
 
     initial_carry = first_attempt_index, jnp.arange(n_lanes), search_result, parameters_and_guess
     _, lane_indices, gathered_search_result, _ = lax.while_loop(
-        has_next_stage, run_stage, initial_carry
+        has_next_attempt_stage, run_attempt_stage, initial_carry
     )
     original_lane_order = jnp.argsort(lane_indices)
     return jax.tree.map(lambda x: x[..., original_lane_order], gathered_search_result)
@@ -863,7 +878,7 @@ def _can_attempt_change_result(
 ) -> Bool[Array, " lanes"]:
     """Return for each wheel (lane) whether an attempt can still change its search result."""
     is_lane_decided = (search_result.collocation_state.failed_check > 0.0) | (
-        search_result.collocation_state.failed_check == HomotopyFailure.BOTH_TRIES
+        search_result.collocation_state.failed_check == HomotopyFailure.BOTH_TRIES_FAILED
     )
     return (search_result.collocation_state.has_cycle < 0.5) & (
         (attempt_index < len(SEARCH_ATTEMPTS)) | ~is_lane_decided
@@ -894,7 +909,7 @@ def init_search_result(
 FAILED_MESH_CHECK_CODE = len(ADMISSIBILITY_CHECKS)
 """Value of `CollocationState.failed_check` for a root whose mesh is too coarse."""
 
-HOMOTOPY_OFFSET = float(len(ADMISSIBILITY_CHECKS))
+HOMOTOPY_FAILURE_OFFSET = float(len(ADMISSIBILITY_CHECKS))
 """Offset of `CollocationState.failed_check` if the check fails for an intermediate wheel of the
 homotopy.
 """
@@ -906,8 +921,8 @@ class HomotopyFailure(IntEnum):
     The homotopy starts at the wheel in Table 1 of the paper.
     """
 
-    FIRST_TRY = -1
-    BOTH_TRIES = -2
+    FIRST_TRY_FAILED = -1
+    BOTH_TRIES_FAILED = -2
 
 
 SEARCH_ATTEMPTS = ("guess", "guess, on", "surface", "surface, on", "homotopy", "without DLS")

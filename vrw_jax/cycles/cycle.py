@@ -79,7 +79,7 @@ class AbstractCycle(AbstractPrintable):
         step also repeats after two steps.
         """
         step_ends, period_n = self.step_ends, self.period_n
-        largest_coordinate = jnp.max(jnp.abs(step_ends), (-2, -1))
+        largest_state_coordinate = jnp.max(jnp.abs(step_ends), (-2, -1))
         relative_tolerance = jnp.maximum(
             SAME_STATE_RELATIVE_TOLERANCE, 100.0 * jnp.finfo(step_ends.dtype).eps
         )
@@ -93,7 +93,7 @@ class AbstractCycle(AbstractPrintable):
                 jnp.abs(jnp.roll(step_ends, candidate_period, -2) - step_ends), (-2, -1)
             )
             minimal_period = jnp.where(
-                state_distance <= relative_tolerance * largest_coordinate,
+                state_distance <= relative_tolerance * largest_state_coordinate,
                 candidate_period,
                 minimal_period,
             )
@@ -104,16 +104,21 @@ class AbstractCycle(AbstractPrintable):
 
         In that case, derivatives with respect to `params` are also NaN.
         """
-        nan_without_gait = jnp.where(self.found, 0.0, jnp.nan)
+        nan_if_no_gait = jnp.where(self.found, 0.0, jnp.nan)
         # The weight contains the parameters, so that derivatives are also NaN.
-        nan_weight = 1.0 + nan_without_gait * sum(jax.tree.leaves(params))
+        nan_weight = 1.0 + nan_if_no_gait * sum(jax.tree.leaves(params))
 
         def apply_nan_weight(x: Array) -> Array:
             return x * nan_weight.astype(x.dtype) if eqx.is_inexact_array(x) else x
 
-        field_names = [name for name in FIELDS_ZERO_WITHOUT_GAIT if name in vars(self)]
+        fields_zero_without_gait = [
+            force_measure_name
+            for force_measure_name in FIELDS_ZERO_WITHOUT_GAIT
+            if force_measure_name in vars(self)
+        ]
         weighted_fields = {
-            name: jax.tree.map(apply_nan_weight, getattr(self, name)) for name in field_names
+            force_measure_name: jax.tree.map(apply_nan_weight, getattr(self, force_measure_name))
+            for force_measure_name in fields_zero_without_gait
         }
         return dataclasses.replace(self, **weighted_fields)
 
@@ -126,13 +131,13 @@ class AbstractCycle(AbstractPrintable):
         return jnp.where(self.found, value_of_gait, 0.0 * self.monodromy_value[..., 0, 0])
 
     def reduce_over_steps(
-        self, step_values: Array, reduce_values: Callable[[Array, int], Array]
+        self, values_by_step: Array, reduce_values: Callable[[Array, int], Array]
     ) -> Array:
         """Reduce the values of the gait steps, on the last axis, to one value per cycle.
 
         `reduce_values` is a reduction of an array over an axis, such as `jnp.sum`.
         """
-        return reduce_values(step_values, -1) if self.period_n > 1 else step_values
+        return reduce_values(values_by_step, -1) if self.period_n > 1 else values_by_step
 
     @property
     def found(self) -> Bool[Array, "..."]:
@@ -302,7 +307,7 @@ def format_floquet_multipliers(monodromy_matrix: np.ndarray) -> tuple[float, str
         for floquet_multiplier in floquet_multipliers
         if abs(floquet_multiplier) >= 5e-6
     ]
-    remainder_text = (
+    unlisted_multipliers_text = (
         f"{len(floquet_multipliers) - len(shown_multipliers)} below 5e-6"
         if len(shown_multipliers) < len(floquet_multipliers)
         else ""
@@ -312,7 +317,7 @@ def format_floquet_multipliers(monodromy_matrix: np.ndarray) -> tuple[float, str
         for floquet_multiplier in shown_multipliers
     ]
     return float(np.abs(floquet_multipliers[0])), ", ".join(
-        [*multiplier_texts, *([remainder_text] if remainder_text else [])]
+        [*multiplier_texts, *([unlisted_multipliers_text] if unlisted_multipliers_text else [])]
     )
 
 
@@ -372,8 +377,10 @@ CYCLE_MEASURE_FUNCTIONS: dict[str, Callable[[AbstractCycle], Array]] = {
     "gait_sensitivity_period": _make_sensitivity_reader("period"),
     "gait_sensitivity_speed": _make_sensitivity_reader("speed"),
     **{
-        name: lambda cycle, name=name: cycle.force_peaks[name]  # type: ignore[misc]
-        for name in FORCE_PEAK_MEASURES
+        force_measure_name: lambda cycle, force_measure_name=force_measure_name: cycle.force_peaks[
+            force_measure_name
+        ]  # type: ignore[misc]
+        for force_measure_name in FORCE_PEAK_MEASURES
     },
 }
 """Functions that map a cycle to a measure, by the name of the measure.

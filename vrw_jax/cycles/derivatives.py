@@ -106,24 +106,24 @@ def _compute_monodromy_tangents(
     unit_weights, zero_weights = jnp.ones_like(total_mass), jnp.zeros_like(total_mass)
     first_parameter_indices = jnp.asarray([*unscaled_parameter_indices, leg_mass_index])
     second_parameter_indices = jnp.asarray([*unscaled_parameter_indices, hub_mass_index])
-    direction_weights = (
+    mass_direction_weights = (
         jnp.stack([unit_weights] * len(unscaled_parameter_indices) + [hub_mass_share]),
         jnp.stack([zero_weights] * len(unscaled_parameter_indices) + [-leg_mass_share]),
     )
     identity_matrix = jnp.eye(len(parameters), dtype=parameters.dtype)[..., None]
     parameter_tangents = jnp.broadcast_to(identity_matrix, (len(parameters), *parameters.shape))
 
-    def compute_monodromy_tangent(indices_and_weights: tuple) -> tuple[Array, Array]:
+    def compute_monodromy_tangent(parameter_indices_and_weights: tuple) -> tuple[Array, Array]:
         (
             first_parameter_index,
             second_parameter_index,
             first_direction_weight,
             second_direction_weight,
-        ) = indices_and_weights
+        ) = parameter_indices_and_weights
         select_tangent = lambda x, first_parameter_index: lax.dynamic_index_in_dim(
             x, first_parameter_index, keepdims=False
         )
-        indices_and_weights = jax.tree.map(
+        parameter_indices_and_weights = jax.tree.map(
             lambda x: (
                 first_direction_weight * select_tangent(x, first_parameter_index)
                 + second_direction_weight * select_tangent(x, second_parameter_index)
@@ -133,12 +133,12 @@ def _compute_monodromy_tangents(
         return jax.jvp(
             functools.partial(_compute_masked_monodromy, collocation_system),
             (parameters, collocation_state),
-            indices_and_weights,
+            parameter_indices_and_weights,
         )
 
     monodromy_matrices, monodromy_tangents = lax.map(
         compute_monodromy_tangent,
-        (first_parameter_indices, second_parameter_indices, *direction_weights),
+        (first_parameter_indices, second_parameter_indices, *mass_direction_weights),
     )
     tangent_by_parameter = dict(
         zip(unscaled_parameter_indices, monodromy_tangents[:-1], strict=True)
@@ -245,25 +245,27 @@ def _search_in_scaled_units(
     step_end_units = jnp.concatenate([position_units[:2], position_units[:2] / time_unit])
 
     def convert_units(
-        collocation_state: CollocationState, apply_unit: Callable[[Array, Array], Array]
+        collocation_state: CollocationState, scale_by_unit: Callable[[Array, Array], Array]
     ) -> CollocationState:
-        """Convert each array of a collocation state by `apply_unit(array, unit)`."""
+        """Convert each array of a collocation state by `scale_by_unit(array, unit)`."""
         collocation_solution = collocation_state.solution
         accelerations = tuple(
-            apply_unit(x, position_units[: x.shape[-2]] / (time_unit * time_unit))
+            scale_by_unit(x, position_units[: x.shape[-2]] / (time_unit * time_unit))
             for x in collocation_solution.accelerations
         )
         collocation_solution = CollocationSolution(
-            apply_unit(collocation_solution.section_state, section_units),
-            apply_unit(collocation_solution.durations, time_unit),
+            scale_by_unit(collocation_solution.section_state, section_units),
+            scale_by_unit(collocation_solution.durations, time_unit),
             accelerations,
         )
         return collocation_state._replace(
             solution=collocation_solution,
-            step_end_states=apply_unit(collocation_state.step_end_states, step_end_units),
+            step_end_states=scale_by_unit(collocation_state.step_end_states, step_end_units),
         )
 
-    scaled_guess = tuple(convert_units(scaled_state, operator.truediv) for scaled_state in si_guess)
+    scaled_search_guess = tuple(
+        convert_units(si_guess_state, operator.truediv) for si_guess_state in si_guess
+    )
     parameter_units = [
         wheel_units.compute_unit_in_si(parameter_domain.unit)
         for parameter_domain in PARAMETER_DOMAINS.values()
@@ -273,7 +275,7 @@ def _search_in_scaled_units(
         for parameter_value, parameter_unit in zip(parameters, parameter_units, strict=True)
     ]
     search_result = search_all_attempts(
-        collocation_system, run_attempts, jnp.stack(scaled_parameters), *scaled_guess
+        collocation_system, run_attempts, jnp.stack(scaled_parameters), *scaled_search_guess
     )
     monodromy_matrix = section_units[:, None] * search_result.monodromy_matrix / section_units
     return search_result._replace(
@@ -303,23 +305,23 @@ def solve_cycle_with_derivatives(
     compute_tangents = _make_tangent_function(collocation_system)
 
     @jax.custom_jvp
-    def solve_with_rule(
+    def solve_with_jvp_rule(
         parameters: Array, *search_guess: CollocationState
     ) -> tuple[CollocationState, tuple]:
         collocation_state, *search_diagnostics = search_one_wheel(parameters, *search_guess)
         return collocation_state, tuple(search_diagnostics)
 
-    @solve_with_rule.defjvp
+    @solve_with_jvp_rule.defjvp
     @with_default_jax_settings
     def jvp_rule(primals: tuple, tangents: tuple) -> tuple:
-        collocation_state, search_diagnostics = solve_with_rule(*primals)
+        collocation_state, search_diagnostics = solve_with_jvp_rule(*primals)
         state_tangent = apply_jacobian(compute_tangents(primals[0], collocation_state), tangents[0])
         return (collocation_state, search_diagnostics), (
             state_tangent,
             make_zero_tangent(search_diagnostics),
         )
 
-    return solve_with_rule(parameters, *(() if search_guess is None else (search_guess,)))
+    return solve_with_jvp_rule(parameters, *(() if search_guess is None else (search_guess,)))
 
 
 def attach_monodromy_derivatives(
@@ -345,16 +347,16 @@ def attach_monodromy_derivatives(
     )
 
     @jax.custom_jvp
-    def attach_with_rule(
+    def attach_with_jvp_rule(
         monodromy_value: Array, parameters: Array, collocation_state: CollocationState
     ) -> Array:
         return monodromy_value
 
-    @attach_with_rule.defjvp
+    @attach_with_jvp_rule.defjvp
     @with_default_jax_settings
     def jvp_rule(primals: tuple, tangents: tuple) -> tuple:
-        return attach_with_rule(*primals), apply_jacobian(
+        return attach_with_jvp_rule(*primals), apply_jacobian(
             compute_parameter_jacobian(*primals[1:]), tangents[1]
         )
 
-    return attach_with_rule(monodromy_value, parameters, collocation_state)
+    return attach_with_jvp_rule(monodromy_value, parameters, collocation_state)

@@ -29,7 +29,7 @@ and m/s. Collocation and event-driven step are independent computations. With th
 each of them has a tenth of this error for gait steps of up to about 1.5 s.
 """
 
-ParameterValues = Float[Array, " n_values"]
+ParameterValues = Float[Array, " n_parameter_values"]
 """Values of the parameters in `AbstractWheel.parameter_names`, in that order."""
 
 
@@ -82,13 +82,15 @@ def is_same_branch(
     first_gait_point, second_gait_point = select_tree_rows(
         (first_gait_point, second_gait_point), ...
     )
-    predicted_change = parameter_change @ (
+    predicted_coordinate_change = parameter_change @ (
         0.5 * (first_gait_point.coordinate_derivatives + second_gait_point.coordinate_derivatives)
     )
-    prediction_error = np.linalg.norm(
-        second_gait_point.gait_coordinates - first_gait_point.gait_coordinates - predicted_change
+    coordinate_prediction_error = np.linalg.norm(
+        second_gait_point.gait_coordinates
+        - first_gait_point.gait_coordinates
+        - predicted_coordinate_change
     )
-    if prediction_error > 0.5 * np.linalg.norm(predicted_change) + 1e-6:
+    if coordinate_prediction_error > 0.5 * np.linalg.norm(predicted_coordinate_change) + 1e-6:
         return False
     fold_test_function = lambda branch_point: np.linalg.det(
         np.eye(len(branch_point.return_map_jacobian)) - branch_point.return_map_jacobian
@@ -106,11 +108,13 @@ def confirm_outcome_by_step(
 
     A step confirms its cycle if its start in `section_states` equals its end in `end_states`.
     """
-    ends_at_same_state = (
+    is_section_state_reproduced = (
         np.max(np.abs(np.asarray(end_states) - np.asarray(section_states)), axis=-1)
         <= STATE_AGREEMENT_TOLERANCE
     )
-    confirmed_outcome = np.where(ends_at_same_state, Outcome.STEPPED, Outcome.MESH_TOO_COARSE)
+    confirmed_outcome = np.where(
+        is_section_state_reproduced, Outcome.STEPPED, Outcome.MESH_TOO_COARSE
+    )
     confirmed_outcome = np.where(
         np.asarray(step_outcomes) == Outcome.STEPPED, confirmed_outcome, np.asarray(step_outcomes)
     )
@@ -164,7 +168,9 @@ class AbstractGaitFinder(eqx.Module):
     def make_initial_guess(self, parameter_values: ParameterValues) -> Any:
         """Return a start of the search for a wheel if no similar wheel is known."""
 
-    def make_initial_guesses(self, parameter_values: Float[Array, "lanes n_values"]) -> Any:
+    def make_initial_guesses(
+        self, parameter_values: Float[Array, "lanes n_parameter_values"]
+    ) -> Any:
         """Return starts of the search for a batch of wheels."""
         return jax.vmap(self.make_initial_guess)(parameter_values)
 
@@ -173,7 +179,7 @@ class AbstractGaitFinder(eqx.Module):
         """Find the gait near `cycle_guess` and its derivatives, by compiled programs."""
 
     def find_gaits(
-        self, parameter_values: Float[Array, "lanes n_values"], cycle_guess: Any
+        self, parameter_values: Float[Array, "lanes n_parameter_values"], cycle_guess: Any
     ) -> Gait:
         """Find the gaits of a batch of wheels and their derivatives.
 
@@ -260,7 +266,7 @@ class GaitMeasures(NamedTuple):
     """Measures of a gait, and their derivatives with respect to the model's parameter values."""
 
     measure_values: Float[Array, " n_names"]
-    parameter_jacobian: Float[Array, "n_names n_values"]
+    parameter_jacobian: Float[Array, "n_names n_parameter_values"]
     outcome: Array
 
 
@@ -292,7 +298,7 @@ def move_derivative_axis_first(derivative_tree: Any) -> Any:
 
 
 def compute_value_and_tangents(
-    function: Callable, input_values: tuple, input_tangents: tuple
+    differentiated_function: Callable, input_values: tuple, input_tangents: tuple
 ) -> tuple[Any, Any]:
     """Return the value of a function at `input_values`, and one JVP for each of the
     `input_tangents`.
@@ -301,7 +307,7 @@ def compute_value_and_tangents(
     """
     float_primals, non_float_inputs = eqx.partition(input_values, eqx.is_inexact_array)
     float_tangents = eqx.filter(input_tangents, eqx.is_inexact_array)
-    evaluate_at_floats = lambda all_float_inputs: function(
+    evaluate_at_floats = lambda all_float_inputs: differentiated_function(
         *eqx.combine(all_float_inputs, non_float_inputs)
     )
     tangents_of_value = jax.vmap(

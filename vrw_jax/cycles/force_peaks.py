@@ -60,15 +60,15 @@ def compute_force_peaks(
                 collocation_solution.accelerations[phase_index][step_index],
             )
             fore_force_extrema.append(
-                _find_force_extrema(phase, collocated_phase, with_rear_foot=False)
+                _find_force_extrema(phase, collocated_phase, includes_rear_force=False)
             )
             has_rear_foot = phase_index == 0
             total_force_extrema.append(
-                _find_force_extrema(phase, collocated_phase, with_rear_foot=True)
+                _find_force_extrema(phase, collocated_phase, includes_rear_force=True)
                 if has_rear_foot
                 else fore_force_extrema[-1]
             )
-        fore_peaks, total_peaks = (
+        fore_force_peaks, total_force_peaks = (
             _summarize_force_extrema(force_extrema, phase_durations)
             for force_extrema in (fore_force_extrema, total_force_extrema)
         )
@@ -76,12 +76,12 @@ def compute_force_peaks(
         landing_result = transitions.resolve_landing(wheel_symbols, end_point.q[0], *end_point.v)
         peaks_by_step.append(
             {
-                "n_force_peaks": fore_peaks.n_peaks,
-                "peak_force": fore_peaks.peak_force,
-                "force_trough_depth": fore_peaks.trough_depth,
-                "second_peak_rate": fore_peaks.second_peak_rate,
-                "n_total_force_peaks": total_peaks.n_peaks,
-                "peak_total_force": total_peaks.peak_force,
+                "n_force_peaks": fore_force_peaks.n_peaks,
+                "peak_force": fore_force_peaks.peak_force,
+                "force_trough_depth": fore_force_peaks.force_trough_depth,
+                "second_peak_rate": fore_force_peaks.second_peak_rate,
+                "n_total_force_peaks": total_force_peaks.n_peaks,
+                "peak_total_force": total_force_peaks.peak_force,
                 "landing_impulse": landing_result.fore_impulse.normal,
             }
         )
@@ -91,12 +91,12 @@ def compute_force_peaks(
 
 
 def _find_force_extrema(
-    phase: AbstractPhase, collocated_phase: CollocatedPhaseMotion, with_rear_foot: bool
+    phase: AbstractPhase, collocated_phase: CollocatedPhaseMotion, includes_rear_force: bool
 ) -> PhaseExtrema:
     """Return the extrema of the normal force in a phase.
 
-    The force is that on the fore foot or, if `with_rear_foot` is true, the sum of the forces on the
-    two feet.
+    The force is that on the fore foot or, if `includes_rear_force` is true, the sum of the forces
+    on the two feet.
     """
 
     def evaluate_acceleration(q: Array, v: Array) -> Array:
@@ -107,7 +107,7 @@ def _find_force_extrema(
     def evaluate_normal_force(q: Array, v: Array) -> Array:
         phase_instant = PhaseInstant(phase, phase.compute_motion(tuple(q), tuple(v)), None)
         normal_force = jnp.asarray(phase_instant.fore_force.normal)
-        if with_rear_foot and phase_instant.rear_force is not None:
+        if includes_rear_force and phase_instant.rear_force is not None:
             normal_force = normal_force + phase_instant.rear_force.normal
         return normal_force
 
@@ -119,7 +119,7 @@ class _ForcePeaks(NamedTuple):
 
     n_peaks: Scalar
     peak_force: Scalar
-    trough_depth: Scalar
+    force_trough_depth: Scalar
     second_peak_rate: Scalar
 
 
@@ -135,35 +135,39 @@ def _summarize_force_extrema(
         )
         for step_extrema, phase_start_time in zip(extrema_of_phases, phase_start_times, strict=True)
     ]
-    step_extrema = jax.tree.map(lambda *phase_parts: jnp.concatenate(phase_parts), *shifted_extrema)
+    step_extrema = jax.tree.map(
+        lambda *values_by_phase: jnp.concatenate(values_by_phase), *shifted_extrema
+    )
     peak_forces = jnp.where(
         step_extrema.is_quantity_maximum, step_extrema.extremum_values, -jnp.inf
     )
     extremum_indices = jnp.arange(len(peak_forces))
-    find_highest_peak = lambda extremum_mask: jnp.max(
+    find_highest_peak_force = lambda extremum_mask: jnp.max(
         jnp.where(extremum_mask, peak_forces, -jnp.inf), axis=1
     )
-    highest_peak_before = find_highest_peak(extremum_indices < extremum_indices[:, None])
-    highest_peak_after = find_highest_peak(extremum_indices > extremum_indices[:, None])
-    lower_neighbor_peak = jnp.minimum(highest_peak_before, highest_peak_after)
-    is_force_trough = step_extrema.is_quantity_minimum & jnp.isfinite(lower_neighbor_peak)
-    trough_depths = jnp.where(
+    highest_peak_force_before = find_highest_peak_force(
+        extremum_indices < extremum_indices[:, None]
+    )
+    highest_peak_force_after = find_highest_peak_force(extremum_indices > extremum_indices[:, None])
+    lower_neighbor_peak_force = jnp.minimum(highest_peak_force_before, highest_peak_force_after)
+    is_force_trough = step_extrema.is_quantity_minimum & jnp.isfinite(lower_neighbor_peak_force)
+    force_trough_depths = jnp.where(
         is_force_trough,
-        jnp.where(is_force_trough, lower_neighbor_peak, 0.0) - step_extrema.extremum_values,
+        jnp.where(is_force_trough, lower_neighbor_peak_force, 0.0) - step_extrema.extremum_values,
         0.0,
     )
     first_peak_time = jnp.min(
         jnp.where(step_extrema.is_quantity_maximum, step_extrema.extremum_times, jnp.inf)
     )
-    is_later_maximum = step_extrema.is_rate_maximum & (
+    is_later_rate_maximum = step_extrema.is_rate_maximum & (
         step_extrema.rate_extremum_times > first_peak_time
     )
     largest_force_rate = jnp.max(
-        jnp.where(is_later_maximum, step_extrema.rate_extremum_values, -jnp.inf)
+        jnp.where(is_later_rate_maximum, step_extrema.rate_extremum_values, -jnp.inf)
     )
     return _ForcePeaks(
         n_peaks=jnp.sum(step_extrema.is_quantity_maximum).astype(phase_durations.dtype),
         peak_force=jnp.where(jnp.any(step_extrema.is_quantity_maximum), jnp.max(peak_forces), 0.0),
-        trough_depth=jnp.max(trough_depths),
-        second_peak_rate=jnp.where(jnp.any(is_later_maximum), largest_force_rate, jnp.nan),
+        force_trough_depth=jnp.max(force_trough_depths),
+        second_peak_rate=jnp.where(jnp.any(is_later_rate_maximum), largest_force_rate, jnp.nan),
     )

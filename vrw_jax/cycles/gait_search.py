@@ -244,17 +244,19 @@ def limit_cycles(
         raise ValueError(f"the wheels' batch has shape {batch_shape}, but it must have one axis.")
     if batch_shape == (0,):
         invalid_params = jax.tree.map(lambda x: jnp.full((1,), jnp.nan, x.dtype), params)
-        missing_cycle = limit_cycles(
+        cycle_without_gait = limit_cycles(
             invalid_params, period_n=period_n, model=model, options=options, which=which
         )
-        return _take_wheels_on_device(missing_cycle, slice(0, 0))
+        return _take_wheels_on_device(cycle_without_gait, slice(0, 0))
     if has_traced_leaf(params):
         params = jax.tree.map(lambda x: jnp.broadcast_to(x, batch_shape), params)
-        single_params = jax.tree.map(lambda x: x[0], params)
+        first_wheel_params = jax.tree.map(lambda x: x[0], params)
     else:  # NumPy is used because JAX would compile a program for each batch size.
         params = jax.tree.map(lambda x: np.broadcast_to(np.asarray(x), batch_shape), params)
-        params, single_params = jax.device_put((params, select_tree_rows(params, 0)))
-    gait_finder = resolve_finder(single_params, model, options, check_int("period_n", period_n))
+        params, first_wheel_params = jax.device_put((params, select_tree_rows(params, 0)))
+    gait_finder = resolve_finder(
+        first_wheel_params, model, options, check_int("period_n", period_n)
+    )
     cycle: Any = _search_with_fallbacks(gait_finder, params, None, options is None, which)
     return cycle
 
@@ -310,11 +312,11 @@ def _search_with_fallbacks(
     """
     has_batch_axis = params.damping.ndim > 0
     params_without_tangents = lax.stop_gradient(params)
-    has_no_values, are_params_concrete = (
+    is_batch_empty, are_params_concrete = (
         has_traced_leaf(params_without_tangents),
         not has_traced_leaf(params),
     )
-    if gait_finder.is_multistable and cycle_guess is None and not has_no_values:
+    if gait_finder.is_multistable and cycle_guess is None and not is_batch_empty:
         cycle = _find_chosen_gaits(
             gait_finder,
             params_without_tangents
@@ -339,10 +341,10 @@ def _search_with_fallbacks(
     section_state = None
     if cycle_guess is not None:
         if isinstance(cycle_guess, CollocationState):
-            guess_state = cycle_guess.step_end_states[-1][jnp.array([0, 2, 3])]
+            guess_section_state = cycle_guess.step_end_states[-1][jnp.array([0, 2, 3])]
         else:
-            guess_state = getattr(cycle_guess, "section_state", cycle_guess)
-        section_state = np.asarray(lax.stop_gradient(guess_state))[None]
+            guess_section_state = getattr(cycle_guess, "section_state", cycle_guess)
+        section_state = np.asarray(lax.stop_gradient(guess_section_state))[None]
     finder_and_starts = _find_fallback_starts(
         gait_finder, *params_and_cycle, section_state, can_refine_mesh
     )
@@ -375,10 +377,10 @@ def _search_with_fallbacks(
             if has_batch_axis
             else _take_wheels_on_device(collocation_state, 0),
         )
-    return _keep_first_failure_reason(cycle, retried_cycle)
+    return _restore_first_failure_reason(cycle, retried_cycle)
 
 
-def _keep_first_failure_reason(cycle: LimitCycle, retried_cycle: LimitCycle) -> LimitCycle:
+def _restore_first_failure_reason(cycle: LimitCycle, retried_cycle: LimitCycle) -> LimitCycle:
     """Return the cycles of the second search, with the failure reasons of the first search.
 
     The reason of the first search replaces that of the second search if no gait exists. All
@@ -401,8 +403,8 @@ def _keep_first_failure_reason(cycle: LimitCycle, retried_cycle: LimitCycle) -> 
         last_failure_reason[0] != Outcome.STEPPED
     )
     failure_reason = [
-        value_selector(is_gait_missing, *reason_pair)
-        for reason_pair in zip(first_failure_reason, last_failure_reason, strict=True)
+        value_selector(is_gait_missing, *failure_reason_pair)
+        for failure_reason_pair in zip(first_failure_reason, last_failure_reason, strict=True)
     ]
     return eqx.tree_at(failure_reason_getter, retried_cycle, tuple(failure_reason))
 
@@ -442,8 +444,8 @@ def _replace_wheels(
 def _find_walk_end_states(
     gait_finder: CollocationFinder,
     params: WheelParams,
-    needs_walk: np.ndarray,
-    guess_states: np.ndarray | None,
+    is_walk_needed: np.ndarray,
+    guess_states_by_wheel: np.ndarray | None,
 ) -> np.ndarray:
     """Return for each wheel the state at the end of its walk with the smallest period defect.
 
@@ -456,11 +458,16 @@ def _find_walk_end_states(
     parameter_matrix = np.stack([np.asarray(getattr(params, name)) for name in PARAMETER_NAMES])
     solver_indices = select_cheapest_solver(parameter_matrix, StepOptions())
     is_solver_explicit = solver_indices != SolverIndex.IMPLICIT_SOLVER
-    unsettled_wheels = np.flatnonzero(needs_walk & is_solver_explicit)
-    parameter_values, walk_end_states = parameter_matrix.T, np.full((len(needs_walk), 3), np.nan)
-    smallest_period_defects = np.full(len(needs_walk), GAIT_WALK_OPTIONS.max_newton_start_defect)
-    if guess_states is not None:
-        guess_section_states = guess_states[unsettled_wheels]
+    unsettled_wheels = np.flatnonzero(is_walk_needed & is_solver_explicit)
+    parameter_values, walk_end_states = (
+        parameter_matrix.T,
+        np.full((len(is_walk_needed), 3), np.nan),
+    )
+    smallest_period_defects = np.full(
+        len(is_walk_needed), GAIT_WALK_OPTIONS.max_newton_start_defect
+    )
+    if guess_states_by_wheel is not None:
+        guess_section_states = guess_states_by_wheel[unsettled_wheels]
         is_guess_usable = (
             measure_period_defects(
                 gait_finder, parameter_values[unsettled_wheels], guess_section_states
@@ -532,7 +539,7 @@ def _find_fallback_starts(
     gait_finder: CollocationFinder,
     params: WheelParams,
     cycle: LimitCycle,
-    guess_states: np.ndarray | None,
+    guess_states_by_wheel: np.ndarray | None,
     can_refine_mesh: bool,
     fallback_options: SearchFallbackOptions = SEARCH_FALLBACK_OPTIONS,
 ) -> tuple[CollocationFinder, CollocationState] | None:
@@ -540,7 +547,7 @@ def _find_fallback_starts(
 
     The result is None if no more gaits are found.
 
-    - `guess_states`: section states of the user's guesses, shape (wheels, 3);
+    - `guess_states_by_wheel`: section states of the user's guesses, shape (wheels, 3);
     - `can_refine_mesh`: whether a finer mesh may be used.
     """
     search_outcomes = np.asarray(cycle.outcome)
@@ -554,7 +561,9 @@ def _find_fallback_starts(
     needs_better_gait = is_gait_missing | has_large_mesh_error
     if not needs_better_gait.any():
         return None
-    walk_end_states = _find_walk_end_states(gait_finder, params, is_gait_missing, guess_states)
+    walk_end_states = _find_walk_end_states(
+        gait_finder, params, is_gait_missing, guess_states_by_wheel
+    )
     # `collocation_state` contains the best start so far of each wheel, on the last finder's mesh.
     collocation_state, has_known_state = cycle.collocation_state, has_large_mesh_error.copy()
     is_mesh_too_coarse = search_outcomes == Outcome.MESH_TOO_COARSE
@@ -620,7 +629,7 @@ def _find_fallback_starts(
     return best_finder_and_starts
 
 
-def retry_from_walks(
+def search_again_from_walks(
     gait_finder: Any, params: WheelParams, search_result: LimitCycle
 ) -> LimitCycle:
     """Search again for the wheels without a cycle, starting from walks on the same mesh.
@@ -635,7 +644,7 @@ def retry_from_walks(
     retried_cycle = map_in_batches(
         gait_finder.find_cycles, batch_sizes.GAIT_BATCH_SIZES, params, finder_and_starts[1]
     )
-    return _keep_first_failure_reason(search_result, retried_cycle)
+    return _restore_first_failure_reason(search_result, retried_cycle)
 
 
 def _retry_from_other_steps(
@@ -650,29 +659,32 @@ def _retry_from_other_steps(
     of all gait steps, whose errors accumulate. A gait step without double support is the most
     sensitive step. If it is the first or the last step, the search may fail.
     """
-    missing_wheels = np.flatnonzero(np.isin(np.asarray(cycle.outcome), RETRY_OUTCOMES))
-    if not len(missing_wheels):
+    wheels_without_gait = np.flatnonzero(np.isin(np.asarray(cycle.outcome), RETRY_OUTCOMES))
+    if not len(wheels_without_gait):
         return None
-    missing_params = _take_wheels_on_device(params, missing_wheels)
-    section_states = np.array(section_states[missing_wheels])
+    params_without_gait = _take_wheels_on_device(params, wheels_without_gait)
+    section_states = np.array(section_states[wheels_without_gait])
     best_finder_and_starts = None
     collocation_state = cycle.collocation_state
     for _ in range(1, gait_finder.period_n):
         section_states = np.asarray(
-            step_batch(missing_params, section_states, model=gait_finder.model).section_state
+            step_batch(params_without_gait, section_states, model=gait_finder.model).section_state
         )
         retried_cycle = map_in_batches(
-            gait_finder.find_cycles, batch_sizes.GAIT_BATCH_SIZES, missing_params, section_states
+            gait_finder.find_cycles,
+            batch_sizes.GAIT_BATCH_SIZES,
+            params_without_gait,
+            section_states,
         )
-        positions_of_found_gaits = np.flatnonzero(
+        found_gait_positions = np.flatnonzero(
             np.asarray(retried_cycle.found)
-            & (np.asarray(collocation_state.has_cycle)[missing_wheels] < 0.5)
+            & (np.asarray(collocation_state.has_cycle)[wheels_without_gait] < 0.5)
         )
-        if len(positions_of_found_gaits):
+        if len(found_gait_positions):
             collocation_state = _replace_wheels(
                 collocation_state,
-                missing_wheels[positions_of_found_gaits],
-                _take_wheels_on_device(retried_cycle.collocation_state, positions_of_found_gaits),
+                wheels_without_gait[found_gait_positions],
+                _take_wheels_on_device(retried_cycle.collocation_state, found_gait_positions),
             )
             best_finder_and_starts = gait_finder, collocation_state
     return best_finder_and_starts
@@ -691,20 +703,22 @@ def _align_first_step(
     """
     gait_finder, collocation_state = finder_and_starts or (gait_finder, cycle.collocation_state)
     end_states = np.asarray(collocation_state.step_end_states)[:, :, [0, 2, 3]]
-    distances_to_start = np.abs(np.roll(end_states, 1, axis=1) - start_section_states[:, None]).max(
-        -1
-    )
-    distances_to_start = np.where(
-        np.asarray(collocation_state.has_cycle)[:, None] > 0.5, distances_to_start, 0.0
+    state_distances_to_start = np.abs(
+        np.roll(end_states, 1, axis=1) - start_section_states[:, None]
+    ).max(-1)
+    state_distances_to_start = np.where(
+        np.asarray(collocation_state.has_cycle)[:, None] > 0.5, state_distances_to_start, 0.0
     )
     for step_index in range(1, gait_finder.period_n):
-        shifted_wheels = np.flatnonzero(np.argmin(distances_to_start, 1) == step_index)
+        shifted_wheels = np.flatnonzero(np.argmin(state_distances_to_start, 1) == step_index)
         if len(shifted_wheels):
-            start_at_step = jax.vmap(functools.partial(gait_finder.shift_first_step, step_index))
+            shift_to_first_step = jax.vmap(
+                functools.partial(gait_finder.shift_first_step, step_index)
+            )
             collocation_state = _replace_wheels(
                 collocation_state,
                 shifted_wheels,
-                start_at_step(
+                shift_to_first_step(
                     _take_wheels_on_device(params, shifted_wheels),
                     _take_wheels_on_device(collocation_state, shifted_wheels),
                 ),

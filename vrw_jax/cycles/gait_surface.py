@@ -104,29 +104,35 @@ def predict_gait(params: WheelParams, phase_meshes: tuple[PhaseMesh, ...]) -> Co
         )
     )
     monomials = jnp.stack(evaluate_monomials(centered_coordinates))
-    predicted_values = jnp.tensordot(
+    predicted_surface_values = jnp.tensordot(
         jnp.asarray(gait_surface.coefficients.T, monomials.dtype), monomials, 1
     )
-    time_scale = compute_time_unit(params)
-    section_state = jnp.stack([predicted_values[0], predicted_values[1] / time_scale])
-    phase_durations = predicted_values[None, 2:5] * time_scale
-    accelerations_by_phase, value_index = [], 5
+    time_unit = compute_time_unit(params)
+    section_state = jnp.stack(
+        [predicted_surface_values[0], predicted_surface_values[1] / time_unit]
+    )
+    phase_durations = predicted_surface_values[None, 2:5] * time_unit
+    accelerations_by_phase, first_value_index = [], 5
     for phase_index, surface_mesh, phase_mesh in zip(
         PAPER_PHASES, GAIT_SURFACE_MESHES, phase_meshes, strict=True
     ):
         n_coordinates = phase_index.n_dof
-        n_values = surface_mesh.n_intervals * N_GAUSS_NODES * n_coordinates
-        surface_accelerations = predicted_values[value_index : value_index + n_values].reshape(
-            -1, n_coordinates, *monomials.shape[1:]
-        )
-        value_index += n_values
+        n_acceleration_values = surface_mesh.n_intervals * N_GAUSS_NODES * n_coordinates
+        surface_accelerations = predicted_surface_values[
+            first_value_index : first_value_index + n_acceleration_values
+        ].reshape(-1, n_coordinates, *monomials.shape[1:])
+        first_value_index += n_acceleration_values
         transfer_matrix = jnp.asarray(
             build_mesh_transfer_matrix(surface_mesh, phase_mesh), monomials.dtype
         )
         # The coordinates are (theta, L1, L2).
-        angle_scale = 1.0 / time_scale**2
-        length_scale = params.locked_length / time_scale**2
-        acceleration_units = jnp.stack([angle_scale, length_scale, length_scale][:n_coordinates])
+        angular_acceleration_unit = 1.0 / time_unit**2
+        length_acceleration_unit = params.locked_length / time_unit**2
+        acceleration_units = jnp.stack(
+            [angular_acceleration_unit, length_acceleration_unit, length_acceleration_unit][
+                :n_coordinates
+            ]
+        )
         phase_accelerations = (
             jnp.tensordot(transfer_matrix, surface_accelerations, 1) * acceleration_units
         )

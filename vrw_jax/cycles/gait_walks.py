@@ -78,13 +78,13 @@ def compute_walk_starts(params: WheelParams) -> np.ndarray:
         math.sin(params.leg_angle),
         math.cos(params.leg_angle),
     )
-    normal_weight = (
+    weight_normal_to_slope = (
         (numpy_params.hub_mass + params.n_legs * numpy_params.leg_mass)
         * numpy_params.gravity
         * np.cos(numpy_params.slope)
     )
     static_length_ratio = (
-        numpy_params.natural_length - normal_weight / numpy_params.stiffness
+        numpy_params.natural_length - weight_normal_to_slope / numpy_params.stiffness
     ) / numpy_params.locked_length
     leg_lengths = [
         np.clip(1.0 + contraction_share * (static_length_ratio - 1.0), slope_cosine + 0.02, 1.0)
@@ -142,11 +142,11 @@ def _make_section_states(
         rigid_leg_rate / np.sin(leg_angle),
         -0.1 * np.sqrt(numpy_params.gravity * numpy_params.locked_length) / 3.0,
     )
-    angles_and_shares = zip(touchdown_angles, rolling_rate_shares, strict=True)
+    touchdown_angles_and_shares = zip(touchdown_angles, rolling_rate_shares, strict=True)
     return np.stack(
         [
             np.stack([theta, rolling_rate_share * rolling_rate, leg_rate], -1)
-            for theta, rolling_rate_share in angles_and_shares
+            for theta, rolling_rate_share in touchdown_angles_and_shares
         ]
     )
 
@@ -189,8 +189,8 @@ def walk_to_gaits(
 
     Args:
         gait_finder: finder of gaits, whose model computes the gait steps.
-        parameter_values: parameters of each wheel, shape (wheels, n_values), in the order of
-            `AbstractWheel.collect_parameter_values`.
+        parameter_values: parameters of each wheel, shape (wheels, n_parameter_values), in the order
+            of `AbstractWheel.collect_parameter_values`.
         start_state_function: function that maps wheels to section states, shape (starts, wheels,
             3).
         walk_options: numerical options of the walks.
@@ -200,32 +200,37 @@ def walk_to_gaits(
     )
     n_wheels, n_coordinates = len(parameter_values), count_section_coordinates(gait_finder)
     walk_wheel_indices = np.tile(np.arange(n_wheels), len(start_section_states))
-    values_by_walk, section_states = (
+    parameter_values_by_walk, section_states = (
         parameter_values[walk_wheel_indices],
         np.concatenate(start_section_states),
     )
     if gait_finder.model.batch_kernel == "legs":
         section_states = np.array(
-            embed_section_states(values_by_walk.T, section_states, gait_finder.n_legs)
+            embed_section_states(parameter_values_by_walk.T, section_states, gait_finder.n_legs)
         )
     period_defects = np.full(len(walk_wheel_indices), np.inf)
     is_walk_duplicate = np.zeros(len(walk_wheel_indices), bool)
-    section_units = stack_section_units(gait_finder.model, values_by_walk, gait_finder.n_legs)
+    section_units = stack_section_units(
+        gait_finder.model, parameter_values_by_walk, gait_finder.n_legs
+    )
     state_scaler = lambda section_states: (section_states / section_units)[:, :n_coordinates]
-    active_walks = np.arange(len(walk_wheel_indices))
+    active_walk_indices = np.arange(len(walk_wheel_indices))
     for n_steps in walk_options.n_steps_by_round:
-        end_states, walk_outcomes = _walk_wheels(
+        end_states, walk_outcomes = _simulate_wheel_walks(
             gait_finder,
-            values_by_walk[active_walks],
-            section_states[active_walks],
+            parameter_values_by_walk[active_walk_indices],
+            section_states[active_walk_indices],
             n_steps,
             walk_options,
         )
         is_walking = walk_outcomes == Outcome.STEPPED
-        active_walks = active_walks[is_walking]
-        section_states[active_walks] = end_states[is_walking]
-        period_defects[active_walks] = measure_period_defects(
-            gait_finder, values_by_walk[active_walks], section_states[active_walks], walk_options
+        active_walk_indices = active_walk_indices[is_walking]
+        section_states[active_walk_indices] = end_states[is_walking]
+        period_defects[active_walk_indices] = measure_period_defects(
+            gait_finder,
+            parameter_values_by_walk[active_walk_indices],
+            section_states[active_walk_indices],
+            walk_options,
         )
         is_walk_duplicate |= _find_duplicate_walks(
             state_scaler(section_states),
@@ -235,8 +240,10 @@ def walk_to_gaits(
             walk_options,
         )
         has_not_settled = period_defects >= walk_options.max_settled_defect
-        active_walks = active_walks[(has_not_settled & ~is_walk_duplicate)[active_walks]]
-        if not len(active_walks):
+        active_walk_indices = active_walk_indices[
+            (has_not_settled & ~is_walk_duplicate)[active_walk_indices]
+        ]
+        if not len(active_walk_indices):
             break
     is_walk_duplicate = _find_duplicate_walks(
         state_scaler(section_states),
@@ -248,12 +255,14 @@ def walk_to_gaits(
     is_walk_selected = ~is_walk_duplicate & (period_defects < walk_options.max_newton_start_defect)
     # If a wheel has no usable walk, its first start is selected.
     is_walk_selected[np.setdiff1d(np.arange(n_wheels), walk_wheel_indices[is_walk_selected])] = True
-    selected_walks = np.flatnonzero(is_walk_selected)
-    selected_walks = selected_walks[np.argsort(walk_wheel_indices[selected_walks], kind="stable")]
+    selected_walk_indices = np.flatnonzero(is_walk_selected)
+    selected_walk_indices = selected_walk_indices[
+        np.argsort(walk_wheel_indices[selected_walk_indices], kind="stable")
+    ]
     return DistinctWalkEnds(
-        walk_wheel_indices[selected_walks],
-        section_states[selected_walks],
-        period_defects[selected_walks],
+        walk_wheel_indices[selected_walk_indices],
+        section_states[selected_walk_indices],
+        period_defects[selected_walk_indices],
     )
 
 
@@ -267,7 +276,7 @@ def measure_period_defects(
 
     Changes are in units of the wheel. The result is infinite if a gait step fails.
     """
-    end_states, period_outcomes = _walk_wheels(
+    end_states, period_outcomes = _simulate_wheel_walks(
         gait_finder, parameter_values, section_states, gait_finder.period_n, walk_options
     )
     section_units = stack_section_units(gait_finder.model, parameter_values, gait_finder.n_legs)
@@ -276,7 +285,7 @@ def measure_period_defects(
     return np.where(period_outcomes == Outcome.STEPPED, period_defects, np.inf)
 
 
-def _walk_wheels(
+def _simulate_wheel_walks(
     gait_finder: Any,
     parameter_values: np.ndarray,
     section_states: np.ndarray,
@@ -299,7 +308,7 @@ def _split_parameter_values(
     gait_finder: Any, parameter_values: np.ndarray
 ) -> tuple[Any, WheelParams]:
     """Return the model and the wheels that `parameter_values` of shape (wheels,
-    n_values) describe.
+    n_parameter_values) describe.
     """
     model, params = gait_finder.model.from_parameter_values(
         tuple(jax.device_put(list(parameter_values.T))), gait_finder.n_legs
@@ -328,20 +337,22 @@ def _find_duplicate_walks(
     )
     start_indices = np.arange(len(scaled_walk_states))[:, None]
     is_walk_duplicate = np.zeros(period_defects.shape, bool)
-    for other_start_index in range(len(scaled_walk_states)):
-        has_smaller_defect = (period_defects[other_start_index] < period_defects) | (
-            (period_defects[other_start_index] == period_defects)
-            & (other_start_index < start_indices)
+    for compared_start_index in range(len(scaled_walk_states)):
+        has_smaller_defect = (period_defects[compared_start_index] < period_defects) | (
+            (period_defects[compared_start_index] == period_defects)
+            & (compared_start_index < start_indices)
         )
-        state_distances = np.abs(scaled_walk_states - scaled_walk_states[other_start_index]).max(-1)
-        is_same_state = state_distances <= np.where(
-            period_defects[other_start_index] < max_settled_defect,
+        state_distances = np.abs(scaled_walk_states - scaled_walk_states[compared_start_index]).max(
+            -1
+        )
+        is_end_state_same = state_distances <= np.where(
+            period_defects[compared_start_index] < max_settled_defect,
             np.maximum(walk_options.walk_merge_distance, 3.0 * period_defects),
             walk_options.walk_merge_distance,
         )
         is_walk_duplicate |= (
             has_smaller_defect
-            & is_same_state
+            & is_end_state_same
             & (period_defects < walk_options.max_newton_start_defect)
         )
     return is_walk_duplicate.ravel()

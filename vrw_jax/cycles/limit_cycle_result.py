@@ -170,8 +170,10 @@ class LimitCycle(AbstractCycle):
                 f"the cycle has {self.period_n} steps, but a gait sensitivity norm is defined here "
                 "for gaits that repeat after one: give a cycle of period_n = 1."
             )
-        compute_response = functools.partial(compute_collocation_slope_response, self.system)
-        return self.map_over_batch_axes(compute_response)(self.parameters, self.collocation_state)
+        compute_slope_response = functools.partial(compute_collocation_slope_response, self.system)
+        return self.map_over_batch_axes(compute_slope_response)(
+            self.parameters, self.collocation_state
+        )
 
     def gait_sensitivity(self, measure_name: str) -> Array:
         """Return the gait sensitivity norm of a measure, in the measure's unit per rad of slope.
@@ -180,12 +182,14 @@ class LimitCycle(AbstractCycle):
         """
         response_index = COLLOCATION_RESPONSE_MEASURES.index(measure_name)
 
-        def compute_norm(slope_response: SlopeResponse) -> Array:
+        def compute_sensitivity_norm(slope_response: SlopeResponse) -> Array:
             return compute_sensitivity_norms(
                 slope_response.select_measures([response_index])
             ).sensitivity_norms[0]
 
-        return self._zero_without_gait(self.map_over_batch_axes(compute_norm)(self.slope_response))
+        return self._zero_without_gait(
+            self.map_over_batch_axes(compute_sensitivity_norm)(self.slope_response)
+        )
 
     def _locate_force_peaks(self) -> dict[str, Array]:
         compute_peaks = functools.partial(compute_force_peaks, self.system)
@@ -325,8 +329,8 @@ def _solve_limit_cycle(
         lambda landing_result: transitions.compute_landing_forces(wheel_symbols, landing_result)
     )(landing_results)
 
-    def select_step_values(step_values: Array) -> Array:
-        return zero_without_gait(step_values[0] if period_n == 1 else step_values)
+    def select_step_values(values_by_step: Array) -> Array:
+        return zero_without_gait(values_by_step[0] if period_n == 1 else values_by_step)
 
     phase_durations = collocation_state.solution.durations
     outcome_code = jnp.where(
@@ -374,7 +378,7 @@ class WalkSamples(NamedTuple):
     post_impact: Float[Array, "2"]  # (theta, dtheta) after the first landing
     landing_distances: Float[Array, " n"]  # distance between the feet at each landing, m
     phase_durations: Float[Array, "n 3"]
-    sample_states: Float[Array, "n 3 n_samples 6"]  # theta, L1, L2 and their rates in each phase
+    sampled_states: Float[Array, "n 3 n_samples 6"]  # theta, L1, L2 and their rates in each phase
 
 
 @eqx.filter_jit
@@ -415,12 +419,14 @@ def guess_cycle_from_walk(
     """Compute the guess of a cycle from the samples of a walk with `period_n` gait steps."""
     wheel_symbols = params.symbols()
 
-    def sample_node_accelerations(foot_distance: Scalar, sample_states: Array) -> tuple[Array, ...]:
+    def sample_node_accelerations(
+        foot_distance: Scalar, sampled_states: Array
+    ) -> tuple[Array, ...]:
         wheel_phases = make_phases(wheel_symbols, foot_distance, stop_at_lift_off=False)
         accelerations_by_phase = []
-        sample_times = jnp.linspace(0.0, 1.0, sample_states.shape[1])
+        sample_times = jnp.linspace(0.0, 1.0, sampled_states.shape[1])
         for wheel_phase, phase_mesh, phase_samples in zip(
-            wheel_phases, collocation_system.phase_meshes, sample_states, strict=True
+            wheel_phases, collocation_system.phase_meshes, sampled_states, strict=True
         ):
             node_states = [
                 jnp.interp(jnp.asarray(phase_mesh.node_fractions), sample_times, coordinate_samples)
@@ -439,7 +445,7 @@ def guess_cycle_from_walk(
         walk_samples.phase_durations.dtype
     )
     phase_accelerations = jax.vmap(sample_node_accelerations)(
-        walk_samples.landing_distances, walk_samples.sample_states
+        walk_samples.landing_distances, walk_samples.sampled_states
     )
     guessed_solution = CollocationSolution(
         walk_samples.post_impact, walk_samples.phase_durations, phase_accelerations

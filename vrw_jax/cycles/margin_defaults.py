@@ -65,7 +65,7 @@ def default_margins(params: WheelParams) -> Mapping[str, float]:
     params.require_single_wheel("take one after the other")
     total_mass = float(params.hub_mass + params.n_legs * params.leg_mass)
     leg_length, gravity_acceleration = float(params.locked_length), float(params.gravity)
-    unit_scales = {
+    margin_unit_values = {
         "N": total_mass * gravity_acceleration,
         "m": leg_length,
         "m/s^2": gravity_acceleration,
@@ -73,6 +73,6 @@ def default_margins(params: WheelParams) -> Mapping[str, float]:
         "1": 1.0,
     }
     return {
-        margin_name: DEFAULT_MARGIN_SHARE * unit_scales[MEASURES[margin_name].unit]
+        margin_name: DEFAULT_MARGIN_SHARE * margin_unit_values[MEASURES[margin_name].unit]
         for margin_name in KEPT_MARGIN_NAMES
     }

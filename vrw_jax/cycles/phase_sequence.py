@@ -1,6 +1,6 @@
 """Describe the phases of the paper's model for the collocation: dynamics, end events and resets.
 
-`make_held_landing_sequence` uses the plane section (theta+, dtheta+) just after an impact that ends
+`make_post_impact_sequence` uses the plane section (theta+, dtheta+) just after an impact that ends
 with both feet on the ground. If double support is absent, the rear foot lifts immediately (case B3
 of the paper). An impact at which the rear foot leaves the ground (case A3) is not in that plane.
 The search therefore does not find such gaits.
@@ -149,9 +149,9 @@ def _make_collocation_phase(
 
 ADMISSIBILITY_CHECKS: tuple[str, ...] = (
     *(
-        check_phrase
+        check_name
         for phase_class in PAPER_PHASES
-        for check_phrase in (
+        for check_name in (
             f"{phase_class.name} lasts",
             f"{phase_class.name} ends only once",
             *(
@@ -173,7 +173,7 @@ between phases and of the mesh follow.
 
 
 @functools.cache
-def make_held_landing_sequence(n_legs: int, stop_at_lift_off: bool = True) -> PhaseSequence:
+def make_post_impact_sequence(n_legs: int, stop_at_lift_off: bool = True) -> PhaseSequence:
     """Build the sequence DLS, SLS-I and SLS-II on the plane section (theta+, dtheta+) after the
     impact.
     """

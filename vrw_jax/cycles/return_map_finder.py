@@ -70,12 +70,12 @@ class ReturnMapCycle(AbstractCycle):
         0.425 s
     """
 
-    section_state: Float[Array, " n_section"]
+    section_state: Float[Array, " n_section_entries"]
     post_impact: Float[Array, "2"]
     durations: Float[Array, "*n 3"]
     step_length: Float[Array, "*n"]
     steps: Any
-    monodromy_value: Float[Array, "n_section n_section"]
+    monodromy_value: Float[Array, "n_section_entries n_section_entries"]
     outcome: Int[Array, ""]
     residual: Scalar
     n_iterations: Int[Array, ""]
@@ -130,8 +130,8 @@ def measure_return_map_force_peaks(
         start_states
     )
     return {
-        measure_name: jnp.nanmax(step_values)
-        for measure_name, step_values in measures_by_step.items()
+        measure_name: jnp.nanmax(values_by_step)
+        for measure_name, values_by_step in measures_by_step.items()
     }
 
 
@@ -230,8 +230,10 @@ class AbstractReturnMapFinder(AbstractGaitFinder):
     supports_cold_start: ClassVar[bool] = False
 
     def find_cycle(self, params: WheelParams, cycle_guess: Any = None) -> ReturnMapCycle:
-        search_arguments = prepare_search(self, params, cycle_guess)
-        return find_return_map_cycle(*search_arguments, self.period_n, uses_implicit_jvp=False)
+        newton_search_arguments = prepare_search(self, params, cycle_guess)
+        return find_return_map_cycle(
+            *newton_search_arguments, self.period_n, uses_implicit_jvp=False
+        )
 
     def make_initial_guess(self, parameter_values: ParameterValues) -> Array:
         """Return the last section state of a walk that begins at the model's default start."""
@@ -285,11 +287,13 @@ def prepare_search(
     """Return the wheel, the section state, the model and the options for a search near
     `cycle_guess`.
     """
-    guess_state = (
+    guess_section_state = (
         cycle_guess.section_state if isinstance(cycle_guess, AbstractCycle) else cycle_guess
     )
     section_state = (
-        gait_finder.model.compute_default_start(params) if guess_state is None else guess_state
+        gait_finder.model.compute_default_start(params)
+        if guess_section_state is None
+        else guess_section_state
     )
     return convert_step_arguments(
         params, section_state, gait_finder.model, gait_finder.step_options

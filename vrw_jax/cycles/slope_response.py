@@ -167,26 +167,26 @@ def compute_step_slope_response(
     n_states = model.count_continuous_entries(params)
     section_state_codes = section_state[n_states:]
 
-    def evaluate_step(state_and_slopes: Array) -> Array:
-        line_slopes: Any = model.split_ground_by_step(
-            eqx.tree_at(lambda p: p.slope, params, state_and_slopes[n_states:]), 1
+    def evaluate_step(step_start_and_slopes: Array) -> Array:
+        stepwise_ground: Any = model.split_ground_by_step(
+            eqx.tree_at(lambda p: p.slope, params, step_start_and_slopes[n_states:]), 1
         )
         step_model, step_params = model.with_step_ground(
-            params, tuple(line_values[0] for line_values in line_slopes)
+            params, tuple(ground_quantity_by_step[0] for ground_quantity_by_step in stepwise_ground)
         )
         gait_step = step_model.take_step(
             step_params,
-            jnp.concatenate([state_and_slopes[:n_states], section_state_codes]),
+            jnp.concatenate([step_start_and_slopes[:n_states], section_state_codes]),
             options,
         )
         step_measures = gait_step.measures()
         measure_values = [jnp.ravel(step_measures[measure_name]) for measure_name in measure_names]
         return jnp.concatenate([gait_step.section_state[:n_states], *measure_values])
 
-    state_and_slopes = jnp.concatenate(
+    step_start_and_slopes = jnp.concatenate(
         [section_state[:n_states], jnp.stack([params.slope, params.slope])]
     )
-    return SlopeResponse.from_jacobian(jax.jacfwd(evaluate_step)(state_and_slopes), n_states)
+    return SlopeResponse.from_jacobian(jax.jacfwd(evaluate_step)(step_start_and_slopes), n_states)
 
 
 COLLOCATION_RESPONSE_MEASURES = (
@@ -245,67 +245,69 @@ def _make_collocation_response_function(collocation_system: CollocationSystem) -
         gait_unknown_vector, unflatten_unknowns = ravel_pytree(gait_unknowns)
 
         def reconstruct_from_unknowns(
-            unknown_vector: Array, state_and_slopes: Array, parameters: Array
+            unknown_vector: Array, step_start_and_slopes: Array, parameters: Array
         ) -> tuple:
             durations, *accelerations = unflatten_unknowns(unknown_vector)
-            line_parameters = parameters.at[slope_index].set(state_and_slopes[2])
+            line_parameters = parameters.at[slope_index].set(step_start_and_slopes[2])
             phase_constants = (
                 *collocation_system.phase_constants_function(*line_parameters),
-                state_and_slopes[3] - state_and_slopes[2],
+                step_start_and_slopes[3] - step_start_and_slopes[2],
             )
             end_section_state, phase_points = reconstruct_step(
                 collocation_system.phase_sequence,
                 collocation_system.phase_meshes,
                 phase_constants,
-                tuple(state_and_slopes[:2]),
+                tuple(step_start_and_slopes[:2]),
                 durations,
                 tuple(accelerations),
             )
             return phase_constants, end_section_state, phase_points
 
         def evaluate_cycle_residual(
-            unknown_vector: Array, state_and_slopes: Array, parameters: Array
+            unknown_vector: Array, step_start_and_slopes: Array, parameters: Array
         ) -> Array:
             durations, *accelerations = unflatten_unknowns(unknown_vector)
             phase_constants, _, phase_points = reconstruct_from_unknowns(
-                unknown_vector, state_and_slopes, parameters
+                unknown_vector, step_start_and_slopes, parameters
             )
-            residual_parts: list[Array] = []
+            cycle_residual_parts: list[Array] = []
             for phase_index, (phase, points_of_phase) in enumerate(
                 zip(collocation_system.phase_sequence.phases, phase_points, strict=True)
             ):
                 node_accelerations = accelerations[phase_index].reshape(-1, phase.n_coordinates).T
-                residual_parts += phase.residual_function(
+                cycle_residual_parts += phase.residual_function(
                     phase_constants, points_of_phase.node_points, tuple(node_accelerations)
                 )
                 end_event_value = phase.end_event_function(
                     phase_constants, points_of_phase.end_point
                 )
-                residual_parts.append(
+                cycle_residual_parts.append(
                     jnp.where(
                         is_phase_active[phase_index] > 0.5, end_event_value, durations[phase_index]
                     )[None]
                 )
-            return jnp.concatenate(residual_parts)
+            return jnp.concatenate(cycle_residual_parts)
 
-        state_and_slopes = jnp.concatenate([section_state, jnp.full(2, parameters[slope_index])])
+        step_start_and_slopes = jnp.concatenate(
+            [section_state, jnp.full(2, parameters[slope_index])]
+        )
         residual_jacobian = jax.jacfwd(evaluate_cycle_residual)(
-            gait_unknown_vector, *lax.stop_gradient((state_and_slopes, parameters))
+            gait_unknown_vector, *lax.stop_gradient((step_start_and_slopes, parameters))
         )
         inverse_jacobian = invert_by_elimination(residual_jacobian)
 
-        def evaluate_outputs(state_and_slopes: Array) -> Array:
-            def refine_unknowns(unknown_vector: Array, _: None) -> tuple[Array, None]:
+        def evaluate_step_outputs(step_start_and_slopes: Array) -> Array:
+            def refine_gait_unknowns(unknown_vector: Array, _: None) -> tuple[Array, None]:
                 newton_correction = inverse_jacobian @ evaluate_cycle_residual(
-                    unknown_vector, state_and_slopes, parameters
+                    unknown_vector, step_start_and_slopes, parameters
                 )
                 return unknown_vector - newton_correction, None
 
             unknown_vector, _ = lax.scan(
-                refine_unknowns, gait_unknown_vector, length=N_CHORD_ITERATIONS
+                refine_gait_unknowns, gait_unknown_vector, length=N_CHORD_ITERATIONS
             )
             _, end_section_state, phase_points = reconstruct_from_unknowns(
-                unknown_vector, state_and_slopes, parameters
+                unknown_vector, step_start_and_slopes, parameters
             )
             durations, (step_length,) = (
                 unflatten_unknowns(unknown_vector)[0],
@@ -322,7 +324,7 @@ def _make_collocation_response_function(collocation_system: CollocationSystem) -
             return jnp.stack([*end_section_state, *measure_values])
 
         return SlopeResponse.from_jacobian(
-            jax.jacfwd(evaluate_outputs)(state_and_slopes), len(section_state)
+            jax.jacfwd(evaluate_step_outputs)(step_start_and_slopes), len(section_state)
         ), ()
 
     return enable_all_ad_modes(compute_response)

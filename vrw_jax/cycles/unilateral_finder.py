@@ -51,11 +51,11 @@ class ContactNewtonOptions:
 
     max_iterations: int = 15
     """Largest number of Newton iterations."""
-    max_halvings: int = 6
+    max_correction_halvings: int = 6
     """Largest number of times that a correction is halved if no gait step completes after it."""
-    far_step_tolerance: float = 1e-6
+    step_tolerance_far_from_gait: float = 1e-6
     """Tolerance of gait steps that start far from a gait."""
-    max_near_correction: float = 1e-4
+    max_correction_near_gait: float = 1e-4
     """Correction below which a state is treated as near a gait, rad, rad/s, m/s."""
     clear_convergence_fraction: float = 0.01
     """Fraction of the tolerance below which one correction suffices for convergence."""
@@ -123,16 +123,16 @@ class UnilateralFinder(AbstractReturnMapFinder):
     def find_cycles_near(self, parameter_values: Any, section_states: Any) -> ReturnMapCycle:
         """Find one gait for each wheel near the given section states, without derivatives."""
         return self._solve_and_evaluate(
-            _make_contact_cycle, parameter_values, section_states, with_parameter_derivatives=False
+            _make_contact_cycle, parameter_values, section_states, needs_parameter_derivatives=False
         )
 
     def precompile_newton_programs(self, parameter_values: np.ndarray) -> None:
         """Compile the programs of Newton's method while another thread computes walks toward its
         start.
         """
-        n_section = self.model.count_section_entries(WheelParams(n_legs=self.n_legs))
+        n_section_entries = self.model.count_section_entries(WheelParams(n_legs=self.n_legs))
         period_map = PeriodMap(self.model, self.n_legs, self.period_n, parameter_values)
-        section_states = np.zeros((len(parameter_values), n_section))
+        section_states = np.zeros((len(parameter_values), n_section_entries))
         period_map.evaluate_period(self.step_options, section_states, False)
 
     def make_initial_guess(self, parameter_values: ParameterValues) -> Array:
@@ -156,7 +156,7 @@ class UnilateralFinder(AbstractReturnMapFinder):
             _make_contact_gait,
             parameter_values,
             getattr(cycle_guess, "section_state", cycle_guess),
-            with_parameter_derivatives=True,
+            needs_parameter_derivatives=True,
         )
 
     def _solve_and_evaluate(
@@ -164,28 +164,28 @@ class UnilateralFinder(AbstractReturnMapFinder):
         evaluate_fixed_point: Callable,
         parameter_values: Any,
         section_states: Any,
-        with_parameter_derivatives: bool,
+        needs_parameter_derivatives: bool,
     ) -> Any:
         """Find the fixed point of the return map for each wheel, and evaluate a function of it.
 
         - `evaluate_fixed_point`: function of a wheel's parameters and fixed point;
         - `section_states`: starts of Newton's method;
-        - `with_parameter_derivatives`: whether the steps are differentiated with respect to
+        - `needs_parameter_derivatives`: whether the steps are differentiated with respect to
           parameters.
         """
-        newton_arguments = (
+        newton_search_inputs = (
             np.asarray(parameter_values),
             np.asarray(section_states),
-            with_parameter_derivatives,
+            needs_parameter_derivatives,
         )
         fixed_points = find_contact_fixed_points(
-            self.model, self.n_legs, self.step_options, self.period_n, *newton_arguments
+            self.model, self.n_legs, self.step_options, self.period_n, *newton_search_inputs
         )
         evaluate_batch = functools.partial(
             _evaluate_over_wheels, evaluate_fixed_point, self.model, self.n_legs
         )
         return map_in_batches(
-            evaluate_batch, self.gait_batch_sizes, newton_arguments[0], fixed_points
+            evaluate_batch, self.gait_batch_sizes, newton_search_inputs[0], fixed_points
         )
 
     def take_gait_step(self, params: WheelParams, section_state: Array) -> AbstractStep:
@@ -244,7 +244,7 @@ class _ContactFixedPoints(NamedTuple):
     """
 
     fixed_section_states: Any
-    period_steps: Any  # gait steps from the fixed point, (period_n, ...)
+    gait_steps_of_period: Any  # gait steps from the fixed point, (period_n, ...)
     step_jacobians: Any  # with respect to parameter values and section state
     newton_residuals: Any
     is_gait_found: Any
@@ -260,7 +260,7 @@ class PeriodMap(NamedTuple):
     model: Any
     n_legs: int
     period_n: int
-    parameter_values: np.ndarray  # (wheels, n_values)
+    parameter_values: np.ndarray  # (wheels, n_parameter_values)
 
     @property
     def section_units_by_wheel(self) -> np.ndarray:
@@ -283,18 +283,18 @@ class PeriodMap(NamedTuple):
 
         The derivatives are with respect to the selected parameter values and to the section states.
         """
-        steps_and_jacobians, (n_values, n_section) = (
+        steps_and_jacobians, (n_parameter_values, n_section_entries) = (
             [],
             (self.parameter_values.shape[1], section_states.shape[1]),
         )
-        input_jacobian = np.concatenate([np.zeros((n_section, n_values)), np.eye(n_section)], 1)[
-            None
-        ]
+        period_jacobian = np.concatenate(
+            [np.zeros((n_section_entries, n_parameter_values)), np.eye(n_section_entries)], 1
+        )[None]
         is_period_complete = np.ones(len(section_states), bool)
         is_input_differentiated = np.concatenate(
             [
-                np.broadcast_to(is_value_differentiated, n_values),
-                np.broadcast_to(is_start_differentiated, n_section),
+                np.broadcast_to(is_value_differentiated, n_parameter_values),
+                np.broadcast_to(is_start_differentiated, n_section_entries),
             ]
         )
         input_indices = np.flatnonzero(is_input_differentiated).tolist()
@@ -312,18 +312,20 @@ class PeriodMap(NamedTuple):
             is_period_complete &= np.asarray(step_result.outcome) == Outcome.STEPPED
             section_states = np.asarray(step_result.section_state)
             step_jacobian = np.asarray(step_result_jacobians.section_state)
-            input_jacobian = step_jacobian[:, :, n_values:] @ input_jacobian
-            input_jacobian[:, :, :n_values] += step_jacobian[:, :, :n_values]
-        period_steps, stacked_jacobians = (
-            jax.tree.map(lambda *stacked_arrays: np.stack(stacked_arrays, 1), *stacked_pair)
-            for stacked_pair in zip(*steps_and_jacobians, strict=True)
+            period_jacobian = step_jacobian[:, :, n_parameter_values:] @ period_jacobian
+            period_jacobian[:, :, :n_parameter_values] += step_jacobian[:, :, :n_parameter_values]
+        gait_steps_of_period, stacked_jacobians = (
+            jax.tree.map(
+                lambda *stacked_arrays: np.stack(stacked_arrays, 1), *step_and_jacobian_arrays
+            )
+            for step_and_jacobian_arrays in zip(*steps_and_jacobians, strict=True)
         )
         return PeriodEvaluation(
-            period_steps,
+            gait_steps_of_period,
             stacked_jacobians,
             section_states,
-            input_jacobian[:, :, :n_values],
-            input_jacobian[:, :, n_values:],
+            period_jacobian[:, :, :n_parameter_values],
+            period_jacobian[:, :, n_parameter_values:],
             is_period_complete,
         )
 
@@ -333,7 +335,7 @@ class PeriodEvaluation(NamedTuple):
     complete.
     """
 
-    period_steps: Any
+    gait_steps_of_period: Any
     step_jacobians: Any
     end_states: np.ndarray
     parameter_jacobian: np.ndarray
@@ -346,29 +348,34 @@ class PeriodEvaluation(NamedTuple):
         """Return Newton's correction of the section states, which is zero if a period
         is not complete.
         """
-        newton_correction, is_complete = np.zeros_like(section_states), self.is_period_complete
-        newton_matrix = np.eye(section_states.shape[1]) - return_map_jacobian[is_complete]
-        newton_correction[is_complete] = solve_linear_systems(
-            newton_matrix, (self.end_states - section_states)[is_complete][..., None]
+        newton_correction, is_period_complete = (
+            np.zeros_like(section_states),
+            self.is_period_complete,
+        )
+        newton_matrix = np.eye(section_states.shape[1]) - return_map_jacobian[is_period_complete]
+        newton_correction[is_period_complete] = solve_linear_systems(
+            newton_matrix, (self.end_states - section_states)[is_period_complete][..., None]
         )[..., 0]
         return newton_correction
 
 
-def solve_linear_systems(system_matrices: np.ndarray, right_sides: np.ndarray) -> np.ndarray:
+def solve_linear_systems(system_matrices: np.ndarray, right_hand_sides: np.ndarray) -> np.ndarray:
     """Solve many linear systems.
 
     The solution of a singular system is NaN. The first axis of matrices and right sides is that of
     the systems.
     """
     try:
-        return np.linalg.solve(system_matrices, right_sides)
+        return np.linalg.solve(system_matrices, right_hand_sides)
     except np.linalg.LinAlgError:
         is_matrix_regular = np.abs(np.linalg.det(system_matrices)) > 0.0
         regular_matrices = np.where(
             is_matrix_regular[:, None, None], system_matrices, np.eye(system_matrices.shape[-1])
         )
         return np.where(
-            is_matrix_regular[:, None, None], np.linalg.solve(regular_matrices, right_sides), np.nan
+            is_matrix_regular[:, None, None],
+            np.linalg.solve(regular_matrices, right_hand_sides),
+            np.nan,
         )
 
 
@@ -379,7 +386,7 @@ def find_contact_fixed_points(
     period_n: int,
     parameter_values: np.ndarray,
     start_states: np.ndarray,
-    with_parameter_derivatives: bool,
+    needs_parameter_derivatives: bool,
     newton_options: ContactNewtonOptions = CONTACT_NEWTON_OPTIONS,
 ) -> _ContactFixedPoints:
     """Find the fixed points of the return maps near `start_states`.
@@ -392,7 +399,7 @@ def find_contact_fixed_points(
     """
     period_map = PeriodMap(model, n_legs, period_n, parameter_values)
     loose_step_tolerances = [
-        np.maximum(newton_tolerance, newton_options.far_step_tolerance)
+        np.maximum(newton_tolerance, newton_options.step_tolerance_far_from_gait)
         for newton_tolerance in (step_options.rtol, step_options.atol)
     ]
     loose_step_options = eqx.tree_at(
@@ -400,7 +407,7 @@ def find_contact_fixed_points(
         step_options,
         jax.device_put(loose_step_tolerances),
     )
-    newton_tolerance, is_every_wheel = (
+    newton_tolerance, is_wheel_requested = (
         float(compute_newton_tolerance(step_options)),
         np.ones(len(parameter_values), bool),
     )
@@ -409,8 +416,8 @@ def find_contact_fixed_points(
         loose_step_options,
         start_states,
         False,
-        newton_options.max_near_correction,
-        is_every_wheel,
+        newton_options.max_correction_near_gait,
+        is_wheel_requested,
         newton_options,
     )
     is_near_gait = loose_fixed_points.is_gait_found
@@ -424,20 +431,20 @@ def find_contact_fixed_points(
     )
     section_states[is_near_gait] += newton_correction[is_near_gait] * (
         np.abs(newton_correction / section_units)[is_near_gait].max(-1, keepdims=True)
-        < newton_options.max_near_correction
+        < newton_options.max_correction_near_gait
     )
     is_near_gait = is_near_gait | (
         exact_period_evaluation.is_period_complete
         & (
             np.abs((exact_period_evaluation.end_states - section_states) / section_units).max(-1)
-            < newton_options.max_near_correction
+            < newton_options.max_correction_near_gait
         )
     )
     exact_fixed_points, _ = _run_contact_newton(
         period_map,
         step_options,
         section_states,
-        with_parameter_derivatives,
+        needs_parameter_derivatives,
         newton_tolerance,
         is_near_gait,
         newton_options,
@@ -454,7 +461,7 @@ def _run_contact_newton(
     period_map: PeriodMap,
     step_options: StepOptions,
     start_states: np.ndarray,
-    with_parameter_derivatives: bool,
+    needs_parameter_derivatives: bool,
     newton_tolerance: float,
     is_wheel_requested: np.ndarray,
     newton_options: ContactNewtonOptions,
@@ -475,18 +482,18 @@ def _run_contact_newton(
         period_map.section_units_by_wheel,
     )
     newton_residuals, n_iterations = np.full(n_wheels, np.inf), np.zeros(n_wheels, np.int32)
-    had_small_correction, is_gait_found, n_halvings = (
+    had_small_correction_before, is_gait_found, n_correction_halvings = (
         np.zeros(n_wheels, float_dtype) for float_dtype in (bool, bool, int)
     )
     return_map_jacobian = np.zeros((n_wheels, start_states.shape[1], start_states.shape[1]))
     active_wheels, stored_steps_and_jacobians = np.arange(n_wheels), None
-    for _ in range(newton_options.max_iterations + newton_options.max_halvings):
+    for _ in range(newton_options.max_iterations + newton_options.max_correction_halvings):
         period_evaluation = period_map.select_wheels(active_wheels).evaluate_period(
-            step_options, section_states[active_wheels], with_parameter_derivatives
+            step_options, section_states[active_wheels], needs_parameter_derivatives
         )
         if stored_steps_and_jacobians is None:
             stored_steps_and_jacobians = jax.tree.map(
-                np.array, (period_evaluation.period_steps, period_evaluation.step_jacobians)
+                np.array, (period_evaluation.gait_steps_of_period, period_evaluation.step_jacobians)
             )
         for stored_array, new_array in zip(
             jax.tree.leaves(stored_steps_and_jacobians),
@@ -511,14 +518,14 @@ def _run_contact_newton(
         is_wheel_done = (
             has_small_correction_now
             & (
-                had_small_correction[active_wheels]
+                had_small_correction_before[active_wheels]
                 | (correction_size <= newton_options.clear_convergence_fraction * newton_tolerance)
             )
             & (not stops_at_small_correction)
         )
-        had_small_correction[active_wheels] = has_small_correction_now
+        had_small_correction_before[active_wheels] = has_small_correction_now
         moving_wheels = active_wheels[is_correction_valid & ~is_wheel_done]
-        last_section_states[moving_wheels], n_halvings[moving_wheels] = (
+        last_section_states[moving_wheels], n_correction_halvings[moving_wheels] = (
             section_states[moving_wheels],
             0,
         )
@@ -527,13 +534,15 @@ def _run_contact_newton(
         section_states[failed_wheels] = 0.5 * (
             section_states[failed_wheels] + last_section_states[failed_wheels]
         )
-        n_halvings[failed_wheels] += 1
+        n_correction_halvings[failed_wheels] += 1
         section_states[failed_wheels, -n_legs:] = last_section_states[failed_wheels, -n_legs:]
         is_gait_found[active_wheels] = is_wheel_requested[active_wheels] & (
-            had_small_correction[active_wheels] if stops_at_small_correction else is_wheel_done
+            had_small_correction_before[active_wheels]
+            if stops_at_small_correction
+            else is_wheel_done
         )
         has_wheel_failed = (
-            (n_halvings > newton_options.max_halvings)
+            (n_correction_halvings > newton_options.max_correction_halvings)
             | (n_iterations > newton_options.max_iterations)
             | ~is_wheel_requested
         )
@@ -572,18 +581,19 @@ def _evaluate_over_wheels(
 
 
 def _compute_return_map_jacobian_of_steps(
-    fixed_points: _ContactFixedPoints, n_values: int
+    fixed_points: _ContactFixedPoints, n_parameter_values: int
 ) -> Array:
     """Return the Jacobian of the return map over one period, as a product of the Jacobians of its
     steps.
 
-    - `n_values`: number of parameter values, whose columns precede those of the section state.
+    - `n_parameter_values`: number of parameter values. Their columns precede those of the
+      section state.
     """
     return_map_jacobian = jnp.eye(
         fixed_points.fixed_section_states.shape[0], dtype=fixed_points.fixed_section_states.dtype
     )
     for step_jacobian in fixed_points.step_jacobians.section_state:
-        return_map_jacobian = step_jacobian[:, n_values:] @ return_map_jacobian
+        return_map_jacobian = step_jacobian[:, n_parameter_values:] @ return_map_jacobian
     return return_map_jacobian
 
 
@@ -602,7 +612,9 @@ def _make_contact_cycle(
         _compute_return_map_jacobian_of_steps(fixed_points, len(parameter_values)),
         *newton_diagnostics,
     )
-    return make_return_map_cycle(params, wheel_model, fixed_point, fixed_points.period_steps)
+    return make_return_map_cycle(
+        params, wheel_model, fixed_point, fixed_points.gait_steps_of_period
+    )
 
 
 def _make_contact_gait(
@@ -611,15 +623,18 @@ def _make_contact_gait(
     """Build the gait that belongs to a fixed point, with derivatives by the implicit
     function theorem.
     """
-    n_values = parameter_values.shape[0]
+    n_parameter_values = parameter_values.shape[0]
     identity_matrix = jnp.eye(
         fixed_points.fixed_section_states.shape[0], dtype=fixed_points.fixed_section_states.dtype
     )
-    parameter_jacobian = jnp.zeros((len(identity_matrix), n_values), identity_matrix.dtype)
-    return_map_jacobian = _compute_return_map_jacobian_of_steps(fixed_points, n_values)
+    parameter_jacobian = jnp.zeros(
+        (len(identity_matrix), n_parameter_values), identity_matrix.dtype
+    )
+    return_map_jacobian = _compute_return_map_jacobian_of_steps(fixed_points, n_parameter_values)
     for step_jacobian in fixed_points.step_jacobians.section_state:
         parameter_jacobian = (
-            step_jacobian[:, :n_values] + step_jacobian[:, n_values:] @ parameter_jacobian
+            step_jacobian[:, :n_parameter_values]
+            + step_jacobian[:, n_parameter_values:] @ parameter_jacobian
         )
     newton_matrix = jnp.where(
         fixed_points.is_gait_found, identity_matrix - return_map_jacobian, identity_matrix
@@ -629,7 +644,7 @@ def _make_contact_gait(
     state_derivatives, derivatives_by_step = section_state_derivatives, []
     for step_index in range(len(fixed_points.step_jacobians.section_state)):
         input_tangents = jnp.concatenate(
-            [jnp.eye(n_values, dtype=identity_matrix.dtype), state_derivatives]
+            [jnp.eye(n_parameter_values, dtype=identity_matrix.dtype), state_derivatives]
         )
         step_tangents = jax.tree.map(
             lambda array_over_steps, step_index=step_index, input_tangents=input_tangents: (
@@ -646,9 +661,9 @@ def _make_contact_gait(
     cycle = _make_contact_cycle(model, n_legs, parameter_values, fixed_points)
     # The derivative of the Jacobian is unknown, so measures of the Jacobian are not in
     # `differentiable_measures`.
-    float_fields = eqx.filter(cycle, eqx.is_inexact_array)
+    float_cycle_fields = eqx.filter(cycle, eqx.is_inexact_array)
     zero_derivatives = jax.tree.map(
-        lambda x: jnp.zeros((n_values, *x.shape), x.dtype), float_fields
+        lambda x: jnp.zeros((n_parameter_values, *x.shape), x.dtype), float_cycle_fields
     )
     make_inputs = lambda parameter_values: eqx.filter(
         model.from_parameter_values(parameter_values, n_legs), eqx.is_inexact_array
@@ -670,7 +685,7 @@ def _make_contact_gait(
         ),
     )  # fmt: skip
     first_step = jax.tree.map(
-        lambda array_over_steps: array_over_steps[0], fixed_points.period_steps
+        lambda array_over_steps: array_over_steps[0], fixed_points.gait_steps_of_period
     )
     first_step_derivatives = jax.tree.map(
         lambda array_over_steps: array_over_steps[:, 0], step_derivatives

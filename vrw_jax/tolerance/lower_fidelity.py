@@ -12,7 +12,7 @@ import numpy as np
 
 from vrw_jax.batches import step_batch
 from vrw_jax.contact import UnilateralWheel
-from vrw_jax.cycles import make_finder, retry_from_walks
+from vrw_jax.cycles import make_finder, search_again_from_walks
 from vrw_jax.models import RigidWheel, ViscoelasticWheel
 from vrw_jax.numerics import (
     StepOptions,
@@ -104,7 +104,7 @@ def find_paper_gaits(params: WheelParams, step_options: StepOptions) -> LowerFid
     if len(
         unsolved_wheel_indices
     ):  # One mesh for all elements makes the digits independent of the batch.
-        limit_cycles = retry_from_walks(
+        limit_cycles = search_again_from_walks(
             cycle_finder,
             *jax.device_put(select_tree_rows((params, limit_cycles), unsolved_wheel_indices)),
         )
