@@ -8,7 +8,7 @@ import vrw_jax as vrw
 from vrw_jax.branches.special_point_map import (
     SPECIAL_POINT_MEASURES,
     find_sign_changes_in_scan,
-    find_unexplained_changes,
+    find_unexplained_sign_changes,
 )
 from vrw_jax.measures import MARGIN_MEASURES
 from vrw_jax.scans import follow_special_points
@@ -44,9 +44,14 @@ def test_only_the_curve_of_the_same_quantity_explains_a_sign_change():
     for change in changes:  # linear: interpolation between two samples is exact
         i, j = change.position_in_cells
         assert 50.0 + 10.0 * i == pytest.approx(50.0 + 25.0 * j / 3.0, abs=1e-9)
-    assert find_unexplained_changes(changes, [make_line("friction_rear", zero, K)], scan) == []
-    assert find_unexplained_changes(changes, [make_line("friction_fore", zero, K)], scan) == changes
-    half = find_unexplained_changes(changes, [make_line("friction_rear", zero[:4], K[:4])], scan)
+    assert find_unexplained_sign_changes(changes, [make_line("friction_rear", zero, K)], scan) == []
+    assert (
+        find_unexplained_sign_changes(changes, [make_line("friction_fore", zero, K)], scan)
+        == changes
+    )
+    half = find_unexplained_sign_changes(
+        changes, [make_line("friction_rear", zero[:4], K[:4])], scan
+    )
     assert 0 < len(half) < len(changes)
     assert all(change.position_in_cells[1] > 3.0 for change in half)
 
@@ -63,7 +68,7 @@ def test_samples_with_too_coarse_a_mesh_do_not_count_as_missing_gaits():
     assert set(result_by_name["gait"]) == {(5, j) for j in range(4)} | {(6, 4), (7, 4)}
     assert set(result_by_name["mesh_too_coarse"]) == {(7, j) for j in range(4, len(K))}
     fold = make_line("fold", np.full(2, 105.0), np.array([400.0, 500.0]))
-    left_part = find_unexplained_changes(
+    left_part = find_unexplained_sign_changes(
         find_sign_changes_in_scan(scan, MAP_PARAMETERS), [fold], scan
     )
     assert {change.quantity_name for change in left_part} == {"gait", "mesh_too_coarse"}

@@ -88,12 +88,15 @@ class SpecialPoint:
         return self.point if self.find_cycle is None else self.find_cycle()
 
     def __str__(self) -> str:
-        name_text = "" if self.name == self.kind else f" {self.name}"
-        end_text = ", ends the branch" if self.ends_branch else ""
+        special_point_name_text = "" if self.name == self.kind else f" {self.name}"
+        ends_branch_text = ", ends the branch" if self.ends_branch else ""
         expected_multiplier_count = 2 if self.kind == "neimark_sacker" else 1
         if self.n_multipliers > expected_multiplier_count:
-            name_text += f" of {self.n_multipliers} multipliers at once"
-        return f"{self.value:.9g}: {self.kind.replace('_', ' ')}{name_text}{end_text}"
+            special_point_name_text += f" of {self.n_multipliers} multipliers at once"
+        return (
+            f"{self.value:.9g}: "
+            f"{self.kind.replace('_', ' ')}{special_point_name_text}{ends_branch_text}"
+        )
 
     def __repr__(self) -> str:
         return f"SpecialPoint at {self}"
@@ -180,10 +183,10 @@ class Branch:
     __repr__ = __str__
 
     def _repr_html_(self) -> str:
-        end_texts = ("", "ends the branch")
+        ends_branch_texts = ("", "ends the branch")
         return format_html_table(
             str(self).split("\n  ")[0],
-            ((f"{p.value:.9g}", p.kind.replace("_", " "), p.name, end_texts[p.ends_branch])
+            ((f"{p.value:.9g}", p.kind.replace("_", " "), p.name, ends_branch_texts[p.ends_branch])
              for p in self.special_points),
             (self.parameter, "kind", "name", ""),
         )  # fmt: skip
@@ -198,8 +201,8 @@ class Codim2Point:
     ends_curve: bool  # whether the curve ends at this point
 
     def __str__(self) -> str:
-        end_text = ", ends the curve" if self.ends_curve else ""
-        return f"({self.values[0]:.9g}, {self.values[1]:.9g}): meets {self.name}{end_text}"
+        ends_branch_text = ", ends the curve" if self.ends_curve else ""
+        return f"({self.values[0]:.9g}, {self.values[1]:.9g}): meets {self.name}{ends_branch_text}"
 
 
 @dataclass(frozen=True, repr=False)
@@ -245,10 +248,11 @@ class SpecialPointCurve:
             f"Curve of {self.name} over {first_parameter_name} and {second_parameter_name}: "
             f"{len(self.values)} points."
         ]
-        for end_index, end_reason in zip((0, -1), self.ends, strict=True):
-            first_parameter_value, second_parameter_value = self.values[end_index]
+        for curve_end_index, curve_end_reason in zip((0, -1), self.ends, strict=True):
+            first_parameter_value, second_parameter_value = self.values[curve_end_index]
             text_lines.append(
-                f"  at ({first_parameter_value:.6g}, {second_parameter_value:.6g}): {end_reason}"
+                f"  at ({first_parameter_value:.6g}, {second_parameter_value:.6g}): "
+                f"{curve_end_reason}"
             )
         return "\n".join(
             [*text_lines, *(f"    {codim2_point}" for codim2_point in self.codim2_points)]

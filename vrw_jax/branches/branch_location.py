@@ -306,14 +306,17 @@ def _continue_in_both_directions(
         branch_continuation.continuation_problem,
         branch_continuation.arclength_options,
     )
-    direction_results: ContinuationResult = jax.tree.map(
+    results_by_direction: ContinuationResult = jax.tree.map(
         np.asarray, continue_all_branches(*continuation_arguments)
     )
     if branch_continuation.continuation_problem.has_kinks:
-        direction_results = continue_beyond_jumps(
-            branch_continuation, continue_all_branches, continuation_arguments[0], direction_results
+        results_by_direction = continue_beyond_jumps(
+            branch_continuation,
+            continue_all_branches,
+            continuation_arguments[0],
+            results_by_direction,
         )
-    return jax.tree.map(lambda x: x.reshape(-1, 2, *x.shape[1:]), direction_results)
+    return jax.tree.map(lambda x: x.reshape(-1, 2, *x.shape[1:]), results_by_direction)
 
 
 @eqx.filter_jit
@@ -414,7 +417,7 @@ class _AdmissibleRange(NamedTuple):
 
     wheel_index: int
     admissible_point_indices: np.ndarray
-    indices_of_points_beyond: tuple[int, int]
+    point_indices_beyond_ends: tuple[int, int]
 
 
 class _BranchPointTable(NamedTuple):
@@ -426,31 +429,38 @@ class _BranchPointTable(NamedTuple):
 
     @classmethod
     def from_results(
-        cls, branch_continuation: AbstractContinuation, direction_results: ContinuationResult
+        cls, branch_continuation: AbstractContinuation, results_by_direction: ContinuationResult
     ) -> "_BranchPointTable":
         """Return the points of branches that were continued in two directions from their starts.
 
         The points of the first direction are reversed and precede those of the second.
         """
         points_by_direction, wheel_indices = [], []
-        for wheel_index in range(direction_results.n_points.shape[0]):
+        for wheel_index in range(results_by_direction.n_points.shape[0]):
             n_toward_lower, n_toward_upper = (
                 int(n_points_of_direction)
-                for n_points_of_direction in direction_results.n_points[wheel_index]
+                for n_points_of_direction in results_by_direction.n_points[wheel_index]
             )
             if n_toward_lower:
-                direction_points = select_tree_rows(direction_results.points, (wheel_index, 0))
-                direction_points = select_tree_rows(
-                    direction_points, np.arange(n_toward_lower)[::-1]
+                points_of_both_directions = select_tree_rows(
+                    results_by_direction.points, (wheel_index, 0)
+                )
+                points_of_both_directions = select_tree_rows(
+                    points_of_both_directions, np.arange(n_toward_lower)[::-1]
                 )
                 points_by_direction.append(
-                    direction_points._replace(fraction_rate=-direction_points.fraction_rate)
+                    points_of_both_directions._replace(
+                        fraction_rate=-points_of_both_directions.fraction_rate
+                    )
                 )
             if n_toward_upper:
-                direction_points = select_tree_rows(direction_results.points, (wheel_index, 1))
+                points_of_both_directions = select_tree_rows(
+                    results_by_direction.points, (wheel_index, 1)
+                )
                 points_by_direction.append(
                     select_tree_rows(
-                        direction_points, np.arange(1 if n_toward_lower else 0, n_toward_upper)
+                        points_of_both_directions,
+                        np.arange(1 if n_toward_lower else 0, n_toward_upper),
                     )
                 )
             wheel_indices += [wheel_index] * (
@@ -458,15 +468,17 @@ class _BranchPointTable(NamedTuple):
             )
         if not wheel_indices:
             return cls(
-                select_tree_rows(direction_results.points, (0, 0, slice(0, 0))),
+                select_tree_rows(results_by_direction.points, (0, 0, slice(0, 0))),
                 np.zeros(0, int),
                 {},
             )
-        direction_points = concatenate_tree_rows(*points_by_direction)
+        points_of_both_directions = concatenate_tree_rows(*points_by_direction)
         return cls(
-            direction_points,
+            points_of_both_directions,
             np.array(wheel_indices),
-            branch_continuation.make_quantity_table(direction_points, np.array(wheel_indices)),
+            branch_continuation.make_quantity_table(
+                points_of_both_directions, np.array(wheel_indices)
+            ),
         )
 
     def find_neighbor_pairs(self, point_indices: np.ndarray) -> list[tuple[int, int]]:
@@ -477,38 +489,52 @@ class _BranchPointTable(NamedTuple):
         is_same_wheel = lambda i, j: self.wheel_indices[i] == self.wheel_indices[j]
         return [(i, j) for i, j in successive_pairs if is_same_wheel(i, j)]
 
-    def find_admissible_ranges(self, start_positions: Mapping[int, int]) -> list[_AdmissibleRange]:
+    def find_admissible_ranges(
+        self, start_point_positions: Mapping[int, int]
+    ) -> list[_AdmissibleRange]:
         """Find for each wheel the range of admissible points that contains the start of its branch.
 
-        `start_positions` maps the index of a wheel to the position of the start on its branch.
+        `start_point_positions` maps the index of a wheel to the position of the start on its
+        branch.
         """
         admissible_ranges = []
-        for wheel_index, start_position in start_positions.items():
+        for wheel_index, start_point_position in start_point_positions.items():
             point_indices = np.flatnonzero(self.wheel_indices == wheel_index)
             is_point_admissible = self.quantity_table[ADMISSIBILITY_COLUMN][point_indices] > 0.0
             # If the start is a special point, it may lie beyond the end. A neighbor is then used.
             admissible_positions = [
                 i
-                for i in (start_position, start_position + 1, start_position - 1)
+                for i in (start_point_position, start_point_position + 1, start_point_position - 1)
                 if 0 <= i < len(point_indices) and is_point_admissible[i]
             ]
             if not admissible_positions:
                 continue
-            start_position = admissible_positions[0]
-            first_index = last_index = start_position
-            while first_index > 0 and is_point_admissible[first_index - 1]:
-                first_index -= 1
-            while last_index < len(point_indices) - 1 and is_point_admissible[last_index + 1]:
-                last_index += 1
-            point_index_below = int(point_indices[first_index - 1]) if first_index > 0 else -1
-            point_index_above = (
-                int(point_indices[last_index + 1]) if last_index < len(point_indices) - 1 else -1
+            start_point_position = admissible_positions[0]
+            first_admissible_position = last_admissible_position = start_point_position
+            while (
+                first_admissible_position > 0 and is_point_admissible[first_admissible_position - 1]
+            ):
+                first_admissible_position -= 1
+            while (
+                last_admissible_position < len(point_indices) - 1
+                and is_point_admissible[last_admissible_position + 1]
+            ):
+                last_admissible_position += 1
+            point_index_below_range = (
+                int(point_indices[first_admissible_position - 1])
+                if first_admissible_position > 0
+                else -1
+            )
+            point_index_above_range = (
+                int(point_indices[last_admissible_position + 1])
+                if last_admissible_position < len(point_indices) - 1
+                else -1
             )
             admissible_ranges.append(
                 _AdmissibleRange(
                     wheel_index,
-                    point_indices[first_index : last_index + 1],
-                    (point_index_below, point_index_above),
+                    point_indices[first_admissible_position : last_admissible_position + 1],
+                    (point_index_below_range, point_index_above_range),
                 )
             )
         return admissible_ranges
@@ -523,42 +549,47 @@ class _BranchPointTable(NamedTuple):
         """
         point_groups, wheel_index_groups, quantity_tables = [], [], []
 
-        def append_points(
-            new_points: ContinuationPoint, wheel_index: int, new_quantities: QuantitiesByName
+        def append_branch_points(
+            added_points: ContinuationPoint, wheel_index: int, added_quantities: QuantitiesByName
         ) -> None:
-            point_groups.append(new_points)
-            wheel_index_groups.append(np.full(len(new_points.p), wheel_index))
-            quantity_tables.append(new_quantities)
+            point_groups.append(added_points)
+            wheel_index_groups.append(np.full(len(added_points.p), wheel_index))
+            quantity_tables.append(added_quantities)
 
         for admissible_range in admissible_ranges:
-            lower_end, upper_end = (
-                located_ends.get((admissible_range.wheel_index, end_index)) for end_index in (0, 1)
+            lower_located_end, upper_located_end = (
+                located_ends.get((admissible_range.wheel_index, range_end_index))
+                for range_end_index in (0, 1)
             )
             if (
-                lower_end is not None
-                and lower_end.quantities_beside_root[ADMISSIBILITY_COLUMN][0] > 0.0
+                lower_located_end is not None
+                and lower_located_end.quantities_beside_root[ADMISSIBILITY_COLUMN][0] > 0.0
             ):
                 # The end was located in the opposite direction, so signs of rates are reversed.
-                end_point = lower_end.point_beside_root
-                append_points(
+                end_point = lower_located_end.point_beside_root
+                append_branch_points(
                     end_point._replace(fraction_rate=-end_point.fraction_rate),
                     admissible_range.wheel_index,
-                    lower_end.quantities_beside_root
-                    | {BRANCH_POINT_KIND: -lower_end.quantities_beside_root[BRANCH_POINT_KIND]},
+                    lower_located_end.quantities_beside_root
+                    | {
+                        BRANCH_POINT_KIND: -lower_located_end.quantities_beside_root[
+                            BRANCH_POINT_KIND
+                        ]
+                    },
                 )
-            append_points(
+            append_branch_points(
                 select_tree_rows(self.all_points, admissible_range.admissible_point_indices),
                 admissible_range.wheel_index,
                 select_tree_rows(self.quantity_table, admissible_range.admissible_point_indices),
             )
             if (
-                upper_end is not None
-                and upper_end.quantities_beside_root[ADMISSIBILITY_COLUMN][0] > 0.0
+                upper_located_end is not None
+                and upper_located_end.quantities_beside_root[ADMISSIBILITY_COLUMN][0] > 0.0
             ):
-                append_points(
-                    upper_end.point_beside_root,
+                append_branch_points(
+                    upper_located_end.point_beside_root,
                     admissible_range.wheel_index,
-                    upper_end.quantities_beside_root,
+                    upper_located_end.quantities_beside_root,
                 )
         return _BranchPointTable(
             concatenate_tree_rows(*point_groups),
@@ -586,13 +617,13 @@ class _LocatedRoot(NamedTuple):
         stalled.
         """
         i, j = jump_pair
-        jump_parameter_values, last_index = (
+        jump_parameter_values, last_point_index = (
             point_table.all_points.p,
             len(point_table.all_points.p) - 1,
         )
         is_root_at_left = abs(
             jump_parameter_values[i] - jump_parameter_values[max(i - 1, 0)]
-        ) <= abs(jump_parameter_values[min(j + 1, last_index)] - jump_parameter_values[j])
+        ) <= abs(jump_parameter_values[min(j + 1, last_point_index)] - jump_parameter_values[j])
         chord_fraction = 0.0 if is_root_at_left else 1.0
         point_index = i if is_root_at_left else j
         point_beside_root, quantities_beside_root = select_tree_rows(
@@ -650,8 +681,8 @@ class _SpecialPointLocator(NamedTuple):
         )
 
         parameter_by_location = {
-            (request_index, 1.0 * chord_end_fraction): end_points.p[request_index]
-            for chord_end_fraction, end_points in enumerate((left_points, right_points))
+            (request_index, 1.0 * chord_end_fraction): chord_end_points.p[request_index]
+            for chord_end_fraction, chord_end_points in enumerate((left_points, right_points))
             for request_index in range(len(root_requests))
         }
 
@@ -695,9 +726,9 @@ class _SpecialPointLocator(NamedTuple):
             return np.array(
                 [
                     evaluate_named_quantity(quantity_table, quantity_names[bracket_index])[
-                        point_position
+                        bracket_position
                     ]
-                    for point_position, bracket_index in enumerate(bracket_indices)
+                    for bracket_position, bracket_index in enumerate(bracket_indices)
                 ]
             )
 
@@ -725,18 +756,19 @@ class _SpecialPointLocator(NamedTuple):
         points_beside_roots, quantities_beside_roots = solve_at_fractions(
             np.maximum(root_locations.left_bracket_ends - bracket_tolerances, 0.0), request_indices
         )
-        for retry_fraction in location_options.retry_chord_fractions:
-            inadmissible_requests = np.flatnonzero(
+        for retry_chord_fraction in location_options.retry_chord_fractions:
+            inadmissible_request_indices = np.flatnonzero(
                 ~(quantities_beside_roots[ADMISSIBILITY_COLUMN] > 0.0)
             )
             point_indices = np.arange(len(root_requests))
-            if len(inadmissible_requests):
+            if len(inadmissible_request_indices):
                 retried_points_and_quantities = solve_at_fractions(
-                    retry_fraction * root_locations.left_bracket_ends[inadmissible_requests],
-                    inadmissible_requests,
+                    retry_chord_fraction
+                    * root_locations.left_bracket_ends[inadmissible_request_indices],
+                    inadmissible_request_indices,
                 )
-                point_indices[inadmissible_requests] = len(point_indices) + np.arange(
-                    len(inadmissible_requests)
+                point_indices[inadmissible_request_indices] = len(point_indices) + np.arange(
+                    len(inadmissible_request_indices)
                 )
                 points_beside_roots, quantities_beside_roots = select_tree_rows(
                     concatenate_tree_rows(
@@ -767,14 +799,14 @@ class _SpecialPointLocator(NamedTuple):
         """Return whether the mesh limits a branch in `admissible_range`, before its special points
         are located.
         """
-        unexplained_ends = [
+        unexplained_range_ends = [
             i
-            for i in admissible_range.indices_of_points_beyond
+            for i in admissible_range.point_indices_beyond_ends
             if i >= 0 and not self.find_crossed_quantities(admissible_range, i)
         ]
         end_names = tuple(
             self.branch_continuation.name_branch_end(self.point_table.quantity_table, i)
-            for i in unexplained_ends
+            for i in unexplained_range_ends
         )
         return self.branch_continuation.is_mesh_limited(
             select_tree_rows(
@@ -786,7 +818,7 @@ class _SpecialPointLocator(NamedTuple):
     def find_crossed_quantities(
         self,
         admissible_range: _AdmissibleRange,
-        point_index_beyond: int,
+        point_index_beyond_end: int,
     ) -> list[str]:
         """Return the names of the branch-ending quantities that change sign at one end of a range.
 
@@ -794,7 +826,7 @@ class _SpecialPointLocator(NamedTuple):
         range.
         """
         last_point_index = admissible_range.admissible_point_indices[
-            0 if point_index_beyond < admissible_range.admissible_point_indices[0] else -1
+            0 if point_index_beyond_end < admissible_range.admissible_point_indices[0] else -1
         ]
         known_quantity_names = [
             quantity_name
@@ -805,7 +837,7 @@ class _SpecialPointLocator(NamedTuple):
             quantity_name
             for quantity_name in known_quantity_names
             if self.point_table.quantity_table[quantity_name][last_point_index]
-            * self.point_table.quantity_table[quantity_name][point_index_beyond]
+            * self.point_table.quantity_table[quantity_name][point_index_beyond_end]
             < 0.0
         ]
 
@@ -819,19 +851,19 @@ class _SpecialPointLocator(NamedTuple):
         """
         root_requests, wheel_and_end_keys = [], []
         for admissible_range in admissible_ranges:
-            for end_index, point_index_beyond in enumerate(
-                admissible_range.indices_of_points_beyond
+            for range_end_index, point_index_beyond_end in enumerate(
+                admissible_range.point_indices_beyond_ends
             ):
-                if point_index_beyond < 0:
+                if point_index_beyond_end < 0:
                     continue
                 last_point_index = int(
-                    admissible_range.admissible_point_indices[0 if end_index == 0 else -1]
+                    admissible_range.admissible_point_indices[0 if range_end_index == 0 else -1]
                 )
                 for quantity_name in self.find_crossed_quantities(
-                    admissible_range, point_index_beyond
+                    admissible_range, point_index_beyond_end
                 ) or [ADMISSIBILITY_COLUMN]:
-                    root_requests.append((last_point_index, point_index_beyond, quantity_name))
-                    wheel_and_end_keys.append((admissible_range.wheel_index, end_index))
+                    root_requests.append((last_point_index, point_index_beyond_end, quantity_name))
+                    wheel_and_end_keys.append((admissible_range.wheel_index, range_end_index))
         nearest_roots: dict[tuple[int, int], _LocatedRoot] = {}
         for wheel_and_end_key, located_root in zip(
             wheel_and_end_keys,
@@ -889,19 +921,21 @@ class _SpecialPointLocator(NamedTuple):
         has_jump_between = lambda left_index, right_index: any(
             left_index <= i and j <= right_index for i, j in jump_pairs
         )
-        is_without_jump = [
+        is_request_without_jump = [
             not has_jump_between(left_index, right_index)
             for left_index, right_index, _ in root_requests
         ]
         root_requests = [
             root_request
-            for root_request, has_no_jump in zip(root_requests, is_without_jump, strict=True)
+            for root_request, has_no_jump in zip(
+                root_requests, is_request_without_jump, strict=True
+            )
             if has_no_jump
         ]
         special_point_names = [
             special_point_name
             for special_point_name, has_no_jump in zip(
-                special_point_names, is_without_jump, strict=True
+                special_point_names, is_request_without_jump, strict=True
             )
             if has_no_jump
         ]
@@ -927,16 +961,16 @@ class _SpecialPointLocator(NamedTuple):
             (CONTACT_ORDER_CHANGE, _LocatedRoot.from_jump(self.point_table, point_pair), 0)
             for point_pair in jump_pairs
         ]
-        off_circle_pairs = self.point_table.find_neighbor_pairs(
+        off_circle_point_pairs = self.point_table.find_neighbor_pairs(
             np.flatnonzero(are_multipliers_off_circle(quantity_table[MULTIPLIER_MODULI_COLUMN]))
         )
-        off_circle_pairs = [
-            point_pair for point_pair in off_circle_pairs if not has_jump_between(*point_pair)
+        off_circle_point_pairs = [
+            point_pair for point_pair in off_circle_point_pairs if not has_jump_between(*point_pair)
         ]
         return add_multiple_bifurcations(
             quantity_table,
             fraction_rates,
-            off_circle_pairs,
+            off_circle_point_pairs,
             drop_duplicate_changes(named_roots),
             self.locate_requested_roots,
         )
@@ -1047,26 +1081,26 @@ def continue_and_locate_special_points(
     - `has_branch_start`: whether each wheel has a start;
     - `make_cycle_finder`: function that returns finders of the limit cycles at special points.
     """
-    direction_results = _continue_in_both_directions(
+    results_by_direction = _continue_in_both_directions(
         branch_continuation, z, parameter_values, has_branch_start
     )
     # In the first direction, a closed curve is complete.
-    is_curve_closed = (direction_results.status == int(ContinuationStatus.CURVE_CLOSED)).all(
+    is_curve_closed = (results_by_direction.status == int(ContinuationStatus.CURVE_CLOSED)).all(
         1, keepdims=True
     ) & np.array([True, False])
-    n_points_by_direction: Any = np.where(is_curve_closed, 0, direction_results.n_points)
-    direction_results = direction_results._replace(n_points=n_points_by_direction)
-    point_table = _BranchPointTable.from_results(branch_continuation, direction_results)
+    n_points_by_direction: Any = np.where(is_curve_closed, 0, results_by_direction.n_points)
+    results_by_direction = results_by_direction._replace(n_points=n_points_by_direction)
+    point_table = _BranchPointTable.from_results(branch_continuation, results_by_direction)
     n_wheels, n_points_before_start = (
         len(has_branch_start),
-        np.maximum(direction_results.n_points[:, 0] - 1, 0),
+        np.maximum(results_by_direction.n_points[:, 0] - 1, 0),
     )
-    start_indices = {
+    start_point_positions = {
         wheel_index: int(n_points_before_start[wheel_index])
         for wheel_index in range(n_wheels)
         if wheel_index in point_table.wheel_indices
     }
-    admissible_ranges = point_table.find_admissible_ranges(start_indices)
+    admissible_ranges = point_table.find_admissible_ranges(start_point_positions)
     point_locator = _SpecialPointLocator(branch_continuation, point_table)
     branch_data_by_wheel: list[BranchData | None] = [None] * n_wheels
     if not is_finest_mesh:
@@ -1139,7 +1173,7 @@ def continue_and_locate_special_points(
         point_indices = np.flatnonzero(
             joined_point_table.wheel_indices == admissible_range.wheel_index
         )
-        points_with_position = [
+        special_points_with_position = [
             (
                 located_root.bracket_and_quantity[0] + located_root.chord_fraction,
                 make_special_point(
@@ -1154,12 +1188,16 @@ def continue_and_locate_special_points(
             if located_root.bracket_and_quantity[0] in point_indices
         ]
         end_reasons = []
-        for end_index in (0, 1):
-            located_root = located_ends.get((admissible_range.wheel_index, end_index))
+        for range_end_index in (0, 1):
+            located_root = located_ends.get((admissible_range.wheel_index, range_end_index))
             if located_root is None:
                 end_reasons.append(
                     ContinuationStatus(
-                        int(direction_results.status[admissible_range.wheel_index, end_index])
+                        int(
+                            results_by_direction.status[
+                                admissible_range.wheel_index, range_end_index
+                            ]
+                        )
                     ).meaning
                 )
                 continue
@@ -1169,14 +1207,19 @@ def continue_and_locate_special_points(
                 admissible_range.wheel_index,
                 True,
             )
-            points_with_position.append(
-                (point_indices[0] - 1.0 if end_index == 0 else point_indices[-1] + 1.0, end_point)
+            special_points_with_position.append(
+                (
+                    point_indices[0] - 1.0 if range_end_index == 0 else point_indices[-1] + 1.0,
+                    end_point,
+                )
             )
             end_reasons.append(
                 branch_continuation.describe_branch_end(end_point.name, end_point.value)
             )
-        points_with_position.sort(key=lambda position_and_point: position_and_point[0])
-        special_points = tuple(special_point for _, special_point in points_with_position)
+        special_points_with_position.sort(
+            key=lambda position_and_special_point: position_and_special_point[0]
+        )
+        special_points = tuple(special_point for _, special_point in special_points_with_position)
         branch_quantities = select_tree_rows(joined_point_table.quantity_table, point_indices)
         end_names = tuple(
             special_point.name for special_point in special_points if special_point.ends_branch

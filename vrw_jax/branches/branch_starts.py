@@ -67,8 +67,8 @@ class LimitCycleFinder:
     - `gait_finder`, `model`: finder and model of the branch's gaits;
     - `parameter_name`: name of the continued parameter;
     - `start_params`, `start_cycle`: wheel and gait at the start of the branch;
-    - `solution_beside`, `parameter_value_beside`: collocation solution and parameter value at the
-      point next to the special point.
+    - `solution_beside_point`, `parameter_value_beside_point`: collocation solution and parameter
+      value at the point next to the special point.
     """
 
     gait_finder: Any
@@ -76,14 +76,14 @@ class LimitCycleFinder:
     parameter_name: str
     start_params: WheelParams
     start_cycle: LimitCycle
-    solution_beside: CollocationSolution
-    parameter_value_beside: Any
+    solution_beside_point: CollocationSolution
+    parameter_value_beside_point: Any
 
     def __call__(self) -> LimitCycle:
         """Find the limit cycle at the special point."""
         params, guess_cycle = jax.device_put((self.start_params, self.start_cycle))
         collocation_state = guess_cycle.collocation_state._replace(
-            solution=jax.tree.map(jnp.asarray, self.solution_beside)
+            solution=jax.tree.map(jnp.asarray, self.solution_beside_point)
         )
         guess_cycle = dataclasses.replace(
             guess_cycle,
@@ -91,16 +91,16 @@ class LimitCycleFinder:
             system=self.gait_finder.collocation_system,
         )
         _, params = self.model.with_parameter(
-            params, self.parameter_name, jnp.asarray(self.parameter_value_beside)
+            params, self.parameter_name, jnp.asarray(self.parameter_value_beside_point)
         )
         limit_cycle: LimitCycle = self.gait_finder.find_cycle(params, guess_cycle)
         return limit_cycle
 
 
-def find_collocation_starts(branch_request: BranchRequest, given_cycle: Any) -> BranchStart:
+def find_collocation_starts(branch_request: BranchRequest, known_start_cycle: Any) -> BranchStart:
     """Return the starts of branches that are continued by collocation.
 
-    If `given_cycle` is None, the limit cycles at the starts are searched for. Without cycle
+    If `known_start_cycle` is None, the limit cycles at the starts are searched for. Without cycle
     options, the mesh of the branch is not coarser than that of the limit cycles.
     """
     params, parameter_name, period_n = (
@@ -109,7 +109,7 @@ def find_collocation_starts(branch_request: BranchRequest, given_cycle: Any) -> 
         branch_request.period_n,
     )
     # The start may have a coarser mesh and larger errors than the branch.
-    start_cycle = given_cycle
+    start_cycle = known_start_cycle
     if start_cycle is None:
         start_cycle = limit_cycles(params, period_n=period_n, model=branch_request.model)
     if not isinstance(start_cycle, LimitCycle):
@@ -164,11 +164,11 @@ def find_collocation_starts(branch_request: BranchRequest, given_cycle: Any) -> 
     )
 
 
-def find_return_map_starts(branch_request: BranchRequest, given_cycle: Any) -> BranchStart:
+def find_return_map_starts(branch_request: BranchRequest, known_start_cycle: Any) -> BranchStart:
     """Return the starts of branches that are continued as fixed points of a model's return map.
 
-    If `given_cycle` is None, the fixed points are searched for, starting from the last states of
-    walks.
+    If `known_start_cycle` is None, the fixed points are searched for, starting from the last states
+    of walks.
     """
     params, model, step_options = (
         branch_request.params,
@@ -181,10 +181,10 @@ def find_return_map_starts(branch_request: BranchRequest, given_cycle: Any) -> B
         walk_result = start_walk_toward_gait(model_at_p, params_at_p, step_options)
         return walk_result.outcome, walk_result.steps.section_state[-1]
 
-    if given_cycle is None:
+    if known_start_cycle is None:
         outcomes, section_states = jax.vmap(walk_to_gait)(params, branch_request.parameter_values)
     else:
-        outcomes, section_states = given_cycle.outcome, given_cycle.section_state
+        outcomes, section_states = known_start_cycle.outcome, known_start_cycle.section_state
     return_map_problem = ReturnMapProblem(
         model=model,
         step_options=step_options,

@@ -350,9 +350,12 @@ def continue_branches(
     batch_padder = lambda parameter_values_of_field: np.broadcast_to(
         np.asarray(parameter_values_of_field), batch_shape
     )[wheel_indices]
-    start_values = batch_padder(getattr(model if name == FRICTION_NAME else params, name))
+    start_parameter_values = batch_padder(getattr(model if name == FRICTION_NAME else params, name))
     params, parameter_values = jax.device_put(
-        (jax.tree.map(batch_padder, params), np.clip(start_values, lower_bound, upper_bound))
+        (
+            jax.tree.map(batch_padder, params),
+            np.clip(start_parameter_values, lower_bound, upper_bound),
+        )
     )
     if isinstance(cycle, AbstractCycle) and padded_batch_size > n_wheels:
         cycle = jax.device_put(select_tree_rows(cycle, wheel_indices))

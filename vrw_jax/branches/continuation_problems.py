@@ -403,15 +403,19 @@ class ContactGaitProblem(AbstractReturnMapProblem):
         parameter_jacobian = period_evaluation.parameter_jacobian[
             :, :n_coordinates, is_continued_parameter
         ]
-        right_sides = np.concatenate(
+        right_hand_sides = np.concatenate(
             [period_defects[:, :n_coordinates, None], parameter_jacobian], -1
         )
-        solved_columns = solve_linear_systems(
-            np.eye(n_coordinates) - return_map_jacobian, right_sides
+        linear_system_solutions = solve_linear_systems(
+            np.eye(n_coordinates) - return_map_jacobian, right_hand_sides
         )
         contact_code_changes = period_defects[:, n_coordinates:]
-        newton_corrections = np.concatenate([solved_columns[..., 0], contact_code_changes], 1)
-        parameter_tangents = np.concatenate([solved_columns[..., 1], 0.0 * contact_code_changes], 1)
+        newton_corrections = np.concatenate(
+            [linear_system_solutions[..., 0], contact_code_changes], 1
+        )
+        parameter_tangents = np.concatenate(
+            [linear_system_solutions[..., 1], 0.0 * contact_code_changes], 1
+        )
         return NewtonStep(newton_corrections, parameter_tangents, jnp.asarray(return_map_jacobian))
 
     def measure_gaits(
@@ -487,22 +491,24 @@ class ContactGaitProblem(AbstractReturnMapProblem):
         return jnp.all(jnp.isfinite(z)) & (self._compute_friction_surplus(wheel, p) > 0.0)
 
 
-def compute_contact_order_numbers(period_steps: Any, n_legs: int) -> np.ndarray:
+def compute_contact_order_numbers(gait_steps_of_period: Any, n_legs: int) -> np.ndarray:
     """Return a number for each period that identifies its order of contacts, shape (periods,).
 
     The number is a checksum of the contact modes that occur, the event counts and the final contact
     modes.
     """
-    has_mode_occurred = np.asarray(period_steps.mode_durations) > 0.0
-    contact_codes = np.asarray(period_steps.section_state)[..., -n_legs:]
-    event_counts = np.stack([np.asarray(period_steps.events), np.asarray(period_steps.impacts)], -1)
-    integer_period_arrays = [
+    has_contact_mode_occurred = np.asarray(gait_steps_of_period.mode_durations) > 0.0
+    contact_codes = np.asarray(gait_steps_of_period.section_state)[..., -n_legs:]
+    event_and_impact_counts = np.stack(
+        [np.asarray(gait_steps_of_period.events), np.asarray(gait_steps_of_period.impacts)], -1
+    )
+    integer_arrays_by_period = [
         x.reshape(len(x), -1).astype(np.int64)
-        for x in (has_mode_occurred, contact_codes, event_counts)
+        for x in (has_contact_mode_occurred, contact_codes, event_and_impact_counts)
     ]
     contact_order_numbers = [
-        zlib.crc32(period_integers.tobytes())
-        for period_integers in np.concatenate(integer_period_arrays, 1)
+        zlib.crc32(integers_of_period.tobytes())
+        for integers_of_period in np.concatenate(integer_arrays_by_period, 1)
     ]
     return np.array(contact_order_numbers, float)
 
@@ -524,17 +530,19 @@ def _combine_period_measures(
 
 
 def interpolate_section_states(
-    left_state: Array, right_state: Array, state_fraction: Scalar, n_coordinates: int
+    left_state: Array, right_state: Array, interpolation_fraction: Scalar, n_coordinates: int
 ) -> Array:
-    """Interpolate linearly between two section states, at the fraction `state_fraction`.
+    """Interpolate linearly between two section states, at the fraction `interpolation_fraction`.
 
     The first `n_coordinates` components are interpolated. The remaining components are discrete
     codes, which are those of the nearer state.
     """
-    nearer_contact_codes = jnp.where(state_fraction < 0.5, left_state, right_state)[n_coordinates:]
+    nearer_contact_codes = jnp.where(interpolation_fraction < 0.5, left_state, right_state)[
+        n_coordinates:
+    ]
     return jnp.concatenate(
         [
-            (left_state + state_fraction * (right_state - left_state))[:n_coordinates],
+            (left_state + interpolation_fraction * (right_state - left_state))[:n_coordinates],
             nearer_contact_codes,
         ]
     )
@@ -572,21 +580,23 @@ def combine_step_measures(
     the end state.
     """
     period_measures = {}
-    for measure_name, step_values in step_measures.items():
+    for measure_name, values_by_step in step_measures.items():
         if measure_name in MARGIN_MEASURES | STOPPER_MARGIN_MEASURES or measure_name.startswith(
             "lambda_"
         ):
-            period_measures[measure_name] = jnp.min(step_values, 0)
+            period_measures[measure_name] = jnp.min(values_by_step, 0)
         elif measure_name.endswith("_touchdown"):
-            period_measures[measure_name] = step_values[-1]
+            period_measures[measure_name] = values_by_step[-1]
         elif measure_name.endswith("_post_impact"):
-            period_measures[measure_name] = step_values[0]
+            period_measures[measure_name] = values_by_step[0]
         elif measure_name == "outcome":
-            period_measures[measure_name] = step_values[jnp.argmax(step_values != Outcome.STEPPED)]
+            period_measures[measure_name] = values_by_step[
+                jnp.argmax(values_by_step != Outcome.STEPPED)
+            ]
         elif MEASURES[measure_name].is_averaged_over_steps:
-            period_measures[measure_name] = jnp.mean(step_values, 0)
+            period_measures[measure_name] = jnp.mean(values_by_step, 0)
         else:
-            period_measures[measure_name] = jnp.sum(step_values, 0)
+            period_measures[measure_name] = jnp.sum(values_by_step, 0)
     positive_period = jnp.where(period_measures["period"] > 0.0, period_measures["period"], 1.0)
     period_measures["dls_fraction"] = period_measures["duration_dls"] / positive_period
     period_measures["speed"] = period_measures["step_length"] / positive_period

@@ -71,8 +71,8 @@ are short.
 class CurveTracingOptions:
     """Numerical options of the tracing of curves. All distances are arc lengths.
 
-    - `same_curve_distance`: largest distance from a curve at which a point is treated as a point of
-      the curve;
+    - `max_distance_on_same_curve`: largest distance from a curve at which a point is treated as a
+      point of the curve;
     - `codim2_overrun_distance`: distance beyond a point of codimension two at which the
       continuation of the second curve through that point starts;
     - `relative_codim2_tolerance`: tolerance for Newton's last correction at a point of codimension
@@ -82,7 +82,7 @@ class CurveTracingOptions:
     - `dls_duration_guess`: initial guess for a nonzero duration of double support, s.
     """
 
-    same_curve_distance: float = 2e-3
+    max_distance_on_same_curve: float = 2e-3
     codim2_overrun_distance: float = 3e-3
     relative_codim2_tolerance: float = 1e-9
     max_zero_dls_duration: float = 1e-4
@@ -119,15 +119,19 @@ class CurveContinuation(AbstractContinuation):
     def evaluate_point_quantities(
         self, wheels: TestFunctionWheel, points: ContinuationPoint
     ) -> QuantitiesByName:
-        z, second_fractions = points.z
-        (lower_bound, upper_bound), second_fractions = (
+        z, second_parameter_fractions = points.z
+        (lower_bound, upper_bound), second_parameter_fractions = (
             self.continuation_problem.second_parameter_bounds,
-            np.asarray(second_fractions),
+            np.asarray(second_parameter_fractions),
         )
-        second_values = lower_bound + (upper_bound - lower_bound) * second_fractions
-        get_second_parameter = lambda params: getattr(params, self.second_parameter_name)
+        second_parameter_values = (
+            lower_bound + (upper_bound - lower_bound) * second_parameter_fractions
+        )
+        get_second_parameter_value = lambda params: getattr(params, self.second_parameter_name)
         gait_wheels = wheels.branch_wheel._replace(
-            params=eqx.tree_at(get_second_parameter, wheels.branch_wheel.params, second_values)
+            params=eqx.tree_at(
+                get_second_parameter_value, wheels.branch_wheel.params, second_parameter_values
+            )
         )
         quantity_table = self.gait_continuation.evaluate_point_quantities(
             gait_wheels, points._replace(z=z)
@@ -136,12 +140,16 @@ class CurveContinuation(AbstractContinuation):
         rear_force_sign = np.where(wheels.branch_wheel.is_phase_active[:, 0, 0] > 0.5, 1.0, -1.0)
         curve_quantities = {
             "lambda_4_plus": rear_force_sign * quantity_table["lambda_4_plus"],
-            "second": second_values,
+            "second": second_parameter_values,
         }
         return (
             quantity_table
             | curve_quantities
-            | {RANGE_EDGE_COLUMN: np.minimum(second_fractions, 1.0 - second_fractions)}
+            | {
+                RANGE_EDGE_COLUMN: np.minimum(
+                    second_parameter_fractions, 1.0 - second_parameter_fractions
+                )
+            }
         )
 
     def mask_undefined_quantities(
@@ -151,10 +159,10 @@ class CurveContinuation(AbstractContinuation):
 
         - `wheel_indices`: index of the curve to which each point belongs.
         """
-        point_names = np.array(self.special_point_names)[wheel_indices]
-        is_dls_vanishing = point_names == DLS_VANISHING_NAME
+        special_point_name_by_point = np.array(self.special_point_names)[wheel_indices]
+        is_dls_vanishing = special_point_name_by_point == DLS_VANISHING_NAME
         is_quantity_discontinuous = np.isin(
-            point_names, (*DISCONTINUOUS_QUANTITIES, DLS_VANISHING_NAME)
+            special_point_name_by_point, (*DISCONTINUOUS_QUANTITIES, DLS_VANISHING_NAME)
         )
         step_measure_names = {
             quantity_name
@@ -162,11 +170,11 @@ class CurveContinuation(AbstractContinuation):
             if quantity_name.partition("[")[0] in MARGIN_MEASURES
         } - set(CONTINUED_QUANTITIES)
         is_undefined_by_name = {
-            quantity_name: point_names == quantity_name
+            quantity_name: special_point_name_by_point == quantity_name
             for quantity_name in {*self.special_point_names} & {*quantity_table}
         }
         is_undefined_by_name |= {
-            substitute_name: point_names == quantity_name
+            substitute_name: special_point_name_by_point == quantity_name
             for quantity_name, substitute_name in LINEAR_MARGIN_SUBSTITUTES.items()
         }
         is_undefined_by_name |= {
@@ -313,7 +321,9 @@ class CurveTracer(NamedTuple):
         new_seeds = [
             curve_seed
             for curve_seed in curve_seeds
-            if not any(self._is_on_curve(curve_seed, curve) for curve in known_curves)
+            if not any(
+                self._is_on_curve(curve_seed, candidate_curve) for candidate_curve in known_curves
+            )
         ]
         quantity_groups = {
             find_test_quantity_group(
@@ -341,18 +351,21 @@ class CurveTracer(NamedTuple):
                     ):
                         batch_seeds.append(curve_seed)
                 accepted_curves: list[TracedCurve] = []
-                for curve in self._trace_curves_of_batch(quantity_group, batch_seeds):
+                for candidate_curve in self._trace_curves_of_batch(quantity_group, batch_seeds):
                     if not any(
-                        self.are_same_curve(curve, other_curve)
-                        for other_curve in (*known_curves, *new_curves, *accepted_curves)
+                        self.are_same_curve(candidate_curve, compared_curve)
+                        for compared_curve in (*known_curves, *new_curves, *accepted_curves)
                     ):
-                        accepted_curves.append(curve)
+                        accepted_curves.append(candidate_curve)
                 new_curves += accepted_curves
                 remaining_seeds = [
                     curve_seed
                     for curve_seed in remaining_seeds
                     if not any(curve_seed is batch_seed for batch_seed in batch_seeds)
-                    and not any(self._is_on_curve(curve_seed, curve) for curve in accepted_curves)
+                    and not any(
+                        self._is_on_curve(curve_seed, candidate_curve)
+                        for candidate_curve in accepted_curves
+                    )
                 ]
         return new_curves
 
@@ -363,26 +376,26 @@ class CurveTracer(NamedTuple):
             self.compute_parameter_fractions(np.array(curve_seed.parameter_values)),
         )
         has_same_name = curve_seed.special_point_name == traced_curve.special_point_curve.name
-        max_curve_distance = self.tracing_options.same_curve_distance
+        max_curve_distance = self.tracing_options.max_distance_on_same_curve
         return has_same_name and bool(
             compute_distances_to_polyline(seed_point[None], traced_curve.scaled_vertices)[0]
             < max_curve_distance
         )
 
-    def are_same_curve(self, traced_curve: TracedCurve, other_curve: TracedCurve) -> bool:
+    def are_same_curve(self, traced_curve: TracedCurve, compared_curve: TracedCurve) -> bool:
         """Return whether two curves are the same curve.
 
         The special points must have the same name, and all points of the first curve must lie on
         the second curve.
         """
         has_same_name = (
-            traced_curve.special_point_curve.name == other_curve.special_point_curve.name
+            traced_curve.special_point_curve.name == compared_curve.special_point_curve.name
         )
-        max_curve_distance = self.tracing_options.same_curve_distance
+        max_curve_distance = self.tracing_options.max_distance_on_same_curve
         return has_same_name and bool(
             np.max(
                 compute_distances_to_polyline(
-                    traced_curve.scaled_vertices, other_curve.scaled_vertices
+                    traced_curve.scaled_vertices, compared_curve.scaled_vertices
                 )
             )
             < max_curve_distance
@@ -508,12 +521,14 @@ class CurveTracer(NamedTuple):
             tuple(curve_seed.special_point_name for curve_seed in padded_seeds),
             gait_continuation,
         )
-        first_values = jnp.asarray([curve_seed.parameter_values[0] for curve_seed in padded_seeds])
+        first_parameter_values = jnp.asarray(
+            [curve_seed.parameter_values[0] for curve_seed in padded_seeds]
+        )
         is_seed_requested = np.arange(len(padded_seeds)) < len(curve_seeds)
         branch_data_by_seed = continue_and_locate_special_points(
             branch_continuation,
             z,
-            first_values,
+            first_parameter_values,
             is_seed_requested,
             lambda wheel_index, point: lambda: point,
             is_finest_mesh,
@@ -539,7 +554,7 @@ class CurveTracer(NamedTuple):
             if special_point.name == RANGE_EDGE_COLUMN:
                 continue
             point_beside_root = special_point.cycle
-            meeting_values = (
+            meeting_parameter_values = (
                 special_point.value,
                 float(
                     self.parameter_ranges[1, 0]
@@ -557,8 +572,8 @@ class CurveTracer(NamedTuple):
                 "lambda_4_plus",
                 DLS_VANISHING_NAME,
             }:
-                meeting_values = self._locate_jump_onset(
-                    curve_seed, point_beside_root.z.z, meeting_values
+                meeting_parameter_values = self._locate_jump_onset(
+                    curve_seed, point_beside_root.z.z, meeting_parameter_values
                 )
                 new_seeds.append(
                     self._seed_beyond_meeting(
@@ -567,27 +582,30 @@ class CurveTracer(NamedTuple):
                         scaled_vertices,
                         parameter_points,
                         branch_data.points.z.z,
-                        meeting_values,
+                        meeting_parameter_values,
                     )
                 )
-                text_replacement = f"{special_point.value:.9g}", f"{meeting_values[0]:.9g}"
+                parameter_text_replacement = (
+                    f"{special_point.value:.9g}",
+                    f"{meeting_parameter_values[0]:.9g}",
+                )
                 end_reasons = (
-                    end_reasons[0].replace(*text_replacement),
-                    end_reasons[1].replace(*text_replacement),
+                    end_reasons[0].replace(*parameter_text_replacement),
+                    end_reasons[1].replace(*parameter_text_replacement),
                 )
             elif can_continue_special_point(special_point_name):
-                seed_values = float(point_beside_root.p), meeting_values[1]
+                seed_parameter_values = float(point_beside_root.p), meeting_parameter_values[1]
                 new_seeds.append(
                     CurveSeed(
                         special_point_name,
-                        seed_values,
+                        seed_parameter_values,
                         curve_seed.collocation_system,
                         curve_seed.branch_wheel,
                         point_beside_root.z.z,
                     )
                 )
             codim2_points.append(
-                Codim2Point(special_point_name, meeting_values, special_point.ends_branch)
+                Codim2Point(special_point_name, meeting_parameter_values, special_point.ends_branch)
             )
         special_point_curve = self._make_labeled_curve(
             curve_seed, branch_data._replace(end_reasons=end_reasons), tuple(codim2_points)
@@ -595,11 +613,11 @@ class CurveTracer(NamedTuple):
         return TracedCurve(special_point_curve, scaled_vertices, tuple(new_seeds))
 
     def _locate_jump_onset(
-        self, curve_seed: CurveSeed, z: CollocationSolution, start_values: Any
+        self, curve_seed: CurveSeed, z: CollocationSolution, start_parameter_values: Any
     ) -> tuple[float, float]:
         """Return the two parameters at the onset of the jump.
 
-        If the onset is not found, return `start_values`.
+        If the onset is not found, return `start_parameter_values`.
         """
         test_function = GaitTestFunction(
             curve_seed.collocation_system,
@@ -608,12 +626,17 @@ class CurveTracer(NamedTuple):
             self.model,
             self.step_options,
         )
-        onset_parameter_values, last_relative_change = locate_jump_onset(
-            test_function, curve_seed.branch_wheel, jax.device_put(z), jnp.asarray(start_values)
+        onset_parameter_values, last_relative_parameter_change = locate_jump_onset(
+            test_function,
+            curve_seed.branch_wheel,
+            jax.device_put(z),
+            jnp.asarray(start_parameter_values),
         )
-        is_onset_found = last_relative_change < self.tracing_options.relative_codim2_tolerance
+        is_onset_found = (
+            last_relative_parameter_change < self.tracing_options.relative_codim2_tolerance
+        )
         first_parameter_value, second_parameter_value = (
-            onset_parameter_values if is_onset_found else start_values
+            onset_parameter_values if is_onset_found else start_parameter_values
         )
         return float(first_parameter_value), float(second_parameter_value)
 
@@ -624,23 +647,23 @@ class CurveTracer(NamedTuple):
         scaled_vertices: np.ndarray,
         parameter_points: np.ndarray,
         z: CollocationSolution,
-        meeting_values: Any,
+        meeting_parameter_values: Any,
     ) -> CurveSeed:
         """Build a seed beyond the point at which the rear foot's force starts to rise or to fall.
 
         The force is zero on the curve. Two curves cross at that point and continue in the same
-        direction. `meeting_values` contains the two parameters at the crossing.
+        direction. `meeting_parameter_values` contains the two parameters at the crossing.
         """
-        starts_at_meeting = (
-            abs(parameter_points[0] - meeting_values).max()
-            < abs(parameter_points[-1] - meeting_values).max()
+        is_meeting_at_start = (
+            abs(parameter_points[0] - meeting_parameter_values).max()
+            < abs(parameter_points[-1] - meeting_parameter_values).max()
         )
-        traversal_sign = 1 if starts_at_meeting else -1
+        curve_traversal_sign = 1 if is_meeting_at_start else -1
         scaled_vertices, parameter_points = (
-            scaled_vertices[::traversal_sign],
-            parameter_points[::traversal_sign],
+            scaled_vertices[::curve_traversal_sign],
+            parameter_points[::curve_traversal_sign],
         )
-        z = jax.tree.map(lambda x: x[::traversal_sign], z)
+        z = jax.tree.map(lambda x: x[::curve_traversal_sign], z)
         overrun_distance = self.tracing_options.codim2_overrun_distance
         distances_to_meeting = np.linalg.norm(scaled_vertices - scaled_vertices[0], axis=1)
         point_index = int(
@@ -691,14 +714,16 @@ class CurveTracer(NamedTuple):
                 self.parameter_names, parameter_values, strict=True
             )
         }
-        start_wheel = collect_provenance_attributes(
+        start_provenance = collect_provenance_attributes(
             curve_seed.branch_wheel.params, self.model, self.step_options
         )
-        axes_description = " and ".join(self.parameter_names)
+        curve_axes_description = " and ".join(self.parameter_names)
         dataset_attrs = {
-            "title": f"Curve of {curve_seed.special_point_name} over {axes_description}"
+            "title": f"Curve of {curve_seed.special_point_name} over {curve_axes_description}"
         }
-        curve_dataset = xr.Dataset(curve_variables, curve_coordinates, dataset_attrs | start_wheel)
+        curve_dataset = xr.Dataset(
+            curve_variables, curve_coordinates, dataset_attrs | start_provenance
+        )
         return SpecialPointCurve(
             curve_seed.special_point_name,
             self.parameter_names,
@@ -716,10 +741,10 @@ def compute_distances_to_polyline(
     Each row of `polyline_vertices` is a vertex of the polyline.
     """
     segment_starts, segment_vectors = polyline_vertices[:-1], np.diff(polyline_vertices, axis=0)
-    squared_lengths = np.maximum(np.sum(segment_vectors**2, 1), 1e-300)
+    squared_segment_lengths = np.maximum(np.sum(segment_vectors**2, 1), 1e-300)
     offsets_from_segment_start = query_points[:, None] - segment_starts
     segment_fractions = np.clip(
-        np.sum(offsets_from_segment_start * segment_vectors, 2) / squared_lengths, 0.0, 1.0
+        np.sum(offsets_from_segment_start * segment_vectors, 2) / squared_segment_lengths, 0.0, 1.0
     )
     segment_distances = np.linalg.norm(
         offsets_from_segment_start - segment_fractions[..., None] * segment_vectors, axis=2
@@ -755,13 +780,13 @@ def choose_continued_special_point_name(
 
 def can_continue_special_point(special_point_name: str) -> bool:
     """Return whether `GaitTestFunction` can continue the named special point as a curve."""
-    continued_names = (
+    continued_special_point_names = (
         *BIFURCATION_NAMES,
         *DISCONTINUOUS_QUANTITIES,
         DLS_VANISHING_NAME,
         *FORCE_QUANTITY_NAMES,
     )
     return (
-        special_point_name in continued_names
+        special_point_name in continued_special_point_names
         or special_point_name.partition("[")[0] in MARGIN_MEASURES
     )

@@ -130,7 +130,7 @@ def select_test_quantity(special_point_name: str, has_double_support: bool) -> s
 def find_test_quantity_group(quantity_name: str, n_legs: int) -> tuple[str, ...]:
     """Return the names of all quantities that are evaluated together with `quantity_name`."""
     leg_suffixes = [f"[{leg_number}]" for leg_number in range(3, n_legs + 1)]
-    step_quantities = [
+    step_quantity_names = [
         quantity_name + leg_suffix
         for quantity_name, margin_measure in MARGIN_MEASURES.items()
         for leg_suffix in (leg_suffixes if margin_measure.leg_dimension else [""])
@@ -141,7 +141,7 @@ def find_test_quantity_group(quantity_name: str, n_legs: int) -> tuple[str, ...]
         FORCE_QUANTITY_NAMES,
         tuple(
             quantity_name
-            for quantity_name in step_quantities
+            for quantity_name in step_quantity_names
             if quantity_name not in CONTINUED_QUANTITIES
         ),
     )
@@ -194,14 +194,14 @@ class GaitTestFunction(AbstractTestFunction):
             branch_wheel.is_phase_active,
             z,
         )
-        newton_correction, tangents_by_parameter, monodromy_matrix, *quantity_data = (
+        newton_correction, tangents_by_parameter, monodromy_matrix, *quantities_and_gradients = (
             linearize_trial(*trial_arguments)
         )
         tangent_by_first_parameter, tangent_by_second_parameter = (
             jax.tree.map(lambda x, i=i: x[i], tangents_by_parameter) for i in range(2)
         )
-        if quantity_data:
-            quantity_values, parameter_gradients = quantity_data
+        if quantities_and_gradients:
+            quantity_values, parameter_gradients = quantities_and_gradients
             if self.quantity_names == BIFURCATION_NAMES:
                 apply_margin_jacobian = lambda quantity_tangent: jax.jvp(
                     compute_offset_bifurcation_margins, (quantity_values,), (quantity_tangent,)
@@ -246,34 +246,34 @@ class GaitTestFunction(AbstractTestFunction):
         an orthonormal basis of the tangents' plane. They start from the point of that plane that is
         nearest to the trial.
         """
-        scaled_tangents = jnp.stack(
+        tangents_times_parameters = jnp.stack(
             [
                 p[parameter_index] * self.section_state(parameter_tangent)
                 for parameter_index, parameter_tangent in enumerate(tangents_by_parameter)
             ]
         )
         orthonormal_basis, triangular_factor = jnp.linalg.qr(
-            jnp.concatenate([scaled_tangents, jnp.eye(2, dtype=p.dtype)], 1).T
+            jnp.concatenate([tangents_times_parameters, jnp.eye(2, dtype=p.dtype)], 1).T
         )
         basis_coefficients = p[:, None] * jnp.linalg.inv(triangular_factor)
         correction_coordinates = orthonormal_basis[:-2].T @ self.section_state(newton_correction)
 
-        def measure_at_offset(basis_offset: Array) -> Array:
+        def measure_gait_at_offset(basis_offset: Array) -> Array:
             parameter_change = basis_coefficients @ (basis_offset - correction_coordinates)
-            displace_leaf = lambda x, correction_array, first_array, second_array: (
+            displace_leaf = lambda x, correction_leaf, first_tangent_leaf, second_tangent_leaf: (
                 x
-                + correction_array
-                + parameter_change[0] * first_array
-                + parameter_change[1] * second_array
+                + correction_leaf
+                + parameter_change[0] * first_tangent_leaf
+                + parameter_change[1] * second_tangent_leaf
             )
-            return self.measure_step(
+            return self.measure_step_quantities(
                 branch_wheel,
                 jax.tree.map(displace_leaf, z, newton_correction, *tangents_by_parameter),
                 p + parameter_change,
             )
 
         difference_step = self.test_function_options.relative_difference_step
-        quantities_at_offsets = jax.vmap(measure_at_offset)(
+        quantities_at_offsets = jax.vmap(measure_gait_at_offset)(
             difference_step * jnp.eye(3, 2, -1, p.dtype)
         )
         quantity_gradients = (
@@ -300,7 +300,9 @@ class GaitTestFunction(AbstractTestFunction):
             additional_quantity_function=_compute_continued_quantities,
         )
 
-    def measure_step(self, branch_wheel: BranchWheel, z: CollocationSolution, p: Array) -> Array:
+    def measure_step_quantities(
+        self, branch_wheel: BranchWheel, z: CollocationSolution, p: Array
+    ) -> Array:
         """Return the quantities of the gait that the collocation equations do not contain.
 
         They are either those of the gait's force, or those of an event-driven step that starts from
@@ -374,9 +376,9 @@ def locate_jump_onset(
             ),
         )
         displace_leaf = (
-            lambda x, correction_array, tangent_by_first_parameter, tangent_by_second_parameter: (
+            lambda x, correction_leaf, tangent_by_first_parameter, tangent_by_second_parameter: (
                 x
-                + correction_array
+                + correction_leaf
                 + parameter_change[0] * tangent_by_first_parameter
                 + parameter_change[1] * tangent_by_second_parameter
             )
@@ -391,13 +393,13 @@ def locate_jump_onset(
             p + parameter_change,
         ), parameter_change / p
 
-    (_, p), relative_changes = lax.scan(
+    (_, p), relative_parameter_changes = lax.scan(
         take_newton_step,
         (z, p),
         None,
         length=test_function.test_function_options.n_codim2_iterations,
     )
-    return p, jnp.max(jnp.abs(relative_changes[-1]))
+    return p, jnp.max(jnp.abs(relative_parameter_changes[-1]))
 
 
 def _stack_continued_quantities(
@@ -440,20 +442,22 @@ def _compute_force_decrease_rates(
     """Return the initial and the mean rate at which the rear foot's force decreases in DLS, N/s."""
     dls_phase = make_phases(s, dls_points.start_point.held_constants[0], stop_at_lift_off=False)[0]
 
-    def make_instant(theta: Array, dtheta: Array) -> PhaseInstant:
+    def make_dls_instant(theta: Array, dtheta: Array) -> PhaseInstant:
         return PhaseInstant(dls_phase, dls_phase.compute_motion((theta,), (dtheta,)), None)
 
-    compute_rear_force = lambda *dls_state: dls_phase.compute_end_guard(make_instant(*dls_state))
+    compute_rear_force = lambda *dls_state: dls_phase.compute_end_guard(
+        make_dls_instant(*dls_state)
+    )
     start_state, end_state = (
         (*dls_points.start_point.q, *dls_points.start_point.v),
         (*dls_points.end_point.q, *dls_points.end_point.v),
     )
-    state_rates = start_state[1], make_instant(*start_state).acceleration.ddtheta
-    initial_rear_force, force_rate = jax.jvp(compute_rear_force, start_state, state_rates)
+    state_rates = start_state[1], make_dls_instant(*start_state).acceleration.ddtheta
+    initial_rear_force, rear_force_rate = jax.jvp(compute_rear_force, start_state, state_rates)
     mean_decrease_rate = (initial_rear_force - compute_rear_force(*end_state)) / jnp.where(
         dls_duration == 0.0, 1.0, dls_duration
     )
-    return -force_rate, mean_decrease_rate
+    return -rear_force_rate, mean_decrease_rate
 
 
 def _compute_trial_monodromy(

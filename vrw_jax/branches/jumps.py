@@ -24,8 +24,8 @@ class JumpOptions:
     - `parameter_change_fractions`: changes of the parameter, as fractions of its range, after which
       a gait beyond a jump is searched for. The values are chosen because two impacts with
       unilateral contact change their order within a fraction of 1e-4;
-    - `min_steepness_factor`: smallest ratio, at a jump, of the steepness of the chord between two
-      points to that of both tangents. The value is chosen because continuation steps turn by at
+    - `min_chord_steepness_factor`: smallest ratio, at a jump, of the steepness of the chord between
+      two points to that of both tangents. The value is chosen because continuation steps turn by at
       most 0.2 rad. The slope of a chord is then between those of the tangents to some tenths, even
       at a kink.
     """
@@ -34,7 +34,7 @@ class JumpOptions:
     parameter_change_fractions: tuple[float, ...] = (
         1e-9, 1e-7, 1e-5, 3e-5, 1e-4, 2e-4, 3e-4, 5e-4, 1e-3,
     )  # fmt: skip
-    min_steepness_factor: float = 5.0
+    min_chord_steepness_factor: float = 5.0
 
 
 DEFAULT_JUMP_OPTIONS = JumpOptions()
@@ -45,7 +45,7 @@ def continue_beyond_jumps(
     branch_continuation: Any,
     branch_continuer: Callable[..., Any],
     wheels: Any,
-    direction_results: ContinuationResult,
+    results_by_direction: ContinuationResult,
     jump_options: JumpOptions = DEFAULT_JUMP_OPTIONS,
 ) -> ContinuationResult:
     """Continue stalled branches beyond jumps, and return the points of all branches.
@@ -55,26 +55,28 @@ def continue_beyond_jumps(
     the branches of `branch_continuation` from given starts.
     """
     branch_indices, parameter_bounds = (
-        np.arange(len(direction_results.n_points)),
+        np.arange(len(results_by_direction.n_points)),
         np.asarray(branch_continuation.parameter_bounds),
     )
     wheel_indices, has_search_failed = branch_indices // 2, np.zeros(len(branch_indices), bool)
     for _ in range(jump_options.max_jumps_per_direction):
         n_points, branch_statuses = (
-            np.asarray(direction_results.n_points),
-            np.asarray(direction_results.status),
+            np.asarray(results_by_direction.n_points),
+            np.asarray(results_by_direction.status),
         )
         is_branch_stalled = branch_statuses == int(ContinuationStatus.STEP_SIZE_UNDERFLOW)
         is_branch_stalled = is_branch_stalled & (n_points > 1) & ~has_search_failed
         if not is_branch_stalled.any():
             break
-        end_points = select_tree_rows(
-            direction_results.points, (branch_indices, np.maximum(n_points - 1, 0))
+        branch_end_points = select_tree_rows(
+            results_by_direction.points, (branch_indices, np.maximum(n_points - 1, 0))
         )
-        direction_signs = np.sign(end_points.fraction_rate)
-        end_quantities = branch_continuation.make_quantity_table(end_points, wheel_indices)
+        direction_signs = np.sign(branch_end_points.fraction_rate)
+        branch_end_quantities = branch_continuation.make_quantity_table(
+            branch_end_points, wheel_indices
+        )
         for parameter_change_fraction in jump_options.parameter_change_fractions:
-            parameter_values = end_points.p + direction_signs * parameter_change_fraction * (
+            parameter_values = branch_end_points.p + direction_signs * parameter_change_fraction * (
                 parameter_bounds[1] - parameter_bounds[0]
             )
             is_branch_requested = (
@@ -87,7 +89,7 @@ def continue_beyond_jumps(
             continuation_arguments = jax.device_put(
                 (
                     wheels,
-                    end_points.z,
+                    branch_end_points.z,
                     parameter_values,
                     parameter_bounds,
                     direction_signs,
@@ -95,45 +97,53 @@ def continue_beyond_jumps(
                 )
             )
             new_results = jax.tree.map(np.asarray, branch_continuer(*continuation_arguments))
-            first_points = select_tree_rows(new_results.points, (branch_indices, 0))
+            first_new_points = select_tree_rows(new_results.points, (branch_indices, 0))
             is_gait_found = is_branch_requested & (np.asarray(new_results.n_points) > 1)
-            first_quantities = branch_continuation.make_quantity_table(first_points, wheel_indices)
-            is_gait_found = is_gait_found & branch_continuation.is_same_gait(
-                end_quantities, first_quantities
+            first_new_quantities = branch_continuation.make_quantity_table(
+                first_new_points, wheel_indices
             )
-            direction_results = append_results(direction_results, new_results, is_gait_found)
+            is_gait_found = is_gait_found & branch_continuation.is_same_gait(
+                branch_end_quantities, first_new_quantities
+            )
+            results_by_direction = append_branch_results(
+                results_by_direction, new_results, is_gait_found
+            )
             is_branch_stalled = is_branch_stalled & ~is_gait_found
         has_search_failed = has_search_failed | is_branch_stalled
-    return direction_results
+    return results_by_direction
 
 
-def append_results(
-    direction_results: ContinuationResult,
+def append_branch_results(
+    results_by_direction: ContinuationResult,
     new_results: ContinuationResult,
-    is_result_appended: np.ndarray,
+    is_branch_extended: np.ndarray,
 ) -> ContinuationResult:
     """Append the points in `new_results` to the branches, and return all results.
 
-    - `is_result_appended`: whether the points of each branch are appended.
+    - `is_branch_extended`: whether the points of each branch are appended.
     """
-    if not is_result_appended.any():
-        return direction_results
-    n_points = direction_results.n_points + np.where(is_result_appended, new_results.n_points, 0)
-    n_buffer_points = max(int(np.max(n_points)), direction_results.points.p.shape[1])
+    if not is_branch_extended.any():
+        return results_by_direction
+    n_points = results_by_direction.n_points + np.where(is_branch_extended, new_results.n_points, 0)
+    n_buffer_points = max(int(np.max(n_points)), results_by_direction.points.p.shape[1])
 
-    def append_points(points: np.ndarray, new_points: np.ndarray) -> np.ndarray:
+    def append_branch_points(points: np.ndarray, new_points: np.ndarray) -> np.ndarray:
         point_buffer = np.zeros((len(points), n_buffer_points, *points.shape[2:]), points.dtype)
         point_buffer[:, : points.shape[1]] = points
-        for branch_index in np.flatnonzero(is_result_appended):
+        for branch_index in np.flatnonzero(is_branch_extended):
             point_buffer[
-                branch_index, direction_results.n_points[branch_index] : n_points[branch_index]
+                branch_index, results_by_direction.n_points[branch_index] : n_points[branch_index]
             ] = new_points[branch_index, : new_results.n_points[branch_index]]
         return point_buffer
 
-    appended_points: Any = jax.tree.map(append_points, direction_results.points, new_results.points)
-    branch_status: Any = np.where(is_result_appended, new_results.status, direction_results.status)
+    appended_points: Any = jax.tree.map(
+        append_branch_points, results_by_direction.points, new_results.points
+    )
+    branch_status: Any = np.where(
+        is_branch_extended, new_results.status, results_by_direction.status
+    )
     point_counts: Any = n_points
-    n_linearizations = direction_results.n_linearizations + new_results.n_linearizations
+    n_linearizations = results_by_direction.n_linearizations + new_results.n_linearizations
     return ContinuationResult(appended_points, point_counts, branch_status, n_linearizations)
 
 
@@ -151,19 +161,22 @@ def find_state_jumps(
     """
 
     def is_state_jump_between(left_index: int, right_index: int) -> bool:
-        fraction_change = parameter_fractions[right_index] - parameter_fractions[left_index]
+        parameter_fraction_change = (
+            parameter_fractions[right_index] - parameter_fractions[left_index]
+        )
         chord_length = np.hypot(
             np.linalg.norm(section_states[right_index] - section_states[left_index]),
-            fraction_change,
+            parameter_fraction_change,
         )
-        min_fraction_change = (
+        min_parameter_fraction_change = (
             min(abs(fraction_rates[left_index]), abs(fraction_rates[right_index])) * chord_length
         )
         # Across a fold the rates have opposite signs, and both parameters may be equal.
-        has_one_direction = fraction_rates[left_index] * fraction_rates[right_index] > 0.0
+        has_same_direction = fraction_rates[left_index] * fraction_rates[right_index] > 0.0
         is_chord_steeper = (
-            jump_options.min_steepness_factor * abs(fraction_change) < min_fraction_change
+            jump_options.min_chord_steepness_factor * abs(parameter_fraction_change)
+            < min_parameter_fraction_change
         )
-        return bool(has_one_direction and is_chord_steeper)
+        return bool(has_same_direction and is_chord_steeper)
 
     return [point_pair for point_pair in point_pairs if is_state_jump_between(*point_pair)]

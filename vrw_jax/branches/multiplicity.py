@@ -101,12 +101,12 @@ def sort_multiplier_moduli(return_map_jacobians: np.ndarray) -> np.ndarray:
     )
 
 
-def format_rank_quantity_name(first_rank: int, last_rank: int) -> str:
+def format_rank_quantity_name(first_multiplier_rank: int, last_multiplier_rank: int) -> str:
     """Return the name of the quantity that vanishes if several ranks cross modulus 1 together.
 
-    The ranks are `first_rank`, ..., `last_rank` - 1.
+    The ranks are `first_multiplier_rank`, ..., `last_multiplier_rank` - 1.
     """
-    return f"{MULTIPLIER_MODULI_COLUMN}:{first_rank}:{last_rank}"
+    return f"{MULTIPLIER_MODULI_COLUMN}:{first_multiplier_rank}:{last_multiplier_rank}"
 
 
 def format_equality_quantity_name(stepwise_name: str, integer_value: float) -> str:
@@ -134,9 +134,13 @@ def evaluate_named_quantity(
         return np.where(np.isnan(integer_values), np.nan, equality_sign)
     if not quantity_name.startswith(MULTIPLIER_MODULI_COLUMN + ":"):
         return quantity_table[quantity_name]
-    first_rank, last_rank = map(int, quantity_name.split(":")[1:])
+    first_multiplier_rank, last_multiplier_rank = map(int, quantity_name.split(":")[1:])
     return np.asarray(
-        np.mean(quantity_table[MULTIPLIER_MODULI_COLUMN][:, first_rank:last_rank], -1) - 1.0
+        np.mean(
+            quantity_table[MULTIPLIER_MODULI_COLUMN][:, first_multiplier_rank:last_multiplier_rank],
+            -1,
+        )
+        - 1.0
     )
 
 
@@ -162,7 +166,7 @@ def find_unexplained_ranks(
     The moduli are in decreasing order. The result is empty if the bifurcations in
     `bifurcation_names` explain all crossings.
     """
-    first_rank, last_rank = sorted(
+    first_multiplier_rank, last_multiplier_rank = sorted(
         int(np.sum(multiplier_moduli > 1.0))
         for multiplier_moduli in (multiplier_moduli_before, multiplier_moduli_after)
     )
@@ -171,25 +175,27 @@ def find_unexplained_ranks(
     )
     return (
         range(0)
-        if last_rank - first_rank <= n_explained_crossings
-        else range(first_rank, last_rank)
+        if last_multiplier_rank - first_multiplier_rank <= n_explained_crossings
+        else range(first_multiplier_rank, last_multiplier_rank)
     )
 
 
 def classify_crossing_ranks(
     return_map_jacobian: np.ndarray,
-    crossing_ranks: range,
+    crossing_multiplier_ranks: range,
     has_parameter_turned: bool,
     multiplier_tolerances: MultiplierTolerances = MULTIPLIER_TOLERANCES,
 ) -> dict[str, int]:
     """Return the number of multipliers for each bifurcation, by the name of the bifurcation.
 
-    - `crossing_ranks`: ranks of the multipliers on the unit circle;
+    - `crossing_multiplier_ranks`: ranks of the multipliers on the unit circle;
     - `has_parameter_turned`: whether the parameter changes its direction at the point. A multiplier
       of 1 is then that of a fold, and otherwise that of a branch point.
     """
     multipliers = np.linalg.eigvals(return_map_jacobian)
-    multipliers = multipliers[np.argsort(-np.abs(multipliers), kind="stable")][list(crossing_ranks)]
+    multipliers = multipliers[np.argsort(-np.abs(multipliers), kind="stable")][
+        list(crossing_multiplier_ranks)
+    ]
     is_complex_pair = np.abs(multipliers.imag) > multiplier_tolerances.min_imaginary_part
     bifurcation_at_one = "fold" if has_parameter_turned else BRANCH_POINT_KIND
     n_multipliers_by_name = {
@@ -214,10 +220,10 @@ def vanishes_at_root(
     values_at_bracket_ends = evaluate_named_quantity(quantity_table, quantity_name)[
         [left_index, right_index]
     ]
-    quantity_value_beside = float(
+    quantity_value_beside_root = float(
         np.abs(evaluate_named_quantity(located_root.quantities_beside_root, quantity_name)[0])
     )
-    return not quantity_value_beside > root_tolerances.max_value_beside_root * float(
+    return not quantity_value_beside_root > root_tolerances.max_value_beside_root * float(
         np.max(np.abs(values_at_bracket_ends))
     )
 
@@ -247,12 +253,12 @@ def drop_duplicate_changes(
             for other_located_root in roots_of_same_change
             if other_located_root.bracket_and_quantity[:2] == located_root.bracket_and_quantity[:2]
         ]
-        compute_max_distance = lambda other_located_root: (
+        compute_max_root_distance = lambda other_located_root: (
             root_tolerances.max_equal_parameter_distance * abs(other_located_root.parameter_value)
         )
         if not any(
             abs(located_root.parameter_value - other_located_root.parameter_value)
-            <= compute_max_distance(other_located_root)
+            <= compute_max_root_distance(other_located_root)
             for other_located_root in roots_of_same_change
         ):
             distinct_roots.append((special_point_name, located_root, n_multipliers))
@@ -279,93 +285,104 @@ def add_multiple_bifurcations(
         point_pair[0] <= located_root.bracket_and_quantity[0]
         and located_root.bracket_and_quantity[1] <= point_pair[1]
     )
-    multiplier_moduli, rank_root_requests = quantity_table[MULTIPLIER_MODULI_COLUMN], []
+    multiplier_moduli, multiplier_root_requests = quantity_table[MULTIPLIER_MODULI_COLUMN], []
     for left_index, right_index in neighbor_pairs:
-        explaining_names = [
+        explaining_bifurcation_names = [
             quantity_name
             for quantity_name, located_root, _ in named_roots
             if quantity_name in CROSSING_MULTIPLIER_COUNTS
             and root_pair_test(located_root, (left_index, right_index))
         ]
         for multiplier_rank in find_unexplained_ranks(
-            multiplier_moduli[left_index], multiplier_moduli[right_index], explaining_names
+            multiplier_moduli[left_index],
+            multiplier_moduli[right_index],
+            explaining_bifurcation_names,
         ):
-            rank_root_requests.append(
+            multiplier_root_requests.append(
                 (
                     left_index,
                     right_index,
                     format_rank_quantity_name(multiplier_rank, multiplier_rank + 1),
                 )
             )
-    if not rank_root_requests:
+    if not multiplier_root_requests:
         return named_roots
-    groups_of_roots: list[
+    root_groups: list[
         list[Any]
     ] = []  # Each group contains the roots for ranks that may cross the unit circle together.
-    for located_root in root_locator(rank_root_requests):
+    for located_root in root_locator(multiplier_root_requests):
         if not vanishes_at_root(quantity_table, located_root, root_tolerances):
             continue
-        last_located_root = groups_of_roots[-1][-1] if groups_of_roots else located_root
+        last_located_root = root_groups[-1][-1] if root_groups else located_root
         is_in_new_group = (
             abs(located_root.chord_fraction - last_located_root.chord_fraction)
             > root_tolerances.max_equal_location_distance
         )
         if (
-            not groups_of_roots
+            not root_groups
             or last_located_root.bracket_and_quantity[:2] != located_root.bracket_and_quantity[:2]
             or is_in_new_group
         ):
-            groups_of_roots.append([])
-        groups_of_roots[-1].append(located_root)
-    first_rank_getter = lambda group_of_roots: int(
-        group_of_roots[0].bracket_and_quantity[2].split(":")[1]
-    )
-    mean_rank_requests = []
-    for group_of_roots in groups_of_roots:
+            root_groups.append([])
+        root_groups[-1].append(located_root)
+    first_rank_getter = lambda root_group: int(root_group[0].bracket_and_quantity[2].split(":")[1])
+    mean_multiplier_requests = []
+    for root_group in root_groups:
         quantity_name = format_rank_quantity_name(
-            first_rank_getter(group_of_roots),
-            first_rank_getter(group_of_roots) + len(group_of_roots),
+            first_rank_getter(root_group),
+            first_rank_getter(root_group) + len(root_group),
         )
-        mean_rank_requests.append((*group_of_roots[0].bracket_and_quantity[:2], quantity_name))
+        mean_multiplier_requests.append((*root_group[0].bracket_and_quantity[:2], quantity_name))
     multiple_bifurcation_roots = []
-    for group_of_roots, located_mean_root in zip(
-        groups_of_roots, root_locator(mean_rank_requests), strict=True
+    for root_group, located_mean_root in zip(
+        root_groups, root_locator(mean_multiplier_requests), strict=True
     ):
-        first_rank, n_ranks = first_rank_getter(group_of_roots), len(group_of_roots)
+        first_multiplier_rank, n_multiplier_ranks = first_rank_getter(root_group), len(root_group)
         unit_circle_distances = np.abs(
             located_mean_root.quantities_beside_root[MULTIPLIER_MODULI_COLUMN][
-                0, first_rank : first_rank + n_ranks
+                0, first_multiplier_rank : first_multiplier_rank + n_multiplier_ranks
             ]
             - 1.0
         )
-        roots_and_their_ranks = [(located_mean_root, range(first_rank, first_rank + n_ranks))]
+        roots_and_ranks = [
+            (
+                located_mean_root,
+                range(first_multiplier_rank, first_multiplier_rank + n_multiplier_ranks),
+            )
+        ]
         if (
-            n_ranks > 1
+            n_multiplier_ranks > 1
             and not np.max(unit_circle_distances) <= multiplier_tolerances.equal_moduli_distance
         ):
-            roots_and_their_ranks = [
-                (located_root, range(first_rank + root_position, first_rank + root_position + 1))
-                for root_position, located_root in enumerate(group_of_roots)
+            roots_and_ranks = [
+                (
+                    located_root,
+                    range(
+                        first_multiplier_rank + index_in_root_group,
+                        first_multiplier_rank + index_in_root_group + 1,
+                    ),
+                )
+                for index_in_root_group, located_root in enumerate(root_group)
             ]
-        for located_root, crossing_ranks in roots_and_their_ranks:
+        for located_root, crossing_multiplier_ranks in roots_and_ranks:
             left_fraction_rate, right_fraction_rate = fraction_rates[
                 list(located_root.bracket_and_quantity[:2])
             ]
             names_and_multiplier_counts = classify_crossing_ranks(
                 np.asarray(located_root.point_beside_root.return_map_jacobian[0]),
-                crossing_ranks,
+                crossing_multiplier_ranks,
                 bool(left_fraction_rate * right_fraction_rate < 0.0),
             )
             multiple_bifurcation_roots += [
                 (quantity_name, located_root, n_multipliers)
                 for quantity_name, n_multipliers in names_and_multiplier_counts.items()
             ]
-    replaced_pairs = {
+    replaced_point_pairs = {
         located_root.bracket_and_quantity[:2] for _, located_root, _ in multiple_bifurcation_roots
     }
     is_root_replaced = lambda quantity_name, located_root: (
         quantity_name in CROSSING_MULTIPLIER_COUNTS
-        and any(root_pair_test(located_root, point_pair) for point_pair in replaced_pairs)
+        and any(root_pair_test(located_root, point_pair) for point_pair in replaced_point_pairs)
     )
     return [
         located_root

@@ -114,7 +114,7 @@ def continue_special_points(
     `continue_special_point` does.
     """
     parameters, parameter_ranges = _check_parameter_plane(parameters, bounds)
-    first_parameter_name, second_parameter = parameters
+    first_parameter_name, second_parameter_name = parameters
     check_type("cycle", cycle, LimitCycle, "give vrw.limit_cycle(params)")
     if cycle.period_n != 1:
         raise ValueError(
@@ -150,11 +150,11 @@ def continue_special_points(
                 curve_seeds[seed_index].special_point_name: curve_seeds[seed_index]
                 for seed_index in seed_order_by_distance
             } | seeds_by_name
-    missing_names = sorted(set(names) - set(seeds_by_name))
-    if missing_names:
+    missing_special_point_names = sorted(set(names) - set(seeds_by_name))
+    if missing_special_point_names:
         raise ValueError(
-            f"no special point {missing_names[0]!r} on branches along {first_parameter_name} "
-            f"and {second_parameter} within their bounds, but "
+            f"no special point {missing_special_point_names[0]!r} on branches along "
+            f"{first_parameter_name} and {second_parameter_name} within their bounds, but "
             f"{', '.join(sorted(seeds_by_name)) or 'none'}: give a gait nearer to it, or wider "
             "bounds."
         )
@@ -164,11 +164,11 @@ def continue_special_points(
             [seeds_by_name[special_point_name] for special_point_name in names], ()
         )
     }
-    untraced_names = sorted(set(names) - set(curves_by_name))
-    if untraced_names:
+    untraced_special_point_names = sorted(set(names) - set(curves_by_name))
+    if untraced_special_point_names:
         raise ValueError(
-            f"special point {untraced_names[0]} at "
-            f"{seeds_by_name[untraced_names[0]].parameter_values[0]:.9g} can't be continued: give "
-            "a gait nearer to the special point."
+            f"special point {untraced_special_point_names[0]} at "
+            f"{seeds_by_name[untraced_special_point_names[0]].parameter_values[0]:.9g} can't be "
+            "continued: give a gait nearer to the special point."
         )
     return tuple(curves_by_name[special_point_name] for special_point_name in names)

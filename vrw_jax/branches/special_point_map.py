@@ -42,15 +42,16 @@ class SpecialPointMapOptions:
       starts;
     - `n_meeting_rounds`: number of rounds in which special points on new curves are continued;
     - `max_search_rounds`: largest number of rounds in which sign changes are examined;
-    - `max_explained_distance`: largest distance of a sign change from a curve that explains it;
-    - `min_examined_distance`: smallest distance between examined sign changes.
+    - `max_distance_to_explaining_curve`: largest distance of a sign change from a curve that
+      explains it;
+    - `min_distance_to_examined`: smallest distance between examined sign changes.
     """
 
     n_parallel_branches: int = 5
     n_meeting_rounds: int = 3
     max_search_rounds: int = 8
-    max_explained_distance: float = 1.0
-    min_examined_distance: float = 5.0
+    max_distance_to_explaining_curve: float = 1.0
+    min_distance_to_examined: float = 5.0
 
 
 DEFAULT_SPECIAL_POINT_MAP_OPTIONS = SpecialPointMapOptions()
@@ -71,7 +72,10 @@ EXPLAINING_CURVE_NAMES: Mapping[str, tuple[str, ...]] = {
     GAIT_CHANGE_NAME: (*BRANCH_ENDING_QUANTITIES, *BIFURCATION_NAMES),
     STABILITY_CHANGE_NAME: BIFURCATION_NAMES,
     "lambda_4_plus": ("lambda_4_plus", DLS_VANISHING_NAME),
-    **{exact: (name,) for name, exact in LINEAR_MARGIN_SUBSTITUTES.items()},
+    **{
+        substitute_name: (margin_name,)
+        for margin_name, substitute_name in LINEAR_MARGIN_SUBSTITUTES.items()
+    },
 }
 """Names of the curves that explain a sign change, by the name of the quantity.
 
@@ -123,43 +127,46 @@ def trace_special_points(
     curve_seeds = find_seeds_on_parallel_lines(curve_tracer, params, map_options)
     traced_curves = _trace_curves_and_meetings(curve_tracer, curve_seeds, [], map_options)
     sign_changes = find_sign_changes_in_scan(scan_dataset, curve_tracer.parameter_names)
-    examined_changes: list[ScanSignChange] = []
-    find_remaining_changes = lambda: find_unexplained_changes(
+    examined_sign_changes: list[ScanSignChange] = []
+    find_remaining_sign_changes = lambda: find_unexplained_sign_changes(
         sign_changes,
         [traced_curve.special_point_curve for traced_curve in traced_curves],
         scan_dataset,
         map_options,
     )
     for _ in range(map_options.max_search_rounds):
-        new_sign_changes = _select_distant_changes(
-            find_remaining_changes(), examined_changes, map_options
+        new_sign_changes = _select_distant_sign_changes(
+            find_remaining_sign_changes(), examined_sign_changes, map_options
         )
         if not new_sign_changes:
             break
-        examined_changes += new_sign_changes
+        examined_sign_changes += new_sign_changes
         curve_seeds = []
         for parameter_index in range(2):
-            wheels_beside_change = []
+            wheels_beside_sign_change = []
             for sign_change in new_sign_changes:
                 if sign_change.parameter_index == parameter_index:
                     parameter_sample_indices = zip(
                         curve_tracer.parameter_names, sign_change.sample_indices, strict=True
                     )
                     sample_parameters = {
-                        parameter_name: float(scan_dataset[parameter_name][change_index])
-                        for parameter_name, change_index in parameter_sample_indices
+                        parameter_name: float(scan_dataset[parameter_name][sample_index])
+                        for parameter_name, sample_index in parameter_sample_indices
                     }
-                    wheels_beside_change.append(
+                    wheels_beside_sign_change.append(
                         curve_tracer.with_parameters(params, sample_parameters)
                     )
             curve_seeds += _find_seeds_in_batches(
-                curve_tracer, parameter_index, wheels_beside_change, map_options.n_parallel_branches
+                curve_tracer,
+                parameter_index,
+                wheels_beside_sign_change,
+                map_options.n_parallel_branches,
             )
         traced_curves = _trace_curves_and_meetings(
             curve_tracer, curve_seeds, traced_curves, map_options
         )
     return tuple(traced_curve.special_point_curve for traced_curve in traced_curves), tuple(
-        find_remaining_changes()
+        find_remaining_sign_changes()
     )
 
 
@@ -199,29 +206,29 @@ def find_seeds_on_parallel_lines(
     A branch in one parameter starts at the middle of that parameter's range. The branches differ by
     evenly spaced values of the other parameter.
     """
-    curve_seeds, range_midpoints, n_lines = (
+    curve_seeds, parameter_range_midpoints, n_parallel_lines = (
         [],
         curve_tracer.parameter_ranges.mean(1),
         map_options.n_parallel_branches,
     )
     for parameter_index, parameter_name in enumerate(curve_tracer.parameter_names):
         lower_bound, upper_bound = curve_tracer.parameter_ranges[1 - parameter_index]
-        line_parameter_values = lower_bound + (np.arange(n_lines) + 0.5) / n_lines * (
-            upper_bound - lower_bound
-        )
-        other_parameter = curve_tracer.parameter_names[1 - parameter_index]
+        line_parameter_values = lower_bound + (
+            np.arange(n_parallel_lines) + 0.5
+        ) / n_parallel_lines * (upper_bound - lower_bound)
+        other_parameter_name = curve_tracer.parameter_names[1 - parameter_index]
         wheels_on_line = [
             curve_tracer.with_parameters(
                 params,
                 {
-                    parameter_name: range_midpoints[parameter_index],
-                    other_parameter: line_parameter_value,
+                    parameter_name: parameter_range_midpoints[parameter_index],
+                    other_parameter_name: line_parameter_value,
                 },
             )
             for line_parameter_value in line_parameter_values
         ]
         curve_seeds += _find_seeds_in_batches(
-            curve_tracer, parameter_index, wheels_on_line, n_lines
+            curve_tracer, parameter_index, wheels_on_line, n_parallel_lines
         )
     return curve_seeds
 
@@ -311,8 +318,8 @@ def find_sign_changes_in_scan(
             *get_neighbor_values(signed_quantities["lambda_4_plus"] > 0.0)
         )
         for quantity_name, quantity_values in signed_quantities.items():
-            first_values, second_values = get_neighbor_values(quantity_values)
-            has_sign_change = first_values * second_values < 0.0
+            first_sample_values, second_sample_values = get_neighbor_values(quantity_values)
+            has_sign_change = first_sample_values * second_sample_values < 0.0
             if quantity_name not in (GAIT_CHANGE_NAME, COARSE_MESH_END_NAME):
                 has_sign_change &= (
                     has_first_sample_gait
@@ -320,8 +327,8 @@ def find_sign_changes_in_scan(
                     & (has_same_double_support | (quantity_name == "lambda_4_plus"))
                 )
             for i, j in np.argwhere(has_sign_change):
-                sign_change_fraction = first_values[i, j] / (
-                    first_values[i, j] - second_values[i, j]
+                sign_change_fraction = first_sample_values[i, j] / (
+                    first_sample_values[i, j] - second_sample_values[i, j]
                 )
                 sample_indices = axis_mover(
                     int(i if has_first_sample_gait[i, j] else i + 1), int(j)
@@ -337,16 +344,16 @@ def find_sign_changes_in_scan(
     return sign_changes
 
 
-def find_unexplained_changes(
+def find_unexplained_sign_changes(
     sign_changes: Sequence[ScanSignChange],
     special_point_curves: Sequence[SpecialPointCurve],
     scan_dataset: xr.Dataset,
     map_options: SpecialPointMapOptions = DEFAULT_SPECIAL_POINT_MAP_OPTIONS,
 ) -> list[ScanSignChange]:
     """Return the sign changes that are not near any curve that explains them."""
-    unexplained_changes = []
+    unexplained_sign_changes = []
     for quantity_name in sorted({sign_change.quantity_name for sign_change in sign_changes}):
-        changes_of_quantity = [
+        sign_changes_of_quantity = [
             sign_change
             for sign_change in sign_changes
             if sign_change.quantity_name == quantity_name
@@ -357,12 +364,12 @@ def find_unexplained_changes(
             if special_point_curve.name
             in EXPLAINING_CURVE_NAMES.get(quantity_name, (quantity_name,))
         ]
-        change_positions = np.array(
-            [sign_change.position_in_cells for sign_change in changes_of_quantity]
+        sign_change_positions = np.array(
+            [sign_change.position_in_cells for sign_change in sign_changes_of_quantity]
         )
-        curve_distances = np.full(len(changes_of_quantity), np.inf)
+        curve_distances = np.full(len(sign_changes_of_quantity), np.inf)
         for special_point_curve in explaining_curves:
-            values_and_names = zip(
+            curve_values_and_names = zip(
                 special_point_curve.values.T, special_point_curve.parameters, strict=True
             )
             curve_positions = [
@@ -371,43 +378,45 @@ def find_unexplained_changes(
                     scan_dataset[parameter_name].values,
                     np.arange(scan_dataset.sizes[parameter_name]),
                 )
-                for curve_parameter_values, parameter_name in values_and_names
+                for curve_parameter_values, parameter_name in curve_values_and_names
             ]
             curve_distances = np.minimum(
                 curve_distances,
-                compute_distances_to_polyline(change_positions, np.stack(curve_positions, -1)),
+                compute_distances_to_polyline(sign_change_positions, np.stack(curve_positions, -1)),
             )
-        unexplained_changes += [
+        unexplained_sign_changes += [
             sign_change
             for sign_change, curve_distance in zip(
-                changes_of_quantity, curve_distances, strict=True
+                sign_changes_of_quantity, curve_distances, strict=True
             )
-            if curve_distance > map_options.max_explained_distance
+            if curve_distance > map_options.max_distance_to_explaining_curve
         ]
-    return unexplained_changes
+    return unexplained_sign_changes
 
 
-def _select_distant_changes(
-    unexplained_changes: Sequence[ScanSignChange],
-    examined_changes: Sequence[ScanSignChange],
+def _select_distant_sign_changes(
+    unexplained_sign_changes: Sequence[ScanSignChange],
+    examined_sign_changes: Sequence[ScanSignChange],
     map_options: SpecialPointMapOptions,
 ) -> list[ScanSignChange]:
     """Select sign changes of each quantity that are distant from each other.
 
-    The selected changes are also distant from `examined_changes`.
+    The selected changes are also distant from `examined_sign_changes`.
     """
-    selected_changes: list[ScanSignChange] = []
-    for sign_change in unexplained_changes:
-        changes_of_same_name = [
-            other_change
-            for other_change in (*examined_changes, *selected_changes)
-            if (other_change.quantity_name, other_change.parameter_index)
+    selected_sign_changes: list[ScanSignChange] = []
+    for sign_change in unexplained_sign_changes:
+        sign_changes_of_same_kind = [
+            compared_sign_change
+            for compared_sign_change in (*examined_sign_changes, *selected_sign_changes)
+            if (compared_sign_change.quantity_name, compared_sign_change.parameter_index)
             == (sign_change.quantity_name, sign_change.parameter_index)
         ]
         if all(
-            np.hypot(*np.subtract(other_change.position_in_cells, sign_change.position_in_cells))
-            > map_options.min_examined_distance
-            for other_change in changes_of_same_name
+            np.hypot(
+                *np.subtract(compared_sign_change.position_in_cells, sign_change.position_in_cells)
+            )
+            > map_options.min_distance_to_examined
+            for compared_sign_change in sign_changes_of_same_kind
         ):
-            selected_changes.append(sign_change)
-    return selected_changes
+            selected_sign_changes.append(sign_change)
+    return selected_sign_changes
