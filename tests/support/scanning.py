@@ -8,7 +8,7 @@ import xarray as xr
 from vrw_jax.measures.table import MARGIN_MEASURES
 from vrw_jax.scans import design as designs
 from vrw_jax.scans import execution as running
-from vrw_jax.scans.design import SampleColumns
+from vrw_jax.scans.design import ParameterSamples
 from vrw_jax.scans.planning import ChunkResult, ScanPlan, plan_scan
 from vrw_jax.wheel.outcomes import Outcome
 
@@ -16,7 +16,7 @@ SCANNED_MEASURES = ("dls_fraction", "speed", "d dls_fraction / d damping")
 SMALL_GRID = designs.grid(damping=np.linspace(100.0, 200.0, 5), slope=np.linspace(0.28, 0.31, 4))
 
 
-def evaluate_arithmetically(columns: SampleColumns) -> Mapping[str, np.ndarray]:
+def evaluate_arithmetically(columns: ParameterSamples) -> Mapping[str, np.ndarray]:
     """Return every variable as a function of the sample, in place of the engine."""
     total = np.sum([np.sin(column) for column in columns.values()], axis=0)
     results = {name: total * (i + 1) for i, name in enumerate(MARGIN_MEASURES)}
@@ -36,7 +36,7 @@ class CountingEngine:
     ) -> None:
         self.n_calls, self.failing_call, self.error = 0, failing_call, error
 
-    def __call__(self, columns: SampleColumns) -> Mapping[str, np.ndarray]:
+    def __call__(self, columns: ParameterSamples) -> Mapping[str, np.ndarray]:
         self.n_calls += 1
         if self.n_calls == self.failing_call:
             raise self.error

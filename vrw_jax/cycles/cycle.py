@@ -112,13 +112,11 @@ class AbstractCycle(AbstractPrintable):
             return x * nan_weight.astype(x.dtype) if eqx.is_inexact_array(x) else x
 
         fields_zero_without_gait = [
-            force_measure_name
-            for force_measure_name in FIELDS_ZERO_WITHOUT_GAIT
-            if force_measure_name in vars(self)
+            field_name for field_name in FIELDS_ZERO_WITHOUT_GAIT if field_name in vars(self)
         ]
         weighted_fields = {
-            force_measure_name: jax.tree.map(apply_nan_weight, getattr(self, force_measure_name))
-            for force_measure_name in fields_zero_without_gait
+            field_name: jax.tree.map(apply_nan_weight, getattr(self, field_name))
+            for field_name in fields_zero_without_gait
         }
         return dataclasses.replace(self, **weighted_fields)
 

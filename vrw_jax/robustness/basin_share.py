@@ -63,18 +63,18 @@ class BasinShare(AbstractPrintable):
             self.walking_share[-1],
             self.walking_share_error[-1],
         )
-        text_rows = [
+        share_text_rows = [
             ("ends up on the gait", f"{self.share:.4f} (standard error {self.share_error:.4f})"),
             (
                 f"walks after {n} steps",
                 f"{final_walking_share:.4f} (standard error {final_walking_share_error:.4f})",
             ),
         ]
-        text_rows += [
+        share_text_rows += [
             (outcome_name, f"{failure_share:.4f}")
             for outcome_name, failure_share in self.failure_shares.items()
         ]
-        return [*text_rows, ("starts", f"{self.n_starts:,}")]
+        return [*share_text_rows, ("starts", f"{self.n_starts:,}")]
 
 
 @with_default_jax_settings
@@ -139,7 +139,7 @@ def basin_share(
 class StartBoxBounds(NamedTuple):
     """Names and bounds of the components of start states, in rad, rad/s and m/s."""
 
-    component_names: tuple[str, ...]
+    start_component_names: tuple[str, ...]
     lower_bounds: np.ndarray
     upper_bounds: np.ndarray
 
@@ -153,20 +153,20 @@ def compute_basin_share(
     seed: int = 0,
 ) -> BasinShare:
     """Return the `BasinShare` for a stable gait and for valid arguments of `basin_share`."""
-    n_components = len(box_bounds.component_names)
+    n_start_components = len(box_bounds.start_component_names)
     random_generator = np.random.default_rng(seed)
     if sampling_name == "random":
-        unit_cube_points = random_generator.random((n_starts, n_components))
+        unit_cube_points = random_generator.random((n_starts, n_start_components))
     else:
         from scipy.stats import qmc  # This import is slow.
 
-        sobol_sampler = qmc.Sobol(n_components, rng=random_generator)
+        sobol_sampler = qmc.Sobol(n_start_components, rng=random_generator)
         unit_cube_points = sobol_sampler.random_base2((n_starts - 1).bit_length())[:n_starts]
     start_states = (
         box_bounds.lower_bounds
         + (box_bounds.upper_bounds - box_bounds.lower_bounds) * unit_cube_points
     )
-    if box_bounds.component_names == POST_LANDING_COMPONENT_NAMES:
+    if box_bounds.start_component_names == POST_LANDING_COMPONENT_NAMES:
         start_states = invert_landing_map(stable_gait.params, start_states)
     is_start_reachable = np.isfinite(start_states).all(-1)
     is_on_gait, n_steps_walked = np.zeros(n_starts, bool), np.zeros(n_starts, int)
@@ -220,8 +220,8 @@ def parse_start_box(box: StartBox) -> StartBoxBounds:
     components of one kind of start.
     """
     check_type("box", box, Mapping, "write {'theta_touchdown': 0.1, 'dtheta_touchdown': (1, 2)...}")
-    for component_names in (PRE_TOUCHDOWN_COMPONENT_NAMES, POST_LANDING_COMPONENT_NAMES):
-        if set(box) == set(component_names):
+    for start_component_names in (PRE_TOUCHDOWN_COMPONENT_NAMES, POST_LANDING_COMPONENT_NAMES):
+        if set(box) == set(start_component_names):
             break
     else:
         raise ValueError(
@@ -231,11 +231,11 @@ def parse_start_box(box: StartBox) -> StartBoxBounds:
             "each a number or two bounds."
         )
     is_fixed_value = lambda box_entry: np.ndim(box_entry) == 0
-    bounds_of_component = [
-        (check_real(component_name, box[component_name]),) * 2
-        if is_fixed_value(box[component_name])
-        else check_range(component_name, box[component_name])
-        for component_name in component_names
+    bounds_of_start_component = [
+        (check_real(start_component_name, box[start_component_name]),) * 2
+        if is_fixed_value(box[start_component_name])
+        else check_range(start_component_name, box[start_component_name])
+        for start_component_name in start_component_names
     ]
-    lower_bounds, upper_bounds = np.array(bounds_of_component).T
-    return StartBoxBounds(component_names, lower_bounds, upper_bounds)
+    lower_bounds, upper_bounds = np.array(bounds_of_start_component).T
+    return StartBoxBounds(start_component_names, lower_bounds, upper_bounds)

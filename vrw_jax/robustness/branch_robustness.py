@@ -74,13 +74,16 @@ def measure_basins(
         >>> vrw.measure_basins(branch, n_points=2).smallest_disturbance.values.round(3).tolist()
         [0.126, 0.109]
     """
-    checked_model, checked_options = convert_model_argument(model), convert_step_options(options)
+    checked_model, checked_step_options = (
+        convert_model_argument(model),
+        convert_step_options(options),
+    )
     n_starts, max_steps = check_int("n_starts", n_starts), check_int("max_steps", max_steps)
     box_bounds = None if box is None else parse_start_box(box)
     point_indices = _select_branch_points(branch, checked_model, n_points)
     values_by_variable: dict[str, np.ndarray] = {}
 
-    def store_value(variable_name: str, result_index: int, variable_value: float) -> None:
+    def store_variable_value(variable_name: str, result_index: int, variable_value: float) -> None:
         values_by_variable.setdefault(variable_name, np.full(len(point_indices), np.nan))[
             result_index
         ] = variable_value
@@ -88,15 +91,19 @@ def measure_basins(
     for result_index, point_index in enumerate(point_indices):
         if not branch.stable[point_index]:
             continue
-        stable_gait = _load_branch_gait(branch, int(point_index), checked_model, checked_options)
+        stable_gait = _load_branch_gait(
+            branch, int(point_index), checked_model, checked_step_options
+        )
         if box_bounds is not None:
             basin_share_result = compute_basin_share(stable_gait, box_bounds, n_starts, max_steps)
-            store_value("basin_share", result_index, basin_share_result.share)
-            store_value("basin_share_error", result_index, basin_share_result.share_error)
+            store_variable_value("basin_share", result_index, basin_share_result.share)
+            store_variable_value("basin_share_error", result_index, basin_share_result.share_error)
         if checked_model.capabilities.can_begin_within_step:
             disturbance_result = compute_smallest_disturbance(stable_gait, None, max_steps)
-            store_value("smallest_disturbance", result_index, disturbance_result.size)
-            store_value("smallest_disturbance_error", result_index, disturbance_result.size_error)
+            store_variable_value("smallest_disturbance", result_index, disturbance_result.size)
+            store_variable_value(
+                "smallest_disturbance_error", result_index, disturbance_result.size_error
+            )
     return _make_point_dataset(
         branch,
         point_indices,
@@ -145,7 +152,7 @@ def measure_gait_sensitivity(
     checked_model = convert_model_argument(model)
     measure_names = check_names("measures", measures)
     point_indices = _select_branch_points(branch, checked_model, n_points)
-    norms = np.full((len(point_indices), len(measure_names)), np.nan)
+    sensitivity_norms = np.full((len(point_indices), len(measure_names)), np.nan)
     for result_index, point_index in enumerate(point_indices):
         branch_gait = _load_branch_gait(branch, int(point_index), checked_model, StepOptions())
         cycle_finder = resolve_finder(branch_gait.params, branch_gait.model, options)
@@ -160,7 +167,7 @@ def measure_gait_sensitivity(
             int(point_cycle.outcome) == Outcome.STEPPED
             and branch_gait.is_on_gait(np.asarray(point_cycle.section_state)[None])[0]
         ):
-            norms[result_index] = compute_gait_sensitivity(
+            sensitivity_norms[result_index] = compute_gait_sensitivity(
                 cycle_finder, branch_gait.params, point_cycle, measure_names
             ).norm
     variable_attrs = {
@@ -173,7 +180,7 @@ def measure_gait_sensitivity(
     return _make_point_dataset(
         branch,
         point_indices,
-        dict(zip(variable_attrs, norms.T, strict=True)),
+        dict(zip(variable_attrs, sensitivity_norms.T, strict=True)),
         variable_attrs,
         f"Gait sensitivity norms along {branch.parameter}",
     )
@@ -246,8 +253,8 @@ def _load_branch_gait(
         if f"parameter_{parameter_name}" in branch_attrs
     }
     params = WheelParams(**parameter_values, n_legs=branch_attrs["parameter_n_legs"])
-    branch_value = jnp.asarray(branch.values[point_index], float_dtype)
-    point_model, params = model.with_parameter(params, branch.parameter, branch_value)
+    branch_parameter_value = jnp.asarray(branch.values[point_index], float_dtype)
+    point_model, params = model.with_parameter(params, branch.parameter, branch_parameter_value)
     section_state = np.asarray(branch.dataset.section_state.values[point_index])[None]
     stable_gait = StableGait(params, point_model, options, section_state)
     next_section_state = step_batch(

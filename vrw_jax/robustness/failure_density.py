@@ -146,7 +146,7 @@ class GaussianMixture:
         """Return the logarithm of each Gaussian's density times its weight, shape (components,
         samples).
         """
-        log_densities = []
+        component_log_densities = []
         for component_weight, component_mean, covariance_cholesky_factor in zip(
             self.component_weights,
             self.component_means,
@@ -162,15 +162,17 @@ class GaussianMixture:
                 - log_cholesky_determinant
                 - 0.5 * len(component_mean) * np.log(2.0 * np.pi)
             )
-            log_densities.append(log_normalization - 0.5 * np.sum(whitened_deviations**2, 0))
-        return np.stack(log_densities)
+            component_log_densities.append(
+                log_normalization - 0.5 * np.sum(whitened_deviations**2, 0)
+            )
+        return np.stack(component_log_densities)
 
     def compute_log_density(self, slope_deviations: np.ndarray) -> np.ndarray:
         """Return the logarithm of the mixture's density at each sample, shape (samples,)."""
-        log_densities: np.ndarray = np.logaddexp.reduce(
+        component_log_densities: np.ndarray = np.logaddexp.reduce(
             self.compute_component_log_densities(slope_deviations), 0
         )
-        return log_densities
+        return component_log_densities
 
     def draw_samples(self, n_samples: int, random_generator: np.random.Generator) -> np.ndarray:
         """Return independent samples from the mixture, shape (samples, dimensions)."""
@@ -184,9 +186,9 @@ class GaussianMixture:
         for component_index, covariance_cholesky_factor in enumerate(
             self.covariance_cholesky_factors
         ):
-            is_from_component = component_indices == component_index
-            slope_deviations[is_from_component] += (
-                normal_samples[is_from_component] @ covariance_cholesky_factor.T
+            is_sample_from_component = component_indices == component_index
+            slope_deviations[is_sample_from_component] += (
+                normal_samples[is_sample_from_component] @ covariance_cholesky_factor.T
             )
         return slope_deviations
 
@@ -206,19 +208,21 @@ def fit_gaussian_mixture(
     covariance_floor = density_options.min_gaussian_variance * np.eye(n_dimensions)
     component_means = slope_deviations[random_generator.integers(n_samples)][None]
     for _ in range(density_options.n_gaussians - 1):
-        squared_distances = np.min(
+        squared_distances_to_means = np.min(
             np.sum((slope_deviations[:, None] - component_means) ** 2, -1), 1
         )
-        total_squared_distance = np.sum(squared_distances)
-        selection_probabilities = (
-            squared_distances / total_squared_distance if total_squared_distance > 0.0 else None
+        total_squared_distance = np.sum(squared_distances_to_means)
+        mean_selection_probabilities = (
+            squared_distances_to_means / total_squared_distance
+            if total_squared_distance > 0.0
+            else None
         )
         component_means = np.concatenate(
             [
                 component_means,
-                slope_deviations[random_generator.choice(n_samples, p=selection_probabilities)][
-                    None
-                ],
+                slope_deviations[
+                    random_generator.choice(n_samples, p=mean_selection_probabilities)
+                ][None],
             ]
         )
     weighted_covariance = (
@@ -231,8 +235,10 @@ def fit_gaussian_mixture(
         np.full(len(component_means), 1.0 / len(component_means)), component_means, cholesky_factors
     )
     for _ in range(density_options.n_em_iterations):
-        log_densities = gaussian_mixture.compute_component_log_densities(slope_deviations)
-        membership_probabilities = np.exp(log_densities - np.logaddexp.reduce(log_densities, 0))
+        component_log_densities = gaussian_mixture.compute_component_log_densities(slope_deviations)
+        membership_probabilities = np.exp(
+            component_log_densities - np.logaddexp.reduce(component_log_densities, 0)
+        )
         # The additional sample prevents an empty Gaussian.
         effective_component_sizes = np.sum(membership_probabilities, 1) + 1.0
         component_means = (
@@ -288,23 +294,23 @@ def fit_failure_density(
         slope_deviations = proposal_density.draw_samples(
             density_options.max_walks_per_stage, random_generator
         )
-        has_failed_last, _ = run_walks(slope_deviations)
-        if not np.any(has_failed_last):
+        has_failed_in_last_step, _ = run_walks(slope_deviations)
+        if not np.any(has_failed_in_last_step):
             return None
-        failing_deviations = slope_deviations[has_failed_last]
+        failing_deviations = slope_deviations[has_failed_in_last_step]
         log_proposal_density = proposal_density.compute_log_density(failing_deviations)
-        next_slope_inflation, failure_weights = _find_next_slope_inflation(
+        next_slope_inflation, failure_importance_weights = _find_next_slope_inflation(
             failing_deviations, log_proposal_density, slope_inflation, density_options
         )
-        resampled_indices = random_generator.choice(
-            len(failing_deviations), density_options.n_em_samples, p=failure_weights
+        resampled_failure_indices = random_generator.choice(
+            len(failing_deviations), density_options.n_em_samples, p=failure_importance_weights
         )
         fitted_mixture = fit_gaussian_mixture(
-            failing_deviations[resampled_indices], random_generator, density_options
+            failing_deviations[resampled_failure_indices], random_generator, density_options
         )
-        wide_mixture = fitted_mixture.widen_gaussians(density_options.widening_factor)
+        widened_mixture = fitted_mixture.widen_gaussians(density_options.widening_factor)
         fitted_mixture = fitted_mixture.add_mixture(
-            wide_mixture, density_options.wide_walk_fraction
+            widened_mixture, density_options.wide_walk_fraction
         )
         n_finished_fits += slope_inflation == 1.0
         if n_finished_fits == density_options.n_uninflated_fits:
@@ -334,29 +340,33 @@ def _find_next_slope_inflation(
       (failures,).
     """
 
-    def compute_weights(target_inflation: float) -> np.ndarray:
+    def compute_importance_weights(target_slope_inflation: float) -> np.ndarray:
         log_target_density = GaussianMixture.make_isotropic_gaussian(
-            failing_deviations.shape[1], target_inflation
+            failing_deviations.shape[1], target_slope_inflation
         ).compute_log_density(failing_deviations)
-        log_weights = log_target_density - log_proposal_density
-        unnormalized_weights = np.exp(log_weights - np.max(log_weights))
-        normalized_weights: np.ndarray = unnormalized_weights / np.sum(unnormalized_weights)
-        return normalized_weights
+        log_importance_weights = log_target_density - log_proposal_density
+        unnormalized_importance_weights = np.exp(
+            log_importance_weights - np.max(log_importance_weights)
+        )
+        normalized_importance_weights: np.ndarray = unnormalized_importance_weights / np.sum(
+            unnormalized_importance_weights
+        )
+        return normalized_importance_weights
 
     min_effective_samples = min(
         density_options.min_effective_failures_per_dimension * failing_deviations.shape[1],
         0.3 * len(failing_deviations),
     )
-    has_enough_samples = lambda failure_weights: (
-        1.0 / np.sum(failure_weights**2) >= min_effective_samples
+    has_enough_effective_samples = lambda failure_importance_weights: (
+        1.0 / np.sum(failure_importance_weights**2) >= min_effective_samples
     )
     next_slope_inflation = slope_inflation
     while next_slope_inflation > 1.0:
-        candidate_inflation = max(next_slope_inflation / 1.05, 1.0)
+        candidate_slope_inflation = max(next_slope_inflation / 1.05, 1.0)
         if (
-            not has_enough_samples(compute_weights(candidate_inflation))
+            not has_enough_effective_samples(compute_importance_weights(candidate_slope_inflation))
             and next_slope_inflation < slope_inflation
         ):
             break
-        next_slope_inflation = candidate_inflation
-    return next_slope_inflation, compute_weights(next_slope_inflation)
+        next_slope_inflation = candidate_slope_inflation
+    return next_slope_inflation, compute_importance_weights(next_slope_inflation)

@@ -274,9 +274,9 @@ def _differentiate_passage(
         if not isinstance(parameter_tangent, SymbolicZero)
     }
     sampled_passage, derivative_by_name = estimate_passage(
-        params, float(slope_sd), differentiated_names=tuple(tangent_by_name)
+        params, float(slope_sd), differentiated_parameter_names=tuple(tangent_by_name)
     )
-    relative_tangent = sum(
+    log_mean_steps_tangent = sum(
         derivative_by_name[parameter_name] * parameter_tangent
         for parameter_name, parameter_tangent in tangent_by_name.items()
     )
@@ -284,9 +284,9 @@ def _differentiate_passage(
         lambda p: (p.mean_steps, p.mean_steps_from_gait, p.failure_probability),
         make_zero_tangent(sampled_passage),
         (
-            sampled_passage.mean_steps * relative_tangent,
-            sampled_passage.mean_steps_from_gait * relative_tangent,
-            -sampled_passage.failure_probability * relative_tangent,
+            sampled_passage.mean_steps * log_mean_steps_tangent,
+            sampled_passage.mean_steps_from_gait * log_mean_steps_tangent,
+            -sampled_passage.failure_probability * log_mean_steps_tangent,
         ),
     )
     return sampled_passage, passage_tangent
@@ -359,13 +359,14 @@ def _estimate_passage_by_sampling(
     n_walkers: int,
     relative_tolerance: float,
     max_steps: int,
-    differentiated_names: tuple[str, ...] = (),
+    differentiated_parameter_names: tuple[str, ...] = (),
 ) -> tuple[FirstPassage, dict[str, float]]:
     """Return the `FirstPassage` that sampled walks estimate, and derivatives of the logarithm of
     `mean_steps`.
 
-    The derivatives are those with respect to the parameters `differentiated_names`, by the names of
-    the parameters. Raise ValueError if the wheel has no gait, or if hardly any step succeeds.
+    The derivatives are those with respect to the parameters `differentiated_parameter_names`, by
+    the names of the parameters. Raise ValueError if the wheel has no gait, or if hardly any step
+    succeeds.
     """
     limit_cycle_result: Any = limit_cycle(params, model=model)
     if int(limit_cycle_result.outcome) != Outcome.STEPPED:
@@ -388,9 +389,9 @@ def _estimate_passage_by_sampling(
             "give a smaller one."
         ) from error
     derivative_by_name = {}
-    if differentiated_names:
+    if differentiated_parameter_names:
         derivative_by_name = differentiate_log_mean_steps(
-            walker_groups, sampled_passage.walk_density, differentiated_names
+            walker_groups, sampled_passage.walk_density, differentiated_parameter_names
         )
     failure_probability = sampled_passage.failure_probability
     mean_steps = 1.0 / failure_probability if failure_probability else np.inf
@@ -401,24 +402,24 @@ def _estimate_passage_by_sampling(
     if not np.isfinite(sampled_passage.relative_error):
         passage_status = PassageStatus.UNKNOWN_ERROR
     passage_status = passage_status if failure_probability else PassageStatus.NO_FAILURE
-    to_float_array = lambda float_values: jnp.asarray(float_values, params.damping.dtype)
+    convert_to_float_array = lambda float_values: jnp.asarray(float_values, params.damping.dtype)
     first_passage_result = FirstPassage(
-        mean_steps=to_float_array(mean_steps),
-        mean_steps_from_gait=to_float_array(sampled_passage.mean_steps_from_gait),
-        failure_probability=to_float_array(failure_probability),
-        kappa_2=to_float_array(sampled_passage.kappa_2),
-        error=to_float_array(
+        mean_steps=convert_to_float_array(mean_steps),
+        mean_steps_from_gait=convert_to_float_array(sampled_passage.mean_steps_from_gait),
+        failure_probability=convert_to_float_array(failure_probability),
+        kappa_2=convert_to_float_array(sampled_passage.kappa_2),
+        error=convert_to_float_array(
             mean_steps * sampled_passage.relative_error if failure_probability else np.inf
         ),
-        states=to_float_array(sampled_passage.quasi_stationary_states),
-        weights=to_float_array(
+        states=convert_to_float_array(sampled_passage.quasi_stationary_states),
+        weights=convert_to_float_array(
             np.full(
                 len(sampled_passage.quasi_stationary_states),
                 1.0 / len(sampled_passage.quasi_stationary_states),
             )
         ),
         status=jnp.asarray(int(passage_status), jnp.int32),
-        end_fractions=to_float_array(list(sampled_passage.fraction_by_outcome.values())),
+        end_fractions=convert_to_float_array(list(sampled_passage.fraction_by_outcome.values())),
         end_names=tuple(sampled_passage.fraction_by_outcome),
         n_steps=sampled_passage.n_sampled_steps,
     )

@@ -68,8 +68,8 @@ class StableGait(NamedTuple):
         )
         require_single_wheel(params, f"call {caller_name} for one wheel after the other")
         checked_model = convert_model_argument(model).fallback_model  # valid for any start
-        checked_options = convert_step_options(options)
-        checked_options.check_tolerances(np.dtype(params.damping.dtype))
+        checked_step_options = convert_step_options(options)
+        checked_step_options.check_tolerances(np.dtype(params.damping.dtype))
         if cycle is None:
             cycle = limit_cycle(params, model=checked_model)
         check_type("cycle", cycle, AbstractCycle, "give vrw.limit_cycle(params)")
@@ -87,11 +87,11 @@ class StableGait(NamedTuple):
         section_states = [np.asarray(cycle.section_state)[None]]
         for _ in range(cycle.period_n):
             gait_step = step_batch(
-                params, section_states[-1], model=checked_model, options=checked_options
+                params, section_states[-1], model=checked_model, options=checked_step_options
             )
             section_states.append(gait_step.section_state)
         stable_gait = cls(
-            params, checked_model, checked_options, np.concatenate(section_states[:-1])
+            params, checked_model, checked_step_options, np.concatenate(section_states[:-1])
         )
         if not stable_gait.is_on_gait(section_states[-1])[0]:
             raise ValueError(
@@ -111,11 +111,12 @@ class StableGait(NamedTuple):
         state_units = self.model.collect_section_units(
             compute_wheel_units(self.params.symbols()), self.params.n_legs
         )
-        n_continuous = self.model.count_continuous_entries(self.params)
-        scaled_differences = (
-            section_states[:, None, :n_continuous] - self.section_states[:, :n_continuous]
-        ) / np.asarray(state_units)[:n_continuous]
-        return np.abs(scaled_differences).max(-1).min(-1) <= arrival_options.max_gait_distance
+        n_continuous_entries = self.model.count_continuous_entries(self.params)
+        scaled_state_differences = (
+            section_states[:, None, :n_continuous_entries]
+            - self.section_states[:, :n_continuous_entries]
+        ) / np.asarray(state_units)[:n_continuous_entries]
+        return np.abs(scaled_state_differences).max(-1).min(-1) <= arrival_options.max_gait_distance
 
 
 class ArrivalWalkResult(NamedTuple):
@@ -143,25 +144,27 @@ def walk_until_on_gait(
         functools.partial(stable_gait.model.complete_section_state, stable_gait.params)
     )
     section_states = np.array(embed_section_states(jnp.asarray(start_states)))
-    walking_indices, n_steps_walked = np.arange(n_starts), 0
-    while len(walking_indices) and n_steps_walked < max_steps:
+    walking_start_indices, n_steps_walked = np.arange(n_starts), 0
+    while len(walking_start_indices) and n_steps_walked < max_steps:
         n_steps_to_test = min(arrival_options.steps_per_arrival_test, max_steps - n_steps_walked)
         walk_results = step_batch(
             stable_gait.params,
-            section_states[walking_indices],
+            section_states[walking_start_indices],
             n_steps_to_test,
             model=stable_gait.model,
             options=stable_gait.step_options,
         )
-        section_states[walking_indices], walk_outcomes[walking_indices] = (
+        section_states[walking_start_indices], walk_outcomes[walking_start_indices] = (
             walk_results.section_state,
             walk_results.outcome,
         )
-        n_steps_by_walk[walking_indices] += walk_results.n_stepped
+        n_steps_by_walk[walking_start_indices] += walk_results.n_stepped
         has_stepped = walk_results.outcome == Outcome.STEPPED
-        is_on_gait[walking_indices] = has_stepped & stable_gait.is_on_gait(
+        is_on_gait[walking_start_indices] = has_stepped & stable_gait.is_on_gait(
             walk_results.section_state, arrival_options
         )
-        walking_indices = walking_indices[has_stepped & ~is_on_gait[walking_indices]]
+        walking_start_indices = walking_start_indices[
+            has_stepped & ~is_on_gait[walking_start_indices]
+        ]
         n_steps_walked += n_steps_to_test
     return ArrivalWalkResult(is_on_gait, walk_outcomes, n_steps_by_walk)

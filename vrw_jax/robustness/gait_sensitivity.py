@@ -72,7 +72,7 @@ class GaitSensitivity(AbstractPrintable):
         """
         if self.outcome != Outcome.STEPPED:
             return [("outcome", self.ending)]
-        text_rows = []
+        share_text_rows = []
         for measure_index, measure_name in enumerate(self.measures):
             measure_definition = MEASURES[measure_name]
             sensitivity_unit = f"{measure_definition.display_unit} per rad".strip()
@@ -82,13 +82,16 @@ class GaitSensitivity(AbstractPrintable):
                 f"step that begins on it: {float(self.beginning_step[measure_index]):.6g}, "
                 f"later steps: {float(self.later_steps[measure_index]):.6g}"
             )
-            text_rows.append(
+            share_text_rows.append(
                 (
                     measure_definition.label_with_symbol,
                     f"{float(self.norm[measure_index]):.6g} {sensitivity_unit} ({norm_parts_text})",
                 )
             )
-        return [*text_rows, ("spectral radius of the gait", f"{float(self.spectral_radius):.5f}")]
+        return [
+            *share_text_rows,
+            ("spectral radius of the gait", f"{float(self.spectral_radius):.5f}"),
+        ]
 
 
 @with_default_jax_settings

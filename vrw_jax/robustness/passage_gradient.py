@@ -46,7 +46,7 @@ class PassageGradientOptions:
     """
     n_bisections: int = 22
     """Number of bisections for each failure radius at the original parameters."""
-    n_changed_bisections: int = 14
+    n_changed_wheel_bisections: int = 14
     """Number of bisections for each failure radius at a changed parameter.
 
     The value is chosen because the error of the radius is then a hundredth of a typical change.
@@ -83,19 +83,19 @@ def differentiate_log_mean_steps(
 
     params, slope_sd = walker_groups.params, walker_groups.slope_sd
     failing_walks = _draw_failing_walks(walker_groups, walk_density, gradient_options)
-    lower_radii, upper_radii = (
+    lower_failure_radii, upper_failure_radii = (
         np.zeros_like(failing_walks.deviation_norms),
         failing_walks.deviation_norms,
     )
     survives_on_mean_slopes = ~_test_walk_failures(
-        walker_groups, params, failing_walks, lower_radii
+        walker_groups, params, failing_walks, lower_failure_radii
     )
     failure_radii = _bisect_failure_radii(
         walker_groups,
         params,
         failing_walks,
-        lower_radii,
-        upper_radii,
+        lower_failure_radii,
+        upper_failure_radii,
         gradient_options.n_bisections,
     )
     radius_distribution = stats.chi(failing_walks.deviation_directions.shape[1])
@@ -104,7 +104,7 @@ def differentiate_log_mean_steps(
     )
     hazard_rates = np.where(survives_on_mean_slopes, hazard_rates, 0.0)
     bracket_half_width = gradient_options.bracket_half_width
-    gait_state = walker_groups.gait_states[0]
+    gait_section_state = walker_groups.gait_states[0]
 
     def differentiate_failure_radii(parameter_name: str) -> np.ndarray:
         """Return the derivatives of all failure radii with respect to one parameter, shape
@@ -124,10 +124,10 @@ def differentiate_log_mean_steps(
             changed_cycle: Any = limit_cycle(changed_params, model=walker_groups.model)
             if int(changed_cycle.outcome) != Outcome.STEPPED:
                 return np.full_like(failure_radii, np.nan)
-            changed_walks = failing_walks._replace(
+            walks_of_changed_wheel = failing_walks._replace(
                 section_states=failing_walks.section_states
                 + np.asarray(changed_cycle.section_state)
-                - gait_state,
+                - gait_section_state,
                 start_slopes=failing_walks.start_slopes
                 + (parameter_change if parameter_name == "slope" else 0.0),
             )
@@ -135,18 +135,19 @@ def differentiate_log_mean_steps(
                 _bisect_failure_radii(
                     walker_groups,
                     changed_params,
-                    changed_walks,
+                    walks_of_changed_wheel,
                     np.maximum(failure_radii - bracket_half_width, 0.0),
                     failure_radii + bracket_half_width,
-                    gradient_options.n_changed_bisections,
+                    gradient_options.n_changed_wheel_bisections,
                 )
             )
         return (changed_failure_radii[0] - changed_failure_radii[1]) / (2.0 * parameter_change_size)
 
-    n_used_walks = np.sum(survives_on_mean_slopes)
+    n_differentiated_walks = np.sum(survives_on_mean_slopes)
     return {
         parameter_name: float(
-            np.sum(hazard_rates * differentiate_failure_radii(parameter_name)) / n_used_walks
+            np.sum(hazard_rates * differentiate_failure_radii(parameter_name))
+            / n_differentiated_walks
         )
         for parameter_name in parameter_names
     }
@@ -169,10 +170,12 @@ def _draw_failing_walks(
         and len(sampling_rounds) < gradient_options.max_sampling_rounds
     ):
         sampling_rounds.append(run_biased_walks(walker_groups, walk_density))
-        slope_deviations, failure_weights = map(np.concatenate, zip(*sampling_rounds, strict=True))
+        slope_deviations, failure_importance_weights = map(
+            np.concatenate, zip(*sampling_rounds, strict=True)
+        )
         effective_number_of_walks = (
-            np.sum(failure_weights) ** 2 / np.sum(failure_weights**2)
-            if np.any(failure_weights)
+            np.sum(failure_importance_weights) ** 2 / np.sum(failure_importance_weights**2)
+            if np.any(failure_importance_weights)
             else 0.0
         )
     if effective_number_of_walks == 0.0:
@@ -181,7 +184,9 @@ def _draw_failing_walks(
             "mean number of steps has no derivative: give a larger slope_sd or n_walkers."
         )
     walk_indices = walker_groups.random.choice(
-        len(failure_weights), n_walks, p=failure_weights / np.sum(failure_weights)
+        len(failure_importance_weights),
+        n_walks,
+        p=failure_importance_weights / np.sum(failure_importance_weights),
     )
     walker_indices = walk_indices % len(walker_groups.states)
     deviation_norms = np.linalg.norm(slope_deviations[walk_indices], axis=1)
@@ -207,36 +212,38 @@ def _test_walk_failures(
         float(params.slope)
         + walker_groups.slope_sd * deviation_norms[:, None] * failing_walks.deviation_directions
     )
-    line_slopes = np.concatenate([failing_walks.start_slopes[:, None], landing_slopes], 1)
+    ground_line_slopes = np.concatenate([failing_walks.start_slopes[:, None], landing_slopes], 1)
     walk_results = step_batch(
-        eqx.tree_at(lambda wheel_on_lines: wheel_on_lines.slope, params, line_slopes),
+        eqx.tree_at(lambda wheel_on_lines: wheel_on_lines.slope, params, ground_line_slopes),
         failing_walks.section_states,
         landing_slopes.shape[1],
         model=walker_groups.model,
         options=walker_groups.step_options,
     )
-    has_failed: np.ndarray = walk_results.outcome != Outcome.STEPPED
-    return has_failed
+    has_walk_failed: np.ndarray = walk_results.outcome != Outcome.STEPPED
+    return has_walk_failed
 
 
 def _bisect_failure_radii(
     walker_groups: WalkerGroups,
     params: WheelParams,
     failing_walks: FailingWalks,
-    lower_radii: np.ndarray,
-    upper_radii: np.ndarray,
+    lower_failure_radii: np.ndarray,
+    upper_failure_radii: np.ndarray,
     n_bisections: int,
 ) -> np.ndarray:
     """Return the failure radius of each walk, shape (walks,), by bisection.
 
-    - `lower_radii`: radii at which the walks do not fail;
-    - `upper_radii`: radii at which the walks fail.
+    - `lower_failure_radii`: radii at which the walks do not fail;
+    - `upper_failure_radii`: radii at which the walks fail.
     """
     for _ in range(n_bisections):
-        middle_radii = 0.5 * (lower_radii + upper_radii)
-        has_failed = _test_walk_failures(walker_groups, params, failing_walks, middle_radii)
-        lower_radii, upper_radii = (
-            np.where(has_failed, lower_radii, middle_radii),
-            np.where(has_failed, middle_radii, upper_radii),
+        middle_failure_radii = 0.5 * (lower_failure_radii + upper_failure_radii)
+        has_walk_failed = _test_walk_failures(
+            walker_groups, params, failing_walks, middle_failure_radii
         )
-    return 0.5 * (lower_radii + upper_radii)
+        lower_failure_radii, upper_failure_radii = (
+            np.where(has_walk_failed, lower_failure_radii, middle_failure_radii),
+            np.where(has_walk_failed, middle_failure_radii, upper_failure_radii),
+        )
+    return 0.5 * (lower_failure_radii + upper_failure_radii)

@@ -65,7 +65,7 @@ class PassageSamplingOptions:
 
     The value is chosen because gaits with slower decay are almost unstable.
     """
-    max_gait_rounds: int = 40
+    max_rounds_from_gait: int = 40
     """Largest number of rounds in which all walkers start on the gait.
 
     The value is chosen because more rounds are needed only if most walks fail within three steps.
@@ -77,13 +77,13 @@ class PassageSamplingOptions:
 
     The value is chosen because the error estimate of fewer rounds is uncertain.
     """
-    round_number_margin: float = 1.2
+    n_rounds_safety_factor: float = 1.2
     """Ratio of the number of rounds before the next error test to the number that is expected to
     suffice.
 
     The value is chosen because three of four wheels then pass the next error test.
     """
-    min_round_number_growth: float = 1.25
+    min_n_rounds_growth: float = 1.25
     """Smallest ratio of the numbers of rounds at two successive error tests.
 
     The value is chosen because later error tests need wider confidence intervals.
@@ -102,12 +102,12 @@ class PassageSamplingOptions:
     The value is chosen because it is a tenth of the usual ratio. A lower ratio means that the fit
     misses a part of the failures. Failures are then counted if they are frequent enough.
     """
-    n_check_steps: int = 12
+    n_failure_check_steps: int = 12
     """Number of gait steps per walker whose failures are counted to check importance sampling.
 
     The value is chosen because these steps take a sixth of the computing time for a usual wheel.
     """
-    min_check_probability: float = 1e-4
+    min_failure_check_probability: float = 1e-4
     """Smallest probability at which the number of counted failures is attributed to chance.
 
     The value is chosen because a wrong alarm is then rare among some thousands of wheels.
@@ -169,18 +169,22 @@ class WalkerGroups:
         model: Any,
         step_options: StepOptions,
         n_walkers: int,
-        generator: np.random.Generator,
+        random_generator: np.random.Generator,
         options: PassageSamplingOptions = PASSAGE_SAMPLING_OPTIONS,
     ) -> None:
         self.params, self.model, self.step_options = params, model, step_options
-        self.mean_slope, self.slope_sd, self.random = float(params.slope), slope_sd, generator
-        self.n_groups, self.n_continuous = (
+        self.mean_slope, self.slope_sd, self.random = (
+            float(params.slope),
+            slope_sd,
+            random_generator,
+        )
+        self.n_groups, self.n_continuous_entries = (
             options.n_walker_groups,
             int(model.count_continuous_entries(params)),
         )
-        walkers_per_group = -(-n_walkers // self.n_groups)
+        n_walkers_per_group = -(-n_walkers // self.n_groups)
         self.states = self.gait_states = np.tile(
-            section_state, (self.n_groups * walkers_per_group, 1)
+            section_state, (self.n_groups * n_walkers_per_group, 1)
         )
         self.slopes = np.full(len(self.states), self.mean_slope)
         self.n_steps = 0
@@ -196,9 +200,9 @@ class WalkerGroups:
         """
         landing_slopes = self.mean_slope + self.slope_sd * slope_deviations
         walker_indices = np.arange(len(slope_deviations)) % len(self.states)
-        line_slopes = np.concatenate([self.slopes[walker_indices, None], landing_slopes], 1)
+        ground_line_slopes = np.concatenate([self.slopes[walker_indices, None], landing_slopes], 1)
         wheels_on_lines = eqx.tree_at(
-            lambda wheel_params: wheel_params.slope, self.params, line_slopes
+            lambda wheel_params: wheel_params.slope, self.params, ground_line_slopes
         )
         walk_results = step_batch(
             wheels_on_lines,
@@ -243,20 +247,22 @@ class WalkerGroups:
         n_walkers = len(self.states)
         slope_deviations = self.random.standard_normal((n_walkers, 1))
         walk_results = self.run_walks(slope_deviations)
-        is_alive: np.ndarray = walk_results.outcome == Outcome.STEPPED
-        self.add_failure_weights(walk_results.outcome, (~is_alive).astype(float))
-        source_walkers = np.arange(n_walkers).reshape(self.n_groups, -1)
-        for group_walkers, is_group_alive in zip(
-            source_walkers, is_alive.reshape(source_walkers.shape), strict=True
+        is_walker_alive: np.ndarray = walk_results.outcome == Outcome.STEPPED
+        self.add_failure_weights(walk_results.outcome, (~is_walker_alive).astype(float))
+        source_walker_indices = np.arange(n_walkers).reshape(self.n_groups, -1)
+        for walker_indices_of_group, is_alive_in_group in zip(
+            source_walker_indices, is_walker_alive.reshape(source_walker_indices.shape), strict=True
         ):
-            if not np.any(is_group_alive):
+            if not np.any(is_alive_in_group):
                 raise ExtinctGroupError
-            group_walkers[~is_group_alive] = self.random.choice(
-                group_walkers[is_group_alive], np.sum(~is_group_alive)
+            walker_indices_of_group[~is_alive_in_group] = self.random.choice(
+                walker_indices_of_group[is_alive_in_group], np.sum(~is_alive_in_group)
             )
-        self.states = walk_results.section_state[source_walkers.ravel()]
-        self.slopes = self.mean_slope + self.slope_sd * slope_deviations[source_walkers.ravel(), 0]
-        return is_alive, slope_deviations[:, 0]
+        self.states = walk_results.section_state[source_walker_indices.ravel()]
+        self.slopes = (
+            self.mean_slope + self.slope_sd * slope_deviations[source_walker_indices.ravel(), 0]
+        )
+        return is_walker_alive, slope_deviations[:, 0]
 
 
 def sample_passage(
@@ -296,9 +302,9 @@ def sample_passage(
     surviving_fractions, step_transitions = _step_until_start_is_forgotten(
         walker_groups, n_forgetting_steps, relative_tolerance, sampling_options
     )
-    is_alive = step_transitions[-1][1]
+    is_walker_alive = step_transitions[-1][1]
     kappa_2 = _estimate_kappa_2(
-        step_transitions[-sampling_options.n_kappa_2_steps :], walker_groups.n_continuous
+        step_transitions[-sampling_options.n_kappa_2_steps :], walker_groups.n_continuous_entries
     )
     walker_groups.weight_by_outcome.clear()
     n_biased_lines = min(
@@ -317,7 +323,7 @@ def sample_passage(
     count_failures = lambda: (~walker_groups.step_and_replace_failures()[0]).astype(float)
     failure_probability, relative_error = 0.0, np.inf
     are_failures_counted = (
-        n_biased_lines * np.mean(~is_alive) > sampling_options.min_failures_for_counting
+        n_biased_lines * np.mean(~is_walker_alive) > sampling_options.min_failures_for_counting
     )
     if not are_failures_counted:
         failure_density = _fit_density_of_failures(walker_groups, n_biased_lines)
@@ -343,7 +349,7 @@ def sample_passage(
         mean_steps_from_gait = float(
             np.sum(surviving_fractions[1:-1]) + surviving_fractions[-1] / failure_probability
         )
-    total_weight = sum(walker_groups.weight_by_outcome.values())
+    total_failure_weight = sum(walker_groups.weight_by_outcome.values())
     return SampledPassage(
         failure_probability=failure_probability,
         relative_error=relative_error,
@@ -351,7 +357,7 @@ def sample_passage(
         kappa_2=kappa_2,
         quasi_stationary_states=walker_groups.stack_states_and_slopes(),
         fraction_by_outcome={
-            Outcome(outcome_code).name: outcome_weight / total_weight
+            Outcome(outcome_code).name: outcome_weight / total_failure_weight
             for outcome_code, outcome_weight in sorted(
                 walker_groups.weight_by_outcome.items(),
                 key=lambda outcome_and_weight: -outcome_and_weight[1],
@@ -365,7 +371,7 @@ def sample_passage(
 def _estimate_failure_probability(
     walker_groups: WalkerGroups,
     failure_weight_sampler: Callable[[], np.ndarray],
-    n_lines: int,
+    n_walk_lines: int,
     *,
     start_effect_decay: tuple[float, int],
     relative_tolerance: float,
@@ -380,7 +386,7 @@ def _estimate_failure_probability(
 
     - `failure_weight_sampler`: function that returns the weight of each walk of a round, which is 0
       unless the walk fails in its last step;
-    - `n_lines`: number of lines of the ground in each walk;
+    - `n_walk_lines`: number of lines of the ground in each walk;
     - `start_effect_decay`: factor per step by which the effect of the start decays, and number of
       steps before the walks.
     """
@@ -390,30 +396,32 @@ def _estimate_failure_probability(
         miss_probability = (1.0 - sampling_options.confidence_level) / 2.0**error_test_number
         return float(stats.t.isf(0.5 * miss_probability, walker_groups.n_groups - 1))
 
-    group_weight_sums, n_rounds = np.zeros(walker_groups.n_groups), 0
+    weight_sum_by_group, n_sampling_rounds = np.zeros(walker_groups.n_groups), 0
     failure_weight_sum, squared_weight_sum, n_failing_walks = 0.0, 0.0, 0
     failure_probability, relative_error = 0.0, np.inf
-    remaining_start_effect = start_effect_decay[0] ** (start_effect_decay[1] + n_lines)
+    remaining_start_effect = start_effect_decay[0] ** (start_effect_decay[1] + n_walk_lines)
     n_error_tests, n_rounds_at_error_test = 0, sampling_options.min_sampling_rounds
     while n_error_tests == 0 or (
         relative_error > relative_tolerance and walker_groups.n_steps < max_steps
     ):
-        while n_rounds < n_rounds_at_error_test and (
+        while n_sampling_rounds < n_rounds_at_error_test and (
             n_error_tests == 0 or walker_groups.n_steps < max_steps
         ):
-            failure_weights = failure_weight_sampler()
-            group_weight_sums += failure_weights.reshape(walker_groups.n_groups, -1).mean(1)
-            failure_weight_sum += float(np.sum(failure_weights))
-            squared_weight_sum += float(np.sum(failure_weights**2))
-            n_failing_walks += int(np.sum(failure_weights > 0.0))
-            n_rounds += 1
+            failure_importance_weights = failure_weight_sampler()
+            weight_sum_by_group += failure_importance_weights.reshape(
+                walker_groups.n_groups, -1
+            ).mean(1)
+            failure_weight_sum += float(np.sum(failure_importance_weights))
+            squared_weight_sum += float(np.sum(failure_importance_weights**2))
+            n_failing_walks += int(np.sum(failure_importance_weights > 0.0))
+            n_sampling_rounds += 1
         n_error_tests += 1
-        n_rounds_at_error_test = 2 * n_rounds
+        n_rounds_at_error_test = 2 * n_sampling_rounds
         if failure_weight_sum == 0.0:
             continue
-        last_step_failure_probability = float(np.mean(group_weight_sums)) / n_rounds
+        last_step_failure_probability = float(np.mean(weight_sum_by_group)) / n_sampling_rounds
         failure_probability, error_amplification = _solve_failure_probability(
-            last_step_failure_probability, n_lines
+            last_step_failure_probability, n_walk_lines
         )
         n_effective_failures = failure_weight_sum**2 / squared_weight_sum
         if n_effective_failures < (
@@ -424,9 +432,9 @@ def _estimate_failure_probability(
             continue
         relative_standard_error = (
             error_amplification
-            * np.std(group_weight_sums, ddof=1)
+            * np.std(weight_sum_by_group, ddof=1)
             / np.sqrt(walker_groups.n_groups)
-            / np.mean(group_weight_sums)
+            / np.mean(weight_sum_by_group)
         )
         relative_error = float(
             compute_student_t_quantile(n_error_tests) * relative_standard_error
@@ -434,17 +442,17 @@ def _estimate_failure_probability(
         )
         tolerated_sampling_error = relative_tolerance - remaining_start_effect
         if tolerated_sampling_error > 0.0:
-            error_ratio = (
+            sampling_error_ratio = (
                 compute_student_t_quantile(n_error_tests + 1)
                 * relative_standard_error
                 / tolerated_sampling_error
             )
             n_rounds_at_error_test = int(
                 np.ceil(
-                    n_rounds
+                    n_sampling_rounds
                     * max(
-                        sampling_options.round_number_margin * error_ratio**2,
-                        sampling_options.min_round_number_growth,
+                        sampling_options.n_rounds_safety_factor * sampling_error_ratio**2,
+                        sampling_options.min_n_rounds_growth,
                     )
                 )
             )
@@ -474,36 +482,46 @@ def _step_until_start_is_forgotten(
     surviving_fractions_by_round: list[np.ndarray] = []
     step_transitions: list[tuple[np.ndarray, ...]] = []
     relative_variance_sum = 0.0
-    while len(surviving_fractions_by_round) < sampling_options.max_gait_rounds and (
+    while len(surviving_fractions_by_round) < sampling_options.max_rounds_from_gait and (
         not surviving_fractions_by_round
         or relative_variance_sum > max_relative_variance * len(surviving_fractions_by_round) ** 2
     ):
         walker_groups.restart_at_gait()
         step_transitions.clear()
         for _ in range(n_steps):
-            states_before = walker_groups.stack_states_and_slopes()
-            is_alive, slope_deviations = walker_groups.step_and_replace_failures()
+            states_before_step = walker_groups.stack_states_and_slopes()
+            is_walker_alive, slope_deviations = walker_groups.step_and_replace_failures()
             step_transitions.append(
-                (states_before, is_alive, slope_deviations, walker_groups.stack_states_and_slopes())
+                (
+                    states_before_step,
+                    is_walker_alive,
+                    slope_deviations,
+                    walker_groups.stack_states_and_slopes(),
+                )
             )
-        alive_fractions = np.array([np.mean(transition[1]) for transition in step_transitions])
-        surviving_fractions_by_round.append(np.cumprod([1.0, *alive_fractions]))
+        alive_walker_fractions = np.array(
+            [np.mean(step_transition[1]) for step_transition in step_transitions]
+        )
+        surviving_fractions_by_round.append(np.cumprod([1.0, *alive_walker_fractions]))
         relative_variance_sum += float(
-            np.sum((1.0 - alive_fractions) / alive_fractions) / len(walker_groups.states)
+            np.sum((1.0 - alive_walker_fractions) / alive_walker_fractions)
+            / len(walker_groups.states)
         )
     return np.mean(surviving_fractions_by_round, 0), step_transitions
 
 
-def _fit_density_of_failures(walker_groups: WalkerGroups, n_lines: int) -> GaussianMixture | None:
+def _fit_density_of_failures(
+    walker_groups: WalkerGroups, n_walk_lines: int
+) -> GaussianMixture | None:
     """Return a density of slope deviations for which walks often fail in their last step.
 
-    Each walk has `n_lines` steps. The result is None if no walk fails.
+    Each walk has `n_walk_lines` steps. The result is None if no walk fails.
     """
 
-    def find_failures(slope_deviations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def find_last_step_failures(slope_deviations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         walk_results = walker_groups.run_walks(slope_deviations)
         has_walk_failed = walk_results.outcome != Outcome.STEPPED
-        return has_walk_failed & (walk_results.n_stepped == n_lines - 1), has_walk_failed
+        return has_walk_failed & (walk_results.n_stepped == n_walk_lines - 1), has_walk_failed
 
     density_options = dataclasses.replace(
         FAILURE_DENSITY_OPTIONS,
@@ -511,7 +529,9 @@ def _fit_density_of_failures(walker_groups: WalkerGroups, n_lines: int) -> Gauss
             FAILURE_DENSITY_OPTIONS.max_walks_per_stage, len(walker_groups.states)
         ),
     )
-    return fit_failure_density(find_failures, n_lines, walker_groups.random, density_options)
+    return fit_failure_density(
+        find_last_step_failures, n_walk_lines, walker_groups.random, density_options
+    )
 
 
 def _has_missed_failures(
@@ -528,22 +548,24 @@ def _has_missed_failures(
     """
     from scipy import stats  # This import is slow.
 
-    sampled_weights = walker_groups.weight_by_outcome
+    importance_weight_by_outcome = walker_groups.weight_by_outcome
     walker_groups.weight_by_outcome = {}
-    for _ in range(sampling_options.n_check_steps):
+    for _ in range(sampling_options.n_failure_check_steps):
         walker_groups.step_and_replace_failures()
     n_failures_by_outcome = walker_groups.weight_by_outcome
-    walker_groups.weight_by_outcome = sampled_weights
-    n_max_failures = (
-        max_failure_probability * sampling_options.n_check_steps * len(walker_groups.states)
+    walker_groups.weight_by_outcome = importance_weight_by_outcome
+    max_failure_count = (
+        max_failure_probability * sampling_options.n_failure_check_steps * len(walker_groups.states)
     )
-    total_weight = sum(sampled_weights.values())
+    total_failure_weight = sum(importance_weight_by_outcome.values())
     return any(
         stats.poisson.sf(
             n_failures - 1.0,
-            n_max_failures * sampled_weights.get(outcome_code, 0.0) / total_weight,
+            max_failure_count
+            * importance_weight_by_outcome.get(outcome_code, 0.0)
+            / total_failure_weight,
         )
-        < sampling_options.min_check_probability
+        < sampling_options.min_failure_check_probability
         for outcome_code, n_failures in n_failures_by_outcome.items()
     )
 
@@ -557,20 +579,20 @@ def run_biased_walks(
     walk, shape (walkers,), is the likelihood ratio if the walk fails in its last step, and 0
     otherwise. The mean weight is the probability of a failure in the last step.
     """
-    n_lines = walk_density.component_means.shape[1]
+    n_walk_lines = walk_density.component_means.shape[1]
     slope_deviations = walk_density.draw_samples(len(walker_groups.states), walker_groups.random)
     walk_results = walker_groups.run_walks(slope_deviations)
-    has_failed_last = (walk_results.outcome != Outcome.STEPPED) & (
-        walk_results.n_stepped == n_lines - 1
+    has_failed_in_last_step = (walk_results.outcome != Outcome.STEPPED) & (
+        walk_results.n_stepped == n_walk_lines - 1
     )
-    nominal_density = GaussianMixture.make_isotropic_gaussian(n_lines, 1.0)
+    nominal_density = GaussianMixture.make_isotropic_gaussian(n_walk_lines, 1.0)
     likelihood_ratios = np.exp(
         nominal_density.compute_log_density(slope_deviations)
         - walk_density.compute_log_density(slope_deviations)
     )
-    failure_weights = np.where(has_failed_last, likelihood_ratios, 0.0)
-    walker_groups.add_failure_weights(walk_results.outcome, failure_weights)
-    return slope_deviations, failure_weights
+    failure_importance_weights = np.where(has_failed_in_last_step, likelihood_ratios, 0.0)
+    walker_groups.add_failure_weights(walk_results.outcome, failure_importance_weights)
+    return slope_deviations, failure_importance_weights
 
 
 def _solve_failure_probability(
@@ -594,7 +616,7 @@ def _solve_failure_probability(
 
 
 def _estimate_kappa_2(
-    step_transitions: Sequence[tuple[np.ndarray, ...]], n_continuous: int
+    step_transitions: Sequence[tuple[np.ndarray, ...]], n_continuous_entries: int
 ) -> float:
     """Return kappa_2, the second eigenvalue of the survival operator's projection on quadratic
     functions.
@@ -607,26 +629,28 @@ def _estimate_kappa_2(
 
     - `step_transitions`: arrays for each gait step: states before the step, survival, deviations of
       the slopes on which the step ends, and states after the step;
-    - `n_continuous`: number of continuous components of a section state.
+    - `n_continuous_entries`: number of continuous components of a section state.
     """
-    states_before, is_alive, landing_deviations, states_after = (
-        np.concatenate(transition_parts) for transition_parts in zip(*step_transitions, strict=True)
+    states_before_step, is_walker_alive, landing_deviations, states_after_step = (
+        np.concatenate(arrays_by_step) for arrays_by_step in zip(*step_transitions, strict=True)
     )
-    mean_state = states_before.mean(0)
-    coordinate_indices = [
-        i for i in (*range(n_continuous), states_before.shape[1] - 1) if np.ptp(states_before[:, i])
+    mean_state_before_step = states_before_step.mean(0)
+    varying_coordinate_indices = [
+        i
+        for i in (*range(n_continuous_entries), states_before_step.shape[1] - 1)
+        if np.ptp(states_before_step[:, i])
     ]
-    standardizing_scales = states_before[:, coordinate_indices].std(0)
+    state_standard_deviations = states_before_step[:, varying_coordinate_indices].std(0)
     standardize_states = lambda states: (
-        (states - mean_state)[:, coordinate_indices] / standardizing_scales
+        (states - mean_state_before_step)[:, varying_coordinate_indices] / state_standard_deviations
     )
     _, singular_values, principal_directions = np.linalg.svd(
-        standardize_states(states_before), full_matrices=False
+        standardize_states(states_before_step), full_matrices=False
     )
     is_direction_resolved = singular_values > MIN_RELATIVE_SINGULAR_VALUE * singular_values[0]
     principal_directions = (
         principal_directions[is_direction_resolved]
-        * np.sqrt(len(states_before))
+        * np.sqrt(len(states_before_step))
         / singular_values[is_direction_resolved, None]
     )
     first_coordinate_indices, second_coordinate_indices = np.triu_indices(len(principal_directions))
@@ -635,24 +659,35 @@ def _estimate_kappa_2(
     def project_second_eigenvalue(has_quadratic_features: bool) -> float:
         """Return the modulus of the second eigenvalue, projected on polynomials of the state."""
 
-        def evaluate_features(states: np.ndarray) -> np.ndarray:
+        def evaluate_state_features(states: np.ndarray) -> np.ndarray:
             z = standardize_states(states) @ principal_directions.T
-            products = z[:, first_coordinate_indices] * z[:, second_coordinate_indices]
+            coordinate_products = z[:, first_coordinate_indices] * z[:, second_coordinate_indices]
             return np.concatenate(
-                [np.ones((len(z), 1)), z, *([products] if has_quadratic_features else [])], 1
+                [
+                    np.ones((len(z), 1)),
+                    z,
+                    *([coordinate_products] if has_quadratic_features else []),
+                ],
+                1,
             )
 
-        features_before_step = evaluate_features(states_before)
-        features_after_step = np.where(is_alive[:, None], evaluate_features(states_after), 0.0)
+        features_before_step = evaluate_state_features(states_before_step)
+        features_after_step = np.where(
+            is_walker_alive[:, None], evaluate_state_features(states_after_step), 0.0
+        )
         linear_features = features_before_step[:, : 1 + len(principal_directions)]
         regressor_matrix = np.concatenate(
             [features_before_step, *(linear_features * h for h in hermite_polynomials)], 1
         )
-        coefficients = np.linalg.lstsq(regressor_matrix, features_after_step, rcond=None)[0]
-        eigenvalues = np.linalg.eigvals(coefficients[: features_before_step.shape[1]])
-        return float(np.sort(np.abs(eigenvalues))[-2])
+        regression_coefficients = np.linalg.lstsq(
+            regressor_matrix, features_after_step, rcond=None
+        )[0]
+        projected_eigenvalues = np.linalg.eigvals(
+            regression_coefficients[: features_before_step.shape[1]]
+        )
+        return float(np.sort(np.abs(projected_eigenvalues))[-2])
 
     kappa_2 = project_second_eigenvalue(has_quadratic_features=True)
     # No second eigenvalue exceeds the leading one, which is near the survival probability.
-    is_overfitted = kappa_2 > np.mean(is_alive)
+    is_overfitted = kappa_2 > np.mean(is_walker_alive)
     return project_second_eigenvalue(has_quadratic_features=False) if is_overfitted else kappa_2

@@ -41,21 +41,21 @@ class DisturbanceSearchOptions:
     The values are chosen because each pass then covers two intervals of the previous pass. The last
     pass resolves a ten-thousandth of a phase.
     """
-    n_pass_intervals: int = 16
+    n_intervals_per_pass: int = 16
     """Number of intervals between the instants that one pass considers in a phase."""
-    n_grid_sizes: int = 24
+    n_disturbance_grid_sizes: int = 24
     """Number of disturbance sizes in the first grid.
 
     An interval of sufficient sizes may be missed if the grid spacing exceeds its width.
     """
-    n_bisection_sizes: int = 8
+    n_sizes_per_bisection: int = 8
     """Number of sizes that divide a bracket, chosen because each batch then gains one digit."""
-    final_size_tolerance: float = 1e-8
+    final_disturbance_tolerance: float = 1e-8
     """Width of a bracket of sizes in the last pass, relative to the size.
 
     The value is chosen as the relative error of a gait step.
     """
-    early_size_tolerance: float = 1e-5
+    early_disturbance_tolerance: float = 1e-5
     """Width of a bracket of sizes in all earlier passes, relative to the size.
 
     The value is chosen because sizes at neighboring instants differ by more than this width.
@@ -64,7 +64,7 @@ class DisturbanceSearchOptions:
     @property
     def n_phase_samples(self) -> int:
         """Return the number of samples per phase, both ends included."""
-        return self.n_pass_intervals * self.sample_strides[0] + 1
+        return self.n_intervals_per_pass * self.sample_strides[0] + 1
 
 
 DISTURBANCE_SEARCH_OPTIONS = DisturbanceSearchOptions()
@@ -196,7 +196,7 @@ class _GaitStep(NamedTuple):
     """Samples of time and state in one step of a gait, with axes over phases and samples."""
 
     sample_times: np.ndarray  # after the landing, s, (phase, sample)
-    sample_states: np.ndarray  # (theta, L1, L2) and their rates, (phase, sample, 6)
+    sampled_states: np.ndarray  # (theta, L1, L2) and their rates, (phase, sample, 6)
     indices_of_occurring_phases: tuple[int, ...]  # indices of the phases with a duration above zero
     foot_distance: Array  # between the feet in double support, m
 
@@ -221,7 +221,7 @@ def compute_smallest_disturbance(
         foot_distance,
     )
     if max_size is None:
-        max_size = 2.0 * float(gait_step.sample_states[..., ANGULAR_VELOCITY_INDEX].max())
+        max_size = 2.0 * float(gait_step.sampled_states[..., ANGULAR_VELOCITY_INDEX].max())
     return _search_disturbance_instants(stable_gait, gait_step, max_size, max_steps, search_options)
 
 
@@ -241,14 +241,14 @@ class _ExitSizeBrackets(NamedTuple):
     Each array has the shape (instants,).
     """
 
-    lower_sizes: np.ndarray  # rad/s
-    upper_sizes: np.ndarray  # rad/s, infinite if no tried size leaves the basin
+    lower_disturbance_sizes: np.ndarray  # rad/s
+    upper_disturbance_sizes: np.ndarray  # rad/s, infinite if no tried size leaves the basin
     exit_outcomes: np.ndarray  # `Outcome` after a disturbance of the upper size
 
     @property
-    def middle_sizes(self) -> np.ndarray:
+    def middle_disturbance_sizes(self) -> np.ndarray:
         """Return the middle of each bracket, rad/s, shape (instants,)."""
-        return 0.5 * (self.lower_sizes + self.upper_sizes)
+        return 0.5 * (self.lower_disturbance_sizes + self.upper_disturbance_sizes)
 
 
 def _search_disturbance_instants(
@@ -263,35 +263,35 @@ def _search_disturbance_instants(
     Each pass of the search considers instants that are closer to each other than in the pass
     before.
     """
-    phase_directions = [
+    phases_and_signs = [
         (phase_index, disturbance_sign)
         for phase_index in gait_step.indices_of_occurring_phases
         for disturbance_sign in DISTURBANCE_SIGNS
     ]
-    window_centers = dict.fromkeys(phase_directions, search_options.n_phase_samples // 2)
-    half_intervals = search_options.n_pass_intervals // 2
+    sample_window_centers = dict.fromkeys(phases_and_signs, search_options.n_phase_samples // 2)
+    half_intervals = search_options.n_intervals_per_pass // 2
     first_pass_result = best_instant_index = None
     for sample_stride in search_options.sample_strides:
         sample_offsets = sample_stride * np.arange(-half_intervals, half_intervals + 1)
         sample_windows = [
             np.clip(
-                window_centers[phase_and_direction] + sample_offsets,
+                sample_window_centers[phase_and_sign] + sample_offsets,
                 0,
                 search_options.n_phase_samples - 1,
             )
-            for phase_and_direction in phase_directions
+            for phase_and_sign in phases_and_signs
         ]
         n_instants = len(sample_offsets)
         directed_instants = _DirectedInstants(
-            np.repeat([phase_index for phase_index, _ in phase_directions], n_instants),
+            np.repeat([phase_index for phase_index, _ in phases_and_signs], n_instants),
             np.concatenate(sample_windows),
-            np.repeat([disturbance_sign for _, disturbance_sign in phase_directions], n_instants),
+            np.repeat([disturbance_sign for _, disturbance_sign in phases_and_signs], n_instants),
         )
         is_last_pass = sample_stride == search_options.sample_strides[-1]
-        size_tolerance = (
-            search_options.final_size_tolerance
+        disturbance_size_tolerance = (
+            search_options.final_disturbance_tolerance
             if is_last_pass
-            else search_options.early_size_tolerance
+            else search_options.early_disturbance_tolerance
         )
         exit_brackets = _bracket_exit_sizes(
             stable_gait,
@@ -299,28 +299,30 @@ def _search_disturbance_instants(
             directed_instants,
             max_size,
             max_steps,
-            size_tolerance,
+            disturbance_size_tolerance,
             search_options,
         )
-        exit_sizes = exit_brackets.middle_sizes.reshape(len(phase_directions), n_instants)
+        exit_sizes = exit_brackets.middle_disturbance_sizes.reshape(
+            len(phases_and_signs), n_instants
+        )
         best_instant_indices = exit_sizes.argmin(1)
-        window_centers = {
-            phase_and_direction: sample_windows[i][best_instant_indices[i]]
-            for i, phase_and_direction in enumerate(phase_directions)
+        sample_window_centers = {
+            phase_and_sign: sample_windows[i][best_instant_indices[i]]
+            for i, phase_and_sign in enumerate(phases_and_signs)
         }
         first_pass_result = first_pass_result or (directed_instants, exit_brackets)
-        best_instant_index = int(exit_brackets.middle_sizes.argmin())
+        best_instant_index = int(exit_brackets.middle_disturbance_sizes.argmin())
     assert first_pass_result is not None
     assert best_instant_index is not None
-    smallest_size, phase_index = (
-        float(exit_brackets.middle_sizes[best_instant_index]),
+    smallest_disturbance_size, phase_index = (
+        float(exit_brackets.middle_disturbance_sizes[best_instant_index]),
         int(directed_instants.phase_indices[best_instant_index]),
     )
     size_error = 0.0
-    if np.isfinite(smallest_size):
+    if np.isfinite(smallest_disturbance_size):
         size_error = float(
-            exit_brackets.upper_sizes[best_instant_index]
-            - exit_brackets.lower_sizes[best_instant_index]
+            exit_brackets.upper_disturbance_sizes[best_instant_index]
+            - exit_brackets.lower_disturbance_sizes[best_instant_index]
         )
         if directed_instants.sample_indices[best_instant_index] not in (
             0,
@@ -328,11 +330,14 @@ def _search_disturbance_instants(
         ):
             # Sizes at the neighboring instants of the last pass bound the change between two
             # instants.
-            phase_direction_index, instant_index = divmod(best_instant_index, n_instants)
-            neighbor_sizes = exit_sizes[
-                phase_direction_index, max(instant_index - 1, 0) : instant_index + 2
+            phase_and_sign_index, instant_index = divmod(best_instant_index, n_instants)
+            neighbor_exit_sizes = exit_sizes[
+                phase_and_sign_index, max(instant_index - 1, 0) : instant_index + 2
             ]
-            size_error += float(np.max(neighbor_sizes[np.isfinite(neighbor_sizes)]) - smallest_size)
+            size_error += float(
+                np.max(neighbor_exit_sizes[np.isfinite(neighbor_exit_sizes)])
+                - smallest_disturbance_size
+            )
     is_backward_disturbance = first_pass_result[0].disturbance_signs < 0.0
     profile_phase_indices, profile_sample_indices = (
         sample_indices_of_pass[is_backward_disturbance]
@@ -342,7 +347,7 @@ def _search_disturbance_instants(
         )
     )
     return SmallestDisturbance(
-        size=smallest_size,
+        size=smallest_disturbance_size,
         size_error=size_error,
         direction=int(directed_instants.disturbance_signs[best_instant_index]),
         time=float(
@@ -354,8 +359,8 @@ def _search_disturbance_instants(
         outcome=np.asarray(exit_brackets.exit_outcomes[best_instant_index]),
         profile_times=gait_step.sample_times[profile_phase_indices, profile_sample_indices],
         profile_phase_indices=profile_phase_indices,
-        backward_sizes=first_pass_result[1].middle_sizes[is_backward_disturbance],
-        forward_sizes=first_pass_result[1].middle_sizes[~is_backward_disturbance],
+        backward_sizes=first_pass_result[1].middle_disturbance_sizes[is_backward_disturbance],
+        forward_sizes=first_pass_result[1].middle_disturbance_sizes[~is_backward_disturbance],
         max_size=max_size,
     )
 
@@ -366,61 +371,79 @@ def _bracket_exit_sizes(
     directed_instants: _DirectedInstants,
     max_size: float,
     max_steps: int,
-    size_tolerance: float,
+    disturbance_size_tolerance: float,
     search_options: DisturbanceSearchOptions,
 ) -> _ExitSizeBrackets:
     """Return, for each instant and direction, a bracket of the smallest disturbance size that takes
     the state out of the basin.
 
-    - `size_tolerance`: width of the final brackets, relative to the size.
+    - `disturbance_size_tolerance`: width of the final brackets, relative to the size.
     """
     n_directed_instants = len(directed_instants.disturbance_signs)
-    lower_sizes, upper_sizes = np.zeros(n_directed_instants), np.full(n_directed_instants, np.inf)
+    lower_disturbance_sizes, upper_disturbance_sizes = (
+        np.zeros(n_directed_instants),
+        np.full(n_directed_instants, np.inf),
+    )
     exit_outcomes = np.full(n_directed_instants, int(Outcome.STEPPED))
-    size_fractions = np.arange(1, search_options.n_grid_sizes + 1) / search_options.n_grid_sizes
-    unresolved_instant_indices, tried_sizes = (
+    max_size_fractions = (
+        np.arange(1, search_options.n_disturbance_grid_sizes + 1)
+        / search_options.n_disturbance_grid_sizes
+    )
+    unresolved_instant_indices, tried_disturbance_sizes = (
         np.arange(n_directed_instants),
-        np.tile(max_size * size_fractions, (n_directed_instants, 1)),
+        np.tile(max_size * max_size_fractions, (n_directed_instants, 1)),
     )
     while len(unresolved_instant_indices):
         unresolved_instants = _DirectedInstants(
-            *(instant_values[unresolved_instant_indices] for instant_values in directed_instants)
+            *(instant_array[unresolved_instant_indices] for instant_array in directed_instants)
         )
         leaves_basin, walk_outcomes = _walk_after_disturbance(
-            stable_gait, gait_step, unresolved_instants, tried_sizes, max_steps
+            stable_gait, gait_step, unresolved_instants, tried_disturbance_sizes, max_steps
         )
         has_exit_size, first_exit_index = leaves_basin.any(1), leaves_basin.argmax(1)
         row_indices = np.arange(len(unresolved_instant_indices))
-        last_inside_index = np.where(has_exit_size, first_exit_index, tried_sizes.shape[1]) - 1
-        largest_inside_size = np.where(
-            last_inside_index >= 0,
-            tried_sizes[row_indices, last_inside_index],
-            lower_sizes[unresolved_instant_indices],
+        last_index_inside_basin = (
+            np.where(has_exit_size, first_exit_index, tried_disturbance_sizes.shape[1]) - 1
         )
-        upper_sizes[unresolved_instant_indices] = np.where(
+        largest_size_inside_basin = np.where(
+            last_index_inside_basin >= 0,
+            tried_disturbance_sizes[row_indices, last_index_inside_basin],
+            lower_disturbance_sizes[unresolved_instant_indices],
+        )
+        upper_disturbance_sizes[unresolved_instant_indices] = np.where(
             has_exit_size,
-            tried_sizes[row_indices, first_exit_index],
-            upper_sizes[unresolved_instant_indices],
+            tried_disturbance_sizes[row_indices, first_exit_index],
+            upper_disturbance_sizes[unresolved_instant_indices],
         )
         exit_outcomes[unresolved_instant_indices] = np.where(
             has_exit_size,
             walk_outcomes[row_indices, first_exit_index],
             exit_outcomes[unresolved_instant_indices],
         )
-        lower_sizes[unresolved_instant_indices] = np.where(
-            np.isfinite(upper_sizes[unresolved_instant_indices]), largest_inside_size, max_size
+        lower_disturbance_sizes[unresolved_instant_indices] = np.where(
+            np.isfinite(upper_disturbance_sizes[unresolved_instant_indices]),
+            largest_size_inside_basin,
+            max_size,
         )
-        bracket_width = np.where(np.isfinite(upper_sizes), upper_sizes - lower_sizes, 0.0)
-        unresolved_instant_indices = np.flatnonzero(bracket_width > size_tolerance * upper_sizes)
-        bracket_fractions = np.arange(1, search_options.n_bisection_sizes + 1) / (
-            search_options.n_bisection_sizes + 1.0
+        exit_bracket_width = np.where(
+            np.isfinite(upper_disturbance_sizes),
+            upper_disturbance_sizes - lower_disturbance_sizes,
+            0.0,
         )
-        tried_sizes = (
-            lower_sizes[unresolved_instant_indices, None]
-            + bracket_width[unresolved_instant_indices, None] * bracket_fractions
+        unresolved_instant_indices = np.flatnonzero(
+            exit_bracket_width > disturbance_size_tolerance * upper_disturbance_sizes
+        )
+        bracket_fractions = np.arange(1, search_options.n_sizes_per_bisection + 1) / (
+            search_options.n_sizes_per_bisection + 1.0
+        )
+        tried_disturbance_sizes = (
+            lower_disturbance_sizes[unresolved_instant_indices, None]
+            + exit_bracket_width[unresolved_instant_indices, None] * bracket_fractions
         )
     return _ExitSizeBrackets(
-        np.where(np.isfinite(upper_sizes), lower_sizes, np.inf), upper_sizes, exit_outcomes
+        np.where(np.isfinite(upper_disturbance_sizes), lower_disturbance_sizes, np.inf),
+        upper_disturbance_sizes,
+        exit_outcomes,
     )
 
 
@@ -436,21 +459,21 @@ def _walk_after_disturbance(
     The two arrays have the shape of `disturbance_sizes`, (instants, sizes). The unit of the sizes
     is rad/s.
     """
-    n_sizes = disturbance_sizes.shape[1]
+    n_disturbance_sizes = disturbance_sizes.shape[1]
     disturbed_states = np.repeat(
-        gait_step.sample_states[directed_instants.phase_indices, directed_instants.sample_indices],
-        n_sizes,
+        gait_step.sampled_states[directed_instants.phase_indices, directed_instants.sample_indices],
+        n_disturbance_sizes,
         0,
     )
     disturbed_states[:, ANGULAR_VELOCITY_INDEX] += (
         directed_instants.disturbance_signs[:, None] * disturbance_sizes
     ).ravel()
-    phase_indices = np.repeat(directed_instants.phase_indices, n_sizes)
+    phase_indices = np.repeat(directed_instants.phase_indices, n_disturbance_sizes)
     walk_outcomes = np.empty(len(phase_indices), int)
     section_states = np.empty((len(phase_indices), stable_gait.section_states.shape[1]))
     for phase_index in np.unique(phase_indices):
-        is_in_phase = phase_indices == phase_index
-        finish_batch = functools.partial(
+        is_instant_in_phase = phase_indices == phase_index
+        finish_disturbed_batch = functools.partial(
             _finish_disturbed_steps,
             stable_gait.model,
             stable_gait.step_options,
@@ -459,10 +482,12 @@ def _walk_after_disturbance(
             gait_step.foot_distance,
         )
         step_results: Any = map_in_batches(
-            finish_batch, batch_sizes.DISTURBANCE_BATCH_SIZES, disturbed_states[is_in_phase]
+            finish_disturbed_batch,
+            batch_sizes.DISTURBANCE_BATCH_SIZES,
+            disturbed_states[is_instant_in_phase],
         )
-        section_states[is_in_phase] = step_results.section_state
-        walk_outcomes[is_in_phase] = step_results.outcome
+        section_states[is_instant_in_phase] = step_results.section_state
+        walk_outcomes[is_instant_in_phase] = step_results.outcome
     leaves_basin = np.ones(len(phase_indices), bool)
     has_stepped = np.flatnonzero(walk_outcomes == Outcome.STEPPED)
     if len(has_stepped):

@@ -42,13 +42,16 @@ def analyze_survival_operator(
     quasi_stationary_weights = _compute_leading_eigenvector(K.T)
     unscaled_eigenvector = _compute_leading_eigenvector(K)
     survival_eigenvector = unscaled_eigenvector / (quasi_stationary_weights @ unscaled_eigenvector)
-    eigenvalues = jnp.sort(jnp.abs(jnp.linalg.eigvals(K)))
+    projected_eigenvalues = jnp.sort(jnp.abs(jnp.linalg.eigvals(K)))
     eigenvector_correction = survival_matrix @ (survival_eigenvector - 1.0)
     failure_probability = quasi_stationary_weights @ (
         failure_probabilities - (eigenvector_correction - lax.stop_gradient(eigenvector_correction))
     )
     return SurvivalAnalysis(
-        failure_probability, eigenvalues[-2], quasi_stationary_weights, survival_eigenvector
+        failure_probability,
+        projected_eigenvalues[-2],
+        quasi_stationary_weights,
+        survival_eigenvector,
     )
 
 
@@ -66,20 +69,22 @@ def _compute_leading_eigenvector(nonnegative_matrix: Array) -> Array:
         )
 
     def apply_matrix(loop_state: tuple) -> tuple:
-        iteration_index, normalized_vector, _ = loop_state
-        next_eigenvector = nonnegative_matrix @ normalized_vector
+        iteration_index, normalized_eigenvector, _ = loop_state
+        next_eigenvector = nonnegative_matrix @ normalized_eigenvector
         next_eigenvector = next_eigenvector / jnp.sum(next_eigenvector)
         return (
             iteration_index + 1,
             next_eigenvector,
-            jnp.max(jnp.abs(next_eigenvector - normalized_vector))
+            jnp.max(jnp.abs(next_eigenvector - normalized_eigenvector))
             / jnp.max(jnp.abs(next_eigenvector)),
         )
 
     n = nonnegative_matrix.shape[0]
-    initial_vector = jnp.full(n, 1.0 / n, nonnegative_matrix.dtype)
+    initial_eigenvector = jnp.full(n, 1.0 / n, nonnegative_matrix.dtype)
     return lax.while_loop(
-        has_not_converged, apply_matrix, (0, initial_vector, jnp.ones((), nonnegative_matrix.dtype))
+        has_not_converged,
+        apply_matrix,
+        (0, initial_eigenvector, jnp.ones((), nonnegative_matrix.dtype)),
     )[1]
 
 

@@ -114,10 +114,12 @@ class CollocationScanEngine:
             """
 
             def find_measures_and_cycle(
-                differentiated_values: Array,
+                differentiated_parameter_values: Array,
             ) -> tuple[dict[str, Array], AbstractCycle]:
                 limit_cycle = gait_finder.find_cycle_from_values(
-                    parameter_values.at[differentiated_parameter_indices].set(differentiated_values)
+                    parameter_values.at[differentiated_parameter_indices].set(
+                        differentiated_parameter_values
+                    )
                 )
                 return limit_cycle.measures(
                     requested_derivative.measure_name
@@ -142,7 +144,7 @@ class CollocationScanEngine:
             """Return outcome, section state and measures of the limit cycle for one vector of
             parameters.
             """
-            limit_cycle, derivative_values = find_cycle_with_derivatives(parameter_values)
+            limit_cycle, derivatives_by_name = find_cycle_with_derivatives(parameter_values)
             cycle_measure_names = (
                 *(
                     measure_name
@@ -154,7 +156,7 @@ class CollocationScanEngine:
             return (
                 limit_cycle.outcome,
                 limit_cycle.section_state,
-                limit_cycle.measures(cycle_measure_names) | derivative_values,
+                limit_cycle.measures(cycle_measure_names) | derivatives_by_name,
             )
 
         def evaluate_confirming_step(
@@ -190,19 +192,21 @@ class CollocationScanEngine:
         # The repr of a model omits fields whose value is the default object itself, and a pickled
         # copy is another object.
         model_identity = (type(wheel_model).__name__, *vars(wheel_model).items())
-        self._cache_key = (variable_names, base_wheel.n_legs, model_identity, cycle_options)
+        self._program_cache_key = (variable_names, base_wheel.n_legs, model_identity, cycle_options)
         self._batch_size = batch_sizes.choose_batch_size(
             batch_sizes.SCAN_BATCH_SIZE, batch_sizes.GPU_SCAN_BATCH_SIZE
         )
         self._free_programs: SimpleQueue[_CompiledDevicePrograms] = SimpleQueue()
         self._n_workers, self._compilation_lock = 0, Lock()
 
-    def __call__(self, sample_columns: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    def __call__(self, samples_by_parameter: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
         """Return the value of each variable for all samples, by the name of the variable.
 
-        - `sample_columns`: value of each swept parameter for each sample.
+        - `samples_by_parameter`: value of each swept parameter for each sample.
         """
-        parameter_rows = stack_parameter_rows(sample_columns, self._wheel_model, self._base_wheel)
+        parameter_rows = stack_parameter_rows(
+            samples_by_parameter, self._wheel_model, self._base_wheel
+        )
         with self._compilation_lock:
             if not self._n_workers:
                 self._compile_programs()
@@ -210,8 +214,10 @@ class CollocationScanEngine:
             parameter_rows[first_sample_index : first_sample_index + self._batch_size]
             for first_sample_index in range(0, len(parameter_rows), self._batch_size)
         )
-        with ThreadPoolExecutor(self._n_workers) as thread_pool:
-            batch_results = list(thread_pool.map(self._evaluate_sample_batch, parameter_batches))
+        with ThreadPoolExecutor(self._n_workers) as scan_thread_pool:
+            batch_results = list(
+                scan_thread_pool.map(self._evaluate_sample_batch, parameter_batches)
+            )
         return {
             variable_name: np.concatenate(
                 [batch_result[variable_name] for batch_result in batch_results]
@@ -239,9 +245,9 @@ class CollocationScanEngine:
             cycle_outcome, cycle_section_state, cycle_measures = device_programs.cycle_program(
                 device_parameter_rows
             )
-            device_options = jax.device_put(self._step_options, device_programs.device)
+            device_step_options = jax.device_put(self._step_options, device_programs.device)
             step_outcome, step_end_state, step_measures = device_programs.step_program(
-                device_parameter_rows, cycle_section_state, device_options
+                device_parameter_rows, cycle_section_state, device_step_options
             )
             confirmed_outcome = confirm_outcome_by_step(
                 cycle_outcome, cycle_section_state, step_outcome, step_end_state
@@ -262,27 +268,31 @@ class CollocationScanEngine:
             (self._batch_size, len(PARAMETER_NAMES)), parameter_dtype
         )
         section_states_shape = jax.ShapeDtypeStruct((self._batch_size, 3), parameter_dtype)
-        cache_key = self._cache_key
+        program_cache_key = self._program_cache_key
         # Threads have separate settings.
         compile_function = with_default_jax_settings(compile_exported_function)
-        with ThreadPoolExecutor(2) as thread_pool:
-            step_arguments = (parameter_rows_shape, section_states_shape, self._step_options)
+        with ThreadPoolExecutor(2) as scan_thread_pool:
+            step_program_arguments = (
+                parameter_rows_shape,
+                section_states_shape,
+                self._step_options,
+            )
             step_programs = [
-                thread_pool.submit(
+                scan_thread_pool.submit(
                     compile_function,
                     self._evaluate_step_batch,
-                    step_arguments,
-                    ("step", *cache_key),
+                    step_program_arguments,
+                    ("step", *program_cache_key),
                     device,
                 )
                 for device in local_devices
             ]
             cycle_programs = [
-                thread_pool.submit(
+                scan_thread_pool.submit(
                     compile_function,
                     self._evaluate_cycle_batch,
                     (parameter_rows_shape,),
-                    ("cycle", *cache_key),
+                    ("cycle", *program_cache_key),
                     device,
                 )
                 for device in local_devices
@@ -316,21 +326,25 @@ def count_available_cores() -> int:
 
 
 def stack_parameter_rows(
-    sample_columns: Mapping[str, np.ndarray], wheel_model: AbstractWheel, base_wheel: WheelParams
+    samples_by_parameter: Mapping[str, np.ndarray],
+    wheel_model: AbstractWheel,
+    base_wheel: WheelParams,
 ) -> np.ndarray:
     """Return the model's parameters for each sample, shape (samples, parameters).
 
     Parameters that are not swept are those of `base_wheel` and `wheel_model`.
     """
-    n_samples = len(next(iter(sample_columns.values())))
+    n_samples = len(next(iter(samples_by_parameter.values())))
     base_parameter_values = np.asarray(wheel_model.collect_parameter_values(base_wheel))
     return np.stack(
         [
             np.asarray(
-                sample_columns.get(parameter_name, np.broadcast_to(base_value, n_samples)),
+                samples_by_parameter.get(
+                    parameter_name, np.broadcast_to(base_parameter_value, n_samples)
+                ),
                 base_parameter_values.dtype,
             )
-            for parameter_name, base_value in zip(
+            for parameter_name, base_parameter_value in zip(
                 wheel_model.parameter_names, base_parameter_values, strict=True
             )
         ],

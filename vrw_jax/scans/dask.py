@@ -22,7 +22,7 @@ import numpy as np
 
 from vrw_jax.runtime import start_jax
 from vrw_jax.scans.collocation_engine import count_available_cores
-from vrw_jax.scans.design import SampleColumns
+from vrw_jax.scans.design import ParameterSamples
 from vrw_jax.scans.engines import make_scan_engine
 from vrw_jax.scans.planning import (
     ChunkExecutor,
@@ -96,8 +96,10 @@ def hide_cancelled_tasks_in_log() -> Iterator[None]:
     client_logger = logging.getLogger("distributed.client")
 
     def is_log_record_shown(log_record: logging.LogRecord) -> bool:
-        error_type = log_record.exc_info[0] if log_record.exc_info else None
-        return error_type is None or not issubclass(error_type, asyncio.CancelledError)
+        logged_error_type = log_record.exc_info[0] if log_record.exc_info else None
+        return logged_error_type is None or not issubclass(
+            logged_error_type, asyncio.CancelledError
+        )
 
     client_logger.addFilter(is_log_record_shown)
     try:
@@ -138,7 +140,10 @@ def _compute_chunks_on_cluster(
 ) -> Iterator[ChunkResult]:
     """Yield each missing chunk's index and results, in the order of completion."""
     pickled_request = pickle.dumps(scan_plan.evaluation_request)
-    local_environment, remaining_chunks = describe_computing_environment(), iter(missing_chunks)
+    local_computing_environment, remaining_chunks = (
+        describe_computing_environment(),
+        iter(missing_chunks),
+    )
     chunk_index_by_future: dict[Future, int] = {}
     completed_futures: SimpleQueue[Future] = SimpleQueue()
 
@@ -146,15 +151,15 @@ def _compute_chunks_on_cluster(
         """Submit chunks until there are `N_QUEUED_CHUNKS_PER_THREAD` chunks per thread of the
         cluster, or until all chunks are submitted.
         """
-        n_free_slots = N_QUEUED_CHUNKS_PER_THREAD * max(
+        n_submittable_chunks = N_QUEUED_CHUNKS_PER_THREAD * max(
             1, sum(dask_client.nthreads().values())
         ) - len(chunk_index_by_future)
-        for chunk_index in itertools.islice(remaining_chunks, max(n_free_slots, 0)):
-            sample_columns = scan_plan.design.select_samples(
+        for chunk_index in itertools.islice(remaining_chunks, max(n_submittable_chunks, 0)):
+            samples_by_parameter = scan_plan.design.select_samples(
                 scan_plan.result_layout.compute_chunk_region(chunk_index)
             )
             chunk_future = dask_client.submit(
-                _compute_chunk_in_worker, pickled_request, sample_columns, pure=False
+                _compute_chunk_in_worker, pickled_request, samples_by_parameter, pure=False
             )
             chunk_index_by_future[chunk_future] = chunk_index
             chunk_future.add_done_callback(completed_futures.put)
@@ -170,7 +175,7 @@ def _compute_chunks_on_cluster(
             with _explain_lost_cluster(scheduler_address):
                 worker_environment, chunk_results = chunk_future.result()
             environment_difference_text = describe_settings_difference(
-                local_environment, worker_environment
+                local_computing_environment, worker_environment
             )
             if environment_difference_text:
                 raise ValueError(
@@ -222,7 +227,7 @@ def _explain_lost_cluster(
     from distributed import CancelledError, KilledWorker
     from distributed.comm import CommClosedError
 
-    loss_errors: tuple[type[BaseException], ...] = (
+    cluster_loss_errors: tuple[type[BaseException], ...] = (
         CancelledError,
         CommClosedError,
         *further_loss_errors,
@@ -234,7 +239,7 @@ def _explain_lost_cluster(
             "a chunk was given up because each worker that had it died: see to the "
             "workers (their memory, say) and run the same again, it goes on from there."
         ) from loss_error
-    except loss_errors as loss_error:
+    except cluster_loss_errors as loss_error:
         raise ValueError(
             f"the dask cluster at {scheduler_address} is gone: start it again and run the same "
             f"again, it goes"
@@ -243,7 +248,7 @@ def _explain_lost_cluster(
 
 
 def _compute_chunk_in_worker(
-    pickled_request: bytes, sample_columns: SampleColumns
+    pickled_request: bytes, samples_by_parameter: ParameterSamples
 ) -> tuple[dict[str, object], Mapping[str, np.ndarray]]:
     """Compute a chunk in a worker.
 
@@ -251,7 +256,9 @@ def _compute_chunk_in_worker(
     by the name of the variable.
     """
     start_jax()
-    return describe_computing_environment(), make_worker_engine(pickled_request)(sample_columns)
+    return describe_computing_environment(), make_worker_engine(pickled_request)(
+        samples_by_parameter
+    )
 
 
 @functools.cache

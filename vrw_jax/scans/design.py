@@ -18,7 +18,7 @@ from vrw_jax.validation import (
 )
 from vrw_jax.wheel import FRICTION_NAME, PARAMETER_NAMES, check_parameter_name
 
-SampleColumns = dict[str, np.ndarray]
+ParameterSamples = dict[str, np.ndarray]
 """Swept parameters by name, with one value per sample."""
 
 SWEEPABLE_PARAMETERS = (*PARAMETER_NAMES, FRICTION_NAME)
@@ -73,7 +73,7 @@ class AbstractSampleDesign(abc.ABC):
         """Return the lengths of the sample axes of the labeled result."""
 
     @abc.abstractmethod
-    def select_samples(self, region_of_samples: tuple[slice, ...]) -> SampleColumns:
+    def select_samples(self, region_of_samples: tuple[slice, ...]) -> ParameterSamples:
         """Return the values of each swept parameter in a rectangular region of samples, by
         parameter.
 
@@ -129,17 +129,17 @@ class GridDesign(AbstractSampleDesign):
             len(parameter_values) for parameter_values in self.values_by_parameter.values()
         )
 
-    def select_samples(self, region_of_samples: tuple[slice, ...]) -> SampleColumns:
-        axis_columns = [
+    def select_samples(self, region_of_samples: tuple[slice, ...]) -> ParameterSamples:
+        axis_values = [
             parameter_values[axis_region]
             for parameter_values, axis_region in zip(
                 self.values_by_parameter.values(), region_of_samples, strict=True
             )
         ]
-        mesh_columns = np.meshgrid(*axis_columns, indexing="ij")
+        grid_columns = np.meshgrid(*axis_values, indexing="ij")
         return {
-            parameter_name: mesh_column.ravel()
-            for parameter_name, mesh_column in zip(self.swept_parameters, mesh_columns, strict=True)
+            parameter_name: grid_column.ravel()
+            for parameter_name, grid_column in zip(self.swept_parameters, grid_columns, strict=True)
         }
 
     def make_result_coordinates(self) -> dict[str, tuple[str, np.ndarray]]:
@@ -167,7 +167,7 @@ class SampleListDesign(AbstractSampleDesign):
     def shape(self) -> tuple[int, ...]:
         return (len(next(iter(self.values_by_parameter.values()))),)
 
-    def select_samples(self, region_of_samples: tuple[slice, ...]) -> SampleColumns:
+    def select_samples(self, region_of_samples: tuple[slice, ...]) -> ParameterSamples:
         return {
             parameter_name: parameter_values[region_of_samples[0]]
             for parameter_name, parameter_values in self.values_by_parameter.items()
@@ -220,18 +220,18 @@ def grid(
         (2, 5)
     """
     values = _merge_mapping_and_keywords("grid", values, parameters)
-    value_columns = {
+    values_by_swept_parameter = {
         parameter_name: _convert_to_value_column(parameter_name, parameter_values)
         for parameter_name, parameter_values in _require_sweepable_parameters(values).items()
     }
-    for parameter_name, value_column in value_columns.items():
+    for parameter_name, value_column in values_by_swept_parameter.items():
         if len(np.unique(value_column)) != len(value_column):
             raise ValueError(
                 f"{parameter_name} holds a value twice, but each value of a grid's axis names "
                 f"one place: "
                 "give every value once."
             )
-    return GridDesign(value_columns)
+    return GridDesign(values_by_swept_parameter)
 
 
 def samples(
@@ -259,19 +259,20 @@ def samples(
         (2,)
     """
     values = _merge_mapping_and_keywords("samples", values, parameters)
-    value_columns = {
+    values_by_swept_parameter = {
         parameter_name: _convert_to_value_column(parameter_name, parameter_values)
         for parameter_name, parameter_values in _require_sweepable_parameters(values).items()
     }
     column_lengths = {
-        parameter_name: len(value_column) for parameter_name, value_column in value_columns.items()
+        parameter_name: len(value_column)
+        for parameter_name, value_column in values_by_swept_parameter.items()
     }
     if len(set(column_lengths.values())) > 1:
         raise ValueError(
             f"the columns have lengths {column_lengths}, but a sample takes one value from each: "
             "give columns of one length."
         )
-    return SampleListDesign(value_columns)
+    return SampleListDesign(values_by_swept_parameter)
 
 
 def sobol(
@@ -390,16 +391,19 @@ def saltelli(
     unit_cube_points = qmc.Sobol(2 * n_parameters, rng=_make_random_generator(seed)).random_base2(
         n.bit_length() - 1
     )
-    points_a, points_b = unit_cube_points[:, :n_parameters], unit_cube_points[:, n_parameters:]
+    saltelli_points_a, saltelli_points_b = (
+        unit_cube_points[:, :n_parameters],
+        unit_cube_points[:, n_parameters:],
+    )
     points_with_swapped_coordinate = [
-        np.where(np.arange(n_parameters) == parameter_index, points_b, points_a)
+        np.where(np.arange(n_parameters) == parameter_index, saltelli_points_b, saltelli_points_a)
         for parameter_index in range(n_parameters)
     ]
     return _scale_unit_points_to_box(
         parameter_names,
         lower_bounds,
         upper_bounds,
-        np.concatenate([points_a, points_b, *points_with_swapped_coordinate]),
+        np.concatenate([saltelli_points_a, saltelli_points_b, *points_with_swapped_coordinate]),
         SALTELLI_DESIGN_KIND,
     )
 

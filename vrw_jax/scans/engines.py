@@ -46,9 +46,9 @@ from vrw_jax.selection import ModelCode, find_selection_reason
 from vrw_jax.tolerance import ModelIndex, measure_to_tolerance
 from vrw_jax.wheel import FRICTION_NAME, PARAMETER_NAMES, Outcome, make_wheel_from_parameters
 
-SampleColumnMapping = Mapping[str, np.ndarray]
+ParameterSampleMapping = Mapping[str, np.ndarray]
 """Swept parameters by name, with one value per sample."""
-VariableColumns = dict[str, np.ndarray]
+ValuesByVariable = dict[str, np.ndarray]
 """Values of each variable by its name, with one value per sample."""
 
 
@@ -93,35 +93,39 @@ class UnilateralScanEngine:
             ),
         )
 
-    def __call__(self, sample_columns: SampleColumnMapping) -> VariableColumns:
+    def __call__(self, samples_by_parameter: ParameterSampleMapping) -> ValuesByVariable:
         """Return the value of each variable for all samples, by the name of the variable.
 
-        - `sample_columns`: value of each swept parameter for each sample.
+        - `samples_by_parameter`: value of each swept parameter for each sample.
         """
-        parameter_rows = stack_parameter_rows(sample_columns, self._wheel_model, self._base_wheel)
+        parameter_rows = stack_parameter_rows(
+            samples_by_parameter, self._wheel_model, self._base_wheel
+        )
         parameter_row_subsets = np.array_split(
             parameter_rows,
             max(self._n_threads, -(-len(parameter_rows) // batch_sizes.SCAN_TASK_SIZE)),
         )
-        first_parameter_rows, *other_parameter_rows = (
-            results_of_subset
-            for results_of_subset in parameter_row_subsets
-            if len(results_of_subset)
+        first_parameter_rows, *remaining_parameter_rows = (
+            parameter_rows_of_subset
+            for parameter_rows_of_subset in parameter_row_subsets
+            if len(parameter_rows_of_subset)
         )
-        subset_results = [
+        results_by_subset = [
             self._evaluate_sample_subset(first_parameter_rows)
         ]  # The first call compiles for all threads.
-        with ThreadPoolExecutor(self._n_threads) as n_threads:
-            subset_results += n_threads.map(self._evaluate_sample_subset, other_parameter_rows)
+        with ThreadPoolExecutor(self._n_threads) as scan_thread_pool:
+            results_by_subset += scan_thread_pool.map(
+                self._evaluate_sample_subset, remaining_parameter_rows
+            )
         return {
             variable_name: np.concatenate(
-                [results_of_subset[variable_name] for results_of_subset in subset_results]
+                [results_of_subset[variable_name] for results_of_subset in results_by_subset]
             )
-            for variable_name in subset_results[0]
+            for variable_name in results_by_subset[0]
         }
 
     @with_default_jax_settings  # It runs in a thread of its own.
-    def _evaluate_sample_subset(self, parameter_rows: np.ndarray) -> VariableColumns:
+    def _evaluate_sample_subset(self, parameter_rows: np.ndarray) -> ValuesByVariable:
         """Return the value of each variable for a subset of the samples, by the name of the
         variable.
 
@@ -147,7 +151,7 @@ class UnilateralScanEngine:
         )
         return mask_failed_samples(sample_outcome, sample_results)
 
-    def _evaluate_gaits(self, parameter_rows: np.ndarray) -> VariableColumns:
+    def _evaluate_gaits(self, parameter_rows: np.ndarray) -> ValuesByVariable:
         """Return outcomes, measures and derivatives for the gaits of some wheels, by name.
 
         Each array has the shape (wheels,).
@@ -184,7 +188,7 @@ def _read_gait_measures(
     measure_reader: MeasureReader, gait_batch: ReturnMapCycle
 ) -> dict[str, Array]:
     """Return the requested measures of a batch of gaits, by name."""
-    first_gait_step = jax.tree.map(lambda step_values: step_values[:, 0], gait_batch.steps)
+    first_gait_step = jax.tree.map(lambda values_by_step: values_by_step[:, 0], gait_batch.steps)
     return eqx.filter_vmap(measure_reader)(gait_batch, first_gait_step)
 
 
@@ -220,30 +224,30 @@ class ModelSelectionScanEngine:
                 measure_name, (measure_name,)
             )
         )
-        paper_request = evaluation_request._replace(
+        paper_evaluation_request = evaluation_request._replace(
             measure_names=tuple(dict.fromkeys(paper_measure_names)), wheel_model=self._paper_model
         )
-        self._paper_engine = CollocationScanEngine(paper_request, n_threads)
+        self._paper_engine = CollocationScanEngine(paper_evaluation_request, n_threads)
         self._unilateral_engine = UnilateralScanEngine(
             evaluation_request._replace(wheel_model=evaluation_request.wheel_model.fallback_model),
             n_threads,
         )
 
-    def __call__(self, sample_columns: SampleColumnMapping) -> VariableColumns:
+    def __call__(self, samples_by_parameter: ParameterSampleMapping) -> ValuesByVariable:
         """Return the value of each variable for all samples, by the name of the variable.
 
         The variables include `rung`, the code of the model, and `reason`, the code of the reason
         for the choice of this model.
         """
-        n_samples = len(next(iter(sample_columns.values())))
-        sample_friction = sample_columns.get(
+        n_samples = len(next(iter(samples_by_parameter.values())))
+        sample_friction = samples_by_parameter.get(
             FRICTION_NAME, np.full(n_samples, float(self._wheel_model.friction))
         )
         paper_results = self._paper_engine(
             {"damping": np.full(n_samples, float(self._base_wheel.damping))}
             | {
-                variable_name: sample_column
-                for variable_name, sample_column in sample_columns.items()
+                variable_name: parameter_samples
+                for variable_name, parameter_samples in samples_by_parameter.items()
                 if variable_name != FRICTION_NAME
             }
         )
@@ -268,8 +272,8 @@ class ModelSelectionScanEngine:
         if unilateral_samples.size:
             unilateral_results = self._unilateral_engine(
                 {
-                    variable_name: sample_column[unilateral_samples]
-                    for variable_name, sample_column in sample_columns.items()
+                    variable_name: parameter_samples[unilateral_samples]
+                    for variable_name, parameter_samples in samples_by_parameter.items()
                 }
             )
             for variable_name in variable_names:
@@ -279,7 +283,7 @@ class ModelSelectionScanEngine:
         return sample_results | {"rung": model_codes, "reason": selection_reasons}
 
     def compute_selection_reasons(
-        self, paper_results: VariableColumns, sample_friction: np.ndarray
+        self, paper_results: ValuesByVariable, sample_friction: np.ndarray
     ) -> np.ndarray:
         """Return `ModelChoice.reason_code` for each sample.
 
@@ -317,16 +321,16 @@ class ToleranceScanEngine:
         )
         self._error_tolerance = evaluation_request.error_tolerance
 
-    def __call__(self, sample_columns: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    def __call__(self, samples_by_parameter: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
         """Return the value of each variable for all samples, by the name of the variable.
 
-        - `sample_columns`: value of each swept parameter for each sample.
+        - `samples_by_parameter`: value of each swept parameter for each sample.
         """
-        *wheel_columns, sample_friction = stack_parameter_rows(
-            sample_columns, self._wheel_model, self._base_wheel
+        *wheel_parameter_columns, sample_friction = stack_parameter_rows(
+            samples_by_parameter, self._wheel_model, self._base_wheel
         ).T
         params = make_wheel_from_parameters(
-            tuple(map(jnp.asarray, wheel_columns)), self._base_wheel.n_legs
+            tuple(map(jnp.asarray, wheel_parameter_columns)), self._base_wheel.n_legs
         )
         stoppers = self._wheel_model.stoppers
         measure_result = measure_to_tolerance(
@@ -373,12 +377,12 @@ class PassageScanEngine:
         )
         self._gait_engine = gait_engine
 
-    def __call__(self, sample_columns: SampleColumnMapping) -> VariableColumns:
+    def __call__(self, samples_by_parameter: ParameterSampleMapping) -> ValuesByVariable:
         """Return the value of each variable for all samples, by the name of the variable.
 
-        - `sample_columns`: value of each swept parameter for each sample.
+        - `samples_by_parameter`: value of each swept parameter for each sample.
         """
-        sample_results: VariableColumns = dict(self._gait_engine(sample_columns))
+        sample_results: ValuesByVariable = dict(self._gait_engine(samples_by_parameter))
         gait_outcomes = sample_results["outcome"]
         passage_measures = np.full(
             (len(self._passage_measure_names), len(gait_outcomes)),
@@ -388,24 +392,24 @@ class PassageScanEngine:
         for sample_index in (
             np.flatnonzero(gait_outcomes == Outcome.STEPPED) if self._passage_measure_names else ()
         ):
-            swept_values = {
-                parameter_name: float(sample_column[sample_index])
-                for parameter_name, sample_column in sample_columns.items()
+            swept_parameter_values = {
+                parameter_name: float(parameter_samples[sample_index])
+                for parameter_name, parameter_samples in samples_by_parameter.items()
             }
-            passage_measures[:, sample_index] = self._measure_sample_passage(swept_values)
+            passage_measures[:, sample_index] = self._measure_sample_passage(swept_parameter_values)
         return sample_results | dict(
             zip(self._passage_measure_names, passage_measures, strict=True)
         )
 
-    def _measure_sample_passage(self, swept_values: Mapping[str, float]) -> list[float]:
+    def _measure_sample_passage(self, swept_parameter_values: Mapping[str, float]) -> list[float]:
         """Return the first-passage measures of one sample.
 
         The measures are NaN if hardly any step of the walks succeeds.
 
-        - `swept_values`: value of each swept parameter for the sample.
+        - `swept_parameter_values`: value of each swept parameter for the sample.
         """
         wheel_model, params = self._wheel_model, self._base_wheel
-        for parameter_name, parameter_value in swept_values.items():
+        for parameter_name, parameter_value in swept_parameter_values.items():
             wheel_model, params = wheel_model.with_parameter(
                 params, parameter_name, jnp.asarray(parameter_value)
             )

@@ -204,11 +204,11 @@ def _compute_and_write_chunks(
     if on_progress is not None:
         on_progress(ScanProgress(n_samples, 0, 0, scan_plan.design.size - n_samples))
     try:
-        for chunk_index, chunk_columns in chunk_executor(scan_plan, missing_chunks):
+        for chunk_index, flat_chunk_results in chunk_executor(scan_plan, missing_chunks):
             chunk_shape = chunk_shapes[chunk_index]
             chunk_results = {
                 variable_name: variable_values.reshape(*chunk_shape, *variable_values.shape[1:])
-                for variable_name, variable_values in chunk_columns.items()
+                for variable_name, variable_values in flat_chunk_results.items()
             }
             try:
                 result_store.write_chunk(chunk_index, chunk_results)
@@ -225,7 +225,9 @@ def _compute_and_write_chunks(
                     "complete: make room and run the same again, it goes on from there",
                 ) from disk_error
             n_samples_done += math.prod(chunk_shape)
-            n_samples_failed += int(np.count_nonzero(chunk_columns["outcome"] != Outcome.STEPPED))
+            n_samples_failed += int(
+                np.count_nonzero(flat_chunk_results["outcome"] != Outcome.STEPPED)
+            )
             if on_progress is not None:
                 on_progress(
                     ScanProgress(
@@ -276,11 +278,11 @@ def open_or_create_store(scan_plan: ScanPlan, store_path: Path) -> ZarrResultSto
         zarr_store = find_matching_store(scan_plan, store_path)
         assert zarr_store is not None
     stored_manifest = read_stored_manifest(store_path) or {}
-    setting_difference = describe_settings_difference(
+    settings_difference_text = describe_settings_difference(
         stored_manifest[PROVENANCE_ATTRIBUTE], describe_computing_environment()
     )
     n_missing_chunks = len(zarr_store.find_missing_chunks())
-    if setting_difference and n_missing_chunks:
+    if settings_difference_text and n_missing_chunks:
         damaged_chunks_text = (
             f" ({len(zarr_store.damaged_chunks)} of them damaged)"
             if zarr_store.damaged_chunks
@@ -290,7 +292,7 @@ def open_or_create_store(scan_plan: ScanPlan, store_path: Path) -> ZarrResultSto
             f"{store_path} lacks {n_missing_chunks} of {scan_plan.result_layout.n_chunks} "
             f"chunks{damaged_chunks_text} and "
             "was begun by other means, so that its last digits might not fit: "
-            f"{setting_difference}. "
+            f"{settings_difference_text}. "
             "Go on with what it was begun with, or begin anew in another place."
         )
     return zarr_store
@@ -308,12 +310,12 @@ def find_matching_store(
     stored_manifest = read_stored_manifest(store_path)
     if stored_manifest is None:
         return None
-    setting_difference = describe_settings_difference(
+    settings_difference_text = describe_settings_difference(
         stored_manifest[MANIFEST_ATTRIBUTE], scan_plan.scan_settings
     )
-    if setting_difference:
+    if settings_difference_text:
         raise ValueError(
-            f"{store_path} holds a scan made with other settings: {setting_difference}. "
+            f"{store_path} holds a scan made with other settings: {settings_difference_text}. "
             "Give another place for this scan, or go back to those settings, or delete the store."
         )
     return ZarrResultStore(store_path, scan_plan.result_layout, verifies_files)

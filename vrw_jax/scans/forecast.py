@@ -11,7 +11,7 @@ import numpy as np
 
 from vrw_jax.numerics import with_default_jax_settings
 from vrw_jax.scans.collocation_engine import count_available_cores
-from vrw_jax.scans.design import AbstractSampleDesign, SampleColumns
+from vrw_jax.scans.design import AbstractSampleDesign, ParameterSamples
 from vrw_jax.scans.execution import find_matching_store
 from vrw_jax.scans.measure_catalog import select_measure_catalog
 from vrw_jax.scans.planning import ScanPlan
@@ -51,29 +51,29 @@ def forecast_scan(scan_plan: ScanPlan, store_path: str | Path | None = None) -> 
         if existing_store is None
         else existing_store.find_missing_chunks()
     )
-    n_samples_left = sum(
+    n_missing_samples = sum(
         math.prod(result_layout.compute_chunk_sample_shape(chunk_index))
         for chunk_index in missing_chunks
     )
     chunk_size = math.prod(result_layout.chunk_shape)
-    axes_description = " x ".join(
-        f"{n_measured_samples} {axis_name}"
-        for axis_name, n_measured_samples in zip(
+    sample_axes_description = " x ".join(
+        f"{axis_length} {axis_name}"
+        for axis_name, axis_length in zip(
             result_layout.sample_dimension_names, result_layout.sample_shape, strict=True
         )
     )
     forecast_texts = {
-        "samples": f"{n_samples:,} ({axes_description})",
+        "samples": f"{n_samples:,} ({sample_axes_description})",
         "measures": ", ".join(scan_plan.requested_measures),
         "always included": ", ".join(measure_catalog.always_included_variables),
         "chunks": f"{result_layout.n_chunks:,} of up to {chunk_size:,} samples, "
         f"{len(missing_chunks):,} to compute",
         "result": f"{_format_bytes(n_samples * result_layout.bytes_per_sample)} before compression",
     }
-    if not n_samples_left:
+    if not n_missing_samples:
         return forecast_texts | {"time": "none: the store is complete"}
     n_measured_samples = min(
-        n_samples_left, measure_catalog.forecast_samples_per_core * count_available_cores()
+        n_missing_samples, measure_catalog.forecast_samples_per_core * count_available_cores()
     )
     scan_engine = scan_plan.build_scan_engine()
     start_seconds = perf_counter()
@@ -88,25 +88,29 @@ def forecast_scan(scan_plan: ScanPlan, store_path: str | Path | None = None) -> 
         "memory": f"about {_format_bytes(forecast_memory_bytes)}, "
         + ("whatever the number of samples" if store_path is not None else "plus the result"),
         "time": f"about "
-        f"{format_duration(n_samples_left / samples_per_second + SCAN_STARTUP_SECONDS)}: "
-        f"{n_samples_left:,} samples at {samples_per_second:,.0f} per "
+        f"{format_duration(n_missing_samples / samples_per_second + SCAN_STARTUP_SECONDS)}: "
+        f"{n_missing_samples:,} samples at {samples_per_second:,.0f} per "
         f"second on {count_available_cores()} cores, {SCAN_STARTUP_SECONDS:.0f} s to start",
         "measured": f"just now, on {n_measured_samples:,} samples spread over the design; the code "
         f"for it took {compilation_end_seconds - start_seconds:.0f} s and is kept",
     }
 
 
-def _select_spread_samples(design: AbstractSampleDesign, n_selected_samples: int) -> SampleColumns:
+def _select_spread_samples(
+    design: AbstractSampleDesign, n_selected_samples: int
+) -> ParameterSamples:
     """Return samples that are spread evenly over a design, as one column per parameter."""
-    sample_numbers = np.linspace(0, design.size - 1, n_selected_samples).round().astype(np.int64)
-    sample_indices = zip(*np.unravel_index(sample_numbers, design.shape), strict=True)
+    flat_sample_indices = (
+        np.linspace(0, design.size - 1, n_selected_samples).round().astype(np.int64)
+    )
+    sample_indices = zip(*np.unravel_index(flat_sample_indices, design.shape), strict=True)
     single_samples = [
         design.select_samples(tuple(slice(int(i), int(i) + 1) for i in sample_index))
         for sample_index in sample_indices
     ]
     return {
         parameter_name: np.concatenate(
-            [sample_columns[parameter_name] for sample_columns in single_samples]
+            [samples_by_parameter[parameter_name] for samples_by_parameter in single_samples]
         )
         for parameter_name in design.swept_parameters
     }

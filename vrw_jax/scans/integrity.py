@@ -104,9 +104,11 @@ class StoredMetadata:
             read_metadata_file(store_path / METADATA_FILE_NAME),
         )
         root_attributes = self.root_metadata.get("attributes")
-        consolidated_entry = self.root_metadata.get("consolidated_metadata")
+        consolidated_metadata_entry = self.root_metadata.get("consolidated_metadata")
         consolidated_arrays = (
-            consolidated_entry.get("metadata") if isinstance(consolidated_entry, dict) else None
+            consolidated_metadata_entry.get("metadata")
+            if isinstance(consolidated_metadata_entry, dict)
+            else None
         )
         self.consolidated_metadata: dict[str, Any] = (
             consolidated_arrays if isinstance(consolidated_arrays, dict) else {}
@@ -121,18 +123,20 @@ class StoredMetadata:
             for group_metadata in group_metadata_copies
             if isinstance(group_metadata, dict)
         ]
-        usable_copies = [
+        usable_attribute_copies = [
             attribute_copy
             for attribute_copy in attribute_copies
             if isinstance(attribute_copy, dict)
             and isinstance(attribute_copy.get(SCAN_VARIABLES_KEY), list)
         ]
-        intact_copies = (
+        intact_attribute_copies = (
             attribute_copy
-            for attribute_copy in usable_copies
+            for attribute_copy in usable_attribute_copies
             if attribute_copy == add_attribute_seal(attribute_copy)
         )
-        self.mark_attributes: dict[str, Any] = next(intact_copies, (*usable_copies, {})[0])
+        self.mark_attributes: dict[str, Any] = next(
+            intact_attribute_copies, (*usable_attribute_copies, {})[0]
+        )
         """Attributes of the Zarr group of marks, from the intact copy; empty in stores without such
         attributes.
         """
@@ -142,7 +146,7 @@ class StoredMetadata:
         )
         """Attributes of the store, completed from the copy in the Zarr group of marks."""
         self._do_mark_attributes_differ = (
-            bool(usable_copies) and attribute_copies[0] != attribute_copies[-1]
+            bool(usable_attribute_copies) and attribute_copies[0] != attribute_copies[-1]
         )
 
     @property
@@ -168,11 +172,11 @@ class StoredMetadata:
             stored_manifest.get("measures", []),
             stored_manifest.get("design", {}).get("swept", []),
         )
-        excluded_names = (*self.coordinate_names, *swept_parameters)
+        excluded_array_names = (*self.coordinate_names, *swept_parameters)
         return sorted(
             array_name
             for array_name in array_names
-            if array_name not in excluded_names
+            if array_name not in excluded_array_names
             and (array_name in measure_names or _is_scan_measure_name(array_name))
         )
 
@@ -188,26 +192,26 @@ class StoredMetadata:
             and isinstance(array_metadata, dict)
             and array_metadata.get("node_type") == "array"
         ]
-        checked_names = (
+        checked_array_names = (
             [*self.coordinate_names, *self.select_scan_variables(array_names)]
             if self.consolidated_metadata
             else []
         )
-        checked_names += [CHECKSUM_ARRAY_NAME] if self.consolidated_metadata else []
-        damaged_names = []
-        for array_name in checked_names:
+        checked_array_names += [CHECKSUM_ARRAY_NAME] if self.consolidated_metadata else []
+        damaged_array_names = []
+        for array_name in checked_array_names:
             array_metadata = self._read_array_metadata(array_name)
             if not array_metadata or array_metadata != self.consolidated_metadata.get(array_name):
-                damaged_names.append(array_name)
+                damaged_array_names.append(array_name)
         if self._do_mark_attributes_differ:
-            damaged_names.append(CHECKSUM_GROUP_NAME)
+            damaged_array_names.append(CHECKSUM_GROUP_NAME)
         sealed_attributes = self.mark_attributes.get(STORE_ATTRIBUTES_KEY, {})
         if any(
             self._root_attributes.get(attribute_key, attribute_value) != attribute_value
             for attribute_key, attribute_value in sealed_attributes.items()
         ):
-            damaged_names.append("attributes")
-        return damaged_names
+            damaged_array_names.append("attributes")
+        return damaged_array_names
 
     def restore_from_intact_store(self, intact_metadata: StoredMetadata) -> None:
         """Write the two copies of all metadata anew, from the metadata of an intact new store for
@@ -222,14 +226,14 @@ class StoredMetadata:
             for array_name, array_metadata in self.consolidated_metadata.items()
             if array_name not in restored_metadata
         }
-        consolidated_entry = {
+        consolidated_metadata_entry = {
             "kind": "inline",
             "must_understand": False,
             "metadata": restored_metadata | other_metadata,
         }
         restored_root_metadata = intact_metadata.root_metadata | {
             "attributes": self.store_attributes,
-            "consolidated_metadata": consolidated_entry,
+            "consolidated_metadata": consolidated_metadata_entry,
         }
         for array_name, array_metadata in [
             *restored_metadata.items(),
@@ -281,8 +285,8 @@ class ChunkChecksums:
         }
         outcome_array = self._variable_arrays["outcome"]
         self._n_chunks_per_axis = tuple(
-            -(-n_samples // chunk_length)
-            for n_samples, chunk_length in zip(
+            -(-axis_length // chunk_length)
+            for axis_length, chunk_length in zip(
                 outcome_array.shape, outcome_array.chunks, strict=True
             )
         )

@@ -187,8 +187,8 @@ def parse_derivative(variable_name: str) -> MeasureDerivative | None:
 
     Return None for any other name.
     """
-    name_match = _DERIVATIVE_NAME_PATTERN.fullmatch(variable_name.strip())
-    return MeasureDerivative(*name_match.groups()) if name_match else None
+    derivative_name_match = _DERIVATIVE_NAME_PATTERN.fullmatch(variable_name.strip())
+    return MeasureDerivative(*derivative_name_match.groups()) if derivative_name_match else None
 
 
 def canonicalize_variable_name(measure_name: str) -> str:
@@ -209,30 +209,30 @@ def check_measure_names(
 
     Variables that every scan contains are omitted. Raise a ValueError for an unknown name.
     """
-    checked_names: dict[str, None] = {}
-    known_names = (
+    checked_variable_names: dict[str, None] = {}
+    known_variable_names = (
         *measure_catalog.requestable_measures,
         *measure_catalog.always_included_variables,
     )
     for measure_name in measure_names:
         requested_derivative = parse_derivative(measure_name)
         if requested_derivative is None:
-            if measure_name in PASSAGE_MEASURES and measure_name not in known_names:
+            if measure_name in PASSAGE_MEASURES and measure_name not in known_variable_names:
                 raise ValueError(
                     f"{measure_name!r} is a measure of walks over random slopes, whose standard "
                     f"deviation "
                     "is missing: give slope_sd, in rad, and no tol."
                 )
-            if measure_name not in known_names:
+            if measure_name not in known_variable_names:
                 raise ValueError(
                     f"{measure_name!r} is no measure of a "
-                    f"scan{format_name_suggestion(measure_name, known_names)}: "
+                    f"scan{format_name_suggestion(measure_name, known_variable_names)}: "
                     f"choose from {', '.join(measure_catalog.requestable_measures)}, or a "
                     f"derivative such as "
                     "'d dls_fraction / d damping'."
                 )
             if measure_name not in measure_catalog.always_included_variables:
-                checked_names[measure_name] = None
+                checked_variable_names[measure_name] = None
             continue
         if not measure_catalog.differentiable_measures:
             raise ValueError(
@@ -241,13 +241,13 @@ def check_measure_names(
                 "drop it, or scan without tol."
             )
         differentiable_measures = measure_catalog.differentiable_measures
-        differentiated_name = requested_derivative.measure_name
-        if differentiated_name not in differentiable_measures:
+        differentiated_measure_name = requested_derivative.measure_name
+        if differentiated_measure_name not in differentiable_measures:
             raise ValueError(
-                f"{measure_name!r} asks for a derivative of {differentiated_name!r}"
-                f"{format_name_suggestion(differentiated_name, differentiable_measures)}, but a "
-                f"scan differentiates only {', '.join(differentiable_measures)}: choose one of "
-                "these."
+                f"{measure_name!r} asks for a derivative of {differentiated_measure_name!r}"
+                f"{format_name_suggestion(differentiated_measure_name, differentiable_measures)}, "
+                f"but a scan differentiates only {', '.join(differentiable_measures)}: choose one "
+                "of these."
             )
         differentiation_parameters = measure_catalog.differentiation_parameters
         parameter_name = requested_derivative.parameter_name
@@ -258,8 +258,8 @@ def check_measure_names(
                 "must be by a "
                 f"parameter: choose from {', '.join(differentiation_parameters)}."
             )
-        checked_names[requested_derivative.variable_name] = None
-    return tuple(checked_names)
+        checked_variable_names[requested_derivative.variable_name] = None
+    return tuple(checked_variable_names)
 
 
 def get_variable_attributes(variable_name: str) -> dict[str, object]:

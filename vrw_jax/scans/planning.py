@@ -20,7 +20,7 @@ from vrw_jax.models import AbstractWheel, ModelCapabilities, ViscoelasticWheel
 from vrw_jax.numerics import StepOptions, batch_sizes
 from vrw_jax.runtime import compute_source_digest
 from vrw_jax.scans.collocation_engine import EvaluationRequest
-from vrw_jax.scans.design import AbstractSampleDesign, SampleColumns
+from vrw_jax.scans.design import AbstractSampleDesign, ParameterSamples
 from vrw_jax.scans.engines import make_scan_engine
 from vrw_jax.scans.integrity import MANIFEST_ATTRIBUTE
 from vrw_jax.scans.measure_catalog import (
@@ -94,7 +94,7 @@ STORED_NAME_BY_MODEL_FIELD = {
 differ.
 """
 
-SampleEvaluator = Callable[[SampleColumns], Mapping[str, np.ndarray]]
+SampleEvaluator = Callable[[ParameterSamples], Mapping[str, np.ndarray]]
 """Function that returns the values of each variable for samples, by the name of the variable.
 
 The first axis of each array is that of the samples.
@@ -236,12 +236,12 @@ def plan_scan(
         measure_catalog.default_measures if measures is None else check_names("measures", measures)
     )
     measure_names = check_measure_names(requested_measures, measure_catalog)
-    canonical_names = (
+    canonical_variable_names = (
         canonicalize_variable_name(measure_name) for measure_name in requested_measures
     )
     variable_names = dict.fromkeys(
         variable_name
-        for measure_name in canonical_names
+        for measure_name in canonical_variable_names
         for variable_name in (measure_name, make_error_variable_name(measure_name))[: 1 + bool(tol)]
     )
     cycle_options = CycleOptions() if cycle_options is None else cycle_options
@@ -330,7 +330,7 @@ def _make_result_layout(
     - `chunk_size`: largest number of samples in a chunk.
     """
     parameter_dtype = str(base_wheel.damping.dtype)
-    locked_legs = make_locked_leg_coordinate(base_wheel.n_legs)
+    locked_leg_coordinate = make_locked_leg_coordinate(base_wheel.n_legs)
 
     def make_variable_layout(variable_name: str) -> VariableLayout:
         """Return the layout of one variable: its type, missing value and attributes."""
@@ -346,7 +346,7 @@ def _make_result_layout(
                 np.nan,
                 variable_attributes,
                 ("leg",),
-                locked_legs.shape,
+                locked_leg_coordinate.shape,
             )
         return VariableLayout(variable_name, parameter_dtype, np.nan, variable_attributes)
 
@@ -363,7 +363,7 @@ def _make_result_layout(
             coordinate_values,
         ) in design.make_result_coordinates().items()
     }
-    result_coordinates["leg"] = ("leg", locked_legs.values, locked_legs.attrs)
+    result_coordinates["leg"] = ("leg", locked_leg_coordinate.values, locked_leg_coordinate.attrs)
     return ResultLayout(
         sample_dimension_names=design.dims,
         sample_shape=design.shape,
@@ -381,15 +381,21 @@ def _convert_settings_to_json(settings_object: object) -> dict[str, object]:
     field_value_by_name: dict[str, object] = {
         "kind": STORED_NAME_BY_CLASS.get(class_name, class_name)
     }
-    stored_names = STORED_NAME_BY_MODEL_FIELD | STORED_NAMES_BY_FIELD_OF_CLASS.get(class_name, {})
+    stored_name_by_field = STORED_NAME_BY_MODEL_FIELD | STORED_NAMES_BY_FIELD_OF_CLASS.get(
+        class_name, {}
+    )
     for field_name in type(settings_object).__dataclass_fields__:  # type: ignore[attr-defined]
         field_value = getattr(settings_object, field_name)
         if isinstance(field_value, StepOptions | ModelCapabilities):
             continue  # Options are recorded separately, and capabilities are code.
         if field_value is None or isinstance(field_value, bool | int | str):
-            field_value_by_name[stored_names.get(field_name, field_name)] = field_value
+            field_value_by_name[stored_name_by_field.get(field_name, field_name)] = field_value
         elif isinstance(field_value, tuple):
-            field_value_by_name[stored_names.get(field_name, field_name)] = list(field_value)
+            field_value_by_name[stored_name_by_field.get(field_name, field_name)] = list(
+                field_value
+            )
         else:
-            field_value_by_name[stored_names.get(field_name, field_name)] = float(field_value)
+            field_value_by_name[stored_name_by_field.get(field_name, field_name)] = float(
+                field_value
+            )
     return field_value_by_name

@@ -28,7 +28,8 @@ class SobolOptions:
     - `min_saltelli_rows`: smallest number of rows of a `saltelli` design, chosen because indices
       from fewer rows are noise;
     - `n_bootstrap_resamples`: number of bootstrap resamples of the rows;
-    - `interval_quantiles`: quantiles that bound the confidence interval, chosen for 95 %;
+    - `confidence_interval_quantiles`: quantiles that bound the confidence interval, chosen for 95
+      %;
     - `max_roundoff_spread`: largest spread of a measure that counts as round-off, as a fraction of
       its largest magnitude. The value is chosen because round-off in the parameters causes spreads
       of 4e-14 in measures and 5e-12 in margins.
@@ -36,7 +37,7 @@ class SobolOptions:
 
     min_saltelli_rows: int = 64
     n_bootstrap_resamples: int = 200
-    interval_quantiles: tuple[float, float] = (0.025, 0.975)
+    confidence_interval_quantiles: tuple[float, float] = (0.025, 0.975)
     max_roundoff_spread: float = 1e-11
 
 
@@ -100,36 +101,38 @@ def sobol_indices(
     has_gaits_in_row = (
         (scan.outcome.values == Outcome.STEPPED).reshape(n_samples_per_row, -1).all(axis=0)
     )
-    rows_with_gaits = np.flatnonzero(has_gaits_in_row)
-    n_rows = 1 << (len(rows_with_gaits).bit_length() - 1) if len(rows_with_gaits) else 0
-    if n_rows < sobol_options.min_saltelli_rows:
+    saltelli_rows_with_gaits = np.flatnonzero(has_gaits_in_row)
+    n_saltelli_rows = (
+        1 << (len(saltelli_rows_with_gaits).bit_length() - 1)
+        if len(saltelli_rows_with_gaits)
+        else 0
+    )
+    if n_saltelli_rows < sobol_options.min_saltelli_rows:
         raise ValueError(
-            f"only {len(rows_with_gaits)} of {len(has_gaits_in_row)} rows walk throughout, but "
-            "indices "
-            f"need {sobol_options.min_saltelli_rows}: narrow the ranges to where there are gaits, "
-            "or take more "
-            "rows."
+            f"only {len(saltelli_rows_with_gaits)} of {len(has_gaits_in_row)} rows walk "
+            f"throughout, but indices need {sobol_options.min_saltelli_rows}: narrow the ranges to "
+            "where there are gaits, or take more rows."
         )
-    selected_rows = rows_with_gaits[:n_rows]
+    selected_saltelli_rows = saltelli_rows_with_gaits[:n_saltelli_rows]
     measure_values = np.stack(
         [
-            scan[measure_name].values.reshape(n_samples_per_row, -1)[:, selected_rows]
+            scan[measure_name].values.reshape(n_samples_per_row, -1)[:, selected_saltelli_rows]
             for measure_name in measure_names
         ],
         axis=1,
     )
 
     random_generator = np.random.default_rng(0)  # The same scan gives the same intervals.
-    index_estimator = _SobolIndexEstimator(measure_values, sobol_options.max_roundoff_spread)
-    index_estimates = index_estimator(np.arange(n_rows))
-    resampled_estimates = [
-        index_estimator(random_generator.integers(0, n_rows, n_rows))
+    sobol_index_estimator = _SobolIndexEstimator(measure_values, sobol_options.max_roundoff_spread)
+    sobol_index_estimates = sobol_index_estimator(np.arange(n_saltelli_rows))
+    resampled_index_estimates = [
+        sobol_index_estimator(random_generator.integers(0, n_saltelli_rows, n_saltelli_rows))
         for _ in range(sobol_options.n_bootstrap_resamples)
     ]
     lower_bounds, upper_bounds = np.quantile(
-        resampled_estimates, sobol_options.interval_quantiles, axis=0
+        resampled_index_estimates, sobol_options.confidence_interval_quantiles, axis=0
     )
-    is_constant_measure = index_estimator.detect_constant_measures(measure_values)
+    is_constant_measure = sobol_index_estimator.detect_constant_measures(measure_values)
     if is_constant_measure.any():
         warnings.warn(
             f"{', '.join(np.array(measure_names)[is_constant_measure])}: constant over these "
@@ -137,30 +140,33 @@ def sobol_indices(
             "but for round-off, so that there is no variance to share, and the indices are 0.",
             stacklevel=2,
         )
-    index_variables: dict[str, tuple] = {}
-    for measure_index, (measure_name, index_label) in enumerate(
+    sobol_index_variables: dict[str, tuple] = {}
+    for measure_index, (measure_name, sobol_index_label) in enumerate(
         (("first_order", "first-order"), ("total", "total"))
     ):
-        index_attributes = {"units": "1", "long_name": f"{index_label} Sobol' index"}
-        for index_suffix, interval_bound_values in (
-            ("", index_estimates),
+        sobol_index_attributes = {"units": "1", "long_name": f"{sobol_index_label} Sobol' index"}
+        for variable_name_suffix, interval_bound_values in (
+            ("", sobol_index_estimates),
             ("_lower", lower_bounds),
             ("_upper", upper_bounds),
         ):
-            index_variables[measure_name + index_suffix] = (
+            sobol_index_variables[measure_name + variable_name_suffix] = (
                 ("measure", "parameter"),
                 interval_bound_values[measure_index],
-                index_attributes,
+                sobol_index_attributes,
             )
-    index_variables["is_constant_measure"] = (
+    sobol_index_variables["is_constant_measure"] = (
         "measure",
         is_constant_measure,
         {"long_name": "varies by round-off alone"},
     )
     return xr.Dataset(
-        index_variables,
+        sobol_index_variables,
         coords={"measure": measure_names, "parameter": swept_parameters},
-        attrs={"rows": n_rows, "left_out": 1.0 - len(rows_with_gaits) / len(has_gaits_in_row)},
+        attrs={
+            "rows": n_saltelli_rows,
+            "left_out": 1.0 - len(saltelli_rows_with_gaits) / len(has_gaits_in_row),
+        },
     )
 
 
@@ -179,23 +185,23 @@ class _SobolIndexEstimator:
         """Return whether each measure varies only by round-off between the samples, shape
         (measures,).
         """
-        is_spread_small: np.ndarray = (
+        is_value_spread_small: np.ndarray = (
             np.ptp(sample_values[:2], axis=(0, 2)) <= self.roundoff_spreads
         )
-        return is_spread_small
+        return is_value_spread_small
 
-    def __call__(self, row_indices: np.ndarray) -> np.ndarray:
-        """Return the indices, estimated from the rows at `row_indices`, shape (2, measures,
-        parameters).
+    def __call__(self, saltelli_row_indices: np.ndarray) -> np.ndarray:
+        """Return the indices, estimated from the rows at `saltelli_row_indices`, shape (2,
+        measures, parameters).
 
         The first axis contains first-order and total indices. Indices of constant measures are 0.
         """
         from scipy.stats import sobol_indices as compute_sobol_indices
 
-        resampled_values = self.measure_values[..., row_indices]
+        resampled_values = self.measure_values[..., saltelli_row_indices]
         varying_measures = np.flatnonzero(~self.detect_constant_measures(resampled_values))
         n_samples_per_row, n_measures, _ = resampled_values.shape
-        index_estimates = np.zeros((2, n_measures, n_samples_per_row - 2))
+        sobol_index_estimates = np.zeros((2, n_measures, n_samples_per_row - 2))
         if len(varying_measures):
             resampled_values = resampled_values[:, varying_measures]
             measure_functions = {
@@ -203,11 +209,13 @@ class _SobolIndexEstimator:
                 "f_B": resampled_values[1],
                 "f_AB": resampled_values[2:],
             }
-            scipy_result = compute_sobol_indices(func=measure_functions, n=len(row_indices))
-            index_estimates[0, varying_measures] = np.reshape(
+            scipy_result = compute_sobol_indices(
+                func=measure_functions, n=len(saltelli_row_indices)
+            )
+            sobol_index_estimates[0, varying_measures] = np.reshape(
                 scipy_result.first_order, (len(varying_measures), -1)
             )
-            index_estimates[1, varying_measures] = np.reshape(
+            sobol_index_estimates[1, varying_measures] = np.reshape(
                 scipy_result.total_order, (len(varying_measures), -1)
             )
-        return index_estimates
+        return sobol_index_estimates

@@ -46,8 +46,11 @@ class SpecialPointMap(NamedTuple):
     @property
     def ending(self) -> str:
         """Return a sentence that states how many sign changes between samples no curve explains."""
-        n_changes = len(self.unexplained_changes)
-        return f"{n_changes} changes of sign between neighboring samples have no curve nearby."
+        n_unexplained_changes = len(self.unexplained_changes)
+        return (
+            f"{n_unexplained_changes} changes of sign between neighboring samples have no curve "
+            "nearby."
+        )
 
     def __str__(self) -> str:
         text_lines = [self.ending]

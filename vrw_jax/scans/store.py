@@ -138,10 +138,10 @@ def choose_chunk_shape(sample_shape: tuple[int, ...], max_chunk_samples: int) ->
 
     A chunk spans the whole length of the last axes.
     """
-    chunk_shape, samples_left = [1] * len(sample_shape), max_chunk_samples
+    chunk_shape, n_remaining_chunk_samples = [1] * len(sample_shape), max_chunk_samples
     for axis_index in range(len(sample_shape) - 1, -1, -1):
-        chunk_shape[axis_index] = min(sample_shape[axis_index], max(samples_left, 1))
-        samples_left //= chunk_shape[axis_index]
+        chunk_shape[axis_index] = min(sample_shape[axis_index], max(n_remaining_chunk_samples, 1))
+        n_remaining_chunk_samples //= chunk_shape[axis_index]
         if chunk_shape[axis_index] < sample_shape[axis_index]:
             break
     return tuple(chunk_shape)
@@ -280,9 +280,9 @@ class ZarrResultStore(AbstractResultStore):
     def find_missing_chunks(self) -> list[int]:
         if self._chunk_checksums is None:
             return list(range(self._result_layout.n_chunks))
-        are_chunks_done = self._chunk_checksums.are_chunks_marked()
-        are_chunks_done[np.asarray(self.damaged_chunks, int)] = False
-        return [int(chunk_index) for chunk_index in np.flatnonzero(~are_chunks_done)]
+        are_chunks_written = self._chunk_checksums.are_chunks_marked()
+        are_chunks_written[np.asarray(self.damaged_chunks, int)] = False
+        return [int(chunk_index) for chunk_index in np.flatnonzero(~are_chunks_written)]
 
     def write_chunk(self, chunk_index: int, chunk_results: ChunkVariables) -> None:
         chunk_region = self._result_layout.compute_chunk_region(chunk_index)
@@ -302,14 +302,14 @@ class ZarrResultStore(AbstractResultStore):
     @contextlib.contextmanager
     def open_for_writing(self) -> Iterator[None]:
         with lock_store(self._store_path):
-            for unfinished_path in self._store_path.rglob("*.partial"):
-                unfinished_path.unlink(missing_ok=True)
+            for unfinished_file_path in self._store_path.rglob("*.partial"):
+                unfinished_file_path.unlink(missing_ok=True)
             if self._damaged_metadata:
                 # The metadata are copied from a temporary new store.
                 stored_metadata = StoredMetadata(self._store_path)
                 store_attributes = stored_metadata.store_attributes
-                temporary_name = f".{self._store_path.name}.{os.urandom(8).hex()}"
-                temporary_path = self._store_path.parent / temporary_name
+                temporary_store_name = f".{self._store_path.name}.{os.urandom(8).hex()}"
+                temporary_path = self._store_path.parent / temporary_store_name
                 try:
                     temporary_path.mkdir()
                     _create_zarr_arrays(temporary_path, self._result_layout, store_attributes)
@@ -444,10 +444,10 @@ def _arrange_requested_variables(stored_dataset: xr.Dataset) -> xr.Dataset:
     A file name cannot be "d speed / d damping", so the array of such a variable has another name in
     a store.
     """
-    requested_text = stored_dataset.attrs.get(REQUESTED_MEASURES_ATTRIBUTE)
+    requested_measures_text = stored_dataset.attrs.get(REQUESTED_MEASURES_ATTRIBUTE)
     requested_measures = (
-        str(requested_text).split(", ")
-        if requested_text
+        str(requested_measures_text).split(", ")
+        if requested_measures_text
         else read_scan_manifest(stored_dataset.attrs).get("measures", [])
     )
     requested_name_by_variable = {
@@ -455,12 +455,14 @@ def _arrange_requested_variables(stored_dataset: xr.Dataset) -> xr.Dataset:
         for variable_name in reversed(requested_measures)
         if canonicalize_variable_name(variable_name) in stored_dataset
     }
-    variables_in_order = list(dict.fromkeys(map(canonicalize_variable_name, requested_measures)))
+    requested_variable_names = list(
+        dict.fromkeys(map(canonicalize_variable_name, requested_measures))
+    )
     ordered_variables = dict.fromkeys(
         [
             *(
                 variable_name
-                for variable_name in variables_in_order
+                for variable_name in requested_variable_names
                 if variable_name in requested_name_by_variable
             ),
             *map(str, stored_dataset.data_vars),
@@ -532,13 +534,13 @@ def find_first_settings_difference(
                 if setting_name not in stored_settings
             ),
         ]:
-            nested_difference = find_first_settings_difference(
+            nested_settings_difference = find_first_settings_difference(
                 stored_settings.get(setting_name),
                 current_settings.get(setting_name),
                 f"{setting_path}.{setting_name}" if setting_path else str(setting_name),
             )
-            if nested_difference[0]:
-                return nested_difference
+            if nested_settings_difference[0]:
+                return nested_settings_difference
         return "", None, None
     return (
         ("", None, None)
@@ -559,10 +561,11 @@ def create_empty_store(
         temporary_path = store_path.parent / f".{store_path.name}.{os.urandom(8).hex()}"
         temporary_path.mkdir()
     except OSError as creation_error:
-        failure_reason = creation_error.strerror or "no folder can be made there"
+        creation_failure_reason = creation_error.strerror or "no folder can be made there"
         raise OSError(
             creation_error.errno,
-            f"no store can be made at {store_path} ({failure_reason}): give a place of your own",
+            f"no store can be made at {store_path} ({creation_failure_reason}): give a place of "
+            "your own",
         ) from creation_error
     try:
         _create_zarr_arrays(temporary_path, result_layout, store_attributes)

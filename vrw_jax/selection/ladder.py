@@ -115,15 +115,15 @@ class ModelChoice(AbstractPrintable):
                     f"{n_viscoelastic_choices} served by the paper's",
                 )
             ]
-        name_margin_pairs = zip(SELECTION_MARGIN_NAMES, np.asarray(self.margins), strict=True)
-        margin_rows = [
+        margin_name_value_pairs = zip(SELECTION_MARGIN_NAMES, np.asarray(self.margins), strict=True)
+        margin_text_rows = [
             (
                 MARGIN_MEASURES[margin_name].label_with_symbol,
                 MARGIN_MEASURES[margin_name].format_with_unit(margin_value),
             )
-            for margin_name, margin_value in name_margin_pairs
+            for margin_name, margin_value in margin_name_value_pairs
         ]
-        return [("model", type(self.model).__name__), ("reason", self.why), *margin_rows]
+        return [("model", type(self.model).__name__), ("reason", self.why), *margin_text_rows]
 
     def collect_selection_codes(self) -> dict[str, Array]:
         """Return the code of the model and the code of the reason.
@@ -160,18 +160,20 @@ def describe_selection_reason(reason_code: int) -> str:
 
 
 def find_selection_reason(
-    step_measures: Mapping[str, Any], friction_difference: Any
+    step_measures: Mapping[str, Any], friction_coefficient_change: Any
 ) -> tuple[Array, Array]:
     """Return the reason for the choice of a model for each step, and the margins of each step.
 
     The reasons are codes of `ModelChoice.reason_code`. The margins are those of the step computed
-    with the viscoelastic model, on the last axis, corrected by `friction_difference`.
+    with the viscoelastic model, on the last axis, corrected by `friction_coefficient_change`.
 
     - `step_measures`: measures and outcome codes of the steps, by name;
-    - `friction_difference`: friction coefficient of the ground minus that in `step_measures`.
+    - `friction_coefficient_change`: friction coefficient of the ground minus that in
+      `step_measures`.
     """
     selection_margins = [
-        step_measures[margin_name] + (friction_difference if "friction" in margin_name else 0.0)
+        step_measures[margin_name]
+        + (friction_coefficient_change if "friction" in margin_name else 0.0)
         for margin_name in SELECTION_MARGIN_NAMES
     ]
     is_margin_violated = ~(jnp.stack(selection_margins, -1) >= 0.0)
@@ -267,9 +269,9 @@ class LadderWheel(AbstractContactWheel):
         """Return the selected model, and the step computed with the viscoelastic model."""
         viscoelastic_model, ground_friction = ViscoelasticWheel(), self.friction.astype(x.dtype)
         # Leg 1 alone must be loaded and at rest, with all other legs on their stoppers.
-        leg_1_mask = jnp.arange(params.n_legs) == 0
+        is_leg_1 = jnp.arange(params.n_legs) == 0
         locked_leg_code = float(LOCKED_CODE_OFFSET + ContactMode.OFF)
-        embedded_contact_codes = jnp.where(leg_1_mask, float(ContactMode.STICK), locked_leg_code)
+        embedded_contact_codes = jnp.where(is_leg_1, float(ContactMode.STICK), locked_leg_code)
         is_start_embeddable = jnp.all(
             jnp.round(x[4 + 2 * params.n_legs :]) == embedded_contact_codes
         )
@@ -376,9 +378,11 @@ def _embed_viscoelastic_result(
 
     If this model is not valid, return the paper's start state in the form of a full section state.
     """
-    fallback_state = jnp.asarray(PAPER_START_STATE, viscoelastic_result.section_state.dtype)
+    placeholder_section_state = jnp.asarray(
+        PAPER_START_STATE, viscoelastic_result.section_state.dtype
+    )
     params, x = replace_invalid_inputs(
-        is_viscoelastic_valid, params, viscoelastic_result.section_state, fallback_state
+        is_viscoelastic_valid, params, viscoelastic_result.section_state, placeholder_section_state
     )
     return embed_section_state(params.symbols(), x)
 

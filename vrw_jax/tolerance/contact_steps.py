@@ -59,7 +59,7 @@ class StepQuantities(NamedTuple):
 class ContactWheelBatch:
     """Batch of wheels with unilateral contact, each with its own friction coefficient."""
 
-    parameter_columns: np.ndarray  # (10, wheels): parameters and friction
+    parameter_matrix: np.ndarray  # (10, wheels): parameters and friction
     n_legs: int  # number of legs of each wheel
     contact_model: UnilateralWheel
     step_options: StepOptions
@@ -70,12 +70,12 @@ class ContactWheelBatch:
         cls, params: WheelParams, friction: np.ndarray, stoppers: str, options: StepOptions
     ) -> "ContactWheelBatch":
         """Return the batch of wheels whose `params` and `friction` have one batch axis."""
-        parameter_columns = [
+        parameter_matrix = [
             *(np.asarray(getattr(params, parameter_name)) for parameter_name in PARAMETER_NAMES),
             friction,
         ]
         contact_model = UnilateralWheel(stoppers=stoppers)  # type: ignore[arg-type]
-        return cls(np.stack(parameter_columns), params.n_legs, contact_model, options)
+        return cls(np.stack(parameter_matrix), params.n_legs, contact_model, options)
 
     def embed_paper_states(
         self, wheel_indices: np.ndarray, section_states: np.ndarray, has_rigid_legs: Any = False
@@ -86,7 +86,7 @@ class ContactWheelBatch:
         """
         contact_section_states = np.array(
             embed_section_states(
-                self.parameter_columns[:, wheel_indices], section_states, self.n_legs
+                self.parameter_matrix[:, wheel_indices], section_states, self.n_legs
             )
         )
         contact_section_states[:, 4 + 2 * self.n_legs] += np.where(
@@ -101,9 +101,9 @@ class ContactWheelBatch:
 
         The section states are full, (wheels, 4 + 3 n). `wheel_indices` selects the wheels.
         """
-        parameter_columns = self.parameter_columns[:, wheel_indices]
+        parameter_matrix = self.parameter_matrix[:, wheel_indices]
         end_states, durations, step_outcomes, *_, step_length = walk_batch(
-            parameter_columns,
+            parameter_matrix,
             section_states,
             n_steps,
             self.contact_model,
@@ -122,13 +122,13 @@ class ContactWheelBatch:
         is that of the step quantities, (wheels, 7, 4 + 3 n). The derivatives are with respect to
         the full section state at the start.
         """
-        parameter_columns = self.parameter_columns[:, wheel_indices]
-        n_parameter_columns = len(parameter_columns)
-        input_indices = range(n_parameter_columns, n_parameter_columns + section_states.shape[1])
+        parameter_matrix = self.parameter_matrix[:, wheel_indices]
+        n_contact_parameters = len(parameter_matrix)
+        input_indices = range(n_contact_parameters, n_contact_parameters + section_states.shape[1])
         contact_step, step_jacobian = jax.tree.map(
             np.asarray,
             step_batch_with_jacobian(
-                parameter_columns,
+                parameter_matrix,
                 section_states,
                 self.contact_model,
                 self.step_options,
@@ -138,22 +138,24 @@ class ContactWheelBatch:
         )
         step_quantities, quantity_jacobian = (
             self._stack_step_quantities(
-                step_arrays.durations, step_arrays.step_length, step_arrays.section_state
+                step_result_or_jacobian.durations,
+                step_result_or_jacobian.step_length,
+                step_result_or_jacobian.section_state,
             )
-            for step_arrays in (contact_step, step_jacobian)
+            for step_result_or_jacobian in (contact_step, step_jacobian)
         )
         return (
             StepQuantities(contact_step.section_state, step_quantities, contact_step.outcome),
-            step_jacobian.section_state[:, :, n_parameter_columns:],
-            quantity_jacobian[:, :, n_parameter_columns:],
+            step_jacobian.section_state[:, :, n_contact_parameters:],
+            quantity_jacobian[:, :, n_contact_parameters:],
         )
 
     def _stack_step_quantities(
         self, durations: Any, step_length: Any, end_states: Any
     ) -> np.ndarray:
         """Return the step quantities or their derivatives as one array, (wheels, 7, ...)."""
-        paper_states = end_states[:, self.list_paper_state_indices()]
-        return np.concatenate([durations, step_length[:, None], paper_states], 1)
+        paper_section_states = end_states[:, self.list_paper_state_indices()]
+        return np.concatenate([durations, step_length[:, None], paper_section_states], 1)
 
     def make_batch_for_walks(self) -> "ContactWheelBatch":
         """Return a copy of the batch with the looser solver tolerance for walks."""
@@ -182,13 +184,13 @@ class ContactWheelBatch:
 
         It is the flight time of the smallest bounce that the solver resolves.
         """
-        get_parameter_column = lambda parameter_name: self.parameter_columns[
+        get_parameter_values = lambda parameter_name: self.parameter_matrix[
             PARAMETER_NAMES.index(parameter_name)
         ]
         # A scalar is used because JAX would compile a program for each batch size.
         relative_bounce_height = float(compute_min_bounce_height(jnp.ones(()), self.step_options))
-        bounce_height = relative_bounce_height * get_parameter_column("locked_length")
-        return np.sqrt(8.0 * bounce_height / get_parameter_column("gravity"))[wheel_indices]
+        bounce_height = relative_bounce_height * get_parameter_values("locked_length")
+        return np.sqrt(8.0 * bounce_height / get_parameter_values("gravity"))[wheel_indices]
 
     def list_paper_state_indices(self) -> np.ndarray:
         """Return the indices of theta-, dtheta- and dL1- in a full section state."""

@@ -59,12 +59,12 @@ class LowerFidelityGaits(NamedTuple):
     model_index: np.ndarray  # a ModelIndex, NONE if there is no gait
     section_states: np.ndarray  # (wheels, 3)
     step_quantities: np.ndarray  # (wheels, 7): step quantities from the section state
-    newton_matrix: np.ndarray  # (wheels, 3, 3): (I - DP)^-1, where P is the return map
+    inverse_newton_matrix: np.ndarray  # (wheels, 3, 3): (I - DP)^-1, where P is the return map
     # (wheels, 7, 3): derivatives of the step quantities with respect to the section state
     step_quantity_jacobian: np.ndarray
     section_state_error: (
         np.ndarray
-    )  # (wheels, 3): `newton_matrix` times the defect of the return map
+    )  # (wheels, 3): `inverse_newton_matrix` times the defect of the return map
     search_outcomes: np.ndarray
 
 
@@ -82,13 +82,13 @@ def make_empty_gaits(n_wheels: int) -> LowerFidelityGaits:
 
 
 def replace_gaits(
-    gaits_with_steps: LowerFidelityGaits,
-    replaced_indices: np.ndarray,
+    stepped_gaits: LowerFidelityGaits,
+    replaced_gait_indices: np.ndarray,
     new_gaits: LowerFidelityGaits,
 ) -> None:
-    """Replace, in place, the gaits with the indices `replaced_indices` by `new_gaits`."""
-    for gait_array, new_gait_array in zip(gaits_with_steps, new_gaits, strict=True):
-        gait_array[replaced_indices] = new_gait_array
+    """Replace, in place, the gaits with the indices `replaced_gait_indices` by `new_gaits`."""
+    for gait_array, new_gait_array in zip(stepped_gaits, new_gaits, strict=True):
+        gait_array[replaced_gait_indices] = new_gait_array
 
 
 def find_paper_gaits(params: WheelParams, step_options: StepOptions) -> LowerFidelityGaits:
@@ -142,17 +142,19 @@ def find_paper_gaits(params: WheelParams, step_options: StepOptions) -> LowerFid
     step_length_jacobian = (foot_distance * np.tan(step_end_states[:, 0]))[
         :, None
     ] * step_jacobian.section_state[:, 0]
-    dls_jacobian, sls1_jacobian, sls2_jacobian = np.moveaxis(step_jacobian.durations, 1, 0)
-    jacobian_rows = [
-        dls_jacobian,
-        sls1_jacobian + sls2_jacobian,
-        0.0 * dls_jacobian,
+    dls_duration_jacobian, sls1_duration_jacobian, sls2_duration_jacobian = np.moveaxis(
+        step_jacobian.durations, 1, 0
+    )
+    quantity_jacobian_rows = [
+        dls_duration_jacobian,
+        sls1_duration_jacobian + sls2_duration_jacobian,
+        0.0 * dls_duration_jacobian,
         step_length_jacobian,
     ]
     step_quantity_jacobian = np.concatenate(
-        [np.stack(jacobian_rows, 1), step_jacobian.section_state], 1
+        [np.stack(quantity_jacobian_rows, 1), step_jacobian.section_state], 1
     )
-    gaits_with_steps = _make_lower_fidelity_gaits(
+    stepped_gaits = _make_lower_fidelity_gaits(
         ModelIndex.VISCOELASTIC,
         section_states[found_wheel_indices],
         step_end_states,
@@ -163,7 +165,7 @@ def find_paper_gaits(params: WheelParams, step_options: StepOptions) -> LowerFid
     replace_gaits(
         gaits_of_all_wheels,
         found_wheel_indices[has_stepped],
-        LowerFidelityGaits(*(gait_array[has_stepped] for gait_array in gaits_with_steps)),
+        LowerFidelityGaits(*(gait_array[has_stepped] for gait_array in stepped_gaits)),
     )
     gaits_of_all_wheels.search_outcomes[found_wheel_indices[~has_stepped]] = np.asarray(
         gait_step.outcome
@@ -229,14 +231,16 @@ def _make_lower_fidelity_gaits(
 ) -> LowerFidelityGaits:
     """Return the gaits of one model from the start, end and Jacobians of their walking steps."""
     with np.errstate(all="ignore"):
-        newton_matrix = np.linalg.inv(np.eye(3) - return_map_jacobian)
-    section_state_error = np.einsum("ijk,ik->ij", newton_matrix, step_end_states - section_states)
+        inverse_newton_matrix = np.linalg.inv(np.eye(3) - return_map_jacobian)
+    section_state_error = np.einsum(
+        "ijk,ik->ij", inverse_newton_matrix, step_end_states - section_states
+    )
     search_outcomes = np.full(len(section_states), int(Outcome.STEPPED))
     return LowerFidelityGaits(
         np.full(len(section_states), model_index),
         section_states,
         step_quantities,
-        newton_matrix,
+        inverse_newton_matrix,
         step_quantity_jacobian,
         section_state_error,
         search_outcomes,

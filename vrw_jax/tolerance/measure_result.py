@@ -189,7 +189,7 @@ class MeasureResult(AbstractPrintable):
         compute_max_error = lambda measure_index: np.max(
             self.errors[self.found][:, measure_index], initial=0.0
         )
-        error_rows = [
+        error_text_rows = [
             (
                 f"largest error of {measure_name}",
                 _format_rounded_number(compute_max_error(measure_index)),
@@ -199,18 +199,18 @@ class MeasureResult(AbstractPrintable):
         return [
             ("models", model_counts_text),
             ("outcomes", format_outcome_counts(self.outcomes, Outcome)),
-            *error_rows,
+            *error_text_rows,
         ]
 
     def _format_measure_value(self, measure_index: int) -> str:
         """Return a text with one measure, its unit and its errors."""
-        measure = MEASURES[self.names[measure_index]]
+        measure_definition = MEASURES[self.names[measure_index]]
         if not self.found:
-            return f"no {measure.name}"
+            return f"no {measure_definition.name}"
         measure_value = float(self.values[measure_index])
         error_bound = float(self.errors[measure_index])
         n_decimals = max(0, math.ceil(-math.log10(max(error_bound, 1e-15))))
-        value_text = f"{measure_value:.{n_decimals}f} {measure.display_unit}".strip()
+        value_text = f"{measure_value:.{n_decimals}f} {measure_definition.display_unit}".strip()
         error_parts_text = (
             f"numerical {_format_rounded_number(self.numerical_errors[measure_index])}"
         )

@@ -202,55 +202,63 @@ def multifidelity_mean(
         )
     measured_wheels = _MeasuredWheels(measure, params, friction_by_wheel, stoppers)
     wheel_permutation = np.random.default_rng(seed).permutation(n_wheels)
-    pilot_wheel_indices, other_wheel_indices = wheel_permutation[:pilot], wheel_permutation[pilot:]
-    gait_tolerance = sampling_options.gait_error_fraction * tol
-    pilot_results = measured_wheels.measure_selected_wheels(pilot_wheel_indices, gait_tolerance)
-    has_pilot_gait = pilot_results.found
+    pilot_wheel_indices, remaining_wheel_indices = (
+        wheel_permutation[:pilot],
+        wheel_permutation[pilot:],
+    )
+    gait_measure_tolerance = sampling_options.gait_error_fraction * tol
+    pilot_measure_results = measured_wheels.measure_selected_wheels(
+        pilot_wheel_indices, gait_measure_tolerance
+    )
+    has_pilot_gait = pilot_measure_results.found
     if np.sum(has_pilot_gait) < min_pilot_gaits:
         raise ValueError(
             f"{np.sum(has_pilot_gait)} of the pilot's {pilot} wheels have a gait with contact, but "
             f"a mean needs {min_pilot_gaits}: give other wheels, or a larger pilot."
         )
-    pilot_sample = _SampledMeasures.from_results(pilot_results)
-    control_columns = [
-        _stack_control_columns(
+    pilot_sample = _SampledMeasures.from_results(pilot_measure_results)
+    control_regressors = [
+        _stack_control_regressors(
             measured_wheels.evaluate_control_variate(pilot_wheel_indices, control_index)
         )
         for control_index in range(len(CONTROL_VARIATES))
     ]
     sampling_plans = [
         _plan_sampling(
-            control_index, pilot_sample, x, tol, len(other_wheel_indices), sampling_options
+            control_index, pilot_sample, x, tol, len(remaining_wheel_indices), sampling_options
         )
-        for control_index, x in enumerate(control_columns)
+        for control_index, x in enumerate(control_regressors)
     ]
     sampling_plan = min(
         sampling_plans, key=lambda sampling_plan: sampling_plan.expected_cost_in_steps
     )
-    drawn_results = measured_wheels.measure_selected_wheels(
-        other_wheel_indices[: sampling_plan.n_drawn_wheels], gait_tolerance
+    drawn_measure_results = measured_wheels.measure_selected_wheels(
+        remaining_wheel_indices[: sampling_plan.n_drawn_wheels], gait_measure_tolerance
     )
-    mean_value, standard_error = _estimate_mean(
+    estimated_mean, standard_error = _estimate_mean(
         sampling_plan,
         pilot_sample,
-        _SampledMeasures.from_results(drawn_results),
-        _stack_control_columns(
+        _SampledMeasures.from_results(drawn_measure_results),
+        _stack_control_regressors(
             measured_wheels.evaluate_control_variate(
-                other_wheel_indices, sampling_plan.control_index
+                remaining_wheel_indices, sampling_plan.control_index
             )
         ),
     )
     gait_error_bounds = np.concatenate(
-        [pilot_results.error[has_pilot_gait], drawn_results.error[drawn_results.found]]
+        [
+            pilot_measure_results.error[has_pilot_gait],
+            drawn_measure_results.error[drawn_measure_results.found],
+        ]
     )
     return MultifidelityMean(
-        value=mean_value,
+        value=estimated_mean,
         error=sampling_options.n_standard_errors * standard_error
         + float(np.mean(gait_error_bounds)),
         n_gaits=float(len(gait_error_bounds)),
         n_high_fidelity=float(pilot + sampling_plan.n_drawn_wheels),
         weight=float(sampling_plan.control_weights[0]),
-        cost=float(np.sum(pilot_results.n_steps) + np.sum(drawn_results.n_steps))
+        cost=float(np.sum(pilot_measure_results.n_steps) + np.sum(drawn_measure_results.n_steps))
         + CONTROL_VARIATES[sampling_plan.control_index].cost_in_steps * n_wheels,
         cost_high_fidelity_only=pilot_sample.mean_steps_per_wheel * pilot
         + sampling_plans[0].expected_cost_in_steps,
@@ -285,7 +293,7 @@ class _MeasuredWheels(NamedTuple):
     friction_coefficients: np.ndarray
     stoppers: str
 
-    def take_wheels(self, wheel_indices: np.ndarray) -> WheelParams:
+    def select_wheel_params(self, wheel_indices: np.ndarray) -> WheelParams:
         """Return the parameters of the wheels with the indices `wheel_indices`."""
         return jax.device_put(select_tree_rows(self.params, wheel_indices))
 
@@ -293,7 +301,11 @@ class _MeasuredWheels(NamedTuple):
         self, wheel_indices: np.ndarray, measure_tolerance: float
     ) -> MeasureResult:
         """Return the measure with unilateral contact for the selected wheels."""
-        measure_arguments = self.measure_name, self.take_wheels(wheel_indices), measure_tolerance
+        measure_arguments = (
+            self.measure_name,
+            self.select_wheel_params(wheel_indices),
+            measure_tolerance,
+        )
         return measure_to_tolerance(
             *measure_arguments,
             friction=self.friction_coefficients[wheel_indices],
@@ -310,7 +322,7 @@ class _MeasuredWheels(NamedTuple):
         if not control_index:
             return control_values
         step_options = StepOptions()
-        paper_gaits = find_paper_gaits(self.take_wheels(wheel_indices), step_options)
+        paper_gaits = find_paper_gaits(self.select_wheel_params(wheel_indices), step_options)
         (found_wheel_indices,) = np.nonzero(paper_gaits.model_index != ModelIndex.NONE)
         paper_gaits = LowerFidelityGaits(
             *(gait_array[found_wheel_indices] for gait_array in paper_gaits)
@@ -319,7 +331,7 @@ class _MeasuredWheels(NamedTuple):
         if control_index == len(CONTROL_VARIATES) - 1:
             wheel_indices_of_gaits = wheel_indices[found_wheel_indices]
             wheel_batch = ContactWheelBatch.from_params(
-                self.take_wheels(wheel_indices_of_gaits),
+                self.select_wheel_params(wheel_indices_of_gaits),
                 self.friction_coefficients[wheel_indices_of_gaits],
                 self.stoppers,
                 step_options,
@@ -333,7 +345,7 @@ class _MeasuredWheels(NamedTuple):
                 gait_positions,
                 section_states,
                 wheel_batch.take_steps(gait_positions, section_states),
-                paper_gaits.newton_matrix,
+                paper_gaits.inverse_newton_matrix,
                 paper_gaits.step_quantity_jacobian,
                 [self.measure_name],
                 wheel_batch.list_paper_state_indices(),
@@ -347,7 +359,7 @@ class _MeasuredWheels(NamedTuple):
         return control_values
 
 
-def _stack_control_columns(control_values: np.ndarray) -> np.ndarray:
+def _stack_control_regressors(control_values: np.ndarray) -> np.ndarray:
     """Return the two regressors for the regression on a control variate, shape (wheels, 2).
 
     The first column is the control variate, or zero for a wheel without a finite control variate.
@@ -360,9 +372,9 @@ def _stack_control_columns(control_values: np.ndarray) -> np.ndarray:
 def _plan_sampling(
     control_index: int,
     pilot_sample: _SampledMeasures,
-    control_columns: np.ndarray,
+    control_regressors: np.ndarray,
     mean_tolerance: float,
-    n_other_wheels: int,
+    n_remaining_wheels: int,
     sampling_options: SamplingOptions,
 ) -> _SamplingPlan:
     """Return the sampling plan for a mean to within `mean_tolerance`, with one control variate.
@@ -379,14 +391,14 @@ def _plan_sampling(
         / fraction_of_wheels_with_gait
         * pilot_sample.has_gait
     )
-    centered_control_columns = control_columns - np.mean(control_columns, axis=0)
+    centered_control_regressors = control_regressors - np.mean(control_regressors, axis=0)
     control_weights, _, matrix_rank, _ = np.linalg.lstsq(
-        centered_control_columns,
+        centered_control_regressors,
         centered_measure_values,
         rcond=sampling_options.singular_value_tolerance,
     )
     residual_sum_of_squares = float(
-        np.sum((centered_measure_values - centered_control_columns @ control_weights) ** 2)
+        np.sum((centered_measure_values - centered_control_regressors @ control_weights) ** 2)
     ) + _compute_unseen_wheel_variance(pilot_sample, centered_measure_values)
     residual_variance = residual_sum_of_squares / (
         len(centered_measure_values) - 1 - int(matrix_rank)
@@ -398,15 +410,15 @@ def _plan_sampling(
         ** 2
     )
     n_drawn_wheels = min(
-        n_other_wheels,
+        n_remaining_wheels,
         max(
             sampling_options.min_pilot_gaits,
-            math.ceil(n_required_wheels / (1.0 + n_required_wheels / n_other_wheels)),
+            math.ceil(n_required_wheels / (1.0 + n_required_wheels / n_remaining_wheels)),
         ),
     )
     return _SamplingPlan(
         n_drawn_wheels * pilot_sample.mean_steps_per_wheel
-        + CONTROL_VARIATES[control_index].cost_in_steps * n_other_wheels,
+        + CONTROL_VARIATES[control_index].cost_in_steps * n_remaining_wheels,
         n_drawn_wheels,
         control_weights,
         control_index,
@@ -417,25 +429,27 @@ def _estimate_mean(
     sampling_plan: _SamplingPlan,
     pilot_sample: _SampledMeasures,
     drawn_sample: _SampledMeasures,
-    control_columns: np.ndarray,
+    control_regressors: np.ndarray,
 ) -> tuple[float, float]:
     """Return the mean of a measure and its standard error.
 
-    - `control_columns`: control columns of all wheels outside the pilot sample. The drawn wheels
+    - `control_regressors`: control columns of all wheels outside the pilot sample. The drawn wheels
       come first.
     """
-    n_other_wheels = len(control_columns)
-    control_values = control_columns @ sampling_plan.control_weights
-    n_gaits_in_all = np.sum(pilot_sample.has_gait) + n_other_wheels * np.mean(drawn_sample.has_gait)
-    control_differences = (
+    n_remaining_wheels = len(control_regressors)
+    control_values = control_regressors @ sampling_plan.control_weights
+    estimated_gait_count = np.sum(pilot_sample.has_gait) + n_remaining_wheels * np.mean(
+        drawn_sample.has_gait
+    )
+    control_value_differences = (
         drawn_sample.measure_values - control_values[: sampling_plan.n_drawn_wheels]
     )
     measure_mean = (
         np.sum(pilot_sample.measure_values)
-        + n_other_wheels * (np.mean(control_values) + np.mean(control_differences))
-    ) / n_gaits_in_all
+        + n_remaining_wheels * (np.mean(control_values) + np.mean(control_value_differences))
+    ) / estimated_gait_count
     residual_sum_of_squares = sampling_plan.n_drawn_wheels * np.var(
-        control_differences - measure_mean * drawn_sample.has_gait
+        control_value_differences - measure_mean * drawn_sample.has_gait
     )
     residual_sum_of_squares += _compute_unseen_wheel_variance(
         pilot_sample, pilot_sample.measure_values - measure_mean * pilot_sample.has_gait
@@ -444,9 +458,11 @@ def _estimate_mean(
         residual_sum_of_squares
         / (sampling_plan.n_drawn_wheels - 1)
         / sampling_plan.n_drawn_wheels
-        * (1.0 - sampling_plan.n_drawn_wheels / n_other_wheels)
+        * (1.0 - sampling_plan.n_drawn_wheels / n_remaining_wheels)
     )
-    return float(measure_mean), float(n_other_wheels / n_gaits_in_all * math.sqrt(mean_variance))
+    return float(measure_mean), float(
+        n_remaining_wheels / estimated_gait_count * math.sqrt(mean_variance)
+    )
 
 
 def _compute_unseen_wheel_variance(

@@ -98,7 +98,7 @@ def estimate_measures(
     wheel_indices: np.ndarray,
     section_states: np.ndarray,
     contact_step: StepQuantities,
-    newton_matrix: np.ndarray,
+    inverse_newton_matrix: np.ndarray,
     step_quantity_jacobian: np.ndarray,
     measure_names: Sequence[str],
     section_coordinates: Any = slice(None),
@@ -111,7 +111,7 @@ def estimate_measures(
         wheel_indices: index of the wheel of each gait.
         section_states: full section states at which the steps begin, (gaits, 4 + 3 n).
         contact_step: section states and step quantities after the steps.
-        newton_matrix: inverse of I - DP, where P is the return map, (gaits, coordinates,
+        inverse_newton_matrix: inverse of I - DP, where P is the return map, (gaits, coordinates,
             coordinates).
         step_quantity_jacobian: derivatives of the step quantities with respect to the section
             state, (gaits, 7, coordinates).
@@ -119,15 +119,17 @@ def estimate_measures(
         section_coordinates: indices of the corrected coordinates of a section state.
         refinement_options: options with the factors of the error bounds.
     """
-    n_continuous = section_states.shape[1] - wheel_batch.n_legs
+    n_continuous_entries = section_states.shape[1] - wheel_batch.n_legs
     has_same_leg_codes = np.all(
-        section_states[:, n_continuous:] == contact_step.section_states[:, n_continuous:], axis=1
+        section_states[:, n_continuous_entries:]
+        == contact_step.section_states[:, n_continuous_entries:],
+        axis=1,
     ) & (contact_step.step_outcomes == Outcome.STEPPED)
     section_state_defect = (contact_step.section_states - section_states)[
         :, section_coordinates
     ] * has_same_leg_codes[:, None]
     with np.errstate(all="ignore"):
-        newton_correction = np.einsum("ijk,ik->ij", newton_matrix, section_state_defect)
+        newton_correction = np.einsum("ijk,ik->ij", inverse_newton_matrix, section_state_defect)
         gait_quantities = contact_step.step_quantities + np.einsum(
             "ijk,ik->ij", step_quantity_jacobian, newton_correction
         )
@@ -139,8 +141,8 @@ def estimate_measures(
         step_error_bound = refinement_options.step_error_in_tolerances * float(
             wheel_batch.step_options.rtol
         )
-        total_sensitivity = np.abs(measure_jacobian).sum(-1) + np.sum(
-            section_state_sensitivity @ np.abs(newton_matrix), axis=-1
+        total_quantity_sensitivity = np.abs(measure_jacobian).sum(-1) + np.sum(
+            section_state_sensitivity @ np.abs(inverse_newton_matrix), axis=-1
         )
         # An unresolved contact adds its time to one duration and takes the time from another.
         duration_sensitivity_range = np.ptp(measure_jacobian[:, :, :N_DURATIONS], axis=-1)
@@ -154,7 +156,7 @@ def estimate_measures(
             evaluate_measures(measure_names, gait_quantities),
             correction_effect_on_measures,
             measure_jacobian,
-            step_error_bound * total_sensitivity,
+            step_error_bound * total_quantity_sensitivity,
             missed_contact_duration[:, None] * duration_sensitivity_range,
         )
 
@@ -214,7 +216,7 @@ def refine_gaits(
     remaining_error_bounds, numerical_error_bounds = np.full((2, *measure_values.shape), np.inf)
     is_found, needs_tolerance_comparison = np.zeros((2, n_gaits), bool)
     walking_speed, n_steps = np.full(n_gaits, np.nan), np.zeros(n_gaits, int)
-    newton_matrix = np.zeros((n_gaits, n_coordinates, n_coordinates))
+    inverse_newton_matrix = np.zeros((n_gaits, n_coordinates, n_coordinates))
     step_quantity_jacobian = np.zeros((n_gaits, N_STEP_QUANTITIES, n_coordinates))
 
     def estimate_gait_measures(
@@ -225,7 +227,7 @@ def refine_gaits(
             wheel_indices[gait_positions],
             gait_section_states[gait_positions],
             contact_step,
-            newton_matrix[gait_positions],
+            inverse_newton_matrix[gait_positions],
             step_quantity_jacobian[gait_positions],
             measure_names,
         )
@@ -240,7 +242,7 @@ def refine_gaits(
                 wheel_indices[gait_positions], gait_section_states[gait_positions]
             )
         )
-        newton_matrix[gait_positions] = solve_linear_systems(
+        inverse_newton_matrix[gait_positions] = solve_linear_systems(
             np.eye(n_coordinates) - return_map_jacobian,
             np.broadcast_to(np.eye(n_coordinates), return_map_jacobian.shape),
         )
@@ -258,7 +260,7 @@ def refine_gaits(
                 * measure_estimates.correction_effect_on_measures
             )
             error_bound_goal = compute_error_goal(measure_estimates.measure_values)
-            is_within_goal = (n_corrections > 0) & np.all(
+            is_error_within_goal = (n_corrections > 0) & np.all(
                 error_bound
                 <= np.maximum(
                     error_bound_goal - measure_estimates.numerical_error_bound,
@@ -272,7 +274,7 @@ def refine_gaits(
                 * float(wheel_batch.step_options.rtol)
             )
             is_refinement_finished = measure_estimates.has_same_leg_codes & np.where(
-                is_contraction_slow, is_correction_at_stall_length, is_within_goal
+                is_contraction_slow, is_correction_at_stall_length, is_error_within_goal
             )
             finished_gait_positions = gait_positions[is_refinement_finished]
             is_found[finished_gait_positions] = True
@@ -306,11 +308,11 @@ def refine_gaits(
                 gait_section_states[gait_positions] + measure_estimates.newton_correction,
                 contact_step.section_states,
             )[is_refinement_continued]
-            needs_jacobian = is_refinement_continued & (
+            needs_new_jacobian = is_refinement_continued & (
                 is_contraction_slow | ~measure_estimates.has_same_leg_codes
             )
-            next_gait_positions = np.append(next_gait_positions, gait_positions[needs_jacobian])
-            is_refinement_continued &= ~needs_jacobian
+            next_gait_positions = np.append(next_gait_positions, gait_positions[needs_new_jacobian])
+            is_refinement_continued &= ~needs_new_jacobian
             gait_positions = gait_positions[is_refinement_continued]
             previous_correction_length = correction_length[is_refinement_continued]
             if not len(gait_positions):
@@ -345,8 +347,10 @@ def refine_gaits(
     is_found &= np.isfinite(total_error_bounds).all(1)
     # All multipliers are inside the unit circle if all eigenvalues of (I - DP)^-1 have real parts
     # above a half.
-    eigenvalues = np.linalg.eigvals(np.nan_to_num(newton_matrix, posinf=0.0, neginf=0.0))
-    is_attracting = eigenvalues.real.min(-1) > 0.5
+    inverse_newton_eigenvalues = np.linalg.eigvals(
+        np.nan_to_num(inverse_newton_matrix, posinf=0.0, neginf=0.0)
+    )
+    is_attracting = inverse_newton_eigenvalues.real.min(-1) > 0.5
     return RefinedGaits(
         is_found,
         is_attracting,

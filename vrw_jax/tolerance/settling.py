@@ -70,7 +70,7 @@ def walk_until_settled(
 
     Each walk settles, fails, or ends without settling after the last leap.
     """
-    n_walks, n_continuous = len(wheel_indices), section_states.shape[1] - wheel_batch.n_legs
+    n_walks, n_continuous_entries = len(wheel_indices), section_states.shape[1] - wheel_batch.n_legs
     loose_step_batch = wheel_batch.make_batch_for_walks()
     walk_ends = WalkEnds(
         np.zeros(n_walks, bool),
@@ -78,32 +78,32 @@ def walk_until_settled(
         np.full(n_walks, int(Outcome.STEPPED)),
         np.zeros(n_walks, int),
     )
-    active_walks, start_states = np.arange(n_walks), section_states
+    active_walk_indices, start_states = np.arange(n_walks), section_states
     n_steps_before_leaps = (
         leap_options.n_warmup_steps,
         *leap_options.max_leaps * (leap_options.steps_per_leap,),
     )
     for leap_index, n_steps_before_leap in enumerate(n_steps_before_leaps):
-        if not len(active_walks):
+        if not len(active_walk_indices):
             break
-        walk_ends.n_steps[active_walks] += n_steps_before_leap
-        active_wheel_indices = wheel_indices[active_walks]
+        walk_ends.n_steps[active_walk_indices] += n_steps_before_leap
+        active_wheel_indices = wheel_indices[active_walk_indices]
         third_last_step = loose_step_batch.take_steps(
             active_wheel_indices, start_states, n_steps_before_leap - 2
         )
-        failed_walks = np.flatnonzero(third_last_step.step_outcomes != Outcome.STEPPED)
-        if len(failed_walks):
+        failed_walk_indices = np.flatnonzero(third_last_step.step_outcomes != Outcome.STEPPED)
+        if len(failed_walk_indices):
             # A leap failed, or the tolerance of the first steps is too loose.
             retried_step = (loose_step_batch if leap_index else wheel_batch).take_steps(
-                active_wheel_indices[failed_walks],
-                walk_ends.section_states[active_walks[failed_walks]],
+                active_wheel_indices[failed_walk_indices],
+                walk_ends.section_states[active_walk_indices[failed_walk_indices]],
                 n_steps_before_leap - 2,
             )
             third_last_step = StepQuantities(*map(np.array, third_last_step))
             for third_last_step_array, retried_step_array in zip(
                 third_last_step, retried_step, strict=True
             ):
-                third_last_step_array[failed_walks] = retried_step_array
+                third_last_step_array[failed_walk_indices] = retried_step_array
         second_last_step = loose_step_batch.take_steps(
             active_wheel_indices, third_last_step.section_states
         )
@@ -115,20 +115,22 @@ def walk_until_settled(
         )
         has_stepped = np.all(step_outcomes == Outcome.STEPPED, axis=0)
         first_failed_step_index = np.argmax(step_outcomes != Outcome.STEPPED, axis=0)
-        walk_ends.walk_outcomes[active_walks] = step_outcomes[
-            first_failed_step_index, np.arange(len(active_walks))
+        walk_ends.walk_outcomes[active_walk_indices] = step_outcomes[
+            first_failed_step_index, np.arange(len(active_walk_indices))
         ]
-        active_walks = active_walks[has_stepped]
-        walk_ends.section_states[active_walks] = last_step.section_states[has_stepped]
-        walk_ends.has_settled[active_walks], leap_vectors, fade_distance = _extrapolate_drift(
-            third_last_step.section_states[has_stepped],
-            second_last_step.section_states[has_stepped],
-            last_step.section_states[has_stepped],
-            n_continuous,
-            leap_options,
+        active_walk_indices = active_walk_indices[has_stepped]
+        walk_ends.section_states[active_walk_indices] = last_step.section_states[has_stepped]
+        walk_ends.has_settled[active_walk_indices], leap_vectors, fade_distance = (
+            _extrapolate_drift(
+                third_last_step.section_states[has_stepped],
+                second_last_step.section_states[has_stepped],
+                last_step.section_states[has_stepped],
+                n_continuous_entries,
+                leap_options,
+            )
         )
         n_remaining_leaps = leap_options.max_leaps - leap_index
-        is_walk_continued = ~walk_ends.has_settled[active_walks] & (
+        is_walk_continued = ~walk_ends.has_settled[active_walk_indices] & (
             (n_remaining_leaps > leap_options.max_leaps_left_to_give_up)
             | (
                 fade_distance
@@ -137,12 +139,12 @@ def walk_until_settled(
                 * n_remaining_leaps
             )
         )
-        active_walks, leap_vectors = (
-            walk_array[is_walk_continued] for walk_array in (active_walks, leap_vectors)
+        active_walk_indices, leap_vectors = (
+            walk_array[is_walk_continued] for walk_array in (active_walk_indices, leap_vectors)
         )
-        start_states = walk_ends.section_states[active_walks]
+        start_states = walk_ends.section_states[active_walk_indices]
         # Each walking step first places loaded feet on the slope, so a leap ends at a valid start.
-        start_states[:, :n_continuous] += leap_vectors
+        start_states[:, :n_continuous_entries] += leap_vectors
     return walk_ends
 
 
@@ -150,23 +152,31 @@ def _extrapolate_drift(
     states_two_steps_before: np.ndarray,
     states_one_step_before: np.ndarray,
     current_states: np.ndarray,
-    n_continuous: int,
+    n_continuous_entries: int,
     leap_options: LeapOptions,
 ) -> tuple[np.ndarray, ...]:
     """Return whether each walk has settled, the leap of each walk, and the fade distance.
 
     The arguments are three successive section states of each walk, (walks, 4 + 3 n). The first
-    `n_continuous` entries are continuous. A leap starts at the last of the three states. The fade
-    distance is the distance from this state to the predicted limit of the drift. The leap and the
-    fade distance are zero if the contact codes of the legs change.
+    `n_continuous_entries` entries are continuous. A leap starts at the last of the three states.
+    The fade distance is the distance from this state to the predicted limit of the drift. The leap
+    and the fade distance are zero if the contact codes of the legs change.
     """
     has_same_leg_codes = np.all(
-        (states_two_steps_before[:, n_continuous:] == current_states[:, n_continuous:])
-        & (states_one_step_before[:, n_continuous:] == current_states[:, n_continuous:]),
+        (
+            states_two_steps_before[:, n_continuous_entries:]
+            == current_states[:, n_continuous_entries:]
+        )
+        & (
+            states_one_step_before[:, n_continuous_entries:]
+            == current_states[:, n_continuous_entries:]
+        ),
         axis=1,
     )
-    earlier_state_change = (states_one_step_before - states_two_steps_before)[:, :n_continuous]
-    last_state_change = (current_states - states_one_step_before)[:, :n_continuous]
+    earlier_state_change = (states_one_step_before - states_two_steps_before)[
+        :, :n_continuous_entries
+    ]
+    last_state_change = (current_states - states_one_step_before)[:, :n_continuous_entries]
     drift_per_step = np.abs(last_state_change).max(1)
     with np.errstate(all="ignore"):
         decay_rate = np.nan_to_num(

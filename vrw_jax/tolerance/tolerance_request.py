@@ -210,7 +210,7 @@ class _MeasureRequest:
         params: WheelParams,
         request_options: MeasureRequestOptions = REQUEST_OPTIONS,
     ) -> None:
-        n_wheels, n_measures = len(wheel_batch.parameter_columns.T), len(measure_names)
+        n_wheels, n_measures = len(wheel_batch.parameter_matrix.T), len(measure_names)
         self.measure_names = measure_names
         self.tol = tol
         self.relative = relative
@@ -253,12 +253,14 @@ class _MeasureRequest:
         if not len(wheel_indices):
             return
         replace_gaits(
-            self.lower_gaits, wheel_indices, find_rigid_gaits(self._take_wheels(wheel_indices))
+            self.lower_gaits,
+            wheel_indices,
+            find_rigid_gaits(self._select_wheel_params(wheel_indices)),
         )
         wheel_indices = wheel_indices[
             np.isfinite(self.lower_gaits.step_quantities[wheel_indices]).all(1)
         ]
-        self._correct_lower_gaits(wheel_indices, are_other_gaits_refined=False)
+        self._correct_lower_gaits(wheel_indices, are_rejected_gaits_refined=False)
 
     def try_paper_model(self) -> None:
         """Compute gaits of the paper's model, and store measures to within `tol`.
@@ -272,11 +274,13 @@ class _MeasureRequest:
         replace_gaits(
             self.lower_gaits,
             wheel_indices,
-            find_paper_gaits(self._take_wheels(wheel_indices), self.wheel_batch.step_options),
+            find_paper_gaits(
+                self._select_wheel_params(wheel_indices), self.wheel_batch.step_options
+            ),
         )
         self._correct_lower_gaits(
             wheel_indices[self.lower_gaits.model_index[wheel_indices] != ModelIndex.NONE],
-            are_other_gaits_refined=True,
+            are_rejected_gaits_refined=True,
         )
 
     def walk_to_gaits(self) -> None:
@@ -290,7 +294,7 @@ class _MeasureRequest:
             MeasureStatus.REACHED_FROM_LOWER_GAIT,
         )
         wheel_indices = wheel_indices[~has_lower_gait]
-        for walk_start in compute_walk_starts(self._take_wheels(wheel_indices))[
+        for walk_start in compute_walk_starts(self._select_wheel_params(wheel_indices))[
             : self.request_options.n_cold_starts
         ]:
             is_gait_missing = self.result_arrays["models"][wheel_indices] == ModelIndex.NONE
@@ -325,18 +329,18 @@ class _MeasureRequest:
             MeasureStatus.SELECTED_BY_RANK,
         )
 
-    def _take_wheels(self, wheel_indices: np.ndarray) -> WheelParams:
+    def _select_wheel_params(self, wheel_indices: np.ndarray) -> WheelParams:
         """Return the parameters of the wheels with the indices `wheel_indices`."""
         return jax.device_put(select_tree_rows(self.params, wheel_indices))
 
     def _correct_lower_gaits(
-        self, wheel_indices: np.ndarray, are_other_gaits_refined: bool
+        self, wheel_indices: np.ndarray, are_rejected_gaits_refined: bool
     ) -> None:
         """Compute one step with unilateral contact from each lower gait, and store measures.
 
         The measures of a lower gait are stored if the estimated errors are within `tol`. If
-        `are_other_gaits_refined` is True, the other lower gaits are the initial guesses for gaits
-        with unilateral contact, whose measures are stored as well.
+        `are_rejected_gaits_refined` is True, the other lower gaits are the initial guesses for
+        gaits with unilateral contact, whose measures are stored as well.
         """
         lower_gaits = LowerFidelityGaits(
             *(gait_array[wheel_indices] for gait_array in self.lower_gaits)
@@ -350,7 +354,7 @@ class _MeasureRequest:
             wheel_indices,
             section_states,
             contact_step,
-            lower_gaits.newton_matrix,
+            lower_gaits.inverse_newton_matrix,
             lower_gaits.step_quantity_jacobian,
             self.measure_names,
             self.wheel_batch.list_paper_state_indices(),
@@ -381,22 +385,24 @@ class _MeasureRequest:
                 + (self.request_options.error_safety_factor - 1.0) * total_measure_change
                 + numerical_error
             )
-            is_accepted = measure_estimates.has_same_leg_codes & np.all(
+            is_estimate_accepted = measure_estimates.has_same_leg_codes & np.all(
                 error_bound <= self.compute_error_goal(lower_measure_values), axis=1
             )
         self.result_arrays["n_steps"][wheel_indices] += 1
         self._record_results(
-            wheel_indices[is_accepted],
-            lower_gaits.model_index[is_accepted],
+            wheel_indices[is_estimate_accepted],
+            lower_gaits.model_index[is_estimate_accepted],
             MeasureStatus.CHECKED_BY_ONE_STEP,
-            lower_measure_values[is_accepted],
-            error_bound[is_accepted],
-            model_error[is_accepted],
-            numerical_error[is_accepted],
-            section_states[is_accepted],
+            lower_measure_values[is_estimate_accepted],
+            error_bound[is_estimate_accepted],
+            model_error[is_estimate_accepted],
+            numerical_error[is_estimate_accepted],
+            section_states[is_estimate_accepted],
         )
         rejected_gait_positions = np.flatnonzero(
-            are_other_gaits_refined & ~is_accepted & measure_estimates.has_same_leg_codes
+            are_rejected_gaits_refined
+            & ~is_estimate_accepted
+            & measure_estimates.has_same_leg_codes
         )
         refined_gaits = refine_gaits(
             self.wheel_batch,
@@ -513,8 +519,8 @@ class _MeasureRequest:
         `gait_results` contains the arrays in the order of `GAIT_RESULT_NAMES`. `model_index` and
         `status` are the model and the method of the results.
         """
-        for result_name, result_values in zip(GAIT_RESULT_NAMES, gait_results, strict=True):
-            self.result_arrays[result_name][wheel_indices] = result_values
+        for result_name, new_result_values in zip(GAIT_RESULT_NAMES, gait_results, strict=True):
+            self.result_arrays[result_name][wheel_indices] = new_result_values
         self.result_arrays["models"][wheel_indices] = model_index
         self.result_arrays["statuses"][wheel_indices] = status
         self.result_arrays["outcomes"][wheel_indices] = Outcome.STEPPED

@@ -24,7 +24,7 @@ class ExplorationOptions:
     """Options of the exploration of many starts.
 
     - `n_first_order_steps`: number of first-order optimizer steps;
-    - `first_step_length`: length of Adam's first step, in widths between the bounds;
+    - `first_optimizer_step_length`: length of Adam's first step, in widths between the bounds;
     - `gradient_decay`, `squared_gradient_decay`: decay rates of Adam's running averages of the
       gradient and of the squared gradient;
     - `penalty_weight`: penalty on a violation of one width between the bounds, in units of the
@@ -32,7 +32,7 @@ class ExplorationOptions:
     """
 
     n_first_order_steps: int = 25
-    first_step_length: float = 0.06
+    first_optimizer_step_length: float = 0.06
     gradient_decay: float = 0.7
     squared_gradient_decay: float = 0.9
     penalty_weight: float = 4.0
@@ -50,7 +50,7 @@ evaluations of neighboring gaits are given, the searches begin at these gaits.
 class ExplorationResult(NamedTuple):
     """Results of the exploration. Each array has a leading axis over starts."""
 
-    normalized_starts: np.ndarray  # (n_starts, n_free): starts in widths of the bounds
+    normalized_starts: np.ndarray  # (n_starts, n_free_parameters): starts in widths of the bounds
     normalized_parameters: np.ndarray
     objective: np.ndarray  # objective at the end; NaN if no gait was found
     max_violations: np.ndarray  # largest violation of a constraint, in widths of the bounds
@@ -103,7 +103,7 @@ def explore_starts(
     objective_gradient_norm = (
         np.median(np.linalg.norm(objective_gradient_norm, axis=1)) if has_active_gait.any() else 1.0
     )
-    step_lengths = np.full((n_starts, 1), exploration_options.first_step_length)
+    optimizer_step_lengths = np.full((n_starts, 1), exploration_options.first_optimizer_step_length)
     import optax  # An import at the top of the module would delay every start of the library.
 
     optimizer = optax.scale_by_adam(
@@ -136,7 +136,7 @@ def explore_starts(
             jnp.asarray(ascent_direction), optimizer_state
         )
         trial_step_lengths = (
-            step_lengths
+            optimizer_step_lengths
             * 0.5
             * (1.0 + np.cos(np.pi * step_index / exploration_options.n_first_order_steps))
         )
@@ -144,13 +144,13 @@ def explore_starts(
             normalized_parameters + trial_step_lengths * np.asarray(adam_update), 0.0, 1.0
         )
         trial_evaluation = gait_batch_evaluator(trial_parameters, current_evaluation)
-        previous_points = current_evaluation.gait.branch_point
-        trial_points = trial_evaluation.gait.branch_point
+        previous_branch_points = current_evaluation.gait.branch_point
+        trial_branch_points = trial_evaluation.gait.branch_point
         parameter_changes = parameter_change_function(trial_parameters - normalized_parameters)
         are_trials_on_branch = [
             is_same_branch(
-                select_tree_rows(previous_points, start_index),
-                select_tree_rows(trial_points, start_index),
+                select_tree_rows(previous_branch_points, start_index),
+                select_tree_rows(trial_branch_points, start_index),
                 parameter_change,
             )
             for start_index, parameter_change in enumerate(parameter_changes)
@@ -162,7 +162,9 @@ def explore_starts(
             & np.array(are_trials_on_branch)
         )
         n_lost_trials += has_active_gait & ~is_trial_accepted
-        step_lengths = np.where(is_trial_accepted[:, None], step_lengths, 0.5 * step_lengths)
+        optimizer_step_lengths = np.where(
+            is_trial_accepted[:, None], optimizer_step_lengths, 0.5 * optimizer_step_lengths
+        )
         normalized_parameters = np.where(
             is_trial_accepted[:, None], trial_parameters, normalized_parameters
         )
@@ -206,9 +208,9 @@ def are_starts_on_gait(gait_evaluation: GaitEvaluation) -> np.ndarray:
 
 def _are_evaluations_finite(gait_evaluation: GaitEvaluation, free_indices: list[int]) -> np.ndarray:
     """Return, for each start, whether objective, constraints and their derivatives are finite."""
-    free_jacobian = np.asarray(gait_evaluation.parameter_jacobian)[:, free_indices]
+    free_parameter_jacobian = np.asarray(gait_evaluation.parameter_jacobian)[:, free_indices]
     return np.isfinite(gait_evaluation.objective_and_constraint_values).all(-1) & np.isfinite(
-        free_jacobian
+        free_parameter_jacobian
     ).all((-1, -2))
 
 

@@ -53,7 +53,7 @@ class EvaluatedTrial(NamedTuple):
     objective: float
     objective_gradient: np.ndarray  # gradient of the objective by normalized parameters
     constraint_slacks: np.ndarray  # constraint values minus their margins, in their own units
-    slack_jacobian: np.ndarray  # (n_constraints, n_free)
+    slack_jacobian: np.ndarray  # (n_constraints, n_free_parameters)
     gait_evaluation: GaitEvaluation | None
 
     @property
@@ -62,7 +62,7 @@ class EvaluatedTrial(NamedTuple):
         return self.outcome == Outcome.STEPPED and self.is_on_branch
 
     @property
-    def has_finite_numbers(self) -> bool:
+    def has_finite_values(self) -> bool:
         """Return whether the objective, the constraints and their derivatives are finite."""
         trial_arrays = (
             self.objective,
@@ -75,9 +75,9 @@ class EvaluatedTrial(NamedTuple):
     @property
     def is_usable_trial(self) -> bool:
         """Return whether the maximization may continue from this trial."""
-        return self.has_gait_on_branch and self.has_finite_numbers
+        return self.has_gait_on_branch and self.has_finite_values
 
-    def describe_first_nonfinite_number(
+    def describe_first_nonfinite_value(
         self,
         objective_label: str,
         constraint_names: tuple[str, ...],
@@ -87,18 +87,23 @@ class EvaluatedTrial(NamedTuple):
 
         The objective is checked first, then the constraints in their order.
         """
-        measure_values = self.objective, *map(float, self.constraint_slacks + min_constraint_values)
-        measure_gradients = self.objective_gradient, *self.slack_jacobian
-        for measure_name, measure_value, measure_gradient in zip(
-            (objective_label, *constraint_names), measure_values, measure_gradients, strict=True
+        objective_and_constraint_values = (
+            self.objective,
+            *map(float, self.constraint_slacks + min_constraint_values),
+        )
+        objective_and_constraint_gradients = self.objective_gradient, *self.slack_jacobian
+        for measure_name, objective_or_constraint_value, objective_or_constraint_gradient in zip(
+            (objective_label, *constraint_names),
+            objective_and_constraint_values,
+            objective_and_constraint_gradients,
+            strict=True,
         ):
-            unprefixed_name = measure_name.removeprefix(UPPER_BOUND_PREFIX)
-            if not np.isfinite(measure_value):
-                return (
-                    f"{unprefixed_name} is {restore_sign_of_bound(measure_name, measure_value):g}"
-                )
-            if not np.isfinite(measure_gradient).all():
-                return f"{unprefixed_name} has a derivative that is not finite"
+            unprefixed_measure_name = measure_name.removeprefix(UPPER_BOUND_PREFIX)
+            if not np.isfinite(objective_or_constraint_value):
+                measure_value = restore_sign_of_bound(measure_name, objective_or_constraint_value)
+                return f"{unprefixed_measure_name} is {measure_value:g}"
+            if not np.isfinite(objective_or_constraint_gradient).all():
+                return f"{unprefixed_measure_name} has a derivative that is not finite"
         raise ValueError("Every number of this trial is finite: describe another.")
 
 
@@ -137,9 +142,10 @@ class _OptimumReachedError(Exception):
 class MaximizationOptions:
     """Options of the maximization. Lengths are in widths between the bounds.
 
-    - `full_box_radius`: half the side of the largest box, chosen because that box contains all
-      bounds from any center;
-    - `min_box_radius`: half the side of a box so small that the branch is considered to end there;
+    - `full_trust_box_radius`: half the side of the largest box, chosen because that box contains
+      all bounds from any center;
+    - `min_trust_box_radius`: half the side of a box so small that the branch is considered to end
+      there;
     - `coarse_objective_tolerance`: relative change of the objective at which SLSQP stops in a box
       smaller than the largest, chosen because another search continues from the result;
     - `fine_objective_tolerance`: relative change of the objective at which SLSQP stops in the
@@ -147,8 +153,8 @@ class MaximizationOptions:
     - `active_bound_tolerance`: relative slack below which a constraint is treated as active.
     """
 
-    full_box_radius: float = 1.0
-    min_box_radius: float = 1e-7
+    full_trust_box_radius: float = 1.0
+    min_trust_box_radius: float = 1e-7
     coarse_objective_tolerance: float = 1e-3
     fine_objective_tolerance: float = 1e-10
     active_bound_tolerance: float = 1e-6
@@ -240,30 +246,34 @@ def maximize_objective(
             raise _OptimumReachedError(trial)
         return trial
 
-    center_trial, box_radius, max_box_radius = (
+    center_trial, trust_box_radius, max_trust_box_radius = (
         start_trial,
-        maximization_options.full_box_radius,
-        maximization_options.full_box_radius,
+        maximization_options.full_trust_box_radius,
+        maximization_options.full_trust_box_radius,
     )
-    tune_status, n_trials_before_box = TuneStatus.CONVERGED, 0
+    tune_status, n_trials_before_trust_box = TuneStatus.CONVERGED, 0
     while True:
         # If this box had no new evaluation, the next box is smaller, because the search would be
         # repeated.
-        max_box_radius = (
-            max_box_radius
-            if len(trial_record.evaluated_trials) > n_trials_before_box
-            else 0.5 * max_box_radius
+        max_trust_box_radius = (
+            max_trust_box_radius
+            if len(trial_record.evaluated_trials) > n_trials_before_trust_box
+            else 0.5 * max_trust_box_radius
         )
-        n_trials_before_box, box_radius = (
+        n_trials_before_trust_box, trust_box_radius = (
             len(trial_record.evaluated_trials),
-            min(box_radius, max_box_radius),
+            min(trust_box_radius, max_trust_box_radius),
         )
-        if box_radius < maximization_options.min_box_radius:
+        if trust_box_radius < maximization_options.min_trust_box_radius:
             tune_status = TuneStatus.BRANCH_ENDED
             break
-        lower_box_side = np.maximum(center_trial.normalized_parameters - box_radius, 0.0)
-        upper_box_side = np.minimum(center_trial.normalized_parameters + box_radius, 1.0)
-        box_iterates = [center_trial]
+        lower_trust_box_side = np.maximum(
+            center_trial.normalized_parameters - trust_box_radius, 0.0
+        )
+        upper_trust_box_side = np.minimum(
+            center_trial.normalized_parameters + trust_box_radius, 1.0
+        )
+        trust_box_iterates = [center_trial]
         try:
             slsqp_result = minimize(
                 lambda trial_parameters: (
@@ -274,7 +284,7 @@ def maximize_objective(
                     -trial_record.evaluate_trial_once(trial_parameters).objective_gradient
                     / gradient_norm
                 ),
-                bounds=list(zip(lower_box_side, upper_box_side, strict=True)),
+                bounds=list(zip(lower_trust_box_side, upper_trust_box_side, strict=True)),
                 constraints={
                     "type": "ineq",
                     "fun": lambda trial_parameters: (
@@ -289,20 +299,22 @@ def maximize_objective(
                 method="SLSQP",
                 options={
                     "ftol": maximization_options.fine_objective_tolerance
-                    if box_radius >= max_box_radius
+                    if trust_box_radius >= max_trust_box_radius
                     else maximization_options.coarse_objective_tolerance,
                     "maxiter": 100,
                 },
-                callback=lambda trial_parameters, box_iterates=box_iterates: box_iterates.append(
-                    stop_at_optimum(trial_record.evaluate_iterate_once(trial_parameters))
+                callback=lambda trial_parameters, trust_box_iterates=trust_box_iterates: (
+                    trust_box_iterates.append(
+                        stop_at_optimum(trial_record.evaluate_iterate_once(trial_parameters))
+                    )
                 ),
             )
             end_trial = trial_record.evaluate_iterate_once(
-                np.clip(slsqp_result.x, lower_box_side, upper_box_side)
+                np.clip(slsqp_result.x, lower_trust_box_side, upper_trust_box_side)
             )
         except _LostBranchError as lost_branch:
-            center_trial = box_iterates[-1]
-            box_radius = 0.5 * float(
+            center_trial = trust_box_iterates[-1]
+            trust_box_radius = 0.5 * float(
                 np.max(
                     np.abs(
                         lost_branch.lost_trial.normalized_parameters
@@ -317,19 +329,19 @@ def maximize_objective(
         except _EvaluationLimitReachedError:
             tune_status = TuneStatus.MAX_EVALUATIONS_REACHED
             break
-        has_reached_inner_box_side = (end_trial.normalized_parameters <= lower_box_side + 1e-9) & (
-            lower_box_side > 0.0
-        )
-        has_reached_inner_box_side |= (end_trial.normalized_parameters >= upper_box_side - 1e-9) & (
-            upper_box_side < 1.0
-        )
+        has_reached_inner_box_side = (
+            end_trial.normalized_parameters <= lower_trust_box_side + 1e-9
+        ) & (lower_trust_box_side > 0.0)
+        has_reached_inner_box_side |= (
+            end_trial.normalized_parameters >= upper_trust_box_side - 1e-9
+        ) & (upper_trust_box_side < 1.0)
         center_trial = end_trial
-        if box_radius >= maximization_options.full_box_radius:
+        if trust_box_radius >= maximization_options.full_trust_box_radius:
             break
-        box_radius = (
-            min(2.0 * box_radius, maximization_options.full_box_radius)
+        trust_box_radius = (
+            min(2.0 * trust_box_radius, maximization_options.full_trust_box_radius)
             if has_reached_inner_box_side.any()
-            else maximization_options.full_box_radius
+            else maximization_options.full_trust_box_radius
         )
     best_trial = center_trial
     if tune_status != TuneStatus.CONVERGED:
@@ -364,15 +376,15 @@ def _find_best_trial(
         compute_max_violation(trial.constraint_slacks, slack_scales)
         <= maximization_options.active_bound_tolerance
     )
-    feasible_gaits = [trial for trial in usable_trials if is_trial_feasible(trial)]
-    if not feasible_gaits:
+    feasible_trials = [trial for trial in usable_trials if is_trial_feasible(trial)]
+    if not feasible_trials:
         return min(
             usable_trials,
             key=lambda trial: compute_max_violation(trial.constraint_slacks, slack_scales),
         )
     if is_trial_feasible(last_trial):
-        feasible_gaits.append(last_trial)
-    return max(feasible_gaits, key=lambda trial: trial.objective)
+        feasible_trials.append(last_trial)
+    return max(feasible_trials, key=lambda trial: trial.objective)
 
 
 class OptimalityConditions(NamedTuple):
@@ -395,19 +407,21 @@ def compute_optimality_conditions(
     """
     from scipy.optimize import nnls  # This import is slow.
 
-    n_free, active_tolerance = (
+    n_free_parameters, active_bound_tolerance = (
         trial.normalized_parameters.size,
         maximization_options.active_bound_tolerance,
     )
     slack_scales = compute_slack_scales(trial.constraint_slacks, trial.slack_jacobian)
     active_constraint_indices = np.flatnonzero(
-        np.abs(trial.constraint_slacks) <= 10.0 * active_tolerance * slack_scales
+        np.abs(trial.constraint_slacks) <= 10.0 * active_bound_tolerance * slack_scales
     )
-    active_lower_bound_indices = np.flatnonzero(trial.normalized_parameters <= active_tolerance)
+    active_lower_bound_indices = np.flatnonzero(
+        trial.normalized_parameters <= active_bound_tolerance
+    )
     active_upper_bound_indices = np.flatnonzero(
-        trial.normalized_parameters >= 1.0 - active_tolerance
+        trial.normalized_parameters >= 1.0 - active_bound_tolerance
     )
-    identity_matrix = np.eye(n_free)
+    identity_matrix = np.eye(n_free_parameters)
     constraint_normals = np.concatenate(
         [
             trial.slack_jacobian[active_constraint_indices]
@@ -418,21 +432,29 @@ def compute_optimality_conditions(
     ).T
     gradient_norm = max(float(np.linalg.norm(trial.objective_gradient)), 1e-300)
     constraint_prices = np.zeros(trial.constraint_slacks.size)
-    lower_bound_prices, upper_bound_prices = np.zeros(n_free), np.zeros(n_free)
+    lower_bound_prices, upper_bound_prices = (
+        np.zeros(n_free_parameters),
+        np.zeros(n_free_parameters),
+    )
     if not constraint_normals.shape[1]:
         return OptimalityConditions(constraint_prices, lower_bound_prices, upper_bound_prices, 1.0)
-    normal_weights, least_squares_residual = nnls(constraint_normals, -trial.objective_gradient)
+    constraint_normal_weights, least_squares_residual = nnls(
+        constraint_normals, -trial.objective_gradient
+    )
     first_lower_bound_weight, first_upper_bound_weight = (
         len(active_constraint_indices),
         len(active_constraint_indices) + len(active_lower_bound_indices),
     )
     constraint_prices[active_constraint_indices] = (
-        normal_weights[:first_lower_bound_weight] / slack_scales[active_constraint_indices]
+        constraint_normal_weights[:first_lower_bound_weight]
+        / slack_scales[active_constraint_indices]
     )
-    lower_bound_prices[active_lower_bound_indices] = normal_weights[
+    lower_bound_prices[active_lower_bound_indices] = constraint_normal_weights[
         first_lower_bound_weight:first_upper_bound_weight
     ]
-    upper_bound_prices[active_upper_bound_indices] = normal_weights[first_upper_bound_weight:]
+    upper_bound_prices[active_upper_bound_indices] = constraint_normal_weights[
+        first_upper_bound_weight:
+    ]
     return OptimalityConditions(
         constraint_prices,
         lower_bound_prices,

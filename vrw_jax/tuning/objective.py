@@ -144,14 +144,14 @@ def _parse_constraint_bound(
             "an upper "
             "bound, as in (None, 0.6), or leave the constraint out."
         )
-    lower_end, upper_end = bound_or_range
-    if lower_end is None:
+    lower_limit, upper_limit = bound_or_range
+    if lower_limit is None:
         return {
             UPPER_BOUND_PREFIX + measure_name: -check_real(
-                f"the upper end of {measure_name}", upper_end
+                f"the upper end of {measure_name}", upper_limit
             )
         }
-    return {measure_name: check_real(f"the lower end of {measure_name}", lower_end)}
+    return {measure_name: check_real(f"the lower end of {measure_name}", lower_limit)}
 
 
 def restore_sign_of_bound(constraint_name: str, lower_bound: float) -> float:

@@ -192,7 +192,7 @@ def tune(
         if exploration_result is None
         else exploration_result.normalized_parameters[exploration_result.best_start_index]
     )
-    compiled_seconds = time.perf_counter()
+    compilation_end_seconds = time.perf_counter()
     maximization_result = maximize_objective(
         tune_problem.evaluate_trial,
         start_trial,
@@ -200,7 +200,7 @@ def tune(
         max_evaluations=max_evaluations,
     )
     return tune_problem.make_tune_result(
-        maximization_result, start_seconds, compiled_seconds, exploration_result
+        maximization_result, start_seconds, compilation_end_seconds, exploration_result
     )
 
 
@@ -279,10 +279,10 @@ class TuneProblem:
     @property
     def normalized_start(self) -> np.ndarray:
         """Return the normalized free parameters of the start wheel, shape (free,)."""
-        start_values = np.array(
+        start_parameter_values = np.array(
             [float(getattr(self.params, parameter_name)) for parameter_name in self.free_parameters]
         )
-        return np.clip((start_values - self.lower_bounds) / self.bound_widths, 0.0, 1.0)
+        return np.clip((start_parameter_values - self.lower_bounds) / self.bound_widths, 0.0, 1.0)
 
     def evaluate_start_trial(self, normalized_parameters: np.ndarray) -> EvaluatedTrial:
         """Evaluate the trial with the parameters `normalized_parameters`, from which the
@@ -297,8 +297,8 @@ class TuneProblem:
                 f"{start_trial.outcome.meaning[:-1]}"
                 "): start from a wheel that walks, such as WheelParams()."
             )
-        if not start_trial.has_finite_numbers:
-            nonfinite_description = start_trial.describe_first_nonfinite_number(
+        if not start_trial.has_finite_values:
+            nonfinite_description = start_trial.describe_first_nonfinite_value(
                 self.objective_label, self.constraint_names, self.min_constraint_values
             )
             raise ValueError(
@@ -353,29 +353,29 @@ class TuneProblem:
     ) -> EvaluatedTrial:
         """Return the trial for a gait whose objective and constraints have been evaluated."""
         objective_and_constraint_values = np.array(gait_evaluation.objective_and_constraint_values)
-        free_jacobian = (
+        free_parameter_jacobian = (
             np.array(gait_evaluation.parameter_jacobian)[self.free_parameter_indices].T
             * self.bound_widths
         )
         if gait_outcome != Outcome.STEPPED:
-            objective_and_constraint_values, free_jacobian = (
+            objective_and_constraint_values, free_parameter_jacobian = (
                 np.full_like(objective_and_constraint_values, np.nan),
-                np.full_like(free_jacobian, np.nan),
+                np.full_like(free_parameter_jacobian, np.nan),
             )
         return EvaluatedTrial(
             normalized_parameters,
             gait_outcome,
             is_on_branch,
             float(objective_and_constraint_values[0]),
-            free_jacobian[0],
+            free_parameter_jacobian[0],
             objective_and_constraint_values[1:] - self.min_constraint_values,
-            free_jacobian[1:],
+            free_parameter_jacobian[1:],
             gait_evaluation,
         )
 
     def explore_random_starts(self, n_starts: int, seed: int) -> ExplorationResult:
         """Explore from this wheel and from random wheels in one batch, and return the ends."""
-        random_starts = np.random.default_rng(seed).uniform(
+        random_normalized_starts = np.random.default_rng(seed).uniform(
             size=(n_starts - 1, len(self.free_parameters))
         )
 
@@ -390,7 +390,7 @@ class TuneProblem:
 
         exploration_result = explore_starts(
             self._evaluate_gait_batch,
-            np.vstack([self.normalized_start, random_starts]),
+            np.vstack([self.normalized_start, random_normalized_starts]),
             denormalize_parameter_changes,
             self.free_parameter_indices,
             self.bound_widths,
@@ -411,7 +411,10 @@ class TuneProblem:
         If `neighbor_evaluation` is given, the searches begin at its gaits.
         """
         parameter_values = jnp.asarray(
-            [self.denormalize_parameters(parameter_row) for parameter_row in normalized_parameters]
+            [
+                self.denormalize_parameters(normalized_parameter_row)
+                for normalized_parameter_row in normalized_parameters
+            ]
         )
         initial_guesses = self.gait_finder.make_initial_guesses(parameter_values)
         search_guesses = (
@@ -428,7 +431,7 @@ class TuneProblem:
         self,
         maximization_result: MaximizationResult,
         start_seconds: float,
-        compiled_seconds: float,
+        compilation_end_seconds: float,
         exploration_result: ExplorationResult | None = None,
     ) -> TuneResult:
         """Return the `TuneResult` for a maximization, with active constraints and a validation
@@ -454,28 +457,31 @@ class TuneProblem:
             )
             if objective_price > 0.0
         ]
-        bound_sides = (
+        bounds_and_prices = (
             (self.lower_bounds, optimality_conditions.lower_bound_prices),
             (self.upper_bounds, optimality_conditions.upper_bound_prices),
         )
-        for bound_values, bound_prices in bound_sides:
+        for bound_values, bound_prices in bounds_and_prices:
             for parameter_name, constraint_limit, objective_price, bound_width in zip(
                 self.free_parameters, bound_values, bound_prices, self.bound_widths, strict=True
             ):
                 if objective_price > 0.0:
-                    limit_unit, price_per_unit = (
+                    constraint_limit_unit, price_per_unit = (
                         get_measure(parameter_name).unit,
                         float(objective_price / bound_width),
                     )
                     active_constraints.append(
                         ActiveConstraint(
-                            parameter_name, float(constraint_limit), limit_unit, price_per_unit
+                            parameter_name,
+                            float(constraint_limit),
+                            constraint_limit_unit,
+                            price_per_unit,
                         )
                     )
         end_seconds = time.perf_counter()
         walk_validation = self._validate_tuned_wheel_by_walking(params, best_gait)
         step_measures = best_gait.step.measures()
-        violated_names = [
+        violated_margin_names = [
             measure_name
             for measure_name in MARGIN_MEASURES
             if measure_name in step_measures and np.min(step_measures[measure_name]) < 0.0
@@ -492,7 +498,7 @@ class TuneProblem:
             kkt_residual=optimality_conditions.kkt_residual,
             violated_margins=tuple(
                 measure_name
-                for measure_name in violated_names
+                for measure_name in violated_margin_names
                 if measure_name not in self.constraint_margins
             ),
             validation=walk_validation,
@@ -504,7 +510,7 @@ class TuneProblem:
                 for trial_kind in maximization_result.trial_kinds
             ),
             seconds=end_seconds - start_seconds,
-            compile_seconds=compiled_seconds - start_seconds,
+            compile_seconds=compilation_end_seconds - start_seconds,
             exploration=exploration_result,
         )
 
@@ -512,22 +518,27 @@ class TuneProblem:
         """Simulate a walk that starts near the section state of the gait, and return its
         validation.
         """
-        cycle_state, walk_options = np.array(gait.cycle.section_state), self.validation_options
+        cycle_section_state, validation_walk_options = (
+            np.array(gait.cycle.section_state),
+            self.validation_options,
+        )
         # The state is scaled down, not up, because no leg may be beyond its stopper.
-        section_state = cycle_state * (1.0 - walk_options.relative_start_displacement)
-        is_gait_feasible, walk_outcome, n_walked = True, Outcome.STEPPED, 0
-        margins_by_default = default_margins(params)
-        for _ in range(walk_options.n_steps_of_walk):
+        section_state = cycle_section_state * (
+            1.0 - validation_walk_options.relative_start_displacement
+        )
+        is_gait_feasible, walk_outcome, n_steps_walked = True, Outcome.STEPPED, 0
+        default_margins_by_name = default_margins(params)
+        for _ in range(validation_walk_options.n_steps_of_walk):
             step_result = self.gait_finder.take_gait_step(params, jnp.asarray(section_state))
             walk_outcome = Outcome(int(step_result.outcome))
             if walk_outcome != Outcome.STEPPED:
                 break
-            n_walked, section_state = n_walked + 1, np.array(step_result.section_state)
+            n_steps_walked, section_state = n_steps_walked + 1, np.array(step_result.section_state)
             step_measures = {
                 measure_name: np.asarray(measure_value)
                 for measure_name, measure_value in step_result.measures().items()
             }
-            for constraint_name, min_value in self.constraint_margins.items():
+            for constraint_name, min_constraint_value in self.constraint_margins.items():
                 if (
                     measure_name := constraint_name.removeprefix(UPPER_BOUND_PREFIX)
                 ) in step_measures:
@@ -536,19 +547,24 @@ class TuneProblem:
                         if measure_name == constraint_name
                         else -step_measures[measure_name]
                     )
-                    default_margin = abs(margins_by_default.get(constraint_name, 0.0))
-                    violation_tolerance = walk_options.constraint_value_tolerance * np.max(
-                        np.abs(constraint_value)
+                    default_margin = abs(default_margins_by_name.get(constraint_name, 0.0))
+                    violation_tolerance = (
+                        validation_walk_options.constraint_value_tolerance
+                        * np.max(np.abs(constraint_value))
                     )
-                    violation_tolerance += walk_options.default_margin_tolerance * default_margin
+                    violation_tolerance += (
+                        validation_walk_options.default_margin_tolerance * default_margin
+                    )
                     is_gait_feasible &= bool(
-                        np.all(constraint_value >= min_value - violation_tolerance - 1e-9)
+                        np.all(
+                            constraint_value >= min_constraint_value - violation_tolerance - 1e-9
+                        )
                     )
-        final_distance = float(np.max(np.abs(section_state - cycle_state)))
+        final_state_distance = float(np.max(np.abs(section_state - cycle_section_state)))
         return WalkValidation(
-            n_walked,
+            n_steps_walked,
             walk_outcome,
-            final_distance,
+            final_state_distance,
             is_gait_feasible and walk_outcome == Outcome.STEPPED,
         )
 
@@ -787,10 +803,10 @@ def _check_parameter_bounds(
                     f"{PARAMETER_DOMAINS[parameter_name].description} must lie "
                     f"in {PARAMETER_DOMAINS[parameter_name]}: keep them inside."
                 )
-        start_value = float(getattr(params, parameter_name))
-        if not lower_bound <= start_value <= upper_bound:
+        start_parameter_value = float(getattr(params, parameter_name))
+        if not lower_bound <= start_parameter_value <= upper_bound:
             raise ValueError(
-                f"the start has {parameter_name} {start_value:g}, outside its bounds "
+                f"the start has {parameter_name} {start_parameter_value:g}, outside its bounds "
                 f"({lower_bound:g}, {upper_bound:g}): widen the bounds or start inside them."
             )
     bound_pairs = np.array(

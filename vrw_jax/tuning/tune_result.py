@@ -111,11 +111,11 @@ class TuneResult:
 
     def describe(self) -> dict[str, str]:
         """Return the printed texts that summarize the result, by label."""
-        free_names = self.path.attrs["free"].split()
+        free_parameter_names = self.path.attrs["free"].split()
         parameter_texts = [
             f"{parameter_name} "
             f"{MEASURES[parameter_name].format_with_unit(getattr(self.params, parameter_name))}"
-            for parameter_name in free_names
+            for parameter_name in free_parameter_names
         ]
         feasibility_text = (
             "every constraint kept" if self.validation.is_feasible else "a constraint broken"
@@ -123,7 +123,7 @@ class TuneResult:
         feasibility_text = (
             feasibility_text if self.path.sizes["constraint"] else "no constraint to keep"
         )
-        active_texts = [
+        active_constraint_texts = [
             f"{parameter_name} at {get_measure(parameter_name).format_with_unit(constraint_limit)}"
             for parameter_name, constraint_limit, *_ in self.active
         ]
@@ -131,7 +131,8 @@ class TuneResult:
             "objective": f"{self.objective}: {self.start_value:.6g} at the start, {self.value:.6g}",
             "wheel": ", ".join(parameter_texts),
             "ending": f"{self.status.name}: {self.status.meaning}",
-            "held by": ", ".join(active_texts) or NO_ACTIVE_CONSTRAINT_TEXTS[self.status],
+            "held by": ", ".join(active_constraint_texts)
+            or NO_ACTIVE_CONSTRAINT_TEXTS[self.status],
             "not asked for, and broken": ", ".join(self.violated_margins) or "none",
             "walked": f"{self.validation.n_steps} steps, {self.validation.outcome.name}, "
             f"{self.validation.distance:.1e} from the cycle at last; {feasibility_text}",

@@ -69,12 +69,12 @@ def find_wheel_page() -> Path:
     """
     package_folder = Path(__file__).parents[1]
     return next(
-        candidate_path
-        for candidate_path in (
+        candidate_page_path
+        for candidate_page_path in (
             package_folder / "wheel.html",
             package_folder.parent / "docs/wheel.html",
         )
-        if candidate_path.exists()
+        if candidate_page_path.exists()
     )
 
 
@@ -87,12 +87,14 @@ def make_page_address(params: WheelParams, model_name: str = PAGE_MODEL_NAMES[0]
     page_values = _make_page_values(
         params, 1.0, check_choice("model_name", model_name, PAGE_MODEL_NAMES)
     )
-    changed_values = {
+    changed_page_values = {
         page_value_name: page_value
         for page_value_name, page_value in page_values.items()
         if page_value != default_values[page_value_name]
     }
-    return find_wheel_page().as_uri() + (f"#{urlencode(changed_values)}" if changed_values else "")
+    return find_wheel_page().as_uri() + (
+        f"#{urlencode(changed_page_values)}" if changed_page_values else ""
+    )
 
 
 @with_renamed_arguments(rung="model_name")
@@ -241,12 +243,12 @@ def _make_page_map(dataset: "xr.Dataset") -> dict[str, Any]:
     import xarray
 
     check_type("dataset", dataset, xarray.Dataset, "give a scan of vrw.grid over two parameters")
-    map_axes = [
+    map_axis_names = [
         str(dimension_name)
         for dimension_name in dataset.sizes
         if dimension_name in PARAMETER_DOMAINS and dataset.sizes[dimension_name] > 1
     ]
-    if len(map_axes) != 2:
+    if len(map_axis_names) != 2:
         raise ValueError(
             f"the dataset has the axes {', '.join(map(str, dataset.sizes))}, but a map has two "
             "parameters: give a scan of vrw.grid over two of them."
@@ -255,19 +257,19 @@ def _make_page_map(dataset: "xr.Dataset") -> dict[str, Any]:
         {
             dimension_name: 0
             for dimension_name in dataset.sizes
-            if dimension_name in PARAMETER_DOMAINS and dimension_name not in map_axes
+            if dimension_name in PARAMETER_DOMAINS and dimension_name not in map_axis_names
         }
     )
     map_measures: dict[str, Any] = {}
     for variable_name, measure_array in measure_values.data_vars.items():
-        other_dimensions = [
+        dimensions_over_legs = [
             dimension_name
             for dimension_name in measure_array.dims
-            if dimension_name not in map_axes
+            if dimension_name not in map_axis_names
         ]
-        if measure_array.dtype.kind == "f" and set(map_axes) <= set(measure_array.dims):
+        if measure_array.dtype.kind == "f" and set(map_axis_names) <= set(measure_array.dims):
             min_values_over_legs = (
-                measure_array.min(other_dimensions).transpose(*map_axes[::-1]).values
+                measure_array.min(dimensions_over_legs).transpose(*map_axis_names[::-1]).values
             )
             map_measures[str(variable_name)] = [
                 [
@@ -278,9 +280,9 @@ def _make_page_map(dataset: "xr.Dataset") -> dict[str, Any]:
             ]
     return {
         "axes": [
-            {"name": axis_name, "values": measure_values[axis_name].values.tolist()}
-            for axis_name in map_axes
+            {"name": map_axis_name, "values": measure_values[map_axis_name].values.tolist()}
+            for map_axis_name in map_axis_names
         ],
         "measures": map_measures,
-        "outcome": measure_values["outcome"].transpose(*map_axes[::-1]).values.tolist(),
+        "outcome": measure_values["outcome"].transpose(*map_axis_names[::-1]).values.tolist(),
     }
