@@ -579,8 +579,8 @@ def test_a_worker_uses_the_trace_keys_of_the_calling_process() -> None:
     """Otherwise each would trace and compile what the cache holds."""
     values_here = make_plan().evaluation_request
     parsed = pickle.loads(pickle.dumps(values_here))
-    assert repr(CollocationScanEngine(values_here)._cache_key) == repr(
-        CollocationScanEngine(parsed)._cache_key
+    assert repr(CollocationScanEngine(values_here)._program_cache_key) == repr(
+        CollocationScanEngine(parsed)._program_cache_key
     )
 
 
