@@ -26,7 +26,7 @@ def walk_by_linear_map(monkeypatch, multiplier, last_step=10**9):
         end_states = FIXED_POINT + multiplier**n_steps * (states - FIXED_POINT)
         return end_states, np.full(len(states), int(outcome))
 
-    monkeypatch.setattr(gait_walks, "_walk_wheels", take_steps)
+    monkeypatch.setattr(gait_walks, "_simulate_wheel_walks", take_steps)
     finder = SimpleNamespace(model=vrw.ViscoelasticWheel(), n_legs=8, period_n=1)
     values = np.asarray(vrw.ViscoelasticWheel().collect_parameter_values(vrw.WheelParams()))[None]
     starts = (FIXED_POINT + 0.01 * np.ones(N_COORDINATES))[None, None]
