@@ -176,16 +176,16 @@ def run_gait_command(
         start = gait_config.gait.start
         section_state = model.compute_default_start(params) if start is None else jnp.asarray(start)
         section_state = model.complete_section_state(params, section_state)
-        n_walked, n_steps = 0, steps or gait_config.gait.steps
+        n_steps_walked, n_steps = 0, steps or gait_config.gait.steps
         with show_computation_stages("walking (the first time compiles for a while)"):
             while True:
                 step_result: Any = step(params, section_state, model=model, options=options)
                 has_stepped = int(step_result.outcome) == Outcome.STEPPED
-                n_walked += has_stepped
-                if not has_stepped or n_walked == n_steps:
+                n_steps_walked += has_stepped
+                if not has_stepped or n_steps_walked == n_steps:
                     break
                 section_state = step_result.section_state
-            model, model_reason = resolve_model_with_reason(params, model)
+            model, model_selection_reason = resolve_model_with_reason(params, model)
             can_search_without_start = (
                 start is None or make_finder(model, params.n_legs).supports_cold_start
             )
@@ -193,17 +193,17 @@ def run_gait_command(
                 params, guess=None if can_search_without_start else section_state, model=model
             )
             force_peaks: dict[str, Any] = {}
-            reason_without_peaks = ""
+            missing_force_peaks_reason = ""
             if model.is_compliant and bool(limit_cycle_result.found):
                 try:
                     force_peaks = limit_cycle_result.measures(FORCE_PEAK_MEASURES)
                 except ValueError as error:  # for unilateral contact without machine code
-                    reason_without_peaks = str(error)
+                    missing_force_peaks_reason = str(error)
         printing.print_wheel_and_gait(
-            params, step_result, section_state, n_walked, limit_cycle_result, force_peaks
+            params, step_result, section_state, n_steps_walked, limit_cycle_result, force_peaks
         )
-        for remark in filter(None, (reason_without_peaks, model_reason)):
-            stdout_console.print(remark)
+        for gait_remark in filter(None, (missing_force_peaks_reason, model_selection_reason)):
+            stdout_console.print(gait_remark)
 
 
 @app.command("explore")
@@ -240,34 +240,34 @@ def run_init_command(
     """
     with report_command_errors():
         example_folder = find_example_config_folder()
-        example_texts = {
+        example_config_texts = {
             config_path.name: config_path.read_text(encoding="utf-8")
             for config_path in example_folder.glob("*.toml")
         }
-        existing_paths = [
+        existing_config_paths = [
             folder / config_name
-            for config_name in sorted(example_texts)
+            for config_name in sorted(example_config_texts)
             if (folder / config_name).exists()
         ]
-        for config_path in existing_paths:
+        for config_path in existing_config_paths:
             if (
                 config_path.read_text(encoding="utf-8", errors="replace")
-                != example_texts[config_path.name]
+                != example_config_texts[config_path.name]
             ):
                 raise ValueError(
                     f"{config_path} is there already and differs: give another folder."
                 )
         _require_writable_folder(folder)
         folder.mkdir(parents=True, exist_ok=True)
-        missing_paths = [
+        missing_config_paths = [
             folder / config_name
-            for config_name in sorted(example_texts)
-            if folder / config_name not in existing_paths
+            for config_name in sorted(example_config_texts)
+            if folder / config_name not in existing_config_paths
         ]
-        for config_path in missing_paths:
-            config_path.write_text(example_texts[config_path.name], encoding="utf-8")
-        printing.print_written_paths(missing_paths)
-        if not missing_paths:
+        for config_path in missing_config_paths:
+            config_path.write_text(example_config_texts[config_path.name], encoding="utf-8")
+        printing.print_written_paths(missing_config_paths)
+        if not missing_config_paths:
             stdout_console.print(f"{folder} has them all: nothing to write.", highlight=False)
 
 
@@ -275,19 +275,22 @@ def find_example_config_folder() -> Path:
     """Return the folder of the example configs, which is in the installed package or next to it."""
     package_folder = Path(__file__).parents[1]
     return next(
-        candidate_folder
-        for candidate_folder in (package_folder / "configs", package_folder.parent / "configs")
-        if candidate_folder.is_dir()
+        candidate_config_folder
+        for candidate_config_folder in (
+            package_folder / "configs",
+            package_folder.parent / "configs",
+        )
+        if candidate_config_folder.is_dir()
     )
 
 
 def _require_writable_folder(folder: Path) -> None:
     """Raise a ValueError if the folder is not writable. No folder is created."""
-    existing_folder = folder
-    while not existing_folder.exists():
-        existing_folder = existing_folder.parent
+    existing_parent_folder = folder
+    while not existing_parent_folder.exists():
+        existing_parent_folder = existing_parent_folder.parent
     try:
-        with tempfile.TemporaryDirectory(dir=existing_folder):
+        with tempfile.TemporaryDirectory(dir=existing_parent_folder):
             pass
     except OSError as write_error:
         raise ValueError(

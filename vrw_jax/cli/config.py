@@ -203,8 +203,8 @@ class TuneConfig:
         objective_setting = config_table.get("objective", cls.objective)
         if isinstance(objective_setting, dict):
             objective_setting = {
-                key_name: _parse_finite_number(given_value, key_name)
-                for key_name, given_value in objective_setting.items()
+                key_name: _parse_finite_number(config_value, key_name)
+                for key_name, config_value in objective_setting.items()
             }
         elif not isinstance(objective_setting, str):
             requirement_text = (
@@ -230,14 +230,14 @@ class TuneConfig:
                     "constraints", constraints_table, requirement_text + "clearance_sls1 = 0.001"
                 )
             constraints_table = {
-                key_name: _parse_finite_number(given_value, key_name)
-                for key_name, given_value in constraints_table.items()
+                key_name: _parse_finite_number(config_value, key_name)
+                for key_name, config_value in constraints_table.items()
             }
         return cls(
             objective=objective_setting,
             bounds={
-                key_name: _parse_parameter_range(key_name, given_value)
-                for key_name, given_value in bounds_table.items()
+                key_name: _parse_parameter_range(key_name, config_value)
+                for key_name, config_value in bounds_table.items()
             },
             constraints=constraints_table,
             evaluations=_parse_whole_number(
@@ -264,17 +264,19 @@ class BranchConfig:
 
     @classmethod
     def from_table(
-        cls, config_table: Mapping[str, object], allowed_parameters: tuple[str, ...]
+        cls, config_table: Mapping[str, object], allowed_parameter_names: tuple[str, ...]
     ) -> "BranchConfig":
         """Read the settings of the table `[branch]`.
 
-        Its parameter must be one of `allowed_parameters`.
+        Its parameter must be one of `allowed_parameter_names`.
         """
-        _raise_for_renamed_keys(config_table, "[branch]")
+        _reject_renamed_keys(config_table, "[branch]")
         _require_known_keys(config_table, cls.__dataclass_fields__, "[branch]", "settings")
         branch_parameter = config_table.get("parameter")
         check_parameter_name(
-            branch_parameter, allowed_parameters, "parameter that a branch of this model runs along"
+            branch_parameter,
+            allowed_parameter_names,
+            "parameter that a branch of this model runs along",
         )
         assert isinstance(branch_parameter, str)
         if "bounds" not in config_table:
@@ -422,7 +424,7 @@ def _parse_config_tables(
             f"[{design_kinds[0]}], but it can only be one: drop one of the two."
         )
     options_table = _get_config_table(config_tables, "options")
-    _raise_for_renamed_keys(options_table, "[options]")
+    _reject_renamed_keys(options_table, "[options]")
     _require_known_keys(options_table, _STEP_OPTION_KEYS, "[options]", "options")
     default_options = {
         option_name: getattr(StepOptions(), option_name) for option_name in _STEP_OPTION_KEYS
@@ -473,29 +475,31 @@ def parse_assignment(assignment_text: str) -> tuple[str, float | int]:
             f"--set {assignment_text} has no '=': write a parameter and its value, damping=150."
         )
     try:
-        given_number = int(value_text) if parameter_name == "n_legs" else float(value_text)
+        assigned_number = int(value_text) if parameter_name == "n_legs" else float(value_text)
     except ValueError:
-        given_number = value_text  # type: ignore[assignment]  # The check below reports the error.
-    return parameter_name, _parse_wheel_table({parameter_name: given_number})[parameter_name]
+        assigned_number = value_text  # type: ignore[assignment]  # The check below reports the error.
+    return parameter_name, _parse_wheel_table({parameter_name: assigned_number})[parameter_name]
 
 
 def _parse_wheel_table(config_table: Mapping[str, object]) -> dict[str, float | int]:
     """Return the parameters in the table `[wheel]`, by name."""
-    known_keys = (*PARAMETER_NAMES, "n_legs", PARAMETER_SET_KEY)
-    _require_known_keys(config_table, known_keys, "[wheel]", "parameters")
+    known_wheel_keys = (*PARAMETER_NAMES, "n_legs", PARAMETER_SET_KEY)
+    _require_known_keys(config_table, known_wheel_keys, "[wheel]", "parameters")
     parameter_values: dict[str, float | int] = {}
     if (parameter_set_name := config_table.get(PARAMETER_SET_KEY)) is not None:
         require_known_name(parameter_set_name, tuple(parameter_sets), "parameter set")
         parameter_values |= parameter_sets[str(parameter_set_name)].values
-    for parameter_name, given_value in config_table.items():
+    for parameter_name, config_value in config_table.items():
         if parameter_name == PARAMETER_SET_KEY:
             continue
         if parameter_name == "n_legs":
-            parameter_values[parameter_name] = _parse_whole_number(given_value, parameter_name, 5)
+            parameter_values[parameter_name] = _parse_whole_number(config_value, parameter_name, 5)
             if parameter_values[parameter_name] > MAX_CONFIG_LEGS:
-                raise _make_value_error(parameter_name, given_value, f"at most {MAX_CONFIG_LEGS:,}")
+                raise _make_value_error(
+                    parameter_name, config_value, f"at most {MAX_CONFIG_LEGS:,}"
+                )
         else:
-            parameter_values[parameter_name] = _parse_parameter_value(parameter_name, given_value)
+            parameter_values[parameter_name] = _parse_parameter_value(parameter_name, config_value)
     return parameter_values
 
 
@@ -503,7 +507,7 @@ def _parse_model_table(
     config_table: Mapping[str, object],
 ) -> tuple[str, dict[str, float | int | str | bool]]:
     """Return the name of the model in the table `[model]`, and the model's settings."""
-    _raise_for_renamed_keys(config_table, "[model]")
+    _reject_renamed_keys(config_table, "[model]")
     model_name = config_table.get("name", Config.model_name)
     require_known_name(model_name, list_model_config_names(), "model")
     assert isinstance(model_name, str)
@@ -529,37 +533,37 @@ def _parse_with_default_types(
     positive.
     """
     parsed_settings: dict[str, float | int | str | bool] = {}
-    for setting_name, given_value in config_table.items():
+    for setting_name, config_value in config_table.items():
         default_value = default_values[setting_name]
         if isinstance(default_value, bool):
-            if not isinstance(given_value, bool):
-                raise _make_value_error(setting_name, given_value, "true or false")
-            parsed_settings[setting_name] = given_value
+            if not isinstance(config_value, bool):
+                raise _make_value_error(setting_name, config_value, "true or false")
+            parsed_settings[setting_name] = config_value
         elif isinstance(default_value, str):
-            if not isinstance(given_value, str):
-                raise _make_value_error(setting_name, given_value, f'a name, "{default_value}"')
-            parsed_settings[setting_name] = given_value
+            if not isinstance(config_value, str):
+                raise _make_value_error(setting_name, config_value, f'a name, "{default_value}"')
+            parsed_settings[setting_name] = config_value
         elif isinstance(default_value, int):
-            parsed_settings[setting_name] = _parse_whole_number(given_value, setting_name, 1)
-        elif setting_name == FRICTION_NAME and given_value == math.inf:
+            parsed_settings[setting_name] = _parse_whole_number(config_value, setting_name, 1)
+        elif setting_name == FRICTION_NAME and config_value == math.inf:
             # Infinite friction means that feet do not slip.
             parsed_settings[setting_name] = math.inf
         else:
             parsed_settings[setting_name] = _parse_finite_number(
-                given_value, setting_name, must_be_positive=True
+                config_value, setting_name, must_be_positive=True
             )
     return parsed_settings
 
 
 def _parse_design_table(
-    design_kind: str, config_table: Mapping[str, object], allowed_parameters: tuple[str, ...]
+    design_kind: str, config_table: Mapping[str, object], allowed_parameter_names: tuple[str, ...]
 ) -> designs.AbstractSampleDesign:
     """Return the sample design that a table defines.
 
-    It may sweep only parameters in `allowed_parameters`.
+    It may sweep only parameters in `allowed_parameter_names`.
     """
-    design_keys = ("n", "seed") if design_kind in RANDOM_DESIGN_FUNCTIONS else ()
-    if FRICTION_NAME in config_table and FRICTION_NAME not in allowed_parameters:
+    design_setting_keys = ("n", "seed") if design_kind in RANDOM_DESIGN_FUNCTIONS else ()
+    if FRICTION_NAME in config_table and FRICTION_NAME not in allowed_parameter_names:
         model_choices = [
             f'name = "{config_name}"'
             for config_name in list_model_config_names("scan", FRICTION_NAME)
@@ -569,14 +573,17 @@ def _parse_design_table(
             f"and below it {' or '.join(model_choices)}."
         )
     _require_known_keys(
-        config_table, (*design_keys, *allowed_parameters), f"[{design_kind}]", "settings"
+        config_table,
+        (*design_setting_keys, *allowed_parameter_names),
+        f"[{design_kind}]",
+        "settings",
     )
     swept_settings = {
-        parameter_name: given_value
-        for parameter_name, given_value in config_table.items()
-        if parameter_name not in design_keys
+        parameter_name: config_value
+        for parameter_name, config_value in config_table.items()
+        if parameter_name not in design_setting_keys
     }
-    if design_keys:
+    if design_setting_keys:
         if "n" not in config_table:
             raise ValueError(f"[{design_kind}] has no number of samples: write n = 4096, say.")
         n, random_seed = (
@@ -584,46 +591,48 @@ def _parse_design_table(
             _parse_whole_number(config_table.get("seed", 0), "seed", 0),
         )
         parameter_ranges = {
-            parameter_name: _parse_parameter_range(parameter_name, given_value)
-            for parameter_name, given_value in swept_settings.items()
+            parameter_name: _parse_parameter_range(parameter_name, config_value)
+            for parameter_name, config_value in swept_settings.items()
         }
         return RANDOM_DESIGN_FUNCTIONS[design_kind](parameter_ranges, n, random_seed)
     if design_kind == "grid":
         return designs.grid(
             **{
-                parameter_name: _parse_grid_axis(parameter_name, given_value)
-                for parameter_name, given_value in swept_settings.items()
+                parameter_name: _parse_grid_axis(parameter_name, config_value)
+                for parameter_name, config_value in swept_settings.items()
             }
         )
     return designs.samples(
         {
-            parameter_name: _parse_value_list(parameter_name, given_value)
-            for parameter_name, given_value in swept_settings.items()
+            parameter_name: _parse_value_list(parameter_name, config_value)
+            for parameter_name, config_value in swept_settings.items()
         }
     )
 
 
-def _parse_grid_axis(parameter_name: str, axis_setting: object) -> np.ndarray:
+def _parse_grid_axis(parameter_name: str, grid_axis_setting: object) -> np.ndarray:
     """Return the values on an axis of a grid.
 
     The setting is a list of values, or a table with the first value, the last value and the count.
     """
-    if not isinstance(axis_setting, dict):
+    if not isinstance(grid_axis_setting, dict):
         return _parse_value_list(
-            parameter_name, axis_setting, " or { from = ..., to = ..., count = ... }"
+            parameter_name, grid_axis_setting, " or { from = ..., to = ..., count = ... }"
         )
-    _require_known_keys(axis_setting, _GRID_AXIS_KEYS, f"the axis of {parameter_name}", "keys")
-    missing_keys = [axis_key for axis_key in _GRID_AXIS_KEYS if axis_key not in axis_setting]
-    if missing_keys:
+    _require_known_keys(grid_axis_setting, _GRID_AXIS_KEYS, f"the axis of {parameter_name}", "keys")
+    missing_axis_keys = [
+        grid_axis_key for grid_axis_key in _GRID_AXIS_KEYS if grid_axis_key not in grid_axis_setting
+    ]
+    if missing_axis_keys:
         raise ValueError(
-            f"the axis of {parameter_name} has no '{missing_keys[0]}': "
+            f"the axis of {parameter_name} has no '{missing_axis_keys[0]}': "
             f"write {parameter_name} = {{ from = ..., to = ..., count = ... }}."
         )
     first_axis_value, last_axis_value = (
-        _parse_parameter_value(parameter_name, axis_setting[axis_key])
-        for axis_key in ("from", "to")
+        _parse_parameter_value(parameter_name, grid_axis_setting[grid_axis_key])
+        for grid_axis_key in ("from", "to")
     )
-    n_axis_values = _parse_whole_number(axis_setting["count"], f"count of {parameter_name}", 1)
+    n_axis_values = _parse_whole_number(grid_axis_setting["count"], f"count of {parameter_name}", 1)
     if n_axis_values > MAX_LISTED_SAMPLES:
         raise ValueError(
             f"the axis of {parameter_name} has {n_axis_values:,} values, but "
@@ -634,41 +643,43 @@ def _parse_grid_axis(parameter_name: str, axis_setting: object) -> np.ndarray:
 
 
 def _parse_value_list(
-    parameter_name: str, given_list: object, alternative_text: str = ""
+    parameter_name: str, config_value_list: object, alternative_text: str = ""
 ) -> np.ndarray:
     """Return an array of numbers from a list. They must lie in the domain of the parameter."""
-    if not isinstance(given_list, list):
-        raise _make_value_error(parameter_name, given_list, f"a list of numbers{alternative_text}")
+    if not isinstance(config_value_list, list):
+        raise _make_value_error(
+            parameter_name, config_value_list, f"a list of numbers{alternative_text}"
+        )
     return np.asarray(
-        [_parse_parameter_value(parameter_name, given_value) for given_value in given_list]
+        [_parse_parameter_value(parameter_name, config_value) for config_value in config_value_list]
     )
 
 
 def _parse_parameter_range(
-    range_name: str, given_range: object, parameter_name: str = ""
+    range_name: str, config_range: object, parameter_name: str = ""
 ) -> tuple[float, float]:
     """Return the lower and the upper bound of a range. They must lie in the domain of a parameter.
 
     The default of `parameter_name` is `range_name`.
     """
-    if not (isinstance(given_range, list) and len(given_range) == 2):
+    if not (isinstance(config_range, list) and len(config_range) == 2):
         raise _make_value_error(
-            range_name, given_range, f"a range of two numbers: write {range_name} = [lower, upper]"
+            range_name, config_range, f"a range of two numbers: write {range_name} = [lower, upper]"
         )
     lower_bound, upper_bound = (
         _parse_parameter_value(parameter_name or range_name, bound_value)
-        for bound_value in given_range
+        for bound_value in config_range
     )
     return lower_bound, upper_bound
 
 
-def _parse_parameter_value(parameter_name: str, given_value: object) -> float:
+def _parse_parameter_value(parameter_name: str, config_value: object) -> float:
     """Return a value as a number.
 
     Raise a ValueError if it is not in the domain of the parameter.
     """
     parameter_value = _parse_finite_number(
-        given_value, parameter_name, must_be_positive=parameter_name == FRICTION_NAME
+        config_value, parameter_name, must_be_positive=parameter_name == FRICTION_NAME
     )
     if parameter_name != FRICTION_NAME:
         PARAMETER_DOMAINS[parameter_name].require_value_in_domain(parameter_name, parameter_value)
@@ -676,32 +687,36 @@ def _parse_parameter_value(parameter_name: str, given_value: object) -> float:
 
 
 def _parse_finite_number(
-    given_value: object, setting_name: str, must_be_positive: bool = False
+    config_value: object, setting_name: str, must_be_positive: bool = False
 ) -> float:
     """Return a value as a finite float. Raise a ValueError if it is not a finite number."""
     finite_number = math.nan
-    if isinstance(given_value, int | float) and not isinstance(given_value, bool):
+    if isinstance(config_value, int | float) and not isinstance(config_value, bool):
         # An integer of hundreds of digits is too large for a float.
         with contextlib.suppress(OverflowError):
-            finite_number = float(given_value)
+            finite_number = float(config_value)
     if not math.isfinite(finite_number):
-        raise _make_value_error(setting_name, given_value, "a finite number")
+        raise _make_value_error(setting_name, config_value, "a finite number")
     if must_be_positive and not finite_number > 0:
         raise ValueError(f"{setting_name} is {finite_number:g}, but it must be positive.")
     return finite_number
 
 
-def _parse_whole_number(given_value: object, setting_name: str, min_value: int) -> int:
+def _parse_whole_number(config_value: object, setting_name: str, min_value: int) -> int:
     """Return a value as an integer. Raise a ValueError if it is not an integer of at least
     `min_value`.
     """
-    if isinstance(given_value, bool) or not isinstance(given_value, int) or given_value < min_value:
+    if (
+        isinstance(config_value, bool)
+        or not isinstance(config_value, int)
+        or config_value < min_value
+    ):
         raise _make_value_error(
-            setting_name, given_value, f"a whole number of at least {min_value}"
+            setting_name, config_value, f"a whole number of at least {min_value}"
         )
-    if given_value > MAX_CONFIG_INTEGER:
-        raise _make_value_error(setting_name, given_value, f"at most {MAX_CONFIG_INTEGER:,}")
-    return given_value
+    if config_value > MAX_CONFIG_INTEGER:
+        raise _make_value_error(setting_name, config_value, f"at most {MAX_CONFIG_INTEGER:,}")
+    return config_value
 
 
 def _require_known_keys(
@@ -712,17 +727,17 @@ def _require_known_keys(
 ) -> None:
     """Raise a ValueError if a table contains a key that is not allowed."""
     allowed_keys = tuple(allowed_keys)
-    for given_key in config_table:
-        raise_for_parameter_symbol(given_key, allowed_keys)
-        if given_key not in allowed_keys:
+    for config_key in config_table:
+        raise_for_parameter_symbol(config_key, allowed_keys)
+        if config_key not in allowed_keys:
             raise ValueError(
                 f"{table_location} has the unknown key "
-                f"'{given_key}'{format_name_suggestion(given_key, allowed_keys)}: "
+                f"'{config_key}'{format_name_suggestion(config_key, allowed_keys)}: "
                 f"its {key_kind} are {', '.join(allowed_keys)}."
             )
 
 
-def _raise_for_renamed_keys(config_table: Mapping[str, object], table_location: str) -> None:
+def _reject_renamed_keys(config_table: Mapping[str, object], table_location: str) -> None:
     """Raise a ValueError if a table contains a key that has a new name."""
     for old_key, new_key in RENAMED_CONFIG_KEYS[table_location].items():
         if old_key in config_table:
@@ -731,14 +746,14 @@ def _raise_for_renamed_keys(config_table: Mapping[str, object], table_location: 
             )
 
 
-def _make_value_error(setting_name: str, given_value: object, requirement_text: str) -> ValueError:
+def _make_value_error(setting_name: str, config_value: object, requirement_text: str) -> ValueError:
     """Return an error that states that a value does not satisfy a requirement.
 
     The message contains the value as written in TOML.
     """
-    value_text = format_value(given_value)
-    if isinstance(given_value, bool):
+    value_text = format_value(config_value)
+    if isinstance(config_value, bool):
         value_text = value_text.lower()
-    elif isinstance(given_value, str):
+    elif isinstance(config_value, str):
         value_text = value_text.replace("'", '"')
     return ValueError(f"{setting_name} is {value_text}, but it must be {requirement_text}.")

@@ -126,8 +126,8 @@ def show_warnings_as_sentences() -> None:
 
 def _format_system_error(system_error: OSError) -> str:
     """Return a sentence that describes an error of the operating system."""
-    file_text = f"{system_error.filename}: " if system_error.filename else ""
-    return f"{file_text}{str(system_error.strerror or system_error).rstrip('.')}."
+    file_name_text = f"{system_error.filename}: " if system_error.filename else ""
+    return f"{file_name_text}{str(system_error.strerror or system_error).rstrip('.')}."
 
 
 @contextlib.contextmanager
@@ -155,7 +155,7 @@ def print_written_paths(paths: Iterable[Path]) -> None:
 
 def print_text_table(
     table_title: str | None,
-    text_rows: Iterable[Sequence[str]],
+    table_rows: Iterable[Sequence[str]],
     column_headings: Sequence[str] = (),
     right_aligned_headings: Sequence[str] = (),
 ) -> None:
@@ -171,15 +171,15 @@ def print_text_table(
         rich_table.add_column(
             column_heading, justify="right" if column_heading in right_aligned_headings else "left"
         )
-    for table_row_cells in text_rows:
-        encodable_texts = [
+    for table_row_cells in table_rows:
+        encodable_cell_texts = [
             replace_unencodable_characters(cell_text, stdout_console.encoding)
             for cell_text in table_row_cells
         ]
         cell_texts = [
             cell_text if column_heading == "" else escape(cell_text)
             for column_heading, cell_text in zip(
-                column_headings or ("name", "text"), encodable_texts, strict=True
+                column_headings or ("name", "text"), encodable_cell_texts, strict=True
             )
         ]
         rich_table.add_row(
@@ -219,13 +219,13 @@ def make_progress_bar(task_name: str) -> "Bar":
     from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn
     from rich.progress import Progress as Bar
 
-    bar_columns = (
+    progress_bar_columns = (
         TextColumn("{task.description}"),
         BarColumn(),
         *((MofNCompleteColumn(),) if task_name == "scan" else ()),
         TextColumn("{task.fields[note]}") if task_name == "scan" else TimeElapsedColumn(),
     )
-    return Bar(*bar_columns, console=stderr_console)
+    return Bar(*progress_bar_columns, console=stderr_console)
 
 
 def make_scan_progress_reporter(
@@ -245,21 +245,23 @@ def make_scan_progress_reporter(
 
     def report_progress(scan_progress: "ScanProgress") -> None:
         """Update the progress bar from the progress of the scan."""
-        present_seconds, n_samples_done = time.monotonic(), scan_progress.n_done
-        bar_note = (
+        current_seconds, n_samples_done = time.monotonic(), scan_progress.n_done
+        progress_bar_note = (
             f"{scan_progress.n_reused:,} from an earlier run" if scan_progress.n_reused else ""
         )
         if n_samples_done:
-            first_report_times_and_counts.append((present_seconds, n_samples_done))
+            first_report_times_and_counts.append((current_seconds, n_samples_done))
             first_report_seconds, n_samples_at_first_report = first_report_times_and_counts[0]
-            bar_note = f"{100 * scan_progress.n_failed / n_samples_done:.0f} % without a gait"
-            if present_seconds > first_report_seconds:
+            progress_bar_note = (
+                f"{100 * scan_progress.n_failed / n_samples_done:.0f} % without a gait"
+            )
+            if current_seconds > first_report_seconds:
                 samples_per_second = (n_samples_done - n_samples_at_first_report) / (
-                    present_seconds - first_report_seconds
+                    current_seconds - first_report_seconds
                 )
                 remaining_seconds = (scan_progress.n_samples - n_samples_done) / samples_per_second
-                bar_note = (
-                    f"{samples_per_second:,.0f} per s, {bar_note}, "
+                progress_bar_note = (
+                    f"{samples_per_second:,.0f} per s, {progress_bar_note}, "
                     f"{format_duration(remaining_seconds)} left"
                 )
         update_progress_bar(
@@ -267,7 +269,7 @@ def make_scan_progress_reporter(
             total=scan_progress.n_reused + scan_progress.n_samples,
             completed=scan_progress.n_reused + n_samples_done,
             description="scanning" if n_samples_done else "compiling",
-            note=bar_note,
+            note=progress_bar_note,
         )
 
     return report_progress
@@ -301,7 +303,7 @@ def print_wheel_and_gait(
     params: "WheelParams",
     step_result: Any,  # `step_result` is the step of any model.
     start_state: "ArrayLike | tuple[float, ...]",
-    n_walked: int,
+    n_steps_walked: int,
     limit_cycle_result: "LimitCycle | ReturnMapCycle",
     force_peaks: "Mapping[str, Any]",
 ) -> None:
@@ -326,21 +328,22 @@ def print_wheel_and_gait(
             np.abs(np.asarray(step_result.section_state) - np.asarray(start_state)).max()
         )
         stdout_console.print(
-            f"Walked {n_walked} steps; the last changed the section state by "
+            f"Walked {n_steps_walked} steps; the last changed the section state by "
             f"{last_state_change:.1e}."
         )
         from vrw_jax.measures import MARGIN_MEASURES
 
-        excluded_names = ("outcome", "solver_steps", *MARGIN_MEASURES)
+        excluded_measure_names = ("outcome", "solver_steps", *MARGIN_MEASURES)
         shown_measures = {
             measure_name: measure_value
             for measure_name, measure_value in step_result.measures().items()
-            if measure_name not in excluded_names
+            if measure_name not in excluded_measure_names
         }
         _print_measure_table("Last step", shown_measures)
     else:
         stdout_console.print(
-            f"[bold]Step {n_walked + 1} ended as {step_outcome.name}:[/] {step_outcome.meaning}"
+            f"[bold]Step {n_steps_walked + 1} ended as {step_outcome.name}:[/] "
+            f"{step_outcome.meaning}"
         )
     _print_limit_cycle(limit_cycle_result)
     if force_peaks:
@@ -354,7 +357,7 @@ def _print_measure_table(table_title: str, measure_values: "Mapping[str, Any]") 
     """Print a table of measures, given as a mapping from names to values."""
     from vrw_jax.measures import MEASURES
 
-    measure_rows = (
+    measure_table_rows = (
         (
             measure_description.long_name,
             measure_description.symbol,
@@ -364,7 +367,9 @@ def _print_measure_table(table_title: str, measure_values: "Mapping[str, Any]") 
         for measure_name, measure_description in MEASURES.items()
         if measure_name in measure_values
     )
-    print_text_table(table_title, measure_rows, ("quantity", "symbol", "value", "unit"), ("value",))
+    print_text_table(
+        table_title, measure_table_rows, ("quantity", "symbol", "value", "unit"), ("value",)
+    )
 
 
 def _print_limit_cycle(limit_cycle_result: "LimitCycle | ReturnMapCycle") -> None:
@@ -398,15 +403,17 @@ def _print_step_margins(step_result: "StepResult") -> None:
 
     from vrw_jax.measures import MARGIN_MEASURES
 
-    margin_rows = []
+    margin_table_rows = []
     for margin_name, margin_description in MARGIN_MEASURES.items():
         margin_values = np.atleast_1d(np.asarray(getattr(step_result.margins, margin_name)))
         lowest_margin, margin_label = float(margin_values.min()), margin_description.long_name
         violation_mark = "[green]holds[/]" if lowest_margin >= 0.0 else "[bold red]broken[/]"
         if margin_description.leg_dimension and lowest_margin < 0.0:
-            leg_texts = [str(leg_index + 3) for leg_index in np.flatnonzero(margin_values < 0.0)]
-            margin_label += f" (broken at legs {', '.join(leg_texts)})"
-        margin_rows.append(
+            violating_leg_texts = [
+                str(leg_index + 3) for leg_index in np.flatnonzero(margin_values < 0.0)
+            ]
+            margin_label += f" (broken at legs {', '.join(violating_leg_texts)})"
+        margin_table_rows.append(
             (
                 violation_mark,
                 margin_label,
@@ -416,12 +423,12 @@ def _print_step_margins(step_result: "StepResult") -> None:
             )
         )
     column_headings = ("", "margin of", "symbol", "least", "unit")
-    print_text_table("Margins of the paper's model", margin_rows, column_headings, ("least",))
-    n_margins, n_violated = (
-        len(margin_rows),
-        sum("broken[" in violation_mark for violation_mark, *_ in margin_rows),
+    print_text_table("Margins of the paper's model", margin_table_rows, column_headings, ("least",))
+    n_margins, n_violated_margins = (
+        len(margin_table_rows),
+        sum("broken[" in violation_mark for violation_mark, *_ in margin_table_rows),
     )
     stdout_console.print(
-        f"{n_margins - n_violated} of {n_margins} margins hold, {n_violated} are broken. The model "
-        "walks on regardless: it measures what it does not model."
+        f"{n_margins - n_violated_margins} of {n_margins} margins hold, {n_violated_margins} are "
+        "broken. The model walks on regardless: it measures what it does not model."
     )

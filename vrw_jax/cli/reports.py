@@ -94,9 +94,9 @@ def write_special_point_map(special_point_map: SpecialPointMap, folder: Path) ->
     scan_dataset, special_point_curves, _ = special_point_map
     parameter_names = tuple(map(str, scan_dataset.outcome.dims))
     csv_rows = [
-        [special_point_curve.name, *map("{:.12g}".format, curve_point_index)]
+        [special_point_curve.name, *map("{:.12g}".format, curve_parameter_values)]
         for special_point_curve in special_point_curves
-        for curve_point_index in special_point_curve.values
+        for curve_parameter_values in special_point_curve.values
     ]
     csv_text = "\n".join(
         ",".join(csv_row_cells) for csv_row_cells in [["border", *parameter_names], *csv_rows]
@@ -105,9 +105,7 @@ def write_special_point_map(special_point_map: SpecialPointMap, folder: Path) ->
     (folder / "map.csv").write_text(csv_text + "\n", encoding="utf-8")
     (folder / "map.md").write_text(f"{special_point_map}\n", encoding="utf-8")
     measure_name = next(
-        parameter_name
-        for parameter_name in scan_dataset
-        if parameter_name in DIFFERENTIABLE_MEASURES
+        variable_name for variable_name in scan_dataset if variable_name in DIFFERENTIABLE_MEASURES
     )
     figure_paths = figures.save(
         figures.map_figure(scan_dataset, str(measure_name), special_point_curves), folder, "map"
@@ -121,8 +119,8 @@ def _write_dataset_and_texts(
     """Write a dataset and text files into `folder`, and return the paths."""
     folder.mkdir(parents=True, exist_ok=True)
     dataset.to_zarr(folder / store_name, mode="w", zarr_format=2)
-    for file_name, file_text in text_by_file_name.items():
-        (folder / file_name).write_text(file_text, encoding="utf-8", newline="")
+    for file_name, file_name_text in text_by_file_name.items():
+        (folder / file_name).write_text(file_name_text, encoding="utf-8", newline="")
     return [folder / file_name for file_name in (store_name, *text_by_file_name)]
 
 
@@ -136,7 +134,7 @@ def format_tuning_summary(tune_result: TuneResult) -> str:
         )
         for active_constraint in tune_result.active
     ]
-    parameter_rows = [
+    parameter_table_rows = [
         (parameter_name, f"{float(tune_result.path[parameter_name][0]):.6g}",
         f"{float(getattr(tune_result.params, parameter_name)):.6g}",
          MEASURES[parameter_name].display_unit)
@@ -153,7 +151,7 @@ def format_tuning_summary(tune_result: TuneResult) -> str:
         "",
         f"First-order condition met to {tune_result.kkt_residual:.1e} of the objective's gradient.",
         "",
-        *format_markdown_table(("parameter", "start", "tuned", "unit"), parameter_rows),
+        *format_markdown_table(("parameter", "start", "tuned", "unit"), parameter_table_rows),
         "",
     ])  # fmt: skip
 

@@ -65,12 +65,12 @@ def verify_scan_store(scan_plan: "ScanPlan", store_path: Path) -> None:
         scan_plan.result_layout.n_chunks,
         len(zarr_store.find_missing_chunks()),
     )
-    state_text = (
+    store_state_text = (
         f"lacks {n_missing_chunks:,} of {n_chunks:,} chunks, the others are"
         if n_missing_chunks
         else "is complete and"
     )
-    stdout_console.print(f"{store_path} {state_text} sound.", highlight=False, soft_wrap=True)
+    stdout_console.print(f"{store_path} {store_state_text} sound.", highlight=False, soft_wrap=True)
 
 
 def compute_scan_with_progress(

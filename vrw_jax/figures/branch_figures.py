@@ -90,17 +90,19 @@ def branch_figure(branch: Branch) -> Figure:
     n_legend_rows = -(-len(special_points) // 2)
     figure = Figure(figsize=(PAGE_FIGURE_WIDTH_INCHES, 4.0 + 0.16 * n_legend_rows))
     panel_axes = figure.subplots(2, 2, sharex=True)
-    has_indicators = "lambda_2_plus" in branch_dataset
-    change_indices = np.flatnonzero(np.diff(branch.stable.astype(int))) + 1
+    has_dls_indicators = "lambda_2_plus" in branch_dataset
+    stability_change_indices = np.flatnonzero(np.diff(branch.stable.astype(int))) + 1
     # A piece of equal stability ends at the point where the next piece starts.
-    stability_pieces = [
+    pieces_of_equal_stability = [
         (
-            np.append(index_piece, index_piece[-1:] + 1)[: branch.values.size - index_piece[0]],
-            bool(branch.stable[index_piece[0]]),
+            np.append(piece_point_indices, piece_point_indices[-1:] + 1)[
+                : branch.values.size - piece_point_indices[0]
+            ],
+            bool(branch.stable[piece_point_indices[0]]),
         )
-        for index_piece in np.split(np.arange(branch.values.size), change_indices)
+        for piece_point_indices in np.split(np.arange(branch.values.size), stability_change_indices)
     ]
-    drawn_panels = PAPER_BRANCH_PANELS if has_indicators else OTHER_MODEL_BRANCH_PANELS
+    drawn_panels = PAPER_BRANCH_PANELS if has_dls_indicators else OTHER_MODEL_BRANCH_PANELS
     for axes, (panel_label, panel_measure_names), panel_letter in zip(
         panel_axes.ravel(), drawn_panels, "abcd", strict=True
     ):
@@ -116,11 +118,11 @@ def branch_figure(branch: Branch) -> Figure:
             if measure_name == "spectral_radius":
                 plotted_columns = list(np.abs(branch.multipliers).T)
             for plotted_measure_values in plotted_columns:
-                for index_piece, is_stable in stability_pieces:
+                for piece_point_indices, is_stable in pieces_of_equal_stability:
                     line_style = "-" if is_stable else "--"
                     axes.plot(
-                        parameter_values[index_piece],
-                        plotted_measure_values[index_piece],
+                        parameter_values[piece_point_indices],
+                        plotted_measure_values[piece_point_indices],
                         line_style,
                         color=line_color,
                     )
@@ -129,7 +131,7 @@ def branch_figure(branch: Branch) -> Figure:
     panel_axes[0, 1].axhline(1.0, color=DARK_GRAY_COLOR, linewidth=0.5)
     panel_axes[0, 1].set_ylim(0.0, None)
     force_axes, clearance_axes = panel_axes[1]
-    if has_indicators:
+    if has_dls_indicators:
         for axes in (force_axes, clearance_axes):
             axes.axhline(0.0, color=DARK_GRAY_COLOR, linewidth=0.5)
         for measure_name, line_color in PAPER_BRANCH_PANELS[2][1].items():
@@ -231,7 +233,7 @@ def basin_figure(results: list[xr.Dataset], titles: list[str]) -> Figure:
     require_variables_of_datasets(
         "results", results, ("outcome", "attractor"), "give vrw.basin(params, grid)"
     )
-    fall_codes = sorted(
+    failure_outcome_codes = sorted(
         {
             int(outcome_code)
             for basin_dataset in results
@@ -241,54 +243,57 @@ def basin_figure(results: list[xr.Dataset], titles: list[str]) -> Figure:
     )
     figure = Figure(figsize=(PAGE_FIGURE_WIDTH_INCHES, 3.3))
     panel_axes = figure.subplots(1, len(results), sharey=True, squeeze=False)[0]
-    max_step_count = max(
+    max_n_steps_to_gait = max(
         float(basin_dataset.steps.where(basin_dataset.attractor >= 0).max())
         for basin_dataset in results
     )
     for axes, basin_dataset, panel_title in zip(panel_axes, results, titles, strict=True):
-        vertical_name, horizontal_name = (
+        vertical_axis_name, horizontal_axis_name = (
             str(axis_name) for axis_name in basin_dataset.attractor.dims
         )
         steps_to_gait = basin_dataset.steps.where(basin_dataset.attractor >= 0)
         step_count_image = axes.pcolormesh(
-            basin_dataset[horizontal_name],
-            basin_dataset[vertical_name],
+            basin_dataset[horizontal_axis_name],
+            basin_dataset[vertical_axis_name],
             steps_to_gait,
             cmap="Greys_r",
             vmin=0.0,
-            vmax=2.2 * max_step_count,
+            vmax=2.2 * max_n_steps_to_gait,
         )
         step_count_image.set_rasterized(True)
-        if fall_codes:
+        if failure_outcome_codes:
             draw_outcome_cells(
                 axes,
-                basin_dataset[horizontal_name].values,
-                basin_dataset[vertical_name].values,
+                basin_dataset[horizontal_axis_name].values,
+                basin_dataset[vertical_axis_name].values,
                 basin_dataset.outcome.values,
-                fall_codes,
+                failure_outcome_codes,
             )
-        if {horizontal_name, vertical_name} <= set(PRE_TOUCHDOWN_COMPONENT_NAMES):
+        if {horizontal_axis_name, vertical_axis_name} <= set(PRE_TOUCHDOWN_COMPONENT_NAMES):
             orbit_section_states = basin_dataset.orbit_state.values.reshape(
                 -1, len(PRE_TOUCHDOWN_COMPONENT_NAMES)
             )
-            shown_columns = [
-                PRE_TOUCHDOWN_COMPONENT_NAMES.index(horizontal_name),
-                PRE_TOUCHDOWN_COMPONENT_NAMES.index(vertical_name),
+            shown_state_columns = [
+                PRE_TOUCHDOWN_COMPONENT_NAMES.index(horizontal_axis_name),
+                PRE_TOUCHDOWN_COMPONENT_NAMES.index(vertical_axis_name),
             ]
             axes.plot(
-                *orbit_section_states[:, shown_columns].T,
+                *orbit_section_states[:, shown_state_columns].T,
                 "+",
                 color=OKABE_ITO_YELLOW,
                 markersize=7.0,
                 markeredgewidth=1.6,
             )
         axes.set_title(panel_title)
-        axes.set_xlabel(format_axis_label(horizontal_name, "{symbol}"))
+        axes.set_xlabel(format_axis_label(horizontal_axis_name, "{symbol}"))
     panel_axes[0].set_ylabel(format_axis_label(str(results[0].attractor.dims[0]), "{symbol}"))
     color_bar = figure.colorbar(step_count_image, ax=list(panel_axes), aspect=25, pad=0.01)
     color_bar.set_label("steps until the gait is reached")
-    color_bar.ax.set_ylim(0.0, max_step_count)
+    color_bar.ax.set_ylim(0.0, max_n_steps_to_gait)
     figure.legend(
-        handles=make_outcome_patches(fall_codes), loc="outside lower center", ncols=4, fontsize=7.5
+        handles=make_outcome_patches(failure_outcome_codes),
+        loc="outside lower center",
+        ncols=4,
+        fontsize=7.5,
     )
     return figure

@@ -74,14 +74,14 @@ class HubAndFootMotion(NamedTuple):
         sample_interval = (
             self.sample_times[sample_index_after] - self.sample_times[sample_index_before]
         )
-        interval_fraction = (
+        sample_interval_fraction = (
             (t - self.sample_times[sample_index_before]) / sample_interval
             if sample_interval > 0.0
             else 1.0
         )
         interpolate_samples = lambda sampled_values: (
-            (1.0 - interval_fraction) * sampled_values[sample_index_before]
-            + interval_fraction * sampled_values[sample_index_after]
+            (1.0 - sample_interval_fraction) * sampled_values[sample_index_before]
+            + sample_interval_fraction * sampled_values[sample_index_after]
         )
         return (
             interpolate_samples(self.hub_positions),
@@ -117,9 +117,9 @@ def compute_foot_motion(walk: xr.Dataset) -> HubAndFootMotion:
         )
         foot_forces = np.zeros_like(foot_positions)
         for leg_number in (1, 2):
-            force_names = f"lambda_{2 * leg_number - 1}", f"lambda_{2 * leg_number}"
+            foot_force_names = f"lambda_{2 * leg_number - 1}", f"lambda_{2 * leg_number}"
             foot_forces[:, leg_number - 1] = np.stack(
-                [walk[force_name].values for force_name in force_names], -1
+                [walk[foot_force_name].values for foot_force_name in foot_force_names], -1
             )
         contact_modes = np.full(leg_angles.shape, ContactMode.OFF)
         contact_modes[:, 0] = ContactMode.STICK
@@ -239,29 +239,32 @@ def _draw_contact_mode_bars(
     """Draw the contact modes of each leg as colored bars over time."""
     for bar_row_index, leg_number in enumerate(drawn_legs):
         contact_modes = foot_motion.contact_modes[:, leg_number - 1]
-        change_indices = (
+        contact_mode_change_indices = (
             np.flatnonzero(np.diff(contact_modes) | np.diff(foot_motion.step_numbers)) + 1
         )
-        for start_index, end_index in zip(
-            np.r_[0, change_indices], np.r_[change_indices, len(contact_modes)], strict=True
+        for bar_start_index, bar_end_index in zip(
+            np.r_[0, contact_mode_change_indices],
+            np.r_[contact_mode_change_indices, len(contact_modes)],
+            strict=True,
         ):
-            if contact_modes[start_index] != ContactMode.OFF:
+            if contact_modes[bar_start_index] != ContactMode.OFF:
                 bar_start_and_duration = (
-                    foot_motion.sample_times[start_index],
-                    foot_motion.sample_times[end_index - 1] - foot_motion.sample_times[start_index],
+                    foot_motion.sample_times[bar_start_index],
+                    foot_motion.sample_times[bar_end_index - 1]
+                    - foot_motion.sample_times[bar_start_index],
                 )
                 axes.broken_barh(
                     [bar_start_and_duration],
                     (bar_row_index - 0.35, 0.7),
-                    color=CONTACT_MODE_COLORS[contact_modes[start_index]],
+                    color=CONTACT_MODE_COLORS[contact_modes[bar_start_index]],
                 )
     axes.set_yticks(range(len(drawn_legs)), [str(leg_number) for leg_number in drawn_legs])
     axes.set_ylim(len(drawn_legs) - 0.5, -0.5)
     axes.set_ylabel("foot on\nthe ground")
-    present_modes = np.unique(foot_motion.contact_modes[:, np.array(drawn_legs) - 1])
+    occurring_contact_modes = np.unique(foot_motion.contact_modes[:, np.array(drawn_legs) - 1])
     legend_patches = [
         Patch(color=CONTACT_MODE_COLORS[contact_mode], label=CONTACT_MODE_NAMES[contact_mode])
-        for contact_mode in present_modes
+        for contact_mode in occurring_contact_modes
         if contact_mode != ContactMode.OFF
     ]
     axes.legend(handles=legend_patches, loc="center left", bbox_to_anchor=(1.0, 0.5))
@@ -300,10 +303,10 @@ def draw_contact_sticks(axes: Axes, walk: xr.Dataset, stick_interval: float) -> 
             foot_motion.contact_modes[sample_index, is_leg_drawn[sample_index]],
             4.0,
         )
-    legend_legs = [(1, "Leg 1"), (2, "Leg 2")]
+    legend_leg_labels = [(1, "Leg 1"), (2, "Leg 2")]
     if is_leg_drawn[sample_indices, 2:].any():
-        legend_legs.append((3, "another leg"))
-    for leg_number, legend_text in legend_legs:
+        legend_leg_labels.append((3, "another leg"))
+    for leg_number, legend_text in legend_leg_labels:
         line_style = _select_stick_line_style(leg_number)
         axes.plot([], [], color="black", linestyle=line_style, linewidth=0.7, label=legend_text)
     axes.plot([], [], color=LEG_2_COLOR, label="hub")

@@ -96,7 +96,7 @@ def scan_figures(scan: xr.Dataset) -> dict[str, Figure]:
         ['scan']
     """
     require_dataset_variables("scan", scan, ("outcome",), "give vrw.scan(design)")
-    swept_axes = [
+    swept_axis_names = [
         parameter_name
         for parameter_name in dict.fromkeys(PARAMETER_AXIS_ORDER)
         if parameter_name in scan.coords
@@ -104,9 +104,9 @@ def scan_figures(scan: xr.Dataset) -> dict[str, Figure]:
     if "sample" in scan.dims:
         varied_parameters = [
             parameter_name
-            for parameter_name in swept_axes
+            for parameter_name in swept_axis_names
             if np.ptp(scan[parameter_name].values) > 0.0
-        ] or swept_axes
+        ] or swept_axis_names
         if len(varied_parameters) < 3:
             return {"scan": draw_scan_samples(scan, varied_parameters)}
         figures_by_name = {
@@ -121,8 +121,8 @@ def scan_figures(scan: xr.Dataset) -> dict[str, Figure]:
             )
         return figures_by_name
     multivalued_axis_names = [
-        parameter_name for parameter_name in swept_axes if scan.sizes[parameter_name] > 1
-    ] or swept_axes
+        parameter_name for parameter_name in swept_axis_names if scan.sizes[parameter_name] > 1
+    ] or swept_axis_names
     if len(multivalued_axis_names) == 1:
         return {"scan": draw_measure_curves(scan, multivalued_axis_names[0])}
     remaining_axis_names = multivalued_axis_names[2:]
@@ -140,10 +140,10 @@ def scan_figures(scan: xr.Dataset) -> dict[str, Figure]:
 
 @figure_style()
 def draw_scan_slices(
-    scan: xr.Dataset, x: str, y: str, column_parameter: str | None = None
+    scan: xr.Dataset, x: str, y: str, panel_column_parameter: str | None = None
 ) -> Figure:
     """Return a figure over two parameters, with one column of panels per value of
-    `column_parameter`.
+    `panel_column_parameter`.
 
     `x` and `y` are the names of the two parameters. The figure shows outcomes and the measures in
     `SHOWN_MEASURE_NAMES`. Every other parameter has the middle one of its values, which the title
@@ -157,87 +157,101 @@ def draw_scan_slices(
     slice_indices = {
         parameter_name: slice_index
         for parameter_name, slice_index in slice_indices.items()
-        if parameter_name not in (x, y, column_parameter)
+        if parameter_name not in (x, y, panel_column_parameter)
     }
     scan_slice = scan.isel(slice_indices)
-    column_datasets = [scan_slice]
-    if column_parameter is not None:
-        n_column_values = scan.sizes[column_parameter]
-        column_indices = np.unique(
-            np.linspace(0, n_column_values - 1, min(n_column_values, MAX_PANEL_COLUMNS))
+    panel_column_datasets = [scan_slice]
+    if panel_column_parameter is not None:
+        n_panel_column_values = scan.sizes[panel_column_parameter]
+        panel_column_indices = np.unique(
+            np.linspace(0, n_panel_column_values - 1, min(n_panel_column_values, MAX_PANEL_COLUMNS))
             .round()
             .astype(int)
         )
-        column_datasets = [
-            scan_slice.isel({column_parameter: int(column_index)})
-            for column_index in column_indices
+        panel_column_datasets = [
+            scan_slice.isel({panel_column_parameter: int(panel_column_index)})
+            for panel_column_index in panel_column_indices
         ]
     panel_measures = _list_shown_measures(scan)
     figure_width = (
-        PAGE_FIGURE_WIDTH_INCHES if len(column_datasets) > 1 else COLUMN_FIGURE_WIDTH_INCHES
+        PAGE_FIGURE_WIDTH_INCHES if len(panel_column_datasets) > 1 else COLUMN_FIGURE_WIDTH_INCHES
     )
     figure = Figure(figsize=(figure_width, 1.65 * (len(panel_measures) + 1) + 1.0))
     panel_axes = figure.subplots(
-        len(panel_measures) + 1, len(column_datasets), sharex=True, sharey=True, squeeze=False
+        len(panel_measures) + 1, len(panel_column_datasets), sharex=True, sharey=True, squeeze=False
     )
-    for axes_of_row, measure_name in zip(panel_axes, panel_measures, strict=False):
-        column_values = [
-            column_dataset[measure_name].transpose(y, x).values
-            for column_dataset in column_datasets
+    for axes_of_panel_row, measure_name in zip(panel_axes, panel_measures, strict=False):
+        measure_values_by_panel = [
+            panel_column_dataset[measure_name].transpose(y, x).values
+            for panel_column_dataset in panel_column_datasets
         ]
         is_stable = [
-            _compute_displayed_outcome_codes(column_dataset).transpose(y, x).values
+            _compute_displayed_outcome_codes(panel_column_dataset).transpose(y, x).values
             == Outcome.STEPPED
-            for column_dataset in column_datasets
+            for panel_column_dataset in panel_column_datasets
         ]
-        color_limits = _find_color_limits(column_values, is_stable)
+        color_limits = _find_color_limits(measure_values_by_panel, is_stable)
         color_scale = _make_color_scale(measure_name, color_limits)
-        for axes, column_dataset, measure_values_by_cell in zip(
-            axes_of_row, column_datasets, column_values, strict=True
+        for axes, panel_column_dataset, measure_values_by_cell in zip(
+            axes_of_panel_row, panel_column_datasets, measure_values_by_panel, strict=True
         ):
             cell_mesh = _draw_measure_cells(
                 axes,
-                column_dataset[x].values,
-                column_dataset[y].values,
+                panel_column_dataset[x].values,
+                panel_column_dataset[y].values,
                 measure_values_by_cell,
                 color_scale,
             )
-        extended_ends = _find_extended_color_bar_ends(column_values, color_limits)
+        extended_color_bar_ends = _find_extended_color_bar_ends(
+            measure_values_by_panel, color_limits
+        )
         color_bar = figure.colorbar(
-            cell_mesh, ax=axes_of_row.tolist(), aspect=12, pad=0.01, extend=extended_ends
+            cell_mesh,
+            ax=axes_of_panel_row.tolist(),
+            aspect=12,
+            pad=0.01,
+            extend=extended_color_bar_ends,
         )
         color_bar.set_label(textwrap.fill(format_axis_label(measure_name, "{name}"), 24))
     outcome_codes = np.unique(
         [
-            _compute_displayed_outcome_codes(column_dataset).values
-            for column_dataset in column_datasets
+            _compute_displayed_outcome_codes(panel_column_dataset).values
+            for panel_column_dataset in panel_column_datasets
         ]
     )
-    for axes, column_dataset in zip(panel_axes[-1], column_datasets, strict=True):
-        cell_outcome_codes = _compute_displayed_outcome_codes(column_dataset).transpose(y, x).values
+    for axes, panel_column_dataset in zip(panel_axes[-1], panel_column_datasets, strict=True):
+        cell_outcome_codes = (
+            _compute_displayed_outcome_codes(panel_column_dataset).transpose(y, x).values
+        )
         draw_outcome_cells(
             axes,
-            _find_cell_edges(column_dataset[x].values),
-            _find_cell_edges(column_dataset[y].values),
+            _find_cell_edges(panel_column_dataset[x].values),
+            _find_cell_edges(panel_column_dataset[y].values),
             cell_outcome_codes,
             outcome_codes,
         )
     legend_lines: dict[str, Line2D] = {}
-    for panel_row in panel_axes:
-        for axes, column_dataset in zip(panel_row, column_datasets, strict=True):
-            legend_lines |= _draw_margin_zero_lines(axes, column_dataset, x, y)
-    for axes, column_dataset in zip(panel_axes[0], column_datasets, strict=True):
-        if column_parameter is not None:
+    for axes_of_panel_row in panel_axes:
+        for axes, panel_column_dataset in zip(
+            axes_of_panel_row, panel_column_datasets, strict=True
+        ):
+            legend_lines |= _draw_margin_zero_lines(axes, panel_column_dataset, x, y)
+    for axes, panel_column_dataset in zip(panel_axes[0], panel_column_datasets, strict=True):
+        if panel_column_parameter is not None:
             axes.set_title(
-                format_value_label(column_parameter, column_dataset[column_parameter].item())
+                format_value_label(
+                    panel_column_parameter, panel_column_dataset[panel_column_parameter].item()
+                )
             )
     for axes in panel_axes[-1]:
         axes.set_xlabel(
-            format_axis_label(x) if len(column_datasets) < 3 else format_axis_label(x, "{symbol}")
+            format_axis_label(x)
+            if len(panel_column_datasets) < 3
+            else format_axis_label(x, "{symbol}")
         )
     for axes in panel_axes[:, 0]:
         axes.set_ylabel(format_axis_label(y, "{symbol}"))
-    _add_scan_legend(figure, outcome_codes, legend_lines, len(column_datasets))
+    _add_scan_legend(figure, outcome_codes, legend_lines, len(panel_column_datasets))
     if slice_indices:
         fixed_values_text = ", ".join(
             format_value_label(parameter_name, scan[parameter_name].values[slice_index])
@@ -261,11 +275,11 @@ def draw_scan_samples(scan: xr.Dataset, parameter_names: Sequence[str]) -> Figur
     panel_axes = figure.subplots(1, len(measure_names) + 1, sharey=True, squeeze=False)[0]
     for axes, measure_name in zip(panel_axes, measure_names, strict=False):
         point_collection = _draw_measure_samples(axes, scan, x, y, measure_name, marker_size)
-        extended_ends = _find_extended_color_bar_ends(
+        extended_color_bar_ends = _find_extended_color_bar_ends(
             [scan[measure_name].values], point_collection.get_clim()
         )
         color_bar = figure.colorbar(
-            point_collection, ax=axes, location="top", aspect=25, extend=extended_ends
+            point_collection, ax=axes, location="top", aspect=25, extend=extended_color_bar_ends
         )
         color_bar.set_label(format_axis_label(measure_name))
     outcome_codes = _compute_displayed_outcome_codes(scan).values
@@ -319,12 +333,16 @@ def draw_parameter_pairs(scan: xr.Dataset, parameter_names: Sequence[str]) -> Fi
             axes.tick_params(labelleft=False)
     panel_axes[0, 0].set_ylabel("share that walks")
     if measure_name is not None and point_collection is not None:
-        extended_ends = _find_extended_color_bar_ends(
+        extended_color_bar_ends = _find_extended_color_bar_ends(
             [drawn_samples[measure_name].values], point_collection.get_clim()
         )
         axes_of_all_panels = panel_axes.ravel().tolist()
         color_bar = figure.colorbar(
-            point_collection, ax=axes_of_all_panels, aspect=40, pad=0.01, extend=extended_ends
+            point_collection,
+            ax=axes_of_all_panels,
+            aspect=40,
+            pad=0.01,
+            extend=extended_color_bar_ends,
         )
         color_bar.set_label(format_axis_label(measure_name, "{name}"))
     _add_scan_legend(figure, np.unique(outcome_codes), {}, 3)
@@ -365,12 +383,12 @@ def _draw_outcome_samples(
 def _draw_stable_fraction(axes: Axes, x: np.ndarray, has_stable_gait: np.ndarray) -> None:
     """Draw the fraction of samples with a stable gait as a function of a parameter."""
     histogram_edges = np.linspace(x.min(), x.max(), 13)
-    n_samples, n_stable = (
+    n_samples, n_stable_samples = (
         np.histogram(parameter_values, histogram_edges)[0]
         for parameter_values in (x, x[has_stable_gait])
     )
     axes.stairs(
-        n_stable / np.maximum(n_samples, 1),
+        n_stable_samples / np.maximum(n_samples, 1),
         histogram_edges,
         fill=True,
         color=OUTCOME_LABELS_AND_COLORS[Outcome.STEPPED][1],
@@ -385,29 +403,31 @@ def draw_sobol_indices(indices: xr.Dataset) -> Figure:
         indices.measure.values,
         [str(parameter_name) for parameter_name in indices.parameter.values],
     )
-    n_columns = min(len(measure_names), 3)
-    n_rows = -(-len(measure_names) // n_columns)
+    n_panel_columns = min(len(measure_names), 3)
+    n_panel_rows = -(-len(measure_names) // n_panel_columns)
     bar_positions = np.arange(len(parameter_names))
-    figure_height = (0.26 * len(parameter_names) + 0.5) * n_rows + 0.6
+    figure_height = (0.26 * len(parameter_names) + 0.5) * n_panel_rows + 0.6
     figure = Figure(figsize=(PAGE_FIGURE_WIDTH_INCHES, figure_height))
-    panel_axes = figure.subplots(n_rows, n_columns, sharex=True, sharey=True, squeeze=False)
+    panel_axes = figure.subplots(
+        n_panel_rows, n_panel_columns, sharex=True, sharey=True, squeeze=False
+    )
     for axes in panel_axes.ravel()[len(measure_names) :]:
         axes.set_axis_off()
     for axes, measure_name in zip(panel_axes.ravel(), measure_names, strict=False):
-        measure_indices = indices.sel(measure=measure_name)
+        sobol_indices_of_measure = indices.sel(measure=measure_name)
         for sobol_index_name, legend_text, bar_offset, bar_color in (
             ("first_order", "by itself (first order)", -0.19, OKABE_ITO_BLUE),
             ("total", "with all it meets (total)", 0.19, OKABE_ITO_AMBER),
         ):
-            sobol_index_values = measure_indices[sobol_index_name].values
-            lower_interval_ends, upper_interval_ends = (
-                measure_indices[f"{sobol_index_name}_lower"].values,
-                measure_indices[f"{sobol_index_name}_upper"].values,
+            sobol_index_values = sobol_indices_of_measure[sobol_index_name].values
+            lower_confidence_bounds, upper_confidence_bounds = (
+                sobol_indices_of_measure[f"{sobol_index_name}_lower"].values,
+                sobol_indices_of_measure[f"{sobol_index_name}_upper"].values,
             )
-            interval_lengths = np.maximum(
+            confidence_interval_lengths = np.maximum(
                 [
-                    sobol_index_values - lower_interval_ends,
-                    upper_interval_ends - sobol_index_values,
+                    sobol_index_values - lower_confidence_bounds,
+                    upper_confidence_bounds - sobol_index_values,
                 ],
                 0.0,
             )
@@ -415,11 +435,11 @@ def draw_sobol_indices(indices: xr.Dataset) -> Figure:
             axes.barh(
                 bar_positions + bar_offset,
                 sobol_index_values,
-                xerr=interval_lengths,
+                xerr=confidence_interval_lengths,
                 error_kw={"elinewidth": 0.7},
                 **bar_style,
             )
-        if measure_indices.is_constant_measure:
+        if sobol_indices_of_measure.is_constant_measure:
             axes.text(0.5, 0.5, "constant", ha="center", va="center", transform=axes.transAxes)
         axes.set_title(typeset_greek_symbols(MEASURES[str(measure_name)].long_name))
         axes.set_yticks(
@@ -428,7 +448,9 @@ def draw_sobol_indices(indices: xr.Dataset) -> Figure:
         )
         axes.set_xlim(0.0, 1.05)
     panel_axes[0, 0].invert_yaxis()
-    for axes in panel_axes.ravel()[max(len(measure_names) - n_columns, 0) : len(measure_names)]:
+    for axes in panel_axes.ravel()[
+        max(len(measure_names) - n_panel_columns, 0) : len(measure_names)
+    ]:
         axes.set_xlabel("share of the variance")
         axes.tick_params(labelbottom=True)
     legend_handles, legend_texts = panel_axes[0, 0].get_legend_handles_labels()
@@ -488,14 +510,14 @@ def _find_color_limits(
     The range is that of the stable gaits, or of all gaits if none is stable. A few distant unstable
     gaits would otherwise make the colors of all other gaits equal.
     """
-    finite_values = [
+    finite_values_by_panel = [
         values_of_panel[np.isfinite(values_of_panel)] for values_of_panel in panel_values
     ]
     stable_values = [
         v[s & np.isfinite(v)] for v, s in zip(panel_values, is_stable_by_panel, strict=True)
     ]
     values_in_range = np.concatenate(
-        stable_values if any(map(len, stable_values)) else finite_values
+        stable_values if any(map(len, stable_values)) else finite_values_by_panel
     )
     return (
         (float(values_in_range.min()), float(values_in_range.max()))
@@ -515,12 +537,12 @@ def _find_extended_color_bar_ends(
     panel_values: Sequence[np.ndarray], color_limits: tuple[float, float]
 ) -> Literal["neither", "min", "max", "both"]:
     """Return the ends of a color bar beyond which values lie: "neither", "min", "max" or "both"."""
-    finite_values = np.concatenate(
+    finite_values_by_panel = np.concatenate(
         [values_of_panel[np.isfinite(values_of_panel)] for values_of_panel in panel_values]
     )
     has_values_below, has_values_above = (
-        np.any(finite_values < color_limits[0]),
-        np.any(finite_values > color_limits[1]),
+        np.any(finite_values_by_panel < color_limits[0]),
+        np.any(finite_values_by_panel > color_limits[1]),
     )
     return (
         ("both" if has_values_above else "min")
@@ -538,11 +560,11 @@ def _draw_measure_cells(
 ) -> AxesImage:
     """Draw one colored cell per grid point, without interpolation, and return the mesh of cells."""
     axes.set_facecolor(LIGHT_GRAY_COLOR)
-    masked_values = np.ma.masked_invalid(measure_values_by_cell)
+    masked_measure_values = np.ma.masked_invalid(measure_values_by_cell)
     cell_mesh = axes.pcolormesh(
         _find_cell_edges(x),
         _find_cell_edges(y),
-        masked_values,
+        masked_measure_values,
         cmap="viridis",
         norm=color_scale,
     )
@@ -569,10 +591,10 @@ def _compute_displayed_outcome_codes(scan: xr.Dataset) -> xr.DataArray:
 
     They are replaced only if the scan contains the spectral radius.
     """
-    codes_with_instability = scan.outcome.astype(int)
+    outcome_codes_with_instability = scan.outcome.astype(int)
     if "spectral_radius" not in scan:
-        return codes_with_instability
-    return codes_with_instability.where(~(scan.spectral_radius >= 1.0), UNSTABLE_CYCLE_CODE)
+        return outcome_codes_with_instability
+    return outcome_codes_with_instability.where(~(scan.spectral_radius >= 1.0), UNSTABLE_CYCLE_CODE)
 
 
 def _draw_margin_zero_lines(axes: Axes, scan: xr.Dataset, x: str, y: str) -> dict[str, Line2D]:
@@ -588,8 +610,12 @@ def _draw_margin_zero_lines(axes: Axes, scan: xr.Dataset, x: str, y: str) -> dic
             # Without missing values the line has no steps.
             margin_array = margin_array.where(scan.takeoff_acceleration >= 0.0)
         margin_values = margin_array.transpose(y, x).values
-        finite_values = margin_values[np.isfinite(margin_values)]
-        if not len(finite_values) or finite_values.min() >= 0.0 or finite_values.max() <= 0.0:
+        finite_values_by_panel = margin_values[np.isfinite(margin_values)]
+        if (
+            not len(finite_values_by_panel)
+            or finite_values_by_panel.min() >= 0.0
+            or finite_values_by_panel.max() <= 0.0
+        ):
             continue
         line_color, line_style = select_special_point_style(margin_name)
         axes.contour(
@@ -607,7 +633,10 @@ def _draw_margin_zero_lines(axes: Axes, scan: xr.Dataset, x: str, y: str) -> dic
 
 
 def _add_scan_legend(
-    figure: Figure, outcome_codes: np.ndarray, legend_lines: Mapping[str, Line2D], n_columns: int
+    figure: Figure,
+    outcome_codes: np.ndarray,
+    legend_lines: Mapping[str, Line2D],
+    n_panel_columns: int,
 ) -> None:
     """Add a legend of outcomes and of margin curves below a figure."""
     margin_lines = [
@@ -618,7 +647,7 @@ def _add_scan_legend(
     figure.legend(
         handles=[*make_outcome_patches(outcome_codes), *margin_lines],
         loc="outside lower center",
-        ncols=4 if n_columns > 1 else 2,
+        ncols=4 if n_panel_columns > 1 else 2,
         fontsize=7.5,
         columnspacing=1.4,
     )

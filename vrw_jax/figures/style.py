@@ -183,26 +183,27 @@ def save(figure: Figure, folder: str | Path, name: str) -> list[Path]:
 
 
 def require_dataset_variables(
-    argument_name: str, labeled_dataset: Any, needed_names: Sequence[str], remedy_text: str
+    argument_name: str, labeled_dataset: Any, required_names: Sequence[str], remedy_text: str
 ) -> None:
     """Raise an error unless `labeled_dataset` is a dataset with the needed variables or
     attributes.
     """
     check_type(argument_name, labeled_dataset, xr.Dataset, remedy_text)
-    missing_names = [
+    missing_required_names = [
         variable_name
-        for variable_name in needed_names
+        for variable_name in required_names
         if variable_name not in labeled_dataset.variables
         and variable_name not in labeled_dataset.attrs
     ]
-    if missing_names:
+    if missing_required_names:
         raise ValueError(
-            f"{argument_name} holds no {missing_names[0]!r}, which is to be drawn: {remedy_text}."
+            f"{argument_name} holds no {missing_required_names[0]!r}, which is to be drawn: "
+            f"{remedy_text}."
         )
 
 
 def require_variables_of_datasets(
-    argument_name: str, datasets: Any, needed_names: Sequence[str], remedy_text: str
+    argument_name: str, datasets: Any, required_names: Sequence[str], remedy_text: str
 ) -> None:
     """Raise an error unless `datasets` is a nonempty list of datasets with the needed variables."""
     check_type(argument_name, datasets, (list, tuple), f"{remedy_text}, several in a list")
@@ -210,7 +211,7 @@ def require_variables_of_datasets(
         raise ValueError(f"{argument_name} is empty, but something is to be drawn: {remedy_text}.")
     for dataset_index, labeled_dataset in enumerate(datasets):
         require_dataset_variables(
-            f"{argument_name}[{dataset_index}]", labeled_dataset, needed_names, remedy_text
+            f"{argument_name}[{dataset_index}]", labeled_dataset, required_names, remedy_text
         )
 
 
@@ -248,12 +249,14 @@ def format_axis_label(quantity_name: str, label_format: str = "{name} {symbol}")
     )
 
 
-def format_value_label(quantity_name: str, quantity_value: float, n_digits: int = 4) -> str:
+def format_value_label(
+    quantity_name: str, quantity_value: float, n_significant_digits: int = 4
+) -> str:
     """Return the symbol of a quantity with its value and unit, as in "c = 50 N·s/m"."""
     if quantity_name not in MEASURES:
-        return f"{quantity_name} = {quantity_value:.{n_digits}g}"
+        return f"{quantity_name} = {quantity_value:.{n_significant_digits}g}"
     symbol_text, unit_text = MEASURES[quantity_name].mathtext, _format_figure_unit(quantity_name)
-    return f"${symbol_text}$ = {quantity_value:.{n_digits}g} {unit_text}".rstrip()
+    return f"${symbol_text}$ = {quantity_value:.{n_significant_digits}g} {unit_text}".rstrip()
 
 
 def draw_panel_letter(axes: Axes, panel_letter: str) -> None:
@@ -268,7 +271,7 @@ def draw_markers(
     marker_symbol: str,
     edge_color: str,
     fill_color: str,
-    **style_overrides: Any,
+    **marker_style_overrides: Any,
 ) -> None:
     """Draw markers without a connecting line, filled with `fill_color`.
 
@@ -278,7 +281,7 @@ def draw_markers(
         "markersize": 3.2,
         "markeredgewidth": 0.7,
         "linestyle": "none",
-    } | style_overrides
+    } | marker_style_overrides
     axes.plot(x, y, marker_symbol, color=edge_color, markerfacecolor=fill_color, **marker_style)
 
 
@@ -330,7 +333,7 @@ def draw_outcome_cells(
             for drawn_outcome_code in drawn_outcome_codes
         ]
     )
-    code_indices = np.ma.masked_where(
+    outcome_code_indices = np.ma.masked_where(
         ~np.isin(outcome_codes, drawn_outcome_codes),
         np.searchsorted(drawn_outcome_codes, outcome_codes),
     )
@@ -340,7 +343,7 @@ def draw_outcome_cells(
         else None
     )
     axes.pcolormesh(
-        x, y, code_indices, cmap=outcome_color_map, norm=outcome_color_norm
+        x, y, outcome_code_indices, cmap=outcome_color_map, norm=outcome_color_norm
     ).set_rasterized(True)
 
 

@@ -72,19 +72,19 @@ def tornado_figure(
     require_dataset_variables(
         "table", table, ("derivative", "elasticity"), "give vrw.sensitivities(params)"
     )
-    known_measures = tuple(map(str, table.measure.values))
-    measure_names = known_measures[:MAX_DEFAULT_DRAWN_MEASURES]
+    known_measure_names = tuple(map(str, table.measure.values))
+    measure_names = known_measure_names[:MAX_DEFAULT_DRAWN_MEASURES]
     if measures is not None:
         measure_names = check_names("measures", measures)
     for measure_name in measure_names:
-        require_known_name(measure_name, known_measures, "measure of this table")
+        require_known_name(measure_name, known_measure_names, "measure of this table")
     if not measure_names:
         raise ValueError('measures is empty, but something is to be drawn: give "speed", say.')
     measure_changes = table.elasticity  # changes in per cent for 1 %
     if spreads is not None:
-        known_parameters = tuple(map(str, table.parameter.values))
+        known_parameter_names = tuple(map(str, table.parameter.values))
         for parameter_name in spreads:
-            check_parameter_name(parameter_name, known_parameters, "parameter of this table")
+            check_parameter_name(parameter_name, known_parameter_names, "parameter of this table")
         if not spreads:
             raise ValueError('spreads is empty, but bars need one: give {"damping": 10.0}, say.')
         parameter_changes = [
@@ -94,14 +94,17 @@ def tornado_figure(
         measure_changes = table.derivative.sel(parameter=list(spreads)) * np.array(
             parameter_changes
         )
-    n_columns = min(len(measure_names), MAX_PANELS_PER_ROW)
-    n_rows = math.ceil(len(measure_names) / n_columns)
+    n_panel_columns = min(len(measure_names), MAX_PANELS_PER_ROW)
+    n_panel_rows = math.ceil(len(measure_names) / n_panel_columns)
     figure_height = (
-        n_rows * (PARAMETER_ROW_HEIGHT_INCHES * measure_changes.sizes["parameter"] + 0.8) + 0.3
+        n_panel_rows * (PARAMETER_ROW_HEIGHT_INCHES * measure_changes.sizes["parameter"] + 0.8)
+        + 0.3
     )
-    figure_width = PAGE_FIGURE_WIDTH_INCHES if n_columns > 1 else 0.6 * PAGE_FIGURE_WIDTH_INCHES
+    figure_width = (
+        PAGE_FIGURE_WIDTH_INCHES if n_panel_columns > 1 else 0.6 * PAGE_FIGURE_WIDTH_INCHES
+    )
     figure = Figure(figsize=(figure_width, figure_height))
-    panel_axes = figure.subplots(n_rows, n_columns, squeeze=False).ravel()
+    panel_axes = figure.subplots(n_panel_rows, n_panel_columns, squeeze=False).ravel()
     for axes in panel_axes[len(measure_names) :]:
         axes.set_axis_off()
     for axes, measure_name in zip(panel_axes, measure_names, strict=False):

@@ -76,11 +76,11 @@ def _draw_objective_path(axes: Axes, path_dataset: xr.Dataset) -> None:
         linewidth=0.7,
         zorder=1,
     )
-    for is_feasible, fill_color, marker_text in (
+    for draws_feasible_gaits, fill_color, marker_text in (
         (True, OKABE_ITO_BLUE, "keeps the constraints"),
         (False, "white", "breaks one"),
     ):
-        is_marker_drawn = ~is_gait_lost & (are_constraints_satisfied == is_feasible)
+        is_marker_drawn = ~is_gait_lost & (are_constraints_satisfied == draws_feasible_gaits)
         draw_markers(
             axes,
             evaluation_numbers[is_marker_drawn],
@@ -114,12 +114,12 @@ def _draw_parameter_paths(axes: Axes, path_dataset: xr.Dataset) -> None:
         np.asarray(path_dataset.attrs["upper"]),
     )
     for i, parameter_name in enumerate(path_dataset.attrs["free"].split()):
-        scaled_values = (path_dataset[parameter_name].values - lower_bounds[i]) / (
+        scaled_parameter_values = (path_dataset[parameter_name].values - lower_bounds[i]) / (
             upper_bounds[i] - lower_bounds[i]
         )
         axes.plot(
             path_dataset.gait_evaluation,
-            scaled_values,
+            scaled_parameter_values,
             marker=".",
             markersize=4.0,
             label=f"${MEASURES[parameter_name].mathtext}$",
@@ -137,7 +137,7 @@ def _draw_constraint_slacks(axes: Axes, tune_result: TuneResult) -> None:
     constraint_names = [str(constraint_name) for constraint_name in path_dataset.constraint.values]
     constraint_values = path_dataset.constraint_value.values
     min_constraint_values = path_dataset.margin.values
-    tuned_index = np.nanargmin(
+    tuned_evaluation_index = np.nanargmin(
         np.sum(
             [
                 np.abs(
@@ -155,7 +155,7 @@ def _draw_constraint_slacks(axes: Axes, tune_result: TuneResult) -> None:
             np.nanmax(np.abs(constraint_values - min_constraint_values), axis=0), 1e-12
         )
     bar_positions = np.arange(len(constraint_names))[::-1]
-    active_names = {active_constraint.name for active_constraint in tune_result.active}
+    active_constraint_names = {active_constraint.name for active_constraint in tune_result.active}
     for slack_fraction, vertical_offset, bar_color, legend_text in (
         (
             (constraint_values[0] - min_constraint_values) / slack_units,
@@ -164,7 +164,7 @@ def _draw_constraint_slacks(axes: Axes, tune_result: TuneResult) -> None:
             "at the start",
         ),
         (
-            (constraint_values[tuned_index] - min_constraint_values) / slack_units,
+            (constraint_values[tuned_evaluation_index] - min_constraint_values) / slack_units,
             -0.19,
             OKABE_ITO_BLUE,
             "tuned",
@@ -189,7 +189,7 @@ def _draw_constraint_slacks(axes: Axes, tune_result: TuneResult) -> None:
         )
     axes.set_yticks(bar_positions, constraint_labels, fontsize=7.0)
     for tick_label, constraint_name in zip(axes.get_yticklabels(), constraint_names, strict=True):
-        if constraint_name in active_names:
+        if constraint_name in active_constraint_names:
             tick_label.set_color(OKABE_ITO_ORANGE)
             tick_label.set_fontweight("bold")
     axes.set_xlim(min(-0.05, axes.get_xlim()[0]), 1.05)

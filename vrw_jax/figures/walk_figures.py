@@ -58,8 +58,8 @@ NO_PAPER_WALK_REMEDY = (
 
 def _require_nonempty_walk(argument_name: str, walk: xr.Dataset) -> None:
     """Raise an error unless `walk` is a trajectory with at least one sample."""
-    needed_names = ("hub_x", "hub_z", "step", "parameter_n_legs")
-    require_dataset_variables(argument_name, walk, needed_names, NO_WALK_REMEDY)
+    required_names = ("hub_x", "hub_z", "step", "parameter_n_legs")
+    require_dataset_variables(argument_name, walk, required_names, NO_WALK_REMEDY)
     if not walk.sizes["time"]:
         raise ValueError(
             f"{argument_name} has no samples, because the walk ended at once as "
@@ -73,12 +73,12 @@ def find_phase_spans(gait: xr.Dataset) -> list[tuple[float, float, int]]:
     trajectory.
     """
     step_phase_codes = 3 * gait.step.values + gait.phase.values
-    change_indices = np.flatnonzero(np.diff(step_phase_codes)) + 1
-    times_by_phase = np.split(gait.time.values, change_indices)
-    phase_codes = gait.phase.values[np.r_[0, change_indices]]
+    phase_change_indices = np.flatnonzero(np.diff(step_phase_codes)) + 1
+    times_by_phase = np.split(gait.time.values, phase_change_indices)
+    phase_codes = gait.phase.values[np.r_[0, phase_change_indices]]
     return [
-        (phase_times[0], phase_times[-1], int(phase_code))
-        for phase_times, phase_code in zip(times_by_phase, phase_codes, strict=True)
+        (phase_sample_times[0], phase_sample_times[-1], int(phase_code))
+        for phase_sample_times, phase_code in zip(times_by_phase, phase_codes, strict=True)
     ]
 
 
@@ -123,12 +123,18 @@ def gait_panels(gait: xr.Dataset) -> Figure:
     panel_axes = figure.subplots(5, 1, sharex=True, height_ratios=[1, 1, 1, 1, 1.5])
     for axes, panel_letter in zip(panel_axes, "abcde", strict=True):
         draw_panel_letter(axes, panel_letter)
-        for start_time, end_time, phase_code in find_phase_spans(gait):
+        for phase_start_time, phase_end_time, phase_code in find_phase_spans(gait):
             if phase_code == 0:
-                axes.axvspan(start_time, end_time, color=LIGHT_GRAY_COLOR, linewidth=0.0, zorder=0)
+                axes.axvspan(
+                    phase_start_time,
+                    phase_end_time,
+                    color=LIGHT_GRAY_COLOR,
+                    linewidth=0.0,
+                    zorder=0,
+                )
             if phase_code == 2:
                 axes.axvline(
-                    start_time,
+                    phase_start_time,
                     color=DARK_GRAY_COLOR,
                     linewidth=0.5,
                     linestyle=(0, (1, 2)),
@@ -136,10 +142,10 @@ def gait_panels(gait: xr.Dataset) -> Figure:
                 )
     panel_axes[0].plot(times_with_gaps, theta, color="black")
     panel_axes[0].set_ylabel(format_axis_label("theta", "{symbol}"))
-    for start_time, end_time, phase_code in find_phase_spans(gait)[:3]:
+    for phase_start_time, phase_end_time, phase_code in find_phase_spans(gait)[:3]:
         panel_axes[0].annotate(
             PHASE_NAMES[phase_code],
-            (0.5 * (start_time + end_time), 1.0),
+            (0.5 * (phase_start_time + phase_end_time), 1.0),
             xycoords=("data", "axes fraction"),
             ha="center",
             va="bottom",
@@ -274,8 +280,13 @@ def foot_height(gaits: Sequence[xr.Dataset], vary: str = "damping") -> Figure:
     figure = Figure(figsize=(PAGE_FIGURE_WIDTH_INCHES, 2.6))
     step_axes, takeoff_axes = figure.subplots(1, 2)
     for gait, line_style in zip(gaits, GAIT_LINE_STYLES, strict=False):
-        gait_label, min_clearance = _format_gait_label(gait, vary), 1e3 * float(gait.foot_2_z.min())
-        clearance_text = f"lowest −{-min_clearance:.1f} mm" if min_clearance < -1e-6 else "clear"
+        gait_label, min_foot_clearance = (
+            _format_gait_label(gait, vary),
+            1e3 * float(gait.foot_2_z.min()),
+        )
+        clearance_text = (
+            f"lowest −{-min_foot_clearance:.1f} mm" if min_foot_clearance < -1e-6 else "clear"
+        )
         step_axes.plot(gait.time, gait.foot_2_z, linestyle=line_style, label=gait_label)
         takeoff_axes.plot(
             gait.time, 1e3 * gait.foot_2_z, linestyle=line_style, label=clearance_text
@@ -286,13 +297,13 @@ def foot_height(gaits: Sequence[xr.Dataset], vary: str = "damping") -> Figure:
         axes.axhline(0.0, color="black", linewidth=0.5, zorder=1)
         axes.set_xlabel("time since landing [s]")
         axes.legend(loc="upper left")
-    min_clearance = min(float(gait.foot_2_z.min()) for gait in gaits)
+    min_foot_clearance = min(float(gait.foot_2_z.min()) for gait in gaits)
     takeoff_times = [float(gait.time[gait.phase == 1][0]) for gait in gaits]
-    max_height = max(float(gait.foot_2_z.max()) for gait in gaits)
-    step_axes.set_ylim(2.0 * min_clearance - 0.004, 1.05 * max_height)
+    max_foot_height = max(float(gait.foot_2_z.max()) for gait in gaits)
+    step_axes.set_ylim(2.0 * min_foot_clearance - 0.004, 1.05 * max_foot_height)
     step_axes.set_xlim(0.0, max(float(gait.time.max()) for gait in gaits))
     step_axes.set_ylabel("height of foot 2, $z_2$ [m]")
-    takeoff_axes.set_ylim(1.3e3 * min_clearance - 0.5, -1.8e3 * min_clearance + 0.5)
+    takeoff_axes.set_ylim(1.3e3 * min_foot_clearance - 0.5, -1.8e3 * min_foot_clearance + 0.5)
     takeoff_axes.set_xlim(min(takeoff_times) - 0.03, max(takeoff_times) + 0.1)
     takeoff_axes.set_ylabel("$z_2$ [mm]")
     takeoff_axes.text(
@@ -383,7 +394,7 @@ def indicators(gaits: xr.Dataset, every: int = 4) -> Figure:
     valid_gaits = gaits.where(gaits.settled & (gaits.lambda_2_plus >= 0.0), drop=True)
     is_scuffing = np.minimum(valid_gaits.clearance_sls1, valid_gaits.clearance_sls2).values < 0.0
     parameter_values = valid_gaits[varied_parameter].values
-    has_marker = (
+    is_marker_drawn_at_value = (
         (parameter_values % every == 0)
         | (parameter_values == parameter_values.min())
         | (parameter_values == parameter_values.max())
@@ -405,7 +416,7 @@ def indicators(gaits: xr.Dataset, every: int = 4) -> Figure:
             )
             axes.plot(parameter_values, indicator_values, color=line_color, linewidth=0.7)
             for is_scuffing_drawn, fill_color in ((False, line_color), (True, "white")):
-                is_marker_drawn = has_marker & (is_scuffing == is_scuffing_drawn)
+                is_marker_drawn = is_marker_drawn_at_value & (is_scuffing == is_scuffing_drawn)
                 legend_text = indicator_symbol + (", scuffing" if is_scuffing_drawn else "")
                 x, y = parameter_values[is_marker_drawn], indicator_values[is_marker_drawn]
                 draw_markers(

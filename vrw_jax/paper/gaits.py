@@ -79,20 +79,24 @@ def walk_into_gait(
     section_states = np.concatenate(
         [gait_walk.start[None], gait_walk.steps.section_state[:n_stepped]]
     )
-    state_changes = np.full(n_stepped + 1, np.nan)
-    state_changes[1:] = np.linalg.norm(np.diff(section_states, axis=0), axis=1)
+    section_state_changes = np.full(n_stepped + 1, np.nan)
+    section_state_changes[1:] = np.linalg.norm(np.diff(section_states, axis=0), axis=1)
     walk_outcome = Outcome(int(gait_walk.outcome))
     n_settled_steps = settling_options.n_settled_steps
-    last_change = (
-        float(state_changes[-n_settled_steps:].max()) if n_stepped >= n_settled_steps else math.inf
+    last_state_change = (
+        float(section_state_changes[-n_settled_steps:].max())
+        if n_stepped >= n_settled_steps
+        else math.inf
     )
-    is_settled = walk_outcome == Outcome.STEPPED and last_change < settling_options.max_state_change
+    is_settled = (
+        walk_outcome == Outcome.STEPPED and last_state_change < settling_options.max_state_change
+    )
     return xr.Dataset(
         {
             "section_state": (("step", "component"), section_states),
             "change": (
                 "step",
-                state_changes,
+                section_state_changes,
                 {"units": "1", "long_name": "change since the step before"},
             ),
         },
@@ -100,7 +104,7 @@ def walk_into_gait(
         {
             "outcome": walk_outcome.name,
             "outcome_meaning": walk_outcome.meaning,
-            "last_change": last_change,
+            "last_change": last_state_change,
             "settled": int(is_settled),
         }
         | collect_provenance_attributes(params, make_formally_continued_model()),
@@ -115,24 +119,24 @@ def walk_along_parameter(
     The start of each walk is extrapolated from the last two settled gaits. Walks that fail or do
     not settle are not used for the extrapolation.
     """
-    settled_values: list[float] = []
-    settled_states: list[np.ndarray] = []
+    settled_parameter_values: list[float] = []
+    settled_section_states: list[np.ndarray] = []
     for parameter_value in parameter_values:
-        start_state = jnp.asarray(settled_states[-1]) if settled_states else x
-        if len(settled_states) > 1:
-            extrapolation_factor = (parameter_value - settled_values[-1]) / (
-                settled_values[-1] - settled_values[-2]
+        start_state = jnp.asarray(settled_section_states[-1]) if settled_section_states else x
+        if len(settled_section_states) > 1:
+            extrapolation_factor = (parameter_value - settled_parameter_values[-1]) / (
+                settled_parameter_values[-1] - settled_parameter_values[-2]
             )
             start_state = jnp.asarray(
-                settled_states[-1]
-                + extrapolation_factor * (settled_states[-1] - settled_states[-2])
+                settled_section_states[-1]
+                + extrapolation_factor * (settled_section_states[-1] - settled_section_states[-2])
             )
         gait_walk = walk_into_gait(
             replace_wheel_parameter(params, parameter_name, parameter_value), start_state
         )
         if gait_walk.settled:
-            settled_values.append(parameter_value)
-            settled_states.append(gait_walk.section_state.values[-1])
+            settled_parameter_values.append(parameter_value)
+            settled_section_states.append(gait_walk.section_state.values[-1])
         yield gait_walk
 
 
@@ -150,37 +154,37 @@ def measure_gaits_along_parameter(
 
     - `on_progress`: function that is called with the completed fraction of the work.
     """
-    measures_of_gaits: list[dict[str, np.ndarray]] = []
+    measures_by_gait: list[dict[str, np.ndarray]] = []
     for parameter_value, gait_walk in zip(
         parameter_values,
         walk_along_parameter(params, parameter_name, parameter_values, x),
         strict=True,
     ):
-        last_state = gait_walk.section_state.values[-1]
+        last_section_state = gait_walk.section_state.values[-1]
         step_result = step(
             replace_wheel_parameter(params, parameter_name, parameter_value),
-            jnp.asarray(last_state),
+            jnp.asarray(last_section_state),
             model=make_formally_continued_model(),
         )
         gait_measures = {
-            measure_name: np.asarray(parameter_values)
-            for measure_name, parameter_values in step_result.measures().items()
+            measure_name: np.asarray(measure_value)
+            for measure_name, measure_value in step_result.measures().items()
         }
         if gait_walk.outcome != Outcome.STEPPED.name:
             gait_measures["outcome"] = np.asarray(int(Outcome[gait_walk.outcome]))
-        gait_measures["section_state"] = last_state
+        gait_measures["section_state"] = last_section_state
         gait_measures["change"] = np.asarray(gait_walk.attrs["last_change"])
         gait_measures["settled"] = np.asarray(bool(gait_walk.settled))
-        measures_of_gaits.append(gait_measures)
+        measures_by_gait.append(gait_measures)
         if on_progress is not None:
-            on_progress(len(measures_of_gaits) / len(parameter_values))
+            on_progress(len(measures_by_gait) / len(parameter_values))
     return _make_gait_dataset(
         params,
         parameter_name,
         parameter_values,
         {
-            measure_name: np.stack([r[measure_name] for r in measures_of_gaits])
-            for measure_name in measures_of_gaits[0]
+            measure_name: np.stack([r[measure_name] for r in measures_by_gait])
+            for measure_name in measures_by_gait[0]
         },
     )
 
@@ -189,12 +193,12 @@ def _make_gait_dataset(
     params: WheelParams,
     parameter_name: str,
     parameter_values: Sequence[float],
-    measure_columns: dict[str, np.ndarray],
+    values_by_measure: dict[str, np.ndarray],
 ) -> xr.Dataset:
     """Return a labeled dataset of measures over a parameter."""
     dataset_variables = make_labeled_variables(
         {
-            measure_name: measure_columns[measure_name]
+            measure_name: values_by_measure[measure_name]
             for measure_name in STEP_MEASURES | MARGIN_MEASURES
         },
         parameter_name,
@@ -203,13 +207,13 @@ def _make_gait_dataset(
     dataset_variables |= {
         "section_state": xr.Variable(
             (parameter_name, "component"),
-            measure_columns["section_state"],
+            values_by_measure["section_state"],
             {"long_name": "section state"},
         ),
-        "change": xr.Variable(parameter_name, measure_columns["change"], state_change_attributes),
+        "change": xr.Variable(parameter_name, values_by_measure["change"], state_change_attributes),
         "settled": xr.Variable(
             parameter_name,
-            measure_columns["settled"],
+            values_by_measure["settled"],
             {"long_name": "whether the walk settled into a period-1 gait"},
         ),
     }

@@ -83,14 +83,14 @@ def measure_gaits_along_damping(on_progress: Callable[[float], None] | None = No
     """
     params = WheelParams()
     start_state = jnp.asarray(walk_into_table_1_gait().section_state.values[-1])
-    gaits_below_table_1 = measure_gaits_along_parameter(
+    gaits_below_table_1_damping = measure_gaits_along_parameter(
         params, "damping", range(200, 0, -1), start_state, on_progress
     )
-    gaits_above_table_1 = measure_gaits_along_parameter(
+    gaits_above_table_1_damping = measure_gaits_along_parameter(
         params, "damping", range(201, 225), start_state
     )
     return xr.concat(
-        [gaits_below_table_1, gaits_above_table_1],
+        [gaits_below_table_1_damping, gaits_above_table_1_damping],
         "damping",
         data_vars="minimal",
         combine_attrs="override",
@@ -162,8 +162,11 @@ def write_paper_figures(paper_evidence: PaperEvidence, folder: Path) -> list[Pat
         for figure_name, figure in figure_by_name.items()
         for figure_path in plots.save(figure, folder, figure_name)
     ]
-    frame_images, milliseconds = plots.walk_frames(paper_evidence.gaits_by_damping[-1])
-    return [*figure_paths, plots.save_animation(frame_images, milliseconds, folder / "walk.gif")]
+    frame_images, frame_duration_ms = plots.walk_frames(paper_evidence.gaits_by_damping[-1])
+    return [
+        *figure_paths,
+        plots.save_animation(frame_images, frame_duration_ms, folder / "walk.gif"),
+    ]
 
 
 def reproduce_paper(

@@ -246,9 +246,9 @@ class ModelSelectionScanEngine:
         paper_results = self._paper_engine(
             {"damping": np.full(n_samples, float(self._base_wheel.damping))}
             | {
-                variable_name: parameter_samples
-                for variable_name, parameter_samples in samples_by_parameter.items()
-                if variable_name != FRICTION_NAME
+                parameter_name: parameter_samples
+                for parameter_name, parameter_samples in samples_by_parameter.items()
+                if parameter_name != FRICTION_NAME
             }
         )
         selection_reasons = self.compute_selection_reasons(paper_results, sample_friction)
@@ -272,8 +272,8 @@ class ModelSelectionScanEngine:
         if unilateral_samples.size:
             unilateral_results = self._unilateral_engine(
                 {
-                    variable_name: parameter_samples[unilateral_samples]
-                    for variable_name, parameter_samples in samples_by_parameter.items()
+                    parameter_name: parameter_samples[unilateral_samples]
+                    for parameter_name, parameter_samples in samples_by_parameter.items()
                 }
             )
             for variable_name in variable_names:

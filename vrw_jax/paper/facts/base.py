@@ -74,7 +74,7 @@ STEP_ERROR_TOLERANCE = 1e-9
 the default options.
 """
 
-ClaimNumbers = Mapping[str, Any]
+ClaimValues = Mapping[str, Any]
 """Values that the claims of a group need, by name, computed from the evidence."""
 
 
@@ -95,21 +95,21 @@ class PaperClaimGroup:
     """Claims under one heading that are computed from the same values."""
 
     group_title: str
-    number_function: Callable[[PaperEvidence], ClaimNumbers]
+    claim_value_function: Callable[[PaperEvidence], ClaimValues]
     claims: tuple[PaperClaim, ...]
 
     def make_facts(self, paper_evidence: PaperEvidence) -> list[PaperFact]:
         """Return the facts for the group's claims, computed from the evidence."""
-        numbers_by_name = self.number_function(paper_evidence)
-        number_namespace = SimpleNamespace(**numbers_by_name)
+        claim_values_by_name = self.claim_value_function(paper_evidence)
+        claim_value_namespace = SimpleNamespace(**claim_values_by_name)
         return [
             PaperFact(
                 group=self.group_title,
                 claim=paper_claim.claim,
                 source=paper_claim.source,
                 published_value=paper_claim.published_value,
-                computed=paper_claim.computed_value_format.format(**numbers_by_name),
-                holds=bool(paper_claim.agreement_test(number_namespace)),
+                computed=paper_claim.computed_value_format.format(**claim_values_by_name),
+                holds=bool(paper_claim.agreement_test(claim_value_namespace)),
                 tolerance_reason=paper_claim.tolerance_reason,
             )
             for paper_claim in self.claims
@@ -117,17 +117,23 @@ class PaperClaimGroup:
 
 
 def make_agreement_test(
-    **published_numbers: tuple[float | tuple[float, ...], float],
+    **published_values_and_tolerances: tuple[float | tuple[float, ...], float],
 ) -> Callable[[Any], bool]:
     """Return a function that tests whether each named value agrees with its published value.
 
-    - `published_numbers`: pairs of published value and tolerance, by name.
+    - `published_values_and_tolerances`: pairs of published value and tolerance, by name.
     """
     return lambda n: all(
         bool(
-            np.all(np.abs(np.asarray(getattr(n, number_name)) - published_value) <= value_tolerance)
+            np.all(
+                np.abs(np.asarray(getattr(n, claim_value_name)) - published_value)
+                <= value_tolerance
+            )
         )
-        for number_name, (published_value, value_tolerance) in published_numbers.items()
+        for claim_value_name, (
+            published_value,
+            value_tolerance,
+        ) in published_values_and_tolerances.items()
     )
 
 

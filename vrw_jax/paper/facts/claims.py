@@ -12,7 +12,7 @@ from vrw_jax.paper.facts.base import (
     INDEPENDENT_CODE_LABEL,
     SIGN_TOLERANCE_REASON,
     STEP_ERROR_TOLERANCE,
-    ClaimNumbers,
+    ClaimValues,
     PaperClaim,
     PaperClaimGroup,
     PaperEvidence,
@@ -24,44 +24,44 @@ from vrw_jax.paper.gaits import DEFAULT_SETTLING_OPTIONS
 from vrw_jax.wheel import Outcome
 
 
-def _compute_typical_gait_numbers(paper_evidence: PaperEvidence) -> ClaimNumbers:
+def _compute_typical_gait_values(paper_evidence: PaperEvidence) -> ClaimValues:
     """Compute the values that the claims on the gait of Table 1 of the paper need, by name."""
-    first_step = select_first_step_of_trajectory(paper_evidence.table_1_trajectory)
+    first_step_trajectory = select_first_step_of_trajectory(paper_evidence.table_1_trajectory)
     phase_trajectories = double_support, single_support_1, single_support_2 = (
-        split_trajectory_by_phase(first_step)
+        split_trajectory_by_phase(first_step_trajectory)
     )
-    state_changes = paper_evidence.settling_walk.change.values[1:]
-    convergence_ratio = float((state_changes[12] / state_changes[4]) ** (1.0 / 8.0))
+    section_state_changes = paper_evidence.settling_walk.change.values[1:]
+    convergence_ratio = float((section_state_changes[12] / section_state_changes[4]) ** (1.0 / 8.0))
     rear_load_fraction = double_support.lambda_4.values / (
         double_support.lambda_2.values + double_support.lambda_4.values
     )
-    step_period = float(first_step.time[-1] - first_step.time[0])
-    total_energies = first_step.total_energy.values
+    gait_step_period = float(first_step_trajectory.time[-1] - first_step_trajectory.time[0])
+    total_energies = first_step_trajectory.total_energy.values
     count_local_maxima = lambda x: int(np.sum((x[1:-1] > x[:-2]) & (x[1:-1] >= x[2:])))
     return {
         "shrink": convergence_ratio,
-        "change": state_changes[-1],
+        "change": section_state_changes[-1],
         "settled": bool(paper_evidence.settling_walk.settled and convergence_ratio < 1.0),
-        "theta": float(first_step.theta[0]),
-        "dtheta": float(first_step.dtheta[0]),
-        "period": step_period,
+        "theta": float(first_step_trajectory.theta[0]),
+        "dtheta": float(first_step_trajectory.dtheta[0]),
+        "period": gait_step_period,
         "speed": float(
             paper_evidence.table_1_trajectory.x[-1] - paper_evidence.table_1_trajectory.x[0]
         )
-        / (2.0 * step_period),
+        / (2.0 * gait_step_period),
         "share": 100 * float(paper_evidence.table_1_gait.dls_fraction),
         "durations": [
             float(phase_trajectory.time[-1] - phase_trajectory.time[0])
             for phase_trajectory in phase_trajectories
         ],
-        "least_rate": float(first_step.dtheta.min()),
-        "fore_rate": float(first_step.dL1.max()),
+        "least_rate": float(first_step_trajectory.dtheta.min()),
+        "fore_rate": float(first_step_trajectory.dL1.max()),
         "rear_rate": min(float(double_support.dL2.min()), float(single_support_1.dL2.min())),
         "rear_length": float(single_support_1.L2[-1]),
         "off_stopper": abs(
             float(single_support_1.L2[-1]) - float(paper_evidence.params.locked_length)
         ),
-        "load_before": float(first_step.lambda_2[-1]),
+        "load_before": float(first_step_trajectory.lambda_2[-1]),
         "first_rear": 100 * rear_load_fraction[0],
         "most_rear": 100 * rear_load_fraction.max(),
         "last_rear": rear_load_fraction[-1],
@@ -72,14 +72,14 @@ def _compute_typical_gait_numbers(paper_evidence: PaperEvidence) -> ClaimNumbers
             count_local_maxima(phase_trajectory.lambda_2.values)
             for phase_trajectory in phase_trajectories
         ),
-        "peak": float(first_step.lambda_2.max()),
+        "peak": float(first_step_trajectory.lambda_2.max()),
         "rise": 1e3 * float(np.diff(single_support_2.foot_2_z.values).min()),
         "energy_rise": np.diff(total_energies).max(),
         "energy_lost": total_energies[0] - total_energies[-1],
     }
 
 
-def _compute_damping_numbers(paper_evidence: PaperEvidence) -> ClaimNumbers:
+def _compute_damping_values(paper_evidence: PaperEvidence) -> ClaimValues:
     """Compute the values that the claims on foot height and rear force need, by name.
 
     The claims concern gaits with three values of damping.
@@ -88,13 +88,15 @@ def _compute_damping_numbers(paper_evidence: PaperEvidence) -> ClaimNumbers:
     lowest_foot_heights = {
         c: float(gaits_by_damping[c].foot_2_z.min()) for c in sorted(gaits_by_damping)
     }
-    first_rear_forces = {
+    initial_rear_forces = {
         c: float(gaits_by_damping[c].lambda_4[0]) for c in sorted(gaits_by_damping)
     }
-    lowest_clearances = np.minimum(
+    lowest_foot_clearances = np.minimum(
         paper_evidence.damping_branch.clearance_sls1, paper_evidence.damping_branch.clearance_sls2
     )
-    is_scuffing = paper_evidence.damping_branch.settled.values & (lowest_clearances.values < 0.0)
+    is_scuffing = paper_evidence.damping_branch.settled.values & (
+        lowest_foot_clearances.values < 0.0
+    )
     return {
         "lowest": ", ".join(
             f"{round(1e3 * z, 2) + 0.0:.2f} mm" for z in lowest_foot_heights.values()
@@ -104,17 +106,17 @@ def _compute_damping_numbers(paper_evidence: PaperEvidence) -> ClaimNumbers:
         if is_scuffing.any()
         else math.nan,
         "all_below": bool(is_scuffing[paper_evidence.damping_branch.damping.values <= 100.0].all()),
-        "first": " > ".join(f"{rear_force:.1f}" for rear_force in first_rear_forces.values()),
-        "falls": first_rear_forces[50.0]
-        > first_rear_forces[100.0]
-        > first_rear_forces[200.0]
+        "first": " > ".join(f"{rear_force:.1f}" for rear_force in initial_rear_forces.values()),
+        "falls": initial_rear_forces[50.0]
+        > initial_rear_forces[100.0]
+        > initial_rear_forces[200.0]
         > 0.0,
     }
 
 
 # fmt: off
 TYPICAL_GAIT_CLAIMS = PaperClaimGroup(
-    "Typical gait, Table 1, slope 0.30 rad", _compute_typical_gait_numbers, (
+    "Typical gait, Table 1, slope 0.30 rad", _compute_typical_gait_values, (
     PaperClaim("the gait is stable and of period 1", "§4, Fig. 6", "stable, period 1",
           "changes shrink by {shrink:.3f} a step, to {change:.0e}",
           lambda n: n.settled,
@@ -172,7 +174,7 @@ TYPICAL_GAIT_CLAIMS = PaperClaimGroup(
 ))
 
 DAMPING_CLAIMS = PaperClaimGroup("Foot 2 and rear force for three dampings",
-          _compute_damping_numbers, (
+          _compute_damping_values, (
     PaperClaim("foot 2 scuffs in SLS-I at c = 50 and 100, not at 200", "§4, Fig. 8",
           "scuffs, scuffs, clear", "{lowest}",
           lambda n: n.below == {50.0: True, 100.0: True, 200.0: False},
@@ -187,7 +189,7 @@ DAMPING_CLAIMS = PaperClaimGroup("Foot 2 and rear force for three dampings",
 # fmt: on
 
 
-def _compute_indicator_numbers(paper_evidence: PaperEvidence) -> ClaimNumbers:
+def _compute_indicator_values(paper_evidence: PaperEvidence) -> ClaimValues:
     """Compute the values that the claims on double-support indicators need, by name.
 
     The indicators are functions of the damping.
@@ -198,20 +200,24 @@ def _compute_indicator_numbers(paper_evidence: PaperEvidence) -> ClaimNumbers:
     read_branch_value = lambda c, indicator_name: float(
         damping_branch[indicator_name].sel(damping=c)
     )
-    branch_impulses = gaits_to_damping_219.lambda_I4.values
+    branch_landing_impulses = gaits_to_damping_219.lambda_I4.values
     landing_impulses = np.array(
         [
             printed.compute_printed_landing(paper_evidence.params, x).corrected_impulse
             for x in gaits_to_damping_219.section_state.values
         ]
     )
-    rear_forces = {c: read_branch_value(c, "lambda_4_plus") for c in (1.0, 218.0, 219.0)}
+    rear_forces_by_damping = {c: read_branch_value(c, "lambda_4_plus") for c in (1.0, 218.0, 219.0)}
     do_walks_continue = bool((gaits_from_damping_220.outcome == Outcome.STEPPED).all())
     return {
         "n_settled": int(gaits_to_damping_219.settled.sum()),
         "n": gaits_to_damping_219.sizes["damping"],
-        "rear": (rear_forces[1.0], rear_forces[219.0], 2 * rear_forces[219.0] - rear_forces[218.0]),
-        "last_rear": rear_forces[219.0],
+        "rear": (
+            rear_forces_by_damping[1.0],
+            rear_forces_by_damping[219.0],
+            2 * rear_forces_by_damping[219.0] - rear_forces_by_damping[218.0],
+        ),
+        "last_rear": rear_forces_by_damping[219.0],
         "rear_falls": bool((np.diff(gaits_to_damping_219.lambda_4_plus) < 0.0).all()),
         "fore": (
             read_branch_value(219.0, "lambda_2_plus"),
@@ -220,8 +226,8 @@ def _compute_indicator_numbers(paper_evidence: PaperEvidence) -> ClaimNumbers:
         "fore_5": read_branch_value(5.0, "lambda_2_plus"),
         "fore_4": read_branch_value(4.0, "lambda_2_plus"),
         "fore_grows": bool((np.diff(gaits_to_damping_219.lambda_2_plus) > 0.0).all()),
-        "least": branch_impulses.min(),
-        "most": branch_impulses.max(),
+        "least": branch_landing_impulses.min(),
+        "most": branch_landing_impulses.max(),
         "fore_impulse": (landing_impulses[:, 1].min(), landing_impulses[:, 1].max()),
         "smallest": [
             min(
@@ -243,7 +249,7 @@ def _compute_indicator_numbers(paper_evidence: PaperEvidence) -> ClaimNumbers:
 
 # fmt: off
 INDICATOR_CLAIMS = PaperClaimGroup("DLS indicators over c, slope 0.30 rad",
-          _compute_indicator_numbers, (
+          _compute_indicator_values, (
     PaperClaim("a period-1 gait exists at every whole c up to 219", "§5.2, Fig. 10",
           "1 … 219 (from 5 on with λ2⁺ ≥ 0)", "{n_settled} of {n} settled",
           lambda n: n.n_settled == n.n,
@@ -291,16 +297,16 @@ INDICATOR_CLAIMS = PaperClaimGroup("DLS indicators over c, slope 0.30 rad",
 # fmt: on
 
 
-def _compute_assumption_numbers(paper_evidence: PaperEvidence) -> ClaimNumbers:
+def _compute_assumption_values(paper_evidence: PaperEvidence) -> ClaimValues:
     """Compute the values that the claims on the model's assumptions need, by name.
 
     The claims concern the gait of Table 1 of the paper.
     """
-    table_1_gait, first_step = (
+    table_1_gait, first_step_trajectory = (
         paper_evidence.table_1_gait,
         select_first_step_of_trajectory(paper_evidence.table_1_trajectory),
     )
-    double_support, *_ = split_trajectory_by_phase(first_step)
+    double_support, *_ = split_trajectory_by_phase(first_step_trajectory)
     natural_length, locked_length = (
         float(paper_evidence.params.natural_length),
         float(paper_evidence.params.locked_length),
@@ -315,7 +321,7 @@ def _compute_assumption_numbers(paper_evidence: PaperEvidence) -> ClaimNumbers:
     required_friction = np.abs(
         double_support.lambda_3.values[:-1] / double_support.lambda_4.values[:-1]
     )
-    phase_codes = first_step.phase.values
+    phase_codes = first_step_trajectory.phase.values
     phase_order = [
         PHASE_NAMES[int(p)] for p in phase_codes[np.r_[0, np.flatnonzero(np.diff(phase_codes)) + 1]]
     ]
@@ -331,11 +337,13 @@ def _compute_assumption_numbers(paper_evidence: PaperEvidence) -> ClaimNumbers:
         "clearance": min(float(table_1_gait.clearance_sls1), float(table_1_gait.clearance_sls2)),
         "locked_force": float(table_1_gait.locked_stopper_force.min()),
         "preload": float(paper_evidence.params.stiffness) * (natural_length - locked_length),
-        "contraction": locked_length - float(first_step.L1[1:].max()),
+        "contraction": locked_length - float(first_step_trajectory.L1[1:].max()),
         "order": " → ".join(phase_order),
         "back_in_time": phase_order == list(PHASE_NAMES)
         and float(double_support.L2.max()) < locked_length,
-        "friction_fore": float(np.abs(first_step.lambda_1 / first_step.lambda_2).max()),
+        "friction_fore": float(
+            np.abs(first_step_trajectory.lambda_1 / first_step_trajectory.lambda_2).max()
+        ),
         "friction_rear": required_friction[0],
         "friction_last": required_friction[-1],
         "last_tangential": float(double_support.lambda_3[-1]),
@@ -356,7 +364,7 @@ def _compute_assumption_numbers(paper_evidence: PaperEvidence) -> ClaimNumbers:
 # fmt: off
 ASSUMPTION_CLAIMS = PaperClaimGroup(
     "Assumptions of the model at Table 1",
-    _compute_assumption_numbers, (
+    _compute_assumption_values, (
     PaperClaim("Leg 1 pushes on the ground: least λ2", INDEPENDENT_CODE_LABEL, "103.9 N",
           "{fore_foot_force:.1f} N", make_agreement_test(fore_foot_force=(103.9, 0.05))),
     PaperClaim("Leg 2 pushes in DLS: least λ4", INDEPENDENT_CODE_LABEL, "≥ 0, 0 at its end",

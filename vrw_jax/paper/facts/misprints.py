@@ -7,7 +7,7 @@ import numpy as np
 from vrw_jax.paper.facts import printed
 from vrw_jax.paper.facts.base import (
     STEP_ERROR_TOLERANCE,
-    ClaimNumbers,
+    ClaimValues,
     PaperClaim,
     PaperClaimGroup,
     PaperEvidence,
@@ -16,23 +16,23 @@ from vrw_jax.paper.facts.base import (
 from vrw_jax.wheel import Outcome
 
 
-def _compute_misprint_numbers(paper_evidence: PaperEvidence) -> ClaimNumbers:
+def _compute_misprint_values(paper_evidence: PaperEvidence) -> ClaimValues:
     """Compute the values that the claims on misprints need, by name.
 
     The values follow from equations as printed in the paper and from corrected equations.
     """
-    section_state, library_impulse = (
+    section_state, library_landing_impulse = (
         paper_evidence.table_1_gait.section_state.values,
         float(paper_evidence.table_1_gait.lambda_I4),
     )
     printed_landing = printed.compute_printed_landing(paper_evidence.params, section_state)
-    reference_velocity = printed.differentiate_landing_foot_position(
+    reference_foot_velocity = printed.differentiate_landing_foot_position(
         paper_evidence.params, section_state
     )
-    velocity_error_function = lambda rate: float(
+    foot_velocity_error_function = lambda rate: float(
         np.abs(
             printed.compute_landing_foot_velocity(paper_evidence.params, section_state, rate)
-            - reference_velocity
+            - reference_foot_velocity
         ).max()
     )
     gentle_slope_gait = paper_evidence.slope_branch.sel(slope=0.10, method="nearest")
@@ -51,10 +51,10 @@ def _compute_misprint_numbers(paper_evidence: PaperEvidence) -> ClaimNumbers:
             )
         ),
         "impulse": printed_landing.corrected_impulse[3],
-        "here": library_impulse,
-        "off": abs(printed_landing.corrected_impulse[3] - library_impulse),
-        "off_new": velocity_error_function(0.0),
-        "off_old": velocity_error_function(float(section_state[2])),
+        "here": library_landing_impulse,
+        "off": abs(printed_landing.corrected_impulse[3] - library_landing_impulse),
+        "off_new": foot_velocity_error_function(0.0),
+        "off_old": foot_velocity_error_function(float(section_state[2])),
         "slow_settled": bool(gentle_slope_gait.settled),
         "share": 100.0 * float(gentle_slope_gait.dls_fraction),
         "period": float(gentle_slope_gait.period),
@@ -80,7 +80,7 @@ def _compute_misprint_numbers(paper_evidence: PaperEvidence) -> ClaimNumbers:
 
 # fmt: off
 MISPRINT_CLAIMS = PaperClaimGroup(
-    "Misprints of the paper, with the evidence", _compute_misprint_numbers, (
+    "Misprints of the paper, with the evidence", _compute_misprint_values, (
     PaperClaim("eq. (11): J43 must be −L1 sin θ + L2 sin(θ+α)", "eq. (11)",
           "−L1 sin θ − L2 sin(θ+α)",
           "J q̇ reaches {wrong:.2f} m/s as printed, {right:.0e} corrected (must be 0)",

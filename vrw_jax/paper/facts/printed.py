@@ -100,7 +100,7 @@ def compute_printed_landing(params: WheelParams, section_state: np.ndarray) -> P
         float, _compute_symbols_and_touchdown_length(params, touchdown_angle)
     )
     foot_velocity = compute_landing_foot_velocity(params, section_state, leg_1_rate=dL1)
-    velocity_before = np.array([*foot_velocity, touchdown_rate, 0.0, dL1])
+    coordinate_rates_before = np.array([*foot_velocity, touchdown_rate, 0.0, dL1])
     theta_after = np.asarray(touchdown_angle - s.alpha)
     coordinates_after_landing = (theta_after, np.asarray(s.L0), np.asarray(touchdown_length))
     J = compute_double_support_jacobian(
@@ -114,15 +114,18 @@ def compute_printed_landing(params: WheelParams, section_state: np.ndarray) -> P
     inverse_mass_matrix = np.linalg.inv(M)
     X = J @ inverse_mass_matrix @ J.T
     velocity_projector = np.eye(5) - inverse_mass_matrix @ J.T @ np.linalg.solve(X, J)
-    velocity_after, landing_impulse = (
-        velocity_projector @ velocity_before,
-        -np.linalg.solve(X, J @ velocity_before),
+    coordinate_rates_after, landing_impulse = (
+        velocity_projector @ coordinate_rates_before,
+        -np.linalg.solve(X, J @ coordinate_rates_before),
     )
     momentum_residual = float(
-        np.abs(M @ (velocity_after - velocity_before) - J.T @ landing_impulse).max()
+        np.abs(M @ (coordinate_rates_after - coordinate_rates_before) - J.T @ landing_impulse).max()
     )
     return PrintedLandingResult(
-        velocity_after, landing_impulse, velocity_projector @ velocity_before, momentum_residual
+        coordinate_rates_after,
+        landing_impulse,
+        velocity_projector @ coordinate_rates_before,
+        momentum_residual,
     )
 
 

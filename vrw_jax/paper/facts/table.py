@@ -47,14 +47,14 @@ def summarize_paper_facts(paper_facts: Sequence[PaperFact]) -> str:
     """Return a sentence that states how many facts hold, and the sources of their published
     values.
     """
-    n_facts, n_facts_from_code = (
+    n_facts, n_facts_from_reference_code = (
         len(paper_facts),
         sum(paper_fact.is_from_reference_code for paper_fact in paper_facts),
     )
     n_facts_that_hold = sum(paper_fact.holds for paper_fact in paper_facts)
     return (
-        f"{n_facts_that_hold} of {n_facts} facts hold: {n_facts - n_facts_from_code} with "
-        f"published numbers, {n_facts_from_code} with independent code"
+        f"{n_facts_that_hold} of {n_facts} facts hold: {n_facts - n_facts_from_reference_code} "
+        f"with published numbers, {n_facts_from_reference_code} with independent code"
     )
 
 
@@ -98,7 +98,7 @@ def format_facts_page(paper_facts: Sequence[PaperFact]) -> str:
     for group_title, facts_of_group in itertools.groupby(
         paper_facts, lambda paper_fact: paper_fact.group
     ):
-        table_rows = []
+        facts_table_rows = []
         for paper_fact in facts_of_group:
             verdict_text = paper_fact.verdict if paper_fact.holds else f"**{paper_fact.verdict}**"
             cell_texts = (
@@ -110,7 +110,7 @@ def format_facts_page(paper_facts: Sequence[PaperFact]) -> str:
                 paper_fact.tolerance_reason,
             )
             # Minus signs replace the hyphens before numbers.
-            table_rows.append(
+            facts_table_rows.append(
                 [re.sub(r"(?<![\w.])-(?=\d)", "−", cell_text) for cell_text in cell_texts]
             )
         column_headings = ("fact", "where", "published", "found", "", "tolerance")
@@ -118,7 +118,7 @@ def format_facts_page(paper_facts: Sequence[PaperFact]) -> str:
             "",
             f"## {group_title}",
             "",
-            *format_markdown_table(column_headings, table_rows),
+            *format_markdown_table(column_headings, facts_table_rows),
         ]
     page_lines += ["", "## Corrected statements of the paper", "", CORRECTED_STATEMENTS]
     return "\n".join(page_lines) + "\n"
