@@ -57,13 +57,13 @@ def test_event_times_of_this_library_are_within_their_stated_errors():
     infinite."""
     timed = ("time", "dip", "switching", "event", "touch", "period", "first impact", "end of the")
     mine = [row for row in FAILURE_TABLE if row["method"].startswith("ours") and not row["digits"]]
-    late_values = [
+    inexact_rows = [
         row
         for row in mine
         if row["quantity"].startswith(timed) and row["error"] != "-" and float(row["error"]) > 1e-12
     ]
-    assert {"grazing", "tangent_guards", "two_states"} <= {row["case"] for row in late_values}
-    for row in late_values:
+    assert {"grazing", "tangent_guards", "two_states"} <= {row["case"] for row in inexact_rows}
+    for row in inexact_rows:
         assert float(row["error"]) <= float(row["says"].split(",")[0].removeprefix("time to "))
 
 
@@ -73,9 +73,9 @@ def test_event_times_are_within_1e_12_or_within_the_reported_tolerance():
         for row in failures.select_exact_rows(FAILURE_TABLE)
         if row["quantity"].startswith(("time", "dip"))
     ]
-    late_values = [row for row in times if float(row["error"]) > 1e-12]
-    assert {row["case"] for row in late_values} <= {"grazing", "tangent_guards"}
-    for row in late_values:
+    inexact_rows = [row for row in times if float(row["error"]) > 1e-12]
+    assert {row["case"] for row in inexact_rows} <= {"grazing", "tangent_guards"}
+    for row in inexact_rows:
         stated, *rounding = (float(part.split(" ")[-1]) for part in row["says"].split(", "))
         assert float(row["error"]) <= stated
         # Asked for as finely as can be it is within roundings of the start.
@@ -163,11 +163,11 @@ def test_clutches_lock_and_slip_at_the_times_of_the_modelica_reference():
 
 
 def test_siconos_and_drake_ran_in_the_run_that_the_page_reports():
-    own_values = {
+    names_by_method = {
         "Siconos": {"bouncing_ball", "slider_crank", "painleve"},
         "Drake": {"compass_gait", "rimless_wheel"},
     }
-    for method, names in own_values.items():
+    for method, names in names_by_method.items():
         rows = [row for row in FAILURE_TABLE if row["method"] == method]
         assert {row["case"] for row in rows} == names
         assert all(row["version"] != "none" and row["found"] != "nan" for row in rows)
@@ -237,8 +237,8 @@ def test_the_return_map_in_40_digits_reproduces_the_stored_gait_of_a_walker(name
     place, step = many_digits.CASES[name]
     result, x = getattr(import_atlas_module(name), place), import_atlas_module(name).EXACT_GAIT.x
     with mp.workdps(40):
-        values_there, period = many_digits.compute_return_map(result, [mpf(v) for v in x], step)
-    np.testing.assert_allclose([float(v) for v in values_there], x, rtol=0.0, atol=2e-16)
+        end_state, period = many_digits.compute_return_map(result, [mpf(v) for v in x], step)
+    np.testing.assert_allclose([float(v) for v in end_state], x, rtol=0.0, atol=2e-16)
     assert (
         abs(float(period) - import_atlas_module(name).EXACT_GAIT.period) < 1e-15
     )  # a rounding of x moves it

@@ -73,10 +73,10 @@ def test_every_argument_and_field_of_a_public_name_is_documented(name):
 
 def test_every_public_name_is_in_the_reference():
     pages = "".join(path.read_text() for path in (ROOT / "docs" / "reference").glob("*.md"))
-    shown_values = set(re.findall(r"^::: vrw_jax\.(\w+)$", pages, re.M))
-    assert set(NAMES) | {"MEASURES", "parameter_sets"} == shown_values
-    drawn_values = set(re.findall(r"^::: vrw_jax\.figures\.(\w+)$", pages, re.M))
-    assert {name.removeprefix("plot.") for name in FIGURE_FUNCTIONS} == drawn_values
+    documented_names = set(re.findall(r"^::: vrw_jax\.(\w+)$", pages, re.M))
+    assert set(NAMES) | {"MEASURES", "parameter_sets"} == documented_names
+    documented_figures = set(re.findall(r"^::: vrw_jax\.figures\.(\w+)$", pages, re.M))
+    assert {name.removeprefix("plot.") for name in FIGURE_FUNCTIONS} == documented_figures
 
 
 def test_the_reference_shows_existing_names_and_the_result_of_a_hybrid_simulation():

@@ -214,8 +214,8 @@ def simulate_bounces(bounces: int = 60) -> dict[str, mpf]:
     mechanism, result = Mechanism(), {}
     flight = lambda y: mechanism.field(y, 0)[0]
     above = lambda y: mechanism.corners(y, 1)[0][0]
-    event_values = integrate_until(flight, above, mechanism.start(), STEP)
-    time, y = event_values.time, event_values.state
+    event = integrate_until(flight, above, mechanism.start(), STEP)
+    time, y = event.time, event.state
     result["first impact"] = time
     y, sizes = mechanism.apply_impact(y, 1, mechanism.restitution)
     result["crank's rate after it"] = y[11]
@@ -223,23 +223,23 @@ def simulate_bounces(bounces: int = 60) -> dict[str, mpf]:
     for bounce in range(2, bounces + 1):
         rate, bend = -y[16], -flight(y)[16]  # of the gap: the slider does not turn
         length = -2 * rate / bend
-        event_values = integrate_until(flight, above, y, min(length * mpf("1.02"), STEP))
-        time, y = time + event_values.time, event_values.state
+        event = integrate_until(flight, above, y, min(length * mpf("1.02"), STEP))
+        time, y = time + event.time, event.state
         y, _ = mechanism.apply_impact(y, 1, mechanism.restitution)
         if bounce == 2:
             result["second impact"] = time
-        if event_values.time < mpf("1e-20"):
+        if event.time < mpf("1e-20"):
             break
     result["end of the bounces"] = time
     result["crank's rate there"] = y[11]
     y, _ = mechanism.apply_impact(y, 1, mpf(0))
     slide = lambda y: mechanism.field(y, 1)[0]
-    event_values = integrate_until(slide, lambda y: min(mechanism.field(y, 1)[1]), y, STEP)
-    time, y = time + event_values.time, event_values.state
+    event = integrate_until(slide, lambda y: min(mechanism.field(y, 1)[1]), y, STEP)
+    time, y = time + event.time, event.state
     result["letting go"] = time
-    event_values = integrate_until(flight, lambda y: mechanism.corners(y, -1)[0][0], y, STEP)
-    result["touch of the other face"] = time + event_values.time
-    result["crank's rate at it"] = event_values.state[11]
+    event = integrate_until(flight, lambda y: mechanism.corners(y, -1)[0][0], y, STEP)
+    result["touch of the other face"] = time + event.time
+    result["crank's rate at it"] = event.state[11]
     return result
 
 

@@ -107,19 +107,19 @@ def curves(axes: Axes, rows: list[Row], by_input: str, x: str, y: str, label: st
         group_rows(rows, by_input).items(), looks, strict=False
     ):
         xs, ys = read_column(selection, x), np.abs(read_column(selection, y))
-        shown_values = ys > 0.0
+        is_positive = ys > 0.0
         look = {"color": colour, "marker": marker, "ms": 3.5, "lw": 0.9}
-        axes.loglog(xs[shown_values], ys[shown_values], label=label.format(key), **look)
+        axes.loglog(xs[is_positive], ys[is_positive], label=label.format(key), **look)
     axes.grid(color="0.9", lw=0.4)
 
 
 def draw_over_steps(
-    rows: list[Row], key: str, label: str, shown_values: dict[str, str], height: float
+    rows: list[Row], key: str, label: str, label_by_column: dict[str, str], height: float
 ) -> tuple[Figure, Axes]:
     """Draw a panel over the number of steps for each column, and return the last panel."""
     figure = Figure(figsize=(PAGE_FIGURE_WIDTH_INCHES, height))
     for axes, (y, name) in zip(
-        figure.subplots(1, len(shown_values)), shown_values.items(), strict=True
+        figure.subplots(1, len(label_by_column)), label_by_column.items(), strict=True
     ):
         curves(axes, rows, key, "steps", y, label)
         axes.set(xlabel="steps", ylabel=name)
@@ -136,10 +136,10 @@ def long_walk(rows: list[Row]) -> Figure:
     rows = sorted(rows, key=lambda row: -float(row["tolerance"]))
     figure, axes = draw_over_steps(rows, "tolerance", "tolerance {}", shown_by_name, 2.8)
     work = group_rows(rows, "tolerance")["1e-06"]
-    lost_values = np.finfo(float).eps * read_column(work, "work_of_gravity_J")
+    work_roundoff = np.finfo(float).eps * read_column(work, "work_of_gravity_J")
     axes.loglog(
         read_column(work, "steps"),
-        lost_values,
+        work_roundoff,
         "--",
         color="0.4",
         lw=1.0,
@@ -176,10 +176,10 @@ def summarize_by_border(rows: list[Row]) -> list[Row]:
     """Both kinds of cases and both sides together; borders met fewer than five times left out."""
     result_list = []
     for border, selection in group_rows(rows, "border").items():
-        for distance, values_here in group_rows(selection, "distance").items():
+        for distance, rows_at_distance in group_rows(selection, "distance").items():
             names = ("cases", "other_outcome", "other_by_diffrax", "stepped")
             cases, other, by_diffrax, step_result = (
-                int(read_column(values_here, n).sum()) for n in names
+                int(read_column(rows_at_distance, n).sum()) for n in names
             )
             if cases >= 10:  # five borders, two sides each
                 result_list.append(
@@ -190,7 +190,7 @@ def summarize_by_border(rows: list[Row]) -> list[Row]:
                         "other_outcome": f"{other} ({by_diffrax})",
                         "share": str(other / cases),
                         "stepped": str(step_result),
-                        "time_difference_s": f"{max(read_column(values_here, 'time_difference_s')):.1e}",  # noqa: E501
+                        "time_difference_s": f"{max(read_column(rows_at_distance, 'time_difference_s')):.1e}",  # noqa: E501
                     }
                 )
     return result_list

@@ -37,8 +37,8 @@ def chenciner_point(returned: Callable, x: np.ndarray, parameters: np.ndarray) -
 
     def cycle(x: np.ndarray, k: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         for _ in range(20):
-            values_there, matrix = map(np.asarray, first(x, k))
-            move = np.linalg.solve(np.eye(len(x)) - matrix, values_there - x)
+            end_state, matrix = map(np.asarray, first(x, k))
+            move = np.linalg.solve(np.eye(len(x)) - matrix, end_state - x)
             x = x + move
             if np.abs(move).max() < 1e-13:
                 break

@@ -189,7 +189,7 @@ def compare(cases: int, done: int) -> Rows:
         codes, durations, _ = step_by_isolated_roots(created, params, starts)
         mine = np.asarray(batch_result.outcome)
         other = mine != codes
-        both_values = ~other & (mine == Outcome.STEPPED)
+        has_stepped_in_both = ~other & (mine == Outcome.STEPPED)
         gap = np.max(np.abs(np.asarray(batch_result.durations) - durations), 1)
         differing = zip(mine[other], codes[other], strict=True)
         pairs = [f"{Outcome(a).name}/{Outcome(b).name}" for a, b in differing]
@@ -198,10 +198,10 @@ def compare(cases: int, done: int) -> Rows:
             "kind": kind,
             "chunk": chunk,
             "cases": CHUNK,
-            "stepped": int(both_values.sum()),
+            "stepped": int(has_stepped_in_both.sum()),
             "other_outcome": int(other.sum()),
-            "late": int((both_values & (gap > LATE_EVENT_SECONDS)).sum()),
-            "largest_time_difference": f"{np.max(gap[both_values], initial=0.0):.2e}",
+            "late": int((has_stepped_in_both & (gap > LATE_EVENT_SECONDS)).sum()),
+            "largest_time_difference": f"{np.max(gap[has_stepped_in_both], initial=0.0):.2e}",
             "ours/isolated": "; ".join(counts),
         }
 
@@ -223,11 +223,11 @@ def compare_dips(cases: int, done: int) -> Rows:
         )
         gave_up = (mine == Outcome.SOLVER_FAILED) | (tight == Outcome.SOLVER_FAILED)
         requested = np.flatnonzero((mine != tight) & ~gave_up)
-        few_items = select_tree_rows(
+        selected_wheels = select_tree_rows(
             jax.tree.map(lambda x: np.broadcast_to(x, N_STARTS), params), requested
         )
         codes = (
-            step_by_isolated_roots(created, few_items, starts[requested])[0]
+            step_by_isolated_roots(created, selected_wheels, starts[requested])[0]
             if len(requested)
             else mine[requested]
         )

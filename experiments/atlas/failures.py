@@ -87,15 +87,15 @@ def anchor(title: str) -> str:
 def summarize_by_method(rows: list[dict[str, str]]) -> list[list[str]]:
     """Return a line for each method of a case, with its worst result and its cost."""
     lines, severities = [], list(VERDICT_LABELS)
-    for method, own_values in group_rows(rows, "method").items():
+    for method, rows_of_method in group_rows(rows, "method").items():
         size = lambda row: math.inf if row["error"] == "-" else float(row["error"])
-        worst = max(own_values, key=lambda row: (severities.index(row["verdict"]), size(row)))
-        good = sum(row["verdict"] == "right" for row in own_values)
-        says = next((row["says"] for row in [worst, *own_values] if row["says"]), "")
+        worst = max(rows_of_method, key=lambda row: (severities.index(row["verdict"]), size(row)))
+        good = sum(row["verdict"] == "right" for row in rows_of_method)
+        says = next((row["says"] for row in [worst, *rows_of_method] if row["says"]), "")
         lines.append(
             [
                 method.replace("ours", "vrw_jax"), VERDICT_LABELS[worst["verdict"]],
-                f"{good} of {len(own_values)}", worst["quantity"],
+                f"{good} of {len(rows_of_method)}", worst["quantity"],
                 worst["error"], says, worst["work"], worst["ms"],
                 f"{worst['options']}; {worst['version']}",
             ]

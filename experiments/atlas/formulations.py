@@ -118,8 +118,8 @@ def drift() -> Iterator[dict[str, object]]:
     for stabilised in ("none", "Baumgarte", "projection"):
         body = ConstrainedWheel(stabilised)
         q, v = reference.pre_impact(PARAMS, START)
-        count, lost_values, height, begin = 0, False, 0.0, time.process_time()
-        while not lost_values:
+        count, is_finished, height, begin = 0, False, 0.0, time.process_time()
+        while not is_finished:
             q, v = exchange(q, v)
             v, _ = body.wheel.impact(q, v, "DLS")
             # Feet are held where they landed, at the ground's own height.
@@ -132,7 +132,7 @@ def drift() -> Iterator[dict[str, object]]:
                     q, v = state
                     count += 1
                     height = max(height, abs(body.gaps(q, mode, anchor)).max())
-                    lost_values = not np.all(np.isfinite(q)) or count >= DRIFT_AT[-1]
+                    is_finished = not np.all(np.isfinite(q)) or count >= DRIFT_AT[-1]
                     if count in DRIFT_AT:
                         yield {
                             "stabilised": stabilised,
@@ -141,9 +141,9 @@ def drift() -> Iterator[dict[str, object]]:
                             "dtheta": f"{v[2]:.6g}",
                             "us_per_step": f"{(time.process_time() - begin) / count * 1e6:.3g}",
                         }
-                    if lost_values:
+                    if is_finished:
                         break
-                if lost_values:
+                if is_finished:
                     break
 
 

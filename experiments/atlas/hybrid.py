@@ -247,9 +247,9 @@ def run_diffrax(
         result = solves[mode](jnp.asarray(y))
         state, time = np.asarray(result.ys[-1]), float(result.ts[-1])
         work = int(result.stats["num_steps"])
-        event_values = np.flatnonzero([bool(x) for x in result.event_mask])
-        if result.result == diffrax.RESULTS.event_occurred and len(event_values):
-            return _ModeExit(state, time, int(event_values[0]), work, "")
+        event_indices = np.flatnonzero([bool(x) for x in result.event_mask])
+        if result.result == diffrax.RESULTS.event_occurred and len(event_indices):
+            return _ModeExit(state, time, int(event_indices[0]), work, "")
         good = result.result == diffrax.RESULTS.successful
         says = "" if good else str(result.result).split("<")[-1].split(".")[0][:90]
         return _ModeExit(state, time, None, work, says)

@@ -340,11 +340,15 @@ def between() -> Rows:
             codes_high[~is_same] = result[~is_same]
         for distance in CLOSER:
             for side, sign in ((low, -1.0), (high, 1.0)):
-                values_there = side + sign * distance * segment
-                result, durations, _ = events.step_by_isolated_roots(created, *asked(values_there))
-                batch_result = vrw.step_batch(*asked(values_there))
+                displaced_starts = side + sign * distance * segment
+                result, durations, _ = events.step_by_isolated_roots(
+                    created, *asked(displaced_starts)
+                )
+                batch_result = vrw.step_batch(*asked(displaced_starts))
                 mine = np.asarray(batch_result.outcome)
-                other = np.asarray(vrw.step_batch(*asked(values_there), engine="diffrax").outcome)
+                other = np.asarray(
+                    vrw.step_batch(*asked(displaced_starts), engine="diffrax").outcome
+                )
                 step_result = (mine == result) & (result == Outcome.STEPPED)
                 gap = np.max(np.abs(np.asarray(batch_result.durations) - durations), 1)
                 pairs = [

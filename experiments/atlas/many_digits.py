@@ -59,8 +59,8 @@ def gait(result: ReturnMap, step: mpf) -> ExactGait:
     identity = mpmath.eye(len(x))
     while True:
         jacobian = compute_jacobian(result, x, step)
-        values_there, period = compute_return_map(result, list(x), step)
-        change = mpmath.lu_solve(jacobian - identity, x - values_there)
+        end_state, period = compute_return_map(result, list(x), step)
+        change = mpmath.lu_solve(jacobian - identity, x - end_state)
         if mpmath.norm(change) < NEWTON_TOLERANCE:
             break
         x = x + change

@@ -23,8 +23,8 @@ ROOT = Path(__file__).parents[2]
 def _run_peer(name: str, *arguments: str) -> dict:
     start = shlex.split(os.environ.get(f"VRW_{name.upper()}", sys.executable))
     command = [*start, "-m", f"experiments.atlas.elsewhere.{name}", *arguments]
-    own_values = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
-    run = subprocess.run(command, cwd=ROOT, env=own_values, capture_output=True, text=True)
+    environment = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
+    run = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
     if run.returncode:
         return {"version": "none", "says": f"not here: {run.stderr.strip().splitlines()[-1]}"}
     return json.loads(run.stdout.splitlines()[-1])

@@ -71,13 +71,19 @@ def accounted_step(params: vrw.WheelParams, x: jax.Array, options: vrw.StepOptio
     step_result = jnp.all(jnp.stack(outcomes) == Outcome.STEPPED)
     theta, _, dtheta, dL1, _ = third.state
     work = (s.Mt) * s.g * landing.foot_distance * s.sin_phi
-    lost_values = landing.energy_loss + hit.energy_loss + lost_1 + lost_2 + lost_3
+    dissipated_energy = landing.energy_loss + hit.energy_loss + lost_1 + lost_2 + lost_3
     change = (
         dynamics.compute_mechanical_energy(s, m).total_energy
         - dynamics.compute_mechanical_energy(s, before).total_energy
     )
     duration = first.duration + second.duration + third.duration
-    return jnp.stack([theta, dtheta, dL1]), step_result, duration, work, work - lost_values - change
+    return (
+        jnp.stack([theta, dtheta, dL1]),
+        step_result,
+        duration,
+        work,
+        work - dissipated_energy - change,
+    )
 
 
 def long_walk() -> Iterator[dict[str, object]]:

@@ -161,8 +161,8 @@ def draw_wheels(n: int) -> tuple[list[str], Columns]:
     design = vrw.sobol(box, n)
     marked = [vrw.parameter_sets[name].params for name in MARKED_SETS]
     columns = {
-        name: np.concatenate([[float(getattr(p, name)) for p in marked], drawn_values])
-        for name, drawn_values in design.values_by_parameter.items()
+        name: np.concatenate([[float(getattr(p, name)) for p in marked], sampled_values])
+        for name, sampled_values in design.values_by_parameter.items()
     }
     return [*MARKED_SETS, *map(str, range(n))], columns
 

@@ -58,10 +58,10 @@ def digest_steps() -> Iterator[tuple[str, NumberTable]]:
     by_collocation = vrw.step_batch(params, states, engine="collocation", durations=expected)
     yield "steps by collocation", collect_numbers(by_collocation)
     ground = vrw.UnilateralWheel(friction=2.0)
-    few_items = jax.tree.map(lambda x: x[:64] if jnp.ndim(x) else x, params)
+    first_wheels = jax.tree.map(lambda x: x[:64] if jnp.ndim(x) else x, params)
     yield (
         "steps with unilateral contact",
-        collect_numbers(vrw.step_batch(few_items, states[:64], 3, model=ground)),
+        collect_numbers(vrw.step_batch(first_wheels, states[:64], 3, model=ground)),
     )
 
 
@@ -167,11 +167,11 @@ def compute_digest(numbers: NumberTable) -> str:
     return result.hexdigest()[:16]
 
 
-def compute_distance(values_here: NumberTable, values_there: NumberTable) -> str:
+def compute_distance(new_numbers: NumberTable, old_numbers: NumberTable) -> str:
     """Return as text the largest relative difference and the names that only one side has."""
     worst, worst_name = 0.0, "none"
-    for name in values_here.keys() & values_there.keys():
-        x, y = values_here[name], values_there[name]
+    for name in new_numbers.keys() & old_numbers.keys():
+        x, y = new_numbers[name], old_numbers[name]
         if x.shape != y.shape:
             return f"{name} has shape {x.shape}, previously {y.shape}"
         if x.dtype.kind != "f":
@@ -182,7 +182,7 @@ def compute_distance(values_here: NumberTable, values_there: NumberTable) -> str
         relative_change = np.where(np.isnan(x) & np.isnan(y), 0.0, np.abs(x - y)) / scale
         if relative_change.size and not np.max(relative_change) <= worst:
             worst, worst_name = float(np.max(relative_change)), name
-    unshared_names = sorted(values_here.keys() ^ values_there.keys())
+    unshared_names = sorted(new_numbers.keys() ^ old_numbers.keys())
     return (
         f"largest relative difference {worst:.1e} "
         f"({worst_name}){f'; on one side only: {unshared_names}' * bool(unshared_names)}"
@@ -206,8 +206,8 @@ def main() -> None:
                 arguments.numbers.mkdir(parents=True, exist_ok=True)
                 np.savez(arguments.numbers / file_name, **numbers)
             if arguments.against:
-                with np.load(arguments.against / file_name) as values_there:
-                    line += f"  {compute_distance(numbers, dict(values_there))}"
+                with np.load(arguments.against / file_name) as old_file:
+                    line += f"  {compute_distance(numbers, dict(old_file))}"
             print(line, flush=True)
     arguments.file.write_text("\n".join(lines) + "\n")
 

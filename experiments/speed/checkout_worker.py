@@ -21,12 +21,12 @@ def seconds(call: Callable[[], object]) -> float:
     """Return the least CPU time of several calls, s; the first call, which compiles, does not
     count."""
     jax.block_until_ready(call())
-    used_values: list[float] = []
-    while not used_values or (len(used_values) < N_REPEATS and sum(used_values) < MAX_SECONDS):
+    durations: list[float] = []
+    while not durations or (len(durations) < N_REPEATS and sum(durations) < MAX_SECONDS):
         began = time.process_time()
         jax.block_until_ready(call())
-        used_values.append(time.process_time() - began)
-    return min(used_values)
+        durations.append(time.process_time() - began)
+    return min(durations)
 
 
 def draw_wheels() -> dict[str, np.ndarray]:
@@ -60,12 +60,12 @@ def turn() -> None:
     by_collocation = lambda: vrw.step_batch(params, states, **known_by_name)
     cycles = lambda: find(selection)
     scan = lambda n: vrw.scan(vrw.samples(first(n)), MEASURES)
-    few_items, many = (seconds(lambda n=n: scan(n)) for n in N_SAMPLES)
+    short_time, long_time = (seconds(lambda n=n: scan(n)) for n in N_SAMPLES)
     result_by_name = {
         "gait steps per s, lanes": N_LANES / seconds(by_lanes),
         "gait steps per s, collocation": N_LANES / seconds(by_collocation),
         "cycles per s, cold guess": N_CYCLES / seconds(cycles),
-        "samples per s, scan": (N_SAMPLES[1] - N_SAMPLES[0]) / (many - few_items),
+        "samples per s, scan": (N_SAMPLES[1] - N_SAMPLES[0]) / (long_time - short_time),
     }
     ended = {
         "lanes": int(np.sum(np.asarray(by_lanes().outcome) == 0)),

@@ -75,9 +75,9 @@ def compare_versions(checkouts: tuple[Path, Path], caches: Path, turns: int) -> 
     for name in result[0][0]:
         a, b = ([one[name] for one in side] for side in result)
         ratios = [y / x for x, y in zip(a, b, strict=True)]
-        shown_values = statistics.median(ratios), min(ratios), max(ratios)
+        median_and_range = statistics.median(ratios), min(ratios), max(ratios)
         sizes = (f"{statistics.median(side):.4g}" for side in (a, b))
-        rows.append((name, *sizes, *(f"{ratio:.3f}" for ratio in shown_values)))
+        rows.append((name, *sizes, *(f"{ratio:.3f}" for ratio in median_and_range)))
     return rows
 
 
@@ -90,8 +90,8 @@ def main() -> None:
     parser.add_argument("--caches", type=Path, default="results/compare_checkouts")
     chosen = parser.parse_args()
     with use_one_core():
-        both_values = chosen.a.resolve(), chosen.b.resolve()
-        rows = compare_versions(both_values, chosen.caches.resolve(), chosen.turns)
+        checkouts = chosen.a.resolve(), chosen.b.resolve()
+        rows = compare_versions(checkouts, chosen.caches.resolve(), chosen.turns)
     print(format_markdown(HEADER, rows))
     if chosen.csv:
         write_table(chosen.csv, HEADER, rows)

@@ -36,10 +36,10 @@ def main() -> None:
         duration_seconds = measure_cpu_seconds(
             lambda: tracer.trace_curves(seeds, ()), repeats, reduction=min
         )
-        both_values = duration_seconds + measure_cpu_seconds(begin, repeats, reduction=min)
+        total_seconds = duration_seconds + measure_cpu_seconds(begin, repeats, reduction=min)
     print(
         f"{duration_seconds:.2f} s, {n / duration_seconds:.0f} points a second; with the "
-        f"branches {n / both_values:.0f}"
+        f"branches {n / total_seconds:.0f}"
     )
 
 

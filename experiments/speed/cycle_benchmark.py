@@ -41,8 +41,8 @@ print(time.time() - began[0], time.process_time() - began[1])
 
 def make_random_wheels(generator: np.random.Generator, n: int) -> vrw.WheelParams:
     """Return random wheels, in which every parameter has an entry per lane."""
-    drawn_values = wheels_of_rows(draw_parameter_rows(WIDE_BOX, n, generator))
-    return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (n,)), drawn_values)
+    random_wheels = wheels_of_rows(draw_parameter_rows(WIDE_BOX, n, generator))
+    return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (n,)), random_wheels)
 
 
 def measure_least_seconds(function: Callable, *arguments: object) -> float:
@@ -87,18 +87,16 @@ def find_reachable_wheels(params: vrw.WheelParams) -> np.ndarray:
     find = jax.jit(
         jax.vmap(lambda p, guess: vrw.limit_cycle(make_wheel_from_parameters(p, 8), guess=guess))
     )
-    values_here = jax.jit(jax.vmap(lambda p: vrw.limit_cycle(make_wheel_from_parameters(p, 8))))(
+    cycles = jax.jit(jax.vmap(lambda p: vrw.limit_cycle(make_wheel_from_parameters(p, 8))))(
         starts.T
     )
     reached = np.ones(ends.shape[1], bool)
     for share in np.linspace(0.0, 1.0, N_STAGES + 1)[1:]:
-        values_there = find((starts + share * (ends - starts)).T, values_here)
-        shifted = np.max(
-            np.abs(np.asarray(values_there.durations - values_here.durations)), axis=-1
-        )
-        with_dls = np.asarray(values_there.durations)[:, 0] > 0.0
-        reached &= np.asarray(values_there.found) & (shifted < 0.1) & with_dls
-        values_here = values_there
+        next_cycles = find((starts + share * (ends - starts)).T, cycles)
+        shifted = np.max(np.abs(np.asarray(next_cycles.durations - cycles.durations)), axis=-1)
+        with_dls = np.asarray(next_cycles.durations)[:, 0] > 0.0
+        reached &= np.asarray(next_cycles.found) & (shifted < 0.1) & with_dls
+        cycles = next_cycles
     return reached
 
 

@@ -97,20 +97,34 @@ def in_batches(n: int, repeats: int) -> list[tuple]:
         choose = lambda factor, at=tolerance: vrw.StepOptions(
             rtol=at, atol=at, derivative_tightening=factor
         )
-        run_result, of_values = timed(choose(1.0), ())
-        values = np.concatenate([run_result.section_state, run_result.durations], 1)
+        batch_result, seconds_without_derivatives = timed(choose(1.0), ())
+        values = np.concatenate([batch_result.section_state, batch_result.durations], 1)
         error = np.quantile(np.max(np.abs(values - reference), 1), 0.99)
-        row = (f"{tolerance:.0e}", "", "none", f"{of_values:.2f}", "1", f"{error:.1e}")
+        row = (
+            f"{tolerance:.0e}",
+            "",
+            "none",
+            f"{seconds_without_derivatives:.2f}",
+            "1",
+            f"{error:.1e}",
+        )
         table.append((*row, ""))
         for factor, (name, requested) in itertools.product((1.0, 20.0), COLUMNS.items()):
-            run_result, used_values = timed(choose(factor), requested)
+            batch_result, seconds_with_derivatives = timed(choose(factor), requested)
             away = np.abs(
-                flatten_derivatives(run_result.derivatives, requested)[selection]
+                flatten_derivatives(batch_result.derivatives, requested)[selection]
                 - flatten_derivatives(exact.derivatives, requested)
             )
-            row = (f"{tolerance:.0e}", f"{factor:g}", name, f"{used_values:.2f}")
+            row = (f"{tolerance:.0e}", f"{factor:g}", name, f"{seconds_with_derivatives:.2f}")
             off = np.quantile(np.max(away, (1, 2)), 0.99)
-            table.append((*row, f"{used_values / of_values:.1f}", "", f"{off:.1e}"))
+            table.append(
+                (
+                    *row,
+                    f"{seconds_with_derivatives / seconds_without_derivatives:.1f}",
+                    "",
+                    f"{off:.1e}",
+                )
+            )
     return table
 
 
@@ -127,17 +141,17 @@ def candidates(rows: np.ndarray, states: np.ndarray) -> Iterator[tuple[str, str,
         )
         return lambda: flatten_derivatives(evaluate().derivatives, requested)
 
-    few_items = len(rows) // 16
+    n_wheels = len(rows) // 16
     for tolerance in (1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10):
         yield LABELS[0], f"{tolerance:.0e}", len(rows), by_library("lanes", tolerance, len(rows))
     for tolerance in (1e-4, 1e-6, 1e-7, 1e-9, 1e-11):
-        run = HeyokaVariations(tolerance).make_run(rows[:few_items], states[:few_items])
-        yield LABELS[1], f"{tolerance:.0e}", few_items, run
+        run = HeyokaVariations(tolerance).make_run(rows[:n_wheels], states[:n_wheels])
+        yield LABELS[1], f"{tolerance:.0e}", n_wheels, run
     for tolerance, share in ((1e-8, 1e-4), (1e-10, 1e-5), (1e-12, 1e-6), (1e-13, 1e-6)):
-        run = numba_differences(rows[:few_items], states[:few_items], tolerance, share)
-        yield LABELS[2], f"{tolerance:.0e}, moved by {share:.0e}", few_items, run
+        run = numba_differences(rows[:n_wheels], states[:n_wheels], tolerance, share)
+        yield LABELS[2], f"{tolerance:.0e}, moved by {share:.0e}", n_wheels, run
     for tolerance in (1e-6, 1e-8, 3e-9, 1e-10):
-        yield LABELS[3], f"{tolerance:.0e}", few_items, by_library("diffrax", tolerance, few_items)
+        yield LABELS[3], f"{tolerance:.0e}", n_wheels, by_library("diffrax", tolerance, n_wheels)
 
 
 def compare_with_others(n: int, repeats: int) -> list[dict]:
@@ -174,10 +188,10 @@ def draw_chart(table: list[dict]) -> None:
         figure, axes = plt.subplots(figsize=(plots.PAGE_FIGURE_WIDTH_INCHES, 3.6))
         known_as = ("lane engine", "heyoka", "numba", "diffrax engine")
         for label, known_values, marker in zip(LABELS, known_as, "osD^", strict=True):
-            sorted_items = sorted(
+            sorted_entries = sorted(
                 (x for x in table if x["method"] == label), key=lambda x: x["error"]
             )
-            result = [x["error"] for x in sorted_items], [x["speed"] for x in sorted_items]
+            result = [x["error"] for x in sorted_entries], [x["speed"] for x in sorted_entries]
             axes.loglog(*result, marker=marker, ms=4, color=COLOURS[known_values], label=label)
         axes.set(
             xlabel="error of derivatives, 99 % of lanes below it",
@@ -193,14 +207,14 @@ def find_fastest(table: list[dict]) -> list[tuple]:
     for entry in sorted(table, key=lambda x: x["speed"]):
         if entry["error"] <= COMPARED_ERROR:
             best[entry["method"]] = entry
-    of_values = best[LABELS[0]]["speed"]
+    seconds_without_derivatives = best[LABELS[0]]["speed"]
     return [
         (
             x["method"],
             x["at"],
             f"{x['error']:.1e}",
             f"{x['speed']:,.0f}",
-            f"{x['speed'] / of_values:.2g}",
+            f"{x['speed'] / seconds_without_derivatives:.2g}",
         )
         for x in (best[label] for label in LABELS if label in best)
     ]

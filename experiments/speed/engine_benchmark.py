@@ -150,9 +150,9 @@ def compare(rows, states, reference, repeats):
         n = max(int(share * len(rows)), 16)
         run = make(rows[:n], states[:n])
         begin = time.perf_counter()
-        run_result = run()
+        end_states = run()
         first = time.perf_counter() - begin
-        error = np.quantile(np.max(np.abs(run_result - reference[:n]), 1), 0.99)
+        error = np.quantile(np.max(np.abs(end_states - reference[:n]), 1), 0.99)
         entry = {"engine": engine, "method": method, "tolerance": tolerance, "p99_error": error}
         table.append(entry | {"lanes": n, "first_call_s": first, "times": []})
         runs.append(run)

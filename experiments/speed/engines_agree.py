@@ -85,10 +85,13 @@ def compute_difference(one: StepValues, other: StepValues) -> np.ndarray:
 
 def moved_by(by_lanes: Callable, rows: np.ndarray, states: np.ndarray, away: float) -> np.ndarray:
     """Return the change of each lane's result if its start moves by a distance."""
-    values_here = by_lanes(rows, states)
+    undisplaced_states = by_lanes(rows, states)
     signs = np.concatenate([np.eye(3), -np.eye(3)])
     return np.max(
-        [compute_difference(by_lanes(rows, states * (1.0 + away * s)), values_here) for s in signs],
+        [
+            compute_difference(by_lanes(rows, states * (1.0 + away * s)), undisplaced_states)
+            for s in signs
+        ],
         axis=0,
     )
 

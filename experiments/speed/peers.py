@@ -380,8 +380,8 @@ class Heyoka:
             for phase, ta in enumerate(self.phases):
                 ta.reset_cooldowns()
                 ta.time, ta.pars[:], ta.state[:] = 0.0, (*P, D)[: len(ta.pars)], y
-                used_values = ta.propagate_until(20.0)[3]
-                out[lane, 6] += used_values * (ta.order + 1)  # a Taylor coefficient each
+                n_taylor_steps = ta.propagate_until(20.0)[3]
+                out[lane, 6] += n_taylor_steps * (ta.order + 1)  # a Taylor coefficient each
                 y, out[lane, 3 + phase] = ta.state.copy(), ta.time
                 y = start_of_phase(phase, y, D, P)
             out[lane, :3] = y[0], y[2], y[3]

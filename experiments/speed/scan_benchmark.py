@@ -172,8 +172,8 @@ def compare(size: int) -> None:
     for index in np.linspace(0, of_values.result_layout.n_chunks - 1, N_CHECKED_CHUNKS).astype(int):
         region = of_values.result_layout.compute_chunk_region(int(index))
         for name, values in engine(of_values.design.select_samples(region)).items():
-            values_there = stored[name][region].values
-            np.testing.assert_array_equal(values.reshape(values_there.shape), values_there, name)
+            stored_values = stored[name][region].values
+            np.testing.assert_array_equal(values.reshape(stored_values.shape), stored_values, name)
     print(f"{N_CHECKED_CHUNKS} chunks of {size:,} samples computed again: bitwise the stored ones")
 
 

@@ -66,14 +66,16 @@ def compute_group_steps(steps: np.ndarray, order: np.ndarray) -> float:
 def powers(rows: np.ndarray, states: np.ndarray, steps: np.ndarray) -> np.ndarray:
     """Return fits of the logarithm of SLS-I's steps: powers of c/m, dtheta, k/m, factors of theta
     and Ls."""
-    own_values = columns_by_name(rows)
-    mass = own_values["leg_mass"]
+    values_by_parameter = columns_by_name(rows)
+    mass = values_by_parameter["leg_mass"]
     logs = [
-        np.log(own_values["damping"] / mass),
+        np.log(values_by_parameter["damping"] / mass),
         np.log(states[:, 1]),
-        np.log(own_values["stiffness"] / mass),
+        np.log(values_by_parameter["stiffness"] / mass),
     ]
-    columns = np.stack([*logs, states[:, 0], own_values["natural_length"], np.ones(len(rows))], 1)
+    columns = np.stack(
+        [*logs, states[:, 0], values_by_parameter["natural_length"], np.ones(len(rows))], 1
+    )
     went = steps[1] > 0
     return np.linalg.lstsq(columns[went], np.log(steps[1][went]), rcond=None)[0][:5]
 
@@ -90,10 +92,10 @@ def main() -> None:
         steps = np.asarray(
             count_tried_steps(jnp.asarray(rows), jnp.asarray(states), solver, options)
         )
-        own_values = columns_by_name(rows)
+        values_by_parameter = columns_by_name(rows)
         orders = (
             np.arange(len(rows)),
-            np.argsort(own_values["damping"] / own_values["leg_mass"]),
+            np.argsort(values_by_parameter["damping"] / values_by_parameter["leg_mass"]),
             order_wheels_by_work(list(rows.T), states),
             np.argsort(steps[1], kind="stable"),
         )

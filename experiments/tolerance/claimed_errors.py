@@ -92,10 +92,10 @@ def compute_part(part: int) -> Columns:
             MEASURES, select_wheels(columns, selection), tol, friction=friction[selection]
         )
         for name in RESULT_FIELDS:
-            own_values = getattr(answered, name)
-            result.setdefault(name, np.zeros((len(tols), *own_values.shape[1:])))[selection] = (
-                own_values
-            )
+            measured_values = getattr(answered, name)
+            result.setdefault(name, np.zeros((len(tols), *measured_values.shape[1:])))[
+                selection
+            ] = measured_values
     exact = compute_reference(
         columns, friction, result.pop("states"), result["outcomes"] == vrw.Outcome.STEPPED
     )
@@ -129,11 +129,13 @@ def compute_reference(
             break
         finder = make_finder(vrw.UnilateralWheel(), legs, step_options=options)
         params, x = select_wheels(columns, open_), near[open_]
-        own_values = [np.broadcast_to(getattr(params, n), len(open_)) for n in PARAMETER_NAMES]
+        parameter_columns = [
+            np.broadcast_to(getattr(params, n), len(open_)) for n in PARAMETER_NAMES
+        ]
         if n_steps:
             ground = vrw.UnilateralWheel(friction[open_])
             x = np.asarray(vrw.step_batch(params, x, n_steps, model=ground).section_state)
-        gait = finder.find_cycles_near(np.column_stack([*own_values, friction[open_]]), x)
+        gait = finder.find_cycles_near(np.column_stack([*parameter_columns, friction[open_]]), x)
         missed = np.abs(np.asarray(gait.section_state) - near[open_]).max(1)
         hit = np.asarray(gait.found) & (missed < SAME_GAIT_DISTANCE)
         exact[open_[hit]] = np.stack([np.asarray(getattr(gait, m)) for m in MEASURES], 1)[hit]
@@ -201,43 +203,57 @@ def count_results() -> None:
     cloud, table = dict(np.load(CLOUD)), []
     hostile = cloud["hostile"] > 0
     for name, selection in (("box", ~hostile), ("hostile", hostile)):
-        own_values = {key: x[selection] for key, x in cloud.items()}
-        answered = own_values["answered"] > 0
+        cloud_at_setting = {key: x[selection] for key, x in cloud.items()}
+        answered = cloud_at_setting["answered"] > 0
         # The error is infinite if there is no gait.
-        ratio = np.nan_to_num(np.abs(own_values["wrong"]) / own_values["errors"], nan=np.inf).max(1)
-        lower = answered & (own_values["statuses"] <= 1) & np.isfinite(ratio)
-        for which, rows in (("all", lower), ("of one step", lower & (own_values["statuses"] == 0))):
-            effect = own_values["effectivity"][rows][
-                np.abs(own_values["model_error"][rows]) > MIN_MODEL_ERROR
+        ratio = np.nan_to_num(
+            np.abs(cloud_at_setting["wrong"]) / cloud_at_setting["errors"], nan=np.inf
+        ).max(1)
+        lower = answered & (cloud_at_setting["statuses"] <= 1) & np.isfinite(ratio)
+        for which, rows in (
+            ("all", lower),
+            ("of one step", lower & (cloud_at_setting["statuses"] == 0)),
+        ):
+            effect = cloud_at_setting["effectivity"][rows][
+                np.abs(cloud_at_setting["model_error"][rows]) > MIN_MODEL_ERROR
             ]
             within = np.sum((effect > 0.5) & (effect < 2.0))
             print(f"{name}: effectivity in 0.5 ... 2, {which}: {within} of {len(effect)}")
-        cost = np.sum((1.0 + own_values["n_steps"])[answered]) / np.sum(
-            find_best_model(own_values)[answered]
+        cost = np.sum((1.0 + cloud_at_setting["n_steps"])[answered]) / np.sum(
+            find_best_model(cloud_at_setting)[answered]
         )
         print(f"{name}: cost over that of the best rung {cost:.3f}")
-        lost_values = Counter(
-            vrw.Outcome(int(code)).name for code in own_values["outcomes"][~answered]
+        outcome_counts = Counter(
+            vrw.Outcome(int(code)).name for code in cloud_at_setting["outcomes"][~answered]
         )
         print(
             f"{name}: {len(answered)} wheels, {answered.sum()} answered; no answer: "
-            f"{dict(lost_values)}"
+            f"{dict(outcome_counts)}"
         )
         for tol in TOLERANCES:
-            values_here = answered & (np.abs(own_values["tol"] / tol - 1.0) < 1e-3)
+            has_tolerance = answered & (np.abs(cloud_at_setting["tol"] / tol - 1.0) < 1e-3)
             hows = [
-                np.sum(values_here & (own_values["statuses"] == status))
+                np.sum(has_tolerance & (cloud_at_setting["statuses"] == status))
                 for status in range(len(KINDS))
             ]
-            outside = ratio[values_here & (ratio > 1.0)]
+            outside = ratio[has_tolerance & (ratio > 1.0)]
             finite = outside[np.isfinite(outside)]
             worst = f"{finite.max():.3g}" if len(finite) else ""
             steps, without = (
-                f"{np.mean(own_values['n_steps'][values_here]):.1f}",
+                f"{np.mean(cloud_at_setting['n_steps'][has_tolerance]):.1f}",
                 len(outside) - len(finite),
             )
             table.append(
-                [name, f"{tol:.0e}", np.sum(values_here), *hows, steps, len(finite), worst, without]
+                [
+                    name,
+                    f"{tol:.0e}",
+                    np.sum(has_tolerance),
+                    *hows,
+                    steps,
+                    len(finite),
+                    worst,
+                    without,
+                ]
             )
     header = "set", "tolerance", "answers", *KINDS, "steps", "outside", "worst", "gait unconfirmed"
     write_table(COUNT, header, table)
@@ -272,10 +288,10 @@ def draw() -> None:
         )
         for name, hows, colour in groups:
             retained = np.isin(cloud["statuses"], hows)
-            values_here = [
+            tolerance_indices = [
                 retained & (np.abs(cloud["tol"] / tol - 1.0) < 1e-3) for tol in TOLERANCES
             ]
-            cost.plot(TOLERANCES, [np.nanmean(cloud["n_steps"][i]) for i in values_here], "o-",
+            cost.plot(TOLERANCES, [np.nanmean(cloud["n_steps"][i]) for i in tolerance_indices], "o-",
             ms=3,
                       color=colour, label=name)  # fmt: skip
         cost.axhline(1.0, color=plots.DARK_GRAY_COLOR, lw=0.6)

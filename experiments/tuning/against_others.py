@@ -199,12 +199,10 @@ def by_other(method: Callable, count: Counter, u: np.ndarray, seed: int) -> Meth
     )
 
 
-def best_so_far(observed_values: MethodHistory) -> np.ndarray:
+def best_so_far(history: MethodHistory) -> np.ndarray:
     """Return the best objective of an admissible gait, after each evaluation."""
-    retained = np.isfinite(observed_values.objective) & (
-        observed_values.breach <= CONSTRAINT_TOLERANCE
-    )
-    return np.maximum.accumulate(np.where(retained, observed_values.objective, -np.inf))
+    retained = np.isfinite(history.objective) & (history.breach <= CONSTRAINT_TOLERANCE)
+    return np.maximum.accumulate(np.where(retained, history.objective, -np.inf))
 
 
 def starts_of(problem: TuneProblem, values: Callable, n: int) -> list[np.ndarray]:
@@ -241,21 +239,25 @@ def compare_methods(problem: TuneProblem, n_starts: int, rows: list[dict], name:
     # Violations are scaled by the change of each constraint over the box, at the config's wheel.
     first = problem.evaluate_start_trial(problem.normalized_start)
     scales = compute_slack_scales(first.constraint_slacks, first.slack_jacobian)
-    observed_values: dict[str, list[MethodHistory]] = {
+    histories_by_method: dict[str, list[MethodHistory]] = {
         "tune": [by_tune(problem, u, scales) for u in starts]
     }
     for method, run in OTHERS.items():
-        observed_values[method] = [
+        histories_by_method[method] = [
             by_other(run, Counter(problem, values, scales), u, i) for i, u in enumerate(starts)
         ]
-        print(name, method, f"{sum(s.seconds for s in observed_values[method]):.0f} s", flush=True)
+        print(
+            name, method, f"{sum(s.seconds for s in histories_by_method[method]):.0f} s", flush=True
+        )
     curves = {
         method: [best_so_far(one) for one in selection]
-        for method, selection in observed_values.items()
+        for method, selection in histories_by_method.items()
     }
     best = max(float(curve[-1]) for selection in curves.values() for curve in selection)
     for method, selection in curves.items():
-        for start, (curve, one) in enumerate(zip(selection, observed_values[method], strict=True)):
+        for start, (curve, one) in enumerate(
+            zip(selection, histories_by_method[method], strict=True)
+        ):
             row = {
                 "problem": name,
                 "method": method,

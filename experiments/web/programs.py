@@ -272,8 +272,8 @@ def _rebuild_tree(rows: Array, form: Any) -> Any:
     solution, begin = [], 0
     for leaf in leaves:
         end = begin + math.prod(leaf.shape[:-1])
-        own_values = rows[begin:end].reshape(*leaf.shape[:-1], rows.shape[-1])
-        solution.append(own_values > 0.5 if leaf.dtype == bool else own_values.astype(leaf.dtype))
+        leaf_values = rows[begin:end].reshape(*leaf.shape[:-1], rows.shape[-1])
+        solution.append(leaf_values > 0.5 if leaf.dtype == bool else leaf_values.astype(leaf.dtype))
         begin = end
     return jax.tree.unflatten(structure, solution)
 

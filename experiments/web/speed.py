@@ -106,10 +106,10 @@ def in_node() -> dict[str, Any]:
         "source": source.replace('"use strict";', ""),
     }
     node = ["node", "-e", IN_NODE]
-    run_result = subprocess.run(
+    process = subprocess.run(
         node, input=json.dumps(given), check=True, capture_output=True, text=True
     )
-    return json.loads(run_result.stdout)
+    return json.loads(process.stdout)
 
 
 def in_chromium() -> dict[str, tuple[list[float], float, float]]:

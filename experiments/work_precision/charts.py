@@ -181,14 +181,14 @@ def batch_chart(rows: list[Row], every: list[Row]) -> Figure:
     cycles = [row for row in every if is_default(row) and row["group"] == "cycle"]
     for row in (*rows, *cycles):
         result.setdefault(f"{row['group']}, {row['family']}: {row['name']}", []).append(row)
-    for label, sorted_items in result.items():
-        sorted_items = sorted(sorted_items, key=lambda row: int(row["lanes"]))
-        marker = "s" if sorted_items[0]["group"] == "cycle" else "o"
-        ls = "--" if sorted_items[0]["group"] == "cycle" else "-"
+    for label, sorted_rows in result.items():
+        sorted_rows = sorted(sorted_rows, key=lambda row: int(row["lanes"]))
+        marker = "s" if sorted_rows[0]["group"] == "cycle" else "o"
+        ls = "--" if sorted_rows[0]["group"] == "cycle" else "-"
         left_part.loglog(
-            [int(row["lanes"]) for row in sorted_items],
-            [time_of(row, unit) for row in sorted_items],
-            ls=ls, marker=marker, ms=3.5, color=COLOURS[sorted_items[0]["family"]], label=label,
+            [int(row["lanes"]) for row in sorted_rows],
+            [time_of(row, unit) for row in sorted_rows],
+            ls=ls, marker=marker, ms=3.5, color=COLOURS[sorted_rows[0]["family"]], label=label,
         )  # fmt: skip
     left_part.set(xlabel="wheels in a call", ylabel="CPU time per gait [µs]")
     left_part.grid(color="0.9", lw=0.4)
@@ -313,8 +313,11 @@ def floors(rows: list[Row]) -> str:
             else:
                 error = float(minimum[f"{quantity}_p99"])
                 failed = int(minimum["failed"])
-                lost_values = f", {failed} of {of_lanes(minimum)} failed" if failed else ""
-                cells += [f"{error:.0e}", f"{minimum['family']}, {minimum['setting']}{lost_values}"]
+                failure_note = f", {failed} of {of_lanes(minimum)} failed" if failed else ""
+                cells += [
+                    f"{error:.0e}",
+                    f"{minimum['family']}, {minimum['setting']}{failure_note}",
+                ]
         lines.append(cells)
     return format_markdown(("quantity", "float32", "by", "float64", "by"), lines)
 
@@ -382,8 +385,8 @@ def draw(rows: list[Row], batches: list[Row], source: str | None = None) -> None
     """Draw all charts and tables; `source` is the line of `describe_run` of a new measurement."""
     unit = unit_of(rows)
     with figure_style():
-        for name, (quantities, shown_values) in CHARTS.items():
-            selection = [row for row in rows if shown_values(row)]
+        for name, (quantities, is_row_shown) in CHARTS.items():
+            selection = [row for row in rows if is_row_shown(row)]
             for work, (label, x_of) in works(unit).items():
                 chart = panels(selection, quantities, x_of, label)
                 save(chart, FIGURES, f"work_precision_{name}_{work}")

@@ -106,26 +106,26 @@ def measure(
     before = measure_repeated(reference)
     begin = time.process_time()
     run = method.make(setting, rows, starts)
-    run_result = run()
+    results = run()
     first = time.process_time() - begin
     if method.family == NUMBA:
         first += compiling
-    used_values = (
+    seconds = (
         first
         if method.family in charts.SCALAR and first > MAX_REPEATED_SECONDS
         else measure_repeated(run)
     )
-    run_result = run_result[: len(references["rows"])]
+    results = results[: len(references["rows"])]
     unit = 0.5 * (before + measure_repeated(reference)) / len(references["rows"]) * 1e6
-    solution = errors(method.group, run_result, references)
+    solution = errors(method.group, results, references)
     failed = ~np.isfinite(next(iter(solution.values())))
     with np.errstate(invalid="ignore"):
-        evaluations = np.nanmean(run_result[:, -1]) if not failed.all() else 0.0
+        evaluations = np.nanmean(results[:, -1]) if not failed.all() else 0.0
     row = key_columns(method, setting) | {
         "failed": int(failed.sum()),
         "evaluations": f"{evaluations:.1f}",
         "first_call_s": f"{first:.3g}",
-        "us_per_gait": f"{used_values / n * 1e6:.4g}",
+        "us_per_gait": f"{seconds / n * 1e6:.4g}",
         "reference_us": f"{unit:.4g}",
     }
     for name, values in solution.items():

@@ -490,11 +490,11 @@ def test_for_stiff_wheels_the_solver_choice_saves_work_without_losing_accuracy()
     saved = evaluations(batch_result) / evaluations(named)
     assert saved[0] == 1.0
     assert np.all(saved[1:] < 0.68)
-    both_values = [
+    states_of_both_runs = [
         np.concatenate([result.section_state, result.durations], 1)
         for result in (batch_result, named)
     ]
-    error, by_named = (np.max(np.abs(x - exact), 1) for x in both_values)
+    error, by_named = (np.max(np.abs(x - exact), 1) for x in states_of_both_runs)
     assert np.all(error <= by_named)
 
 

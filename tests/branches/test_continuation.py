@@ -495,14 +495,14 @@ def test_the_map_before_touchdown_and_after_impact_have_the_same_multipliers(fin
 
 
 def test_each_wheel_of_a_batch_has_its_own_branch(branches):
-    walks, lost_values = branches[1:]
+    walks, branch_without_gait = branches[1:]
     i = int(np.argmin(np.abs(walks.values - 150.0)))
     gait = vrw.limit_cycle(jax.tree.map(lambda x: jnp.broadcast_to(x, 3)[1], BRANCH_WHEELS))
     assert walks.values[i] == 150.0
     assert abs(walks.dataset.dls_fraction[i] - gait.dls_fraction) < 1e-8
-    assert lost_values.outcome == vrw.Outcome.NO_CYCLE_FOUND
-    assert not lost_values.values.size
-    assert "none" in str(lost_values)
+    assert branch_without_gait.outcome == vrw.Outcome.NO_CYCLE_FOUND
+    assert not branch_without_gait.values.size
+    assert "none" in str(branch_without_gait)
 
 
 @pytest.mark.slow

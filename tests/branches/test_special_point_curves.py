@@ -168,14 +168,14 @@ def test_period_doubling_lies_between_its_meetings_with_both_double_support_curv
     """A branch along the stiffness meets the doubling at c = 141.66, k = 571.4737."""
     _, jumps, rolls = special_point_curves
     (one,) = [
-        event_values.values
-        for event_values in rolls.codim2_points
-        if event_values.name == "period_doubling"
+        codim2_point.values
+        for codim2_point in rolls.codim2_points
+        if codim2_point.name == "period_doubling"
     ]
     (other,) = [
-        event_values.values
-        for event_values in jumps.codim2_points
-        if event_values.name == "period_doubling"
+        codim2_point.values
+        for codim2_point in jumps.codim2_points
+        if codim2_point.name == "period_doubling"
     ]
     share = (141.66 - one[0]) / (other[0] - one[0])
     # Its curve is off the chord by as much there, of 0.6 N/m.
@@ -186,31 +186,33 @@ def test_curves_of_vanishing_and_of_zero_double_support_meet_at_one_point(specia
     """And the polynomial through six points at which it still lasts says where it does not."""
     _, jumps, rolls = special_point_curves
     (one,) = [
-        event_values.values
-        for event_values in jumps.codim2_points
-        if event_values.name == "duration_dls"
+        codim2_point.values
+        for codim2_point in jumps.codim2_points
+        if codim2_point.name == "duration_dls"
     ]
     (other,) = [
-        event_values.values
-        for event_values in rolls.codim2_points
-        if event_values.name == "lambda_4_plus"
+        codim2_point.values
+        for codim2_point in rolls.codim2_points
+        if codim2_point.name == "lambda_4_plus"
     ]
     np.testing.assert_allclose(one, other, rtol=1e-12)
     lasts = jumps.dataset.duration_dls.values
-    few_items = [i for i in np.argsort(lasts) if lasts[i] > 1e-3][:6]
-    nowhere = [np.polyfit(lasts[few_items], values, 5)[-1] for values in jumps.values[few_items].T]
+    point_indices = [i for i in np.argsort(lasts) if lasts[i] > 1e-3][:6]
+    nowhere = [
+        np.polyfit(lasts[point_indices], values, 5)[-1] for values in jumps.values[point_indices].T
+    ]
     np.testing.assert_allclose(one, nowhere, rtol=1e-5)  # itself off by less than 1e-6
     assert f"{one[0]:.9g}" in jumps.ends[0] + jumps.ends[1]
 
 
 def test_both_test_functions_vanish_at_a_codimension_two_point(special_point_curves):
     scuffing, *_ = special_point_curves
-    (event_values,) = [
-        event_values
-        for event_values in scuffing.codim2_points
-        if event_values.name == "friction_rear"
+    (codim2_point,) = [
+        codim2_point
+        for codim2_point in scuffing.codim2_points
+        if codim2_point.name == "friction_rear"
     ]
-    params = vrw.WheelParams(**dict(zip(CURVE_PARAMETERS, event_values.values, strict=True)))
+    params = vrw.WheelParams(**dict(zip(CURVE_PARAMETERS, codim2_point.values, strict=True)))
     gait = vrw.limit_cycle(params, options=vrw.CycleOptions.tight())
     step = vrw.step(params, gait.section_state, options=vrw.StepOptions.tight())
     assert abs(gait.takeoff_acceleration) < 1e-7
@@ -238,9 +240,9 @@ def test_margins_of_steps_are_as_accurate_as_quantities_of_the_gait(step_margin_
 def test_branches_turn_back_at_the_meeting_of_a_margin_and_a_fold(step_margin_curves):
     for curve in step_margin_curves:
         (damping, stiffness) = next(
-            event_values.values
-            for event_values in curve.codim2_points
-            if event_values.name == "fold"
+            codim2_point.values
+            for codim2_point in curve.codim2_points
+            if codim2_point.name == "fold"
         )
         before = vrw.WheelParams(damping=damping, stiffness=stiffness - 10.0)
         bounds = stiffness - 20.0, stiffness + 20.0

@@ -104,10 +104,10 @@ def test_progress_shows_rate_failures_and_time_left(monkeypatch: pytest.MonkeyPa
     clock = iter([0.0, 100.0, 110.0])
     monkeypatch.setattr("time.monotonic", lambda: next(clock))
     result: list[dict] = []
-    report = make_scan_progress_reporter(lambda _, **shown_values: result.append(shown_values), 0)
+    report = make_scan_progress_reporter(lambda _, **bar_state: result.append(bar_state), 0)
     for done, failed in ((0, 0), (1000, 100), (3000, 300)):
         report(ScanProgress(n_samples=6_000, n_done=done, n_failed=failed, n_reused=0))
-    assert [shown_values["description"] for shown_values in result] == [
+    assert [bar_state["description"] for bar_state in result] == [
         "compiling",
         "scanning",
         "scanning",
@@ -125,7 +125,7 @@ def test_the_bar_of_a_resumed_scan_includes_the_earlier_run(
     clock = iter([0.0, 100.0, 110.0])
     monkeypatch.setattr("time.monotonic", lambda: next(clock))
     result: list[dict] = []
-    report = make_scan_progress_reporter(lambda _, **shown_values: result.append(shown_values), 0)
+    report = make_scan_progress_reporter(lambda _, **bar_state: result.append(bar_state), 0)
     for done in (0, 1000, 3000):
         report(ScanProgress(n_samples=6_000, n_done=done, n_failed=0, n_reused=4_000))
     assert [(shown["completed"], shown["total"]) for shown in result] == [

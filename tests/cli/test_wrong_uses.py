@@ -486,14 +486,14 @@ def test_a_misspelled_command_points_to_the_help(mistake: str, working_folder: P
 @pytest.mark.parametrize("command", ["gait", "scan"])
 def test_a_missing_device_is_reported_in_one_sentence(command: str, tmp_path: Path) -> None:
     path = Path(__file__).parents[2] / "configs" / "quickstart.toml"
-    run_result = subprocess.run(
+    process = subprocess.run(
         [sys.executable, "-m", "vrw_jax", command, str(path)],
         cwd=tmp_path, capture_output=True, text=True,
         env=os.environ | {"JAX_PLATFORMS": "cuda"},
     )  # fmt: skip
-    assert run_result.returncode == 2
-    assert run_result.stderr.startswith("vrw: JAX_PLATFORMS is 'cuda', but JAX finds no device")
-    assert run_result.stderr.count("\n") == 1
+    assert process.returncode == 2
+    assert process.stderr.startswith("vrw: JAX_PLATFORMS is 'cuda', but JAX finds no device")
+    assert process.stderr.count("\n") == 1
     assert not list(tmp_path.iterdir())
 
 

@@ -78,9 +78,9 @@ def test_values_and_from_values_of_a_model_are_inverse_to_each_other(model: Abst
     values = model.collect_parameter_values(TABLE_1)
     assert values.shape == (9 + feels,)
     changed = values.at[6].set(150.0)
-    values_there, wheel = model.from_parameter_values(changed, 8)
+    restored_model, wheel = model.from_parameter_values(changed, 8)
     assert float(wheel.damping) == 150.0
-    np.testing.assert_array_equal(values_there.collect_parameter_values(wheel), changed)
+    np.testing.assert_array_equal(restored_model.collect_parameter_values(wheel), changed)
     if feels:
         ground, _ = model.with_parameter(TABLE_1, FRICTION_NAME, jnp.asarray(1.25))
         assert float(ground.friction) == 1.25
@@ -117,18 +117,18 @@ def test_a_cycle_of_two_steps_has_two_as_its_minimal_period():
 
 def test_a_cycle_is_confirmed_only_if_the_step_from_it_returns_to_it():
     outcome = vrw.Outcome
-    solution, lost_values, fell = outcome.STEPPED, outcome.NO_CYCLE_FOUND, outcome.FELL_BACK
+    stepped, no_cycle, fell = outcome.STEPPED, outcome.NO_CYCLE_FOUND, outcome.FELL_BACK
     coarse = outcome.MESH_TOO_COARSE
     state = np.zeros((4, 3))
     reached = state + np.array([0.0, 0.9, 1.1, 0.0])[:, None] * STATE_AGREEMENT_TOLERANCE
     result = confirm_outcome_by_step(
-        [solution, solution, solution, lost_values],
+        [stepped, stepped, stepped, no_cycle],
         state,
-        [solution, solution, solution, fell],
+        [stepped, stepped, stepped, fell],
         reached,
     )
-    assert list(result) == [solution, solution, coarse, lost_values]
-    assert confirm_outcome_by_step(solution, state[0], fell, reached[0]) == fell
+    assert list(result) == [stepped, stepped, coarse, no_cycle]
+    assert confirm_outcome_by_step(stepped, state[0], fell, reached[0]) == fell
 
 
 @pytest.mark.slow

@@ -88,8 +88,8 @@ def test_cycles_agree_with_the_reference(options, allowed):
             )
             < allowed
         ), name
-    for own_values, name in (("lambda_I4", "lambda_impulse_4"), ("lambda_2", "lambda2_plus")):
-        indicator = getattr(solution.indicators, own_values)
+    for indicator_name, name in (("lambda_I4", "lambda_impulse_4"), ("lambda_2", "lambda2_plus")):
+        indicator = getattr(solution.indicators, indicator_name)
         assert (
             reference_values.compute_scaled_error(
                 indicator, reference_values.stack_quantity("cycle", name)
@@ -117,8 +117,8 @@ def test_first_derivatives_agree_with_the_reference(options, allowed):
                 for case in reference_values.REFERENCE_CASES
             ]
         )
-        own_values = np.asarray(solution[name]).reshape(expected.shape)
-        assert compute_relative_error(own_values, expected) < allowed, name
+        derivative = np.asarray(solution[name]).reshape(expected.shape)
+        assert compute_relative_error(derivative, expected) < allowed, name
 
 
 @pytest.mark.skipif(not simd.is_machine_code_available(), reason="machine code is for CPUs")
@@ -158,11 +158,11 @@ def test_derivatives_by_both_masses_are_accurate_for_a_hub_lighter_than_a_leg():
     radius = np.abs(np.linalg.eigvals(solution.monodromy_value)).max(-1)
     differences = (radius[1::2] - radius[2::2]) / (2.0 * step)
     # Errors of differences: the step squared, and the search's 1e-13 over the step.
-    own_values = np.asarray(slopes["spectral_radius"])[0, MASS_NAMES]
+    mass_derivatives = np.asarray(slopes["spectral_radius"])[0, MASS_NAMES]
     np.testing.assert_allclose(
-        own_values, differences, rtol=0, atol=1e-7 * np.abs(own_values).max()
+        mass_derivatives, differences, rtol=0, atol=1e-7 * np.abs(mass_derivatives).max()
     )
-    assert np.all(np.abs(own_values) > 1e-3)
+    assert np.all(np.abs(mass_derivatives) > 1e-3)
 
 
 @pytest.mark.slow
@@ -295,9 +295,9 @@ def test_a_batch_has_the_ending_of_each_wheel_alone():
 
 def test_a_missing_gait_is_nan_in_value_and_derivative_on_request():
     fraction = lambda c, **how: vrw.limit_cycle(vrw.WheelParams(damping=c), **how).dls_fraction
-    both_values = jax.value_and_grad(lambda c: fraction(c, on_failure="nan"))
-    assert all(map(np.isnan, both_values(240.0)))
-    np.testing.assert_array_equal(both_values(150.0), jax.value_and_grad(fraction)(150.0))
+    value_and_gradient = jax.value_and_grad(lambda c: fraction(c, on_failure="nan"))
+    assert all(map(np.isnan, value_and_gradient(240.0)))
+    np.testing.assert_array_equal(value_and_gradient(150.0), jax.value_and_grad(fraction)(150.0))
     assert [float(x) for x in jax.value_and_grad(fraction)(240.0)] == [0.0, 0.0]
     margin = lambda c: vrw.limit_cycle(vrw.WheelParams(damping=c), on_failure="nan").spectral_margin
     assert all(map(np.isnan, jax.value_and_grad(margin)(240.0)))
@@ -434,9 +434,9 @@ def test_another_model_is_solved_on_its_own_return_map():
         np.testing.assert_allclose(
             solution, difference, rtol=1e-7
         )  # error of differences: h squared
-    lost_values = vrw.limit_cycle(vrw.WheelParams(slope=0.02), model=model)
-    assert int(lost_values.outcome) == Outcome.NO_CYCLE_FOUND
-    assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(lost_values))
+    cycle_without_gait = vrw.limit_cycle(vrw.WheelParams(slope=0.02), model=model)
+    assert int(cycle_without_gait.outcome) == Outcome.NO_CYCLE_FOUND
+    assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(cycle_without_gait))
 
 
 def test_options_of_the_wrong_type_are_refused_in_one_sentence():

@@ -20,8 +20,8 @@ def test_special_point_curves_and_codimension_two_points_are_drawn_at_their_valu
     )
     radius = {"spectral_radius": ("point", [0.5, 0.9, 1.1, 1.2])}
     line = xr.Dataset(radius, {"damping": ("point", 0.2 * K), "stiffness": ("point", K)})
-    event_values = Codim2Point("fold", (100.0, 500.0), False)
-    curve = vrw.SpecialPointCurve("lambda_4_plus", over_values, line, (event_values,), ("", ""))
+    codim2_point = Codim2Point("fold", (100.0, 500.0), False)
+    curve = vrw.SpecialPointCurve("lambda_4_plus", over_values, line, (codim2_point,), ("", ""))
     figure = map_figure(scan, "dls_fraction", [curve])
     axes = figure.axes[0]
     stable, thin, points = axes.lines

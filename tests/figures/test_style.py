@@ -55,13 +55,13 @@ def test_cells_have_the_colors_of_their_outcomes_and_others_stay_empty(known):
     style.draw_outcome_cells(axes, np.arange(2.0), np.arange(2.0), codes, sorted(known))
     (mesh,) = axes.collections
     mesh.update_scalarmappable()
-    for code, drawn_values in zip(codes.ravel(), mesh.get_facecolor().reshape(-1, 4), strict=True):
+    for code, drawn_color in zip(codes.ravel(), mesh.get_facecolor().reshape(-1, 4), strict=True):
         expected = (
             style.OUTCOME_LABELS_AND_COLORS[Outcome(code)][1]
             if code in known
             else (0.0, 0.0, 0.0, 0.0)
         )
-        assert np.allclose(drawn_values, mpl.colors.to_rgba(expected))
+        assert np.allclose(drawn_color, mpl.colors.to_rgba(expected))
 
 
 def test_a_style_ends_with_its_figure():
@@ -80,7 +80,7 @@ def test_special_points_in_confusable_colors_share_no_dash():
     assert not dashes(style.OKABE_ITO_GREEN) & dashes(style.OKABE_ITO_PINK)
     looks = [
         style.select_special_point_style(name)
-        for own_values in names.values()
-        for name in own_values
+        for names_of_dash in names.values()
+        for name in names_of_dash
     ]
     assert len(set(looks)) == len(looks)

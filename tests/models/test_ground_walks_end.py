@@ -60,9 +60,9 @@ def test_outcomes_with_one_sided_stoppers_do_not_depend_on_the_tolerance(toleran
 def test_the_painleve_paradox_occurs_at_the_singularity_of_another_code():
     """Forces jump there; the determinant that vanishes does not."""
     (params, starts), place = draw_wheels(), 123
-    own_values = [float(x[place]) for x in (params.damping, params.slope, HIGH_FRICTION)]
+    parameter_values = [float(x[place]) for x in (params.damping, params.slope, HIGH_FRICTION)]
     wheel = complementarity.ComplementarityWheel(
-        own_values[2], c=own_values[0], slope=own_values[1]
+        parameter_values[2], c=parameter_values[0], slope=parameter_values[1]
     )
     start = complementarity.paper_start(wheel, *starts[place])
     begin, _ = complementarity._process_event(wheel, start, 0, None)
@@ -79,8 +79,8 @@ def test_the_painleve_paradox_occurs_at_the_singularity_of_another_code():
     method_name = solve_ivp(rates, (0.0, 1.0), y, "DOP853", events=left, rtol=1e-12, atol=1e-12)
     time, y = method_name.t[-1], method_name.y[:, -1]
     slope = -left(time, y - 1e-7 * rates(time, y)) / 1e-7  # the last bit by a straight line
-    model = vrw.UnilateralWheel(friction=own_values[2])
-    params = vrw.WheelParams(damping=own_values[0], slope=own_values[1])
+    model = vrw.UnilateralWheel(friction=parameter_values[2])
+    params = vrw.WheelParams(damping=parameter_values[0], slope=parameter_values[1])
     for tolerance in (1e-6, 1e-10):
         options = vrw.StepOptions(rtol=tolerance, atol=tolerance)
         step = vrw.step(params, starts[place], model=model, options=options)

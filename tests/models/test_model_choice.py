@@ -79,17 +79,17 @@ def test_a_step_of_the_ladder_equals_that_of_the_chosen_model(ladder_steps):
         if rung == ModelCode.VISCOELASTIC:
             step_result = vrw.step(params, START)
             x = step.section_state[i, jnp.asarray([0, 1, 4 + n])]
-            lost_values = step_result.energy.landing + step_result.energy.stopper
+            impact_loss = step_result.energy.landing + step_result.energy.stopper
         else:
             ground = vrw.UnilateralWheel(
                 friction=friction[i], infinite_friction_rule="paper"
             )  # it is finite
             step_result = vrw.step(params, START, model=ground)
-            x, lost_values = step.section_state[i], step_result.energy_impacts
+            x, impact_loss = step.section_state[i], step_result.energy_impacts
         np.testing.assert_allclose(x, step_result.section_state, atol=1e-12)
         np.testing.assert_allclose(step.period[i], step_result.period, atol=1e-12)
         np.testing.assert_allclose(step.dls_fraction[i], step_result.dls_fraction, atol=1e-12)
-        np.testing.assert_allclose(step.energy_impacts[i], lost_values, atol=1e-10)
+        np.testing.assert_allclose(step.energy_impacts[i], impact_loss, atol=1e-10)
 
 
 def test_an_element_of_the_papers_model_costs_no_unilateral_steps(ladder_steps):

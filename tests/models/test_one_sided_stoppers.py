@@ -104,8 +104,8 @@ def test_no_stopper_pulls_and_energy_losses_are_reported_by_cause(friction, damp
         before, after = (unpack_section_state(s, y)[0] for y in (x, step.section_state))
         # The origin is each step's own landing.
         dropped = s.Mt * s.g * math.sin(0.30) * float(step.step_length)
-        lost_values = step.energy_impacts + step.energy_damping + step.energy_friction
-        assert abs(float(lost_values) - (total(before) - total(after) + float(dropped))) < 1e-7
+        energy_loss = step.energy_impacts + step.energy_damping + step.energy_friction
+        assert abs(float(energy_loss) - (total(before) - total(after) + float(dropped))) < 1e-7
         x = step.section_state
 
 
@@ -189,7 +189,7 @@ def test_high_friction_from_any_start_has_an_admissible_contact_at_every_impact(
     )
     outcome = np.asarray(batch_result.outcome)
     assert not np.any(outcome == vrw.Outcome.NO_ADMISSIBLE_CONTACT)
-    lost_values = np.isin(outcome, [vrw.Outcome.SOLVER_FAILED, vrw.Outcome.TOO_MANY_EVENTS])
-    assert lost_values.sum() <= n // 50
+    has_solver_failed = np.isin(outcome, [vrw.Outcome.SOLVER_FAILED, vrw.Outcome.TOO_MANY_EVENTS])
+    assert has_solver_failed.sum() <= n // 50
     assert not np.any(np.asarray(batch_result.section_state)[outcome != vrw.Outcome.STEPPED])
     assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(batch_result))

@@ -64,9 +64,9 @@ def test_tangents_derived_from_units_equal_those_of_the_step(name):
     params = vrw.WheelParams(**other)
     every = vrw.step_batch(params, shifted, options=TIGHT_OPTIONS, derivatives=ALL_INPUT_NAMES)
     batch_result = vrw.step_batch(params, shifted, options=TIGHT_OPTIONS, derivatives=(name,))
-    both_values = every.derivatives[name], batch_result.derivatives[name]
+    both_sensitivities = every.derivatives[name], batch_result.derivatives[name]
     for part in ("section_state", "durations"):
-        result, carried = (getattr(by_input, part) for by_input in both_values)
+        result, carried = (getattr(by_input, part) for by_input in both_sensitivities)
         size = np.abs(carried).max(0)
         # Derivatives are right to some 1e-11 of their size; sums of five terms lose a digit.
         assert np.max(np.abs(result - carried) / size) < 1e-9

@@ -151,8 +151,8 @@ def test_energy_lost_in_a_step_is_reported_by_cause(scene_traces):
     begin = float(compute_kinetic_energy(s, before) + sum(compute_potential_energy(s, before)))
     *_, (_, motion, _) = iterate_phases(params, trace)
     step = compute_step(friction)
-    lost_values = step.energy_impacts + step.energy_damping + step.energy_friction
-    assert abs(float(lost_values) - (begin - compute_total_energy(s, motion)[-1])) < 1e-9
+    energy_loss = step.energy_impacts + step.energy_damping + step.energy_friction
+    assert abs(float(energy_loss) - (begin - compute_total_energy(s, motion)[-1])) < 1e-9
     assert float(step.energy_friction) > 0.0
 
 
@@ -354,10 +354,10 @@ def test_a_single_leg_bounces_as_a_damped_oscillator():
     assert abs(float(end.duration) - time) < 1e-8
     assert abs(float(landed.L[0]) - length(time)) < 1e-9
     assert abs(float(landed.theta)) < 1e-12
-    lost_values = 0.5 * mass * speed**2 - 0.5 * mass * float(landed.vz) ** 2
-    lost_values += 0.5 * float(s.k) * float((s.Ls - s.L0) ** 2 - (s.Ls - landed.L[0]) ** 2)
-    lost_values += float(mass * s.g * (s.L0 - landed.L[0]))
-    assert abs(float(tally.damping_loss) - lost_values) < 1e-9
+    energy_loss = 0.5 * mass * speed**2 - 0.5 * mass * float(landed.vz) ** 2
+    energy_loss += 0.5 * float(s.k) * float((s.Ls - s.L0) ** 2 - (s.Ls - landed.L[0]) ** 2)
+    energy_loss += float(mass * s.g * (s.L0 - landed.L[0]))
+    assert abs(float(tally.damping_loss) - energy_loss) < 1e-9
 
 
 @pytest.mark.parametrize("friction", [0.0, 0.1, 0.5])

@@ -259,8 +259,8 @@ def test_the_product_of_multipliers_is_accurate_at_a_grazing_event(depth):
         abs(float(flow_jacobian_determinant(modes, start, result, TIGHT_OPTIONS)) - retained**2)
         < 1e-15
     )
-    lost_values = abs(float(jnp.linalg.det(fixed_point.jacobian)) - retained**2)
-    assert (lost_values > 1e-12) == (depth == 1e-6)
+    determinant_error = abs(float(jnp.linalg.det(fixed_point.jacobian)) - retained**2)
+    assert (determinant_error > 1e-12) == (depth == 1e-6)
 
 
 def test_newtons_method_finds_a_repeating_state_next_to_a_jump_of_the_map():
@@ -284,9 +284,11 @@ def test_volumes_shrink_by_friction_and_by_every_bounce():
 
     def moved(y):
         """With the time held: states past the fifth event flow for a moment more."""
-        own_values = simulate_hybrid([Mode(drag, (floor,))], y, events=5, options=TIGHT_OPTIONS)
-        late_values = result.time - own_values.time
-        return own_values.state + late_values * drag(own_values.state)
+        last_simulation = simulate_hybrid(
+            [Mode(drag, (floor,))], y, events=5, options=TIGHT_OPTIONS
+        )
+        remaining_time = result.time - last_simulation.time
+        return last_simulation.state + remaining_time * drag(last_simulation.state)
 
     # The saltation matrix of each event, by differentiating through its time.
     np.testing.assert_allclose(solution, jnp.linalg.det(jax.jacfwd(moved)(start)), rtol=1e-9)
@@ -311,8 +313,8 @@ def test_failures_of_a_simulation_are_termination_codes():
         read_termination(simulate_hybrid([make_ball_mode()], [1.0, 0.0], events=3, options=short))
         == Termination.MAX_TIME_REACHED
     )
-    few_items = vrw.StepOptions(max_solver_steps=2)
-    result = simulate_hybrid([make_ball_mode()], [1.0, 0.0], events=3, options=few_items)
+    two_step_options = vrw.StepOptions(max_solver_steps=2)
+    result = simulate_hybrid([make_ball_mode()], [1.0, 0.0], events=3, options=two_step_options)
     assert read_termination(result) == Termination.MAX_STEPS_REACHED
     assert int(result.n_events) == 0
     sinks = Mode(lambda y: -0.5 / y, (Guard(lambda y: y[0] + 1.0),))  # sqrt(1 - t), then nothing

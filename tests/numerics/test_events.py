@@ -30,8 +30,8 @@ def find_phase_end(
 
 
 def test_the_earliest_guard_wins_whatever_its_place_in_the_list():
-    late_values, early = lambda y: 2.0 - y[0], lambda y: 1.0 - y[0]
-    for guards, index in [((late_values, early), 1), ((early, late_values), 0)]:
+    late_guard, early_guard = lambda y: 2.0 - y[0], lambda y: 1.0 - y[0]
+    for guards, index in [((late_guard, early_guard), 1), ((early_guard, late_guard), 0)]:
         end = find_phase_end(guards)
         assert int(end.guard) == index
         assert abs(float(end.duration) - 1.0) < 1e-14

@@ -14,8 +14,10 @@ RANDOM_GENERATOR = np.random.default_rng(3)
 def test_eigenvalues_agree_with_lapack(size):
     matrices = RANDOM_GENERATOR.normal(size=(400, size, size))
     values_array = np.asarray(floquet.floquet_multipliers(jnp.asarray(matrices)))
-    for own_values, expected in zip(values_array, np.linalg.eigvals(matrices), strict=True):
-        gap = np.abs(own_values[:, None] - expected[None])
+    for computed_eigenvalues, expected in zip(
+        values_array, np.linalg.eigvals(matrices), strict=True
+    ):
+        gap = np.abs(computed_eigenvalues[:, None] - expected[None])
         assert gap.min(0).max() < 1e-10
         assert gap.min(1).max() < 1e-10
     radius = np.abs(np.linalg.eigvals(matrices)).max(1)

@@ -316,7 +316,10 @@ def _process_event(w, place, struck_foot, struck_leg):
     pushed = rows[feet, 1] + np.array(drag).reshape(-1, 1) * rows[feet, 0]
     others = [rows[is_unfinished, 0], _locked_rows(legs)]
     v = _bring_to_rest(
-        w, q, v, *(np.concatenate([own_values, *others]) for own_values in (rows[feet, 1], pushed))
+        w,
+        q,
+        v,
+        *(np.concatenate([pushed_array, *others]) for pushed_array in (rows[feet, 1], pushed)),
     )
     may = [
         (CONTACT_STICK, SLIP_DOWNHILL, SLIP_UPHILL, CONTACT_OFF)
@@ -467,13 +470,13 @@ def _integrate_to_event(w, place):
             exact = by(begin, y, first, length)
             while exact.status == "running":
                 exact.step()
-            values_here, before = exact.y, exact.y - 1e-2 * length * rates(0.0, exact.y)
-            slope = (values(values_here)[which] - values(before)[which]) / (1e-2 * length)
-            shift = -values(values_here)[which] / slope if slope < 0.0 else 0.0
+            state_at_event, before = exact.y, exact.y - 1e-2 * length * rates(0.0, exact.y)
+            slope = (values(state_at_event)[which] - values(before)[which]) / (1e-2 * length)
+            shift = -values(state_at_event)[which] / slope if slope < 0.0 else 0.0
             if abs(shift) < 1e-15 or abs(shift) > 0.1 * length:
                 break
             first += shift
-        return first, values_here if first > begin else y, names[which]
+        return first, state_at_event if first > begin else y, names[which]
     raise NoAdmissibleContactError("no landing")
 
 

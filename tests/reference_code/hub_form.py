@@ -154,7 +154,7 @@ class HubForm:
             """Rows d(velocity) / dw, of a part in w and one in omega."""
             return [[direct[i][j] + arm[i] * turning[j] for j in range(3)] for i in range(2)]
 
-        both_values, both_t = plus(u, u2), plus(t, t2)
+        sum_of_directions, sum_of_tangents = plus(u, u2), plus(t, t2)
         zero, one = [0, 0, 0], [[1, 0, 0], [0, 1, 0]]
         square = omega * omega
         # mass, velocity coefficients, acceleration at w' = 0
@@ -172,8 +172,11 @@ class HubForm:
             ),
             (
                 b.body,
-                field(one, times(b.reach, both_t)),
-                plus(times(b.reach * drift, both_t), times(-b.reach * square, both_values)),
+                field(one, times(b.reach, sum_of_tangents)),
+                plus(
+                    times(b.reach * drift, sum_of_tangents),
+                    times(-b.reach * square, sum_of_directions),
+                ),
             ),
         ]
         matrix: list[Vector] = [
@@ -216,12 +219,12 @@ class HubForm:
         velocity = times(radius * rate, tangential_part)
         pushes = [b.push(lengths[i], dot(u[i], velocity)) for i in range(2)]
         omega = rate / 2
-        both_values, both_t = plus(u[0], u[1]), plus(t[0], t[1])
+        sum_of_directions, sum_of_tangents = plus(u[0], u[1]), plus(t[0], t[1])
         # velocities per psi', and accelerations at psi'' = 0
         hub_row = times(radius, tangential_part)
         hub_rest = times(radius * rate * rate, inward)
-        body_row = plus(hub_row, times(b.reach / 2, both_t))
-        body_rest = plus(hub_rest, times(-b.reach * omega * omega, both_values))
+        body_row = plus(hub_row, times(b.reach / 2, sum_of_tangents))
+        body_rest = plus(hub_rest, times(-b.reach * omega * omega, sum_of_directions))
         points = [(b.hub, hub_row, hub_rest), (b.body, body_row, body_rest)]
         for i in range(2):
             points.append((b.leg, times(b.com / 2, t[i]), times(-b.com * omega * omega, u[i])))
@@ -248,11 +251,11 @@ class HubForm:
         u2, u1 = [mp.sin(theta), mp.cos(theta)], [mp.sin(new), mp.cos(new)]
         t1, t2 = direction_derivative(u1), direction_derivative(u2)
         L1, L2 = p[3], p[3] * u1[1] / u2[1]
-        both_t = plus(t1, t2)
+        sum_of_tangents = plus(t1, t2)
         hub = plus(times(dL1, u2), times(L2 * omega, t2))
         before = [
             (b.hub, hub),
-            (b.body, plus(hub, times(b.reach * omega, both_t))),
+            (b.body, plus(hub, times(b.reach * omega, sum_of_tangents))),
             (b.leg, plus(hub, times(-(L1 - b.com) * omega, t1))),
             (b.leg, times(b.com * omega, t2)),
         ]
@@ -264,7 +267,7 @@ class HubForm:
         reach = (foot2[0] * normal2[1] - normal2[0] * foot2[1]) / determinant
         centre = times(reach, normal1)
         row = direction_derivative(plus(times(L1, u1), times(-1, centre)))
-        rows = [row, plus(row, times(b.reach, both_t)), times(b.com, t1), times(b.com, t2)]
+        rows = [row, plus(row, times(b.reach, sum_of_tangents)), times(b.com, t1), times(b.com, t2)]
         retained = b.inertia * omega + mp.fsum(
             mass * dot(r, v) for (mass, v), r in zip(before, rows, strict=True)
         )

@@ -121,7 +121,10 @@ def stopper_forces(wheel: Wheel, q: Array, v: Array, a: Array) -> Array:
 def _velocity_jumps(wheel: Wheel, q: Array, before: Array, after: Array) -> list[Array]:
     """Jumps of the velocities of the hub and of the masses of legs 1..n, m/s."""
     old, new = mass_velocities(wheel, q, before), mass_velocities(wheel, q, after)
-    return [late_values - early for early, late_values in zip(old, new, strict=True)]
+    return [
+        late_velocity - early_velocity
+        for early_velocity, late_velocity in zip(old, new, strict=True)
+    ]
 
 
 def _landing_impulses(wheel: Wheel, q: Array, before: Array, after: Array) -> Array:

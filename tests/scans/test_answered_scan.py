@@ -28,18 +28,18 @@ def test_a_scan_to_a_tolerance_has_value_error_and_model(tmp_path: Path) -> None
     assert np.array_equal(
         full_values.period.values.ravel(), measured.value["period"], equal_nan=True
     )
-    values_here = measured.found.reshape(2, 2)
+    has_measure = measured.found.reshape(2, 2)
     assert np.array_equal(
-        full_values.speed_error.values[values_here], measured.error["speed"][measured.found]
+        full_values.speed_error.values[has_measure], measured.error["speed"][measured.found]
     )
     meanings = full_values.rung.attrs["flag_meanings"].split()
     names = {"RigidWheel": "rigid", "ViscoelasticWheel": "viscoelastic"}
-    own_values = [
-        names.get(meanings[i], "unilateral") for i in full_values.rung.values[values_here]
+    model_names = [
+        names.get(meanings[i], "unilateral") for i in full_values.rung.values[has_measure]
     ]
-    assert own_values == list(measured.model[measured.found])
-    assert np.all(full_values.rung.values[~values_here] == -1)
-    assert {"viscoelastic"} < {*own_values, "none"}
+    assert model_names == list(measured.model[measured.found])
+    assert np.all(full_values.rung.values[~has_measure] == -1)
+    assert {"viscoelastic"} < {*model_names, "none"}
 
 
 def test_a_tolerance_requires_the_unilateral_model() -> None:

@@ -51,10 +51,10 @@ def list_files(store: Path) -> dict[str, bytes]:
 
 
 def test_a_stored_scan_equals_the_scan_in_memory(tmp_path: Path) -> None:
-    run_result = run_plan(make_plan(), evaluate=evaluate_arithmetically)
-    values_there = run_plan(make_plan(), tmp_path / "s.zarr", evaluate=evaluate_arithmetically)
-    xr.testing.assert_identical(run_result.drop_attrs(), values_there.load().drop_attrs())
-    assert run_result.attrs == values_there.attrs
+    scan_in_memory = run_plan(make_plan(), evaluate=evaluate_arithmetically)
+    stored_scan = run_plan(make_plan(), tmp_path / "s.zarr", evaluate=evaluate_arithmetically)
+    xr.testing.assert_identical(scan_in_memory.drop_attrs(), stored_scan.load().drop_attrs())
+    assert scan_in_memory.attrs == stored_scan.attrs
 
 
 def test_a_stored_scan_opens_with_xarray_alone(tmp_path: Path) -> None:
@@ -67,12 +67,12 @@ def test_a_stored_scan_opens_with_xarray_alone(tmp_path: Path) -> None:
 
 def test_a_stored_list_of_samples_keeps_its_coordinates(tmp_path: Path) -> None:
     design = designs.sobol({"damping": (100.0, 200.0), "slope": (0.28, 0.3)}, 16)
-    run_result = run_plan(plan_scan(design, SCANNED_MEASURES), evaluate=evaluate_arithmetically)
-    values_there = run_plan(
+    scan_in_memory = run_plan(plan_scan(design, SCANNED_MEASURES), evaluate=evaluate_arithmetically)
+    stored_scan = run_plan(
         plan_scan(design, SCANNED_MEASURES), tmp_path / "s.zarr", evaluate=evaluate_arithmetically
     )
-    xr.testing.assert_identical(run_result.drop_attrs(), values_there.load().drop_attrs())
-    assert set(values_there.coords) == {"sample", "damping", "slope", "leg"}
+    xr.testing.assert_identical(scan_in_memory.drop_attrs(), stored_scan.load().drop_attrs())
+    assert set(stored_scan.coords) == {"sample", "damping", "slope", "leg"}
 
 
 def test_a_scan_interrupted_at_any_chunk_ends_bitwise_the_same(tmp_path: Path) -> None:
@@ -282,10 +282,10 @@ def test_every_sample_is_in_exactly_one_chunk() -> None:
     for chunk in (1, 2, 5, 7, 8, 14, 40, 42, 100):
         layout = plan_scan(design, SCANNED_MEASURES, chunk=chunk).result_layout
         assert np.prod(layout.chunk_shape) <= chunk
-        observed_values = np.zeros(design.shape, int)
+        n_chunks_of_sample = np.zeros(design.shape, int)
         for index in range(layout.n_chunks):
-            observed_values[layout.compute_chunk_region(index)] += 1
-        assert np.all(observed_values == 1)
+            n_chunks_of_sample[layout.compute_chunk_region(index)] += 1
+        assert np.all(n_chunks_of_sample == 1)
 
 
 def test_chunks_are_slabs() -> None:
@@ -478,11 +478,11 @@ def test_parallel_batches_give_the_same_results(
     engine: CollocationScanEngine, engine_results: Mapping[str, np.ndarray]
 ) -> None:
     """Each of two batches waits until the other has begun: with turns none would ever go on."""
-    both_values = threading.Barrier(2, timeout=60.0)
+    barrier = threading.Barrier(2, timeout=60.0)
     programs = [engine._free_programs.get(timeout=60.0) for _ in range(2)]
 
     def met(program: Callable) -> Callable:
-        return lambda values: (both_values.wait(), program(values))[1]
+        return lambda values: (barrier.wait(), program(values))[1]
 
     for program in programs:
         engine._free_programs.put(program._replace(cycle_program=met(program.cycle_program)))
@@ -577,9 +577,9 @@ def test_a_cluster_that_loses_a_worker_gives_bitwise_the_serial_scan(
 
 def test_a_worker_uses_the_trace_keys_of_the_calling_process() -> None:
     """Otherwise each would trace and compile what the cache holds."""
-    values_here = make_plan().evaluation_request
-    parsed = pickle.loads(pickle.dumps(values_here))
-    assert repr(CollocationScanEngine(values_here)._program_cache_key) == repr(
+    evaluation_request = make_plan().evaluation_request
+    parsed = pickle.loads(pickle.dumps(evaluation_request))
+    assert repr(CollocationScanEngine(evaluation_request)._program_cache_key) == repr(
         CollocationScanEngine(parsed)._program_cache_key
     )
 

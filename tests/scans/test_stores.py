@@ -154,13 +154,13 @@ def test_xarray_opens_a_store_without_a_warning_and_sees_no_bookkeeping(
 @pytest.mark.parametrize("place", [None, "s.zarr"])
 def test_variables_have_the_requested_order_and_names(tmp_path: Path, place: str | None) -> None:
     requested = ("speed", "d dls_fraction / d damping", "outcome", "dls_fraction")
-    run_result = run_plan(
+    scan_result = run_plan(
         plan_scan(SMALL_GRID, requested),
         place and tmp_path / place,
         evaluate=evaluate_arithmetically,
     )
-    assert tuple(run_result.data_vars)[:4] == requested
-    assert run_result["d dls_fraction / d damping"].attrs["units"]
+    assert tuple(scan_result.data_vars)[:4] == requested
+    assert scan_result["d dls_fraction / d damping"].attrs["units"]
     underscored = run_plan(
         plan_scan(SMALL_GRID, ["d_dls_fraction_d_damping"]), evaluate=evaluate_arithmetically
     )
@@ -234,10 +234,10 @@ def test_of_two_simultaneous_scans_one_creates_the_store(
         start_result.wait(1.0)
         return evaluate_arithmetically(columns)
 
-    both_values = [threading.Thread(target=scan) for _ in range(2)]
-    for one in both_values:
+    threads = [threading.Thread(target=scan) for _ in range(2)]
+    for one in threads:
         one.start()
-    for one in both_values:
+    for one in threads:
         one.join()
     rows = [end for end in ends if isinstance(end, Exception)]
     assert len(rows) == 1

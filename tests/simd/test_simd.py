@@ -118,11 +118,11 @@ def test_a_lane_gives_the_same_bits_in_any_batch_and_on_any_number_of_cores(monk
     lanes = [RANDOM_GENERATOR.normal(size=5_003) for _ in range(2)]
     run = make_program(evaluate_arithmetic, lanes, [np.float64(0.7)])
     monkeypatch.setattr(simd.program, "_count_available_cores", lambda: 1)
-    run_result = run([np.float64(0.7)], lanes)
+    results_of_all_lanes = run([np.float64(0.7)], lanes)
     monkeypatch.setattr(simd.program, "_count_available_cores", lambda: 3)
     selection = RANDOM_GENERATOR.permutation(5_003)[:n]
     for part, all_ in zip(
-        run([np.float64(0.7)], [x[selection] for x in lanes]), run_result, strict=True
+        run([np.float64(0.7)], [x[selection] for x in lanes]), results_of_all_lanes, strict=True
     ):
         np.testing.assert_array_equal(part, all_[selection])
 
@@ -147,7 +147,7 @@ def use_arrays_in_loops(x):
 
     start = (jnp.zeros((4, x.shape[-1]), x.dtype), x[0, 0])
     rows = flat.reshape(4, 12, -1)
-    (total, observed_values), stacked = lax.scan(turn, start, (rows, jnp.arange(4.0)), reverse=True)
+    (total, last_rows), stacked = lax.scan(turn, start, (rows, jnp.arange(4.0)), reverse=True)
 
     def halve(state):
         field, count = state
@@ -162,7 +162,7 @@ def use_arrays_in_loops(x):
     return {
         "stacked": stacked,
         "apart": first * last + sum(jnp.unstack(x[:3])),
-        "rest": (observed_values, jnp.min(flat, 0), jnp.min(stacked, (0, 2)), total),
+        "rest": (last_rows, jnp.min(flat, 0), jnp.min(stacked, (0, 2)), total),
         "halved": halved - jnp.max(large, 0),
         "found": jnp.any(large > 1.5, (0, 1)),
         "summed": (jnp.cumsum(flat[:5], 0), lax.cumsum(flat[:5], 0, reverse=True)),
@@ -189,23 +189,24 @@ def overwrite_in_loops(x):
         return lax.while_loop(lambda s: jnp.any(s[0] < len(rows)), turn, (zero, rows))[1]
 
     def turn(state):
-        count, values_here_2, values_there_2, total = state
-        observed_values = values_here_2[1]  # read after `here` is overwritten
+        count, first_array_in_turn, values_there_2, total = state
+        early_read = first_array_in_turn[1]  # read after `here` is overwritten
         shifted = each(
-            each(values_here_2, lambda row, k: 0.5 * row + 0.1 * k), lambda row, _: row[:5] + 1.0
+            each(first_array_in_turn, lambda row, k: 0.5 * row + 0.1 * k),
+            lambda row, _: row[:5] + 1.0,
         )
         fresh = each(is_unfinished, lambda row, k: row - 0.2 * count)  # the same begin at each turn
         part = lax.dynamic_update_index_in_dim(values_there_2, shifted[0] + fresh[3], count & 1, 0)
-        late_values = part[1]  # likewise
+        late_read = part[1]  # likewise
         missing_values = each(part, lambda row, k: 0.5 * row + count)
-        total = total + observed_values + shifted[2] - fresh[1] + late_values
+        total = total + early_read + shifted[2] - fresh[1] + late_read
         return count + 1, missing_values, shifted, total
 
     full_values = each(jnp.concatenate([x, 2.0 * x, x * x]), lambda row, _: row + 1.0)
     is_unfinished = each(full_values, lambda row, _: row + 2.0)
     begin = zero, each(full_values, lambda row, _: row + 1.0), full_values, 0.0 * x[0]
-    _, values_here, values_there, total = lax.while_loop(lambda s: s[0] < 5, turn, begin)
-    return values_here + full_values, values_there, total
+    _, first_array, second_array, total = lax.while_loop(lambda s: s[0] < 5, turn, begin)
+    return first_array + full_values, second_array, total
 
 
 def test_in_place_updates_of_loops_do_not_change_other_readers():

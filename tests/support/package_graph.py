@@ -171,8 +171,8 @@ class ImportGraph:
             elif isinstance(node, ast.ImportFrom):
                 origin = self._origin(module, node)
                 names |= {a.asname or a.name: f"{origin}:{a.name}" for a in node.names}
-        own_values = {getattr(node, "name", "") for node in ast.iter_child_nodes(tree)}
-        return {name: origin for name, origin in names.items() if name not in own_values}
+        defined_names = {getattr(node, "name", "") for node in ast.iter_child_nodes(tree)}
+        return {name: origin for name, origin in names.items() if name not in defined_names}
 
     def _origin(self, module: str, node: ast.ImportFrom) -> str:
         """Return the absolute name of the module between `from` and `import`."""

@@ -106,8 +106,8 @@ def test_errors_hold_if_contact_sequences_change_and_feet_barely_lift_off():
     for tol in (1e-2, 1e-4):
         measured = vrw.measure_to_tolerance(names, wheels, tol, friction=HARD_FRICTION)
         for each in (measured, exact):
-            lost_values = np.flatnonzero(~each.found)
-            assert {int(i): each.outcomes[i] for i in lost_values} == OUTCOMES_WITHOUT_GAIT
+            indices_without_gait = np.flatnonzero(~each.found)
+            assert {int(i): each.outcomes[i] for i in indices_without_gait} == OUTCOMES_WITHOUT_GAIT
         wrong = np.abs(measured.values - exact.values)
         assert np.all((wrong <= measured.errors + exact.errors)[measured.found])
 
@@ -181,11 +181,11 @@ def test_a_mean_combines_few_unilateral_gaits_with_all_gaits_of_the_paper():
 def test_a_mean_includes_only_wheels_with_a_gait():
     """Whether some are asked, or all: then it is theirs and nothing but theirs."""
     rng = np.random.default_rng(1)
-    drawn_values = (
+    random_columns = (
         rng.uniform(*ends, 60) for ends in ((120.0, 200.0), (450.0, 550.0), (0.26, 0.34))
     )
     wheels = vrw.WheelParams(
-        **dict(zip(("damping", "stiffness", "slope"), drawn_values, strict=True))
+        **dict(zip(("damping", "stiffness", "slope"), random_columns, strict=True))
     )
     every = vrw.measure_to_tolerance("speed", wheels, 1e-5, friction=30.0)
     assert 40 < np.sum(every.found) < 60

@@ -16,8 +16,8 @@ def walk_scalar_map(one_step, start: float, failing_interval: tuple[float, float
         y = x.copy()
         for _ in range(n_steps):
             y[:, 0] = one_step(y[:, 0])
-        lost_values = (failing_interval[0] < x[:, 0]) & (x[:, 0] < failing_interval[1])
-        return StepQuantities(y, y, np.where(lost_values, int(vrw.Outcome.FELL_BACK), 0))
+        has_failed = (failing_interval[0] < x[:, 0]) & (x[:, 0] < failing_interval[1])
+        return StepQuantities(y, y, np.where(has_failed, int(vrw.Outcome.FELL_BACK), 0))
 
     map_on_ground = Mock(ContactWheelBatch, n_legs=1, take_steps=step)
     map_on_ground.make_batch_for_walks.return_value = map_on_ground

@@ -51,14 +51,14 @@ def max_dls_without_margins() -> TuneResult:
 def test_gradients_of_objective_and_all_constraints_agree_with_central_differences():
     problem = make_problem({"dls_fraction": 1.0, "speed": -0.3})
     u = np.array([0.7, 0.45, 0.4, 0.55])
-    values_here = problem.evaluate_trial(u, None)
-    exact = np.vstack([values_here.objective_gradient, values_here.slack_jacobian])
+    trial = problem.evaluate_trial(u, None)
+    exact = np.vstack([trial.objective_gradient, trial.slack_jacobian])
     for i in range(u.size):
         h = 1e-3 * np.eye(u.size)[i]
         values = []
         for k in (-2, -1, 1, 2):
-            values_there = problem.evaluate_trial(u + k * h, values_here)
-            values.append(np.r_[values_there.objective, values_there.constraint_slacks])
+            displaced_trial = problem.evaluate_trial(u + k * h, trial)
+            values.append(np.r_[displaced_trial.objective, displaced_trial.constraint_slacks])
         # Fourth order, and exact to the step's error over h.
         difference = (values[0] - 8.0 * values[1] + 8.0 * values[2] - values[3]) / 12e-3
         scale = np.maximum(np.abs(exact).max(axis=1), 1e-3)
@@ -142,12 +142,12 @@ def test_a_lost_gait_shortens_the_step_and_is_reported():
     # lambda_4_plus = 0 ends the branch near c = 219: there is nothing to climb on beyond it.
     bounds = {"damping": (150.0, 400.0)}
     tuned = tune(vrw.WheelParams(), {"lambda_4_plus": -1.0}, ["damping"], bounds, {})
-    lost_values = tuned.path.kind.values == TrialKind.LOST
+    is_gait_lost = tuned.path.kind.values == TrialKind.LOST
     assert tuned.status == TuneStatus.BRANCH_ENDED
-    assert tuned.n_backtracks == lost_values.sum() > 0
-    assert np.all(tuned.path.outcome.values[lost_values] != vrw.Outcome.STEPPED)
-    assert np.all(tuned.path.outcome.values[~lost_values] == vrw.Outcome.STEPPED)
-    assert np.all(tuned.path.damping.values[~lost_values] <= float(tuned.params.damping))
+    assert tuned.n_backtracks == is_gait_lost.sum() > 0
+    assert np.all(tuned.path.outcome.values[is_gait_lost] != vrw.Outcome.STEPPED)
+    assert np.all(tuned.path.outcome.values[~is_gait_lost] == vrw.Outcome.STEPPED)
+    assert np.all(tuned.path.damping.values[~is_gait_lost] <= float(tuned.params.damping))
     assert 219.0 < float(tuned.params.damping) < 220.0
     assert 0.0 < float(tuned.cycle.indicators.lambda_4) < 1e-3
 
@@ -333,12 +333,10 @@ def test_unilateral_tuning_keeps_the_slip_within_its_bound():
     start = vrw.WheelParams(damping=280.0)
     given = {"slip": (0.0, 0.06), "speed": 0.1}
     problem = make_tune_problem(start, "dls_fraction", ["damping"], bounds, given, model=ground)
-    values_here = problem.evaluate_trial(problem.normalized_start, None)
-    ends = [
-        problem.evaluate_trial(problem.normalized_start + d, values_here) for d in (1e-3, -1e-3)
-    ]
+    trial = problem.evaluate_trial(problem.normalized_start, None)
+    ends = [problem.evaluate_trial(problem.normalized_start + d, trial) for d in (1e-3, -1e-3)]
     np.testing.assert_allclose(
-        values_here.slack_jacobian[:, 0],
+        trial.slack_jacobian[:, 0],
         (ends[0].constraint_slacks - ends[1].constraint_slacks) / 2e-3,
         rtol=1e-4,
     )

@@ -99,8 +99,8 @@ def test_energy_falls_from_step_to_step_by_what_the_step_lost(sampled_walk: xr.D
     ends = [float(total[sampled_walk.step.values == k][-1]) for k in range(N_STEPS)]
     x = vrw.step(PARAMS, START, model=GROUND_MODEL).section_state
     step = vrw.step(PARAMS, x, model=GROUND_MODEL)
-    lost_values = step.energy_impacts + step.energy_damping + step.energy_friction
-    assert ends[0] - ends[1] == pytest.approx(float(lost_values), abs=1e-8)
+    energy_loss = step.energy_impacts + step.energy_damping + step.energy_friction
+    assert ends[0] - ends[1] == pytest.approx(float(energy_loss), abs=1e-8)
 
 
 def test_forces_match_the_contact_mode(sampled_walk: xr.Dataset) -> None:

@@ -103,24 +103,24 @@ def test_between_collisions_energy_falls_by_the_work_of_the_dampers(
 ) -> None:
     params = vrw.WheelParams()
     for part in _phases(sampled_walk):
-        lost_values = float(part.total_energy[0] - part.total_energy[-1])
+        energy_loss = float(part.total_energy[0] - part.total_energy[-1])
         rates = part.dL1.values**2 + part.dL2.values**2
-        used_values = _integral(float(params.damping) * rates, part.time.values)
-        assert lost_values == pytest.approx(used_values, abs=1e-7)
+        damper_work = _integral(float(params.damping) * rates, part.time.values)
+        assert energy_loss == pytest.approx(damper_work, abs=1e-7)
         assert part.damping_power.values == pytest.approx(200.0 * rates, abs=1e-12)
 
 
 def test_total_energy_jumps_only_in_the_two_collisions_and_by_their_losses(
     sampled_walk: xr.Dataset,
 ) -> None:
-    lost_values = vrw.step(vrw.WheelParams(), STEADY_STATE).energy
+    collision_losses = vrw.step(vrw.WheelParams(), STEADY_STATE).energy
     parts = _phases(sampled_walk)
     jumps = [
         float(before.total_energy[-1] - after.total_energy[0]) for before, after in pairwise(parts)
     ]
     assert jumps[0::3] == pytest.approx([0.0] * 3, abs=1e-8)
-    assert jumps[1::3] == pytest.approx([float(lost_values.stopper)] * 3, abs=1e-7)
-    assert jumps[2::3] == pytest.approx([float(lost_values.landing)] * 2, abs=1e-6)
+    assert jumps[1::3] == pytest.approx([float(collision_losses.stopper)] * 3, abs=1e-7)
+    assert jumps[2::3] == pytest.approx([float(collision_losses.landing)] * 2, abs=1e-6)
 
 
 def test_ground_forces_and_weight_are_the_rate_of_total_momentum(sampled_walk: xr.Dataset) -> None:

@@ -196,11 +196,11 @@ def test_each_foot_keeps_the_friction_of_its_landing():
     np.testing.assert_allclose(friction, FRICTIONS)
     np.testing.assert_allclose(others, (0.7, 0.7, 0.5, 0.9))
     np.testing.assert_allclose(tilt, (0.03, -0.06, 0.04, 0.0), atol=1e-15)
-    both_values, rear = (
+    slots_of_two_feet, rear = (
         find_contact_slots(jnp.arange(8) < 2),
         find_contact_slots(jnp.arange(8) == 1),
     )
-    assert [float(x) for x in select_slot_friction((0.7, 0.5), both_values)] == [0.7, 0.5]
+    assert [float(x) for x in select_slot_friction((0.7, 0.5), slots_of_two_feet)] == [0.7, 0.5]
     assert [float(x) for x in select_slot_friction((0.7, 0.5), rear)] == [0.5, 0.5]
 
 

@@ -63,13 +63,13 @@ def grid(**outside):
 
 def test_a_dataset_becomes_the_map():
     pytest.importorskip("anywidget", reason="widgets are anywidget's")
-    shown_values = vrw.explore(dataset=grid()).map
-    assert [axis["name"] for axis in shown_values["axes"]] == ["damping", "slope"]
-    assert shown_values["measures"]["speed"] == [
+    page_map = vrw.explore(dataset=grid()).map
+    assert [axis["name"] for axis in page_map["axes"]] == ["damping", "slope"]
+    assert page_map["measures"]["speed"] == [
         [None, 2.0, 4.0],
         [1.0, 3.0, 5.0],
     ]  # rows: of the slope
-    assert shown_values["measures"]["locked_stopper_force"][0] == [
+    assert page_map["measures"]["locked_stopper_force"][0] == [
         0.0,
         12.0,
         24.0,

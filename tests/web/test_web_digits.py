@@ -271,7 +271,7 @@ def assert_same_unilateral_steps(n, n_legs):
         for i in others:  # steps of hundreds of events: a start's last bit moves both about so far
             near = np.repeat(state[:, i : i + 1], 64, 1)
             near[:4] *= 1.0 + EPS * np.random.default_rng(i).integers(-1, 2, (4, 64))
-            values_here, ends, values_there, known_ends = both(
+            page_states, ends, library_states, known_ends = both(
                 np.repeat(wheels[:, i : i + 1], 64, 1), near
             )
             if outcome[i] not in known_ends:
@@ -279,8 +279,8 @@ def assert_same_unilateral_steps(n, n_legs):
                     make_wheels(wheels[:, i : i + 1], n_legs), model, state[:, i : i + 1].T
                 )
             if is_active[i] and expected[i] == 0:
-                spread = np.ptp(values_here[:, ends == 0], 1) + np.ptp(
-                    values_there[:, known_ends == 0], 1
+                spread = np.ptp(page_states[:, ends == 0], 1) + np.ptp(
+                    library_states[:, known_ends == 0], 1
                 )
                 assert np.all(
                     np.abs(numbers - known_values)[:, i]
@@ -323,10 +323,12 @@ def test_all_measures_of_a_unilateral_step_equal_the_librarys():
     assert rows.shape[1] == len(trajectory["time"])
     names = "hub_x", "hub_z", "theta", *["length"] * n_legs
     for i, name in enumerate(names):
-        own_values = trajectory[name].values
+        variable_values = trajectory[name].values
         assert (
             compute_relative_difference(
-                rows[i], own_values[:, i - 3] if own_values.ndim == 2 else own_values, 1.0
+                rows[i],
+                variable_values[:, i - 3] if variable_values.ndim == 2 else variable_values,
+                1.0,
             )
             < SAME_TOLERANCE
         ), name

@@ -54,18 +54,18 @@ def record_requests(address, complaints):
 @pytest.fixture
 def page(browser):
     """Return the page, opened from its file; any console message fails the test."""
-    shown_values, complaints = browser.new_page(), []
-    shown_values.on("pageerror", lambda error: complaints.append(str(error)))
-    shown_values.on(
+    browser_page, complaints = browser.new_page(), []
+    browser_page.on("pageerror", lambda error: complaints.append(str(error)))
+    browser_page.on(
         "console", lambda said: complaints.append(said.text) if said.type == "error" else None
     )
-    shown_values.on(
+    browser_page.on(
         "request", lambda asked: complaints.append(asked.url) if asked.url[:4] == "http" else None
     )
-    shown_values.goto(PAGE_PATH.as_uri())
-    shown_values.evaluate("vrw.ready")
-    yield shown_values
-    shown_values.close()
+    browser_page.goto(PAGE_PATH.as_uri())
+    browser_page.evaluate("vrw.ready")
+    yield browser_page
+    browser_page.close()
     assert not complaints
 
 
@@ -131,9 +131,9 @@ def test_rigid_legs_move_as_in_the_library(page, held):
         if np.ndim(value) == 0 and name in result["measures"]:
             assert abs(result["measures"][name] - float(value)) < 1e-9 * (1.0 + abs(value)), name
     trace = vrw.simulate(params, x, n_steps=1, n_samples=24, model=model)
-    [shown_values] = result["steps"]
+    [step] = result["steps"]
     for row, name in (("times", "time"), (0, "theta"), (7, "lambda_2")):
-        values_array = np.array(shown_values[row] if row == "times" else shown_values["rows"][row])
+        values_array = np.array(step[row] if row == "times" else step["rows"][row])
         assert np.max(np.abs(values_array - trace[name].values[-24:])) < 1e-8, name
 
 
@@ -196,17 +196,17 @@ def test_insufficient_friction_is_reported(page):
 
 
 def test_a_wheel_can_be_sent_as_an_address(browser):
-    shown_values = browser.new_page()
-    shown_values.goto(PAGE_PATH.as_uri() + "#damping=40&n_legs=8")
-    shown_values.evaluate("vrw.ready")
-    assert "scuffs" in shown_values.inner_text("#verdict")
-    shown_values.goto("about:blank")
-    shown_values.goto(PAGE_PATH.as_uri() + "#n_legs=10")
-    shown_values.evaluate("vrw.ready")
-    assert "ten legs" in shown_values.inner_text("header")
-    assert shown_values.evaluate("vrw.state.result.measures.locked_stopper_force === undefined")
-    assert shown_values.evaluate("'locked_stopper_force[10]' in vrw.state.result.measures")
-    shown_values.close()
+    browser_page = browser.new_page()
+    browser_page.goto(PAGE_PATH.as_uri() + "#damping=40&n_legs=8")
+    browser_page.evaluate("vrw.ready")
+    assert "scuffs" in browser_page.inner_text("#verdict")
+    browser_page.goto("about:blank")
+    browser_page.goto(PAGE_PATH.as_uri() + "#n_legs=10")
+    browser_page.evaluate("vrw.ready")
+    assert "ten legs" in browser_page.inner_text("header")
+    assert browser_page.evaluate("vrw.state.result.measures.locked_stopper_force === undefined")
+    assert browser_page.evaluate("'locked_stopper_force[10]' in vrw.state.result.measures")
+    browser_page.close()
 
 
 def test_map_and_basin_are_drawn_and_the_marker_sets_the_wheel(page):
@@ -248,17 +248,17 @@ def test_nothing_is_clipped_and_every_element_has_a_name(page, size, scheme, tmp
     page.set_viewport_size({"width": width, "height": page.evaluate("document.body.scrollHeight")})
     folder = Path(os.environ.get("VRW_SCREENSHOTS", tmp_path))
     page.screenshot(path=folder / f"wheel_{size}_{scheme}.png", timeout=TIMEOUT_MILLISECONDS)
-    drawn_values = page.evaluate("""() => ["walk", "strips", "circle"].map((id) => {
+    canvas_fills = page.evaluate("""() => ["walk", "strips", "circle"].map((id) => {
       const canvas = document.getElementById(id), { width, height } = canvas;
       const dots = canvas.getContext("2d").getImageData(0, 0, width, height).data;
       return new Set(new Uint32Array(dots.buffer)).size;
     })""")
-    assert min(drawn_values) > 10
+    assert min(canvas_fills) > 10
 
 
 def test_the_frame_of_a_widget_exchanges_values_in_both_directions(browser):
-    shown_values = browser.new_page()
-    shown_values.set_content("<div id='cell'></div>")
+    browser_page = browser.new_page()
+    browser_page.set_content("<div id='cell'></div>")
     traits = {
         "page": PAGE_PATH.read_text(encoding="utf-8"),
         "height": 800,
@@ -268,7 +268,7 @@ def test_the_frame_of_a_widget_exchanges_values_in_both_directions(browser):
     traits["values"] = explorer._make_page_values(
         vrw.WheelParams(damping=150.0), 0.9, "viscoelastic"
     )
-    shown_values.evaluate(
+    browser_page.evaluate(
         """traits => {
           const listeners = {};
           window.model = {
@@ -282,33 +282,33 @@ def test_the_frame_of_a_widget_exchanges_values_in_both_directions(browser):
         traits,
     )
     render = explorer.WIDGET_JAVASCRIPT.replace("export default { render };", "")
-    shown_values.evaluate(
+    browser_page.evaluate(
         f"() => {{ {render}; render({{ model, el: document.getElementById('cell') }}) }}"
     )
-    shown_values.wait_for_function(
+    browser_page.wait_for_function(
         "model.get('measures').speed > 0 && model.get('values').damping === 150"
     )
-    result = shown_values.evaluate("model.get('measures')")
+    result = browser_page.evaluate("model.get('measures')")
     cycle = vrw.limit_cycle(vrw.WheelParams(damping=150.0))
     assert abs(result["speed"] - float(cycle.speed)) < 1e-8
-    shown_values.evaluate("model.fromPython('values', { ...model.get('values'), damping: 170 })")
-    shown_values.wait_for_function(
+    browser_page.evaluate("model.fromPython('values', { ...model.get('values'), damping: 170 })")
+    browser_page.wait_for_function(
         f"Math.abs(model.get('measures').speed - {result['speed']}) > 1e-4"
     )
-    inside = shown_values.frames[1]
+    inside = browser_page.frames[1]
     assert inside.input_value("#number-damping") == "170"
     inside.fill("#number-damping", "180")
     inside.locator("#number-damping").press("Tab")
-    shown_values.wait_for_function("model.get('values').damping === 180")
+    browser_page.wait_for_function("model.get('values').damping === 180")
     axes = [{"name": "damping", "values": [100, 150, 200]}, {"name": "slope", "values": [0.2, 0.3]}]
     given = {
         "axes": axes,
         "measures": {"speed": [[1, 2, None], [3, 4, 5]]},
         "outcome": [[0, 0, 3]] * 2,
     }
-    shown_values.evaluate("given => model.fromPython('map', given)", given)
+    browser_page.evaluate("given => model.fromPython('map', given)", given)
     inside.wait_for_function(
         "document.getElementById('map-state').innerText === 'From your dataset.'"
     )
     assert "fell back" in inside.inner_text("#map-legend")
-    shown_values.close()
+    browser_page.close()

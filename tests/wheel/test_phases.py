@@ -51,10 +51,12 @@ def make_state_at(index, distance=STATE_DISTANCE, stop_at_lift_off=True):
 def test_the_residual_vanishes_at_the_acceleration_and_is_linear_in_it(index):
     phase, q, v = make_state_at(index)
     motion = phase.compute_motion(q, v)
-    own_values = phase.solve_acceleration(motion)[: phase.n_dof]
-    np.testing.assert_allclose(phase.compute_dynamics_residual(motion, own_values), 0.0, atol=1e-12)
+    accelerations = phase.solve_acceleration(motion)[: phase.n_dof]
+    np.testing.assert_allclose(
+        phase.compute_dynamics_residual(motion, accelerations), 0.0, atol=1e-12
+    )
     shifted_rows = [
-        phase.compute_dynamics_residual(motion, tuple(a + k for a in own_values))
+        phase.compute_dynamics_residual(motion, tuple(a + k for a in accelerations))
         for k in (1.0, 2.0)
     ]
     assert np.min(np.abs(shifted_rows[0])) > 0.1
@@ -64,15 +66,15 @@ def test_the_residual_vanishes_at_the_acceleration_and_is_linear_in_it(index):
 @each
 def test_dependent_coordinates_follow_those_of_the_phase(index):
     phase, q, v = make_state_at(index)
-    own_values = phase.solve_acceleration(phase.compute_motion(q, v))[: phase.n_dof]
+    accelerations = phase.solve_acceleration(phase.compute_motion(q, v))[: phase.n_dof]
     evaluate_along = lambda q, v: jnp.stack(phase.compute_motion(q, v))
-    motion, rates = jax.jvp(evaluate_along, (q, v), (v, own_values))
+    motion, rates = jax.jvp(evaluate_along, (q, v), (v, accelerations))
     m = phase.compute_motion(q, v)
     np.testing.assert_allclose(
         rates[:2], [m.cos_theta * m.dtheta, -m.sin_theta * m.dtheta], rtol=1e-14
     )
     np.testing.assert_allclose(rates[2:4], motion[5:], rtol=1e-12, atol=1e-15)
-    for complete in (phase.complete_acceleration(m, own_values), phase.solve_acceleration(m)):
+    for complete in (phase.complete_acceleration(m, accelerations), phase.solve_acceleration(m)):
         np.testing.assert_allclose(rates[4:], jnp.stack(complete), rtol=1e-12, atol=1e-14)
 
 
@@ -148,9 +150,9 @@ def test_the_outcome_of_a_phase_end_matches_its_guard(index):
     guards = jnp.arange(-1, len(phase.all_guard_outcomes), dtype=jnp.int32)
     expected = [Outcome.SOLVER_FAILED, *phase.all_guard_outcomes]
     np.testing.assert_array_equal(phase.select_guard_outcome(guards, guards > 99), expected)
-    late_values = phase.select_guard_outcome(guards, guards == -1)
+    outcome_after_timeout = phase.select_guard_outcome(guards, guards == -1)
     np.testing.assert_array_equal(
-        late_values, [Outcome.NO_TOUCHDOWN_IN_TIME, *phase.all_guard_outcomes]
+        outcome_after_timeout, [Outcome.NO_TOUCHDOWN_IN_TIME, *phase.all_guard_outcomes]
     )
 
 

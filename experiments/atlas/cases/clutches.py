@@ -116,8 +116,8 @@ def reference() -> tuple[np.ndarray, float]:
                 )
                 shares = zip(y, SHARES[mode], strict=False)
                 rates = [
-                    w + sum(a * s for a, s in zip(own_values, sums, strict=True))
-                    for w, own_values in shares
+                    w + sum(a * s for a, s in zip(torque_shares, sums, strict=True))
+                    for w, torque_shares in shares
                 ]
                 return [*rates, t]
 

@@ -91,12 +91,16 @@ EXACT_GAIT = ExactGait(
 
 def rows() -> Iterator[Row]:
     for gait in gaits(COMPASS):
-        for name, solution, own_values, result in zip(
+        for name, computed_coordinate, exact_coordinate, published_coordinate in zip(
             NAMES, gait.x, EXACT_GAIT.x, PUBLISHED_STATE, strict=True
         ):
-            yield make_row(gait.simulation, name, float(solution), own_values)
+            yield make_row(gait.simulation, name, float(computed_coordinate), exact_coordinate)
             yield make_row(
-                gait.simulation, f"{name}, as published", float(solution), result, digits=4
+                gait.simulation,
+                f"{name}, as published",
+                float(computed_coordinate),
+                published_coordinate,
+                digits=4,
             )
         yield make_row(gait.simulation, "period", gait.duration, EXACT_GAIT.period)
         radius = abs(EXACT_GAIT.multipliers[0])

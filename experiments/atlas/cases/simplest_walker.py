@@ -70,16 +70,28 @@ def rows() -> Iterator[Row]:
             ("real", first.real, reference.real),
             ("imaginary", abs(first.imag), reference.imag),
         )
-        for name, solution, own_values, result in zip(
+        for name, computed_value, exact_value, published_value in zip(
             ("stance angle", "its rate"), gait.x, EXACT_GAIT.x, LONG_PERIOD_GAIT, strict=True
         ):
-            yield make_row(walk_result, name, float(solution), own_values)
-            yield make_row(walk_result, f"{name}, as published", float(solution), result, digits=13)
+            yield make_row(walk_result, name, float(computed_value), exact_value)
+            yield make_row(
+                walk_result,
+                f"{name}, as published",
+                float(computed_value),
+                published_value,
+                digits=13,
+            )
         yield make_row(walk_result, "period", gait.duration, EXACT_GAIT.period)
-        for (name, solution, own_values), result in zip(parts, PAIR, strict=True):
+        for (name, computed_value, exact_value), published_value in zip(parts, PAIR, strict=True):
             name = f"multipliers, {name} part"
-            yield make_row(walk_result, name, float(solution), own_values)
-            yield make_row(walk_result, f"{name}, as published", float(solution), result, digits=6)
+            yield make_row(walk_result, name, float(computed_value), exact_value)
+            yield make_row(
+                walk_result,
+                f"{name}, as published",
+                float(computed_value),
+                published_value,
+                digits=6,
+            )
 
 
 def draw(figure: Figure, rows: list[dict[str, str]]) -> None:

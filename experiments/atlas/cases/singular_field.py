@@ -49,8 +49,13 @@ def draw(figure: Figure, rows: list[dict[str, str]]) -> None:
         walks = [method(root(level), (1.0,), 1, 1.5) for level in levels]
         errors = [error(w, level) for w, level in zip(walks, levels, strict=True)]
         line = axes.loglog(levels, errors, marker + "-", ms=4, label=walks[0].method)
-        lost_values = levels[np.isnan(errors)]
-        axes.loglog(lost_values, np.full(len(lost_values), 1.0), "x", color=line[0].get_color())
+        levels_without_result = levels[np.isnan(errors)]
+        axes.loglog(
+            levels_without_result,
+            np.full(len(levels_without_result), 1.0),
+            "x",
+            color=line[0].get_color(),
+        )
     axes.set_xlabel("guard's distance from the pole")
     axes.set_ylabel("error of the time (×: no event)")
     axes.legend()

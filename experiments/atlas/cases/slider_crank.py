@@ -73,11 +73,11 @@ def generalized_contact_force(y: Numbers, m: Any, transverse_part: float, face: 
 
 def solve_mass_matrix(y: Numbers, m: Any, force: Numbers) -> tuple:
     """Return accelerations for given forces, or jumps of rates for given impulses."""
-    both_values = COUPLING_INERTIA * m.cos(y[1] - y[0])
-    scale = 1.0 / (CRANK_SELF * ROD_SELF - both_values * both_values)
+    coupling = COUPLING_INERTIA * m.cos(y[1] - y[0])
+    scale = 1.0 / (CRANK_SELF * ROD_SELF - coupling * coupling)
     return (
-        scale * (ROD_SELF * force[0] - both_values * force[1]),
-        scale * (CRANK_SELF * force[1] - both_values * force[0]),
+        scale * (ROD_SELF * force[0] - coupling * force[1]),
+        scale * (CRANK_SELF * force[1] - coupling * force[0]),
         force[2] / SLIDER_INERTIA,
     )
 

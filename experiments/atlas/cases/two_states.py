@@ -50,12 +50,12 @@ def reference() -> np.ndarray:
         y1, y2, time, result = mpmath.mpf(START[0]), mpmath.mpf(START[1]), mpmath.mpf(0), []
         for (c2, c4, level), _ in zip(itertools.cycle(LEVELS), range(EVENTS), strict=False):
             c2, c4, level = map(mpmath.mpf, (c2, c4, level))
-            own_values = fast / (fast - slow) * (y2 - c4)  # of the slow exponential in y1
-            value_at = lambda t, y1=y1, own_values=own_values, c2=c2, c4=c4: (
-                c4 + c2 + own_values * mpmath.exp(-slow * t)
-                + (y1 - c4 - c2 - own_values) * mpmath.exp(-fast * t)
+            slow_amplitude = fast / (fast - slow) * (y2 - c4)  # of the slow exponential in y1
+            value_at = lambda t, y1=y1, slow_amplitude=slow_amplitude, c2=c2, c4=c4: (
+                c4 + c2 + slow_amplitude * mpmath.exp(-slow * t)
+                + (y1 - c4 - c2 - slow_amplitude) * mpmath.exp(-fast * t)
             )  # fmt: skip
-            first = -mpmath.log((level - c4 - c2) / own_values) / slow
+            first = -mpmath.log((level - c4 - c2) / slow_amplitude) / slow
             t = mpmath.findroot(
                 lambda t, value_at=value_at, level=level: value_at(t) - level, first
             )
@@ -68,8 +68,8 @@ def reference() -> np.ndarray:
 def walks() -> Iterator[MethodRun]:
     many = {"first_step": 1e-7, "max_solver_steps": 4_000_000}
     yield run_library(SYSTEM, START, EVENTS, 5.0, **many)
-    few_items = run_library(SYSTEM, START, EVENTS, 5.0, first_step=1e-7)
-    yield few_items._replace(method="ours, 20,000 steps")
+    simulation = run_library(SYSTEM, START, EVENTS, 5.0, first_step=1e-7)
+    yield simulation._replace(method="ours, 20,000 steps")
     implicit = run_library(SYSTEM, START, EVENTS, 5.0, solver="Kvaerno5", tolerance=1e-10)
     yield implicit._replace(method="ours, implicit")
     yield run_diffrax(SYSTEM, START, EVENTS, 5.0, solver="Kvaerno5", tolerance=1e-10)

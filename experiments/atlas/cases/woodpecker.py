@@ -170,16 +170,20 @@ EXACT_GAIT = ExactGait(
 
 def rows() -> Iterator[Row]:
     for gait in gaits(CYCLE):
-        for name, solution, own_values, result in zip(
+        for name, computed_value, exact_value, published_value in zip(
             ("rate of the sleeve", "rate of the bird"),
             gait.x,
             EXACT_GAIT.x,
             PUBLISHED_RATES,
             strict=True,
         ):
-            yield make_row(gait.simulation, name, float(solution), own_values)
+            yield make_row(gait.simulation, name, float(computed_value), exact_value)
             yield make_row(
-                gait.simulation, f"{name}, as published", float(solution), result, digits=2
+                gait.simulation,
+                f"{name}, as published",
+                float(computed_value),
+                published_value,
+                digits=2,
             )
         yield make_row(gait.simulation, "period", gait.duration, EXACT_GAIT.period)
         radius = abs(EXACT_GAIT.multipliers[0])

@@ -33,12 +33,12 @@ def ends_of_steps(plant: Any, state: list[float], accuracy: float, **changed: fl
     context.get_mutable_continuous_state_vector().SetFromVector(state)
     context.SetAccuracy(accuracy)  # of where a witness is isolated
     simulator.get_mutable_integrator().set_target_accuracy(accuracy)
-    observed_values: list = []
+    contacts: list = []
 
     def record_event(context: Any) -> Any:
         toe = context.get_discrete_state(0).GetAtIndex(0)
         numbers = context.get_continuous_state_vector().CopyToVector()
-        observed_values.append((toe, context.get_time(), [float(x) for x in numbers]))
+        contacts.append((toe, context.get_time(), [float(x) for x in numbers]))
         return EventStatus.DidNothing()
 
     simulator.set_monitor(record_event)
@@ -46,8 +46,8 @@ def ends_of_steps(plant: Any, state: list[float], accuracy: float, **changed: fl
     began = time.process_time()
     simulator.AdvanceTo(0.9 * STEPS)
     seconds = time.process_time() - began
-    ends = [a[1:] for a, b in itertools.pairwise(observed_values) if a[0] != b[0]]
-    return [ends, len(observed_values), seconds]
+    ends = [a[1:] for a, b in itertools.pairwise(contacts) if a[0] != b[0]]
+    return [ends, len(contacts), seconds]
 
 
 def compute_drake_values(accuracy: float) -> list[dict]:
