@@ -89,10 +89,10 @@ class Mechanism:
                     angle, rate = y[3 * body + 2], y[3 * body + 11]
                     reach = lengths[body]  # of its end, or start, from its middle
                     row[3 * body + axis] += sign
-                    tangential_part = cos(angle) if axis == 0 else sin(angle)
+                    direction_cosine = cos(angle) if axis == 0 else sin(angle)
                     transverse_part = -sin(angle) if axis == 0 else cos(angle)
                     row[3 * body + 2] += reach * transverse_part
-                    bend -= reach * tangential_part * rate * rate
+                    bend -= reach * direction_cosine * rate * rate
                 rows.append(row)
                 bends.append(bend)
         return rows, bends
@@ -144,12 +144,12 @@ class Mechanism:
         rates, sizes = self.solve_constraints(y, face, self.weight, bends, open_)
         return y[9:] + rates, sizes
 
-    def apply_impact(self, y: Row, face: int, retained: mpf) -> tuple[Row, Row]:
+    def apply_impact(self, y: Row, face: int, restitution: mpf) -> tuple[Row, Row]:
         """Past an impact of both corners, and their impulses."""
         _, normals, _, _ = self.corners(y, face)
         rates = [sum(n * v for n, v in zip(normal, y[9:], strict=True)) for normal in normals]
         jumps, sizes = self.solve_constraints(
-            y, face, [mpf(0)] * 9, [mpf(0)] * 6, [-(1 + retained) * rate for rate in rates]
+            y, face, [mpf(0)] * 9, [mpf(0)] * 6, [-(1 + restitution) * rate for rate in rates]
         )
         return y[:9] + [v + jump for v, jump in zip(y[9:], jumps, strict=True)], sizes
 
@@ -161,15 +161,15 @@ def extrapolate_step(field: Callable[[Row], Row], y: Row, length: mpf) -> Row:
     for level in range(1, LEVELS + 1):
         n = 2 * level
         h = length / n
-        before, current_value = y, [a + h * b for a, b in zip(y, first, strict=True)]
+        before, state = y, [a + h * b for a, b in zip(y, first, strict=True)]
         for _ in range(n - 1):
-            rate = field(current_value)
-            before, current_value = (
-                current_value,
+            rate = field(state)
+            before, state = (
+                state,
                 [a + 2 * h * b for a, b in zip(before, rate, strict=True)],
             )
-        rate = field(current_value)
-        entry = [(a + b + h * c) / 2 for a, b, c in zip(before, current_value, rate, strict=True)]
+        rate = field(state)
+        entry = [(a + b + h * c) / 2 for a, b, c in zip(before, state, rate, strict=True)]
         line = [entry]
         for k in range(1, level):
             ratio = (mpf(level) / (level - k)) ** 2 - 1
@@ -198,13 +198,13 @@ def integrate_until(field: Callable, value: Callable, y: Row, length: mpf) -> Ev
     near = mpf("0.9") * length
     low, high = (near, value(extrapolate_step(field, y, near))), (length, value(after))
     for _ in range(60):
-        value_at = high[0] - high[1] * (high[0] - low[0]) / (high[1] - low[1])
-        if abs(value_at - high[0]) < STEP_TOLERANCE * STEP:
+        root = high[0] - high[1] * (high[0] - low[0]) / (high[1] - low[1])
+        if abs(root - high[0]) < STEP_TOLERANCE * STEP:
             break
-        low, high = high, (value_at, value(extrapolate_step(field, y, value_at)))
+        low, high = high, (root, value(extrapolate_step(field, y, root)))
         if low[1] == high[1]:
             break
-    return EventState(time + value_at, extrapolate_step(field, y, value_at))
+    return EventState(time + root, extrapolate_step(field, y, root))
 
 
 def simulate_bounces(bounces: int = 60) -> dict[str, mpf]:

@@ -152,17 +152,17 @@ def long_walk(rows: list[Row]) -> Figure:
 def between(rows: list[Row]) -> Figure:
     """Share of other outcomes, and the times' largest difference, next to borders of outcomes."""
     figure = Figure(figsize=(PAGE_FIGURE_WIDTH_INCHES, 3.4))
-    left_part, right = figure.subplots(1, 2)
+    left_axes, right_axes = figure.subplots(1, 2)
     result = summarize_by_border(rows)
     for row in result:
         row["border"] = ", ".join(map(describe_outcome, row["border"].split(" | ")))
-    curves(left_part, result, "border", "distance", "share")
-    curves(right, result, "border", "distance", "time_difference_s")
-    left_part.set(xlabel="relative distance to the border", ylabel="share with another outcome")
-    right.set(
+    curves(left_axes, result, "border", "distance", "share")
+    curves(right_axes, result, "border", "distance", "time_difference_s")
+    left_axes.set(xlabel="relative distance to the border", ylabel="share with another outcome")
+    right_axes.set(
         xlabel="relative distance to the border", ylabel="largest difference of durations [s]"
     )
-    handles = left_part.get_legend_handles_labels()
+    handles = left_axes.get_legend_handles_labels()
     figure.legend(*handles, loc="outside lower center", ncols=2, fontsize=6)
     return figure
 
@@ -174,7 +174,7 @@ def describe_outcome(outcome: str) -> str:
 
 def summarize_by_border(rows: list[Row]) -> list[Row]:
     """Both kinds of cases and both sides together; borders met fewer than five times left out."""
-    result_list = []
+    table_rows = []
     for border, selection in group_rows(rows, "border").items():
         for distance, rows_at_distance in group_rows(selection, "distance").items():
             names = ("cases", "other_outcome", "other_by_diffrax", "stepped")
@@ -182,7 +182,7 @@ def summarize_by_border(rows: list[Row]) -> list[Row]:
                 int(read_column(rows_at_distance, n).sum()) for n in names
             )
             if cases >= 10:  # five borders, two sides each
-                result_list.append(
+                table_rows.append(
                     {
                         "border": border,
                         "distance": distance,
@@ -193,7 +193,7 @@ def summarize_by_border(rows: list[Row]) -> list[Row]:
                         "time_difference_s": f"{max(read_column(rows_at_distance, 'time_difference_s')):.1e}",  # noqa: E501
                     }
                 )
-    return result_list
+    return table_rows
 
 
 def corners(rows: list[Row]) -> str:
@@ -235,23 +235,23 @@ def limits(rows: list[Row]) -> str:
 def first_order(rows: list[Row]) -> Figure:
     """Error and cost of a leg of first order over c/m."""
     figure = Figure(figsize=(PAGE_FIGURE_WIDTH_INCHES, 2.8))
-    left_part, right = figure.subplots(1, 2)
-    curves(left_part, rows, "leg", "c_over_m", "error", "leg: {}")
+    left_axes, right = figure.subplots(1, 2)
+    curves(left_axes, rows, "leg", "c_over_m", "error", "leg: {}")
     curves(right, rows, "leg", "c_over_m", "us_per_gait")
-    left_part.set(xlabel=r"$c/m$ [s$^{-1}$]", ylabel="error of state and durations")
+    left_axes.set(xlabel=r"$c/m$ [s$^{-1}$]", ylabel="error of state and durations")
     right.set(xlabel=r"$c/m$ [s$^{-1}$]", ylabel="CPU time per gait [µs]")
-    left_part.legend()
+    left_axes.legend()
     return figure
 
 
 def slowing(rows: list[Row]) -> Figure:
     """Period, and error of the period by each method, over the distance to the stop."""
     figure = Figure(figsize=(PAGE_FIGURE_WIDTH_INCHES, 2.8))
-    left_part, right = figure.subplots(1, 2)
+    left_axes, right = figure.subplots(1, 2)
     x, period, rate = (read_column(rows, name) for name in ("distance", "period_s", "upright_rate"))
-    left_part.semilogx(x, period, "o", ms=3.5, color=COLOURS[0], label="gait, by isolated roots")
+    left_axes.semilogx(x, period, "o", ms=3.5, color=COLOURS[0], label="gait, by isolated roots")
     line = period[-1] - np.log(x / x[-1]) / rate[-1]
-    left_part.semilogx(x, line, "--", color="0.4", lw=1.0, label="slope −1/rate of falling upright")
+    left_axes.semilogx(x, line, "--", color="0.4", lw=1.0, label="slope −1/rate of falling upright")
     for (name, result), colour, marker in zip(
         {
             "default": "limit cycle, defaults",
@@ -265,11 +265,11 @@ def slowing(rows: list[Row]) -> Figure:
         error = read_column(rows, f"{name}_period_error")
         look = {"color": colour, "marker": marker, "ms": 3.5, "lw": 0.9}
         right.loglog(x, error, label=result, **look)
-    left_part.set(xlabel="slope minus the least slope of a gait [rad]", ylabel="period [s]")
+    left_axes.set(xlabel="slope minus the least slope of a gait [rad]", ylabel="period [s]")
     right.set(
         xlabel="slope minus the least slope of a gait [rad]", ylabel="relative error of the period"
     )
-    for axes in (left_part, right):
+    for axes in (left_axes, right):
         axes.grid(color="0.9", lw=0.4)
         axes.legend()
     return figure
@@ -340,14 +340,14 @@ def meeting(rows: list[Row]) -> Figure:
 def modes(rows: list[Row]) -> Figure:
     """Error and cost of a gait's derivative, implicit and through n steps."""
     figure = Figure(figsize=(PAGE_FIGURE_WIDTH_INCHES, 2.8))
-    left_part, right = figure.subplots(1, 2)
+    left_axes, right = figure.subplots(1, 2)
     walk_rows = [row for row in rows if row["steps"] != "0"]
-    curves(left_part, walk_rows, "way", "steps", "median_error")
+    curves(left_axes, walk_rows, "way", "steps", "median_error")
     curves(right, walk_rows, "way", "steps", "ms")
     for row, line in zip([row for row in rows if row["steps"] == "0"], ("--", ":"), strict=True):
-        for axes, name in ((left_part, "median_error"), (right, "ms")):
+        for axes, name in ((left_axes, "median_error"), (right, "ms")):
             axes.axhline(float(row[name]), color=COLOURS[2], ls=line, lw=1.2, label=row["way"])
-    left_part.set(
+    left_axes.set(
         xlabel="steps of the walk", ylabel="relative error of the period's derivative, median"
     )
     right.set(xlabel="steps of the walk", ylabel="CPU time per gait [ms]")
@@ -358,15 +358,15 @@ def modes(rows: list[Row]) -> Figure:
 def formulations(drift: list[Row], penalty: list[Row]) -> Figure:
     """Constraint drift over steps, and a penalty ground's error over its work."""
     figure = Figure(figsize=(PAGE_FIGURE_WIDTH_INCHES, 2.9))
-    left_part, right = figure.subplots(1, 2)
+    left_axes, right = figure.subplots(1, 2)
     for marker, name in zip("os^", dict.fromkeys(row["stabilised"] for row in drift), strict=True):
         selection = [row for row in drift if row["stabilised"] == name]
         gap = read_column(selection, "gap_m")
-        left_part.loglog(
+        left_axes.loglog(
             read_column(selection, "steps"), gap, f"{marker}-", ms=4, label=f"stabilised: {name}"
         )
-    left_part.set(xlabel="integrator steps", ylabel="largest gap of a held foot [m]")
-    left_part.legend()
+    left_axes.set(xlabel="integrator steps", ylabel="largest gap of a held foot [m]")
+    left_axes.legend()
     for marker, name in zip("os", dict.fromkeys(row["ground"] for row in penalty), strict=True):
         selection = [
             row for row in penalty if row["ground"] == name and row["outcome"] == "STEPPED"
@@ -380,7 +380,7 @@ def formulations(drift: list[Row], penalty: list[Row]) -> Figure:
     error_of = r"error of $\dot\theta$ [rad/s] and period [s], the larger"
     right.set(xlabel="evaluations per gait", ylabel=error_of)
     right.legend()
-    for axes in (left_part, right):
+    for axes in (left_axes, right):
         axes.xaxis.set_minor_formatter(NullFormatter())
         axes.grid(color="0.9", lw=0.4)
     return figure
@@ -411,14 +411,14 @@ def automatic(rows: list[Row]) -> str:
 
 def events(rows: list[Row]) -> list[Row]:
     """Count the cases by kind over all chunks."""
-    result_list = []
+    table_rows = []
     for kind, selection in group_rows(rows, "kind").items():
         pairs: dict[str, int] = {}
         for part in filter(None, "; ".join(row["ours/isolated"] for row in selection).split("; ")):
             pair, count = part.split(": ")
             pairs[pair] = pairs.get(pair, 0) + int(count)
         counts = ("cases", "stepped", "other_outcome", "late")
-        result_list.append(
+        table_rows.append(
             {"kind": kind}
             | {name: str(sum(int(row[name]) for row in selection)) for name in counts}
             | {
@@ -426,7 +426,7 @@ def events(rows: list[Row]) -> list[Row]:
             }
             | {"ours/isolated": "; ".join(f"{pair}: {n}" for pair, n in sorted(pairs.items()))}
         )
-    return result_list
+    return table_rows
 
 
 def dips(rows: list[Row]) -> list[Row]:

@@ -50,8 +50,8 @@ def chenciner_point(returned: Callable, x: np.ndarray, parameters: np.ndarray) -
         for v in vectors:
             parts = [(*p, (w, u)) for p in parts for w, u in ((1.0, v.real), (1j, v.imag))]
         columns = [np.array([p[min(i, len(p) - 1)][1] for p in parts]) for i in range(3)]
-        values_array = np.asarray(higher(x, k, *columns)[len(vectors) - 2])
-        return np.array([np.prod([w for w, _ in p]) for p in parts]) @ values_array
+        derivative_values = np.asarray(higher(x, k, *columns)[len(vectors) - 2])
+        return np.array([np.prod([w for w, _ in p]) for p in parts]) @ derivative_values
 
     def conditions(k: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
         """Return |multiplier| − 1 and the real part of the cubic coefficient, with state and
@@ -61,17 +61,19 @@ def chenciner_point(returned: Callable, x: np.ndarray, parameters: np.ndarray) -
         values, right = np.linalg.eig(matrix)
         place = np.argmax(values.imag)
         pair, q = values[place], right[:, place] / np.linalg.norm(right[:, place])
-        others, left_part = np.linalg.eig(matrix.T)
-        p = left_part[:, np.argmin(np.abs(others - pair.conj()))]
+        others, left_eigenvectors = np.linalg.eig(matrix.T)
+        p = left_eigenvectors[:, np.argmin(np.abs(others - pair.conj()))]
         p = p / np.vdot(p, q).conj()
         angle, one = float(np.angle(pair)), np.eye(len(value_at_2))
         turned = np.linalg.solve(np.exp(2j * angle) * one - matrix, form(value_at_2, k, q, q))
-        is_unfinished = np.linalg.solve(one - matrix, form(value_at_2, k, q, q.conj()))
-        cubic = form(value_at_2, k, q, q, q.conj()) + 2.0 * form(value_at_2, k, q, is_unfinished)
+        second_order_state = np.linalg.solve(one - matrix, form(value_at_2, k, q, q.conj()))
+        cubic = form(value_at_2, k, q, q, q.conj()) + 2.0 * form(
+            value_at_2, k, q, second_order_state
+        )
         cubic = cubic + form(value_at_2, k, q.conj(), turned)
         real = 0.5 * (np.exp(-1j * angle) * np.vdot(p, cubic)).real
         return np.array([abs(pair) - 1.0, real]), value_at_2, angle
 
     solution = root(lambda k: conditions(k)[0], parameters, tol=1e-14, options={"eps": 1e-12})
-    _, value_at, angle = conditions(solution.x)
-    return Point(solution.x, value_at, angle)
+    _, normal_form, angle = conditions(solution.x)
+    return Point(solution.x, normal_form, angle)

@@ -238,7 +238,7 @@ def growth() -> Rows:
     for damping in DAMPINGS:
         x = walk_by_isolated_roots(created, damping, start, 300)[-1]  # on the attractor
         params = vrw.WheelParams(damping=damping)
-        values_array, by_damping, by_start, lowest = x, np.zeros(3), np.eye(3), []
+        section_state, by_damping, by_start, lowest = x, np.zeros(3), np.eye(3), []
         size = 1e-5
         sides = {
             h: walk_by_isolated_roots(created, damping + h * size, x, N_GROWTH_STEPS)
@@ -248,15 +248,15 @@ def growth() -> Rows:
         far = (sides[2] - sides[-2]) / (4.0 * size)
         reference = (4.0 * near - far) / 3.0
         for count in range(1, N_GROWTH_STEPS + 1):
-            by_params, by_x = step(params, jnp.asarray(values_array))
+            by_params, by_x = step(params, jnp.asarray(section_state))
             by_x = np.asarray(by_x)
             by_damping = by_x @ by_damping + np.asarray(by_params.damping)
             by_start = by_x @ by_start
             _, rear = transitions.compute_landing_forces(
-                params.symbols(), transitions.resolve_landing(params.symbols(), *values_array)
+                params.symbols(), transitions.resolve_landing(params.symbols(), *section_state)
             )
             lowest.append(float(rear.normal))
-            values_array = np.asarray(vrw.return_map(params, values_array))
+            section_state = np.asarray(vrw.return_map(params, section_state))
             if count in SHOWN_STEP_COUNTS:
                 miss = np.max(np.abs(by_damping - reference[count - 1]))
                 yield {
@@ -323,10 +323,10 @@ def meeting() -> Rows:
         turned([[0, 0], [1, 0]]),
     )
     as_array = lambda matrix: jnp.asarray(np.array(matrix.tolist(), float))
-    value_at = lambda s: as_array(base) + s * as_array(change)
+    interpolate_matrix = lambda s: as_array(base) + s * as_array(change)
     measures = {
-        "radius": lambda s: floquet.compute_spectral_radius(value_at(s)),
-        "jury": lambda s: floquet.compute_jury_margins(value_at(s)),
+        "radius": lambda s: floquet.compute_spectral_radius(interpolate_matrix(s)),
+        "jury": lambda s: floquet.compute_jury_margins(interpolate_matrix(s)),
     }
     derive = {name: jax.jit(jax.jacfwd(measure)) for name, measure in measures.items()}
     for kind, sign in (("real", 1), ("complex", -1)):

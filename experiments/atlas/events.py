@@ -72,8 +72,8 @@ class Phase:
 
     def run(self, y: np.ndarray, parameters: tuple) -> tuple[Outcome, np.ndarray, float]:
         """Outcome, state and duration."""
-        values_array = np.array(parameters[: self.guards.nparams])
-        values = self.guards(y, pars=values_array) if len(values_array) else self.guards(y)
+        parameter_values = np.array(parameters[: self.guards.nparams])
+        values = self.guards(y, pars=parameter_values) if len(parameter_values) else self.guards(y)
         if np.any(values < 0.0):
             return self.outcomes[int(np.argmax(values < 0.0))], y, 0.0
         flow = self.flow

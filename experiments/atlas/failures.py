@@ -126,12 +126,12 @@ def format_page(rows: list[dict[str, str]], measured_names: Collection[str] = ()
         errors = [
             float(row["error"]) / float(row["condition"]) for row in select_exact_rows(selection)
         ]
-        result_list = [
+        method_cells = [
             "; ".join(m for m, verdict, *_ in methods if verdict == label)
             for label in VERDICT_LABELS.values()
         ]
         link = f"[{case.title}]({PROBLEMS.name}#{anchor(case.title)})"
-        results.append([link, *result_list, f"{max(errors):.0e}" if errors else "-"])
+        results.append([link, *method_cells, f"{max(errors):.0e}" if errors else "-"])
         origins.append([link, case.breaks, case.reference, case.source])
         header = ["method", "worst result", "correct", "worst quantity", "error", "report", "work",
                   "ms", "options; version"]  # fmt: skip

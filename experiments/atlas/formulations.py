@@ -170,7 +170,7 @@ def penalty() -> Iterator[dict[str, object]]:
             )
 
 
-def penalty_step(h: float, held_values: float) -> dict[str, object]:
+def penalty_step(h: float, min_count: float) -> dict[str, object]:
     """Semi-implicit Euler with springs and dampers at feet and stopper; `held` counts steps."""
     wheel, mass = Wheel(PARAMS), PARAMS["leg_mass"]
     k = mass * (RATIO / h) ** 2
@@ -184,8 +184,8 @@ def penalty_step(h: float, held_values: float) -> dict[str, object]:
         jacobian = np.array(equations.jacobian(q, wheel.pack))
         gap = np.array(equations.feet(q, wheel.pack)) - anchor
         force = -k * gap - c * jacobian @ v
-        lifted = lifted or (gap[3] > LIFT_OFF_HEIGHT and count >= held_values)
-        if lifted or (force[3] <= 0.0 and count >= held_values):
+        lifted = lifted or (gap[3] > LIFT_OFF_HEIGHT and count >= min_count)
+        if lifted or (force[3] <= 0.0 and count >= min_count):
             force[2:] = 0.0
         total = wheel.spring_damper(q, v) - np.array(equations.bias(q, v, wheel.pack))
         total = total + jacobian.T @ force

@@ -134,7 +134,7 @@ def _simulate_modes(
     """Simulate the modes one after another by another library, restarted as its documentation
     describes.
     """
-    mode, time, is_unfinished, work = 0, 0.0, 0, 0
+    mode, time, n_events_at_once, work = 0, 0.0, 0, 0
     y, says = np.asarray(start, float), ""
     times, states, edges = [], [], []
     while len(times) < events and not says:
@@ -147,8 +147,8 @@ def _simulate_modes(
         if solution.edge is None:
             says = solution.says or NO_EVENT
             break
-        is_unfinished = 0 if time + solution.duration > time else is_unfinished + 1
-        if is_unfinished > MAX_INSTANT_EVENTS:
+        n_events_at_once = 0 if time + solution.duration > time else n_events_at_once + 1
+        if n_events_at_once > MAX_INSTANT_EVENTS:
             says = "stands still (stopped here)"
             break
         edge = system[mode].edges[solution.edge]

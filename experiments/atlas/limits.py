@@ -52,12 +52,12 @@ def first_order_rates(s: Symbols, y: jax.Array, ddL2: jax.Array | float = 0.0) -
     Forces are linear in L2': with L2'' known the three rows of M q'' = f give theta'', L1'', L2'.
     """
     theta, L1, L2, dtheta, dL1 = y
-    value_at = lambda dL2: dynamics.compute_equation_terms(
+    evaluate_terms = lambda dL2: dynamics.compute_equation_terms(
         s, Motion.from_angle(theta, L1, L2, dtheta, dL1, dL2)
     )
     zero = 0.0 * theta
-    M, *rest = value_at(zero)
-    slope = [a - b for a, b in zip(value_at(zero + 1.0)[1:], rest, strict=True)]
+    M, *rest = evaluate_terms(zero)
+    slope = [a - b for a, b in zip(evaluate_terms(zero + 1.0)[1:], rest, strict=True)]
     rows = [[M.M11, M.M12, -slope[0]], [M.M12, M.M22, -slope[1]], [M.M13, M.M23, -slope[2]]]
     rows = [[zero + entry for entry in row] for row in rows]
     column = jnp.stack([M.M13 + zero, M.M23 + zero, M.M33 + zero])
@@ -83,12 +83,12 @@ def after_the_layer(s: Symbols, state: jax.Array, rates: Callable) -> jax.Array:
     zero = 0.0 * state[0]
     matrix = [[M.M11, M.M12, M.M13], [M.M12, M.M22, M.M23], [M.M13, M.M23, M.M33]]
     matrix = jnp.array([[zero + entry for entry in row] for row in matrix])
-    tangential_part = jnp.linalg.solve(matrix, jnp.array([0.0, 0.0, 1.0]))
+    leg_direction = jnp.linalg.solve(matrix, jnp.array([0.0, 0.0, 1.0]))
     y = state[:5]
     for _ in range(3):  # the slow value is that of the state left behind
         excess = state[5] - rates(y)[2]
-        jump = tangential_part * excess / tangential_part[2]
-        shifted = state[:3] + jump / (s.c * tangential_part[2])
+        jump = leg_direction * excess / leg_direction[2]
+        shifted = state[:3] + jump / (s.c * leg_direction[2])
         y = jnp.concatenate([shifted, state[3:5] - jump[:2]])
     return y
 
@@ -99,11 +99,11 @@ def step_with_leg(
     """Section state and durations, and solver steps and outcome of SLS-I, of a step."""
     s = params.symbols()
     landing = transitions.resolve_landing(s, *x)
-    values_array = jnp.asarray(True)
+    is_requested = jnp.asarray(True)
     phases = make_phases(s, landing.foot_distance, stop_at_lift_off=True)
     dls, sls1, sls2 = (make_diffrax_phase(phase, records_margins=False) for phase in phases)
     run = lambda phase, y: integrate_phase(
-        phase.vector_field, phase.guards, y, values_array, options
+        phase.vector_field, phase.guards, y, is_requested, options
     )
     first = run(dls, jnp.stack([landing.theta_after, landing.motion_after.dtheta]))
     m = dls.motion_unpacker(first.state)
@@ -119,7 +119,7 @@ def step_with_leg(
         def guards(y: jax.Array) -> jax.Array:
             return jnp.stack([s.L0 - y[2], compute_landing_foot_height(s, full(y)), y[3]])
 
-        second = integrate_phase(rates, MonitoredFunctions(guards, 3), start, values_array, options)
+        second = integrate_phase(rates, MonitoredFunctions(guards, 3), start, is_requested, options)
         motion = full(second.state)
     hit = transitions.resolve_stopper_collision(s, motion).motion_after
     third = run(sls2, jnp.stack([second.state[0], hit.L1, hit.dtheta, hit.dL1]))
@@ -253,10 +253,10 @@ def upright_rate(slope: float, start: np.ndarray) -> float:
     rises = np.diff(np.sign(np.asarray(jax.vmap(push)(jnp.asarray(places))))) > 0
     if not np.any(rises):
         return np.nan
-    value_at = places[np.flatnonzero(rises)[0]]
+    turning_angle = places[np.flatnonzero(rises)[0]]
     for _ in range(5):
-        value_at = value_at - push(value_at) / jax.grad(push)(value_at)
-    matrix = np.asarray(jax.jacfwd(field)(jnp.stack([value_at, 0.0 * value_at])))
+        turning_angle = turning_angle - push(turning_angle) / jax.grad(push)(turning_angle)
+    matrix = np.asarray(jax.jacfwd(field)(jnp.stack([turning_angle, 0.0 * turning_angle])))
     return float(np.max(np.linalg.eigvals(matrix).real))
 
 
@@ -271,9 +271,11 @@ def slowing() -> Rows:
         middle = 0.5 * (low + high)
         walks, end, _ = settle_walk(created, middle, near)
         low, high, near = (low, middle, end) if walks else (middle, high, near)
-    value_at = lambda slope: vrw.WheelParams(**SLOW_WALK_PARAMETERS, slope=slope)
+    make_wheel = lambda slope: vrw.WheelParams(**SLOW_WALK_PARAMETERS, slope=slope)
     meshes = {"default": vrw.CycleOptions(), "tight": vrw.CycleOptions.tight()}
-    guess = {name: vrw.limit_cycle(value_at(WALKS), options=mesh) for name, mesh in meshes.items()}
+    guess = {
+        name: vrw.limit_cycle(make_wheel(WALKS), options=mesh) for name, mesh in meshes.items()
+    }
     for distance in SLOPE_DISTANCES:
         slope = high + distance
         _, start, durations = settle_walk(created, slope, start)
@@ -285,7 +287,7 @@ def slowing() -> Rows:
             "upright_rate": f"{upright_rate(slope, start):.9g}",
         }
         for name, options in meshes.items():
-            cycle = vrw.limit_cycle(value_at(slope), guess=guess[name], options=options)
+            cycle = vrw.limit_cycle(make_wheel(slope), guess=guess[name], options=options)
             solution = bool(cycle.found)
             guess[name] = cycle if solution else guess[name]
             gap = np.max(np.abs(np.asarray(cycle.section_state) - start))
@@ -296,7 +298,7 @@ def slowing() -> Rows:
                 f"{name}_period_error": f"{missed:.1e}" if solution else "nan",
             }
         step = vrw.step(
-            value_at(slope),
+            make_wheel(slope),
             start,
             options=vrw.StepOptions(max_phase_time=MAX_DOUBLE_SUPPORT_SECONDS),
         )
@@ -356,14 +358,14 @@ def between() -> Rows:
                     for pair in zip(codes_low, codes_high, strict=True)
                 ]
                 for pair in sorted(set(pairs)):
-                    values_array = np.array([one == pair for one in pairs])
+                    has_outcome_pair = np.array([one == pair for one in pairs])
                     yield {
                         "kind": kind,
                         "border": " | ".join(pair),
                         "distance": f"{distance:.0e}",
-                        "cases": int(values_array.sum()),
-                        "other_outcome": int((values_array & (mine != result)).sum()),
-                        "other_by_diffrax": int((values_array & (other != result)).sum()),
-                        "stepped": int((values_array & step_result).sum()),
-                        "time_difference_s": f"{np.max(gap[values_array & step_result], initial=0.0):.1e}",  # noqa: E501
+                        "cases": int(has_outcome_pair.sum()),
+                        "other_outcome": int((has_outcome_pair & (mine != result)).sum()),
+                        "other_by_diffrax": int((has_outcome_pair & (other != result)).sum()),
+                        "stepped": int((has_outcome_pair & step_result).sum()),
+                        "time_difference_s": f"{np.max(gap[has_outcome_pair & step_result], initial=0.0):.1e}",  # noqa: E501
                     }

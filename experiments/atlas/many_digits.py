@@ -47,9 +47,12 @@ def compute_jacobian(result: ReturnMap, x: mpmath.matrix, step: mpf) -> mpmath.m
     columns = []
     for k in range(len(x)):
         shift = mpmath.matrix([DIFFERENCE if i == k else 0 for i in range(len(x))])
-        value_at = lambda n, shift=shift: compute_return_map(result, list(x + n * shift), step)[0]
+        displaced_end = lambda n, shift=shift: compute_return_map(
+            result, list(x + n * shift), step
+        )[0]
         columns.append(
-            (8 * (value_at(1) - value_at(-1)) - value_at(2) + value_at(-2)) / (12 * DIFFERENCE)
+            (8 * (displaced_end(1) - displaced_end(-1)) - displaced_end(2) + displaced_end(-2))
+            / (12 * DIFFERENCE)
         )
     return mpmath.matrix([[column[i] for column in columns] for i in range(len(x))])
 

@@ -83,11 +83,15 @@ def main() -> None:
         for name, rows in MAPS.items():
             if chosen.redraw or chosen.only not in (None, name):
                 continue
-            retained = len(read_table(select_table(name))) if select_table(name).exists() else 0
+            n_stored_rows = (
+                len(read_table(select_table(name))) if select_table(name).exists() else 0
+            )
             if name in GO_ON:
-                write_table(name, rows(GO_ON[name] * chosen.cases, retained), append=retained > 0)
+                write_table(
+                    name, rows(GO_ON[name] * chosen.cases, n_stored_rows), append=n_stored_rows > 0
+                )
                 measured_names.append(name)
-            elif retained == 0:
+            elif n_stored_rows == 0:
                 write_table(name, rows())
                 measured_names.append(name)
     tables = {name: select_table(name) for name in MAPS}

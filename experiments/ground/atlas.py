@@ -89,10 +89,10 @@ def follow_branches() -> list[Row]:
     for damping, speed, branch in zip(BRANCH_DAMPINGS, slow_gaits.speed, branches, strict=True):
         print(damping, float(speed), branch, flush=True)
         for k, friction in enumerate(branch.values):
-            value_at = branch.dataset.isel(point=k)
+            branch_point = branch.dataset.isel(point=k)
             row = {"damping": damping, "kind": "gait", "friction": f"{friction:.6g}"}
             result_by_name = {
-                name: f"{float(value_at[name]):.6g}" for name in (*MEASURES, "spectral_radius")
+                name: f"{float(branch_point[name]):.6g}" for name in (*MEASURES, "spectral_radius")
             }
             rows.append(row | result_by_name)
         for special_point in branch.special_points:

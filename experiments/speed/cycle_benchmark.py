@@ -105,7 +105,7 @@ def measure_hit_rate() -> dict[str, int]:
     params = make_random_wheels(np.random.default_rng(7), N_SETS)
     reached = find_reachable_wheels(params)
     cold = jax.jit(jax.vmap(vrw.limit_cycle))(params)
-    values_array = np.asarray(cold.found)
+    is_found_cold = np.asarray(cold.found)
     options = vrw.StepOptions.tight()
     walk = jax.jit(jax.vmap(lambda p, x: vrw.return_map(p, x, options=options)))
     x = np.asarray(cold.section_state)
@@ -113,10 +113,10 @@ def measure_hit_rate() -> dict[str, int]:
     return {
         "random wheels": N_SETS,
         "gait reached by continuation": int(reached.sum()),
-        "gait also found without a guess": int((reached & values_array).sum()),
-        "gait found without a guess only": int((values_array & ~reached).sum()),
+        "gait also found without a guess": int((reached & is_found_cold).sum()),
+        "gait found without a guess only": int((is_found_cold & ~reached).sum()),
         "gait found, but not confirmed by the event-driven step to 1e-7": int(
-            (values_array & ~(away < 1e-7)).sum()
+            (is_found_cold & ~(away < 1e-7)).sum()
         ),
     }
 
@@ -125,9 +125,9 @@ def measure_batch_time() -> dict[str, float]:
     """Return microseconds of one core per cycle, in batches."""
     params = make_random_wheels(np.random.default_rng(3), 8 * LANES)
     every = jax.jit(jax.vmap(vrw.limit_cycle))
-    retained = np.flatnonzero(np.asarray(every(params).found))[:LANES]
-    params = jax.tree.map(lambda x: x[retained], params)
-    vectors = stack_parameters(params).T
+    found_indices = np.flatnonzero(np.asarray(every(params).found))[:LANES]
+    params = jax.tree.map(lambda x: x[found_indices], params)
+    parameter_rows = stack_parameters(params).T
     cold = jax.jit(jax.vmap(vrw.limit_cycle))
     near = cold(jax.tree.map(lambda x: x * (1.0 + 1e-3), params))
 
@@ -161,8 +161,13 @@ def measure_batch_time() -> dict[str, float]:
         "from a neighbor 0.1 % away, with multipliers": (
             jax.jit(jax.vmap(from_neighbor)), params, near,
         ),
-        "with nine first derivatives of everything": (jax.jit(jax.vmap(differentiated)), vectors),
-        **{name: (jax.jit(jax.vmap(function)), vectors) for name, function in derived.items()},
+        "with nine first derivatives of everything": (
+            jax.jit(jax.vmap(differentiated)), parameter_rows,
+        ),
+        **{
+            name: (jax.jit(jax.vmap(function)), parameter_rows)
+            for name, function in derived.items()
+        },
     }  # fmt: skip
     return {name: 1e6 * measure_least_seconds(*call) / LANES for name, call in table.items()}
 

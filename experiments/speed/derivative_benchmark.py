@@ -64,11 +64,11 @@ SINGLE_WHEEL_CALLS = {
 
 def flatten_derivatives(by_input: dict, names: Sequence[str]) -> np.ndarray:
     """Return derivatives of section state and durations, shape (lanes, 6, columns)."""
-    full_values = [
+    derivative_arrays = [
         np.concatenate([by_input[name].section_state, by_input[name].durations], 1)
         for name in names
     ]
-    return np.concatenate([x.reshape(*x.shape[:2], -1) for x in full_values], 2)
+    return np.concatenate([x.reshape(*x.shape[:2], -1) for x in derivative_arrays], 2)
 
 
 def in_batches(n: int, repeats: int) -> list[tuple]:
@@ -167,11 +167,9 @@ def compare_with_others(n: int, repeats: int) -> list[dict]:
         requested,
     )  # fmt: skip
     table, runs = list[dict](), []
-    for method, value_at, lanes, run in candidates(rows, states):
+    for method, setting, lanes, run in candidates(rows, states):
         error = np.quantile(np.max(np.abs(run()[selection] - exact), (1, 2)), 0.99)
-        table.append(
-            {"method": method, "at": value_at, "error": error, "lanes": lanes, "taken": []}
-        )
+        table.append({"method": method, "at": setting, "error": error, "lanes": lanes, "taken": []})
         runs.append(run)
     with use_one_core():
         for _ in range(
@@ -186,13 +184,13 @@ def draw_chart(table: list[dict]) -> None:
     """Draw speed over error."""
     with plots.figure_style():
         figure, axes = plt.subplots(figsize=(plots.PAGE_FIGURE_WIDTH_INCHES, 3.6))
-        known_as = ("lane engine", "heyoka", "numba", "diffrax engine")
-        for label, known_values, marker in zip(LABELS, known_as, "osD^", strict=True):
+        method_labels = ("lane engine", "heyoka", "numba", "diffrax engine")
+        for label, method_label, marker in zip(LABELS, method_labels, "osD^", strict=True):
             sorted_entries = sorted(
                 (x for x in table if x["method"] == label), key=lambda x: x["error"]
             )
             result = [x["error"] for x in sorted_entries], [x["speed"] for x in sorted_entries]
-            axes.loglog(*result, marker=marker, ms=4, color=COLOURS[known_values], label=label)
+            axes.loglog(*result, marker=marker, ms=4, color=COLOURS[method_label], label=label)
         axes.set(
             xlabel="error of derivatives, 99 % of lanes below it",
             ylabel="gait steps with seven columns\nper second and core",

@@ -58,9 +58,10 @@ def numba_differences(
         shifted_rows.append((compute_landing(wheel, x)[:, :2], peers.pack(make_wheels(wheel))))
 
     def run() -> np.ndarray:
-        result_list = [peers.numba_steps(*each, tolerance)[:, :6] for each in shifted_rows]
+        displaced_results = [peers.numba_steps(*each, tolerance)[:, :6] for each in shifted_rows]
         return np.stack(
-            [(a - b) for a, b in zip(result_list[::2], result_list[1::2], strict=True)], 2
+            [(a - b) for a, b in zip(displaced_results[::2], displaced_results[1::2], strict=True)],
+            2,
         ) / (2.0 * size)
 
     return run

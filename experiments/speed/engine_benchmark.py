@@ -265,17 +265,17 @@ def redraw(figures):
 
 def draw_charts(table, shares, cost):
     """Draw speed over error of every engine, and cost over the share of lanes that fall back."""
-    figure, (left_part, right) = plt.subplots(1, 2, figsize=(plots.PAGE_FIGURE_WIDTH_INCHES, 3.9))
+    figure, (left_axes, right) = plt.subplots(1, 2, figsize=(plots.PAGE_FIGURE_WIDTH_INCHES, 3.9))
     markers = dict(zip(("Tsit5", "Dopri5", "Dopri8"), "os^", strict=True))
     colours = {
-        name: COLOURS[known_values] for name, known_values in zip(LABELS, KNOWN_AS, strict=True)
+        name: COLOURS[method_label] for name, method_label in zip(LABELS, KNOWN_AS, strict=True)
     }
     for name, label in LABELS.items():
         for method in dict.fromkeys(e["method"] for e in table if e["engine"] == name):
             selection = [e for e in table if (e["engine"], e["method"]) == (name, method)]
             selection.sort(key=lambda e: e["p99_error"])
             several = name in ("lanes", "by hand", "diffrax")
-            left_part.loglog(
+            left_axes.loglog(
                 [e["p99_error"] for e in selection],
                 [e["steps_per_s"] for e in selection],
                 ms=4,
@@ -284,9 +284,9 @@ def draw_charts(table, shares, cost):
                 color=colours[name],
                 label=f"{label}, {method}" if several else label,
             )
-    left_part.axvline(COMPARED_ERROR, color="0.7", lw=1)
-    left_part.set(xlabel="error, 99 % of lanes below it", ylabel="gait steps per second and core")
-    figure.legend(*left_part.get_legend_handles_labels(), loc="outside lower center", ncols=2)
+    left_axes.axvline(COMPARED_ERROR, color="0.7", lw=1)
+    left_axes.set(xlabel="error, 99 % of lanes below it", ylabel="gait steps per second and core")
+    figure.legend(*left_axes.get_legend_handles_labels(), loc="outside lower center", ncols=2)
     for name, values in cost.items():
         right.semilogy(100.0 * shares, values, "o-", ms=4, color=colours[name], label=LABELS[name])
     right.set(xlabel="lanes that fall back [%]", ylabel="CPU time per lane [µs]")

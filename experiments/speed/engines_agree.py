@@ -105,53 +105,64 @@ def reasons(n: int, seed: int) -> tuple[list[tuple[str, int, str]], np.ndarray, 
     difference = compute_difference(lanes, by_diffrax(rows, states, tried, default))
     agree = difference <= AGREE
     quantiles = np.quantile(difference[agree], (0.5, 0.99, 1.0))
-    result_list = [
+    reason_rows = [
         (f"the same outcome, and within {AGREE:g}", int(agree.sum()), f"{quantiles[2]:.1e}")
     ]
 
-    left_part = np.flatnonzero(~agree)
+    unexplained_lanes = np.flatnonzero(~agree)
 
     def explained(reason: str, by_input: np.ndarray) -> np.ndarray:
-        maximum = np.max(difference[left_part[by_input]], initial=0.0)
+        maximum = np.max(difference[unexplained_lanes[by_input]], initial=0.0)
         size = f"{maximum:.1e}" if np.isfinite(maximum) else "outcomes"
-        result_list.append((reason, int(by_input.sum()), size if by_input.any() else ""))
-        return left_part[~by_input]
+        reason_rows.append((reason, int(by_input.sum()), size if by_input.any() else ""))
+        return unexplained_lanes[~by_input]
 
     by_lanes = lambda rows, states: compute_steps(rows, states, "lanes", tight)[0]
-    second_result, tried = compute_steps(rows[left_part], states[left_part], "lanes", tight)
-    tightly = by_diffrax(rows[left_part], states[left_part], tried, tight)
-    closer = compute_difference(second_result, tightly)
-    rests = np.minimum(second_result[1][:, 3], tightly[1][:, 3]) > RESTS
+    tight_result, tried = compute_steps(
+        rows[unexplained_lanes], states[unexplained_lanes], "lanes", tight
+    )
+    tightly = by_diffrax(rows[unexplained_lanes], states[unexplained_lanes], tried, tight)
+    closer = compute_difference(tight_result, tightly)
+    rests = np.minimum(tight_result[1][:, 3], tightly[1][:, 3]) > RESTS
     others = (closer > TIGHTLY) & ~rests
     at_rest = f"both come to rest upright: double support of more than {RESTS:g} s"
-    left_part, rests = (
+    unexplained_lanes, rests = (
         explained(f"within {TIGHTLY:g} at tolerances of 1e-13", closer <= TIGHTLY),
         rests[closer > TIGHTLY],
     )
-    left_part, closer = explained(at_rest, rests), closer[others]
+    unexplained_lanes, closer = explained(at_rest, rests), closer[others]
     less = vrw.StepOptions(rtol=LESS, atol=LESS)
-    second_result, tried = compute_steps(rows[left_part], states[left_part], "lanes", less)
+    tight_result, tried = compute_steps(
+        rows[unexplained_lanes], states[unexplained_lanes], "lanes", less
+    )
     near = (
         compute_difference(
-            second_result, by_diffrax(rows[left_part], states[left_part], tried, less)
+            tight_result,
+            by_diffrax(rows[unexplained_lanes], states[unexplained_lanes], tried, less),
         )
         <= AGREE
     )
     reason = f"within {AGREE:g} at tolerances of {LESS:g}; at 1e-13 an engine gives up"
-    left_part, closer = explained(reason, near), closer[~near]
+    unexplained_lanes, closer = explained(reason, near), closer[~near]
     for away in AWAY:
-        if not len(left_part):
+        if not len(unexplained_lanes):
             break
-        moves = moved_by(by_lanes, rows[left_part], states[left_part], away)
+        moves = moved_by(by_lanes, rows[unexplained_lanes], states[unexplained_lanes], away)
         which = moves >= closer
-        left_part = explained(f"a start {away:g} away differs as much, or ends otherwise", which)
+        unexplained_lanes = explained(
+            f"a start {away:g} away differs as much, or ends otherwise", which
+        )
         closer = closer[~which]
-    result_list.append(("no reason found", len(left_part), ""))
+    reason_rows.append(("no reason found", len(unexplained_lanes), ""))
     spread = "median {:.1e}, 99th percentile {:.1e}, largest {:.1e}".format(*quantiles)
     codes = np.unique(lanes[0], return_counts=True)
     each = zip(*codes, strict=True)
     names = ", ".join(f"{count:,} {Outcome(int(code)).name}" for code, count in each)
-    return result_list, left_part, f"Outcomes: {names}. Differences of equal outcomes: {spread}."
+    return (
+        reason_rows,
+        unexplained_lanes,
+        f"Outcomes: {names}. Differences of equal outcomes: {spread}.",
+    )
 
 
 def main() -> None:
@@ -159,11 +170,13 @@ def main() -> None:
     parser.add_argument("--lanes", type=int, default=1_000_000)
     parser.add_argument("--seed", type=int, default=0)
     chosen = parse_and_start_jax(parser)
-    result, left_part, spread = reasons(chosen.lanes, chosen.seed)
+    result, unexplained_lanes, spread = reasons(chosen.lanes, chosen.seed)
     header = f"of {chosen.lanes:,} random lanes, seed {chosen.seed}", "lanes", "largest difference"
     table = format_markdown(header, [(reason, f"{n:,}", size) for reason, n, size in result])
     unexplained = (
-        f"\n\nNo reason was found for lanes {left_part.tolist()}." if len(left_part) else ""
+        f"\n\nNo reason was found for lanes {unexplained_lanes.tolist()}."
+        if len(unexplained_lanes)
+        else ""
     )
     replace_block(
         DOCS / "verification" / "accuracy.md",

@@ -144,12 +144,12 @@ def draw(rows: list[Any]) -> None:
     )  # The first process compiles, and its time is not part of the trend.
     with plots.figure_style():
         figure = Figure(figsize=(plots.PAGE_FIGURE_WIDTH_INCHES, 2.6))
-        left_part, right = figure.subplots(1, 2)
-        left_part.set(xscale="log", yscale="log", xlabel="samples", ylabel="time [s]")
+        left_axes, right = figure.subplots(1, 2)
+        left_axes.set(xscale="log", yscale="log", xlabel="samples", ylabel="time [s]")
         right.set(xscale="log", xlabel="samples", ylabel="peak memory [MiB]", ylim=(0, 2300))
         series = (
-            (left_part, "wall_s", plots.LEG_1_COLOR, "o", "-", "wall"),
-            (left_part, "cpu_s", plots.LEG_2_COLOR, "s", "--", "CPU, both cores"),
+            (left_axes, "wall_s", plots.LEG_1_COLOR, "o", "-", "wall"),
+            (left_axes, "cpu_s", plots.LEG_2_COLOR, "s", "--", "CPU, both cores"),
             (right, "peak_MiB", plots.LEG_1_COLOR, "o", "-", "peak"),
         )
         for axes, key, colour, mark, line, label in series:
@@ -159,7 +159,7 @@ def draw(rows: list[Any]) -> None:
             text = f"{label}, with compiling"
             axes.plot(*zip(*first, strict=True), mark, color=colour, mfc="white", ms=4, label=text)
         right.axhline(2048, color=plots.DARK_GRAY_COLOR, linestyle=":", label="2 GiB")
-        for axes in (left_part, right):
+        for axes in (left_axes, right):
             axes.legend(fontsize=7)
     plots.save(figure, FIGURES, "scan_benchmark")
 

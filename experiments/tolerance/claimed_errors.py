@@ -287,13 +287,12 @@ def draw() -> None:
             ("walked to", (2, 3), COLOURS[2]),
         )
         for name, hows, colour in groups:
-            retained = np.isin(cloud["statuses"], hows)
-            tolerance_indices = [
-                retained & (np.abs(cloud["tol"] / tol - 1.0) < 1e-3) for tol in TOLERANCES
+            has_status = np.isin(cloud["statuses"], hows)
+            masks_by_tolerance = [
+                has_status & (np.abs(cloud["tol"] / tol - 1.0) < 1e-3) for tol in TOLERANCES
             ]
-            cost.plot(TOLERANCES, [np.nanmean(cloud["n_steps"][i]) for i in tolerance_indices], "o-",
-            ms=3,
-                      color=colour, label=name)  # fmt: skip
+            mean_n_steps = [np.nanmean(cloud["n_steps"][i]) for i in masks_by_tolerance]
+            cost.plot(TOLERANCES, mean_n_steps, "o-", ms=3, color=colour, label=name)
         cost.axhline(1.0, color=plots.DARK_GRAY_COLOR, lw=0.6)
         cost.set(
             xscale="log", yscale="log", xlabel="tolerance", ylabel="steps with unilateral contact"

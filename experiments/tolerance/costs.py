@@ -88,12 +88,12 @@ def measure_means() -> None:
                     many = (
                         SAMPLING_OPTIONS.n_standard_errors * np.std(values) / mean.error
                     ) ** 2 / solution
-                    single_result = many / (1.0 + many / N_MEAN)
+                    n_reference_wheels = many / (1.0 + many / N_MEAN)
                     rows.append([
                         name, friction, measure, tol, int(mean.n_high_fidelity), mean.control,
                         f"{mean.error:.2g}", f"{mean.value - np.mean(values):.2g}", f"{cpu:.3f}",
-                        f"{single_result:.0f}", f"{one * 1e3:.2f}",
-                        f"{cpu / (single_result * one):.3f}",
+                        f"{n_reference_wheels:.0f}", f"{one * 1e3:.2f}",
+                        f"{cpu / (n_reference_wheels * one):.3f}",
                     ])  # fmt: skip
                     print(*rows[-1], flush=True)
     header = (

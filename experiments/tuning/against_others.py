@@ -201,8 +201,8 @@ def by_other(method: Callable, count: Counter, u: np.ndarray, seed: int) -> Meth
 
 def best_so_far(history: MethodHistory) -> np.ndarray:
     """Return the best objective of an admissible gait, after each evaluation."""
-    retained = np.isfinite(history.objective) & (history.breach <= CONSTRAINT_TOLERANCE)
-    return np.maximum.accumulate(np.where(retained, history.objective, -np.inf))
+    is_feasible = np.isfinite(history.objective) & (history.breach <= CONSTRAINT_TOLERANCE)
+    return np.maximum.accumulate(np.where(is_feasible, history.objective, -np.inf))
 
 
 def starts_of(problem: TuneProblem, values: Callable, n: int) -> list[np.ndarray]:
@@ -219,7 +219,7 @@ def starts_of(problem: TuneProblem, values: Callable, n: int) -> list[np.ndarray
 def grid_around(problem: TuneProblem, values: Callable, u: np.ndarray, best: float) -> dict:
     """Return whether any wheel of a grid of 7 values per parameter around u is better, at two
     scales."""
-    checked = retained = better = 0
+    checked = n_feasible = better = 0
     for reach in (0.05, 0.005):
         for offset in itertools.product(np.linspace(-reach, reach, 7), repeat=u.size):
             place = u + np.array(offset)
@@ -228,9 +228,9 @@ def grid_around(problem: TuneProblem, values: Callable, u: np.ndarray, best: flo
             solution, result = values(jnp.asarray(problem.denormalize_parameters(place)))
             checked += 1
             if bool(solution) and np.all(np.asarray(result)[1:] >= problem.min_constraint_values):
-                retained += 1
+                n_feasible += 1
                 better += float(result[0]) > best + 1e-9
-    return {"checked": checked, "keep the constraints": retained, "better": better}
+    return {"checked": checked, "keep the constraints": n_feasible, "better": better}
 
 
 def compare_methods(problem: TuneProblem, n_starts: int, rows: list[dict], name: str) -> dict:
@@ -308,14 +308,14 @@ def summary(rows: list[dict]) -> str:
     select = lambda row: (row["problem"], row["method"])
     for (problem, method), selection in itertools.groupby(rows, key=select):
         mine = list(selection)
-        result_list = []
+        reached_cells = []
         for gap in RELATIVE_GAPS:
             reached = [int(row[f"gaits to {gap:g}"]) for row in mine if row[f"gaits to {gap:g}"]]
             gaits = f", {np.median(reached):.0f}" if reached else ""
-            result_list.append(f"{len(reached)} of {len(mine)}{gaits}")
+            reached_cells.append(f"{len(reached)} of {len(mine)}{gaits}")
         seconds = [float(row["seconds"]) for row in mine]
         times = f"{np.median(seconds):.2f}", f"{max(seconds):.2f}"
-        lines.append((problem, method, *result_list, *times))
+        lines.append((problem, method, *reached_cells, *times))
     return format_markdown(("problem", "method", *near, "s", "longest, s"), lines)
 
 

@@ -68,13 +68,13 @@ def main() -> None:
         print(rows[-1], flush=True)
 
     paper = vrw.tune(vrw.WheelParams(), "dls_fraction", list(BOX), PAPER_MODEL_BOX)
-    held_values = "; ".join(f"{a.name} at {a.limit:.4g}" for a in paper.active)
+    active_text = "; ".join(f"{a.name} at {a.limit:.4g}" for a in paper.active)
     row(
         "paper's optimum, paper's model",
         paper.params,
         measure_with_paper_model(paper.params),
         paper.status.name,
-        held_values,
+        active_text,
     )
     row(
         "paper's optimum, unilateral contact",
@@ -91,10 +91,10 @@ def main() -> None:
             start, "dls_fraction", list(BOX), BOX, model=model, options=vrw.StepOptions(**OPTIONS),
             tolerance=TOLERANCE, max_evaluations=MAX_EVALUATIONS,
         )  # fmt: skip
-        held_values = "; ".join(f"{a.name} at {a.limit:.4g}" for a in tuned.active)
+        active_text = "; ".join(f"{a.name} at {a.limit:.4g}" for a in tuned.active)
         result = measure_with_contact(tuned.params, tuned.cycle.section_state)
         print(tuned, flush=True)
-        row(scene, tuned.params, result, tuned.status.name, held_values)
+        row(scene, tuned.params, result, tuned.status.name, active_text)
         tuned_results.append(tuned)
     best = max(tuned_results, key=lambda tuned: tuned.value)
     row(

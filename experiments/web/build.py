@@ -200,13 +200,13 @@ def read_page_content(page: str, name: str) -> Any:
 def write_page(code: dict[str, str]) -> str:
     """Return the page with scripts, styles and data inside."""
     part = lambda name: (SOURCES / name).read_text(encoding="utf-8")
-    page, held_values = part("page.html"), {}
+    page, text_by_mark = part("page.html"), {}
     for name in ("page.css", "engine.js", "ground.js", "worker.js", "pictures.js", "page.js"):
         lines = (line.strip() for line in part(name).splitlines())
-        held_values[f"/*{name}*/"] = "\n".join(x for x in lines if x and not x.startswith("// "))
-    held_values[f"/*{FACTS}*/"] = json.dumps(facts(), ensure_ascii=False)
-    held_values[f"/*{CODE}*/"] = json.dumps(code)
-    for mark, text in held_values.items():
+        text_by_mark[f"/*{name}*/"] = "\n".join(x for x in lines if x and not x.startswith("// "))
+    text_by_mark[f"/*{FACTS}*/"] = json.dumps(facts(), ensure_ascii=False)
+    text_by_mark[f"/*{CODE}*/"] = json.dumps(code)
+    for mark, text in text_by_mark.items():
         if page.count(mark) != 1:
             raise SystemExit(f"page.html says {mark} {page.count(mark)} times: once is needed.")
         page = page.replace(mark, text)

@@ -125,11 +125,11 @@ def programs(n_legs: int) -> dict[str, Program]:
             walk_result.phases, walk_result.phase_starts, walk_result.phase_ends, strict=True
         ):
             flow = make_batch_phase(phase, records_margins=False)
-            known_values = sample_batch_phase(
+            sampled_states = sample_batch_phase(
                 flow, load_explicit_tableau(SOLVER), *start, end.duration, SAMPLES, options
             )
             motion.append(
-                jnp.concatenate(evaluate_phase_states(phase, jnp.moveaxis(known_values, 1, 0)))
+                jnp.concatenate(evaluate_phase_states(phase, jnp.moveaxis(sampled_states, 1, 0)))
             )
         codes = jnp.stack([step.outcome, step.solver_steps]).astype(jnp.int32)
         return _numbers_of(step), codes, *motion
@@ -222,18 +222,16 @@ def _on_ground(wheel: Callable[[Array], WheelParams], n_legs: int) -> dict[str, 
             flow, motion, blank, stretch[-1], SAMPLES, walk.step_options, tableau
         )
 
-        def row(current_value: Array) -> Array:
-            motion = unpack_motion(
-                IntervalPoint(current_value[:n], current_value[n : 2 * n], current_value)
-            )
+        def row(row_values: Array) -> Array:
+            motion = unpack_motion(IntervalPoint(row_values[:n], row_values[n : 2 * n], row_values))
             energies = (
                 compute_kinetic_energy(flow.s, motion),
                 *compute_potential_energy(flow.s, motion),
             )
             return jnp.concatenate(
                 [
-                    current_value[:n],
-                    current_value[2 * n + N_ACCUMULATOR_ROWS :],
+                    row_values[:n],
+                    row_values[2 * n + N_ACCUMULATOR_ROWS :],
                     jnp.stack(energies),
                 ]
             )

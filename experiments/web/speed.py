@@ -146,7 +146,7 @@ def in_chromium() -> dict[str, tuple[list[float], float, float]]:
 def main() -> None:
     parse_and_start_jax(make_parser(__doc__))
     node, chromium = in_node(), in_chromium()
-    (times, basin, full_values), (real, slow, wide) = (
+    (times, basin, map_seconds), (real, slow, wide) = (
         chromium["viscoelastic"],
         chromium["unilateral"],
     )
@@ -156,7 +156,7 @@ def main() -> None:
         ("the same for a wheel without a gait: search, and walk until the fall",
          "{:.0f} ms, 95 % below {:.0f} ms, none above {:.0f} ms".format(*node["lost"]), ""),
         ("a basin of 64 × 64 starts", f"{node['basin'] / 1000:.2f} s", f"{basin:.1f} s"),
-        ("a map of 65 × 65 gaits", "", f"{full_values:.1f} s"),
+        ("a map of 65 × 65 gaits", "", f"{map_seconds:.1f} s"),
         ("unilateral contact: gait after a slider moves a little",
          "{:.0f} ms, 95 % below {:.0f} ms".format(*node["real"]),
          f"{real[0]:.0f} ms, 95 % below {real[1]:.0f} ms"),

@@ -175,7 +175,7 @@ def panels(rows: list[Row], quantities: list[str], x_of, x_label: str) -> Figure
 def batch_chart(rows: list[Row], every: list[Row]) -> Figure:
     """Time per gait over the batch, and the first call beside a warm one."""
     figure = Figure(figsize=(PAGE_FIGURE_WIDTH_INCHES, 4.4))
-    left_part, right = figure.subplots(1, 2, width_ratios=(1.0, 1.15))
+    left_axes, right = figure.subplots(1, 2, width_ratios=(1.0, 1.15))
     unit = unit_of(every)
     result: dict[str, list[Row]] = {}
     cycles = [row for row in every if is_default(row) and row["group"] == "cycle"]
@@ -185,14 +185,14 @@ def batch_chart(rows: list[Row], every: list[Row]) -> Figure:
         sorted_rows = sorted(sorted_rows, key=lambda row: int(row["lanes"]))
         marker = "s" if sorted_rows[0]["group"] == "cycle" else "o"
         ls = "--" if sorted_rows[0]["group"] == "cycle" else "-"
-        left_part.loglog(
+        left_axes.loglog(
             [int(row["lanes"]) for row in sorted_rows],
             [time_of(row, unit) for row in sorted_rows],
             ls=ls, marker=marker, ms=3.5, color=COLOURS[sorted_rows[0]["family"]], label=label,
         )  # fmt: skip
-    left_part.set(xlabel="wheels in a call", ylabel="CPU time per gait [µs]")
-    left_part.grid(color="0.9", lw=0.4)
-    left_part.legend(fontsize=6, loc="upper center", bbox_to_anchor=(0.45, -0.14), ncols=2)
+    left_axes.set(xlabel="wheels in a call", ylabel="CPU time per gait [µs]")
+    left_axes.grid(color="0.9", lw=0.4)
+    left_axes.legend(fontsize=6, loc="upper center", bbox_to_anchor=(0.45, -0.14), ncols=2)
     first: dict[str, tuple[float, float]] = {}
     for row in every:
         name = f"{row['group']}, {label_of(row)}" + (", one" if row["lanes"] == "1" else "")
@@ -210,7 +210,7 @@ def batch_chart(rows: list[Row], every: list[Row]) -> Figure:
     return figure
 
 
-def best(rows: list[Row], group: str, single_result: bool, target: float) -> Row | None:
+def best(rows: list[Row], group: str, is_for_one_wheel: bool, target: float) -> Row | None:
     """Return the fastest row in which each p99 error is below the target and no lane failed.
 
     A single wheel is judged by the errors of the batch, because its error alone may be small by
@@ -221,8 +221,8 @@ def best(rows: list[Row], group: str, single_result: bool, target: float) -> Row
     selection = []
     for row in rows:
         fits = row["group"] == group and int(row["failed"]) == 0
-        fits = fits and (row["lanes"] == "1" or not single_result or row["family"] in SCALAR)
-        fits = fits and (single_result or row["lanes"] != "1")
+        fits = fits and (row["lanes"] == "1" or not is_for_one_wheel or row["family"] in SCALAR)
+        fits = fits and (is_for_one_wheel or row["lanes"] != "1")
         is_same = [r for r in rows if r["lanes"] != "1" and curve_of(r) == curve_of(row)]
         judged = is_same[0] if is_same else row
         fits = fits and int(judged["failed"]) == 0
@@ -247,13 +247,13 @@ def table(rows: list[Row]) -> str:
     unit = unit_of(rows)
     ours = [row for row in rows if row["family"] not in (*SCALAR, "diffrax by hand")]
     lines = []
-    for method_name, (group, single_result) in TABLE_METHODS.items():
+    for method_name, (group, is_for_one_wheel) in TABLE_METHODS.items():
         for target in TARGETS:
             cells = [method_name, f"1e{round(math.log10(target))}"]
             for selection in (ours, rows):
-                row = best(selection, group, single_result, target)
+                row = best(selection, group, is_for_one_wheel, target)
                 if row is None:
-                    tried = best(selection, group, single_result, math.inf) is not None
+                    tried = best(selection, group, is_for_one_wheel, math.inf) is not None
                     cells += ["none" if tried else "not measured", "–"]
                 else:
                     cells += [f"{label_of(row)}, {row['setting']}", format_time(time_of(row, unit))]

@@ -83,16 +83,16 @@ def by_library(engine: str, solver: str, dtype: type = np.float64) -> Callable:
 def by_fixed_work(spread: float, rows: np.ndarray, starts: np.ndarray) -> Run:
     """`vrw.steps` by collocation, durations known to a spread; lanes it does not trust failed."""
     near = vrw.step_batch(make_wheels(rows), starts).durations
-    known_values = np.asarray(near) * np.random.default_rng(3).uniform(
+    expected_durations = np.asarray(near) * np.random.default_rng(3).uniform(
         1.0 - spread, 1.0 + spread, (len(rows), 3)
     )
 
     def run() -> np.ndarray:
         batch_result = vrw.step_batch(
-            make_wheels(rows), starts, engine="collocation", durations=known_values
+            make_wheels(rows), starts, engine="collocation", durations=expected_durations
         )
         joined_values = np.concatenate(
-            [batch_result.section_state, batch_result.durations, 0.0 * known_values[:, :1]], 1
+            [batch_result.section_state, batch_result.durations, 0.0 * expected_durations[:, :1]], 1
         )
         joined_values[~np.asarray(batch_result.is_collocated)] = np.nan
         return joined_values

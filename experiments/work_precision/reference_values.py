@@ -112,27 +112,27 @@ def one_lane(models, row, start, guess_step, guess_cycle, check):
             break
     else:
         raise ArithmeticError("Newton's method did not settle")
-    value_at = [multiprecision.NAMES.index(name) for name in VARIED_PARAMETERS]
+    parameter_indices = [multiprecision.NAMES.index(name) for name in VARIED_PARAMETERS]
 
     def by_parameters(values):
         shifted = list(p)
-        for i, value in zip(value_at, values, strict=True):
+        for i, value in zip(parameter_indices, values, strict=True):
             shifted[i] = value
         return plane_map(hub, y, shifted, about)
 
-    varied = [p[i] for i in value_at]
+    varied = [p[i] for i in parameter_indices]
     by_p = differences(by_parameters, varied, [SIZE * v for v in varied])
     d_cycle = []
     for column in by_p:
         dy = solve_two(slope, column[:2])
-        tangential_part = [
+        parameter_derivatives = [
             column[2 + k] + sum(columns[j][2 + k] * dy[j] for j in range(2)) for k in range(3)
         ]
-        d_cycle.append([*dy, *tangential_part])
+        d_cycle.append([*dy, *parameter_derivatives])
     gap = mp.mpf("nan")
     if check:
-        second_result = plane_map(other, y, p, about)
-        gap = max(abs(a - b) for a, b in zip(second_result, [*y, *image[2:]], strict=True))
+        other_image = plane_map(other, y, p, about)
+        gap = max(abs(a - b) for a, b in zip(other_image, [*y, *image[2:]], strict=True))
         landed = other.walk(other.land(x, p)[0], p, [float(d) for d in guess_step])
         found_rows = [*landed.section_state, *landed.durations]
         gap = max([gap, *(abs(a - b) for a, b in zip(found_rows, step, strict=True))])

@@ -56,7 +56,7 @@ def test_derivatives_of_a_walk_by_parameters_equal_difference_quotients(
 
 def test_derivatives_of_a_walk_by_its_start_equal_difference_quotients(walks_with_derivatives):
     states = np.asarray(walk_batch().section_state)  # full: legs and codes, too
-    second_result = walk_batch(states=states, derivatives="section_state").derivatives[
+    sensitivities = walk_batch(states=states, derivatives="section_state").derivatives[
         "section_state"
     ]
     for place in range(4):
@@ -65,7 +65,7 @@ def test_derivatives_of_a_walk_by_its_start_equal_difference_quotients(walks_wit
             x[:, place] += sign * 1e-6
         plus, minus = (concat_end_values(walk_batch(states=x)) for x in shifted_rows)
         joined_values = np.concatenate(
-            [second_result.section_state[:, :4, place], second_result.durations[..., place]], 1
+            [sensitivities.section_state[:, :4, place], sensitivities.durations[..., place]], 1
         )
         assert np.abs(joined_values - (plus - minus) / 2e-6).max() < 1e-4 * max(
             np.abs(joined_values).max(), 1.0
@@ -87,10 +87,13 @@ def test_a_falling_batch_element_is_zero_and_leaves_the_others_unchanged(walks_w
     fallen = walk_batch(states=backward, derivatives=requested)
     assert fallen.outcome[1] != vrw.Outcome.STEPPED
     for name in requested:
-        mine, full_values = fallen.derivatives[name], walks_with_derivatives.derivatives[name]
+        mine, sensitivity_without_fall = (
+            fallen.derivatives[name],
+            walks_with_derivatives.derivatives[name],
+        )
         assert not np.any(mine.section_state[1])
         assert not np.any(mine.durations[1])
-        assert np.array_equal(mine.section_state[0], full_values.section_state[0])
+        assert np.array_equal(mine.section_state[0], sensitivity_without_fall.section_state[0])
 
 
 def test_arguments_are_not_modified():

@@ -41,11 +41,11 @@ FEW_STEPS_OPTIONS = vrw.StepOptions(solver="Bosh3", max_solver_steps=60)
 """Too few for a gait at the default tolerances."""
 
 
-def compute_values(vectors, states, options=None, **keywords):
+def compute_values(parameter_rows, states, options=None, **keywords):
     """State and durations of each lane, and its outcome."""
     options = vrw.StepOptions() if options is None else options
     batch_result = vrw.step_batch(
-        reference_values.make_wheels(vectors), states, options=options, **keywords
+        reference_values.make_wheels(parameter_rows), states, options=options, **keywords
     )
     return np.concatenate([batch_result.section_state, batch_result.durations], 1), np.asarray(
         batch_result.outcome
@@ -55,13 +55,13 @@ def compute_values(vectors, states, options=None, **keywords):
 def draw_hard_starts(n):
     """Wheels and starts of which most fail, some in every way."""
     draw = np.random.default_rng(5).uniform
-    vectors = make_parameter_rows(
+    parameter_rows = make_parameter_rows(
         damping=draw(20.0, 400.0, n),
         stiffness=draw(50.0, 3000.0, n),
         natural_length=draw(0.95, 1.15, n),
         slope=draw(0.02, 0.5, n),
     )
-    return vectors, np.stack([draw(-0.4, 0.4, n), draw(0.3, 6.0, n), draw(-2.0, 1.0, n)], 1)
+    return parameter_rows, np.stack([draw(-0.4, 0.4, n), draw(0.3, 6.0, n), draw(-2.0, 1.0, n)], 1)
 
 
 @pytest.mark.parametrize(
@@ -76,9 +76,9 @@ def test_batched_state_and_durations_are_accurate_to_the_claimed_error(options, 
 
 
 def test_hard_starts_have_the_outcomes_of_the_diffrax_engine():
-    vectors, states = draw_hard_starts(512)
-    by_lanes, codes = compute_values(vectors, states)
-    by_diffrax, expected = compute_values(vectors, states, engine="diffrax")
+    parameter_rows, states = draw_hard_starts(512)
+    by_lanes, codes = compute_values(parameter_rows, states)
+    by_diffrax, expected = compute_values(parameter_rows, states, engine="diffrax")
     np.testing.assert_array_equal(codes, expected)
     assert set(codes) == {0, 1, 2, 3, 5}
     # Both at 1e-10 for each local step.
@@ -90,9 +90,9 @@ def test_hard_starts_have_the_outcomes_of_the_diffrax_engine():
 
 
 def test_each_outcome_occurs_in_one_batch_with_finite_values():
-    vectors = np.concatenate([v for v, _ in OUTCOME_CASES.values()])
+    parameter_rows = np.concatenate([v for v, _ in OUTCOME_CASES.values()])
     states = np.stack([np.asarray(x) for _, x in OUTCOME_CASES.values()])
-    solution, outcome = compute_values(vectors, states)
+    solution, outcome = compute_values(parameter_rows, states)
     assert [Outcome(code) for code in outcome] == list(OUTCOME_CASES)
     assert np.all(np.isfinite(solution))
     assert np.all(solution[outcome != Outcome.STEPPED, :3] == 0.0)
@@ -118,24 +118,27 @@ def test_reaching_the_solver_step_limit_is_an_outcome_of_a_batch():
 @pytest.fixture(scope="module")
 def hard_batch():
     """65,536 lanes, the hard ones among them, and what each gives there."""
-    vectors, states = draw_hard_starts(65_536)
-    vectors[::3], states[::3] = reference_values.REFERENCE_PARAMETERS[0], TABLE_1_SECTION_STATE
-    return vectors, states, *compute_values(vectors, states)
+    parameter_rows, states = draw_hard_starts(65_536)
+    parameter_rows[::3], states[::3] = (
+        reference_values.REFERENCE_PARAMETERS[0],
+        TABLE_1_SECTION_STATE,
+    )
+    return parameter_rows, states, *compute_values(parameter_rows, states)
 
 
 def test_a_batch_element_is_bitwise_equal_to_the_single_wheel(hard_batch):
-    vectors, states, solution, codes = hard_batch
+    parameter_rows, states, solution, codes = hard_batch
     for i in (0, 1, 4, 40_001, 65_534):
-        single_result, code = compute_values(vectors[i : i + 1], states[i : i + 1])
-        np.testing.assert_array_equal(single_result[0], solution[i])
+        single_states, code = compute_values(parameter_rows[i : i + 1], states[i : i + 1])
+        np.testing.assert_array_equal(single_states[0], solution[i])
         assert code[0] == codes[i]
 
 
 def test_the_order_of_batch_elements_changes_no_bit(hard_batch):
-    vectors, states, solution, codes = hard_batch
+    parameter_rows, states, solution, codes = hard_batch
     selection = np.random.default_rng(0).permutation(len(states))[:9_000]
-    second_result, code = compute_values(vectors[selection], states[selection])
-    np.testing.assert_array_equal(second_result, solution[selection])
+    second_states, code = compute_values(parameter_rows[selection], states[selection])
+    np.testing.assert_array_equal(second_states, solution[selection])
     np.testing.assert_array_equal(code, codes[selection])
 
 
@@ -143,27 +146,29 @@ def test_lanes_of_similar_cost_are_grouped():
     """Eight wait for the slowest of them: for less than half as much as where any stand together,
     and for less than in order of the airborne leg's fast rate alone."""
     n, draw = 1024, np.random.default_rng(2).uniform
-    vectors = make_parameter_rows(
+    parameter_rows = make_parameter_rows(
         damping=draw(100.0, 215.0, n),
         stiffness=draw(400.0, 600.0, n),
         natural_length=draw(1.01, 1.04, n),
         slope=draw(0.28, 0.34, n),
     )
     states = TABLE_1_SECTION_STATE * draw(0.95, 1.05, (n, 3))
-    tried = np.asarray(vrw.step_batch(reference_values.make_wheels(vectors), states).solver_steps)
+    tried = np.asarray(
+        vrw.step_batch(reference_values.make_wheels(parameter_rows), states).solver_steps
+    )
     waits = lambda order: tried[order].reshape(-1, 8).max(1).mean() / tried.mean() - 1.0
-    ours = waits(lane_batch.order_wheels_by_work(list(vectors.T), states))
+    ours = waits(lane_batch.order_wheels_by_work(list(parameter_rows.T), states))
     assert ours < 0.5 * waits(np.arange(n))
-    assert ours < 0.8 * waits(np.argsort(vectors[:, NAMES.index("damping")]))
+    assert ours < 0.8 * waits(np.argsort(parameter_rows[:, NAMES.index("damping")]))
 
 
 def test_invalid_wheels_have_a_position_in_that_order():
-    vectors, states = (
+    parameter_rows, states = (
         make_parameter_rows(damping=[200.0, np.nan, -1.0, 0.0, 1e300]),
         np.tile(TABLE_1_SECTION_STATE, (5, 1)),
     )
     states[:, 1] = [1.6, 1e300, np.inf, -1.0, 0.0]
-    order = lane_batch.order_wheels_by_work(list(vectors.T), states)
+    order = lane_batch.order_wheels_by_work(list(parameter_rows.T), states)
     np.testing.assert_array_equal(np.sort(order), np.arange(5))
 
 
@@ -173,18 +178,18 @@ COARSE_OPTIONS = vrw.StepOptions(solver="Bosh3", max_solver_steps=60, rtol=1e-4,
 
 @pytest.mark.slow
 def test_xla_blocks_agree_with_machine_code(monkeypatch):
-    vectors, states = draw_hard_starts(300)
-    solution, codes = compute_values(vectors, states, COARSE_OPTIONS)
+    parameter_rows, states = draw_hard_starts(300)
+    solution, codes = compute_values(parameter_rows, states, COARSE_OPTIONS)
     monkeypatch.setattr(simd, "is_machine_code_available", lambda: False)
     monkeypatch.setattr(batch_sizes, "XLA_LANE_BATCH_SIZE", 64)
     monkeypatch.setattr(batch_programs, "STRAGGLER_COUNT_DIVISOR", 10**9)  # no block stops early
-    patient, code = compute_values(vectors, states, COARSE_OPTIONS)
+    patient, code = compute_values(parameter_rows, states, COARSE_OPTIONS)
     np.testing.assert_array_equal(code, codes)
     # Their step control takes powers that differ in the sixth digit: both keep their tolerance.
     np.testing.assert_allclose(patient, solution, rtol=1e-4, atol=1e-4)
     monkeypatch.setattr(batch_programs, "STRAGGLER_COUNT_DIVISOR", 2)  # stragglers run again
-    second_result, code = compute_values(vectors, states, COARSE_OPTIONS)
-    np.testing.assert_array_equal(second_result, patient)
+    second_states, code = compute_values(parameter_rows, states, COARSE_OPTIONS)
+    np.testing.assert_array_equal(second_states, patient)
     np.testing.assert_array_equal(code, codes)
 
 
@@ -211,14 +216,16 @@ def test_batches_of_gaits_are_larger_on_a_gpu(monkeypatch):
 
 
 def test_a_batched_walk_equals_single_walks_and_ends_at_its_first_failure():
-    vectors = make_parameter_rows(slope=[0.30, 0.09], damping=[200.0, 100.0])
+    parameter_rows = make_parameter_rows(slope=[0.30, 0.09], damping=[200.0, 100.0])
     states = np.asarray([TABLE_1_SECTION_STATE, [0.1027, 2.0, -0.109]])
-    batch_result = vrw.step_batch(reference_values.make_wheels(vectors), states, 12)
+    batch_result = vrw.step_batch(reference_values.make_wheels(parameter_rows), states, 12)
     assert batch_result.outcome.tolist() == [Outcome.STEPPED, Outcome.FELL_BACK]
     for i in (0, 1):
-        single = vrw.walk(reference_values.make_wheel(vectors[i]), states[i], 12)
+        single = vrw.walk(reference_values.make_wheel(parameter_rows[i]), states[i], 12)
         assert int(batch_result.n_stepped[i]) == int(single.n_stepped)
-    last = vrw.walk(reference_values.make_wheel(vectors[0]), states[0], 12).steps.section_state[-1]
+    last = vrw.walk(
+        reference_values.make_wheel(parameter_rows[0]), states[0], 12
+    ).steps.section_state[-1]
     np.testing.assert_allclose(batch_result.section_state[0], last, atol=1e-8)
 
 
@@ -383,10 +390,10 @@ def test_collocation_is_accurate_near_known_durations_and_marks_its_elements():
 
 
 def test_collocation_passes_uncertain_elements_to_the_event_driven_engine(hard_batch):
-    vectors, states, solution, codes = hard_batch
+    parameter_rows, states, solution, codes = hard_batch
     selection = slice(0, 3000)
     guessed = np.tile([0.4, 0.25, 0.06], (3000, 1))
-    params = reference_values.make_wheels(vectors[selection])
+    params = reference_values.make_wheels(parameter_rows[selection])
     told_by = vrw.step_batch(params, states[selection], engine="collocation", durations=guessed)
     np.testing.assert_array_equal(told_by.outcome, codes[selection])
     joined_values = np.concatenate([told_by.section_state, told_by.durations], 1)
@@ -466,13 +473,15 @@ def test_each_wheel_uses_the_cheapest_solver():
 
 
 def test_for_stiff_wheels_the_solver_choice_saves_work_without_losing_accuracy():
-    vectors = make_stiff_wheels([200.0, 1e3, 1e4])
+    parameter_rows = make_stiff_wheels([200.0, 1e3, 1e4])
     starts = np.tile([0.1, 1.6, -0.1], (3, 1))
-    exact, _ = compute_values(vectors, starts, vrw.StepOptions.tight(), engine="lanes")
+    exact, _ = compute_values(parameter_rows, starts, vrw.StepOptions.tight(), engine="lanes")
     options = vrw.StepOptions(rtol=1e-6, atol=1e-6)
-    batch_result = vrw.step_batch(reference_values.make_wheels(vectors), starts, options=options)
+    batch_result = vrw.step_batch(
+        reference_values.make_wheels(parameter_rows), starts, options=options
+    )
     named = vrw.step_batch(
-        reference_values.make_wheels(vectors), starts, options=options, engine="lanes"
+        reference_values.make_wheels(parameter_rows), starts, options=options, engine="lanes"
     )
     assert [batch_result.solver_names[i] for i in batch_result.solver_index] == [
         "Dopri8",
@@ -499,49 +508,55 @@ def test_for_stiff_wheels_the_solver_choice_saves_work_without_losing_accuracy()
 
 
 def test_elements_of_a_batch_with_several_solvers_are_bitwise_those_of_single_wheels():
-    vectors = make_stiff_wheels(np.tile([200.0, 1e4, 1e3], 5))
+    parameter_rows = make_stiff_wheels(np.tile([200.0, 1e4, 1e3], 5))
     starts = np.tile([0.1, 1.6, -0.1], (15, 1)) * np.linspace(1.0, 1.01, 15)[:, None]
     options = vrw.StepOptions(rtol=1e-6, atol=1e-6)
-    among, codes = compute_values(vectors, starts, options, n_steps=2)
+    among, codes = compute_values(parameter_rows, starts, options, n_steps=2)
     assert np.all(codes == Outcome.STEPPED)
     for i in range(4):
-        single_result, _ = compute_values(vectors[i : i + 1], starts[i : i + 1], options, n_steps=2)
-        np.testing.assert_array_equal(single_result[0], among[i])
+        single_states, _ = compute_values(
+            parameter_rows[i : i + 1], starts[i : i + 1], options, n_steps=2
+        )
+        np.testing.assert_array_equal(single_states[0], among[i])
 
 
 @pytest.mark.slow
 def test_wheels_too_stiff_for_an_explicit_solver_use_an_implicit_one():
     mass = np.array([1.0, 0.005])  # c/m of 100 and 20,000 1/s
-    vectors = make_parameter_rows(leg_mass=mass, hub_mass=18.0 - 8.0 * mass, damping=100.0)
+    parameter_rows = make_parameter_rows(leg_mass=mass, hub_mass=18.0 - 8.0 * mass, damping=100.0)
     options = vrw.StepOptions(solver="Tsit5", rtol=1e-6, atol=1e-6, max_solver_steps=300)
     starts = np.tile([0.1, 1.6, -0.1], (2, 1))
-    batch_result = vrw.step_batch(reference_values.make_wheels(vectors), starts, options=options)
+    batch_result = vrw.step_batch(
+        reference_values.make_wheels(parameter_rows), starts, options=options
+    )
     assert [batch_result.solver_names[i] for i in batch_result.solver_index] == [
         "Tsit5",
         lane_batch.SOLVER_SELECTION_OPTIONS.implicit_solver,
     ]
     assert list(batch_result.outcome) == [Outcome.STEPPED, Outcome.STEPPED]
-    _, explicit = compute_values(vectors, starts, options, engine="lanes")
+    _, explicit = compute_values(parameter_rows, starts, options, engine="lanes")
     assert list(explicit) == [Outcome.STEPPED, Outcome.SOLVER_FAILED]
-    exact, _ = compute_values(vectors, starts, vrw.StepOptions(), engine="lanes")
+    exact, _ = compute_values(parameter_rows, starts, vrw.StepOptions(), engine="lanes")
     np.testing.assert_allclose(batch_result.section_state[1], exact[1, :3], rtol=0, atol=1e-4)
 
 
 @pytest.mark.slow
 def test_a_stiff_wheel_with_an_unexpectedly_long_phase_uses_an_implicit_solver():
-    vectors = make_parameter_rows(
+    parameter_rows = make_parameter_rows(
         damping=[1e4, 1e3]
     )  # the first falls back after 0.69 s: 2,300 steps
     starts = np.tile([0.1, 1.6, -0.1], (2, 1))
     options = vrw.StepOptions(rtol=1e-6, atol=1e-6, max_solver_steps=1000)
-    batch_result = vrw.step_batch(reference_values.make_wheels(vectors), starts, options=options)
+    batch_result = vrw.step_batch(
+        reference_values.make_wheels(parameter_rows), starts, options=options
+    )
     solvers = [batch_result.solver_names[i] for i in batch_result.solver_index]
     assert solvers == [
         lane_batch.SOLVER_SELECTION_OPTIONS.implicit_solver,
         lane_batch.SOLVER_SELECTION_OPTIONS.stable_solver,
     ]
     assert list(batch_result.outcome) == [Outcome.FELL_BACK, Outcome.FELL_BACK]
-    _, code = compute_values(vectors[1:], starts[1:], options)
+    _, code = compute_values(parameter_rows[1:], starts[1:], options)
     assert code[0] == Outcome.FELL_BACK
 
 

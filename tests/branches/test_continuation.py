@@ -111,10 +111,10 @@ def test_branches_continued_together_equal_single_ones_with_two_iterations_per_p
     assert every.n_points[2] == 0
     assert np.ptp(every.n_points[3:]) > 10
     for i in (0, 5, 10):
-        single_result = tracks(np.array([i]), np.array([True]))
-        np.testing.assert_array_equal(every.n_points[i], single_result.n_points[0])
+        single_branch = tracks(np.array([i]), np.array([True]))
+        np.testing.assert_array_equal(every.n_points[i], single_branch.n_points[0])
         # One program is for one branch, the other for eight: last digits may differ.
-        np.testing.assert_allclose(every.points.p[i], single_result.points.p[0], rtol=0, atol=1e-10)
+        np.testing.assert_allclose(every.points.p[i], single_branch.points.p[0], rtol=0, atol=1e-10)
     assert every.n_linearizations.sum() < 2.3 * every.n_points.sum()
 
 

@@ -32,17 +32,17 @@ def make_scan(signs, outcome=None):
 
 def make_line(name, c, k):
     data = {"spectral_radius": ("point", np.full(len(c), 0.5))}
-    value_at = {"damping": ("point", c), "stiffness": ("point", k)}
-    return vrw.SpecialPointCurve(name, MAP_PARAMETERS, xr.Dataset(data, value_at), (), ("", ""))
+    coordinates = {"damping": ("point", c), "stiffness": ("point", k)}
+    return vrw.SpecialPointCurve(name, MAP_PARAMETERS, xr.Dataset(data, coordinates), (), ("", ""))
 
 
 def test_only_the_curve_of_the_same_quantity_explains_a_sign_change():
     zero = 50.0 + (K - 400.0) / 3.0
     scan = make_scan({"friction_rear": C[:, None] - zero})
     changes = find_sign_changes_in_scan(scan, MAP_PARAMETERS)
-    assert {change.quantity_name for change in changes} == {"friction_rear"}
-    for change in changes:  # linear: interpolation between two samples is exact
-        i, j = change.position_in_cells
+    assert {sign_change.quantity_name for sign_change in changes} == {"friction_rear"}
+    for sign_change in changes:  # linear: interpolation between two samples is exact
+        i, j = sign_change.position_in_cells
         assert 50.0 + 10.0 * i == pytest.approx(50.0 + 25.0 * j / 3.0, abs=1e-9)
     assert find_unexplained_sign_changes(changes, [make_line("friction_rear", zero, K)], scan) == []
     assert (
@@ -53,7 +53,7 @@ def test_only_the_curve_of_the_same_quantity_explains_a_sign_change():
         changes, [make_line("friction_rear", zero[:4], K[:4])], scan
     )
     assert 0 < len(half) < len(changes)
-    assert all(change.position_in_cells[1] > 3.0 for change in half)
+    assert all(sign_change.position_in_cells[1] > 3.0 for sign_change in half)
 
 
 def test_samples_with_too_coarse_a_mesh_do_not_count_as_missing_gaits():
@@ -63,18 +63,23 @@ def test_samples_with_too_coarse_a_mesh_do_not_count_as_missing_gaits():
     outcome[6:8, 4:] = vrw.Outcome.STEPPED
     scan = make_scan({}, outcome)
     result_by_name = {name: [] for name in ("gait", "mesh_too_coarse")}
-    for change in find_sign_changes_in_scan(scan, MAP_PARAMETERS):
-        result_by_name[change.quantity_name].append(change.sample_indices)
+    for sign_change in find_sign_changes_in_scan(scan, MAP_PARAMETERS):
+        result_by_name[sign_change.quantity_name].append(sign_change.sample_indices)
     assert set(result_by_name["gait"]) == {(5, j) for j in range(4)} | {(6, 4), (7, 4)}
     assert set(result_by_name["mesh_too_coarse"]) == {(7, j) for j in range(4, len(K))}
     fold = make_line("fold", np.full(2, 105.0), np.array([400.0, 500.0]))
-    left_part = find_unexplained_sign_changes(
+    unexplained_changes = find_unexplained_sign_changes(
         find_sign_changes_in_scan(scan, MAP_PARAMETERS), [fold], scan
     )
-    assert {change.quantity_name for change in left_part} == {"gait", "mesh_too_coarse"}
-    assert {change.sample_indices for change in left_part if change.quantity_name == "gait"} == {
-        (7, 4)
+    assert {sign_change.quantity_name for sign_change in unexplained_changes} == {
+        "gait",
+        "mesh_too_coarse",
     }
+    assert {
+        sign_change.sample_indices
+        for sign_change in unexplained_changes
+        if sign_change.quantity_name == "gait"
+    } == {(7, 4)}
 
 
 @pytest.mark.slow
@@ -82,10 +87,10 @@ def test_each_sign_change_of_a_scan_is_near_a_curve():
     grid = vrw.grid(damping=np.linspace(4.0, 240.0, 60), stiffness=np.linspace(350.0, 700.0, 36))
     scan = vrw.scan(grid, ["dls_fraction", *SPECIAL_POINT_MEASURES])
     stages = []
-    _, curves, left_part = follow_special_points(
+    _, curves, unexplained_changes = follow_special_points(
         scan, vrw.WheelParams(), vrw.ViscoelasticWheel(), stages.append
     )
-    assert not left_part
+    assert not unexplained_changes
     assert stages[0] == "following 5 branches along damping"
     assert any(stage.startswith("following special points: ") for stage in stages)
     (doubling,) = [curve.values for curve in curves if curve.name == "period_doubling"]

@@ -262,9 +262,9 @@ def test_a_stopped_scan_names_the_command_that_continues_it(
     monkeypatch.setattr(ScanPlan, "build_scan_engine", lambda _: rest)
     assert run_command("scan", config).exit_code == 0
     assert rest.n_calls == 2
-    second_result = run_command("scan", config)
-    assert second_result.exit_code == 0
-    assert "nothing to compute" in second_result.stdout
+    second_run = run_command("scan", config)
+    assert second_run.exit_code == 0
+    assert "nothing to compute" in second_run.stdout
     assert rest.n_calls == 2
 
 
@@ -329,9 +329,9 @@ def test_init_writes_the_example_configs_and_nothing_twice(config: Path) -> None
     for path in examples.glob("*.toml"):
         assert (config.parent / "mine" / path.name).read_text() == path.read_text()
         assert path.name in result.stdout
-    second_result = run_command("init", "mine")
-    assert second_result.exit_code == 0
-    assert "nothing to write" in second_result.stdout
+    second_run = run_command("init", "mine")
+    assert second_run.exit_code == 0
+    assert "nothing to write" in second_run.stdout
 
 
 def test_an_installed_wheel_brings_the_example_configs() -> None:
@@ -361,9 +361,9 @@ def test_verify_reports_whether_a_store_is_complete_and_intact(
     assert not file.exists()
     rest = CountingEngine()
     monkeypatch.setattr(ScanPlan, "build_scan_engine", lambda _: rest)
-    second_result = run_command("scan", config, "--no-picture")
-    assert second_result.exit_code == 0
-    assert "1 damaged chunk (number 1): computed again" in second_result.stderr
+    second_run = run_command("scan", config, "--no-picture")
+    assert second_run.exit_code == 0
+    assert "1 damaged chunk (number 1): computed again" in second_run.stderr
     assert rest.n_calls == 1
 
 

@@ -220,9 +220,9 @@ def test_a_unilateral_branch_turns_at_its_fold_and_returns_unstable():
 @pytest.mark.slow
 def test_without_slip_the_multipliers_equal_those_of_the_paper():
     paper = vrw.limit_cycle(vrw.WheelParams())
-    held_values = vrw.UnilateralWheel(friction=math.inf, infinite_friction_rule="paper")
+    model_without_slip = vrw.UnilateralWheel(friction=math.inf, infinite_friction_rule="paper")
     ground = vrw.limit_cycle(
-        vrw.WheelParams(), guess=START, model=held_values, options=TIGHT_OPTIONS
+        vrw.WheelParams(), guess=START, model=model_without_slip, options=TIGHT_OPTIONS
     )
     assert int(ground.outcome) == vrw.Outcome.STEPPED
     np.testing.assert_allclose(ground.period, paper.period, atol=1e-9)
@@ -323,13 +323,13 @@ def test_an_impossible_start_has_the_outcome_bad_input():
     full = np.array(
         [GROUND_MODEL.complete_section_state(SLOW_WHEEL, jnp.asarray(x)) for x in starts]
     )
-    free, held_values, near = (full[0].copy() for _ in range(3))
+    free, state_on_stopper, near = (full[0].copy() for _ in range(3))
     free[4 + 2 * 8 + 2], free[4 + 2] = 0.0, 1.01  # a leg in the air off its stopper, too long
-    held_values[4 + 2 * 8] = 5.0  # the loaded leg on its stopper: its foot is in the ground
+    state_on_stopper[4 + 2 * 8] = 5.0  # the loaded leg on its stopper: its foot is in the ground
     near[4 + 2 * 8 + 2], near[4 + 2] = 0.0, 1.0005  # by no more than Newton's method may be wrong
     batch_result = vrw.step_batch(
         SLOW_WHEEL,
-        np.stack([*full, free, held_values, near]),
+        np.stack([*full, free, state_on_stopper, near]),
         1,
         model=GROUND_MODEL,
         options=TIGHT_OPTIONS,
@@ -361,9 +361,9 @@ def test_independent_rates_and_their_shares_do_not_depend_on_other_batch_element
         )
         weights = single_result.combination_weights[0]
         np.testing.assert_array_equal(joint_result.combination_weights[k, :n], weights)
-        retained = settled[k][:, joint_result.independent_rate_indices[k, :n]]
+        independent_tangents = settled[k][:, joint_result.independent_rate_indices[k, :n]]
         # Largest in thirty such sets: 4e-16.
-        np.testing.assert_allclose(retained @ weights, settled[k], rtol=0, atol=1e-14)
+        np.testing.assert_allclose(independent_tangents @ weights, settled[k], rtol=0, atol=1e-14)
 
 
 @pytest.mark.slow
@@ -515,8 +515,8 @@ def test_a_batched_step_has_measures_and_derivatives_of_a_single_wheel(scene, st
             [single_result.section_state[:20], times(single_result.durations)]
         ), single_result
 
-    value_at = [jnp.asarray(v) for v in (damping, friction, x[1])]
-    exact, step_result = jax.jacfwd(result, argnums=(0, 1, 2), has_aux=True)(*value_at)
+    argument_values = [jnp.asarray(v) for v in (damping, friction, x[1])]
+    exact, step_result = jax.jacfwd(result, argnums=(0, 1, 2), has_aux=True)(*argument_values)
     for name in ("section_state", "durations", "post_impact", "slip", "energy_impacts",
                  "energy_damping", "energy_friction", "step_length", "mode_durations"):  # fmt: skip
         result = getattr(step, name)[0]

@@ -101,9 +101,9 @@ def test_cycles_agree_with_the_reference(options, allowed):
 @pytest.mark.parametrize(("options", "allowed"), [(None, 1e-8), (TIGHT_OPTIONS, 1e-11)])
 def test_multipliers_agree_with_the_reference(options, allowed):
     expected = reference_values.stack_quantity("cycle", "multipliers")
-    values_array = np.asarray(find_reference_cycles(options).multipliers)
+    multipliers = np.asarray(find_reference_cycles(options).multipliers)
     expected = expected[..., 0] + 1j * expected[..., 1]
-    gap = np.abs(values_array[:, :, None] - expected[:, None, :])
+    gap = np.abs(multipliers[:, :, None] - expected[:, None, :])
     assert gap.min(1).max() < allowed
 
 
@@ -207,14 +207,14 @@ def test_a_gait_that_the_mesh_does_not_resolve_is_not_reported_as_found():
         differentiate_measures(rows, TIGHT_OPTIONS)[1],
         differentiate_measures(rows)[1],
     )
-    values_array = np.asarray(solution.found)
-    assert list(values_array) == [True, True, True, False, False, False]
+    is_gait_found = np.asarray(solution.found)
+    assert list(is_gait_found) == [True, True, True, False, False, False]
     assert np.asarray(expected.found)[3]
     np.testing.assert_allclose(
-        solution.period[values_array], expected.period[values_array], rtol=1e-8
+        solution.period[is_gait_found], expected.period[is_gait_found], rtol=1e-8
     )
-    error = np.abs(np.asarray(solution.period / expected.period)[values_array] - 1.0)
-    assert np.all(error <= solution.mesh_error[values_array])
+    error = np.abs(np.asarray(solution.period / expected.period)[is_gait_found] - 1.0)
+    assert np.all(error <= solution.mesh_error[is_gait_found])
 
 
 def test_every_measure_of_a_cycle_can_be_differentiated():
@@ -316,8 +316,8 @@ def test_step_and_cycle_agree_on_the_smooth_margin():
         cycle = vrw.limit_cycle(params)
         return vrw.step(params, cycle.section_state).margins.takeoff_acceleration
 
-    value_at = vrw.WheelParams(damping=150.0)
-    ours, theirs = (jax.value_and_grad(of_values)(value_at) for of_values in (of_step, of_cycle))
+    wheel = vrw.WheelParams(damping=150.0)
+    ours, theirs = (jax.value_and_grad(of_values)(wheel) for of_values in (of_step, of_cycle))
     for one, other in zip(jax.tree.leaves(ours), jax.tree.leaves(theirs), strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-7)
     assert ours[0] > 0.0 > of_step(vrw.WheelParams(damping=100.0))  # where foot 2 scuffs
@@ -376,12 +376,12 @@ def test_long_double_support_is_found_if_round_off_exceeds_the_tolerance():
     draw, n = np.random.default_rng(5).uniform, 64
     wheel = vrw.WheelParams(damping=draw(50.0, 130.0, n), stiffness=draw(203.0, 215.0, n))
     params = jax.tree.map(lambda x: jnp.broadcast_to(x, n), wheel)
-    known_values = vrw.limit_cycles(params)
-    assert np.max(known_values.durations[:, 0]) > 3.0
+    first_cycles = vrw.limit_cycles(params)
+    assert np.max(first_cycles.durations[:, 0]) > 3.0
     fine = vrw.CycleOptions.tight().refine_mesh().refine_mesh()
-    second_result = jax.vmap(lambda p, x: vrw.limit_cycle(p, guess=x, options=fine))
-    solution = second_result(params, known_values.section_state).found
-    np.testing.assert_array_equal(solution, known_values.found)
+    find_again = jax.vmap(lambda p, x: vrw.limit_cycle(p, guess=x, options=fine))
+    solution = find_again(params, first_cycles.section_state).found
+    np.testing.assert_array_equal(solution, first_cycles.found)
 
 
 @pytest.mark.slow
@@ -421,8 +421,8 @@ def test_another_model_is_solved_on_its_own_return_map():
     back = vrw.return_map(params, cycle.section_state, model=model)
     np.testing.assert_allclose(back, cycle.section_state, rtol=1e-12)
     # Energy gained over a step is what the landing takes: the kept rate squared is the multiplier.
-    retained = cycle.post_impact[1] / cycle.section_state[1]
-    np.testing.assert_allclose(cycle.spectral_radius, retained**2, rtol=1e-10)
+    rate_ratio = cycle.post_impact[1] / cycle.section_state[1]
+    np.testing.assert_allclose(cycle.spectral_radius, rate_ratio**2, rtol=1e-10)
     assert float(cycle.dls_fraction) == 0.0
     table = vrw.sensitivities(params, model=model, measures=("period", "speed"))
     above, below = (
@@ -598,12 +598,12 @@ def test_a_search_by_xla_agrees_with_machine_code(monkeypatch):
     rows[3, [column("damping"), column("slope")]] = 40.0, 0.33
     rows[5, column("slope")] = 0.05
 
-    def evaluate(vectors):
+    def evaluate(parameter_rows):
         one = lambda vector: vrw.limit_cycle(reference_values.make_wheel(vector))
         period = lambda vector: one(vector).period
         margin = lambda vector: one(vector).stability_margin
-        cycle = jax.vmap(one)(vectors)
-        slopes, second = (jax.vmap(jax.grad(f))(vectors) for f in (period, margin))
+        cycle = jax.vmap(one)(parameter_rows)
+        slopes, second = (jax.vmap(jax.grad(f))(parameter_rows) for f in (period, margin))
         return (
             cycle.durations,
             cycle.monodromy_value,
@@ -615,7 +615,7 @@ def test_a_search_by_xla_agrees_with_machine_code(monkeypatch):
 
     *solution, outcome, passes = jax.jit(evaluate)(rows)
     monkeypatch.setattr(simd, "is_machine_code_available", lambda: False)
-    *by_xla, code, n = jax.jit(lambda vectors: evaluate(vectors))(rows)
+    *by_xla, code, n = jax.jit(lambda parameter_rows: evaluate(parameter_rows))(rows)
     np.testing.assert_array_equal(code, outcome)
     np.testing.assert_array_equal(n, passes)
     for a, b in zip(by_xla, solution, strict=True):

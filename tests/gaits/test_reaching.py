@@ -142,9 +142,9 @@ def test_gaits_of_few_legs_that_only_fast_walks_reach_are_found(
 
 def test_gaits_of_a_finer_mesh_have_accurate_derivatives():
     period = lambda slope: vrw.limit_cycle(vrw.WheelParams(slope=slope)).period
-    value_at, step = 0.12, 1e-6
-    quotient = (period(value_at + step) - period(value_at - step)) / (2.0 * step)
-    np.testing.assert_allclose(jax.jacfwd(period)(value_at), quotient, rtol=1e-6)
+    slope, step = 0.12, 1e-6
+    quotient = (period(slope + step) - period(slope - step)) / (2.0 * step)
+    np.testing.assert_allclose(jax.jacfwd(period)(slope), quotient, rtol=1e-6)
 
 
 def test_a_gait_near_a_section_state_has_the_derivatives_of_the_one_found_cold():

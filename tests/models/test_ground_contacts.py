@@ -68,27 +68,27 @@ def enumerate_admissible_contacts(wheel, q, v, at_stopper, locked, moving):
     bias = (rows_at(q + h * v) - rows_at(q - h * v)) @ v / (2.0 * h) * moving
     found_rows = []
     stoppers = itertools.product(
-        *((False, True) if value_at else (False,) for value_at in at_stopper)
+        *((False, True) if is_at_stopper else (False,) for is_at_stopper in at_stopper)
     )
-    for modes, held_values in itertools.product(itertools.product(MODE_RANKS, repeat=2), stoppers):
-        if modes == (ContactMode.STICK, ContactMode.STICK) and all(held_values):
+    for modes, is_leg_locked in itertools.product(
+        itertools.product(MODE_RANKS, repeat=2), stoppers
+    ):
+        if modes == (ContactMode.STICK, ContactMode.STICK) and all(is_leg_locked):
             continue  # fixes the hub twice over
         closed = []  # row kept at rest, direction of its force, bias
         for i, mode in enumerate(modes):
-            tangential_part, off = feet[i]
+            tangential_row, off = feet[i]
             drag = {
                 ContactMode.SLIP_DOWN: -wheel.friction,
                 ContactMode.SLIP_UP: wheel.friction,
             }.get(mode, 0.0)
             closed += (
-                [(off, off + drag * tangential_part, bias[i, 1])] if mode != ContactMode.OFF else []
+                [(off, off + drag * tangential_row, bias[i, 1])] if mode != ContactMode.OFF else []
             )
             closed += (
-                [(tangential_part, tangential_part, bias[i, 0])]
-                if mode == ContactMode.STICK
-                else []
+                [(tangential_row, tangential_row, bias[i, 0])] if mode == ContactMode.STICK else []
             )
-            closed += [(room[i], room[i], 0.0)] if held_values[i] else []
+            closed += [(room[i], room[i], 0.0)] if is_leg_locked[i] else []
         R, C = (np.reshape([c[k] for c in closed], (-1, len(axes))) for k in range(2))
         p = -np.linalg.solve(R @ inverse @ C.T, R @ free + [c[2] for c in closed])
         after, forces, good = free + inverse @ C.T @ p, iter(p), True
@@ -102,11 +102,11 @@ def enumerate_admissible_contacts(wheel, q, v, at_stopper, locked, moving):
             good &= mode != ContactMode.SLIP_UP or x <= 0.0
             good &= (
                 next(forces) >= 0.0
-                if held_values[i]
+                if is_leg_locked[i]
                 else not at_stopper[i] or room[i] @ after >= 0.0
             )
         if good:
-            found_rows.append((modes, held_values, dict(zip(axes.tolist(), after, strict=True))))
+            found_rows.append((modes, is_leg_locked, dict(zip(axes.tolist(), after, strict=True))))
     return found_rows
 
 
@@ -150,7 +150,7 @@ def test_the_selected_contact_combination_is_admissible_and_solutions_are_counte
     numbers = set()
     for q, v, at_stopper, locked in draw_contact_cases():
         expected = enumerate_admissible_contacts(wheel, q, v, at_stopper, locked, moving)
-        contact, held_values, rates, solutions = select_contacts(
+        contact, is_leg_locked, rates, solutions = select_contacts(
             q, v, at_stopper, locked, friction, moving
         )
         assert int(solutions) == len(expected)
@@ -158,7 +158,7 @@ def test_the_selected_contact_combination_is_admissible_and_solutions_are_counte
         if not expected:
             continue
         modes = tuple(np.asarray(contact).tolist())
-        stoppers = tuple(np.asarray(held_values).tolist())
+        stoppers = tuple(np.asarray(is_leg_locked).tolist())
         (is_same,) = (x for m, h, x in expected if m == modes and h == stoppers)
         # Differences of the feet's rows: rounding 1e-16 / 1e-5 and error 1e-10, times some 10.
         np.testing.assert_allclose(rates, [is_same[i] for i in range(5)], rtol=1e-8, atol=1e-8)
@@ -173,10 +173,10 @@ def test_infinite_friction_is_the_limit_of_large_friction(moving):
     slid = 0
     for q, v, at_stopper, locked in itertools.islice(draw_contact_cases(), 60):
         given = q, v, at_stopper, locked
-        contact, held_values, rates, _ = select_contacts(*given, jnp.inf, moving)
+        contact, is_leg_locked, rates, _ = select_contacts(*given, jnp.inf, moving)
         large = select_contacts(*given, 1e8, moving)
         np.testing.assert_array_equal(contact, large[0])
-        np.testing.assert_array_equal(held_values, large[1])
+        np.testing.assert_array_equal(is_leg_locked, large[1])
         np.testing.assert_allclose(rates, large[2], rtol=1e-4, atol=1e-4)
         slid += bool(np.isin(contact, (ContactMode.SLIP_DOWN, ContactMode.SLIP_UP)).any())
     assert slid > 5

@@ -79,12 +79,14 @@ def test_derivatives_through_the_events_of_a_step_match_differences(name):
     x = wheel.complete_section_state(params, jnp.asarray([0.1, dtheta, -0.1]))
     trace = wheel.sample_step(params, x, vrw.StepOptions(), 2)
     assert kinds <= classify_events(trace, bool(x[3 + 3 * params.n_legs] >= 4))
-    value_at = [jnp.asarray(v) for v in (mu, c, dtheta)]
-    jacobian = jax.jacfwd(compute_step, argnums=(0, 1, 2))(*value_at, stoppers)
+    argument_values = [jnp.asarray(v) for v in (mu, c, dtheta)]
+    jacobian = jax.jacfwd(compute_step, argnums=(0, 1, 2))(*argument_values, stoppers)
     for i, column in enumerate(jacobian):
-        size = 1e-5 * max(1.0, float(value_at[i]))
+        size = 1e-5 * max(1.0, float(argument_values[i]))
         ends = [
-            compute_step(*value_at[:i], value_at[i] + d, *value_at[i + 1 :], stoppers)
+            compute_step(
+                *argument_values[:i], argument_values[i] + d, *argument_values[i + 1 :], stoppers
+            )
             for d in (size, -size)
         ]
         difference = (ends[0] - ends[1]) / (2.0 * size)
@@ -94,7 +96,7 @@ def test_derivatives_through_the_events_of_a_step_match_differences(name):
 def test_batched_gradients_equal_difference_quotients():
     """Machine code within `jit`, `vmap` and `grad`; each of these wheels has events of its own."""
     wheels = [STEP_SCENES[name][0] for name in ("lands sliding", "reverses", "flies")]
-    value_at = [jnp.asarray(column) for column in list(zip(*wheels, strict=True))[:3]]
+    argument_values = [jnp.asarray(column) for column in list(zip(*wheels, strict=True))[:3]]
 
     def evaluate(mu, c, dtheta):
         wheel, params = vrw.UnilateralWheel(friction=mu), vrw.WheelParams(damping=c)
@@ -103,10 +105,13 @@ def test_batched_gradients_equal_difference_quotients():
         return {"period": step.period, "slip": step.slip, "force": step.margins.stopper_force}
 
     values = jax.jit(jax.vmap(evaluate))
-    slopes = jax.jit(jax.vmap(jax.jacrev(evaluate, argnums=(0, 1, 2))))(*value_at)
-    for i in range(len(value_at)):
-        size = 1e-5 * jnp.maximum(1.0, value_at[i])
-        ends = [values(*value_at[:i], value_at[i] + d, *value_at[i + 1 :]) for d in (size, -size)]
+    slopes = jax.jit(jax.vmap(jax.jacrev(evaluate, argnums=(0, 1, 2))))(*argument_values)
+    for i in range(len(argument_values)):
+        size = 1e-5 * jnp.maximum(1.0, argument_values[i])
+        ends = [
+            values(*argument_values[:i], argument_values[i] + d, *argument_values[i + 1 :])
+            for d in (size, -size)
+        ]
         for name, slope in slopes.items():
             difference = (ends[0][name] - ends[1][name]) / (2.0 * size)
             np.testing.assert_allclose(slope[i], difference, rtol=1e-6, atol=1e-7, err_msg=name)
@@ -139,8 +144,8 @@ def test_derivatives_are_accurate_if_only_stability_limits_the_solver_step(solve
         given = params, batch_result.section_state
         requested = ("section_state", "natural_length")
         solution = vrw.step_batch(*given, model=ground, options=options, derivatives=requested)
-        full_values = [solution.derivatives[name].section_state for name in requested]
-        return np.concatenate([full_values[0], full_values[1][:, :, None]], 2)
+        derivatives = [solution.derivatives[name].section_state for name in requested]
+        return np.concatenate([derivatives[0], derivatives[1][:, :, None]], 2)
 
     reference = moved(1e-10 if solver == "Tsit5" else 1e-8)
     for tolerance in (5e-7, 3e-7, 2e-7):

@@ -37,10 +37,10 @@ def find_walk_ends(friction, stoppers, tolerance):
     params, starts = draw_wheels()
     model = vrw.UnilateralWheel(friction=friction, stoppers=stoppers)
     options = vrw.StepOptions(solver="Tsit5", rtol=tolerance, atol=tolerance)
-    values_array = np.asarray(
+    outcomes = np.asarray(
         vrw.step_batch(params, starts, N_STEPS, model=model, options=options).outcome
     )
-    return {int(i): values_array[i] for i in np.flatnonzero(values_array)}
+    return {int(i): outcomes[i] for i in np.flatnonzero(outcomes)}
 
 
 @pytest.mark.parametrize("tolerance", [1e-6, 1e-8, 1e-10])

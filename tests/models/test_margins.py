@@ -124,7 +124,7 @@ def test_a_rear_foot_without_load_after_the_landing_skips_double_support():
 
 def test_batches_have_all_measures_of_a_single_step():
     # Gaits, steps without double support (A3, B3), falls and a bad wheel, side by side.
-    vectors = make_parameter_rows(
+    parameter_rows = make_parameter_rows(
         damping=[200.0, 60.0, 225.0, 100.0, -1.0, 160.0],
         slope=[0.30, 0.23, 0.39, 0.09, 0.30, 0.30],
     )
@@ -133,7 +133,7 @@ def test_batches_have_all_measures_of_a_single_step():
          [0.1027, 2.0, -0.109], [0.1027, 1.8, -0.1]]
     )  # fmt: skip
     wheel, lanes = (
-        compute_full_steps(vectors, starts, uses_lane_engine=method_name)
+        compute_full_steps(parameter_rows, starts, uses_lane_engine=method_name)
         for method_name in (False, True)
     )
     assert len(set(map(int, wheel.outcome))) == 3
@@ -146,11 +146,13 @@ def test_batches_have_all_measures_of_a_single_step():
 
 def test_margins_of_a_batch_element_are_bitwise_those_of_the_single_wheel():
     rng = np.random.default_rng(1)
-    vectors = make_parameter_rows(damping=rng.uniform(100.0, 215.0, 16))
+    parameter_rows = make_parameter_rows(damping=rng.uniform(100.0, 215.0, 16))
     starts = np.array([0.1027, 2.0, -0.109]) * rng.uniform(0.95, 1.05, (16, 1))
-    full_values = compute_full_steps(vectors, starts, uses_lane_engine=True)
+    full_values = compute_full_steps(parameter_rows, starts, uses_lane_engine=True)
     order = rng.permutation(16)
     for selection in (order[:7], *order[7:, None]):
-        part = compute_full_steps(vectors[selection], starts[selection], uses_lane_engine=True)
+        part = compute_full_steps(
+            parameter_rows[selection], starts[selection], uses_lane_engine=True
+        )
         for a, b in zip(jax.tree.leaves(part), jax.tree.leaves(full_values), strict=True):
             np.testing.assert_array_equal(a, np.asarray(b)[selection])

@@ -22,8 +22,8 @@ from vrw_jax import Outcome
 
 @pytest.mark.parametrize("outcome", OUTCOME_CASES, ids=lambda o: o.name)
 def test_each_outcome_occurs(outcome):
-    vectors, start = OUTCOME_CASES[outcome]
-    result = compute_full_steps(vectors, start)
+    parameter_rows, start = OUTCOME_CASES[outcome]
+    result = compute_full_steps(parameter_rows, start)
     assert Outcome(int(result.outcome[0])) is outcome
 
 
@@ -86,8 +86,8 @@ def test_a_wheel_at_rest_has_the_same_outcome_from_every_engine(tolerance):
 
 def test_a_wheel_comes_to_rest_where_the_ground_carries_its_weight():
     """Reference: statics, the sum of both feet's forces against gravity in the slope's frame."""
-    vectors, start = OUTCOME_CASES[Outcome.CAME_TO_REST]
-    params = reference_values.make_wheel(vectors[0])
+    parameter_rows, start = OUTCOME_CASES[Outcome.CAME_TO_REST]
+    params = reference_values.make_wheel(parameter_rows[0])
     for engine in ("lanes", "diffrax"):
         options = vrw.StepOptions(engine=engine)
         trace = vrw.ViscoelasticWheel().sample_step(params, jnp.asarray(start), options, 2)
@@ -123,25 +123,25 @@ def test_every_outcome_has_a_name_and_one_sentence():
 
 
 def test_failing_batch_elements_do_not_change_the_others():
-    bad = [vectors[0] for vectors, _ in OUTCOME_CASES.values()]
+    bad = [parameter_rows[0] for parameter_rows, _ in OUTCOME_CASES.values()]
     starts = [np.asarray(start) for _, start in OUTCOME_CASES.values()]
     among = compute_full_steps(np.stack(bad), np.stack(starts))
-    single_result = compute_full_steps(make_parameter_rows(), TABLE_1_SECTION_STATE)
-    for mixed, single in zip(jax.tree.leaves(among), jax.tree.leaves(single_result), strict=True):
+    single_step = compute_full_steps(make_parameter_rows(), TABLE_1_SECTION_STATE)
+    for mixed, single in zip(jax.tree.leaves(among), jax.tree.leaves(single_step), strict=True):
         # A vmapped loop may fuse differently: round-off, a few 1e-14 relative.
         np.testing.assert_allclose(mixed[0], single[0], rtol=5e-14, atol=5e-14)
 
 
 def test_failing_batch_elements_have_finite_values_and_derivatives():
-    vectors = jnp.asarray(np.stack([v[0] for v, _ in OUTCOME_CASES.values()]))
+    parameter_rows = jnp.asarray(np.stack([v[0] for v, _ in OUTCOME_CASES.values()]))
     starts = jnp.asarray(np.stack([np.asarray(x) for _, x in OUTCOME_CASES.values()]))
     pad = 16 - len(OUTCOME_CASES)
-    vectors = jnp.concatenate([vectors, jnp.tile(TABLE_1_VALUES, (pad, 1))])
+    parameter_rows = jnp.concatenate([parameter_rows, jnp.tile(TABLE_1_VALUES, (pad, 1))])
     starts = jnp.concatenate([starts, jnp.tile(TABLE_1_SECTION_STATE, (pad, 1))])
-    result = compute_full_steps(vectors, starts)
+    result = compute_full_steps(parameter_rows, starts)
     for leaf in jax.tree.leaves(result):
         assert np.all(np.isfinite(leaf))
-    by_parameter, by_start = compute_jacobians(vectors, starts, vrw.StepOptions())
+    by_parameter, by_start = compute_jacobians(parameter_rows, starts, vrw.StepOptions())
     assert np.all(np.isfinite(by_parameter))
     assert np.all(np.isfinite(by_start))
     clean, _ = compute_jacobians(
@@ -153,8 +153,8 @@ def test_failing_batch_elements_have_finite_values_and_derivatives():
 
 
 def test_a_failed_step_returns_zeros_instead_of_a_section_state():
-    vectors, start = OUTCOME_CASES[Outcome.FELL_BACK]
-    result = compute_full_steps(vectors, start)
+    parameter_rows, start = OUTCOME_CASES[Outcome.FELL_BACK]
+    result = compute_full_steps(parameter_rows, start)
     assert np.all(np.asarray(result.section_state) == 0.0)
 
 

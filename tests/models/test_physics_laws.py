@@ -125,11 +125,11 @@ DURATION_DIMENSIONS = np.array([(0, 0, 1)] * 3)
 @pytest.mark.parametrize("scale", [(3.0, 1.0, 1.0), (1.0, 2.0, 1.0), (1.0, 1.0, 0.5)], ids=str)
 def test_mass_length_and_time_scale_out(scale):
     factor = lambda exponents: np.prod(np.asarray(scale) ** np.asarray(exponents), axis=-1)
-    values_array = np.array([factor(DIMENSIONS[name]) for name in NAMES])
+    unit_factors = np.array([factor(DIMENSIONS[name]) for name in NAMES])
     options = vrw.StepOptions.tight()
     plain, _ = compute_states_and_work(reference_values.REFERENCE_PARAMETERS, STARTS, options)
     scaled, _ = compute_states_and_work(
-        reference_values.REFERENCE_PARAMETERS * values_array,
+        reference_values.REFERENCE_PARAMETERS * unit_factors,
         STARTS * factor(START_DIMENSIONS),
         options,
     )

@@ -35,10 +35,12 @@ def test_leg_masses_enter_by_their_inertia_about_the_hub():
     p = vrw.WheelParams(slope=0.15)
     mass, inertia = 10.0 + 8.0, 8.0 * 0.7**2
     result = vrw.step(p, [HALF_ANGLE, 2.0, 0.0], model=rigid_walks())
-    retained = (mass * np.cos(np.pi / 4) + inertia) / (mass + inertia)
-    np.testing.assert_allclose(result.post_impact[1], 2.0 * retained, rtol=1e-14)
+    retained_share = (mass * np.cos(np.pi / 4) + inertia) / (mass + inertia)
+    np.testing.assert_allclose(result.post_impact[1], 2.0 * retained_share, rtol=1e-14)
     gained = 4.0 * mass * 9.81 * np.sin(HALF_ANGLE) * np.sin(0.15) / (mass + inertia)
-    np.testing.assert_allclose(result.section_state[1], np.sqrt((2.0 * retained) ** 2 + gained))
+    np.testing.assert_allclose(
+        result.section_state[1], np.sqrt((2.0 * retained_share) ** 2 + gained)
+    )
 
 
 @pytest.mark.parametrize("slope", [0.1, 0.3, 0.39, 0.45])
@@ -106,14 +108,14 @@ def test_the_rigid_wheel_is_the_second_order_limit_of_the_viscoelastic_wheel():
     """
     start = np.array([HALF_ANGLE, 2.0, 0.0])
     sizes = np.array([1 / 16, 1 / 32, 1 / 64])
-    vectors = make_parameter_rows(
+    parameter_rows = make_parameter_rows(
         slope=0.15,
         stiffness=500.0 / sizes**2,
         damping=200.0 / sizes,
         natural_length=1.0 + 0.02 * sizes**2,
     )
     model = vrw.ViscoelasticWheel(stop_at_lift_off=False)
-    soft = compute_full_steps(vectors, np.tile(start, (3, 1)), model=model)
+    soft = compute_full_steps(parameter_rows, np.tile(start, (3, 1)), model=model)
     assert np.all(np.asarray(soft.outcome) == vrw.Outcome.STEPPED)
     p = vrw.WheelParams(slope=0.15)
     step_result = vrw.step(p, start, model=rigid_walks(held_landing=True))

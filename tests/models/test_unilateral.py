@@ -86,8 +86,8 @@ def compute_total_energy(s, motion):
 
 def test_without_slip_the_gait_equals_that_of_the_paper():
     paper = vrw.walk(TABLE_1, START, 40, options=TIGHT_OPTIONS).steps
-    held_values = vrw.UnilateralWheel(math.inf, infinite_friction_rule="paper")
-    ground = vrw.walk(TABLE_1, START, 40, model=held_values, options=TIGHT_OPTIONS).steps
+    model_without_slip = vrw.UnilateralWheel(math.inf, infinite_friction_rule="paper")
+    ground = vrw.walk(TABLE_1, START, 40, model=model_without_slip, options=TIGHT_OPTIONS).steps
     assert float(jnp.max(jnp.abs(paper.section_state[-1] - paper.section_state[-2]))) < 1e-12
     theta_rates = ground.section_state[-1][jnp.asarray([0, 1, 12])]
     np.testing.assert_allclose(theta_rates, paper.section_state[-1], atol=1e-11)
@@ -276,9 +276,9 @@ def test_a_wheel_on_two_stiff_legs_slides_like_a_block():
         flow, make_resting_motion(-math.pi / 8, vx=jnp.asarray(0.1))
     ).force_solution
     g, slope = 9.81, 0.30
-    tangential_part = g * (math.sin(slope) - friction * math.cos(slope))
+    downhill_acceleration = g * (math.sin(slope) - friction * math.cos(slope))
     np.testing.assert_allclose(
-        jnp.stack(solution.hub_motion), [tangential_part, 0.0, 0.0], atol=1e-12
+        jnp.stack(solution.hub_motion), [downhill_acceleration, 0.0, 0.0], atol=1e-12
     )
     assert abs(float(sum(solution.normal_forces)) - 18.0 * g * math.cos(slope)) < 1e-10
 
@@ -292,14 +292,14 @@ def test_a_wheel_in_the_air_falls_freely():
         make_contact_state((ContactMode.OFF, ContactMode.OFF), [True] * 8),
     )
     motion = make_resting_motion(-0.3, z=jnp.asarray(2.0), dtheta=jnp.asarray(3.0))
-    current_value = compute_forces(flow, motion)
+    contact_forces = compute_forces(flow, motion)
     expected = [9.81 * math.sin(0.3), -9.81 * math.cos(0.3), 0.0]
     np.testing.assert_allclose(
-        jnp.stack(current_value.force_solution.hub_motion), expected, atol=1e-12
+        jnp.stack(contact_forces.force_solution.hub_motion), expected, atol=1e-12
     )
     # Preload and spin press each leg on its stopper: 500 * 0.02 + 0.7 * 3^2 N.
     np.testing.assert_allclose(
-        compute_airborne_stopper_force(flow, current_value), 10.0 + 6.3, atol=1e-12
+        compute_airborne_stopper_force(flow, contact_forces), 10.0 + 6.3, atol=1e-12
     )
 
 

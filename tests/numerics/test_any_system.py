@@ -142,17 +142,17 @@ def make_switching_system(rate):
             lambda y, a=a, b=b: jnp.stack([rate * (y[1] + a - y[0]), slow * (b - y[1])]),
             (
                 Guard(
-                    lambda y, value_at=value_at, sign=1.0 - 2.0 * k: sign * (value_at - y[0]),
+                    lambda y, level=level, sign=1.0 - 2.0 * k: sign * (level - y[0]),
                     target_mode=1 - k,
                 ),
             ),
         )
-        for k, (a, b, value_at) in enumerate(levels)
+        for k, (a, b, level) in enumerate(levels)
     ]
     y, times = 0.3, []
     for k in range(6):
-        a, b, value_at = levels[k % 2]
-        times.append(np.log((y - b) * rate / (rate - slow) / (value_at - a - b)) / slow)
+        a, b, level = levels[k % 2]
+        times.append(np.log((y - b) * rate / (rate - slow) / (level - a - b)) / slow)
         y = b + (y - b) * np.exp(-slow * times[-1])
     return modes, [4.2, 0.3], np.cumsum(times)
 
@@ -241,7 +241,7 @@ def make_impact_oscillator(depth):
 
 @pytest.mark.parametrize("depth", [1e-2, 1e-6])
 def test_the_product_of_multipliers_is_accurate_at_a_grazing_event(depth):
-    modes, start, retained = make_impact_oscillator(depth)
+    modes, start, restitution = make_impact_oscillator(depth)
 
     def back(x):
         return simulate_hybrid(
@@ -256,10 +256,10 @@ def test_the_product_of_multipliers_is_accurate_at_a_grazing_event(depth):
     result = simulate_hybrid(modes, start, events=1, options=TIGHT_OPTIONS)
     # Area shrinks by the restitution twice: of the rate, and of the time at which it passes.
     assert (
-        abs(float(flow_jacobian_determinant(modes, start, result, TIGHT_OPTIONS)) - retained**2)
+        abs(float(flow_jacobian_determinant(modes, start, result, TIGHT_OPTIONS)) - restitution**2)
         < 1e-15
     )
-    determinant_error = abs(float(jnp.linalg.det(fixed_point.jacobian)) - retained**2)
+    determinant_error = abs(float(jnp.linalg.det(fixed_point.jacobian)) - restitution**2)
     assert (determinant_error > 1e-12) == (depth == 1e-6)
 
 
@@ -389,10 +389,10 @@ def test_multipliers_of_a_product_are_accurate_or_marked_as_inaccurate():
     assert np.all(result.is_known)
     np.testing.assert_allclose(result.values, [1.0, np.exp(-48 * np.pi)], rtol=1e-12)
     assert abs(float(cut(200).divergence) + 48 * np.pi) < 1e-12
-    full_values = product_multipliers(cut(1).jacobians)
-    np.testing.assert_array_equal(full_values.is_known, [True, False])
-    assert abs(full_values.values[0] - 1.0) < 1e-12
-    assert np.isnan(full_values.values[1])
+    product = product_multipliers(cut(1).jacobians)
+    np.testing.assert_array_equal(product.is_known, [True, False])
+    assert abs(product.values[0] - 1.0) < 1e-12
+    assert np.isnan(product.values[1])
 
 
 @pytest.mark.parametrize("n_segments", [1, 2, 7, 10, 100])

@@ -143,8 +143,8 @@ def test_event_time_and_state_have_accurate_first_and_second_derivatives():
 
 def test_a_margin_has_its_minimum_to_the_accuracy_of_the_integrator():
     # Lowest value of sin t + t / 10 on (0, 8): where cos t = -1/10, after pi.
-    value_at = 2.0 * np.pi - np.arccos(-0.1)
-    reference = np.sin(value_at) + value_at / 10.0
+    minimum_time = 2.0 * np.pi - np.arccos(-0.1)
+    reference = np.sin(minimum_time) + minimum_time / 10.0
     end = find_phase_end(
         (lambda y: 8.0 - y[0],), monitors=(lambda y: y[1] + y[0] / 10.0,), count_start=(True,)
     )

@@ -13,9 +13,9 @@ RANDOM_GENERATOR = np.random.default_rng(3)
 @pytest.mark.parametrize("size", [1, 2, 3])
 def test_eigenvalues_agree_with_lapack(size):
     matrices = RANDOM_GENERATOR.normal(size=(400, size, size))
-    values_array = np.asarray(floquet.floquet_multipliers(jnp.asarray(matrices)))
+    eigenvalues = np.asarray(floquet.floquet_multipliers(jnp.asarray(matrices)))
     for computed_eigenvalues, expected in zip(
-        values_array, np.linalg.eigvals(matrices), strict=True
+        eigenvalues, np.linalg.eigvals(matrices), strict=True
     ):
         gap = np.abs(computed_eigenvalues[:, None] - expected[None])
         assert gap.min(0).max() < 1e-10
@@ -30,9 +30,9 @@ def test_eigenvalues_agree_with_lapack(size):
 def test_radius_differentiates_like_left_and_right_eigenvectors(size):
     for matrix in RANDOM_GENERATOR.normal(size=(20, size, size)):
         values, right = np.linalg.eig(matrix)
-        left_part = np.linalg.inv(right)
+        left_eigenvectors = np.linalg.inv(right)
         k = np.argmax(np.abs(values))
-        derivative = np.outer(left_part[k], right[:, k])  # d value / d matrix
+        derivative = np.outer(left_eigenvectors[k], right[:, k])  # d value / d matrix
         expected = np.real(np.conj(values[k]) * derivative) / np.abs(values[k])
         solution = jax.grad(floquet.compute_spectral_radius)(jnp.asarray(matrix))
         np.testing.assert_allclose(solution, expected, rtol=1e-9, atol=1e-9)

@@ -140,42 +140,42 @@ def _locked_rows(legs):
 def _contact_rows(w, q, v, mode):
     """Of loaded feet: rows of what is at rest, along what forces act, and which these are."""
     feet, extra_values = _points(q, v, q[3:])
-    rows, tangential_part, bias, where = [], [], [], []
+    rows, force_directions, bias, where = [], [], [], []
     for j in range(N):
         if mode[j] == CONTACT_OFF:
             continue
         drag = -SLIP_DIRECTIONS.get(mode[j], 0.0) * w.friction_by_foot[j]
         rows.append(feet[j, 1])
-        tangential_part.append(feet[j, 1] + drag * feet[j, 0])
+        force_directions.append(feet[j, 1] + drag * feet[j, 0])
         bias.append(extra_values[j, 1])
         where.append((j, drag, 1.0))
         if mode[j] == CONTACT_STICK:
             rows.append(feet[j, 0])
-            tangential_part.append(feet[j, 0])
+            force_directions.append(feet[j, 0])
             bias.append(extra_values[j, 0])
             where.append((j, 1.0, 0.0))
-    return rows, tangential_part, bias, where
+    return rows, force_directions, bias, where
 
 
-def is_singular(w, q, v, mode, held_values):
+def is_singular(w, q, v, mode, is_locked):
     """Vanishes where no forces keep a sliding foot on the ground: Painlevé's singularity."""
     mass, _ = _mass_and_force(w, q, v)
-    rows, tangential_part, *_ = _contact_rows(w, q, v, mode)
-    stops = list(_locked_rows(np.flatnonzero(held_values)))
+    rows, force_directions, *_ = _contact_rows(w, q, v, mode)
+    stops = list(_locked_rows(np.flatnonzero(is_locked)))
     return np.linalg.det(
-        np.array(rows + stops) @ np.linalg.solve(mass, np.array(tangential_part + stops).T)
+        np.array(rows + stops) @ np.linalg.solve(mass, np.array(force_directions + stops).T)
     )
 
 
-def _solve_contact_forces(w, q, v, mode, held_values):
+def _solve_contact_forces(w, q, v, mode, is_locked):
     """Accelerations in these modes; forces (tangential, normal) of feet; stopper forces."""
     mass, force = _mass_and_force(w, q, v)
-    rows, tangential_part, bias, where = _contact_rows(w, q, v, mode)
-    legs = np.flatnonzero(held_values)
+    rows, force_directions, bias, where = _contact_rows(w, q, v, mode)
+    legs = np.flatnonzero(is_locked)
     rows = np.array(rows + list(_locked_rows(legs))).reshape(-1, 3 + N)
-    tangential_part = np.array(tangential_part + list(_locked_rows(legs))).reshape(-1, 3 + N)
+    force_directions = np.array(force_directions + list(_locked_rows(legs))).reshape(-1, 3 + N)
     bias = np.r_[bias, np.zeros(len(legs))]
-    solved = np.linalg.solve(mass, np.column_stack([force, tangential_part.T]))
+    solved = np.linalg.solve(mass, np.column_stack([force, force_directions.T]))
     p = -np.linalg.solve(rows @ solved[:, 1:], rows @ solved[:, 0] + bias) if len(rows) else bias
     on_feet, on_legs = np.zeros((N, 2)), np.zeros(N)
     for (j, x, z), value in zip(where, p, strict=False):
@@ -270,25 +270,25 @@ def _solve_acceleration_level(w, q, v, feet, may, at_stopper, moving):
     return _ContactProblem(inverse, free, feet, may, unilateral, locked, rows, bias, scales)
 
 
-def _bring_to_rest(w, q, v, rows, tangential_part):
+def _bring_to_rest(w, q, v, rows, force_directions):
     """Rates with these rows exactly at rest, by impulses along those."""
     if not len(rows):
         return v
     mass, _ = _mass_and_force(w, q, v)
-    turned = np.linalg.solve(mass, tangential_part.T)
+    turned = np.linalg.solve(mass, force_directions.T)
     p, *_ = np.linalg.lstsq(rows @ turned, rows @ v, rcond=1e-11)
     return v - turned @ p
 
 
 def _process_event(w, place, struck_foot, struck_leg):
     """Through an event: rates, modes and held legs after it, and how many modes would do."""
-    q, v, mode, held_values = place
+    q, v, mode, is_locked = place
     gaps, (rows, _) = _gaps(w, q), _points(q, v, q[3:])
     speeds = rows @ v
     near = (gaps <= TOUCH_TOLERANCE) & (speeds[:, 1] <= REST_SPEED)
     feet = [j for j in range(N) if mode[j] != CONTACT_OFF or j == struck_foot or near[j]]
     out = (w.L0 - q[3:] <= TOUCH_TOLERANCE) & (v[3:] >= -REST_SPEED)
-    legs = [j for j in range(N) if held_values[j] or j == struck_leg or out[j]]
+    legs = [j for j in range(N) if is_locked[j] or j == struck_leg or out[j]]
     several = 0
     if np.any(speeds[feet, 1] < -REST_SPEED) or np.any(v[3:][legs] > REST_SPEED):
         problem = _solve_acceleration_level(
@@ -307,14 +307,14 @@ def _process_event(w, place, struck_foot, struck_leg):
         _, is_active, v = _select_preferred(solution)
         speeds = rows @ v
         feet = [j for j in feet if speeds[j, 1] < REST_SPEED]
-        retained = {*problem.locked, *itertools.compress(problem.legs, is_active)}
-        legs = [j for j in legs if j in retained or v[3 + j] > -REST_SPEED]
-    is_unfinished = [j for j in feet if abs(speeds[j, 0]) < REST_SPEED]
+        loaded_legs = {*problem.locked, *itertools.compress(problem.legs, is_active)}
+        legs = [j for j in legs if j in loaded_legs or v[3 + j] > -REST_SPEED]
+    resting_feet = [j for j in feet if abs(speeds[j, 0]) < REST_SPEED]
     drag = [
-        0.0 if j in is_unfinished else -np.sign(speeds[j, 0]) * w.friction_by_foot[j] for j in feet
+        0.0 if j in resting_feet else -np.sign(speeds[j, 0]) * w.friction_by_foot[j] for j in feet
     ]
     pushed = rows[feet, 1] + np.array(drag).reshape(-1, 1) * rows[feet, 0]
-    others = [rows[is_unfinished, 0], _locked_rows(legs)]
+    others = [rows[resting_feet, 0], _locked_rows(legs)]
     v = _bring_to_rest(
         w,
         q,
@@ -323,7 +323,7 @@ def _process_event(w, place, struck_foot, struck_leg):
     )
     may = [
         (CONTACT_STICK, SLIP_DOWNHILL, SLIP_UPHILL, CONTACT_OFF)
-        if j in is_unfinished
+        if j in resting_feet
         else (SLIP_DOWNHILL if speeds[j, 0] > 0 else SLIP_UPHILL, CONTACT_OFF)
         for j in feet
     ]
@@ -341,7 +341,7 @@ def _process_event(w, place, struck_foot, struck_leg):
         options.append((tuple(after.tolist()), tuple(stays.tolist())))
     if len(options) > 1:
         holds = [
-            _short_time_margin(w, q, v, *one, feet, is_unfinished, problem.legs) for one in options
+            _short_time_margin(w, q, v, *one, feet, resting_feet, problem.legs) for one in options
         ]
         good = [one for one, margin in zip(options, holds, strict=True) if margin > 0.0]
         several += len(good) > 1
@@ -351,13 +351,13 @@ def _process_event(w, place, struck_foot, struck_leg):
     return HybridState(q, v, *options[0]), several
 
 
-def _short_time_margin(w, q, v, mode, held_values, feet, is_unfinished, legs):
+def _short_time_margin(w, q, v, mode, is_locked, feet, resting_feet, legs):
     """Least sign, scaled, of these modes a moment later."""
     h = SHORT_TIME_SECONDS
-    a = _solve_contact_forces(w, q, v, mode, held_values)[0]
-    middle = _solve_contact_forces(w, q + 0.5 * h * v, v + 0.5 * h * a, mode, held_values)[0]
+    a = _solve_contact_forces(w, q, v, mode, is_locked)[0]
+    middle = _solve_contact_forces(w, q + 0.5 * h * v, v + 0.5 * h * a, mode, is_locked)[0]
     q, v = q + h * v + 0.5 * h * h * a, v + h * middle
-    a, on_feet, on_legs = _solve_contact_forces(w, q, v, mode, held_values)
+    a, on_feet, on_legs = _solve_contact_forces(w, q, v, mode, is_locked)
     rows, extra_values = _points(q, v, q[3:])
     F, A, minimum = w.mass * w.g, w.g, np.inf
     for j in feet:
@@ -366,33 +366,31 @@ def _short_time_margin(w, q, v, mode, held_values, feet, is_unfinished, legs):
         minimum = min(minimum, z / A if mode[j] == CONTACT_OFF else n / F)
         if mode[j] == CONTACT_STICK:
             minimum = min(minimum, (w.friction_by_foot[j] * n - abs(t)) / F)
-        elif mode[j] != CONTACT_OFF and j in is_unfinished:
+        elif mode[j] != CONTACT_OFF and j in resting_feet:
             minimum = min(minimum, SLIP_DIRECTIONS[mode[j]] * x / A)
     for j in legs:
-        minimum = min(minimum, on_legs[j] / F if held_values[j] else -a[3 + j] / A)
+        minimum = min(minimum, on_legs[j] / F if is_locked[j] else -a[3 + j] / A)
     return minimum
 
 
 def _make_guards(w, place):
     """Names of what is watched in these modes, their values at a state, the least that arms each,
     and which leave zero at a speed."""
-    q, v, mode, held_values = place
+    q, v, mode, is_locked = place
     names = [("gap", j) for j in range(N) if mode[j] == CONTACT_OFF]
-    names += [("room", j) for j in range(N) if not held_values[j]]
+    names += [("room", j) for j in range(N) if not is_locked[j]]
     names += [("normal", j) for j in range(N) if mode[j] != CONTACT_OFF]
     names += [
         (name, j) for j in range(N) if mode[j] == CONTACT_STICK for name in ("cone up", "cone down")
     ]
     names += [("speed", j) for j in range(N) if mode[j] in SLIP_DIRECTIONS]
     names += [
-        ("stopper", j)
-        for j in range(N)
-        if held_values[j] and (w.one_sided or mode[j] != CONTACT_OFF)
+        ("stopper", j) for j in range(N) if is_locked[j] and (w.one_sided or mode[j] != CONTACT_OFF)
     ]
 
     def values(y):
         q, v = y[: 3 + N], y[3 + N :]
-        on_feet, on_legs = _solve_contact_forces(w, q, v, mode, held_values)[1:]
+        on_feet, on_legs = _solve_contact_forces(w, q, v, mode, is_locked)[1:]
         speeds = _points(q, v, q[3:])[0][:, 0] @ v
         result_by_name = {
             "gap": _gaps(w, q),
@@ -452,15 +450,15 @@ def _integrate_to_event(w, place):
         return DOP853(rates, t, y, end, rtol=RTOL, atol=ATOL, first_step=h, max_step=4e-3)
 
     y = np.r_[place.q, place.v]
-    solver, current_value = by(0.0, y, 5.0, 1e-7), values(y)
-    armed = (current_value > minimum) | leaves
+    solver, margins = by(0.0, y, 5.0, 1e-7), values(y)
+    armed = (margins > minimum) | leaves
     while solver.status == "running":
         begin, y = solver.t, solver.y.copy()
         solver.step()
         inside, times = solver.dense_output(), np.linspace(begin, solver.t, 5)
-        rows = [current_value, *(values(inside(t)) for t in times[1:-1]), values(solver.y)]
+        rows = [margins, *(values(inside(t)) for t in times[1:-1]), values(solver.y)]
         first, which = _find_first_fall(values, inside, times, rows, armed, minimum)
-        current_value = rows[-1]
+        margins = rows[-1]
         if which is None:
             continue
         for _ in range(3):  # the interpolant is coarser than a step that ends there
@@ -506,10 +504,10 @@ def compute_step(
 
 def _project_to_constraints(w, place):
     """Loaded feet on the slope, held legs on their stoppers: the integrator's drift."""
-    q, _, mode, held_values = place
+    q, _, mode, is_locked = place
     u, _ = _legs(q[2])
     for j in range(N):
-        if held_values[j]:
+        if is_locked[j]:
             q[3 + j] = w.L0
         elif mode[j] != CONTACT_OFF:
             q[3 + j] = q[1] / u[j, 1]
@@ -522,5 +520,5 @@ def _relabel_legs(w, place):
     q[:2] = q[3] * np.array([np.sin(q[2]), np.cos(q[2])])
     sin, cos = np.sin(w.tilt), np.cos(w.tilt)
     v = np.r_[np.array([[cos, -sin], [sin, cos]]) @ place.v[:2], place.v[2], roll(place.v[3:])]
-    mode, held_values = (tuple(roll(np.array(x)).tolist()) for x in (place.mode, place.is_locked))
-    return HybridState(q, v, mode, held_values)
+    mode, is_locked = (tuple(roll(np.array(x)).tolist()) for x in (place.mode, place.is_locked))
+    return HybridState(q, v, mode, is_locked)

@@ -95,8 +95,8 @@ class Wheel:
 
     def foot2(self, q: Array) -> tuple[float, float]:
         """Position of Leg 2's foot, m."""
-        _, _, tangential_part, height = equations.feet(q, self.pack)
-        return float(tangential_part), float(height)
+        _, _, tangential_position, height = equations.feet(q, self.pack)
+        return float(tangential_position), float(height)
 
     def clearance(self, q: Array) -> float:
         """Height of the foot of the next fore leg, at theta - alpha, m."""

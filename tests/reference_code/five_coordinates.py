@@ -78,14 +78,14 @@ def exchange_labels(params: Params, q: Array, v: Array) -> tuple[Array, Array, f
     wheel = Wheel(params)
     length, theta, dtheta = params["locked_length"], q[2], v[2]
     new = theta - wheel.alpha
-    tangential_part = q[0] + q[3] * math.sin(theta) - length * math.sin(new)
+    foot_position = q[0] + q[3] * math.sin(theta) - length * math.sin(new)
     dx = v[0] + (q[3] * math.cos(theta) - length * math.cos(new)) * dtheta
     dz = v[1] - (q[3] * math.sin(theta) - length * math.sin(new)) * dtheta
     dx, dz = dx + v[3] * math.sin(theta), dz + v[3] * math.cos(theta)
     return (
         np.array([0.0, 0.0, new, length, q[3]]),
         np.array([dx, dz, dtheta, 0.0, v[3]]),
-        tangential_part - q[0],
+        foot_position - q[0],
     )
 
 

@@ -200,28 +200,28 @@ class HubForm:
     ) -> tuple[Vector, Vector, Vector, Number]:
         """Hub from either foot, its direction of travel, and the radius of its circle."""
         radius = chord / (2 * b.turn[1])
-        out, tangential_part = [sin(psi), cos(psi)], [cos(psi), -sin(psi)]
+        out, tangent = [sin(psi), cos(psi)], [cos(psi), -sin(psi)]
         height = radius * (b.turn[0] + out[1])
         from1 = [-chord / 2 + radius * out[0], height]
         from2 = [chord / 2 + radius * out[0], height]
-        return from1, from2, tangential_part, radius
+        return from1, from2, tangent, radius
 
     def _double(
         self, b: Bodies, chord: Number, psi: Number, rate: Number, sin: Any, cos: Any
     ) -> tuple[Number, Vector]:
         """psi'' and the normal forces (lambda2, lambda4) with both feet planted."""
         sqrt = hy.sqrt
-        from1, from2, tangential_part, radius = self._circle(b, chord, psi, sin, cos)
+        from1, from2, tangent, radius = self._circle(b, chord, psi, sin, cos)
         inward = [-sin(psi), -cos(psi)]
         lengths = [sqrt(dot(from1, from1)), sqrt(dot(from2, from2))]
         u = [times(1 / lengths[0], from1), times(1 / lengths[1], from2)]
         t = [direction_derivative(u[0]), direction_derivative(u[1])]
-        velocity = times(radius * rate, tangential_part)
+        velocity = times(radius * rate, tangent)
         pushes = [b.push(lengths[i], dot(u[i], velocity)) for i in range(2)]
         omega = rate / 2
         sum_of_directions, sum_of_tangents = plus(u[0], u[1]), plus(t[0], t[1])
         # velocities per psi', and accelerations at psi'' = 0
-        hub_row = times(radius, tangential_part)
+        hub_row = times(radius, tangent)
         hub_rest = times(radius * rate * rate, inward)
         body_row = plus(hub_row, times(b.reach / 2, sum_of_tangents))
         body_rest = plus(hub_rest, times(-b.reach * omega * omega, sum_of_directions))
@@ -268,13 +268,13 @@ class HubForm:
         centre = times(reach, normal1)
         row = direction_derivative(plus(times(L1, u1), times(-1, centre)))
         rows = [row, plus(row, times(b.reach, sum_of_tangents)), times(b.com, t1), times(b.com, t2)]
-        retained = b.inertia * omega + mp.fsum(
+        retained_momentum = b.inertia * omega + mp.fsum(
             mass * dot(r, v) for (mass, v), r in zip(before, rows, strict=True)
         )
         resist = b.inertia + mp.fsum(
             mass * dot(r, r) for (mass, _), r in zip(before, rows, strict=True)
         )
-        after = retained / resist
+        after = retained_momentum / resist
         jumps = [
             times(mass, plus(times(after, r), times(-1, v)))
             for (mass, v), r in zip(before, rows, strict=True)
@@ -296,8 +296,8 @@ class HubForm:
         forces = self._forces(np.array([to_real(value) for value in state]), packed)
         state, double = self._dls.until_guard(state, [*constants, chord], about[0])
 
-        hub, from2, tangential_part, radius = self._circle(b, chord, state[0], mp.sin, mp.cos)
-        velocity = times(radius * state[1], tangential_part)
+        hub, from2, tangent, radius = self._circle(b, chord, state[0], mp.sin, mp.cos)
+        velocity = times(radius * state[1], tangent)
         L2 = mp.sqrt(dot(from2, from2))
         state = [*hub, L2, *velocity, dot(from2, velocity) / L2]
         state, swing = self._swing.until_guard(state, constants, about[1])

@@ -330,12 +330,12 @@ def check_cycle(
     rows = max(compute_gap(a, b) for a, b in zip(other, matrix, strict=True))
     solution = compute_gap(spectrum(other)[0], multipliers)
     move = [w * v for w, v in zip(DIRECTION, p, strict=True)]
-    tangential_part = [
+    rates_along_parameter = [
         mp.fsum(derivatives["post_impact"][i][k] * move[i] for i in range(9)) for k in range(2)
     ]
     images, radii = [], []
     for sign in (1, -1):
-        y_moved = [v + sign * CHECK_SIZE * d for v, d in zip(y, tangential_part, strict=True)]
+        y_moved = [v + sign * CHECK_SIZE * d for v, d in zip(y, rates_along_parameter, strict=True)]
         p_moved = [v + sign * CHECK_SIZE * d for v, d in zip(p, move, strict=True)]
         images.append(function([*y_moved, *p_moved]))
         radii.append(spectrum(plane_jacobian(function, y_moved, p_moved, CHECK_SIZE))[1])

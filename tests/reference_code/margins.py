@@ -94,8 +94,8 @@ def contact_forces(wheel: Wheel, q: Array, v: Array, a: Array, mode: str) -> Arr
         return np.array([*total, 0.0, 0.0])
     push = params["stiffness"] * (params["natural_length"] - q[3:]) - params["damping"] * v[3:]
     angles = q[2], q[2] + wheel.alpha
-    tangential_part = [demands[i + 1] @ _radial(angles[i]) + push[i] for i in range(2)]
-    return _split(total, tangential_part[0], tangential_part[1], *angles)
+    axial_parts = [demands[i + 1] @ _radial(angles[i]) + push[i] for i in range(2)]
+    return _split(total, axial_parts[0], axial_parts[1], *angles)
 
 
 def stopper_forces(wheel: Wheel, q: Array, v: Array, a: Array) -> Array:
@@ -136,8 +136,8 @@ def _landing_impulses(wheel: Wheel, q: Array, before: Array, after: Array) -> Ar
     velocities = _velocity_jumps(wheel, q, before, after)
     jumps = [mass * dv for mass, dv in zip(_masses(wheel), velocities, strict=True)]
     angles = q[2], q[2] + wheel.alpha
-    tangential_part = [float(jumps[i + 1] @ _radial(angles[i])) for i in range(2)]
-    return _split(np.sum(jumps, axis=0), tangential_part[0], tangential_part[1], *angles)
+    axial_parts = [float(jumps[i + 1] @ _radial(angles[i])) for i in range(2)]
+    return _split(np.sum(jumps, axis=0), axial_parts[0], axial_parts[1], *angles)
 
 
 def _lowest(

@@ -156,10 +156,10 @@ def compute_step(w: TimeSteppingWheel, start: StepStart, h: float) -> StepEnd:
         if rows:
             J = np.array(rows)[:, free_axes]
             W, free = J @ inverse @ J.T, J @ following[free_axes]
-            current_value = _gaps(q)
+            gap_values = _gaps(q)
             for i, j in enumerate(feet):  # the gap counts for feet that carried load before
                 if carried[j]:
-                    free[2 * i + 1] += current_value[j] / h
+                    free[2 * i + 1] += gap_values[j] / h
             guess = np.concatenate(
                 [impulses.get(j, np.zeros(2)) for j in feet] + [np.zeros(len(stops))]
             )

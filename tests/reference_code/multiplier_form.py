@@ -62,13 +62,13 @@ class MultiplierForm:
         mass: list[Vector], rows: list[Vector], force: Vector, rates: Vector
     ) -> tuple[Vector, Vector]:
         """q'' and lambda of eqs (5)-(8)."""
-        free, *tangential_part = solve_positive(mass, force, *rows)
-        cross = [[dot(row, column) for column in tangential_part] for row in rows]
+        free, *columns = solve_positive(mass, force, *rows)
+        cross = [[dot(row, column) for column in columns] for row in rows]
         (multipliers,) = solve_positive(
             cross, [-rate - dot(row, free) for rate, row in zip(rates, rows, strict=True)]
         )
         acceleration = free
-        for multiplier, column in zip(multipliers, tangential_part, strict=True):
+        for multiplier, column in zip(multipliers, columns, strict=True):
             acceleration = plus(acceleration, times(multiplier, column))
         return acceleration, multipliers
 

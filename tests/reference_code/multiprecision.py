@@ -116,14 +116,14 @@ def solve_positive(matrix: list[Vector], *right: Vector) -> list[Vector]:
 def dot(a: Sequence[Number], b: Sequence[Number]) -> Number:
     """Scalar product."""
     total = a[0] * b[0]
-    for left_part, right in zip(a[1:], b[1:], strict=True):
-        total = total + left_part * right
+    for left, right in zip(a[1:], b[1:], strict=True):
+        total = total + left * right
     return total
 
 
 def plus(a: Sequence[Number], b: Sequence[Number]) -> Vector:
     """Sum of two vectors."""
-    return [left_part + right for left_part, right in zip(a, b, strict=True)]
+    return [left + right for left, right in zip(a, b, strict=True)]
 
 
 def times(scale: Number, a: Sequence[Number]) -> Vector:

@@ -17,28 +17,32 @@ def test_a_scan_to_a_tolerance_has_value_error_and_model(tmp_path: Path) -> None
     scan_result = vrw.scan(
         TOLERANCE_DESIGN, ["speed", "period"], **given, store=tmp_path / "a", chunk=1
     )
-    full_values = vrw.scan(TOLERANCE_DESIGN, ["speed", "period"], **given)
+    scan_with_tolerance = vrw.scan(TOLERANCE_DESIGN, ["speed", "period"], **given)
     for name in ("speed", "speed_error", "period_error", "rung", "outcome"):
-        assert np.array_equal(scan_result[name].values, full_values[name].values, equal_nan=True)
+        assert np.array_equal(
+            scan_result[name].values, scan_with_tolerance[name].values, equal_nan=True
+        )
     damping, friction = (x.ravel() for x in np.meshgrid([150.0, 300.0], [4.0, 60.0], indexing="ij"))
     measured = vrw.measure_to_tolerance(
         ["speed", "period"], vrw.WheelParams(damping=damping), 1e-2, friction=friction
     )
-    assert np.array_equal(full_values.speed.values.ravel(), measured.value["speed"], equal_nan=True)
     assert np.array_equal(
-        full_values.period.values.ravel(), measured.value["period"], equal_nan=True
+        scan_with_tolerance.speed.values.ravel(), measured.value["speed"], equal_nan=True
+    )
+    assert np.array_equal(
+        scan_with_tolerance.period.values.ravel(), measured.value["period"], equal_nan=True
     )
     has_measure = measured.found.reshape(2, 2)
     assert np.array_equal(
-        full_values.speed_error.values[has_measure], measured.error["speed"][measured.found]
+        scan_with_tolerance.speed_error.values[has_measure], measured.error["speed"][measured.found]
     )
-    meanings = full_values.rung.attrs["flag_meanings"].split()
+    meanings = scan_with_tolerance.rung.attrs["flag_meanings"].split()
     names = {"RigidWheel": "rigid", "ViscoelasticWheel": "viscoelastic"}
     model_names = [
-        names.get(meanings[i], "unilateral") for i in full_values.rung.values[has_measure]
+        names.get(meanings[i], "unilateral") for i in scan_with_tolerance.rung.values[has_measure]
     ]
     assert model_names == list(measured.model[measured.found])
-    assert np.all(full_values.rung.values[~has_measure] == -1)
+    assert np.all(scan_with_tolerance.rung.values[~has_measure] == -1)
     assert {"viscoelastic"} < {*model_names, "none"}
 
 

@@ -59,10 +59,10 @@ def test_a_stored_scan_equals_the_scan_in_memory(tmp_path: Path) -> None:
 
 def test_a_stored_scan_opens_with_xarray_alone(tmp_path: Path) -> None:
     run_plan(make_plan(), tmp_path / "s.zarr", evaluate=evaluate_arithmetically)
-    single_result = xr.open_zarr(tmp_path / "s.zarr", consolidated=False, chunks=None)
-    assert single_result.speed.dims == ("damping", "slope")
-    assert single_result.speed.attrs["units"] == "m/s"
-    np.testing.assert_array_equal(single_result.damping, SMALL_GRID.values_by_parameter["damping"])
+    opened_scan = xr.open_zarr(tmp_path / "s.zarr", consolidated=False, chunks=None)
+    assert opened_scan.speed.dims == ("damping", "slope")
+    assert opened_scan.speed.attrs["units"] == "m/s"
+    np.testing.assert_array_equal(opened_scan.damping, SMALL_GRID.values_by_parameter["damping"])
 
 
 def test_a_stored_list_of_samples_keeps_its_coordinates(tmp_path: Path) -> None:
@@ -76,8 +76,8 @@ def test_a_stored_list_of_samples_keeps_its_coordinates(tmp_path: Path) -> None:
 
 
 def test_a_scan_interrupted_at_any_chunk_ends_bitwise_the_same(tmp_path: Path) -> None:
-    full_values = tmp_path / "whole.zarr"
-    run_plan(make_plan(), full_values, evaluate=evaluate_arithmetically)
+    whole_store = tmp_path / "whole.zarr"
+    run_plan(make_plan(), whole_store, evaluate=evaluate_arithmetically)
     n_chunks = make_plan().result_layout.n_chunks
     for stop in range(1, n_chunks + 1):
         store = tmp_path / f"stopped_{stop}.zarr"
@@ -86,14 +86,14 @@ def test_a_scan_interrupted_at_any_chunk_ends_bitwise_the_same(tmp_path: Path) -
         rest = CountingEngine()
         run_plan(make_plan(), store, evaluate=rest)
         assert rest.n_calls == n_chunks - (stop - 1)
-        assert list_files(store) == list_files(full_values)
+        assert list_files(store) == list_files(whole_store)
 
 
 def test_a_finished_scan_computes_nothing(tmp_path: Path) -> None:
     first = run_plan(make_plan(), tmp_path / "s.zarr", evaluate=evaluate_arithmetically).load()
-    second_result = CountingEngine()
-    second = run_plan(make_plan(), tmp_path / "s.zarr", evaluate=second_result)
-    assert second_result.n_calls == 0
+    counting_engine = CountingEngine()
+    second = run_plan(make_plan(), tmp_path / "s.zarr", evaluate=counting_engine)
+    assert counting_engine.n_calls == 0
     xr.testing.assert_identical(first, second.load())
 
 
@@ -192,8 +192,8 @@ def test_a_store_whose_creation_was_killed_is_created_again(
 
 
 def test_a_scan_killed_with_signal_9_ends_bitwise_the_same(tmp_path: Path) -> None:
-    full_values, store = tmp_path / "whole.zarr", tmp_path / "killed.zarr"
-    run_plan(make_plan(1), full_values, evaluate=evaluate_arithmetically)
+    whole_store, store = tmp_path / "whole.zarr", tmp_path / "killed.zarr"
+    run_plan(make_plan(1), whole_store, evaluate=evaluate_arithmetically)
     code = KILLED_SCAN_SCRIPT.format(tests=str(Path(__file__).parents[1]), store=str(store))
     process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE)
     assert process.stdout is not None
@@ -207,7 +207,7 @@ def test_a_scan_killed_with_signal_9_ends_bitwise_the_same(tmp_path: Path) -> No
     rest = CountingEngine()
     run_plan(make_plan(1), store, evaluate=rest)
     assert 0 < rest.n_calls <= SMALL_GRID.size - done + 1
-    assert list_files(store) == list_files(full_values)
+    assert list_files(store) == list_files(whole_store)
 
 
 SETTING_CHANGES = {
@@ -298,10 +298,8 @@ def test_values_match_their_coordinates() -> None:
     scan_result = run_plan(make_plan(), evaluate=evaluate_arithmetically)
     for damping in SMALL_GRID.values_by_parameter["damping"]:
         for slope in SMALL_GRID.values_by_parameter["slope"]:
-            value_at = scan_result.sel(damping=damping, slope=slope)
-            assert value_at.dls_fraction == pytest.approx(
-                np.sin(damping) + np.sin(slope), abs=1e-15
-            )
+            sample = scan_result.sel(damping=damping, slope=slope)
+            assert sample.dls_fraction == pytest.approx(np.sin(damping) + np.sin(slope), abs=1e-15)
 
 
 def test_every_variable_is_described() -> None:
@@ -388,12 +386,12 @@ def test_the_result_of_a_sample_does_not_depend_on_the_others(
     columns = SMALL_GRID.select_samples((slice(None), slice(None)))
     order = np.random.default_rng(0).permutation(SMALL_GRID.size)
     shuffled = engine({name: column[order] for name, column in columns.items()})
-    single_result = engine({name: column[7:8] for name, column in columns.items()})
+    single_sample = engine({name: column[7:8] for name, column in columns.items()})
     strangers = {"damping": np.full(40, 60.0), "slope": np.full(40, 0.5)}
     mixed = engine({n: np.concatenate([strangers[n], columns[n]]) for n in columns})
     for name, value in engine_results.items():
         np.testing.assert_array_equal(shuffled[name], value[order], name)
-        np.testing.assert_array_equal(single_result[name], value[7:8], name)
+        np.testing.assert_array_equal(single_sample[name], value[7:8], name)
         np.testing.assert_array_equal(mixed[name][40:], value, name)
 
 
@@ -545,8 +543,8 @@ def test_a_cluster_that_loses_a_worker_gives_bitwise_the_serial_scan(
     """Two worker processes; the one at work on most chunks is killed with signal 9 in mid-scan."""
     from distributed import Client, LocalCluster
 
-    single_result, shared = tmp_path / "alone.zarr", tmp_path / "shared.zarr"
-    run_plan(make_plan(1), single_result, evaluate=engine)
+    serial_store, shared = tmp_path / "alone.zarr", tmp_path / "shared.zarr"
+    run_plan(make_plan(1), serial_store, evaluate=engine)
     cache = jax.config.jax_compilation_cache_dir  # type: ignore[attr-defined]
     monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", cache)  # workers start out with the suite's
     reports: list[ScanProgress] = []
@@ -572,7 +570,7 @@ def test_a_cluster_that_loses_a_worker_gives_bitwise_the_serial_scan(
         assert killed[0] not in client.run(os.getpid).values()
     assert reports[-1].n_done == SMALL_GRID.size
     assert np.all(result.outcome.values != -1)
-    assert list_files(shared) == list_files(single_result)
+    assert list_files(shared) == list_files(serial_store)
 
 
 def test_a_worker_uses_the_trace_keys_of_the_calling_process() -> None:

@@ -60,16 +60,16 @@ CHUNK_FILE = "c/1/0"
 def test_a_damaged_chunk_is_computed_again_with_a_warning(
     complete_store: Path, what: str, variable: str
 ) -> None:
-    full_values, n = list_files(complete_store), make_plan().result_layout.n_chunks
+    files, n = list_files(complete_store), make_plan().result_layout.n_chunks
     file = complete_store / variable / (CHUNK_FILE + "/0" * (variable == "locked_stopper_force"))
     DAMAGE_CASES[what](file)
     with pytest.raises(ValueError, match=r"1 damaged chunk \(number 1\): run the scan again"):
         open_scan(complete_store)
-    second_result = CountingEngine()
+    counting_engine = CountingEngine()
     with pytest.warns(UserWarning, match=r"1 damaged chunk \(number 1\): computed again"):
-        run_plan(make_plan(), complete_store, evaluate=second_result)
-    assert second_result.n_calls == 1 < n
-    assert list_files(complete_store) == full_values
+        run_plan(make_plan(), complete_store, evaluate=counting_engine)
+    assert counting_engine.n_calls == 1 < n
+    assert list_files(complete_store) == files
 
 
 def test_a_running_scan_can_be_opened(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -107,22 +107,22 @@ def test_damage_in_an_unfinished_scan_is_found(tmp_path: Path) -> None:
 
 
 def test_damaged_coordinates_are_written_again(complete_store: Path) -> None:
-    full_values = list_files(complete_store)
+    files = list_files(complete_store)
     (complete_store / "damping" / "c" / "0").write_bytes(b"nonsense")
     with pytest.raises(ValueError, match="damaged coordinates"):
         open_scan(complete_store)
-    second_result = CountingEngine()
+    counting_engine = CountingEngine()
     with pytest.warns(UserWarning, match="damaged coordinates"):
-        run_plan(make_plan(), complete_store, evaluate=second_result)
-    assert second_result.n_calls == 0
-    assert list_files(complete_store) == full_values
+        run_plan(make_plan(), complete_store, evaluate=counting_engine)
+    assert counting_engine.n_calls == 0
+    assert list_files(complete_store) == files
 
 
 def test_intact_parts_of_a_damaged_store_can_be_read(complete_store: Path) -> None:
     (complete_store / "speed" / CHUNK_FILE).unlink()
-    left_part = open_scan(complete_store, verify=False)
-    assert np.isnan(left_part.speed.values[1]).all()
-    assert np.isfinite(left_part.speed.values[0]).all()
+    intact_scan = open_scan(complete_store, verify=False)
+    assert np.isnan(intact_scan.speed.values[1]).all()
+    assert np.isfinite(intact_scan.speed.values[0]).all()
 
 
 def test_a_damaged_chunk_is_not_recomputed_by_other_code(
@@ -142,13 +142,13 @@ def test_xarray_opens_a_store_without_a_warning_and_sees_no_bookkeeping(
 ) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        single_result = xr.open_zarr(complete_store)
-    assert list(single_result.data_vars)[:4] == [
+        opened_scan = xr.open_zarr(complete_store)
+    assert list(opened_scan.data_vars)[:4] == [
         *SCANNED_MEASURES[:2],
         "d_dls_fraction_d_damping",
         "outcome",
     ]
-    assert set(single_result.sizes) == {"damping", "slope", "leg"}
+    assert set(opened_scan.sizes) == {"damping", "slope", "leg"}
 
 
 @pytest.mark.parametrize("place", [None, "s.zarr"])

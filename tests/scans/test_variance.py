@@ -29,14 +29,14 @@ def make_ishigami_scan(n: int = 4096) -> tuple[xr.Dataset, np.ndarray]:
 def test_indices_of_the_ishigami_function_equal_the_published_ones() -> None:
     """First order 0.3139, 0.4424, 0; total 0.5576, 0.4424, 0.2437 (Ishigami and Homma 1990)."""
     result = vrw.sobol_indices(make_ishigami_scan()[0], ["speed"]).sel(measure="speed")
-    for name, known_values in (
+    for name, published_values in (
         ("first_order", [0.3139, 0.4424, 0.0]),
         ("total", [0.5576, 0.4424, 0.2437]),
     ):
         # 4,096 rows of a Sobol' sequence: three times what other seeds were off by
-        np.testing.assert_allclose(result[name], known_values, atol=0.02)
-        assert np.all(result[f"{name}_lower"] <= known_values)
-        assert np.all(known_values <= result[f"{name}_upper"])
+        np.testing.assert_allclose(result[name], published_values, atol=0.02)
+        assert np.all(result[f"{name}_lower"] <= published_values)
+        assert np.all(published_values <= result[f"{name}_upper"])
 
 
 def test_shares_of_a_sum_are_the_variances_of_its_terms() -> None:

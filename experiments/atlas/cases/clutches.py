@@ -138,9 +138,12 @@ def rows() -> Iterator[Row]:
         for event in (3, 7, 8):
             solution = last_time(walk_result, event)
             yield make_row(walk_result, NAMES[event], solution, times[event - 1], event=event)
-        full_values = len(walk_result.times) == len(ENDS)
+        has_all_events = len(walk_result.times) == len(ENDS)
         yield make_row(
-            walk_result, "rate at 1.5 s", float(walk_result.end[0]) if full_values else np.nan, rate
+            walk_result,
+            "rate at 1.5 s",
+            float(walk_result.end[0]) if has_all_events else np.nan,
+            rate,
         )
         if method is run_library:
             for event, result in PUBLISHED_TIMES.items():

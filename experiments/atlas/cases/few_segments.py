@@ -71,14 +71,14 @@ def variational_field(z, m):
 
 def rows() -> Iterator[Row]:
     for n in (1, 100):
-        (solution, known_values, _), seconds = time_second_call(
+        (solution, is_known, _), seconds = time_second_call(
             lambda n=n: compute_library_multiplier(n)
         )
         name = f"ours, {n} segment{'s' * (n > 1)}"
         yield Row(
             "multiplier", name, solution, REFERENCE, compute_error(solution, REFERENCE,
             relative=True), "",
-            not known_values, n, seconds, "Dopri8 1e-13", version("vrw-jax"), STEEP,
+            not is_known, n, seconds, "Dopri8 1e-13", version("vrw-jax"), STEEP,
         )  # fmt: skip
     for n in (10, 40, 400):
         solution, seconds = time_second_call(lambda n=n: compute_collocation_multiplier(n))

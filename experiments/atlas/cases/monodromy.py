@@ -93,14 +93,14 @@ def rows() -> Iterator[Row]:
     for name, n in (("ours", SEGMENTS), ("ours, one segment", 1)):
         (result, _), seconds = time_second_call(lambda n=n: compute_by_segments(n))
         for i, reference in enumerate((1.0, SMALL_MULTIPLIER)):
-            solution, known_values = float(result.values[i].real), bool(result.is_known[i])
-            says = "" if known_values else f"not known: uncertainty {result.relative_error[i]:.0e}"
+            solution, is_known = float(result.values[i].real), bool(result.is_known[i])
+            says = "" if is_known else f"not known: uncertainty {result.relative_error[i]:.0e}"
             yield Row(
                 f"multiplier "
                     f"{reference:.1e}", name, solution, reference, compute_error(solution,
                     reference,
                     relative=True),
-                says, not known_values, n, seconds, f"Dopri8 1e-13, {n} "
+                says, not is_known, n, seconds, f"Dopri8 1e-13, {n} "
                     f"segments", version("vrw-jax"),
             )  # fmt: skip
     for name, call, options, package in PEERS:
@@ -119,19 +119,19 @@ def rows() -> Iterator[Row]:
 def draw(figure: Figure, rows: list[dict[str, str]]) -> None:
     axes = figure.subplots()
     counts = (4, 8, 16, 30, 60, 120, 250, 500)
-    result_list = [compute_by_segments(n) for n in counts]
-    gap = [max(abs(t.logarithms[1] + 48.0 * math.pi), 1e-16) for t, _ in result_list]
+    products = [compute_by_segments(n) for n in counts]
+    gap = [max(abs(t.logarithms[1] + 48.0 * math.pi), 1e-16) for t, _ in products]
     axes.loglog(counts, gap, "o-", label="triangular factors")
     axes.loglog(
         counts,
-        [t.relative_error[1] for t, _ in result_list],
+        [t.relative_error[1] for t, _ in products],
         "o--",
         mfc="w",
         label="estimated error",
     )
     naive = [
         abs(multiply_segments(np.linalg.multi_dot(maps[::-1]))[1] / SMALL_MULTIPLIER - 1.0)
-        for _, maps in result_list
+        for _, maps in products
     ]
     axes.loglog(counts, naive, "s:", label="product of the matrices")
     axes.set_xlabel("segments")

@@ -30,8 +30,13 @@ def field(y, m):
 
 def heelstrike(y, m):
     theta, rate = y[0], y[1]
-    retained = m.cos(2.0 * theta)
-    return -theta, retained * rate, -2.0 * theta, retained * (1.0 - retained) * rate
+    retained_share = m.cos(2.0 * theta)
+    return (
+        -theta,
+        retained_share * rate,
+        -2.0 * theta,
+        retained_share * (1.0 - retained_share) * rate,
+    )
 
 
 def height(y, m):
@@ -48,8 +53,8 @@ SYSTEM = (
 
 
 def begin(x, m):
-    retained = (m if hasattr(m, "cos") else math).cos(2.0 * x[0])
-    return x[0], x[1], 2.0 * x[0], x[1] * (1.0 - retained)
+    retained_share = (m if hasattr(m, "cos") else math).cos(2.0 * x[0])
+    return x[0], x[1], 2.0 * x[0], x[1] * (1.0 - retained_share)
 
 
 WALKER = ReturnMap(SYSTEM, begin, lambda y: (y[0], y[1]), events=2, guess=(0.2, -0.2))

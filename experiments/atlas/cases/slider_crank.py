@@ -168,14 +168,21 @@ def sliding(y: Numbers, m: Any) -> tuple:
     return (*q[3:], solve_mass_matrix(q, m, force)[0], *(0.0 * x for x in y[4:]))
 
 
-def make_impact(retained: float) -> Callable:
+def make_impact(restitution: float) -> Callable:
     """Both upper corners at once."""
 
     def reset(y: Numbers, m: Any) -> tuple:
         q = plain(y, m)
-        free = ((1.0 + retained) * y[4], (1.0 + retained) * y[5])
+        free = ((1.0 + restitution) * y[4], (1.0 + restitution) * y[5])
         jumps = solve_mass_matrix(q, m, total(q, m, ABOVE, impulses(q, m, ABOVE, free)))
-        return (*y[:3], y[3] + jumps[0], -retained * y[4], -retained * y[5], 0.0 * y[6], 0.0 * y[7])
+        return (
+            *y[:3],
+            y[3] + jumps[0],
+            -restitution * y[4],
+            -restitution * y[5],
+            0.0 * y[6],
+            0.0 * y[7],
+        )
 
     return reset
 
@@ -294,13 +301,13 @@ def rows() -> Iterator[Row]:
         yield make_row(once, name, float(once.end[3]), REFERENCE[name])
         end = float(walk_result.times[-1]) if len(walk_result.times) else math.nan
         yield make_row(walk_result, "end of the bounces", end, REFERENCE["end of the bounces"])
-        left_part = method(CLOSED_GAP_MODE, make_impact(0.0)(walk_result.end, math), 2, LIMIT)
+        last_phase = method(CLOSED_GAP_MODE, make_impact(0.0)(walk_result.end, math), 2, LIMIT)
         for event, name in enumerate(("letting go", "touch of the other face"), 1):
-            yield make_row(left_part, name, end + last_time(left_part, event), REFERENCE[name])
+            yield make_row(last_phase, name, end + last_time(last_phase, event), REFERENCE[name])
             if method is run_library and name in SICONOS_EVENT_TIMES:
-                solution = end + last_time(left_part, event)
+                solution = end + last_time(last_phase, event)
                 yield make_row(
-                    left_part,
+                    last_phase,
                     f"{name}, as Siconos stored",
                     solution,
                     SICONOS_EVENT_TIMES[name],
@@ -330,7 +337,7 @@ def draw(figure: Figure, rows: list[dict[str, str]]) -> None:
     axes = figure.subplots()
     walk_result = run_library(SIMULTANEOUS_IMPACTS, make_start_state(), BOUNCES, LIMIT)
     closed = make_impact(0.0)(walk_result.end, math)
-    left_part = run_library(CLOSED_GAP_MODE, closed, 2, LIMIT)
+    last_phase = run_library(CLOSED_GAP_MODE, closed, 2, LIMIT)
     begin, y = 0.0, make_start_state()
     for time, state in zip(walk_result.times[:12], walk_result.states, strict=False):
         result = solve_ivp(
@@ -338,10 +345,10 @@ def draw(figure: Figure, rows: list[dict[str, str]]) -> None:
         )
         axes.plot(1e3 * result.t, 1e3 * result.y[6], color="C0")
         begin, y = time, make_impact(RESTITUTION_COEFFICIENT)(state, math)
-    lets_go, end = walk_result.times[-1] + left_part.times
+    lets_go, end = walk_result.times[-1] + last_phase.times
     axes.plot([1e3 * begin, 1e3 * lets_go], [0.0, 0.0], color="C1", lw=2.0, label="both slide")
     result = solve_ivp(
-        lambda t, y: flying(y, math), (lets_go, end), left_part.states[0], rtol=1e-8, atol=1e-10,
+        lambda t, y: flying(y, math), (lets_go, end), last_phase.states[0], rtol=1e-8, atol=1e-10,
         max_step=1e-4,
     )  # fmt: skip
     axes.plot(1e3 * result.t, 1e3 * result.y[6], color="C0", label="flies")

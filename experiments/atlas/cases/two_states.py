@@ -51,13 +51,13 @@ def reference() -> np.ndarray:
         for (c2, c4, level), _ in zip(itertools.cycle(LEVELS), range(EVENTS), strict=False):
             c2, c4, level = map(mpmath.mpf, (c2, c4, level))
             slow_amplitude = fast / (fast - slow) * (y2 - c4)  # of the slow exponential in y1
-            value_at = lambda t, y1=y1, slow_amplitude=slow_amplitude, c2=c2, c4=c4: (
+            first_state = lambda t, y1=y1, slow_amplitude=slow_amplitude, c2=c2, c4=c4: (
                 c4 + c2 + slow_amplitude * mpmath.exp(-slow * t)
                 + (y1 - c4 - c2 - slow_amplitude) * mpmath.exp(-fast * t)
             )  # fmt: skip
             first = -mpmath.log((level - c4 - c2) / slow_amplitude) / slow
             t = mpmath.findroot(
-                lambda t, value_at=value_at, level=level: value_at(t) - level, first
+                lambda t, first_state=first_state, level=level: first_state(t) - level, first
             )
             y1, y2 = level, c4 + (y2 - c4) * mpmath.exp(-slow * t)
             time += t

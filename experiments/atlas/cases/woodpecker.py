@@ -76,8 +76,8 @@ def normal_force(y, contact, sign):
 
 
 def flying(y, m):
-    tangential_part, sleeve, bird = solve_mass_matrix(forces(y))
-    return tangential_part, y[2], sleeve, y[4], bird
+    hub_acceleration, sleeve, bird = solve_mass_matrix(forces(y))
+    return hub_acceleration, y[2], sleeve, y[4], bird
 
 
 def sliding(contact, sign):
@@ -87,8 +87,8 @@ def sliding(contact, sign):
             f + push * p
             for f, p in zip(forces(y), generalized_contact_force(contact, sign), strict=True)
         ]
-        tangential_part, _, bird = solve_mass_matrix(total)
-        return tangential_part, 0.0 * y[1], 0.0 * y[2], y[4], bird
+        hub_acceleration, _, bird = solve_mass_matrix(total)
+        return hub_acceleration, 0.0 * y[1], 0.0 * y[2], y[4], bird
 
     return field
 
@@ -105,9 +105,9 @@ def grip(y, m):
     """Friction left while jammed, N."""
     turning = jammed_bird(y)
     first, second, _ = forces(y)
-    tangential_part = MASS[0, 2] * turning - first
-    normal = (MASS[1, 2] * turning - second - HOLE * tangential_part) / HALF
-    return FRICTION * normal - tangential_part
+    hub_acceleration = MASS[0, 2] * turning - first
+    normal = (MASS[1, 2] * turning - second - HOLE * hub_acceleration) / HALF
+    return FRICTION * normal - hub_acceleration
 
 
 def make_impact(contact, sign):
@@ -120,13 +120,13 @@ def make_impact(contact, sign):
         retained = RESTITUTION_COEFFICIENT if contact == 1 else 0.0
         size = -(1.0 + retained) * dot(NORMAL[contact], before)
         size = size / dot(NORMAL[contact], solve_mass_matrix(push))
-        tangential_part, sleeve, bird = (
+        hub_acceleration, sleeve, bird = (
             v + size * j for v, j in zip(before, solve_mass_matrix(push), strict=True)
         )
         if contact == 1:
-            return tangential_part, y[1], sleeve, y[3], bird
+            return hub_acceleration, y[1], sleeve, y[3], bird
         return (
-            tangential_part,
+            hub_acceleration,
             (TILT if contact == 3 else -TILT) + 0.0 * y[1],
             0.0 * y[2],
             y[3],

@@ -55,12 +55,12 @@ def compute_drake_values(accuracy: float) -> list[dict]:
 
     wheel = RimlessWheelParams()
     alpha = math.pi / wheel.number_of_spokes()
-    retained, low = math.cos(2.0 * alpha), wheel.slope() - alpha
+    retained_share, low = math.cos(2.0 * alpha), wheel.slope() - alpha
     ends, work, seconds = ends_of_steps(RimlessWheel(), [low + 1e-9, 1.7], accuracy)
-    squares = [(retained * rate) ** 2 for _, (_, rate) in ends]
+    squares = [(retained_share * rate) ** 2 for _, (_, rate) in ends]
     far = [square - squares[-1] for square in squares]
     result_by_name = {
-        "rate after impact": retained * ends[-1][1][1],
+        "rate after impact": retained_share * ends[-1][1][1],
         "period": ends[-1][0] - ends[-2][0],
         "multiplier": far[3] / far[2],
     }
