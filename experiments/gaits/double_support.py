@@ -106,7 +106,8 @@ class StudySize:
     - `n_contact`: number of gaits that are compared with unilateral contact;
     - `n_rows`: number of rows of the Sobol' indices;
     - `front_levels`: least DLS fractions of the fronts;
-    - `n_front_starts`: number of searches for each of them.
+    - `n_front_starts`: number of random wheels from which searches for each of them start;
+    - `n_front_restarts`: number of best ends from which further searches start.
     """
 
     n_wheels: int = 62
@@ -114,7 +115,8 @@ class StudySize:
     n_contact: int = 8
     n_rows: int = 128
     front_levels: tuple[float, ...] = (0.1, 0.25, 0.4, 0.55, 0.7)
-    n_front_starts: int = 6
+    n_front_starts: int = 24
+    n_front_restarts: int = 4
 
 
 LIFE_SLOPE_SD = 0.01
@@ -451,49 +453,87 @@ FRONTS = {
 """Constraints of the fronts besides speed and DLS fraction."""
 
 
+def search_least_energy(
+    params: vrw.WheelParams, constraints: Mapping[str, float]
+) -> list[vrw.TuneResult]:
+    """Return the end of a search from one wheel; no end if the wheel has no gait."""
+    try:
+        return [
+            vrw.tune(
+                params, compute_energy_gain, list(BOX), BOX, constraints,
+                cycle_options=GAIT_OPTIONS, max_evaluations=60, tolerance=1e-4,
+            )
+        ]  # fmt: skip
+    except ValueError as error:  # the single search found no gait of this wheel
+        print(error, flush=True)
+        return []
+
+
+CONSTRAINT_TOLERANCES = {"speed": 1e-3, "dls_fraction": 1e-3, "takeoff_acceleration": 1e-3,
+                         "clearance_sls1": 1e-6, "clearance_sls2": 1e-6}  # fmt: skip
+"""Violations that count as satisfied, in SI units, chosen above those of converged searches."""
+
+
+def select_best_ends(
+    ends: Sequence[vrw.TuneResult], constraints: Mapping[str, float], n: int
+) -> list[vrw.TuneResult]:
+    """Return the `n` ends of least energy that satisfy all constraints.
+
+    A search that ends early may violate its constraints.
+    """
+    satisfying = []
+    for tuned in ends:
+        measures = tuned.step.measures()
+        if all(
+            float(measures[name]) > bound - CONSTRAINT_TOLERANCES[name]
+            for name, bound in constraints.items()
+        ):
+            satisfying.append(tuned)
+    return sorted(satisfying, key=lambda tuned: -tuned.value)[:n]
+
+
 def compute_fronts(rows: Sequence[Row], size: StudySize) -> list[Row]:
     """Return the gait of least energy per metre for each front and each least DLS fraction.
 
     Searches start from the random wheels of least energy that satisfy the DLS fraction, or else
-    have the most double support. The result is the best gait at the end of a search.
+    have the most double support. Further searches start from the best ends of all levels. The
+    result is the best end of all levels that satisfies the constraints.
     """
     wheels = [
         row for row in select_compliant(rows) if row["comparison"] == f"speed {EQUAL_SPEED:g} m/s"
     ]
     lines: list[Row] = []
-    for front, constraints in FRONTS.items():
+    for front, foot_constraints in FRONTS.items():
+        constraints = {
+            level: {"speed": EQUAL_SPEED, "dls_fraction": level} | foot_constraints
+            for level in size.front_levels
+        }
+        ends: dict[float, list[vrw.TuneResult]] = {}
         for level in size.front_levels:
 
             def rank_start(row: Row, level: float = level) -> tuple[float, float]:
                 missing = max(level - float(row["dls_fraction"]), 0.0)
                 return missing, float(row["energy_per_meter"])
 
-            ends = []
+            ends[level] = []
             for row in sorted(wheels, key=rank_start)[: size.n_front_starts]:
-                try:
-                    tuned = vrw.tune(
-                        make_wheel(row), compute_energy_gain, list(BOX), BOX,
-                        {"speed": EQUAL_SPEED, "dls_fraction": level} | constraints,
-                        cycle_options=GAIT_OPTIONS, max_evaluations=60, tolerance=1e-4,
-                    )  # fmt: skip
-                except ValueError as error:  # the single search found no gait of this wheel
-                    print(error, flush=True)
-                else:
-                    ends.append(tuned)
-            satisfying = [
-                tuned for tuned in ends
-                if float(tuned.cycle.speed) > EQUAL_SPEED - SPEED_TOLERANCE
-                and float(tuned.cycle.dls_fraction) > level - SPEED_TOLERANCE
-            ]  # fmt: skip
-            best = max(satisfying or ends, key=lambda tuned: tuned.value)
+                ends[level] += search_least_energy(make_wheel(row), constraints[level])
+        for level in size.front_levels:
+            all_ends = [tuned for level_ends in ends.values() for tuned in level_ends]
+            for tuned in select_best_ends(all_ends, constraints[level], size.n_front_restarts):
+                ends[level] += search_least_energy(tuned.params, constraints[level])
+        for level in size.front_levels:
+            all_ends = [tuned for level_ends in ends.values() for tuned in level_ends]
+            (best,) = select_best_ends(all_ends, constraints[level], 1)
             values = {name: float(getattr(best.params, name)) for name in BOX}
             values |= {"dls_fraction": float(best.cycle.dls_fraction),
                        "speed": float(best.cycle.speed), "energy_per_meter": -best.value,
                        "spectral_radius": float(best.cycle.spectral_radius)}  # fmt: skip
-            n_converged = sum(tuned.status.name == "CONVERGED" for tuned in ends)
+            n_converged = sum(tuned.status.name == "CONVERGED" for tuned in ends[level])
             lines.append(
                 {"front": front, "least_dls_fraction": f"{level:g}",
-                 "converged_searches": f"{n_converged} of {len(ends)}", "status": best.status.name}
+                 "converged_searches": f"{n_converged} of {len(ends[level])}",
+                 "status": best.status.name}
                 | {name: f"{value:.6g}" for name, value in values.items()}
             )  # fmt: skip
             print(lines[-1], flush=True)
