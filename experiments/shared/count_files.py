@@ -24,6 +24,8 @@ LIBRARY_FOLDER = Path(vrw.__file__).parent
 """Folder of the package `vrw_jax`."""
 UNCOUNTED_PACKAGES = ("validation", "printing", "runtime", "simd")
 """Packages of which no file is counted."""
+UNCOUNTED_FILES = ("numerics/cached_programs.py", "numerics/settings.py")
+"""Files that compile functions, or set JAX's settings, and are not counted."""
 
 
 def run_step() -> object:
@@ -62,7 +64,8 @@ def list_files(call: Callable[[], object]) -> list[str]:
         is_function = event == "call" and frame.f_code.co_name != "<module>"
         if is_function and path.is_relative_to(LIBRARY_FOLDER) and path.name != "__init__.py":
             relative_path = path.relative_to(LIBRARY_FOLDER)
-            if relative_path.parts[0] not in UNCOUNTED_PACKAGES:
+            is_uncounted_file = relative_path.as_posix() in UNCOUNTED_FILES
+            if relative_path.parts[0] not in UNCOUNTED_PACKAGES and not is_uncounted_file:
                 files[str(relative_path)] = None
 
     sys.setprofile(record)
