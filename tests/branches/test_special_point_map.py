@@ -42,7 +42,7 @@ def test_only_the_curve_of_the_same_quantity_explains_a_sign_change():
     changes = find_sign_changes_in_scan(scan, MAP_PARAMETERS)
     assert {sign_change.quantity_name for sign_change in changes} == {"friction_rear"}
     for sign_change in changes:  # linear: interpolation between two samples is exact
-        i, j = sign_change.position_in_cells
+        i, j = sign_change.scan_position_in_cells
         assert 50.0 + 10.0 * i == pytest.approx(50.0 + 25.0 * j / 3.0, abs=1e-9)
     assert find_unexplained_sign_changes(changes, [make_line("friction_rear", zero, K)], scan) == []
     assert (
@@ -53,7 +53,7 @@ def test_only_the_curve_of_the_same_quantity_explains_a_sign_change():
         changes, [make_line("friction_rear", zero[:4], K[:4])], scan
     )
     assert 0 < len(half) < len(changes)
-    assert all(sign_change.position_in_cells[1] > 3.0 for sign_change in half)
+    assert all(sign_change.scan_position_in_cells[1] > 3.0 for sign_change in half)
 
 
 def test_samples_with_too_coarse_a_mesh_do_not_count_as_missing_gaits():

@@ -512,9 +512,10 @@ def _step_lanes_by_kernel(
 
     The results are those of `_BatchEngine.take_lane_steps`.
     """
-    option_leaves, options_structure = jax.tree.flatten(options)
+    step_option_leaves, options_structure = jax.tree.flatten(options)
     scalar_kernel_arguments = [
-        np.asarray(option_leaf, parameter_matrix.dtype) for option_leaf in option_leaves
+        np.asarray(step_option_leaf, parameter_matrix.dtype)
+        for step_option_leaf in step_option_leaves
     ]
     solver_tableau, n_parameters = load_explicit_tableau(options.solver), len(PARAMETER_NAMES)
     assert solver_tableau is not None  # `_select_batch_engine` has checked the solver.
@@ -649,7 +650,7 @@ def _step_lanes_by_diffrax(
     The results are those of `_BatchEngine.take_lane_steps`.
     """
     convert_options_dtype = functools.partial(
-        jax.tree.map, lambda option_leaf: np.asarray(option_leaf, parameter_matrix.dtype)
+        jax.tree.map, lambda step_option_leaf: np.asarray(step_option_leaf, parameter_matrix.dtype)
     )
     derivative_step_options = convert_options_dtype(options.with_derivative_tolerances())
     options = convert_options_dtype(options)

@@ -280,10 +280,10 @@ def _estimate_next_correction(newton_sweep_state: _NewtonSweepState) -> Array:
     """Return the correction that one more Newton sweep would make, extrapolated from the last two
     sweeps.
     """
-    correction_ratio = newton_sweep_state.rate_correction / jnp.maximum(
+    rate_correction_ratio = newton_sweep_state.rate_correction / jnp.maximum(
         newton_sweep_state.previous_rate_correction, 1e-300
     )
-    return newton_sweep_state.rate_correction * jnp.minimum(correction_ratio, 1.0)
+    return newton_sweep_state.rate_correction * jnp.minimum(rate_correction_ratio, 1.0)
 
 
 def _sum_weighted_accelerations(
@@ -674,12 +674,12 @@ def _invert_stage_matrix(
     ]
     adjugate_matrix, stage_determinant = _compute_adjugate_and_determinant(stage_matrix)
 
-    squared_modulus = (
+    squared_determinant_modulus = (
         stage_determinant[0] * stage_determinant[0] + stage_determinant[1] * stage_determinant[1]
     )
     inverse_determinant = (
-        stage_determinant[0] / squared_modulus,
-        -stage_determinant[1] / squared_modulus,
+        stage_determinant[0] / squared_determinant_modulus,
+        -stage_determinant[1] / squared_determinant_modulus,
     )
     return [
         [_multiply_complex_pairs(inverse_determinant, matrix_entry) for matrix_entry in matrix_row]

@@ -78,7 +78,7 @@ def step_batch_with_contact(
         x, phase_durations, step_outcomes, n_stepped, n_solver_steps, _ = map(
             np.asarray, kernel_walk_result
         )
-        result_arrays = (
+        kernel_result_arrays = (
             x,
             phase_durations,
             step_outcomes,
@@ -87,7 +87,9 @@ def step_batch_with_contact(
             zeros_by_element > 0,
             zeros_by_element,
         )
-        return StepBatchResult(*result_arrays, engine="lanes", solver_names=(options.solver,))
+        return StepBatchResult(
+            *kernel_result_arrays, engine="lanes", solver_names=(options.solver,)
+        )
     parameter_names: tuple[str, ...] = CONTACT_PARAMETER_NAMES
     stepwise_parameters: dict[str, StepwiseParameter] = {}
     if is_ground_uneven:
@@ -101,7 +103,7 @@ def step_batch_with_contact(
         if not len(active_lanes):
             break
         parameter_matrix = (
-            stepwise_ground.make_step_parameters(k, parameter_matrix)
+            stepwise_ground.make_parameters_of_step(k, parameter_matrix)
             if is_ground_uneven
             else parameter_matrix
         )
@@ -181,7 +183,7 @@ class _StepwiseGround(NamedTuple):
             *stepwise_value_counts,
         )
 
-    def make_step_parameters(self, k: int, parameter_matrix: np.ndarray) -> np.ndarray:
+    def make_parameters_of_step(self, k: int, parameter_matrix: np.ndarray) -> np.ndarray:
         """Return the parameters of gait step `k`, shape (parameters, elements).
 
         The last two parameters are `UNEVEN_GROUND_PARAMETER_NAMES`.
@@ -212,10 +214,10 @@ class _StepwiseGround(NamedTuple):
         tilt_input_index = previous_friction_input_index + 1
         n_stepwise_slopes, n_stepwise_frictions = self.n_stepwise_slopes, self.n_stepwise_frictions
 
-        def list_slope_terms(k: int) -> tuple[tuple[int, int, float], ...]:
+        def list_slope_chain_terms(k: int) -> tuple[tuple[int, int, float], ...]:
             return (0, k, 1.0), (1, k, -1.0), (1, min(k + 1, (n_stepwise_slopes or 1) - 1), 1.0)
 
-        def list_friction_terms(k: int) -> tuple[tuple[int, int, float], ...]:
+        def list_friction_chain_terms(k: int) -> tuple[tuple[int, int, float], ...]:
             if n_stepwise_frictions is None:
                 return (0, 0, 1.0), (1, 0, 1.0)
             return (0, k, 1.0), (1, max(k - 1, 0), 1.0)
@@ -223,11 +225,11 @@ class _StepwiseGround(NamedTuple):
         stepwise_friction = StepwiseParameter(
             (CONTACT_FRICTION_INDEX, previous_friction_input_index),
             n_stepwise_frictions,
-            list_friction_terms,
+            list_friction_chain_terms,
         )
         if n_stepwise_slopes is None:
             return {"friction": stepwise_friction}
         stepwise_slope = StepwiseParameter(
-            (CONTACT_SLOPE_INDEX, tilt_input_index), n_stepwise_slopes, list_slope_terms
+            (CONTACT_SLOPE_INDEX, tilt_input_index), n_stepwise_slopes, list_slope_chain_terms
         )
         return {"slope": stepwise_slope, "friction": stepwise_friction}

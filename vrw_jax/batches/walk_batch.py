@@ -134,7 +134,7 @@ class WalkBatch:
         - `stepwise_parameters`: parameters that are not one equal input of every gait step, by
           name.
         """
-        state_size, n_lanes = section_states.shape
+        section_state_size, n_lanes = section_states.shape
         self.section_state, self.durations = (
             section_states,
             np.zeros((3, n_lanes), section_states.dtype),
@@ -160,7 +160,7 @@ class WalkBatch:
             for i in stepwise_parameter.input_indices
         ]
         state_input_indices = range(
-            len(step_parameter_names), len(step_parameter_names) + state_size
+            len(step_parameter_names), len(step_parameter_names) + section_state_size
         )
         self.input_indices = (
             (*parameter_input_indices, *state_input_indices) if derivative_names else ()
@@ -171,9 +171,11 @@ class WalkBatch:
         ]
         # The first index of each parameter on axis 0 of the Jacobian, and then that of the start.
         self.first_jacobian_rows = np.cumsum([0, *n_jacobian_rows_by_parameter])
-        n_jacobian_rows = self.first_jacobian_rows[-1] + state_size if derivative_names else 0
+        n_jacobian_rows = (
+            self.first_jacobian_rows[-1] + section_state_size if derivative_names else 0
+        )
         self.walk_jacobian = np.zeros(
-            (n_jacobian_rows, state_size + 3, n_lanes), section_states.dtype
+            (n_jacobian_rows, section_state_size + 3, n_lanes), section_states.dtype
         )
 
     def find_walking_lanes(self) -> np.ndarray:
@@ -216,11 +218,11 @@ class WalkBatch:
         if not self.derivative_names:
             return {}
         self.walk_jacobian[..., self.outcome != Outcome.STEPPED] = 0.0
-        jacobian_in_batch_order, state_size = (
+        jacobian_in_batch_order, section_state_size = (
             self.walk_jacobian.take(inverse_lane_order, -1).T,
             len(self.section_state),
         )
-        jacobian_rows_by_name: dict[str, Any] = {
+        jacobian_rows_by_input: dict[str, Any] = {
             START_INPUT_NAME: slice(self.first_jacobian_rows[-1], None)
         }
         for input_name, stepwise_parameter, first_jacobian_row in zip(
@@ -230,18 +232,18 @@ class WalkBatch:
             strict=True,
         ):
             n_stepwise_values = stepwise_parameter.n_stepwise_values
-            jacobian_rows_by_name[input_name] = (
+            jacobian_rows_by_input[input_name] = (
                 first_jacobian_row
                 if n_stepwise_values is None
                 else slice(first_jacobian_row, first_jacobian_row + n_stepwise_values)
             )
-        jacobian_by_name = {
-            input_name: jacobian_in_batch_order[:, :, jacobian_rows_by_name[input_name]]
+        jacobian_by_input = {
+            input_name: jacobian_in_batch_order[:, :, jacobian_rows_by_input[input_name]]
             for input_name in self.derivative_names
         }
         return {
-            input_name: StepSensitivity(x[:, :state_size], x[:, state_size:])
-            for input_name, x in jacobian_by_name.items()
+            input_name: StepSensitivity(x[:, :section_state_size], x[:, section_state_size:])
+            for input_name, x in jacobian_by_input.items()
         }
 
     def store_lane_steps(
@@ -278,16 +280,19 @@ class WalkBatch:
         """
         if not self.has_flat_ground:
             return self._chain_stepwise_jacobian(lane_selection, step_jacobian)
-        n_parameters, state_size = len(self.differentiated_parameter_names), len(self.section_state)
+        n_parameters, section_state_size = (
+            len(self.differentiated_parameter_names),
+            len(self.section_state),
+        )
         if not self.n_stepped[lane_selection].any():
             return step_jacobian
-        previous_jacobian = self.walk_jacobian[:, :state_size, lane_selection]
-        chained_jacobian = sum(
-            step_jacobian[n_parameters + i] * previous_jacobian[:, i, None]
-            for i in range(state_size)
+        previous_walk_jacobian = self.walk_jacobian[:, :section_state_size, lane_selection]
+        chained_walk_jacobian = sum(
+            step_jacobian[n_parameters + i] * previous_walk_jacobian[:, i, None]
+            for i in range(section_state_size)
         )
-        chained_jacobian[:n_parameters] += step_jacobian[:n_parameters]
-        return chained_jacobian
+        chained_walk_jacobian[:n_parameters] += step_jacobian[:n_parameters]
+        return chained_walk_jacobian
 
     def _chain_stepwise_jacobian(
         self, lane_selection: Any, step_jacobian: np.ndarray
@@ -298,13 +303,16 @@ class WalkBatch:
         Axis 0 has one index for each value of such a parameter. The derivatives with respect to
         values of later steps are still 0.
         """
-        state_size, first_start_state_row = len(self.section_state), self.first_jacobian_rows[-1]
-        n_step_inputs = len(step_jacobian) - state_size
+        section_state_size, first_start_state_row = (
+            len(self.section_state),
+            self.first_jacobian_rows[-1],
+        )
+        n_step_inputs = len(step_jacobian) - section_state_size
         k = int(np.max(self.n_stepped[lane_selection], initial=0))
-        jacobian_shape = len(self.walk_jacobian), *step_jacobian.shape[1:]
-        chained_jacobian = np.zeros(jacobian_shape, step_jacobian.dtype)
+        walk_jacobian_shape = len(self.walk_jacobian), *step_jacobian.shape[1:]
+        chained_walk_jacobian = np.zeros(walk_jacobian_shape, step_jacobian.dtype)
         if k == 0:
-            chained_jacobian[first_start_state_row:] = step_jacobian[n_step_inputs:]
+            chained_walk_jacobian[first_start_state_row:] = step_jacobian[n_step_inputs:]
         else:
             nonzero_jacobian_row_ranges = [
                 range(first_jacobian_row, min(first_jacobian_row + k + 1, next_jacobian_row))
@@ -315,15 +323,15 @@ class WalkBatch:
             nonzero_jacobian_rows = np.array(
                 [
                     *itertools.chain(*nonzero_jacobian_row_ranges),
-                    *range(first_start_state_row, len(chained_jacobian)),
+                    *range(first_start_state_row, len(chained_walk_jacobian)),
                 ]
             )
-            previous_jacobian = self.walk_jacobian[nonzero_jacobian_rows, :state_size][
+            previous_walk_jacobian = self.walk_jacobian[nonzero_jacobian_rows, :section_state_size][
                 ..., lane_selection
             ]
-            chained_jacobian[nonzero_jacobian_rows] = sum(
-                step_jacobian[n_step_inputs + i] * previous_jacobian[:, i, None]
-                for i in range(state_size)
+            chained_walk_jacobian[nonzero_jacobian_rows] = sum(
+                step_jacobian[n_step_inputs + i] * previous_walk_jacobian[:, i, None]
+                for i in range(section_state_size)
             )
         first_parameter_input_row = 0
         for stepwise_parameter, first_jacobian_row in zip(
@@ -334,11 +342,11 @@ class WalkBatch:
                 stepwise_value_index,
                 input_derivative,
             ) in stepwise_parameter.list_chain_rule_terms(k):
-                chained_jacobian[first_jacobian_row + stepwise_value_index] += (
+                chained_walk_jacobian[first_jacobian_row + stepwise_value_index] += (
                     input_derivative * step_jacobian[first_parameter_input_row + input_position]
                 )
             first_parameter_input_row += len(stepwise_parameter.input_indices)
-        return chained_jacobian
+        return chained_walk_jacobian
 
 
 def select_lanes(lane_indices: np.ndarray, walk_batch: WalkBatch) -> Any:

@@ -156,9 +156,9 @@ class Branch:
     def __str__(self) -> str:
         if not self.values.size:
             return f"Branch along {self.parameter}: none. {self.outcome.meaning}"
-        has_known_unit = self.parameter in MEASURES
+        has_parameter_unit = self.parameter in MEASURES
         parameter_unit = (
-            f" {MEASURES[self.parameter].display_unit}".rstrip() if has_known_unit else ""
+            f" {MEASURES[self.parameter].display_unit}".rstrip() if has_parameter_unit else ""
         )
         is_gait_stable = self.stable
         text_lines = [

@@ -547,14 +547,14 @@ class _BranchPointTable(NamedTuple):
         """Return a table with the admissible points of all ranges and the points next to the
         located ends.
         """
-        point_groups, wheel_index_groups, quantity_tables = [], [], []
+        points_by_range, wheel_index_groups, quantity_tables_by_range = [], [], []
 
         def append_branch_points(
             added_points: ContinuationPoint, wheel_index: int, added_quantities: QuantitiesByName
         ) -> None:
-            point_groups.append(added_points)
+            points_by_range.append(added_points)
             wheel_index_groups.append(np.full(len(added_points.p), wheel_index))
-            quantity_tables.append(added_quantities)
+            quantity_tables_by_range.append(added_quantities)
 
         for admissible_range in admissible_ranges:
             lower_located_end, upper_located_end = (
@@ -592,9 +592,9 @@ class _BranchPointTable(NamedTuple):
                     upper_located_end.quantities_beside_root,
                 )
         return _BranchPointTable(
-            concatenate_tree_rows(*point_groups),
+            concatenate_tree_rows(*points_by_range),
             np.concatenate(wheel_index_groups),
-            concatenate_tree_rows(*quantity_tables),
+            concatenate_tree_rows(*quantity_tables_by_range),
         )
 
 
@@ -686,13 +686,13 @@ class _SpecialPointLocator(NamedTuple):
             for request_index in range(len(root_requests))
         }
 
-        def solve_at_fractions(
+        def solve_for_points_at_fractions(
             chord_fractions: np.ndarray, bracket_indices: np.ndarray
         ) -> tuple[ContinuationPoint, QuantitiesByName]:
             selected_brackets = select_tree_rows(
                 (bracket_wheels, left_points, right_points), bracket_indices
             )
-            solved_points, is_solve_successful = self.branch_continuation.map_over_points(
+            solved_chord_points, is_solve_successful = self.branch_continuation.map_over_points(
                 chord_point_solver,
                 batch_sizes.LOCATION_BATCH_SIZES[-1],
                 *selected_brackets,
@@ -700,29 +700,33 @@ class _SpecialPointLocator(NamedTuple):
             )
             parameter_by_location.update(
                 zip(
-                    zip(bracket_indices, chord_fractions, strict=True), solved_points.p, strict=True
+                    zip(bracket_indices, chord_fractions, strict=True),
+                    solved_chord_points.p,
+                    strict=True,
                 )
             )
-            solved_points = solved_points._replace(
-                is_admissible=solved_points.is_admissible & is_solve_successful
+            solved_chord_points = solved_chord_points._replace(
+                is_admissible=solved_chord_points.is_admissible & is_solve_successful
             )
             quantity_table = self.branch_continuation.make_quantity_table(
-                solved_points, wheel_indices[bracket_indices]
+                solved_chord_points, wheel_indices[bracket_indices]
             )
-            flag_broadcaster = lambda is_point_found, quantity_values: is_point_found.reshape(
+            found_flag_broadcaster = lambda is_point_found, quantity_values: is_point_found.reshape(
                 -1, *(1,) * (quantity_values.ndim - 1)
             )
-            return solved_points, {
+            return solved_chord_points, {
                 quantity_name: np.where(
-                    flag_broadcaster(is_solve_successful, quantity_values), quantity_values, np.nan
+                    found_flag_broadcaster(is_solve_successful, quantity_values),
+                    quantity_values,
+                    np.nan,
                 )
                 for quantity_name, quantity_values in quantity_table.items()
             }
 
-        def evaluate_at_fractions(
+        def evaluate_quantities_at_fractions(
             chord_fractions: np.ndarray, bracket_indices: np.ndarray
         ) -> np.ndarray:
-            quantity_table = solve_at_fractions(chord_fractions, bracket_indices)[1]
+            quantity_table = solve_for_points_at_fractions(chord_fractions, bracket_indices)[1]
             return np.array(
                 [
                     evaluate_named_quantity(quantity_table, quantity_names[bracket_index])[
@@ -746,14 +750,14 @@ class _SpecialPointLocator(NamedTuple):
             location_options.min_bracket_fraction,
         )
         root_locations = locate_function_roots(
-            evaluate_at_fractions,
+            evaluate_quantities_at_fractions,
             (evaluate_at_points(left_indices), evaluate_at_points(right_indices)),
             bracket_tolerances,
         )
         request_indices = np.arange(len(root_requests))
         # Even for an exact root, the point next to it lies to the left, where the gaits are
         # admissible.
-        points_beside_roots, quantities_beside_roots = solve_at_fractions(
+        points_beside_roots, quantities_beside_roots = solve_for_points_at_fractions(
             np.maximum(root_locations.left_bracket_ends - bracket_tolerances, 0.0), request_indices
         )
         for retry_chord_fraction in location_options.retry_chord_fractions:
@@ -762,7 +766,7 @@ class _SpecialPointLocator(NamedTuple):
             )
             point_indices = np.arange(len(root_requests))
             if len(inadmissible_request_indices):
-                retried_points_and_quantities = solve_at_fractions(
+                retried_points_and_quantities = solve_for_points_at_fractions(
                     retry_chord_fraction
                     * root_locations.left_bracket_ends[inadmissible_request_indices],
                     inadmissible_request_indices,

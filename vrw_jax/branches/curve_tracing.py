@@ -375,9 +375,11 @@ class CurveTracer(NamedTuple):
             curve_seed.z.section_state,
             self.compute_parameter_fractions(np.array(curve_seed.parameter_values)),
         )
-        has_same_name = curve_seed.special_point_name == traced_curve.special_point_curve.name
+        has_same_special_point_name = (
+            curve_seed.special_point_name == traced_curve.special_point_curve.name
+        )
         max_curve_distance = self.tracing_options.max_distance_on_same_curve
-        return has_same_name and bool(
+        return has_same_special_point_name and bool(
             compute_distances_to_polyline(seed_point[None], traced_curve.scaled_vertices)[0]
             < max_curve_distance
         )
@@ -388,11 +390,11 @@ class CurveTracer(NamedTuple):
         The special points must have the same name, and all points of the first curve must lie on
         the second curve.
         """
-        has_same_name = (
+        has_same_special_point_name = (
             traced_curve.special_point_curve.name == compared_curve.special_point_curve.name
         )
         max_curve_distance = self.tracing_options.max_distance_on_same_curve
-        return has_same_name and bool(
+        return has_same_special_point_name and bool(
             np.max(
                 compute_distances_to_polyline(
                     traced_curve.scaled_vertices, compared_curve.scaled_vertices

@@ -252,11 +252,13 @@ class GaitTestFunction(AbstractTestFunction):
                 for parameter_index, parameter_tangent in enumerate(tangents_by_parameter)
             ]
         )
-        orthonormal_basis, triangular_factor = jnp.linalg.qr(
+        orthonormal_tangent_basis, triangular_factor = jnp.linalg.qr(
             jnp.concatenate([tangents_times_parameters, jnp.eye(2, dtype=p.dtype)], 1).T
         )
         basis_coefficients = p[:, None] * jnp.linalg.inv(triangular_factor)
-        correction_coordinates = orthonormal_basis[:-2].T @ self.section_state(newton_correction)
+        correction_coordinates = orthonormal_tangent_basis[:-2].T @ self.section_state(
+            newton_correction
+        )
 
         def measure_gait_at_offset(basis_offset: Array) -> Array:
             parameter_change = basis_coefficients @ (basis_offset - correction_coordinates)
@@ -452,8 +454,8 @@ def _compute_force_decrease_rates(
         (*dls_points.start_point.q, *dls_points.start_point.v),
         (*dls_points.end_point.q, *dls_points.end_point.v),
     )
-    state_rates = start_state[1], make_dls_instant(*start_state).acceleration.ddtheta
-    initial_rear_force, rear_force_rate = jax.jvp(compute_rear_force, start_state, state_rates)
+    dls_state_rates = start_state[1], make_dls_instant(*start_state).acceleration.ddtheta
+    initial_rear_force, rear_force_rate = jax.jvp(compute_rear_force, start_state, dls_state_rates)
     mean_decrease_rate = (initial_rear_force - compute_rear_force(*end_state)) / jnp.where(
         dls_duration == 0.0, 1.0, dls_duration
     )

@@ -96,17 +96,19 @@ def continue_beyond_jumps(
                     is_branch_requested,
                 )
             )
-            new_results = jax.tree.map(np.asarray, branch_continuer(*continuation_arguments))
-            first_new_points = select_tree_rows(new_results.points, (branch_indices, 0))
-            is_gait_found = is_branch_requested & (np.asarray(new_results.n_points) > 1)
-            first_new_quantities = branch_continuation.make_quantity_table(
-                first_new_points, wheel_indices
+            new_branch_results = jax.tree.map(np.asarray, branch_continuer(*continuation_arguments))
+            first_points_beyond_jump = select_tree_rows(
+                new_branch_results.points, (branch_indices, 0)
+            )
+            is_gait_found = is_branch_requested & (np.asarray(new_branch_results.n_points) > 1)
+            first_quantities_beyond_jump = branch_continuation.make_quantity_table(
+                first_points_beyond_jump, wheel_indices
             )
             is_gait_found = is_gait_found & branch_continuation.is_same_gait(
-                branch_end_quantities, first_new_quantities
+                branch_end_quantities, first_quantities_beyond_jump
             )
             results_by_direction = append_branch_results(
-                results_by_direction, new_results, is_gait_found
+                results_by_direction, new_branch_results, is_gait_found
             )
             is_branch_stalled = is_branch_stalled & ~is_gait_found
         has_search_failed = has_search_failed | is_branch_stalled
@@ -115,16 +117,18 @@ def continue_beyond_jumps(
 
 def append_branch_results(
     results_by_direction: ContinuationResult,
-    new_results: ContinuationResult,
+    new_branch_results: ContinuationResult,
     is_branch_extended: np.ndarray,
 ) -> ContinuationResult:
-    """Append the points in `new_results` to the branches, and return all results.
+    """Append the points in `new_branch_results` to the branches, and return all results.
 
     - `is_branch_extended`: whether the points of each branch are appended.
     """
     if not is_branch_extended.any():
         return results_by_direction
-    n_points = results_by_direction.n_points + np.where(is_branch_extended, new_results.n_points, 0)
+    n_points = results_by_direction.n_points + np.where(
+        is_branch_extended, new_branch_results.n_points, 0
+    )
     n_buffer_points = max(int(np.max(n_points)), results_by_direction.points.p.shape[1])
 
     def append_branch_points(points: np.ndarray, new_points: np.ndarray) -> np.ndarray:
@@ -133,17 +137,17 @@ def append_branch_results(
         for branch_index in np.flatnonzero(is_branch_extended):
             point_buffer[
                 branch_index, results_by_direction.n_points[branch_index] : n_points[branch_index]
-            ] = new_points[branch_index, : new_results.n_points[branch_index]]
+            ] = new_points[branch_index, : new_branch_results.n_points[branch_index]]
         return point_buffer
 
     appended_points: Any = jax.tree.map(
-        append_branch_points, results_by_direction.points, new_results.points
+        append_branch_points, results_by_direction.points, new_branch_results.points
     )
     branch_status: Any = np.where(
-        is_branch_extended, new_results.status, results_by_direction.status
+        is_branch_extended, new_branch_results.status, results_by_direction.status
     )
     point_counts: Any = n_points
-    n_linearizations = results_by_direction.n_linearizations + new_results.n_linearizations
+    n_linearizations = results_by_direction.n_linearizations + new_branch_results.n_linearizations
     return ContinuationResult(appended_points, point_counts, branch_status, n_linearizations)
 
 

@@ -196,12 +196,14 @@ def classify_crossing_ranks(
     multipliers = multipliers[np.argsort(-np.abs(multipliers), kind="stable")][
         list(crossing_multiplier_ranks)
     ]
-    is_complex_pair = np.abs(multipliers.imag) > multiplier_tolerances.min_imaginary_part
-    bifurcation_at_one = "fold" if has_parameter_turned else BRANCH_POINT_KIND
+    is_multiplier_complex = np.abs(multipliers.imag) > multiplier_tolerances.min_imaginary_part
+    bifurcation_at_multiplier_one = "fold" if has_parameter_turned else BRANCH_POINT_KIND
     n_multipliers_by_name = {
-        bifurcation_at_one: int(np.sum(~is_complex_pair & (multipliers.real > 0.0))),
-        "period_doubling": int(np.sum(~is_complex_pair & (multipliers.real < 0.0))),
-        "neimark_sacker": int(np.sum(is_complex_pair)),
+        bifurcation_at_multiplier_one: int(
+            np.sum(~is_multiplier_complex & (multipliers.real > 0.0))
+        ),
+        "period_doubling": int(np.sum(~is_multiplier_complex & (multipliers.real < 0.0))),
+        "neimark_sacker": int(np.sum(is_multiplier_complex)),
     }
     return {
         bifurcation_name: n_multipliers
@@ -217,14 +219,14 @@ def vanishes_at_root(
 ) -> bool:
     """Return whether a quantity vanishes at its located root. Otherwise it jumps there."""
     left_index, right_index, quantity_name = located_root.bracket_and_quantity
-    values_at_bracket_ends = evaluate_named_quantity(quantity_table, quantity_name)[
+    quantity_at_bracket_ends = evaluate_named_quantity(quantity_table, quantity_name)[
         [left_index, right_index]
     ]
     quantity_value_beside_root = float(
         np.abs(evaluate_named_quantity(located_root.quantities_beside_root, quantity_name)[0])
     )
     return not quantity_value_beside_root > root_tolerances.max_value_beside_root * float(
-        np.max(np.abs(values_at_bracket_ends))
+        np.max(np.abs(quantity_at_bracket_ends))
     )
 
 
@@ -241,28 +243,30 @@ def drop_duplicate_changes(
         special_point_name == earlier_name in STEPWISE_CHANGE_NAMES.values()
         or (special_point_name, earlier_name) == (FORCE_PEAK_COUNT_CHANGE, SECOND_PEAK_RATE_NAME)
     )
-    distinct_roots: list[NamedLocatedRoot] = []
+    distinct_named_roots: list[NamedLocatedRoot] = []
     for special_point_name, located_root, n_multipliers in named_roots:
         roots_of_same_change = [
-            other_located_root
-            for other_special_point_name, other_located_root, _ in distinct_roots
-            if is_same_change(special_point_name, other_special_point_name)
+            compared_located_root
+            for compared_special_point_name, compared_located_root, _ in distinct_named_roots
+            if is_same_change(special_point_name, compared_special_point_name)
         ]
         roots_of_same_change = [
-            other_located_root
-            for other_located_root in roots_of_same_change
-            if other_located_root.bracket_and_quantity[:2] == located_root.bracket_and_quantity[:2]
+            compared_located_root
+            for compared_located_root in roots_of_same_change
+            if compared_located_root.bracket_and_quantity[:2]
+            == located_root.bracket_and_quantity[:2]
         ]
-        compute_max_root_distance = lambda other_located_root: (
-            root_tolerances.max_equal_parameter_distance * abs(other_located_root.parameter_value)
+        compute_max_root_distance = lambda compared_located_root: (
+            root_tolerances.max_equal_parameter_distance
+            * abs(compared_located_root.parameter_value)
         )
         if not any(
-            abs(located_root.parameter_value - other_located_root.parameter_value)
-            <= compute_max_root_distance(other_located_root)
-            for other_located_root in roots_of_same_change
+            abs(located_root.parameter_value - compared_located_root.parameter_value)
+            <= compute_max_root_distance(compared_located_root)
+            for compared_located_root in roots_of_same_change
         ):
-            distinct_roots.append((special_point_name, located_root, n_multipliers))
-    return distinct_roots
+            distinct_named_roots.append((special_point_name, located_root, n_multipliers))
+    return distinct_named_roots
 
 
 def add_multiple_bifurcations(
@@ -325,19 +329,24 @@ def add_multiple_bifurcations(
         ):
             root_groups.append([])
         root_groups[-1].append(located_root)
-    first_rank_getter = lambda root_group: int(root_group[0].bracket_and_quantity[2].split(":")[1])
+    first_group_rank_getter = lambda root_group: int(
+        root_group[0].bracket_and_quantity[2].split(":")[1]
+    )
     mean_multiplier_requests = []
     for root_group in root_groups:
         quantity_name = format_rank_quantity_name(
-            first_rank_getter(root_group),
-            first_rank_getter(root_group) + len(root_group),
+            first_group_rank_getter(root_group),
+            first_group_rank_getter(root_group) + len(root_group),
         )
         mean_multiplier_requests.append((*root_group[0].bracket_and_quantity[:2], quantity_name))
     multiple_bifurcation_roots = []
     for root_group, located_mean_root in zip(
         root_groups, root_locator(mean_multiplier_requests), strict=True
     ):
-        first_multiplier_rank, n_multiplier_ranks = first_rank_getter(root_group), len(root_group)
+        first_multiplier_rank, n_multiplier_ranks = (
+            first_group_rank_getter(root_group),
+            len(root_group),
+        )
         unit_circle_distances = np.abs(
             located_mean_root.quantities_beside_root[MULTIPLIER_MODULI_COLUMN][
                 0, first_multiplier_rank : first_multiplier_rank + n_multiplier_ranks

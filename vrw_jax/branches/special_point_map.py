@@ -89,7 +89,7 @@ class ScanSignChange(NamedTuple):
     quantity_name: str
     parameter_index: int
     sample_indices: tuple[int, int]  # indices of the first sample, which has a gait
-    position_in_cells: tuple[float, float]  # position of the change in each parameter
+    scan_position_in_cells: tuple[float, float]  # position of the change in each parameter
 
 
 @with_default_jax_settings
@@ -306,7 +306,7 @@ def find_sign_changes_in_scan(
             np.moveaxis(x, parameter_index, 0)[:-1],
             np.moveaxis(x, parameter_index, 0)[1:],
         )
-        axis_mover = (
+        parameter_axis_mover = (
             lambda first_neighbor_values, second_neighbor_values, parameter_index=parameter_index: (
                 (first_neighbor_values, second_neighbor_values)
                 if parameter_index == 0
@@ -330,7 +330,7 @@ def find_sign_changes_in_scan(
                 sign_change_fraction = first_sample_values[i, j] / (
                     first_sample_values[i, j] - second_sample_values[i, j]
                 )
-                sample_indices = axis_mover(
+                sample_indices = parameter_axis_mover(
                     int(i if has_first_sample_gait[i, j] else i + 1), int(j)
                 )
                 sign_changes.append(
@@ -338,7 +338,7 @@ def find_sign_changes_in_scan(
                         quantity_name,
                         parameter_index,
                         sample_indices,
-                        axis_mover(float(i + sign_change_fraction), float(j)),
+                        parameter_axis_mover(float(i + sign_change_fraction), float(j)),
                     )
                 )
     return sign_changes
@@ -365,7 +365,7 @@ def find_unexplained_sign_changes(
             in EXPLAINING_CURVE_NAMES.get(quantity_name, (quantity_name,))
         ]
         sign_change_positions = np.array(
-            [sign_change.position_in_cells for sign_change in sign_changes_of_quantity]
+            [sign_change.scan_position_in_cells for sign_change in sign_changes_of_quantity]
         )
         curve_distances = np.full(len(sign_changes_of_quantity), np.inf)
         for special_point_curve in explaining_curves:
@@ -413,7 +413,9 @@ def _select_distant_sign_changes(
         ]
         if all(
             np.hypot(
-                *np.subtract(compared_sign_change.position_in_cells, sign_change.position_in_cells)
+                *np.subtract(
+                    compared_sign_change.scan_position_in_cells, sign_change.scan_position_in_cells
+                )
             )
             > map_options.min_distance_to_examined
             for compared_sign_change in sign_changes_of_same_kind

@@ -455,12 +455,14 @@ def run_map_command(
 ) -> None:
     """Draw all special points of gaits over two parameters: `vrw map configs/map_c_k.toml`."""
     with report_command_errors():
-        map_config, folder = _load_config_with_table(config, folder, "design", "map")
+        special_point_map_config, folder = _load_config_with_table(config, folder, "design", "map")
         from vrw_jax.branches import SPECIAL_POINT_MEASURES
         from vrw_jax.cli.reports import write_special_point_map
         from vrw_jax.scans import follow_special_points, require_map_grid
 
-        scan_plan = scanning.plan_config_scan(map_config, None, SPECIAL_POINT_MEASURES)
+        scan_plan = scanning.plan_config_scan(
+            special_point_map_config, None, SPECIAL_POINT_MEASURES
+        )
         require_map_grid(scan_plan.design)
         _require_writable_folder(folder)
         _require_figure_backend(True)
@@ -473,7 +475,10 @@ def run_map_command(
         ) as stage_reporter,
     ):
         special_point_map = follow_special_points(
-            scan_dataset, map_config.make_wheel(), map_config.make_model(), stage_reporter
+            scan_dataset,
+            special_point_map_config.make_wheel(),
+            special_point_map_config.make_model(),
+            stage_reporter,
         )
         stage_reporter("drawing the map")
         written_paths = write_special_point_map(special_point_map, folder)

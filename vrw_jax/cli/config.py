@@ -527,14 +527,14 @@ def _parse_model_table(
 
 
 def _parse_with_default_types(
-    config_table: Mapping[str, object], default_values: Mapping[str, object]
+    config_table: Mapping[str, object], default_setting_values: Mapping[str, object]
 ) -> dict[str, float | int | str | bool]:
     """Return the settings, converted to the types of their default values. Numbers must be
     positive.
     """
     parsed_settings: dict[str, float | int | str | bool] = {}
     for setting_name, config_value in config_table.items():
-        default_value = default_values[setting_name]
+        default_value = default_setting_values[setting_name]
         if isinstance(default_value, bool):
             if not isinstance(config_value, bool):
                 raise _make_value_error(setting_name, config_value, "true or false")

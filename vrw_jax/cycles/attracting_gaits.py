@@ -138,12 +138,12 @@ def _find_gaits_from_starts(
     # The cycle of a wheel without a valid candidate contains zeros and has a failure as outcome.
     selected_gaits = select_tree_rows(candidate_gaits, selected_gait_indices)
     is_selected_gait_missing = ~is_gait_valid[selected_gait_indices]
-    broadcast_mask = lambda gait_array: is_selected_gait_missing.reshape(
+    broadcast_missing_mask = lambda gait_array: is_selected_gait_missing.reshape(
         -1, *[1] * (gait_array.ndim - 1)
     )
     masked_gaits = jax.tree.map(
         lambda gait_array: np.where(
-            broadcast_mask(gait_array), np.zeros_like(gait_array), gait_array
+            broadcast_missing_mask(gait_array), np.zeros_like(gait_array), gait_array
         ),
         selected_gaits,
     )

@@ -184,7 +184,7 @@ def limit_cycle(
     parse_gait_choice(which)
     model = resolve_model(params, model)
     gait_finder = resolve_finder(params, model, options, check_int("period_n", period_n))
-    returns_nan = check_choice("on_failure", on_failure, FAILURE_FILLS) == "nan"
+    fills_missing_gait_with_nan = check_choice("on_failure", on_failure, FAILURE_FILLS) == "nan"
     if guess is None and period_n > 1 and not gait_finder.is_multistable:
         raise ValueError(
             f"period_n is {period_n} and there is no guess, but a gait of several steps is one of "
@@ -193,7 +193,7 @@ def limit_cycle(
     cycle: Any = _search_with_fallbacks(
         gait_finder, params, check_cycle_guess(guess), options is None, which
     )
-    return cycle.replace_missing_gaits_by_nan(params) if returns_nan else cycle
+    return cycle.replace_missing_gaits_by_nan(params) if fills_missing_gait_with_nan else cycle
 
 
 @with_default_jax_settings
@@ -392,18 +392,18 @@ def _restore_first_failure_reason(cycle: LimitCycle, retried_cycle: LimitCycle) 
         failure_reason_getter(cycle),
         failure_reason_getter(retried_cycle),
     )
-    value_selector: Any = jnp.where
+    wheel_value_selector: Any = jnp.where
     # NumPy compiles nothing for a new batch size.
     if not has_traced_leaf((first_failure_reason, last_failure_reason)):
         first_failure_reason, last_failure_reason = jax.tree.map(
             np.asarray, (first_failure_reason, last_failure_reason)
         )
-        value_selector = lambda *arrays: jax.device_put(np.where(*arrays))
+        wheel_value_selector = lambda *arrays: jax.device_put(np.where(*arrays))
     is_gait_missing = (first_failure_reason[0] != Outcome.STEPPED) & (
         last_failure_reason[0] != Outcome.STEPPED
     )
     failure_reason = [
-        value_selector(is_gait_missing, *failure_reason_pair)
+        wheel_value_selector(is_gait_missing, *failure_reason_pair)
         for failure_reason_pair in zip(first_failure_reason, last_failure_reason, strict=True)
     ]
     return eqx.tree_at(failure_reason_getter, retried_cycle, tuple(failure_reason))
@@ -433,12 +433,12 @@ def _replace_wheels(
 ) -> Any:
     """Return a tree of arrays in which `tree_of_new_wheels` replaces the selected wheels."""
 
-    def replace_leaf_rows(array_over_wheels: Any, array_of_new_wheels: Any) -> np.ndarray:
+    def replace_wheel_rows(array_over_wheels: Any, array_of_new_wheels: Any) -> np.ndarray:
         array_over_wheels = np.array(array_over_wheels)
         array_over_wheels[wheel_indices] = array_of_new_wheels
         return array_over_wheels
 
-    return jax.tree.map(replace_leaf_rows, tree_over_wheels, tree_of_new_wheels)
+    return jax.tree.map(replace_wheel_rows, tree_over_wheels, tree_of_new_wheels)
 
 
 def _find_walk_end_states(
@@ -458,7 +458,7 @@ def _find_walk_end_states(
     parameter_matrix = np.stack([np.asarray(getattr(params, name)) for name in PARAMETER_NAMES])
     solver_indices = select_cheapest_solver(parameter_matrix, StepOptions())
     is_solver_explicit = solver_indices != SolverIndex.IMPLICIT_SOLVER
-    unsettled_wheels = np.flatnonzero(is_walk_needed & is_solver_explicit)
+    unsettled_wheel_indices = np.flatnonzero(is_walk_needed & is_solver_explicit)
     parameter_values, walk_end_states = (
         parameter_matrix.T,
         np.full((len(is_walk_needed), 3), np.nan),
@@ -467,23 +467,25 @@ def _find_walk_end_states(
         len(is_walk_needed), GAIT_WALK_OPTIONS.max_newton_start_defect
     )
     if guess_states_by_wheel is not None:
-        guess_section_states = guess_states_by_wheel[unsettled_wheels]
+        guess_section_states = guess_states_by_wheel[unsettled_wheel_indices]
         is_guess_usable = (
             measure_period_defects(
-                gait_finder, parameter_values[unsettled_wheels], guess_section_states
+                gait_finder, parameter_values[unsettled_wheel_indices], guess_section_states
             )
             < GAIT_WALK_OPTIONS.max_newton_start_defect
         )
-        walk_end_states[unsettled_wheels[is_guess_usable]] = guess_section_states[is_guess_usable]
-        unsettled_wheels = unsettled_wheels[~is_guess_usable]
+        walk_end_states[unsettled_wheel_indices[is_guess_usable]] = guess_section_states[
+            is_guess_usable
+        ]
+        unsettled_wheel_indices = unsettled_wheel_indices[~is_guess_usable]
     for start_state_function in (compute_walk_starts, compute_fallback_walk_starts):
-        if not len(unsettled_wheels):
+        if not len(unsettled_wheel_indices):
             break
         walk_ends = walk_to_gaits(
-            gait_finder, parameter_values[unsettled_wheels], start_state_function
+            gait_finder, parameter_values[unsettled_wheel_indices], start_state_function
         )
         for wheel_index, walk_end_state, period_defect in zip(
-            unsettled_wheels[walk_ends.wheel_indices], *walk_ends[1:], strict=True
+            unsettled_wheel_indices[walk_ends.wheel_indices], *walk_ends[1:], strict=True
         ):
             if period_defect < smallest_period_defects[wheel_index]:
                 smallest_period_defects[wheel_index], walk_end_states[wheel_index] = (
@@ -491,9 +493,9 @@ def _find_walk_end_states(
                     walk_end_state,
                 )
         has_not_settled = (
-            smallest_period_defects[unsettled_wheels] >= GAIT_WALK_OPTIONS.max_settled_defect
+            smallest_period_defects[unsettled_wheel_indices] >= GAIT_WALK_OPTIONS.max_settled_defect
         )
-        unsettled_wheels = unsettled_wheels[has_not_settled]
+        unsettled_wheel_indices = unsettled_wheel_indices[has_not_settled]
     return walk_end_states
 
 
@@ -586,16 +588,16 @@ def _find_fallback_starts(
             | (is_mesh_too_coarse & (refinement_index > 0))
             | (refinement_index == 1)
         )
-        retried_wheels = np.flatnonzero(needs_better_gait & is_retry_promising)
-        if not len(retried_wheels):
+        retried_wheel_indices = np.flatnonzero(needs_better_gait & is_retry_promising)
+        if not len(retried_wheel_indices):
             continue
-        retried_params = _take_wheels_on_device(params, retried_wheels)
+        retried_params = _take_wheels_on_device(params, retried_wheel_indices)
         start_states = _make_search_starts(
             gait_finder,
             retried_params,
-            _take_wheels_on_device(collocation_state, retried_wheels),
-            has_known_state[retried_wheels],
-            walk_end_states[retried_wheels],
+            _take_wheels_on_device(collocation_state, retried_wheel_indices),
+            has_known_state[retried_wheel_indices],
+            walk_end_states[retried_wheel_indices],
         )
         retried_cycle = map_in_batches(
             gait_finder.find_cycles, batch_sizes.GAIT_BATCH_SIZES, retried_params, start_states
@@ -608,17 +610,17 @@ def _find_fallback_starts(
         )
         collocation_state = _replace_wheels(
             collocation_state,
-            retried_wheels[is_gait_found],
+            retried_wheel_indices[is_gait_found],
             _take_wheels_on_device(retried_cycle.collocation_state, is_gait_found),
         )
         if is_gait_found.any():
             best_finder_and_starts = gait_finder, collocation_state
-        has_known_state[retried_wheels[is_gait_found]] = True
-        is_mesh_too_coarse[retried_wheels] = (
+        has_known_state[retried_wheel_indices[is_gait_found]] = True
+        is_mesh_too_coarse[retried_wheel_indices] = (
             np.asarray(retried_cycle.outcome) == Outcome.MESH_TOO_COARSE
         )
         needs_better_gait[
-            retried_wheels[
+            retried_wheel_indices[
                 is_gait_found
                 & (
                     (mesh_errors <= fallback_options.max_unrefined_mesh_error)
@@ -710,17 +712,17 @@ def _align_first_step(
         np.asarray(collocation_state.has_cycle)[:, None] > 0.5, state_distances_to_start, 0.0
     )
     for step_index in range(1, gait_finder.period_n):
-        shifted_wheels = np.flatnonzero(np.argmin(state_distances_to_start, 1) == step_index)
-        if len(shifted_wheels):
+        shifted_wheel_indices = np.flatnonzero(np.argmin(state_distances_to_start, 1) == step_index)
+        if len(shifted_wheel_indices):
             shift_to_first_step = jax.vmap(
                 functools.partial(gait_finder.shift_first_step, step_index)
             )
             collocation_state = _replace_wheels(
                 collocation_state,
-                shifted_wheels,
+                shifted_wheel_indices,
                 shift_to_first_step(
-                    _take_wheels_on_device(params, shifted_wheels),
-                    _take_wheels_on_device(collocation_state, shifted_wheels),
+                    _take_wheels_on_device(params, shifted_wheel_indices),
+                    _take_wheels_on_device(collocation_state, shifted_wheel_indices),
                 ),
             )
             finder_and_starts = gait_finder, collocation_state

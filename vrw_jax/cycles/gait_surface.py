@@ -74,17 +74,17 @@ def compute_surface_coordinates(params: WheelParams) -> tuple[Elementwise, ...]:
     )
 
 
-def evaluate_monomials(centered_coordinates: tuple[Elementwise, ...]) -> list[Elementwise]:
+def evaluate_monomials(centered_surface_coordinates: tuple[Elementwise, ...]) -> list[Elementwise]:
     """Return all monomials of the coordinates up to the degree of the surface.
 
     The constant monomial is the first.
     """
-    constant_monomial = jnp.ones_like(centered_coordinates[0])
+    constant_monomial = jnp.ones_like(centered_surface_coordinates[0])
     return [
         functools.reduce(operator.mul, monomial_factors, constant_monomial)
         for monomial_degree in range(GAIT_SURFACE_DEGREE + 1)
         for monomial_factors in itertools.combinations_with_replacement(
-            centered_coordinates, monomial_degree
+            centered_surface_coordinates, monomial_degree
         )
     ]
 
@@ -97,13 +97,13 @@ def predict_gait(params: WheelParams, phase_meshes: tuple[PhaseMesh, ...]) -> Co
     gait_surface = load_gait_surface()
     # Python floats do not change the dtype of the parameters.
     coordinate_ranges = (surface_coordinate.tolist() for surface_coordinate in gait_surface[:4])
-    centered_coordinates = tuple(
+    centered_surface_coordinates = tuple(
         (jnp.clip(surface_coordinate, lower_bound, upper_bound) - coordinate_center) / half_range
         for surface_coordinate, coordinate_center, half_range, lower_bound, upper_bound in zip(
             compute_surface_coordinates(params), *coordinate_ranges, strict=True
         )
     )
-    monomials = jnp.stack(evaluate_monomials(centered_coordinates))
+    monomials = jnp.stack(evaluate_monomials(centered_surface_coordinates))
     predicted_surface_values = jnp.tensordot(
         jnp.asarray(gait_surface.coefficients.T, monomials.dtype), monomials, 1
     )

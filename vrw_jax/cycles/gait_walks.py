@@ -213,7 +213,9 @@ def walk_to_gaits(
     section_units = stack_section_units(
         gait_finder.model, parameter_values_by_walk, gait_finder.n_legs
     )
-    state_scaler = lambda section_states: (section_states / section_units)[:, :n_coordinates]
+    section_state_scaler = lambda section_states: (section_states / section_units)[
+        :, :n_coordinates
+    ]
     active_walk_indices = np.arange(len(walk_wheel_indices))
     for n_steps in walk_options.n_steps_by_round:
         end_states, walk_outcomes = _simulate_wheel_walks(
@@ -233,7 +235,7 @@ def walk_to_gaits(
             walk_options,
         )
         is_walk_duplicate |= _find_duplicate_walks(
-            state_scaler(section_states),
+            section_state_scaler(section_states),
             period_defects,
             n_wheels,
             walk_options.max_settled_defect,
@@ -246,7 +248,7 @@ def walk_to_gaits(
         if not len(active_walk_indices):
             break
     is_walk_duplicate = _find_duplicate_walks(
-        state_scaler(section_states),
+        section_state_scaler(section_states),
         period_defects,
         n_wheels,
         walk_options.max_newton_start_defect,

@@ -80,7 +80,7 @@ def _make_collocation_phase(
     """
     phase_class = PAPER_PHASES[phase_index]
 
-    def evaluate_phase(
+    def evaluate_phase_motion(
         phase_constants: PhaseConstants, phase_point: PhasePoint
     ) -> tuple[AbstractPhase, Motion]:
         next_line_tilt = (
@@ -99,15 +99,15 @@ def _make_collocation_phase(
     def evaluate_dynamics_residual(
         phase_constants: PhaseConstants, phase_point: PhasePoint, phase_acceleration: Vector
     ) -> Vector:
-        wheel_phase, wheel_motion = evaluate_phase(phase_constants, phase_point)
+        wheel_phase, wheel_motion = evaluate_phase_motion(phase_constants, phase_point)
         return wheel_phase.compute_dynamics_residual(wheel_motion, phase_acceleration)
 
     def evaluate_end_event(phase_constants: PhaseConstants, phase_point: PhasePoint) -> Elementwise:
-        wheel_phase, wheel_motion = evaluate_phase(phase_constants, phase_point)
+        wheel_phase, wheel_motion = evaluate_phase_motion(phase_constants, phase_point)
         return wheel_phase.compute_end_guard(PhaseInstant(wheel_phase, wheel_motion, None))
 
     def evaluate_phase_guards(phase_constants: PhaseConstants, phase_point: PhasePoint) -> Vector:
-        wheel_phase, wheel_motion = evaluate_phase(phase_constants, phase_point)
+        wheel_phase, wheel_motion = evaluate_phase_motion(phase_constants, phase_point)
         guard_values = wheel_phase.compute_guards(PhaseInstant(wheel_phase, wheel_motion, None))
         # Every guard keeps its index in ADMISSIBILITY_CHECKS, even if it is not checked.
         return (
@@ -117,7 +117,7 @@ def _make_collocation_phase(
         )
 
     def reset_to_next_phase(phase_constants: PhaseConstants, phase_point: PhasePoint) -> PhasePoint:
-        wheel_phase, wheel_motion = evaluate_phase(phase_constants, phase_point)
+        wheel_phase, wheel_motion = evaluate_phase_motion(phase_constants, phase_point)
         return PhasePoint(
             (),
             *PAPER_PHASES[phase_index + 1].select_coordinates(

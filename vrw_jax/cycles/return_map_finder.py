@@ -84,10 +84,12 @@ class ReturnMapCycle(AbstractCycle):
 
     def _drop_single_step_axis(self, tree_over_steps: Any) -> Any:
         """Return the tree without its axis over the gait steps if the cycle has only one step."""
-        step_axis, is_single_step = self.outcome.ndim, self.period_n == 1
+        gait_step_axis, is_single_step = self.outcome.ndim, self.period_n == 1
         return jax.tree.map(
             lambda array_over_steps: (
-                jnp.squeeze(array_over_steps, step_axis) if is_single_step else array_over_steps
+                jnp.squeeze(array_over_steps, gait_step_axis)
+                if is_single_step
+                else array_over_steps
             ),
             tree_over_steps,
         )
@@ -184,20 +186,23 @@ def find_return_map_cycle(
 
 
 def make_return_map_cycle(
-    params: WheelParams, model: AbstractWheel, fixed_point: FixedPointResult, cycle_steps: Any
+    params: WheelParams,
+    model: AbstractWheel,
+    fixed_point: FixedPointResult,
+    gait_steps_of_cycle: Any,
 ) -> ReturnMapCycle:
     """Build the cycle that belongs to a fixed point, from its gait steps on a leading axis."""
     # A failed step returns zeros, to which Newton's method may converge.
-    is_gait_valid = fixed_point.converged & jnp.all(cycle_steps.outcome == Outcome.STEPPED)
+    is_gait_valid = fixed_point.converged & jnp.all(gait_steps_of_cycle.outcome == Outcome.STEPPED)
     failure_outcome = jnp.where(params.is_in_domain(), Outcome.NO_CYCLE_FOUND, Outcome.BAD_INPUT)
     zero_without_gait = lambda array_over_steps: jnp.where(
         is_gait_valid, array_over_steps, jnp.zeros_like(array_over_steps)
     )
-    cycle_steps = jax.tree.map(zero_without_gait, cycle_steps)
+    gait_steps_of_cycle = jax.tree.map(zero_without_gait, gait_steps_of_cycle)
     return ReturnMapCycle(
         zero_without_gait(fixed_point.x),
-        *summarize_cycle_steps(cycle_steps),
-        steps=cycle_steps,
+        *summarize_cycle_steps(gait_steps_of_cycle),
+        steps=gait_steps_of_cycle,
         monodromy_value=zero_without_gait(fixed_point.jacobian),
         outcome=jnp.where(is_gait_valid, Outcome.STEPPED, failure_outcome).astype(jnp.int32),
         residual=fixed_point.residual,
@@ -207,15 +212,15 @@ def make_return_map_cycle(
     )
 
 
-def summarize_cycle_steps(cycle_steps: Any) -> tuple[Array, Array, Array]:
+def summarize_cycle_steps(gait_steps_of_cycle: Any) -> tuple[Array, Array, Array]:
     """Return the post-impact state, the phase durations, s, and the step lengths, m, of a cycle.
 
     The gait steps of the cycle are on a leading axis.
     """
-    phase_durations, step_lengths = cycle_steps.durations, cycle_steps.step_length
+    phase_durations, step_lengths = gait_steps_of_cycle.durations, gait_steps_of_cycle.step_length
     if len(phase_durations) == 1:
         phase_durations, step_lengths = phase_durations[0], step_lengths[0]
-    return cycle_steps.post_impact[0], phase_durations, step_lengths
+    return gait_steps_of_cycle.post_impact[0], phase_durations, step_lengths
 
 
 class AbstractReturnMapFinder(AbstractGaitFinder):

@@ -181,11 +181,11 @@ class UnilateralFinder(AbstractReturnMapFinder):
         fixed_points = find_contact_fixed_points(
             self.model, self.n_legs, self.step_options, self.period_n, *newton_search_inputs
         )
-        evaluate_batch = functools.partial(
+        evaluate_wheel_batch = functools.partial(
             _evaluate_over_wheels, evaluate_fixed_point, self.model, self.n_legs
         )
         return map_in_batches(
-            evaluate_batch, self.gait_batch_sizes, newton_search_inputs[0], fixed_points
+            evaluate_wheel_batch, self.gait_batch_sizes, newton_search_inputs[0], fixed_points
         )
 
     def take_gait_step(self, params: WheelParams, section_state: Array) -> AbstractStep:
@@ -359,18 +359,22 @@ class PeriodEvaluation(NamedTuple):
         return newton_correction
 
 
-def solve_linear_systems(system_matrices: np.ndarray, right_hand_sides: np.ndarray) -> np.ndarray:
+def solve_linear_systems(
+    linear_system_matrices: np.ndarray, right_hand_sides: np.ndarray
+) -> np.ndarray:
     """Solve many linear systems.
 
     The solution of a singular system is NaN. The first axis of matrices and right sides is that of
     the systems.
     """
     try:
-        return np.linalg.solve(system_matrices, right_hand_sides)
+        return np.linalg.solve(linear_system_matrices, right_hand_sides)
     except np.linalg.LinAlgError:
-        is_matrix_regular = np.abs(np.linalg.det(system_matrices)) > 0.0
+        is_matrix_regular = np.abs(np.linalg.det(linear_system_matrices)) > 0.0
         regular_matrices = np.where(
-            is_matrix_regular[:, None, None], system_matrices, np.eye(system_matrices.shape[-1])
+            is_matrix_regular[:, None, None],
+            linear_system_matrices,
+            np.eye(linear_system_matrices.shape[-1]),
         )
         return np.where(
             is_matrix_regular[:, None, None],
@@ -486,10 +490,10 @@ def _run_contact_newton(
         np.zeros(n_wheels, float_dtype) for float_dtype in (bool, bool, int)
     )
     return_map_jacobian = np.zeros((n_wheels, start_states.shape[1], start_states.shape[1]))
-    active_wheels, stored_steps_and_jacobians = np.arange(n_wheels), None
+    active_wheel_indices, stored_steps_and_jacobians = np.arange(n_wheels), None
     for _ in range(newton_options.max_iterations + newton_options.max_correction_halvings):
-        period_evaluation = period_map.select_wheels(active_wheels).evaluate_period(
-            step_options, section_states[active_wheels], needs_parameter_derivatives
+        period_evaluation = period_map.select_wheels(active_wheel_indices).evaluate_period(
+            step_options, section_states[active_wheel_indices], needs_parameter_derivatives
         )
         if stored_steps_and_jacobians is None:
             stored_steps_and_jacobians = jax.tree.map(
@@ -500,44 +504,48 @@ def _run_contact_newton(
             jax.tree.leaves(period_evaluation[:2]),
             strict=True,
         ):
-            stored_array[active_wheels] = new_array
+            stored_array[active_wheel_indices] = new_array
         newton_correction = period_evaluation.compute_newton_correction(
-            section_states[active_wheels], period_evaluation.return_map_jacobian
+            section_states[active_wheel_indices], period_evaluation.return_map_jacobian
         )
-        correction_size = np.abs(newton_correction / section_units[active_wheels]).max(-1)
+        correction_size = np.abs(newton_correction / section_units[active_wheel_indices]).max(-1)
         is_correction_valid = period_evaluation.is_period_complete & np.isfinite(
             newton_correction
         ).all(-1)
-        newton_residuals[active_wheels] = np.abs(
-            (period_evaluation.end_states - section_states[active_wheels])
-            / section_units[active_wheels]
+        newton_residuals[active_wheel_indices] = np.abs(
+            (period_evaluation.end_states - section_states[active_wheel_indices])
+            / section_units[active_wheel_indices]
         ).max(-1)
-        return_map_jacobian[active_wheels] = period_evaluation.return_map_jacobian
-        n_iterations[active_wheels] += 1
+        return_map_jacobian[active_wheel_indices] = period_evaluation.return_map_jacobian
+        n_iterations[active_wheel_indices] += 1
         has_small_correction_now = is_correction_valid & (correction_size <= newton_tolerance)
         is_wheel_done = (
             has_small_correction_now
             & (
-                had_small_correction_before[active_wheels]
+                had_small_correction_before[active_wheel_indices]
                 | (correction_size <= newton_options.clear_convergence_fraction * newton_tolerance)
             )
             & (not stops_at_small_correction)
         )
-        had_small_correction_before[active_wheels] = has_small_correction_now
-        moving_wheels = active_wheels[is_correction_valid & ~is_wheel_done]
-        last_section_states[moving_wheels], n_correction_halvings[moving_wheels] = (
-            section_states[moving_wheels],
+        had_small_correction_before[active_wheel_indices] = has_small_correction_now
+        moving_wheel_indices = active_wheel_indices[is_correction_valid & ~is_wheel_done]
+        last_section_states[moving_wheel_indices], n_correction_halvings[moving_wheel_indices] = (
+            section_states[moving_wheel_indices],
             0,
         )
-        section_states[moving_wheels] += newton_correction[is_correction_valid & ~is_wheel_done]
-        failed_wheels = active_wheels[~is_correction_valid]
-        section_states[failed_wheels] = 0.5 * (
-            section_states[failed_wheels] + last_section_states[failed_wheels]
+        section_states[moving_wheel_indices] += newton_correction[
+            is_correction_valid & ~is_wheel_done
+        ]
+        failed_wheel_indices = active_wheel_indices[~is_correction_valid]
+        section_states[failed_wheel_indices] = 0.5 * (
+            section_states[failed_wheel_indices] + last_section_states[failed_wheel_indices]
         )
-        n_correction_halvings[failed_wheels] += 1
-        section_states[failed_wheels, -n_legs:] = last_section_states[failed_wheels, -n_legs:]
-        is_gait_found[active_wheels] = is_wheel_requested[active_wheels] & (
-            had_small_correction_before[active_wheels]
+        n_correction_halvings[failed_wheel_indices] += 1
+        section_states[failed_wheel_indices, -n_legs:] = last_section_states[
+            failed_wheel_indices, -n_legs:
+        ]
+        is_gait_found[active_wheel_indices] = is_wheel_requested[active_wheel_indices] & (
+            had_small_correction_before[active_wheel_indices]
             if stops_at_small_correction
             else is_wheel_done
         )
@@ -546,10 +554,10 @@ def _run_contact_newton(
             | (n_iterations > newton_options.max_iterations)
             | ~is_wheel_requested
         )
-        active_wheels = active_wheels[
-            ~is_gait_found[active_wheels] & ~has_wheel_failed[active_wheels]
+        active_wheel_indices = active_wheel_indices[
+            ~is_gait_found[active_wheel_indices] & ~has_wheel_failed[active_wheel_indices]
         ]
-        if not len(active_wheels):
+        if not len(active_wheel_indices):
             break
     assert stored_steps_and_jacobians is not None
     return _ContactFixedPoints(
@@ -665,11 +673,11 @@ def _make_contact_gait(
     zero_derivatives = jax.tree.map(
         lambda x: jnp.zeros((n_parameter_values, *x.shape), x.dtype), float_cycle_fields
     )
-    make_inputs = lambda parameter_values: eqx.filter(
+    make_cycle_inputs = lambda parameter_values: eqx.filter(
         model.from_parameter_values(parameter_values, n_legs), eqx.is_inexact_array
     )
     model_derivatives, params_derivatives = move_derivative_axis_first(
-        jax.jacfwd(make_inputs)(parameter_values)
+        jax.jacfwd(make_cycle_inputs)(parameter_values)
     )
     cycle_derivatives = eqx.tree_at(
         lambda c: (
@@ -684,12 +692,12 @@ def _make_contact_gait(
             *jax.vmap(summarize_cycle_steps)(step_derivatives),
         ),
     )  # fmt: skip
-    first_step = jax.tree.map(
+    first_gait_step = jax.tree.map(
         lambda array_over_steps: array_over_steps[0], fixed_points.gait_steps_of_period
     )
-    first_step_derivatives = jax.tree.map(
+    first_gait_step_derivatives = jax.tree.map(
         lambda array_over_steps: array_over_steps[:, 0], step_derivatives
     )
     return make_return_map_gait(
-        model, n_legs, cycle, first_step, cycle_derivatives, first_step_derivatives
+        model, n_legs, cycle, first_gait_step, cycle_derivatives, first_gait_step_derivatives
     )

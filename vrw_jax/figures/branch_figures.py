@@ -162,8 +162,8 @@ def _draw_special_points(
 ) -> None:
     """Draw a vertical line at each special point, with its number if `draws_numbers` is true."""
     lower_limit, upper_limit = axes.get_xlim()
-    label_position = -np.inf
-    for point_number, special_point in enumerate(special_points):
+    last_number_position = -np.inf
+    for special_point_number, special_point in enumerate(special_points):
         axes.axvline(
             special_point.value,
             color=_select_special_point_color(special_point),
@@ -172,12 +172,12 @@ def _draw_special_points(
             zorder=0,
         )
         if draws_numbers:
-            label_position = max(
-                special_point.value, label_position + 0.03 * (upper_limit - lower_limit)
+            last_number_position = max(
+                special_point.value, last_number_position + 0.03 * (upper_limit - lower_limit)
             )
             axes.annotate(
-                str(point_number + 1),
-                (label_position, 1.0),
+                str(special_point_number + 1),
+                (last_number_position, 1.0),
                 xycoords=("data", "axes fraction"),
                 ha="center",
                 va="bottom",
@@ -189,10 +189,10 @@ def _draw_special_points(
 def _add_branch_legend(figure: Figure, special_points: list[SpecialPoint], parameter: str) -> None:
     """Add a legend that explains the special points and the line styles to a figure."""
     legend_handles = []
-    for point_number, special_point in enumerate(special_points):
+    for special_point_number, special_point in enumerate(special_points):
         violation_text = typeset_greek_symbols(describe_violation(special_point.name))
         legend_text = f"{format_value_label(parameter, special_point.value, 6)}: {violation_text}"
-        legend_text = f"{point_number + 1}  {legend_text}" + (
+        legend_text = f"{special_point_number + 1}  {legend_text}" + (
             " (ends here)" if special_point.ends_branch else ""
         )
         legend_handles.append(

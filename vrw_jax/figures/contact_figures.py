@@ -189,21 +189,21 @@ def make_contact_panels(walk: xr.Dataset) -> Figure:
     moving_legs = _select_marked_legs(is_foot_touching | ~walk.on_stopper.values.astype(bool))
     # At landings the legs are relabeled.
     landing_indices = np.flatnonzero(np.diff(foot_motion.step_numbers)) + 1
-    insert_gaps = lambda leg_values: np.insert(
-        np.asarray(leg_values, float), landing_indices, np.nan
+    insert_nan_at_landings = lambda quantity_by_leg: np.insert(
+        np.asarray(quantity_by_leg, float), landing_indices, np.nan
     )
-    times_with_gaps = insert_gaps(foot_motion.sample_times)
+    times_with_gaps = insert_nan_at_landings(foot_motion.sample_times)
     other_leg_line_styles = iter(OTHER_LEG_LINE_STYLES * len(moving_legs))
     line_style_by_leg = {
         leg_number: LEG_LINE_STYLES.get(leg_number) or next(other_leg_line_styles)
         for leg_number in moving_legs
     }
     figure = Figure(figsize=(0.8 * PAGE_FIGURE_WIDTH_INCHES, 8.0))
-    height_ratios = [1.0, 1.0, 0.35 + 0.11 * len(touching_legs), 1.0, 1.2, 1.2]
-    panel_axes = figure.subplots(6, 1, sharex=True, height_ratios=height_ratios)
+    panel_height_ratios = [1.0, 1.0, 0.35 + 0.11 * len(touching_legs), 1.0, 1.2, 1.2]
+    panel_axes = figure.subplots(6, 1, sharex=True, height_ratios=panel_height_ratios)
     for axes, panel_letter in zip(panel_axes, "abcdef", strict=True):
         draw_panel_letter(axes, panel_letter)
-    panel_axes[0].plot(times_with_gaps, insert_gaps(walk.theta), color="black")
+    panel_axes[0].plot(times_with_gaps, insert_nan_at_landings(walk.theta), color="black")
     panel_axes[0].set_ylabel(format_axis_label("theta", "{symbol}"))
     leg_panels = (
         (panel_axes[1], moving_legs, walk.length.values, "$L$ [m]"),
@@ -211,13 +211,13 @@ def make_contact_panels(walk: xr.Dataset) -> Figure:
         (panel_axes[4], touching_legs, foot_motion.foot_forces[..., 1], "normal\nforce [N]"),
         (panel_axes[5], touching_legs, foot_motion.foot_forces[..., 0], "tangential\nforce [N]"),
     )
-    for axes, drawn_legs, leg_values, panel_label in leg_panels:
+    for axes, drawn_legs, quantity_by_leg, panel_label in leg_panels:
         for leg_number in drawn_legs:
             line_color, line_style = line_style_by_leg[leg_number]
-            values_with_gaps = insert_gaps(leg_values[:, leg_number - 1])
+            quantity_with_gaps = insert_nan_at_landings(quantity_by_leg[:, leg_number - 1])
             axes.plot(
                 times_with_gaps,
-                values_with_gaps,
+                quantity_with_gaps,
                 color=line_color,
                 linestyle=line_style,
                 label=f"Leg {leg_number}",

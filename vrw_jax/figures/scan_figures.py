@@ -431,13 +431,13 @@ def draw_sobol_indices(indices: xr.Dataset) -> Figure:
                 ],
                 0.0,
             )
-            bar_style = {"height": 0.36, "color": bar_color, "label": legend_text}
+            sobol_bar_style = {"height": 0.36, "color": bar_color, "label": legend_text}
             axes.barh(
                 bar_positions + bar_offset,
                 sobol_index_values,
                 xerr=confidence_interval_lengths,
                 error_kw={"elinewidth": 0.7},
-                **bar_style,
+                **sobol_bar_style,
             )
         if sobol_indices_of_measure.is_constant_measure:
             axes.text(0.5, 0.5, "constant", ha="center", va="center", transform=axes.transAxes)
@@ -503,7 +503,7 @@ def _list_shown_measures(scan: xr.Dataset) -> list[str]:
 
 
 def _find_color_limits(
-    panel_values: Sequence[np.ndarray], is_stable_by_panel: Sequence[np.ndarray]
+    measure_values_by_panel: Sequence[np.ndarray], is_stable_by_panel: Sequence[np.ndarray]
 ) -> tuple[float, float]:
     """Return the color range for the panels of one measure.
 
@@ -511,13 +511,14 @@ def _find_color_limits(
     gaits would otherwise make the colors of all other gaits equal.
     """
     finite_values_by_panel = [
-        values_of_panel[np.isfinite(values_of_panel)] for values_of_panel in panel_values
+        values_of_panel[np.isfinite(values_of_panel)] for values_of_panel in measure_values_by_panel
     ]
-    stable_values = [
-        v[s & np.isfinite(v)] for v, s in zip(panel_values, is_stable_by_panel, strict=True)
+    stable_values_by_panel = [
+        v[s & np.isfinite(v)]
+        for v, s in zip(measure_values_by_panel, is_stable_by_panel, strict=True)
     ]
     values_in_range = np.concatenate(
-        stable_values if any(map(len, stable_values)) else finite_values_by_panel
+        stable_values_by_panel if any(map(len, stable_values_by_panel)) else finite_values_by_panel
     )
     return (
         (float(values_in_range.min()), float(values_in_range.max()))
@@ -534,11 +535,14 @@ def _make_color_scale(measure_name: str, color_limits: tuple[float, float]) -> N
 
 
 def _find_extended_color_bar_ends(
-    panel_values: Sequence[np.ndarray], color_limits: tuple[float, float]
+    measure_values_by_panel: Sequence[np.ndarray], color_limits: tuple[float, float]
 ) -> Literal["neither", "min", "max", "both"]:
     """Return the ends of a color bar beyond which values lie: "neither", "min", "max" or "both"."""
     finite_values_by_panel = np.concatenate(
-        [values_of_panel[np.isfinite(values_of_panel)] for values_of_panel in panel_values]
+        [
+            values_of_panel[np.isfinite(values_of_panel)]
+            for values_of_panel in measure_values_by_panel
+        ]
     )
     has_values_below, has_values_above = (
         np.any(finite_values_by_panel < color_limits[0]),
@@ -572,16 +576,16 @@ def _draw_measure_cells(
     return cell_mesh  # type: ignore[return-value]  # A color bar accepts it.
 
 
-def _find_cell_edges(sample_positions: np.ndarray) -> np.ndarray:
+def _find_cell_edges(cell_center_positions: np.ndarray) -> np.ndarray:
     """Return the edges of cells around the given positions."""
-    if len(sample_positions) == 1:
-        return sample_positions[0] + np.array([-0.5, 0.5]) * max(
-            abs(sample_positions[0]) * 0.01, 1e-6
+    if len(cell_center_positions) == 1:
+        return cell_center_positions[0] + np.array([-0.5, 0.5]) * max(
+            abs(cell_center_positions[0]) * 0.01, 1e-6
         )
-    inner_cell_edges = 0.5 * (sample_positions[1:] + sample_positions[:-1])
+    inner_cell_edges = 0.5 * (cell_center_positions[1:] + cell_center_positions[:-1])
     first_cell_edge, last_cell_edge = (
-        2.0 * sample_positions[0] - inner_cell_edges[0],
-        2.0 * sample_positions[-1] - inner_cell_edges[-1],
+        2.0 * cell_center_positions[0] - inner_cell_edges[0],
+        2.0 * cell_center_positions[-1] - inner_cell_edges[-1],
     )
     return np.concatenate([[first_cell_edge], inner_cell_edges, [last_cell_edge]])
 

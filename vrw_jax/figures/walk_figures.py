@@ -489,8 +489,8 @@ def walk_frames(
     n_frames, slow = check_int("n_frames", n_frames), check_positive("slow", slow)
     ground_slope, foot_motion = step.attrs["parameter_slope"], compute_foot_motion(step)
     walk_duration = foot_motion.sample_times[-1]
-    hub_distance = float(foot_motion.hub_positions[-1, 0] - foot_motion.hub_positions[0, 0])
-    hub_distance_per_step = hub_distance / max(
+    hub_travel_distance = float(foot_motion.hub_positions[-1, 0] - foot_motion.hub_positions[0, 0])
+    hub_distance_per_step = hub_travel_distance / max(
         int(foot_motion.step_numbers[-1] - foot_motion.step_numbers[0]) + 1, 1
     )
     frame_images = []
@@ -500,7 +500,9 @@ def walk_frames(
         canvas = FigureCanvasAgg(figure)
         axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
         axes.set_axis_off()
-        camera_position = float(foot_motion.hub_positions[0, 0]) + hub_distance * t / walk_duration
+        camera_position = (
+            float(foot_motion.hub_positions[0, 0]) + hub_travel_distance * t / walk_duration
+        )
         _draw_ground_with_marks(axes, ground_slope, camera_position, hub_distance_per_step)
         sample_index = _draw_wheel_at_time(axes, foot_motion, t, ground_slope)
         camera_center = [

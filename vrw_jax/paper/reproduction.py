@@ -60,8 +60,10 @@ def simulate_gaits_at_dampings(dampings: Sequence[float]) -> list[xr.Dataset]:
     for damping in dampings:
         start_damping = float(table_1_wheel.damping)
         n_dampings = 1 + math.ceil(abs(damping - start_damping) / 10.0)
-        damping_path = np.linspace(start_damping, damping, n_dampings).tolist()
-        *_, gait_walk = walk_along_parameter(table_1_wheel, "damping", damping_path, start_state)
+        dampings_on_path = np.linspace(start_damping, damping, n_dampings).tolist()
+        *_, gait_walk = walk_along_parameter(
+            table_1_wheel, "damping", dampings_on_path, start_state
+        )
         if not gait_walk.settled:
             raise ValueError(f"No period-1 gait was met at damping {damping:g}: choose 1 to 219.")
         section_state = jnp.asarray(gait_walk.section_state.values[-1])

@@ -97,8 +97,8 @@ FAILURE_DENSITY_OPTIONS = FailureDensityOptions()
 class GaussianMixture:
     """Mixture of Gaussian densities of standardized slope deviations."""
 
-    component_weights: np.ndarray  # (components,), sum 1
-    component_means: np.ndarray  # (components, dimensions)
+    gaussian_weights: np.ndarray  # (components,), sum 1
+    gaussian_means: np.ndarray  # (components, dimensions)
     # Cholesky factors of the covariances, (components, dimensions, dimensions)
     covariance_cholesky_factors: np.ndarray
 
@@ -114,81 +114,80 @@ class GaussianMixture:
         )
 
     def add_mixture(
-        self, added_mixture: "GaussianMixture", added_weight: float
+        self, added_mixture: "GaussianMixture", added_mixture_weight: float
     ) -> "GaussianMixture":
         """Return the weighted sum of this mixture and `added_mixture`, whose weight is
-        `added_weight`.
+        `added_mixture_weight`.
 
-        The weight of this mixture is 1 - `added_weight`.
+        The weight of this mixture is 1 - `added_mixture_weight`.
         """
         return GaussianMixture(
             np.concatenate(
                 [
-                    (1.0 - added_weight) * self.component_weights,
-                    added_weight * added_mixture.component_weights,
+                    (1.0 - added_mixture_weight) * self.gaussian_weights,
+                    added_mixture_weight * added_mixture.gaussian_weights,
                 ]
             ),
-            np.concatenate([self.component_means, added_mixture.component_means]),
+            np.concatenate([self.gaussian_means, added_mixture.gaussian_means]),
             np.concatenate(
                 [self.covariance_cholesky_factors, added_mixture.covariance_cholesky_factors]
             ),
         )
 
-    def widen_gaussians(self, deviation_factor: float) -> "GaussianMixture":
-        """Return the mixture with all standard deviations multiplied by `deviation_factor`."""
+    def widen_gaussians(self, standard_deviation_factor: float) -> "GaussianMixture":
+        """Return the mixture with all standard deviations multiplied by
+        `standard_deviation_factor`."""
         return GaussianMixture(
-            self.component_weights,
-            self.component_means,
-            deviation_factor * self.covariance_cholesky_factors,
+            self.gaussian_weights,
+            self.gaussian_means,
+            standard_deviation_factor * self.covariance_cholesky_factors,
         )
 
-    def compute_component_log_densities(self, slope_deviations: np.ndarray) -> np.ndarray:
+    def compute_gaussian_log_densities(self, slope_deviations: np.ndarray) -> np.ndarray:
         """Return the logarithm of each Gaussian's density times its weight, shape (components,
         samples).
         """
-        component_log_densities = []
-        for component_weight, component_mean, covariance_cholesky_factor in zip(
-            self.component_weights,
-            self.component_means,
+        gaussian_log_densities = []
+        for gaussian_weight, gaussian_mean, covariance_cholesky_factor in zip(
+            self.gaussian_weights,
+            self.gaussian_means,
             self.covariance_cholesky_factors,
             strict=True,
         ):
             whitened_deviations = np.linalg.solve(
-                covariance_cholesky_factor, (slope_deviations - component_mean).T
+                covariance_cholesky_factor, (slope_deviations - gaussian_mean).T
             )
             log_cholesky_determinant = np.sum(np.log(np.diag(covariance_cholesky_factor)))
             log_normalization = (
-                np.log(component_weight)
+                np.log(gaussian_weight)
                 - log_cholesky_determinant
-                - 0.5 * len(component_mean) * np.log(2.0 * np.pi)
+                - 0.5 * len(gaussian_mean) * np.log(2.0 * np.pi)
             )
-            component_log_densities.append(
+            gaussian_log_densities.append(
                 log_normalization - 0.5 * np.sum(whitened_deviations**2, 0)
             )
-        return np.stack(component_log_densities)
+        return np.stack(gaussian_log_densities)
 
     def compute_log_density(self, slope_deviations: np.ndarray) -> np.ndarray:
         """Return the logarithm of the mixture's density at each sample, shape (samples,)."""
-        component_log_densities: np.ndarray = np.logaddexp.reduce(
-            self.compute_component_log_densities(slope_deviations), 0
+        gaussian_log_densities: np.ndarray = np.logaddexp.reduce(
+            self.compute_gaussian_log_densities(slope_deviations), 0
         )
-        return component_log_densities
+        return gaussian_log_densities
 
     def draw_samples(self, n_samples: int, random_generator: np.random.Generator) -> np.ndarray:
         """Return independent samples from the mixture, shape (samples, dimensions)."""
-        component_indices = random_generator.choice(
-            len(self.component_weights), n_samples, p=self.component_weights
+        gaussian_indices = random_generator.choice(
+            len(self.gaussian_weights), n_samples, p=self.gaussian_weights
         )
-        normal_samples = random_generator.standard_normal(
-            (n_samples, self.component_means.shape[1])
-        )
-        slope_deviations = self.component_means[component_indices]
-        for component_index, covariance_cholesky_factor in enumerate(
+        normal_samples = random_generator.standard_normal((n_samples, self.gaussian_means.shape[1]))
+        slope_deviations = self.gaussian_means[gaussian_indices]
+        for gaussian_index, covariance_cholesky_factor in enumerate(
             self.covariance_cholesky_factors
         ):
-            is_sample_from_component = component_indices == component_index
-            slope_deviations[is_sample_from_component] += (
-                normal_samples[is_sample_from_component] @ covariance_cholesky_factor.T
+            is_sample_from_gaussian = gaussian_indices == gaussian_index
+            slope_deviations[is_sample_from_gaussian] += (
+                normal_samples[is_sample_from_gaussian] @ covariance_cholesky_factor.T
             )
         return slope_deviations
 
@@ -206,10 +205,10 @@ def fit_gaussian_mixture(
     """
     n_samples, n_dimensions = slope_deviations.shape
     covariance_floor = density_options.min_gaussian_variance * np.eye(n_dimensions)
-    component_means = slope_deviations[random_generator.integers(n_samples)][None]
+    gaussian_means = slope_deviations[random_generator.integers(n_samples)][None]
     for _ in range(density_options.n_gaussians - 1):
         squared_distances_to_means = np.min(
-            np.sum((slope_deviations[:, None] - component_means) ** 2, -1), 1
+            np.sum((slope_deviations[:, None] - gaussian_means) ** 2, -1), 1
         )
         total_squared_distance = np.sum(squared_distances_to_means)
         mean_selection_probabilities = (
@@ -217,9 +216,9 @@ def fit_gaussian_mixture(
             if total_squared_distance > 0.0
             else None
         )
-        component_means = np.concatenate(
+        gaussian_means = np.concatenate(
             [
-                component_means,
+                gaussian_means,
                 slope_deviations[
                     random_generator.choice(n_samples, p=mean_selection_probabilities)
                 ][None],
@@ -228,34 +227,34 @@ def fit_gaussian_mixture(
     weighted_covariance = (
         np.cov(slope_deviations.T).reshape(n_dimensions, n_dimensions) + covariance_floor
     )
-    cholesky_factors = np.tile(
-        np.linalg.cholesky(weighted_covariance), (len(component_means), 1, 1)
-    )
+    cholesky_factors = np.tile(np.linalg.cholesky(weighted_covariance), (len(gaussian_means), 1, 1))
     gaussian_mixture = GaussianMixture(
-        np.full(len(component_means), 1.0 / len(component_means)), component_means, cholesky_factors
+        np.full(len(gaussian_means), 1.0 / len(gaussian_means)), gaussian_means, cholesky_factors
     )
     for _ in range(density_options.n_em_iterations):
-        component_log_densities = gaussian_mixture.compute_component_log_densities(slope_deviations)
+        gaussian_log_densities = gaussian_mixture.compute_gaussian_log_densities(slope_deviations)
         membership_probabilities = np.exp(
-            component_log_densities - np.logaddexp.reduce(component_log_densities, 0)
+            gaussian_log_densities - np.logaddexp.reduce(gaussian_log_densities, 0)
         )
         # The additional sample prevents an empty Gaussian.
-        effective_component_sizes = np.sum(membership_probabilities, 1) + 1.0
-        component_means = (
-            membership_probabilities @ slope_deviations + gaussian_mixture.component_means
-        ) / effective_component_sizes[:, None]
+        effective_gaussian_sizes = np.sum(membership_probabilities, 1) + 1.0
+        gaussian_means = (
+            membership_probabilities @ slope_deviations + gaussian_mixture.gaussian_means
+        ) / effective_gaussian_sizes[:, None]
         cholesky_factors = np.empty_like(gaussian_mixture.covariance_cholesky_factors)
-        for component_index, (component_membership, component_mean) in enumerate(
-            zip(membership_probabilities, component_means, strict=True)
+        for gaussian_index, (gaussian_membership, gaussian_mean) in enumerate(
+            zip(membership_probabilities, gaussian_means, strict=True)
         ):
-            centered_deviations = slope_deviations - component_mean
+            centered_slope_deviations = slope_deviations - gaussian_mean
             weighted_covariance = (
-                component_membership * centered_deviations.T
-            ) @ centered_deviations / effective_component_sizes[component_index] + covariance_floor
-            cholesky_factors[component_index] = np.linalg.cholesky(weighted_covariance)
+                gaussian_membership * centered_slope_deviations.T
+            ) @ centered_slope_deviations / effective_gaussian_sizes[
+                gaussian_index
+            ] + covariance_floor
+            cholesky_factors[gaussian_index] = np.linalg.cholesky(weighted_covariance)
         gaussian_mixture = GaussianMixture(
-            effective_component_sizes / np.sum(effective_component_sizes),
-            component_means,
+            effective_gaussian_sizes / np.sum(effective_gaussian_sizes),
+            gaussian_means,
             cholesky_factors,
         )
     return gaussian_mixture

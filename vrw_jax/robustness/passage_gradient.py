@@ -61,8 +61,8 @@ class FailingWalks(NamedTuple):
 
     section_states: np.ndarray  # at the starts, (walks, components)
     start_slopes: np.ndarray  # of the lines at the starts, (walks,), rad
-    deviation_directions: np.ndarray  # unit vectors of slope deviations, (walks, lines)
-    deviation_norms: np.ndarray  # norms of the slope deviations, (walks,)
+    slope_deviation_directions: np.ndarray  # unit vectors of slope deviations, (walks, lines)
+    slope_deviation_norms: np.ndarray  # norms of the slope deviations, (walks,)
 
 
 def differentiate_log_mean_steps(
@@ -84,8 +84,8 @@ def differentiate_log_mean_steps(
     params, slope_sd = walker_groups.params, walker_groups.slope_sd
     failing_walks = _draw_failing_walks(walker_groups, walk_density, gradient_options)
     lower_failure_radii, upper_failure_radii = (
-        np.zeros_like(failing_walks.deviation_norms),
-        failing_walks.deviation_norms,
+        np.zeros_like(failing_walks.slope_deviation_norms),
+        failing_walks.slope_deviation_norms,
     )
     survives_on_mean_slopes = ~_test_walk_failures(
         walker_groups, params, failing_walks, lower_failure_radii
@@ -98,7 +98,7 @@ def differentiate_log_mean_steps(
         upper_failure_radii,
         gradient_options.n_bisections,
     )
-    radius_distribution = stats.chi(failing_walks.deviation_directions.shape[1])
+    radius_distribution = stats.chi(failing_walks.slope_deviation_directions.shape[1])
     hazard_rates = np.exp(
         radius_distribution.logpdf(failure_radii) - radius_distribution.logsf(failure_radii)
     )
@@ -183,18 +183,18 @@ def _draw_failing_walks(
             f"no sampled walk failed with slope_sd {walker_groups.slope_sd:g} rad, so that the "
             "mean number of steps has no derivative: give a larger slope_sd or n_walkers."
         )
-    walk_indices = walker_groups.random.choice(
+    resampled_walk_indices = walker_groups.random.choice(
         len(failure_importance_weights),
         n_walks,
         p=failure_importance_weights / np.sum(failure_importance_weights),
     )
-    walker_indices = walk_indices % len(walker_groups.states)
-    deviation_norms = np.linalg.norm(slope_deviations[walk_indices], axis=1)
+    walker_indices = resampled_walk_indices % len(walker_groups.states)
+    slope_deviation_norms = np.linalg.norm(slope_deviations[resampled_walk_indices], axis=1)
     return FailingWalks(
         walker_groups.states[walker_indices],
         walker_groups.slopes[walker_indices],
-        slope_deviations[walk_indices] / deviation_norms[:, None],
-        deviation_norms,
+        slope_deviations[resampled_walk_indices] / slope_deviation_norms[:, None],
+        slope_deviation_norms,
     )
 
 
@@ -202,15 +202,18 @@ def _test_walk_failures(
     walker_groups: WalkerGroups,
     params: WheelParams,
     failing_walks: FailingWalks,
-    deviation_norms: np.ndarray,
+    slope_deviation_norms: np.ndarray,
 ) -> np.ndarray:
-    """Return whether each walk fails if its slope deviations are scaled to norm `deviation_norms`.
+    """Return whether each walk fails if its slope deviations are scaled to norm
+    `slope_deviation_norms`.
 
     The result has the shape (walks,).
     """
     landing_slopes = (
         float(params.slope)
-        + walker_groups.slope_sd * deviation_norms[:, None] * failing_walks.deviation_directions
+        + walker_groups.slope_sd
+        * slope_deviation_norms[:, None]
+        * failing_walks.slope_deviation_directions
     )
     ground_line_slopes = np.concatenate([failing_walks.start_slopes[:, None], landing_slopes], 1)
     walk_results = step_batch(

@@ -286,8 +286,8 @@ def sample_passage(
     Raises:
         ExtinctGroupError: if no walker of a group survives a step.
     """
-    count_decay_steps = lambda remaining_fraction: int(
-        np.ceil(np.log(remaining_fraction) / np.log(np.clip(spectral_radius, 0.01, 0.99)))
+    count_decay_steps = lambda remaining_start_effect: int(
+        np.ceil(np.log(remaining_start_effect) / np.log(np.clip(spectral_radius, 0.01, 0.99)))
     )
     forgetting_step_limits = (
         sampling_options.min_forgetting_steps,
@@ -579,7 +579,7 @@ def run_biased_walks(
     walk, shape (walkers,), is the likelihood ratio if the walk fails in its last step, and 0
     otherwise. The mean weight is the probability of a failure in the last step.
     """
-    n_walk_lines = walk_density.component_means.shape[1]
+    n_walk_lines = walk_density.gaussian_means.shape[1]
     slope_deviations = walk_density.draw_samples(len(walker_groups.states), walker_groups.random)
     walk_results = walker_groups.run_walks(slope_deviations)
     has_failed_in_last_step = (walk_results.outcome != Outcome.STEPPED) & (
@@ -654,7 +654,10 @@ def _estimate_kappa_2(
         / singular_values[is_direction_resolved, None]
     )
     first_coordinate_indices, second_coordinate_indices = np.triu_indices(len(principal_directions))
-    hermite_polynomials = landing_deviations[:, None], landing_deviations[:, None] ** 2 - 1.0
+    landing_hermite_polynomials = (
+        landing_deviations[:, None],
+        landing_deviations[:, None] ** 2 - 1.0,
+    )
 
     def project_second_eigenvalue(has_quadratic_features: bool) -> float:
         """Return the modulus of the second eigenvalue, projected on polynomials of the state."""
@@ -671,19 +674,23 @@ def _estimate_kappa_2(
                 1,
             )
 
-        features_before_step = evaluate_state_features(states_before_step)
-        features_after_step = np.where(
+        state_features_before_step = evaluate_state_features(states_before_step)
+        state_features_after_step = np.where(
             is_walker_alive[:, None], evaluate_state_features(states_after_step), 0.0
         )
-        linear_features = features_before_step[:, : 1 + len(principal_directions)]
+        linear_state_features = state_features_before_step[:, : 1 + len(principal_directions)]
         regressor_matrix = np.concatenate(
-            [features_before_step, *(linear_features * h for h in hermite_polynomials)], 1
+            [
+                state_features_before_step,
+                *(linear_state_features * h for h in landing_hermite_polynomials),
+            ],
+            1,
         )
         regression_coefficients = np.linalg.lstsq(
-            regressor_matrix, features_after_step, rcond=None
+            regressor_matrix, state_features_after_step, rcond=None
         )[0]
         projected_eigenvalues = np.linalg.eigvals(
-            regression_coefficients[: features_before_step.shape[1]]
+            regression_coefficients[: state_features_before_step.shape[1]]
         )
         return float(np.sort(np.abs(projected_eigenvalues))[-2])
 

@@ -215,14 +215,14 @@ class CollocationScanEngine:
             for first_sample_index in range(0, len(parameter_rows), self._batch_size)
         )
         with ThreadPoolExecutor(self._n_workers) as scan_thread_pool:
-            batch_results = list(
+            results_by_batch = list(
                 scan_thread_pool.map(self._evaluate_sample_batch, parameter_batches)
             )
         return {
             variable_name: np.concatenate(
-                [batch_result[variable_name] for batch_result in batch_results]
+                [results_of_batch[variable_name] for results_of_batch in results_by_batch]
             )[: len(parameter_rows)]
-            for variable_name in batch_results[0]
+            for variable_name in results_by_batch[0]
         }
 
     @with_default_jax_settings  # It runs in a thread of its own.

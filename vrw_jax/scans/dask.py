@@ -93,7 +93,7 @@ def connect_dask_workers(scheduler_address: str) -> Iterator[ChunkExecutor]:
 @contextlib.contextmanager
 def hide_cancelled_tasks_in_log() -> Iterator[None]:
     """Return a context in which the client of dask logs no tasks that a lost scheduler cancels."""
-    client_logger = logging.getLogger("distributed.client")
+    dask_client_logger = logging.getLogger("distributed.client")
 
     def is_log_record_shown(log_record: logging.LogRecord) -> bool:
         logged_error_type = log_record.exc_info[0] if log_record.exc_info else None
@@ -101,11 +101,11 @@ def hide_cancelled_tasks_in_log() -> Iterator[None]:
             logged_error_type, asyncio.CancelledError
         )
 
-    client_logger.addFilter(is_log_record_shown)
+    dask_client_logger.addFilter(is_log_record_shown)
     try:
         yield
     finally:
-        client_logger.removeFilter(is_log_record_shown)
+        dask_client_logger.removeFilter(is_log_record_shown)
 
 
 def _require_scheduler_response(scheduler_address: str) -> None:

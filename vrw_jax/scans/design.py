@@ -130,13 +130,13 @@ class GridDesign(AbstractSampleDesign):
         )
 
     def select_samples(self, region_of_samples: tuple[slice, ...]) -> ParameterSamples:
-        axis_values = [
-            parameter_values[axis_region]
-            for parameter_values, axis_region in zip(
+        selected_axis_values = [
+            parameter_values[axis_slice]
+            for parameter_values, axis_slice in zip(
                 self.values_by_parameter.values(), region_of_samples, strict=True
             )
         ]
-        grid_columns = np.meshgrid(*axis_values, indexing="ij")
+        grid_columns = np.meshgrid(*selected_axis_values, indexing="ij")
         return {
             parameter_name: grid_column.ravel()
             for parameter_name, grid_column in zip(self.swept_parameters, grid_columns, strict=True)

@@ -146,10 +146,10 @@ class UnilateralScanEngine:
             variable_name: variable_values[gait_indices]
             for variable_name, variable_values in gait_results.items()
         }
-        sample_outcome = np.where(
+        outcome_by_sample = np.where(
             has_enough_friction, sample_results.pop("outcome"), Outcome.NO_CYCLE_FOUND
         )
-        return mask_failed_samples(sample_outcome, sample_results)
+        return mask_failed_samples(outcome_by_sample, sample_results)
 
     def _evaluate_gaits(self, parameter_rows: np.ndarray) -> ValuesByVariable:
         """Return outcomes, measures and derivatives for the gaits of some wheels, by name.

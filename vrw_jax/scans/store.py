@@ -204,9 +204,9 @@ class MemoryResultStore(AbstractResultStore):
         return [int(chunk_index) for chunk_index in np.flatnonzero(~self._is_chunk_done)]
 
     def write_chunk(self, chunk_index: int, chunk_results: ChunkVariables) -> None:
-        chunk_region = self._result_layout.compute_chunk_region(chunk_index)
+        chunk_slices = self._result_layout.compute_chunk_region(chunk_index)
         for variable_name, variable_array in self._variable_arrays.items():
-            variable_array[chunk_region] = chunk_results[variable_name]
+            variable_array[chunk_slices] = chunk_results[variable_name]
         self._is_chunk_done[chunk_index] = True
 
     def open_for_writing(self) -> contextlib.AbstractContextManager[None]:
@@ -285,9 +285,9 @@ class ZarrResultStore(AbstractResultStore):
         return [int(chunk_index) for chunk_index in np.flatnonzero(~are_chunks_written)]
 
     def write_chunk(self, chunk_index: int, chunk_results: ChunkVariables) -> None:
-        chunk_region = self._result_layout.compute_chunk_region(chunk_index)
+        chunk_slices = self._result_layout.compute_chunk_region(chunk_index)
         for variable_layout in self._result_layout.variable_layouts:
-            _select_zarr_array(self._zarr_group, variable_layout.variable_name)[chunk_region] = (
+            _select_zarr_array(self._zarr_group, variable_layout.variable_name)[chunk_slices] = (
                 chunk_results[variable_layout.variable_name]
             )
         assert self._chunk_checksums is not None
@@ -384,11 +384,11 @@ def open_scan(path: str | Path, *, verify: bool = True) -> xr.Dataset:
             metadata_error
         ):
             raise
-        damage_reason = ", ".join(damaged_metadata) or " ".join(str(metadata_error).split()).rstrip(
-            "."
-        )
+        store_damage_reason = ", ".join(damaged_metadata) or " ".join(
+            str(metadata_error).split()
+        ).rstrip(".")
         raise ValueError(
-            f"{path} can't be opened ({damage_reason}): run the scan again, which mends the "
+            f"{path} can't be opened ({store_damage_reason}): run the scan again, which mends the "
             f"arrays that "
             "it wrote, and delete others without dimension names."
         ) from metadata_error
@@ -519,7 +519,7 @@ def read_stored_manifest(store_path: Path) -> dict | None:
 
 
 def find_first_settings_difference(
-    stored_settings: object, current_settings: object, setting_path: str = ""
+    stored_settings: object, current_settings: object, nested_setting_path: str = ""
 ) -> tuple[str, object, object]:
     """Return the name of the first setting that differs, its stored value and its current value.
 
@@ -537,7 +537,9 @@ def find_first_settings_difference(
             nested_settings_difference = find_first_settings_difference(
                 stored_settings.get(setting_name),
                 current_settings.get(setting_name),
-                f"{setting_path}.{setting_name}" if setting_path else str(setting_name),
+                f"{nested_setting_path}.{setting_name}"
+                if nested_setting_path
+                else str(setting_name),
             )
             if nested_settings_difference[0]:
                 return nested_settings_difference
@@ -545,7 +547,7 @@ def find_first_settings_difference(
     return (
         ("", None, None)
         if stored_settings == current_settings
-        else (setting_path, stored_settings, current_settings)
+        else (nested_setting_path, stored_settings, current_settings)
     )
 
 
@@ -592,7 +594,7 @@ def _create_zarr_arrays(
         "coordinates": " ".join(result_layout.result_coordinates),
     }
     zarr_group = zarr.create_group(store_path, zarr_format=3, attributes=group_attributes)
-    compressors = [ZstdCodec(level=3), Crc32cCodec()]  # The checksum reveals damage.
+    array_compressors = [ZstdCodec(level=3), Crc32cCodec()]  # The checksum reveals damage.
     for coordinate_name, (
         dimension_name,
         coordinate_values,
@@ -604,7 +606,7 @@ def _create_zarr_arrays(
             chunks=coordinate_values.shape,
             dtype=coordinate_values.dtype,
             dimension_names=(dimension_name,),
-            compressors=compressors,
+            compressors=array_compressors,
             attributes=dict(coordinate_attributes),
         )
         coordinate_array[:] = coordinate_values
@@ -619,7 +621,7 @@ def _create_zarr_arrays(
                 *result_layout.sample_dimension_names,
                 *variable_layout.extra_dimension_names,
             ),
-            compressors=compressors,
+            compressors=array_compressors,
             attributes=dict(variable_layout.variable_attributes),
         )
     chunk_mark_array_shape = (result_layout.n_chunks, DIGEST_SIZE_BYTES)

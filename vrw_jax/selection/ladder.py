@@ -321,8 +321,8 @@ class LadderWheel(AbstractContactWheel):
         unilateral_result: UnilateralStep = self.unilateral_model.take_step(
             params, jnp.where(is_viscoelastic_valid, jnp.nan, x), options
         )
-        leaf_selector = lambda paper_value, contact_value: jnp.where(
-            is_viscoelastic_valid, paper_value, contact_value
+        leaf_selector = lambda viscoelastic_value, unilateral_value: jnp.where(
+            is_viscoelastic_valid, viscoelastic_value, unilateral_value
         )
         return LadderStep(
             choice=model_choice,

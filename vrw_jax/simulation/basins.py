@@ -223,11 +223,11 @@ def invert_landing_map(params: WheelParams, post_landing_states: np.ndarray) -> 
 
     def find_section_state_before(post_landing_state: jax.Array) -> jax.Array:
         touchdown_angle, post_landing_rate = post_landing_state[0] + s.alpha, post_landing_state[1]
-        landing_at_unit_rate = transitions.resolve_landing(
+        landing_with_unit_rate = transitions.resolve_landing(
             s, touchdown_angle, jnp.ones_like(post_landing_rate), jnp.zeros_like(post_landing_rate)
         )
-        touchdown_rate = post_landing_rate / landing_at_unit_rate.motion_after.dtheta
-        is_landing_admissible = landing_at_unit_rate.is_rear_foot_planted & (touchdown_rate > 0.0)
+        touchdown_rate = post_landing_rate / landing_with_unit_rate.motion_after.dtheta
+        is_landing_admissible = landing_with_unit_rate.is_rear_foot_planted & (touchdown_rate > 0.0)
         return jnp.where(
             is_landing_admissible,
             jnp.stack([touchdown_angle, touchdown_rate, 0.0 * touchdown_rate]),

@@ -46,9 +46,9 @@ def force_peaks(walk: xr.Dataset) -> xr.Dataset:
     Args:
         walk: a trajectory with at least 9 samples per phase.
 
-    Returns:
-        A dataset of the force measures over `step_index`. Its variables `force`, `force_time`,
-        `force_step` and `is_maximum` over `extremum` describe the extrema of the fore foot's force.
+    Returns: A dataset of the force measures over `step_index`. Its variables `force`, `force_time`,
+        `force_step` and `is_force_maximum` over `extremum` describe the extrema of the fore foot's
+        force.
 
     Raises:
         TypeError, ValueError: an invalid argument, described in one sentence.
@@ -247,8 +247,8 @@ def _summarize_force_extrema(
     force_trough_depth = 0.0
     for i in np.flatnonzero(~fore_force_extrema.is_extremum_maximum):
         earlier_peak_forces, later_peak_forces = (
-            extremum_forces[is_maximum]
-            for extremum_forces, is_maximum in (
+            extremum_forces[is_force_maximum]
+            for extremum_forces, is_force_maximum in (
                 (fore_force_extrema.force[:i], fore_force_extrema.is_extremum_maximum[:i]),
                 (fore_force_extrema.force[i:], fore_force_extrema.is_extremum_maximum[i:]),
             )

@@ -65,7 +65,7 @@ SAMPLING_OPTIONS = SamplingOptions()
 class _ControlVariate(NamedTuple):
     """Name of a control variate, and its cost per wheel in steps with unilateral contact."""
 
-    control_name: str
+    control_variate_name: str
     cost_in_steps: float
 
 
@@ -263,7 +263,7 @@ def multifidelity_mean(
         cost_high_fidelity_only=pilot_sample.mean_steps_per_wheel * pilot
         + sampling_plans[0].expected_cost_in_steps,
         measure=measure,
-        control=CONTROL_VARIATES[sampling_plan.control_index].control_name,
+        control=CONTROL_VARIATES[sampling_plan.control_index].control_variate_name,
     )
 
 
@@ -336,15 +336,15 @@ class _MeasuredWheels(NamedTuple):
                 self.stoppers,
                 step_options,
             )
-            gait_positions = np.arange(len(wheel_indices_of_gaits))
+            gait_indices = np.arange(len(wheel_indices_of_gaits))
             section_states = wheel_batch.embed_paper_states(
-                gait_positions, paper_gaits.section_states
+                gait_indices, paper_gaits.section_states
             )
             measure_estimates = estimate_measures(
                 wheel_batch,
-                gait_positions,
+                gait_indices,
                 section_states,
-                wheel_batch.take_steps(gait_positions, section_states),
+                wheel_batch.take_steps(gait_indices, section_states),
                 paper_gaits.inverse_newton_matrix,
                 paper_gaits.step_quantity_jacobian,
                 [self.measure_name],

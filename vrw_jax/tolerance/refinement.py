@@ -167,7 +167,7 @@ class RefinedGaits(NamedTuple):
     is_found: np.ndarray  # whether the iteration has converged
     is_attracting: np.ndarray  # whether all multipliers are inside the unit circle
     measure_values: np.ndarray  # (gaits, measures)
-    error_bounds: np.ndarray  # (gaits, measures)
+    measure_error_bounds: np.ndarray  # (gaits, measures)
     n_steps: np.ndarray  # walking steps; a Jacobian costs `jacobian_cost_in_steps`
     section_states: np.ndarray  # (gaits, 4 + 3 n)
     walking_speed: np.ndarray  # mean speed of the last step, m/s
@@ -184,7 +184,9 @@ class RefinedGaits(NamedTuple):
             measure_differences = np.abs(
                 self.measure_values[gait_index] - self.measure_values[distinct_indices]
             )
-            error_bound_sums = self.error_bounds[gait_index] + self.error_bounds[distinct_indices]
+            error_bound_sums = (
+                self.measure_error_bounds[gait_index] + self.measure_error_bounds[distinct_indices]
+            )
             if np.all(np.any(measure_differences > error_bound_sums, axis=1)):
                 distinct_indices.append(gait_index)
         return sorted(distinct_indices, key=lambda gait_index: self.walking_speed[gait_index])
@@ -220,36 +222,36 @@ def refine_gaits(
     step_quantity_jacobian = np.zeros((n_gaits, N_STEP_QUANTITIES, n_coordinates))
 
     def estimate_gait_measures(
-        stepping_batch: ContactWheelBatch, gait_positions: np.ndarray, contact_step: StepQuantities
+        stepping_batch: ContactWheelBatch, gait_indices: np.ndarray, contact_step: StepQuantities
     ) -> MeasureEstimates:
         return estimate_measures(
             stepping_batch,
-            wheel_indices[gait_positions],
-            gait_section_states[gait_positions],
+            wheel_indices[gait_indices],
+            gait_section_states[gait_indices],
             contact_step,
-            inverse_newton_matrix[gait_positions],
-            step_quantity_jacobian[gait_positions],
+            inverse_newton_matrix[gait_indices],
+            step_quantity_jacobian[gait_indices],
             measure_names,
         )
 
-    next_gait_positions = np.arange(n_gaits)
+    next_gait_indices = np.arange(n_gaits)
     for _ in range(refinement_options.max_jacobians_per_gait):
-        if not len(next_gait_positions):
+        if not len(next_gait_indices):
             break
-        gait_positions, next_gait_positions = next_gait_positions, next_gait_positions[:0]
-        contact_step, return_map_jacobian, step_quantity_jacobian[gait_positions] = (
+        gait_indices, next_gait_indices = next_gait_indices, next_gait_indices[:0]
+        contact_step, return_map_jacobian, step_quantity_jacobian[gait_indices] = (
             wheel_batch.linearize_steps(
-                wheel_indices[gait_positions], gait_section_states[gait_positions]
+                wheel_indices[gait_indices], gait_section_states[gait_indices]
             )
         )
-        inverse_newton_matrix[gait_positions] = solve_linear_systems(
+        inverse_newton_matrix[gait_indices] = solve_linear_systems(
             np.eye(n_coordinates) - return_map_jacobian,
             np.broadcast_to(np.eye(n_coordinates), return_map_jacobian.shape),
         )
-        n_steps[gait_positions] += refinement_options.jacobian_cost_in_steps
-        previous_correction_length = np.full(len(gait_positions), np.inf)
+        n_steps[gait_indices] += refinement_options.jacobian_cost_in_steps
+        previous_correction_length = np.full(len(gait_indices), np.inf)
         for n_corrections in range(refinement_options.max_corrections_per_jacobian):
-            measure_estimates = estimate_gait_measures(wheel_batch, gait_positions, contact_step)
+            measure_estimates = estimate_gait_measures(wheel_batch, gait_indices, contact_step)
             correction_length = np.linalg.norm(measure_estimates.newton_correction, axis=1)
             contraction_rate = correction_length / np.maximum(
                 previous_correction_length, np.finfo(float).tiny
@@ -276,20 +278,20 @@ def refine_gaits(
             is_refinement_finished = measure_estimates.has_same_leg_codes & np.where(
                 is_contraction_slow, is_correction_at_stall_length, is_error_within_goal
             )
-            finished_gait_positions = gait_positions[is_refinement_finished]
-            is_found[finished_gait_positions] = True
-            measure_values[finished_gait_positions] = measure_estimates.measure_values[
+            finished_gait_indices = gait_indices[is_refinement_finished]
+            is_found[finished_gait_indices] = True
+            measure_values[finished_gait_indices] = measure_estimates.measure_values[
                 is_refinement_finished
             ]
-            remaining_error_bounds[finished_gait_positions] = error_bound[is_refinement_finished]
-            numerical_error_bounds[finished_gait_positions] = (
+            remaining_error_bounds[finished_gait_indices] = error_bound[is_refinement_finished]
+            numerical_error_bounds[finished_gait_indices] = (
                 measure_estimates.numerical_error_bound
                 + measure_estimates.missed_contact_error_bound
             )[is_refinement_finished]
-            walking_speed[finished_gait_positions] = evaluate_measures(
+            walking_speed[finished_gait_indices] = evaluate_measures(
                 ("speed",), contact_step.step_quantities[is_refinement_finished]
             )[:, 0]
-            needs_tolerance_comparison[finished_gait_positions] = (
+            needs_tolerance_comparison[finished_gait_indices] = (
                 is_every_gait_compared
                 | np.any(
                     measure_estimates.missed_contact_error_bound
@@ -303,46 +305,46 @@ def refine_gaits(
                 & (correction_length <= refinement_options.max_correction_length)
                 & (contraction_rate < 1.0)
             )
-            gait_section_states[gait_positions[is_refinement_continued]] = np.where(
+            gait_section_states[gait_indices[is_refinement_continued]] = np.where(
                 measure_estimates.has_same_leg_codes[:, None],
-                gait_section_states[gait_positions] + measure_estimates.newton_correction,
+                gait_section_states[gait_indices] + measure_estimates.newton_correction,
                 contact_step.section_states,
             )[is_refinement_continued]
             needs_new_jacobian = is_refinement_continued & (
                 is_contraction_slow | ~measure_estimates.has_same_leg_codes
             )
-            next_gait_positions = np.append(next_gait_positions, gait_positions[needs_new_jacobian])
+            next_gait_indices = np.append(next_gait_indices, gait_indices[needs_new_jacobian])
             is_refinement_continued &= ~needs_new_jacobian
-            gait_positions = gait_positions[is_refinement_continued]
+            gait_indices = gait_indices[is_refinement_continued]
             previous_correction_length = correction_length[is_refinement_continued]
-            if not len(gait_positions):
+            if not len(gait_indices):
                 break
             contact_step = wheel_batch.take_steps(
-                wheel_indices[gait_positions], gait_section_states[gait_positions]
+                wheel_indices[gait_indices], gait_section_states[gait_indices]
             )
-            n_steps[gait_positions] += 1
-    compared_gait_positions = np.flatnonzero(needs_tolerance_comparison)
-    error_bounds_by_tolerance = [np.zeros((len(compared_gait_positions), len(measure_names)))]
+            n_steps[gait_indices] += 1
+    compared_gait_indices = np.flatnonzero(needs_tolerance_comparison)
+    error_bounds_by_tolerance = [np.zeros((len(compared_gait_indices), len(measure_names)))]
     for comparison_batch in wheel_batch.make_comparison_batches():
         # The duration of the shortest resolved contact depends on the tolerance.
         contact_step = comparison_batch.take_steps(
-            wheel_indices[compared_gait_positions], gait_section_states[compared_gait_positions]
+            wheel_indices[compared_gait_indices], gait_section_states[compared_gait_indices]
         )
         measure_estimates = estimate_gait_measures(
-            comparison_batch, compared_gait_positions, contact_step
+            comparison_batch, compared_gait_indices, contact_step
         )
         error_bound = refinement_options.error_safety_factor * np.abs(
-            measure_estimates.measure_values - measure_values[compared_gait_positions]
+            measure_estimates.measure_values - measure_values[compared_gait_indices]
         )
         error_bound += np.minimum(
-            measure_estimates.numerical_error_bound, numerical_error_bounds[compared_gait_positions]
+            measure_estimates.numerical_error_bound, numerical_error_bounds[compared_gait_indices]
         )
         # A step that changes the legs' codes gives no bound.
         error_bounds_by_tolerance.append(
             np.where(measure_estimates.has_same_leg_codes[:, None], error_bound, np.inf)
         )
-        n_steps[compared_gait_positions] += 1
-    numerical_error_bounds[compared_gait_positions] = np.max(error_bounds_by_tolerance, axis=0)
+        n_steps[compared_gait_indices] += 1
+    numerical_error_bounds[compared_gait_indices] = np.max(error_bounds_by_tolerance, axis=0)
     total_error_bounds = remaining_error_bounds + numerical_error_bounds
     is_found &= np.isfinite(total_error_bounds).all(1)
     # All multipliers are inside the unit circle if all eigenvalues of (I - DP)^-1 have real parts

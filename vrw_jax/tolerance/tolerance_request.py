@@ -173,12 +173,12 @@ def broadcast_params_and_friction(
     axes or different lengths.
     """
     check_type("params", params, WheelParams, "write vrw.WheelParams(damping=..., slope=...)")
-    argument_shapes = {
+    batch_argument_shapes = {
         np.shape(argument_array) for argument_array in (*jax.tree.leaves(params), friction)
     }
-    batch_shape = max(argument_shapes, key=len)
-    if len(batch_shape) > 1 or argument_shapes - {(), batch_shape}:
-        shapes_text = ", ".join(map(str, sorted(argument_shapes - {()})))
+    batch_shape = max(batch_argument_shapes, key=len)
+    if len(batch_shape) > 1 or batch_argument_shapes - {(), batch_shape}:
+        shapes_text = ", ".join(map(str, sorted(batch_argument_shapes - {()})))
         raise ValueError(
             f"parameters and {FRICTION_NAME} have shapes {shapes_text}, but a batch has one "
             "axis, the same for all: give one value for all, or one for each element."
@@ -314,18 +314,18 @@ class _MeasureRequest:
         wheel_indices_of_gaits, refined_gaits = self._walk_and_refine_gaits(
             np.tile(wheel_indices, len(walk_starts)), np.concatenate(walk_starts)
         )
-        selected_gait_positions: list[int] = []
+        selected_gait_indices: list[int] = []
         for wheel_index in wheel_indices:
-            distinct_gait_positions = refined_gaits.find_distinct_gaits(
+            distinct_gait_indices = refined_gaits.find_distinct_gaits(
                 np.flatnonzero(wheel_indices_of_gaits == wheel_index)
             )
-            self.result_arrays["n_gaits"][wheel_index] = len(distinct_gait_positions)
-            if -len(distinct_gait_positions) <= gait_rank < len(distinct_gait_positions):
-                selected_gait_positions.append(distinct_gait_positions[gait_rank])
+            self.result_arrays["n_gaits"][wheel_index] = len(distinct_gait_indices)
+            if -len(distinct_gait_indices) <= gait_rank < len(distinct_gait_indices):
+                selected_gait_indices.append(distinct_gait_indices[gait_rank])
         self._record_gaits(
             wheel_indices_of_gaits,
             refined_gaits,
-            np.array(selected_gait_positions, int),
+            np.array(selected_gait_indices, int),
             MeasureStatus.SELECTED_BY_RANK,
         )
 
@@ -399,33 +399,31 @@ class _MeasureRequest:
             numerical_error[is_estimate_accepted],
             section_states[is_estimate_accepted],
         )
-        rejected_gait_positions = np.flatnonzero(
+        rejected_gait_indices = np.flatnonzero(
             are_rejected_gaits_refined
             & ~is_estimate_accepted
             & measure_estimates.has_same_leg_codes
         )
         refined_gaits = refine_gaits(
             self.wheel_batch,
-            wheel_indices[rejected_gait_positions],
-            contact_step.section_states[rejected_gait_positions],
+            wheel_indices[rejected_gait_indices],
+            contact_step.section_states[rejected_gait_indices],
             self.measure_names,
             self.compute_error_goal,
             is_every_gait_compared=False,
         )
-        self.result_arrays["n_steps"][wheel_indices[rejected_gait_positions]] += (
-            refined_gaits.n_steps
-        )
+        self.result_arrays["n_steps"][wheel_indices[rejected_gait_indices]] += refined_gaits.n_steps
         gait_distance = np.linalg.norm(
-            (refined_gaits.section_states - section_states[rejected_gait_positions])[
+            (refined_gaits.section_states - section_states[rejected_gait_indices])[
                 :, self.wheel_batch.list_paper_state_indices()
             ],
             axis=1,
         )
         max_gait_distance = self.request_options.max_gait_distance_ratio * np.linalg.norm(
-            measure_estimates.newton_correction[rejected_gait_positions], axis=1
+            measure_estimates.newton_correction[rejected_gait_indices], axis=1
         )
         self._record_gaits(
-            wheel_indices[rejected_gait_positions],
+            wheel_indices[rejected_gait_indices],
             refined_gaits,
             refined_gaits.is_found & (gait_distance <= max_gait_distance),
             MeasureStatus.CONTINUES_LOWER_GAIT,
@@ -483,27 +481,27 @@ class _MeasureRequest:
         self,
         wheel_indices_of_gaits: np.ndarray,
         refined_gaits: RefinedGaits,
-        selected_gait_positions: np.ndarray,
+        selected_gait_indices: np.ndarray,
         status: MeasureStatus,
     ) -> None:
         """Store the measures of the selected gaits with unilateral contact.
 
         - `wheel_indices_of_gaits`: index of the wheel of each gait;
-        - `selected_gait_positions`: indices or mask of the selected gaits.
+        - `selected_gait_indices`: indices or mask of the selected gaits.
         """
-        wheel_indices = wheel_indices_of_gaits[selected_gait_positions]
+        wheel_indices = wheel_indices_of_gaits[selected_gait_indices]
         refined_gaits = RefinedGaits(
-            *(gait_array[selected_gait_positions] for gait_array in refined_gaits)
+            *(gait_array[selected_gait_indices] for gait_array in refined_gaits)
         )
         self._record_results(
             wheel_indices,
             np.full(len(wheel_indices), ModelIndex.UNILATERAL),
             status,
             refined_gaits.measure_values,
-            refined_gaits.error_bounds,
+            refined_gaits.measure_error_bounds,
             evaluate_measures(self.measure_names, self.lower_gaits.step_quantities[wheel_indices])
             - refined_gaits.measure_values,
-            refined_gaits.error_bounds,
+            refined_gaits.measure_error_bounds,
             refined_gaits.section_states,
         )
 

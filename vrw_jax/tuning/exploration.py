@@ -70,7 +70,7 @@ class ExplorationResult(NamedTuple):
 def explore_starts(
     gait_batch_evaluator: GaitBatchEvaluator,
     normalized_starts: np.ndarray,
-    parameter_change_function: Callable[[np.ndarray], np.ndarray],
+    parameter_change_converter: Callable[[np.ndarray], np.ndarray],
     free_indices: list[int],
     bound_widths: np.ndarray,
     min_constraint_values: np.ndarray,
@@ -79,7 +79,7 @@ def explore_starts(
     """Take first-order optimizer steps from every start, and return the parameters and gaits at the
     ends.
 
-    - `parameter_change_function`: function that converts changes of normalized parameters to
+    - `parameter_change_converter`: function that converts changes of normalized parameters to
       changes of all parameters;
     - `free_indices`: indices of the free parameters in the Jacobian of a gait.
     """
@@ -146,7 +146,7 @@ def explore_starts(
         trial_evaluation = gait_batch_evaluator(trial_parameters, current_evaluation)
         previous_branch_points = current_evaluation.gait.branch_point
         trial_branch_points = trial_evaluation.gait.branch_point
-        parameter_changes = parameter_change_function(trial_parameters - normalized_parameters)
+        parameter_changes = parameter_change_converter(trial_parameters - normalized_parameters)
         are_trials_on_branch = [
             is_same_branch(
                 select_tree_rows(previous_branch_points, start_index),

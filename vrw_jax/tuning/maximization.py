@@ -64,13 +64,13 @@ class EvaluatedTrial(NamedTuple):
     @property
     def has_finite_values(self) -> bool:
         """Return whether the objective, the constraints and their derivatives are finite."""
-        trial_arrays = (
+        trial_values = (
             self.objective,
             self.objective_gradient,
             self.constraint_slacks,
             self.slack_jacobian,
         )
-        return all(bool(np.isfinite(trial_array).all()) for trial_array in trial_arrays)
+        return all(bool(np.isfinite(trial_value).all()) for trial_value in trial_values)
 
     @property
     def is_usable_trial(self) -> bool:

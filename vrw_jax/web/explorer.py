@@ -83,17 +83,17 @@ def make_page_address(params: WheelParams, model_name: str = PAGE_MODEL_NAMES[0]
 
     The address contains the parameters of the wheel that differ from their default values.
     """
-    default_values = _make_page_values(WheelParams(), 1.0, PAGE_MODEL_NAMES[0])
-    page_values = _make_page_values(
+    default_input_values = _make_page_values(WheelParams(), 1.0, PAGE_MODEL_NAMES[0])
+    page_input_values = _make_page_values(
         params, 1.0, check_choice("model_name", model_name, PAGE_MODEL_NAMES)
     )
-    changed_page_values = {
-        page_value_name: page_value
-        for page_value_name, page_value in page_values.items()
-        if page_value != default_values[page_value_name]
+    changed_input_values = {
+        page_input_name: page_input_value
+        for page_input_name, page_input_value in page_input_values.items()
+        if page_input_value != default_input_values[page_input_name]
     }
     return find_wheel_page().as_uri() + (
-        f"#{urlencode(changed_page_values)}" if changed_page_values else ""
+        f"#{urlencode(changed_input_values)}" if changed_input_values else ""
     )
 
 
@@ -274,9 +274,9 @@ def _make_page_map(dataset: "xr.Dataset") -> dict[str, Any]:
             map_measures[str(variable_name)] = [
                 [
                     float(measure_value) if math.isfinite(measure_value) else None
-                    for measure_value in measure_row
+                    for measure_value in map_row_values
                 ]
-                for measure_row in min_values_over_legs.tolist()
+                for map_row_values in min_values_over_legs.tolist()
             ]
     return {
         "axes": [

@@ -101,7 +101,7 @@ def format_facts_page(paper_facts: Sequence[PaperFact]) -> str:
         facts_table_rows = []
         for paper_fact in facts_of_group:
             verdict_text = paper_fact.verdict if paper_fact.holds else f"**{paper_fact.verdict}**"
-            cell_texts = (
+            table_cell_texts = (
                 paper_fact.claim,
                 paper_fact.source,
                 paper_fact.published_value,
@@ -111,7 +111,10 @@ def format_facts_page(paper_facts: Sequence[PaperFact]) -> str:
             )
             # Minus signs replace the hyphens before numbers.
             facts_table_rows.append(
-                [re.sub(r"(?<![\w.])-(?=\d)", "−", cell_text) for cell_text in cell_texts]
+                [
+                    re.sub(r"(?<![\w.])-(?=\d)", "−", table_cell_text)
+                    for table_cell_text in table_cell_texts
+                ]
             )
         column_headings = ("fact", "where", "published", "found", "", "tolerance")
         page_lines += [
