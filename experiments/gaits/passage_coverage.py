@@ -43,7 +43,9 @@ MAX_COUNTED_STEPS = 6_000_000
 """Largest number of counted steps, chosen because a count then takes half a minute."""
 MAX_REFERENCE_STEPS = 20_000_000
 """Largest number of steps of the second sampling."""
-REFERENCE_OPTIONS = PassageSamplingOptions(negligible_line_effect=1e-3, min_forgetting_steps=12)
+REFERENCE_OPTIONS = PassageSamplingOptions(
+    negligible_ground_line_effect=1e-3, min_forgetting_steps=12
+)
 """Options of the second sampling, chosen so that more lines are biased and more steps forgotten."""
 SLOW_RADIUS = 0.7
 """Spectral radius above which the effect of the start decays slowly."""

@@ -176,7 +176,7 @@ def test_a_life_of_millions_of_steps_depends_on_no_choice_of_the_sampling():
     gait = vrw.limit_cycle(params)
     start, random = np.asarray(gait.section_state), np.random.default_rng(11)
     options = PassageSamplingOptions(
-        negligible_line_effect=3e-4, min_forgetting_steps=14, n_walker_groups=64
+        negligible_ground_line_effect=3e-4, min_forgetting_steps=14, n_walker_groups=64
     )
     groups = WalkerGroups(
         params, start, slope_sd, vrw.ViscoelasticWheel(), vrw.StepOptions(), 8192, random, options

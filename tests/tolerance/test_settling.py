@@ -20,7 +20,7 @@ def walk_scalar_map(one_step, start: float, failing_interval: tuple[float, float
         return StepQuantities(y, y, np.where(has_failed, int(vrw.Outcome.FELL_BACK), 0))
 
     map_on_ground = Mock(ContactWheelBatch, n_legs=1, take_steps=step)
-    map_on_ground.make_batch_for_walks.return_value = map_on_ground
+    map_on_ground.make_walk_batch.return_value = map_on_ground
     return walk_until_settled(map_on_ground, np.arange(1), np.array([[start, 0.0]]))
 
 

@@ -9,7 +9,7 @@ from support.files import assert_netcdf_round_trip
 
 import vrw_jax as vrw
 from vrw_jax.cycles import make_finder
-from vrw_jax.cycles.margin_defaults import KEPT_MARGIN_NAMES, default_margins
+from vrw_jax.cycles.margin_defaults import DEFAULT_MARGIN_NAMES, default_margins
 from vrw_jax.measures.table import MARGIN_MEASURES
 from vrw_jax.tuning.maximization import DEFAULT_MAXIMIZATION_OPTIONS, TrialKind, TuneStatus
 from vrw_jax.tuning.objective import (
@@ -119,7 +119,7 @@ def test_without_margins_the_optimum_of_double_support_scuffs(
     assert "clearance_sls1" in free.violated_margins
     assert float(free.step.margins.clearance_sls1) < 0.0
     margins = default_margins(max_dls_result.params)
-    for name in KEPT_MARGIN_NAMES:
+    for name in DEFAULT_MARGIN_NAMES:
         if name in MARGIN_MEASURES:
             minimum = float(jnp.min(getattr(max_dls_result.step.margins, name)))
             # 1e-6 of what the bounds' width changes: of take-off, 22 m/s^2.

@@ -868,18 +868,19 @@ class _SpecialPointLocator(NamedTuple):
                 ) or [ADMISSIBILITY_COLUMN]:
                     root_requests.append((last_point_index, point_index_beyond_end, quantity_name))
                     wheel_and_end_keys.append((admissible_range.wheel_index, range_end_index))
-        nearest_roots: dict[tuple[int, int], _LocatedRoot] = {}
+        nearest_root_by_end: dict[tuple[int, int], _LocatedRoot] = {}
         for wheel_and_end_key, located_root in zip(
             wheel_and_end_keys,
             self.locate_requested_roots(root_requests),
             strict=True,
         ):
             if (
-                wheel_and_end_key not in nearest_roots
-                or located_root.chord_fraction < nearest_roots[wheel_and_end_key].chord_fraction
+                wheel_and_end_key not in nearest_root_by_end
+                or located_root.chord_fraction
+                < nearest_root_by_end[wheel_and_end_key].chord_fraction
             ):
-                nearest_roots[wheel_and_end_key] = located_root
-        return nearest_roots
+                nearest_root_by_end[wheel_and_end_key] = located_root
+        return nearest_root_by_end
 
     def locate_inner_special_points(
         self,

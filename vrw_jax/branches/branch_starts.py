@@ -153,8 +153,8 @@ def find_collocation_starts(branch_request: BranchRequest, known_start_cycle: An
         ),
         BranchWheel(params, start_cycle.collocation_state.is_phase_active),
         jax.vmap(
-            lambda solution: transfer_solution_to_mesh(
-                start_cycle.system, collocation_system, solution
+            lambda collocation_solution: transfer_solution_to_mesh(
+                start_cycle.system, collocation_system, collocation_solution
             )
         )(start_cycle.collocation_state.solution),
         np.asarray(start_cycle.outcome),

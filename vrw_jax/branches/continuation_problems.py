@@ -186,8 +186,8 @@ class CollocationProblem(AbstractGaitProblem):
         ).symbols()
         _, phase_points_by_step = self.collocation_system.evaluate_phase_points(parameters, z)
         takeoff_accelerations = [
-            compute_takeoff_acceleration(wheel_symbols, sls1_points)
-            for _, sls1_points, _ in phase_points_by_step
+            compute_takeoff_acceleration(wheel_symbols, sls1_phase_points)
+            for _, sls1_phase_points, _ in phase_points_by_step
         ]
         last_end_point, min_durations = (
             phase_points_by_step[-1][-1].end_point,

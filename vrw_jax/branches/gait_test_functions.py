@@ -422,9 +422,9 @@ def _compute_continued_quantities(
     """Return the `CONTINUED_QUANTITIES` of a gait step by name, computed from the points of its
     phases.
     """
-    dls_points, sls1_points, sls2_points = phase_points
+    dls_phase_points, sls1_phase_points, sls2_phase_points = phase_points
     landing_result = transitions.resolve_landing(
-        wheel_symbols, sls2_points.end_point.q[0], *sls2_points.end_point.v
+        wheel_symbols, sls2_phase_points.end_point.q[0], *sls2_phase_points.end_point.v
     )
     fore_force, rear_force = transitions.compute_landing_forces(wheel_symbols, landing_result)
     dls_duration, *single_support_durations = z.durations[0]
@@ -432,17 +432,19 @@ def _compute_continued_quantities(
     quantity_values = (
         *landing_forces,
         *single_support_durations,
-        compute_takeoff_acceleration(wheel_symbols, sls1_points),
-        *_compute_force_decrease_rates(wheel_symbols, dls_points, dls_duration),
+        compute_takeoff_acceleration(wheel_symbols, sls1_phase_points),
+        *_compute_force_decrease_rates(wheel_symbols, dls_phase_points, dls_duration),
     )
     return dict(zip(CONTINUED_QUANTITIES, quantity_values, strict=True))
 
 
 def _compute_force_decrease_rates(
-    s: Symbols, dls_points: PhasePoints, dls_duration: Array
+    s: Symbols, dls_phase_points: PhasePoints, dls_duration: Array
 ) -> tuple[Array, Array]:
     """Return the initial and the mean rate at which the rear foot's force decreases in DLS, N/s."""
-    dls_phase = make_phases(s, dls_points.start_point.held_constants[0], stop_at_lift_off=False)[0]
+    dls_phase = make_phases(
+        s, dls_phase_points.start_point.held_constants[0], stop_at_lift_off=False
+    )[0]
 
     def make_dls_instant(theta: Array, dtheta: Array) -> PhaseInstant:
         return PhaseInstant(dls_phase, dls_phase.compute_motion((theta,), (dtheta,)), None)
@@ -451,8 +453,8 @@ def _compute_force_decrease_rates(
         make_dls_instant(*dls_state)
     )
     start_state, end_state = (
-        (*dls_points.start_point.q, *dls_points.start_point.v),
-        (*dls_points.end_point.q, *dls_points.end_point.v),
+        (*dls_phase_points.start_point.q, *dls_phase_points.start_point.v),
+        (*dls_phase_points.end_point.q, *dls_phase_points.end_point.v),
     )
     dls_state_rates = start_state[1], make_dls_instant(*start_state).acceleration.ddtheta
     initial_rear_force, rear_force_rate = jax.jvp(compute_rear_force, start_state, dls_state_rates)

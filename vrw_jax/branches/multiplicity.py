@@ -318,14 +318,14 @@ def add_multiple_bifurcations(
         if not vanishes_at_root(quantity_table, located_root, root_tolerances):
             continue
         last_located_root = root_groups[-1][-1] if root_groups else located_root
-        is_in_new_group = (
+        starts_new_root_group = (
             abs(located_root.chord_fraction - last_located_root.chord_fraction)
             > root_tolerances.max_equal_location_distance
         )
         if (
             not root_groups
             or last_located_root.bracket_and_quantity[:2] != located_root.bracket_and_quantity[:2]
-            or is_in_new_group
+            or starts_new_root_group
         ):
             root_groups.append([])
         root_groups[-1].append(located_root)

@@ -309,7 +309,7 @@ class Config:
     wheel_values: Mapping[str, float | int] = field(default_factory=dict)
     model_name: str = "viscoelastic"
     model_settings: Mapping[str, float | int | str | bool] = field(default_factory=dict)
-    option_values: Mapping[str, float | int | str | bool] = field(default_factory=dict)
+    step_option_values: Mapping[str, float | int | str | bool] = field(default_factory=dict)
     scan: ScanConfig = ScanConfig()
     gait: GaitConfig = GaitConfig()
     tune: TuneConfig | None = None
@@ -332,8 +332,8 @@ class Config:
 
     def make_options(self) -> StepOptions:
         """Return the numerical options of the walking steps."""
-        option_values: dict[str, Any] = {**self.option_values}
-        return StepOptions(**option_values)
+        step_option_values: dict[str, Any] = {**self.step_option_values}
+        return StepOptions(**step_option_values)
 
 
 def load_config(config_path: str | Path) -> Config:
@@ -429,12 +429,12 @@ def _parse_config_tables(
     default_options = {
         option_name: getattr(StepOptions(), option_name) for option_name in _STEP_OPTION_KEYS
     }
-    option_values = _parse_with_default_types(options_table, default_options)
+    step_option_values = _parse_with_default_types(options_table, default_options)
     checked_config = Config(
         wheel_values=wheel_values,
         model_name=model_name,
         model_settings=model_settings,
-        option_values=option_values,
+        step_option_values=step_option_values,
         scan=ScanConfig.from_table(_get_config_table(config_tables, "scan"), model_class),
         gait=GaitConfig.from_table(_get_config_table(config_tables, "gait")),
         tune=TuneConfig.from_table(_get_config_table(config_tables, "tune"))

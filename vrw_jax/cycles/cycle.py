@@ -217,7 +217,7 @@ class AbstractCycle(AbstractPrintable):
 
     @with_default_jax_settings
     def measure(self, measure_name: str) -> Array:
-        """Return the measure of the cycle with a name in `CYCLE_MEASURE_FUNCTIONS`.
+        """Return the measure that `CYCLE_MEASURE_FUNCTIONS` computes for this name.
 
         Durations are sums over the gait steps of the cycle, and indicators are minima over the gait
         steps. Batch axes come first.

@@ -21,7 +21,7 @@ def compute_takeoff_acceleration(s: Symbols, sls1_points: PhasePoints) -> Elemen
     )
 
 
-KEPT_MARGIN_NAMES: tuple[str, ...] = (
+DEFAULT_MARGIN_NAMES: tuple[str, ...] = (
     "fore_foot_force",
     "takeoff_acceleration",
     "clearance_sls1",
@@ -42,7 +42,7 @@ DEFAULT_MARGIN_SHARE = 1e-3
 
 @with_default_jax_settings
 def default_margins(params: WheelParams) -> Mapping[str, float]:
-    """Return the default lower limit for each margin in `KEPT_MARGIN_NAMES`.
+    """Return the default lower limit for each margin in `DEFAULT_MARGIN_NAMES`.
 
     Each limit is a thousandth of the margin's natural scale for this wheel. The limits are above
     zero, because a search needs a distance from the boundary. At lambda_4_plus = 0, for example,
@@ -74,5 +74,5 @@ def default_margins(params: WheelParams) -> Mapping[str, float]:
     }
     return {
         margin_name: DEFAULT_MARGIN_SHARE * margin_unit_values[MEASURES[margin_name].unit]
-        for margin_name in KEPT_MARGIN_NAMES
+        for margin_name in DEFAULT_MARGIN_NAMES
     }

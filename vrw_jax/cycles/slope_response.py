@@ -47,20 +47,23 @@ class SlopeResponse(NamedTuple):
     D0: Float[Array, " n_measures"]
 
     @classmethod
-    def from_jacobian(cls, step_jacobian: Array, n_states: int) -> "SlopeResponse":
+    def from_jacobian(cls, step_jacobian: Array, n_state_entries: int) -> "SlopeResponse":
         """Build the response from the Jacobian of (end state, measures).
 
-        The Jacobian is with respect to (start state, slope, next slope). A state has `n_states`
-        entries.
+        The Jacobian is with respect to (start state, slope, next slope). A state has
+        `n_state_entries` entries.
         """
-        end_state_rows, measure_rows = step_jacobian[:n_states], step_jacobian[n_states:]
+        end_state_rows, measure_rows = (
+            step_jacobian[:n_state_entries],
+            step_jacobian[n_state_entries:],
+        )
         return cls(
-            end_state_rows[:, :n_states],
-            end_state_rows[:, n_states],
-            end_state_rows[:, n_states + 1],
-            measure_rows[:, :n_states],
-            measure_rows[:, n_states],
-            measure_rows[:, n_states + 1],
+            end_state_rows[:, :n_state_entries],
+            end_state_rows[:, n_state_entries],
+            end_state_rows[:, n_state_entries + 1],
+            measure_rows[:, :n_state_entries],
+            measure_rows[:, n_state_entries],
+            measure_rows[:, n_state_entries + 1],
         )
 
     def select_measures(self, measure_indices: Sequence[int]) -> "SlopeResponse":
@@ -164,29 +167,31 @@ def compute_step_slope_response(
 
     The discrete codes in the section state do not vary.
     """
-    n_states = model.count_continuous_entries(params)
-    section_state_codes = section_state[n_states:]
+    n_state_entries = model.count_continuous_entries(params)
+    section_state_codes = section_state[n_state_entries:]
 
     def evaluate_step(step_start_and_slopes: Array) -> Array:
         stepwise_ground: Any = model.split_ground_by_step(
-            eqx.tree_at(lambda p: p.slope, params, step_start_and_slopes[n_states:]), 1
+            eqx.tree_at(lambda p: p.slope, params, step_start_and_slopes[n_state_entries:]), 1
         )
         step_model, step_params = model.with_step_ground(
             params, tuple(ground_quantity_by_step[0] for ground_quantity_by_step in stepwise_ground)
         )
         gait_step = step_model.take_step(
             step_params,
-            jnp.concatenate([step_start_and_slopes[:n_states], section_state_codes]),
+            jnp.concatenate([step_start_and_slopes[:n_state_entries], section_state_codes]),
             options,
         )
         step_measures = gait_step.measures()
         measure_values = [jnp.ravel(step_measures[measure_name]) for measure_name in measure_names]
-        return jnp.concatenate([gait_step.section_state[:n_states], *measure_values])
+        return jnp.concatenate([gait_step.section_state[:n_state_entries], *measure_values])
 
     step_start_and_slopes = jnp.concatenate(
-        [section_state[:n_states], jnp.stack([params.slope, params.slope])]
+        [section_state[:n_state_entries], jnp.stack([params.slope, params.slope])]
     )
-    return SlopeResponse.from_jacobian(jax.jacfwd(evaluate_step)(step_start_and_slopes), n_states)
+    return SlopeResponse.from_jacobian(
+        jax.jacfwd(evaluate_step)(step_start_and_slopes), n_state_entries
+    )
 
 
 COLLOCATION_RESPONSE_MEASURES = (

@@ -37,14 +37,14 @@ class PassageSamplingOptions:
     The value is chosen because the quantile for 99 % of Student's distribution is then within 7 %
     of that of the normal distribution.
     """
-    negligible_line_effect: float = 0.01
+    negligible_ground_line_effect: float = 0.01
     """Relative effect of a line's slope below which the slope is drawn without bias.
 
     A line joins two footholds. The effect is that on a later state, divided by that on the next
     state. The result has no bias for any value. The value is chosen because likelihood ratios are
     then similar.
     """
-    max_biased_lines: int = 12
+    max_biased_ground_lines: int = 12
     """Largest number of lines of the ground whose slopes are drawn with a bias.
 
     The value is chosen because fits in more dimensions need more samples.
@@ -307,11 +307,11 @@ def sample_passage(
         step_transitions[-sampling_options.n_kappa_2_steps :], walker_groups.n_continuous_entries
     )
     walker_groups.weight_by_outcome.clear()
-    n_biased_lines = min(
-        count_decay_steps(sampling_options.negligible_line_effect),
-        sampling_options.max_biased_lines,
+    n_biased_ground_lines = min(
+        count_decay_steps(sampling_options.negligible_ground_line_effect),
+        sampling_options.max_biased_ground_lines,
     )
-    walk_density = GaussianMixture.make_isotropic_gaussian(n_biased_lines, 1.0)
+    walk_density = GaussianMixture.make_isotropic_gaussian(n_biased_ground_lines, 1.0)
     estimate_probability = functools.partial(
         _estimate_failure_probability,
         walker_groups,
@@ -323,14 +323,15 @@ def sample_passage(
     count_failures = lambda: (~walker_groups.step_and_replace_failures()[0]).astype(float)
     failure_probability, relative_error = 0.0, np.inf
     are_failures_counted = (
-        n_biased_lines * np.mean(~is_walker_alive) > sampling_options.min_failures_for_counting
+        n_biased_ground_lines * np.mean(~is_walker_alive)
+        > sampling_options.min_failures_for_counting
     )
     if not are_failures_counted:
-        failure_density = _fit_density_of_failures(walker_groups, n_biased_lines)
+        failure_density = _fit_density_of_failures(walker_groups, n_biased_ground_lines)
         if failure_density is not None:
             walk_density = failure_density
             failure_probability, relative_error = estimate_probability(
-                lambda: run_biased_walks(walker_groups, walk_density)[1], n_biased_lines
+                lambda: run_biased_walks(walker_groups, walk_density)[1], n_biased_ground_lines
             )
             if np.isfinite(relative_error) and _has_missed_failures(
                 walker_groups, failure_probability * (1.0 + relative_error), sampling_options
@@ -371,7 +372,7 @@ def sample_passage(
 def _estimate_failure_probability(
     walker_groups: WalkerGroups,
     failure_weight_sampler: Callable[[], np.ndarray],
-    n_walk_lines: int,
+    n_ground_lines: int,
     *,
     start_effect_decay: tuple[float, int],
     relative_tolerance: float,
@@ -386,7 +387,7 @@ def _estimate_failure_probability(
 
     - `failure_weight_sampler`: function that returns the weight of each walk of a round, which is 0
       unless the walk fails in its last step;
-    - `n_walk_lines`: number of lines of the ground in each walk;
+    - `n_ground_lines`: number of lines of the ground in each walk;
     - `start_effect_decay`: factor per step by which the effect of the start decays, and number of
       steps before the walks.
     """
@@ -399,7 +400,7 @@ def _estimate_failure_probability(
     weight_sum_by_group, n_sampling_rounds = np.zeros(walker_groups.n_groups), 0
     failure_weight_sum, squared_weight_sum, n_failing_walks = 0.0, 0.0, 0
     failure_probability, relative_error = 0.0, np.inf
-    remaining_start_effect = start_effect_decay[0] ** (start_effect_decay[1] + n_walk_lines)
+    remaining_start_effect = start_effect_decay[0] ** (start_effect_decay[1] + n_ground_lines)
     n_error_tests, n_rounds_at_error_test = 0, sampling_options.min_sampling_rounds
     while n_error_tests == 0 or (
         relative_error > relative_tolerance and walker_groups.n_steps < max_steps
@@ -421,7 +422,7 @@ def _estimate_failure_probability(
             continue
         last_step_failure_probability = float(np.mean(weight_sum_by_group)) / n_sampling_rounds
         failure_probability, error_amplification = _solve_failure_probability(
-            last_step_failure_probability, n_walk_lines
+            last_step_failure_probability, n_ground_lines
         )
         n_effective_failures = failure_weight_sum**2 / squared_weight_sum
         if n_effective_failures < (
@@ -511,17 +512,17 @@ def _step_until_start_is_forgotten(
 
 
 def _fit_density_of_failures(
-    walker_groups: WalkerGroups, n_walk_lines: int
+    walker_groups: WalkerGroups, n_ground_lines: int
 ) -> GaussianMixture | None:
     """Return a density of slope deviations for which walks often fail in their last step.
 
-    Each walk has `n_walk_lines` steps. The result is None if no walk fails.
+    Each walk has `n_ground_lines` steps. The result is None if no walk fails.
     """
 
     def find_last_step_failures(slope_deviations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         walk_results = walker_groups.run_walks(slope_deviations)
         has_walk_failed = walk_results.outcome != Outcome.STEPPED
-        return has_walk_failed & (walk_results.n_stepped == n_walk_lines - 1), has_walk_failed
+        return has_walk_failed & (walk_results.n_stepped == n_ground_lines - 1), has_walk_failed
 
     density_options = dataclasses.replace(
         FAILURE_DENSITY_OPTIONS,
@@ -530,7 +531,7 @@ def _fit_density_of_failures(
         ),
     )
     return fit_failure_density(
-        find_last_step_failures, n_walk_lines, walker_groups.random, density_options
+        find_last_step_failures, n_ground_lines, walker_groups.random, density_options
     )
 
 
@@ -579,13 +580,13 @@ def run_biased_walks(
     walk, shape (walkers,), is the likelihood ratio if the walk fails in its last step, and 0
     otherwise. The mean weight is the probability of a failure in the last step.
     """
-    n_walk_lines = walk_density.gaussian_means.shape[1]
+    n_ground_lines = walk_density.gaussian_means.shape[1]
     slope_deviations = walk_density.draw_samples(len(walker_groups.states), walker_groups.random)
     walk_results = walker_groups.run_walks(slope_deviations)
     has_failed_in_last_step = (walk_results.outcome != Outcome.STEPPED) & (
-        walk_results.n_stepped == n_walk_lines - 1
+        walk_results.n_stepped == n_ground_lines - 1
     )
-    nominal_density = GaussianMixture.make_isotropic_gaussian(n_walk_lines, 1.0)
+    nominal_density = GaussianMixture.make_isotropic_gaussian(n_ground_lines, 1.0)
     likelihood_ratios = np.exp(
         nominal_density.compute_log_density(slope_deviations)
         - walk_density.compute_log_density(slope_deviations)
@@ -596,23 +597,24 @@ def run_biased_walks(
 
 
 def _solve_failure_probability(
-    last_step_failure_probability: float, n_biased_lines: int
+    last_step_failure_probability: float, n_biased_ground_lines: int
 ) -> tuple[float, float]:
     """Return the failure probability p of a gait step, and the amplification of its relative error.
 
-    Each step from the quasi-stationary distribution fails with probability p. A walk therefore
-    fails in the last of `n_biased_lines` steps with probability p (1 - p)^(n_biased_lines - 1).
-    This probability is `last_step_failure_probability`. The amplification is the relative error of
-    p, divided by the relative error of `last_step_failure_probability`.
+    Each step from the quasi-stationary distribution fails with probability p. A walk of n steps,
+    where n is `n_biased_ground_lines`, therefore fails in its last step with probability
+    p (1 - p)^(n - 1). This probability is `last_step_failure_probability`. The amplification is the
+    relative error of p, divided by the relative error of `last_step_failure_probability`.
     """
     p = last_step_failure_probability
-    if n_biased_lines == 1:
+    if n_biased_ground_lines == 1:
         return p, 1.0
     for _ in range(N_FIXED_POINT_ITERATIONS):
         p = min(
-            last_step_failure_probability / (1.0 - p) ** (n_biased_lines - 1), 0.9 / n_biased_lines
+            last_step_failure_probability / (1.0 - p) ** (n_biased_ground_lines - 1),
+            0.9 / n_biased_ground_lines,
         )
-    return p, 1.0 / (1.0 - (n_biased_lines - 1) * p / (1.0 - p))
+    return p, 1.0 / (1.0 - (n_biased_ground_lines - 1) * p / (1.0 - p))
 
 
 def _estimate_kappa_2(

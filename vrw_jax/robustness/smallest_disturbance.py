@@ -193,7 +193,7 @@ def smallest_disturbance(
 
 
 class _GaitStep(NamedTuple):
-    """Samples of time and state in one step of a gait, with axes over phases and samples."""
+    """Times and states that sample one step of a gait, with axes over phases and samples."""
 
     sample_times: np.ndarray  # after the landing, s, (phase, sample)
     sampled_states: np.ndarray  # (theta, L1, L2) and their rates, (phase, sample, 6)
@@ -293,7 +293,7 @@ def _search_disturbance_instants(
             if is_last_pass
             else search_options.early_disturbance_tolerance
         )
-        exit_brackets = _bracket_exit_sizes(
+        exit_size_brackets = _bracket_exit_sizes(
             stable_gait,
             gait_step,
             directed_instants,
@@ -302,7 +302,7 @@ def _search_disturbance_instants(
             disturbance_size_tolerance,
             search_options,
         )
-        exit_sizes = exit_brackets.middle_disturbance_sizes.reshape(
+        exit_sizes = exit_size_brackets.middle_disturbance_sizes.reshape(
             len(phases_and_signs), n_instants
         )
         best_instant_indices = exit_sizes.argmin(1)
@@ -310,19 +310,19 @@ def _search_disturbance_instants(
             phase_and_sign: sample_windows[i][best_instant_indices[i]]
             for i, phase_and_sign in enumerate(phases_and_signs)
         }
-        first_pass_result = first_pass_result or (directed_instants, exit_brackets)
-        best_instant_index = int(exit_brackets.middle_disturbance_sizes.argmin())
+        first_pass_result = first_pass_result or (directed_instants, exit_size_brackets)
+        best_instant_index = int(exit_size_brackets.middle_disturbance_sizes.argmin())
     assert first_pass_result is not None
     assert best_instant_index is not None
     smallest_disturbance_size, phase_index = (
-        float(exit_brackets.middle_disturbance_sizes[best_instant_index]),
+        float(exit_size_brackets.middle_disturbance_sizes[best_instant_index]),
         int(directed_instants.phase_indices[best_instant_index]),
     )
     size_error = 0.0
     if np.isfinite(smallest_disturbance_size):
         size_error = float(
-            exit_brackets.upper_disturbance_sizes[best_instant_index]
-            - exit_brackets.lower_disturbance_sizes[best_instant_index]
+            exit_size_brackets.upper_disturbance_sizes[best_instant_index]
+            - exit_size_brackets.lower_disturbance_sizes[best_instant_index]
         )
         if directed_instants.sample_indices[best_instant_index] not in (
             0,
@@ -356,7 +356,7 @@ def _search_disturbance_instants(
             ]
         ),
         phase_index=phase_index,
-        outcome=np.asarray(exit_brackets.exit_outcomes[best_instant_index]),
+        outcome=np.asarray(exit_size_brackets.exit_outcomes[best_instant_index]),
         profile_times=gait_step.sample_times[profile_phase_indices, profile_sample_indices],
         profile_phase_indices=profile_phase_indices,
         backward_sizes=first_pass_result[1].middle_disturbance_sizes[is_backward_disturbance],

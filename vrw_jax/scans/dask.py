@@ -196,13 +196,13 @@ def _wait_for_completed_future(
     dask_client: "Client", scheduler_address: str, completed_futures: "SimpleQueue[Future]"
 ) -> "Future":
     """Return the next completed future. Warn once if the cluster has no workers."""
-    has_issued_warning = False
+    has_warned_of_no_workers = False
     while True:
         try:
             return completed_futures.get(timeout=MAX_SECONDS_WITHOUT_RESULT)
         except Empty:
             pass
-        if not has_issued_warning and not dask_client.nthreads():
+        if not has_warned_of_no_workers and not dask_client.nthreads():
             warnings.warn(
                 f"the dask cluster at {scheduler_address} has no workers, so that nothing is "
                 f"computed: start "
@@ -211,7 +211,7 @@ def _wait_for_completed_future(
                 "one.",
                 stacklevel=1,
             )
-            has_issued_warning = True
+            has_warned_of_no_workers = True
 
 
 @contextlib.contextmanager

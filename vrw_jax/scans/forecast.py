@@ -57,8 +57,8 @@ def forecast_scan(scan_plan: ScanPlan, store_path: str | Path | None = None) -> 
     )
     chunk_size = math.prod(result_layout.chunk_shape)
     sample_axes_description = " x ".join(
-        f"{axis_length} {axis_name}"
-        for axis_name, axis_length in zip(
+        f"{axis_length} {sample_axis_name}"
+        for sample_axis_name, axis_length in zip(
             result_layout.sample_dimension_names, result_layout.sample_shape, strict=True
         )
     )

@@ -109,10 +109,10 @@ class ResultLayout:
         chunk_indices = np.unravel_index(chunk_index, self._chunks_per_axis)
         return tuple(
             slice(
-                int(axis_index) * chunk_length,
-                min((int(axis_index) + 1) * chunk_length, axis_length),
+                int(sample_axis_index) * chunk_length,
+                min((int(sample_axis_index) + 1) * chunk_length, axis_length),
             )
-            for axis_index, chunk_length, axis_length in zip(
+            for sample_axis_index, chunk_length, axis_length in zip(
                 chunk_indices, self.chunk_shape, self.sample_shape, strict=True
             )
         )
@@ -139,10 +139,12 @@ def choose_chunk_shape(sample_shape: tuple[int, ...], max_chunk_samples: int) ->
     A chunk spans the whole length of the last axes.
     """
     chunk_shape, n_remaining_chunk_samples = [1] * len(sample_shape), max_chunk_samples
-    for axis_index in range(len(sample_shape) - 1, -1, -1):
-        chunk_shape[axis_index] = min(sample_shape[axis_index], max(n_remaining_chunk_samples, 1))
-        n_remaining_chunk_samples //= chunk_shape[axis_index]
-        if chunk_shape[axis_index] < sample_shape[axis_index]:
+    for sample_axis_index in range(len(sample_shape) - 1, -1, -1):
+        chunk_shape[sample_axis_index] = min(
+            sample_shape[sample_axis_index], max(n_remaining_chunk_samples, 1)
+        )
+        n_remaining_chunk_samples //= chunk_shape[sample_axis_index]
+        if chunk_shape[sample_axis_index] < sample_shape[sample_axis_index]:
             break
     return tuple(chunk_shape)
 

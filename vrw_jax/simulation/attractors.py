@@ -50,7 +50,7 @@ DEFAULT_ATTRACTOR_OPTIONS = AttractorOptions()
 
 
 class PeriodicWalkEnds(NamedTuple):
-    """Ends of walks, as NumPy arrays with a leading axis over starts."""
+    """Ends of the walks from many starts, as NumPy arrays with a leading axis over the starts."""
 
     outcome: np.ndarray  # STEPPED if the wheel still walks
     period: np.ndarray  # period of the orbit, in steps; 0 if not periodic

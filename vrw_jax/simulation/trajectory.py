@@ -106,7 +106,7 @@ def simulate(
     params, x, model, options = convert_step_arguments(
         params, start_state, checked_model, options, engine
     )
-    trajectory_specifier = (
+    specify_trajectory = (
         specify_contact_trajectory if model.reports_contacts else specify_phase_trajectory
     )
     s, models_and_wheels, ground_lines = (
@@ -127,7 +127,7 @@ def simulate(
         )
         ground_line_slopes = complete_line_slopes(ground_line_slopes, n_steps)
         ground_lines = UnevenGroundLines(np.asarray(ground_line_slopes, float), float(s.Mt * s.g))
-    trajectory_spec = trajectory_specifier(models_and_wheels, options, n_samples)
+    trajectory_spec = specify_trajectory(models_and_wheels, options, n_samples)
     sampled_walk = sample_walk_steps(
         trajectory_spec, x, n_steps, float(s.Mt * s.g * s.sin_phi), ground_lines
     )

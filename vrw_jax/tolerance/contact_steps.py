@@ -157,7 +157,7 @@ class ContactWheelBatch:
         paper_section_states = end_states[:, self.list_paper_state_indices()]
         return np.concatenate([durations, step_length[:, None], paper_section_states], 1)
 
-    def make_batch_for_walks(self) -> "ContactWheelBatch":
+    def make_walk_batch(self) -> "ContactWheelBatch":
         """Return a copy of the batch with the looser solver tolerance for walks."""
         solver_tolerance = self.step_tolerances.walk_tolerance
         return dataclasses.replace(
@@ -166,7 +166,7 @@ class ContactWheelBatch:
         )
 
     def make_comparison_batches(self) -> list["ContactWheelBatch"]:
-        """Return copies of the batch, one for each comparison tolerance."""
+        """Return a copy of the batch for each solver tolerance at which steps are compared."""
         comparison_tolerances = (
             self.step_tolerances.very_tight_comparison_tolerances
             if float(self.step_options.rtol) < 0.5 * self.step_tolerances.tight_tolerance

@@ -71,7 +71,7 @@ def walk_until_settled(
     Each walk settles, fails, or ends without settling after the last leap.
     """
     n_walks, n_continuous_entries = len(wheel_indices), section_states.shape[1] - wheel_batch.n_legs
-    loose_step_batch = wheel_batch.make_batch_for_walks()
+    loose_step_batch = wheel_batch.make_walk_batch()
     walk_ends = WalkEnds(
         np.zeros(n_walks, bool),
         section_states.copy(),

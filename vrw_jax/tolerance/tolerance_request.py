@@ -174,7 +174,8 @@ def broadcast_params_and_friction(
     """
     check_type("params", params, WheelParams, "write vrw.WheelParams(damping=..., slope=...)")
     batch_argument_shapes = {
-        np.shape(argument_array) for argument_array in (*jax.tree.leaves(params), friction)
+        np.shape(wheel_argument_array)
+        for wheel_argument_array in (*jax.tree.leaves(params), friction)
     }
     batch_shape = max(batch_argument_shapes, key=len)
     if len(batch_shape) > 1 or batch_argument_shapes - {(), batch_shape}:
@@ -184,8 +185,8 @@ def broadcast_params_and_friction(
             "axis, the same for all: give one value for all, or one for each element."
         )
     n_wheels = batch_shape[0] if batch_shape else 1
-    broadcast_to_batch = lambda argument_array: np.broadcast_to(
-        np.asarray(argument_array, float), (n_wheels,)
+    broadcast_to_batch = lambda wheel_argument_array: np.broadcast_to(
+        np.asarray(wheel_argument_array, float), (n_wheels,)
     )
     return (
         jax.tree.map(broadcast_to_batch, params),

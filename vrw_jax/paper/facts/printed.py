@@ -101,14 +101,18 @@ def compute_printed_landing(params: WheelParams, section_state: np.ndarray) -> P
     )
     foot_velocity = compute_landing_foot_velocity(params, section_state, leg_1_rate=dL1)
     coordinate_rates_before = np.array([*foot_velocity, touchdown_rate, 0.0, dL1])
-    theta_after = np.asarray(touchdown_angle - s.alpha)
-    coordinates_after_landing = (theta_after, np.asarray(s.L0), np.asarray(touchdown_length))
+    theta_after_landing = np.asarray(touchdown_angle - s.alpha)
+    coordinates_after_landing = (
+        theta_after_landing,
+        np.asarray(s.L0),
+        np.asarray(touchdown_length),
+    )
     J = compute_double_support_jacobian(
         *coordinates_after_landing, float(s.alpha), is_as_printed=False
     )
     M = np.asarray(
         compute_five_coordinate_mass_matrix(
-            s, jnp.asarray(theta_after), s.L0, jnp.asarray(touchdown_length)
+            s, jnp.asarray(theta_after_landing), s.L0, jnp.asarray(touchdown_length)
         )
     )
     inverse_mass_matrix = np.linalg.inv(M)
