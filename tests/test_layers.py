@@ -100,8 +100,8 @@ def test_packages_of_one_layer_do_not_import_each_other(tmp_path):
 
 def test_a_package_outside_the_layers_is_found(tmp_path):
     files = {"attic/__init__.py": "", "loose.py": ""}
-    solution = rules.find_upward_imports(make_import_graph(tmp_path, files))
-    assert [line.split()[0] for line in solution] == ["attic", "loose"]
+    import_errors = rules.find_upward_imports(make_import_graph(tmp_path, files))
+    assert [line.split()[0] for line in import_errors] == ["attic", "loose"]
 
 
 def test_an_import_cycle_through_an_init_file_is_found(tmp_path):

@@ -48,16 +48,18 @@ def stiffness(rows: list[Row], limit: Callable[[str], float]) -> Figure:
     grid = figure.subplots(3, 2, sharex="col", sharey="row")
     for column, axis in enumerate(AXES):
         for method, (colour, marker) in STYLES.items():
-            selection = [row for row in rows if row["axis"] == axis and row["method"] == method]
+            rows_of_group = [row for row in rows if row["axis"] == axis and row["method"] == method]
             good = [
-                row for row in selection if row["outcome"] == "STEPPED" and row["error"] != "nan"
+                row
+                for row in rows_of_group
+                if row["outcome"] == "STEPPED" and row["error"] != "nan"
             ]
             look = {"color": colour, "marker": marker, "ms": 3.5, "lw": 0.9}
             for axes, name in zip(grid[:, column], ("us_per_gait", "work", "error"), strict=True):
                 axes.loglog(
                     read_column(good, "value"), read_column(good, name), label=method, **look
                 )
-                failed = [row for row in selection if row not in good]
+                failed = [row for row in rows_of_group if row not in good]
                 y = np.nan_to_num(read_column(failed, name), nan=1.0)
                 axes.plot(read_column(failed, "value"), y, "x", color="black", ms=6, zorder=5)
         grid[2, column].set_xlabel(AXES[axis])
@@ -83,10 +85,12 @@ def borders(rows: list[Row]) -> Figure:
     figure = Figure(figsize=(PAGE_FIGURE_WIDTH_INCHES, 2.8))
     grid = figure.subplots(1, len(names), sharey=True)
     for axes, name in zip(grid, names, strict=True):
-        selection = [row for row in rows if row["border"] == name]
-        x = read_column(selection, "distance")
-        axes.loglog(x, read_column(selection, "derivative_error"), "o-", ms=4, label="derivative")
-        axes.loglog(x, read_column(selection, "value_error"), "s--", ms=4, label="value")
+        rows_of_group = [row for row in rows if row["border"] == name]
+        x = read_column(rows_of_group, "distance")
+        axes.loglog(
+            x, read_column(rows_of_group, "derivative_error"), "o-", ms=4, label="derivative"
+        )
+        axes.loglog(x, read_column(rows_of_group, "value_error"), "s--", ms=4, label="value")
         axes.set_title(SIGNS.sub(r"$\\lambda_\1^+ \\to 0$", name), fontsize=8)
         axes.grid(color="0.9", lw=0.4)
     figure.supxlabel("relative distance to the border", fontsize="medium")
@@ -97,16 +101,16 @@ def borders(rows: list[Row]) -> Figure:
 
 def select_last_rows(rows: list[Row], name: str) -> list[Row]:
     """Return the last row for each value of a column."""
-    return [selection[-1] for selection in group_rows(rows, name).values()]
+    return [rows_of_group[-1] for rows_of_group in group_rows(rows, name).values()]
 
 
 def curves(axes: Axes, rows: list[Row], by_input: str, x: str, y: str, label: str = "{}") -> None:
     """Draw one curve for each value of a column, with a color and a marker, and without zeros."""
     looks = zip(COLOURS, "os^Dv<>p", strict=True)
-    for (key, selection), (colour, marker) in zip(
+    for (key, rows_of_group), (colour, marker) in zip(
         group_rows(rows, by_input).items(), looks, strict=False
     ):
-        xs, ys = read_column(selection, x), np.abs(read_column(selection, y))
+        xs, ys = read_column(rows_of_group, x), np.abs(read_column(rows_of_group, y))
         is_positive = ys > 0.0
         look = {"color": colour, "marker": marker, "ms": 3.5, "lw": 0.9}
         axes.loglog(xs[is_positive], ys[is_positive], label=label.format(key), **look)
@@ -175,8 +179,8 @@ def describe_outcome(outcome: str) -> str:
 def summarize_by_border(rows: list[Row]) -> list[Row]:
     """Both kinds of cases and both sides together; borders met fewer than five times left out."""
     table_rows = []
-    for border, selection in group_rows(rows, "border").items():
-        for distance, rows_at_distance in group_rows(selection, "distance").items():
+    for border, rows_of_group in group_rows(rows, "border").items():
+        for distance, rows_at_distance in group_rows(rows_of_group, "distance").items():
             names = ("cases", "other_outcome", "other_by_diffrax", "stepped")
             cases, other, by_diffrax, step_result = (
                 int(read_column(rows_at_distance, n).sum()) for n in names
@@ -203,10 +207,10 @@ def corners(rows: list[Row]) -> str:
     lines = [
         (
             border.replace(" | ", " / "),
-            selection[0]["cases"],
-            *(row["other_outcome"] for row in selection),
+            rows_of_group[0]["cases"],
+            *(row["other_outcome"] for row in rows_of_group),
         )
-        for border, selection in group_rows(result, "border").items()
+        for border, rows_of_group in group_rows(result, "border").items()
     ]
     return format_markdown(("border", "cases", *distances), lines)
 
@@ -214,18 +218,18 @@ def corners(rows: list[Row]) -> str:
 def limits(rows: list[Row]) -> str:
     """Write a table of the behavior near each limit, with the values at which it changes."""
     lines = []
-    for limit, selection in group_rows(rows, "limit").items():
+    for limit, rows_of_group in group_rows(rows, "limit").items():
         result: list[str] = []
-        for i, row in enumerate(selection):
-            if i == 0 or row["outcome"] != selection[i - 1]["outcome"]:
+        for i, row in enumerate(rows_of_group):
+            if i == 0 or row["outcome"] != rows_of_group[i - 1]["outcome"]:
                 result.append(f"from {row['value']}: {row['outcome']}")
-        is_same = sum(row["outcome"] == row["isolated"] for row in selection)
+        is_same = sum(row["outcome"] == row["isolated"] for row in rows_of_group)
         cells = (
             limit,
             "; ".join(result),
-            f"{is_same} of {len(selection)}",
-            f"{max(read_column(selection, 'time_difference_s')):.0e} s",
-            str(int(max(read_column(selection, "solver_steps")))),
+            f"{is_same} of {len(rows_of_group)}",
+            f"{max(read_column(rows_of_group, 'time_difference_s')):.0e} s",
+            str(int(max(read_column(rows_of_group, "solver_steps")))),
         )
         lines.append(cells)
     header = ("limit", "outcomes by value", "as isolated", "times differ by", "most solver steps")
@@ -315,8 +319,10 @@ def meeting(rows: list[Row]) -> Figure:
     """Draw errors of derivatives of stability measures over the distance between multipliers."""
     figure = Figure(figsize=(PAGE_FIGURE_WIDTH_INCHES, 2.8))
     grid = figure.subplots(1, 2, sharey=True)
-    for axes, (kind, selection) in zip(grid, group_rows(rows, "multipliers").items(), strict=True):
-        x = np.abs(read_column(selection, "distance"))
+    for axes, (kind, rows_of_group) in zip(
+        grid, group_rows(rows, "multipliers").items(), strict=True
+    ):
+        x = np.abs(read_column(rows_of_group, "distance"))
         for y, label, line, colour in (
             ("d_radius", "derivative of the spectral radius", "o-", COLOURS[0]),
             ("d_radius_error", "its error", "s--", COLOURS[1]),
@@ -324,7 +330,7 @@ def meeting(rows: list[Row]) -> Figure:
         ):
             axes.loglog(
                 x,
-                np.maximum(np.abs(read_column(selection, y)), 1e-17),
+                np.maximum(np.abs(read_column(rows_of_group, y)), 1e-17),
                 line,
                 color=colour,
                 ms=3.5,
@@ -360,23 +366,27 @@ def formulations(drift: list[Row], penalty: list[Row]) -> Figure:
     figure = Figure(figsize=(PAGE_FIGURE_WIDTH_INCHES, 2.9))
     left_axes, right = figure.subplots(1, 2)
     for marker, name in zip("os^", dict.fromkeys(row["stabilised"] for row in drift), strict=True):
-        selection = [row for row in drift if row["stabilised"] == name]
-        gap = read_column(selection, "gap_m")
+        rows_of_group = [row for row in drift if row["stabilised"] == name]
+        gap = read_column(rows_of_group, "gap_m")
         left_axes.loglog(
-            read_column(selection, "steps"), gap, f"{marker}-", ms=4, label=f"stabilised: {name}"
+            read_column(rows_of_group, "steps"),
+            gap,
+            f"{marker}-",
+            ms=4,
+            label=f"stabilised: {name}",
         )
     left_axes.set(xlabel="integrator steps", ylabel="largest gap of a held foot [m]")
     left_axes.legend()
     for marker, name in zip("os", dict.fromkeys(row["ground"] for row in penalty), strict=True):
-        selection = [
+        rows_of_group = [
             row for row in penalty if row["ground"] == name and row["outcome"] == "STEPPED"
         ]
         look = {"ms": 4, "label": f"penalty, {name}"}
         # Each of the two errors changes sign somewhere.
         error = np.maximum(
-            read_column(selection, "dtheta_error"), read_column(selection, "period_error")
+            read_column(rows_of_group, "dtheta_error"), read_column(rows_of_group, "period_error")
         )
-        right.loglog(read_column(selection, "evaluations"), error, f"{marker}-", **look)
+        right.loglog(read_column(rows_of_group, "evaluations"), error, f"{marker}-", **look)
     error_of = r"error of $\dot\theta$ [rad/s] and period [s], the larger"
     right.set(xlabel="evaluations per gait", ylabel=error_of)
     right.legend()
@@ -391,11 +401,15 @@ def automatic(rows: list[Row]) -> str:
     choice.
     """
     lines = []
-    fast = lambda selection: min(selection, key=lambda row: float(row["us_per_gait"]))
+    fast = lambda rows_of_group: min(rows_of_group, key=lambda row: float(row["us_per_gait"]))
     for axis in AXES:
-        for value, selection in group_rows([r for r in rows if r["axis"] == axis], "value").items():
-            chosen = next(row for row in selection if row["method"] == "automatic")
-            good = [r for r in selection if r["outcome"] == "STEPPED" and float(r["error"]) < 1e-4]
+        for value, rows_of_group in group_rows(
+            [r for r in rows if r["axis"] == axis], "value"
+        ).items():
+            chosen = next(row for row in rows_of_group if row["method"] == "automatic")
+            good = [
+                r for r in rows_of_group if r["outcome"] == "STEPPED" and float(r["error"]) < 1e-4
+            ]
             assert chosen in good
             good.remove(chosen)
             ours = fast([r for r in good if r["method"].split()[0] in ("lanes", "diffrax")])
@@ -412,17 +426,19 @@ def automatic(rows: list[Row]) -> str:
 def events(rows: list[Row]) -> list[Row]:
     """Count the cases by kind over all chunks."""
     table_rows = []
-    for kind, selection in group_rows(rows, "kind").items():
+    for kind, rows_of_group in group_rows(rows, "kind").items():
         pairs: dict[str, int] = {}
-        for part in filter(None, "; ".join(row["ours/isolated"] for row in selection).split("; ")):
+        for part in filter(
+            None, "; ".join(row["ours/isolated"] for row in rows_of_group).split("; ")
+        ):
             pair, count = part.split(": ")
             pairs[pair] = pairs.get(pair, 0) + int(count)
         counts = ("cases", "stepped", "other_outcome", "late")
         table_rows.append(
             {"kind": kind}
-            | {name: str(sum(int(row[name]) for row in selection)) for name in counts}
+            | {name: str(sum(int(row[name]) for row in rows_of_group)) for name in counts}
             | {
-                "largest_time_difference": f"{max(read_column(selection, 'largest_time_difference')):.2e}"  # noqa: E501
+                "largest_time_difference": f"{max(read_column(rows_of_group, 'largest_time_difference')):.2e}"  # noqa: E501
             }
             | {"ours/isolated": "; ".join(f"{pair}: {n}" for pair, n in sorted(pairs.items()))}
         )
@@ -433,8 +449,9 @@ def dips(rows: list[Row]) -> list[Row]:
     """Count the local minima by kind of case over all chunks."""
     counts = ("cases", "stepped", "gave_up", "differ", "other_outcome", "other_by_tight")
     return [
-        {"kind": kind} | {name: str(sum(int(row[name]) for row in selection)) for name in counts}
-        for kind, selection in group_rows(rows, "kind").items()
+        {"kind": kind}
+        | {name: str(sum(int(row[name]) for row in rows_of_group)) for name in counts}
+        for kind, rows_of_group in group_rows(rows, "kind").items()
     ]
 
 

@@ -77,7 +77,7 @@ def compare_versions(checkouts: tuple[Path, Path], caches: Path, turns: int) -> 
         ratios = [y / x for x, y in zip(a, b, strict=True)]
         median_and_range = statistics.median(ratios), min(ratios), max(ratios)
         sizes = (f"{statistics.median(side):.4g}" for side in (a, b))
-        rows.append((name, *sizes, *(f"{ratio:.3f}" for ratio in median_and_range)))
+        rows.append((name, *sizes, *(f"{statistic:.3f}" for statistic in median_and_range)))
     return rows
 
 

@@ -250,13 +250,13 @@ def compare_methods(problem: TuneProblem, n_starts: int, rows: list[dict], name:
             name, method, f"{sum(s.seconds for s in histories_by_method[method]):.0f} s", flush=True
         )
     curves = {
-        method: [best_so_far(one) for one in selection]
-        for method, selection in histories_by_method.items()
+        method: [best_so_far(history) for history in histories]
+        for method, histories in histories_by_method.items()
     }
-    best = max(float(curve[-1]) for selection in curves.values() for curve in selection)
-    for method, selection in curves.items():
+    best = max(float(curve[-1]) for method_curves in curves.values() for curve in method_curves)
+    for method, method_curves in curves.items():
         for start, (curve, one) in enumerate(
-            zip(selection, histories_by_method[method], strict=True)
+            zip(method_curves, histories_by_method[method], strict=True)
         ):
             row = {
                 "problem": name,

@@ -125,9 +125,9 @@ def of_lanes(row: Row) -> int:
 def draw_panel(axes: Axes, rows: list[Row], quantity: str, x_of) -> None:
     """p99 as a curve, p50 to worst as bars, failures as crosses with their share."""
     styles = style_of(rows)
-    for label, selection in curves(rows, quantity).items():
+    for label, selected_rows in curves(rows, quantity).items():
         shown_rows = [
-            row for row in selection if x_of(row) > 0.0 and int(row["failed"]) < of_lanes(row)
+            row for row in selected_rows if x_of(row) > 0.0 and int(row["failed"]) < of_lanes(row)
         ]
         shown_rows = [row for row in shown_rows if float(row[f"{quantity}_p99"]) > 0.0]
         if not shown_rows:
@@ -218,7 +218,7 @@ def best(rows: list[Row], group: str, is_for_one_wheel: bool, target: float) -> 
     """
     quantities = [name for name, (of_values, _) in QUANTITIES.items() if of_values == group]
     unit = unit_of(rows)
-    selection = []
+    selected_rows = []
     for row in rows:
         fits = row["group"] == group and int(row["failed"]) == 0
         fits = fits and (row["lanes"] == "1" or not is_for_one_wheel or row["family"] in SCALAR)
@@ -227,8 +227,8 @@ def best(rows: list[Row], group: str, is_for_one_wheel: bool, target: float) -> 
         judged = is_same[0] if is_same else row
         fits = fits and int(judged["failed"]) == 0
         if fits and all(float(judged[f"{name}_p99"] or "nan") <= target for name in quantities):
-            selection.append(row)
-    return min(selection, key=lambda row: time_of(row, unit), default=None)
+            selected_rows.append(row)
+    return min(selected_rows, key=lambda row: time_of(row, unit), default=None)
 
 
 def curve_of(row: Row) -> tuple[str, ...]:
@@ -250,10 +250,10 @@ def table(rows: list[Row]) -> str:
     for method_name, (group, is_for_one_wheel) in TABLE_METHODS.items():
         for target in TARGETS:
             cells = [method_name, f"1e{round(math.log10(target))}"]
-            for selection in (ours, rows):
-                row = best(selection, group, is_for_one_wheel, target)
+            for selected_rows in (ours, rows):
+                row = best(selected_rows, group, is_for_one_wheel, target)
                 if row is None:
-                    tried = best(selection, group, is_for_one_wheel, math.inf) is not None
+                    tried = best(selected_rows, group, is_for_one_wheel, math.inf) is not None
                     cells += ["none" if tried else "not measured", "–"]
                 else:
                     cells += [f"{label_of(row)}, {row['setting']}", format_time(time_of(row, unit))]
@@ -273,7 +273,7 @@ def on_the_front(rows: list[Row]) -> str:
             if group != row["group"]:
                 continue
             error = float(row[f"{quantity}_p99"])
-            selection = [
+            selected_rows = [
                 r
                 for r in rows
                 if r["family"] not in (*SCALAR, "diffrax by hand")
@@ -282,7 +282,7 @@ def on_the_front(rows: list[Row]) -> str:
                 and int(r["failed"]) == 0
                 and float(r[f"{quantity}_p99"] or "inf") <= error
             ]
-            quick = min(selection, key=lambda r: time_of(r, unit))
+            quick = min(selected_rows, key=lambda r: time_of(r, unit))
             ratio = time_of(row, unit) / time_of(quick, unit)
             default = f"{label_of(row)}, {row['setting']}"
             fastest = f"{label_of(quick)}, {quick['setting']}"
@@ -298,7 +298,7 @@ def floors(rows: list[Row]) -> str:
     for quantity, (_, title) in QUANTITIES.items():
         cells = [title]
         for precision in ("float32", "float64"):
-            selection = [
+            selected_rows = [
                 row
                 for row in rows
                 if row["precision"] == precision
@@ -307,7 +307,9 @@ def floors(rows: list[Row]) -> str:
                 and int(row["lanes"]) > 1
                 and "durations" not in row["name"]  # of a step, with wheels handed on
             ]
-            minimum = min(selection, key=lambda row: float(row[f"{quantity}_p99"]), default=None)
+            minimum = min(
+                selected_rows, key=lambda row: float(row[f"{quantity}_p99"]), default=None
+            )
             if minimum is None:
                 cells += ["not measured", "–"]
             else:
@@ -360,7 +362,7 @@ def write_page(
     """Write all methods and quantities into one page with a switch for each."""
     curves_of = []
     for quantity, (_, title) in QUANTITIES.items():
-        for label, selection in curves(rows, quantity).items():
+        for label, selected_rows in curves(rows, quantity).items():
             parts = [f"{quantity}_{part}" for part in ("p50", "p99", "worst")]
             points = [
                 [
@@ -370,7 +372,7 @@ def write_page(
                     int(row["failed"]),
                     of_lanes(row),
                 ]
-                for row in selection
+                for row in selected_rows
                 if int(row["failed"]) < of_lanes(row)
             ]
             look = {"quantity": title, "label": label, "colour": COLOURS[label.split(":")[0]]}
@@ -386,9 +388,9 @@ def draw(rows: list[Row], batches: list[Row], source: str | None = None) -> None
     unit = unit_of(rows)
     with figure_style():
         for name, (quantities, is_row_shown) in CHARTS.items():
-            selection = [row for row in rows if is_row_shown(row)]
+            selected_rows = [row for row in rows if is_row_shown(row)]
             for work, (label, x_of) in works(unit).items():
-                chart = panels(selection, quantities, x_of, label)
+                chart = panels(selected_rows, quantities, x_of, label)
                 save(chart, FIGURES, f"work_precision_{name}_{work}")
         save(batch_chart(batches, rows), FIGURES, "work_precision_batch")
     write_page(rows, FIGURES / "work_precision.html", works(unit))

@@ -128,7 +128,7 @@ def test_the_bar_of_a_resumed_scan_includes_the_earlier_run(
     report = make_scan_progress_reporter(lambda _, **bar_state: result.append(bar_state), 0)
     for done in (0, 1000, 3000):
         report(ScanProgress(n_samples=6_000, n_done=done, n_failed=0, n_reused=4_000))
-    assert [(shown["completed"], shown["total"]) for shown in result] == [
+    assert [(bar_state["completed"], bar_state["total"]) for bar_state in result] == [
         (4_000, 10_000), (5_000, 10_000), (7_000, 10_000),
     ]  # fmt: skip
     assert result[0]["note"] == "4,000 from an earlier run"

@@ -29,7 +29,7 @@ def draw_wheels():
     draw = np.random.default_rng(0).uniform
     params = vrw.WheelParams(damping=draw(20.0, 400.0, N_WHEELS), slope=draw(0.1, 0.34, N_WHEELS))
     limits = (0.05, 0.15), (0.8, 2.2), (-0.3, 0.0)
-    return params, np.stack([draw(*selection, N_WHEELS) for selection in limits], 1)
+    return params, np.stack([draw(*bounds, N_WHEELS) for bounds in limits], 1)
 
 
 def find_walk_ends(friction, stoppers, tolerance):

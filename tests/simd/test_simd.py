@@ -272,8 +272,8 @@ def test_noinline_functions_are_called_and_give_the_same():
 
     lanes = [RANDOM_GENERATOR.normal(size=11) for _ in range(2)]
     called = make_program(cubes(simd.mark_noinline), lanes)([], lanes)
-    for solution, expected in zip(called, cubes(jax.jit)((), lanes), strict=True):
-        np.testing.assert_allclose(solution, expected, rtol=1e-13, atol=1e-13)
+    for called_result, expected in zip(called, cubes(jax.jit)((), lanes), strict=True):
+        np.testing.assert_allclose(called_result, expected, rtol=1e-13, atol=1e-13)
 
 
 def test_integers_and_booleans_compare_and_multiply_as_in_jax():

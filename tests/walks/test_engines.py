@@ -75,7 +75,7 @@ def test_engines_agree_on_outcomes_and_values(results_of_both_engines):
 
 def test_engines_agree_on_derivatives_by_start_and_every_parameter(results_of_both_engines):
     lanes, diffrax = (
-        flatten_derivatives(solution.derivatives) for solution in results_of_both_engines
+        flatten_derivatives(batch_result.derivatives) for batch_result in results_of_both_engines
     )
     scale = 1.0 + np.max(np.abs(diffrax), axis=(1, 2), keepdims=True)
     assert np.max(np.abs(lanes - diffrax) / scale) < 1e-9

@@ -93,26 +93,22 @@ def rows() -> Iterator[Row]:
     for name, n in (("ours", SEGMENTS), ("ours, one segment", 1)):
         (result, _), seconds = time_second_call(lambda n=n: compute_by_segments(n))
         for i, reference in enumerate((1.0, SMALL_MULTIPLIER)):
-            solution, is_known = float(result.values[i].real), bool(result.is_known[i])
+            computed_multiplier, is_known = float(result.values[i].real), bool(result.is_known[i])
             says = "" if is_known else f"not known: uncertainty {result.relative_error[i]:.0e}"
+            error = compute_error(computed_multiplier, reference, relative=True)
             yield Row(
-                f"multiplier "
-                    f"{reference:.1e}", name, solution, reference, compute_error(solution,
-                    reference,
-                    relative=True),
-                says, not is_known, n, seconds, f"Dopri8 1e-13, {n} "
-                    f"segments", version("vrw-jax"),
+                f"multiplier {reference:.1e}", name, computed_multiplier, reference, error, says,
+                not is_known, n, seconds, f"Dopri8 1e-13, {n} segments", version("vrw-jax"),
             )  # fmt: skip
     for name, call, options, package in PEERS:
         (matrix, work), seconds = time_second_call(call)
-        for solution, reference in zip(
+        for computed_multiplier, reference in zip(
             multiply_segments(matrix).real, (1.0, SMALL_MULTIPLIER), strict=True
         ):
-            error = compute_error(float(solution), reference, relative=True)
+            error = compute_error(float(computed_multiplier), reference, relative=True)
             yield Row(
-                f"multiplier {reference:.1e}", name, float(solution), reference, error, "", False,
-                work,
-                seconds, options, version(package),
+                f"multiplier {reference:.1e}", name, float(computed_multiplier), reference, error,
+                "", False, work, seconds, options, version(package),
             )  # fmt: skip
 
 

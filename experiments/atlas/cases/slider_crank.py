@@ -266,10 +266,12 @@ def first_impulses() -> Iterator[Row]:
     free = [(1.0 + RESTITUTION_COEFFICIENT) * float(rate) for rate in y[4:6]]
     result, seconds = time_second_call(lambda: enumerate_lcp_solutions(matrix, free))
     says = "" if result.status == LCPStatus.UNIQUE_SOLUTION else LCPStatus(int(result.status)).name
-    for name, solution in zip(("impulse behind", "impulse ahead"), result.force, strict=True):
+    for name, computed_impulse in zip(
+        ("impulse behind", "impulse ahead"), result.force, strict=True
+    ):
+        error = compute_error(float(computed_impulse), REFERENCE[name])
         yield Row(
-            name, "ours", float(solution), REFERENCE[name], compute_error(float(solution),
-            REFERENCE[name]), says,
+            name, "ours", float(computed_impulse), REFERENCE[name], error, says,
             bool(says), len(result.is_solution), seconds, "complementary", version("vrw-jax"),
         )  # fmt: skip
 
