@@ -321,9 +321,7 @@ class CurveTracer(NamedTuple):
         new_seeds = [
             curve_seed
             for curve_seed in curve_seeds
-            if not any(
-                self._is_on_curve(curve_seed, candidate_curve) for candidate_curve in known_curves
-            )
+            if not any(self._is_on_curve(curve_seed, known_curve) for known_curve in known_curves)
         ]
         quantity_groups = {
             find_test_quantity_group(
@@ -363,8 +361,8 @@ class CurveTracer(NamedTuple):
                     for curve_seed in remaining_seeds
                     if not any(curve_seed is batch_seed for batch_seed in batch_seeds)
                     and not any(
-                        self._is_on_curve(curve_seed, candidate_curve)
-                        for candidate_curve in accepted_curves
+                        self._is_on_curve(curve_seed, accepted_curve)
+                        for accepted_curve in accepted_curves
                     )
                 ]
         return new_curves

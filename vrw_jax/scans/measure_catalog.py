@@ -32,7 +32,11 @@ derivatives.
 
 REQUESTABLE_PAPER_MEASURES = (
     *DIFFERENTIABLE_MEASURES,
-    *(name for name in STEP_MEASURES if name not in (*DIFFERENTIABLE_MEASURES, "outcome")),
+    *(
+        measure_name
+        for measure_name in STEP_MEASURES
+        if measure_name not in (*DIFFERENTIABLE_MEASURES, "outcome")
+    ),
 )
 
 DEFAULT_SCAN_MEASURES = (
@@ -89,7 +93,9 @@ MODEL_SELECTION_MEASURE_CATALOG = MeasureCatalog(
     UNILATERAL_MEASURE_CATALOG.requestable_measures,
     ("outcome", "spectral_radius", *SELECTION_VARIABLE_ATTRIBUTES),
     tuple(
-        name for name in UnilateralFinder.differentiable_measures if name in DIFFERENTIABLE_MEASURES
+        measure_name
+        for measure_name in UnilateralFinder.differentiable_measures
+        if measure_name in DIFFERENTIABLE_MEASURES
     ),
     PARAMETER_NAMES,
     _CONTACT_DEFAULT_MEASURES,

@@ -453,9 +453,9 @@ def _arrange_requested_variables(stored_dataset: xr.Dataset) -> xr.Dataset:
         else read_scan_manifest(stored_dataset.attrs).get("measures", [])
     )
     requested_name_by_variable = {
-        canonicalize_variable_name(variable_name): variable_name
-        for variable_name in reversed(requested_measures)
-        if canonicalize_variable_name(variable_name) in stored_dataset
+        canonicalize_variable_name(requested_measure): requested_measure
+        for requested_measure in reversed(requested_measures)
+        if canonicalize_variable_name(requested_measure) in stored_dataset
     }
     requested_variable_names = list(
         dict.fromkeys(map(canonicalize_variable_name, requested_measures))
