@@ -79,7 +79,7 @@ from vrw_jax.tolerance import (
     measure_to_tolerance,
     multifidelity_mean,
 )
-from vrw_jax.tuning import TuneResult, tune
+from vrw_jax.tuning import TuneResult, WheelObjective, tune
 from vrw_jax.validation import (
     PRESENT_PACKAGE_NAME_BY_OLD_NAME,
     describe_renamed_attribute,
@@ -123,6 +123,7 @@ __all__ = (
     "UnilateralWheel",
     "ViscoelasticWheel",
     "Walk",
+    "WheelObjective",
     "WheelParams",
     "basin",
     "basin_share",

@@ -346,3 +346,42 @@ def test_unilateral_tuning_keeps_the_slip_within_its_bound():
     (active,) = tuned.active
     assert (active.name, active.limit) == ("slip", pytest.approx(0.06))
     assert active.price > 0.0
+
+
+def estimate_log_life(params: vrw.WheelParams) -> jnp.ndarray:
+    """Return the logarithm of the mean number of steps on random slopes."""
+    return jnp.log(vrw.first_passage(params, 0.01, n_walkers=4096, tol=0.03).mean_steps)
+
+
+def test_tuning_raises_the_mean_number_of_steps_on_random_slopes():
+    """A second estimate with another seed confirms the life of the tuned wheel."""
+    bounds = {"damping": (190.0, 202.0)}
+    objective = vrw.WheelObjective(estimate_log_life)
+    tuned = vrw.tune(vrw.WheelParams(), objective, ["damping"], bounds)
+    assert tuned.status == TuneStatus.CONVERGED
+    assert [constraint.name for constraint in tuned.active] == ["damping"]
+    assert float(tuned.params.damping) == 190.0
+    passage = vrw.first_passage(tuned.params, 0.01, seed=7)
+    relative_error = 0.03 + float(passage.error / passage.mean_steps)
+    assert abs(np.exp(tuned.value) / float(passage.mean_steps) - 1.0) < relative_error
+    assert tuned.value - tuned.start_value > 1.0  # 205 steps instead of 61
+    assert tuned.objective == "estimate_log_life"
+
+
+@pytest.mark.parametrize(
+    ("wheel_function", "choices", "sentence"),
+    [
+        (lambda params: params.damping, {"n_starts": 4}, "n_starts is 4, but a WheelObjective"),
+        (lambda params: jnp.ones(2) * params.damping, {}, "returns an array of shape"),
+        (lambda params: "life", {}, "objective is 'life'"),
+    ],
+)
+def test_bad_wheel_objectives_are_one_sentence(wheel_function, choices, sentence):
+    with pytest.raises((TypeError, ValueError), match=sentence):
+        vrw.tune(
+            vrw.WheelParams(),
+            vrw.WheelObjective(wheel_function),
+            ["damping"],
+            {"damping": (190.0, 202.0)},
+            **choices,
+        )

@@ -4,6 +4,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
@@ -51,6 +53,68 @@ class CycleObjective:
 
 
 @dataclass(frozen=True)
+class WheelObjective:
+    """Objective of `tune` that a function computes from the parameters of the wheel.
+
+    `tune` calls the function with the `WheelParams` of each trial wheel, and does not compile the
+    function. The function may therefore sample walks, as `first_passage` does. JAX differentiates
+    the function with respect to the free parameters.
+
+    - `wheel_function`: function of `WheelParams` that returns one number.
+
+    Examples:
+        >>> life = lambda params: jnp.log(vrw.first_passage(params, 0.01).mean_steps)
+        >>> bounds = {"damping": (190.0, 205.0)}
+        >>> tuned = vrw.tune(vrw.WheelParams(), vrw.WheelObjective(life), ["damping"], bounds)
+        >>> float(tuned.params.damping)
+        190.0
+    """
+
+    wheel_function: Callable[[WheelParams], Any]
+
+    @property
+    def label(self) -> str:
+        """Return the name of the function, or "objective" if the function has no name."""
+        return getattr(self.wheel_function, "__name__", "objective")
+
+    def evaluate_with_gradient(
+        self, params: WheelParams, free_parameters: Sequence[str]
+    ) -> tuple[float, np.ndarray]:
+        """Return the objective of a wheel, and its derivatives with respect to the free parameters,
+        shape (free,).
+        """
+        select_free_values = lambda wheel_params: [
+            getattr(wheel_params, parameter_name) for parameter_name in free_parameters
+        ]
+
+        def evaluate_free_values(free_values: list[Array]) -> Array:
+            objective_value = self.wheel_function(
+                eqx.tree_at(select_free_values, params, free_values)
+            )
+            _check_objective_value(objective_value)
+            return jnp.asarray(objective_value)
+
+        objective_value, free_gradient = jax.value_and_grad(evaluate_free_values)(
+            select_free_values(params)
+        )
+        return float(objective_value), np.array(free_gradient, float)
+
+
+def _check_objective_value(objective_value: Any) -> None:
+    """Raise an error if the value of an objective is not one real number."""
+    if jnp.shape(check_reals("objective", objective_value, "return one number")):
+        raise ValueError(
+            f"objective returns an array of shape {jnp.shape(objective_value)}, but what is "
+            "maximised is one number: reduce it, as by jnp.min or jnp.sum."
+        )
+
+
+def zero_objective(cycle: AbstractCycle, step: Any) -> Array:
+    """Return 0 for any gait, in place of an objective that is not compiled."""
+    return jnp.zeros(())
+
+
+@dataclass(frozen=True)
 class ObjectiveAndConstraints:
     """Function that returns the objective and the constraints of a gait as one array, objective
     first.
@@ -65,11 +129,7 @@ class ObjectiveAndConstraints:
 
     def __call__(self, cycle: AbstractCycle, step: Any) -> Array:
         objective_value = self.objective_function(cycle, step)
-        if jnp.shape(check_reals("objective", objective_value, "return one number")):
-            raise ValueError(
-                f"objective returns an array of shape {jnp.shape(objective_value)}, but what is "
-                "maximised is one number: reduce it, as by jnp.min or jnp.sum."
-            )
+        _check_objective_value(objective_value)
         constraint_values = []
         for constraint_name in self.constraint_names:
             measure_name = constraint_name.removeprefix(UPPER_BOUND_PREFIX)

@@ -61,10 +61,12 @@ from vrw_jax.tuning.objective import (
     GaitEvaluation,
     ObjectiveAndConstraints,
     WeightedMeasureSum,
+    WheelObjective,
     compute_max_violation,
     compute_slack_scales,
     parse_constraint_margins,
     restore_sign_of_bound,
+    zero_objective,
 )
 from vrw_jax.tuning.tune_result import ActiveConstraint, TuneResult, WalkValidation
 from vrw_jax.validation import (
@@ -86,7 +88,7 @@ from vrw_jax.wheel import (
     check_parameter_name,
 )
 
-ObjectiveSpecification = str | Mapping[str, float] | Callable[..., Array]
+ObjectiveSpecification = str | Mapping[str, float] | Callable[..., Array] | WheelObjective
 
 
 @dataclasses.dataclass(frozen=True)
@@ -134,16 +136,17 @@ def tune(
     first-order optimizer steps improve all starts in one batch, and the maximization continues from
     the best.
 
-    With unilateral contact (`UnilateralWheel`) the objective is a measure of a step or a weighted
-    sum of measures. A walk from the start finds the first gait. There are no default constraints,
-    and constraints are on measures of a step, for example {"slip": (0.0, 0.05)}. The model "auto"
-    is the model that is selected for the gait of the start. If this is the paper's model, its
-    margins are the constraints, so that the model stays valid.
+    With unilateral contact (`UnilateralWheel`) the objective is a measure of a step, a weighted sum
+    of measures, or a `WheelObjective`. A walk from the start finds the first gait. There are no
+    default constraints, and constraints are on measures of a step, for example
+    {"slip": (0.0, 0.05)}. The model "auto" is the model that is selected for the gait of the start.
+    If this is the paper's model, its margins are the constraints, so that the model stays valid.
 
     Args:
         params: the start, one wheel.
         objective: quantity to maximize: name of a measure, weights of measures by name, or a
             function of a LimitCycle. A function of two arguments also gets the cycle's StepResult.
+            A `WheelObjective` is a function of the wheel that is not compiled.
         free: names of the parameters that may change.
         bounds: lower and upper bound of each free parameter.
         constraints: lower bounds of measures by name, or pairs of lower and upper bounds, of which
@@ -172,6 +175,11 @@ def tune(
     max_evaluations = check_int("max_evaluations", max_evaluations)
     n_starts = check_int("n_starts", n_starts)
     tolerance, seed = check_positive("tolerance", tolerance), check_int("seed", seed, 0)
+    if isinstance(objective, WheelObjective) and n_starts > 1:
+        raise ValueError(
+            f"n_starts is {n_starts}, but a WheelObjective cannot be evaluated for a batch of "
+            "wheels: give n_starts=1, and call vrw.tune for each start."
+        )
     start_seconds = time.perf_counter()
     tune_problem = make_tune_problem(
         params,
@@ -216,6 +224,7 @@ class TuneProblem:
     objective_label: str
     objective_and_constraints: ObjectiveAndConstraints
     gait_finder: AbstractGaitFinder
+    wheel_objective: WheelObjective | None = None
     validation_options: WalkValidationOptions = WalkValidationOptions()
 
     @property
@@ -353,10 +362,16 @@ class TuneProblem:
     ) -> EvaluatedTrial:
         """Return the trial for a gait whose objective and constraints have been evaluated."""
         objective_and_constraint_values = np.array(gait_evaluation.objective_and_constraint_values)
-        free_parameter_jacobian = (
-            np.array(gait_evaluation.parameter_jacobian)[self.free_parameter_indices].T
-            * self.bound_widths
-        )
+        free_parameter_jacobian = np.array(gait_evaluation.parameter_jacobian)[
+            self.free_parameter_indices
+        ].T
+        if self.wheel_objective is not None and gait_outcome == Outcome.STEPPED and is_on_branch:
+            objective_and_constraint_values[0], free_parameter_jacobian[0] = (
+                self.wheel_objective.evaluate_with_gradient(
+                    self.make_wheel(normalized_parameters), self.free_parameters
+                )
+            )
+        free_parameter_jacobian = free_parameter_jacobian * self.bound_widths
         if gait_outcome != Outcome.STEPPED:
             objective_and_constraint_values, free_parameter_jacobian = (
                 np.full_like(objective_and_constraint_values, np.nan),
@@ -644,7 +659,7 @@ class TuneProblem:
         }
         path_dataset_attributes = {
             "title": f"Path of tuning {self.objective_label} over "
-            "{', '.join(self.free_parameters)}",
+            f"{', '.join(self.free_parameters)}",
             "free": " ".join(
                 self.free_parameters
             ),  # It is a text because netCDF has no lists of names.
@@ -711,6 +726,7 @@ def make_tune_problem(
             gait_finder.model.take_step, params, section_state_template, gait_finder.step_options
         )
         jax.eval_shape(objective_and_constraints, cycle_template, step_result_template)
+    wheel_objective = objective if isinstance(objective, WheelObjective) else None
     return TuneProblem(
         params,
         free_parameters,
@@ -720,13 +736,19 @@ def make_tune_problem(
         objective_label,
         objective_and_constraints,
         gait_finder,
+        wheel_objective,
     )
 
 
 def _parse_objective_function(
     objective: ObjectiveSpecification, gait_finder: AbstractGaitFinder
 ) -> tuple[GaitFunction, str]:
-    """Return the objective as a function, and its label."""
+    """Return the objective as a function of the cycle and the step, and its label.
+
+    The function returns 0 if the objective is a `WheelObjective`.
+    """
+    if isinstance(objective, WheelObjective):
+        return zero_objective, objective.label
     if not (callable(objective) or isinstance(objective, str | Mapping)):
         raise TypeError(
             f"objective is {format_value(objective)}, but it is a measure's name, weights of "
