@@ -21,7 +21,7 @@ import vrw_jax as vrw
 from experiments.shared import tables
 from experiments.shared.command import make_parser, parse_and_start_jax
 from experiments.shared.failure_counts import NORMAL_QUANTILE, count_failures
-from vrw_jax.robustness.first_passage import SAMPLED_STEP_TOLERANCE, PassageStatus
+from vrw_jax.robustness.first_passage import PassageStatus
 from vrw_jax.robustness.sampled_passage import PassageSamplingOptions, WalkerGroups, sample_passage
 
 PAGE = tables.DOCS / "benchmarks" / "first_passage.md"
@@ -47,6 +47,9 @@ REFERENCE_OPTIONS = PassageSamplingOptions(
     negligible_ground_line_effect=1e-3, min_forgetting_steps=12
 )
 """Options of the second sampling, chosen so that more lines are biased and more steps forgotten."""
+REFERENCE_STEP_TOLERANCE = 1e-6
+"""Relative and absolute tolerance of gait steps in references, chosen because it is a tenth of the
+tolerance of `first_passage`."""
 SLOW_RADIUS = 0.7
 """Spectral radius above which the effect of the start decays slowly."""
 
@@ -58,7 +61,12 @@ def count_reference(
     n_failures = min((NORMAL_QUANTILE / REFERENCE_ERROR) ** 2, MAX_COUNTED_STEPS / mean_steps)
     n_forgetting_steps = int(np.clip(np.log(1e-3) / np.log(radius), 12, 100))
     count = count_failures(
-        params, slope_sd, int(n_failures), seed=seed, n_forgetting_steps=n_forgetting_steps
+        params,
+        slope_sd,
+        int(n_failures),
+        seed=seed,
+        n_forgetting_steps=n_forgetting_steps,
+        step_tolerance=REFERENCE_STEP_TOLERANCE,
     )
     return count.mean_steps, count.relative_error
 
@@ -72,7 +80,7 @@ def sample_reference(
         np.asarray(gait.section_state),
         slope_sd,
         vrw.ViscoelasticWheel(),
-        vrw.StepOptions(rtol=SAMPLED_STEP_TOLERANCE, atol=SAMPLED_STEP_TOLERANCE),
+        vrw.StepOptions(rtol=REFERENCE_STEP_TOLERANCE, atol=REFERENCE_STEP_TOLERANCE),
         16384,
         np.random.default_rng(seed),
         REFERENCE_OPTIONS,

@@ -38,18 +38,20 @@ def count_failures(
     seed: int,
     n_forgetting_steps: int = 12,
     n_walkers: int = 16384,
+    step_tolerance: float = SAMPLED_STEP_TOLERANCE,
 ) -> FailureCount:
     """Return a count for walks of the paper's model, with at least `n_failures` failures.
 
     The walks run side by side, and all begin at the gait. A failed walk continues as a copy of
     another one, so that the walks have the quasi-stationary distribution after `n_forgetting_steps`
-    steps. The count begins then.
+    steps. The count begins then. The relative and absolute tolerance of gait steps is
+    `step_tolerance`.
     """
     random, mean_slope = np.random.default_rng(seed), float(params.slope)
     gait_state = np.asarray(vrw.limit_cycle(params).section_state)
     states = np.tile(gait_state, (n_walkers, 1))
     slopes = np.full(n_walkers, mean_slope)
-    options = vrw.StepOptions(rtol=SAMPLED_STEP_TOLERANCE, atol=SAMPLED_STEP_TOLERANCE)
+    options = vrw.StepOptions(rtol=step_tolerance, atol=step_tolerance)
     n_failed, n_rounds = 0, 0
     while n_failed < n_failures:
         next_slopes = mean_slope + slope_sd * random.standard_normal(n_walkers)

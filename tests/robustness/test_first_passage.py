@@ -1,5 +1,7 @@
 """First passage: published values, extended precision, counts, gradients and bad input."""
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import numpy as np
@@ -13,6 +15,7 @@ from vrw_jax.robustness.sampled_passage import (
     PassageSamplingOptions,
     WalkerGroups,
     _estimate_failure_probability,
+    _estimate_kappa_2,
     sample_passage,
 )
 
@@ -201,7 +204,7 @@ def test_the_error_keeps_its_level_although_the_error_ends_the_sampling():
     n_covered, n_rounds = 0, 0
     for _ in range(n_estimates):
         groups.n_steps = 0
-        estimate, error = _estimate_failure_probability(
+        estimate, error, _ = _estimate_failure_probability(
             groups,
             draw_weights,
             1,
@@ -216,6 +219,73 @@ def test_the_error_keeps_its_level_although_the_error_ends_the_sampling():
     assert n_covered >= 0.99 * n_estimates
     # With a known variance, (2.576 * 0.2 / tol)^2 / 32 = 21 rounds have this error.
     assert n_rounds < 2.5 * 21 * n_estimates
+
+
+def test_sampling_ends_if_the_effect_of_the_start_exceeds_the_tolerance():
+    """More walks from the same walkers cannot reduce this effect."""
+    random, tol, decay_factor, n_steps = np.random.default_rng(0), 0.02, 0.9, 20
+    groups = WalkerGroups(BYL, np.zeros(1), 0.01, RIGID, vrw.StepOptions(), 32, random)
+    start_effect = decay_factor ** (n_steps + 1)  # 0.11
+
+    def run_rounds(are_walkers_advanced):
+        groups.n_steps = 0
+
+        def draw_weights():
+            groups.n_steps += 1
+            return 1e-3 * (1.0 + 0.01 * random.standard_normal(groups.n_groups))
+
+        _, error, remaining_effect = _estimate_failure_probability(
+            groups,
+            draw_weights,
+            1,
+            start_effect_decay=(decay_factor, n_steps),
+            relative_tolerance=tol,
+            max_steps=10_000,
+            sampling_options=dataclasses.replace(
+                PASSAGE_SAMPLING_OPTIONS, min_effective_failures=1.0
+            ),  # Each of 32 weights per round is one failure.
+            are_walkers_advanced=are_walkers_advanced,
+        )
+        return error, remaining_effect, groups.n_steps
+
+    error, remaining_effect, n_rounds = run_rounds(are_walkers_advanced=False)
+    assert remaining_effect == pytest.approx(start_effect)
+    assert start_effect < error < start_effect + tol
+    assert n_rounds == PASSAGE_SAMPLING_OPTIONS.min_sampling_rounds
+    # If each round advances the walkers, the mean effect over the rounds decays.
+    error, remaining_effect, n_rounds = run_rounds(are_walkers_advanced=True)
+    mean_effect = start_effect * (1.0 - decay_factor**n_rounds) / (1.0 - decay_factor) / n_rounds
+    assert remaining_effect == pytest.approx(mean_effect)
+    assert error <= tol
+
+
+@pytest.mark.parametrize("n_walkers", [256, 512, 4096])
+def test_kappa_2_of_many_components_with_outliers_is_that_of_the_linear_map(n_walkers):
+    """Twenty components with Student's noise, of which the slowest decays by 0.8 per step.
+
+    With 512 walkers, a projection on all quadratic functions gives 0.94 to 3.9.
+    """
+    random, decay_factors = np.random.default_rng(0), np.linspace(0.8, 0.0, 20)
+    states, step_transitions = random.standard_normal((n_walkers, 21)), []
+    for i_step in range(24):
+        slope_deviations = random.standard_normal(n_walkers)
+        noise = random.standard_t(3.0, (n_walkers, 20))
+        next_components = decay_factors * states[:, :20] + noise + slope_deviations[:, None]
+        next_states = np.concatenate([next_components, slope_deviations[:, None]], 1)
+        if i_step >= 20:
+            is_alive = np.ones(n_walkers, bool)
+            step_transitions.append((states, is_alive, slope_deviations, next_states))
+        states = next_states
+    assert _estimate_kappa_2(step_transitions, 20) == pytest.approx(0.8, abs=0.06)
+
+
+def test_kappa_2_is_unknown_if_its_estimate_exceeds_kappa_1():
+    """The second eigenvalue of an operator is not larger than the first."""
+    random, n_walkers = np.random.default_rng(0), 256
+    states, slope_deviations = random.standard_normal((n_walkers, 3)), np.zeros(n_walkers)
+    is_alive = random.random(n_walkers) < 0.5
+    transition = states, is_alive, slope_deviations, 3.0 * states
+    assert np.isnan(_estimate_kappa_2([transition], 2))
 
 
 def test_a_mean_that_few_walks_dominate_has_no_error_estimate():

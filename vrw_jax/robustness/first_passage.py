@@ -43,12 +43,12 @@ from vrw_jax.wheel import PARAMETER_NAMES, Outcome, WheelParams
 MAX_QUADRATURE_NODES = 3200
 """Largest number n of quadrature nodes, chosen because an n by n matrix then takes 80 MB."""
 
-SAMPLED_STEP_TOLERANCE = 1e-6
+SAMPLED_STEP_TOLERANCE = 1e-5
 """Relative and absolute tolerance of sampled gait steps without unilateral contact.
 
-The value is chosen because the error of an event time is then only a ten-thousandth of its standard
-deviation over random slopes. With unilateral contact and infinite friction, one step in a thousand
-would end with a spurious Painlevé paradox at this tolerance.
+The value is chosen because the error of a section state is then only a ten-thousandth of its
+standard deviation over random slopes. With unilateral contact and infinite friction, one step in a
+thousand would end with a spurious Painlevé paradox even at tolerances of 1e-6.
 """
 
 SAMPLED_TRACING_REMEDY = "take jax.grad of a function that is not compiled"
@@ -65,6 +65,10 @@ class PassageStatus(StatusCode):
         3,
         "The error is unknown: sampled walks miss failures, or a few of them dominate the mean.",
     )
+    START_NOT_FORGOTTEN = (
+        4,
+        "The effect of the start exceeds the tolerance: allow more walkers or a larger error.",
+    )
 
 
 class FirstPassage(AbstractPrintable):
@@ -78,10 +82,11 @@ class FirstPassage(AbstractPrintable):
     - `failure_probability`: probability 1 - kappa_1 that a step from the quasi-stationary
       distribution fails;
     - `kappa_2`: second eigenvalue, the factor per step by which the effect of the start decays. If
-      walks are sampled, its error is some hundredths;
+      walks are sampled, its error is some hundredths. It is NaN if more walkers are needed for an
+      estimate;
     - `error`: error estimate of `mean_steps`. If walks are sampled, it is half the width of a 99 %
-      confidence interval. It is infinite if the sampled walks miss failures, or if a few walks
-      dominate the mean;
+      confidence interval, plus the effect of the start. It is infinite if the sampled walks miss
+      failures, if a few walks dominate the mean, or if `kappa_2` is NaN;
     - `states`: states of the quasi-stationary distribution. For quadrature, they are squared
       angular rates at the instant at which the stance leg is vertical, 1/s^2, shape (n, 1). For
       sampled walks, they are section states with the slope as last component;
@@ -177,18 +182,20 @@ def first_passage(
     `jax.grad` of a sampled mean returns first derivatives with an error of a few percent. A walk
     fails beyond a radius in the space of slopes, and this radius is a smooth function of the
     parameters. The derivatives neglect terms of the relative size 1/`mean_steps`. They are computed
-    from concrete values, so `jit`, `vmap` and `tune` do not accept sampled means.
+    from concrete values, so `jit` and `vmap` do not accept sampled means. A `WheelObjective` passes
+    them to `tune`.
 
     Args:
         params: parameters of the wheel; the slope is the mean slope.
         slope_sd: standard deviation of the slopes, rad.
         model: model of the wheel; by default the paper's, `ViscoelasticWheel()`.
-        options: numerical options of sampled gait steps; by default rtol and atol are 1e-6, or with
+        options: numerical options of sampled gait steps; by default rtol and atol are 1e-5, or with
             unilateral contact those of `StepOptions()`.
         seed: seed of the random slopes.
         n_nodes: initial number of quadrature nodes, doubled until the relative error is at most
             `tol`.
-        n_walkers: number of walks that are simulated at the same time.
+        n_walkers: number of walks that are simulated at the same time, rounded up to 32 times a
+            power of two.
         tol: relative error of `mean_steps`; by default 1e-8 for quadrature and 0.02 for sampled
             walks.
         max_steps: number of sampled gait steps after which no further walks begin.
@@ -401,6 +408,8 @@ def _estimate_passage_by_sampling(
     )
     if not np.isfinite(sampled_passage.relative_error):
         passage_status = PassageStatus.UNKNOWN_ERROR
+    if sampled_passage.start_effect > relative_tolerance:
+        passage_status = PassageStatus.START_NOT_FORGOTTEN
     passage_status = passage_status if failure_probability else PassageStatus.NO_FAILURE
     convert_to_float_array = lambda float_values: jnp.asarray(float_values, params.damping.dtype)
     first_passage_result = FirstPassage(

@@ -169,7 +169,12 @@ def _draw_failing_walks(
         effective_number_of_walks < n_walks
         and len(sampling_rounds) < gradient_options.max_sampling_rounds
     ):
-        sampling_rounds.append(run_biased_walks(walker_groups, walk_density))
+        drawn_deviations = walk_density.draw_samples(
+            len(walker_groups.states), walker_groups.random
+        )
+        sampling_rounds.append(
+            (drawn_deviations, run_biased_walks(walker_groups, walk_density, drawn_deviations))
+        )
         slope_deviations, failure_importance_weights = map(
             np.concatenate, zip(*sampling_rounds, strict=True)
         )

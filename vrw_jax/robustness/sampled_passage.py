@@ -49,9 +49,9 @@ class PassageSamplingOptions:
 
     The value is chosen because fits in more dimensions need more samples.
     """
-    min_failures_for_counting: float = 0.2
-    """Expected number of failures over the biased lines above which failures are counted without
-    bias.
+    min_failures_for_counting: float = 0.35
+    """Expected number of failures over the lines that affect a state, above which failures are
+    counted without bias.
 
     The value is chosen because counting and importance sampling then need equally many steps.
     """
@@ -60,8 +60,7 @@ class PassageSamplingOptions:
     decayed.
     """
     max_forgetting_steps: int = 100
-    """Largest number of gait steps after which the effect of the start is considered to have
-    decayed.
+    """Largest number of gait steps after which walks from the gait begin to be sampled.
 
     The value is chosen because gaits with slower decay are almost unstable.
     """
@@ -71,11 +70,22 @@ class PassageSamplingOptions:
     The value is chosen because more rounds are needed only if most walks fail within three steps.
     """
     n_kappa_2_steps: int = 4
-    """Number of gait steps whose states before and after the step are used to estimate kappa_2."""
-    min_sampling_rounds: int = 4
+    """Smallest number of gait steps whose states before and after the step are used to estimate
+    kappa_2.
+
+    If the effect of the start decays slowly, the second half of all steps is used.
+    """
+    min_transitions_per_regressor: float = 25.0
+    """Smallest number of transitions per regressor in a regression on quadratic functions.
+
+    The value is chosen because the eigenvalues of a wheel with unilateral contact, which has 250
+    quadratic regressors, then vary by a few hundredths. With 8 transitions per regressor, many
+    eigenvalues exceed 1.
+    """
+    min_sampling_rounds: int = 2
     """Smallest number of rounds, each with one walk per walker.
 
-    The value is chosen because the error estimate of fewer rounds is uncertain.
+    The value is chosen because most wheels then pass the first error test.
     """
     n_rounds_safety_factor: float = 1.2
     """Ratio of the number of rounds before the next error test to the number that is expected to
@@ -115,9 +125,15 @@ class PassageSamplingOptions:
     confidence_level: float = 0.99
     """Confidence level of the error estimate.
 
-    An error test compares the error with the tolerance. The interval of error test k misses the
-    mean with the probability (1 - `confidence_level`)/2^k. These probabilities sum to
-    1 - `confidence_level`, so that the level holds although the error decides when sampling ends.
+    An error test compares the error with the tolerance. The probability that the interval of an
+    error test misses the mean is a fraction of 1 - `confidence_level`. The fractions of all error
+    tests sum to 1, so that the level holds although the error decides when sampling ends.
+    """
+    first_error_test_fractions: tuple[float, ...] = (0.45, 0.45)
+    """Fractions of the miss probability 1 - `confidence_level` for the first two error tests.
+
+    Each later error test has half of the remaining fraction. The values are chosen because nearly
+    all wheels pass one of the first two tests.
     """
 
 
@@ -145,9 +161,10 @@ class SampledPassage(NamedTuple):
     """Results of `sample_passage`: first-passage times that sampled walks estimate."""
 
     failure_probability: float  # of one step from the quasi-stationary distribution
-    relative_error: float  # of the mean; half a confidence interval plus the start's effect
+    relative_error: float  # of the mean; half a confidence interval plus `start_effect`
+    start_effect: float  # relative effect of the start of the walks on the mean
     mean_steps_from_gait: float
-    kappa_2: float
+    kappa_2: float  # NaN if the walkers are too few for an estimate
     quasi_stationary_states: np.ndarray  # with the slope as last component, (n, components)
     fraction_by_outcome: dict[str, float]
     n_sampled_steps: int
@@ -182,7 +199,8 @@ class WalkerGroups:
             options.n_walker_groups,
             int(model.count_continuous_entries(params)),
         )
-        n_walkers_per_group = -(-n_walkers // self.n_groups)
+        # A digital net has a power of two points.
+        n_walkers_per_group = 1 << (-(-n_walkers // self.n_groups) - 1).bit_length()
         self.states = self.gait_states = np.tile(
             section_state, (self.n_groups * n_walkers_per_group, 1)
         )
@@ -286,52 +304,78 @@ def sample_passage(
     Raises:
         ExtinctGroupError: if no walker of a group survives a step.
     """
-    count_decay_steps = lambda remaining_start_effect: int(
-        np.ceil(np.log(remaining_start_effect) / np.log(np.clip(spectral_radius, 0.01, 0.99)))
+    count_decay_steps = lambda remaining_start_effect, decay_factor: int(
+        np.ceil(np.log(remaining_start_effect) / np.log(np.clip(decay_factor, 0.01, 0.99)))
     )
-    forgetting_step_limits = (
-        sampling_options.min_forgetting_steps,
-        sampling_options.max_forgetting_steps,
+    n_biased_ground_lines = min(
+        count_decay_steps(sampling_options.negligible_ground_line_effect, spectral_radius),
+        sampling_options.max_biased_ground_lines,
     )
+    max_start_effect = sampling_options.max_start_effect_per_tol * relative_tolerance
     n_forgetting_steps = int(
         np.clip(
-            count_decay_steps(sampling_options.max_start_effect_per_tol * relative_tolerance),
-            *forgetting_step_limits,
+            count_decay_steps(max_start_effect, spectral_radius),
+            sampling_options.min_forgetting_steps,
+            sampling_options.max_forgetting_steps,
         )
     )
     surviving_fractions, step_transitions = _step_until_start_is_forgotten(
         walker_groups, n_forgetting_steps, relative_tolerance, sampling_options
     )
-    is_walker_alive = step_transitions[-1][1]
-    kappa_2 = _estimate_kappa_2(
-        step_transitions[-sampling_options.n_kappa_2_steps :], walker_groups.n_continuous_entries
-    )
+    while True:
+        n_forgetting_steps = len(step_transitions)
+        late_transitions = step_transitions[
+            -max(sampling_options.n_kappa_2_steps, n_forgetting_steps // 2) :
+        ]
+        kappa_1 = float(np.mean([is_walker_alive for _, is_walker_alive, _, _ in late_transitions]))
+        kappa_2 = _estimate_kappa_2(
+            late_transitions, walker_groups.n_continuous_entries, sampling_options
+        )
+        # The effect of the start, divided by the survival probability, decays by this factor.
+        start_effect_factor = 1.0 if np.isnan(kappa_2) else max(kappa_2 / kappa_1, spectral_radius)
+        # The number of steps is at most doubled, because more transitions improve kappa_2.
+        n_missing_steps = (
+            min(
+                count_decay_steps(max_start_effect, start_effect_factor)
+                + 1
+                - n_biased_ground_lines,
+                sampling_options.max_forgetting_steps,
+                2 * n_forgetting_steps,
+            )
+            - n_forgetting_steps
+        )
+        if n_missing_steps <= 0:
+            break
+        for _ in range(n_missing_steps):
+            step_transitions.append(_record_transition(walker_groups))
+            surviving_fractions = np.append(
+                surviving_fractions, surviving_fractions[-1] * np.mean(step_transitions[-1][1])
+            )
     walker_groups.weight_by_outcome.clear()
-    n_biased_ground_lines = min(
-        count_decay_steps(sampling_options.negligible_ground_line_effect),
-        sampling_options.max_biased_ground_lines,
-    )
     walk_density = GaussianMixture.make_isotropic_gaussian(n_biased_ground_lines, 1.0)
     estimate_probability = functools.partial(
         _estimate_failure_probability,
         walker_groups,
-        start_effect_decay=(max(kappa_2, spectral_radius), n_forgetting_steps - 1),
+        start_effect_decay=(start_effect_factor, n_forgetting_steps - 1),
         relative_tolerance=relative_tolerance,
         max_steps=max_steps,
         sampling_options=sampling_options,
     )
     count_failures = lambda: (~walker_groups.step_and_replace_failures()[0]).astype(float)
-    failure_probability, relative_error = 0.0, np.inf
+    failure_probability, relative_error, start_effect = 0.0, np.inf, 0.0
+    n_effective_lines = count_decay_steps(
+        sampling_options.negligible_ground_line_effect, start_effect_factor
+    )
     are_failures_counted = (
-        n_biased_ground_lines * np.mean(~is_walker_alive)
+        n_effective_lines * np.mean(~step_transitions[-1][1])
         > sampling_options.min_failures_for_counting
     )
     if not are_failures_counted:
         failure_density = _fit_density_of_failures(walker_groups, n_biased_ground_lines)
         if failure_density is not None:
             walk_density = failure_density
-            failure_probability, relative_error = estimate_probability(
-                lambda: run_biased_walks(walker_groups, walk_density)[1], n_biased_ground_lines
+            failure_probability, relative_error, start_effect = estimate_probability(
+                _make_weight_sampler(walker_groups, walk_density), n_biased_ground_lines
             )
             if np.isfinite(relative_error) and _has_missed_failures(
                 walker_groups, failure_probability * (1.0 + relative_error), sampling_options
@@ -344,7 +388,11 @@ def sample_passage(
         )
     if are_failures_counted:
         walker_groups.weight_by_outcome.clear()
-        failure_probability, relative_error = estimate_probability(count_failures, 1)
+        failure_probability, relative_error, start_effect = estimate_probability(
+            count_failures, 1, are_walkers_advanced=True
+        )
+    if np.isnan(kappa_2):
+        relative_error = np.inf
     mean_steps_from_gait = np.inf
     if failure_probability > 0.0:
         mean_steps_from_gait = float(
@@ -354,6 +402,7 @@ def sample_passage(
     return SampledPassage(
         failure_probability=failure_probability,
         relative_error=relative_error,
+        start_effect=start_effect,
         mean_steps_from_gait=mean_steps_from_gait,
         kappa_2=kappa_2,
         quasi_stationary_states=walker_groups.stack_states_and_slopes(),
@@ -378,35 +427,50 @@ def _estimate_failure_probability(
     relative_tolerance: float,
     max_steps: int,
     sampling_options: PassageSamplingOptions,
-) -> tuple[float, float]:
-    """Return the failure probability of a gait step, and the relative error of that probability.
+    are_walkers_advanced: bool = False,
+) -> tuple[float, float, float]:
+    """Return the failure probability of a gait step, the relative error of that probability, and
+    the part of this error that is the effect of the start.
 
     A round samples one walk per walker. After the first rounds, and after each further number of
     rounds that is expected to suffice, the error is compared with the tolerance. The error is
-    infinite if a few walks dominate the probability.
+    infinite if a few walks dominate the probability. Sampling also ends if the effect of the start
+    exceeds the tolerance and further rounds cannot reduce this effect.
 
     - `failure_weight_sampler`: function that returns the weight of each walk of a round, which is 0
       unless the walk fails in its last step;
     - `n_ground_lines`: number of lines of the ground in each walk;
     - `start_effect_decay`: factor per step by which the effect of the start decays, and number of
-      steps before the walks.
+      steps before the walks;
+    - `are_walkers_advanced`: whether each round advances the walkers by one step, so that later
+      rounds are affected less by the start.
     """
     from scipy import stats  # This import is slow.
 
+    first_fractions = sampling_options.first_error_test_fractions
+
     def compute_student_t_quantile(error_test_number: int) -> float:
-        miss_probability = (1.0 - sampling_options.confidence_level) / 2.0**error_test_number
+        n_later_tests = error_test_number - len(first_fractions)
+        miss_fraction = (
+            (1.0 - sum(first_fractions)) / 2.0**n_later_tests
+            if n_later_tests > 0
+            else first_fractions[error_test_number - 1]
+        )
+        miss_probability = (1.0 - sampling_options.confidence_level) * miss_fraction
         return float(stats.t.isf(0.5 * miss_probability, walker_groups.n_groups - 1))
 
     weight_sum_by_group, n_sampling_rounds = np.zeros(walker_groups.n_groups), 0
     failure_weight_sum, squared_weight_sum, n_failing_walks = 0.0, 0.0, 0
     failure_probability, relative_error = 0.0, np.inf
-    remaining_start_effect = start_effect_decay[0] ** (start_effect_decay[1] + n_ground_lines)
+    start_effect_factor, n_steps_before_walks = start_effect_decay
+    start_effect = start_effect_factor ** (n_steps_before_walks + n_ground_lines)
     n_error_tests, n_rounds_at_error_test = 0, sampling_options.min_sampling_rounds
-    while n_error_tests == 0 or (
+    while n_sampling_rounds == 0 or (
         relative_error > relative_tolerance and walker_groups.n_steps < max_steps
     ):
         while n_sampling_rounds < n_rounds_at_error_test and (
-            n_error_tests == 0 or walker_groups.n_steps < max_steps
+            n_sampling_rounds < sampling_options.min_sampling_rounds
+            or walker_groups.n_steps < max_steps
         ):
             failure_importance_weights = failure_weight_sampler()
             weight_sum_by_group += failure_importance_weights.reshape(
@@ -416,7 +480,6 @@ def _estimate_failure_probability(
             squared_weight_sum += float(np.sum(failure_importance_weights**2))
             n_failing_walks += int(np.sum(failure_importance_weights > 0.0))
             n_sampling_rounds += 1
-        n_error_tests += 1
         n_rounds_at_error_test = 2 * n_sampling_rounds
         if failure_weight_sum == 0.0:
             continue
@@ -428,20 +491,30 @@ def _estimate_failure_probability(
         if n_effective_failures < (
             sampling_options.min_effective_failure_fraction * n_failing_walks
         ):
-            return failure_probability, np.inf
+            return failure_probability, np.inf, start_effect
         if n_effective_failures < sampling_options.min_effective_failures:
             continue
+        n_error_tests += 1
         relative_standard_error = (
             error_amplification
             * np.std(weight_sum_by_group, ddof=1)
             / np.sqrt(walker_groups.n_groups)
             / np.mean(weight_sum_by_group)
         )
+        if are_walkers_advanced:
+            start_effect = float(
+                np.mean(
+                    start_effect_factor
+                    ** (n_steps_before_walks + n_ground_lines + np.arange(n_sampling_rounds))
+                )
+            )
         relative_error = float(
-            compute_student_t_quantile(n_error_tests) * relative_standard_error
-            + remaining_start_effect
+            compute_student_t_quantile(n_error_tests) * relative_standard_error + start_effect
         )
-        tolerated_sampling_error = relative_tolerance - remaining_start_effect
+        tolerated_sampling_error = relative_tolerance - start_effect
+        can_start_effect_decay = are_walkers_advanced and start_effect_factor < 1.0
+        if tolerated_sampling_error <= 0.0 and not can_start_effect_decay:
+            break
         if tolerated_sampling_error > 0.0:
             sampling_error_ratio = (
                 compute_student_t_quantile(n_error_tests + 1)
@@ -457,7 +530,23 @@ def _estimate_failure_probability(
                     )
                 )
             )
-    return failure_probability, relative_error
+    return failure_probability, relative_error, start_effect
+
+
+def _record_transition(walker_groups: WalkerGroups) -> tuple[np.ndarray, ...]:
+    """Simulate one gait step of every walker, replace failed walkers, and return the transition.
+
+    The transition is a tuple of states before the step, survival, deviations of the slopes on which
+    the step ends, and states after the step. States have the slope as last component.
+    """
+    states_before_step = walker_groups.stack_states_and_slopes()
+    is_walker_alive, slope_deviations = walker_groups.step_and_replace_failures()
+    return (
+        states_before_step,
+        is_walker_alive,
+        slope_deviations,
+        walker_groups.stack_states_and_slopes(),
+    )
 
 
 def _step_until_start_is_forgotten(
@@ -467,13 +556,12 @@ def _step_until_start_is_forgotten(
     sampling_options: PassageSamplingOptions,
 ) -> tuple[np.ndarray, list[tuple[np.ndarray, ...]]]:
     """Return the fractions of walks from the gait that survive 0, 1, ..., `n_steps` gait steps, and
-    the transitions of the walkers.
+    the transitions of the walkers in each of these steps.
 
-    The fractions have the shape (n_steps + 1,). The transitions are those that `_estimate_kappa_2`
-    describes. All walkers start on the gait and take `n_steps` steps. These rounds are repeated
-    until the last fraction is accurate. The walkers then have the quasi-stationary distribution.
-    The product of the surviving fractions of successive steps has no bias, although survivors
-    replace failed walkers (Del Moral 2004).
+    The fractions have the shape (n_steps + 1,). All walkers start on the gait and take `n_steps`
+    steps. These rounds are repeated until the last fraction is accurate. The product of the
+    surviving fractions of successive steps has no bias, although survivors replace failed walkers
+    (Del Moral 2004).
     """
     from scipy import stats  # This import is slow.
 
@@ -488,18 +576,7 @@ def _step_until_start_is_forgotten(
         or relative_variance_sum > max_relative_variance * len(surviving_fractions_by_round) ** 2
     ):
         walker_groups.restart_at_gait()
-        step_transitions.clear()
-        for _ in range(n_steps):
-            states_before_step = walker_groups.stack_states_and_slopes()
-            is_walker_alive, slope_deviations = walker_groups.step_and_replace_failures()
-            step_transitions.append(
-                (
-                    states_before_step,
-                    is_walker_alive,
-                    slope_deviations,
-                    walker_groups.stack_states_and_slopes(),
-                )
-            )
+        step_transitions = [_record_transition(walker_groups) for _ in range(n_steps)]
         alive_walker_fractions = np.array(
             [np.mean(step_transition[1]) for step_transition in step_transitions]
         )
@@ -571,17 +648,47 @@ def _has_missed_failures(
     )
 
 
-def run_biased_walks(
+def _make_weight_sampler(
     walker_groups: WalkerGroups, walk_density: GaussianMixture
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the slope deviations and failure weights of one walk from every walker.
+) -> Callable[[], np.ndarray]:
+    """Return a function that runs one walk from every walker and returns the failure weights.
 
-    The slope deviations, shape (walkers, lines), are drawn from `walk_density`. The weight of a
-    walk, shape (walkers,), is the likelihood ratio if the walk fails in its last step, and 0
-    otherwise. The mean weight is the probability of a failure in the last step.
+    The slope deviations of each group come from a randomized digital net (Owen 1997), which fills
+    the space of slopes more evenly than independent numbers. Each point of the net is uniformly
+    distributed, so that estimates have no bias. The nets of different groups are independent.
     """
-    n_ground_lines = walk_density.gaussian_means.shape[1]
-    slope_deviations = walk_density.draw_samples(len(walker_groups.states), walker_groups.random)
+    from scipy.stats import qmc  # This import is slow.
+
+    random_generator, n_ground_lines = walker_groups.random, walk_density.gaussian_means.shape[1]
+    group_nets = [
+        qmc.Sobol(1 + n_ground_lines, rng=random_generator) for _ in range(walker_groups.n_groups)
+    ]
+    n_walkers_per_group = len(walker_groups.states) // walker_groups.n_groups
+
+    def sample_failure_weights() -> np.ndarray:
+        # The permutation lets each walker meet all parts of the space of slopes.
+        net_points = np.concatenate(
+            [random_generator.permutation(net.random(n_walkers_per_group)) for net in group_nets]
+        )
+        return run_biased_walks(
+            walker_groups, walk_density, walk_density.map_uniform_numbers(net_points)
+        )
+
+    return sample_failure_weights
+
+
+def run_biased_walks(
+    walker_groups: WalkerGroups, walk_density: GaussianMixture, slope_deviations: np.ndarray
+) -> np.ndarray:
+    """Return the failure weights of one walk from every walker, shape (walkers,).
+
+    The weight of a walk is the likelihood ratio if the walk fails in its last step, and 0
+    otherwise. The mean weight is the probability of a failure in the last step.
+
+    - `walk_density`: density from which the slope deviations are drawn;
+    - `slope_deviations`: standardized deviations of the slopes, shape (walkers, lines).
+    """
+    n_ground_lines = slope_deviations.shape[1]
     walk_results = walker_groups.run_walks(slope_deviations)
     has_failed_in_last_step = (walk_results.outcome != Outcome.STEPPED) & (
         walk_results.n_stepped == n_ground_lines - 1
@@ -593,7 +700,7 @@ def run_biased_walks(
     )
     failure_importance_weights = np.where(has_failed_in_last_step, likelihood_ratios, 0.0)
     walker_groups.add_failure_weights(walk_results.outcome, failure_importance_weights)
-    return slope_deviations, failure_importance_weights
+    return failure_importance_weights
 
 
 def _solve_failure_probability(
@@ -618,7 +725,9 @@ def _solve_failure_probability(
 
 
 def _estimate_kappa_2(
-    step_transitions: Sequence[tuple[np.ndarray, ...]], n_continuous_entries: int
+    step_transitions: Sequence[tuple[np.ndarray, ...]],
+    n_continuous_entries: int,
+    sampling_options: PassageSamplingOptions = PASSAGE_SAMPLING_OPTIONS,
 ) -> float:
     """Return kappa_2, the second eigenvalue of the survival operator's projection on quadratic
     functions.
@@ -627,10 +736,11 @@ def _estimate_kappa_2(
     2015). Hermite polynomials of the slope deviations have a mean of zero in any state. As
     regressors, they remove most of the noise. In the limit of equal slopes, the eigenvalue becomes
     the leading multiplier of the gait. With unilateral contact, sampled states have many components
-    and outliers, so that a quadratic projection may overfit. A linear projection then replaces it.
+    and outliers. If transitions are too few for a quadratic projection, or if its second eigenvalue
+    exceeds kappa_1, a linear projection replaces it. The result is NaN if the second eigenvalue of
+    the linear projection exceeds kappa_1 too, because no second eigenvalue exceeds the leading one.
 
-    - `step_transitions`: arrays for each gait step: states before the step, survival, deviations of
-      the slopes on which the step ends, and states after the step;
+    - `step_transitions`: transitions that `_record_transition` returns, one for each gait step;
     - `n_continuous_entries`: number of continuous components of a section state.
     """
     states_before_step, is_walker_alive, landing_deviations, states_after_step = (
@@ -662,7 +772,10 @@ def _estimate_kappa_2(
     )
 
     def project_second_eigenvalue(has_quadratic_features: bool) -> float:
-        """Return the modulus of the second eigenvalue, projected on polynomials of the state."""
+        """Return the modulus of the second eigenvalue, projected on polynomials of the state.
+
+        The result is NaN if there are too few transitions, or if it exceeds kappa_1.
+        """
 
         def evaluate_state_features(states: np.ndarray) -> np.ndarray:
             z = standardize_states(states) @ principal_directions.T
@@ -677,9 +790,6 @@ def _estimate_kappa_2(
             )
 
         state_features_before_step = evaluate_state_features(states_before_step)
-        state_features_after_step = np.where(
-            is_walker_alive[:, None], evaluate_state_features(states_after_step), 0.0
-        )
         linear_state_features = state_features_before_step[:, : 1 + len(principal_directions)]
         regressor_matrix = np.concatenate(
             [
@@ -688,15 +798,23 @@ def _estimate_kappa_2(
             ],
             1,
         )
+        if has_quadratic_features and len(regressor_matrix) < (
+            sampling_options.min_transitions_per_regressor * regressor_matrix.shape[1]
+        ):
+            return np.nan
+        state_features_after_step = np.where(
+            is_walker_alive[:, None], evaluate_state_features(states_after_step), 0.0
+        )
         regression_coefficients = np.linalg.lstsq(
-            regressor_matrix, state_features_after_step, rcond=None
+            regressor_matrix.T @ regressor_matrix,
+            regressor_matrix.T @ state_features_after_step,
+            rcond=None,
         )[0]
         projected_eigenvalues = np.linalg.eigvals(
             regression_coefficients[: state_features_before_step.shape[1]]
         )
-        return float(np.sort(np.abs(projected_eigenvalues))[-2])
+        second_modulus = float(np.sort(np.abs(projected_eigenvalues))[-2])
+        return second_modulus if second_modulus < np.mean(is_walker_alive) else np.nan
 
     kappa_2 = project_second_eigenvalue(has_quadratic_features=True)
-    # No second eigenvalue exceeds the leading one, which is near the survival probability.
-    is_overfitted = kappa_2 > np.mean(is_walker_alive)
-    return project_second_eigenvalue(has_quadratic_features=False) if is_overfitted else kappa_2
+    return project_second_eigenvalue(has_quadratic_features=False) if np.isnan(kappa_2) else kappa_2
