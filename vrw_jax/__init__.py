@@ -81,7 +81,7 @@ from vrw_jax.tolerance import (
 )
 from vrw_jax.tuning import TuneResult, WheelObjective, tune
 from vrw_jax.validation import (
-    PRESENT_PACKAGE_NAME_BY_OLD_NAME,
+    NEW_PUBLIC_NAME_BY_OLD_NAME,
     describe_renamed_attribute,
     format_name_suggestion,
 )
@@ -179,7 +179,7 @@ def __getattr__(name: str) -> Any:
         return importlib.metadata.version("vrw-jax")
     if name == "plot":  # imports matplotlib only if figures are drawn
         return importlib.import_module("vrw_jax.figures")
-    if sentence := describe_renamed_attribute("vrw_jax", name, PRESENT_PACKAGE_NAME_BY_OLD_NAME):
+    if sentence := describe_renamed_attribute("vrw_jax", name, NEW_PUBLIC_NAME_BY_OLD_NAME):
         raise AttributeError(sentence)
     raise AttributeError(
         f"vrw_jax has no {name!r}{format_name_suggestion(name, __all__)}: dir(vrw_jax) lists what "

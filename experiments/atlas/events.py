@@ -145,7 +145,7 @@ def step_by_isolated_roots(created: tuple, params: vrw.WheelParams, starts: np.n
     landing = transitions.resolve_landing(params.symbols(), *starts.T)
     stays = np.asarray(landing.is_rear_foot_planted)
     posture = np.stack(
-        [landing.theta_after, *landing.motion_after[2:]], 1
+        [landing.theta_after_landing, *landing.motion_after[2:]], 1
     )  # theta, L1, L2 and rates
     outcomes, durations, ends = np.zeros(len(starts), int), *np.zeros((2, len(starts), 3))
     for lane, values in enumerate(packed):

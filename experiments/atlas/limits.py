@@ -17,14 +17,14 @@ from experiments.atlas.events import START, Rows
 from experiments.shared.timing import measure_cpu_seconds
 from experiments.speed import peers
 from vrw_jax import Outcome
-from vrw_jax.hybrid import MonitoredFunctions, integrate_phase
+from vrw_jax.hybrid import GuardsAndMargins, integrate_phase
 from vrw_jax.models.viscoelastic import make_diffrax_phase
 from vrw_jax.wheel import (
     Motion,
     Symbols,
     compute_landing_foot_height,
     dynamics,
-    make_phases,
+    make_paper_phases,
     transitions,
 )
 
@@ -100,12 +100,12 @@ def step_with_leg(
     s = params.symbols()
     landing = transitions.resolve_landing(s, *x)
     is_requested = jnp.asarray(True)
-    phases = make_phases(s, landing.foot_distance, stop_at_lift_off=True)
+    phases = make_paper_phases(s, landing.foot_distance, stop_at_lift_off=True)
     dls, sls1, sls2 = (make_diffrax_phase(phase, records_margins=False) for phase in phases)
     run = lambda phase, y: integrate_phase(
         phase.vector_field, phase.guards, y, is_requested, options
     )
-    first = run(dls, jnp.stack([landing.theta_after, landing.motion_after.dtheta]))
+    first = run(dls, jnp.stack([landing.theta_after_landing, landing.motion_after.dtheta]))
     m = dls.motion_unpacker(first.state)
     state = jnp.stack([first.state[0], m.L1, m.L2, m.dtheta, m.dL1, m.dL2])
     if leg == "full":
@@ -119,14 +119,14 @@ def step_with_leg(
         def guards(y: jax.Array) -> jax.Array:
             return jnp.stack([s.L0 - y[2], compute_landing_foot_height(s, full(y)), y[3]])
 
-        second = integrate_phase(rates, MonitoredFunctions(guards, 3), start, is_requested, options)
+        second = integrate_phase(rates, GuardsAndMargins(guards, 3), start, is_requested, options)
         motion = full(second.state)
     hit = transitions.resolve_stopper_collision(s, motion).motion_after
     third = run(sls2, jnp.stack([second.state[0], hit.L1, hit.dtheta, hit.dL1]))
     theta, _, dtheta, dL1 = third.state
     durations = jnp.stack([first.duration, second.duration, third.duration])
     joined_values = jnp.concatenate([jnp.stack([theta, dtheta, dL1]), durations])
-    return joined_values, second.solver_steps, second.guard
+    return joined_values, second.solver_steps, second.end_guard_index
 
 
 def first_order() -> Rows:
@@ -141,7 +141,10 @@ def first_order() -> Rows:
         params = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (LANES,)), params)
         landing = transitions.resolve_landing(params.symbols(), *START)
         y = np.stack(
-            [landing.theta_after + 0.0 * landing.motion_after.dtheta, landing.motion_after.dtheta],
+            [
+                landing.theta_after_landing + 0.0 * landing.motion_after.dtheta,
+                landing.motion_after.dtheta,
+            ],
             1,
         )[:1]
         reference = peers.Heyoka(1e-15)(y, peers.pack(params)[:1])[0, :6]
@@ -246,10 +249,10 @@ def upright_rate(slope: float, start: np.ndarray) -> float:
     """Rate at which double support leaves its upright equilibrium, 1/s; NaN without one."""
     s = vrw.WheelParams(**SLOW_WALK_PARAMETERS, slope=slope).symbols()
     landing = transitions.resolve_landing(s, *start)
-    double_support = make_phases(s, landing.foot_distance, stop_at_lift_off=True)[0]
+    double_support = make_paper_phases(s, landing.foot_distance, stop_at_lift_off=True)[0]
     field = make_diffrax_phase(double_support, records_margins=False).vector_field
     push = jax.jit(lambda theta: field(jnp.stack([theta, 0.0 * theta]))[1])
-    places = float(landing.theta_after) + np.linspace(0.0, 1.0, 2001)
+    places = float(landing.theta_after_landing) + np.linspace(0.0, 1.0, 2001)
     rises = np.diff(np.sign(np.asarray(jax.vmap(push)(jnp.asarray(places))))) > 0
     if not np.any(rises):
         return np.nan

@@ -55,7 +55,10 @@ def measure_over_rates() -> Rows:
         params = vrw.WheelParams(**{name: np.full(1, x) for name, x in wheel.items()})
         landing = transitions.resolve_landing(params.symbols(), *START)
         y = np.stack(
-            [landing.theta_after + 0.0 * landing.motion_after.dtheta, landing.motion_after.dtheta],
+            [
+                landing.theta_after_landing + 0.0 * landing.motion_after.dtheta,
+                landing.motion_after.dtheta,
+            ],
             1,
         )
         packed = peers.pack(params)

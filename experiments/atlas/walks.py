@@ -10,9 +10,9 @@ import numpy as np
 
 import vrw_jax as vrw
 from vrw_jax import Outcome
-from vrw_jax.hybrid import MonitoredFunctions, PhaseEnd, integrate_phase
+from vrw_jax.hybrid import GuardsAndMargins, PhaseEnd, integrate_phase
 from vrw_jax.models.viscoelastic import DiffraxPhaseFunctions, make_diffrax_phase
-from vrw_jax.wheel import Motion, dynamics, make_phases, transitions
+from vrw_jax.wheel import Motion, dynamics, make_paper_phases, transitions
 
 REFERENCE = Path(__file__).parents[2] / "tests" / "reference_code"
 BLOCK = 1000
@@ -34,8 +34,8 @@ def with_damping(
     s = params.symbols()
     power = lambda y: dynamics.compute_damping_power(s, phase.motion_unpacker(y))
     field = lambda y: jnp.append(phase.vector_field(y[:-1]), power(y[:-1]))
-    watched = MonitoredFunctions(
-        lambda y: phase.guards.evaluate_monitored(y[:-1]), phase.guards.n_guards
+    watched = GuardsAndMargins(
+        lambda y: phase.guards.evaluate_guards_and_margins(y[:-1]), phase.guards.n_guards
     )
     zero = 0.0 * start[:1]
     end = integrate_phase(
@@ -53,9 +53,9 @@ def accounted_step(params: vrw.WheelParams, x: jax.Array, options: vrw.StepOptio
     s = params.symbols()
     before = transitions.compute_motion_before_landing(s, *x)
     landing = transitions.resolve_landing(s, *x)
-    phases = make_phases(s, landing.foot_distance, stop_at_lift_off=True)
+    phases = make_paper_phases(s, landing.foot_distance, stop_at_lift_off=True)
     dls, sls1, sls2 = (make_diffrax_phase(phase, records_margins=False) for phase in phases)
-    start = jnp.stack([landing.theta_after, landing.motion_after.dtheta])
+    start = jnp.stack([landing.theta_after_landing, landing.motion_after.dtheta])
     first, lost_1, m = with_damping(dls, start, params, options)
     start = jnp.stack([first.state[0], m.L1, m.L2, m.dtheta, m.dL1, m.dL2])
     second, lost_2, m = with_damping(sls1, start, params, options)
@@ -66,7 +66,8 @@ def accounted_step(params: vrw.WheelParams, x: jax.Array, options: vrw.StepOptio
     third, lost_3, m = with_damping(sls2, start, params, options)
     ends = first, second, third
     outcomes = [
-        p.select_guard_outcome(e.guard, e.is_timed_out) for p, e in zip(phases, ends, strict=True)
+        p.select_guard_outcome(e.end_guard_index, e.is_timed_out)
+        for p, e in zip(phases, ends, strict=True)
     ]
     step_result = jnp.all(jnp.stack(outcomes) == Outcome.STEPPED)
     theta, _, dtheta, dL1, _ = third.state

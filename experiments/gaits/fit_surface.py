@@ -18,7 +18,7 @@ import vrw_jax as vrw
 from experiments.shared.command import make_parser, parse_and_start_jax
 from vrw_jax.cycles import collocation_search as search
 from vrw_jax.cycles import gait_surface as surface
-from vrw_jax.numerics import apply_in_blocks
+from vrw_jax.numerics import apply_function_in_blocks
 from vrw_jax.wheel import PARAMETER_NAMES, make_wheel_from_parameters, stack_parameters
 
 PARAMETER_BOX = {
@@ -52,7 +52,7 @@ def find_gaits_by_continuation(
             problem, parameters, start, table_1_parameters, stages, limit, pending
         )
 
-    return jax.jit(apply_in_blocks(search_from_table_1, 64))(parameters)
+    return jax.jit(apply_function_in_blocks(search_from_table_1, 64))(parameters)
 
 
 def main() -> None:

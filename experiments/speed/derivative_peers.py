@@ -26,7 +26,9 @@ COLUMNS = 7
 def compute_landing(rows: np.ndarray, states: np.ndarray) -> np.ndarray:
     """Return theta, its rate and the distance of the feet after the landing, for each lane."""
     landing = transitions.resolve_landing(make_wheels(rows).symbols(), *np.asarray(states).T)
-    return np.stack([landing.theta_after, landing.motion_after.dtheta, landing.foot_distance], 1)
+    return np.stack(
+        [landing.theta_after_landing, landing.motion_after.dtheta, landing.foot_distance], 1
+    )
 
 
 def compute_landing_with_tangents(
@@ -37,7 +39,7 @@ def compute_landing_with_tangents(
     def one(given: jax.Array) -> jax.Array:
         landing = transitions.resolve_landing(make_wheels(given[3:]).symbols(), *given[:3])
         return jax.numpy.stack(
-            [landing.theta_after, landing.motion_after.dtheta, landing.foot_distance]
+            [landing.theta_after_landing, landing.motion_after.dtheta, landing.foot_distance]
         )
 
     columns = jax.jit(jax.vmap(jax.jacfwd(one)))(np.concatenate([states, rows], 1))

@@ -104,7 +104,7 @@ def by_peer(function, side_by_side=False):
             order = order_wheels_by_work(columns, states)
             params, states, back = make_wheels(rows[order]), states[order], np.argsort(order)
         landing = transitions.resolve_landing(params.symbols(), *np.asarray(states).T)
-        starts = np.asarray(np.stack([landing.theta_after, landing.motion_after.dtheta], 1))
+        starts = np.asarray(np.stack([landing.theta_after_landing, landing.motion_after.dtheta], 1))
         packed = peers.pack(params)
         return lambda: function(starts, packed)[back, :6]
 

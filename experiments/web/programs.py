@@ -122,7 +122,10 @@ def programs(n_legs: int) -> dict[str, Program]:
         step = make_step_result(walk_result, friction, "lanes")
         motion = []
         for phase, start, end in zip(
-            walk_result.phases, walk_result.phase_starts, walk_result.phase_ends, strict=True
+            walk_result.phases,
+            walk_result.phase_start_states,
+            walk_result.phase_end_results,
+            strict=True,
         ):
             flow = make_batch_phase(phase, records_margins=False)
             sampled_states = sample_batch_phase(

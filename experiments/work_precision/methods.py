@@ -27,7 +27,7 @@ from experiments.shared.wheels import PARAMETER_BOX, make_wheels
 from experiments.speed import peers
 from vrw_jax.integrator import load_explicit_tableau
 from vrw_jax.models.viscoelastic import make_diffrax_phase
-from vrw_jax.wheel import make_phases, transitions
+from vrw_jax.wheel import make_paper_phases, transitions
 
 VARIED_PARAMETERS = tuple(PARAMETER_BOX)
 Run = Callable[[], np.ndarray]
@@ -135,7 +135,7 @@ def by_diffeqsolve(solver: diffrax.AbstractAdaptiveSolver, fixed: bool) -> Calla
             solver, 0.0, 20.0, setting if fixed else 5e-3, y,
             stepsize_controller=controller,
             event=diffrax.Event(
-                lambda t, y, args, **_: phase.guards.evaluate_monitored(y)[0],
+                lambda t, y, args, **_: phase.guards.evaluate_guards_and_margins(y)[0],
                 root_finder, direction=False,
             ),
             max_steps=20_000, throw=False,
@@ -150,10 +150,10 @@ def by_diffeqsolve(solver: diffrax.AbstractAdaptiveSolver, fixed: bool) -> Calla
     def one(row: jax.Array, x: jax.Array, setting: jax.Array) -> jax.Array:
         s = make_wheels(row).symbols()
         landing = transitions.resolve_landing(s, *x)
-        phases = make_phases(s, landing.foot_distance, stop_at_lift_off=True)
+        phases = make_paper_phases(s, landing.foot_distance, stop_at_lift_off=True)
         dls, sls1, sls2 = (make_diffrax_phase(phase, records_margins=False) for phase in phases)
         y, first_time, n1 = until(
-            dls, jnp.stack([landing.theta_after, landing.motion_after.dtheta]), setting
+            dls, jnp.stack([landing.theta_after_landing, landing.motion_after.dtheta]), setting
         )
         m = dls.motion_unpacker(y)
         start = jnp.stack([y[0], m.L1, m.L2, m.dtheta, m.dL1, m.dL2])
@@ -185,7 +185,7 @@ def compute_landing(params: vrw.WheelParams, states: np.ndarray) -> np.ndarray:
 @jax.jit
 def _compute_landing_columns(params: vrw.WheelParams, states: jax.Array) -> jax.Array:
     landing = transitions.resolve_landing(params.symbols(), *states.T)
-    return jnp.stack([landing.theta_after, landing.motion_after.dtheta], 1)
+    return jnp.stack([landing.theta_after_landing, landing.motion_after.dtheta], 1)
 
 
 def peer_steps(name: str, tolerance: float) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
@@ -257,7 +257,7 @@ def cycle_of_map(row: jax.Array, start: jax.Array, options: vrw.StepOptions) -> 
 
     def section(y: jax.Array) -> jax.Array:
         landing = transitions.resolve_landing(s, *y)
-        return jnp.stack([landing.theta_after, landing.motion_after.dtheta])
+        return jnp.stack([landing.theta_after_landing, landing.motion_after.dtheta])
 
     fixed_point = vrw.solve_fixed_point(
         lambda x: model.advance(params, x, options).section_state,

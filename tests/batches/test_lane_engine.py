@@ -320,7 +320,7 @@ def integrate_free_flight(start, rate, acceleration=1.0, options=None):
         zero + 5e-3,
         options,
     )
-    return end.guard[0], end.duration[0]
+    return end.end_guard_index[0], end.duration[0]
 
 
 def test_a_guard_that_dips_below_zero_within_one_step_is_found():

@@ -20,7 +20,7 @@ from vrw_jax.continuation.arclength import (
 )
 from vrw_jax.continuation.sign_changes import locate_function_roots
 from vrw_jax.figures.branch_figures import branch_figure
-from vrw_jax.hybrid.minima import MonitoredFunctions
+from vrw_jax.hybrid.minima import GuardsAndMargins
 from vrw_jax.hybrid.phase_integration import integrate_phase
 
 RADIUS_AT_200 = 0.32861954  # Table 1: published for orientation beside the physics
@@ -293,13 +293,15 @@ def make_simplest_walker(options):
         theta, dtheta = x
         start = jnp.stack([theta, 2.0 * theta, dtheta, (1.0 - jnp.cos(2.0 * theta)) * dtheta])
         going = jnp.asarray(True)
-        past = MonitoredFunctions(lambda y: jnp.stack([y[0] - MIDSTANCE]), 1)
-        strike = MonitoredFunctions(lambda y: jnp.stack([2.0 * y[0] - y[1]]), 1)
+        past = GuardsAndMargins(lambda y: jnp.stack([y[0] - MIDSTANCE]), 1)
+        strike = GuardsAndMargins(lambda y: jnp.stack([2.0 * y[0] - y[1]]), 1)
         middle = integrate_phase(field(slope), past, start, going, options)
-        end = integrate_phase(field(slope), strike, middle.state, middle.guard == 0, options)
+        end = integrate_phase(
+            field(slope), strike, middle.state, middle.end_guard_index == 0, options
+        )
         theta, _, dtheta, _ = end.state
         after = jnp.stack([-theta, jnp.cos(2.0 * theta) * dtheta])
-        walk_result = (end.guard == 0) & (end.duration > 0.0)
+        walk_result = (end.end_guard_index == 0) & (end.duration > 0.0)
         return jnp.where(walk_result, after, jnp.nan), middle.duration + end.duration
 
     return walk

@@ -10,7 +10,7 @@ from support import reference_values
 from support.batched import NAMES, compute_full_steps, compute_states_and_work
 
 import vrw_jax as vrw
-from vrw_jax.wheel import Motion, compute_rear_foot_height, dynamics, make_phases, transitions
+from vrw_jax.wheel import Motion, compute_rear_foot_height, dynamics, make_paper_phases, transitions
 
 STARTS = reference_values.stack_quantity("step", "start")
 
@@ -80,7 +80,7 @@ def test_planted_feet_do_not_move_in_double_support(theta, dtheta, distance):
     s = vrw.WheelParams().symbols()
 
     def rear_foot(angle):
-        phase = make_phases(s, jnp.asarray(distance), True)[0]
+        phase = make_paper_phases(s, jnp.asarray(distance), True)[0]
         m = phase.compute_motion((angle,), (jnp.asarray(dtheta),))
         rear = jnp.stack([jnp.sin(angle + s.alpha), jnp.cos(angle + s.alpha)])
         return m.L1 * jnp.stack([m.sin_theta, m.cos_theta]) - m.L2 * rear
@@ -96,7 +96,7 @@ def test_both_feet_are_at_rest_after_a_landing_that_holds_them():
     m = landing.motion_after
 
     def height(t):
-        theta = landing.theta_after + t * m.dtheta
+        theta = landing.theta_after_landing + t * m.dtheta
         shifted = Motion.from_angle(
             theta, m.L1 + t * m.dL1, m.L2 + t * m.dL2, m.dtheta, m.dL1, m.dL2
         )

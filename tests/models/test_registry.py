@@ -18,7 +18,7 @@ class PointFeetWheel(vrw.AbstractWheel):
     capabilities: ClassVar[ModelCapabilities] = ModelCapabilities(
         config_name="point_feet",
         gait_method=GaitMethod.RETURN_MAP,
-        accepted_commands=frozenset({"branch"}),
+        accepted_cli_commands=frozenset({"branch"}),
     )
     parameter_names: ClassVar[tuple[str, ...]] = PARAMETER_NAMES
     reports_contacts: ClassVar[bool] = False
@@ -62,7 +62,7 @@ def test_a_new_model_in_the_registry_is_known_to_configurations_and_messages(mon
 
 @pytest.mark.parametrize("model_class", REGISTERED_MODEL_CLASSES, ids=lambda entry: entry.__name__)
 def test_each_model_declares_known_commands(model_class):
-    assert model_class.capabilities.accepted_commands <= {
+    assert model_class.capabilities.accepted_cli_commands <= {
         "scan",
         "map",
         "tune",

@@ -33,7 +33,7 @@ from vrw_jax.contact.mechanics import (
     compute_potential_energy,
 )
 from vrw_jax.contact.section import unpack_section_state
-from vrw_jax.hybrid.minima import MonitoredFunctions
+from vrw_jax.hybrid.minima import GuardsAndMargins
 from vrw_jax.hybrid.phase_integration import integrate_phase
 from vrw_jax.wheel import ContactMode
 
@@ -345,7 +345,7 @@ def test_a_single_leg_bounces_as_a_damped_oscillator():
         make_contact_state((ContactMode.STICK, ContactMode.OFF), [False] + [True] * 7),
     )
     lift = make_guard_layout(8, False).first_liftoff_guard
-    watched = MonitoredFunctions(lambda y: compute_guard_values(flow, y)[lift : lift + 1], 1)
+    watched = GuardsAndMargins(lambda y: compute_guard_values(flow, y)[lift : lift + 1], 1)
     start = pack_state(motion, LossAccumulators(zero, zero, zero, zero))
     end = integrate_phase(
         partial(evaluate_vector_field, flow), watched, start, jnp.asarray(True), TIGHT_OPTIONS

@@ -24,7 +24,7 @@ from vrw_jax.hybrid.program_cache import (
     MAX_CACHED_PROGRAMS,
     _program_by_key,
     call_compiled_program,
-    find_program,
+    get_compiled_program,
 )
 
 GRAVITY = 9.81
@@ -162,6 +162,6 @@ def test_a_closure_over_a_differentiated_or_mapped_value_shares_no_program():
 def test_at_most_the_stated_number_of_programs_is_kept():
     scale = lambda static, x: static * x
     for factor in range(2 * MAX_CACHED_PROGRAMS):
-        program = find_program(scale, float(factor), 2.0)
+        program = get_compiled_program(scale, float(factor), 2.0)
         assert float(program(2.0)) == 2.0 * factor
         assert len(_program_by_key) <= MAX_CACHED_PROGRAMS

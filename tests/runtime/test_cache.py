@@ -110,7 +110,7 @@ GARBAGE = [
 def test_garbage_with_a_valid_digest_is_compiled_anew(folder, process, kind, what):
     multiples()
     for place in folder.glob(f"{kind}_*"):
-        store.save_bytes(place.stem, OBJECTS[what](store.load_bytes(place.stem)))
+        store.save_cache_record(place.stem, OBJECTS[what](store.load_cache_record(place.stem)))
     process.reset_registry()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -160,9 +160,9 @@ def test_another_users_records_are_not_used(folder, process, monkeypatch):
     monkeypatch.setattr(os, "geteuid", lambda: owner)
     with pytest.warns(UserWarning, match="belongs to another user, but"):
         assert store.find_cache_folder() is None
-    assert store.load_bytes(next(folder.glob("lanes_code_*")).stem) is None
+    assert store.load_cache_record(next(folder.glob("lanes_code_*")).stem) is None
     monkeypatch.setenv(store.TRUST_SHARED_CACHE_VARIABLE, "1")
-    assert store.load_bytes(next(folder.glob("lanes_code_*")).stem)
+    assert store.load_cache_record(next(folder.glob("lanes_code_*")).stem)
 
 
 def test_a_trace_of_other_versions_is_not_used(folder, monkeypatch):
@@ -185,7 +185,7 @@ def test_a_record_that_can_t_be_written_whole_leaves_nothing(folder, monkeypatch
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(os, "fsync", full)
-    store.save_bytes("lanes_code_x", b"content")
+    store.save_cache_record("lanes_code_x", b"content")
     assert not list(folder.iterdir())
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import vrw_jax as vrw
-from vrw_jax.numerics.cached_programs import call_through_saved_trace
+from vrw_jax.numerics.cached_programs import wrap_with_saved_trace
 from vrw_jax.runtime.start import make_fusion_emitter_options
 
 
@@ -77,17 +77,17 @@ def test_a_cached_trace_is_reused_and_gives_the_same_values(cache_folder):
     expected = function(x, y)["sum"]
     traces.clear()
     for _ in range(2):  # each as another process would: nothing is remembered but on disk
-        result = jax.jit(lambda x, y: call_through_saved_trace(function, "ours")(x, y)["sum"])(x, y)
+        result = jax.jit(lambda x, y: wrap_with_saved_trace(function, "ours")(x, y)["sum"])(x, y)
         np.testing.assert_array_equal(result, expected)
     assert len(traces) == 1
-    jax.jit(lambda x, y: call_through_saved_trace(function, "other settings")(x, y)["sum"])(x, y)
-    jax.jit(lambda x, y: call_through_saved_trace(function, "ours")(x, y)["sum"])(x[:2], y[:2])
+    jax.jit(lambda x, y: wrap_with_saved_trace(function, "other settings")(x, y)["sum"])(x, y)
+    jax.jit(lambda x, y: wrap_with_saved_trace(function, "ours")(x, y)["sum"])(x[:2], y[:2])
     assert len(traces) == 3
 
 
 def test_a_damaged_trace_is_traced_again(cache_folder):
     function, traces = make_counted_function()
-    call = lambda x: call_through_saved_trace(function, "ours")(x, x)["sum"]
+    call = lambda x: wrap_with_saved_trace(function, "ours")(x, x)["sum"]
     expected = jax.jit(call)(jnp.ones(2))
     (place,) = cache_folder.glob("vrw_trace_*")
     place.write_bytes(place.read_bytes()[:-1] + b"?")

@@ -22,8 +22,8 @@ LANES, X = [np.arange(4.0)], np.arange(4.0)
 class MemoryStore(dict):
     """A store in memory."""
 
-    load_bytes = dict.get
-    save_bytes = dict.__setitem__
+    load_cache_record = dict.get
+    save_cache_record = dict.__setitem__
 
 
 @pytest.fixture(autouse=True)
@@ -90,7 +90,7 @@ def test_other_traces_and_compiler_settings_have_separate_code(monkeypatch):
     store = MemoryStore()
     assert run_program(make_counted_function(2.0)[0], 2, store)[3] == 6.0
     assert run_program(make_counted_function(3.0)[0], 3, store)[3] == 9.0
-    monkeypatch.setattr(code, "describe_compilation", lambda: "by another processor")
+    monkeypatch.setattr(code, "describe_compiler_settings", lambda: "by another processor")
     double, traces = make_counted_function()
     assert run_program(double, 2, store)[3] == 6.0
     assert len(traces) == 1

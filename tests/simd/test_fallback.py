@@ -101,7 +101,7 @@ def test_the_handler_reports_its_version_to_a_request_for_metadata_only():
     """Structs of xla/ffi/api/c_api.h: a call frame, its extension, and the metadata."""
     run = simd.compile_lane_function(lambda x: x + 1.0, lambda x: x, "version test", None)
     np.testing.assert_array_equal(run(jnp.arange(8.0)), np.arange(8.0) + 1.0)
-    code = list(ffi_primitive.LOADED_CODE_BY_NAME.values())[-1]
+    code = list(ffi_primitive.LOADED_CODE_BY_FFI_TARGET.values())[-1]
     handler = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_void_p)(
         code.find_function_address(ffi_handler.FFI_HANDLER_NAME)
     )

@@ -298,7 +298,7 @@ def test_a_new_primitive_needs_one_row_of_the_table(monkeypatch):
         make_program(tangent, lanes)
     monkeypatch.setitem(
         ELEMENTWISE_RULES, "tan",
-        lambda operation, x: operation.value_emitter.builder.fdiv(
+        lambda operation, x: operation.value_emitter.llvm_builder.fdiv(
             *(ELEMENTWISE_RULES[name](operation, x) for name in ("sin", "cos"))
         ),
     )  # fmt: skip

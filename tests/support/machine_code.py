@@ -6,7 +6,7 @@ from vrw_jax.simd import code_cache as code
 from vrw_jax.simd import ffi_primitive as ffi
 from vrw_jax.simd import program
 
-_REGISTERED = ffi.LOADED_CODE_BY_NAME  # XLA never releases code and accepts one code per name
+_REGISTERED = ffi.LOADED_CODE_BY_FFI_TARGET  # XLA never releases code and accepts one code per name
 
 
 class CodeRegistrySpy:
@@ -20,10 +20,10 @@ class CodeRegistrySpy:
         self.reset_registry()
 
     def reset_registry(self):
-        self._monkeypatch.setattr(code, "_machine_code_by_name", {})
+        self._monkeypatch.setattr(code, "_machine_code_by_record_name", {})
         registered = PersistentRegistry()
         for module in (ffi, program):
-            self._monkeypatch.setattr(module, "LOADED_CODE_BY_NAME", registered)
+            self._monkeypatch.setattr(module, "LOADED_CODE_BY_FFI_TARGET", registered)
 
     def _register(self, name, *rest, **options):
         self.names.append(name)

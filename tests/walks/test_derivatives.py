@@ -9,7 +9,7 @@ from support import reference_values
 import vrw_jax as vrw
 from vrw_jax.models.viscoelastic import make_diffrax_phase
 from vrw_jax.numerics.autodiff import enable_all_ad_modes
-from vrw_jax.wheel import make_phases, transitions
+from vrw_jax.wheel import make_paper_phases, transitions
 
 PARAMS = vrw.WheelParams()
 START = jnp.asarray(reference_values.stack_quantity("step", "start")[0])
@@ -73,13 +73,15 @@ def test_the_saltation_formula_agrees(forward_jacobian):
     def through(phase, y, duration):
         ending = lambda y: (flow(phase.vector_field, y, duration),) * 2
         matrix, end = jax.jacfwd(ending, has_aux=True)(y)
-        gradient = jax.grad(lambda y: phase.guards.evaluate_monitored(y)[0])(end)
+        gradient = jax.grad(lambda y: phase.guards.evaluate_guards_and_margins(y)[0])(end)
         f = phase.vector_field(end)
         return end, matrix - jnp.outer(f, gradient @ matrix) / (gradient @ f)
 
     def landed(x):
         landing = transitions.resolve_landing(s, *x)
-        return jnp.stack([landing.theta_after, landing.motion_after.dtheta, landing.foot_distance])
+        return jnp.stack(
+            [landing.theta_after_landing, landing.motion_after.dtheta, landing.foot_distance]
+        )
 
     @jax.jit
     def by_saltation(durations):
@@ -87,13 +89,15 @@ def test_the_saltation_formula_agrees(forward_jacobian):
         # The distance between the feet is a constant of double support: a third coordinate at rest.
         distance = at_landing[2]
         flows = lambda distance: [
-            make_diffrax_phase(phase, False) for phase in make_phases(s, distance, True)
+            make_diffrax_phase(phase, False) for phase in make_paper_phases(s, distance, True)
         ]
         first, second, third = flows(distance)
         with_distance = first._replace(
             vector_field=lambda y: jnp.append(flows(y[2])[0].vector_field(y[:2]), 0.0),
             guards=first.guards._replace(
-                evaluate_monitored=lambda y: flows(y[2])[0].guards.evaluate_monitored(y[:2])
+                evaluate_guards_and_margins=lambda y: flows(y[2])[
+                    0
+                ].guards.evaluate_guards_and_margins(y[:2])
             ),
         )
 

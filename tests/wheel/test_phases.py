@@ -21,7 +21,7 @@ from vrw_jax.wheel import (
     compute_landing_foot_height,
     compute_rear_foot_height,
     dynamics,
-    make_phases,
+    make_paper_phases,
     stack_parameters,
     transitions,
 )
@@ -37,14 +37,14 @@ PHASE_STATES = (
     ((-0.1, 0.96), (1.2, 0.1)),
 )
 """Coordinates and rates within each phase, none of them at an end."""
-NAMES = [phase.name for phase in PAPER_PHASES]
+NAMES = [phase.phase_name for phase in PAPER_PHASES]
 each = pytest.mark.parametrize("index", range(3), ids=NAMES)
 
 
 def make_state_at(index, distance=STATE_DISTANCE, stop_at_lift_off=True):
     """Return a phase, and coordinates and rates in it."""
     q, v = (tuple(map(jnp.asarray, x)) for x in PHASE_STATES[index])
-    return make_phases(SYMBOLS, distance, stop_at_lift_off)[index], q, v
+    return make_paper_phases(SYMBOLS, distance, stop_at_lift_off)[index], q, v
 
 
 @each
@@ -74,14 +74,17 @@ def test_dependent_coordinates_follow_those_of_the_phase(index):
         rates[:2], [m.cos_theta * m.dtheta, -m.sin_theta * m.dtheta], rtol=1e-14
     )
     np.testing.assert_allclose(rates[2:4], motion[5:], rtol=1e-12, atol=1e-15)
-    for complete in (phase.complete_acceleration(m, accelerations), phase.solve_acceleration(m)):
+    for complete in (
+        phase.complete_wheel_acceleration(m, accelerations),
+        phase.solve_acceleration(m),
+    ):
         np.testing.assert_allclose(rates[4:], jnp.stack(complete), rtol=1e-12, atol=1e-14)
 
 
 @each
 def test_phase_coordinates_reproduce_the_motion(index):
     phase, q, v = make_state_at(index)
-    assert phase.select_coordinates(q[0], phase.compute_motion(q, v)) == (q, v)
+    assert phase.select_phase_coordinates(q[0], phase.compute_motion(q, v)) == (q, v)
 
 
 def test_forces_agree_with_the_equations_of_motion():
@@ -108,8 +111,8 @@ def test_guards_have_meanings_and_margins_have_names(index, stop_at_lift_off):
     assert phase.all_guard_outcomes[0] == Outcome.STEPPED
     assert guards[0] == phase.compute_end_guard(current_value)
     assert (Outcome.LEG_1_LIFTED_OFF in phase.all_guard_outcomes) == stop_at_lift_off
-    assert len(margins) == len(phase.margins_counted_at_start)
-    named = PhaseMargins.from_values(margins, SYMBOLS.n)
+    assert len(margins) == len(phase.are_margins_counted_at_start)
+    named = PhaseMargins.from_margin_values(margins, SYMBOLS.n)
     assert named.fore_foot_force == current_value.fore_force.normal
     assert len(named.locked_stopper_force) == SYMBOLS.n - 2
     assert (named.rear_clearance is None) == (index == 0)
@@ -160,7 +163,7 @@ def test_guards_are_positive_along_a_gait_until_the_end():
     trajectory = vrw.simulate(PARAMS, GAIT, n_steps=1)
     names = ("theta", "L1", "L2", "dtheta", "dL1", "dL2")
     states = jnp.stack([np.asarray(trajectory[name]) for name in names]).reshape(6, 3, -1)
-    for index, phase in enumerate(make_phases(SYMBOLS, STATE_DISTANCE, True)):
+    for index, phase in enumerate(make_paper_phases(SYMBOLS, STATE_DISTANCE, True)):
         q, v = (tuple(part[: phase.n_dof, index]) for part in (states[:3], states[3:]))
         guards = jnp.stack(
             phase.compute_guards(PhaseInstant(phase, phase.compute_motion(q, v), None))
@@ -170,7 +173,7 @@ def test_guards_are_positive_along_a_gait_until_the_end():
 
 
 def test_resets_agree_with_the_collisions():
-    dls, sls1, _ = make_phases(SYMBOLS, STATE_DISTANCE, True)
+    dls, sls1, _ = make_paper_phases(SYMBOLS, STATE_DISTANCE, True)
     m = dls.compute_motion(*(tuple(map(jnp.asarray, x)) for x in PHASE_STATES[0]))
     assert dls.reset_motion(m) == m
     _, q, v = make_state_at(1)

@@ -576,7 +576,7 @@ def _step_lanes_by_kernel(
         program_cache_key,
         batch_sizes.XLA_LANE_BATCH_SIZE,
         register_limits,
-        can_stop_early=True,
+        can_leave_lanes_unfinished=True,
     )
     kernel_results = batch_program(scalar_kernel_arguments, lane_input_arrays)
     _, step_outcomes, n_solver_steps, step_outputs, *step_jacobian = kernel_results

@@ -40,14 +40,14 @@ from vrw_jax.collocation import (
     compute_lagrange_weights,
 )
 from vrw_jax.models import PAPER_START_STATE, is_valid_start_state, replace_invalid_inputs
-from vrw_jax.numerics import Vector, evaluate_with_partials
+from vrw_jax.numerics import Vector, evaluate_with_partial_derivatives
 from vrw_jax.wheel import (
     AbstractPhase,
     PhaseInstant,
     WheelParams,
     compute_wheel_units,
     convert_to_wheel_units,
-    make_phases,
+    make_paper_phases,
     transitions,
 )
 
@@ -182,7 +182,7 @@ def solve_phase_by_collocation(
     The phase ends at the root of its event guard that is near `expected_duration`.
     """
     interval_length_fractions, lane_zeros = (
-        phase_mesh.interval_fractions,
+        phase_mesh.interval_length_fractions,
         jnp.zeros_like(expected_duration),
     )
     # The nonlinear part scales with the squared ratio of successive interval lengths.
@@ -611,7 +611,7 @@ def _linearize_dynamics_residual(phase: AbstractPhase, q: Vector, v: Vector, a: 
         q, v, a = (residual_arguments[i * n : (i + 1) * n] for i in range(3))
         return phase.compute_dynamics_residual(phase.compute_motion(q, v), a)
 
-    dynamics_residual, partial_derivative_rows = evaluate_with_partials(
+    dynamics_residual, partial_derivative_rows = evaluate_with_partial_derivatives(
         evaluate_dynamics_residual, (*q, *v, *a)
     )
     derivative_columns = list(zip(*partial_derivative_rows, strict=True))
@@ -923,8 +923,8 @@ def take_collocation_step(
     s = params.symbols()
     landing_result = transitions.resolve_landing(s, *x)
     is_collocation_trusted = is_start_state_valid & landing_result.is_rear_foot_planted
-    wheel_angle, wheel_motion = landing_result.theta_after, landing_result.motion_after
-    phases_of_step = make_phases(s, landing_result.foot_distance, stop_at_lift_off)
+    wheel_angle, wheel_motion = landing_result.theta_after_landing, landing_result.motion_after
+    phases_of_step = make_paper_phases(s, landing_result.foot_distance, stop_at_lift_off)
     phase_durations = []
     for collocated_phase, expected_duration, phase_mesh, max_start_rate_error in zip(
         phases_of_step,
@@ -933,7 +933,7 @@ def take_collocation_step(
         options.max_start_rate_errors,
         strict=True,
     ):
-        phase_start_state = collocated_phase.select_coordinates(wheel_angle, wheel_motion)
+        phase_start_state = collocated_phase.select_phase_coordinates(wheel_angle, wheel_motion)
         phase_end = solve_phase_by_collocation(
             collocated_phase, *phase_start_state, expected_duration, phase_mesh, options
         )

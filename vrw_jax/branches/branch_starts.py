@@ -190,7 +190,7 @@ def find_return_map_starts(branch_request: BranchRequest, known_start_cycle: Any
         step_options=step_options,
         parameter_name=branch_request.parameter_name,
         period_n=branch_request.period_n,
-        n_coordinates=model.count_continuous_entries(params),
+        n_coordinates=model.count_continuous_section_entries(params),
     )
     is_phase_active = jnp.ones(
         (*branch_request.parameter_values.shape, 1, 1), branch_request.parameter_values.dtype
@@ -227,7 +227,7 @@ def find_contact_gait_starts(branch_request: BranchRequest, start_cycle: Any) ->
         step_options=step_options,
         parameter_name=branch_request.parameter_name,
         period_n=branch_request.period_n,
-        n_coordinates=model.count_continuous_entries(params),
+        n_coordinates=model.count_continuous_section_entries(params),
         n_legs=params.n_legs,
         measures_force_peaks=branch_request.measures_force_peaks,
     )

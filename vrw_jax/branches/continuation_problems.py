@@ -190,7 +190,7 @@ class CollocationProblem(AbstractGaitProblem):
             for _, sls1_phase_points, _ in phase_points_by_step
         ]
         last_end_point, min_durations = (
-            phase_points_by_step[-1][-1].end_point,
+            phase_points_by_step[-1][-1].phase_end_point,
             jnp.min(z.durations, 0),
         )
         solution_with_lane = jax.tree.map(lambda x: x[..., None], z)
@@ -305,8 +305,9 @@ class AbstractReturnMapProblem(AbstractGaitProblem):
     """Continuation problem of fixed points of the return map over `period_n` gait steps.
 
     The unknowns z are the section state. Its last components are discrete codes (see
-    `AbstractWheel.count_continuous_entries`), which are copied from the image under the return map
-    in every Newton iteration. Newton's method converges only if state and image have equal codes.
+    `AbstractWheel.count_continuous_section_entries`), which are copied from the image under the
+    return map in every Newton iteration. Newton's method converges only if state and image have
+    equal codes.
     """
 
     model: AbstractWheel

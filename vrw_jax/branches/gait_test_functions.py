@@ -49,7 +49,7 @@ from vrw_jax.wheel import (
     PARAMETER_NAMES,
     PhaseInstant,
     Symbols,
-    make_phases,
+    make_paper_phases,
     make_wheel_from_parameters,
     stack_parameters,
     transitions,
@@ -424,7 +424,7 @@ def _compute_continued_quantities(
     """
     dls_phase_points, sls1_phase_points, sls2_phase_points = phase_points
     landing_result = transitions.resolve_landing(
-        wheel_symbols, sls2_phase_points.end_point.q[0], *sls2_phase_points.end_point.v
+        wheel_symbols, sls2_phase_points.phase_end_point.q[0], *sls2_phase_points.phase_end_point.v
     )
     fore_force, rear_force = transitions.compute_landing_forces(wheel_symbols, landing_result)
     dls_duration, *single_support_durations = z.durations[0]
@@ -442,8 +442,8 @@ def _compute_force_decrease_rates(
     s: Symbols, dls_phase_points: PhasePoints, dls_duration: Array
 ) -> tuple[Array, Array]:
     """Return the initial and the mean rate at which the rear foot's force decreases in DLS, N/s."""
-    dls_phase = make_phases(
-        s, dls_phase_points.start_point.held_constants[0], stop_at_lift_off=False
+    dls_phase = make_paper_phases(
+        s, dls_phase_points.phase_start_point.held_constants[0], stop_at_lift_off=False
     )[0]
 
     def make_dls_instant(theta: Array, dtheta: Array) -> PhaseInstant:
@@ -453,8 +453,8 @@ def _compute_force_decrease_rates(
         make_dls_instant(*dls_state)
     )
     start_state, end_state = (
-        (*dls_phase_points.start_point.q, *dls_phase_points.start_point.v),
-        (*dls_phase_points.end_point.q, *dls_phase_points.end_point.v),
+        (*dls_phase_points.phase_start_point.q, *dls_phase_points.phase_start_point.v),
+        (*dls_phase_points.phase_end_point.q, *dls_phase_points.phase_end_point.v),
     )
     dls_state_rates = start_state[1], make_dls_instant(*start_state).acceleration.ddtheta
     initial_rear_force, rear_force_rate = jax.jvp(compute_rear_force, start_state, dls_state_rates)

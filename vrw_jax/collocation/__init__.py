@@ -28,5 +28,5 @@ from vrw_jax.collocation.phase_collocation import (
     PhaseSequence,
     estimate_mesh_error,
     linearize_cycle,
-    reconstruct_step,
+    reconstruct_gait_step,
 )

@@ -101,9 +101,9 @@ class CollocatedPhaseMotion(NamedTuple):
     In each mesh interval the accelerations are a polynomial of time.
     """
 
-    boundary_times: Float[Array, " boundaries"]  # times of the interval boundaries, s
-    boundary_q: Float[Array, "boundaries coordinates"]
-    boundary_v: Float[Array, "boundaries coordinates"]
+    interval_boundary_times: Float[Array, " boundaries"]  # times of the interval boundaries, s
+    interval_boundary_q: Float[Array, "boundaries coordinates"]
+    interval_boundary_v: Float[Array, "boundaries coordinates"]
     node_accelerations: Float[Array, "intervals nodes coordinates"]
 
     @classmethod
@@ -121,37 +121,40 @@ class CollocatedPhaseMotion(NamedTuple):
         `node_accelerations` has the shape (intervals, nodes, coordinates).
         """
         interval_lengths = (
-            jnp.asarray(phase_mesh.interval_fractions, phase_duration.dtype)[:, None]
+            jnp.asarray(phase_mesh.interval_length_fractions, phase_duration.dtype)[:, None]
             * phase_duration
         )
         rate_increments, position_increments = (
             jnp.einsum("n,ind->id", end_weights, node_accelerations)
             for end_weights in (END_WEIGHTS, DOUBLE_END_WEIGHTS)
         )
-        accumulate_increments = lambda start_value, interval_increments: jnp.concatenate(
-            [start_value[None], start_value + jnp.cumsum(interval_increments, axis=0)]
+        accumulate_increments = lambda initial_boundary_value, interval_increments: jnp.concatenate(
+            [
+                initial_boundary_value[None],
+                initial_boundary_value + jnp.cumsum(interval_increments, axis=0),
+            ]
         )
-        boundary_v = accumulate_increments(start_v, interval_lengths * rate_increments)
-        boundary_q = accumulate_increments(
+        interval_boundary_v = accumulate_increments(start_v, interval_lengths * rate_increments)
+        interval_boundary_q = accumulate_increments(
             start_q,
-            interval_lengths * boundary_v[:-1]
+            interval_lengths * interval_boundary_v[:-1]
             + interval_lengths * interval_lengths * position_increments,
         )
         return cls(
             accumulate_increments(jnp.zeros(1), interval_lengths)[:, 0],
-            boundary_q,
-            boundary_v,
+            interval_boundary_q,
+            interval_boundary_v,
             node_accelerations,
         )
 
-    def find_interval_at_time(self, time_in_phase: Scalar) -> Array:
+    def find_mesh_interval_at_time(self, time_in_phase: Scalar) -> Array:
         """Return the index of the mesh interval that contains a time.
 
         `time_in_phase` is the time since the start of the phase, in s.
         """
-        last_interval_index = len(self.boundary_times) - 2
+        last_interval_index = len(self.interval_boundary_times) - 2
         return jnp.clip(
-            jnp.searchsorted(self.boundary_times, time_in_phase, side="right") - 1,
+            jnp.searchsorted(self.interval_boundary_times, time_in_phase, side="right") - 1,
             0,
             last_interval_index,
         )
@@ -161,18 +164,21 @@ class CollocatedPhaseMotion(NamedTuple):
 
         `location_in_interval` is in [0, 1]. The two arrays have the shape (intervals, coordinates).
         """
-        interval_lengths = jnp.diff(self.boundary_times)[:, None]
+        interval_lengths = jnp.diff(self.interval_boundary_times)[:, None]
         rate_node_weights, position_node_weights = compute_integration_weights(location_in_interval)
         rate_increments, position_increments = (
             jnp.einsum("n,ind->id", node_weights, self.node_accelerations)
             for node_weights in (rate_node_weights, position_node_weights)
         )
-        interval_start_q, interval_start_v = self.boundary_q[:-1], self.boundary_v[:-1]
+        interval_start_q, interval_start_v = (
+            self.interval_boundary_q[:-1],
+            self.interval_boundary_v[:-1],
+        )
         return interval_start_q + interval_lengths * (
             location_in_interval * interval_start_v + interval_lengths * position_increments
         ), interval_start_v + interval_lengths * rate_increments
 
-    def integrate_to_time(
+    def integrate_motion_to_time(
         self,
         time_in_phase: Scalar,
         compute_acceleration: FunctionOfCoordinatesAndRates,
@@ -185,15 +191,15 @@ class CollocatedPhaseMotion(NamedTuple):
         method solves for the node accelerations of the additional interval. The result is
         differentiable with respect to the motion, but not with respect to the time.
         """
-        interval_index = self.find_interval_at_time(time_in_phase)
+        interval_index = self.find_mesh_interval_at_time(time_in_phase)
         interval_start_time, interval_start_q, interval_start_v = (
-            self.boundary_times[interval_index],
-            self.boundary_q[interval_index],
-            self.boundary_v[interval_index],
+            self.interval_boundary_times[interval_index],
+            self.interval_boundary_q[interval_index],
+            self.interval_boundary_v[interval_index],
         )
         partial_interval_length = lax.stop_gradient(time_in_phase - interval_start_time)
 
-        def compute_residual(flat_accelerations: Array) -> Array:
+        def compute_dynamics_residual(flat_accelerations: Array) -> Array:
             node_accelerations = flat_accelerations.reshape(N_GAUSS_NODES, -1)
             node_q = interval_start_q + partial_interval_length * (
                 GAUSS_NODES[:, None] * interval_start_v
@@ -204,16 +210,18 @@ class CollocatedPhaseMotion(NamedTuple):
             )
             return (node_accelerations - jax.vmap(compute_acceleration)(node_q, node_v)).ravel()
 
-        def refine_accelerations(flat_accelerations: Array, _: None) -> tuple[Array, None]:
+        def refine_node_accelerations(flat_accelerations: Array, _: None) -> tuple[Array, None]:
             # The tangents of the last iteration are exact because the Jacobian has none.
-            residual_jacobian = lax.stop_gradient(jax.jacfwd(compute_residual)(flat_accelerations))
+            residual_jacobian = lax.stop_gradient(
+                jax.jacfwd(compute_dynamics_residual)(flat_accelerations)
+            )
             return flat_accelerations - jnp.linalg.solve(
-                residual_jacobian, compute_residual(flat_accelerations)
+                residual_jacobian, compute_dynamics_residual(flat_accelerations)
             ), None
 
-        guessed_accelerations = lax.stop_gradient(self.node_accelerations[interval_index].ravel())
+        initial_accelerations = lax.stop_gradient(self.node_accelerations[interval_index].ravel())
         node_accelerations = lax.scan(
-            refine_accelerations, guessed_accelerations, length=n_newton_iterations
+            refine_node_accelerations, initial_accelerations, length=n_newton_iterations
         )[0].reshape(N_GAUSS_NODES, -1)
         return interval_start_q + partial_interval_length * (
             interval_start_v + partial_interval_length * (DOUBLE_END_WEIGHTS @ node_accelerations)
@@ -226,11 +234,11 @@ class _PiecewiseQuantityPolynomial(NamedTuple):
     The coefficients carry no derivatives.
     """
 
-    boundary_times: Float[Array, " boundaries"]
+    interval_boundary_times: Float[Array, " boundaries"]
     interval_coefficients: Float[Array, "intervals powers"]  # in powers of the location in [0, 1]
 
     @classmethod
-    def interpolate_motion(
+    def interpolate_quantity(
         cls,
         phase_motion: CollocatedPhaseMotion,
         compute_quantity: FunctionOfCoordinatesAndRates,
@@ -254,38 +262,40 @@ class _PiecewiseQuantityPolynomial(NamedTuple):
             sample_locations[:, None] ** np.arange(n_samples_per_interval)
         )
         return lax.stop_gradient(
-            cls(phase_motion.boundary_times, sampled_values @ interpolation_matrix.T)
+            cls(phase_motion.interval_boundary_times, sampled_values @ interpolation_matrix.T)
         )
 
-    def evaluate_time_derivative(self, evaluation_times: Array, derivative_order: int) -> Array:
+    def evaluate_polynomial_time_derivative(
+        self, evaluation_times: Array, derivative_order: int
+    ) -> Array:
         """Return the first or the second time derivative of an interpolated quantity at each time.
 
         `derivative_order` is 1 or 2. Times are in s since the start of the phase.
         """
-        last_interval_index = len(self.boundary_times) - 2
+        last_interval_index = len(self.interval_boundary_times) - 2
         interval_indices = jnp.clip(
-            jnp.searchsorted(self.boundary_times, evaluation_times, side="right") - 1,
+            jnp.searchsorted(self.interval_boundary_times, evaluation_times, side="right") - 1,
             0,
             last_interval_index,
         )
-        interval_lengths = jnp.diff(self.boundary_times)[interval_indices]
+        interval_lengths = jnp.diff(self.interval_boundary_times)[interval_indices]
         interval_lengths = jnp.where(interval_lengths > 0.0, interval_lengths, 1.0)
         locations_in_intervals = (
-            evaluation_times - self.boundary_times[interval_indices]
+            evaluation_times - self.interval_boundary_times[interval_indices]
         ) / interval_lengths
-        scaled_derivatives = jnp.zeros_like(evaluation_times)
+        derivatives_by_location = jnp.zeros_like(evaluation_times)
         for monomial_power in range(
             self.interval_coefficients.shape[1] - 1, derivative_order - 1, -1
         ):
             power_derivative_factor = (
                 monomial_power if derivative_order == 1 else monomial_power * (monomial_power - 1)
             )
-            scaled_derivatives = (
-                scaled_derivatives * locations_in_intervals
+            derivatives_by_location = (
+                derivatives_by_location * locations_in_intervals
                 + power_derivative_factor
                 * self.interval_coefficients[interval_indices, monomial_power]
             )
-        return scaled_derivatives / interval_lengths**derivative_order
+        return derivatives_by_location / interval_lengths**derivative_order
 
     @property
     def sample_times_in_phase(self) -> Array:
@@ -298,10 +308,10 @@ class _PiecewiseQuantityPolynomial(NamedTuple):
             0.0, 1.0, self.interval_coefficients.shape[1], endpoint=False
         )
         times_before_phase_end = (
-            self.boundary_times[:-1, None]
-            + jnp.diff(self.boundary_times)[:, None] * locations_in_interval
+            self.interval_boundary_times[:-1, None]
+            + jnp.diff(self.interval_boundary_times)[:, None] * locations_in_interval
         )
-        return jnp.append(times_before_phase_end.ravel(), self.boundary_times[-1])
+        return jnp.append(times_before_phase_end.ravel(), self.interval_boundary_times[-1])
 
 
 def find_quantity_extrema(
@@ -320,14 +330,16 @@ def find_quantity_extrema(
         compute_quantity: function that maps coordinates and rates to the quantity, a scalar.
         search_options: numerical options of the search.
     """
-    quantity_polynomial = _PiecewiseQuantityPolynomial.interpolate_motion(
+    quantity_polynomial = _PiecewiseQuantityPolynomial.interpolate_quantity(
         phase_motion, compute_quantity, search_options.n_samples_per_interval
     )
     phase_duration, sample_times_in_phase = (
-        quantity_polynomial.boundary_times[-1],
+        quantity_polynomial.interval_boundary_times[-1],
         quantity_polynomial.sample_times_in_phase,
     )
-    sampled_second_rates = quantity_polynomial.evaluate_time_derivative(sample_times_in_phase, 2)
+    sampled_second_rates = quantity_polynomial.evaluate_polynomial_time_derivative(
+        sample_times_in_phase, 2
+    )
     last_sample_index = len(sampled_second_rates) - 1
     # An unused bracket has zero length and lies at the end of the phase.
     has_second_rate_zero = sampled_second_rates[:-1] * sampled_second_rates[1:] < 0.0
@@ -339,7 +351,7 @@ def find_quantity_extrema(
     bracket_end_indices = jnp.minimum(bracket_start_indices + 1, last_sample_index)
     is_rate_extremum = bracket_start_indices < last_sample_index
     rate_extremum_times = _find_bracketed_zeros(
-        lambda t: quantity_polynomial.evaluate_time_derivative(t, 2),
+        lambda t: quantity_polynomial.evaluate_polynomial_time_derivative(t, 2),
         (sample_times_in_phase[bracket_start_indices], sample_times_in_phase[bracket_end_indices]),
         (sampled_second_rates[bracket_start_indices], sampled_second_rates[bracket_end_indices]),
         search_options.n_bracketing_iterations,
@@ -364,7 +376,7 @@ def find_quantity_extrema(
     )
     inverse_second_rate_slopes = jnp.pad(inverse_second_rate_slopes, 1)
 
-    def correct_times(
+    def correct_extremum_times(
         compute_time_corrections: Callable[[QuantityTimeDerivatives], Array], extremum_times: Array
     ) -> tuple:
         """Return the corrected times, and the time derivatives of the quantity at the corrected
@@ -374,33 +386,37 @@ def find_quantity_extrema(
         time.
         """
 
-        def evaluate_at_time(time_in_phase: Array) -> QuantityTimeDerivatives:
+        def evaluate_quantity_at_time(time_in_phase: Array) -> QuantityTimeDerivatives:
             n_newton_iterations = search_options.n_state_newton_iterations
-            state_at_time = phase_motion.integrate_to_time(
+            state_at_time = phase_motion.integrate_motion_to_time(
                 time_in_phase, compute_acceleration, n_newton_iterations
             )
             return evaluate_quantity_time_derivatives(
                 compute_quantity, compute_acceleration, *state_at_time
             )
 
-        def correct_times_once(times_and_derivatives: tuple, _: None) -> tuple[tuple, None]:
-            corrected_times, time_derivatives = times_and_derivatives
-            time_corrections = lax.stop_gradient(compute_time_corrections(time_derivatives))
+        def correct_extremum_times_once(
+            times_and_quantity_derivatives: tuple, _: None
+        ) -> tuple[tuple, None]:
+            corrected_times, quantity_derivatives = times_and_quantity_derivatives
+            time_corrections = lax.stop_gradient(compute_time_corrections(quantity_derivatives))
             corrected_times = jnp.clip(corrected_times - time_corrections, 0.0, phase_duration)
-            return (corrected_times, jax.vmap(evaluate_at_time)(corrected_times)), None
+            return (corrected_times, jax.vmap(evaluate_quantity_at_time)(corrected_times)), None
 
         zero_derivatives = jnp.zeros_like(extremum_times)
-        initial_carry = (
+        initial_loop_carry = (
             extremum_times,
             QuantityTimeDerivatives(zero_derivatives, zero_derivatives, zero_derivatives),
         )
         return lax.scan(
-            correct_times_once, initial_carry, length=search_options.n_time_corrections
+            correct_extremum_times_once,
+            initial_loop_carry,
+            length=search_options.n_time_corrections,
         )[0]
 
-    rate_extremum_times, derivatives_at_rate_extrema = correct_times(
-        lambda derivatives_at_rate_extrema: (
-            derivatives_at_rate_extrema.second_time_derivative * inverse_second_rate_slopes
+    rate_extremum_times, derivatives_at_rate_extrema = correct_extremum_times(
+        lambda derivatives_at_times: (
+            derivatives_at_times.second_time_derivative * inverse_second_rate_slopes
         ),
         rate_extremum_times,
     )
@@ -410,22 +426,22 @@ def find_quantity_extrema(
     )
     has_extremum = (rate_before_extremum * rate_after_extremum < 0.0) & (phase_duration > 0.0)
     extremum_times = _find_bracketed_zeros(
-        lambda t: quantity_polynomial.evaluate_time_derivative(t, 1),
+        lambda t: quantity_polynomial.evaluate_polynomial_time_derivative(t, 1),
         (rate_extremum_times[:-1], rate_extremum_times[1:]),
         (rate_before_extremum, rate_after_extremum),
         search_options.n_bracketing_iterations,
     )
-    compute_newton_correction = lambda derivatives_at_rate_extrema: jnp.where(
+    compute_newton_correction = lambda derivatives_at_times: jnp.where(
         has_extremum,
-        derivatives_at_rate_extrema.first_time_derivative
+        derivatives_at_times.first_time_derivative
         / jnp.where(
-            derivatives_at_rate_extrema.second_time_derivative == 0.0,
+            derivatives_at_times.second_time_derivative == 0.0,
             1.0,
-            derivatives_at_rate_extrema.second_time_derivative,
+            derivatives_at_times.second_time_derivative,
         ),
         0.0,
     )
-    extremum_times, derivatives_at_extrema = correct_times(
+    extremum_times, derivatives_at_extrema = correct_extremum_times(
         compute_newton_correction, extremum_times
     )
     return PhaseExtrema(
@@ -447,12 +463,14 @@ def evaluate_quantity_time_derivatives(
 ) -> QuantityTimeDerivatives:
     """Return the value and the first two time derivatives of a quantity at the state (q, v)."""
 
-    def compute_with_time_derivative(function_of_state: Callable, q: Array, v: Array) -> tuple:
+    def compute_value_and_time_derivative(function_of_state: Callable, q: Array, v: Array) -> tuple:
         return jax.jvp(function_of_state, (q, v), (v, compute_acceleration(q, v)))
 
-    compute_quantity_and_rate = lambda q, v: compute_with_time_derivative(compute_quantity, q, v)
+    compute_quantity_and_rate = lambda q, v: compute_value_and_time_derivative(
+        compute_quantity, q, v
+    )
     (quantity_value, first_time_derivative), (_, second_time_derivative) = (
-        compute_with_time_derivative(compute_quantity_and_rate, q, v)
+        compute_value_and_time_derivative(compute_quantity_and_rate, q, v)
     )
     return QuantityTimeDerivatives(quantity_value, first_time_derivative, second_time_derivative)
 
@@ -475,7 +493,7 @@ def _find_bracketed_zeros(
     has_sign_change = bracket_start_values * bracket_end_values < 0.0
     avoid_zero_division = lambda x: jnp.where(x == 0.0, 1.0, x)
 
-    def shrink_brackets(loop_carry: tuple, _: None) -> tuple[tuple, None]:
+    def shrink_root_brackets(loop_carry: tuple, _: None) -> tuple[tuple, None]:
         a, value_at_a, b, value_at_b, c, value_at_c, next_bracket_fraction = loop_carry
         x = a + next_bracket_fraction * (b - a)
         value_at_x = bracketed_function(x)
@@ -505,7 +523,7 @@ def _find_bracketed_zeros(
         next_bracket_fraction = jnp.where(value_at_a == 0.0, 0.0, next_bracket_fraction)
         return (a, value_at_a, b, value_at_b, c, value_at_c, next_bracket_fraction), None
 
-    initial_carry = (
+    initial_loop_carry = (
         bracket_ends,
         bracket_end_values,
         bracket_starts,
@@ -515,7 +533,7 @@ def _find_bracketed_zeros(
         jnp.full_like(bracket_starts, 0.5),
     )
     a, value_at_a, b, value_at_b, *_ = lax.scan(
-        shrink_brackets, initial_carry, None, length=n_iterations
+        shrink_root_brackets, initial_loop_carry, None, length=n_iterations
     )[0]
     return jnp.where(
         has_sign_change, jnp.where(jnp.abs(value_at_a) <= jnp.abs(value_at_b), a, b), bracket_starts

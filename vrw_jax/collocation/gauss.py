@@ -46,22 +46,26 @@ class PhaseMesh(NamedTuple):
     grading: float
 
     @property
-    def interval_fractions(self) -> np.ndarray:
+    def interval_length_fractions(self) -> np.ndarray:
         """Return the length of each mesh interval as a fraction of the phase's duration."""
-        boundary_fractions = np.linspace(0.0, 1.0, self.n_intervals + 1)
+        interval_boundary_fractions = np.linspace(0.0, 1.0, self.n_intervals + 1)
         log_grading = np.log(self.grading)
         if abs(log_grading) > 1e-12:
-            boundary_fractions = np.expm1(log_grading * boundary_fractions) / np.expm1(log_grading)
-        return np.diff(boundary_fractions)
+            interval_boundary_fractions = np.expm1(
+                log_grading * interval_boundary_fractions
+            ) / np.expm1(log_grading)
+        return np.diff(interval_boundary_fractions)
 
     @property
-    def node_fractions(self) -> np.ndarray:
+    def node_time_fractions(self) -> np.ndarray:
         """Return the time of each node as a fraction of the phase's duration.
 
         Times are measured from the start of the phase.
         """
-        interval_starts = np.cumsum(self.interval_fractions) - self.interval_fractions
-        return (interval_starts[:, None] + self.interval_fractions[:, None] * GAUSS_NODES).ravel()
+        interval_starts = np.cumsum(self.interval_length_fractions) - self.interval_length_fractions
+        return (
+            interval_starts[:, None] + self.interval_length_fractions[:, None] * GAUSS_NODES
+        ).ravel()
 
 
 def build_phase_integration_matrices(phase_mesh: PhaseMesh) -> tuple[np.ndarray, ...]:
@@ -71,7 +75,7 @@ def build_phase_integration_matrices(phase_mesh: PhaseMesh) -> tuple[np.ndarray,
     matrices belong to the nodes in the order of time. The last row belongs to the end of the phase.
     """
     n_nodes = phase_mesh.n_intervals * N_GAUSS_NODES
-    rate_matrix, position_matrix = (
+    rate_integration_matrix, position_integration_matrix = (
         np.zeros((n_nodes + 1, n_nodes)),
         np.zeros((n_nodes + 1, n_nodes)),
     )
@@ -81,25 +85,25 @@ def build_phase_integration_matrices(phase_mesh: PhaseMesh) -> tuple[np.ndarray,
         np.zeros(n_nodes),
         0.0,
     )
-    for interval_index, h in enumerate(phase_mesh.interval_fractions):
+    for interval_index, h in enumerate(phase_mesh.interval_length_fractions):
         node_slice = slice(interval_index * N_GAUSS_NODES, (interval_index + 1) * N_GAUSS_NODES)
-        rate_matrix[node_slice] = interval_rate_weights
-        position_matrix[node_slice] = (
+        rate_integration_matrix[node_slice] = interval_rate_weights
+        position_integration_matrix[node_slice] = (
             interval_position_weights + h * GAUSS_NODES[:, None] * interval_rate_weights
         )
-        rate_matrix[node_slice, node_slice] += h * INTEGRATION_MATRIX
-        position_matrix[node_slice, node_slice] += h * h * DOUBLE_INTEGRATION_MATRIX
+        rate_integration_matrix[node_slice, node_slice] += h * INTEGRATION_MATRIX
+        position_integration_matrix[node_slice, node_slice] += h * h * DOUBLE_INTEGRATION_MATRIX
         node_times[node_slice] = interval_start + h * GAUSS_NODES
         interval_position_weights = interval_position_weights + h * interval_rate_weights
         interval_position_weights[node_slice] += h * h * DOUBLE_END_WEIGHTS
         interval_rate_weights = interval_rate_weights.copy()
         interval_rate_weights[node_slice] += h * END_WEIGHTS
         interval_start += h
-    rate_matrix[n_nodes], position_matrix[n_nodes] = (
+    rate_integration_matrix[n_nodes], position_integration_matrix[n_nodes] = (
         interval_rate_weights,
         interval_position_weights,
     )
-    return node_times, rate_matrix, position_matrix
+    return node_times, rate_integration_matrix, position_integration_matrix
 
 
 def compute_lagrange_weights(location_in_interval: float) -> np.ndarray:
@@ -126,13 +130,13 @@ def build_mesh_transfer_matrix(source_mesh: PhaseMesh, target_mesh: PhaseMesh) -
     that are cubic polynomials in each interval of the source mesh.
     """
 
-    def compute_boundary_fractions(phase_mesh: PhaseMesh) -> np.ndarray:
-        return np.concatenate([[0.0], np.cumsum(phase_mesh.interval_fractions)])
+    def compute_interval_boundary_fractions(phase_mesh: PhaseMesh) -> np.ndarray:
+        return np.concatenate([[0.0], np.cumsum(phase_mesh.interval_length_fractions)])
 
-    source_boundary_fractions = compute_boundary_fractions(source_mesh)
+    source_interval_boundaries = compute_interval_boundary_fractions(source_mesh)
     target_node_fractions = (
-        compute_boundary_fractions(target_mesh)[:-1, None]
-        + target_mesh.interval_fractions[:, None] * GAUSS_NODES
+        compute_interval_boundary_fractions(target_mesh)[:-1, None]
+        + target_mesh.interval_length_fractions[:, None] * GAUSS_NODES
     ).ravel()
     transfer_matrix = np.zeros(
         (target_node_fractions.size, source_mesh.n_intervals * N_GAUSS_NODES)
@@ -140,14 +144,14 @@ def build_mesh_transfer_matrix(source_mesh: PhaseMesh, target_mesh: PhaseMesh) -
     for target_node_index, target_node_fraction in enumerate(target_node_fractions):
         source_interval_index = int(
             np.clip(
-                np.searchsorted(source_boundary_fractions, target_node_fraction) - 1,
+                np.searchsorted(source_interval_boundaries, target_node_fraction) - 1,
                 0,
                 source_mesh.n_intervals - 1,
             )
         )
         location_in_source_interval = (
-            target_node_fraction - source_boundary_fractions[source_interval_index]
-        ) / source_mesh.interval_fractions[source_interval_index]
+            target_node_fraction - source_interval_boundaries[source_interval_index]
+        ) / source_mesh.interval_length_fractions[source_interval_index]
         transfer_matrix[
             target_node_index,
             source_interval_index * N_GAUSS_NODES : (source_interval_index + 1) * N_GAUSS_NODES,
@@ -160,9 +164,9 @@ def build_differentiation_matrix() -> np.ndarray:
 
     The interval has length 1.
     """
-    higher_powers = _MONOMIAL_POWERS[1:]
+    positive_powers = _MONOMIAL_POWERS[1:]
     return (
-        higher_powers * GAUSS_NODES[:, None] ** (higher_powers - 1)
+        positive_powers * GAUSS_NODES[:, None] ** (positive_powers - 1)
     ) @ _COEFFICIENTS_FROM_NODE_VALUES[1:]
 
 
@@ -172,9 +176,9 @@ def compute_integration_weights(location_in_interval: float) -> tuple[np.ndarray
     The integrals extend from 0 to `location_in_interval`, the time since the start of the mesh
     interval in interval lengths. Each array of weights has the shape (N_GAUSS_NODES,).
     """
-    integrated_powers = location_in_interval ** (_MONOMIAL_POWERS + 1) / (_MONOMIAL_POWERS + 1)
-    twice_integrated_powers = location_in_interval * integrated_powers / (_MONOMIAL_POWERS + 2)
+    monomial_integrals = location_in_interval ** (_MONOMIAL_POWERS + 1) / (_MONOMIAL_POWERS + 1)
+    monomial_double_integrals = location_in_interval * monomial_integrals / (_MONOMIAL_POWERS + 2)
     return (
-        integrated_powers @ _COEFFICIENTS_FROM_NODE_VALUES,
-        twice_integrated_powers @ _COEFFICIENTS_FROM_NODE_VALUES,
+        monomial_integrals @ _COEFFICIENTS_FROM_NODE_VALUES,
+        monomial_double_integrals @ _COEFFICIENTS_FROM_NODE_VALUES,
     )

@@ -44,7 +44,7 @@ from vrw_jax.numerics import (
     apply_matrix,
     contract_inner_axis,
     evaluate_with_jvps,
-    evaluate_with_partials,
+    evaluate_with_partial_derivatives,
     invert_small_matrices,
     make_fusion_barrier,
     solve_node_equations,
@@ -123,9 +123,9 @@ class CycleLinearization(NamedTuple):
         CollocationSolution
     )
     # corrected coordinates and rates at the end of each gait step: (n, 2 n_coordinates, batch)
-    step_end_states: LaneArray
-    # derivatives of `step_end_states`; requested parameters on a leading axis
-    step_end_tangents: LaneArray
+    gait_step_end_states: LaneArray
+    # derivatives of `gait_step_end_states`; requested parameters on a leading axis
+    gait_step_end_tangents: LaneArray
     monodromy: LaneArray  # Jacobian of the return map: (row, column, batch)
 
 
@@ -142,7 +142,7 @@ class _LinearizationContext(NamedTuple):
     parameters: LaneArray
     compute_phase_constants: Callable[..., PhaseConstants]
     phase_constants: PhaseConstants
-    constant_tangents: tuple[
+    phase_constants_tangents: tuple[
         LaneArray, ...
     ]  # tangents of each constant with respect to the requested parameters
     prevent_fusion: FusionBarrierFn
@@ -159,7 +159,7 @@ class _LinearizationContext(NamedTuple):
         """Return the slice that selects the tangents for the section state."""
         return slice(1, 1 + self.section_size)
 
-    def evaluate_with_tangents(
+    def evaluate_function_with_tangents(
         self, function_of_point: Callable, phase_point: tuple, point_tangents: tuple
     ) -> tuple:
         """Evaluate `function_of_point(*point, *phase_constants)` and its tangents."""
@@ -169,19 +169,19 @@ class _LinearizationContext(NamedTuple):
                 phase_point,
                 point_tangents,
             )
-        n_trailing_axes = point_tangents[0].shape[0] - self.n_tangents
+        n_duration_tangents = point_tangents[0].shape[0] - self.n_tangents
         tangent_padding = (
-            (self.section_tangent_slice.stop, n_trailing_axes),
+            (self.section_tangent_slice.stop, n_duration_tangents),
             *((0, 0),) * (self.parameters.ndim - 1),
         )
-        padded_constant_tangents = (
-            jnp.pad(constant_tangent, tangent_padding)
-            for constant_tangent in self.constant_tangents
+        padded_phase_constants_tangents = (
+            jnp.pad(phase_constant_tangent, tangent_padding)
+            for phase_constant_tangent in self.phase_constants_tangents
         )
         return evaluate_with_jvps(
             function_of_point,
             (*phase_point, *self.phase_constants),
-            (*point_tangents, *padded_constant_tangents),
+            (*point_tangents, *padded_phase_constants_tangents),
         )
 
 
@@ -195,39 +195,45 @@ def _make_linearization_context(
     linearization context.
     """
     prevent_fusion = make_fusion_barrier(parameters)
-    dtype, lane_shape = parameters.dtype, parameters.shape[1:]
+    dtype, batch_shape = parameters.dtype, parameters.shape[1:]
     unit_parameter_tangents = np.eye(parameters.shape[0], dtype=dtype)[list(parameter_indices)]
     parameter_tangents = tuple(
-        jnp.broadcast_to(x[:, None], (len(parameter_indices), *lane_shape))
+        jnp.broadcast_to(x[:, None], (len(parameter_indices), *batch_shape))
         for x in unit_parameter_tangents.T
     )
     if parameter_indices:
-        phase_constants, constant_tangents = evaluate_with_jvps(
+        phase_constants, phase_constants_tangents = evaluate_with_jvps(
             compute_phase_constants, tuple(parameters), parameter_tangents
         )
     else:
-        phase_constants, constant_tangents = compute_phase_constants(*parameters), ()
+        phase_constants, phase_constants_tangents = compute_phase_constants(*parameters), ()
     return _LinearizationContext(
         section_size,
         parameter_indices,
         parameters,
         compute_phase_constants,
         phase_constants,
-        constant_tangents,
+        phase_constants_tangents,
         prevent_fusion,
     )
 
 
-def _stack_phase_point(phase_point: PhasePoint, template_array: Array) -> tuple[Array, ...]:
+def _stack_phase_point(
+    phase_point: PhasePoint, template_component_array: Array
+) -> tuple[Array, ...]:
     """Stack the held constants, the coordinates and the rates of a point into one array each.
 
     A part without components becomes an empty array. Its trailing shape and type are those of
-    `template_array`.
+    `template_component_array`.
     """
-    empty_array = jnp.zeros((0, *template_array.shape[1:]), template_array.dtype)
+    array_without_components = jnp.zeros(
+        (0, *template_component_array.shape[1:]), template_component_array.dtype
+    )
     return tuple(
-        jnp.stack(point_components) if point_components else empty_array
-        for point_components in phase_point
+        jnp.stack(components_of_point_part)
+        if components_of_point_part
+        else array_without_components
+        for components_of_point_part in phase_point
     )
 
 
@@ -240,7 +246,7 @@ class _PhaseTangentState(NamedTuple):
     held_constants: LaneArray
     q: LaneArray
     v: LaneArray
-    held_constant_tangents: LaneArray
+    held_constants_tangents: LaneArray
     q_tangents: LaneArray
     v_tangents: LaneArray
 
@@ -248,7 +254,7 @@ class _PhaseTangentState(NamedTuple):
 class _MeshInterval(NamedTuple):
     """Length and node accelerations of one mesh interval in a phase."""
 
-    length_fraction: Array  # fraction of the phase's duration
+    interval_length_fraction: Array  # fraction of the phase's duration
     h: LaneArray  # length, s
     node_accelerations: LaneArray  # (node, coordinate, batch)
 
@@ -262,22 +268,22 @@ def _evaluate_interval_nodes(
     tangent_state: _PhaseTangentState, mesh_interval: _MeshInterval
 ) -> tuple[Array, ...]:
     """Return the coordinates, the rates and their tangents at the nodes of a mesh interval."""
-    length_fraction, h, node_accelerations = mesh_interval
+    interval_length_fraction, h, node_accelerations = mesh_interval
     v, q_tangents, v_tangents = tangent_state.v, tangent_state.q_tangents, tangent_state.v_tangents
-    gauss_node_column = GAUSS_NODES.astype(h.dtype)[:, None, None]
+    gauss_nodes_as_column = GAUSS_NODES.astype(h.dtype)[:, None, None]
     duration_unit_tangent = _make_unit_tangent(q_tangents.shape[0], -1, h.dtype)
     rate_increments = apply_matrix(INTEGRATION_MATRIX, node_accelerations)
     position_increments = apply_matrix(DOUBLE_INTEGRATION_MATRIX, node_accelerations)
-    node_q = tangent_state.q + h * (gauss_node_column * v + h * position_increments)
+    node_q = tangent_state.q + h * (gauss_nodes_as_column * v + h * position_increments)
     node_v = v + h * rate_increments
     node_q_tangents = (
         q_tangents[:, None]
-        + (h * gauss_node_column) * v_tangents[:, None]
+        + (h * gauss_nodes_as_column) * v_tangents[:, None]
         + duration_unit_tangent
-        * (length_fraction * (gauss_node_column * v + 2.0 * h * position_increments))
+        * (interval_length_fraction * (gauss_nodes_as_column * v + 2.0 * h * position_increments))
     )
     node_v_tangents = v_tangents[:, None] + duration_unit_tangent * (
-        length_fraction * rate_increments
+        interval_length_fraction * rate_increments
     )
     return node_q, node_v, node_q_tangents, node_v_tangents
 
@@ -288,7 +294,7 @@ def _evaluate_interval_end(
     acceleration_tangents: LaneArray,
 ) -> _PhaseTangentState:
     """Return the state and its tangents at the end of a mesh interval."""
-    length_fraction, h, node_accelerations = mesh_interval
+    interval_length_fraction, h, node_accelerations = mesh_interval
     _, q, v, _, q_tangents, v_tangents = tangent_state
     duration_unit_tangent = _make_unit_tangent(q_tangents.shape[0], -1, h.dtype)[:, 0]
     rate_increment = sum_with_weights(END_WEIGHTS, node_accelerations)
@@ -300,12 +306,12 @@ def _evaluate_interval_end(
         q_tangents
         + h * v_tangents
         + h * h * position_increment_tangents
-        + duration_unit_tangent * (length_fraction * (v + 2.0 * h * position_increment))
+        + duration_unit_tangent * (interval_length_fraction * (v + 2.0 * h * position_increment))
     )
     v_tangents = (
         v_tangents
         + h * rate_increment_tangents
-        + duration_unit_tangent * (length_fraction * rate_increment)
+        + duration_unit_tangent * (interval_length_fraction * rate_increment)
     )
     q, v = q + h * v + h * h * position_increment, v + h * rate_increment
     return tangent_state._replace(q=q, v=v, q_tangents=q_tangents, v_tangents=v_tangents)
@@ -327,54 +333,56 @@ def _linearize_residual(
     """
     n_coordinates, n_held_constants = phase.n_coordinates, tangent_state.held_constants.shape[0]
 
-    def evaluate_residual_of_arguments(*arguments: Array) -> Vector:
-        q, v, a = (arguments[i * n_coordinates : (i + 1) * n_coordinates] for i in range(3))
-        held_constants = arguments[3 * n_coordinates :][:n_held_constants]
-        parameters = arguments[3 * n_coordinates :][n_held_constants:]
-        constants = (
+    def evaluate_residual_of_arguments(*residual_arguments: Array) -> Vector:
+        q, v, a = (
+            residual_arguments[i * n_coordinates : (i + 1) * n_coordinates] for i in range(3)
+        )
+        held_constants = residual_arguments[3 * n_coordinates :][:n_held_constants]
+        parameters = residual_arguments[3 * n_coordinates :][n_held_constants:]
+        phase_constants = (
             linearization_context.compute_phase_constants(*parameters)
             if linearization_context.parameter_indices
             else linearization_context.phase_constants
         )
-        return phase.residual_function(constants, PhasePoint(held_constants, q, v), a)
+        return phase.residual_function(phase_constants, PhasePoint(held_constants, q, v), a)
 
     residual_arguments = [
-        residual_argument[:, argument_index]
-        for residual_argument in (node_q, node_v, node_accelerations)
-        for argument_index in range(n_coordinates)
+        node_array[:, coordinate_index]
+        for node_array in (node_q, node_v, node_accelerations)
+        for coordinate_index in range(n_coordinates)
     ]
     residual_arguments += [
-        jnp.broadcast_to(residual_argument, node_q[:, 0].shape)
-        for residual_argument in tangent_state.held_constants
+        jnp.broadcast_to(held_constant, node_q[:, 0].shape)
+        for held_constant in tangent_state.held_constants
     ]
     n_state_arguments = len(residual_arguments)
     if linearization_context.parameter_indices:
         residual_arguments += [
-            jnp.broadcast_to(residual_argument, node_q[:, 0].shape)
-            for residual_argument in linearization_context.parameters
+            jnp.broadcast_to(parameter_value, node_q[:, 0].shape)
+            for parameter_value in linearization_context.parameters
         ]
     # The partial derivatives are stacked only after they are computed, because each is a small
     # kernel and stacking copies it.
-    dynamics_residual, partials_by_output = linearization_context.prevent_fusion(
-        evaluate_with_partials(evaluate_residual_of_arguments, residual_arguments)
+    dynamics_residual, partial_derivatives_by_output = linearization_context.prevent_fusion(
+        evaluate_with_partial_derivatives(evaluate_residual_of_arguments, residual_arguments)
     )
-    partials_by_argument = list(zip(*partials_by_output, strict=True))
+    derivatives_by_argument = list(zip(*partial_derivatives_by_output, strict=True))
     residual_jacobian = jnp.stack(
         [
-            jnp.stack(partials_of_argument, 1)
-            for partials_of_argument in partials_by_argument[:n_state_arguments]
+            jnp.stack(derivatives_of_argument, 1)
+            for derivatives_of_argument in derivatives_by_argument[:n_state_arguments]
         ],
         2,
     )
-    parameter_partials = [
-        jnp.stack(partials_by_argument[n_state_arguments + argument_index], 1)
-        for argument_index in linearization_context.parameter_indices
+    parameter_derivatives = [
+        jnp.stack(derivatives_by_argument[n_state_arguments + parameter_index], 1)
+        for parameter_index in linearization_context.parameter_indices
     ]
     return linearization_context.prevent_fusion(
         (
             jnp.stack(dynamics_residual, 1),
             residual_jacobian,
-            jnp.stack(parameter_partials) if parameter_partials else (),
+            jnp.stack(parameter_derivatives) if parameter_derivatives else (),
         )
     )
 
@@ -390,30 +398,30 @@ def _assemble_node_system(
 
     Return the matrix and the right-hand sides. Each tangent has one right-hand side.
     """
-    dynamics_residual, residual_jacobian, parameter_partials = linearized_residual
+    dynamics_residual, residual_jacobian, parameter_derivatives = linearized_residual
     n_tangents, n_coordinates, float_dtype = (
         state_tangents.shape[0],
         dynamics_residual.shape[1],
         h.dtype,
     )
     tangent_terms = [
-        residual_jacobian[:, :, argument_index] * state_tangents[:, :, argument_index, None]
-        for argument_index in range(2 * n_coordinates)
+        residual_jacobian[:, :, state_index] * state_tangents[:, :, state_index, None]
+        for state_index in range(2 * n_coordinates)
     ]
     tangent_terms += [
-        residual_jacobian[:, :, 3 * n_coordinates + argument_index]
-        * tangent_state.held_constant_tangents[:, argument_index, None, None]
-        for argument_index in range(tangent_state.held_constants.shape[0])
+        residual_jacobian[:, :, 3 * n_coordinates + constant_index]
+        * tangent_state.held_constants_tangents[:, constant_index, None, None]
+        for constant_index in range(tangent_state.held_constants.shape[0])
     ]
     right_hand_sides = sum(
         tangent_terms, start=_make_unit_tangent(n_tangents, 0, float_dtype) * dynamics_residual
     )
     if linearization_context.parameter_indices:
-        n_other_tangents = linearization_context.n_tangents - len(
+        n_tangents_before_parameters = linearization_context.n_tangents - len(
             linearization_context.parameter_indices
         )
         right_hand_sides = right_hand_sides + jnp.pad(
-            parameter_partials, ((n_other_tangents, 1), *((0, 0),) * 3)
+            parameter_derivatives, ((n_tangents_before_parameters, 1), *((0, 0),) * 3)
         )
     double_integration_matrix, integration_matrix = (
         float64_matrix.astype(float_dtype)[:, None, :, None, None]
@@ -444,20 +452,20 @@ def _linearize_phase(
     """
     append_duration_tangent = lambda x: jnp.concatenate([x, jnp.zeros_like(x[:1])])
     tangent_state = tangent_state._replace(
-        held_constant_tangents=append_duration_tangent(tangent_state.held_constant_tangents),
+        held_constants_tangents=append_duration_tangent(tangent_state.held_constants_tangents),
         q_tangents=append_duration_tangent(tangent_state.q_tangents),
         v_tangents=append_duration_tangent(tangent_state.v_tangents),
     )
 
-    def linearize_interval(
-        start_field_values: tuple, interval_inputs: tuple
+    def linearize_mesh_interval(
+        start_state_values: tuple, interval_scan_inputs: tuple
     ) -> tuple[tuple, Array]:
-        node_accelerations, length_fraction = interval_inputs
+        node_accelerations, interval_length_fraction = interval_scan_inputs
         mesh_interval = _MeshInterval(
-            length_fraction, length_fraction * phase_duration, node_accelerations
+            interval_length_fraction, interval_length_fraction * phase_duration, node_accelerations
         )
         start_state = tangent_state._replace(
-            **dict(zip(PROPAGATED_STATE_FIELDS, start_field_values, strict=True))
+            **dict(zip(PROPAGATED_STATE_FIELDS, start_state_values, strict=True))
         )
         node_q, node_v, node_q_tangents, node_v_tangents = linearization_context.prevent_fusion(
             _evaluate_interval_nodes(start_state, mesh_interval)
@@ -481,27 +489,31 @@ def _linearize_phase(
             solve_node_equations(*node_system, linearization_context.parameters)
         )
         end_state = _evaluate_interval_end(start_state, mesh_interval, acceleration_tangents)
-        end_field_values = tuple(
+        end_state_values = tuple(
             getattr(end_state, field_name) for field_name in PROPAGATED_STATE_FIELDS
         )
-        return end_field_values, jnp.moveaxis(acceleration_tangents, 2, 0)
+        return end_state_values, jnp.moveaxis(acceleration_tangents, 2, 0)
 
-    start_fields = tuple(
+    start_state_values = tuple(
         getattr(tangent_state, field_name) for field_name in PROPAGATED_STATE_FIELDS
     )
-    length_fractions = jnp.asarray(phase_mesh.interval_fractions, phase_duration.dtype)
-    end_field_values, acceleration_tangents = lax.scan(
-        linearize_interval, start_fields, (phase_accelerations, length_fractions)
+    interval_length_fractions = jnp.asarray(
+        phase_mesh.interval_length_fractions, phase_duration.dtype
     )
-    end_values_by_field = dict(zip(PROPAGATED_STATE_FIELDS, end_field_values, strict=True))
-    return tangent_state._replace(**end_values_by_field), acceleration_tangents
+    end_state_values, acceleration_tangents = lax.scan(
+        linearize_mesh_interval,
+        start_state_values,
+        (phase_accelerations, interval_length_fractions),
+    )
+    end_value_by_field = dict(zip(PROPAGATED_STATE_FIELDS, end_state_values, strict=True))
+    return tangent_state._replace(**end_value_by_field), acceleration_tangents
 
 
 PROPAGATED_STATE_FIELDS = ("q", "v", "q_tangents", "v_tangents")
 """Names of those fields of `_PhaseTangentState` that change during a phase."""
 
 
-def _eliminate_duration(
+def _eliminate_phase_duration(
     linearization_context: _LinearizationContext,
     phase: CollocationPhase,
     tangent_state: _PhaseTangentState,
@@ -515,41 +527,46 @@ def _eliminate_duration(
     phase is 0 s.
     """
 
-    def evaluate_phase_end(held_constants: Array, q: Array, v: Array, *constants: Array) -> tuple:
+    def evaluate_phase_end(
+        held_constants: Array, q: Array, v: Array, *phase_constants: Array
+    ) -> tuple:
         phase_end_point = PhasePoint(tuple(held_constants), tuple(q), tuple(v))
-        return phase.end_event_function(constants, phase_end_point), _stack_phase_point(
-            phase.reset_map(constants, phase_end_point), q
+        return phase.end_event_function(phase_constants, phase_end_point), _stack_phase_point(
+            phase.reset_map(phase_constants, phase_end_point), q
         )
 
-    end_point = tangent_state.held_constants, tangent_state.q, tangent_state.v
+    phase_end_point = tangent_state.held_constants, tangent_state.q, tangent_state.v
     point_tangents = (
-        tangent_state.held_constant_tangents,
+        tangent_state.held_constants_tangents,
         tangent_state.q_tangents,
         tangent_state.v_tangents,
     )
     (event_value, next_phase_point), (event_tangents, next_point_tangents) = (
-        linearization_context.evaluate_with_tangents(evaluate_phase_end, end_point, point_tangents)
+        linearization_context.evaluate_function_with_tangents(
+            evaluate_phase_end, phase_end_point, point_tangents
+        )
     )
-    correction_unit_tangent, duration_unit_tangent = (
+    newton_correction_unit_tangent, duration_unit_tangent = (
         _make_unit_tangent(event_tangents.shape[0], i, phase_duration.dtype)[:, 0, 0]
         for i in (0, -1)
     )
     event_value = jnp.where(is_phase_active, event_value, phase_duration)
     event_tangents = jnp.where(is_phase_active, event_tangents, duration_unit_tangent)
     duration_tangents = (
-        -(event_tangents[:-1] + correction_unit_tangent[:-1] * event_value) / event_tangents[-1]
+        -(event_tangents[:-1] + newton_correction_unit_tangent[:-1] * event_value)
+        / event_tangents[-1]
     )
 
-    def eliminate_duration(tangents_with_duration: Array) -> Array:
+    def eliminate_duration_tangent(tangents_with_duration: Array) -> Array:
         duration_factor = duration_tangents.reshape(
             duration_tangents.shape[:1] + (1,) * (tangents_with_duration.ndim - 2) + (-1,)
         )
         return tangents_with_duration[:-1] + duration_factor * tangents_with_duration[-1:]
 
     next_state = _PhaseTangentState(
-        *next_phase_point, *(eliminate_duration(x) for x in next_point_tangents)
+        *next_phase_point, *(eliminate_duration_tangent(x) for x in next_point_tangents)
     )
-    return next_state, duration_tangents, eliminate_duration
+    return next_state, duration_tangents, eliminate_duration_tangent
 
 
 def _linearize_gait_step(
@@ -557,7 +574,7 @@ def _linearize_gait_step(
     phase_sequence: PhaseSequence,
     phase_meshes: tuple[PhaseMesh, ...],
     section_state_and_tangents: tuple,
-    step_inputs: tuple,
+    gait_step_inputs: tuple,
 ) -> tuple:
     """Linearize one gait step, and return the section state after it, its tangents and the outputs.
 
@@ -565,17 +582,17 @@ def _linearize_gait_step(
     tangents of the phase durations and of the node accelerations.
     """
     section_state, section_tangents = section_state_and_tangents
-    phase_durations, accelerations_by_phase, is_phase_active = step_inputs
+    phase_durations, accelerations_by_phase, is_phase_active = gait_step_inputs
 
-    def evaluate_step_start(section_state: Array, *constants: Array) -> tuple:
+    def evaluate_gait_step_start(section_state: Array, *phase_constants: Array) -> tuple:
         return _stack_phase_point(
-            phase_sequence.step_start_map(constants, tuple(section_state)), section_state
+            phase_sequence.step_start_map(phase_constants, tuple(section_state)), section_state
         )
 
-    start_point, start_tangents = linearization_context.evaluate_with_tangents(
-        evaluate_step_start, (section_state,), (section_tangents,)
+    phase_start_point, start_tangents = linearization_context.evaluate_function_with_tangents(
+        evaluate_gait_step_start, (section_state,), (section_tangents,)
     )
-    tangent_state = _PhaseTangentState(*start_point, *start_tangents)
+    tangent_state = _PhaseTangentState(*phase_start_point, *start_tangents)
     duration_tangents, acceleration_tangents = [], []
     for i, collocation_phase in enumerate(phase_sequence.phases):
         tangent_state, phase_acceleration_tangents = _linearize_phase(
@@ -590,27 +607,29 @@ def _linearize_gait_step(
         phase_end_tangents = jnp.concatenate(
             (tangent_state.q_tangents, tangent_state.v_tangents), -2
         )
-        tangent_state, phase_duration_tangents, eliminate_duration = _eliminate_duration(
-            linearization_context,
-            collocation_phase,
-            tangent_state,
-            phase_durations[i],
-            is_phase_active[i],
+        tangent_state, phase_duration_tangents, eliminate_duration_tangent = (
+            _eliminate_phase_duration(
+                linearization_context,
+                collocation_phase,
+                tangent_state,
+                phase_durations[i],
+                is_phase_active[i],
+            )
         )
         duration_tangents.append(phase_duration_tangents)
         # Axes: (tangent, interval, node, row, batch).
         acceleration_tangents.append(
-            eliminate_duration(jnp.swapaxes(phase_acceleration_tangents, 0, 1))
+            eliminate_duration_tangent(jnp.swapaxes(phase_acceleration_tangents, 0, 1))
         )
         tangent_state = linearization_context.prevent_fusion(tangent_state)
     # After the loop, the end state and its tangents belong to the last phase.
-    step_outputs = (
+    gait_step_tangent_outputs = (
         phase_end_state,
-        eliminate_duration(phase_end_tangents),
+        eliminate_duration_tangent(phase_end_tangents),
         jnp.stack(duration_tangents, 1),
         tuple(acceleration_tangents),
     )
-    return (tangent_state.q, tangent_state.q_tangents), step_outputs
+    return (tangent_state.q, tangent_state.q_tangents), gait_step_tangent_outputs
 
 
 def linearize_cycle(
@@ -643,71 +662,75 @@ def linearize_cycle(
         section_state,
         jnp.broadcast_to(section_unit_tangents, (n_tangents, *section_state.shape)),
     )
-    step_inputs = (trial_solution.durations, trial_solution.accelerations, is_phase_active)
-    linearize_one_step = functools.partial(
+    gait_step_inputs = (trial_solution.durations, trial_solution.accelerations, is_phase_active)
+    linearize_one_gait_step = functools.partial(
         _linearize_gait_step, linearization_context, phase_sequence, phase_meshes
     )
     if trial_solution.durations.shape[0] == 1:
-        (state_after_cycle, tangents_after_cycle), step_outputs = linearize_one_step(
-            section_state_and_tangents, jax.tree.map(lambda x: x[0], step_inputs)
+        (section_state_after_cycle, section_tangents_after_cycle), gait_step_tangent_outputs = (
+            linearize_one_gait_step(
+                section_state_and_tangents, jax.tree.map(lambda x: x[0], gait_step_inputs)
+            )
         )
-        step_outputs = jax.tree.map(lambda x: x[None], step_outputs)
+        gait_step_tangent_outputs = jax.tree.map(lambda x: x[None], gait_step_tangent_outputs)
     else:
-        (state_after_cycle, tangents_after_cycle), step_outputs = lax.scan(
-            linearize_one_step, section_state_and_tangents, step_inputs
+        (section_state_after_cycle, section_tangents_after_cycle), gait_step_tangent_outputs = (
+            lax.scan(linearize_one_gait_step, section_state_and_tangents, gait_step_inputs)
         )
 
     monodromy = jnp.swapaxes(
-        tangents_after_cycle[linearization_context.section_tangent_slice], 0, 1
+        section_tangents_after_cycle[linearization_context.section_tangent_slice], 0, 1
     )
     drop_section_tangents = lambda x: jnp.concatenate(
         [x[:1], x[linearization_context.section_tangent_slice.stop :]]
     )
-    correction_unit_vector = np.eye(
+    newton_correction_unit_vector = np.eye(
         n_tangents - linearization_context.section_size, dtype=float_dtype
     )[0][:, None, None]
-    right_hand_sides = drop_section_tangents(tangents_after_cycle) + correction_unit_vector * (
-        state_after_cycle - section_state
-    )
-    closing_matrix = invert_small_matrices(
+    right_hand_sides = drop_section_tangents(
+        section_tangents_after_cycle
+    ) + newton_correction_unit_vector * (section_state_after_cycle - section_state)
+    cycle_closing_matrix = invert_small_matrices(
         jnp.eye(linearization_context.section_size, dtype=float_dtype)[:, :, None] - monodromy
     )
-    closed_section_tangents = jnp.swapaxes(
-        contract_inner_axis(closing_matrix, jnp.swapaxes(right_hand_sides, 0, 1)), 0, 1
+    section_state_tangents = jnp.swapaxes(
+        contract_inner_axis(cycle_closing_matrix, jnp.swapaxes(right_hand_sides, 0, 1)), 0, 1
     )
 
-    def close_cycle(tangents_of_open_cycle: Array) -> Array:
+    def close_cycle_tangents(open_cycle_tangent: Array) -> Array:
         """Return the tangents of the closed cycle, whose section state is an unknown.
 
         The axes (n, tangent, ...) of the argument become (tangent, n, ...).
         """
-        tangents_of_open_cycle = jnp.swapaxes(tangents_of_open_cycle, 0, 1)
-        broadcast_shape = (-1, *(1,) * (tangents_of_open_cycle.ndim - 2), *section_state.shape[1:])
-        section_tangents = tangents_of_open_cycle[linearization_context.section_tangent_slice]
-        section_state_terms = [
-            closed_section_tangents[:, section_coordinate].reshape(broadcast_shape)
+        open_cycle_tangent = jnp.swapaxes(open_cycle_tangent, 0, 1)
+        broadcast_shape = (-1, *(1,) * (open_cycle_tangent.ndim - 2), *section_state.shape[1:])
+        section_tangents = open_cycle_tangent[linearization_context.section_tangent_slice]
+        section_state_contributions = [
+            section_state_tangents[:, section_coordinate].reshape(broadcast_shape)
             * section_tangents[section_coordinate]
             for section_coordinate in range(len(section_state))
         ]
-        return drop_section_tangents(tangents_of_open_cycle) + sum(
-            section_state_terms[1:], start=section_state_terms[0]
+        return drop_section_tangents(open_cycle_tangent) + sum(
+            section_state_contributions[1:], start=section_state_contributions[0]
         )
 
-    step_end_states, *uncorrected_tangents = linearization_context.prevent_fusion(step_outputs)
-    step_end_tangents, duration_tangents, acceleration_tangents = jax.tree.map(
-        close_cycle, tuple(uncorrected_tangents)
+    gait_step_end_states, *open_cycle_tangents = linearization_context.prevent_fusion(
+        gait_step_tangent_outputs
     )
-    step_end_tangents, solution_tangents = linearization_context.prevent_fusion(
+    gait_step_end_tangents, duration_tangents, acceleration_tangents = jax.tree.map(
+        close_cycle_tangents, tuple(open_cycle_tangents)
+    )
+    gait_step_end_tangents, solution_tangents = linearization_context.prevent_fusion(
         (
-            step_end_tangents,
-            CollocationSolution(closed_section_tangents, duration_tangents, acceleration_tangents),
+            gait_step_end_tangents,
+            CollocationSolution(section_state_tangents, duration_tangents, acceleration_tangents),
         )
     )
     return CycleLinearization(
         newton_correction=jax.tree.map(lambda x: x[0], solution_tangents),
         parameter_tangents=jax.tree.map(lambda x: x[1:], solution_tangents),
-        step_end_states=step_end_states + step_end_tangents[0],
-        step_end_tangents=step_end_tangents[1:],
+        gait_step_end_states=gait_step_end_states + gait_step_end_tangents[0],
+        gait_step_end_tangents=gait_step_end_tangents[1:],
         monodromy=monodromy,
     )
 
@@ -717,12 +740,12 @@ class PhasePoints(NamedTuple):
     end point.
     """
 
-    start_point: PhasePoint
+    phase_start_point: PhasePoint
     node_points: PhasePoint
-    end_point: PhasePoint
+    phase_end_point: PhasePoint
 
 
-def reconstruct_step(
+def reconstruct_gait_step(
     phase_sequence: PhaseSequence,
     phase_meshes: tuple[PhaseMesh, ...],
     phase_constants: PhaseConstants,
@@ -735,36 +758,39 @@ def reconstruct_step(
     Return the section state at the end of the gait step, and the points of each phase. No equation
     is solved. Arrays may have additional trailing axes.
     """
-    start_point = phase_sequence.step_start_map(phase_constants, section_state)
+    phase_start_point = phase_sequence.step_start_map(phase_constants, section_state)
     phase_points = []
     for i, collocation_phase in enumerate(phase_sequence.phases):
-        node_times, rate_matrix, position_matrix = (
+        node_times, rate_integration_matrix, position_integration_matrix = (
             float64_weights.astype(phase_durations.dtype)
             for float64_weights in build_phase_integration_matrices(phase_meshes[i])
         )
         phase_accelerations, phase_duration = accelerations_by_phase[i], phase_durations[i]
         phase_accelerations = phase_accelerations.reshape(-1, *phase_accelerations.shape[2:])
-        q, v = jnp.stack(start_point.q), jnp.stack(start_point.v)
+        q, v = jnp.stack(phase_start_point.q), jnp.stack(phase_start_point.v)
         node_times = node_times.reshape(-1, *(1,) * q.ndim)
         node_q = q + phase_duration * (
-            node_times * v + phase_duration * jnp.tensordot(position_matrix, phase_accelerations, 1)
+            node_times * v
+            + phase_duration * jnp.tensordot(position_integration_matrix, phase_accelerations, 1)
         )
-        node_v = v + phase_duration * jnp.tensordot(rate_matrix, phase_accelerations, 1)
+        node_v = v + phase_duration * jnp.tensordot(rate_integration_matrix, phase_accelerations, 1)
         node_points = PhasePoint(
-            start_point.held_constants,
+            phase_start_point.held_constants,
             tuple(node_q[:-1].swapaxes(0, 1)),
             tuple(node_v[:-1].swapaxes(0, 1)),
         )
-        end_point = PhasePoint(start_point.held_constants, tuple(node_q[-1]), tuple(node_v[-1]))
-        phase_points.append(PhasePoints(start_point, node_points, end_point))
-        start_point = collocation_phase.reset_map(phase_constants, end_point)
-    return start_point.q, tuple(phase_points)
+        phase_end_point = PhasePoint(
+            phase_start_point.held_constants, tuple(node_q[-1]), tuple(node_v[-1])
+        )
+        phase_points.append(PhasePoints(phase_start_point, node_points, phase_end_point))
+        phase_start_point = collocation_phase.reset_map(phase_constants, phase_end_point)
+    return phase_start_point.q, tuple(phase_points)
 
 
 def estimate_mesh_error(
     phase_sequence: PhaseSequence,
     phase_meshes: tuple[PhaseMesh, ...],
-    solution: CollocationSolution,
+    collocation_solution: CollocationSolution,
     error_per_acceleration_jump: float = 0.05,
 ) -> LaneArray:
     """Estimate the discretization error of a cycle for each batch element, shape (batch,).
@@ -781,7 +807,7 @@ def estimate_mesh_error(
       10 s. For most gaits the estimate is far above the error.
     """
     largest_acceleration_jump = jnp.zeros(
-        solution.section_state.shape[-1], solution.section_state.dtype
+        collocation_solution.section_state.shape[-1], collocation_solution.section_state.dtype
     )
     for i, phase_mesh in enumerate(phase_meshes):
         if phase_mesh.n_intervals == 1 or not phase_sequence.phases[i].is_motion_smooth:
@@ -795,16 +821,16 @@ def estimate_mesh_error(
                 (0, 2),
             )
             for location_in_interval, node_accelerations in (
-                (1.0, solution.accelerations[i][:, :-1]),
-                (0.0, solution.accelerations[i][:, 1:]),
+                (1.0, collocation_solution.accelerations[i][:, :-1]),
+                (0.0, collocation_solution.accelerations[i][:, 1:]),
             )
         )
         longer_interval_fraction = np.maximum(
-            phase_mesh.interval_fractions[1:], phase_mesh.interval_fractions[:-1]
+            phase_mesh.interval_length_fractions[1:], phase_mesh.interval_length_fractions[:-1]
         )
         longer_interval_length = (
             longer_interval_fraction[:, None, None].astype(largest_acceleration_jump.dtype)
-            * solution.durations[:, None, None, i]
+            * collocation_solution.durations[:, None, None, i]
         )
         acceleration_jump = (
             jnp.abs(accelerations_before_boundary - accelerations_after_boundary)

@@ -46,7 +46,7 @@ from vrw_jax.integrator import (
     find_guard_minimum,
     fit_guard_parabola,
 )
-from vrw_jax.numerics import StepOptions, select_tree_leaves
+from vrw_jax.numerics import StepOptions, select_trees_by_condition
 from vrw_jax.wheel import Outcome, Symbols, compute_wheel_units
 
 N_CONTACT_QUANTITY_ROWS = 9
@@ -692,12 +692,12 @@ def advance_running_lanes(
     )
     lane_status = jnp.where(is_at_singularity, Outcome.PAINLEVE_PARADOX, lane_status)
     return lane_states._replace(
-        interval_point=select_tree_leaves(is_state_updated, end_point, start_point),
+        interval_point=select_trees_by_condition(is_state_updated, end_point, start_point),
         guard_values=jnp.where(is_accepted, attempted_step.guard_values, lane_states.guard_values),
         interval_accumulators=interval_accumulators,
         h=jnp.where(is_running, next_step_size, h),
         time_since_event=time,
-        event_bracket=select_tree_leaves(is_running, next_bracket, event_bracket),
+        event_bracket=select_trees_by_condition(is_running, next_bracket, event_bracket),
         lane_status=jnp.where(is_running, lane_status, lane_states.lane_status).astype(jnp.int32),
         triggered_guard_index=jnp.where(
             has_reached_event, located_event.guard_index, lane_states.triggered_guard_index

@@ -34,7 +34,7 @@ from vrw_jax.contact.mechanics import (
     SlotPair,
     prevent_fusion,
 )
-from vrw_jax.numerics import Elementwise, select_tree_leaves
+from vrw_jax.numerics import Elementwise, select_trees_by_condition
 from vrw_jax.wheel import ContactMode, Symbols, compute_wheel_units
 
 Friction = Elementwise | SlotPair
@@ -813,13 +813,13 @@ def choose_combination(
         combination, combination_violation, n_admissible = _find_least_violating(
             evaluate_combination, combinations
         )
-        best_combination, lowest_violation = select_tree_leaves(
+        best_combination, lowest_violation = select_trees_by_condition(
             combination_violation < lowest_violation,
             (combination, combination_violation),
             (best_combination, lowest_violation),
         )
         n_solutions = n_solutions + n_admissible
-        return select_tree_leaves(
+        return select_trees_by_condition(
             is_unfinished(enumeration_state),
             _EnumerationState(untested_mask, best_combination, lowest_violation, n_solutions),
             enumeration_state,

@@ -40,7 +40,11 @@ from vrw_jax.contact.contact_state import (
     unpack_state,
 )
 from vrw_jax.contact.mechanics import WheelMotion, stop_gradients
-from vrw_jax.hybrid import MonitoredFunctions, integrate_in_units, sample_in_units
+from vrw_jax.hybrid import (
+    GuardsAndMargins,
+    integrate_phase_in_scaled_units,
+    sample_phase_in_scaled_units,
+)
 from vrw_jax.numerics import StepOptions
 from vrw_jax.wheel import Outcome, compute_wheel_units
 
@@ -112,9 +116,9 @@ def integrate_by_diffrax(
     guard_offset = guard_offset.at[guard_layout.rolling_rate_guard].set(
         jnp.where((end_rates < 0.0) & (end_acceleration > 0.0), end_rates, 0.0)
     )
-    end_result = integrate_in_units(
+    end_result = integrate_phase_in_scaled_units(
         partial(evaluate_vector_field, mode_dynamics),
-        MonitoredFunctions(
+        GuardsAndMargins(
             lambda packed_state: compute_guard_values(mode_dynamics, packed_state) - guard_offset,
             guard_layout.n_guards,
             guard_scales=compute_guard_scales(mode_dynamics),
@@ -136,7 +140,7 @@ def integrate_by_diffrax(
     failure_outcome = jnp.where(
         end_result.is_timed_out, Outcome.NO_TOUCHDOWN_IN_TIME, Outcome.SOLVER_FAILED
     )
-    lane_status = jnp.where(end_result.guard >= 0, LaneStatus.EVENT, failure_outcome)
+    lane_status = jnp.where(end_result.end_guard_index >= 0, LaneStatus.EVENT, failure_outcome)
     lane_status = jnp.where(is_singular, Outcome.PAINLEVE_PARADOX, lane_status)
     dynamics_rows = jnp.where(
         is_running, end_rows[:n_dynamics_rows], interval.interval_point.dynamics_rows
@@ -147,7 +151,7 @@ def integrate_by_diffrax(
         time_since_event=jnp.where(is_running, end_result.duration, interval.time_since_event),
         lane_status=jnp.where(is_running, lane_status, interval.lane_status).astype(jnp.int32),
         triggered_guard_index=jnp.where(
-            is_running, end_result.guard, interval.triggered_guard_index
+            is_running, end_result.end_guard_index, interval.triggered_guard_index
         ),
         n_solver_steps=jnp.where(is_running, end_result.solver_steps, interval.n_solver_steps),
     )
@@ -180,7 +184,7 @@ def sample_by_diffrax(
         compute_packed_units(mode_dynamics.s),
         compute_wheel_units(mode_dynamics.s).time_unit,
     )
-    packed_states = sample_in_units(
+    packed_states = sample_phase_in_scaled_units(
         partial(evaluate_vector_field, mode_dynamics),
         start_state,
         duration,

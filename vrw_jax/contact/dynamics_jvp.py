@@ -193,10 +193,10 @@ def _solve_with_jvp_rule(
     The JVP rule solves the contact equations with the tangent of the residual on the right-hand
     side.
     """
-    float_leaves, static_leaves = eqx.partition(contact_configuration, eqx.is_inexact_array)
-    other_arrays, static_leaves = eqx.partition(static_leaves, eqx.is_array)
+    float_leaves, nonarray_leaves = eqx.partition(contact_configuration, eqx.is_inexact_array)
+    other_arrays, nonarray_leaves = eqx.partition(nonarray_leaves, eqx.is_array)
     assemble_configuration = lambda float_leaves, other_arrays: eqx.combine(
-        float_leaves, other_arrays, static_leaves
+        float_leaves, other_arrays, nonarray_leaves
     )
     solve_from_arrays = jax.custom_jvp(
         lambda *arrays: _solve_with_free_motion(free_motion_fn, assemble_configuration(*arrays))[2]

@@ -51,7 +51,7 @@ from vrw_jax.contact.mechanics import (
     select_slot_friction,
     stop_gradients,
 )
-from vrw_jax.numerics import Elementwise, run_if_any, select_tree_leaves
+from vrw_jax.numerics import Elementwise, run_if_any_element_active, select_trees_by_condition
 from vrw_jax.wheel import ContactMode, Symbols
 
 
@@ -209,7 +209,7 @@ def _solve_stopper_lcp(
         max_violation = jnp.maximum(
             jnp.max(sign_violation, axis=0), level_solution.chosen_combination.sign_violation
         )
-        best_solution = select_tree_leaves(
+        best_solution = select_trees_by_condition(
             max_violation < best_solution[0],
             (max_violation, is_stopper_holding, level_solution.chosen_combination),
             best_solution,
@@ -227,7 +227,7 @@ def _solve_stopper_lcp(
         enumerated_legs = jnp.where(
             is_stopper_tested, ((combination_code >> tested_leg_rank) & 1) == 1, is_at_stopper
         )
-        return select_tree_leaves(
+        return select_trees_by_condition(
             is_unfinished(pivot_state),
             (
                 jnp.where(is_pivoting, switched_legs, enumerated_legs),
@@ -702,12 +702,12 @@ def _bring_slow_contacts_to_rest(
             (modes_after_rest == ContactMode.SLIP_UP) & (slip_speed_after > 0.0)
         )
 
-    is_slip_reversed = has_contact_changed & run_if_any(
+    is_slip_reversed = has_contact_changed & run_if_any_element_active(
         jnp.any(has_contact_changed), find_reversed_slip, is_locked & False
     )
     modes_after_rest = jnp.where(is_slip_reversed, ContactMode.STICK, modes_after_rest)
     return (
-        select_tree_leaves(
+        select_trees_by_condition(
             has_contact_changed,
             project_motion(
                 contact_law.s, motion, modes_after_rest, is_locked, contact_law.friction
@@ -791,7 +791,11 @@ def _replace_liftoff_by_slip(
     )
     zero_slot_flags = jnp.zeros_like(motion.theta), jnp.zeros_like(motion.theta)
     is_force_uphill = (
-        jnp.stack(run_if_any(jnp.any(is_starting_to_slide), tangential_forces, zero_slot_flags))
+        jnp.stack(
+            run_if_any_element_active(
+                jnp.any(is_starting_to_slide), tangential_forces, zero_slot_flags
+            )
+        )
         > 0.0
     )
     return contact_event._replace(
@@ -851,7 +855,7 @@ def resolve_event(
         stays_at_stopper,
         was_at_stopper,
     )
-    motion_after, contact_modes, is_at_stopper = select_tree_leaves(
+    motion_after, contact_modes, is_at_stopper = select_trees_by_condition(
         is_impact, slow_contact_result, (motion, contact_state.contact_modes, was_at_stopper)
     )
     leg_directions = compute_leg_directions(s, motion.theta)

@@ -49,7 +49,7 @@ from vrw_jax.numerics import (
     ForwardFunction,
     StepOptions,
     compile_batch_function,
-    make_opaque_condition,
+    make_opaque_loop_condition,
     unbatch,
 )
 from vrw_jax.wheel import ContactMode, stack_parameters
@@ -97,9 +97,9 @@ class ContactStepConfig(NamedTuple):
         )
         return input_columns, x, (wheel, params, options)
 
-    def make_walk_settings(self, step_settings: Any) -> BatchWalkSettings:
+    def make_walk_settings(self, gait_step_settings: Any) -> BatchWalkSettings:
         """Return the settings for a batch of walks of one step each."""
-        wheel, params, options = step_settings
+        wheel, params, options = gait_step_settings
         tableau = None if self.uses_diffrax else load_explicit_tableau(options.solver)
         assert self.uses_diffrax or tableau is not None  # The caller has checked the solver.
         contact_rules = (
@@ -128,9 +128,9 @@ class ContactStepConfig(NamedTuple):
 
         The argument leaves have the batch on their last axis.
         """
-        input_columns, x, step_settings = self.unpack_leaves(leaves)
+        input_columns, x, gait_step_settings = self.unpack_leaves(leaves)
         return _partition_result(
-            run_walks(self.make_walk_settings(step_settings), input_columns, x)
+            run_walks(self.make_walk_settings(gait_step_settings), input_columns, x)
         )
 
     def compute_tangents(self, leaves: tuple[Array, ...], tangents: tuple[Array, ...]) -> tuple:
@@ -138,13 +138,13 @@ class ContactStepConfig(NamedTuple):
 
         Each batch element has one tangent of its argument leaves.
         """
-        input_columns, x, step_settings = self.unpack_leaves(leaves)
+        input_columns, x, gait_step_settings = self.unpack_leaves(leaves)
         input_column_tangents, section_state_tangents = (
             tangent_rows[None] for tangent_rows in self.unpack_leaves(tangents)[:2]
         )
         n_tangents = jnp.ones_like(input_columns[0], jnp.int32)
         walk_result, result_tangents = walk_with_tangents(
-            self.make_walk_settings(step_settings),
+            self.make_walk_settings(gait_step_settings),
             input_columns,
             x,
             input_column_tangents,
@@ -201,8 +201,8 @@ def build_contact_step_jacobian(
     """
 
     def make_template(leaves: tuple[Array, ...], _tangents: tuple[Array, ...]) -> tuple:
-        float_outputs, other_outputs = step_config.make_template(*leaves)
-        return float_outputs, float_outputs, other_outputs
+        float_outputs, nonfloat_outputs = step_config.make_template(*leaves)
+        return float_outputs, float_outputs, nonfloat_outputs
 
     structure_name = str(step_config.argument_tree_structure)
     cache_key = (
@@ -227,14 +227,16 @@ def build_contact_step_jacobian(
                 leaf_tangents.reshape(-1, *jnp.shape(leaves[i])), leaves[i].dtype
             )
         batch_axes = tuple(0 if i in input_indices else None for i in range(len(leaves)))
-        jacobian_columns, float_outputs, other_outputs = jax.vmap(
+        jacobian_columns, float_outputs, nonfloat_outputs = jax.vmap(
             compute_tangents, (None, batch_axes)
         )(leaves, tuple(tangents))
-        float_outputs, other_outputs = jax.tree.map(lambda x: x[0], (float_outputs, other_outputs))
+        float_outputs, nonfloat_outputs = jax.tree.map(
+            lambda x: x[0], (float_outputs, nonfloat_outputs)
+        )
         return (
             split_jacobian_by_leaf(jacobian_columns, leaves, input_indices),
             float_outputs,
-        ), other_outputs
+        ), nonfloat_outputs
 
     return evaluate_jacobian
 
@@ -321,12 +323,14 @@ def build_contact_step_sampler(
     cache_key = str(step_config.argument_tree_structure)
 
     def init_lane_state(*leaves: Array) -> Any:
-        input_columns, x, step_settings = step_config.unpack_leaves(leaves)
-        return init_lane_states(step_config.make_walk_settings(step_settings), input_columns, x)[1]
+        input_columns, x, gait_step_settings = step_config.unpack_leaves(leaves)
+        return init_lane_states(
+            step_config.make_walk_settings(gait_step_settings), input_columns, x
+        )[1]
 
     def advance_to_event(leaves: tuple[Array, ...], lane_state: Any) -> tuple[Any, IntervalLog]:
-        input_columns, x, step_settings = step_config.unpack_leaves(leaves)
-        walk_settings = step_config.make_walk_settings(step_settings)
+        input_columns, x, gait_step_settings = step_config.unpack_leaves(leaves)
+        walk_settings = step_config.make_walk_settings(gait_step_settings)
         state_after_event, lane_state = process_and_integrate(
             walk_settings,
             walk_settings.replace_invalid_lanes(input_columns, x)[0],
@@ -355,8 +359,8 @@ def build_contact_step_sampler(
     def make_logged_dynamics(
         leaves: tuple[Array, ...], interval_log: IntervalLog
     ) -> tuple[BatchWalkSettings, ModeDynamics]:
-        input_columns, x, step_settings = step_config.unpack_leaves(leaves)
-        walk_settings = step_config.make_walk_settings(step_settings)
+        input_columns, x, gait_step_settings = step_config.unpack_leaves(leaves)
+        walk_settings = step_config.make_walk_settings(gait_step_settings)
         no_leg_flags = interval_log.is_locked & False
         contact_state = ContactState(
             interval_log.contact_modes,
@@ -410,7 +414,7 @@ def build_contact_step_sampler(
             )
             return lane_state, jax.tree.map(write_log_entry, interval_log, interval_entry)
 
-        should_continue = lambda state: make_opaque_condition(
+        should_continue = lambda state: make_opaque_loop_condition(
             state[0].walk_outcome == STATUS_UNFINISHED, state[0].step_counters.n_events
         )
         lane_state, interval_log = lax.while_loop(
@@ -422,8 +426,8 @@ def build_contact_step_sampler(
             unpack_motion(lane_state.interval_state.interval_point),
             lane_state.interval_state.contact_state,
         )
-        input_columns, _, step_settings = step_config.unpack_leaves(leaves)
-        walk_settings = step_config.make_walk_settings(step_settings)
+        input_columns, _, gait_step_settings = step_config.unpack_leaves(leaves)
+        walk_settings = step_config.make_walk_settings(gait_step_settings)
         step_summary = walk_settings.summarize_step(
             final_state,
             lane_state.step_counters,

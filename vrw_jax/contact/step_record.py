@@ -34,7 +34,7 @@ from vrw_jax.contact.impacts import (
 from vrw_jax.contact.mechanics import WheelMotion, compute_landing_position
 from vrw_jax.contact.section import FullState, pack_section_state
 from vrw_jax.models import AbstractContactStep
-from vrw_jax.numerics import Elementwise, StepOptions, select_tree_leaves
+from vrw_jax.numerics import Elementwise, StepOptions, select_trees_by_condition
 from vrw_jax.wheel import ContactMode, Outcome, Symbols, replace_rest_outcome
 
 
@@ -375,7 +375,7 @@ def record_event(
         step_details.landing_normal,
         step_details.landing_tangential,
     )
-    post_impact, landing_normal, landing_tangential = select_tree_leaves(
+    post_impact, landing_normal, landing_tangential = select_trees_by_condition(
         is_first_event, opening_quantities, previous_quantities
     )
     stopper_impulse = jnp.minimum(

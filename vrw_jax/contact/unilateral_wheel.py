@@ -31,7 +31,7 @@ from vrw_jax.models import (
     ModelCapabilities,
     StepGroundValues,
     can_use_batch_kernel,
-    complete_line_slopes,
+    complete_ground_line_slopes,
     require_stepwise_shape,
 )
 from vrw_jax.numerics import (
@@ -122,7 +122,7 @@ class AbstractContactWheel(AbstractWheel):
     def count_section_entries(self, params: WheelParams) -> int:
         return compute_full_section_size(params.n_legs)
 
-    def count_continuous_entries(self, params: WheelParams) -> int:
+    def count_continuous_section_entries(self, params: WheelParams) -> int:
         return compute_full_section_size(params.n_legs) - params.n_legs
 
     def collect_section_units(self, wheel_units: WheelUnits, n_legs: int) -> list[Elementwise]:
@@ -171,8 +171,13 @@ class UnilateralWheel(AbstractContactWheel):
     capabilities: ClassVar[ModelCapabilities] = ModelCapabilities(
         config_name="unilateral",
         gait_method=GaitMethod.CONTACT_WALKS,
-        accepted_commands=frozenset({"scan", "tune", "branch", "explore"}),
-        default_only_fields=("restitution", "infinite_friction_rule", "uneven", "max_events"),
+        accepted_cli_commands=frozenset({"scan", "tune", "branch", "explore"}),
+        fields_with_fixed_defaults=(
+            "restitution",
+            "infinite_friction_rule",
+            "uneven",
+            "max_events",
+        ),
     )
     batch_kernel: ClassVar[str] = "legs"
 
@@ -228,7 +233,9 @@ class UnilateralWheel(AbstractContactWheel):
             return None
         is_flat_ground = slope.ndim == 0
         line_slopes = (
-            jnp.full(n_steps + 1, slope) if is_flat_ground else complete_line_slopes(slope, n_steps)
+            jnp.full(n_steps + 1, slope)
+            if is_flat_ground
+            else complete_ground_line_slopes(slope, n_steps)
         )
         if friction.ndim:
             require_stepwise_shape(FRICTION_NAME, friction, n_steps)

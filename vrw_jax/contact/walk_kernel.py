@@ -64,9 +64,9 @@ from vrw_jax.contact.step_record import (
 from vrw_jax.integrator import ButcherTableau
 from vrw_jax.numerics import (
     StepOptions,
-    make_opaque_condition,
+    make_opaque_loop_condition,
     make_zeros_like_output,
-    select_tree_leaves,
+    select_trees_by_condition,
 )
 from vrw_jax.wheel import (
     PARAMETER_NAMES,
@@ -378,14 +378,14 @@ class BatchWalkSettings(NamedTuple):
         opened_contact_state = opened_contact_state._replace(
             force_rate_signs=interval_state.contact_state.force_rate_signs
         )
-        motion, contact_state = select_tree_leaves(
+        motion, contact_state = select_trees_by_condition(
             begins_step,
             (opened_motion, opened_contact_state),
             (motion, interval_state.contact_state),
         )
         new_counters, *new_records = self._init_step_records(motion.x)
         new_counters = new_counters._replace(n_solver_steps=step_counters.n_solver_steps)
-        step_counters, step_details, step_accumulators = select_tree_leaves(
+        step_counters, step_details, step_accumulators = select_trees_by_condition(
             begins_step,
             (new_counters, *new_records),
             (step_counters, step_details, step_accumulators),
@@ -422,7 +422,7 @@ class BatchWalkSettings(NamedTuple):
             )
             event_outcome = jnp.where(is_contact_event, event_outcome, Outcome.STEPPED)
             state_after_event = event_result.motion, event_result.contact_state
-            motion_after, contact_state_after = select_tree_leaves(
+            motion_after, contact_state_after = select_trees_by_condition(
                 is_contact_event,
                 state_after_event,
                 (motion, contact_state.continue_unchanged()),
@@ -464,9 +464,9 @@ class BatchWalkSettings(NamedTuple):
         has_interval_ended = (interval_state.lane_status != LaneStatus.RUNNING) & (
             lane_state.walk_outcome == STATUS_UNFINISHED
         )
-        return select_tree_leaves(
+        return select_trees_by_condition(
             has_interval_ended,
-            select_tree_leaves(has_ended, ended_lane_state, continued_lane_state),
+            select_trees_by_condition(has_ended, ended_lane_state, continued_lane_state),
             lane_state,
         )
 
@@ -613,7 +613,7 @@ def run_walks(
         walk_settings, input_columns, lane_state
     )[1]
     should_continue = lambda lane_state: jnp.any(
-        make_opaque_condition(
+        make_opaque_loop_condition(
             lane_state.walk_outcome == STATUS_UNFINISHED, lane_state.step_counters.n_events
         )
     )

@@ -39,7 +39,7 @@ from vrw_jax.contact.walk_kernel import (
     LaneState,
 )
 from vrw_jax.integrator import ButcherTableau, compute_real_stability_limit
-from vrw_jax.numerics import StepOptions, run_if_any, select_tree_leaves
+from vrw_jax.numerics import StepOptions, run_if_any_element_active, select_trees_by_condition
 from vrw_jax.wheel import ContactMode, compute_wheel_units
 
 
@@ -391,7 +391,7 @@ def _integrate_with_tangents(
                 stage_tangents[last_stage],
                 start_tangent.time_since_event,
             )
-            return select_tree_leaves(
+            return select_trees_by_condition(
                 is_state_updated,
                 end_tangent,
                 start_tangent._replace(dynamics_rows=stage_tangents[0]),
@@ -462,12 +462,12 @@ def _evaluate_stages(
             )
             input_tangent = _unpack_tangent(tangents.column_tangents, k, input_columns)
             has_input_tangent = jnp.any(k < tangents.n_column_tangents)
-            row_tangent = run_if_any(
+            row_tangent = run_if_any_element_active(
                 ~has_input_tangent,
                 lambda _: push_coordinates(*coordinate_tangents),
                 tangent.dynamics_rows,
             )
-            row_tangent = run_if_any(
+            row_tangent = run_if_any_element_active(
                 has_input_tangent,
                 lambda _: pushforward(input_tangent, *coordinate_tangents),
                 row_tangent,

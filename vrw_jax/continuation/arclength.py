@@ -24,7 +24,7 @@ from vrw_jax.numerics import (
     StatusCode,
     batch_sizes,
     evaluate_with_jacobian,
-    select_tree_leaves,
+    select_trees_by_condition,
 )
 from vrw_jax.validation import (
     check_int,
@@ -173,19 +173,19 @@ def compute_fixed_point_newton_step(
     continuous_map = lambda x, p: return_map(jnp.concatenate([x, z[n_continuous:]]), p)
     mapped_point, partial_jacobians = evaluate_with_jacobian(continuous_map, z[:n_continuous], p)
     jacobian_by_z, jacobian_by_p = (
-        return_map_jacobian[:n_continuous] for return_map_jacobian in partial_jacobians
+        partial_jacobian[:n_continuous] for partial_jacobian in partial_jacobians
     )
     map_defect = mapped_point - z
     right_hand_sides = jnp.stack([map_defect[:n_continuous], jacobian_by_p], -1)
-    solved_columns = jnp.linalg.solve(
+    correction_and_tangent_columns = jnp.linalg.solve(
         jnp.eye(n_continuous, dtype=z.dtype) - jacobian_by_z, right_hand_sides
     )
     discrete_code_corrections = map_defect[n_continuous:]
     branch_tangent = jnp.concatenate(
-        [solved_columns[:, 1], jnp.zeros_like(discrete_code_corrections)]
+        [correction_and_tangent_columns[:, 1], jnp.zeros_like(discrete_code_corrections)]
     )
     return NewtonStep(
-        jnp.concatenate([solved_columns[:, 0], discrete_code_corrections]),
+        jnp.concatenate([correction_and_tangent_columns[:, 0], discrete_code_corrections]),
         branch_tangent,
         jacobian_by_z,
     )
@@ -255,9 +255,9 @@ class CorrectorPlane(NamedTuple):
     """
 
     plane_section_state: SectionStateVector
-    plane_fraction: Scalar
+    plane_parameter_fraction: Scalar
     normal_section_part: SectionStateVector
-    normal_fraction_part: Scalar
+    normal_parameter_part: Scalar
 
 
 class CorrectorState(NamedTuple):
@@ -302,20 +302,26 @@ def correct_trial_point(
     section_state = problem.section_state(z) + problem.section_state(newton_step.newton_correction)
     plane_residual = corrector_plane.normal_section_part @ (
         section_state - corrector_plane.plane_section_state
-    ) + corrector_plane.normal_fraction_part * (parameter_fraction - corrector_plane.plane_fraction)
-    d_fraction = -plane_residual / (
+    ) + corrector_plane.normal_parameter_part * (
+        parameter_fraction - corrector_plane.plane_parameter_fraction
+    )
+    parameter_fraction_correction = -plane_residual / (
         corrector_plane.normal_section_part @ problem.section_state(fraction_tangent)
-        + corrector_plane.normal_fraction_part
+        + corrector_plane.normal_parameter_part
     )
     dz = jax.tree.map(
-        lambda unknown_leaf, tangent_leaf: unknown_leaf + d_fraction * tangent_leaf,
+        lambda unknown_leaf, tangent_leaf: (
+            unknown_leaf + parameter_fraction_correction * tangent_leaf
+        ),
         newton_step.newton_correction,
         fraction_tangent,
     )
-    correction_norm = jnp.maximum(problem.correction_norm(z, dz), jnp.abs(d_fraction))
+    correction_norm = jnp.maximum(
+        problem.correction_norm(z, dz), jnp.abs(parameter_fraction_correction)
+    )
     return CorrectorState(
         jax.tree.map(jnp.add, z, dz),
-        parameter_fraction + d_fraction,
+        parameter_fraction + parameter_fraction_correction,
         correction_norm,
         fraction_tangent,
         newton_step.return_map_jacobian,
@@ -361,31 +367,33 @@ def _predict_trial_point(
     points and their tangents. Its error is two orders smaller than the error of a prediction by the
     tangent. This saves one of three Newton iterations.
     """
-    fraction = _compute_parameter_fraction(current_point.p, parameter_bounds)
+    parameter_fraction = _compute_parameter_fraction(current_point.p, parameter_bounds)
     fraction_rate = current_point.fraction_rate
-    range_end = jnp.where(fraction_rate > 0.0, 1.0, 0.0)
+    range_end_fraction = jnp.where(fraction_rate > 0.0, 1.0, 0.0)
     is_parameter_stationary = fraction_rate == 0.0
-    bound_distance = jnp.where(
+    arc_length_to_range_end = jnp.where(
         is_parameter_stationary,
         jnp.inf,
-        (range_end - fraction) / jnp.where(is_parameter_stationary, 1.0, fraction_rate),
+        (range_end_fraction - parameter_fraction)
+        / jnp.where(is_parameter_stationary, 1.0, fraction_rate),
     )
-    is_range_end = bound_distance <= ds
-    predicted_arc_length = jnp.where(is_range_end, bound_distance, ds)
+    is_range_end = arc_length_to_range_end <= ds
+    predicted_arc_length = jnp.where(is_range_end, arc_length_to_range_end, ds)
     section_tangent = problem.section_state(current_point.arclength_tangent)
     section_state = problem.section_state(current_point.z)
-    target_fraction = jnp.where(
-        is_range_end, range_end, fraction + predicted_arc_length * fraction_rate
+    target_parameter_fraction = jnp.where(
+        is_range_end, range_end_fraction, parameter_fraction + predicted_arc_length * fraction_rate
     )
     corrector_plane = CorrectorPlane(
         section_state + predicted_arc_length * section_tangent,
-        target_fraction,
+        target_parameter_fraction,
         jnp.where(is_range_end, 0.0, section_tangent),
         jnp.where(is_range_end, 1.0, fraction_rate),
     )
-    previous_fraction = _compute_parameter_fraction(previous_point.p, parameter_bounds)
+    previous_parameter_fraction = _compute_parameter_fraction(previous_point.p, parameter_bounds)
     point_displacement = jnp.append(
-        section_state - problem.section_state(previous_point.z), fraction - previous_fraction
+        section_state - problem.section_state(previous_point.z),
+        parameter_fraction - previous_parameter_fraction,
     )
     has_previous_point = has_previous_point & problem.is_smooth_between(
         previous_point.z, current_point.z
@@ -398,7 +406,7 @@ def _predict_trial_point(
         has_previous_point, jnp.sqrt(point_displacement @ point_displacement), 1.0
     )
 
-    def extrapolate(
+    def extrapolate_cubic(
         previous_leaf: Array, previous_rate: Array, current_leaf: Array, current_rate: Array
     ) -> Array:
         mean_rate = (current_leaf - previous_leaf) / chord_length
@@ -412,18 +420,23 @@ def _predict_trial_point(
         )
 
     z = jax.tree.map(
-        extrapolate,
+        extrapolate_cubic,
         previous_point.z,
         previous_point.arclength_tangent,
         current_point.z,
         current_point.arclength_tangent,
     )
-    fraction = jnp.where(
+    parameter_fraction = jnp.where(
         is_range_end,
-        range_end,
-        extrapolate(previous_fraction, previous_point.fraction_rate, fraction, fraction_rate),
+        range_end_fraction,
+        extrapolate_cubic(
+            previous_parameter_fraction,
+            previous_point.fraction_rate,
+            parameter_fraction,
+            fraction_rate,
+        ),
     )
-    return _TrialPoint(corrector_plane, z, fraction, predicted_arc_length, is_range_end)
+    return _TrialPoint(corrector_plane, z, parameter_fraction, predicted_arc_length, is_range_end)
 
 
 class _TrialVerdict(NamedTuple):
@@ -432,10 +445,10 @@ class _TrialVerdict(NamedTuple):
     If the trial is neither accepted nor failed, another Newton iteration follows.
     """
 
-    is_accepted: Bool[Array, ""]
-    has_failed: Bool[Array, ""]
+    is_trial_accepted: Bool[Array, ""]
+    has_trial_failed: Bool[Array, ""]
     # whether the trial is accepted despite a turn of more than `max_turn_angle`
-    is_kink: Bool[Array, ""]
+    is_trial_kink: Bool[Array, ""]
     fraction_rate: Scalar  # derivative of the parameter fraction in the direction of continuation
 
 
@@ -465,31 +478,34 @@ class ContinuationState(NamedTuple):
     ) -> "ContinuationState":
         """Return the initial state of one branch, whose first trial point is (z, p)."""
         section_state = problem.section_state(z)
-        n_section, float_dtype = section_state.shape[0], section_state.dtype
-        zero_step_length, zero_count = jnp.zeros((), float_dtype), jnp.zeros((), jnp.int32)
-        false_scalar = jnp.asarray(False)
-        zero_tangent = jax.tree.map(jnp.zeros_like, z)
-        fraction = _compute_parameter_fraction(p, parameter_bounds)
+        n_section_coordinates, float_dtype = section_state.shape[0], section_state.dtype
+        initial_arc_length, initial_count = jnp.zeros((), float_dtype), jnp.zeros((), jnp.int32)
+        initial_flag = jnp.asarray(False)
+        initial_tangent = jax.tree.map(jnp.zeros_like, z)
+        parameter_fraction = _compute_parameter_fraction(p, parameter_bounds)
         initial_point = ContinuationPoint(
             z,
             p,
-            zero_tangent,
-            zero_step_length + direction_sign,
-            jnp.zeros((n_section, n_section), float_dtype),
-            false_scalar,
+            initial_tangent,
+            initial_arc_length + direction_sign,
+            jnp.zeros((n_section_coordinates, n_section_coordinates), float_dtype),
+            initial_flag,
         )
         trial_point = _TrialPoint(
             CorrectorPlane(
-                section_state, fraction, jnp.zeros_like(section_state), zero_step_length + 1.0
+                section_state,
+                parameter_fraction,
+                jnp.zeros_like(section_state),
+                initial_arc_length + 1.0,
             ),
             z,
-            fraction,
-            zero_step_length,
-            false_scalar,
+            parameter_fraction,
+            initial_arc_length,
+            initial_flag,
         )
-        running_status = zero_count + int(ContinuationStatus.RUNNING)
-        jump_suspicion = BranchJumpSuspicion(zero_step_length, false_scalar)
-        initial_ds = zero_step_length + options.initial_ds
+        running_status = initial_count + int(ContinuationStatus.RUNNING)
+        jump_suspicion = BranchJumpSuspicion(initial_arc_length, initial_flag)
+        initial_ds = initial_arc_length + options.initial_ds
         return cls(
             initial_point,
             initial_point,
@@ -497,10 +513,10 @@ class ContinuationState(NamedTuple):
             initial_ds,
             trial_point,
             jump_suspicion,
-            zero_count,
-            zero_count,
+            initial_count,
+            initial_count,
             running_status,
-            zero_count,
+            initial_count,
         )
 
     def assess_trial(
@@ -521,7 +537,8 @@ class ContinuationState(NamedTuple):
                 )
             ),
             jnp.abs(
-                corrector_state.parameter_fraction - trial_point.corrector_plane.plane_fraction
+                corrector_state.parameter_fraction
+                - trial_point.corrector_plane.plane_parameter_fraction
             ),
         )
         is_trial_valid = jnp.isfinite(corrector_state.correction_norm) & (
@@ -539,22 +556,22 @@ class ContinuationState(NamedTuple):
             jnp.abs(tangent_alignment) >= tangent_norm * jnp.cos(options.max_turn_angle)
         )
         # At a kink a branch turns by more than the limit, even if the continuation step is short.
-        is_kink = (
+        is_trial_kink = (
             has_trial_converged
             & ~is_turn_small
             & (self.ds < options.kink_step_factor * options.min_ds)
         )
-        is_kink = is_kink & problem.has_kinks
-        is_accepted = has_trial_converged & (is_turn_small | is_kink)
-        has_failed = ~is_accepted & (
+        is_trial_kink = is_trial_kink & problem.has_kinks
+        is_trial_accepted = has_trial_converged & (is_turn_small | is_trial_kink)
+        has_trial_failed = ~is_trial_accepted & (
             ~is_trial_valid
             | has_trial_converged
             | (self.n_newton_iterations + 1 >= options.max_newton_iterations)
         )
         return _TrialVerdict(
-            is_accepted,
-            has_failed,
-            is_kink,
+            is_trial_accepted,
+            has_trial_failed,
+            is_trial_kink,
             jnp.where(tangent_alignment >= 0.0, 1.0, -1.0) / tangent_norm,
         )
 
@@ -571,17 +588,19 @@ class ContinuationState(NamedTuple):
         if not problem.has_multipliers:
             return jnp.asarray(False)
         current_point = self.current_point
-        has_turned_back = current_point.fraction_rate * new_point.fraction_rate < 0.0
+        has_parameter_turned_back = current_point.fraction_rate * new_point.fraction_rate < 0.0
         is_multiplier_change_explained_by_bifurcations = is_multiplier_change_explained(
-            current_point.return_map_jacobian, new_point.return_map_jacobian, has_turned_back
+            current_point.return_map_jacobian,
+            new_point.return_map_jacobian,
+            has_parameter_turned_back,
         )
-        can_be_suspicious = (
-            trial_verdict.is_accepted
+        can_trial_be_suspicious = (
+            trial_verdict.is_trial_accepted
             & (self.n_points > 0)
             & ~self.jump_suspicion.accepts_any_multipliers
             & new_point.is_admissible
         )
-        return can_be_suspicious & ~is_multiplier_change_explained_by_bifurcations
+        return can_trial_be_suspicious & ~is_multiplier_change_explained_by_bifurcations
 
     def choose_next_ds(
         self,
@@ -595,12 +614,12 @@ class ContinuationState(NamedTuple):
         """
         has_converged_quickly = self.n_newton_iterations < 4
         has_converged_slowly = self.n_newton_iterations >= 6
-        growth_factor = jnp.where(
+        ds_growth_factor = jnp.where(
             has_converged_quickly, 1.4, jnp.where(has_converged_slowly, 0.6, 1.0)
         )
-        longer_ds = jnp.minimum(self.ds * growth_factor, options.max_ds)
-        shorter_ds = jnp.where(trial_verdict.has_failed, 0.5 * self.ds, self.ds)
-        chosen_ds = jnp.where(trial_verdict.is_accepted, longer_ds, shorter_ds)
+        longer_ds = jnp.minimum(self.ds * ds_growth_factor, options.max_ds)
+        shorter_ds = jnp.where(trial_verdict.has_trial_failed, 0.5 * self.ds, self.ds)
+        chosen_ds = jnp.where(trial_verdict.is_trial_accepted, longer_ds, shorter_ds)
         return jnp.where(self.n_points == 0, options.initial_ds, chosen_ds)
 
     def compute_next_status_code(
@@ -617,25 +636,29 @@ class ContinuationState(NamedTuple):
         `ds` is the proposed length of the next continuation step. `next_arc_length` is its
         predicted arc length, which is shorter at the end of the range.
         """
-        is_accepted, has_failed = trial_verdict.is_accepted, trial_verdict.has_failed
-        n_points, branch_status_code = self.n_points + is_accepted, self.status_code
-        for has_ending_reason_occurred, status_code in (
+        is_trial_accepted, has_trial_failed = (
+            trial_verdict.is_trial_accepted,
+            trial_verdict.has_trial_failed,
+        )
+        n_points, branch_status_code = self.n_points + is_trial_accepted, self.status_code
+        for has_branch_ended, status_code in (
             (ds < options.min_ds, ContinuationStatus.STEP_SIZE_UNDERFLOW),
-            (has_failed & (self.n_points == 0), ContinuationStatus.START_NOT_FOUND),
-            (is_accepted & (n_points >= options.max_points), ContinuationStatus.MAX_POINTS_REACHED),
+            (has_trial_failed & (self.n_points == 0), ContinuationStatus.START_NOT_FOUND),
             (
-                is_accepted & (self.trial_point.is_range_end | (next_arc_length <= 1e-12)),
+                is_trial_accepted & (n_points >= options.max_points),
+                ContinuationStatus.MAX_POINTS_REACHED,
+            ),
+            (
+                is_trial_accepted & (self.trial_point.is_range_end | (next_arc_length <= 1e-12)),
                 ContinuationStatus.RANGE_END_REACHED,
             ),
-            (is_accepted & ~new_point.is_admissible, ContinuationStatus.POINT_NOT_ADMISSIBLE),
+            (is_trial_accepted & ~new_point.is_admissible, ContinuationStatus.POINT_NOT_ADMISSIBLE),
             (
-                is_accepted & is_curve_closed & (self.n_points > 2),
+                is_trial_accepted & is_curve_closed & (self.n_points > 2),
                 ContinuationStatus.CURVE_CLOSED,
             ),
         ):
-            branch_status_code = jnp.where(
-                has_ending_reason_occurred, int(status_code), branch_status_code
-            )
+            branch_status_code = jnp.where(has_branch_ended, int(status_code), branch_status_code)
         return branch_status_code.astype(jnp.int32)
 
 
@@ -647,22 +670,26 @@ def _is_curve_closed(
     parameter_bounds: Array,
 ) -> Bool[Array, ""]:
     """Return whether the start of the branch lies on the segment between two successive points."""
-    stack_coordinates = lambda point: jnp.append(
+    stack_arclength_coordinates = lambda point: jnp.append(
         problem.section_state(point.z), _compute_parameter_fraction(point.p, parameter_bounds)
     )
-    chord_vector = stack_coordinates(next_point) - stack_coordinates(current_point)
-    offset_from_start = stack_coordinates(start_point) - stack_coordinates(current_point)
+    chord_vector = stack_arclength_coordinates(next_point) - stack_arclength_coordinates(
+        current_point
+    )
+    offset_to_start = stack_arclength_coordinates(start_point) - stack_arclength_coordinates(
+        current_point
+    )
     squared_chord_length = chord_vector @ chord_vector
     chord_fraction = (
-        offset_from_start
+        offset_to_start
         @ chord_vector
         / jnp.where(squared_chord_length > 0.0, squared_chord_length, 1.0)
     )
-    start_distance = offset_from_start - chord_fraction * chord_vector
+    offset_from_chord = offset_to_start - chord_fraction * chord_vector
     return (
         (chord_fraction >= 0.0)
         & (chord_fraction <= 1.0)
-        & (start_distance @ start_distance < 0.01 * squared_chord_length)
+        & (offset_from_chord @ offset_from_chord < 0.01 * squared_chord_length)
     )
 
 
@@ -709,13 +736,13 @@ def iterate_branches(
     args_by_branch: Any,
     parameter_bounds: Array,
     direction_signs: Array,
-    buffer_indices: Array,
+    branch_buffer_indices: Array,
     branch_batch: BranchBatch,
     newton_steps: NewtonStep,
 ) -> BranchBatch:
     """Apply one Newton iteration to the trial of each branch, and store the accepted points.
 
-    Accepted points of branch i are stored in the buffer with index `buffer_indices[i]`.
+    Accepted points of branch i are stored in the buffer with index `branch_buffer_indices[i]`.
     """
 
     def iterate_branch(
@@ -739,7 +766,7 @@ def iterate_branches(
         accepted_parameter = compute_parameter_from_fraction(
             jnp.where(
                 trial_point.is_range_end,
-                trial_point.corrector_plane.plane_fraction,
+                trial_point.corrector_plane.plane_parameter_fraction,
                 corrector_state.parameter_fraction,
             ),
             parameter_bounds,
@@ -760,37 +787,37 @@ def iterate_branches(
             problem, trial_verdict, new_point
         )
         trial_verdict = trial_verdict._replace(
-            is_accepted=trial_verdict.is_accepted & ~is_trial_suspicious,
-            has_failed=trial_verdict.has_failed | is_trial_suspicious,
+            is_trial_accepted=trial_verdict.is_trial_accepted & ~is_trial_suspicious,
+            has_trial_failed=trial_verdict.has_trial_failed | is_trial_suspicious,
         )
-        current_point = select_tree_leaves(
-            trial_verdict.is_accepted, new_point, continuation_state.current_point
+        current_point = select_trees_by_condition(
+            trial_verdict.is_trial_accepted, new_point, continuation_state.current_point
         )
-        first_point = select_tree_leaves(
-            trial_verdict.is_accepted & (continuation_state.n_points == 0),
+        first_point = select_trees_by_condition(
+            trial_verdict.is_trial_accepted & (continuation_state.n_points == 0),
             new_point,
             continuation_state.first_point,
         )
         # The cubic prediction must not cross a kink.
-        previous_point = select_tree_leaves(
-            trial_verdict.is_kink, new_point, continuation_state.current_point
+        previous_point = select_trees_by_condition(
+            trial_verdict.is_trial_kink, new_point, continuation_state.current_point
         )
-        previous_point = select_tree_leaves(
-            trial_verdict.is_accepted, previous_point, continuation_state.previous_point
+        previous_point = select_trees_by_condition(
+            trial_verdict.is_trial_accepted, previous_point, continuation_state.previous_point
         )
-        n_points = continuation_state.n_points + trial_verdict.is_accepted
+        n_points = continuation_state.n_points + trial_verdict.is_trial_accepted
         ds = continuation_state.choose_next_ds(options, trial_verdict)
         jump_suspicion = continuation_state.jump_suspicion.update_after_trial(
             is_trial_suspicious, continuation_state.ds
         )
         jump_suspicion, ds = jump_suspicion.choose_trial_ds(
-            trial_verdict.is_accepted, ds, options.min_ds
+            trial_verdict.is_trial_accepted, ds, options.min_ds
         )
         next_trial_point = _predict_trial_point(
             problem, previous_point, current_point, n_points > 1, ds, parameter_bounds
         )
-        is_trial_finished = trial_verdict.is_accepted | trial_verdict.has_failed
-        next_trial_point = select_tree_leaves(
+        is_trial_finished = trial_verdict.is_trial_accepted | trial_verdict.has_trial_failed
+        next_trial_point = select_trees_by_condition(
             is_trial_finished,
             next_trial_point,
             trial_point._replace(
@@ -822,34 +849,35 @@ def iterate_branches(
             next_n_newton_iterations,
             *next_counters,
         )
-        return next_continuation_state, new_point, trial_verdict.is_accepted
+        return next_continuation_state, new_point, trial_verdict.is_trial_accepted
 
-    # Buffers are updated outside `select_tree_leaves`, which would copy them in every iteration.
-    continuation_state, branch_points = branch_batch
-    next_continuation_states, new_points, is_accepted = jax.vmap(iterate_branch)(
+    # Buffers are updated outside `select_trees_by_condition`, which would copy them in every
+    # iteration.
+    continuation_state, point_buffers = branch_batch
+    next_continuation_states, new_points, is_trial_accepted = jax.vmap(iterate_branch)(
         args_by_branch, direction_signs, continuation_state, newton_steps
     )
-    buffer_index = jnp.where(
-        are_branches_active(branch_batch) & is_accepted,
+    point_index_in_buffer = jnp.where(
+        are_branches_active(branch_batch) & is_trial_accepted,
         continuation_state.n_points,
         options.max_points,
     )
     write_point = lambda point_buffer, new_points: point_buffer.at[
-        buffer_indices, buffer_index
+        branch_buffer_indices, point_index_in_buffer
     ].set(new_points, mode="drop")
-    branch_points = jax.tree.map(
-        write_point, branch_points, new_points._replace(arclength_tangent=())
+    point_buffers = jax.tree.map(
+        write_point, point_buffers, new_points._replace(arclength_tangent=())
     )
-    return jax.vmap(select_tree_leaves)(
+    return jax.vmap(select_trees_by_condition)(
         are_branches_active(branch_batch), next_continuation_states, continuation_state
-    ), branch_points
+    ), point_buffers
 
 
 def make_continuation_result(branch_batch: BranchBatch) -> ContinuationResult:
     """Return the points of all branches, the number of points per branch, and the statuses."""
-    continuation_states, branch_points = branch_batch
+    continuation_states, point_buffers = branch_batch
     return ContinuationResult(
-        branch_points,
+        point_buffers,
         continuation_states.n_points,
         continuation_states.status_code,
         continuation_states.n_linearizations,
@@ -878,10 +906,10 @@ def continue_from(
     and iteration. When a branch of the group ends, the next branch starts.
     """
     if p.ndim == 0:
-        add_branch_axis = lambda tree_over_branches: jax.tree.map(
-            lambda x: x[None], tree_over_branches
+        add_branch_axis = lambda tree_of_one_branch: jax.tree.map(
+            lambda x: x[None], tree_of_one_branch
         )
-        branch_data = continue_from(
+        batched_continuation_result = continue_from(
             problem,
             options,
             add_branch_axis(args_by_branch),
@@ -890,7 +918,7 @@ def continue_from(
             parameter_bounds,
             direction_signs[None],
         )
-        return jax.tree.map(lambda x: x[0], branch_data)
+        return jax.tree.map(lambda x: x[0], batched_continuation_result)
     is_branch_requested = (
         jnp.ones(p.shape, bool) if is_branch_requested is None else is_branch_requested
     )
@@ -899,15 +927,15 @@ def continue_from(
         concurrent_branch_indices = jnp.argsort(~are_branches_active(branch_batch), stable=True)[
             : batch_sizes.BRANCH_BATCH_SIZE
         ]
-        concurrent_branch_args, concurrent_directions, branch_queue_state = jax.tree.map(
+        concurrent_branch_args, concurrent_directions, concurrent_branch_states = jax.tree.map(
             lambda x: x[concurrent_branch_indices],
             (args_by_branch, direction_signs, branch_batch[0]),
         )
-        has_waiting_branch = jnp.sum(are_branches_active(branch_batch)) > len(
+        is_any_branch_waiting = jnp.sum(are_branches_active(branch_batch)) > len(
             concurrent_branch_indices
         )
 
-        def advance_once(branch_batch: BranchBatch) -> BranchBatch:
+        def advance_group_once(branch_batch: BranchBatch) -> BranchBatch:
             linearize_trial = lambda args, trial_point: evaluate_newton_step_at_fraction(
                 problem, args, parameter_bounds, trial_point.z, trial_point.parameter_fraction
             )
@@ -926,18 +954,18 @@ def continue_from(
             )
 
         has_active_branch = lambda branch_batch: jnp.where(
-            has_waiting_branch,
+            is_any_branch_waiting,
             jnp.all(are_branches_active(branch_batch)),
             jnp.any(are_branches_active(branch_batch)),
         )
-        branch_queue_state, branch_points = lax.while_loop(
-            has_active_branch, advance_once, (branch_queue_state, branch_batch[1])
+        concurrent_branch_states, point_buffers = lax.while_loop(
+            has_active_branch, advance_group_once, (concurrent_branch_states, branch_batch[1])
         )
         return jax.tree.map(
             lambda x, new_point: x.at[concurrent_branch_indices].set(new_point),
             branch_batch[0],
-            branch_queue_state,
-        ), branch_points
+            concurrent_branch_states,
+        ), point_buffers
 
     branch_batch = init_branches(
         problem, options, z, p, parameter_bounds, direction_signs, is_branch_requested

@@ -31,7 +31,7 @@ from vrw_jax.continuation.arclength import (
     iterate_branches,
     make_continuation_result,
 )
-from vrw_jax.numerics import select_tree_leaves, select_tree_rows
+from vrw_jax.numerics import select_tree_rows, select_trees_by_condition
 
 
 class PlaneNewtonState(NamedTuple):
@@ -44,17 +44,19 @@ class PlaneNewtonState(NamedTuple):
 
 def init_plane_newton(z: ProblemUnknowns, corrector_plane: CorrectorPlane) -> PlaneNewtonState:
     """Return the initial state of Newton's method in a plane, with the initial guess z."""
-    n_section = corrector_plane.plane_section_state.shape[0]
-    zero_tangent, zero_count = jax.tree.map(jnp.zeros_like, z), jnp.zeros((), jnp.int32)
-    zero_jacobian = jnp.zeros((n_section, n_section), corrector_plane.plane_section_state.dtype)
-    initial_corrector = CorrectorState(
-        z,
-        corrector_plane.plane_fraction,
-        jnp.ones_like(corrector_plane.plane_fraction),
-        zero_tangent,
-        zero_jacobian,
+    n_section_coordinates = corrector_plane.plane_section_state.shape[0]
+    initial_tangent, initial_count = jax.tree.map(jnp.zeros_like, z), jnp.zeros((), jnp.int32)
+    initial_jacobian = jnp.zeros(
+        (n_section_coordinates, n_section_coordinates), corrector_plane.plane_section_state.dtype
     )
-    return PlaneNewtonState(initial_corrector, zero_count, zero_count)
+    initial_corrector_state = CorrectorState(
+        z,
+        corrector_plane.plane_parameter_fraction,
+        jnp.ones_like(corrector_plane.plane_parameter_fraction),
+        initial_tangent,
+        initial_jacobian,
+    )
+    return PlaneNewtonState(initial_corrector_state, initial_count, initial_count)
 
 
 def needs_newton_iteration(
@@ -78,7 +80,7 @@ def iterate_plane_newton(
 ) -> PlaneNewtonState:
     """Apply one Newton iteration in a plane, and return the new state of Newton's method."""
     corrector_state = plane_newton_state.corrector_state
-    next_corrector = correct_trial_point(
+    next_corrector_state = correct_trial_point(
         problem,
         newton_step,
         parameter_bounds,
@@ -87,22 +89,22 @@ def iterate_plane_newton(
         corrector_state.parameter_fraction,
     )
     # A trial that is not finite leaves the state unchanged. NaN reaches no other batch element.
-    is_correction_valid = jnp.isfinite(next_corrector.correction_norm)
-    next_corrector = select_tree_leaves(
-        is_correction_valid, next_corrector, corrector_state
-    )._replace(correction_norm=next_corrector.correction_norm)
+    is_correction_valid = jnp.isfinite(next_corrector_state.correction_norm)
+    next_corrector_state = select_trees_by_condition(
+        is_correction_valid, next_corrector_state, corrector_state
+    )._replace(correction_norm=next_corrector_state.correction_norm)
     # If the correction is negligible, the last Jacobian is exact and no other iteration follows.
-    negligible_correction = options.jacobian_reuse_fraction * options.tolerance
-    n_converged_iterations_before = jnp.where(
-        next_corrector.correction_norm < negligible_correction, 2, 1
+    negligible_correction_norm = options.jacobian_reuse_fraction * options.tolerance
+    n_added_converged_iterations = jnp.where(
+        next_corrector_state.correction_norm < negligible_correction_norm, 2, 1
     )
     n_converged_iterations = jnp.where(
-        next_corrector.correction_norm < options.tolerance,
-        plane_newton_state.n_converged_iterations + n_converged_iterations_before,
+        next_corrector_state.correction_norm < options.tolerance,
+        plane_newton_state.n_converged_iterations + n_added_converged_iterations,
         0,
     )
     return PlaneNewtonState(
-        next_corrector, plane_newton_state.n_iterations + 1, n_converged_iterations
+        next_corrector_state, plane_newton_state.n_iterations + 1, n_converged_iterations
     )
 
 
@@ -126,7 +128,8 @@ def make_plane_newton_point(
     is_admissible = problem.is_admissible(args, corrector_state.z, p)
     section_tangent = problem.section_state(corrector_state.fraction_tangent)
     normal_alignment = (
-        corrector_plane.normal_section_part @ section_tangent + corrector_plane.normal_fraction_part
+        corrector_plane.normal_section_part @ section_tangent
+        + corrector_plane.normal_parameter_part
     )
     normal_direction = jnp.where(normal_alignment >= 0.0, 1.0, -1.0)
     fraction_rate = normal_direction / jnp.sqrt(1.0 + section_tangent @ section_tangent)
@@ -152,7 +155,7 @@ def solve_on_plane(
     therefore as accurate as the point.
     """
 
-    def iterate_once(plane_newton_state: PlaneNewtonState) -> PlaneNewtonState:
+    def iterate_plane_newton_once(plane_newton_state: PlaneNewtonState) -> PlaneNewtonState:
         newton_step = evaluate_newton_step_at_fraction(
             problem,
             args,
@@ -166,7 +169,7 @@ def solve_on_plane(
 
     needs_more_iterations = functools.partial(needs_newton_iteration, options)
     plane_newton_state = lax.while_loop(
-        needs_more_iterations, iterate_once, init_plane_newton(z, corrector_plane)
+        needs_more_iterations, iterate_plane_newton_once, init_plane_newton(z, corrector_plane)
     )
     return make_plane_newton_point(
         problem, args, parameter_bounds, corrector_plane, plane_newton_state
@@ -190,7 +193,7 @@ def continue_branches_uncompiled(
     branch_batch = init_branches(
         problem, options, z, p, parameter_bounds, direction_signs, is_branch_requested
     )
-    buffer_indices = jnp.arange(len(p))
+    branch_buffer_indices = jnp.arange(len(p))
     while np.any(is_branch_unfinished := np.asarray(_are_branches_active_jit(branch_batch))):
         trial_point = branch_batch[0].trial_point
         newton_steps = _linearize_selected_branches(
@@ -207,7 +210,7 @@ def continue_branches_uncompiled(
             args_by_branch,
             parameter_bounds,
             direction_signs,
-            buffer_indices,
+            branch_buffer_indices,
             branch_batch,
             newton_steps,
         )
@@ -231,12 +234,14 @@ def _linearize_selected_branches(
     fill_with_nan = lambda selected_leaf: np.full(
         (len(is_branch_selected), *selected_leaf.shape[1:]), np.nan
     )
-    newton_steps_of_all = jax.tree.map(fill_with_nan, selected_newton_steps)
-    for leaf_of_all, selected_leaf in zip(
-        jax.tree.leaves(newton_steps_of_all), jax.tree.leaves(selected_newton_steps), strict=True
+    newton_steps_of_all_branches = jax.tree.map(fill_with_nan, selected_newton_steps)
+    for leaf_of_all_branches, selected_leaf in zip(
+        jax.tree.leaves(newton_steps_of_all_branches),
+        jax.tree.leaves(selected_newton_steps),
+        strict=True,
     ):
-        leaf_of_all[is_branch_selected] = selected_leaf
-    return jax.device_put(newton_steps_of_all)
+        leaf_of_all_branches[is_branch_selected] = selected_leaf
+    return jax.device_put(newton_steps_of_all_branches)
 
 
 def solve_on_many_planes(
@@ -305,7 +310,7 @@ def _iterate_unfinished_plane_newton(
         next_plane_newton_state = iterate_plane_newton(
             problem, options, parameter_bounds, corrector_plane, plane_newton_state, newton_step
         )
-        return select_tree_leaves(
+        return select_trees_by_condition(
             needs_newton_iteration(options, plane_newton_state),
             next_plane_newton_state,
             plane_newton_state,

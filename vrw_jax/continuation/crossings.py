@@ -22,29 +22,32 @@ from vrw_jax.numerics import Scalar
 
 
 def is_multiplier_change_explained(
-    jacobian_before: Float[Array, "n n"],
-    jacobian_after: Float[Array, "n n"],
-    has_turned_back: Bool[Array, ""],
+    previous_point_jacobian: Float[Array, "n n"],
+    next_point_jacobian: Float[Array, "n n"],
+    has_parameter_turned_back: Bool[Array, ""],
     multiplier_tolerances: MultiplierTolerances = MULTIPLIER_TOLERANCES,
 ) -> Bool[Array, ""]:
     """Return whether bifurcations explain the change of the multipliers between two points.
 
-    `jacobian_before` and `jacobian_after` are the Jacobians of the return map at the two points.
-    `has_turned_back` is whether the parameter changes its direction between the points.
+    `previous_point_jacobian` and `next_point_jacobian` are the Jacobians of the return map at the
+    two points. `has_parameter_turned_back` is whether the parameter changes its direction between
+    the points.
     """
-    margins_before, margins_after = map(
-        compute_bifurcation_margins, (jacobian_before, jacobian_after)
+    previous_point_margins, next_point_margins = map(
+        compute_bifurcation_margins, (previous_point_jacobian, next_point_jacobian)
     )
-    has_margin_sign_change = margins_before * margins_after < 0.0
-    crosses_other_branch = has_margin_sign_change[0] != has_turned_back
-    if jacobian_before.shape[-1] > MAX_CLOSED_FORM_SIZE and jax.default_backend() != "cpu":
-        return ~crosses_other_branch  # JAX computes eigenvalues of larger matrices only on CPUs.
+    has_margin_sign_change = previous_point_margins * next_point_margins < 0.0
+    has_crossed_other_branch = has_margin_sign_change[0] != has_parameter_turned_back
+    if previous_point_jacobian.shape[-1] > MAX_CLOSED_FORM_SIZE and jax.default_backend() != "cpu":
+        return (
+            ~has_crossed_other_branch
+        )  # JAX computes eigenvalues of larger matrices only on CPUs.
     n_explained_multipliers = has_margin_sign_change[0].astype(int) + has_margin_sign_change[1]
     n_explained_multipliers = n_explained_multipliers + (
         2 * has_margin_sign_change[2] if len(has_margin_sign_change) > 2 else 0
     )
 
-    def count_multipliers_outside(return_map_jacobian: Array) -> tuple[Array, Array]:
+    def count_unstable_multipliers(return_map_jacobian: Array) -> tuple[Array, Array]:
         """Return the least and the largest possible number of multipliers outside the
         unit circle.
         """
@@ -56,12 +59,15 @@ def is_multiplier_change_explained(
             multiplier_moduli > 1.0 - circle_distance_tolerance
         )
 
-    min_n_outside_before, max_n_outside_before = count_multipliers_outside(jacobian_before)
-    min_n_outside_after, max_n_outside_after = count_multipliers_outside(jacobian_after)
-    n_changed_multipliers = jnp.maximum(
-        min_n_outside_after - max_n_outside_before, min_n_outside_before - max_n_outside_after
+    min_n_unstable_at_previous, max_n_unstable_at_previous = count_unstable_multipliers(
+        previous_point_jacobian
     )
-    return ~crosses_other_branch & (n_changed_multipliers <= n_explained_multipliers)
+    min_n_unstable_at_next, max_n_unstable_at_next = count_unstable_multipliers(next_point_jacobian)
+    n_changed_multipliers = jnp.maximum(
+        min_n_unstable_at_next - max_n_unstable_at_previous,
+        min_n_unstable_at_previous - max_n_unstable_at_next,
+    )
+    return ~has_crossed_other_branch & (n_changed_multipliers <= n_explained_multipliers)
 
 
 class BranchJumpSuspicion(NamedTuple):

@@ -10,7 +10,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from vrw_jax.hybrid import ReturnMap, Termination, find_program
+from vrw_jax.hybrid import ReturnMap, Termination, get_compiled_program
 from vrw_jax.numerics import (
     Scalar,
     evaluate_with_jacobian,
@@ -18,10 +18,10 @@ from vrw_jax.numerics import (
     with_default_jax_settings,
 )
 from vrw_jax.printing import (
+    format_each_batch_element,
     format_heading_and_rows,
     format_numbers,
     format_quantity,
-    map_text_of_elements,
 )
 from vrw_jax.validation import (
     check_callable,
@@ -71,7 +71,7 @@ class FixedPointResult(NamedTuple):
                 "to the fixed point."
             )
 
-        return map_text_of_elements(describe_convergence, self.converged, self.n_iterations)
+        return format_each_batch_element(describe_convergence, self.converged, self.n_iterations)
 
     def __repr__(self) -> str:
         if isinstance(self.x, jax.core.Tracer) or np.ndim(self.x) != 1:
@@ -193,13 +193,14 @@ def _solve_checked_fixed_point(
     newton_configuration = (newton_method, function, period_n, max_iterations)
     newton_arguments = start, tolerance
     uses_program_cache = isinstance(function, ReturnMap)
-    solver_program = (
-        find_program(_find_fixed_point_of_iterate, newton_configuration, *newton_arguments)
+    compiled_newton_program = (
+        get_compiled_program(_find_fixed_point_of_iterate, newton_configuration, *newton_arguments)
         if uses_program_cache
         else None
     )
     return (
-        solver_program or functools.partial(_find_fixed_point_of_iterate, newton_configuration)
+        compiled_newton_program
+        or functools.partial(_find_fixed_point_of_iterate, newton_configuration)
     )(*newton_arguments)
 
 
@@ -213,19 +214,21 @@ def _find_fixed_point_of_iterate(
             x = function(x)
         return x
 
-    converted_map, closed_over_values = jax.closure_convert(apply_map_repeatedly, start)
-    return newton_method(converted_map, max_iterations, start, tolerance, *closed_over_values)
+    closure_converted_map, closed_over_values = jax.closure_convert(apply_map_repeatedly, start)
+    return newton_method(
+        closure_converted_map, max_iterations, start, tolerance, *closed_over_values
+    )
 
 
 ClosureConvertedMap = Callable[..., Array]
 
 
 def _compute_newton_correction(
-    converted_map: ClosureConvertedMap, x: Array, closed_over_values: tuple
+    closure_converted_map: ClosureConvertedMap, x: Array, closed_over_values: tuple
 ) -> tuple[Array, Array, Array]:
     """Return Newton's correction, the Jacobian of the map, and the defect map(x) - x."""
     mapped_point, jacobian = evaluate_with_jacobian(
-        lambda y: converted_map(y, *closed_over_values), x
+        lambda y: closure_converted_map(y, *closed_over_values), x
     )
     map_defect = mapped_point - x
     return (
@@ -243,7 +246,7 @@ provides only first derivatives of the fixed point.
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0, 1))
 def _run_newton_loop(
-    converted_map: ClosureConvertedMap,
+    closure_converted_map: ClosureConvertedMap,
     max_iterations: int,
     start: Array,
     tolerance: Array,
@@ -273,7 +276,7 @@ def _run_newton_loop(
             n_iterations.dtype
         )
         newton_correction, jacobian, map_defect = _compute_newton_correction(
-            converted_map, x, closed_over_values
+            closure_converted_map, x, closed_over_values
         )
         # The correction is also checked in the last iterations, because the map may jump near the
         # point.
@@ -288,17 +291,17 @@ def _run_newton_loop(
             jnp.max(jnp.abs(map_defect)),
         )
 
-    zero_iterations, unit_norm = jnp.zeros((), jnp.int32), jnp.ones((), start.dtype)
-    initial_state = (
+    initial_count, initial_norm = jnp.zeros((), jnp.int32), jnp.ones((), start.dtype)
+    initial_loop_state = (
         start,
-        unit_norm,
-        zero_iterations,
-        zero_iterations,
+        initial_norm,
+        initial_count,
+        initial_count,
         jnp.zeros((start.size,) * 2, start.dtype),
-        unit_norm,
+        initial_norm,
     )
     x, correction_norm, n_iterations, _, jacobian, residual = lax.while_loop(
-        needs_newton_iteration, iterate_newton, initial_state
+        needs_newton_iteration, iterate_newton, initial_loop_state
     )
     has_newton_converged = correction_norm <= tolerance
     return FixedPointResult(
@@ -313,19 +316,21 @@ def _run_newton_loop(
 @_run_newton_loop.defjvp
 @with_default_jax_settings
 def _run_newton_jvp(
-    converted_map: ClosureConvertedMap, max_iterations: int, primals: tuple, tangents: tuple
+    closure_converted_map: ClosureConvertedMap, max_iterations: int, primals: tuple, tangents: tuple
 ) -> tuple[FixedPointResult, FixedPointResult]:
     """Return the fixed point and its tangent, by Newton iterations with derivatives.
 
     The iterations start at the fixed point.
     """
     start, _, *closed_over_values = primals
-    newton_result = _run_newton_loop(converted_map, max_iterations, *lax.stop_gradient(primals))
+    newton_result = _run_newton_loop(
+        closure_converted_map, max_iterations, *lax.stop_gradient(primals)
+    )
 
     def solve_from_fixed_point(*closed_over_values: Any) -> FixedPointResult:
         def iterate_with_derivatives(point: Array, _: None) -> tuple[Array, tuple[Array, Array]]:
             newton_correction, jacobian, map_defect = _compute_newton_correction(
-                converted_map, point, closed_over_values
+                closure_converted_map, point, closed_over_values
             )
             next_point = point + jnp.where(newton_result.converged, newton_correction, 0.0)
             return next_point, (jacobian, jnp.max(jnp.abs(map_defect)))
@@ -343,7 +348,7 @@ def _run_newton_jvp(
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0, 1))
 def _run_newton_implicit(
-    converted_map: ClosureConvertedMap,
+    closure_converted_map: ClosureConvertedMap,
     max_iterations: int,
     start: Array,
     tolerance: Array,
@@ -352,32 +357,36 @@ def _run_newton_implicit(
     """Find the fixed point by Newton's method, with derivatives by the implicit
     function theorem.
     """
-    return _run_newton_loop(converted_map, max_iterations, start, tolerance, *closed_over_values)
+    return _run_newton_loop(
+        closure_converted_map, max_iterations, start, tolerance, *closed_over_values
+    )
 
 
 @_run_newton_implicit.defjvp
 @with_default_jax_settings
 def _run_newton_implicit_jvp(
-    converted_map: ClosureConvertedMap, max_iterations: int, primals: tuple, tangents: tuple
+    closure_converted_map: ClosureConvertedMap, max_iterations: int, primals: tuple, tangents: tuple
 ) -> tuple[FixedPointResult, FixedPointResult]:
     """Return the fixed point and its tangent by the implicit function theorem.
 
     The tangent depends on the fixed point. Derivatives of the tangent therefore use the same rule.
     """
-    newton_result = _run_newton_implicit(converted_map, max_iterations, *primals)
+    newton_result = _run_newton_implicit(closure_converted_map, max_iterations, *primals)
     closed_over_values, closed_over_tangents = tuple(primals[2:]), tuple(tangents[2:])
-    _, map_tangent = jax.jvp(
-        lambda *arguments: converted_map(newton_result.x, *arguments),
+    _, map_output_tangent = jax.jvp(
+        lambda *arguments: closure_converted_map(newton_result.x, *arguments),
         closed_over_values,
         closed_over_tangents,
     )
     _, jacobian = evaluate_with_jacobian(
-        lambda x: converted_map(x, *closed_over_values), newton_result.x
+        lambda x: closure_converted_map(x, *closed_over_values), newton_result.x
     )
-    point_tangent = jnp.linalg.solve(
-        jnp.eye(newton_result.x.size, dtype=newton_result.x.dtype) - jacobian, map_tangent
+    fixed_point_tangent = jnp.linalg.solve(
+        jnp.eye(newton_result.x.size, dtype=newton_result.x.dtype) - jacobian, map_output_tangent
     )
-    point_tangent = jnp.where(newton_result.converged, point_tangent, 0.0)
-    nan_jacobian_tangent = jnp.full_like(jacobian, jnp.nan) * jnp.sum(point_tangent)
+    fixed_point_tangent = jnp.where(newton_result.converged, fixed_point_tangent, 0.0)
+    nan_jacobian_tangent = jnp.full_like(jacobian, jnp.nan) * jnp.sum(fixed_point_tangent)
     zero_tangents = make_zero_tangent(newton_result)
-    return newton_result, zero_tangents._replace(x=point_tangent, jacobian=nan_jacobian_tangent)
+    return newton_result, zero_tangents._replace(
+        x=fixed_point_tangent, jacobian=nan_jacobian_tangent
+    )

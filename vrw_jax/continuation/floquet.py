@@ -98,14 +98,15 @@ class _EigenvaluePair(NamedTuple):
     """
 
     pair_mean: Array
-    real_offset: Array
-    imaginary_offset: Array
+    real_eigenvalue_offset: Array
+    imaginary_eigenvalue_offset: Array
 
     @property
-    def modulus(self) -> Array:
+    def pair_modulus(self) -> Array:
         """Return the common modulus of a complex pair."""
         return compute_square_root(
-            self.pair_mean * self.pair_mean + self.imaginary_offset * self.imaginary_offset
+            self.pair_mean * self.pair_mean
+            + self.imaginary_eigenvalue_offset * self.imaginary_eigenvalue_offset
         )
 
 
@@ -153,12 +154,12 @@ def _solve_cubic_real_root(a0: Array, a1: Array, a2: Array) -> Array:
         unique_real_root,
     )
     for _ in range(3):
-        polynomial_value = a0 + z * (a1 + z * (a2 + z))
-        polynomial_derivative = a1 + z * (2.0 * a2 + 3.0 * z)
+        cubic_value = a0 + z * (a1 + z * (a2 + z))
+        cubic_derivative = a1 + z * (2.0 * a2 + 3.0 * z)
         z = z - jnp.where(
-            polynomial_derivative == 0.0,
+            cubic_derivative == 0.0,
             0.0,
-            polynomial_value / jnp.where(polynomial_derivative == 0.0, 1.0, polynomial_derivative),
+            cubic_value / jnp.where(cubic_derivative == 0.0, 1.0, cubic_derivative),
         )
     return z
 
@@ -195,9 +196,12 @@ def floquet_multipliers(matrix: RealSquareMatrix) -> Complex[Array, "... n"]:
     isolated_eigenvalues, remaining_pair = _split_into_isolated_and_pair(matrix)
     eigenvalues = [lax.complex(x, jnp.zeros_like(x)) for x in isolated_eigenvalues]
     if remaining_pair is not None:
-        pair_mean, real_offset, imaginary_offset = remaining_pair
+        pair_mean, real_eigenvalue_offset, imaginary_eigenvalue_offset = remaining_pair
         eigenvalues += [
-            lax.complex(pair_mean + offset_sign * real_offset, offset_sign * imaginary_offset)
+            lax.complex(
+                pair_mean + offset_sign * real_eigenvalue_offset,
+                offset_sign * imaginary_eigenvalue_offset,
+            )
             for offset_sign in (1.0, -1.0)
         ]
     return _sort_eigenvalues_by_modulus(jnp.stack(eigenvalues, -1))
@@ -221,10 +225,12 @@ def compute_spectral_radius(matrix: RealSquareMatrix) -> Float[Array, "..."]:
     isolated_eigenvalues, remaining_pair = _split_into_isolated_and_pair(matrix)
     eigenvalue_moduli = [jnp.abs(x) for x in isolated_eigenvalues]
     if remaining_pair is not None:
-        max_real_modulus = jnp.abs(remaining_pair.pair_mean) + remaining_pair.real_offset
+        max_real_modulus = jnp.abs(remaining_pair.pair_mean) + remaining_pair.real_eigenvalue_offset
         eigenvalue_moduli.append(
             jnp.where(
-                remaining_pair.imaginary_offset > 0.0, remaining_pair.modulus, max_real_modulus
+                remaining_pair.imaginary_eigenvalue_offset > 0.0,
+                remaining_pair.pair_modulus,
+                max_real_modulus,
             )
         )
     return functools.reduce(jnp.maximum, eigenvalue_moduli)
@@ -261,7 +267,7 @@ def compute_bifurcation_margins(matrix: RealSquareMatrix) -> Float[Array, "... n
     n = matrix.shape[-1]
     if n <= MAX_CLOSED_FORM_SIZE:
         return compute_jury_margins(matrix)[..., :3]
-    identity, eigenvalues = jnp.eye(n, dtype=matrix.dtype), floquet_multipliers(matrix)
+    identity_matrix, eigenvalues = jnp.eye(n, dtype=matrix.dtype), floquet_multipliers(matrix)
     first_eigenvalue_indices, second_eigenvalue_indices = np.triu_indices(n, 1)
     eigenvalue_products = jnp.prod(
         1.0
@@ -269,7 +275,11 @@ def compute_bifurcation_margins(matrix: RealSquareMatrix) -> Float[Array, "... n
         axis=-1,
     ).real
     return jnp.stack(
-        [jnp.linalg.det(identity - matrix), jnp.linalg.det(identity + matrix), eigenvalue_products],
+        [
+            jnp.linalg.det(identity_matrix - matrix),
+            jnp.linalg.det(identity_matrix + matrix),
+            eigenvalue_products,
+        ],
         -1,
     )
 
@@ -282,8 +292,8 @@ def compute_stability_margin(matrix: RealSquareMatrix) -> Float[Array, "..."]:
     """
     jury_margin_values = SMOOTH_MIN_SHARPNESS * compute_jury_margins(matrix)
     lowest_jury_margin = lax.stop_gradient(jnp.min(jury_margin_values, -1))
-    scaled_excess = jnp.sum(jnp.exp(lowest_jury_margin[..., None] - jury_margin_values), -1)
-    return (lowest_jury_margin - jnp.log(scaled_excess)) / SMOOTH_MIN_SHARPNESS
+    sum_of_exponentials = jnp.sum(jnp.exp(lowest_jury_margin[..., None] - jury_margin_values), -1)
+    return (lowest_jury_margin - jnp.log(sum_of_exponentials)) / SMOOTH_MIN_SHARPNESS
 
 
 @jax.jit
@@ -299,18 +309,23 @@ def has_double_multiplier(
     isolated_eigenvalues, remaining_pair = _split_into_isolated_and_pair(matrix)
     if remaining_pair is None:
         return jnp.zeros(matrix.shape[:-2], bool)
-    pair_mean, real_offset, imaginary_offset = remaining_pair
-    real_eigenvalues = [*isolated_eigenvalues, pair_mean + real_offset, pair_mean - real_offset]
-    is_complex_pair = imaginary_offset > 0.0
+    pair_mean, real_eigenvalue_offset, imaginary_eigenvalue_offset = remaining_pair
+    real_eigenvalues = [
+        *isolated_eigenvalues,
+        pair_mean + real_eigenvalue_offset,
+        pair_mean - real_eigenvalue_offset,
+    ]
+    is_complex_pair = imaginary_eigenvalue_offset > 0.0
     eigenvalue_moduli = jnp.sort(jnp.abs(jnp.stack(real_eigenvalues, -1)), -1)
     has_equal_real_moduli = (
         eigenvalue_moduli[..., -1] - eigenvalue_moduli[..., -2] <= modulus_tolerance
     )
     has_equal_moduli = jnp.where(
-        is_complex_pair, imaginary_offset <= modulus_tolerance, has_equal_real_moduli
+        is_complex_pair, imaginary_eigenvalue_offset <= modulus_tolerance, has_equal_real_moduli
     )
     for x in isolated_eigenvalues:
         has_equal_moduli = has_equal_moduli | (
-            is_complex_pair & (jnp.abs(jnp.abs(x) - remaining_pair.modulus) <= modulus_tolerance)
+            is_complex_pair
+            & (jnp.abs(jnp.abs(x) - remaining_pair.pair_modulus) <= modulus_tolerance)
         )
     return has_equal_moduli

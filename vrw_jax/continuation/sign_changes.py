@@ -27,14 +27,14 @@ multipliers has modulus 1 at a Neimark-Sacker bifurcation.
 class RootSearchOptions:
     """Numerical options of `locate_function_roots`.
 
-    - `max_rounds_in_smooth_brackets`: number of rounds after which an unresolved bracket is
+    - `max_search_rounds_per_smooth_bracket`: number of rounds after which an unresolved bracket is
       treated as a jump;
-    - `n_sections_per_jump_bracket`: number of equal sections into which each round divides a
+    - `n_parts_per_jump_bracket`: number of equal sections into which each round divides a
       bracket that contains a jump.
     """
 
-    max_rounds_in_smooth_brackets: int = 12
-    n_sections_per_jump_bracket: int = 9
+    max_search_rounds_per_smooth_bracket: int = 12
+    n_parts_per_jump_bracket: int = 9
 
 
 ROOT_SEARCH_OPTIONS = RootSearchOptions()
@@ -91,10 +91,10 @@ def find_sign_changes(quantity_values: np.ndarray) -> list[QuantitySignChange]:
     between the same neighboring points cancel, and neither is detected.
     """
     quantity_signs = np.sign(np.nan_to_num(quantity_values))
-    signed_points = np.argwhere(quantity_signs[:-1] * quantity_signs[1:] < 0.0)
+    sign_change_indices = np.argwhere(quantity_signs[:-1] * quantity_signs[1:] < 0.0)
     return [
-        QuantitySignChange(int(signed_position), int(signed_position) + 1, int(quantity_index))
-        for signed_position, quantity_index in signed_points
+        QuantitySignChange(int(point_index), int(point_index) + 1, int(quantity_index))
+        for point_index, quantity_index in sign_change_indices
     ]
 
 
@@ -111,82 +111,93 @@ class RootLocations(NamedTuple):
 
 def locate_function_roots(
     function: Callable[[np.ndarray, np.ndarray], np.ndarray],
-    end_values: tuple[np.ndarray, np.ndarray],
+    bracket_end_values: tuple[np.ndarray, np.ndarray],
     max_bracket_width: np.ndarray,
     options: RootSearchOptions = ROOT_SEARCH_OPTIONS,
 ) -> RootLocations:
     """Locate the roots of functions that have opposite signs at 0 and 1, by Chandrupatla's method.
 
-    `function` maps locations and the indices of their brackets to function values. `end_values`
-    contains the function values at 0 and at 1. A round uses inverse quadratic interpolation if it
-    is reliable, and bisection otherwise. A bracket in which the function jumps or stalls is divided
-    into several sections per round. A jump is therefore located as reliably as a smooth root. The
-    search ends when every bracket is narrower than `max_bracket_width` or has an exact root. If the
-    function is NaN at a location, that location is treated as having the sign of location 1.
+    `function` maps locations and the indices of their brackets to function values.
+    `bracket_end_values` contains the function values at 0 and at 1. A round uses inverse quadratic
+    interpolation if it is reliable, and bisection otherwise. A bracket in which the function jumps
+    or stalls is divided into several sections per round. A jump is therefore located as reliably as
+    a smooth root. The search ends when every bracket is narrower than `max_bracket_width` or has an
+    exact root. If the function is NaN at a location, that location is treated as having the sign of
+    location 1.
     """
-    values_at_fraction_0, values_at_fraction_1 = end_values
+    values_at_location_0, values_at_location_1 = bracket_end_values
     # The rows are the newest location, the end with the other sign, and the location replaced by
     # the newest one.
     bracket_locations = np.outer((0.0, 1.0, 1.0), np.ones_like(max_bracket_width))
-    function_values = np.stack([values_at_fraction_0, values_at_fraction_1, values_at_fraction_1])
-    is_sign_jump, n_rounds, n_sections = (
+    function_values = np.stack([values_at_location_0, values_at_location_1, values_at_location_1])
+    is_sign_jump, n_search_rounds, n_bracket_parts = (
         np.zeros(len(max_bracket_width), bool),
         0,
-        options.n_sections_per_jump_bracket,
+        options.n_parts_per_jump_bracket,
     )
     while len(
         unresolved_indices := np.flatnonzero(
             np.abs(bracket_locations[0] - bracket_locations[1]) > max_bracket_width
         )
     ):
-        smooth_brackets = unresolved_indices[~is_sign_jump[unresolved_indices]]
-        jump_brackets = unresolved_indices[is_sign_jump[unresolved_indices]]
+        smooth_bracket_indices = unresolved_indices[~is_sign_jump[unresolved_indices]]
+        jump_bracket_indices = unresolved_indices[is_sign_jump[unresolved_indices]]
         proposed_locations = _propose_root_location(
-            bracket_locations[:, smooth_brackets],
-            function_values[:, smooth_brackets],
-            max_bracket_width[smooth_brackets],
+            bracket_locations[:, smooth_bracket_indices],
+            function_values[:, smooth_bracket_indices],
+            max_bracket_width[smooth_bracket_indices],
         )
-        bracket_lower_ends, bracket_upper_ends = np.sort(bracket_locations[:2, jump_brackets], 0)
-        section_ends = np.linspace(bracket_lower_ends, bracket_upper_ends, n_sections + 1, axis=-1)
+        bracket_lower_ends, bracket_upper_ends = np.sort(
+            bracket_locations[:2, jump_bracket_indices], 0
+        )
+        bracket_part_ends = np.linspace(
+            bracket_lower_ends, bracket_upper_ends, n_bracket_parts + 1, axis=-1
+        )
         bracket_indices = np.concatenate(
-            [smooth_brackets, np.repeat(jump_brackets, n_sections - 1)]
+            [smooth_bracket_indices, np.repeat(jump_bracket_indices, n_bracket_parts - 1)]
         )
-        section_values_matrix = function(
-            np.concatenate([proposed_locations, section_ends[:, 1:-1].ravel()]), bracket_indices
+        new_function_values = function(
+            np.concatenate([proposed_locations, bracket_part_ends[:, 1:-1].ravel()]),
+            bracket_indices,
         )
-        is_function_undefined = np.isnan(section_values_matrix)
-        section_values_matrix = np.where(
-            is_function_undefined, values_at_fraction_1[bracket_indices], section_values_matrix
+        is_function_undefined = np.isnan(new_function_values)
+        new_function_values = np.where(
+            is_function_undefined, values_at_location_1[bracket_indices], new_function_values
         )
-        values_at_proposals = section_values_matrix[: len(smooth_brackets)]
-        section_values = section_values_matrix[len(smooth_brackets) :].reshape(-1, n_sections - 1)
-        has_same_sign = np.sign(values_at_proposals) == np.sign(function_values[0, smooth_brackets])
+        values_at_proposals = new_function_values[: len(smooth_bracket_indices)]
+        values_at_part_ends = new_function_values[len(smooth_bracket_indices) :].reshape(
+            -1, n_bracket_parts - 1
+        )
+        has_same_sign = np.sign(values_at_proposals) == np.sign(
+            function_values[0, smooth_bracket_indices]
+        )
         for stored_values, proposed_values in (
             (bracket_locations, proposed_locations),
             (function_values, values_at_proposals),
         ):
-            newest_values, opposite_values, _ = stored_values[:, smooth_brackets]
-            stored_values[:, smooth_brackets] = (
+            newest_values, opposite_values, _ = stored_values[:, smooth_bracket_indices]
+            stored_values[:, smooth_bracket_indices] = (
                 proposed_values,
                 np.where(has_same_sign, opposite_values, newest_values),
                 np.where(has_same_sign, newest_values, opposite_values),
             )
-        bracket_locations[1, smooth_brackets[values_at_proposals == 0.0]] = proposed_locations[
-            values_at_proposals == 0.0
-        ]
+        bracket_locations[1, smooth_bracket_indices[values_at_proposals == 0.0]] = (
+            proposed_locations[values_at_proposals == 0.0]
+        )
         is_left_side = (
-            np.sign(section_values) != np.sign(values_at_fraction_1[jump_brackets])[:, None]
+            np.sign(values_at_part_ends)
+            != np.sign(values_at_location_1[jump_bracket_indices])[:, None]
         )
         # The root lies between the last location with the sign of location 0 and the next location.
         last_left_index = np.sum(np.cumprod(is_left_side, 1), 1)
-        bracket_locations[:2, jump_brackets] = section_ends[
-            np.arange(len(jump_brackets)), np.stack([last_left_index, last_left_index + 1])
+        bracket_locations[:2, jump_bracket_indices] = bracket_part_ends[
+            np.arange(len(jump_bracket_indices)), np.stack([last_left_index, last_left_index + 1])
         ]
-        n_rounds += 1
-        is_sign_jump[smooth_brackets] = (
-            is_function_undefined[: len(smooth_brackets)]
-            | (values_at_proposals == function_values[2, smooth_brackets])
-            | (n_rounds >= options.max_rounds_in_smooth_brackets)
+        n_search_rounds += 1
+        is_sign_jump[smooth_bracket_indices] = (
+            is_function_undefined[: len(smooth_bracket_indices)]
+            | (values_at_proposals == function_values[2, smooth_bracket_indices])
+            | (n_search_rounds >= options.max_search_rounds_per_smooth_bracket)
         )
     best_locations = np.where(
         is_sign_jump,
@@ -230,13 +241,13 @@ def _propose_root_location(
             / (function_values[1] - function_values[2])
         )
     bracket_length = bracket_locations[1] - bracket_locations[0]
-    min_fraction = 0.5 * max_bracket_width / np.abs(bracket_length)
+    min_bracket_fraction = 0.5 * max_bracket_width / np.abs(bracket_length)
     return (
         bracket_locations[0]
         + np.clip(
             np.where(is_interpolation_trusted, interpolated_fraction, 0.5),
-            min_fraction,
-            1.0 - min_fraction,
+            min_bracket_fraction,
+            1.0 - min_bracket_fraction,
         )
         * bracket_length
     )

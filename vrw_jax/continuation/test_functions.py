@@ -94,27 +94,32 @@ class TestFunctionCurve(AbstractContinuationProblem):
             args, z.z, jnp.stack([p, self.compute_second_parameter(z)])
         )
         derivative_by_first_parameter = newton_step.parameter_gradient[0]
-        derivative_by_fraction = parameter_range * newton_step.parameter_gradient[1]
-        fraction_change = -newton_step.test_function_value / derivative_by_fraction
-        fraction_tangent = -derivative_by_first_parameter / derivative_by_fraction
-        first_tangent, second_tangent = newton_step.tangents_by_parameter
-        combine_tangent_leaves = lambda parameter_change: (
-            lambda first_leaf, second_leaf: (
-                first_leaf + parameter_range * parameter_change * second_leaf
+        derivative_by_second_fraction = parameter_range * newton_step.parameter_gradient[1]
+        second_fraction_change = -newton_step.test_function_value / derivative_by_second_fraction
+        second_fraction_tangent = -derivative_by_first_parameter / derivative_by_second_fraction
+        tangent_by_first_parameter, tangent_by_second_parameter = newton_step.tangents_by_parameter
+        combine_fixed_point_tangents = lambda parameter_change: (
+            lambda leaf_by_first_parameter, leaf_by_second_parameter: (
+                leaf_by_first_parameter
+                + parameter_range * parameter_change * leaf_by_second_parameter
             )
         )
-        correction_leaf = jax.tree.map(
-            combine_tangent_leaves(fraction_change), newton_step.newton_correction, second_tangent
+        fixed_point_correction = jax.tree.map(
+            combine_fixed_point_tangents(second_fraction_change),
+            newton_step.newton_correction,
+            tangent_by_second_parameter,
         )
-        tangent_leaf = jax.tree.map(
-            combine_tangent_leaves(fraction_tangent), first_tangent, second_tangent
+        fixed_point_tangent = jax.tree.map(
+            combine_fixed_point_tangents(second_fraction_tangent),
+            tangent_by_first_parameter,
+            tangent_by_second_parameter,
         )
         # The fraction adds a multiplier of zero, which has no effect.
-        jacobian_row = jnp.pad(newton_step.return_map_jacobian, (0, 1))
+        padded_return_map_jacobian = jnp.pad(newton_step.return_map_jacobian, (0, 1))
         return NewtonStep(
-            TestFunctionPoint(correction_leaf, fraction_change),
-            TestFunctionPoint(tangent_leaf, fraction_tangent),
-            jacobian_row,
+            TestFunctionPoint(fixed_point_correction, second_fraction_change),
+            TestFunctionPoint(fixed_point_tangent, second_fraction_tangent),
+            padded_return_map_jacobian,
         )
 
     def section_state(self, z: TestFunctionPoint) -> SectionStateVector:

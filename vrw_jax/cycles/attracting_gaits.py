@@ -90,7 +90,7 @@ def _find_gaits_from_starts(
     # NumPy is used, because JAX would compile each operation for every number of wheels.
     is_gait_attracting = np.abs(np.linalg.eigvals(candidate_gaits.monodromy_value)).max(-1) < 1.0
     is_gait_valid = (np.asarray(candidate_gaits.outcome) == Outcome.STEPPED) & is_gait_attracting
-    step_end_states = np.asarray(
+    gait_step_end_states = np.asarray(
         candidate_gaits.steps.section_state
     )  # section states at the ends of all gait steps
     sum_over_steps = lambda walk_states: (
@@ -102,7 +102,7 @@ def _find_gaits_from_starts(
     section_units = stack_section_units(
         gait_finder.model, np.asarray(parameter_values)[candidate_wheel_indices], gait_finder.n_legs
     )
-    scaled_step_end_states = (step_end_states / section_units[:, None])[
+    scaled_step_end_states = (gait_step_end_states / section_units[:, None])[
         :, :, : count_section_coordinates(gait_finder)
     ]
     # A gait that repeats after fewer steps is a gait of a shorter period.

@@ -144,7 +144,7 @@ class CollocationFinder(AbstractGaitFinder):
         self, first_step_index: int, params: WheelParams, collocation_state: CollocationState
     ) -> CollocationState:
         """Return the same cycle, starting with its gait step at the index `first_step_index`."""
-        previous_end_state = collocation_state.step_end_states[first_step_index - 1]
+        previous_end_state = collocation_state.gait_step_end_states[first_step_index - 1]
         landing_result = transitions.resolve_landing(
             params.symbols(), previous_end_state[0], *previous_end_state[2:]
         )
@@ -153,14 +153,16 @@ class CollocationFinder(AbstractGaitFinder):
             (
                 collocation_state.solution,
                 collocation_state.is_phase_active,
-                collocation_state.step_end_states,
+                collocation_state.gait_step_end_states,
             ),
         )
-        section_state = jnp.stack([landing_result.theta_after, landing_result.motion_after.dtheta])
+        section_state = jnp.stack(
+            [landing_result.theta_after_landing, landing_result.motion_after.dtheta]
+        )
         return collocation_state._replace(
             solution=collocation_solution._replace(section_state=section_state),
             is_phase_active=is_phase_active,
-            step_end_states=step_ends,
+            gait_step_end_states=step_ends,
         )
 
     def transfer_state_to_mesh(

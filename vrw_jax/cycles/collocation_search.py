@@ -33,7 +33,7 @@ from vrw_jax.collocation import (
     PhaseSequence,
     estimate_mesh_error,
     linearize_cycle,
-    reconstruct_step,
+    reconstruct_gait_step,
 )
 from vrw_jax.cycles.gait_surface import predict_gait
 from vrw_jax.cycles.options import CycleOptions
@@ -148,7 +148,7 @@ class CollocationSystem(NamedTuple):
                 lambda x, step_index=step_index: x[step_index],
                 (collocation_solution.durations, collocation_solution.accelerations),
             )
-            section_state, phase_points = reconstruct_step(
+            section_state, phase_points = reconstruct_gait_step(
                 self.phase_sequence,
                 self.phase_meshes,
                 phase_constants,
@@ -174,7 +174,9 @@ class CollocationState(NamedTuple):
     # (lanes,): 1 + index in ADMISSIBILITY_CHECKS of the check that a root fails;
     # plus HOMOTOPY_FAILURE_OFFSET for a root of a wheel on the homotopy; a HomotopyFailure; else 0
     failed_check: LaneArray
-    step_end_states: LaneArray  # (n, 4, lanes): theta, L1 and their rates at the end of each step
+    gait_step_end_states: (
+        LaneArray  # (n, 4, lanes): theta, L1 and their rates at the end of each step
+    )
 
 
 class CycleSearchResult(NamedTuple):
@@ -271,7 +273,7 @@ def make_start_state(
 def init_search_flags(
     collocation_system: CollocationSystem, section_state: Array
 ) -> tuple[Array, Array, Array]:
-    """Return `has_cycle`, `failed_check` and `step_end_states` before the search, which are
+    """Return `has_cycle`, `failed_check` and `gait_step_end_states` before the search, which are
     zeros.
     """
     lane_shape, n_step_end_components = (
@@ -373,7 +375,7 @@ def compute_state_tangents(
     The tangents of the active phases and of the results of admissibility checks are zero.
     """
     make_zero_tangents = lambda x: jnp.zeros(
-        (cycle_linearization.step_end_tangents.shape[0], *x.shape), x.dtype
+        (cycle_linearization.gait_step_end_tangents.shape[0], *x.shape), x.dtype
     )
     has_cycle_tangents, failed_check_tangents = (
         make_zero_tangents(collocation_state.has_cycle),
@@ -384,7 +386,7 @@ def compute_state_tangents(
         make_zero_tangents(collocation_state.is_phase_active),
         has_cycle_tangents,
         failed_check_tangents,
-        cycle_linearization.step_end_tangents,
+        cycle_linearization.gait_step_end_tangents,
     )
 
 
@@ -466,8 +468,9 @@ def run_newton_iterations(
         has_lane_converged = is_lane_moving & is_at_target & (correction_norm < newton_tolerance)
         collocation_state = newton_state.collocation_state._replace(
             solution=jax.tree.map(apply_correction, collocation_solution, newton_correction),
-            step_end_states=update_moving_lanes(
-                cycle_linearization.step_end_states, newton_state.collocation_state.step_end_states
+            gait_step_end_states=update_moving_lanes(
+                cycle_linearization.gait_step_end_states,
+                newton_state.collocation_state.gait_step_end_states,
             ),
         )
         return _NewtonState(
@@ -536,7 +539,9 @@ def _compute_guard_minima(
         )
         return tuple(map(jnp.minimum, guard_minima, node_guards)), None
 
-    start_guards = collocation_phase.guards_function(phase_constants, phase_points.start_point)
+    start_guards = collocation_phase.guards_function(
+        phase_constants, phase_points.phase_start_point
+    )
     node_states = jnp.stack(phase_points.node_points.q, 1), jnp.stack(phase_points.node_points.v, 1)
     return lax.scan(update_minimum, start_guards, node_states)[0]
 
@@ -560,7 +565,7 @@ def find_first_failed_check(
         section_state, failed_check = loop_carry
         phase_durations, accelerations_by_phase, is_phase_active = step_inputs
         is_phase_active = is_phase_active > 0.5
-        next_section_state, phase_points = reconstruct_step(
+        next_section_state, phase_points = reconstruct_gait_step(
             phase_sequence,
             collocation_system.phase_meshes,
             phase_constants,
@@ -576,7 +581,7 @@ def find_first_failed_check(
                 ~is_phase_active[phase_index] | (phase_durations[phase_index] > 0.0)
             )
             guards_at_phase_end = collocation_phase.guards_function(
-                phase_constants, points_of_phase.end_point
+                phase_constants, points_of_phase.phase_end_point
             )
             for guard_minimum, end_guard_value in zip(
                 _compute_guard_minima(collocation_phase, phase_constants, points_of_phase),

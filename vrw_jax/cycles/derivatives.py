@@ -30,7 +30,7 @@ from vrw_jax.models import unit_scaling as scales
 from vrw_jax.numerics import (
     BatchFunction,
     ExecutionWrapper,
-    apply_in_blocks,
+    apply_function_in_blocks,
     apply_jacobian,
     compile_batch_function,
     make_implicit_jacobian,
@@ -144,7 +144,7 @@ def _compute_monodromy_tangents(
         zip(unscaled_parameter_indices, monodromy_tangents[:-1], strict=True)
     )
     mass_scale_tangent = (
-        scales.MASS_UNIT_SCALING.subtract_known_columns(
+        scales.MASS_UNIT_SCALING.subtract_known_jacobian_columns(
             jnp.zeros_like(monodromy_tangents[0]), tuple(parameters), tangent_by_parameter
         )
         / total_mass
@@ -200,7 +200,7 @@ def _make_derivative_compiler(
                 (function_name, derivative_order, collocation_system),
                 batch_size,
             )
-        return apply_in_blocks(function_of_element, batch_size)
+        return apply_function_in_blocks(function_of_element, batch_size)
 
     return compile_function
 
@@ -260,7 +260,9 @@ def _search_in_scaled_units(
         )
         return collocation_state._replace(
             solution=collocation_solution,
-            step_end_states=scale_by_unit(collocation_state.step_end_states, step_end_units),
+            gait_step_end_states=scale_by_unit(
+                collocation_state.gait_step_end_states, step_end_units
+            ),
         )
 
     scaled_search_guess = tuple(

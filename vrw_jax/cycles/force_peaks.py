@@ -22,7 +22,7 @@ from vrw_jax.numerics import Scalar
 from vrw_jax.wheel import (
     AbstractPhase,
     PhaseInstant,
-    make_phases,
+    make_paper_phases,
     make_wheel_from_parameters,
     transitions,
 )
@@ -44,8 +44,10 @@ def compute_force_peaks(
         collocation_system.evaluate_phase_points(parameters, collocation_solution),
     )
     for step_index, phase_points in enumerate(phase_points_by_step):
-        wheel_phases = make_phases(
-            wheel_symbols, phase_points[0].start_point.held_constants[0], stop_at_lift_off=False
+        wheel_phases = make_paper_phases(
+            wheel_symbols,
+            phase_points[0].phase_start_point.held_constants[0],
+            stop_at_lift_off=False,
         )
         phase_durations = collocation_solution.durations[step_index]
         fore_force_extrema, total_force_extrema = [], []
@@ -54,8 +56,8 @@ def compute_force_peaks(
         ):
             collocated_phase = CollocatedPhaseMotion.from_node_accelerations(
                 collocation_system.phase_meshes[phase_index],
-                jnp.stack(points_of_phase.start_point.q),
-                jnp.stack(points_of_phase.start_point.v),
+                jnp.stack(points_of_phase.phase_start_point.q),
+                jnp.stack(points_of_phase.phase_start_point.v),
                 phase_durations[phase_index],
                 collocation_solution.accelerations[phase_index][step_index],
             )
@@ -72,7 +74,7 @@ def compute_force_peaks(
             _summarize_force_extrema(force_extrema, phase_durations)
             for force_extrema in (fore_force_extrema, total_force_extrema)
         )
-        end_point = phase_points[-1].end_point
+        end_point = phase_points[-1].phase_end_point
         landing_result = transitions.resolve_landing(wheel_symbols, end_point.q[0], *end_point.v)
         peaks_by_step.append(
             {

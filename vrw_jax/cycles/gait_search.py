@@ -341,7 +341,7 @@ def _search_with_fallbacks(
     section_state = None
     if cycle_guess is not None:
         if isinstance(cycle_guess, CollocationState):
-            guess_section_state = cycle_guess.step_end_states[-1][jnp.array([0, 2, 3])]
+            guess_section_state = cycle_guess.gait_step_end_states[-1][jnp.array([0, 2, 3])]
         else:
             guess_section_state = getattr(cycle_guess, "section_state", cycle_guess)
         section_state = np.asarray(lax.stop_gradient(guess_section_state))[None]
@@ -704,7 +704,7 @@ def _align_first_step(
     The first step is the gait step that starts nearest to `start_section_states`.
     """
     gait_finder, collocation_state = finder_and_starts or (gait_finder, cycle.collocation_state)
-    end_states = np.asarray(collocation_state.step_end_states)[:, :, [0, 2, 3]]
+    end_states = np.asarray(collocation_state.gait_step_end_states)[:, :, [0, 2, 3]]
     state_distances_to_start = np.abs(
         np.roll(end_states, 1, axis=1) - start_section_states[:, None]
     ).max(-1)

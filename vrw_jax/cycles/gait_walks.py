@@ -164,7 +164,9 @@ def count_section_coordinates(gait_finder: Any) -> int:
 
     The remaining components are discrete codes.
     """
-    return int(gait_finder.model.count_continuous_entries(WheelParams(n_legs=gait_finder.n_legs)))
+    return int(
+        gait_finder.model.count_continuous_section_entries(WheelParams(n_legs=gait_finder.n_legs))
+    )
 
 
 class DistinctWalkEnds(NamedTuple):

@@ -40,13 +40,13 @@ from vrw_jax.cycles.slope_response import (
 )
 from vrw_jax.models import DoubleSupportIndicators, Margins, SectionState, ViscoelasticWheel
 from vrw_jax.numerics import Scalar, StepOptions, is_inside_jit
-from vrw_jax.printing import LabelAndText, format_numbers, map_text_of_elements
+from vrw_jax.printing import LabelAndText, format_each_batch_element, format_numbers
 from vrw_jax.simulation import step
 from vrw_jax.wheel import (
     Motion,
     Outcome,
     WheelParams,
-    make_phases,
+    make_paper_phases,
     make_wheel_from_parameters,
     stack_parameters,
     transitions,
@@ -96,7 +96,7 @@ class LimitCycle(AbstractCycle):
 
     @property
     def step_ends(self) -> Array:
-        return jnp.asarray(self.collocation_state.step_end_states)
+        return jnp.asarray(self.collocation_state.gait_step_end_states)
 
     @property
     def warm_start(self) -> CollocationState:
@@ -219,7 +219,7 @@ class LimitCycle(AbstractCycle):
             check_index = int(failed_check - 1) % len(ADMISSIBILITY_CHECKS)
             return f"{outcome_sentence} Broken: {ADMISSIBILITY_CHECKS[check_index]}."
 
-        return map_text_of_elements(
+        return format_each_batch_element(
             describe_outcome, self.outcome, self.collocation_state.failed_check
         )
 
@@ -317,7 +317,11 @@ def _solve_limit_cycle(
     period_n = collocation_system.period_n
     # The states are theta, its rate and the rate of L1. At touchdown, L1 follows from theta.
     touchdown_states = jnp.concatenate(
-        [collocation_state.step_end_states[:, :1], collocation_state.step_end_states[:, 2:]], 1
+        [
+            collocation_state.gait_step_end_states[:, :1],
+            collocation_state.gait_step_end_states[:, 2:],
+        ],
+        1,
     )
     # The landing at the start of a step follows the state at the end of the previous step.
     landing_results = jax.vmap(
@@ -397,7 +401,9 @@ def sample_walk_in_time(
     """
     step_options, wheel_symbols = StepOptions(), params.symbols()
     landing_result = transitions.resolve_landing(wheel_symbols, *section_state)
-    post_impact_state = jnp.stack([landing_result.theta_after, landing_result.motion_after.dtheta])
+    post_impact_state = jnp.stack(
+        [landing_result.theta_after_landing, landing_result.motion_after.dtheta]
+    )
 
     def sample_next_step(section_state: Array, _: None) -> tuple[Array, tuple]:
         step_trajectory = model.sample_step(params, section_state, step_options, n_samples)
@@ -422,14 +428,16 @@ def guess_cycle_from_walk(
     def sample_node_accelerations(
         foot_distance: Scalar, sampled_states: Array
     ) -> tuple[Array, ...]:
-        wheel_phases = make_phases(wheel_symbols, foot_distance, stop_at_lift_off=False)
+        wheel_phases = make_paper_phases(wheel_symbols, foot_distance, stop_at_lift_off=False)
         accelerations_by_phase = []
         sample_times = jnp.linspace(0.0, 1.0, sampled_states.shape[1])
         for wheel_phase, phase_mesh, phase_samples in zip(
             wheel_phases, collocation_system.phase_meshes, sampled_states, strict=True
         ):
             node_states = [
-                jnp.interp(jnp.asarray(phase_mesh.node_fractions), sample_times, coordinate_samples)
+                jnp.interp(
+                    jnp.asarray(phase_mesh.node_time_fractions), sample_times, coordinate_samples
+                )
                 for coordinate_samples in phase_samples.T
             ]
             node_motion = Motion.from_angle(*node_states)

@@ -17,7 +17,7 @@ def compute_takeoff_acceleration(s: Symbols, sls1_points: PhasePoints) -> Elemen
     See `dynamics.compute_takeoff_acceleration`.
     """
     return dynamics.compute_takeoff_acceleration(
-        s, Motion.from_angle(*sls1_points.start_point.q, *sls1_points.start_point.v)
+        s, Motion.from_angle(*sls1_points.phase_start_point.q, *sls1_points.phase_start_point.v)
     )
 
 

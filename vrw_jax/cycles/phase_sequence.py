@@ -120,7 +120,7 @@ def _make_collocation_phase(
         wheel_phase, wheel_motion = evaluate_phase_motion(phase_constants, phase_point)
         return PhasePoint(
             (),
-            *PAPER_PHASES[phase_index + 1].select_coordinates(
+            *PAPER_PHASES[phase_index + 1].select_phase_coordinates(
                 phase_point.q[0], wheel_phase.reset_motion(wheel_motion)
             ),
         )
@@ -137,7 +137,7 @@ def _make_collocation_phase(
 
     reset_function = reset_to_section if phase_class is PAPER_PHASES[-1] else reset_to_next_phase
     return CollocationPhase(
-        phase_class.name,
+        phase_class.phase_name,
         phase_class.n_dof,
         evaluate_dynamics_residual,
         evaluate_end_event,
@@ -152,10 +152,10 @@ ADMISSIBILITY_CHECKS: tuple[str, ...] = (
         check_name
         for phase_class in PAPER_PHASES
         for check_name in (
-            f"{phase_class.name} lasts",
-            f"{phase_class.name} ends only once",
+            f"{phase_class.phase_name} lasts",
+            f"{phase_class.phase_name} ends only once",
             *(
-                f"no {failure_outcome.name} in {phase_class.name}"
+                f"no {failure_outcome.name} in {phase_class.phase_name}"
                 for failure_outcome in (*phase_class.guard_outcomes[1:], *SHARED_FAILURE_OUTCOMES)
             ),
         )
@@ -195,16 +195,16 @@ def make_post_impact_sequence(n_legs: int, stop_at_lift_off: bool = True) -> Pha
     ) -> Vector:
         dls_points, sls1_points, sls2_points = phase_points
         lift_off_guard = collocation_phases[0].end_event_function(
-            phase_constants, dls_points.start_point
+            phase_constants, dls_points.phase_start_point
         )
-        (theta, _), (dtheta, dL1) = sls2_points.end_point.q, sls2_points.end_point.v
+        (theta, _), (dtheta, dL1) = sls2_points.phase_end_point.q, sls2_points.phase_end_point.v
         landing_result = transitions.resolve_landing(
             _restore_symbols(n_legs, phase_constants), theta, dtheta, dL1
         )
         return (
             jnp.where(is_phase_active[0], lift_off_guard, -lift_off_guard),
             landing_result.rear_impulse.normal,
-            sls1_points.end_point.v[2],
+            sls1_points.phase_end_point.v[2],
         )
 
     return PhaseSequence(2, make_start_point, collocation_phases, evaluate_transition_margins)

@@ -322,7 +322,7 @@ def make_return_map_gait(
     - `cycle_derivatives`, `step_derivatives`: derivatives of cycle and step with respect to the
       parameters on the branch, with a leading axis over the parameters.
     """
-    n_coordinates = model.count_continuous_entries(WheelParams(n_legs=n_legs))
+    n_coordinates = model.count_continuous_section_entries(WheelParams(n_legs=n_legs))
     gait_coordinates = lambda cycle, event_driven_step: jnp.concatenate(
         [cycle.section_state[:n_coordinates], event_driven_step.durations]
     )

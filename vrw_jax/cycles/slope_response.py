@@ -16,7 +16,7 @@ from jax import lax
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
-from vrw_jax.collocation import reconstruct_step
+from vrw_jax.collocation import reconstruct_gait_step
 from vrw_jax.continuation import floquet
 from vrw_jax.cycles.collocation_search import CollocationState, CollocationSystem
 from vrw_jax.models import AbstractWheel
@@ -167,7 +167,7 @@ def compute_step_slope_response(
 
     The discrete codes in the section state do not vary.
     """
-    n_state_entries = model.count_continuous_entries(params)
+    n_state_entries = model.count_continuous_section_entries(params)
     section_state_codes = section_state[n_state_entries:]
 
     def evaluate_step(step_start_and_slopes: Array) -> Array:
@@ -258,7 +258,7 @@ def _make_collocation_response_function(collocation_system: CollocationSystem) -
                 *collocation_system.phase_constants_function(*line_parameters),
                 step_start_and_slopes[3] - step_start_and_slopes[2],
             )
-            end_section_state, phase_points = reconstruct_step(
+            end_section_state, phase_points = reconstruct_gait_step(
                 collocation_system.phase_sequence,
                 collocation_system.phase_meshes,
                 phase_constants,
@@ -284,7 +284,7 @@ def _make_collocation_response_function(collocation_system: CollocationSystem) -
                     phase_constants, points_of_phase.node_points, tuple(node_accelerations)
                 )
                 end_event_value = phase.end_event_function(
-                    phase_constants, points_of_phase.end_point
+                    phase_constants, points_of_phase.phase_end_point
                 )
                 cycle_residual_parts.append(
                     jnp.where(
@@ -316,7 +316,7 @@ def _make_collocation_response_function(collocation_system: CollocationSystem) -
             )
             durations, (step_length,) = (
                 unflatten_unknowns(unknown_vector)[0],
-                phase_points[0].start_point.held_constants,
+                phase_points[0].phase_start_point.held_constants,
             )
             period = jnp.sum(durations)
             measure_values = (

@@ -3,7 +3,7 @@
 from vrw_jax.hybrid.complementarity import LCPStatus, enumerate_lcp_solutions
 from vrw_jax.hybrid.minima import (
     GUARD_ROUNDOFF_IN_EPS,
-    MonitoredFunctions,
+    GuardsAndMargins,
     StateArray,
 )
 from vrw_jax.hybrid.phase_integration import (
@@ -11,10 +11,13 @@ from vrw_jax.hybrid.phase_integration import (
     VectorField,
     integrate_phase,
 )
-from vrw_jax.hybrid.program_cache import find_program
+from vrw_jax.hybrid.program_cache import get_compiled_program
 from vrw_jax.hybrid.return_map import ReturnMap
 from vrw_jax.hybrid.saltation import flow_jacobian_determinant
-from vrw_jax.hybrid.scaled_integration import integrate_in_units, sample_in_units
+from vrw_jax.hybrid.scaled_integration import (
+    integrate_phase_in_scaled_units,
+    sample_phase_in_scaled_units,
+)
 from vrw_jax.hybrid.segments import product_multipliers, segment_maps
 from vrw_jax.hybrid.simulation import (
     Guard,

@@ -15,21 +15,22 @@ from jaxtyping import Array, Bool, Float, Int
 from vrw_jax.numerics import MINIMUM_LOCATION_TOLERANCE, Scalar, find_cubic_minimum
 
 StateArray = Float[Array, " dim"]
-EvaluateMonitored = Callable[[StateArray], Float[Array, " n_watched"]]
+EvaluateGuardsAndMargins = Callable[[StateArray], Float[Array, " n_guards_and_margins"]]
 """Function that returns the values of all guards, followed by all margins, at a state."""
 
 
-class MonitoredFunctions(NamedTuple):
+class GuardsAndMargins(NamedTuple):
     """Guards and margins that the integration evaluates during a phase.
 
     A guard ends the phase when it falls to zero. The integration computes the minimum of each
     margin over the phase.
 
-    - `evaluate_monitored`: function that returns the guards, followed by the margins, at a state;
+    - `evaluate_guards_and_margins`: function that returns the guards, followed by the margins, at a
+      state;
     - `n_guards`: number of guards;
-    - `includes_start`: whether the minimum of each margin includes its value at the start of the
-      phase. The value is False for a margin that is zero there by construction, such as the height
-      of a foot that leaves the ground. Interior minima and the value at the end are always
+    - `includes_phase_start`: whether the minimum of each margin includes its value at the start of
+      the phase. The value is False for a margin that is zero there by construction, such as the
+      height of a foot that leaves the ground. Interior minima and the value at the end are always
       included;
     - `guard_scales`: magnitude of the terms whose difference is the guard. A guard within some
       round-offs of this magnitude is treated as zero, because a guard that is negative only for
@@ -39,9 +40,9 @@ class MonitoredFunctions(NamedTuple):
       scale.
     """
 
-    evaluate_monitored: EvaluateMonitored
+    evaluate_guards_and_margins: EvaluateGuardsAndMargins
     n_guards: int
-    includes_start: tuple[bool, ...] = ()
+    includes_phase_start: tuple[bool, ...] = ()
     guard_scales: Array | None = None
     is_zero_at_start: Bool[Array, " n_guards"] | None = None
 
@@ -54,7 +55,7 @@ The value is chosen because a guard is a sum of several terms, each with its own
 
 
 def is_guard_at_roundoff(
-    monitored_functions: MonitoredFunctions,
+    guards_and_margins: GuardsAndMargins,
     is_guard_crossing: Bool[Array, " n_guards"],
     guard_values: Float[Array, " n_guards"],
 ) -> tuple[Bool[Array, ""], Int[Array, ""]]:
@@ -64,20 +65,20 @@ def is_guard_at_roundoff(
     """
     guard_scales = (
         jnp.ones_like(guard_values)
-        if monitored_functions.guard_scales is None
-        else monitored_functions.guard_scales
+        if guards_and_margins.guard_scales is None
+        else guards_and_margins.guard_scales
     )
     scaled_guard_values = jnp.where(is_guard_crossing, guard_values / guard_scales, jnp.inf)
     is_guard_near_zero = (
         jnp.abs(jnp.min(scaled_guard_values))
         <= GUARD_ROUNDOFF_IN_EPS * jnp.finfo(scaled_guard_values.dtype).eps
     )
-    has_guard_scales = monitored_functions.guard_scales is not None
+    has_guard_scales = guards_and_margins.guard_scales is not None
     return is_guard_near_zero & has_guard_scales, jnp.argmin(scaled_guard_values).astype(jnp.int32)
 
 
 def find_guards_met_at_start(
-    monitored_functions: MonitoredFunctions,
+    guards_and_margins: GuardsAndMargins,
     guard_values: Float[Array, " n_guards"],
     guard_rates: Float[Array, " n_guards"],
 ) -> tuple[Bool[Array, " n_guards"], Bool[Array, " n_guards"]]:
@@ -90,43 +91,43 @@ def find_guards_met_at_start(
     """
     is_guard_met = (guard_values < 0.0) | ((guard_values == 0.0) & (guard_rates <= 0.0))
     is_guard_zero = guard_values == 0.0
-    if monitored_functions.guard_scales is not None:
+    if guards_and_margins.guard_scales is not None:
         guard_roundoff = GUARD_ROUNDOFF_IN_EPS * jnp.finfo(guard_values.dtype).eps
         is_guard_zero = is_guard_zero | (
-            guard_values >= -guard_roundoff * monitored_functions.guard_scales
+            guard_values >= -guard_roundoff * guards_and_margins.guard_scales
         )
-    if monitored_functions.is_zero_at_start is not None:
-        is_guard_zero = monitored_functions.is_zero_at_start
+    if guards_and_margins.is_zero_at_start is not None:
+        is_guard_zero = guards_and_margins.is_zero_at_start
         is_guard_met = jnp.where(is_guard_zero, guard_rates <= 0.0, is_guard_met)
     return is_guard_met, is_guard_met & is_guard_zero & (guard_rates < 0.0)
 
 
-class AcceptedPhaseStep(NamedTuple):
+class SolverStepEnd(NamedTuple):
     """State, guards and margins at the end of the last accepted solver step."""
 
     end_time: Scalar
     state: StateArray
     solver_state: Any
-    monitored_values: Float[Array, " n_watched"]
-    monitored_rates: Float[Array, " n_watched"]
+    guard_and_margin_values: Float[Array, " n_guards_and_margins"]
+    guard_and_margin_rates: Float[Array, " n_guards_and_margins"]
 
 
-class InteriorMinimum(NamedTuple):
+class InteriorMarginMinima(NamedTuple):
     """Lowest interior minimum of each margin so far, and the solver step that contains it."""
 
-    minimum_values: Float[Array, " n"]
-    start_state: Float[Array, "n dim"]
+    interior_minimum_values: Float[Array, " n"]
+    step_start_state: Float[Array, "n dim"]
     step_length: Float[Array, " n"]  # length of the solver step, s
     time_to_minimum: Float[Array, " n"]  # time from the start of the solver step, s
-    start_margin_rates: Float[Array, " n"]
+    step_start_margin_rates: Float[Array, " n"]
 
     @property
-    def has_minimum(self) -> Bool[Array, " n"]:
+    def has_interior_minimum(self) -> Bool[Array, " n"]:
         """Return whether each margin has an interior minimum, shape (margins,)."""
-        return jnp.isfinite(self.minimum_values)
+        return jnp.isfinite(self.interior_minimum_values)
 
 
-class MinimumRefinement(NamedTuple):
+class MarginMinimumRefinement(NamedTuple):
     """State of the secant iterations that refine the minima of the margins after the integration.
 
     The iterations find the time at which the time derivative of one margin is zero. They treat one
@@ -141,13 +142,13 @@ class MinimumRefinement(NamedTuple):
     lowest_margin_values: Float[Array, " n"]
 
 
-def make_empty_interior_minimum(
-    monitored_functions: MonitoredFunctions, start_state: StateArray
-) -> InteriorMinimum:
-    """Return an `InteriorMinimum` in which no margin has a minimum yet."""
-    n_margins = len(monitored_functions.includes_start)
+def make_empty_interior_margin_minima(
+    guards_and_margins: GuardsAndMargins, start_state: StateArray
+) -> InteriorMarginMinima:
+    """Return an `InteriorMarginMinima` in which no margin has a minimum yet."""
+    n_margins = len(guards_and_margins.includes_phase_start)
     zero_margins = jnp.zeros((n_margins,), start_state.dtype)
-    return InteriorMinimum(
+    return InteriorMarginMinima(
         zero_margins + jnp.inf,
         jnp.tile(start_state, (n_margins, 1)),
         zero_margins,
@@ -156,59 +157,74 @@ def make_empty_interior_minimum(
     )
 
 
-def update_interior_minimum(
-    monitored_functions: MonitoredFunctions,
-    interior_minimum: InteriorMinimum,
-    step_start: AcceptedPhaseStep,
-    step_end: AcceptedPhaseStep,
+def update_interior_margin_minima(
+    guards_and_margins: GuardsAndMargins,
+    interior_margin_minima: InteriorMarginMinima,
+    step_start: SolverStepEnd,
+    step_end: SolverStepEnd,
     step_length: Scalar,
-    is_step_counted: Bool[Array, ""],
-) -> InteriorMinimum:
+    is_step_in_phase: Bool[Array, ""],
+) -> InteriorMarginMinima:
     """Return the lowest interior minima after one more solver step from `step_start` to `step_end`.
 
     - `step_length`: duration of the solver step, s;
-    - `is_step_counted`: whether the step is part of the phase. If False, nothing changes.
+    - `is_step_in_phase`: whether the step is part of the phase. If False, nothing changes.
 
     A margin has a minimum inside the step if its time derivative changes from negative to positive.
     A margin that is zero at the start of the phase by construction cannot fall there. Its negative
     time derivative at the start is round-off and is replaced by zero.
     """
-    if not monitored_functions.includes_start:
-        return interior_minimum
-    start_margins, start_rates, end_margins, end_rates = (
-        lax.stop_gradient(v)[monitored_functions.n_guards :]
+    if not guards_and_margins.includes_phase_start:
+        return interior_margin_minima
+    start_margin_values, start_margin_rates, end_margin_values, end_margin_rates = (
+        lax.stop_gradient(v)[guards_and_margins.n_guards :]
         for v in (
-            step_start.monitored_values,
-            step_start.monitored_rates,
-            step_end.monitored_values,
-            step_end.monitored_rates,
+            step_start.guard_and_margin_values,
+            step_start.guard_and_margin_rates,
+            step_end.guard_and_margin_values,
+            step_end.guard_and_margin_rates,
         )
     )
     is_zero_at_phase_start = (step_start.end_time == 0.0) & ~jnp.asarray(
-        monitored_functions.includes_start
+        guards_and_margins.includes_phase_start
     )
-    start_rates = jnp.where(is_zero_at_phase_start, jnp.maximum(start_rates, 0.0), start_rates)
+    start_margin_rates = jnp.where(
+        is_zero_at_phase_start, jnp.maximum(start_margin_rates, 0.0), start_margin_rates
+    )
     step_length = lax.stop_gradient(step_length)
-    minimum_fraction, minimum_margins = find_cubic_minimum(
-        start_margins, start_rates * step_length, end_margins, end_rates * step_length
+    minimum_fractions, cubic_minimum_values = find_cubic_minimum(
+        start_margin_values,
+        start_margin_rates * step_length,
+        end_margin_values,
+        end_margin_rates * step_length,
     )
-    minimum_margins = jnp.where(
-        jnp.isfinite(minimum_margins), minimum_margins, jnp.minimum(start_margins, end_margins)
+    cubic_minimum_values = jnp.where(
+        jnp.isfinite(cubic_minimum_values),
+        cubic_minimum_values,
+        jnp.minimum(start_margin_values, end_margin_values),
     )
     is_minimum_lower = (
-        is_step_counted
-        & (start_rates < 0.0)
-        & (end_rates >= 0.0)
-        & (minimum_margins < interior_minimum.minimum_values)
+        is_step_in_phase
+        & (start_margin_rates < 0.0)
+        & (end_margin_rates >= 0.0)
+        & (cubic_minimum_values < interior_margin_minima.interior_minimum_values)
     )
-    return InteriorMinimum(
-        jnp.where(is_minimum_lower, minimum_margins, interior_minimum.minimum_values),
-        jnp.where(is_minimum_lower[:, None], step_start.state, interior_minimum.start_state),
-        jnp.where(is_minimum_lower, step_length, interior_minimum.step_length),
+    return InteriorMarginMinima(
         jnp.where(
-            is_minimum_lower, minimum_fraction * step_length, interior_minimum.time_to_minimum
+            is_minimum_lower, cubic_minimum_values, interior_margin_minima.interior_minimum_values
         ),
-        jnp.where(is_minimum_lower, start_rates, interior_minimum.start_margin_rates),
+        jnp.where(
+            is_minimum_lower[:, None], step_start.state, interior_margin_minima.step_start_state
+        ),
+        jnp.where(is_minimum_lower, step_length, interior_margin_minima.step_length),
+        jnp.where(
+            is_minimum_lower,
+            minimum_fractions * step_length,
+            interior_margin_minima.time_to_minimum,
+        ),
+        jnp.where(
+            is_minimum_lower, start_margin_rates, interior_margin_minima.step_start_margin_rates
+        ),
     )
 
 
@@ -226,107 +242,111 @@ def select_entry_by_mask(entry_index: Int[Array, ""], stacked_entries: Array) ->
     )
 
 
-def advance_minimum_refinement(
-    minimum_refinement: MinimumRefinement,
-    monitored_functions: MonitoredFunctions,
-    interior_minimum: InteriorMinimum,
-    tried_step: AcceptedPhaseStep,
+def advance_margin_minimum_refinement(
+    margin_minimum_refinement: MarginMinimumRefinement,
+    guards_and_margins: GuardsAndMargins,
+    interior_margin_minima: InteriorMarginMinima,
+    tried_step_end: SolverStepEnd,
     step_length: Scalar,
     is_refining: Bool[Array, ""],
     is_phase_start: Bool[Array, ""],
     is_phase_end: Bool[Array, ""],
     max_iterations: int,
     min_iterations: int = 3,
-) -> tuple[MinimumRefinement, Bool[Array, ""], Scalar]:
+) -> tuple[MarginMinimumRefinement, Bool[Array, ""], Scalar]:
     """Return the next refinement state, whether another solver step is needed, and its length, s.
 
     After the integration, a secant iteration finds the time at which the time derivative of each
     margin is zero. Each iteration takes a solver step of `step_length` from the start of the solver
     step that contains the minimum.
 
-    - `tried_step`: end of the last solver step;
-    - `is_refining`: whether `tried_step` was such an iteration;
-    - `is_phase_start`: whether `tried_step` is the start of the phase, where the margins are
+    - `tried_step_end`: end of the last solver step;
+    - `is_refining`: whether `tried_step_end` was such an iteration;
+    - `is_phase_start`: whether `tried_step_end` is the start of the phase, where the margins are
       stored;
     - `is_phase_end`: whether the integration has ended, so that the first margin is refined next;
     - `max_iterations`, `min_iterations`: largest and smallest number of iterations per margin. The
       smallest number is required because each iteration makes the derivatives of the minimum's time
       accurate to more digits.
     """
-    margin_values = tried_step.monitored_values[monitored_functions.n_guards :]
-    margin_rates = tried_step.monitored_rates[monitored_functions.n_guards :]
-    margin_index = minimum_refinement.margin_index
-    n_iterations = minimum_refinement.n_iterations + is_refining
-    margin_value, margin_rate, original_step_length = (
+    margin_values = tried_step_end.guard_and_margin_values[guards_and_margins.n_guards :]
+    margin_rates = tried_step_end.guard_and_margin_rates[guards_and_margins.n_guards :]
+    margin_index = margin_minimum_refinement.margin_index
+    n_iterations = margin_minimum_refinement.n_iterations + is_refining
+    margin_value, margin_rate, minimum_step_length = (
         select_entry_by_mask(margin_index, x)
-        for x in (margin_values, margin_rates, interior_minimum.step_length)
+        for x in (margin_values, margin_rates, interior_margin_minima.step_length)
     )
     margin_rate_value, step_length_value = lax.stop_gradient((margin_rate, step_length))
-    length_change = step_length_value - minimum_refinement.best_step_length
-    margin_rate_slope = (margin_rate_value - minimum_refinement.best_margin_rate) / jnp.where(
-        length_change == 0.0, 1.0, length_change
-    )
+    length_change = step_length_value - margin_minimum_refinement.best_step_length
+    margin_rate_slope = (
+        margin_rate_value - margin_minimum_refinement.best_margin_rate
+    ) / jnp.where(length_change == 0.0, 1.0, length_change)
     is_secant_usable = (length_change != 0.0) & (margin_rate_slope > 0.0)
     proposed_step_length = step_length - jnp.where(
         is_secant_usable, margin_rate / jnp.where(is_secant_usable, margin_rate_slope, 1.0), 0.0
     )
     proposed_step_length = jnp.clip(
-        proposed_step_length, 0.0, lax.stop_gradient(original_step_length)
+        proposed_step_length, 0.0, lax.stop_gradient(minimum_step_length)
     )
     has_secant_converged = (
         jnp.abs(proposed_step_length - step_length)
-        <= MINIMUM_LOCATION_TOLERANCE * original_step_length
+        <= MINIMUM_LOCATION_TOLERANCE * minimum_step_length
     )
-    is_margin_done = is_refining & (
+    is_margin_refined = is_refining & (
         (n_iterations == max_iterations) | (has_secant_converged & (n_iterations >= min_iterations))
     )
     has_smaller_margin_rate = jnp.abs(margin_rate_value) < jnp.abs(
-        minimum_refinement.best_margin_rate
+        margin_minimum_refinement.best_margin_rate
     )
 
     margin_indices = jnp.arange(margin_values.shape[0])
     lowest_margin_values = jnp.where(
-        is_margin_done & (margin_indices == margin_index),
-        jnp.minimum(margin_value, minimum_refinement.lowest_margin_values),
-        minimum_refinement.lowest_margin_values,
+        is_margin_refined & (margin_indices == margin_index),
+        jnp.minimum(margin_value, margin_minimum_refinement.lowest_margin_values),
+        margin_minimum_refinement.lowest_margin_values,
     )
     start_margin_values = jnp.where(
-        jnp.asarray(monitored_functions.includes_start), margin_values, jnp.inf
+        jnp.asarray(guards_and_margins.includes_phase_start), margin_values, jnp.inf
     )
-    needs_refinement = interior_minimum.has_minimum & (
+    needs_margin_refinement = interior_margin_minima.has_interior_minimum & (
         is_phase_end | (margin_indices > margin_index)
     )
-    is_next_margin_selected = is_phase_end | is_margin_done
+    is_next_margin_selected = is_phase_end | is_margin_refined
     margin_index = jnp.where(
-        is_next_margin_selected, jnp.argmax(needs_refinement).astype(jnp.int32), margin_index
+        is_next_margin_selected, jnp.argmax(needs_margin_refinement).astype(jnp.int32), margin_index
     )
-    time_to_minimum, start_rate = lax.stop_gradient(
+    time_to_minimum, step_start_margin_rate = lax.stop_gradient(
         (
-            select_entry_by_mask(margin_index, interior_minimum.time_to_minimum),
-            select_entry_by_mask(margin_index, interior_minimum.start_margin_rates),
+            select_entry_by_mask(margin_index, interior_margin_minima.time_to_minimum),
+            select_entry_by_mask(margin_index, interior_margin_minima.step_start_margin_rates),
         )
     )
-    next_refinement = MinimumRefinement(
+    next_margin_minimum_refinement = MarginMinimumRefinement(
         margin_index=margin_index,
         n_iterations=jnp.where(is_next_margin_selected, 0, n_iterations),
         best_step_length=jnp.where(
             is_next_margin_selected,
             0.0,
             jnp.where(
-                has_smaller_margin_rate, step_length_value, minimum_refinement.best_step_length
+                has_smaller_margin_rate,
+                step_length_value,
+                margin_minimum_refinement.best_step_length,
             ),
         ),
         best_margin_rate=jnp.where(
             is_next_margin_selected,
-            start_rate,
+            step_start_margin_rate,
             jnp.where(
-                has_smaller_margin_rate, margin_rate_value, minimum_refinement.best_margin_rate
+                has_smaller_margin_rate,
+                margin_rate_value,
+                margin_minimum_refinement.best_margin_rate,
             ),
         ),
         lowest_margin_values=jnp.where(is_phase_start, start_margin_values, lowest_margin_values),
     )
     return (
-        next_refinement,
-        jnp.where(is_next_margin_selected, jnp.any(needs_refinement), is_refining),
+        next_margin_minimum_refinement,
+        jnp.where(is_next_margin_selected, jnp.any(needs_margin_refinement), is_refining),
         jnp.where(is_next_margin_selected, time_to_minimum, proposed_step_length),
     )

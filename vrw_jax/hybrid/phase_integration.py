@@ -21,25 +21,25 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from vrw_jax.hybrid.minima import (
-    AcceptedPhaseStep,
-    InteriorMinimum,
-    MinimumRefinement,
-    MonitoredFunctions,
+    GuardsAndMargins,
+    InteriorMarginMinima,
+    MarginMinimumRefinement,
+    SolverStepEnd,
     StateArray,
-    advance_minimum_refinement,
+    advance_margin_minimum_refinement,
     find_guards_met_at_start,
     is_guard_at_roundoff,
-    make_empty_interior_minimum,
+    make_empty_interior_margin_minima,
     select_entry_by_mask,
-    update_interior_minimum,
+    update_interior_margin_minima,
 )
 from vrw_jax.numerics import (
     Scalar,
     StepOptions,
     evaluate_cubic,
     find_cubic_minimum,
-    make_opaque_condition,
-    select_tree_leaves,
+    make_opaque_loop_condition,
+    select_trees_by_condition,
 )
 from vrw_jax.runtime import lazy_import
 
@@ -57,11 +57,11 @@ class PhaseEnd(NamedTuple):
 
     state: StateArray
     duration: Scalar  # duration of the phase, s
-    guard: Int[Array, ""]  # index of the guard that ended the phase; -1 if none did
+    end_guard_index: Int[Array, ""]  # index of the guard that ended the phase; -1 if none did
     is_timed_out: Bool[Array, ""]
-    has_given_up: Bool[Array, ""]
+    has_integration_failed: Bool[Array, ""]
     solver_steps: Int[Array, ""]  # number of tried solver steps, accepted or not
-    margin_minima: Float[Array, " n_monitors"]  # minima of the margins, empty if there are none
+    margin_minima: Float[Array, " n_margins"]  # minima of the margins, empty if there are none
 
 
 class StepPurpose(IntEnum):
@@ -78,7 +78,7 @@ class StepPurpose(IntEnum):
 class EventSearchOptions:
     """Options of the search for an event, and of the growth of solver steps."""
 
-    max_step_growth: float = 2.0
+    max_solver_step_growth: float = 2.0
     """Largest ratio of the lengths of successive solver steps.
 
     The error estimate for a solver step far shorter than needed is round-off. A length derived from
@@ -86,20 +86,20 @@ class EventSearchOptions:
     1e-12 from the result for the same system alone. The value is chosen to avoid this difference,
     which is more than a hundred times the round-off.
     """
-    n_required_confirmations: int = 3
+    n_required_confirming_steps: int = 3
     """Number of solver steps to the located event that must confirm the event's time.
 
     The value is chosen because of the derivatives of the event's time. The first step makes them
     accurate to first order, the second to third order. The last step evaluates the state at the
     event.
     """
-    max_confirmed_length_change: float = 1e-4
+    max_confirming_time_correction: float = 1e-4
     """Largest correction of the event's time by a Newton iteration that confirms this time.
 
     The correction is relative to the duration of the phase. The value is chosen because Newton's
     method squares the correction in each of the next two iterations, to 1e-16 in the last.
     """
-    min_stalled_change_ratio: float = 0.9
+    min_stalled_correction_ratio: float = 0.9
     """Ratio of successive corrections of the event's time above which a correction is round-off.
 
     The value is chosen because Newton's method at least halves the corrections. The exception is a
@@ -114,27 +114,29 @@ class _EventSearch(NamedTuple):
     """State of the Newton iteration that locates the earliest event inside a solver step."""
 
     is_guard_crossing: Bool[Array, " n_guards"]
-    lower_length_bound: Scalar  # bracket of the event's time, s from the start of the solver step
-    upper_length_bound: Scalar
+    lower_step_length_bound: (
+        Scalar  # bracket of the event's time, s from the start of the solver step
+    )
+    upper_step_length_bound: Scalar
     time_tolerance: Scalar  # tolerance of the event's time, s
     n_iterations: Int[Array, ""]
-    n_confirmed_proposals: Int[Array, ""]  # number of solver steps that confirmed the time
-    last_length_change: Scalar  # last correction of the event's time, s
+    n_confirming_steps: Int[Array, ""]  # number of solver steps that confirmed the time
+    last_event_time_correction: Scalar  # last correction of the event's time, s
 
 
 class _PhaseState(NamedTuple):
     """State of the loop that integrates a phase."""
 
     step_purpose: Int[Array, ""]  # a StepPurpose
-    accepted_step: AcceptedPhaseStep  # the last accepted solver step
+    last_accepted_step_end: SolverStepEnd  # the last accepted solver step
     next_step_length: Scalar  # length of the next solver step, s
     controller_state: Any
     event_search: _EventSearch
-    interior_minimum: InteriorMinimum
-    minimum_refinement: MinimumRefinement
-    triggered_guard: Int[Array, ""]
+    interior_margin_minima: InteriorMarginMinima
+    margin_minimum_refinement: MarginMinimumRefinement
+    triggered_guard_index: Int[Array, ""]
     is_timed_out: Bool[Array, ""]
-    has_given_up: Bool[Array, ""]
+    has_integration_failed: Bool[Array, ""]
     n_tried_steps: Int[Array, ""]
 
 
@@ -150,10 +152,10 @@ class _SolverStepper(NamedTuple):
         self, state: StateArray, options: StepOptions
     ) -> tuple[Any, Any]:
         """Return the initial internal states of diffrax's solver and step-size controller."""
-        zero_time = jnp.zeros((), state.dtype)
+        zero_duration = jnp.zeros((), state.dtype)
         _, controller_state = self.step_size_controller.init(
             self.ode_term,
-            zero_time,
+            zero_duration,
             options.dt0,
             lax.stop_gradient(state),
             options.dt0,
@@ -165,8 +167,8 @@ class _SolverStepper(NamedTuple):
 
     def init_solver_state(self, state: StateArray, options: StepOptions) -> Any:
         """Return the internal state of diffrax's solver for a start at `state`."""
-        zero_time = jnp.zeros((), state.dtype)
-        return self.diffrax_solver.init(self.ode_term, zero_time, options.dt0, state, None)
+        zero_duration = jnp.zeros((), state.dtype)
+        return self.diffrax_solver.init(self.ode_term, zero_duration, options.dt0, state, None)
 
     def take_solver_step(
         self, state: StateArray, solver_state: Any, step_length: Scalar
@@ -175,9 +177,9 @@ class _SolverStepper(NamedTuple):
 
         The third result is the new internal state of the solver.
         """
-        zero_time = jnp.zeros_like(step_length)
+        zero_duration = jnp.zeros_like(step_length)
         end_state, error_estimate, _, solver_state, solver_result = self.diffrax_solver.step(
-            self.ode_term, zero_time, step_length, state, None, solver_state, jnp.asarray(False)
+            self.ode_term, zero_duration, step_length, state, None, solver_state, jnp.asarray(False)
         )
         if error_estimate is None:
             raise ValueError(
@@ -226,12 +228,12 @@ class _SolverStepper(NamedTuple):
 
 
 def _make_stepper(
-    vector_field: VectorField, options: StepOptions, max_step_growth: float
+    vector_field: VectorField, options: StepOptions, max_solver_step_growth: float
 ) -> _SolverStepper:
     """Return the solver and step-size controller that `options` select for a vector field.
 
-    `max_step_growth` is the largest ratio of successive step lengths. The solver is configured for
-    forward-mode derivatives.
+    `max_solver_step_growth` is the largest ratio of successive step lengths. The solver is
+    configured for forward-mode derivatives.
     """
     diffrax_solver_class = getattr(diffrax, options.solver)
     field_names = diffrax_solver_class.__dataclass_fields__
@@ -245,7 +247,7 @@ def _make_stepper(
         vector_field=vector_field,
         diffrax_solver=diffrax_solver_class(**solver_arguments),
         step_size_controller=diffrax.PIDController(
-            rtol=options.rtol, atol=options.atol, factormax=max_step_growth
+            rtol=options.rtol, atol=options.atol, factormax=max_solver_step_growth
         ),
         ode_term=diffrax.ODETerm(lambda t, y, args: vector_field(y)),
     )
@@ -253,7 +255,7 @@ def _make_stepper(
 
 def integrate_phase(
     vector_field: VectorField,
-    monitored_functions: MonitoredFunctions,
+    guards_and_margins: GuardsAndMargins,
     start_state: StateArray,
     is_active: Bool[Array, ""],
     options: StepOptions,
@@ -272,25 +274,25 @@ def integrate_phase(
     the phase. If `is_active` is False, nothing is integrated. Errors are those of the solver for
     the tolerances of `options`.
     """
-    solver_stepper = _make_stepper(vector_field, options, event_options.max_step_growth)
-    phase_context = _PhaseContext(solver_stepper, monitored_functions, options, event_options)
+    solver_stepper = _make_stepper(vector_field, options, event_options.max_solver_step_growth)
+    phase_context = _PhaseContext(solver_stepper, guards_and_margins, options, event_options)
     phase_state = lax.while_loop(
-        lambda phase_state: make_opaque_condition(
+        lambda phase_state: make_opaque_loop_condition(
             phase_state.step_purpose != StepPurpose.DONE, phase_state.n_tried_steps
         ),
         functools.partial(_advance_phase_state, phase_context),
         _init_phase_state(phase_context, start_state, is_active),
     )
     margin_minima = jnp.minimum(
-        phase_state.minimum_refinement.lowest_margin_values,
-        phase_state.accepted_step.monitored_values[monitored_functions.n_guards :],
+        phase_state.margin_minimum_refinement.lowest_margin_values,
+        phase_state.last_accepted_step_end.guard_and_margin_values[guards_and_margins.n_guards :],
     )
     return PhaseEnd(
-        state=phase_state.accepted_step.state,
-        duration=phase_state.accepted_step.end_time,
-        guard=phase_state.triggered_guard,
+        state=phase_state.last_accepted_step_end.state,
+        duration=phase_state.last_accepted_step_end.end_time,
+        end_guard_index=phase_state.triggered_guard_index,
         is_timed_out=phase_state.is_timed_out,
-        has_given_up=phase_state.has_given_up,
+        has_integration_failed=phase_state.has_integration_failed,
         solver_steps=phase_state.n_tried_steps,
         margin_minima=margin_minima,
     )
@@ -300,7 +302,7 @@ class _PhaseContext(NamedTuple):
     """Arguments of the integration loop that do not change during a phase."""
 
     solver_stepper: _SolverStepper
-    monitored_functions: MonitoredFunctions
+    guards_and_margins: GuardsAndMargins
     step_options: StepOptions
     event_options: EventSearchOptions
 
@@ -313,48 +315,48 @@ def _init_phase_state(
     All arrays that the loop batches or differentiates are batched or differentiated from the start.
     Otherwise JAX would trace the loop again for each array that becomes batched or differentiated.
     """
-    solver_stepper, monitored_functions, options, _ = phase_context
-    zero_time = 0.0 * start_state[0]
-    zero_count = jnp.where(is_active, 0, 0).astype(jnp.int32)
-    zero_values = (
+    solver_stepper, guards_and_margins, options, _ = phase_context
+    zero_duration = 0.0 * start_state[0]
+    initial_count = jnp.where(is_active, 0, 0).astype(jnp.int32)
+    initial_values = (
         jnp.zeros(
-            jax.eval_shape(monitored_functions.evaluate_monitored, start_state).shape,
+            jax.eval_shape(guards_and_margins.evaluate_guards_and_margins, start_state).shape,
             start_state.dtype,
         )
-        + zero_time
+        + zero_duration
     )
-    false_array = is_active & False
-    float_zero = lax.stop_gradient(zero_time)
+    initial_flag = is_active & False
+    float_zero = lax.stop_gradient(zero_duration)
     solver_state, controller_state = solver_stepper.init_solver_and_controller(start_state, options)
-    is_guard_crossing = jnp.zeros((monitored_functions.n_guards,), bool) | false_array
+    is_guard_crossing = jnp.zeros((guards_and_margins.n_guards,), bool) | initial_flag
     return _PhaseState(
         step_purpose=jnp.where(is_active, StepPurpose.START, StepPurpose.DONE).astype(jnp.int32),
-        accepted_step=AcceptedPhaseStep(
-            zero_time, start_state, solver_state, zero_values, zero_values
+        last_accepted_step_end=SolverStepEnd(
+            zero_duration, start_state, solver_state, initial_values, initial_values
         ),
-        next_step_length=zero_time,  # The first step has length zero and evaluates the start.
+        next_step_length=zero_duration,  # The first step has length zero and evaluates the start.
         controller_state=jax.tree.map(lambda x: x + float_zero, controller_state),
         event_search=_EventSearch(
             is_guard_crossing,
             float_zero,
             float_zero,
             float_zero,
-            zero_count,
-            zero_count,
+            initial_count,
+            initial_count,
             float_zero,
         ),
-        interior_minimum=make_empty_interior_minimum(monitored_functions, start_state),
-        minimum_refinement=MinimumRefinement(
-            zero_count,
-            zero_count,
+        interior_margin_minima=make_empty_interior_margin_minima(guards_and_margins, start_state),
+        margin_minimum_refinement=MarginMinimumRefinement(
+            initial_count,
+            initial_count,
             float_zero,
             float_zero,
-            zero_values[monitored_functions.n_guards :] + jnp.inf,
+            initial_values[guards_and_margins.n_guards :] + jnp.inf,
         ),
-        triggered_guard=zero_count - 1,
-        is_timed_out=false_array,
-        has_given_up=false_array,
-        n_tried_steps=zero_count,
+        triggered_guard_index=initial_count - 1,
+        is_timed_out=initial_flag,
+        has_integration_failed=initial_flag,
+        n_tried_steps=initial_count,
     )
 
 
@@ -363,57 +365,65 @@ def _advance_phase_state(phase_context: _PhaseContext, phase_state: _PhaseState)
 
     The searches for the event and for minima of margins are updated.
     """
-    _, monitored_functions, options, event_options = phase_context
-    n_guards, event_search = monitored_functions.n_guards, phase_state.event_search
-    previous_step, step_length = phase_state.accepted_step, phase_state.next_step_length
+    _, guards_and_margins, options, event_options = phase_context
+    n_guards, event_search = guards_and_margins.n_guards, phase_state.event_search
+    previous_step_end, step_length = (
+        phase_state.last_accepted_step_end,
+        phase_state.next_step_length,
+    )
     is_phase_start = phase_state.step_purpose == StepPurpose.START
     is_searching_event = phase_state.step_purpose == StepPurpose.EVENT_SEARCH
-    accepted_step, error_estimate = _try_solver_step(phase_context, phase_state)
-    guard_values = accepted_step.monitored_values[:n_guards]
-    guard_rates = accepted_step.monitored_rates[:n_guards]
+    tried_step_end, error_estimate = _try_solver_step(phase_context, phase_state)
+    guard_values = tried_step_end.guard_and_margin_values[:n_guards]
+    guard_rates = tried_step_end.guard_and_margin_rates[:n_guards]
     is_guard_met, is_guard_falling = find_guards_met_at_start(
-        monitored_functions, guard_values, guard_rates
+        guards_and_margins, guard_values, guard_rates
     )
-    first_met_guard = jnp.argmax(is_guard_met).astype(jnp.int32)
+    first_met_guard_index = jnp.argmax(is_guard_met).astype(jnp.int32)
     # An event at time zero is searched for like any other, because its time depends on the start.
-    is_start_event_searched = is_phase_start & is_guard_falling[first_met_guard]
+    is_start_event_searched = is_phase_start & is_guard_falling[first_met_guard_index]
     has_immediate_event = (
-        is_phase_start & jnp.any(is_guard_met) & ~is_guard_falling[first_met_guard]
+        is_phase_start & jnp.any(is_guard_met) & ~is_guard_falling[first_met_guard_index]
     )
-    step_assessment = _assess_solver_step(phase_context, phase_state, accepted_step, error_estimate)
+    step_assessment = _assess_solver_step(
+        phase_context, phase_state, tried_step_end, error_estimate
+    )
     event_proposal = _propose_event_time(event_search, guard_values, guard_rates, step_length)
     # A try confirms the event if it changes the event's time by little compared with the step. For
     # an event much earlier than the step's end, the change is also compared with the time since the
     # phase began. The comparison is skipped if the change is only the guard's round-off.
-    proposed_length_value, constant_length, start_time = lax.stop_gradient(
-        (event_proposal.proposed_step_length, step_length, previous_step.end_time)
+    proposed_step_length_value, step_length_value, start_time = lax.stop_gradient(
+        (event_proposal.proposed_step_length, step_length, previous_step_end.end_time)
     )
-    event_time_change = jnp.abs(proposed_length_value - constant_length)
-    is_length_change_small = event_time_change <= event_options.max_confirmed_length_change * (
-        start_time + proposed_length_value
+    event_time_correction = jnp.abs(proposed_step_length_value - step_length_value)
+    is_time_correction_small = (
+        event_time_correction
+        <= event_options.max_confirming_time_correction * (start_time + proposed_step_length_value)
     )
     is_search_stalled = (
-        event_time_change
-        >= event_options.min_stalled_change_ratio * event_search.last_length_change
+        event_time_correction
+        >= event_options.min_stalled_correction_ratio * event_search.last_event_time_correction
     )
-    is_event_confirmed = (event_time_change <= event_search.time_tolerance) & (
-        is_length_change_small | is_search_stalled
+    is_event_confirmed = (event_time_correction <= event_search.time_tolerance) & (
+        is_time_correction_small | is_search_stalled
     )
-    is_guard_at_zero, lowest_guard = is_guard_at_roundoff(
-        monitored_functions, event_search.is_guard_crossing, guard_values
+    is_guard_at_zero, lowest_guard_index = is_guard_at_roundoff(
+        guards_and_margins, event_search.is_guard_crossing, guard_values
     )
     event_proposal = event_proposal._replace(
-        proposing_guard=jnp.where(is_guard_at_zero, lowest_guard, event_proposal.proposing_guard)
+        proposing_guard_index=jnp.where(
+            is_guard_at_zero, lowest_guard_index, event_proposal.proposing_guard_index
+        )
     )
-    n_confirmed_proposals = event_search.n_confirmed_proposals + (
+    n_confirming_steps = event_search.n_confirming_steps + (
         is_searching_event & (is_event_confirmed | is_guard_at_zero)
     )
     is_at_event = is_searching_event & (
-        n_confirmed_proposals >= event_options.n_required_confirmations
+        n_confirming_steps >= event_options.n_required_confirming_steps
     )
 
-    is_timed_out = step_assessment.is_accepted & (accepted_step.end_time >= options.max_phase_time)
-    is_timed_out = is_timed_out | (is_at_event & (accepted_step.end_time > options.max_phase_time))
+    is_timed_out = step_assessment.is_accepted & (tried_step_end.end_time >= options.max_phase_time)
+    is_timed_out = is_timed_out | (is_at_event & (tried_step_end.end_time > options.max_phase_time))
     is_step_too_short = step_assessment.is_step_too_short | (
         is_searching_event
         & ~is_at_event
@@ -435,37 +445,41 @@ def _advance_phase_state(phase_context: _PhaseContext, phase_state: _PhaseState)
         step_assessment.is_guard_crossing,
         event_search.is_guard_crossing,
     )
-    is_first_met_guard = is_start_event_searched & (jnp.arange(n_guards) == first_met_guard)
-    is_step_counted = (step_assessment.is_accepted & ~is_phase_start) | is_at_event
-    interior_minimum = update_interior_minimum(
-        monitored_functions,
-        phase_state.interior_minimum,
-        previous_step,
-        accepted_step,
+    is_first_met_guard = is_start_event_searched & (jnp.arange(n_guards) == first_met_guard_index)
+    is_step_in_phase = (step_assessment.is_accepted & ~is_phase_start) | is_at_event
+    interior_margin_minima = update_interior_margin_minima(
+        guards_and_margins,
+        phase_state.interior_margin_minima,
+        previous_step_end,
+        tried_step_end,
         step_length,
-        is_step_counted,
+        is_step_in_phase,
     )
-    minimum_refinement = phase_state.minimum_refinement
-    if monitored_functions.includes_start:
+    margin_minimum_refinement = phase_state.margin_minimum_refinement
+    if guards_and_margins.includes_phase_start:
         was_refining_minimum = phase_state.step_purpose == StepPurpose.REFINEMENT
-        minimum_refinement, is_refining, length_to_minimum = advance_minimum_refinement(
-            minimum_refinement,
-            monitored_functions,
-            interior_minimum,
-            accepted_step,
-            step_length,
-            was_refining_minimum,
-            is_phase_start,
-            is_phase_end,
-            options.max_margin_search_iterations,
+        margin_minimum_refinement, is_refining, step_length_to_minimum = (
+            advance_margin_minimum_refinement(
+                margin_minimum_refinement,
+                guards_and_margins,
+                interior_margin_minima,
+                tried_step_end,
+                step_length,
+                was_refining_minimum,
+                is_phase_start,
+                is_phase_end,
+                options.max_margin_search_iterations,
+            )
         )
         step_purpose = jnp.where(was_refining_minimum, StepPurpose.DONE, step_purpose)
         step_purpose = jnp.where(is_refining, StepPurpose.REFINEMENT, step_purpose)
-        following_step_length = jnp.where(is_refining, length_to_minimum, following_step_length)
+        following_step_length = jnp.where(
+            is_refining, step_length_to_minimum, following_step_length
+        )
     return _PhaseState(
         step_purpose=step_purpose,
-        accepted_step=select_tree_leaves(
-            step_assessment.is_accepted | is_at_event, accepted_step, previous_step
+        last_accepted_step_end=select_trees_by_condition(
+            step_assessment.is_accepted | is_at_event, tried_step_end, previous_step_end
         ),
         next_step_length=following_step_length,
         controller_state=step_assessment.controller_state,
@@ -473,13 +487,13 @@ def _advance_phase_state(phase_context: _PhaseContext, phase_state: _PhaseState)
             is_guard_crossing=jnp.where(
                 is_start_event_searched, is_first_met_guard, is_guard_crossing
             ),
-            lower_length_bound=jnp.where(
-                is_event_search_started, 0.0, event_proposal.lower_length_bound
+            lower_step_length_bound=jnp.where(
+                is_event_search_started, 0.0, event_proposal.lower_step_length_bound
             ),
-            upper_length_bound=jnp.where(
+            upper_step_length_bound=jnp.where(
                 is_event_search_started,
                 lax.stop_gradient(step_length),
-                event_proposal.upper_length_bound,
+                event_proposal.upper_step_length_bound,
             ),
             time_tolerance=jnp.where(
                 step_assessment.has_guard_crossed,
@@ -487,63 +501,71 @@ def _advance_phase_state(phase_context: _PhaseContext, phase_state: _PhaseState)
                 event_search.time_tolerance,
             ),
             n_iterations=event_search.n_iterations + is_searching_event,
-            n_confirmed_proposals=n_confirmed_proposals,
-            last_length_change=jnp.where(is_event_search_started, jnp.inf, event_time_change),
+            n_confirming_steps=n_confirming_steps,
+            last_event_time_correction=jnp.where(
+                is_event_search_started, jnp.inf, event_time_correction
+            ),
         ),
-        interior_minimum=interior_minimum,
-        minimum_refinement=minimum_refinement,
-        triggered_guard=jnp.where(
+        interior_margin_minima=interior_margin_minima,
+        margin_minimum_refinement=margin_minimum_refinement,
+        triggered_guard_index=jnp.where(
             has_immediate_event,
-            first_met_guard,
+            first_met_guard_index,
             jnp.where(
                 is_at_event & ~is_timed_out,
-                event_proposal.proposing_guard,
-                phase_state.triggered_guard,
+                event_proposal.proposing_guard_index,
+                phase_state.triggered_guard_index,
             ),
         ),
         is_timed_out=is_timed_out | phase_state.is_timed_out,
-        has_given_up=is_step_too_short | phase_state.has_given_up,
+        has_integration_failed=is_step_too_short | phase_state.has_integration_failed,
         n_tried_steps=step_assessment.n_tried_steps,
     )
 
 
 def _try_solver_step(
     phase_context: _PhaseContext, phase_state: _PhaseState
-) -> tuple[AcceptedPhaseStep, Array]:
+) -> tuple[SolverStepEnd, Array]:
     """Return the end of one tried solver step with guards and margins, and the error estimate.
 
     All purposes of a solver step share this call of the solver and of the monitored functions, so
     this code is compiled once.
     """
-    solver_stepper, monitored_functions, options, _ = phase_context
-    start_state = phase_state.accepted_step.state, phase_state.accepted_step.solver_state
-    if monitored_functions.includes_start:
+    solver_stepper, guards_and_margins, options, _ = phase_context
+    start_state = (
+        phase_state.last_accepted_step_end.state,
+        phase_state.last_accepted_step_end.solver_state,
+    )
+    if guards_and_margins.includes_phase_start:
         state_before_minimum = select_entry_by_mask(
-            phase_state.minimum_refinement.margin_index, phase_state.interior_minimum.start_state
+            phase_state.margin_minimum_refinement.margin_index,
+            phase_state.interior_margin_minima.step_start_state,
         )
         starts_at_minimum_step = (
             state_before_minimum,
             solver_stepper.init_solver_state(state_before_minimum, options),
         )
-        start_state = select_tree_leaves(
+        start_state = select_trees_by_condition(
             phase_state.step_purpose == StepPurpose.REFINEMENT, starts_at_minimum_step, start_state
         )
     end_state, error_estimate, solver_state = solver_stepper.take_solver_step(
         *start_state, phase_state.next_step_length
     )
-    monitored_values, monitored_rates = jax.jvp(
-        monitored_functions.evaluate_monitored,
+    guard_and_margin_values, guard_and_margin_rates = jax.jvp(
+        guards_and_margins.evaluate_guards_and_margins,
         (end_state,),
         (solver_stepper.vector_field(end_state),),
     )
-    error_estimate = jnp.where(jnp.all(jnp.isfinite(monitored_values)), error_estimate, jnp.inf)
-    time_limit = lax.stop_gradient(options.max_phase_time)
-    start_time = phase_state.accepted_step.end_time
+    error_estimate = jnp.where(
+        jnp.all(jnp.isfinite(guard_and_margin_values)), error_estimate, jnp.inf
+    )
+    phase_time_limit = lax.stop_gradient(options.max_phase_time)
+    start_time = phase_state.last_accepted_step_end.end_time
     is_integrating = phase_state.step_purpose == StepPurpose.INTEGRATION
-    is_last_step = is_integrating & (phase_state.next_step_length >= time_limit - start_time)
-    end_time = jnp.where(is_last_step, time_limit, start_time + phase_state.next_step_length)
-    return AcceptedPhaseStep(
-        end_time, end_state, solver_state, monitored_values, monitored_rates
+    is_last_step = is_integrating & (phase_state.next_step_length >= phase_time_limit - start_time)
+    end_time = jnp.where(is_last_step, phase_time_limit, start_time + phase_state.next_step_length)
+    return SolverStepEnd(
+        end_time, end_state, solver_state, guard_and_margin_values, guard_and_margin_rates
     ), error_estimate
 
 
@@ -563,71 +585,73 @@ class _StepAssessment(NamedTuple):
 def _assess_solver_step(
     phase_context: _PhaseContext,
     phase_state: _PhaseState,
-    tried_step: AcceptedPhaseStep,
+    tried_step_end: SolverStepEnd,
     error_estimate: Array,
 ) -> _StepAssessment:
     """Return whether a solver step is accepted, which guards cross zero, and the next length.
 
     A guard may cross zero at the end of the solver step or inside it.
     """
-    solver_stepper, monitored_functions, options, _ = phase_context
-    n_guards = monitored_functions.n_guards
-    previous_step = phase_state.accepted_step
+    solver_stepper, guards_and_margins, options, _ = phase_context
+    n_guards = guards_and_margins.n_guards
+    previous_step_end = phase_state.last_accepted_step_end
     step_length = phase_state.next_step_length
     is_phase_start = phase_state.step_purpose == StepPurpose.START
     is_integrating = phase_state.step_purpose == StepPurpose.INTEGRATION
     uninterrupted_step_length = jnp.where(is_phase_start, options.dt0, step_length)
     is_within_tolerance, next_step_length, controller_state = solver_stepper.control_step_size(
-        previous_step.state,
-        tried_step.state,
+        previous_step_end.state,
+        tried_step_end.state,
         error_estimate,
         uninterrupted_step_length,
         phase_state.controller_state,
     )
     is_within_tolerance = is_within_tolerance & is_integrating
-    is_guard_crossing = tried_step.monitored_values[:n_guards] <= 0.0
+    is_guard_crossing = tried_step_end.guard_and_margin_values[:n_guards] <= 0.0
     minimum_fractions, may_have_minimum = _find_guard_minima(
-        previous_step,
-        tried_step.monitored_values,
-        tried_step.monitored_rates,
+        previous_step_end,
+        tried_step_end.guard_and_margin_values,
+        tried_step_end.guard_and_margin_rates,
         step_length,
         n_guards,
     )
-    length_to_minimum = step_length * jnp.min(
+    step_length_to_minimum = step_length * jnp.min(
         jnp.where(may_have_minimum & ~is_guard_crossing, minimum_fractions, 1.0)
     )
-    must_shorten_step = is_within_tolerance & (length_to_minimum < step_length)
+    must_shorten_step = is_within_tolerance & (step_length_to_minimum < step_length)
     has_guard_crossed = is_within_tolerance & jnp.any(is_guard_crossing) & ~must_shorten_step
     n_tried_steps = phase_state.n_tried_steps + (phase_state.step_purpose != StepPurpose.REFINEMENT)
     has_step_failed = (n_tried_steps >= options.max_solver_steps) | (
-        previous_step.end_time + next_step_length == previous_step.end_time
+        previous_step_end.end_time + next_step_length == previous_step_end.end_time
     )
     following_step_length = jnp.where(is_phase_start, options.dt0, next_step_length)
-    following_step_length = jnp.where(must_shorten_step, length_to_minimum, following_step_length)
+    following_step_length = jnp.where(
+        must_shorten_step, step_length_to_minimum, following_step_length
+    )
     is_accepted = is_phase_start | (is_within_tolerance & ~has_guard_crossed & ~must_shorten_step)
-    end_time = jnp.where(is_accepted, tried_step.end_time, previous_step.end_time)
+    end_time = jnp.where(is_accepted, tried_step_end.end_time, previous_step_end.end_time)
     # The last step ends at the time limit.
     remaining_phase_time = lax.stop_gradient(options.max_phase_time - end_time)
     following_step_length = jnp.minimum(following_step_length, remaining_phase_time)
-    event_length_guess = _guess_event_length(
-        previous_step,
-        tried_step.monitored_values,
-        tried_step.monitored_rates,
+    event_step_length_guess = _guess_event_step_length(
+        previous_step_end,
+        tried_step_end.guard_and_margin_values,
+        tried_step_end.guard_and_margin_rates,
         step_length,
         n_guards,
         is_guard_crossing,
     )
-    time_resolution = 1e3 * jnp.finfo(step_length.dtype).eps * tried_step.end_time
+    time_resolution = 1e3 * jnp.finfo(step_length.dtype).eps * tried_step_end.end_time
     return _StepAssessment(
         is_accepted=is_accepted,
         has_guard_crossed=has_guard_crossed,
         is_guard_crossing=is_guard_crossing,
         is_step_too_short=is_integrating & ~has_guard_crossed & has_step_failed,
         following_step_length=jnp.where(
-            has_guard_crossed, event_length_guess, following_step_length
+            has_guard_crossed, event_step_length_guess, following_step_length
         ),
         time_tolerance=lax.stop_gradient(jnp.maximum(options.rtol * step_length, time_resolution)),
-        controller_state=select_tree_leaves(
+        controller_state=select_trees_by_condition(
             is_integrating & ~must_shorten_step, controller_state, phase_state.controller_state
         ),
         n_tried_steps=n_tried_steps,
@@ -635,7 +659,7 @@ def _assess_solver_step(
 
 
 def _find_guard_minima(
-    previous_step: AcceptedPhaseStep,
+    previous_step_end: SolverStepEnd,
     guard_values: Array,
     guard_rates: Array,
     step_length: Scalar,
@@ -650,34 +674,42 @@ def _find_guard_minima(
     shorter steps, the coefficients are closer to the guard. The caller stops when the coefficients
     are positive or the guard is negative at the end of a step.
     """
-    start_guards, start_rates, end_guards, end_rates = lax.stop_gradient(
-        (previous_step.monitored_values, previous_step.monitored_rates, guard_values, guard_rates)
+    start_guard_values, start_guard_rates, end_guard_values, end_guard_rates = lax.stop_gradient(
+        (
+            previous_step_end.guard_and_margin_values,
+            previous_step_end.guard_and_margin_rates,
+            guard_values,
+            guard_rates,
+        )
     )
-    start_guards = start_guards[:n_guards]
-    start_rates = start_rates[:n_guards]
-    end_guards = end_guards[:n_guards]
-    end_rates = end_rates[:n_guards]
+    start_guard_values = start_guard_values[:n_guards]
+    start_guard_rates = start_guard_rates[:n_guards]
+    end_guard_values = end_guard_values[:n_guards]
+    end_guard_rates = end_guard_rates[:n_guards]
     step_length = lax.stop_gradient(step_length)
-    first_bernstein_coefficient = start_guards + start_rates * step_length / 3.0
-    second_bernstein_coefficient = end_guards - end_rates * step_length / 3.0
+    first_bernstein_coefficient = start_guard_values + start_guard_rates * step_length / 3.0
+    second_bernstein_coefficient = end_guard_values - end_guard_rates * step_length / 3.0
     minimum_fractions = jnp.clip(
         find_cubic_minimum(
-            start_guards, start_rates * step_length, end_guards, end_rates * step_length
+            start_guard_values,
+            start_guard_rates * step_length,
+            end_guard_values,
+            end_guard_rates * step_length,
         )[0],
         0.1,
         0.9,
     )
     does_step_advance_time = (
-        previous_step.end_time + minimum_fractions * step_length > previous_step.end_time
+        previous_step_end.end_time + minimum_fractions * step_length > previous_step_end.end_time
     )
     may_be_negative = (
         jnp.minimum(first_bernstein_coefficient, second_bernstein_coefficient) <= 0.0
-    ) & (end_rates >= 0.0)
+    ) & (end_guard_rates >= 0.0)
     return minimum_fractions, may_be_negative & does_step_advance_time
 
 
-def _guess_event_length(
-    previous_step: AcceptedPhaseStep,
+def _guess_event_step_length(
+    previous_step_end: SolverStepEnd,
     guard_values: Array,
     guard_rates: Array,
     step_length: Scalar,
@@ -689,55 +721,62 @@ def _guess_event_length(
     Each guard is approximated by the cubic through its values and time derivatives. The secant
     method, followed by Newton's method, locates the root of the cubic.
     """
-    start_guards, start_rates, end_guards, end_rates = lax.stop_gradient(
+    start_guard_values, start_guard_rates, end_guard_values, end_guard_rates = lax.stop_gradient(
         (
-            previous_step.monitored_values,
-            previous_step.monitored_rates * step_length,
+            previous_step_end.guard_and_margin_values,
+            previous_step_end.guard_and_margin_rates * step_length,
             guard_values,
             guard_rates * step_length,
         )
     )
-    start_guards = start_guards[:n_guards]
-    start_rates = start_rates[:n_guards]
-    end_guards = end_guards[:n_guards]
-    end_rates = end_rates[:n_guards]
+    start_guard_values = start_guard_values[:n_guards]
+    start_guard_rates = start_guard_rates[:n_guards]
+    end_guard_values = end_guard_values[:n_guards]
+    end_guard_rates = end_guard_rates[:n_guards]
     guard_decrease = jnp.where(
-        is_guard_crossing & (start_guards > end_guards), start_guards - end_guards, 1.0
+        is_guard_crossing & (start_guard_values > end_guard_values),
+        start_guard_values - end_guard_values,
+        1.0,
     )
     fraction_to_zero = jnp.where(
-        is_guard_crossing, jnp.clip(start_guards / guard_decrease, 0.0, 1.0), 1.0
+        is_guard_crossing, jnp.clip(start_guard_values / guard_decrease, 0.0, 1.0), 1.0
     )
     # A guard that rises from zero, or from round-off above it, has its other zero where the cubic
     # divided by x vanishes.
-    linear_coefficient = 3.0 * end_guards - 2.0 * start_rates - end_rates
-    quadratic_coefficient = start_rates - 2.0 * end_guards + end_rates
+    linear_coefficient = 3.0 * end_guard_values - 2.0 * start_guard_rates - end_guard_rates
+    quadratic_coefficient = start_guard_rates - 2.0 * end_guard_values + end_guard_rates
     root_denominator = (
         jnp.sqrt(
             jnp.maximum(
-                linear_coefficient * linear_coefficient - 4.0 * start_rates * quadratic_coefficient,
+                linear_coefficient * linear_coefficient
+                - 4.0 * start_guard_rates * quadratic_coefficient,
                 0.0,
             )
         )
         - linear_coefficient
     )
-    other_parabola_zero = jnp.clip(
-        2.0 * start_rates / jnp.where(root_denominator > 0.0, root_denominator, 1.0), 0.0, 1.0
+    nonzero_parabola_root = jnp.clip(
+        2.0 * start_guard_rates / jnp.where(root_denominator > 0.0, root_denominator, 1.0), 0.0, 1.0
     )
     cubic_rate_function = lambda fraction_to_zero: (
-        6.0 * fraction_to_zero * (fraction_to_zero - 1.0) * (start_guards - end_guards)
-        + (1.0 - fraction_to_zero) * (1.0 - 3.0 * fraction_to_zero) * start_rates
-        + fraction_to_zero * (3.0 * fraction_to_zero - 2.0) * end_rates
+        6.0 * fraction_to_zero * (fraction_to_zero - 1.0) * (start_guard_values - end_guard_values)
+        + (1.0 - fraction_to_zero) * (1.0 - 3.0 * fraction_to_zero) * start_guard_rates
+        + fraction_to_zero * (3.0 * fraction_to_zero - 2.0) * end_guard_rates
     )
     does_guard_rise_from_zero = (
         is_guard_crossing
-        & (start_rates > 0.0)
-        & ((start_guards == 0.0) | (cubic_rate_function(fraction_to_zero) >= 0.0))
+        & (start_guard_rates > 0.0)
+        & ((start_guard_values == 0.0) | (cubic_rate_function(fraction_to_zero) >= 0.0))
     )
-    fraction_to_zero = jnp.where(does_guard_rise_from_zero, other_parabola_zero, fraction_to_zero)
+    fraction_to_zero = jnp.where(does_guard_rise_from_zero, nonzero_parabola_root, fraction_to_zero)
     for _ in range(3):
         is_guard_falling = (cubic_rate_value := cubic_rate_function(fraction_to_zero)) < 0.0
         fraction_change = evaluate_cubic(
-            fraction_to_zero, start_guards, start_rates, end_guards, end_rates
+            fraction_to_zero,
+            start_guard_values,
+            start_guard_rates,
+            end_guard_values,
+            end_guard_rates,
         ) / jnp.where(is_guard_falling, cubic_rate_value, 1.0)
         fraction_to_zero = jnp.where(
             is_guard_crossing & is_guard_falling,
@@ -756,9 +795,9 @@ class _EventProposal(NamedTuple):
     """
 
     proposed_step_length: Scalar
-    proposing_guard: Int[Array, ""]
-    lower_length_bound: Scalar
-    upper_length_bound: Scalar
+    proposing_guard_index: Int[Array, ""]
+    lower_step_length_bound: Scalar
+    upper_step_length_bound: Scalar
 
 
 def _propose_event_time(
@@ -780,35 +819,43 @@ def _propose_event_time(
         is_guard_falling, step_length + time_to_zero, missed_event_time
     )
     # If no crossing guard falls here, the lowest of the crossing guards is taken.
-    lowest_guard = jnp.argmin(jnp.where(event_search.is_guard_crossing, guard_values, jnp.inf))
-    proposing_guard = jnp.where(
-        jnp.any(proposed_step_lengths < jnp.inf), jnp.argmin(proposed_step_lengths), lowest_guard
+    lowest_guard_index = jnp.argmin(
+        jnp.where(event_search.is_guard_crossing, guard_values, jnp.inf)
+    )
+    proposing_guard_index = jnp.where(
+        jnp.any(proposed_step_lengths < jnp.inf),
+        jnp.argmin(proposed_step_lengths),
+        lowest_guard_index,
     ).astype(jnp.int32)
     # This happens at the start of the step.
     is_guard_rising = (guard_values == 0.0) & (guard_rates > 0.0)
     is_step_before_event = jnp.all(
         jnp.where(event_search.is_guard_crossing, (guard_values > 0.0) | is_guard_rising, True)
     )
-    lower_length_bound = jnp.where(
-        is_step_before_event, lax.stop_gradient(step_length), event_search.lower_length_bound
+    lower_step_length_bound = jnp.where(
+        is_step_before_event, lax.stop_gradient(step_length), event_search.lower_step_length_bound
     )
-    upper_length_bound = jnp.where(
-        is_step_before_event, event_search.upper_length_bound, lax.stop_gradient(step_length)
+    upper_step_length_bound = jnp.where(
+        is_step_before_event, event_search.upper_step_length_bound, lax.stop_gradient(step_length)
     )
-    earliest_proposed_length = proposed_step_lengths[proposing_guard]
+    earliest_proposed_step_length = proposed_step_lengths[proposing_guard_index]
     # A proposal within round-off of a collapsed bracket counts as inside.
-    is_proposal_inside = (
-        earliest_proposed_length >= lower_length_bound - event_search.time_tolerance
-    ) & (earliest_proposed_length <= upper_length_bound + event_search.time_tolerance)
+    is_proposal_in_bracket = (
+        earliest_proposed_step_length >= lower_step_length_bound - event_search.time_tolerance
+    ) & (earliest_proposed_step_length <= upper_step_length_bound + event_search.time_tolerance)
     # If round-off moves Newton's proposal out of the bracket, its derivative is still valid.
-    finite_proposed_length = jnp.where(
-        jnp.isfinite(earliest_proposed_length), earliest_proposed_length, 0.0
+    finite_proposed_step_length = jnp.where(
+        jnp.isfinite(earliest_proposed_step_length), earliest_proposed_step_length, 0.0
     )
-    bisected_step_length = 0.5 * (lower_length_bound + upper_length_bound) + (
-        finite_proposed_length - lax.stop_gradient(finite_proposed_length)
+    bisected_step_length = 0.5 * (lower_step_length_bound + upper_step_length_bound) + (
+        finite_proposed_step_length - lax.stop_gradient(finite_proposed_step_length)
     )
-    next_step_length = jnp.where(is_proposal_inside, finite_proposed_length, bisected_step_length)
-    return _EventProposal(next_step_length, proposing_guard, lower_length_bound, upper_length_bound)
+    next_step_length = jnp.where(
+        is_proposal_in_bracket, finite_proposed_step_length, bisected_step_length
+    )
+    return _EventProposal(
+        next_step_length, proposing_guard_index, lower_step_length_bound, upper_step_length_bound
+    )
 
 
 def sample_phase(
@@ -824,7 +871,9 @@ def sample_phase(
     between two samples is integrated with adaptive solver steps. The last of these solver steps
     ends exactly at the time of the sample.
     """
-    solver_stepper = _make_stepper(vector_field, options, EVENT_SEARCH_OPTIONS.max_step_growth)
+    solver_stepper = _make_stepper(
+        vector_field, options, EVENT_SEARCH_OPTIONS.max_solver_step_growth
+    )
     sample_interval = duration / (n_samples - 1)
 
     def take_adaptive_step(loop_carry: tuple) -> tuple:
@@ -840,27 +889,27 @@ def sample_phase(
         time = jnp.where(
             is_last_step, sample_interval, jnp.where(is_within_tolerance, time + step_length, time)
         )
-        state, solver_state = select_tree_leaves(
+        state, solver_state = select_trees_by_condition(
             is_within_tolerance, (end_state, end_solver_state), (state, solver_state)
         )
         return time, state, solver_state, next_step_length, controller_state, n_tried_steps + 1
 
     needs_step = lambda c: (c[0] < sample_interval) & (c[-1] < options.max_solver_steps)
 
-    def integrate_to_next(state: StateArray, _sample: None) -> tuple[StateArray, StateArray]:
-        zero_count = jnp.zeros((), jnp.int32)
+    def integrate_to_next_sample(state: StateArray, _sample: None) -> tuple[StateArray, StateArray]:
+        initial_count = jnp.zeros((), jnp.int32)
         solver_state, controller_state = solver_stepper.init_solver_and_controller(state, options)
-        zero_time = jnp.zeros_like(sample_interval)
+        zero_duration = jnp.zeros_like(sample_interval)
         loop_carry = (
-            zero_time,
+            zero_duration,
             state,
             solver_state,
-            zero_time + options.dt0,
+            zero_duration + options.dt0,
             controller_state,
-            zero_count,
+            initial_count,
         )
         next_state = lax.while_loop(needs_step, take_adaptive_step, loop_carry)[1]
         return next_state, next_state
 
-    _, states = lax.scan(integrate_to_next, start_state, None, length=n_samples - 1)
+    _, states = lax.scan(integrate_to_next_sample, start_state, None, length=n_samples - 1)
     return jnp.concatenate([start_state[None], states])

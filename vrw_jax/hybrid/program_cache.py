@@ -69,36 +69,39 @@ class _IdentityKey:
         return id(self.identified_object)
 
 
-def call_compiled_program(function: Callable, constants: Any, *arguments: Any) -> Any:
-    """Return `function(constants, *arguments)`, computed by a compiled program.
+def call_compiled_program(function: Callable, static_arguments: Any, *arguments: Any) -> Any:
+    """Return `function(static_arguments, *arguments)`, computed by a compiled program.
 
-    `constants` is a tree of functions and values. Calls with equal `constants` share one program. A
-    function that refers to a traced value or to an object that can change unnoticed is compiled for
-    this call alone. Inside `jax.jit` the function becomes part of the caller's program.
+    `static_arguments` is a tree of functions and values. Calls with equal `static_arguments` share
+    one program. A function that refers to a traced value or to an object that can change unnoticed
+    is compiled for this call alone. Inside `jax.jit` the function becomes part of the caller's
+    program.
     """
     if is_inside_jit():
-        return function(constants, *arguments)
-    compiled_program = find_program(function, constants, *arguments)
-    return (compiled_program or jax.jit(functools.partial(function, constants)))(*arguments)
+        return function(static_arguments, *arguments)
+    compiled_program = get_compiled_program(function, static_arguments, *arguments)
+    return (compiled_program or jax.jit(functools.partial(function, static_arguments)))(*arguments)
 
 
-def find_program(function: Callable, constants: Any, *arguments: Any) -> Callable | None:
-    """Return the compiled program for equal `constants`, or None if they have no key.
+def get_compiled_program(
+    function: Callable, static_arguments: Any, *arguments: Any
+) -> Callable | None:
+    """Return the compiled program for equal `static_arguments`, or None if they have no key.
 
-    No key exists inside `jax.jit`, or if `constants` refers to a traced value or to an object that
-    can change unnoticed. The key contains the types of the arguments. Each program is therefore
-    traced once, when `constants` has the values from which the key is made.
+    No key exists inside `jax.jit`, or if `static_arguments` refers to a traced value or to an
+    object that can change unnoticed. The key contains the types of the arguments. Each program is
+    therefore traced once, when `static_arguments` has the values from which the key is made.
     """
     if is_inside_jit():
         return None
     argument_leaves, tree_structure = jax.tree.flatten(arguments)
     try:
         argument_type_keys = tree_structure, tuple(map(jax.typeof, argument_leaves))
-        program_key = (function, argument_type_keys, _make_cache_key(constants, frozenset()))
+        program_key = (function, argument_type_keys, _make_cache_key(static_arguments, frozenset()))
     except _UncacheableFunctionError:
         return None
     if program_key not in _program_by_key:
-        _program_by_key[program_key] = jax.jit(functools.partial(function, constants))
+        _program_by_key[program_key] = jax.jit(functools.partial(function, static_arguments))
     _program_by_key.move_to_end(program_key)
     if len(_program_by_key) > MAX_CACHED_PROGRAMS:
         _program_by_key.popitem(last=False)

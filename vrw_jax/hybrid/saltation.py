@@ -62,8 +62,10 @@ def _multiply_event_determinants(
         for mode in modes
         for guard in mode.guards
     ]
-    first_guards = jnp.cumsum(jnp.asarray([0, *(len(mode.guards) for mode in modes)]))[:-1]
-    phase_starts = jnp.concatenate([start[None], solution.states_after[:-1]])
+    first_guard_index_by_mode = jnp.cumsum(jnp.asarray([0, *(len(mode.guards) for mode in modes)]))[
+        :-1
+    ]
+    phase_start_states = jnp.concatenate([start[None], solution.states_after[:-1]])
     durations = jnp.diff(solution.times, prepend=0.0)
     next_modes = jnp.append(solution.modes[1:], solution.mode)
     event_indices = jnp.arange(len(solution.times))
@@ -71,7 +73,7 @@ def _multiply_event_determinants(
     vector_fields = [mode.field for mode in modes]
 
     def multiply_event_determinant(
-        flow_determinant: Array, event_data: tuple
+        flow_determinant: Array, event_inputs: tuple
     ) -> tuple[Array, None]:
         (
             event_index,
@@ -79,12 +81,12 @@ def _multiply_event_determinants(
             state_before_event,
             state_after_event,
             mode_duration,
-            event_factor_index,
+            event_determinant_index,
             next_mode,
-        ) = event_data
+        ) = event_inputs
         field_after_event = lax.switch(next_mode, vector_fields, state_after_event)
-        event_factor = lax.switch(
-            event_factor_index,
+        event_determinant = lax.switch(
+            event_determinant_index,
             event_determinant_functions,
             start_state,
             state_before_event,
@@ -92,15 +94,15 @@ def _multiply_event_determinants(
             mode_duration,
         )
         return flow_determinant * jnp.where(
-            event_index < solution.n_events, event_factor, 1.0
+            event_index < solution.n_events, event_determinant, 1.0
         ), None
 
-    event_data_by_event = (
-        event_indices, phase_starts, solution.states_before, solution.states_after, durations,
-        first_guards[solution.modes] + solution.guards,
+    event_inputs_by_event = (
+        event_indices, phase_start_states, solution.states_before, solution.states_after, durations,
+        first_guard_index_by_mode[solution.modes] + solution.guards,
         next_modes,
     )  # fmt: skip
-    return lax.scan(multiply_event_determinant, jnp.ones((), start.dtype), event_data_by_event)[0]
+    return lax.scan(multiply_event_determinant, jnp.ones((), start.dtype), event_inputs_by_event)[0]
 
 
 def _make_event_determinant_function(mode: Mode, guard: Guard, options: StepOptions) -> Callable:

@@ -3,14 +3,14 @@
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from vrw_jax.hybrid.minima import MonitoredFunctions, StateArray
+from vrw_jax.hybrid.minima import GuardsAndMargins, StateArray
 from vrw_jax.hybrid.phase_integration import PhaseEnd, VectorField, integrate_phase, sample_phase
 from vrw_jax.numerics import Scalar, StepOptions
 
 
-def integrate_in_units(
+def integrate_phase_in_scaled_units(
     vector_field: VectorField,
-    monitored_functions: MonitoredFunctions,
+    guards_and_margins: GuardsAndMargins,
     start_state: StateArray,
     is_active: Bool[Array, ""],
     options: StepOptions,
@@ -26,10 +26,12 @@ def integrate_in_units(
     other arguments are in SI units, including guards and margins.
     """
     state_units, time_unit = lax.stop_gradient((state_units, time_unit))
-    evaluate_in_si = lambda y: monitored_functions.evaluate_monitored(y * state_units)
+    evaluate_guards_and_margins_in_si = lambda y: guards_and_margins.evaluate_guards_and_margins(
+        y * state_units
+    )
     phase_end = integrate_phase(
-        _make_scaled_field(vector_field, state_units, time_unit),
-        monitored_functions._replace(evaluate_monitored=evaluate_in_si),
+        _make_scaled_vector_field(vector_field, state_units, time_unit),
+        guards_and_margins._replace(evaluate_guards_and_margins=evaluate_guards_and_margins_in_si),
         start_state / state_units,
         is_active,
         options,
@@ -39,7 +41,7 @@ def integrate_in_units(
     )
 
 
-def sample_in_units(
+def sample_phase_in_scaled_units(
     vector_field: VectorField,
     start_state: StateArray,
     duration: Scalar,
@@ -50,16 +52,18 @@ def sample_in_units(
 ) -> Float[Array, "n_samples dim"]:
     """Return the result of `sample_phase` in SI units, computed in scaled units.
 
-    The arguments are those of `integrate_in_units`.
+    The arguments are those of `integrate_phase_in_scaled_units`.
     """
     state_units, time_unit = lax.stop_gradient((state_units, time_unit))
-    scaled_field = _make_scaled_field(vector_field, state_units, time_unit)
+    scaled_vector_field = _make_scaled_vector_field(vector_field, state_units, time_unit)
     start_state, duration = start_state / state_units, duration / time_unit
-    return sample_phase(scaled_field, start_state, duration, n_samples, options) * state_units
+    return (
+        sample_phase(scaled_vector_field, start_state, duration, n_samples, options) * state_units
+    )
 
 
-def _make_scaled_field(
+def _make_scaled_vector_field(
     vector_field: VectorField, state_units: StateArray, time_unit: Scalar
 ) -> VectorField:
-    rate_factors = time_unit / state_units
-    return lambda y: vector_field(y * state_units) * rate_factors
+    scaled_rate_factors = time_unit / state_units
+    return lambda y: vector_field(y * state_units) * scaled_rate_factors

@@ -70,18 +70,21 @@ def segment_maps(
             f"from 1 to "
             f"{start.size} and the other positive."
         )
-    constants = (field, n_segments, n_tangents)
+    static_arguments = (field, n_segments, n_tangents)
     duration = jnp.asarray(duration, start.dtype)
     flow_segments = call_compiled_program(
-        _integrate_flow_segments, constants, start, duration, options
+        _integrate_flow_segments, static_arguments, start, duration, options
     )
     return forbid_reverse_mode("segment_maps", flow_segments)
 
 
 def _integrate_flow_segments(
-    constants: tuple[VectorField, int, int], start: Array, duration: Array, options: StepOptions
+    static_arguments: tuple[VectorField, int, int],
+    start: Array,
+    duration: Array,
+    options: StepOptions,
 ) -> FlowSegments:
-    field, n_segments, n_tangents = constants
+    field, n_segments, n_tangents = static_arguments
     n_coordinates, n_state_and_tangents = start.size, start.size * (1 + n_tangents)
     segment_duration = duration / n_segments
 
@@ -189,26 +192,26 @@ def product_multipliers(
         has_subdiagonal_entry = np.abs(np.tril(closing_matrix, -1)) > 1e-14
         if not has_subdiagonal_entry.any():
             break
-    diagonal_blocks, block_start = [], 0
+    block_slices, block_start = [], 0
     for block_end in range(1, n_coordinates + 1):
         if not has_subdiagonal_entry[block_end:, :block_end].any():
-            diagonal_blocks.append(slice(block_start, block_end))
+            block_slices.append(slice(block_start, block_end))
             block_start = block_end
-    triangular_factor_norms = np.linalg.norm(jacobians, axis=(1, 2))
+    jacobian_norms = np.linalg.norm(jacobians, axis=(1, 2))
     block_results = [
         _compute_block_multipliers(
-            triangular_factors, closing_matrix, diagonal_block, triangular_factor_norms, tolerance
+            triangular_factors, closing_matrix, block_slice, jacobian_norms, tolerance
         )
-        for diagonal_block in diagonal_blocks
+        for block_slice in block_slices
     ]
     block_multipliers, logarithms, relative_error = (
         np.concatenate(x) for x in zip(*block_results, strict=True)
     )
     is_known = relative_error <= accuracy
     descending_order = np.argsort(-logarithms, kind="stable")
-    known_values = np.where(is_known, block_multipliers, np.nan)
+    multipliers_or_nan = np.where(is_known, block_multipliers, np.nan)
     return ProductMultipliers(
-        known_values[descending_order],
+        multipliers_or_nan[descending_order],
         logarithms[descending_order],
         relative_error[descending_order],
         is_known[descending_order],

@@ -17,7 +17,7 @@ from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int
 
-from vrw_jax.hybrid.minima import MonitoredFunctions, StateArray
+from vrw_jax.hybrid.minima import GuardsAndMargins, StateArray
 from vrw_jax.hybrid.phase_integration import PhaseEnd, VectorField, integrate_phase
 from vrw_jax.hybrid.program_cache import call_compiled_program
 from vrw_jax.numerics import (
@@ -26,7 +26,7 @@ from vrw_jax.numerics import (
     StepOptions,
     describe_step_ending,
     forbid_reverse_mode,
-    make_opaque_condition,
+    make_opaque_loop_condition,
     with_default_jax_settings,
 )
 from vrw_jax.validation import check_callable, check_int, check_reals, check_type
@@ -192,9 +192,9 @@ def _estimate_time_errors(
 
     def compute_time_change(tolerance_factor: Array) -> Array:
         looser_options = options.with_tightened_tolerances(tolerance_factor)
-        modes_and_events = (modes, len(event_indices))
+        modes_and_max_events = (modes, len(event_indices))
         looser_solution = _simulate_modes(
-            modes_and_events, looser_options, start, solution.modes[0]
+            modes_and_max_events, looser_options, start, solution.modes[0]
         )
         is_same_event = (looser_solution.guards == solution.guards) & (
             looser_solution.modes == solution.modes
@@ -238,15 +238,15 @@ def convert_modes_to_tuple(modes: Sequence[Mode] | Mode) -> tuple[Mode, ...]:
     if isinstance(modes, Mode | Guard):  # Mode and Guard are tuples themselves.
         modes = (modes,)  # type: ignore[assignment]
     check_type("modes", modes, (list, tuple), "give Modes in a list")
-    normalized_modes = []
+    modes_with_guard_tuples = []
     for mode in modes:
         check_type("a mode", mode, Mode, "give Mode(field, guards)")
         guards = (mode.guards,) if isinstance(mode.guards, Guard) else mode.guards
         check_type("guards", guards, (list, tuple), "give Guards in a tuple")
         for guard in guards:
             check_type("a guard", guard, Guard, "give Guard(value, reset, target_mode)")
-        normalized_modes.append(mode._replace(guards=tuple(guards)))
-    return tuple(normalized_modes)
+        modes_with_guard_tuples.append(mode._replace(guards=tuple(guards)))
+    return tuple(modes_with_guard_tuples)
 
 
 def _check_simulation_arguments(
@@ -305,33 +305,31 @@ def _integrate_mode(
     mode: Mode, state: Array, time: Array, options: StepOptions
 ) -> tuple[PhaseEnd, Array]:
     """Return the end of the phase in `mode`, and whether a guard is violated at its start."""
-    guard_rates = lambda y: jax.jvp(mode.guard_values, (y,), (mode.field(y),))[1]
+    compute_guard_rates = lambda y: jax.jvp(mode.guard_values, (y,), (mode.field(y),))[1]
     guard_values = mode.guard_values(state)
-    guard_rate_values, second_guard_rates = jax.jvp(guard_rates, (state,), (mode.field(state),))
-    guard_values, guard_rate_values, second_guard_rates = lax.stop_gradient(
-        (guard_values, guard_rate_values, second_guard_rates)
+    guard_rates, second_guard_rates = jax.jvp(compute_guard_rates, (state,), (mode.field(state),))
+    guard_values, guard_rates, second_guard_rates = lax.stop_gradient(
+        (guard_values, guard_rates, second_guard_rates)
     )
     time_after_first_step = lax.stop_gradient(time + options.dt0)
     time_resolution = 1e3 * jnp.finfo(state.dtype).eps * time_after_first_step
-    is_guard_near_zero = -guard_values <= jnp.abs(guard_rate_values) * time_resolution
+    is_guard_near_zero = -guard_values <= jnp.abs(guard_rates) * time_resolution
     is_guard_violated = jnp.any((guard_values < 0.0) & ~is_guard_near_zero)
     guard_offset = jnp.where(
-        (guard_values < 0.0) & is_guard_near_zero & (guard_rate_values > 0.0), -guard_values, 0.0
+        (guard_values < 0.0) & is_guard_near_zero & (guard_rates > 0.0), -guard_values, 0.0
     )
     # For a guard at rest the second derivative decides: the guard does not end the mode if it will
     # rise.
-    will_guard_rise = (
-        (guard_values == 0.0) & (guard_rate_values == 0.0) & (second_guard_rates > 0.0)
-    )
+    will_guard_rise = (guard_values == 0.0) & (guard_rates == 0.0) & (second_guard_rates > 0.0)
     guard_offset = jnp.where(will_guard_rise, jnp.finfo(state.dtype).tiny, guard_offset)
     is_guard_zero = (guard_values <= 0.0) & is_guard_near_zero & ~will_guard_rise
-    monitored_functions = MonitoredFunctions(
+    guards_and_margins = GuardsAndMargins(
         lambda y: mode.guard_values(y) + guard_offset,
         len(mode.guards),
         is_zero_at_start=is_guard_zero,
     )
     return integrate_phase(
-        mode.field, monitored_functions, state, ~is_guard_violated, options
+        mode.field, guards_and_margins, state, ~is_guard_violated, options
     ), is_guard_violated
 
 
@@ -343,37 +341,41 @@ def _compute_event_time_errors(
     The errors are large if the guard is grazed.
     """
     state = lax.stop_gradient(phase_end.state)
-    guard_gradient = jax.jacfwd(mode.guard_values)(state)[jnp.maximum(phase_end.guard, 0)]
+    guard_gradient = jax.jacfwd(mode.guard_values)(state)[jnp.maximum(phase_end.end_guard_index, 0)]
     state_roundoff = jnp.finfo(state.dtype).eps * jnp.abs(state)
     state_tolerance = options.atol + options.rtol * jnp.abs(state)
     guard_rate = jnp.abs(guard_gradient @ mode.field(state))
-    time_scales = [
+    event_time_errors = [
         jnp.abs(guard_gradient) @ state_error_bound / guard_rate
         for state_error_bound in (state_tolerance, state_roundoff)
     ]
-    return lax.stop_gradient((time_scales[0], time_scales[1]))
+    return lax.stop_gradient((event_time_errors[0], event_time_errors[1]))
 
 
 def _simulate_modes(
-    modes_and_events: tuple[tuple[Mode, ...], int], options: StepOptions, start: Array, mode: Array
+    modes_and_max_events: tuple[tuple[Mode, ...], int],
+    options: StepOptions,
+    start: Array,
+    first_mode_index: Array,
 ) -> HybridSolution:
-    """Return the simulation that begins at `start` in the mode with the index `mode`.
+    """Return the simulation that begins at `start` in the mode with the index `first_mode_index`.
 
-    `modes_and_events` is a pair of the modes and the largest number of events.
+    `modes_and_max_events` is a pair of the modes and the largest number of events.
     """
-    modes, events = modes_and_events
+    modes, events = modes_and_max_events
 
     def make_mode_branch(mode_index: int) -> Callable:
-        def run_numbered_mode(state: Array, time: Array) -> tuple:
+        def integrate_indexed_mode(state: Array, time: Array) -> tuple:
             phase_end, is_guard_violated = _integrate_mode(modes[mode_index], state, time, options)
-            time_scales = _compute_event_time_errors(modes[mode_index], phase_end, options)
-            guards, guard = modes[mode_index].guards, jnp.maximum(phase_end.guard, 0)
-            next_state = lax.switch(guard, [g.reset for g in guards], phase_end.state)
+            event_time_errors = _compute_event_time_errors(modes[mode_index], phase_end, options)
+            guards = modes[mode_index].guards
+            guard_index = jnp.maximum(phase_end.end_guard_index, 0)
+            next_state = lax.switch(guard_index, [g.reset for g in guards], phase_end.state)
             next_modes = [mode_index if g.target_mode is None else g.target_mode for g in guards]
-            next_mode = jnp.asarray(next_modes, jnp.int32)[guard]
-            return phase_end, is_guard_violated, time_scales, next_state, next_mode
+            next_mode = jnp.asarray(next_modes, jnp.int32)[guard_index]
+            return phase_end, is_guard_violated, event_time_errors, next_state, next_mode
 
-        return run_numbered_mode
+        return integrate_indexed_mode
 
     mode_branches = [make_mode_branch(mode_index) for mode_index in range(len(modes))]
     # The n - 1 guards between n bodies that meet in one point have up to n (n - 1) / 2 events.
@@ -381,10 +383,10 @@ def _simulate_modes(
 
     def simulate_next_event(loop_carry: tuple) -> tuple:
         solution, n_events_without_progress, time_roundoff_remainder = loop_carry
-        phase_end, is_guard_violated, time_scales, next_state, next_mode = lax.switch(
+        phase_end, is_guard_violated, event_time_errors, next_state, next_mode = lax.switch(
             solution.mode, mode_branches, solution.state, solution.time
         )
-        has_event = ~is_guard_violated & (phase_end.guard >= 0)
+        has_event = ~is_guard_violated & (phase_end.end_guard_index >= 0)
         # D. E. Knuth's two-sum returns the rounded sum of two times and its rounding error.
         duration = phase_end.duration + time_roundoff_remainder
         time = solution.time + duration
@@ -395,7 +397,7 @@ def _simulate_modes(
         n_events_without_progress = jnp.where(
             time > solution.time, 0, n_events_without_progress + 1
         )
-        has_exhausted_steps = phase_end.solver_steps >= options.max_solver_steps
+        has_exhausted_solver_steps = phase_end.solver_steps >= options.max_solver_steps
         termination = jnp.where(
             solution.n_events + 1 >= events,
             int(Termination.MAX_EVENTS_REACHED),
@@ -404,34 +406,36 @@ def _simulate_modes(
         termination = jnp.where(
             n_events_without_progress > max_simultaneous_events, int(Termination.ZENO), termination
         )
-        failure_code = jnp.where(
+        failure_termination = jnp.where(
             phase_end.is_timed_out,
             int(Termination.MAX_TIME_REACHED),
             int(Termination.STEP_SIZE_UNDERFLOW),
         )
-        failure_code = jnp.where(
-            phase_end.has_given_up & has_exhausted_steps,
+        failure_termination = jnp.where(
+            phase_end.has_integration_failed & has_exhausted_solver_steps,
             int(Termination.MAX_STEPS_REACHED),
-            failure_code,
+            failure_termination,
         )
         termination = jnp.where(
             has_event,
             termination,
-            jnp.where(is_guard_violated, int(Termination.GUARD_VIOLATED_AT_ENTRY), failure_code),
+            jnp.where(
+                is_guard_violated, int(Termination.GUARD_VIOLATED_AT_ENTRY), failure_termination
+            ),
         )
         event_index = jnp.where(has_event, solution.n_events, events)
-        write_event_entry = lambda event_array, event_entry: event_array.at[event_index].set(
-            event_entry, mode="drop"
-        )
+        write_event_entry = lambda quantity_by_event, quantity_of_event: quantity_by_event.at[
+            event_index
+        ].set(quantity_of_event, mode="drop")
         return (
             HybridSolution(
                 times=write_event_entry(solution.times, time),
-                time_tolerance=write_event_entry(solution.time_tolerance, time_scales[0]),
-                time_roundoff=write_event_entry(solution.time_roundoff, time_scales[1]),
+                time_tolerance=write_event_entry(solution.time_tolerance, event_time_errors[0]),
+                time_roundoff=write_event_entry(solution.time_roundoff, event_time_errors[1]),
                 states_before=write_event_entry(solution.states_before, phase_end.state),
                 states_after=write_event_entry(solution.states_after, next_state),
                 modes=write_event_entry(solution.modes, solution.mode),
-                guards=write_event_entry(solution.guards, phase_end.guard),
+                guards=write_event_entry(solution.guards, phase_end.end_guard_index),
                 n_events=solution.n_events + has_event,
                 time=time,
                 state=jnp.where(has_event, next_state, phase_end.state),
@@ -443,21 +447,22 @@ def _simulate_modes(
             time_roundoff_remainder,
         )
 
-    zero_count, int_zero = jnp.zeros((), jnp.int32), 0.0 * start[0]
-    zero_states = jnp.zeros((events, start.size)) + int_zero
-    zero_indices = jnp.zeros((events,), jnp.int32)
-    zero_times = jnp.zeros(events) + int_zero
-    constant_zero_states = lax.stop_gradient(zero_times)
+    initial_count, float_zero = jnp.zeros((), jnp.int32), 0.0 * start[0]
+    initial_states = jnp.zeros((events, start.size)) + float_zero
+    initial_indices = jnp.zeros((events,), jnp.int32)
+    initial_times = jnp.zeros(events) + float_zero
+    initial_time_errors = lax.stop_gradient(initial_times)
     initial_solution = HybridSolution(
-        times=zero_times, time_tolerance=constant_zero_states, time_roundoff=constant_zero_states,
-        states_before=zero_states, states_after=zero_states,
-        modes=zero_indices, guards=zero_indices, n_events=zero_count, time=int_zero, state=start,
-        mode=zero_count + mode,
-        solver_steps=zero_count, termination=zero_count + STATUS_RUNNING_CODE,
+        times=initial_times, time_tolerance=initial_time_errors, time_roundoff=initial_time_errors,
+        states_before=initial_states, states_after=initial_states,
+        modes=initial_indices, guards=initial_indices, n_events=initial_count,
+        time=float_zero, state=start,
+        mode=initial_count + first_mode_index,
+        solver_steps=initial_count, termination=initial_count + STATUS_RUNNING_CODE,
     )  # fmt: skip
-    is_running = lambda loop_carry: make_opaque_condition(
+    is_running = lambda loop_carry: make_opaque_loop_condition(
         loop_carry[0].termination == STATUS_RUNNING_CODE, loop_carry[0].n_events
     )
     return lax.while_loop(
-        is_running, simulate_next_event, (initial_solution, zero_count, int_zero)
+        is_running, simulate_next_event, (initial_solution, initial_count, float_zero)
     )[0]

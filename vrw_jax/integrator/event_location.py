@@ -19,10 +19,10 @@ from vrw_jax.integrator.tableaus import (
     load_explicit_tableau,
     take_rk_step,
 )
-from vrw_jax.numerics import StepOptions, Vector, select_tree_leaves
+from vrw_jax.numerics import StepOptions, Vector, select_trees_by_condition
 
 
-class CrossingStep(NamedTuple):
+class GuardCrossingStep(NamedTuple):
     """Last solver step of each batch element, with the guards that cross zero during this step."""
 
     start_state: StageState  # state at the start of the solver step
@@ -30,7 +30,7 @@ class CrossingStep(NamedTuple):
     middle_guard_values: Vector  # guards at the tableau's stage `middle_stage_index`
     end_guard_values: Vector  # guards at the end of the solver step
     step_length: Array
-    crossing_bits: Array  # bit i is set if guard i crosses
+    crossing_guard_bits: Array  # bit i is set if guard i crosses
     has_guard_crossed: Array  # whether the step of this batch element contains a crossing
 
 
@@ -38,11 +38,11 @@ class EventSearch(NamedTuple):
     """State and result of the search for the event of each batch element."""
 
     event_step_length: Array  # length of the next solver step, or time to the event, s
-    lower_length_bound: Array
-    upper_length_bound: Array
-    is_unresolved: Array
+    lower_step_length_bound: Array
+    upper_step_length_bound: Array
+    is_event_unresolved: Array
     end_state: StageState
-    remaining_time: Array  # time from `end_state` to the event, by Newton's method, s
+    remaining_time_to_event: Array  # time from `end_state` to the event, by Newton's method, s
     guard_index: Array
     n_tried_steps: Array
     n_iterations: Array
@@ -51,9 +51,9 @@ class EventSearch(NamedTuple):
 def locate_event(
     evaluate_guards: Callable[[StageState], Vector],
     evaluate_acceleration: EvaluateAcceleration,
-    step_function: TakeStep,
+    solver_step_function: TakeStep,
     tableau: ButcherTableau,
-    crossing_step: CrossingStep,
+    guard_crossing_step: GuardCrossingStep,
     options: StepOptions,
 ) -> EventSearch:
     """Return, for each batch element, the earliest event inside its crossing solver step.
@@ -67,50 +67,56 @@ def locate_event(
     low order replaces the last corrections. The state is then extrapolated linearly over the
     remaining time.
     """
-    step_length, event_time_rtol = crossing_step.step_length, jnp.sqrt(options.rtol)
+    step_length, event_time_rtol = guard_crossing_step.step_length, jnp.sqrt(options.rtol)
     max_extrapolation_time = 0.1 * event_time_rtol * step_length
     max_short_step_time = 0.3 * jnp.sqrt(event_time_rtol) * step_length
     is_crossing = [
-        (crossing_step.crossing_bits >> i) & 1 == 1
-        for i in range(len(crossing_step.start_guard_values))
+        (guard_crossing_step.crossing_guard_bits >> i) & 1 == 1
+        for i in range(len(guard_crossing_step.start_guard_values))
     ]
 
     def improve_event_search(event_search: EventSearch) -> EventSearch:
-        step_end = step_function(
-            crossing_step.start_state, event_search.event_step_length
+        step_end = solver_step_function(
+            guard_crossing_step.start_state, event_search.event_step_length
         ).end_state
         guard_values, guard_rates = evaluate_with_rates(
             evaluate_guards, evaluate_acceleration, step_end
         )
         time_to_event, guard_index = _propose_earliest_event(
-            guard_values, guard_rates, crossing_step.crossing_bits
+            guard_values, guard_rates, guard_crossing_step.crossing_guard_bits
         )
         is_before_event = jnp.ones(step_length.shape, bool)
         is_guard_straight = jnp.ones(step_length.shape, bool)
         for start_guard_value, guard_value, guard_rate, is_crossing_guard in zip(
-            crossing_step.start_guard_values, guard_values, guard_rates, is_crossing, strict=True
+            guard_crossing_step.start_guard_values,
+            guard_values,
+            guard_rates,
+            is_crossing,
+            strict=True,
         ):
             has_crossed, is_guard_curved = _classify_guard_crossing(
                 start_guard_value, guard_value, guard_rate, event_search.event_step_length
             )
             is_before_event = is_before_event & ~(is_crossing_guard & has_crossed)
             is_guard_straight = is_guard_straight & ~(is_crossing_guard & is_guard_curved)
-        lower_length_bound = jnp.where(
-            is_before_event, event_search.event_step_length, event_search.lower_length_bound
+        lower_step_length_bound = jnp.where(
+            is_before_event, event_search.event_step_length, event_search.lower_step_length_bound
         )
-        upper_length_bound = jnp.where(
-            is_before_event, event_search.upper_length_bound, event_search.event_step_length
+        upper_step_length_bound = jnp.where(
+            is_before_event, event_search.upper_step_length_bound, event_search.event_step_length
         )
-        proposed_length = event_search.event_step_length + time_to_event
-        is_proposal_inside = (proposed_length >= lower_length_bound - max_extrapolation_time) & (
-            proposed_length <= upper_length_bound + max_extrapolation_time
-        )
+        proposed_step_length = event_search.event_step_length + time_to_event
+        is_proposal_in_bracket = (
+            proposed_step_length >= lower_step_length_bound - max_extrapolation_time
+        ) & (proposed_step_length <= upper_step_length_bound + max_extrapolation_time)
         next_event_step_length = jnp.where(
-            is_proposal_inside, proposed_length, 0.5 * (lower_length_bound + upper_length_bound)
+            is_proposal_in_bracket,
+            proposed_step_length,
+            0.5 * (lower_step_length_bound + upper_step_length_bound),
         )
         is_at_event = (
-            event_search.is_unresolved
-            & is_proposal_inside
+            event_search.is_event_unresolved
+            & is_proposal_in_bracket
             & (
                 jnp.abs(time_to_event)
                 <= jnp.where(is_guard_straight, max_short_step_time, max_extrapolation_time)
@@ -118,47 +124,54 @@ def locate_event(
         )
         return EventSearch(
             event_step_length=jnp.where(
-                event_search.is_unresolved, next_event_step_length, event_search.event_step_length
+                event_search.is_event_unresolved,
+                next_event_step_length,
+                event_search.event_step_length,
             ),
-            lower_length_bound=lower_length_bound,
-            upper_length_bound=upper_length_bound,
-            is_unresolved=event_search.is_unresolved & ~is_at_event,
-            end_state=select_tree_leaves(is_at_event, step_end, event_search.end_state),
-            remaining_time=jnp.where(is_at_event, time_to_event, event_search.remaining_time),
+            lower_step_length_bound=lower_step_length_bound,
+            upper_step_length_bound=upper_step_length_bound,
+            is_event_unresolved=event_search.is_event_unresolved & ~is_at_event,
+            end_state=select_trees_by_condition(is_at_event, step_end, event_search.end_state),
+            remaining_time_to_event=jnp.where(
+                is_at_event, time_to_event, event_search.remaining_time_to_event
+            ),
             guard_index=jnp.where(is_at_event, guard_index, event_search.guard_index),
-            n_tried_steps=event_search.n_tried_steps + event_search.is_unresolved,
+            n_tried_steps=event_search.n_tried_steps + event_search.is_event_unresolved,
             n_iterations=event_search.n_iterations + 1,
         )
 
     first_crossing_fraction = jnp.ones_like(step_length)
-    values_by_guard = zip(
-        crossing_step.start_guard_values,
-        crossing_step.middle_guard_values,
-        crossing_step.end_guard_values,
+    stage_values_by_guard = zip(
+        guard_crossing_step.start_guard_values,
+        guard_crossing_step.middle_guard_values,
+        guard_crossing_step.end_guard_values,
         strict=True,
     )
-    for is_crossing_guard, crossing_values in zip(is_crossing, values_by_guard, strict=True):
+    for is_crossing_guard, crossing_values in zip(is_crossing, stage_values_by_guard, strict=True):
         fraction_to_zero = _find_parabola_zero(tableau, is_crossing_guard, *crossing_values)
         first_crossing_fraction = jnp.where(
             is_crossing_guard,
             jnp.minimum(first_crossing_fraction, fraction_to_zero),
             first_crossing_fraction,
         )
-    zero_indices, zero_time = jnp.zeros(step_length.shape, jnp.int32), jnp.zeros_like(step_length)
-    zero_count = jnp.zeros((), jnp.int32)
+    initial_indices, zero_duration = (
+        jnp.zeros(step_length.shape, jnp.int32),
+        jnp.zeros_like(step_length),
+    )
+    initial_count = jnp.zeros((), jnp.int32)
     initial_search = EventSearch(
         step_length * first_crossing_fraction,
-        zero_time,
+        zero_duration,
         step_length,
-        crossing_step.has_guard_crossed,
-        crossing_step.start_state,
-        zero_time,
-        zero_indices,
-        zero_indices,
-        zero_count,
+        guard_crossing_step.has_guard_crossed,
+        guard_crossing_step.start_state,
+        zero_duration,
+        initial_indices,
+        initial_indices,
+        initial_count,
     )
     needs_iteration = lambda event_search: (
-        jnp.any(event_search.is_unresolved)
+        jnp.any(event_search.is_event_unresolved)
         & (event_search.n_iterations < options.max_event_iterations)
     )
     search_result = lax.while_loop(needs_iteration, improve_event_search, initial_search)
@@ -166,7 +179,7 @@ def locate_event(
     return _refine_event_location(
         evaluate_guards,
         evaluate_acceleration,
-        crossing_step,
+        guard_crossing_step,
         search_result,
         (max_extrapolation_time, max_short_step_time),
         options,
@@ -176,94 +189,112 @@ def locate_event(
 def _refine_event_location(
     evaluate_guards: Callable[[StageState], Vector],
     evaluate_acceleration: EvaluateAcceleration,
-    crossing_step: CrossingStep,
+    guard_crossing_step: GuardCrossingStep,
     event_search: EventSearch,
-    step_time_limits: tuple[Array, Array],
+    extrapolation_and_step_limits: tuple[Array, Array],
     options: StepOptions,
 ) -> EventSearch:
     """Return the search result after short solver steps of low order from a state near the event.
 
-    - `step_time_limits`: largest time of the linear extrapolation, and largest length of a short
-      solver step, s.
+    - `extrapolation_and_step_limits`: largest time of the linear extrapolation, and largest length
+      of a short solver step, s.
 
     One short solver step suffices unless a guard grazes zero. The event stays unresolved if
     Newton's method diverges.
     """
-    max_extrapolation_time, max_short_step_time = step_time_limits
+    max_extrapolation_time, max_short_step_time = extrapolation_and_step_limits
     # During a thousandth of a solver step, a method of order 3 is accurate to round-off.
     low_order_tableau = load_explicit_tableau("Bosh3")
     assert low_order_tableau is not None
 
-    def can_take_short_step(is_event_distant: Array, remaining_time: Array) -> Array:
-        return is_event_distant & (jnp.abs(remaining_time) <= max_short_step_time)
+    def can_take_short_solver_step(
+        is_event_distant: Array, remaining_time_to_event: Array
+    ) -> Array:
+        return is_event_distant & (jnp.abs(remaining_time_to_event) <= max_short_step_time)
 
-    def take_short_step(loop_carry: tuple) -> tuple:
-        step_end, remaining_time, short_step_length, guard_index, is_event_distant, n_iterations = (
-            loop_carry
+    def take_short_solver_step(loop_carry: tuple) -> tuple:
+        (
+            step_end,
+            remaining_time_to_event,
+            short_solver_step_length,
+            guard_index,
+            is_event_distant,
+            n_iterations,
+        ) = loop_carry
+        is_short_solver_step_taken = can_take_short_solver_step(
+            is_event_distant, remaining_time_to_event
         )
-        is_short_step_taken = can_take_short_step(is_event_distant, remaining_time)
-        step_end = select_tree_leaves(
-            is_short_step_taken,
+        step_end = select_trees_by_condition(
+            is_short_solver_step_taken,
             take_rk_step(
                 low_order_tableau,
                 evaluate_acceleration,
                 step_end,
-                remaining_time,
+                remaining_time_to_event,
                 computes_error_estimate=False,
             ).end_state,
             step_end,
         )
-        new_remaining_time, earliest_guard_index = _propose_earliest_event(
+        new_remaining_time_to_event, earliest_guard_index = _propose_earliest_event(
             *evaluate_with_rates(evaluate_guards, evaluate_acceleration, step_end),
-            crossing_step.crossing_bits,
+            guard_crossing_step.crossing_guard_bits,
         )
-        remaining_time = jnp.where(is_short_step_taken, new_remaining_time, remaining_time)
-        short_step_length = jnp.where(
-            can_take_short_step(is_short_step_taken, new_remaining_time),
-            short_step_length + new_remaining_time,
-            short_step_length,
+        remaining_time_to_event = jnp.where(
+            is_short_solver_step_taken, new_remaining_time_to_event, remaining_time_to_event
         )
-        guard_index = jnp.where(is_short_step_taken, earliest_guard_index, guard_index)
+        short_solver_step_length = jnp.where(
+            can_take_short_solver_step(is_short_solver_step_taken, new_remaining_time_to_event),
+            short_solver_step_length + new_remaining_time_to_event,
+            short_solver_step_length,
+        )
+        guard_index = jnp.where(is_short_solver_step_taken, earliest_guard_index, guard_index)
         return (
             step_end,
-            remaining_time,
-            short_step_length,
+            remaining_time_to_event,
+            short_solver_step_length,
             guard_index,
-            is_event_distant & (jnp.abs(remaining_time) > max_extrapolation_time),
+            is_event_distant & (jnp.abs(remaining_time_to_event) > max_extrapolation_time),
             n_iterations + 1,
         )
 
     is_event_distant = (
-        crossing_step.has_guard_crossed
-        & ~event_search.is_unresolved
-        & (jnp.abs(event_search.remaining_time) > max_extrapolation_time)
+        guard_crossing_step.has_guard_crossed
+        & ~event_search.is_event_unresolved
+        & (jnp.abs(event_search.remaining_time_to_event) > max_extrapolation_time)
     )
     initial_loop_carry = (
         event_search.end_state,
-        event_search.remaining_time,
+        event_search.remaining_time_to_event,
         event_search.event_step_length,
         event_search.guard_index,
         is_event_distant,
         jnp.zeros((), jnp.int32),
     )
     needs_iteration = lambda loop_carry: (
-        jnp.any(can_take_short_step(loop_carry[4], loop_carry[1]))
+        jnp.any(can_take_short_solver_step(loop_carry[4], loop_carry[1]))
         & (loop_carry[5] < options.max_event_iterations)
     )
-    event_state, remaining_time, short_step_length, guard_index, is_event_distant, _ = (
-        lax.while_loop(needs_iteration, take_short_step, initial_loop_carry)
+    (
+        event_state,
+        remaining_time_to_event,
+        short_solver_step_length,
+        guard_index,
+        is_event_distant,
+        _,
+    ) = lax.while_loop(needs_iteration, take_short_solver_step, initial_loop_carry)
+    q = tuple(
+        x + remaining_time_to_event * y for x, y in zip(event_state.q, event_state.v, strict=True)
     )
-    q = tuple(x + remaining_time * y for x, y in zip(event_state.q, event_state.v, strict=True))
     v = tuple(
-        x + remaining_time * y
+        x + remaining_time_to_event * y
         for x, y in zip(event_state.v, event_state.acceleration.acceleration, strict=False)
     )
-    event_state = select_tree_leaves(
-        is_event_distant, crossing_step.start_state, event_state._replace(q=q, v=v)
+    event_state = select_trees_by_condition(
+        is_event_distant, guard_crossing_step.start_state, event_state._replace(q=q, v=v)
     )
     return event_search._replace(
-        event_step_length=short_step_length,
-        is_unresolved=event_search.is_unresolved | is_event_distant,
+        event_step_length=short_solver_step_length,
+        is_event_unresolved=event_search.is_event_unresolved | is_event_distant,
         end_state=event_state,
         guard_index=guard_index,
     )
@@ -287,24 +318,24 @@ def _classify_guard_crossing(
 
 
 def _propose_earliest_event(
-    guard_values: Vector, guard_rates: Vector, crossing_bits: Array
+    guard_values: Vector, guard_rates: Vector, crossing_guard_bits: Array
 ) -> tuple[Array, Array]:
     """Return the time to the earliest event, s, by one Newton step, and the guard's index.
 
     The time is negative if the event is earlier than the present state. It is minus infinity for a
     guard that is negative and rises, because this guard crossed zero at an unknown earlier time.
-    `crossing_bits` has bit i set if guard i crosses zero.
+    `crossing_guard_bits` has bit i set if guard i crosses zero.
     """
     time_to_event = jnp.full_like(guard_values[0], jnp.inf)
-    guard_index = jnp.zeros_like(crossing_bits)
-    for guard_number, (guard_value, guard_rate) in enumerate(
+    guard_index = jnp.zeros_like(crossing_guard_bits)
+    for candidate_guard_index, (guard_value, guard_rate) in enumerate(
         zip(guard_values, guard_rates, strict=True)
     ):
-        guard_time = _compute_time_to_zero(
-            (crossing_bits >> guard_number) & 1 == 1, guard_value, guard_rate
+        guard_zero_time = _compute_time_to_zero(
+            (crossing_guard_bits >> candidate_guard_index) & 1 == 1, guard_value, guard_rate
         )
-        guard_index = jnp.where(guard_time < time_to_event, guard_number, guard_index)
-        time_to_event = jnp.minimum(guard_time, time_to_event)
+        guard_index = jnp.where(guard_zero_time < time_to_event, candidate_guard_index, guard_index)
+        time_to_event = jnp.minimum(guard_zero_time, time_to_event)
     return time_to_event, guard_index
 
 
@@ -316,11 +347,11 @@ def _compute_time_to_zero(is_crossing: Array, guard_value: Array, guard_rate: Ar
     guard that is negative and does not fall.
     """
     is_guard_falling = is_crossing & (guard_rate < 0.0)
-    time_without_fall = jnp.where(is_crossing & (guard_value < 0.0), -jnp.inf, jnp.inf)
+    time_to_zero_if_rising = jnp.where(is_crossing & (guard_value < 0.0), -jnp.inf, jnp.inf)
     return jnp.where(
         is_guard_falling,
         -guard_value / jnp.where(is_guard_falling, guard_rate, -1.0),
-        time_without_fall,
+        time_to_zero_if_rising,
     )
 
 

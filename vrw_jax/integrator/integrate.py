@@ -15,17 +15,17 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
-from vrw_jax.integrator.event_location import CrossingStep, locate_event
+from vrw_jax.integrator.event_location import GuardCrossingStep, locate_event
 from vrw_jax.integrator.minima import (
-    AcceptedStep,
     MarginFunctions,
-    MinimaResult,
-    MinimaState,
-    compute_minima_jvp,
+    MarginMinimaResult,
+    MarginMinimaState,
+    TriedSolverStep,
+    compute_margin_minima_jvp,
     evaluate_with_rates,
-    init_minima_state,
-    refine_minima,
-    update_minima_state,
+    init_margin_minima_state,
+    refine_margin_minima,
+    update_margin_minima_state,
 )
 from vrw_jax.integrator.tableaus import (
     ButcherTableau,
@@ -47,7 +47,7 @@ from vrw_jax.numerics import (
     StepOptions,
     Vector,
     make_zero_tangent,
-    select_tree_leaves,
+    select_trees_by_condition,
     with_default_jax_settings,
 )
 from vrw_jax.simd import mark_noinline
@@ -84,7 +84,7 @@ class BatchPhaseEnd(NamedTuple):
 
     state: StageState
     duration: Array  # s
-    guard: Array  # index of the guard that ended the phase; -1 if none did
+    end_guard_index: Array  # index of the guard that ended the phase; -1 if none did
     is_timed_out: Array
     # whether the element is a straggler, see `integrate_batch_phase`
     is_unfinished: Array
@@ -101,14 +101,14 @@ class _IntegratorState(NamedTuple):
     next_step_length: Array
     elapsed_time: Array
     integration_status: Array  # an IntegrationStatus, after the last tried step
-    crossing_bits: Array  # bit i is set if guard i crosses zero in that step
+    crossing_guard_bits: Array  # bit i is set if guard i crosses zero in that step
     middle_guard_values: Vector  # guards at the middle stage of the crossing step
     end_guard_values: Vector
     n_tried_steps: Array
     # number of iterations after which half of the batch had ended
     n_iterations_until_half_ended: Array
     n_iterations: Array
-    minima_state: MinimaState | None
+    margin_minima_state: MarginMinimaState | None
     state_tangents: (
         Array | None
     )  # tangents of the state, (directions, components, batch), see `tangents`
@@ -137,7 +137,7 @@ MakeBatchPhase = Callable[[Any, Vector], BatchPhase]
 
 def integrate_batch_phase(
     make_phase: MakeBatchPhase,
-    constants: Any,
+    phase_constants: Any,
     held_constants: Vector,
     tableau: ButcherTableau,
     q: Vector,
@@ -149,8 +149,9 @@ def integrate_batch_phase(
 ) -> BatchPhaseEnd:
     """Return the end of a phase that begins at positions `q` and rates `v`, for each batch element.
 
-    - `make_phase`: function that returns the phase for `constants` and `held_constants`;
-    - `constants`, `held_constants`: constants of the equations, see `tangents.ImplicitDynamicsFn`;
+    - `make_phase`: function that returns the phase for `phase_constants` and `held_constants`;
+    - `phase_constants`, `held_constants`: constants of the equations, see
+      `tangents.ImplicitDynamicsFn`;
     - `tableau`: tableau of the Runge-Kutta method;
     - `q`, `v`: tuples of arrays (batch,), one array per coordinate;
     - `is_active`: which elements are integrated, (batch,);
@@ -162,8 +163,8 @@ def integrate_batch_phase(
     that take `STRAGGLER_ITERATION_FACTOR` times as many iterations as half of the batch. Their
     integration stops early, and the caller integrates them again in a batch of stragglers.
 
-    The result is differentiable with respect to `constants`, `held_constants`, `q` and `v`, see
-    `tangents`.
+    The result is differentiable with respect to `phase_constants`, `held_constants`, `q` and `v`,
+    see `tangents`.
     """
     integrate_with_rule = jax.custom_jvp(
         lambda *arguments: _integrate_to_event(make_phase, tableau, None, *arguments).phase_end
@@ -174,22 +175,28 @@ def integrate_batch_phase(
     def compute_integration_jvp(
         primals: tuple, state_tangents: tuple
     ) -> tuple[BatchPhaseEnd, BatchPhaseEnd]:
-        def make_implicit_dynamics(*constants: Any) -> ImplicitDynamics:
-            implicit_dynamics = make_phase(*constants).implicit_dynamics
+        def make_implicit_dynamics(*phase_constants: Any) -> ImplicitDynamics:
+            implicit_dynamics = make_phase(*phase_constants).implicit_dynamics
             assert implicit_dynamics is not None
             return implicit_dynamics
 
         def integrate_with_tangents(
             primals: tuple, directions: tuple
         ) -> tuple[BatchPhaseEnd, tuple]:
-            constants_tangents, held_constants, q, v = directions
+            phase_constants_tangents, held_constants, q, v = directions
             start_tangents = stack_directions((*q, *v, *held_constants))
             phase_tangents = PhaseTangents(
-                make_implicit_dynamics, primals[0], primals[1], constants_tangents, start_tangents
+                make_implicit_dynamics,
+                primals[0],
+                primals[1],
+                phase_constants_tangents,
+                start_tangents,
             )
-            phase_run = _integrate_to_event(make_phase, tableau, phase_tangents, *primals)
-            return phase_run.phase_end, _compute_phase_end_jvp(
-                make_phase, tableau, phase_tangents, phase_run
+            phase_integration_result = _integrate_to_event(
+                make_phase, tableau, phase_tangents, *primals
+            )
+            return phase_integration_result.phase_end, _compute_phase_end_jvp(
+                make_phase, tableau, phase_tangents, phase_integration_result
             )
 
         phase_end, (q, v, event_time_tangent, minima_tangents) = apply_batched_jvp_rule(
@@ -202,71 +209,86 @@ def integrate_batch_phase(
         )
 
     return integrate_with_rule(
-        constants, held_constants, q, v, is_active, initial_dt, options, straggler_count
+        phase_constants, held_constants, q, v, is_active, initial_dt, options, straggler_count
     )
 
 
-class _PhaseRun(NamedTuple):
+class _PhaseIntegrationResult(NamedTuple):
     """End of a phase, with the intermediate results from which its tangents are computed."""
 
-    step_function: TakeStep
+    solver_step_function: TakeStep
     start_state: StageState
     phase_end: BatchPhaseEnd
     integrator_state: _IntegratorState
-    minima_state: MinimaState | None
-    minima_result: MinimaResult | None
+    margin_minima_state: MarginMinimaState | None
+    margin_minima_result: MarginMinimaResult | None
 
 
 def _compute_phase_end_jvp(
     make_phase: MakeBatchPhase,
     tableau: ButcherTableau,
     phase_tangents: PhaseTangents,
-    phase_run: _PhaseRun,
+    phase_integration_result: _PhaseIntegrationResult,
 ) -> tuple[Vector, Vector, Array, Array | None]:
     """Return the tangents at the end of a phase, for given tangents of its start and constants.
 
     The result contains the tangents of positions, rates, duration and minima of the margins. The
     first axis contains the directions.
     """
-    step_function, start_state, phase_end, integrator_state, minima_state, minima_result = phase_run
+    (
+        solver_step_function,
+        start_state,
+        phase_end,
+        integrator_state,
+        margin_minima_state,
+        margin_minima_result,
+    ) = phase_integration_result
     n = len(start_state.q)
     has_guard_crossed = integrator_state.integration_status == IntegrationStatus.CROSSED
-    last_length = jnp.where(
+    last_step_length = jnp.where(
         has_guard_crossed, phase_end.duration - integrator_state.elapsed_time, 0.0
     )
-    rk_step = step_function(integrator_state.state, last_length)
+    rk_step = solver_step_function(integrator_state.state, last_step_length)
     assert integrator_state.state_tangents is not None
     end_state_tangents = phase_tangents.propagate_to_step_end(
-        tableau, rk_step.stage_states, integrator_state.state_tangents, last_length
+        tableau, rk_step.stage_states, integrator_state.state_tangents, last_step_length
     )
 
-    end_state, stacked_tangents = rk_step.end_state, tuple(jnp.moveaxis(end_state_tangents, 1, 0))
+    end_state, tangents_by_component = (
+        rk_step.end_state,
+        tuple(jnp.moveaxis(end_state_tangents, 1, 0)),
+    )
     event_time_tangent = _compute_event_time_jvp(
-        make_phase, phase_tangents, end_state, end_state_tangents, integrator_state, phase_end.guard
+        make_phase,
+        phase_tangents,
+        end_state,
+        end_state_tangents,
+        integrator_state,
+        phase_end.end_guard_index,
     )
     motion_rates = (*end_state.v, *end_state.acceleration.acceleration[:n])
     state_tangents = tuple(
         x + event_time_tangent * y
-        for x, y in zip(stacked_tangents[: 2 * n], motion_rates, strict=True)
+        for x, y in zip(tangents_by_component[: 2 * n], motion_rates, strict=True)
     )
     minima_tangents = None
-    if minima_state is not None and minima_result is not None:
+    if margin_minima_state is not None and margin_minima_result is not None:
 
-        def make_margins(*constants: Any) -> tuple[MarginFunctions, EvaluateAcceleration]:
-            phase = make_phase(*constants)
+        def make_margins(*phase_constants: Any) -> tuple[MarginFunctions, EvaluateAcceleration]:
+            phase = make_phase(*phase_constants)
             assert phase.margin_functions is not None
             return phase.margin_functions, phase.evaluate_acceleration
 
-        phase_ends = start_state, phase_end.state
-        end_tangents = jnp.stack([*state_tangents, *stacked_tangents[2 * n :]], 1)
-        minima_tangents = compute_minima_jvp(
+        start_and_end_states = start_state, phase_end.state
+        end_tangents = jnp.stack([*state_tangents, *tangents_by_component[2 * n :]], 1)
+        minima_tangents = compute_margin_minima_jvp(
             make_margins,
-            step_function,
+            solver_step_function,
             tableau,
             phase_tangents,
-            minima_state,
-            minima_result,
-            phase_ends,
+            margin_minima_state,
+            margin_minima_result,
+            start_and_end_states,
             end_tangents,
         )
     return state_tangents[:n], state_tangents[n:], event_time_tangent, minima_tangents
@@ -287,12 +309,12 @@ def _compute_event_time_jvp(
     """
 
     def evaluate_perturbed_guards(
-        constants: Any, held_constants: Vector, q: Vector, v: Vector
+        phase_constants: Any, held_constants: Vector, q: Vector, v: Vector
     ) -> Vector:
-        phase = make_phase(constants, held_constants)
+        phase = make_phase(phase_constants, held_constants)
         return phase.evaluate_guards(StageState(q, v, phase.evaluate_acceleration(q, v)))
 
-    phase = make_phase(phase_tangents.constants, phase_tangents.held_constants)
+    phase = make_phase(phase_tangents.phase_constants, phase_tangents.held_constants)
     _, guard_rates = evaluate_with_rates(
         phase.evaluate_guards, phase.evaluate_acceleration, end_state
     )
@@ -300,26 +322,26 @@ def _compute_event_time_jvp(
         evaluate_perturbed_guards, end_state, state_tangents
     )
     has_guard_crossed = integrator_state.integration_status == IntegrationStatus.CROSSED
-    time_tangent = jnp.zeros_like(integrator_state.next_step_length)
-    for guard_number, (guard_rate, guard_tangent) in enumerate(
+    event_time_tangent = jnp.zeros_like(integrator_state.next_step_length)
+    for candidate_guard_index, (guard_rate, guard_tangent) in enumerate(
         zip(guard_rates, guard_tangents, strict=True)
     ):
         is_event_guard = (
-            has_guard_crossed & (event_guard_index == guard_number) & (guard_rate < 0.0)
+            has_guard_crossed & (event_guard_index == candidate_guard_index) & (guard_rate < 0.0)
         )
-        time_tangent = jnp.where(
+        event_time_tangent = jnp.where(
             is_event_guard,
             -guard_tangent / jnp.where(is_event_guard, guard_rate, -1.0),
-            time_tangent,
+            event_time_tangent,
         )
-    return time_tangent
+    return event_time_tangent
 
 
 def _integrate_to_event(
     make_phase: MakeBatchPhase,
     tableau: ButcherTableau,
     phase_tangents: PhaseTangents | None,
-    constants: Any,
+    phase_constants: Any,
     held_constants: Vector,
     q: Vector,
     v: Vector,
@@ -327,13 +349,13 @@ def _integrate_to_event(
     initial_dt: Array,
     options: StepOptions,
     straggler_count: Array | None,
-) -> _PhaseRun:
+) -> _PhaseIntegrationResult:
     """Return the end of a phase with all intermediate results, for each batch element."""
-    phase = make_phase(constants, held_constants)
+    phase = make_phase(phase_constants, held_constants)
     phase = _wrap_each_phase_function(
         phase, mark_noinline if phase.is_compiled_separately else jax.jit
     )
-    step_function = _make_step_function(phase, tableau)
+    solver_step_function = _make_solver_step_function(phase, tableau)
     start_state = StageState(q, v, phase.evaluate_acceleration(q, v))
     guard_values, guard_rates = evaluate_with_rates(
         phase.evaluate_guards, phase.evaluate_acceleration, start_state
@@ -343,14 +365,16 @@ def _integrate_to_event(
         for guard_value, guard_rate in zip(guard_values, guard_rates, strict=True)
     )
     # The index is that of the first guard whose event is the start itself; -1 if there is none.
-    start_guard = jnp.full(is_guard_met_at_start[0].shape, -1, jnp.int32)
+    start_event_guard_index = jnp.full(is_guard_met_at_start[0].shape, -1, jnp.int32)
     for guard_index in range(len(is_guard_met_at_start) - 1, -1, -1):
-        start_guard = jnp.where(is_guard_met_at_start[guard_index], guard_index, start_guard)
-    is_phase_started = is_active & (start_guard < 0)
+        start_event_guard_index = jnp.where(
+            is_guard_met_at_start[guard_index], guard_index, start_event_guard_index
+        )
+    is_phase_started = is_active & (start_event_guard_index < 0)
 
     integrator_state = _integrate_until_crossing(
         phase,
-        step_function,
+        solver_step_function,
         tableau,
         start_state,
         guard_values,
@@ -364,76 +388,87 @@ def _integrate_to_event(
     if phase.margin_functions is not None or phase_tangents is not None:
         # The functions are called, not inlined, because the program is already long.
         phase = _wrap_each_phase_function(phase, mark_noinline)
-        step_function = _make_step_function(phase, tableau)
-    crossing_step = CrossingStep(
+        solver_step_function = _make_solver_step_function(phase, tableau)
+    guard_crossing_step = GuardCrossingStep(
         *integrator_state[:2],
         integrator_state.middle_guard_values,
         integrator_state.end_guard_values,
         integrator_state.next_step_length,
-        integrator_state.crossing_bits,
+        integrator_state.crossing_guard_bits,
         has_guard_crossed,
     )
     event_search = locate_event(
         phase.evaluate_guards,
         phase.evaluate_acceleration,
-        step_function,
+        solver_step_function,
         tableau,
-        crossing_step,
+        guard_crossing_step,
         options,
     )
-    is_event_unresolved = has_guard_crossed & event_search.is_unresolved
+    is_crossing_event_unresolved = has_guard_crossed & event_search.is_event_unresolved
     duration = integrator_state.elapsed_time + jnp.where(
         has_guard_crossed, event_search.event_step_length, 0.0
     )
-    end_state = select_tree_leaves(
+    end_state = select_trees_by_condition(
         has_guard_crossed, event_search.end_state, integrator_state.state
     )
-    minima_state, minima_result = integrator_state.minima_state, None
-    if phase.margin_functions is not None and minima_state is not None:
+    margin_minima_state, margin_minima_result = integrator_state.margin_minima_state, None
+    if phase.margin_functions is not None and margin_minima_state is not None:
         margin_arguments = phase.margin_functions, phase.evaluate_acceleration
-        accepted_step = AcceptedStep(
+        tried_solver_step = TriedSolverStep(
             integrator_state.state,
             end_state,
             event_search.event_step_length,
             has_guard_crossed,
             integrator_state.state_tangents,
         )
-        minima_state = update_minima_state(*margin_arguments, minima_state, accepted_step)
+        margin_minima_state = update_margin_minima_state(
+            *margin_arguments, margin_minima_state, tried_solver_step
+        )
         start_margins = jnp.stack(phase.margin_functions.evaluate_margins(start_state))
-        minima_result = refine_minima(
+        margin_minima_result = refine_margin_minima(
             phase.margin_functions,
-            step_function,
+            solver_step_function,
             phase.evaluate_acceleration,
-            minima_state,
+            margin_minima_state,
             start_margins,
             options,
         )
     is_straggler = (
-        has_guard_crossed & ~event_search.is_unresolved & (duration > options.max_phase_time)
+        has_guard_crossed & ~event_search.is_event_unresolved & (duration > options.max_phase_time)
     )
     event_guard_index = jnp.where(
-        is_active & (start_guard >= 0),
-        start_guard,
+        is_active & (start_event_guard_index >= 0),
+        start_event_guard_index,
         jnp.where(has_guard_crossed, event_search.guard_index, -1),
     )
     phase_end = BatchPhaseEnd(
         state=end_state,
         duration=duration,
-        guard=jnp.where(is_event_unresolved | is_straggler, -1, event_guard_index),
+        end_guard_index=jnp.where(
+            is_crossing_event_unresolved | is_straggler, -1, event_guard_index
+        ),
         is_timed_out=(integrator_state.integration_status == IntegrationStatus.TIMED_OUT)
         | is_straggler,
         is_unfinished=integrator_state.integration_status == IntegrationStatus.RUNNING,
         n_tried_steps=integrator_state.n_tried_steps
         + jnp.where(has_guard_crossed, event_search.n_tried_steps, 0),
         next_solver_dt=integrator_state.next_step_length,
-        margin_minima=None if minima_result is None else minima_result.phase_minima,
+        margin_minima=None
+        if margin_minima_result is None
+        else margin_minima_result.phase_margin_minima,
     )
-    return _PhaseRun(
-        step_function, start_state, phase_end, integrator_state, minima_state, minima_result
+    return _PhaseIntegrationResult(
+        solver_step_function,
+        start_state,
+        phase_end,
+        integrator_state,
+        margin_minima_state,
+        margin_minima_result,
     )
 
 
-def _make_step_function(phase: BatchPhase, tableau: ButcherTableau) -> TakeStep:
+def _make_solver_step_function(phase: BatchPhase, tableau: ButcherTableau) -> TakeStep:
     """Return a function of state and length that takes one Runge-Kutta step in the phase.
 
     The function is traced once for all its calls.
@@ -457,7 +492,7 @@ def _wrap_each_phase_function(phase: BatchPhase, wrap_function: Callable) -> Bat
 
 def _integrate_until_crossing(
     phase: BatchPhase,
-    step_function: TakeStep,
+    solver_step_function: TakeStep,
     tableau: ButcherTableau,
     start_state: StageState,
     guard_values: Vector,
@@ -473,60 +508,62 @@ def _integrate_until_crossing(
     The loop ends when no element is running, or earlier if it cuts off stragglers.
     """
 
-    def take_one_step(integrator_state: _IntegratorState) -> _IntegratorState:
-        rk_step = step_function(integrator_state.state, integrator_state.next_step_length)
-        stage_values = [
+    def take_one_solver_step(integrator_state: _IntegratorState) -> _IntegratorState:
+        rk_step = solver_step_function(integrator_state.state, integrator_state.next_step_length)
+        stage_guard_values = [
             phase.evaluate_guards(rk_step.stage_states[i]) for i in tableau.guard_stage_indices
         ]
         end_guard_values = phase.evaluate_guards(rk_step.end_state)
-        squared_error = _compute_mean_squared_error(
+        mean_squared_error = _compute_mean_squared_error(
             rk_step, integrator_state.state, end_guard_values, options, phase.state_units
         )
         guard_minimum_fraction = find_earliest_guard_minimum_fraction(
-            tableau, [integrator_state.guard_values, *stage_values, end_guard_values]
+            tableau, [integrator_state.guard_values, *stage_guard_values, end_guard_values]
         )
-        is_within_tolerance = squared_error <= 1.0
+        is_within_tolerance = mean_squared_error <= 1.0
         # A step inside which a guard may be negative is repeated up to the guard's minimum.
         may_cross_inside = is_within_tolerance & (guard_minimum_fraction < 1.0)
         is_step_rejected = may_cross_inside | ~is_within_tolerance
         controller_factor = compute_step_size_factor(
-            tableau, squared_error, guard_minimum_fraction.dtype
+            tableau, mean_squared_error, guard_minimum_fraction.dtype
         )
         step_length_factor = jnp.where(may_cross_inside, guard_minimum_fraction, controller_factor)
-        integration_status, crossing_bits, is_accepted, elapsed_time, next_step_length = (
-            _classify_step(
+        integration_status, crossing_guard_bits, is_accepted, elapsed_time, next_step_length = (
+            _classify_solver_step(
                 options, integrator_state, step_length_factor, is_step_rejected, end_guard_values
             )
         )
-        state, guard_values = select_tree_leaves(
+        state, guard_values = select_trees_by_condition(
             is_accepted,
             (rk_step.end_state, end_guard_values),
             (integrator_state.state, integrator_state.guard_values),
         )
         was_element_running = integrator_state.integration_status == IntegrationStatus.RUNNING
         middle_guard_values = (
-            stage_values[tableau.guard_stage_indices.index(tableau.middle_stage_index)]
-            if stage_values
+            stage_guard_values[tableau.guard_stage_indices.index(tableau.middle_stage_index)]
+            if stage_guard_values
             else integrator_state.guard_values
         )
-        new_middle_guard_values, new_end_guard_values = select_tree_leaves(
+        new_middle_guard_values, new_end_guard_values = select_trees_by_condition(
             was_element_running,
             (middle_guard_values, end_guard_values),
             (integrator_state.middle_guard_values, integrator_state.end_guard_values),
         )
-        minima_state = integrator_state.minima_state
+        margin_minima_state = integrator_state.margin_minima_state
         state_tangents = integrator_state.state_tangents
         n_iterations_until_half_ended = integrator_state.n_iterations_until_half_ended
-        if phase.margin_functions is not None and minima_state is not None:
+        if phase.margin_functions is not None and margin_minima_state is not None:
             margin_arguments = phase.margin_functions, phase.evaluate_acceleration
-            accepted_step = AcceptedStep(
+            tried_solver_step = TriedSolverStep(
                 integrator_state.state,
                 rk_step.end_state,
                 integrator_state.next_step_length,
                 is_accepted,
                 integrator_state.state_tangents,
             )
-            minima_state = update_minima_state(*margin_arguments, minima_state, accepted_step)
+            margin_minima_state = update_margin_minima_state(
+                *margin_arguments, margin_minima_state, tried_solver_step
+            )
         if phase_tangents is not None and state_tangents is not None:
             state_tangents = phase_tangents.propagate_if_accepted(
                 tableau,
@@ -550,13 +587,13 @@ def _integrate_until_crossing(
             next_step_length=next_step_length,
             elapsed_time=elapsed_time,
             integration_status=integration_status,
-            crossing_bits=crossing_bits,
+            crossing_guard_bits=crossing_guard_bits,
             middle_guard_values=new_middle_guard_values,
             end_guard_values=new_end_guard_values,
             n_tried_steps=integrator_state.n_tried_steps + was_element_running,
             n_iterations_until_half_ended=n_iterations_until_half_ended,
             n_iterations=integrator_state.n_iterations + 1,
-            minima_state=minima_state,
+            margin_minima_state=margin_minima_state,
             state_tangents=state_tangents,
         )
 
@@ -574,10 +611,10 @@ def _integrate_until_crossing(
             (n_running_elements <= straggler_count) & is_iteration_limit_exceeded
         )
 
-    initial_minima = phase.margin_functions and init_minima_state(
+    initial_minima = phase.margin_functions and init_margin_minima_state(
         phase.margin_functions, phase.evaluate_acceleration, start_state, phase_tangents
     )
-    zero_counts, zero_count = jnp.zeros(initial_dt.shape, jnp.int32), jnp.zeros((), jnp.int32)
+    initial_counts, initial_count = jnp.zeros(initial_dt.shape, jnp.int32), jnp.zeros((), jnp.int32)
     initial_state = _IntegratorState(
         state=start_state,
         guard_values=guard_values,
@@ -586,19 +623,19 @@ def _integrate_until_crossing(
         integration_status=jnp.where(
             is_phase_started, IntegrationStatus.RUNNING, IntegrationStatus.IDLE
         ).astype(jnp.int32),
-        crossing_bits=zero_counts,
+        crossing_guard_bits=initial_counts,
         middle_guard_values=guard_values,
         end_guard_values=guard_values,
-        n_tried_steps=zero_counts,
-        n_iterations_until_half_ended=zero_count,
-        n_iterations=zero_count,
-        minima_state=initial_minima,
+        n_tried_steps=initial_counts,
+        n_iterations_until_half_ended=initial_count,
+        n_iterations=initial_count,
+        margin_minima_state=initial_minima,
         state_tangents=None if phase_tangents is None else phase_tangents.start_tangents,
     )
-    return lax.while_loop(needs_more_steps, take_one_step, initial_state)
+    return lax.while_loop(needs_more_steps, take_one_solver_step, initial_state)
 
 
-def _classify_step(
+def _classify_solver_step(
     options: StepOptions,
     integrator_state: _IntegratorState,
     step_length_factor: Array,
@@ -615,22 +652,24 @@ def _classify_step(
     """
     is_running = integrator_state.integration_status == IntegrationStatus.RUNNING
     is_valid_step = is_running & ~is_step_rejected
-    crossing_bits = jnp.zeros_like(integrator_state.crossing_bits)
-    for guard_number, end_guard_value in enumerate(end_guard_values):
-        crossing_bits = crossing_bits | jnp.where(end_guard_value <= 0.0, 1 << guard_number, 0)
-    has_guard_crossed = is_valid_step & (crossing_bits > 0)
+    crossing_guard_bits = jnp.zeros_like(integrator_state.crossing_guard_bits)
+    for candidate_guard_index, end_guard_value in enumerate(end_guard_values):
+        crossing_guard_bits = crossing_guard_bits | jnp.where(
+            end_guard_value <= 0.0, 1 << candidate_guard_index, 0
+        )
+    has_guard_crossed = is_valid_step & (crossing_guard_bits > 0)
     is_accepted = is_valid_step & ~has_guard_crossed
     step_length = integrator_state.next_step_length
     elapsed_time = integrator_state.elapsed_time
-    time_limit = options.max_phase_time
+    phase_time_limit = options.max_phase_time
     end_time = jnp.where(
-        step_length == time_limit - elapsed_time, time_limit, elapsed_time + step_length
+        step_length == phase_time_limit - elapsed_time, phase_time_limit, elapsed_time + step_length
     )
     elapsed_time = jnp.where(is_accepted, end_time, elapsed_time)
     next_step_length_limit = jnp.minimum(
-        step_length * step_length_factor, time_limit - elapsed_time
+        step_length * step_length_factor, phase_time_limit - elapsed_time
     )
-    has_timed_out = is_accepted & (elapsed_time >= time_limit)
+    has_timed_out = is_accepted & (elapsed_time >= phase_time_limit)
     is_step_too_short = (integrator_state.n_tried_steps + 1 >= options.max_solver_steps) | (
         elapsed_time + next_step_length_limit == elapsed_time
     )
@@ -646,7 +685,7 @@ def _classify_step(
         jnp.where(is_running, integration_status, integrator_state.integration_status).astype(
             jnp.int32
         ),
-        jnp.where(is_running, crossing_bits, integrator_state.crossing_bits),
+        jnp.where(is_running, crossing_guard_bits, integrator_state.crossing_guard_bits),
         is_accepted,
         elapsed_time,
         jnp.where(is_running & ~has_guard_crossed, next_step_length_limit, step_length),
@@ -656,7 +695,7 @@ def _classify_step(
 def _compute_mean_squared_error(
     rk_step: RKStep,
     start_state: StageState,
-    weighted_guards: Vector,
+    end_guard_values: Vector,
     options: StepOptions,
     state_units: Vector | None,
 ) -> Array:
@@ -665,7 +704,7 @@ def _compute_mean_squared_error(
     The result is infinite for a solver step whose end is not finite. The mean is computed in
     float32, because an error estimate needs no higher precision.
 
-    - `weighted_guards`: guards at the end of the step, which must be finite;
+    - `end_guard_values`: guards at the end of the step, which must be finite;
     - `state_units`: units of the coordinates and rates for the absolute tolerance; None for SI
       units.
     """
@@ -673,23 +712,23 @@ def _compute_mean_squared_error(
     end_state_components = (*rk_step.end_state.q, *rk_step.end_state.v)
     convert_to_float32 = lambda x: x.astype(jnp.float32)
     sum_of_squares: Any = 0.0
-    units_of_state: Any = (
+    component_units: Any = (
         (1.0,) * len(start_state_components) if state_units is None else state_units
     )
-    for coordinate_error, start_coordinate, end_coordinate, state_unit in zip(
+    for component_error, start_component, end_component, component_unit in zip(
         rk_step.error_estimate,
         start_state_components,
         end_state_components,
-        units_of_state,
+        component_units,
         strict=True,
     ):
-        error_tolerance = options.atol * state_unit + options.rtol * jnp.maximum(
-            jnp.abs(start_coordinate), jnp.abs(end_coordinate)
+        error_tolerance = options.atol * component_unit + options.rtol * jnp.maximum(
+            jnp.abs(start_component), jnp.abs(end_component)
         )
-        relative_error = convert_to_float32(coordinate_error) / convert_to_float32(error_tolerance)
+        relative_error = convert_to_float32(component_error) / convert_to_float32(error_tolerance)
         sum_of_squares = sum_of_squares + relative_error * relative_error
-    for weighted_guard in weighted_guards:
-        sum_of_squares = sum_of_squares + convert_to_float32(0.0 * weighted_guard)
+    for end_guard_value in end_guard_values:
+        sum_of_squares = sum_of_squares + convert_to_float32(0.0 * end_guard_value)
     return jnp.where(
         jnp.isfinite(sum_of_squares), sum_of_squares / len(start_state_components), jnp.inf
     )
@@ -710,7 +749,7 @@ def sample_batch_phase(
     has the shape (samples, 2 coordinates, batch), with the positions before the rates.
     """
 
-    def step_function(state: StageState, step_length: Array) -> tuple[StageState, Array]:
+    def solver_step_function(state: StageState, step_length: Array) -> tuple[StageState, Array]:
         sampled_step = take_rk_step(tableau, phase.evaluate_acceleration, state, step_length)
         return sampled_step.end_state, _compute_mean_squared_error(
             sampled_step, state, (), options, phase.state_units
@@ -719,12 +758,12 @@ def sample_batch_phase(
     pack_sample = lambda phase_state: jnp.stack([*phase_state.q, *phase_state.v])
     start_state = StageState(q, v, phase.evaluate_acceleration(q, v))
     return sample_at_equal_times(
-        step_function, pack_sample, start_state, tableau, duration, n_samples, options
+        solver_step_function, pack_sample, start_state, tableau, duration, n_samples, options
     )
 
 
 def sample_at_equal_times(
-    step_function: Callable[[Any, Array], tuple[Any, Array]],
+    solver_step_function: Callable[[Any, Array], tuple[Any, Array]],
     pack_sample: Callable[[Any], Array],
     start_state: Any,
     tableau: ButcherTableau,
@@ -734,49 +773,55 @@ def sample_at_equal_times(
 ) -> Array:
     """Return samples at `n_samples` equally spaced times from 0 to `duration`, s.
 
-    - `step_function`: function of state and step length, s, that returns the state at the end of a
-      solver step and the squared ratio of its error to the tolerance;
+    - `solver_step_function`: function of state and step length, s, that returns the state at the
+      end of a solver step and the squared ratio of its error to the tolerance;
     - `pack_sample`: function that returns the sample for a state. The first axis of the result
       contains the samples.
     """
-    zero_count = jnp.zeros((), jnp.int32)
+    initial_count = jnp.zeros((), jnp.int32)
 
-    def take_sample_step(loop_carry: tuple) -> tuple:
-        sample_state, h, remaining_time, n_tried_steps = loop_carry
-        sampled_step_length = jnp.minimum(h, remaining_time)
-        step_end, squared_error = step_function(sample_state, sampled_step_length)
+    def take_solver_step_to_sample(loop_carry: tuple) -> tuple:
+        sample_state, h, remaining_time_to_sample, n_tried_steps = loop_carry
+        sampled_step_length = jnp.minimum(h, remaining_time_to_sample)
+        step_end, mean_squared_error = solver_step_function(sample_state, sampled_step_length)
         step_length_factor = compute_step_size_factor(
-            tableau, squared_error, sampled_step_length.dtype
+            tableau, mean_squared_error, sampled_step_length.dtype
         )
-        is_within_tolerance = squared_error <= 1.0
+        is_within_tolerance = mean_squared_error <= 1.0
         # A step that was shortened to end at a sample does not reduce the next step's length.
         h = jnp.where(
             is_within_tolerance & (sampled_step_length < h),
             jnp.maximum(h, sampled_step_length * step_length_factor),
             sampled_step_length * step_length_factor,
         )
-        is_running = remaining_time > 0.0
+        is_running = remaining_time_to_sample > 0.0
         return (
-            select_tree_leaves(is_running & is_within_tolerance, step_end, sample_state),
+            select_trees_by_condition(is_running & is_within_tolerance, step_end, sample_state),
             jnp.where(is_running, h, loop_carry[1]),
             jnp.where(
                 is_running & is_within_tolerance,
                 jnp.where(
-                    sampled_step_length == remaining_time, 0.0, remaining_time - sampled_step_length
+                    sampled_step_length == remaining_time_to_sample,
+                    0.0,
+                    remaining_time_to_sample - sampled_step_length,
                 ),
-                remaining_time,
+                remaining_time_to_sample,
             ),
             n_tried_steps + 1,
         )
 
-    def integrate_to_next(loop_carry: tuple, _: None) -> tuple[tuple, Array]:
+    def integrate_to_next_sample(loop_carry: tuple, _: None) -> tuple[tuple, Array]:
         needs_step = lambda loop_carry: (
             jnp.any(loop_carry[2] > 0.0) & (loop_carry[3] < options.max_solver_steps)
         )
-        initial_loop_carry = (*loop_carry, duration / (n_samples - 1), zero_count)
-        sample_state, h, _, _ = lax.while_loop(needs_step, take_sample_step, initial_loop_carry)
+        initial_loop_carry = (*loop_carry, duration / (n_samples - 1), initial_count)
+        sample_state, h, _, _ = lax.while_loop(
+            needs_step, take_solver_step_to_sample, initial_loop_carry
+        )
         return (sample_state, h), pack_sample(sample_state)
 
     initial_loop_carry = start_state, options.dt0 + jnp.zeros_like(duration)
-    later_samples = lax.scan(integrate_to_next, initial_loop_carry, None, length=n_samples - 1)[1]
-    return jnp.concatenate([pack_sample(start_state)[None], later_samples])
+    samples_after_start = lax.scan(
+        integrate_to_next_sample, initial_loop_carry, None, length=n_samples - 1
+    )[1]
+    return jnp.concatenate([pack_sample(start_state)[None], samples_after_start])

@@ -23,7 +23,7 @@ from vrw_jax.numerics import (
     StepOptions,
     Vector,
     find_cubic_minimum,
-    select_tree_leaves,
+    select_trees_by_condition,
 )
 
 
@@ -31,11 +31,11 @@ class MarginFunctions(NamedTuple):
     """Function that returns all margins at a state, and whether each minimum includes the start."""
 
     evaluate_margins: Callable[[StageState], Vector]
-    # whether the margin at the phase's start counts, see `hybrid.MonitoredFunctions`
-    includes_start: tuple[bool, ...]
+    # whether the margin at the phase's start counts, see `hybrid.GuardsAndMargins`
+    includes_phase_start: tuple[bool, ...]
 
 
-class MinimaState(NamedTuple):
+class MarginMinimaState(NamedTuple):
     """Margins at the present state, and the lowest minimum of each margin so far."""
 
     margin_values: Array  # margins at the present state, (margins, batch)
@@ -43,13 +43,13 @@ class MinimaState(NamedTuple):
     lowest_margin_values: (
         Array  # lowest interior minimum, (margins, batch); infinity if there is none
     )
-    start_q: Array  # positions at the start of that step, (margins, coordinates, batch)
-    start_v: Array
+    step_start_q: Array  # positions at the start of that step, (margins, coordinates, batch)
+    step_start_v: Array
     step_length: Array  # length of that step, (margins, batch), s
     time_to_minimum: Array  # time from the step's start to the minimum, s
-    start_margin_rates: Array  # rates of the margins at the step's start
+    step_start_margin_rates: Array  # rates of the margins at the step's start
     # tangents of that start, (margins, directions, components, batch)
-    start_tangents: Array | None = None
+    step_start_tangents: Array | None = None
 
 
 def evaluate_with_rates(
@@ -70,12 +70,12 @@ def evaluate_with_rates(
     )
 
 
-def init_minima_state(
+def init_margin_minima_state(
     margin_functions: MarginFunctions,
     evaluate_acceleration: EvaluateAcceleration,
     start_state: StageState,
     phase_tangents: PhaseTangents | None,
-) -> MinimaState:
+) -> MarginMinimaState:
     """Return the state of the search for minima before the first solver step.
 
     A margin that is zero at the start of the phase by construction cannot fall there. Its negative
@@ -85,66 +85,68 @@ def init_minima_state(
         jnp.stack,
         evaluate_with_rates(margin_functions.evaluate_margins, evaluate_acceleration, start_state),
     )
-    includes_start = jnp.asarray(margin_functions.includes_start)[:, None]
-    infinite_minima = jnp.zeros_like(margin_values)
+    includes_phase_start = jnp.asarray(margin_functions.includes_phase_start)[:, None]
+    zero_margins = jnp.zeros_like(margin_values)
     zero_start_coordinates = jnp.zeros(
         (len(margin_values), len(start_state.q), margin_values.shape[-1]), margin_values.dtype
     )
-    margin_rates = jnp.where(includes_start, margin_rates, jnp.maximum(margin_rates, 0.0))
+    margin_rates = jnp.where(includes_phase_start, margin_rates, jnp.maximum(margin_rates, 0.0))
     zero_tangents = (
         None
         if phase_tangents is None
         else jnp.stack([jnp.zeros_like(phase_tangents.start_tangents)] * len(margin_values))
     )
-    return MinimaState(
+    return MarginMinimaState(
         margin_values,
         margin_rates,
-        infinite_minima + jnp.inf,
+        zero_margins + jnp.inf,
         zero_start_coordinates,
         zero_start_coordinates,
-        infinite_minima,
-        infinite_minima,
-        infinite_minima,
+        zero_margins,
+        zero_margins,
+        zero_margins,
         zero_tangents,
     )
 
 
-class AcceptedStep(NamedTuple):
+class TriedSolverStep(NamedTuple):
     """Solver step of all batch elements, and whether each element accepts the step."""
 
     start_state: StageState
     end_state: StageState
     step_length: Array
     is_accepted: Array
-    start_tangents: Array | None  # tangents of the step's start
+    step_start_tangents: Array | None  # tangents of the step's start
 
 
-def update_minima_state(
+def update_margin_minima_state(
     margin_functions: MarginFunctions,
     evaluate_acceleration: EvaluateAcceleration,
-    minima_state: MinimaState,
-    accepted_step: AcceptedStep,
-) -> MinimaState:
+    margin_minima_state: MarginMinimaState,
+    tried_solver_step: TriedSolverStep,
+) -> MarginMinimaState:
     """Return the lowest interior minima after one more accepted solver step."""
-    step_start, step_end, step_length, is_accepted, _ = accepted_step
+    step_start, step_end, step_length, is_accepted, _ = tried_solver_step
     margin_values, margin_rates = map(
         jnp.stack,
         evaluate_with_rates(margin_functions.evaluate_margins, evaluate_acceleration, step_end),
     )
-    minimum_location, minimum_value = find_cubic_minimum(
-        minima_state.margin_values,
-        minima_state.margin_rates * step_length,
+    margin_minimum_location, margin_minimum = find_cubic_minimum(
+        margin_minima_state.margin_values,
+        margin_minima_state.margin_rates * step_length,
         margin_values,
         margin_rates * step_length,
     )
-    minimum_value = jnp.where(
-        jnp.isfinite(minimum_value),
-        minimum_value,
-        jnp.minimum(minima_state.margin_values, margin_values),
+    margin_minimum = jnp.where(
+        jnp.isfinite(margin_minimum),
+        margin_minimum,
+        jnp.minimum(margin_minima_state.margin_values, margin_values),
     )
-    has_interior_minimum = (minima_state.margin_rates < 0.0) & (margin_rates >= 0.0)
+    has_interior_minimum = (margin_minima_state.margin_rates < 0.0) & (margin_rates >= 0.0)
     is_minimum_lower = (
-        is_accepted & has_interior_minimum & (minimum_value < minima_state.lowest_margin_values)
+        is_accepted
+        & has_interior_minimum
+        & (margin_minimum < margin_minima_state.lowest_margin_values)
     )
     replace_if_lower = lambda new_minimum, old_minimum: jnp.where(
         is_minimum_lower, new_minimum, old_minimum
@@ -152,83 +154,101 @@ def update_minima_state(
     replace_start_if_lower = lambda new_minimum, old_minimum: jnp.where(
         is_minimum_lower[:, None], jnp.stack(new_minimum), old_minimum
     )
-    start_tangents = minima_state.start_tangents
-    if start_tangents is not None and accepted_step.start_tangents is not None:
-        start_tangents = jnp.where(
-            is_minimum_lower[:, None, None], accepted_step.start_tangents[None], start_tangents
+    step_start_tangents = margin_minima_state.step_start_tangents
+    if step_start_tangents is not None and tried_solver_step.step_start_tangents is not None:
+        step_start_tangents = jnp.where(
+            is_minimum_lower[:, None, None],
+            tried_solver_step.step_start_tangents[None],
+            step_start_tangents,
         )
-    return MinimaState(
-        margin_values=jnp.where(is_accepted, margin_values, minima_state.margin_values),
-        margin_rates=jnp.where(is_accepted, margin_rates, minima_state.margin_rates),
-        lowest_margin_values=replace_if_lower(minimum_value, minima_state.lowest_margin_values),
-        start_q=replace_start_if_lower(step_start.q, minima_state.start_q),
-        start_v=replace_start_if_lower(step_start.v, minima_state.start_v),
-        step_length=replace_if_lower(step_length, minima_state.step_length),
+    return MarginMinimaState(
+        margin_values=jnp.where(is_accepted, margin_values, margin_minima_state.margin_values),
+        margin_rates=jnp.where(is_accepted, margin_rates, margin_minima_state.margin_rates),
+        lowest_margin_values=replace_if_lower(
+            margin_minimum, margin_minima_state.lowest_margin_values
+        ),
+        step_start_q=replace_start_if_lower(step_start.q, margin_minima_state.step_start_q),
+        step_start_v=replace_start_if_lower(step_start.v, margin_minima_state.step_start_v),
+        step_length=replace_if_lower(step_length, margin_minima_state.step_length),
         time_to_minimum=replace_if_lower(
-            minimum_location * step_length, minima_state.time_to_minimum
+            margin_minimum_location * step_length, margin_minima_state.time_to_minimum
         ),
-        start_margin_rates=replace_if_lower(
-            minima_state.margin_rates, minima_state.start_margin_rates
+        step_start_margin_rates=replace_if_lower(
+            margin_minima_state.margin_rates, margin_minima_state.step_start_margin_rates
         ),
-        start_tangents=start_tangents,
+        step_start_tangents=step_start_tangents,
     )
 
 
-class MinimaResult(NamedTuple):
+class MarginMinimaResult(NamedTuple):
     """Minima of margins over a phase; each field has the shape (margins, batch)."""
 
-    phase_minima: Array  # minima over the phase, ends included
-    interior_minima: Array  # interior minima; infinity if a margin has none
-    length_to_minimum: Array  # length of the step from the stored start to the interior minimum, s
+    phase_margin_minima: Array  # minima over the phase, ends included
+    interior_margin_minima: Array  # interior minima; infinity if a margin has none
+    step_length_to_minimum: (
+        Array  # length of the step from the stored start to the interior minimum, s
+    )
 
 
-class _MinimumSearch(NamedTuple):
+class _MarginMinimumSearch(NamedTuple):
     """State of the secant iteration for the minimum of one margin in each batch element."""
 
     step_length: Array  # length of the next solver step, s
     best_step_length: Array  # length of the step that ended with the smallest rate, s
     best_margin_rate: Array
     margin_value: Array
-    is_unresolved: Array
+    is_minimum_unresolved: Array
     n_iterations: Array
 
 
-def refine_minima(
+def refine_margin_minima(
     margin_functions: MarginFunctions,
-    step_function: TakeStep,
+    solver_step_function: TakeStep,
     evaluate_acceleration: EvaluateAcceleration,
-    minima_state: MinimaState,
-    start_values: Array,
+    margin_minima_state: MarginMinimaState,
+    start_margin_values: Array,
     options: StepOptions,
-) -> MinimaResult:
+) -> MarginMinimaResult:
     """Return the minima of the margins over the phase, refined by a secant iteration.
 
-    `start_values` are the margins at the start of the phase, (margins, batch). Each iteration takes
-    a solver step from the start of the solver step that contains the minimum. At most
-    `max_margin_search_iterations` iterations are made per margin.
+    `start_margin_values` are the margins at the start of the phase, (margins, batch). Each
+    iteration takes a solver step from the start of the solver step that contains the minimum. At
+    most `max_margin_search_iterations` iterations are made per margin.
     """
 
-    def refine_margin_minimum(_: None, margin_inputs: tuple) -> tuple[None, tuple[Array, Array]]:
-        margin_index, minima_state_of_margin = margin_inputs
-        q, v = tuple(minima_state_of_margin.start_q), tuple(minima_state_of_margin.start_v)
-        minimum_step_start = StageState(q, v, evaluate_acceleration(q, v))
+    def refine_one_margin_minimum(
+        _: None, margin_scan_inputs: tuple
+    ) -> tuple[None, tuple[Array, Array]]:
+        margin_index, margin_minimum_state = margin_scan_inputs
+        q, v = tuple(margin_minimum_state.step_start_q), tuple(margin_minimum_state.step_start_v)
+        minimum_step_start_state = StageState(q, v, evaluate_acceleration(q, v))
 
         def evaluate_selected_margin(state: StageState) -> Array:
-            is_selected = jnp.arange(len(margin_functions.includes_start)) == margin_index
+            is_selected_margin = (
+                jnp.arange(len(margin_functions.includes_phase_start)) == margin_index
+            )
             return jnp.sum(
                 jnp.where(
-                    is_selected[:, None], jnp.stack(margin_functions.evaluate_margins(state)), 0.0
+                    is_selected_margin[:, None],
+                    jnp.stack(margin_functions.evaluate_margins(state)),
+                    0.0,
                 ),
                 0,
             )
 
-        def improve_minimum_search(minimum_search: _MinimumSearch) -> _MinimumSearch:
-            step_end = step_function(minimum_step_start, minimum_search.step_length).end_state
+        def improve_margin_minimum_search(
+            margin_minimum_search: _MarginMinimumSearch,
+        ) -> _MarginMinimumSearch:
+            step_end = solver_step_function(
+                minimum_step_start_state, margin_minimum_search.step_length
+            ).end_state
             (margin_value,), (margin_rate,) = evaluate_with_rates(
                 lambda state: (evaluate_selected_margin(state),), evaluate_acceleration, step_end
             )
-            length_change = minimum_search.step_length - minimum_search.best_step_length
-            margin_rate_slope = (margin_rate - minimum_search.best_margin_rate) / jnp.where(
+            length_change = (
+                margin_minimum_search.step_length - margin_minimum_search.best_step_length
+            )
+            margin_rate_slope = (margin_rate - margin_minimum_search.best_margin_rate) / jnp.where(
                 length_change == 0.0, 1.0, length_change
             )
             is_secant_usable = (length_change != 0.0) & (margin_rate_slope > 0.0)
@@ -238,127 +258,146 @@ def refine_minima(
                 0.0,
             )
             step_length = jnp.clip(
-                minimum_search.step_length + length_correction,
+                margin_minimum_search.step_length + length_correction,
                 0.0,
-                minima_state_of_margin.step_length,
+                margin_minimum_state.step_length,
             )
             has_secant_converged = (
-                jnp.abs(step_length - minimum_search.step_length)
-                <= MINIMUM_LOCATION_TOLERANCE * minima_state_of_margin.step_length
+                jnp.abs(step_length - margin_minimum_search.step_length)
+                <= MINIMUM_LOCATION_TOLERANCE * margin_minimum_state.step_length
             )
-            has_smaller_rate = jnp.abs(margin_rate) < jnp.abs(minimum_search.best_margin_rate)
-            improved_minimum_search = _MinimumSearch(
+            has_smaller_rate = jnp.abs(margin_rate) < jnp.abs(
+                margin_minimum_search.best_margin_rate
+            )
+            improved_margin_minimum_search = _MarginMinimumSearch(
                 step_length=step_length,
                 best_step_length=jnp.where(
-                    has_smaller_rate, minimum_search.step_length, minimum_search.best_step_length
+                    has_smaller_rate,
+                    margin_minimum_search.step_length,
+                    margin_minimum_search.best_step_length,
                 ),
                 best_margin_rate=jnp.where(
-                    has_smaller_rate, margin_rate, minimum_search.best_margin_rate
+                    has_smaller_rate, margin_rate, margin_minimum_search.best_margin_rate
                 ),
                 margin_value=margin_value,
-                is_unresolved=minimum_search.is_unresolved & ~has_secant_converged,
-                n_iterations=minimum_search.n_iterations,
+                is_minimum_unresolved=margin_minimum_search.is_minimum_unresolved
+                & ~has_secant_converged,
+                n_iterations=margin_minimum_search.n_iterations,
             )
-            return select_tree_leaves(
-                minimum_search.is_unresolved, improved_minimum_search, minimum_search
-            )._replace(n_iterations=minimum_search.n_iterations + 1)
+            return select_trees_by_condition(
+                margin_minimum_search.is_minimum_unresolved,
+                improved_margin_minimum_search,
+                margin_minimum_search,
+            )._replace(n_iterations=margin_minimum_search.n_iterations + 1)
 
-        has_minimum = jnp.isfinite(minima_state_of_margin.lowest_margin_values)
-        zero_step_length = jnp.zeros_like(minima_state_of_margin.step_length)
+        has_interior_minimum = jnp.isfinite(margin_minimum_state.lowest_margin_values)
+        zero_step_length = jnp.zeros_like(margin_minimum_state.step_length)
         n_iterations = jnp.zeros((), jnp.int32)
-        minimum_search = _MinimumSearch(
-            minima_state_of_margin.time_to_minimum,
+        margin_minimum_search = _MarginMinimumSearch(
+            margin_minimum_state.time_to_minimum,
             zero_step_length,
-            minima_state_of_margin.start_margin_rates,
+            margin_minimum_state.step_start_margin_rates,
             zero_step_length + jnp.inf,
-            has_minimum,
+            has_interior_minimum,
             n_iterations,
         )
-        needs_iteration = lambda minimum_search: (
-            jnp.any(minimum_search.is_unresolved)
-            & (minimum_search.n_iterations < options.max_margin_search_iterations)
+        needs_iteration = lambda margin_minimum_search: (
+            jnp.any(margin_minimum_search.is_minimum_unresolved)
+            & (margin_minimum_search.n_iterations < options.max_margin_search_iterations)
         )
-        final_minimum_search = lax.while_loop(
-            needs_iteration, improve_minimum_search, minimum_search
+        final_margin_minimum_search = lax.while_loop(
+            needs_iteration, improve_margin_minimum_search, margin_minimum_search
         )
-        return None, (final_minimum_search.margin_value, final_minimum_search.step_length)
+        return None, (
+            final_margin_minimum_search.margin_value,
+            final_margin_minimum_search.step_length,
+        )
 
-    includes_start = np.asarray(margin_functions.includes_start)[:, None]
-    end_minima = jnp.minimum(
-        jnp.where(includes_start, start_values, jnp.inf), minima_state.margin_values
+    includes_phase_start = np.asarray(margin_functions.includes_phase_start)[:, None]
+    end_margin_minima = jnp.minimum(
+        jnp.where(includes_phase_start, start_margin_values, jnp.inf),
+        margin_minima_state.margin_values,
     )
-    margin_indices = jnp.arange(len(includes_start), dtype=jnp.int32)
-    interior_minima, minimum_length = lax.scan(
-        refine_margin_minimum, None, (margin_indices, minima_state._replace(start_tangents=None))
+    margin_indices = jnp.arange(len(includes_phase_start), dtype=jnp.int32)
+    interior_margin_minima, step_length_to_minimum = lax.scan(
+        refine_one_margin_minimum,
+        None,
+        (margin_indices, margin_minima_state._replace(step_start_tangents=None)),
     )[1]
-    return MinimaResult(jnp.minimum(interior_minima, end_minima), interior_minima, minimum_length)
+    return MarginMinimaResult(
+        jnp.minimum(interior_margin_minima, end_margin_minima),
+        interior_margin_minima,
+        step_length_to_minimum,
+    )
 
 
-def compute_minima_jvp(
+def compute_margin_minima_jvp(
     make_margins: Callable[..., tuple[MarginFunctions, EvaluateAcceleration]],
-    step_function: TakeStep,
+    solver_step_function: TakeStep,
     tableau: ButcherTableau,
     phase_tangents: PhaseTangents,
-    minima_state: MinimaState,
-    minima_result: MinimaResult,
-    phase_ends: tuple[StageState, StageState],
+    margin_minima_state: MarginMinimaState,
+    margin_minima_result: MarginMinimaResult,
+    start_and_end_states: tuple[StageState, StageState],
     end_tangents: Array,
 ) -> Array:
     """Return the tangents of the minima of the margins, shape (directions, margins, batch).
 
     The tangents are those of the margins at fixed times, because the shift of a minimum in time has
-    no first-order effect. `phase_ends` are the states at the start and at the end of the phase, and
-    `end_tangents` are the tangents of the end state.
+    no first-order effect. `start_and_end_states` are the states at the start and at the end of the
+    phase, and `end_tangents` are the tangents of the end state.
     """
     margin_functions, evaluate_acceleration = make_margins(
-        phase_tangents.constants, phase_tangents.held_constants
+        phase_tangents.phase_constants, phase_tangents.held_constants
     )
 
-    def evaluate_margins(constants: Any, held_constants: Vector, q: Vector, v: Vector) -> Array:
-        margin_functions, evaluate_acceleration_at = make_margins(constants, held_constants)
+    def evaluate_margins(
+        phase_constants: Any, held_constants: Vector, q: Vector, v: Vector
+    ) -> Array:
+        margin_functions, evaluate_acceleration_at = make_margins(phase_constants, held_constants)
         return jnp.stack(
             margin_functions.evaluate_margins(StageState(q, v, evaluate_acceleration_at(q, v)))
         )
 
     compute_margin_tangents = functools.partial(phase_tangents.evaluate_tangents, evaluate_margins)
 
-    def compute_margin_tangent(_: None, margin_inputs: tuple) -> tuple[None, Array]:
-        margin_index, minima_state_of_margin, step_length = margin_inputs
-        q, v = tuple(minima_state_of_margin.start_q), tuple(minima_state_of_margin.start_v)
-        minimum_step_start = StageState(q, v, evaluate_acceleration(q, v))
-        rk_step = step_function(minimum_step_start, step_length)
+    def compute_margin_tangent(_: None, margin_scan_inputs: tuple) -> tuple[None, Array]:
+        margin_index, margin_minimum_state, step_length = margin_scan_inputs
+        q, v = tuple(margin_minimum_state.step_start_q), tuple(margin_minimum_state.step_start_v)
+        minimum_step_start_state = StageState(q, v, evaluate_acceleration(q, v))
+        rk_step = solver_step_function(minimum_step_start_state, step_length)
         state_tangents = phase_tangents.propagate_to_step_end(
-            tableau, rk_step.stage_states, minima_state_of_margin.start_tangents, step_length
+            tableau, rk_step.stage_states, margin_minimum_state.step_start_tangents, step_length
         )
-        is_selected = jnp.arange(len(margin_functions.includes_start)) == margin_index
+        is_selected_margin = jnp.arange(len(margin_functions.includes_phase_start)) == margin_index
         return None, jnp.sum(
             jnp.where(
-                is_selected[:, None],
+                is_selected_margin[:, None],
                 compute_margin_tangents(rk_step.end_state, state_tangents),
                 0.0,
             ),
             1,
         )
 
-    margin_indices = jnp.arange(len(minima_result.phase_minima), dtype=jnp.int32)
-    interior_tangents = jnp.moveaxis(
+    margin_indices = jnp.arange(len(margin_minima_result.phase_margin_minima), dtype=jnp.int32)
+    interior_minima_tangents = jnp.moveaxis(
         lax.scan(
             compute_margin_tangent,
             None,
-            (margin_indices, minima_state, minima_result.length_to_minimum),
+            (margin_indices, margin_minima_state, margin_minima_result.step_length_to_minimum),
         )[1],
         0,
         1,
     )
-    start_tangents = compute_margin_tangents(phase_ends[0], phase_tangents.start_tangents)
-    end_margin_tangents = compute_margin_tangents(phase_ends[1], end_tangents)
-    end_minima_tangents = jnp.where(
-        minima_state.margin_values <= minima_result.phase_minima,
+    start_tangents = compute_margin_tangents(start_and_end_states[0], phase_tangents.start_tangents)
+    end_margin_tangents = compute_margin_tangents(start_and_end_states[1], end_tangents)
+    end_margin_minima_tangents = jnp.where(
+        margin_minima_state.margin_values <= margin_minima_result.phase_margin_minima,
         end_margin_tangents,
         start_tangents,
     )
     return jnp.where(
-        minima_result.interior_minima <= minima_result.phase_minima,
-        interior_tangents,
-        end_minima_tangents,
+        margin_minima_result.interior_margin_minima <= margin_minima_result.phase_margin_minima,
+        interior_minima_tangents,
+        end_margin_minima_tangents,
     )

@@ -22,7 +22,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
-from vrw_jax.numerics import Vector, run_if_any
+from vrw_jax.numerics import Vector, run_if_any_element_active
 
 
 class ButcherTableau(NamedTuple):
@@ -118,21 +118,16 @@ def _choose_guard_stages(stage_nodes: np.ndarray) -> tuple[int, ...]:
     Of several stages at one node, the last stage is chosen, because it is the most accurate.
     """
     last_stage_at_node = {
-        round(float(target_stage_node), 3): i
-        for i, target_stage_node in enumerate(stage_nodes)
-        if 0.05 < target_stage_node < 0.95
+        round(float(stage_node), 3): i
+        for i, stage_node in enumerate(stage_nodes)
+        if 0.05 < stage_node < 0.95
     }
     nearest_nodes = {
-        min(
-            (abs(target_stage_node - target_node), target_stage_node)
-            for target_stage_node in last_stage_at_node
-        )[1]
-        for target_node in GUARD_STAGE_NODES
+        min((abs(stage_node - guard_node), stage_node) for stage_node in last_stage_at_node)[1]
+        for guard_node in GUARD_STAGE_NODES
         if last_stage_at_node
     }
-    return tuple(
-        last_stage_at_node[target_stage_node] for target_stage_node in sorted(nearest_nodes)
-    )
+    return tuple(last_stage_at_node[stage_node] for stage_node in sorted(nearest_nodes))
 
 
 def fit_guard_parabola(
@@ -196,8 +191,8 @@ def find_guard_minimum(tableau: ButcherTableau, guard_values: list[Array]) -> tu
             inner_bernstein_coefficient, min_bernstein_coefficient
         )
     has_guard_risen = inner_bernstein_coefficients[-1] < guard_values[-1]
-    for preceding_coefficient, following_coefficient in itertools.pairwise(guard_values):
-        has_guard_risen = has_guard_risen | (preceding_coefficient < following_coefficient)
+    for preceding_guard_value, following_guard_value in itertools.pairwise(guard_values):
+        has_guard_risen = has_guard_risen | (preceding_guard_value < following_guard_value)
     has_guard_minimum = (
         (min_bernstein_coefficient <= 0.0)
         & (minimum_fraction > 0.0)
@@ -216,15 +211,15 @@ def find_earliest_guard_minimum_fraction(
     `guard_values` are the guards at the start, at the stages `guard_stage_indices`, and at the end.
     The computation is skipped if no batch element may have a minimum.
     """
-    values_by_guard = [list(guard_values) for guard_values in zip(*guard_values, strict=True)]
+    stage_values_by_guard = [list(stage_values) for stage_values in zip(*guard_values, strict=True)]
     may_cross_inside = functools.reduce(
         operator.or_,
-        (_may_cross_inside_step(tableau, guard_values) for guard_values in values_by_guard),
+        (_may_cross_inside_step(tableau, stage_values) for stage_values in stage_values_by_guard),
     )
 
     def find_first_minimum(earliest_minimum_fraction: Array) -> Array:
-        for guard_values in values_by_guard:
-            has_guard_minimum, minimum_fraction = find_guard_minimum(tableau, guard_values)
+        for stage_values in stage_values_by_guard:
+            has_guard_minimum, minimum_fraction = find_guard_minimum(tableau, stage_values)
             earliest_minimum_fraction = jnp.where(
                 has_guard_minimum,
                 jnp.minimum(earliest_minimum_fraction, minimum_fraction),
@@ -233,7 +228,9 @@ def find_earliest_guard_minimum_fraction(
         return earliest_minimum_fraction
 
     whole_step_fraction = jnp.ones_like(guard_values[0][0])
-    return run_if_any(jnp.any(may_cross_inside), find_first_minimum, whole_step_fraction)
+    return run_if_any_element_active(
+        jnp.any(may_cross_inside), find_first_minimum, whole_step_fraction
+    )
 
 
 @dataclass(frozen=True)
@@ -246,9 +243,9 @@ class StepSizeController:
 
     safety_factor: float = 0.9
     """Factor by which the estimated step length for the tolerance is multiplied."""
-    min_factor: float = 0.2
+    min_step_length_ratio: float = 0.2
     """Smallest ratio of successive step lengths."""
-    max_factor: float = 5.0
+    max_step_length_ratio: float = 5.0
     """Largest ratio of successive step lengths; after a rejected step the ratio is at most 1."""
 
 
@@ -257,21 +254,21 @@ STEP_SIZE_CONTROLLER = StepSizeController()
 
 def compute_step_size_factor(
     tableau: ButcherTableau,
-    squared_error: Array,
+    mean_squared_error: Array,
     float_dtype: Any,
     step_size_controller: StepSizeController = STEP_SIZE_CONTROLLER,
 ) -> Array:
     """Return the ratio of the next step length to the present one, as `float_dtype`.
 
-    `squared_error` is the mean square of the solver step's error divided by the tolerance.
+    `mean_squared_error` is the mean square of the solver step's error divided by the tolerance.
     """
     error_power = jnp.exp(
-        jnp.log(jnp.clip(squared_error, 1e-20, 1e20)) * (-0.5 / tableau.convergence_order)
+        jnp.log(jnp.clip(mean_squared_error, 1e-20, 1e20)) * (-0.5 / tableau.convergence_order)
     ).astype(float_dtype)
     return jnp.clip(
         step_size_controller.safety_factor * error_power,
-        step_size_controller.min_factor,
-        jnp.where(squared_error <= 1.0, step_size_controller.max_factor, 1.0),
+        step_size_controller.min_step_length_ratio,
+        jnp.where(mean_squared_error <= 1.0, step_size_controller.max_step_length_ratio, 1.0),
     )
 
 
@@ -295,14 +292,14 @@ def compute_real_stability_limit(tableau: ButcherTableau) -> float:
     For a motion that decays as exp(-r t), the longest stable solver step is z / r.
     """
     z = np.linspace(0.01, 20.0, 2000)
-    stage_values = np.ones(len(tableau.stage_nodes))
+    stage_vector = np.ones(len(tableau.stage_nodes))
     stability_polynomial = 1.0
     # R is the polynomial 1 - z w (1 - z A + ...).
-    for matrix_power in range(1, len(stage_values) + 1):
+    for matrix_power in range(1, len(stage_vector) + 1):
         stability_polynomial = stability_polynomial + (-z) ** matrix_power * (
-            tableau.stage_matrix[-1] @ stage_values
+            tableau.stage_matrix[-1] @ stage_vector
         )
-        stage_values = tableau.stage_matrix @ stage_values
+        stage_vector = tableau.stage_matrix @ stage_vector
     return float(z[np.argmax(np.abs(stability_polynomial) > 1.0 + 1e-12)])
 
 
@@ -403,12 +400,12 @@ def evaluate_stage(
     return tuple(stage_positions), tuple(stage_rates)
 
 
-def _sum_weighted_terms(term_weights: np.ndarray, summed_terms: list[Array]) -> Any:
-    """Return the sum of `term_weights` times `summed_terms`, or None if all weights are zero.
+def _sum_weighted_terms(term_weights: np.ndarray, terms_to_sum: list[Array]) -> Any:
+    """Return the sum of `term_weights` times `terms_to_sum`, or None if all weights are zero.
 
     Half of the operations in a solver step are such sums. The sum uses functions of `lax`, because
     they are traced in a third of the time of Python's operators.
     """
-    weights_and_terms = zip(term_weights, summed_terms, strict=False)
+    weights_and_terms = zip(term_weights, terms_to_sum, strict=False)
     weighted_terms = [lax.mul(x.dtype.type(w), x) for w, x in weights_and_terms if w != 0.0]
     return functools.reduce(lax.add, weighted_terms) if weighted_terms else None

@@ -29,7 +29,12 @@ from vrw_jax.integrator.tableaus import (
     StageState,
     evaluate_stage,
 )
-from vrw_jax.numerics import Vector, make_zero_tangent, run_if_any, with_default_jax_settings
+from vrw_jax.numerics import (
+    Vector,
+    make_zero_tangent,
+    run_if_any_element_active,
+    with_default_jax_settings,
+)
 
 
 class ImplicitDynamics(NamedTuple):
@@ -51,26 +56,26 @@ such as the state at its start.
 
 
 def apply_batched_jvp_rule(
-    evaluate_rule: Callable[[Any, Any], tuple[Any, Any]], primals: Any, tangents: Any
+    evaluate_jvp_rule: Callable[[Any, Any], tuple[Any, Any]], primals: Any, tangents: Any
 ) -> tuple[Any, Any]:
     """Return the values and tangents of a JVP rule that computes all directions of a vmap together.
 
-    - `evaluate_rule`: function of primals and tangents that returns the values and their tangents.
-      The first axis of its tangents contains the directions. The length of this axis is 1 if all
-      directions have the same tangents;
+    - `evaluate_jvp_rule`: function of primals and tangents that returns the values and their
+      tangents. The first axis of its tangents contains the directions. The length of this axis is 1
+      if all directions have the same tangents;
     - `primals`, `tangents`: arguments of the JVP rule, without an axis of directions.
     """
     leaves, tree_structure = jax.tree.flatten((primals, tangents))
     n_primal_leaves = len(jax.tree.leaves(primals))
     n_directions = len(_count_vmapped_directions(tangents))
     if n_directions == 0:
-        function_values, output_tangents = evaluate_rule(
+        function_values, output_tangents = evaluate_jvp_rule(
             primals, jax.tree.map(lambda x: x[None], tangents)
         )
         return function_values, jax.tree.map(lambda x: x[0], output_tangents)
     output_structure: Any = None
 
-    def evaluate_batched(leaves: Any, axes: Any) -> tuple[list, list]:
+    def evaluate_batched_jvp_rule(leaves: Any, axes: Any) -> tuple[list, list]:
         nonlocal output_structure
         if any(leaf_axis is not None for leaf_axis in axes[:n_primal_leaves]):
             raise NotImplementedError(
@@ -82,7 +87,7 @@ def apply_batched_jvp_rule(
             x[None] if leaf_axis is None else jnp.moveaxis(x, leaf_axis, 0)
             for x, leaf_axis in leaves_and_axes
         ]
-        function_values, output_tangents = evaluate_rule(
+        function_values, output_tangents = evaluate_jvp_rule(
             *jax.tree.unflatten(tree_structure, [*leaves[:n_primal_leaves], *direction_leaves])
         )
         output_tangents = jax.tree.map(
@@ -94,7 +99,9 @@ def apply_batched_jvp_rule(
             len(flat_results) - n_function_values
         )
 
-    flat_results = _HOIST_OUT_OF_VMAP_PRIMITIVE.bind(*leaves, map_over_axes=evaluate_batched)
+    flat_results = _HOIST_OUT_OF_VMAP_PRIMITIVE.bind(
+        *leaves, map_over_axes=evaluate_batched_jvp_rule
+    )
     return jax.tree.unflatten(output_structure, flat_results)
 
 
@@ -123,7 +130,7 @@ loops again.
 """
 
 
-def _map_sequentially(evaluate_direction: Callable[[Any], Any], directions: Any) -> Any:
+def _map_sequentially(evaluate_for_direction: Callable[[Any], Any], directions: Any) -> Any:
     """Return the results of a function for all directions, computed in a loop.
 
     The loop makes the values for one direction fit into registers.
@@ -134,7 +141,7 @@ def _map_sequentially(evaluate_direction: Callable[[Any], Any], directions: Any)
     def evaluate_selected_direction(varying_leaves: list[Array]) -> Any:
         remaining_leaves = iter(varying_leaves)
         leaves_and_flags = zip(leaves, has_several_directions, strict=True)
-        return evaluate_direction(
+        return evaluate_for_direction(
             jax.tree.unflatten(
                 tree_structure,
                 [
@@ -164,39 +171,39 @@ class StageJacobians(NamedTuple):
     # constants
     state_jacobians: Array
     # tangents due to the constants, (stages, directions, coordinates, batch)
-    constants_tangents: Array
+    phase_constants_tangents: Array
 
 
 @functools.partial(jax.jit, static_argnums=0)
 def _compute_stage_jacobians(
-    make_dynamics: ImplicitDynamicsFn,
-    constants: Any,
-    constants_directions: Any,
+    make_implicit_dynamics: ImplicitDynamicsFn,
+    phase_constants: Any,
+    phase_constants_directions: Any,
     held_constants: Vector,
     stage_states: list[StageState],
 ) -> StageJacobians:
     """Return derivatives of the accelerations at all stages of a solver step except the last."""
 
     def linearize_stage(packed_state: Array) -> tuple[Array, Array]:
-        # inverse of `_pack_state`
+        # inverse of `_pack_stage_state`
         n = (len(packed_state) - 2) // 3
         state_components = tuple(packed_state)
         acceleration = StageAccelerations(
             state_components[2 * n], state_components[2 * n + 1], state_components[2 * n + 2 :]
         )
         stage_state = StageState(state_components[:n], state_components[n : 2 * n], acceleration)
-        implicit_dynamics = make_dynamics(constants, held_constants)
+        implicit_dynamics = make_implicit_dynamics(phase_constants, held_constants)
         implicit_dynamics = ImplicitDynamics(
             jax.jit(implicit_dynamics.evaluate_residual),
             jax.jit(implicit_dynamics.solve_for_accelerations),
         )
-        evaluate_residual = lambda constants, held_constants: make_dynamics(
-            constants, held_constants
+        evaluate_residual = lambda phase_constants, held_constants: make_implicit_dynamics(
+            phase_constants, held_constants
         ).evaluate_residual(stage_state)
-        compute_acceleration_along = lambda *tangent: _solve_acceleration(
+        compute_acceleration_derivative = lambda *tangent: _solve_acceleration(
             implicit_dynamics, stage_state, jax.jvp(evaluate_residual, *tangent)[1]
         )
-        zero_constants = jax.tree.map(jnp.zeros_like, constants)
+        zero_phase_constants = jax.tree.map(jnp.zeros_like, phase_constants)
         jacobian_columns = [
             jnp.stack(
                 _compute_acceleration_tangent(
@@ -206,38 +213,46 @@ def _compute_stage_jacobians(
             for unit_vector in _make_unit_vectors((*stage_state.q, *stage_state.v))
         ]
         jacobian_columns += [
-            compute_acceleration_along((constants, held_constants), (zero_constants, unit_vector))
+            compute_acceleration_derivative(
+                (phase_constants, held_constants), (zero_phase_constants, unit_vector)
+            )
             for unit_vector in _make_unit_vectors(held_constants)
         ]
         zero_held_constants = tuple(jnp.zeros_like(x) for x in held_constants)
-        acceleration_by_constants = lambda constants_direction: compute_acceleration_along(
-            (constants, held_constants), (constants_direction, zero_held_constants)
+        differentiate_by_phase_constants = lambda phase_constants_direction: (
+            compute_acceleration_derivative(
+                (phase_constants, held_constants), (phase_constants_direction, zero_held_constants)
+            )
         )
         return jnp.stack(jacobian_columns, 1), _map_unrolled(
-            acceleration_by_constants, constants_directions
+            differentiate_by_phase_constants, phase_constants_directions
         )
 
     return StageJacobians(
-        *lax.map(linearize_stage, jnp.stack([_pack_state(state) for state in stage_states[:-1]]))
+        *lax.map(
+            linearize_stage, jnp.stack([_pack_stage_state(state) for state in stage_states[:-1]])
+        )
     )
 
 
-def _map_unrolled(evaluate_direction: Callable[[Any], Array], directions: Any) -> Array:
+def _map_unrolled(evaluate_for_direction: Callable[[Any], Array], directions: Any) -> Array:
     """Return the results of a function for all directions, computed without a loop.
 
     Without a loop, the compiler removes entries that are known to be zero.
     """
     leaves, tree_structure = jax.tree.flatten(directions)
     if all(len(x) == 1 for x in leaves):
-        return evaluate_direction(jax.tree.unflatten(tree_structure, [x[0] for x in leaves]))[None]
+        return evaluate_for_direction(jax.tree.unflatten(tree_structure, [x[0] for x in leaves]))[
+            None
+        ]
     leaf_axes = [0 if len(x) > 1 else None for x in leaves]
     direction_leaves = [x if len(x) > 1 else x[0] for x in leaves]
     return jax.vmap(
-        lambda *x: evaluate_direction(jax.tree.unflatten(tree_structure, x)), leaf_axes
+        lambda *x: evaluate_for_direction(jax.tree.unflatten(tree_structure, x)), leaf_axes
     )(*direction_leaves)
 
 
-def _pack_state(state: StageState) -> Array:
+def _pack_stage_state(state: StageState) -> Array:
     """Return positions, rates, sine and cosine of theta, and accelerations as one array.
 
     The array has the shape (components, batch).
@@ -295,11 +310,11 @@ def _propagate_tangents(
     """
     state_jacobian, n = stage_jacobians.state_jacobians, stage_jacobians.state_jacobians.shape[1]
 
-    def propagate_direction(tangent_direction: tuple[Array, Array]) -> Array:
-        constants_tangent, start_tangent = tangent_direction
+    def propagate_tangent_direction(tangent_direction: tuple[Array, Array]) -> Array:
+        phase_constants_tangent, start_tangent = tangent_direction
         start_position_tangents = tuple(start_tangent[:n])
         start_rate_tangents = tuple(start_tangent[n : 2 * n])
-        held_tangents = tuple(start_tangent[2 * n :])
+        held_constants_tangents = tuple(start_tangent[2 * n :])
         stage_tangents: list[Vector] = []
         for i in range(len(tableau.stage_nodes) - 1):
             q, v = (
@@ -309,10 +324,10 @@ def _propagate_tangents(
                 if i
                 else (start_position_tangents, start_rate_tangents)
             )
-            state_tangents = (*q, *v, *held_tangents)
+            state_tangents = (*q, *v, *held_constants_tangents)
             acceleration_terms = [
                 [
-                    constants_tangent[i, coordinate_index],
+                    phase_constants_tangent[i, coordinate_index],
                     *map(lax.mul, state_jacobian[i, coordinate_index], state_tangents),
                 ]
                 for coordinate_index in range(n)
@@ -331,11 +346,11 @@ def _propagate_tangents(
             stage_tangents,
             h,
         )
-        return jnp.stack([*q, *v, *held_tangents])
+        return jnp.stack([*q, *v, *held_constants_tangents])
 
     return _map_sequentially(
-        propagate_direction,
-        (jnp.moveaxis(stage_jacobians.constants_tangents, 1, 0), start_tangents),
+        propagate_tangent_direction,
+        (jnp.moveaxis(stage_jacobians.phase_constants_tangents, 1, 0), start_tangents),
     )
 
 
@@ -354,21 +369,21 @@ def with_batched_jvp(function: Callable[..., Any]) -> Callable[..., Any]:
     """
 
     def call_with_batched_jvp(*arguments: Any) -> Any:
-        float_arguments, other_arguments = eqx.partition(arguments, eqx.is_inexact_array)
+        float_arguments, nonfloat_arguments = eqx.partition(arguments, eqx.is_inexact_array)
         evaluate_with_float_arguments = lambda *float_arguments: function(
-            *eqx.combine(float_arguments, other_arguments)
+            *eqx.combine(float_arguments, nonfloat_arguments)
         )
-        evaluate_floats = lambda *float_arguments: eqx.filter(
+        evaluate_float_results = lambda *float_arguments: eqx.filter(
             evaluate_with_float_arguments(*float_arguments), eqx.is_inexact_array
         )
         differentiable_function = jax.custom_jvp(evaluate_with_float_arguments)
 
         @differentiable_function.defjvp
         @with_default_jax_settings
-        def evaluate_jvp_of_floats(primals: tuple, tangent: tuple) -> tuple:
+        def evaluate_float_jvp(primals: tuple, tangent: tuple) -> tuple:
             evaluate_with_tangents = lambda primals, directions: (
                 evaluate_with_float_arguments(*primals),
-                compute_each_jvp(evaluate_floats, primals, directions),
+                compute_each_jvp(evaluate_float_results, primals, directions),
             )
             function_outputs, float_tangents = apply_batched_jvp_rule(
                 evaluate_with_tangents, primals, tangent
@@ -385,10 +400,10 @@ def with_batched_jvp(function: Callable[..., Any]) -> Callable[..., Any]:
 class PhaseTangents(NamedTuple):
     """Tangents of the start state, of the constants and of the held constants of a phase."""
 
-    make_dynamics: ImplicitDynamicsFn
-    constants: Any
+    make_implicit_dynamics: ImplicitDynamicsFn
+    phase_constants: Any
     held_constants: Vector
-    constants_tangents: Any  # tree of the constants, directions first
+    phase_constants_tangents: Any  # tree of the constants, directions first
     # tangents of positions, rates, held constants, (directions, components, batch)
     start_tangents: Array
 
@@ -404,9 +419,9 @@ class PhaseTangents(NamedTuple):
         `h` is the length of the step, s.
         """
         stage_jacobians = _compute_stage_jacobians(
-            self.make_dynamics,
-            self.constants,
-            self.constants_tangents,
+            self.make_implicit_dynamics,
+            self.phase_constants,
+            self.phase_constants_tangents,
             self.held_constants,
             stage_states,
         )
@@ -433,22 +448,25 @@ class PhaseTangents(NamedTuple):
                 start_tangents,
             )
 
-        return run_if_any(jnp.any(is_accepted), propagate_accepted_tangents, start_tangents)
+        return run_if_any_element_active(
+            jnp.any(is_accepted), propagate_accepted_tangents, start_tangents
+        )
 
     def evaluate_tangents(
         self, evaluate_function: Callable[..., Any], state: StageState, directions: Array
     ) -> Any:
-        """Return the tangents of `evaluate_function(constants, held_constants, q, v)` at a state.
+        """Return the tangents of `evaluate_function(phase_constants, held_constants, q, v)` at a
+        state.
 
         The first axis of the result contains the directions.
         """
         n, direction_components = len(state.q), tuple(jnp.moveaxis(directions, 1, 0))
-        primals = self.constants, self.held_constants, state.q, state.v
+        primals = self.phase_constants, self.held_constants, state.q, state.v
         return compute_each_jvp(
             evaluate_function,
             primals,
             (
-                self.constants_tangents,
+                self.phase_constants_tangents,
                 direction_components[2 * n :],
                 direction_components[:n],
                 direction_components[n : 2 * n],

@@ -374,8 +374,14 @@ CONTACT_MEASURES = _index_measures_by_name(
 # fmt: on
 PARAMETER_MEASURES = _index_measures_by_name(
     *(
-        Measure(name, domain.unit or "1", domain.symbol, name.replace("_", " "), domain.description)
-        for name, domain in PARAMETER_DOMAINS.items()
+        Measure(
+            name,
+            parameter_domain.unit or "1",
+            parameter_domain.symbol,
+            name.replace("_", " "),
+            parameter_domain.description,
+        )
+        for name, parameter_domain in PARAMETER_DOMAINS.items()
     )
 )
 """Parameters of the wheel as measures, for the axes of a scan."""
@@ -395,7 +401,7 @@ MEASURES: dict[str, Measure] = (
 )
 """All measures by name."""
 
-PHASE_NAMES = tuple(phase.name for phase in PAPER_PHASES)
+PHASE_NAMES = tuple(phase.phase_name for phase in PAPER_PHASES)
 """Names of the phases of a step, in order: values 0, 1, 2 of `phase`."""
 
 CONTACT_MODE_NAMES = ("in the air", "at rest", "sliding downhill", "sliding uphill")
@@ -417,7 +423,7 @@ def get_measure(measure_name: str) -> Measure:
 
 
 def make_labeled_variables(
-    columns_by_name: Mapping[str, np.ndarray], row_dimension: str
+    column_by_variable_name: Mapping[str, np.ndarray], row_dimension: str
 ) -> dict[str, xr.Variable]:
     """Return dataset variables for columns of values over the dimension `row_dimension`.
 
@@ -432,7 +438,7 @@ def make_labeled_variables(
         variable_name: xr.Variable(
             dimension_selector(variable_name), x, make_measure_attributes(variable_name)
         )
-        for variable_name, x in columns_by_name.items()
+        for variable_name, x in column_by_variable_name.items()
     }
 
 

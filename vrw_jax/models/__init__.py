@@ -15,7 +15,7 @@ from vrw_jax.models.step_inputs import (
     PAPER_START_STATE,
     AnySectionState,
     SectionState,
-    complete_line_slopes,
+    complete_ground_line_slopes,
     is_slope_in_domain,
     is_valid_start_state,
     replace_invalid_inputs,

@@ -103,7 +103,7 @@ class BatchAdvanceResult(NamedTuple):
     is_unfinished: Bool[Array, " lanes"]  # lanes stopped as stragglers; no other field is valid
 
 
-class _PhaseCarry(NamedTuple):
+class _NextPhaseInputs(NamedTuple):
     """Data that the integration of a phase passes to the integration of the next phase."""
 
     next_solver_dt: Array  # step size that the controller proposes next, s
@@ -126,32 +126,32 @@ def make_batch_phase(
         return StageAccelerations(
             sin_theta,
             cos_theta,
-            phase.solve_acceleration(phase.complete_motion(sin_theta, cos_theta, q, v))[
+            phase.solve_acceleration(phase.complete_wheel_motion(sin_theta, cos_theta, q, v))[
                 : phase.n_dof
             ],
         )
 
-    def complete_stage_motion(stage_state: StageState) -> Motion:
-        return phase.complete_motion(
+    def complete_motion_at_stage(stage_state: StageState) -> Motion:
+        return phase.complete_wheel_motion(
             stage_state.acceleration.sin, stage_state.acceleration.cos, stage_state.q, stage_state.v
         )
 
     def make_phase_instant(stage_state: StageState) -> PhaseInstant:
         return PhaseInstant(
-            phase, complete_stage_motion(stage_state), stage_state.acceleration.acceleration
+            phase, complete_motion_at_stage(stage_state), stage_state.acceleration.acceleration
         )
 
     implicit_dynamics = ImplicitDynamics(
         lambda stage: phase.compute_dynamics_residual(
-            complete_stage_motion(stage), stage.acceleration.acceleration
+            complete_motion_at_stage(stage), stage.acceleration.acceleration
         ),
         lambda stage, right_hand_side: phase.solve_dynamics(
-            complete_stage_motion(stage), right_hand_side
+            complete_motion_at_stage(stage), right_hand_side
         ),
     )
     evaluate_stage_margins = lambda stage: phase.compute_margins(make_phase_instant(stage))
     recorded_margins = (
-        MarginFunctions(evaluate_stage_margins, phase.margins_counted_at_start)
+        MarginFunctions(evaluate_stage_margins, phase.are_margins_counted_at_start)
         if records_margins
         else None
     )
@@ -191,20 +191,23 @@ def advance_gait_step(
         records_margins=False,
         straggler_count=straggler_count,
     )
-    phase_ends, has_stepped = phase_sequence.phase_ends, phase_sequence.outcome == Outcome.STEPPED
+    phase_end_results, has_stepped = (
+        phase_sequence.phase_end_results,
+        phase_sequence.outcome == Outcome.STEPPED,
+    )
     next_state = select_next_section_state(phase_sequence)
     return BatchAdvanceResult(
         section_state=tuple(
             jnp.where(has_stepped, state_component, 0.0) for state_component in next_state
         ),
-        durations=tuple(phase_end.duration for phase_end in phase_ends),
+        durations=tuple(phase_end.duration for phase_end in phase_end_results),
         outcome=phase_sequence.outcome,
-        solver_steps=phase_ends[0].n_solver_steps
-        + phase_ends[1].n_solver_steps
-        + phase_ends[2].n_solver_steps,
-        is_unfinished=phase_ends[0].engine_carry.is_unfinished
-        | phase_ends[1].engine_carry.is_unfinished
-        | phase_ends[2].engine_carry.is_unfinished,
+        solver_steps=phase_end_results[0].n_solver_steps
+        + phase_end_results[1].n_solver_steps
+        + phase_end_results[2].n_solver_steps,
+        is_unfinished=phase_end_results[0].next_phase_inputs.is_unfinished
+        | phase_end_results[1].next_phase_inputs.is_unfinished
+        | phase_end_results[2].next_phase_inputs.is_unfinished,
     )
 
 
@@ -258,13 +261,13 @@ def _make_phase_runner(
         q: Vector,
         v: Vector,
         is_active_lane: Array,
-        previous_end: PhaseResult | None,
+        previous_phase_end: PhaseResult | None,
     ) -> PhaseResult:
         scaled_options = compute_wheel_units(phase.s).scale_times_to_seconds(options)
         dt0 = scaled_options.dt0 + jnp.zeros_like(q[0])
-        if previous_end is not None:
-            engine_carry: _PhaseCarry = previous_end.engine_carry
-            dt0 = engine_carry.next_solver_dt
+        if previous_phase_end is not None:
+            next_phase_inputs: _NextPhaseInputs = previous_phase_end.next_phase_inputs
+            dt0 = next_phase_inputs.next_solver_dt
             if phase.has_stiff_start:
                 tolerance_root = jnp.exp(
                     jnp.log(options.rtol.astype(jnp.float32)) / tableau.convergence_order
@@ -275,15 +278,21 @@ def _make_phase_runner(
                 )
                 max_transient_dt = max_dt_in_transient_times * phase.s.m / phase.s.c
                 dt0 = jnp.minimum(stiff_start_options.max_first_step_ratio * dt0, max_transient_dt)
-                dt0 = jnp.where(engine_carry.has_phase_occurred, dt0, engine_carry.next_solver_dt)
-        float_leaves, static_leaves = eqx.partition((phase.s, phase.tilt_sine_cosine), eqx.is_array)
+                dt0 = jnp.where(
+                    next_phase_inputs.has_phase_occurred, dt0, next_phase_inputs.next_solver_dt
+                )
+        float_leaves, nonarray_leaves = eqx.partition(
+            (phase.s, phase.tilt_sine_cosine), eqx.is_array
+        )
 
         def make_phase(float_leaves: Any, phase_constants: Vector) -> BatchPhase:
-            s, tilt_sine_cosine = eqx.combine(float_leaves, static_leaves)
-            rebuilt_phase = dataclasses.replace(
+            s, tilt_sine_cosine = eqx.combine(float_leaves, nonarray_leaves)
+            phase_with_traced_inputs = dataclasses.replace(
                 phase, s=s, phase_constants=phase_constants, tilt_sine_cosine=tilt_sine_cosine
             )
-            return make_batch_phase(rebuilt_phase, records_margins, is_compiled_separately)
+            return make_batch_phase(
+                phase_with_traced_inputs, records_margins, is_compiled_separately
+            )
 
         phase_end = integrate_batch_phase(
             make_phase,
@@ -300,11 +309,11 @@ def _make_phase_runner(
         return PhaseResult(
             *phase_end.state[:2],
             duration=phase_end.duration,
-            guard=phase_end.guard,
+            end_guard_index=phase_end.end_guard_index,
             is_timed_out=phase_end.is_timed_out,
             n_solver_steps=phase_end.n_tried_steps,
             margin_minima=phase_end.margin_minima,
-            engine_carry=_PhaseCarry(
+            next_phase_inputs=_NextPhaseInputs(
                 phase_end.next_solver_dt, is_active_lane, phase_end.is_unfinished
             ),
         )
@@ -363,11 +372,12 @@ class _StepTraceConfig(NamedTuple):
         phase_sequence, friction = self.run_lane_phases(*argument_leaves)[0], self.friction
         if friction is None:
             return eqx.partition(make_advance_result(phase_sequence, "lanes"), eqx.is_inexact_array)
-        phase_ends = tuple(
-            phase_end._replace(engine_carry=None) for phase_end in phase_sequence.phase_ends
+        phase_end_results = tuple(
+            phase_end._replace(next_phase_inputs=None)
+            for phase_end in phase_sequence.phase_end_results
         )
         float_phase_sequence = phase_sequence._replace(
-            phases=(), phase_starts=(), phase_ends=phase_ends
+            phases=(), phase_start_states=(), phase_end_results=phase_end_results
         )  # only floats
         step_result = with_batched_jvp(
             lambda phase_sequence: make_step_result(phase_sequence, friction, "lanes")
@@ -379,30 +389,36 @@ class _StepTraceConfig(NamedTuple):
         `compute_step_outputs`.
         """
         x = argument_leaves[0]
-        int_zeros = jnp.zeros_like(x, jnp.int32)
-        two_row_template, three_row_template = (jnp.broadcast_to(x, (n, *x.shape)) for n in (2, 3))
+        zero_codes = jnp.zeros_like(x, jnp.int32)
+        two_component_template, three_component_template = (
+            jnp.broadcast_to(x, (n, *x.shape)) for n in (2, 3)
+        )
         step_result_template: Any = AdvanceResult(
-            three_row_template, three_row_template, int_zeros, int_zeros, engine="lanes"
+            three_component_template,
+            three_component_template,
+            zero_codes,
+            zero_codes,
+            engine="lanes",
         )
         if self.friction is not None:
             step_result_template = StepResult(
-                section_state=three_row_template,
-                post_impact=two_row_template,
-                durations=three_row_template,
+                section_state=three_component_template,
+                post_impact=two_component_template,
+                durations=three_component_template,
                 step_length=x,
-                indicators=_fill_all_fields(DoubleSupportIndicators, x),
-                margins=_fill_all_fields(Margins, x),
-                energy=_fill_all_fields(EnergyLoss, x),
-                outcome=int_zeros,
-                solver_steps=int_zeros,
+                indicators=_make_with_equal_fields(DoubleSupportIndicators, x),
+                margins=_make_with_equal_fields(Margins, x),
+                energy=_make_with_equal_fields(EnergyLoss, x),
+                outcome=zero_codes,
+                solver_steps=zero_codes,
                 engine="lanes",
             )
         return eqx.partition(step_result_template, eqx.is_inexact_array)
 
 
-def _fill_all_fields(record_type: Any, field_value: Array) -> Any:
-    """Return a record of the class `record_type` whose fields all equal `field_value`."""
-    return record_type(*(field_value for _ in dataclasses.fields(record_type)))
+def _make_with_equal_fields(field_class: Any, field_value: Array) -> Any:
+    """Return a record of the class `field_class` whose fields all equal `field_value`."""
+    return field_class(*(field_value for _ in dataclasses.fields(field_class)))
 
 
 def build_step_function(
@@ -418,11 +434,13 @@ def build_step_function(
     - `stop_at_lift_off`: see `ViscoelasticWheel`;
     - `friction`: friction coefficient for the margins, or None for results without margins.
     """
-    trace_config = _StepTraceConfig(argument_structure, stop_at_lift_off, friction)
-    trace_key = ("gait step", *trace_config.trace_key)
+    step_trace_config = _StepTraceConfig(argument_structure, stop_at_lift_off, friction)
+    trace_key = ("gait step", *step_trace_config.trace_key)
     return unbatch(
         compile_batch_function(
-            trace_config.compute_step_outputs, trace_config.make_output_template, trace_key
+            step_trace_config.compute_step_outputs,
+            step_trace_config.make_output_template,
+            trace_key,
         )
     )
 
@@ -445,16 +463,23 @@ def build_step_finisher(
         phase_runner = _make_phase_runner(
             options, tableau, False, None, True, DEFAULT_STIFF_START_OPTIONS
         )
-        step_settings = options, stop_at_lift_off, "lanes"
+        gait_step_settings = options, stop_at_lift_off, "lanes"
         remaining_step_result = finish_gait_step(
-            phase_runner, params, phase_index, foot_distance, tuple(phase_state), *step_settings
+            phase_runner,
+            params,
+            phase_index,
+            foot_distance,
+            tuple(phase_state),
+            *gait_step_settings,
         )
         return eqx.partition(remaining_step_result, eqx.is_inexact_array)
 
-    trace_config = _StepTraceConfig(argument_structure, stop_at_lift_off, None)
-    trace_key = ("end of a step", phase_index, *trace_config.trace_key)
+    step_trace_config = _StepTraceConfig(argument_structure, stop_at_lift_off, None)
+    trace_key = ("end of a step", phase_index, *step_trace_config.trace_key)
     return unbatch(
-        compile_batch_function(compute_finish_outputs, trace_config.make_output_template, trace_key)
+        compile_batch_function(
+            compute_finish_outputs, step_trace_config.make_output_template, trace_key
+        )
     )
 
 
@@ -466,10 +491,10 @@ def build_step_sampler(
     The arguments of the function are the leaves of (params, x, options), whose pytree structure is
     `argument_structure`.
     """
-    trace_config = _StepTraceConfig(argument_structure, stop_at_lift_off, None)
+    step_trace_config = _StepTraceConfig(argument_structure, stop_at_lift_off, None)
 
     def sample_lane_steps(*argument_leaves: Array) -> Trajectory:
-        phase_sequence, tableau, options = trace_config.run_lane_phases(*argument_leaves)
+        phase_sequence, tableau, options = step_trace_config.run_lane_phases(*argument_leaves)
         phase_samples = [
             sample_batch_phase(
                 make_batch_phase(phase, False),
@@ -481,31 +506,31 @@ def build_step_sampler(
             )
             for phase, phase_start, phase_end in zip(
                 phase_sequence.phases,
-                phase_sequence.phase_starts,
-                phase_sequence.phase_ends,
+                phase_sequence.phase_start_states,
+                phase_sequence.phase_end_results,
                 strict=True,
             )
         ]
         return make_trajectory(phase_sequence, phase_samples)
 
     def make_trajectory_template(x: Array, *_: Array) -> Trajectory:
-        sample_array_maker = lambda *n: jnp.broadcast_to(x, (3, *n, *x.shape))
+        make_sample_array = lambda *n: jnp.broadcast_to(x, (3, *n, *x.shape))
         n = n_samples
         sample_arrays = (
-            sample_array_maker(n),
-            sample_array_maker(n, 6),
-            sample_array_maker(n, 4),
-            sample_array_maker(n, 3),
+            make_sample_array(n),
+            make_sample_array(n, 6),
+            make_sample_array(n, 4),
+            make_sample_array(n, 3),
         )
         return Trajectory(
-            *sample_arrays, sample_array_maker(), sample_array_maker(), jnp.zeros_like(x, jnp.int32)
+            *sample_arrays, make_sample_array(), make_sample_array(), jnp.zeros_like(x, jnp.int32)
         )
 
     return unbatch(
         compile_batch_function(
             sample_lane_steps,
             make_trajectory_template,
-            ("samples", *trace_config.trace_key, n_samples),
+            ("samples", *step_trace_config.trace_key, n_samples),
         )
     )
 
@@ -522,20 +547,20 @@ def build_step_jacobian(
     the float results, the float results, and all other results. The Jacobian is with respect to the
     leaves at `input_indices`.
     """
-    trace_config = _StepTraceConfig(argument_structure, stop_at_lift_off, friction)
+    step_trace_config = _StepTraceConfig(argument_structure, stop_at_lift_off, friction)
 
     def tighten_tolerances(*argument_leaves: Array) -> list[Array]:
         params, x, options = jax.tree.unflatten(argument_structure, argument_leaves)
         return jax.tree.leaves((params, x, options.with_derivative_tolerances()))
 
     def make_jacobian_template(*argument_leaves: Array) -> tuple:
-        float_outputs, other_outputs = trace_config.make_output_template(*argument_leaves)
-        return float_outputs, float_outputs, other_outputs
+        float_outputs, nonfloat_outputs = step_trace_config.make_output_template(*argument_leaves)
+        return float_outputs, float_outputs, nonfloat_outputs
 
     lane_jacobian_function = lambda *leaves: compute_jacobian_columns(
-        trace_config.compute_step_outputs, leaves, input_indices
+        step_trace_config.compute_step_outputs, leaves, input_indices
     )
-    trace_key = ("gait step with derivatives", *trace_config.trace_key, input_indices)
+    trace_key = ("gait step with derivatives", *step_trace_config.trace_key, input_indices)
     jacobian_functions_by_size = {
         n: unbatch(
             compile_batch_function(
@@ -553,13 +578,13 @@ def build_step_jacobian(
         jacobian_column_function = jacobian_functions_by_size[
             N_STEP_INPUTS + (n_jacobian_columns > N_STEP_INPUTS)
         ]
-        jacobian_columns, float_outputs, other_outputs = jacobian_column_function(
+        jacobian_columns, float_outputs, nonfloat_outputs = jacobian_column_function(
             *tighten_tolerances(*argument_leaves)
         )
         return (
             split_jacobian_by_leaf(jacobian_columns, argument_leaves, input_indices),
             float_outputs,
-        ), other_outputs
+        ), nonfloat_outputs
 
     return evaluate_step_jacobian
 
@@ -572,15 +597,19 @@ def split_jacobian_by_leaf(
     - `jacobian_columns`: Jacobian, whose leading axis runs over all entries of the selected leaves;
     - `input_indices`: indices of the selected leaves in `argument_leaves`.
     """
-    jacobian_by_leaf, first_column = [], 0
+    jacobian_by_leaf, first_column_index = [], 0
     for i in input_indices:
         leaf_shape = jnp.shape(argument_leaves[i])
-        column_range = slice(first_column, first_column + int(np.prod(leaf_shape)))
-        column_selector = lambda x, column_range=column_range, leaf_shape=leaf_shape: jnp.moveaxis(
-            x[column_range], 0, -1
-        ).reshape(*x.shape[1:], *leaf_shape)
-        jacobian_by_leaf.append(jax.tree.map(column_selector, jacobian_columns))
-        first_column = column_range.stop
+        jacobian_column_slice = slice(
+            first_column_index, first_column_index + int(np.prod(leaf_shape))
+        )
+        select_leaf_jacobian = (
+            lambda x, jacobian_column_slice=jacobian_column_slice, leaf_shape=leaf_shape: (
+                jnp.moveaxis(x[jacobian_column_slice], 0, -1).reshape(*x.shape[1:], *leaf_shape)
+            )
+        )
+        jacobian_by_leaf.append(jax.tree.map(select_leaf_jacobian, jacobian_columns))
+        first_column_index = jacobian_column_slice.stop
     return tuple(jacobian_by_leaf)
 
 
@@ -612,10 +641,10 @@ def compute_jacobian_columns(
     directional_derivative_function = lambda tangents: jax.jvp(
         evaluate_at_selected_leaves, selected_leaves, tangents, has_aux=True
     )
-    float_outputs, jacobian_columns, other_outputs = jax.vmap(
+    float_outputs, jacobian_columns, nonfloat_outputs = jax.vmap(
         directional_derivative_function, out_axes=(None, 0, None)
     )(_make_unit_tangents(selected_leaves))
-    return jacobian_columns, float_outputs, other_outputs
+    return jacobian_columns, float_outputs, nonfloat_outputs
 
 
 def _make_unit_tangents(selected_leaves: Sequence[Array]) -> list[Array]:
@@ -624,12 +653,14 @@ def _make_unit_tangents(selected_leaves: Sequence[Array]) -> list[Array]:
     The leading axis runs over the unit vectors. Each entry of a unit vector is a separate constant
     0 or 1, so that machine code omits products with 0.
     """
-    entries_per_leaf = [int(np.prod(selected_leaf.shape[:-1])) for selected_leaf in selected_leaves]
-    unit_vectors, leaf_tangents, n_previous_entries = np.eye(sum(entries_per_leaf)), [], 0
-    for selected_leaf, n_entries in zip(selected_leaves, entries_per_leaf, strict=True):
+    n_entries_by_leaf = [
+        int(np.prod(selected_leaf.shape[:-1])) for selected_leaf in selected_leaves
+    ]
+    unit_vectors, leaf_tangents, n_previous_entries = np.eye(sum(n_entries_by_leaf)), [], 0
+    for selected_leaf, n_leaf_entries in zip(selected_leaves, n_entries_by_leaf, strict=True):
         entry_tangents = [
             jnp.asarray(unit_vectors[:, i], selected_leaf.dtype)[:, None]
-            for i in range(n_previous_entries, n_previous_entries + n_entries)
+            for i in range(n_previous_entries, n_previous_entries + n_leaf_entries)
         ]
         lane_tangents = [
             jnp.broadcast_to(entry_tangent, (len(unit_vectors), selected_leaf.shape[-1]))
@@ -638,5 +669,5 @@ def _make_unit_tangents(selected_leaves: Sequence[Array]) -> list[Array]:
         leaf_tangents.append(
             lane_tangents[0] if selected_leaf.ndim == 1 else jnp.stack(lane_tangents, 1)
         )
-        n_previous_entries += n_entries
+        n_previous_entries += n_leaf_entries
     return leaf_tangents

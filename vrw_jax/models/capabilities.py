@@ -43,9 +43,9 @@ class ModelCapabilities:
     """Method of the gait search with this model; it determines the methods of branches and
     scans.
     """
-    accepted_commands: frozenset[str]
+    accepted_cli_commands: frozenset[str]
     """Commands that accept the model: "scan", "map", "tune", "branch" and "explore"."""
-    default_only_fields: tuple[str, ...] | None = None
+    fields_with_fixed_defaults: tuple[str, ...] | None = None
     """Fields that must have their default values for a measure requested to a tolerance. None means
     that the model does not support measures to a tolerance.
     """
@@ -53,7 +53,7 @@ class ModelCapabilities:
     """Method that `first_passage` uses with this model."""
     supports_uneven_ground: bool = True
     """Whether the slope may change from step to step of a walk."""
-    can_begin_within_step: bool = False
+    can_start_within_gait_step: bool = False
     """Whether the model implements `finish_step`, so that a step can be disturbed at any
     instant.
     """

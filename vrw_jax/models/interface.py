@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from vrw_jax.models.capabilities import ModelCapabilities
-from vrw_jax.models.step_inputs import SectionState, complete_line_slopes
+from vrw_jax.models.step_inputs import SectionState, complete_ground_line_slopes
 from vrw_jax.models.step_results import AdvanceResult
 from vrw_jax.numerics import Elementwise, StepOptions
 from vrw_jax.printing import format_quantity
@@ -187,7 +187,7 @@ class AbstractWheel(eqx.Module):
         - `foot_distance`: distance between the two feet in the double support of this step, m;
         - `phase_state`: (theta, L1, L2) and their rates, rad, m, rad/s, m/s.
 
-        Only models whose capabilities have `can_begin_within_step` implement this method.
+        Only models whose capabilities have `can_start_within_gait_step` implement this method.
         """
         raise NotImplementedError(f"{type(self).__name__} cannot begin within a step.")
 
@@ -202,7 +202,7 @@ class AbstractWheel(eqx.Module):
         """
         if jnp.ndim(params.slope) == 0 or not self.capabilities.supports_uneven_ground:
             return None
-        line_slopes = complete_line_slopes(params.slope, n_steps)
+        line_slopes = complete_ground_line_slopes(params.slope, n_steps)
         return (jnp.stack([line_slopes[:-1], line_slopes[1:]], axis=-1),)
 
     def with_step_ground(
@@ -219,7 +219,7 @@ class AbstractWheel(eqx.Module):
         """Return the number of entries of a section state."""
         return 3
 
-    def count_continuous_entries(self, params: WheelParams) -> int:
+    def count_continuous_section_entries(self, params: WheelParams) -> int:
         """Return the number of entries of a section state that vary continuously.
 
         These entries come first. The other entries are integer codes.

@@ -32,7 +32,7 @@ from vrw_jax.numerics import (
     StepOptions,
     Vector,
     compute_sine_cosine,
-    select_tree_leaves,
+    select_trees_by_condition,
 )
 from vrw_jax.wheel import (
     MAX_SI_VALUE,
@@ -45,7 +45,7 @@ from vrw_jax.wheel import (
     Symbols,
     WheelParams,
     dynamics,
-    make_phases,
+    make_paper_phases,
     replace_rest_outcome,
     transitions,
 )
@@ -64,11 +64,11 @@ class PhaseResult(NamedTuple):
     q: Vector
     v: Vector
     duration: Elementwise  # s
-    guard: Int[Array, "..."]  # index of the guard that ended the phase; -1 if none did
+    end_guard_index: Int[Array, "..."]  # index of the guard that ended the phase; -1 if none did
     is_timed_out: Bool[Array, "..."]
     n_solver_steps: Int[Array, "..."]  # attempted, accepted or not
     margin_minima: Array | None  # one minimum per margin on the leading axis, if recorded
-    engine_carry: Any = None  # data that the engine passes to the next phase
+    next_phase_inputs: Any = None  # data that the engine passes to the next phase
 
 
 PhaseRunner = Callable[[AbstractPhase, Vector, Vector, Array, PhaseResult | None], PhaseResult]
@@ -81,10 +81,10 @@ class PhaseSequenceResult(NamedTuple):
     """Starts and ends of all phases of a step, and the outcome of the step."""
 
     s: Symbols
-    opening_landing: Landing
+    step_start_landing: Landing
     phases: tuple[AbstractPhase, ...]
-    phase_starts: tuple[tuple[Vector, Vector], ...]
-    phase_ends: tuple[PhaseResult, ...]
+    phase_start_states: tuple[tuple[Vector, Vector], ...]
+    phase_end_results: tuple[PhaseResult, ...]
     has_phase_occurred: tuple[Bool[Array, "..."], ...]
     outcome: Int[Array, "..."]  # an Outcome
     next_line_tilt: Elementwise | None = None  # angle of the next line, rad; None on flat ground
@@ -112,13 +112,15 @@ def run_step_phases(
     s = params.symbols()
     landing_result = landing_function(s, *x)
     tilt_sine_cosine = () if next_line_tilt is None else compute_sine_cosine(next_line_tilt)
-    step_phases = make_phases(s, landing_result.foot_distance, stop_at_lift_off, tilt_sine_cosine)
+    step_phases = make_paper_phases(
+        s, landing_result.foot_distance, stop_at_lift_off, tilt_sine_cosine
+    )
     # A landing that releases the rear foot continues in SLS-I.
     is_double_support_active = is_valid_step & landing_result.is_rear_foot_planted
     remaining_phases = _run_remaining_phases(
         phase_runner,
         step_phases,
-        landing_result.theta_after,
+        landing_result.theta_after_landing,
         landing_result.motion_after,
         is_valid_step,
         is_double_support_active,
@@ -130,8 +132,8 @@ def run_step_phases(
 class _RemainingPhases(NamedTuple):
     """Starts and ends of the remaining phases of a step. See `PhaseSequenceResult`."""
 
-    phase_starts: tuple[tuple[Vector, Vector], ...]
-    phase_ends: tuple[PhaseResult, ...]
+    phase_start_states: tuple[tuple[Vector, Vector], ...]
+    phase_end_results: tuple[PhaseResult, ...]
     has_phase_occurred: tuple[Bool[Array, "..."], ...]
     outcome: Int[Array, "..."]
 
@@ -154,41 +156,48 @@ def _run_remaining_phases(
     step_outcome = jnp.where(
         is_valid_step, jnp.int32(Outcome.STEPPED), jnp.int32(Outcome.BAD_INPUT)
     )
-    phase_starts, has_phase_occurred = [], []
-    phase_ends: list[PhaseResult] = []
+    phase_start_states, has_phase_occurred = [], []
+    phase_end_results: list[PhaseResult] = []
     for previous_phase, phase in zip((None, *remaining_phases), remaining_phases, strict=False):
         if previous_phase is not None:
             end_state = (
-                phase_ends[-1].q[0],
-                previous_phase.compute_motion(phase_ends[-1].q, phase_ends[-1].v),
+                phase_end_results[-1].q[0],
+                previous_phase.compute_motion(phase_end_results[-1].q, phase_end_results[-1].v),
             )
-            wheel_angle, wheel_motion = select_tree_leaves(
+            wheel_angle, wheel_motion = select_trees_by_condition(
                 is_phase_active, end_state, (wheel_angle, wheel_motion)
             )
             is_phase_active = step_outcome == Outcome.STEPPED
-            fallback_theta, *fallback_lengths_and_rates = (
+            fallback_theta, *fallback_single_support_lengths_and_rates = (
                 jnp.asarray(state_component, jnp.result_type(wheel_angle))
                 for state_component in FALLBACK_SINGLE_SUPPORT_STATE
             )
             replaced_state = (
                 fallback_theta,
-                Motion(*compute_sine_cosine(fallback_theta), *fallback_lengths_and_rates),
+                Motion(
+                    *compute_sine_cosine(fallback_theta), *fallback_single_support_lengths_and_rates
+                ),
             )
-            wheel_angle, wheel_motion = select_tree_leaves(
+            wheel_angle, wheel_motion = select_trees_by_condition(
                 is_phase_active, (wheel_angle, wheel_motion), replaced_state
             )
             wheel_motion = previous_phase.reset_motion(wheel_motion)
-        start_state = phase.select_coordinates(wheel_angle, wheel_motion)
+        start_state = phase.select_phase_coordinates(wheel_angle, wheel_motion)
         phase_end = phase_runner(
-            phase, *start_state, is_phase_active, phase_ends[-1] if phase_ends else None
+            phase,
+            *start_state,
+            is_phase_active,
+            phase_end_results[-1] if phase_end_results else None,
         )
-        phase_outcome = phase.select_guard_outcome(phase_end.guard, phase_end.is_timed_out)
+        phase_outcome = phase.select_guard_outcome(
+            phase_end.end_guard_index, phase_end.is_timed_out
+        )
         if phase.can_come_to_rest:
             is_at_rest = phase.is_at_rest(phase_end.q, phase_end.v, options.atol)
             phase_outcome = replace_rest_outcome(phase_outcome, is_at_rest)
         step_outcome = jnp.where(is_phase_active, phase_outcome, step_outcome)
-        phase_starts.append(start_state)
-        phase_ends.append(phase_end)
+        phase_start_states.append(start_state)
+        phase_end_results.append(phase_end)
         # The start of the last phase is itself an event: Leg 2 hits its stopper.
         has_phase_occurred.append(
             is_phase_active
@@ -196,7 +205,7 @@ def _run_remaining_phases(
             else is_phase_active & (phase_end.duration > 0.0)
         )
     return _RemainingPhases(
-        tuple(phase_starts), tuple(phase_ends), tuple(has_phase_occurred), step_outcome
+        tuple(phase_start_states), tuple(phase_end_results), tuple(has_phase_occurred), step_outcome
     )
 
 
@@ -220,16 +229,18 @@ def finish_gait_step(
     - `engine`: name of the engine, which the result reports.
     """
     are_inputs_bounded = [
-        jnp.abs(input_value) < MAX_SI_VALUE for input_value in (*phase_state, foot_distance)
+        jnp.abs(input_array) < MAX_SI_VALUE for input_array in (*phase_state, foot_distance)
     ]
     is_valid_state = params.is_in_domain() & functools.reduce(operator.and_, are_inputs_bounded)
     is_valid_state = is_valid_state & (jnp.abs(phase_state[0]) < 0.5 * jnp.pi)
-    params, (wheel_angle, *lengths_and_rates) = replace_invalid_inputs(
+    params, (wheel_angle, *single_support_lengths_and_rates) = replace_invalid_inputs(
         is_valid_state, params, phase_state, FALLBACK_SINGLE_SUPPORT_STATE
     )
-    remaining_phases = make_phases(params.symbols(), foot_distance, stop_at_lift_off)[phase_index:]
-    wheel_motion = Motion.from_angle(wheel_angle, *lengths_and_rates)
-    remaining_results = _run_remaining_phases(
+    remaining_phases = make_paper_phases(params.symbols(), foot_distance, stop_at_lift_off)[
+        phase_index:
+    ]
+    wheel_motion = Motion.from_angle(wheel_angle, *single_support_lengths_and_rates)
+    remaining_phase_results = _run_remaining_phases(
         phase_runner,
         remaining_phases,
         wheel_angle,
@@ -238,20 +249,20 @@ def finish_gait_step(
         is_valid_state,
         options,
     )
-    phase_ends, has_stepped = (
-        remaining_results.phase_ends,
-        remaining_results.outcome == Outcome.STEPPED,
+    phase_end_results, has_stepped = (
+        remaining_phase_results.phase_end_results,
+        remaining_phase_results.outcome == Outcome.STEPPED,
     )
-    section_state = phase_ends[-1].q[0], *phase_ends[-1].v
+    section_state = phase_end_results[-1].q[0], *phase_end_results[-1].v
     phase_durations = [jnp.zeros_like(wheel_angle)] * phase_index + [
-        phase_end.duration for phase_end in phase_ends
+        phase_end.duration for phase_end in phase_end_results
     ]
     return AdvanceResult(
         section_state=jnp.stack([jnp.where(has_stepped, x, 0.0) for x in section_state]),
         durations=jnp.stack(phase_durations),
-        outcome=remaining_results.outcome,
+        outcome=remaining_phase_results.outcome,
         solver_steps=functools.reduce(
-            operator.add, [phase_end.n_solver_steps for phase_end in phase_ends]
+            operator.add, [phase_end.n_solver_steps for phase_end in phase_end_results]
         ),
         engine=engine,
     )
@@ -263,8 +274,8 @@ def select_next_section_state(phase_sequence: PhaseSequenceResult) -> Vector:
     The angle theta- is measured in the frame of the line of the ground at the next landing.
     """
     touchdown_angle, touchdown_rates = (
-        phase_sequence.phase_ends[2].q[0],
-        phase_sequence.phase_ends[2].v,
+        phase_sequence.phase_end_results[2].q[0],
+        phase_sequence.phase_end_results[2].v,
     )
     return (
         touchdown_angle
@@ -281,10 +292,10 @@ def make_advance_result(phase_sequence: PhaseSequenceResult, engine: str) -> Adv
     """
     theta, dtheta, dL1 = select_next_section_state(phase_sequence)
     has_stepped = phase_sequence.outcome == Outcome.STEPPED
-    solver_steps = [phase_end.n_solver_steps for phase_end in phase_sequence.phase_ends]
+    solver_steps = [phase_end.n_solver_steps for phase_end in phase_sequence.phase_end_results]
     return AdvanceResult(
         section_state=jnp.stack([jnp.where(has_stepped, x, 0.0) for x in (theta, dtheta, dL1)]),
-        durations=jnp.stack([phase_end.duration for phase_end in phase_sequence.phase_ends]),
+        durations=jnp.stack([phase_end.duration for phase_end in phase_sequence.phase_end_results]),
         outcome=phase_sequence.outcome,
         solver_steps=solver_steps[0] + solver_steps[1] + solver_steps[2],
         engine=engine,
@@ -300,33 +311,36 @@ def make_step_result(
 
     - `friction`: friction coefficient of the ground, for the friction margins.
     """
-    s, landing_result, phase_ends = (
+    s, landing_result, phase_end_results = (
         phase_sequence.s,
-        phase_sequence.opening_landing,
-        phase_sequence.phase_ends,
+        phase_sequence.step_start_landing,
+        phase_sequence.phase_end_results,
     )
     has_step_begun = phase_sequence.outcome != Outcome.BAD_INPUT
     has_stopper_collision, has_stepped = (
         phase_sequence.has_phase_occurred[2],
         phase_sequence.outcome == Outcome.STEPPED,
     )
-    dls_phase, sls1_phase, sls2_phase = make_phases(
+    dls_phase, sls1_phase, sls2_phase = make_paper_phases(
         s, landing_result.foot_distance, stop_at_lift_off=True
     )
-    liftoff_motion = dls_phase.compute_motion(phase_ends[0].q, phase_ends[0].v)
-    stopper_state = [
+    liftoff_motion = dls_phase.compute_motion(phase_end_results[0].q, phase_end_results[0].v)
+    state_before_stopper = [
         jnp.where(has_stopper_collision, x, jnp.asarray(fallback_value, x.dtype))
         for x, fallback_value in zip(
-            (*phase_ends[1].q, *phase_ends[1].v), FALLBACK_SINGLE_SUPPORT_STATE, strict=True
+            (*phase_end_results[1].q, *phase_end_results[1].v),
+            FALLBACK_SINGLE_SUPPORT_STATE,
+            strict=True,
         )
     ]
     stopper_collision = transitions.resolve_stopper_collision(
-        s, sls1_phase.compute_motion(tuple(stopper_state[:3]), tuple(stopper_state[3:]))
+        s,
+        sls1_phase.compute_motion(tuple(state_before_stopper[:3]), tuple(state_before_stopper[3:])),
     )
-    last_motion = sls2_phase.compute_motion(phase_ends[2].q, phase_ends[2].v)
+    motion_at_step_end = sls2_phase.compute_motion(phase_end_results[2].q, phase_end_results[2].v)
     initial_energy, final_energy = (
         dynamics.compute_mechanical_energy(s, m).total_energy
-        for m in (landing_result.motion_after, last_motion)
+        for m in (landing_result.motion_after, motion_at_step_end)
     )
     fore_force, rear_force = transitions.compute_landing_forces(s, landing_result)
     advance_result = make_advance_result(phase_sequence, engine)
@@ -335,7 +349,7 @@ def make_step_result(
         post_impact=jnp.stack(
             [
                 jnp.where(has_step_begun, x, 0.0)
-                for x in (landing_result.theta_after, landing_result.motion_after.dtheta)
+                for x in (landing_result.theta_after_landing, landing_result.motion_after.dtheta)
             ]
         ),
         durations=advance_result.durations,
@@ -431,7 +445,7 @@ def _make_step_margins(
     """
     s, landing_result, has_phase_occurred = (
         phase_sequence.s,
-        phase_sequence.opening_landing,
+        phase_sequence.step_start_landing,
         phase_sequence.has_phase_occurred,
     )
     has_step_begun, has_stopper_collision = (
@@ -440,11 +454,12 @@ def _make_step_margins(
     )
     recorded_minima = [
         phase_end.margin_minima
-        for phase_end in phase_sequence.phase_ends
+        for phase_end in phase_sequence.phase_end_results
         if phase_end.margin_minima is not None
     ]
     phase_minima = [
-        PhaseMargins.from_values(tuple(phase_margins), s.n) for phase_margins in recorded_minima
+        PhaseMargins.from_margin_values(tuple(phase_margins), s.n)
+        for phase_margins in recorded_minima
     ]
 
     def find_lowest_margin(margin_name: str, *phase_indices: int) -> Array:

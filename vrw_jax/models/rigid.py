@@ -26,7 +26,7 @@ from vrw_jax.models.step_results import (
     StepResult,
     Trajectory,
 )
-from vrw_jax.numerics import Elementwise, StepOptions, select_tree_leaves
+from vrw_jax.numerics import Elementwise, StepOptions, select_trees_by_condition
 from vrw_jax.validation import check_bool
 from vrw_jax.wheel import (
     PARAMETER_NAMES,
@@ -92,9 +92,9 @@ class RigidWheel(AbstractWheel):
     capabilities: ClassVar[ModelCapabilities] = ModelCapabilities(
         config_name="rigid",
         gait_method=GaitMethod.RETURN_MAP,
-        accepted_commands=frozenset({"branch", "explore"}),
+        accepted_cli_commands=frozenset({"branch", "explore"}),
         passage_method=PassageMethod.QUADRATURE,
-        can_begin_within_step=True,
+        can_start_within_gait_step=True,
     )
     parameter_names: ClassVar[tuple[str, ...]] = PARAMETER_NAMES
     reports_contacts: ClassVar[bool] = False
@@ -189,7 +189,7 @@ class RigidWheel(AbstractWheel):
         fallback_rolling_motion = RollingMotion(
             s, params.slope, jnp.where(has_passed_apex, rate_after, 10.0)
         )
-        end_rate, rolling_duration = (
+        final_angular_rate, rolling_duration = (
             jnp.sqrt(fallback_rolling_motion.compute_squared_rate(end_angle)),
             fallback_rolling_motion.compute_time_to_angle(end_angle),
         )
@@ -206,7 +206,7 @@ class RigidWheel(AbstractWheel):
         )
         return StepResult(
             section_state=zero_unless_stepped(
-                jnp.stack([half_angle + zero_like_rate, end_rate, zero_like_rate])
+                jnp.stack([half_angle + zero_like_rate, final_angular_rate, zero_like_rate])
             ),
             post_impact=zero_invalid_steps(jnp.stack([-half_angle + zero_like_rate, rate_after])),
             durations=zero_unless_stepped(
@@ -266,7 +266,9 @@ class RigidWheel(AbstractWheel):
         """
         wheel_angle, angular_rate = phase_state[0], phase_state[3]
         s, half_angle = params.symbols(), jnp.asarray(0.5 * params.leg_angle, wheel_angle.dtype)
-        rolling_motion = RollingMotion(s, params.slope, angular_rate, given_first_angle=wheel_angle)
+        rolling_motion = RollingMotion(
+            s, params.slope, angular_rate, explicit_first_angle=wheel_angle
+        )
         apex_angle = jnp.maximum(wheel_angle, -params.slope)
         has_passed_apex = (angular_rate > 0.0) & (
             rolling_motion.compute_squared_rate(apex_angle) > 0.0
@@ -285,10 +287,12 @@ class RigidWheel(AbstractWheel):
         has_stepped, zero_like_angle = step_outcome == Outcome.STEPPED, jnp.zeros_like(angular_rate)
         fallback_rate = jnp.where(has_stepped, angular_rate, 10.0)
         fallback_rolling_motion = RollingMotion(
-            s, params.slope, fallback_rate, given_first_angle=wheel_angle
+            s, params.slope, fallback_rate, explicit_first_angle=wheel_angle
         )
-        end_rate = jnp.sqrt(fallback_rolling_motion.compute_squared_rate(half_angle))
-        section_state = jnp.stack([half_angle + zero_like_angle, end_rate, zero_like_angle])
+        final_angular_rate = jnp.sqrt(fallback_rolling_motion.compute_squared_rate(half_angle))
+        section_state = jnp.stack(
+            [half_angle + zero_like_angle, final_angular_rate, zero_like_angle]
+        )
         phase_durations = jnp.stack(
             [
                 zero_like_angle,
@@ -362,8 +366,8 @@ class RigidWheel(AbstractWheel):
         sampled_angles = jnp.stack([start_angles, start_angles, rolling_angles])
 
         sampled_states, foot_forces, sampled_energies = (
-            jnp.moveaxis(sample_rows, 0, -1)
-            for sample_rows in rolling_motion.evaluate_states_at_angles(sampled_angles)
+            jnp.moveaxis(sampled_quantity, 0, -1)
+            for sampled_quantity in rolling_motion.evaluate_states_at_angles(sampled_angles)
         )
         end_state = step_result.section_state, step_result.durations, step_result.outcome
         return Trajectory(
@@ -381,7 +385,7 @@ class VerticalRateMap(NamedTuple):
     The map is x' = r (x + G (1 - cos(h + slope))) - G (1 - cos(h - slope)). The slope is that of
     the next line of the ground, and x is the squared rate with the stance leg vertical, 1/s^2. The
     wheel falls back if x' < 0, for a slope below h. As a function of the slope, x' = offset(x) +
-    amplitude cos(slope - slope_of_maximum).
+    amplitude cos(slope - slope_of_largest_squared_rate).
     """
 
     retained_squared_rate_fraction: (
@@ -399,7 +403,7 @@ class VerticalRateMap(NamedTuple):
         return (1.0 - r) * jnp.cos(h), (1.0 + r) * jnp.sin(h)
 
     @property
-    def slope_of_maximum(self) -> Elementwise:
+    def slope_of_largest_squared_rate(self) -> Elementwise:
         """Return the slope at which x' is largest, rad. At smaller slopes, x' increases with the
         slope.
         """
@@ -407,14 +411,14 @@ class VerticalRateMap(NamedTuple):
         return jnp.arctan2(sine_coefficient, cosine_coefficient)
 
     @property
-    def slope_amplitude(self) -> Elementwise:
+    def squared_rate_amplitude(self) -> Elementwise:
         """Return the amplitude of x' as a function of the slope, 1/s^2."""
         cosine_coefficient, sine_coefficient = self._cosine_and_sine_coefficients
         return self.doubled_gravity_stiffness * jnp.sqrt(
             cosine_coefficient**2 + sine_coefficient**2
         )
 
-    def compute_slope_independent_part(self, x: Elementwise) -> Elementwise:
+    def compute_slope_independent_squared_rate(self, x: Elementwise) -> Elementwise:
         """Return the part of x' that does not depend on the slope, 1/s^2."""
         return self.retained_squared_rate_fraction * x - self.doubled_gravity_stiffness * (
             1.0 - self.retained_squared_rate_fraction
@@ -425,9 +429,11 @@ class VerticalRateMap(NamedTuple):
 
         - `slope`: slope of the ground, rad.
         """
-        periodic_part = self.slope_amplitude * jnp.cos(slope - self.slope_of_maximum)
+        slope_dependent_squared_rate = self.squared_rate_amplitude * jnp.cos(
+            slope - self.slope_of_largest_squared_rate
+        )
         return (
-            periodic_part / (1.0 - self.retained_squared_rate_fraction)
+            slope_dependent_squared_rate / (1.0 - self.retained_squared_rate_fraction)
             - self.doubled_gravity_stiffness
         )
 
@@ -442,15 +448,15 @@ class RollingMotion(eqx.Module):
     initial_rate: Elementwise  # at the first angle, rad/s
     end_angle: Elementwise | None = None
     """Angle theta at the next landing, rad; None means alpha/2, as on flat ground."""
-    given_first_angle: Elementwise | None = None
+    explicit_first_angle: Elementwise | None = None
     """First angle theta, rad; None means -alpha/2, as just after a landing."""
 
     @property
     def first_angle(self) -> Elementwise | float:
         """Return the first angle theta, rad."""
-        if self.given_first_angle is None:
+        if self.explicit_first_angle is None:
             return -0.5 * self.s.alpha
-        return self.given_first_angle
+        return self.explicit_first_angle
 
     def compute_squared_rate(self, theta: Elementwise) -> Elementwise:
         """Return the square of dtheta at the angle theta, rad^2/s^2.
@@ -612,11 +618,11 @@ class RollingMotion(eqx.Module):
         )
 
         def zoom_to_minima(
-            round_index: Array, centers_and_half_width: tuple[Array, Array]
+            zoom_round_index: Array, bracket_centers_and_half_width: tuple[Array, Array]
         ) -> tuple[Array, Array]:
-            bracket_centers, half_bracket_width = centers_and_half_width
+            bracket_centers, half_bracket_width = bracket_centers_and_half_width
 
-            def compare_with_lowest(
+            def update_lowest_margins(
                 i: Array, lowest_angles_and_margins: tuple[Array, Array]
             ) -> tuple[Array, Array]:
                 angle_offset = half_bracket_width * (
@@ -624,7 +630,7 @@ class RollingMotion(eqx.Module):
                 )
                 candidate_angles = jnp.clip(bracket_centers + angle_offset, -half_angle, end_angle)
                 candidate_margins = self.evaluate_margins_at_angles(candidate_angles)
-                return select_tree_leaves(
+                return select_trees_by_condition(
                     candidate_margins < lowest_angles_and_margins[1],
                     (candidate_angles, candidate_margins),
                     lowest_angles_and_margins,
@@ -634,7 +640,7 @@ class RollingMotion(eqx.Module):
             minimum_angles, _ = lax.fori_loop(
                 0,
                 search_options.n_angles_per_zoom_round,
-                compare_with_lowest,
+                update_lowest_margins,
                 initial_angles_and_margins,
             )
             return minimum_angles, half_bracket_width * (
@@ -675,8 +681,8 @@ def _compute_cos_theta_plus_phi(s: Symbols, theta: Elementwise | float) -> Eleme
 
 
 def _compute_rolling_time(
-    begin_angle_squared: Elementwise,
-    end_angle_squared: Elementwise,
+    first_half_angle_squared: Elementwise,
+    last_half_angle_squared: Elementwise,
     min_rate_squared: Elementwise,
     kappa: Elementwise,
 ) -> Elementwise:
@@ -686,16 +692,18 @@ def _compute_rolling_time(
     the integral of dt / sqrt(t (1 - t) (min_rate_squared + 2 kappa t)). Its closed form is 2 R_F
     (DLMF 19.29.4). The result is 0 if the two half-angles are equal.
     """
-    has_nonzero_range = end_angle_squared > begin_angle_squared
-    lower_angle_squared = jnp.where(has_nonzero_range, begin_angle_squared, 0.0)
-    upper_angle_squared = jnp.where(has_nonzero_range, end_angle_squared, 1.0)
-    has_nonzero_lower_end = lower_angle_squared > 0.0  # The square root has no derivative at 0.
+    has_nonzero_range = last_half_angle_squared > first_half_angle_squared
+    smaller_half_angle_squared = jnp.where(has_nonzero_range, first_half_angle_squared, 0.0)
+    larger_half_angle_squared = jnp.where(has_nonzero_range, last_half_angle_squared, 1.0)
+    has_nonzero_lower_end = (
+        smaller_half_angle_squared > 0.0
+    )  # The square root has no derivative at 0.
     smaller_half_angle = jnp.where(
         has_nonzero_lower_end,
-        jnp.sqrt(jnp.where(has_nonzero_lower_end, lower_angle_squared, 1.0)),
+        jnp.sqrt(jnp.where(has_nonzero_lower_end, smaller_half_angle_squared, 1.0)),
         0.0,
     )
-    larger_half_angle = jnp.sqrt(upper_angle_squared)
+    larger_half_angle = jnp.sqrt(larger_half_angle_squared)
     y1, y2 = jnp.sin(smaller_half_angle), jnp.cos(smaller_half_angle)
     x1, x2 = jnp.sin(larger_half_angle), jnp.cos(larger_half_angle)
     y3 = jnp.sqrt(jnp.maximum(min_rate_squared + 2.0 * kappa * y1**2, 1e-300))
@@ -715,19 +723,19 @@ def evaluate_carlson_rf(x: Elementwise, y: Elementwise, z: Elementwise) -> Eleme
     within ten decades of each other.
     """
 
-    def duplicate_arguments(
+    def apply_duplication_step(
         _: object, xyz: tuple[Array, Array, Array]
     ) -> tuple[Array, Array, Array]:
         x, y, z = xyz
         sqrt_x, sqrt_y, sqrt_z = jnp.sqrt(x), jnp.sqrt(y), jnp.sqrt(z)
-        argument_shift = sqrt_x * sqrt_y + sqrt_y * sqrt_z + sqrt_z * sqrt_x
+        duplication_shift = sqrt_x * sqrt_y + sqrt_y * sqrt_z + sqrt_z * sqrt_x
         return (
-            0.25 * (x + argument_shift),
-            0.25 * (y + argument_shift),
-            0.25 * (z + argument_shift),
+            0.25 * (x + duplication_shift),
+            0.25 * (y + duplication_shift),
+            0.25 * (z + duplication_shift),
         )
 
-    x, y, z = lax.fori_loop(0, 12, duplicate_arguments, (x, y, z))
+    x, y, z = lax.fori_loop(0, 12, apply_duplication_step, (x, y, z))
     mean_argument = (x + y + z) / 3.0
     dx, dy = 1.0 - x / mean_argument, 1.0 - y / mean_argument
     dz = -dx - dy

@@ -64,15 +64,15 @@ def replace_invalid_inputs(
     NaN in the step and its derivatives.
     """
     return jax.tree.map(
-        lambda given_value, safe_value: jnp.where(
-            is_valid_start, given_value, jnp.asarray(safe_value, given_value.dtype)
+        lambda given_value, valid_input_value: jnp.where(
+            is_valid_start, given_value, jnp.asarray(valid_input_value, given_value.dtype)
         ),
         (params, x),
         (type(params)(n_legs=params.n_legs), fallback_state),
     )
 
 
-def complete_line_slopes(slope: Array, n_steps: int) -> Array:
+def complete_ground_line_slopes(slope: Array, n_steps: int) -> Array:
     """Return the slopes of the n + 1 lines of the ground under a walk of n steps, rad.
 
     If `slope` has n entries, the last slope is repeated.
@@ -108,7 +108,7 @@ def separate_next_slope(params: WheelParams) -> tuple[WheelParams, Elementwise |
 
 def is_slope_in_domain(slope: Elementwise) -> Array:
     """Return whether a slope (rad) lies in the allowed domain. NaN gives False."""
-    return jnp.asarray(PARAMETER_DOMAINS["slope"].contains_value(slope))
+    return jnp.asarray(PARAMETER_DOMAINS["slope"].contains_parameter_value(slope))
 
 
 def select_stance_line_and_tilt(

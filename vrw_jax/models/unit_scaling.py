@@ -21,7 +21,7 @@ from vrw_jax.wheel import PARAMETER_DOMAINS, PARAMETER_NAMES, UNIT_POWERS
 
 _SECTION_STATE_UNITS = ("rad", "rad/s", "m/s")
 _STEP_INPUT_UNITS = (
-    *(domain.unit for domain in PARAMETER_DOMAINS.values()),
+    *(parameter_domain.unit for parameter_domain in PARAMETER_DOMAINS.values()),
     *_SECTION_STATE_UNITS,
     "rad",
 )
@@ -33,8 +33,11 @@ class UnitScalingPowers(NamedTuple):
     step_input_powers: tuple[int, ...]  # exponents for parameters, start, slope of the next line
     step_output_powers: tuple[int, ...]  # exponents for section state and durations
 
-    def subtract_known_columns(
-        self, scaled_output: Array, step_inputs: Sequence[Array], known_columns: Mapping[int, Array]
+    def subtract_known_jacobian_columns(
+        self,
+        scaled_output: Array,
+        step_inputs: Sequence[Array],
+        known_jacobian_columns: Mapping[int, Array],
     ) -> Array:
         """Subtract the contribution of each known Jacobian column from the sum in Euler's theorem.
 
@@ -42,10 +45,11 @@ class UnitScalingPowers(NamedTuple):
         of a column is the column times its input and the exponent of the unit in that input. By
         Euler's theorem, the result is the sum of the contributions of the unknown columns.
         """
-        for i, known_column in known_columns.items():
+        for i, known_jacobian_column in known_jacobian_columns.items():
             if self.step_input_powers[i]:
                 scaled_output = (
-                    scaled_output - (self.step_input_powers[i] * step_inputs[i]) * known_column
+                    scaled_output
+                    - (self.step_input_powers[i] * step_inputs[i]) * known_jacobian_column
                 )
         return scaled_output
 
@@ -70,26 +74,26 @@ Gravity comes first, because its unit contains a length.
 
 def complete_jacobian_by_scaling(
     step_inputs: Sequence[Array],
-    known_columns: Mapping[int, Array],
+    known_jacobian_columns: Mapping[int, Array],
     scaled_outputs: Mapping[int, Array],
 ) -> dict[int, Array]:
     """Return all columns of a Jacobian, by the index of the input.
 
     Euler's theorem determines the columns of `UNIT_SCALING_BY_PARAMETER_INDEX`.
 
-    - `known_columns`: all other columns, by the index of the input;
+    - `known_jacobian_columns`: all other columns, by the index of the input;
     - `scaled_outputs`: outputs times the exponents of a unit, by the index of the parameter whose
       column the unit determines.
     """
-    known_columns = dict(known_columns)
+    known_jacobian_columns = dict(known_jacobian_columns)
     for parameter_index, unit_scaling in UNIT_SCALING_BY_PARAMETER_INDEX.items():
-        unknown_column_product = unit_scaling.subtract_known_columns(
-            scaled_outputs[parameter_index], step_inputs, known_columns
+        unknown_column_product = unit_scaling.subtract_known_jacobian_columns(
+            scaled_outputs[parameter_index], step_inputs, known_jacobian_columns
         )
-        known_columns[parameter_index] = unknown_column_product / (
+        known_jacobian_columns[parameter_index] = unknown_column_product / (
             unit_scaling.step_input_powers[parameter_index] * step_inputs[parameter_index]
         )
-    return known_columns
+    return known_jacobian_columns
 
 
 def complete_jacobian_columns(
@@ -108,14 +112,20 @@ def complete_jacobian_columns(
     computed_indices = [
         i for i in range(len(step_inputs)) if i not in UNIT_SCALING_BY_PARAMETER_INDEX
     ]
-    computed_columns, step_outputs, other_outputs = compute_jacobian_columns(
+    computed_jacobian_columns, step_outputs, nonfloat_outputs = compute_jacobian_columns(
         batch_function, step_inputs, computed_indices
     )
     scaled_outputs = {
         i: jnp.asarray(unit_scaling.step_output_powers, step_outputs.dtype)[:, None] * step_outputs
         for i, unit_scaling in UNIT_SCALING_BY_PARAMETER_INDEX.items()
     }
-    columns_by_input = complete_jacobian_by_scaling(
-        step_inputs, dict(zip(computed_indices, computed_columns, strict=True)), scaled_outputs
+    jacobian_columns_by_input = complete_jacobian_by_scaling(
+        step_inputs,
+        dict(zip(computed_indices, computed_jacobian_columns, strict=True)),
+        scaled_outputs,
     )
-    return jnp.stack([columns_by_input[i] for i in input_indices]), step_outputs, other_outputs
+    return (
+        jnp.stack([jacobian_columns_by_input[i] for i in input_indices]),
+        step_outputs,
+        nonfloat_outputs,
+    )

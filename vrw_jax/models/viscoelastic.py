@@ -14,11 +14,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from vrw_jax.hybrid import (
-    MonitoredFunctions,
+    GuardsAndMargins,
     StateArray,
     VectorField,
-    integrate_in_units,
-    sample_in_units,
+    integrate_phase_in_scaled_units,
+    sample_phase_in_scaled_units,
 )
 from vrw_jax.models.batch_step import (
     build_step_finisher,
@@ -61,7 +61,7 @@ class DiffraxPhaseFunctions(NamedTuple):
 
     motion_unpacker: Callable[[StateArray], Motion]
     vector_field: VectorField
-    guards: MonitoredFunctions
+    guards: GuardsAndMargins
 
 
 def make_diffrax_phase(phase: AbstractPhase, records_margins: bool) -> DiffraxPhaseFunctions:
@@ -88,11 +88,11 @@ def make_diffrax_phase(phase: AbstractPhase, records_margins: bool) -> DiffraxPh
             ]
         )
 
-    is_margin_counted = phase.margins_counted_at_start if records_margins else ()
+    is_margin_counted = phase.are_margins_counted_at_start if records_margins else ()
     return DiffraxPhaseFunctions(
         unpack_motion,
         evaluate_vector_field,
-        MonitoredFunctions(
+        GuardsAndMargins(
             evaluate_guards_and_margins, len(phase.all_guard_outcomes), is_margin_counted
         ),
     )
@@ -119,8 +119,8 @@ class ViscoelasticWheel(AbstractWheel):
     capabilities: ClassVar[ModelCapabilities] = ModelCapabilities(
         config_name="viscoelastic",
         gait_method=GaitMethod.COLLOCATION,
-        accepted_commands=frozenset({"scan", "map", "tune", "branch", "explore"}),
-        can_begin_within_step=True,
+        accepted_cli_commands=frozenset({"scan", "map", "tune", "branch", "explore"}),
+        can_start_within_gait_step=True,
     )
     parameter_names: ClassVar[tuple[str, ...]] = PARAMETER_NAMES
     reports_contacts: ClassVar[bool] = False
@@ -178,8 +178,8 @@ class ViscoelasticWheel(AbstractWheel):
         )
         for phase, phase_start, phase_end in zip(
             phase_sequence.phases,
-            phase_sequence.phase_starts,
-            phase_sequence.phase_ends,
+            phase_sequence.phase_start_states,
+            phase_sequence.phase_end_results,
             strict=True,
         ):
             vector_field = make_diffrax_phase(phase, records_margins=False).vector_field
@@ -189,7 +189,7 @@ class ViscoelasticWheel(AbstractWheel):
                 compute_wheel_units(phase.s).time_unit,
             )
             phase_samples.append(
-                sample_in_units(
+                sample_phase_in_scaled_units(
                     vector_field,
                     start_vector,
                     phase_end.duration,
@@ -224,9 +224,14 @@ class ViscoelasticWheel(AbstractWheel):
             )
             return eqx.combine(*step_finisher(*argument_leaves))
         phase_runner = _make_diffrax_phase_runner(options, records_margins=False)
-        step_settings = options, self.stop_at_lift_off, "diffrax"
+        gait_step_settings = options, self.stop_at_lift_off, "diffrax"
         return finish_gait_step(
-            phase_runner, params, phase_index, foot_distance, tuple(phase_state), *step_settings
+            phase_runner,
+            params,
+            phase_index,
+            foot_distance,
+            tuple(phase_state),
+            *gait_step_settings,
         )
 
 
@@ -237,7 +242,7 @@ def _make_diffrax_phase_runner(options: StepOptions, records_margins: bool) -> P
         phase: AbstractPhase, q: Vector, v: Vector, is_phase_active: Array, _: PhaseResult | None
     ) -> PhaseResult:
         diffrax_phase = make_diffrax_phase(phase, records_margins)
-        phase_end = integrate_in_units(
+        phase_end = integrate_phase_in_scaled_units(
             diffrax_phase.vector_field,
             diffrax_phase.guards,
             jnp.stack([*q, *v]),
@@ -251,7 +256,7 @@ def _make_diffrax_phase_runner(options: StepOptions, records_margins: bool) -> P
             end_state[: phase.n_dof],
             end_state[phase.n_dof :],
             phase_end.duration,
-            phase_end.guard,
+            phase_end.end_guard_index,
             phase_end.is_timed_out,
             phase_end.solver_steps,
             phase_end.margin_minima if records_margins else None,
@@ -275,7 +280,7 @@ def _compile_step_function(
     )[2]
     engine_name = "lanes" if can_use_batch_kernel(options_without_numbers) else "diffrax"
 
-    def compute_with_diffrax(has_tight_tolerances: bool, *argument_leaves: Array) -> tuple:
+    def compute_step_with_diffrax(has_tight_tolerances: bool, *argument_leaves: Array) -> tuple:
         """Compute a step with diffrax and return its results, split into float arrays and other
         arrays.
 
@@ -293,18 +298,18 @@ def _compile_step_function(
         return eqx.partition(step_result, eqx.is_inexact_array)
 
     diffrax_step_function, tight_diffrax_step_function = (
-        functools.partial(compute_with_diffrax, has_tight_tolerances)
+        functools.partial(compute_step_with_diffrax, has_tight_tolerances)
         for has_tight_tolerances in (False, True)
     )
     if engine_name == "diffrax":
         return enable_all_ad_modes(diffrax_step_function, tight_diffrax_step_function)
-    trace_config = (
+    step_trace_config = (
         argument_structure,
         model.stop_at_lift_off,
         model.friction if records_margins else None,
     )
     return enable_all_ad_modes(
-        build_step_function(*trace_config),
+        build_step_function(*step_trace_config),
         tight_diffrax_step_function,
-        functools.partial(build_step_jacobian, *trace_config),
+        functools.partial(build_step_jacobian, *step_trace_config),
     )

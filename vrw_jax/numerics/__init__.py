@@ -20,7 +20,7 @@ from vrw_jax.numerics.batch_algebra import (
     apply_matrix,
     contract_inner_axis,
     evaluate_with_jvps,
-    evaluate_with_partials,
+    evaluate_with_partial_derivatives,
     invert_small_matrices,
     make_fusion_barrier,
     solve_node_equations,
@@ -29,22 +29,23 @@ from vrw_jax.numerics.batch_algebra import (
 from vrw_jax.numerics.batch_programs import compile_batch_program
 from vrw_jax.numerics.batching import (
     BatchFunction,
-    apply_in_blocks,
+    apply_function_in_blocks,
     concatenate_tree_rows,
     is_inside_jit,
-    make_opaque_condition,
+    make_opaque_loop_condition,
     make_zeros_like_output,
     map_in_batches,
     map_in_numpy_batches,
-    run_if_any,
-    select_tree_leaves,
+    run_if_any_element_active,
     select_tree_rows,
+    select_trees_by_condition,
     unbatch,
 )
 from vrw_jax.numerics.cached_programs import (
     compile_batch_function,
     compile_cached_lane_program,
     compile_exported_function,
+    wrap_with_saved_trace,
 )
 from vrw_jax.numerics.cubic_minima import (
     MINIMUM_LOCATION_TOLERANCE,
@@ -57,4 +58,4 @@ from vrw_jax.numerics.settings import with_default_jax_settings
 from vrw_jax.numerics.status_codes import StatusCode, describe_step_ending
 from vrw_jax.numerics.trigonometry import compute_sine_cosine
 from vrw_jax.numerics.types import Elementwise, RealInput, Scalar, Vector
-from vrw_jax.validation import raise_for_missing_numerics_name as __getattr__
+from vrw_jax.validation import raise_missing_numerics_attribute as __getattr__

@@ -59,7 +59,7 @@ def enable_all_ad_modes(
         )
 
     @with_default_jax_settings
-    def wrapped_jvp(primals: tuple, tangents: tuple) -> tuple:
+    def compute_function_jvp(primals: tuple, tangents: tuple) -> tuple:
         perturbed_argnums = tuple(
             i
             for i, tangent_or_zero in enumerate(tangents)
@@ -68,17 +68,20 @@ def enable_all_ad_modes(
         if not perturbed_argnums:
             jacobian_result = wrapped_function(*primals)
             return jacobian_result, make_zero_tangent(jacobian_result)
-        (argument_jacobians, float_outputs), other_outputs = get_differentiable_jacobian(
+        (argument_jacobians, float_outputs), nonfloat_outputs = get_differentiable_jacobian(
             perturbed_argnums
         )(*primals)
         output_tangent = _apply_argument_jacobians(
             float_outputs, argument_jacobians, tuple(tangents[i] for i in perturbed_argnums)
         )
-        return (float_outputs, other_outputs), (output_tangent, make_zero_tangent(other_outputs))
+        return (float_outputs, nonfloat_outputs), (
+            output_tangent,
+            make_zero_tangent(nonfloat_outputs),
+        )
 
-    wrapped_function.defjvp(wrapped_jvp, symbolic_zeros=True)
+    wrapped_function.defjvp(compute_function_jvp, symbolic_zeros=True)
 
-    def call_function(*arrays: Any) -> tuple:
+    def call_differentiable_function(*arrays: Any) -> tuple:
         has_traced_argument = any(isinstance(x, jax.core.Tracer) for x in arrays)
         # The rule costs as much as a solver step, so it is applied only to traced arguments.
         if not has_traced_argument:
@@ -91,7 +94,7 @@ def enable_all_ad_modes(
             )
         )
 
-    return call_function
+    return call_differentiable_function
 
 
 def _make_forward_jacobian_function(
@@ -104,11 +107,11 @@ def _make_forward_jacobian_function(
     """
 
     def evaluate_with_aux(*arrays: Any) -> tuple[PyTree, PyTree]:
-        float_outputs, other_outputs = function(*arrays)
-        return float_outputs, (float_outputs, other_outputs)
+        float_outputs, nonfloat_outputs = function(*arrays)
+        return float_outputs, (float_outputs, nonfloat_outputs)
 
     def evaluate_argument_jacobians(*arrays: Any) -> tuple[PyTree, PyTree]:
-        output_jacobians, (float_outputs, other_outputs) = jax.jacfwd(
+        output_jacobians, (float_outputs, nonfloat_outputs) = jax.jacfwd(
             evaluate_with_aux, argnums=argnums, has_aux=True
         )(*arrays)
         jacobians_by_argument = tuple(
@@ -121,7 +124,7 @@ def _make_forward_jacobian_function(
             )
             for argument_index in range(len(argnums))
         )
-        return (jacobians_by_argument, float_outputs), other_outputs
+        return (jacobians_by_argument, float_outputs), nonfloat_outputs
 
     return evaluate_argument_jacobians
 
@@ -135,14 +138,14 @@ def _apply_argument_jacobians(
     Products are written as sums, because a matrix product of small arrays is a library call.
     """
 
-    def apply_leaf(_: Array, *leaf_jacobians: Array) -> Array:
+    def apply_leaf_jacobians(_: Array, *leaf_jacobians: Array) -> Array:
         product_terms = [
             jnp.sum(jacobian * tangent, axis=tuple(range(-jnp.ndim(tangent), 0)))
             for jacobian, tangent in zip(leaf_jacobians, tangents, strict=True)
         ]
         return sum(product_terms[1:], start=product_terms[0])
 
-    return jax.tree.map(apply_leaf, output_template, *jacobians)
+    return jax.tree.map(apply_leaf_jacobians, output_template, *jacobians)
 
 
 ExecutionWrapper = Callable[[BatchFunction, int], BatchFunction]
@@ -168,7 +171,7 @@ def with_implicit_derivative(
 
     @wrapped_function.defjvp
     @with_default_jax_settings
-    def wrapped_jvp(primals: tuple, tangents: tuple) -> tuple:
+    def compute_function_jvp(primals: tuple, tangents: tuple) -> tuple:
         jacobian = make_implicit_jacobian(
             function, compute_tangents, execution_wrapper, derivative_order + 1
         )(*primals)
@@ -191,7 +194,7 @@ def make_implicit_jacobian(
     Jacobian by a faster one.
     """
 
-    def jvp_sequentially(p: Array, z_and_jacobian: tuple[PyTree, PyTree]) -> PyTree:
+    def compute_jvps_sequentially(p: Array, z_and_jacobian: tuple[PyTree, PyTree]) -> PyTree:
         """Return the derivatives for a batch, computed one direction after another.
 
         The compiled code is then as short as for one direction.
@@ -204,7 +207,7 @@ def make_implicit_jacobian(
             lambda tangent: jax.jvp(function, (p, z), tangent)[1], (unit_tangents, z_jacobian)
         )
 
-    def compute_known_tangents(
+    def compute_branch_tangents(
         p: Array, z_and_jacobian: tuple[PyTree, PyTree]
     ) -> tuple[PyTree, PyTree]:
         z, z_jacobian = z_and_jacobian
@@ -212,8 +215,8 @@ def make_implicit_jacobian(
         return z_jacobian, jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), second_derivatives)
 
     jacobian_function = with_implicit_derivative(
-        make_jacobian or jvp_sequentially,
-        compute_known_tangents,
+        make_jacobian or compute_jvps_sequentially,
+        compute_branch_tangents,
         execution_wrapper,
         derivative_order,
     )
@@ -229,14 +232,14 @@ def evaluate_with_jacobian(function: Callable, *arguments: Array) -> tuple[Any, 
     """
 
     def select_float_outputs(*arguments: Array) -> tuple:
-        float_outputs, other_outputs = eqx.partition(function(*arguments), eqx.is_inexact_array)
-        return float_outputs, (float_outputs, other_outputs)
+        float_outputs, nonfloat_outputs = eqx.partition(function(*arguments), eqx.is_inexact_array)
+        return float_outputs, (float_outputs, nonfloat_outputs)
 
     all_argnums = tuple(range(len(arguments))) if len(arguments) > 1 else 0
-    output_jacobian, (float_outputs, other_outputs) = jax.jacfwd(
+    output_jacobian, (float_outputs, nonfloat_outputs) = jax.jacfwd(
         select_float_outputs, all_argnums, has_aux=True
     )(*arguments)
-    return eqx.combine(float_outputs, other_outputs), output_jacobian
+    return eqx.combine(float_outputs, nonfloat_outputs), output_jacobian
 
 
 def apply_jacobian(jacobian: PyTree, tangent: Array) -> PyTree:

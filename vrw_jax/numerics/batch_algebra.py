@@ -23,21 +23,21 @@ LaneArray = Float[Array, "... lanes"]
 FusionBarrierFn = Callable[[Any], Any]
 
 
-def make_fusion_barrier(lane_values: Float[Array, "... lanes"]) -> FusionBarrierFn:
+def make_fusion_barrier(nan_free_values: Float[Array, "... lanes"]) -> FusionBarrierFn:
     """Return an identity function across which XLA cannot fuse operations.
 
-    `lane_values` must not contain NaN, which XLA cannot prove.
+    `nan_free_values` must not contain NaN, which XLA cannot prove.
     """
     if simd.targets_machine_code():
         return lax.optimization_barrier
-    is_always_true = ~jnp.isnan(jnp.max(lane_values))
+    is_always_true = ~jnp.isnan(jnp.max(nan_free_values))
 
-    def hide_from_fusion(tree: Any) -> Any:
+    def apply_fusion_barrier(tree: Any) -> Any:
         return lax.cond(
             is_always_true, lambda t: t, lambda t: jax.tree.map(jnp.zeros_like, t), tree
         )
 
-    return hide_from_fusion
+    return apply_fusion_barrier
 
 
 def apply_matrix(matrix: np.ndarray, x: Array) -> Array:
@@ -72,38 +72,29 @@ def contract_inner_axis(left_array: Array, right_array: Array) -> Array:
 
 def invert_small_matrices(matrix: Float[Array, "n n lanes"]) -> Float[Array, "n n lanes"]:
     """Return the inverse of each 1x1, 2x2 or 3x3 matrix, computed by cofactors."""
-    matrix_entries = matrix
-    if matrix_entries.shape[0] == 1:
-        return 1.0 / matrix_entries
-    if matrix_entries.shape[0] == 2:
-        determinant = (
-            matrix_entries[0, 0] * matrix_entries[1, 1]
-            - matrix_entries[0, 1] * matrix_entries[1, 0]
-        )
+    if matrix.shape[0] == 1:
+        return 1.0 / matrix
+    if matrix.shape[0] == 2:
+        determinant = matrix[0, 0] * matrix[1, 1] - matrix[0, 1] * matrix[1, 0]
         adjugate_2x2 = jnp.stack(
             [
-                jnp.stack([matrix_entries[1, 1], -matrix_entries[0, 1]]),
-                jnp.stack([-matrix_entries[1, 0], matrix_entries[0, 0]]),
+                jnp.stack([matrix[1, 1], -matrix[0, 1]]),
+                jnp.stack([-matrix[1, 0], matrix[0, 0]]),
             ]
         )
         return adjugate_2x2 / determinant
-    if matrix_entries.shape[0] != 3:
-        raise ValueError(
-            f"the matrix has {matrix_entries.shape[0]} rows, but only 1, 2 or 3 are built."
-        )
+    if matrix.shape[0] != 3:
+        raise ValueError(f"the matrix has {matrix.shape[0]} rows, but only 1, 2 or 3 are built.")
 
     def compute_cofactor(i: int, j: int) -> Array:
         (a, b), (c, d) = ((i + 1) % 3, (i + 2) % 3), ((j + 1) % 3, (j + 2) % 3)
-        return (
-            matrix_entries[a, c] * matrix_entries[b, d]
-            - matrix_entries[a, d] * matrix_entries[b, c]
-        )
+        return matrix[a, c] * matrix[b, d] - matrix[a, d] * matrix[b, c]
 
     adjugate = [[compute_cofactor(j, i) for j in range(3)] for i in range(3)]
     determinant = (
-        matrix_entries[0, 0] * adjugate[0][0]
-        + matrix_entries[0, 1] * adjugate[1][0]
-        + matrix_entries[0, 2] * adjugate[2][0]
+        matrix[0, 0] * adjugate[0][0]
+        + matrix[0, 1] * adjugate[1][0]
+        + matrix[0, 2] * adjugate[2][0]
     )
     return jnp.stack([jnp.stack(adjugate_row) for adjugate_row in adjugate]) / determinant
 
@@ -112,38 +103,38 @@ def invert_small_matrices(matrix: Float[Array, "n n lanes"]) -> Float[Array, "n 
 def solve_node_equations(
     matrix: Float[Array, "nodes dim nodes dim lanes"],
     rhs: Float[Array, "nodes dim columns lanes"],
-    barrier_values: LaneArray,
+    nan_free_values: LaneArray,
 ) -> Float[Array, "nodes dim columns lanes"]:
     """Return the solution of the linear equations at the collocation nodes of one mesh interval.
 
     The method is block elimination without pivoting. The matrix is the mass matrix plus terms of
-    order h, the length of the mesh interval, so its diagonal blocks stay regular. `barrier_values`
+    order h, the length of the mesh interval, so its diagonal blocks stay regular. `nan_free_values`
     is the argument of `make_fusion_barrier`.
     """
-    barrier_function = make_fusion_barrier(barrier_values)
+    apply_fusion_barrier = make_fusion_barrier(nan_free_values)
     n_nodes, n_coordinates = matrix.shape[:2]
     remaining_system = jnp.concatenate(
         [matrix.reshape(n_nodes, n_coordinates, n_nodes * n_coordinates, -1), rhs], axis=2
     )
-    eliminated_rows: list[Array] = []
+    eliminated_block_rows: list[Array] = []
     for _ in range(n_nodes):
-        inverse_pivot_block = remaining_system[0]
-        block_row_matrix = contract_inner_axis(
-            invert_small_matrices(inverse_pivot_block[:, :n_coordinates]),
-            inverse_pivot_block[:, n_coordinates:],
+        pivot_block_row = remaining_system[0]
+        solved_block_row = contract_inner_axis(
+            invert_small_matrices(pivot_block_row[:, :n_coordinates]),
+            pivot_block_row[:, n_coordinates:],
         )
-        if len(eliminated_rows) < n_nodes - 1:
-            block_row_matrix = barrier_function(block_row_matrix)
-            remaining_system = barrier_function(
+        if len(eliminated_block_rows) < n_nodes - 1:
+            solved_block_row = apply_fusion_barrier(solved_block_row)
+            remaining_system = apply_fusion_barrier(
                 remaining_system[1:, :, n_coordinates:]
-                - contract_inner_axis(remaining_system[1:, :, :n_coordinates], block_row_matrix)
+                - contract_inner_axis(remaining_system[1:, :, :n_coordinates], solved_block_row)
             )
-        eliminated_rows.append(block_row_matrix)
-    node_solution = eliminated_rows[-1]
-    for block_row_matrix in eliminated_rows[-2::-1]:
+        eliminated_block_rows.append(solved_block_row)
+    node_solution = eliminated_block_rows[-1]
+    for solved_block_row in eliminated_block_rows[-2::-1]:
         n_solved_blocks = node_solution.shape[0]
-        block_solution = block_row_matrix[:, n_solved_blocks:] - contract_inner_axis(
-            block_row_matrix[:, :n_solved_blocks], node_solution
+        block_solution = solved_block_row[:, n_solved_blocks:] - contract_inner_axis(
+            solved_block_row[:, :n_solved_blocks], node_solution
         )
         node_solution = jnp.concatenate([block_solution, node_solution])
     return node_solution.reshape(n_nodes, n_coordinates, *node_solution.shape[1:])
@@ -156,7 +147,7 @@ def _solve_node_equations_jvp(primals: tuple, tangents: tuple) -> tuple:
 
     Differentiation of the elimination would double its work.
     """
-    (matrix, _, barrier_values), (matrix_tangent, rhs_tangent, _) = primals, tangents
+    (matrix, _, nan_free_values), (matrix_tangent, rhs_tangent, _) = primals, tangents
     node_solution = solve_node_equations(*primals)
     n_nodes, n_coordinates = matrix.shape[:2]
     flat_matrix_tangent = matrix_tangent.reshape(
@@ -167,7 +158,7 @@ def _solve_node_equations_jvp(primals: tuple, tangents: tuple) -> tuple:
         node_solution.reshape(n_nodes * n_coordinates, *node_solution.shape[2:]),
     )
     return node_solution, solve_node_equations(
-        matrix, rhs_tangent - matrix_tangent_product, barrier_values
+        matrix, rhs_tangent - matrix_tangent_product, nan_free_values
     )
 
 
@@ -179,7 +170,7 @@ def evaluate_with_jvps(function: Callable, primals: tuple, tangents: tuple) -> t
     return jax.vmap(linearized_function, in_axes=0, out_axes=(None, 0))(*tangents)
 
 
-def evaluate_with_partials(
+def evaluate_with_partial_derivatives(
     function: Callable[..., Vector], arguments: Sequence[Array]
 ) -> tuple[Vector, list[Vector]]:
     """Return the value of an elementwise function, and the derivatives of each of its outputs.
@@ -188,10 +179,10 @@ def evaluate_with_partials(
     phase has fewer equations than arguments.
     """
     function_values, linearized_function = jax.linearize(function, *arguments)
-    partials_by_output = []
+    partial_derivatives_by_output = []
     for i, function_value in enumerate(function_values):
         transposed_function = jax.linear_transpose(
             lambda *t, i=i: linearized_function(*t)[i], *arguments
         )
-        partials_by_output.append(transposed_function(jnp.ones_like(function_value)))
-    return function_values, partials_by_output
+        partial_derivatives_by_output.append(transposed_function(jnp.ones_like(function_value)))
+    return function_values, partial_derivatives_by_output

@@ -34,7 +34,7 @@ def compile_batch_program(
     trace_key_settings: Any,
     xla_block_size: int,
     register_limits: simd.RegisterLimits = simd.DEFAULT_REGISTER_LIMITS,
-    can_stop_early: bool = False,
+    can_leave_lanes_unfinished: bool = False,
 ) -> BatchProgram:
     """Compile `lane_function(scalars, lanes)` to machine code, or with XLA if machine code is not
     available.
@@ -44,22 +44,25 @@ def compile_batch_program(
 
     - `trace_key_settings`: all settings on which `lane_function` depends, besides its arguments;
     - `xla_block_size`: number of lanes that one call of an XLA program computes;
-    - `can_stop_early`: whether an XLA program may stop while a few lanes are unfinished. The
-      function then takes the number of these lanes as a third argument, and its first result is a
-      boolean array that marks them.
+    - `can_leave_lanes_unfinished`: whether an XLA program may stop while a few lanes are
+      unfinished. The function then takes the number of these lanes as a third argument, and its
+      first result is a boolean array that marks them.
     """
     uses_machine_code = simd.is_machine_code_available()
-    call_format = tuple(scalar_dtypes), n_lane_arrays, lane_dtype
-    program_key = (trace_key_settings, call_format, uses_machine_code, xla_block_size)
+    program_signature = tuple(scalar_dtypes), n_lane_arrays, lane_dtype
+    program_key = (trace_key_settings, program_signature, uses_machine_code, xla_block_size)
     batch_program = _compiled_batch_programs.get(program_key)  # one hash of a large key
     if batch_program is None:
         batch_program = (
             compile_cached_lane_program(
-                lane_function, *call_format, trace_key_settings, register_limits
+                lane_function, *program_signature, trace_key_settings, register_limits
             )
             if uses_machine_code
             else functools.partial(
-                _run_xla_program_by_blocks, jax.jit(lane_function), xla_block_size, can_stop_early
+                _run_xla_program_by_blocks,
+                jax.jit(lane_function),
+                xla_block_size,
+                can_leave_lanes_unfinished,
             )
         )
         _compiled_batch_programs[program_key] = batch_program
@@ -69,7 +72,7 @@ def compile_batch_program(
 def _run_xla_program_by_blocks(
     xla_program: Callable,
     block_size: int,
-    can_stop_early: bool,
+    can_leave_lanes_unfinished: bool,
     scalar_arguments: Sequence[Any],
     lane_arrays: Sequence[np.ndarray],
 ) -> list[np.ndarray]:
@@ -84,31 +87,45 @@ def _run_xla_program_by_blocks(
             xla_program,
             tuple(scalar_arguments),
             tuple(lane_shapes),
-            *[np.int32(0)] * can_stop_early,
+            *[np.int32(0)] * can_leave_lanes_unfinished,
         )
         return [np.empty((*x.shape[:-1], 0), x.dtype) for x in output_shapes]
     result_arrays: list[np.ndarray] = []
-    unfinished_lanes = np.arange(len(lane_arrays[0]))
-    while len(unfinished_lanes) > 0:
-        is_last_round = len(unfinished_lanes) <= block_size
+    unfinished_lane_indices = np.arange(len(lane_arrays[0]))
+    while len(unfinished_lane_indices) > 0:
+        is_last_round = len(unfinished_lane_indices) <= block_size
         straggler_count = np.int32(0 if is_last_round else block_size // STRAGGLER_COUNT_DIVISOR)
-        straggler_lanes = []
-        for block_start in range(0, len(unfinished_lanes), block_size):
-            block_lanes = unfinished_lanes[block_start : block_start + block_size]
-            padded_lanes = np.concatenate(
-                [block_lanes, np.repeat(block_lanes[-1:], block_size - len(block_lanes))]
+        straggler_lane_indices = []
+        for block_start in range(0, len(unfinished_lane_indices), block_size):
+            block_lane_indices = unfinished_lane_indices[block_start : block_start + block_size]
+            padded_lane_indices = np.concatenate(
+                [
+                    block_lane_indices,
+                    np.repeat(block_lane_indices[-1:], block_size - len(block_lane_indices)),
+                ]
             )
-            block_arguments = tuple(scalar_arguments), tuple(x[padded_lanes] for x in lane_arrays)
+            block_arguments = (
+                tuple(scalar_arguments),
+                tuple(x[padded_lane_indices] for x in lane_arrays),
+            )
             block_outputs = [
-                np.asarray(x)[..., : len(block_lanes)]
-                for x in xla_program(*block_arguments, *[straggler_count] * can_stop_early)
+                np.asarray(x)[..., : len(block_lane_indices)]
+                for x in xla_program(
+                    *block_arguments, *[straggler_count] * can_leave_lanes_unfinished
+                )
             ]
             result_arrays = result_arrays or [
                 np.empty((*x.shape[:-1], len(lane_arrays[0])), x.dtype) for x in block_outputs
             ]
-            is_finished = ~block_outputs[0] if can_stop_early else np.ones(len(block_lanes), bool)
+            is_lane_finished = (
+                ~block_outputs[0]
+                if can_leave_lanes_unfinished
+                else np.ones(len(block_lane_indices), bool)
+            )
             for result_array, block_output in zip(result_arrays, block_outputs, strict=True):
-                result_array[..., block_lanes[is_finished]] = block_output[..., is_finished]
-            straggler_lanes.append(block_lanes[~is_finished])
-        unfinished_lanes = np.concatenate(straggler_lanes)
+                result_array[..., block_lane_indices[is_lane_finished]] = block_output[
+                    ..., is_lane_finished
+                ]
+            straggler_lane_indices.append(block_lane_indices[~is_lane_finished])
+        unfinished_lane_indices = np.concatenate(straggler_lane_indices)
     return result_arrays

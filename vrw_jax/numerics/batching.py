@@ -32,12 +32,12 @@ def unbatch(function: BatchFunction) -> BatchFunction:
 
     @batched_function.def_vmap
     @with_default_jax_settings
-    def merge_vmapped_axis(
+    def merge_vmapped_axis_into_lanes(
         axis_size: int, is_batched_by_argument: PyTree, *arrays: PyTree
     ) -> tuple:
         n_lanes = jax.tree.leaves(arrays)[0].shape[-1]
 
-        def merge_into_lanes(x: Array, is_batched: bool) -> Array:
+        def merge_axis_into_lanes(x: Array, is_batched: bool) -> Array:
             x = x if is_batched else jnp.broadcast_to(x, (axis_size, *x.shape))
             array_with_lanes_last = jnp.moveaxis(x, 0, -2)
             return array_with_lanes_last.reshape(
@@ -48,20 +48,20 @@ def unbatch(function: BatchFunction) -> BatchFunction:
             return jnp.moveaxis(x.reshape(*x.shape[:-1], axis_size, n_lanes), -2, 0)
 
         outputs_with_lanes_last = batched_function(
-            *jax.tree.map(merge_into_lanes, arrays, tuple(is_batched_by_argument))
+            *jax.tree.map(merge_axis_into_lanes, arrays, tuple(is_batched_by_argument))
         )
         return jax.tree.map(split_lanes, outputs_with_lanes_last), jax.tree.map(
             lambda _: True, outputs_with_lanes_last
         )
 
-    def evaluate_single(*arrays: PyTree) -> PyTree:
+    def evaluate_one_element(*arrays: PyTree) -> PyTree:
         outputs = batched_function(*jax.tree.map(lambda x: jnp.asarray(x)[..., None], arrays))
         return jax.tree.map(lambda x: x[..., 0], outputs)
 
-    return evaluate_single
+    return evaluate_one_element
 
 
-def apply_in_blocks(function: BatchFunction, block_size: int) -> BatchFunction:
+def apply_function_in_blocks(function: BatchFunction, block_size: int) -> BatchFunction:
     """Return a function that applies `function` to `block_size` batch elements at a time.
 
     The arrays of a block stay in the processor's cache. A GPU takes larger blocks, of
@@ -78,12 +78,12 @@ def apply_in_blocks(function: BatchFunction, block_size: int) -> BatchFunction:
         has_lane_axis_by_leaf = [jnp.ndim(x) > 0 for x in argument_leaves]
 
         def split_blocks(x: Array) -> Array:  # The last element pads the last block.
-            n_padding = -n_lanes % block_size
-            padded_array = jnp.concatenate([x, jnp.repeat(x[..., -1:], n_padding, -1)], -1)
+            n_padding_elements = -n_lanes % block_size
+            padded_array = jnp.concatenate([x, jnp.repeat(x[..., -1:], n_padding_elements, -1)], -1)
             return jnp.moveaxis(padded_array.reshape(*x.shape[:-1], -1, block_size), -2, 0)
 
-        def evaluate_block(batched_leaves: list[Array]) -> PyTree:
-            leaf_blocks_iterator = iter(batched_leaves)
+        def evaluate_block(block_of_leaves: list[Array]) -> PyTree:
+            leaf_blocks_iterator = iter(block_of_leaves)
             block_leaves = [
                 next(leaf_blocks_iterator) if has_lane_axis else x
                 for x, has_lane_axis in zip(argument_leaves, has_lane_axis_by_leaf, strict=True)
@@ -96,12 +96,12 @@ def apply_in_blocks(function: BatchFunction, block_size: int) -> BatchFunction:
                 ..., :n_lanes
             ]
 
-        split_leaves = [
+        leaves_split_into_blocks = [
             split_blocks(x)
             for x, has_lane_axis in zip(argument_leaves, has_lane_axis_by_leaf, strict=True)
             if has_lane_axis
         ]
-        return jax.tree.map(merge_blocks, lax.map(evaluate_block, split_leaves))
+        return jax.tree.map(merge_blocks, lax.map(evaluate_block, leaves_split_into_blocks))
 
     return evaluate_blockwise
 
@@ -115,11 +115,11 @@ def is_inside_jit() -> bool:
     return isinstance(jnp.zeros(()), jax.core.Tracer)
 
 
-def run_if_any(
-    is_any_element_active: Array, function: Callable[[PyTree], PyTree], fallback_value: PyTree
+def run_if_any_element_active(
+    is_any_element_active: Array, function: Callable[[PyTree], PyTree], initial_value: PyTree
 ) -> PyTree:
-    """Return `function(fallback_value)` if `is_any_element_active` is true, and else
-    `fallback_value`.
+    """Return `function(initial_value)` if `is_any_element_active` is true, and else
+    `initial_value`.
 
     `is_any_element_active` is one flag for the whole batch. The call is a loop with at most one
     iteration, which machine code skips if the flag is false.
@@ -128,11 +128,11 @@ def run_if_any(
     return lax.while_loop(
         lambda loop_carry: loop_carry[0],
         call_function_once,
-        (is_any_element_active, fallback_value),
+        (is_any_element_active, initial_value),
     )[1]
 
 
-def make_opaque_condition(loop_condition: Array, nonnegative_count: Array) -> Array:
+def make_opaque_loop_condition(loop_condition: Array, nonnegative_count: Array) -> Array:
     """Return a loop condition that equals `loop_condition` but also reads a nonnegative count.
 
     If a loop condition reads only one value, XLA looks for an iteration counter in a copy of the
@@ -141,7 +141,9 @@ def make_opaque_condition(loop_condition: Array, nonnegative_count: Array) -> Ar
     return loop_condition & (nonnegative_count >= 0)
 
 
-def select_tree_leaves(condition: Array, tree_if_true: PyTree, tree_if_false: PyTree) -> PyTree:
+def select_trees_by_condition(
+    condition: Array, tree_if_true: PyTree, tree_if_false: PyTree
+) -> PyTree:
     """Select each entry from `tree_if_true` where `condition` is true, and else from
     `tree_if_false`.
     """
@@ -179,7 +181,7 @@ def map_in_batches(function: Callable, batch_sizes: tuple[int, ...], *trees: PyT
     """
     if len(jax.tree.leaves(trees)[0]) in batch_sizes:
         return function(*jax.device_put(trees))
-    call_with_device_arrays = lambda *row_trees: function(*jax.device_put(row_trees))
+    call_with_device_arrays = lambda *batches_of_trees: function(*jax.device_put(batches_of_trees))
     return jax.device_put(map_in_numpy_batches(call_with_device_arrays, batch_sizes, *trees))
 
 
@@ -192,19 +194,25 @@ def map_in_numpy_batches(
     of `map_in_batches`.
     """
     n_rows, batch_results = len(jax.tree.leaves(trees)[0]), []
-    first_row = 0
-    while first_row < n_rows:
-        n_remaining_rows = n_rows - first_row
-        size_index = min(bisect.bisect_left(batch_sizes, n_remaining_rows), len(batch_sizes) - 1)
-        batch_size = batch_sizes[size_index]
-        if size_index > 0:
-            smaller_size = batch_sizes[size_index - 1]
+    batch_start_row = 0
+    while batch_start_row < n_rows:
+        n_remaining_rows = n_rows - batch_start_row
+        batch_size_index = min(
+            bisect.bisect_left(batch_sizes, n_remaining_rows), len(batch_sizes) - 1
+        )
+        batch_size = batch_sizes[batch_size_index]
+        if batch_size_index > 0:
+            smaller_batch_size = batch_sizes[batch_size_index - 1]
             # Several smaller batches replace a batch that would be at most half full.
-            if -(-n_remaining_rows // smaller_size) * smaller_size <= batch_size // 2:
-                batch_size = smaller_size
-        last_row = min(first_row + batch_size, n_rows)
-        row_indices = np.minimum(np.arange(first_row, first_row + batch_size), n_rows - 1)
+            if -(-n_remaining_rows // smaller_batch_size) * smaller_batch_size <= batch_size // 2:
+                batch_size = smaller_batch_size
+        batch_end_row = min(batch_start_row + batch_size, n_rows)
+        row_indices = np.minimum(
+            np.arange(batch_start_row, batch_start_row + batch_size), n_rows - 1
+        )
         batch_result = function(*select_tree_rows(trees, row_indices))
-        batch_results.append(select_tree_rows(batch_result, slice(0, last_row - first_row)))
-        first_row = last_row
+        batch_results.append(
+            select_tree_rows(batch_result, slice(0, batch_end_row - batch_start_row))
+        )
+        batch_start_row = batch_end_row
     return concatenate_tree_rows(*batch_results) if len(batch_results) > 1 else batch_results[0]

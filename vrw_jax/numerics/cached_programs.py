@@ -19,7 +19,7 @@ from jax import export
 from jax.sharding import SingleDeviceSharding
 
 from vrw_jax import simd
-from vrw_jax.numerics.batching import BatchFunction, apply_in_blocks
+from vrw_jax.numerics.batching import BatchFunction, apply_function_in_blocks
 from vrw_jax.runtime import disk_cache as store
 from vrw_jax.runtime import make_fusion_emitter_options
 
@@ -47,10 +47,10 @@ def compile_exported_function(
         .lower(*argument_shapes)
         .compile(make_fusion_emitter_options(False))
     )
-    return lambda *example_arguments: compiled_program(*jax.tree.leaves(example_arguments))
+    return lambda *arguments: compiled_program(*jax.tree.leaves(arguments))
 
 
-def call_through_saved_trace(traced_function: Callable, trace_key_settings: object) -> Callable:
+def wrap_with_saved_trace(traced_function: Callable, trace_key_settings: object) -> Callable:
     """Return a function that calls `traced_function` through its saved trace.
 
     If no trace exists yet, it is exported and saved. Without a cache folder, `traced_function` is
@@ -107,8 +107,8 @@ def compile_batch_function(
     - `register_limits`: as for `simd.compile_lane_function`.
     """
     if not simd.is_machine_code_available():
-        return call_through_saved_trace(
-            apply_in_blocks(batch_function, xla_block_size), trace_key_settings
+        return wrap_with_saved_trace(
+            apply_function_in_blocks(batch_function, xla_block_size), trace_key_settings
         )
     trace_key = (trace_key_settings, store.describe_trace_environment())
     return simd.compile_lane_function(
@@ -129,7 +129,7 @@ def _load_or_export_trace(
         jax.ShapeDtypeStruct(jnp.shape(x), jnp.result_type(x)) for x in argument_leaves
     ]
     # A trace calls the machine code of one processor, but several may share the folder.
-    device_platform = (
+    platform_and_processor = (
         jax.default_backend(),
         simd.describe_processor() if simd.is_machine_code_available() else None,
     )
@@ -137,59 +137,59 @@ def _load_or_export_trace(
         trace_key_settings,
         str(argument_structure),
         argument_shapes,
-        device_platform,
+        platform_and_processor,
         store.describe_trace_environment(),
     )
-    record_name = f"vrw_trace_{hashlib.sha256(repr(trace_key_parts).encode()).hexdigest()}"
-    record_content = store.load_bytes(record_name)
-    if record_content is not None:
-        machine_code_names_bytes, _, serialized_trace = record_content.partition(b"\n")
+    cache_record_name = f"vrw_trace_{hashlib.sha256(repr(trace_key_parts).encode()).hexdigest()}"
+    cache_record_content = store.load_cache_record(cache_record_name)
+    if cache_record_content is not None:
+        encoded_ffi_target_names, _, serialized_trace = cache_record_content.partition(b"\n")
         try:
-            if simd.load_saved_machine_code(machine_code_names_bytes.decode().split(), store):
+            if simd.load_saved_machine_code(encoded_ffi_target_names.decode().split(), store):
                 return export.deserialize(bytearray(serialized_trace))
         except Exception:  # JAX documents no type of error for bytes that are no trace.
-            store.warn_of_unusable_record(f"{record_name} is no trace")
+            store.warn_of_unusable_cache_record(f"{cache_record_name} is no trace")
     flattened_function = jax.jit(
         lambda *argument_leaves: traced_function(
             *jax.tree.unflatten(argument_structure, argument_leaves)
         )
     )
     # Cached traces that are called inside become part of this trace.
-    context_token = _is_exporting_trace.set(True)
+    export_flag_token = _is_exporting_trace.set(True)
     try:
         # The export below finds this trace in JAX's cache.
-        machine_code_names = sorted(
-            _find_machine_code_names(flattened_function.trace(*argument_shapes).jaxpr)
+        ffi_target_names = sorted(
+            _find_ffi_target_names(flattened_function.trace(*argument_shapes).jaxpr)
         )
         disabled_export_checks = [
-            export.DisabledSafetyCheck.custom_call(record_name)
-            for record_name in machine_code_names
+            export.DisabledSafetyCheck.custom_call(ffi_target_name)
+            for ffi_target_name in ffi_target_names
         ]
         exported_trace = export.export(flattened_function, disabled_checks=disabled_export_checks)(
             *argument_shapes
         )
     finally:
-        _is_exporting_trace.reset(context_token)
-    store.save_bytes(
-        record_name,
-        " ".join(machine_code_names).encode() + b"\n" + bytes(exported_trace.serialize()),
+        _is_exporting_trace.reset(export_flag_token)
+    store.save_cache_record(
+        cache_record_name,
+        " ".join(ffi_target_names).encode() + b"\n" + bytes(exported_trace.serialize()),
     )
     return exported_trace
 
 
-def _find_machine_code_names(traced_program: Any) -> set[str]:
+def _find_ffi_target_names(jaxpr: Any) -> set[str]:
     """Return the names of all machine-code functions that a traced program calls."""
-    traced_program = getattr(traced_program, "jaxpr", traced_program)
-    machine_code_names = {
-        inner_jaxpr_equation.params["code"].code_name
-        for inner_jaxpr_equation in traced_program.eqns
+    jaxpr = getattr(jaxpr, "jaxpr", jaxpr)
+    ffi_target_names = {
+        inner_jaxpr_equation.params["machine_code"].ffi_target_name
+        for inner_jaxpr_equation in jaxpr.eqns
         if inner_jaxpr_equation.primitive is simd.MACHINE_CODE_PRIMITIVE
     }
-    for jaxpr_equation in traced_program.eqns:
+    for jaxpr_equation in jaxpr.eqns:
         for equation_parameter in jax.tree.leaves(list(jaxpr_equation.params.values())):
             if hasattr(getattr(equation_parameter, "jaxpr", equation_parameter), "eqns"):
-                machine_code_names |= _find_machine_code_names(equation_parameter)
-    return machine_code_names
+                ffi_target_names |= _find_ffi_target_names(equation_parameter)
+    return ffi_target_names
 
 
 _is_exporting_trace: ContextVar[bool] = ContextVar("_exporting", default=False)

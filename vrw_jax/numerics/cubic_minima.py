@@ -11,47 +11,57 @@ because the error of the minimum is proportional to the square of the error of i
 
 
 def evaluate_cubic(
-    x: Array, value_at_0: Array, rate_at_0: Array, value_at_1: Array, rate_at_1: Array
+    x: Array,
+    cubic_value_at_0: Array,
+    cubic_rate_at_0: Array,
+    cubic_value_at_1: Array,
+    cubic_rate_at_1: Array,
 ) -> Array:
     """Return the value at `x`, between 0 and 1, of the cubic Hermite interpolant.
 
     The rates at 0 and 1 must be multiplied by the length of the solver step.
     """
     return (
-        (1 + 2 * x) * (1 - x) ** 2 * value_at_0
-        + x * (1 - x) ** 2 * rate_at_0
-        + x * x * (3 - 2 * x) * value_at_1
-        + x * x * (x - 1) * rate_at_1
+        (1 + 2 * x) * (1 - x) ** 2 * cubic_value_at_0
+        + x * (1 - x) ** 2 * cubic_rate_at_0
+        + x * x * (3 - 2 * x) * cubic_value_at_1
+        + x * x * (x - 1) * cubic_rate_at_1
     )
 
 
 @jax.jit  # The function is traced once for all margins.
 def find_cubic_minimum(
-    value_at_0: Array, rate_at_0: Array, value_at_1: Array, rate_at_1: Array
+    cubic_value_at_0: Array, cubic_rate_at_0: Array, cubic_value_at_1: Array, cubic_rate_at_1: Array
 ) -> tuple[Array, Array]:
     """Return the location and the value of the interior minimum of the cubic Hermite interpolant.
 
     The location is between 0 and 1. The value is infinite if there is no interior minimum.
     """
-    quadratic_coefficient = 3.0 * (2.0 * value_at_0 + rate_at_0 - 2.0 * value_at_1 + rate_at_1)
-    linear_coefficient = 2.0 * (-3.0 * value_at_0 - 2.0 * rate_at_0 + 3.0 * value_at_1 - rate_at_1)
-    discriminant = linear_coefficient * linear_coefficient - 4.0 * quadratic_coefficient * rate_at_0
-    discriminant_root = jnp.sqrt(jnp.where(discriminant > 0.0, discriminant, 1.0))
+    quadratic_coefficient = 3.0 * (
+        2.0 * cubic_value_at_0 + cubic_rate_at_0 - 2.0 * cubic_value_at_1 + cubic_rate_at_1
+    )
+    linear_coefficient = 2.0 * (
+        -3.0 * cubic_value_at_0 - 2.0 * cubic_rate_at_0 + 3.0 * cubic_value_at_1 - cubic_rate_at_1
+    )
+    discriminant = (
+        linear_coefficient * linear_coefficient - 4.0 * quadratic_coefficient * cubic_rate_at_0
+    )
+    sqrt_discriminant = jnp.sqrt(jnp.where(discriminant > 0.0, discriminant, 1.0))
     # The minimum is the root with positive curvature, computed without cancellation.
-    minimum_denominator = jnp.where(
+    location_denominator = jnp.where(
         linear_coefficient >= 0.0,
-        -(linear_coefficient + discriminant_root),
+        -(linear_coefficient + sqrt_discriminant),
         2.0 * quadratic_coefficient,
     )
-    minimum_numerator = jnp.where(
-        linear_coefficient >= 0.0, 2.0 * rate_at_0, discriminant_root - linear_coefficient
+    location_numerator = jnp.where(
+        linear_coefficient >= 0.0, 2.0 * cubic_rate_at_0, sqrt_discriminant - linear_coefficient
     )
-    safe_denominator = jnp.where(minimum_denominator == 0.0, 1.0, minimum_denominator)
-    x = jnp.where(minimum_denominator == 0.0, -1.0, minimum_numerator / safe_denominator)
+    nonzero_denominator = jnp.where(location_denominator == 0.0, 1.0, location_denominator)
+    x = jnp.where(location_denominator == 0.0, -1.0, location_numerator / nonzero_denominator)
     has_interior_minimum = (discriminant > 0.0) & (x > 0.0) & (x < 1.0)
     x = jnp.where(has_interior_minimum, x, 0.5)
     return x, jnp.where(
         has_interior_minimum,
-        evaluate_cubic(x, value_at_0, rate_at_0, value_at_1, rate_at_1),
+        evaluate_cubic(x, cubic_value_at_0, cubic_rate_at_0, cubic_value_at_1, cubic_rate_at_1),
         jnp.inf,
     )

@@ -169,11 +169,11 @@ class StepOptions(AbstractPrintable):
 
         The divided tolerances are not below round-off.
         """
-        present_tolerances = self.rtol, self.atol
+        current_tolerances = self.rtol, self.atol
         return eqx.tree_at(
             lambda o: (o.rtol, o.atol),
             self,
-            _tighten_tolerances(present_tolerances, tightening_factor),
+            _tighten_tolerances(current_tolerances, tightening_factor),
         )
 
     def require_scalar_options(self) -> None:

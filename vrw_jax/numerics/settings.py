@@ -21,12 +21,12 @@ def with_default_jax_settings(function: FunctionType) -> FunctionType:
     @functools.wraps(function)
     def call_with_default_settings(*args: Any, **keywords: Any) -> Any:
         jax_config: Any = jax.config
-        is_jax_config_default = (
+        has_default_jax_settings = (
             not jax_config.jax_disable_jit
             and jax_config.jax_numpy_rank_promotion == "allow"
             and jax_config.jax_numpy_dtype_promotion == "standard"
         )
-        if is_jax_config_default:
+        if has_default_jax_settings:
             return function(*args, **keywords)
         with (
             jax.disable_jit(False),

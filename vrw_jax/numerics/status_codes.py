@@ -3,7 +3,7 @@
 import enum
 from typing import Any
 
-from vrw_jax.printing import map_text_of_elements
+from vrw_jax.printing import format_each_batch_element
 
 
 class StatusCode(enum.IntEnum):
@@ -23,5 +23,5 @@ class StatusCode(enum.IntEnum):
 
 def describe_step_ending(status_codes: Any, status_code_class: type[StatusCode]) -> Any:
     """Return the sentence that explains a status code, or an array of sentences for a batch."""
-    describe_code = lambda status_code: status_code_class(int(status_code)).meaning
-    return map_text_of_elements(describe_code, status_codes)
+    describe_status_code = lambda status_code: status_code_class(int(status_code)).meaning
+    return format_each_batch_element(describe_status_code, status_codes)

@@ -17,37 +17,37 @@ because it exceeds pi/2, the largest angle of a valid start.
 """
 
 
-def _compute_economized_coefficients(series_order_offset: int) -> tuple[float, ...]:
+def _compute_economized_coefficients(taylor_order_offset: int) -> tuple[float, ...]:
     """Return nine coefficients of a polynomial in the squared angle.
 
-    The polynomial approximates the cosine if `series_order_offset` is 0, and the sine divided by
+    The polynomial approximates the cosine if `taylor_order_offset` is 0, and the sine divided by
     the angle if it is 1. The coefficients are those of the Taylor series, in which Chebyshev
     polynomials of lower degree replace the last terms. The polynomial is as accurate as a Taylor
     series with three more terms.
     """
     factorial_of_order, squared_angle_limit = math.factorial, MAX_EXACT_ANGLE * MAX_EXACT_ANGLE
     series_coefficients = [
-        (-1) ** series_order / factorial_of_order(2 * series_order + series_order_offset)
-        for series_order in range(1, 14)
+        (-1) ** taylor_order / factorial_of_order(2 * taylor_order + taylor_order_offset)
+        for taylor_order in range(1, 14)
     ]
     while len(series_coefficients) > 8:
         chebyshev_degree, last_coefficient = len(series_coefficients) - 1, series_coefficients.pop()
         # The list contains the coefficients of Chebyshev's polynomial over the range of the squared
         # angle, scaled so that the last coefficient is 1.
-        for series_order in range(chebyshev_degree):
+        for taylor_order in range(chebyshev_degree):
             chebyshev_coefficient = (
                 chebyshev_degree
-                * factorial_of_order(chebyshev_degree + series_order - 1)
+                * factorial_of_order(chebyshev_degree + taylor_order - 1)
                 / (
-                    factorial_of_order(chebyshev_degree - series_order)
-                    * factorial_of_order(2 * series_order)
+                    factorial_of_order(chebyshev_degree - taylor_order)
+                    * factorial_of_order(2 * taylor_order)
                 )
             )
-            series_coefficients[series_order] -= (
+            series_coefficients[taylor_order] -= (
                 last_coefficient
-                * (-1) ** (chebyshev_degree - series_order)
+                * (-1) ** (chebyshev_degree - taylor_order)
                 * chebyshev_coefficient
-                * (squared_angle_limit / 4.0) ** (chebyshev_degree - series_order)
+                * (squared_angle_limit / 4.0) ** (chebyshev_degree - taylor_order)
                 * 2.0
             )
     return 1.0, *series_coefficients

@@ -18,8 +18,8 @@ def has_concrete_numbers(result_tree: Any) -> bool:
 
     Inside `jit`, numbers are not concrete.
     """
-    is_leaf_concrete = lambda tree_leaf: (
-        eqx.is_array_like(tree_leaf) and not isinstance(tree_leaf, int | jax.core.Tracer)
+    is_leaf_concrete = lambda result_leaf: (
+        eqx.is_array_like(result_leaf) and not isinstance(result_leaf, int | jax.core.Tracer)
     )
     has_all_fields = not any(field_value is None for field_value in vars(result_tree).values())
     return has_all_fields and all(map(is_leaf_concrete, jax.tree.leaves(result_tree)))
@@ -60,12 +60,12 @@ def format_quantity(quantity_value: object, quantity_unit: str) -> str:
     )
     if value_array.ndim == 0:
         return f"{float(value_array):.6g} {quantity_unit}".strip()
-    range_text = (
+    value_range_text = (
         f" from {np.min(value_array):.6g} to {np.max(value_array):.6g} {quantity_unit}"
         if value_array.size
         else ""
     )
-    return f"{value_array.size} values{range_text}".rstrip()
+    return f"{value_array.size} values{value_range_text}".rstrip()
 
 
 def format_outcome_counts(outcomes: Any, status_code_class: type[enum.IntEnum]) -> str:
@@ -81,9 +81,9 @@ def format_outcome_counts(outcomes: Any, status_code_class: type[enum.IntEnum]) 
     return f"{n_outcomes:,} in shape {outcome_array_shape}: {', '.join(outcome_count_texts)}"
 
 
-def map_text_of_elements(element_text_function: Callable[..., str], *element_values: Any) -> Any:
+def format_each_batch_element(format_batch_element: Callable[..., str], *batch_values: Any) -> Any:
     """Return the text for one element, or an array of texts with one entry per batch element."""
-    return np.vectorize(element_text_function, otypes=[object])(*element_values)[()]
+    return np.vectorize(format_batch_element, otypes=[object])(*batch_values)[()]
 
 
 def format_heading_and_rows(heading_text: str, text_rows: Iterable[LabelAndText]) -> str:

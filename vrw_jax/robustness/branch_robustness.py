@@ -98,7 +98,7 @@ def measure_basins(
             basin_share_result = compute_basin_share(stable_gait, box_bounds, n_starts, max_steps)
             store_variable_value("basin_share", result_index, basin_share_result.share)
             store_variable_value("basin_share_error", result_index, basin_share_result.share_error)
-        if checked_model.capabilities.can_begin_within_step:
+        if checked_model.capabilities.can_start_within_gait_step:
             disturbance_result = compute_smallest_disturbance(stable_gait, None, max_steps)
             store_variable_value("smallest_disturbance", result_index, disturbance_result.size)
             store_variable_value(

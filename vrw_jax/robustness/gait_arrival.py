@@ -111,7 +111,7 @@ class StableGait(NamedTuple):
         state_units = self.model.collect_section_units(
             compute_wheel_units(self.params.symbols()), self.params.n_legs
         )
-        n_continuous_entries = self.model.count_continuous_entries(self.params)
+        n_continuous_entries = self.model.count_continuous_section_entries(self.params)
         scaled_state_differences = (
             section_states[:, None, :n_continuous_entries]
             - self.section_states[:, :n_continuous_entries]

@@ -49,7 +49,8 @@ def solve_rigid_passage(
     """
     vertical_rate_map, mean_slope = rigid_model.make_vertical_rate_map(params), params.slope
     steepest_slope = jnp.minimum(
-        mean_slope + MAX_SLOPE_STANDARD_DEVIATIONS * slope_sd, vertical_rate_map.slope_of_maximum
+        mean_slope + MAX_SLOPE_STANDARD_DEVIATIONS * slope_sd,
+        vertical_rate_map.slope_of_largest_squared_rate,
     )
     largest_squared_rate = lax.stop_gradient(vertical_rate_map.compute_fixed_point(steepest_slope))
     legendre_nodes, legendre_weights = np.polynomial.legendre.leggauss(n_nodes)
@@ -63,22 +64,25 @@ def solve_rigid_passage(
         The row contains the kernel at all nodes, multiplied by the quadrature weights.
         """
         compute_slope_cosine = lambda next_squared_rate: (
-            (next_squared_rate - vertical_rate_map.compute_slope_independent_part(squared_rate))
-            / vertical_rate_map.slope_amplitude
+            (
+                next_squared_rate
+                - vertical_rate_map.compute_slope_independent_squared_rate(squared_rate)
+            )
+            / vertical_rate_map.squared_rate_amplitude
         )
         slope_cosine = compute_slope_cosine(squared_rate_nodes)
         is_node_reachable = jnp.abs(slope_cosine) < 1.0
         slope_cosine = jnp.where(is_node_reachable, slope_cosine, 0.0)
         slope_deviation = (
-            vertical_rate_map.slope_of_maximum - jnp.arccos(slope_cosine) - mean_slope
+            vertical_rate_map.slope_of_largest_squared_rate - jnp.arccos(slope_cosine) - mean_slope
         ) / slope_sd
         squared_rate_density = jnp.exp(-0.5 * slope_deviation**2) / (
             jnp.sqrt(2.0 * jnp.pi) * slope_sd
         )
         squared_rate_density = squared_rate_density / (
-            vertical_rate_map.slope_amplitude * jnp.sqrt(1.0 - slope_cosine**2)
+            vertical_rate_map.squared_rate_amplitude * jnp.sqrt(1.0 - slope_cosine**2)
         )
-        flattest_slope = vertical_rate_map.slope_of_maximum - jnp.arccos(
+        flattest_slope = vertical_rate_map.slope_of_largest_squared_rate - jnp.arccos(
             jnp.clip(compute_slope_cosine(0.0), -1.0, 1.0)
         )
         return jnp.where(is_node_reachable, squared_rate_density, 0.0) * node_weights, ndtr(

@@ -197,7 +197,7 @@ class WalkerGroups:
         )
         self.n_groups, self.n_continuous_entries = (
             options.n_walker_groups,
-            int(model.count_continuous_entries(params)),
+            int(model.count_continuous_section_entries(params)),
         )
         # A digital net has a power of two points.
         n_walkers_per_group = 1 << (-(-n_walkers // self.n_groups) - 1).bit_length()

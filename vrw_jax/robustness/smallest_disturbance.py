@@ -177,7 +177,7 @@ def smallest_disturbance(
     """
     max_steps = check_int("max_steps", max_steps)
     stable_gait = StableGait.from_cycle("vrw.smallest_disturbance", params, model, cycle, options)
-    if not stable_gait.model.capabilities.can_begin_within_step:
+    if not stable_gait.model.capabilities.can_start_within_gait_step:
         raise ValueError(
             f"{type(stable_gait.model).__name__} cannot begin within a step, so that disturbances "
             "within a step are not available: take ViscoelasticWheel() or RigidWheel(), or disturb "

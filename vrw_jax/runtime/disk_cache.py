@@ -52,11 +52,13 @@ def compute_source_digest() -> str:
 @functools.cache
 def _list_library_versions() -> tuple[str, ...]:
     """Return the versions of Python and of the installed libraries in `TRACE_LIBRARY_NAMES`."""
-    version_texts = [f"python {sys.version_info[0]}.{sys.version_info[1]}"]
+    library_version_texts = [f"python {sys.version_info[0]}.{sys.version_info[1]}"]
     for library_name in TRACE_LIBRARY_NAMES:
         with contextlib.suppress(importlib.metadata.PackageNotFoundError):
-            version_texts.append(f"{library_name} {importlib.metadata.version(library_name)}")
-    return tuple(version_texts)
+            library_version_texts.append(
+                f"{library_name} {importlib.metadata.version(library_name)}"
+            )
+    return tuple(library_version_texts)
 
 
 def describe_trace_environment() -> tuple[object, ...]:
@@ -79,7 +81,7 @@ def find_cache_folder() -> Any:
     # Only JAX can read a storage bucket.
     if not jax_cache_folder or "://" in str(jax_cache_folder):
         return None
-    distrust_reason = explain_folder_distrust(Path(jax_cache_folder))
+    distrust_reason = explain_cache_folder_distrust(Path(jax_cache_folder))
     if distrust_reason:
         _warn_once(
             "folder", f"{distrust_reason}; until then no machine code or trace is kept or used."
@@ -88,111 +90,121 @@ def find_cache_folder() -> Any:
     return jax_cache_folder
 
 
-def explain_folder_distrust(code_folder: Path) -> str:
+def explain_cache_folder_distrust(cache_folder: Path) -> str:
     """Return the reason why code in a folder must not be executed, with a remedy.
 
     The text is empty if the code may be executed.
     """
     try:
-        distrust_reason = _explain_file_distrust(code_folder.stat())
+        distrust_reason = _explain_file_distrust(cache_folder.stat())
     except OSError:
         return ""  # The folder does not exist or cannot be read, so nothing in it is executed.
     if not distrust_reason:
         return ""
     return (
-        f"the cache {code_folder} {distrust_reason}, but its files are executed: run `chmod 700` "
+        f"the cache {cache_folder} {distrust_reason}, but its files are executed: run `chmod 700` "
         "on a folder "
         "of your own, give another one, or, if you trust all who can write there, say so by "
         f"start_jax(..., trust_shared=True) or {TRUST_SHARED_CACHE_VARIABLE}=1"
     )
 
 
-def has_shared_cache_trust() -> bool:
+def is_shared_cache_trusted() -> bool:
     """Return whether the user trusts everyone who can write to the cache folder."""
     return os.environ.get(TRUST_SHARED_CACHE_VARIABLE, "") not in ("", "0")
 
 
-def create_cache_folder(code_folder: Path) -> None:
+def create_cache_folder(cache_folder: Path) -> None:
     """Create a folder for code, and its parents.
 
     Only the user can access the folder, unless the user trusts a shared cache.
     """
-    for missing_folder in reversed([code_folder, *code_folder.parents]):
+    for missing_folder in reversed([cache_folder, *cache_folder.parents]):
         if not missing_folder.exists():
-            missing_folder.mkdir(mode=0o777 if has_shared_cache_trust() else 0o700, exist_ok=True)
+            missing_folder.mkdir(mode=0o777 if is_shared_cache_trusted() else 0o700, exist_ok=True)
 
 
-def load_bytes(record_name: str) -> bytes | None:
-    """Return the content of the record `record_name`, or None if no usable record exists."""
+def load_cache_record(cache_record_name: str) -> bytes | None:
+    """Return the content of the record `cache_record_name`, or None if no usable record exists."""
     # Some names are read from a record.
-    if not (cache_folder := find_cache_folder()) or not re.fullmatch(r"\w+", record_name):
+    if not (cache_folder := find_cache_folder()) or not re.fullmatch(r"\w+", cache_record_name):
         return None
-    record_path = Path(cache_folder) / f"{record_name}{CACHE_RECORD_SUFFIX}"
+    cache_record_path = Path(cache_folder) / f"{cache_record_name}{CACHE_RECORD_SUFFIX}"
     # Without this flag the call would block if the file were a pipe.
-    open_nonblocking = lambda record_path, open_flags: os.open(
-        record_path, open_flags | getattr(os, "O_NONBLOCK", 0)
+    open_nonblocking = lambda cache_record_path, open_flags: os.open(
+        cache_record_path, open_flags | getattr(os, "O_NONBLOCK", 0)
     )
     try:
-        with open(record_path, "rb", opener=open_nonblocking) as record_file:
-            file_stat_result = os.fstat(record_file.fileno())
+        with open(cache_record_path, "rb", opener=open_nonblocking) as cache_record_file:
+            file_stat_result = os.fstat(cache_record_file.fileno())
             is_regular_file = stat.S_ISREG(file_stat_result.st_mode)
             distrust_reason = (
                 _explain_file_distrust(file_stat_result) if is_regular_file else "is no file"
             )
-            record_bytes = b"" if distrust_reason else record_file.read()
+            cache_record_bytes = b"" if distrust_reason else cache_record_file.read()
     except FileNotFoundError:
         return None
     except OSError as read_error:
-        distrust_reason, record_bytes = f"can't be read ({read_error.strerror})", b""
+        distrust_reason, cache_record_bytes = f"can't be read ({read_error.strerror})", b""
     n_digest_bytes = hashlib.sha256().digest_size
-    stored_digest, record_content = record_bytes[:n_digest_bytes], record_bytes[n_digest_bytes:]
-    if not distrust_reason and _compute_record_digest(record_name, record_content) != stored_digest:
+    stored_record_digest, cache_record_content = (
+        cache_record_bytes[:n_digest_bytes],
+        cache_record_bytes[n_digest_bytes:],
+    )
+    if (
+        not distrust_reason
+        and _compute_cache_record_digest(cache_record_name, cache_record_content)
+        != stored_record_digest
+    ):
         distrust_reason = "is damaged"
     if distrust_reason:
-        warn_of_unusable_record(f"{record_path} {distrust_reason}")
+        warn_of_unusable_cache_record(f"{cache_record_path} {distrust_reason}")
         return None
-    return record_content
+    return cache_record_content
 
 
-def warn_of_unusable_record(record_description: str) -> None:
+def warn_of_unusable_cache_record(unusable_record_text: str) -> None:
     """Issue a warning, once per process, that a cache record is unusable."""
     _warn_once(
         "record",
-        f"the cached code {record_description}: it is compiled again, as is any other such file.",
+        f"the cached code {unusable_record_text}: it is compiled again, as is any other such file.",
     )
 
 
-def save_bytes(record_name: str, record_content: bytes) -> None:
+def save_cache_record(cache_record_name: str, cache_record_content: bytes) -> None:
     """Write a record atomically: write a temporary file, synchronize it to disk, and rename it.
 
     If the cache folder is not writable, no error is raised.
     """
     if not find_cache_folder():
         return
-    record_path, temporary_path = (
-        Path(find_cache_folder()) / f"{record_name}{CACHE_RECORD_SUFFIX}",
+    cache_record_path, temporary_path = (
+        Path(find_cache_folder()) / f"{cache_record_name}{CACHE_RECORD_SUFFIX}",
         None,
     )
     try:
-        create_cache_folder(record_path.parent)
+        create_cache_folder(cache_record_path.parent)
         file_descriptor, temporary_path = tempfile.mkstemp(
-            dir=record_path.parent, prefix="unfinished_"
+            dir=cache_record_path.parent, prefix="unfinished_"
         )
-        with os.fdopen(file_descriptor, "wb") as record_file:
-            record_file.write(_compute_record_digest(record_name, record_content) + record_content)
-            record_file.flush()
-            os.fsync(record_file.fileno())
-        if has_shared_cache_trust():  # Otherwise only the user can read it.
+        with os.fdopen(file_descriptor, "wb") as cache_record_file:
+            cache_record_file.write(
+                _compute_cache_record_digest(cache_record_name, cache_record_content)
+                + cache_record_content
+            )
+            cache_record_file.flush()
+            os.fsync(cache_record_file.fileno())
+        if is_shared_cache_trusted():  # Otherwise only the user can read it.
             os.chmod(temporary_path, 0o644)
-        os.replace(temporary_path, record_path)
+        os.replace(temporary_path, cache_record_path)
     except OSError:
         if temporary_path is not None:
             Path(temporary_path).unlink(missing_ok=True)
 
 
-def _compute_record_digest(record_name: str, record_content: bytes) -> bytes:
+def _compute_cache_record_digest(cache_record_name: str, cache_record_content: bytes) -> bytes:
     """Return the digest of a record's name and content."""
-    return hashlib.sha256(record_name.encode() + b"\n" + record_content).digest()
+    return hashlib.sha256(cache_record_name.encode() + b"\n" + cache_record_content).digest()
 
 
 def _explain_file_distrust(file_stat_result: os.stat_result) -> str:
@@ -201,7 +213,7 @@ def _explain_file_distrust(file_stat_result: os.stat_result) -> str:
     The text is empty if no other user can have written the file, or if the user trusts a shared
     cache.
     """
-    if os.name != "posix" or has_shared_cache_trust():
+    if os.name != "posix" or is_shared_cache_trusted():
         return ""
     if file_stat_result.st_uid != os.geteuid():
         return "belongs to another user"

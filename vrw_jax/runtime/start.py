@@ -53,7 +53,7 @@ def start_jax(cache: str | Path | None = None, *, trust_shared: bool = False) ->
         jax.config.update("jax_compilation_cache_dir", str(jax_cache_folder))
     cache_folder = jax.config.jax_compilation_cache_dir  # type: ignore[attr-defined]
     if cache_folder and "://" not in cache_folder:  # A storage bucket is no folder.
-        distrust_reason = store.explain_folder_distrust(Path(cache_folder))
+        distrust_reason = store.explain_cache_folder_distrust(Path(cache_folder))
         if distrust_reason:
             jax.config.update("jax_compilation_cache_dir", None)
             raise PermissionError(f"{distrust_reason}.")
@@ -66,15 +66,15 @@ def start_jax(cache: str | Path | None = None, *, trust_shared: bool = False) ->
         os.environ["XLA_FLAGS"] = f"{xla_flags} --{_FUSION_EMITTERS_FLAG}=false".strip()
 
 
-def make_fusion_emitter_options(are_emitters_enabled: bool) -> dict[str, str | bool]:
+def make_fusion_emitter_options(are_fusion_emitters_enabled: bool) -> dict[str, str | bool]:
     """Return options for `jax.jit` that switch XLA's fusion emitters on or off on a CPU.
 
     Without fusion emitters, XLA compiles in half to two thirds of the time. The compiled code is as
     fast, except for events with unilateral contact, where it is slower by a seventh. Programs whose
     digits must not depend on the process always set this option.
     """
-    emitters_flag = _accepts_fusion_emitters_flag() and jax.default_backend() == "cpu"
-    return {_FUSION_EMITTERS_FLAG: are_emitters_enabled} if emitters_flag else {}
+    can_set_emitters_flag = _accepts_fusion_emitters_flag() and jax.default_backend() == "cpu"
+    return {_FUSION_EMITTERS_FLAG: are_fusion_emitters_enabled} if can_set_emitters_flag else {}
 
 
 _FUSION_EMITTERS_FLAG = "xla_cpu_use_fusion_emitters"

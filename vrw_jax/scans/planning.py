@@ -263,10 +263,10 @@ def _require_reference_model(wheel_model: AbstractWheel, error_tolerance: float)
     Otherwise raise a ValueError.
     """
     model_fields: dict[str, Any] = type(wheel_model).__dataclass_fields__
-    default_only_fields = wheel_model.capabilities.default_only_fields
-    if default_only_fields is None or any(
+    fields_with_fixed_defaults = wheel_model.capabilities.fields_with_fixed_defaults
+    if fields_with_fixed_defaults is None or any(
         getattr(wheel_model, field_name) != model_fields[field_name].default
-        for field_name in default_only_fields
+        for field_name in fields_with_fixed_defaults
     ):
         raise ValueError(
             f"tol is given and model is {wheel_model!r}, but a tolerance refers to unilateral "

@@ -40,7 +40,7 @@ from vrw_jax.models import (
     replace_invalid_inputs,
 )
 from vrw_jax.numerics import RealInput, Scalar, StepOptions
-from vrw_jax.printing import AbstractPrintable, LabelAndText, map_text_of_elements
+from vrw_jax.printing import AbstractPrintable, LabelAndText, format_each_batch_element
 from vrw_jax.wheel import (
     ContactMode,
     Outcome,
@@ -144,7 +144,7 @@ class ModelChoice(AbstractPrintable):
         """Return a sentence that states why the model was selected; a batch has an array of
         sentences.
         """
-        return map_text_of_elements(describe_selection_reason, self.reason_code)
+        return format_each_batch_element(describe_selection_reason, self.reason_code)
 
 
 def describe_selection_reason(reason_code: int) -> str:
@@ -242,7 +242,7 @@ class LadderWheel(AbstractContactWheel):
     capabilities: ClassVar[ModelCapabilities] = ModelCapabilities(
         config_name="auto",
         gait_method=GaitMethod.SELECTION,
-        accepted_commands=frozenset({"scan"}),
+        accepted_cli_commands=frozenset({"scan"}),
         supports_uneven_ground=False,
     )
 

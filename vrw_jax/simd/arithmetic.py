@@ -37,7 +37,7 @@ class ElementwiseOperation(NamedTuple):
     result_dtype: Any
 
 
-def emit_llvm_elementwise(
+def emit_llvm_elementwise_primitive(
     value_emitter: ValueEmitter,
     primitive_name: str,
     primitive_params: Any,
@@ -69,18 +69,22 @@ def emit_llvm_elementwise(
 # The rules of sums and products drop terms known to be zero and factors known to be one.
 
 
-def _emit_llvm_sum(operation: ElementwiseOperation, x: LlvmValue, y: LlvmValue) -> LlvmValue:
+def _emit_llvm_sum(
+    elementwise_operation: ElementwiseOperation, x: LlvmValue, y: LlvmValue
+) -> LlvmValue:
     """Emit the sum x + y and return its LLVM value. A constant operand 0 needs no instruction."""
     if _equals_llvm_constant(y, 0):
         return x
     return (
         y
         if _equals_llvm_constant(x, 0)
-        else _emit_binary_instruction(operation, ("fadd", "add"), x, y)
+        else _emit_binary_instruction(elementwise_operation, ("fadd", "add"), x, y)
     )
 
 
-def _emit_llvm_product(operation: ElementwiseOperation, x: LlvmValue, y: LlvmValue) -> LlvmValue:
+def _emit_llvm_product(
+    elementwise_operation: ElementwiseOperation, x: LlvmValue, y: LlvmValue
+) -> LlvmValue:
     """Emit the product x * y and return its LLVM value. A constant factor 0 or 1 needs no
     instruction.
     """
@@ -89,35 +93,41 @@ def _emit_llvm_product(operation: ElementwiseOperation, x: LlvmValue, y: LlvmVal
     return (
         y
         if _equals_llvm_constant(x, 1) or _equals_llvm_constant(y, 0)
-        else _emit_binary_instruction(operation, ("fmul", "mul"), x, y)
+        else _emit_binary_instruction(elementwise_operation, ("fmul", "mul"), x, y)
     )
 
 
-def _emit_llvm_quotient(operation: ElementwiseOperation, x: LlvmValue, y: LlvmValue) -> LlvmValue:
+def _emit_llvm_quotient(
+    elementwise_operation: ElementwiseOperation, x: LlvmValue, y: LlvmValue
+) -> LlvmValue:
     """Emit the quotient x / y of two floats and return its LLVM value."""
     # An integer division by zero would stop the process.
-    _require_float_dtype("div", operation.operand_dtype)
+    _require_float_dtype("div", elementwise_operation.operand_dtype)
     if _equals_llvm_constant(y, 1):
         return x
-    x, y = operation.value_emitter.to_scalars_or_vectors(x, y)
-    return operation.value_emitter.builder.fdiv(
+    x, y = elementwise_operation.value_emitter.to_scalars_or_vectors(x, y)
+    return elementwise_operation.value_emitter.llvm_builder.fdiv(
         x,
         y,
         flags=RECIPROCAL_DIVISION_FLAGS
-        if operation.operand_dtype == np.float64
+        if elementwise_operation.operand_dtype == np.float64
         else FUSED_MULTIPLY_ADD_FLAGS,
     )
 
 
-def _emit_llvm_integer_power(operation: ElementwiseOperation, x: LlvmValue) -> LlvmValue:
+def _emit_llvm_integer_power(
+    elementwise_operation: ElementwiseOperation, x: LlvmValue
+) -> LlvmValue:
     """Emit the power of `x` with a constant integer exponent by repeated squaring, and return its
     LLVM value.
     """
-    emit_product = lambda x, y: _emit_binary_instruction(operation, ("fmul", "mul"), x, y)
+    emit_product = lambda x, y: _emit_binary_instruction(
+        elementwise_operation, ("fmul", "mul"), x, y
+    )
     partial_power, repeated_square, remaining_exponent = (
         None,
         x,
-        abs(operation.primitive_params["y"]),
+        abs(elementwise_operation.primitive_params["y"]),
     )
     while remaining_exponent:
         if remaining_exponent & 1:
@@ -132,34 +142,36 @@ def _emit_llvm_integer_power(operation: ElementwiseOperation, x: LlvmValue) -> L
             if remaining_exponent
             else repeated_square
         )
-    one_constant = operation.value_emitter.make_llvm_constant(x.type, 1)
+    one_constant = elementwise_operation.value_emitter.make_llvm_constant(x.type, 1)
     partial_power = one_constant if partial_power is None else partial_power
     return (
-        operation.value_emitter.builder.fdiv(
+        elementwise_operation.value_emitter.llvm_builder.fdiv(
             one_constant, partial_power, flags=FUSED_MULTIPLY_ADD_FLAGS
         )
-        if operation.primitive_params["y"] < 0
+        if elementwise_operation.primitive_params["y"] < 0
         else partial_power
     )
 
 
-def _emit_llvm_absolute_value(operation: ElementwiseOperation, x: LlvmValue) -> LlvmValue:
+def _emit_llvm_absolute_value(
+    elementwise_operation: ElementwiseOperation, x: LlvmValue
+) -> LlvmValue:
     """Emit the absolute value of `x` and return its LLVM value."""
-    if operation.operand_dtype.kind == "f":
-        return _emit_llvm_intrinsic_call(operation.value_emitter, "fabs", x)
+    if elementwise_operation.operand_dtype.kind == "f":
+        return _emit_llvm_intrinsic_call(elementwise_operation.value_emitter, "fabs", x)
     is_negative_value = _emit_llvm_comparison(
-        operation.value_emitter,
+        elementwise_operation.value_emitter,
         "<",
-        operation.operand_dtype,
+        elementwise_operation.operand_dtype,
         x,
-        operation.value_emitter.make_llvm_constant(x.type, 0),
+        elementwise_operation.value_emitter.make_llvm_constant(x.type, 0),
     )
-    return operation.value_emitter.builder.select(
-        is_negative_value, operation.value_emitter.builder.neg(x), x
+    return elementwise_operation.value_emitter.llvm_builder.select(
+        is_negative_value, elementwise_operation.value_emitter.llvm_builder.neg(x), x
     )
 
 
-def _return_operand(operation: ElementwiseOperation, x: LlvmValue) -> LlvmValue:
+def _return_operand(elementwise_operation: ElementwiseOperation, x: LlvmValue) -> LlvmValue:
     """Return the operand unchanged."""
     return x
 
@@ -171,25 +183,27 @@ def _make_bitwise_rule(builder_method_name: str) -> ElementwiseRule:
       instruction.
     """
 
-    def emit_llvm_bitwise(operation: ElementwiseOperation, x: LlvmValue, y: LlvmValue) -> LlvmValue:
-        return getattr(operation.value_emitter.builder, builder_method_name)(
-            *operation.value_emitter.to_scalars_or_vectors(x, y)
+    def emit_llvm_bitwise_operation(
+        elementwise_operation: ElementwiseOperation, x: LlvmValue, y: LlvmValue
+    ) -> LlvmValue:
+        return getattr(elementwise_operation.value_emitter.llvm_builder, builder_method_name)(
+            *elementwise_operation.value_emitter.to_scalars_or_vectors(x, y)
         )
 
-    return emit_llvm_bitwise
+    return emit_llvm_bitwise_operation
 
 
 def _make_comparison_rule(comparison_operator: str) -> ElementwiseRule:
     """Return an elementwise rule that compares two numbers by an operator such as "<"."""
 
     def emit_llvm_comparison(
-        operation: ElementwiseOperation, x: LlvmValue, y: LlvmValue
+        elementwise_operation: ElementwiseOperation, x: LlvmValue, y: LlvmValue
     ) -> LlvmValue:
         return _emit_llvm_comparison(
-            operation.value_emitter,
+            elementwise_operation.value_emitter,
             comparison_operator,
-            operation.operand_dtype,
-            *operation.value_emitter.to_scalars_or_vectors(x, y),
+            elementwise_operation.operand_dtype,
+            *elementwise_operation.value_emitter.to_scalars_or_vectors(x, y),
         )
 
     return emit_llvm_comparison
@@ -201,28 +215,34 @@ def _make_extremum_rule(comparison_operator: str) -> ElementwiseRule:
     """
 
     def emit_llvm_extremum(
-        operation: ElementwiseOperation, x: LlvmValue, y: LlvmValue
+        elementwise_operation: ElementwiseOperation, x: LlvmValue, y: LlvmValue
     ) -> LlvmValue:
-        x, y = operation.value_emitter.to_scalars_or_vectors(x, y)
-        selected_value = operation.value_emitter.builder.select(
+        x, y = elementwise_operation.value_emitter.to_scalars_or_vectors(x, y)
+        selected_value = elementwise_operation.value_emitter.llvm_builder.select(
             _emit_llvm_comparison(
-                operation.value_emitter, comparison_operator, operation.operand_dtype, x, y
+                elementwise_operation.value_emitter,
+                comparison_operator,
+                elementwise_operation.operand_dtype,
+                x,
+                y,
             ),
             x,
             y,
         )
-        if operation.operand_dtype.kind != "f":
+        if elementwise_operation.operand_dtype.kind != "f":
             return selected_value
         # The result is NaN if either operand is NaN.
-        return operation.value_emitter.builder.select(
-            operation.value_emitter.builder.fcmp_unordered("uno", x, x), x, selected_value
+        return elementwise_operation.value_emitter.llvm_builder.select(
+            elementwise_operation.value_emitter.llvm_builder.fcmp_unordered("uno", x, x),
+            x,
+            selected_value,
         )
 
     return emit_llvm_extremum
 
 
 def _emit_llvm_select(
-    operation: ElementwiseOperation, *condition_and_cases: LlvmValue
+    elementwise_operation: ElementwiseOperation, *condition_and_cases: LlvmValue
 ) -> LlvmValue:
     """Emit the selection of the first case where the condition is false, and of the second where it
     is true.
@@ -237,10 +257,13 @@ def _emit_llvm_select(
         return case_values[0]
     if isinstance(lane_condition.type, ir.VectorType):
         case_values = [
-            operation.value_emitter.to_lane_vector(case_value) for case_value in case_values
+            elementwise_operation.value_emitter.to_lane_vector(case_value)
+            for case_value in case_values
         ]
-    false_case, true_case = operation.value_emitter.to_scalars_or_vectors(*case_values)
-    return operation.value_emitter.builder.select(lane_condition, true_case, false_case)
+    false_case, true_case = elementwise_operation.value_emitter.to_scalars_or_vectors(*case_values)
+    return elementwise_operation.value_emitter.llvm_builder.select(
+        lane_condition, true_case, false_case
+    )
 
 
 def _make_intrinsic_rule(
@@ -252,12 +275,14 @@ def _make_intrinsic_rule(
     For float32 operands, `emit_float32_value` emits the instructions instead, if it is given.
     """
 
-    def emit_llvm_intrinsic(operation: ElementwiseOperation, x: LlvmValue) -> LlvmValue:
-        _require_float_dtype(intrinsic_function_name, operation.operand_dtype)
+    def emit_llvm_intrinsic(elementwise_operation: ElementwiseOperation, x: LlvmValue) -> LlvmValue:
+        _require_float_dtype(intrinsic_function_name, elementwise_operation.operand_dtype)
         return (
-            emit_float32_value(operation.value_emitter, x)
-            if emit_float32_value and operation.operand_dtype == np.float32
-            else _emit_llvm_intrinsic_call(operation.value_emitter, intrinsic_function_name, x)
+            emit_float32_value(elementwise_operation.value_emitter, x)
+            if emit_float32_value and elementwise_operation.operand_dtype == np.float32
+            else _emit_llvm_intrinsic_call(
+                elementwise_operation.value_emitter, intrinsic_function_name, x
+            )
         )
 
     return emit_llvm_intrinsic
@@ -272,7 +297,7 @@ def _require_float_dtype(primitive_name: str, operand_dtype: Any) -> None:
 
 
 def _emit_binary_instruction(
-    operation: ElementwiseOperation,
+    elementwise_operation: ElementwiseOperation,
     float_and_integer_opcodes: tuple[str, str],
     x: LlvmValue,
     y: LlvmValue,
@@ -282,10 +307,10 @@ def _emit_binary_instruction(
     The opcode is the first of `float_and_integer_opcodes` if the operands are floats, else
     the second.
     """
-    x, y = operation.value_emitter.to_scalars_or_vectors(x, y)
-    return operation.value_emitter.emit_binary_instruction(
+    x, y = elementwise_operation.value_emitter.to_scalars_or_vectors(x, y)
+    return elementwise_operation.value_emitter.emit_binary_instruction(
         f"{float_and_integer_opcodes[0]} {' '.join(FUSED_MULTIPLY_ADD_FLAGS)}"
-        if operation.operand_dtype.kind == "f"
+        if elementwise_operation.operand_dtype.kind == "f"
         else float_and_integer_opcodes[1],
         x,
         y,
@@ -304,13 +329,13 @@ def _emit_llvm_comparison(
     `comparison_operator` is an operator such as "<".
     """
     if operand_dtype.kind == "b":  # The signed value of true would be -1.
-        return value_emitter.builder.icmp_unsigned(comparison_operator, x, y)
+        return value_emitter.llvm_builder.icmp_unsigned(comparison_operator, x, y)
     if operand_dtype.kind != "f":
-        return value_emitter.builder.icmp_signed(comparison_operator, x, y)
+        return value_emitter.llvm_builder.icmp_signed(comparison_operator, x, y)
     compare_floats = (
-        value_emitter.builder.fcmp_unordered
+        value_emitter.llvm_builder.fcmp_unordered
         if comparison_operator == "!="
-        else value_emitter.builder.fcmp_ordered
+        else value_emitter.llvm_builder.fcmp_ordered
     )
     return compare_floats(comparison_operator, x, y)
 
@@ -321,7 +346,10 @@ def convert_llvm_value(
     """Emit the conversion of an LLVM value from `operand_dtype` to `result_dtype`, and return the
     converted value.
     """
-    builder, result_llvm_type = value_emitter.builder, LLVM_NUMBER_TYPES[result_dtype.name]
+    llvm_builder, result_llvm_type = (
+        value_emitter.llvm_builder,
+        LLVM_NUMBER_TYPES[result_dtype.name],
+    )
     result_llvm_type = (
         value_emitter.make_vector_type(result_llvm_type)
         if isinstance(llvm_value.type, ir.VectorType)
@@ -339,19 +367,21 @@ def convert_llvm_value(
         )
     if operand_dtype.kind == result_dtype.kind == "f":
         return (
-            builder.fptrunc if result_dtype.itemsize < operand_dtype.itemsize else builder.fpext
+            llvm_builder.fptrunc
+            if result_dtype.itemsize < operand_dtype.itemsize
+            else llvm_builder.fpext
         )(llvm_value, result_llvm_type)
     if result_dtype.kind == "f":
-        return (builder.uitofp if operand_dtype.kind == "b" else builder.sitofp)(
+        return (llvm_builder.uitofp if operand_dtype.kind == "b" else llvm_builder.sitofp)(
             llvm_value, result_llvm_type
         )
     if operand_dtype.kind == "f":
-        return builder.fptosi(llvm_value, result_llvm_type)
+        return llvm_builder.fptosi(llvm_value, result_llvm_type)
     if operand_dtype.kind == "b":
-        return builder.zext(llvm_value, result_llvm_type)
-    return (builder.trunc if result_dtype.itemsize < operand_dtype.itemsize else builder.sext)(
-        llvm_value, result_llvm_type
-    )
+        return llvm_builder.zext(llvm_value, result_llvm_type)
+    return (
+        llvm_builder.trunc if result_dtype.itemsize < operand_dtype.itemsize else llvm_builder.sext
+    )(llvm_value, result_llvm_type)
 
 
 def _emit_llvm_intrinsic_call(
@@ -368,10 +398,10 @@ def _emit_llvm_intrinsic_call(
     intrinsic_name = (
         f"llvm.{intrinsic_function_name}.{f'v{llvm_type.count}' if is_vector else ''}f{n_type_bits}"
     )
-    llvm_module = value_emitter.builder.module
+    llvm_module = value_emitter.llvm_builder.module
     if intrinsic_name not in llvm_module.globals:
         ir.Function(llvm_module, ir.FunctionType(llvm_type, [llvm_type]), intrinsic_name)
-    return value_emitter.builder.call(llvm_module.globals[intrinsic_name], [operand])
+    return value_emitter.llvm_builder.call(llvm_module.globals[intrinsic_name], [operand])
 
 
 def _emit_llvm_polynomial(
@@ -380,13 +410,13 @@ def _emit_llvm_polynomial(
     """Emit a polynomial in `x` by Horner's scheme and return its LLVM value. The coefficients begin
     with the lowest power.
     """
-    builder, horner_sum = (
-        value_emitter.builder,
+    llvm_builder, horner_sum = (
+        value_emitter.llvm_builder,
         value_emitter.make_llvm_constant(x.type, polynomial_coefficients[-1]),
     )
     for polynomial_coefficient in polynomial_coefficients[-2::-1]:
-        horner_product = builder.fmul(horner_sum, x, flags=FUSED_MULTIPLY_ADD_FLAGS)
-        horner_sum = builder.fadd(
+        horner_product = llvm_builder.fmul(horner_sum, x, flags=FUSED_MULTIPLY_ADD_FLAGS)
+        horner_sum = llvm_builder.fadd(
             horner_product,
             value_emitter.make_llvm_constant(x.type, polynomial_coefficient),
             flags=FUSED_MULTIPLY_ADD_FLAGS,
@@ -400,24 +430,26 @@ def _emit_float32_logarithm(value_emitter: ValueEmitter, operand: LlvmValue) -> 
 
     LLVM's own logarithm would call the C library once per lane.
     """
-    builder, llvm_type = value_emitter.builder, operand.type
+    llvm_builder, llvm_type = value_emitter.llvm_builder, operand.type
     llvm_integer_type = (
         ir.VectorType(I32, llvm_type.count) if isinstance(llvm_type, ir.VectorType) else I32
     )
-    float_bits = builder.bitcast(operand, llvm_integer_type)
+    float_bits = llvm_builder.bitcast(operand, llvm_integer_type)
     make_integer_constant = lambda x: value_emitter.make_llvm_constant(llvm_integer_type, x)
-    binary_exponent = builder.sub(
-        builder.ashr(float_bits, make_integer_constant(23)), make_integer_constant(127)
+    binary_exponent = llvm_builder.sub(
+        llvm_builder.ashr(float_bits, make_integer_constant(23)), make_integer_constant(127)
     )
-    mantissa_bits = builder.or_(
-        builder.and_(float_bits, make_integer_constant(0x7FFFFF)), make_integer_constant(0x3F800000)
+    mantissa_bits = llvm_builder.or_(
+        llvm_builder.and_(float_bits, make_integer_constant(0x7FFFFF)),
+        make_integer_constant(0x3F800000),
     )
-    mantissa_minus_one = builder.fsub(
-        builder.bitcast(mantissa_bits, llvm_type), value_emitter.make_llvm_constant(llvm_type, 1.0)
+    mantissa_minus_one = llvm_builder.fsub(
+        llvm_builder.bitcast(mantissa_bits, llvm_type),
+        value_emitter.make_llvm_constant(llvm_type, 1.0),
     )
-    return builder.fadd(
-        builder.fmul(
-            builder.sitofp(binary_exponent, llvm_type),
+    return llvm_builder.fadd(
+        llvm_builder.fmul(
+            llvm_builder.sitofp(binary_exponent, llvm_type),
             value_emitter.make_llvm_constant(llvm_type, np.log(2.0)),
         ),
         _emit_llvm_polynomial(value_emitter, mantissa_minus_one, LOGARITHM_COEFFICIENTS),
@@ -429,26 +461,28 @@ def _emit_float32_exponential(value_emitter: ValueEmitter, operand: LlvmValue) -
 
     The relative error is at most 1e-6.
     """
-    builder, llvm_type = value_emitter.builder, operand.type
+    llvm_builder, llvm_type = value_emitter.llvm_builder, operand.type
     llvm_integer_type = (
         ir.VectorType(I32, llvm_type.count) if isinstance(llvm_type, ir.VectorType) else I32
     )
-    exponent_of_two = builder.fmul(
+    exponent_of_two = llvm_builder.fmul(
         operand, value_emitter.make_llvm_constant(llvm_type, 1.0 / np.log(2.0))
     )
     integer_exponent = _emit_llvm_intrinsic_call(value_emitter, "floor", exponent_of_two)
     fractional_power_of_two = _emit_llvm_polynomial(
-        value_emitter, builder.fsub(exponent_of_two, integer_exponent), POWER_OF_TWO_COEFFICIENTS
+        value_emitter,
+        llvm_builder.fsub(exponent_of_two, integer_exponent),
+        POWER_OF_TWO_COEFFICIENTS,
     )
     make_integer_constant = lambda x: value_emitter.make_llvm_constant(llvm_integer_type, x)
-    integer_power_of_two_bits = builder.shl(
-        builder.add(
-            builder.fptosi(integer_exponent, llvm_integer_type), make_integer_constant(127)
+    integer_power_of_two_bits = llvm_builder.shl(
+        llvm_builder.add(
+            llvm_builder.fptosi(integer_exponent, llvm_integer_type), make_integer_constant(127)
         ),
         make_integer_constant(23),
     )
-    return builder.fmul(
-        fractional_power_of_two, builder.bitcast(integer_power_of_two_bits, llvm_type)
+    return llvm_builder.fmul(
+        fractional_power_of_two, llvm_builder.bitcast(integer_power_of_two_bits, llvm_type)
     )
 
 
@@ -459,14 +493,16 @@ def _equals_llvm_constant(llvm_value: LlvmValue, expected_number: int) -> bool:
     )
 
 
-def _has_equal_constant_entries(constant_content: Any, expected_number: int) -> bool:
+def _has_equal_constant_entries(llvm_constant_content: Any, expected_number: int) -> bool:
     """Return whether all entries of a constant, nested to any depth, equal `expected_number`."""
-    if isinstance(constant_content, (list, tuple)):
+    if isinstance(llvm_constant_content, (list, tuple)):
         return all(
             _has_equal_constant_entries(constant_entry.constant, expected_number)
-            for constant_entry in constant_content
+            for constant_entry in llvm_constant_content
         )
-    return isinstance(constant_content, (int, float)) and constant_content == expected_number
+    return (
+        isinstance(llvm_constant_content, (int, float)) and llvm_constant_content == expected_number
+    )
 
 
 def _fit_polynomial(
@@ -493,8 +529,11 @@ ELEMENTWISE_RULES: dict[str, ElementwiseRule] = {
     "add": _emit_llvm_sum,
     "add_any": _emit_llvm_sum,
     "and": _make_bitwise_rule("and_"),
-    "convert_element_type": lambda operation, x: convert_llvm_value(
-        operation.value_emitter, x, operation.operand_dtype, operation.result_dtype
+    "convert_element_type": lambda elementwise_operation, x: convert_llvm_value(
+        elementwise_operation.value_emitter,
+        x,
+        elementwise_operation.operand_dtype,
+        elementwise_operation.result_dtype,
     ),
     "copy": _return_operand,
     "cos": _make_intrinsic_rule("cos"),
@@ -505,10 +544,12 @@ ELEMENTWISE_RULES: dict[str, ElementwiseRule] = {
     "ge": _make_comparison_rule(">="),
     "gt": _make_comparison_rule(">"),
     "integer_pow": _emit_llvm_integer_power,
-    "is_finite": lambda operation, x: operation.value_emitter.builder.fcmp_ordered(
-        "<",
-        _emit_llvm_intrinsic_call(operation.value_emitter, "fabs", x),
-        operation.value_emitter.make_llvm_constant(x.type, np.inf),
+    "is_finite": lambda elementwise_operation, x: (
+        elementwise_operation.value_emitter.llvm_builder.fcmp_ordered(
+            "<",
+            _emit_llvm_intrinsic_call(elementwise_operation.value_emitter, "fabs", x),
+            elementwise_operation.value_emitter.make_llvm_constant(x.type, np.inf),
+        )
     ),
     "le": _make_comparison_rule("<="),
     "log": _make_intrinsic_rule("log", _emit_float32_logarithm),
@@ -517,12 +558,14 @@ ELEMENTWISE_RULES: dict[str, ElementwiseRule] = {
     "min": _make_extremum_rule("<"),
     "mul": _emit_llvm_product,
     "ne": _make_comparison_rule("!="),
-    "neg": lambda operation, x: (
-        operation.value_emitter.builder.fneg(x)
-        if operation.operand_dtype.kind == "f"
-        else operation.value_emitter.builder.neg(x)
+    "neg": lambda elementwise_operation, x: (
+        elementwise_operation.value_emitter.llvm_builder.fneg(x)
+        if elementwise_operation.operand_dtype.kind == "f"
+        else elementwise_operation.value_emitter.llvm_builder.neg(x)
     ),
-    "not": lambda operation, x: operation.value_emitter.builder.not_(x),
+    "not": lambda elementwise_operation, x: elementwise_operation.value_emitter.llvm_builder.not_(
+        x
+    ),
     "or": _make_bitwise_rule("or_"),
     "select_n": _emit_llvm_select,
     "shift_left": _make_bitwise_rule("shl"),
@@ -530,13 +573,15 @@ ELEMENTWISE_RULES: dict[str, ElementwiseRule] = {
     "shift_right_logical": _make_bitwise_rule("lshr"),
     "sin": _make_intrinsic_rule("sin"),
     "sqrt": _make_intrinsic_rule("sqrt"),
-    "square": lambda operation, x: _emit_binary_instruction(operation, ("fmul", "mul"), x, x),
+    "square": lambda elementwise_operation, x: _emit_binary_instruction(
+        elementwise_operation, ("fmul", "mul"), x, x
+    ),
     "stop_gradient": _return_operand,
     # A constant operand y = 0 needs no instruction.
-    "sub": lambda operation, x, y: (
+    "sub": lambda elementwise_operation, x, y: (
         x
         if _equals_llvm_constant(y, 0)
-        else _emit_binary_instruction(operation, ("fsub", "sub"), x, y)
+        else _emit_binary_instruction(elementwise_operation, ("fsub", "sub"), x, y)
     ),
     "xor": _make_bitwise_rule("xor"),
 }

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from vrw_jax.simd.arithmetic import emit_llvm_elementwise
+from vrw_jax.simd.arithmetic import emit_llvm_elementwise_primitive
 from vrw_jax.simd.lazy_arrays import (
     EntryIndex,
     LazyArray,
@@ -82,9 +82,9 @@ class ArrayEmitter:
         register_limits: RegisterLimits,
         is_in_innermost_loop: bool = False,
     ) -> None:
-        self.value_emitter, self.builder, self.register_limits = (
+        self.value_emitter, self.llvm_builder, self.register_limits = (
             value_emitter,
-            value_emitter.builder,
+            value_emitter.llvm_builder,
             register_limits,
         )
         self.objects_kept_alive: list[Any] = []  # objects that are identified by `id`
@@ -98,7 +98,7 @@ class ArrayEmitter:
         """
         return (
             self.value_emitter.make_vector_type(get_llvm_number_type(aval))
-            if has_lanes(aval)
+            if has_lane_axis(aval)
             else get_llvm_number_type(aval)
         )
 
@@ -144,7 +144,7 @@ class ArrayEmitter:
                 *(i if isinstance(i, int) else ("at", id(i)) for i in entry_index),
             )
             return self.value_emitter.emit_value_once(
-                entry_key, lambda: array.get_entry_at(entry_index)
+                entry_key, lambda: array.get_entry_at_index(entry_index)
             )
         # An array with stride 0 along an axis has the same entry at all indices of the axis.
         indices_strides_lengths = zip(entry_index, array.strides, array.shape, strict=True)
@@ -175,7 +175,7 @@ class ArrayEmitter:
                 self.get_array_entries(array), get_shape_without_lanes(aval)
             ).ravel()
             flat_entries += [
-                self.value_emitter.to_lane_vector(x) if has_lanes(aval) else x
+                self.value_emitter.to_lane_vector(x) if has_lane_axis(aval) else x
                 for x in broadcast_entries
             ]
         return flat_entries
@@ -194,17 +194,17 @@ class ArrayEmitter:
                 constant_offset += i * axis_stride
                 continue
             axis_offset = (
-                i if axis_stride == 1 else self.builder.mul(i, ir.Constant(I64, axis_stride))
+                i if axis_stride == 1 else self.llvm_builder.mul(i, ir.Constant(I64, axis_stride))
             )
             memory_offset = (
                 axis_offset
                 if memory_offset is None
-                else self.builder.add(memory_offset, axis_offset)
+                else self.llvm_builder.add(memory_offset, axis_offset)
             )
         if memory_offset is None:
             return ir.Constant(I64, constant_offset)
         return (
-            self.builder.add(memory_offset, ir.Constant(I64, constant_offset))
+            self.llvm_builder.add(memory_offset, ir.Constant(I64, constant_offset))
             if constant_offset
             else memory_offset
         )
@@ -212,20 +212,20 @@ class ArrayEmitter:
     def emit_index_loops(
         self,
         index_shape: Sequence[int],
-        emit_body: Callable[[EntryIndex, list[LlvmValue]], Sequence[LlvmValue]],
+        emit_loop_body: Callable[[EntryIndex, list[LlvmValue]], Sequence[LlvmValue]],
         loop_carry: Sequence[LlvmValue] = (),
     ) -> list[LlvmValue]:
         """Emit nested loops over all indices of an array of shape `index_shape`.
 
-        Each iteration computes `loop_carry = emit_body(index, loop_carry)`. Return the loop carry
-        after the last iteration.
+        Each iteration computes `loop_carry = emit_loop_body(index, loop_carry)`. Return the loop
+        carry after the last iteration.
         """
 
         def emit_nested_index_loops(
             outer_index: EntryIndex, loop_carry: Sequence[LlvmValue]
         ) -> Sequence[LlvmValue]:
             if len(outer_index) == len(index_shape):
-                return emit_body(outer_index, list(loop_carry))
+                return emit_loop_body(outer_index, list(loop_carry))
             if index_shape[len(outer_index)] == 1:
                 return emit_nested_index_loops((*outer_index, 0), loop_carry)
             emit_inner_loop = lambda i, loop_carry: emit_nested_index_loops(
@@ -240,36 +240,39 @@ class ArrayEmitter:
     def emit_counted_loop(
         self,
         n_iterations: int,
-        emit_body: Callable[[LlvmValue, list[LlvmValue]], Sequence[LlvmValue]],
+        emit_loop_body: Callable[[LlvmValue, list[LlvmValue]], Sequence[LlvmValue]],
         initial_loop_carry: Sequence[LlvmValue],
     ) -> list[LlvmValue]:
         """Emit a loop of `n_iterations` iterations, and return the loop carry after the last one.
 
-        Iteration i computes `carry = emit_body(i, carry)`.
+        Iteration i computes `carry = emit_loop_body(i, carry)`.
         """
         return self.emit_range_loop(
-            ir.Constant(I64, 0), ir.Constant(I64, n_iterations), emit_body, initial_loop_carry
+            ir.Constant(I64, 0), ir.Constant(I64, n_iterations), emit_loop_body, initial_loop_carry
         )
 
     def emit_range_loop(
         self,
         first_iteration: LlvmValue,
         end_iteration: LlvmValue,
-        emit_body: Callable[[LlvmValue, list[LlvmValue]], Sequence[LlvmValue]],
+        emit_loop_body: Callable[[LlvmValue, list[LlvmValue]], Sequence[LlvmValue]],
         initial_loop_carry: Sequence[LlvmValue] = (),
     ) -> list[LlvmValue]:
         """Emit a loop over `range(first_iteration, end_iteration)`, and return the loop carry after
         its end.
 
-        Iteration i computes `carry = emit_body(i, carry)`.
+        Iteration i computes `carry = emit_loop_body(i, carry)`.
         """
 
-        def emit_range_body(loop_values: list[LlvmValue]) -> list[LlvmValue]:
-            next_loop_carry = emit_body(loop_values[0], loop_values[1:])
-            return [self.builder.add(loop_values[0], ir.Constant(I64, 1)), *next_loop_carry]
+        def emit_range_body(loop_carried_values: list[LlvmValue]) -> list[LlvmValue]:
+            next_loop_carry = emit_loop_body(loop_carried_values[0], loop_carried_values[1:])
+            return [
+                self.llvm_builder.add(loop_carried_values[0], ir.Constant(I64, 1)),
+                *next_loop_carry,
+            ]
 
-        emit_range_condition = lambda loop_values: self.builder.icmp_signed(
-            "<", loop_values[0], end_iteration
+        emit_range_condition = lambda loop_carried_values: self.llvm_builder.icmp_signed(
+            "<", loop_carried_values[0], end_iteration
         )
         return self.value_emitter.emit_llvm_loop(
             [first_iteration, *initial_loop_carry], emit_range_condition, emit_range_body
@@ -280,20 +283,20 @@ class ArrayEmitter:
 
         The memory is allocated once, at the start of the LLVM function.
         """
-        with self.builder.goto_entry_block():
-            base_pointer = self.builder.alloca(
+        with self.llvm_builder.goto_entry_block():
+            base_pointer = self.llvm_builder.alloca(
                 entry_type, ir.Constant(I64, max(1, math.prod(array_shape)))
             )
         return MemoryArray(self, array_shape, entry_type, base_pointer)
 
-    def store_array_into_memory(self, memory_array: MemoryArray, array: LlvmArray) -> None:
+    def emit_array_stores(self, memory_array: MemoryArray, array: LlvmArray) -> None:
         """Emit stores of all initialized entries of `array` into `memory_array`, which has the same
         shape.
         """
         if isinstance(array, UninitializedArray):
             return
         if isinstance(array, PendingArrayUpdate):
-            self.store_array_into_memory(memory_array, array.base_array)
+            self.emit_array_stores(memory_array, array.base_array)
             array.emit_update_stores(memory_array)
             return
         if isinstance(array, np.ndarray) and any(array.strides):
@@ -301,13 +304,13 @@ class ArrayEmitter:
                 memory_array.emit_entry_store(entry_index, array[entry_index])
             return
 
-        def store_entry(entry_index: EntryIndex, _: Any) -> list[LlvmValue]:
+        def emit_array_entry_store(entry_index: EntryIndex, _: Any) -> list[LlvmValue]:
             memory_array.emit_entry_store(entry_index, self.get_array_entry(array, entry_index))
             return []
 
-        self.emit_index_loops(memory_array.shape, store_entry)
+        self.emit_index_loops(memory_array.shape, emit_array_entry_store)
 
-    def store_in_memory(self, array: LlvmArray) -> MemoryArray:
+    def store_array_in_memory(self, array: LlvmArray) -> MemoryArray:
         """Return the array with all entries computed and stored in memory.
 
         In memory, an LLVM value can serve as an index.
@@ -327,7 +330,7 @@ class ArrayEmitter:
                 entry_types[0],
             )
         memory_array = self.allocate_memory_array(array.shape, entry_type)
-        self.store_array_into_memory(memory_array, array)
+        self.emit_array_stores(memory_array, array)
         return memory_array
 
     def make_memory_table(self, array: np.ndarray) -> MemoryArray:
@@ -336,10 +339,10 @@ class ArrayEmitter:
         An array of constants becomes part of the program.
         """
         if not all(isinstance(x, ir.Constant) for x in array.ravel()):
-            return self.store_in_memory(array)
+            return self.store_array_in_memory(array)
         llvm_element_type = array.ravel()[0].type
         llvm_table_type = ir.ArrayType(llvm_element_type, array.size)
-        llvm_module = self.builder.module
+        llvm_module = self.llvm_builder.module
         llvm_table = ir.GlobalVariable(
             llvm_module, llvm_table_type, llvm_module.get_unique_name("table")
         )
@@ -362,7 +365,7 @@ class ArrayEmitter:
             return make_entry_array(
                 (),
                 [
-                    emit_llvm_elementwise(
+                    emit_llvm_elementwise_primitive(
                         self.value_emitter,
                         primitive_name,
                         primitive_params,
@@ -381,7 +384,7 @@ class ArrayEmitter:
             operand_arrays = [
                 self.broadcast_array(x, result_shape, range(len(x.shape))) for x in operand_arrays
             ]
-        emit_result_entry = lambda entry_operands: emit_llvm_elementwise(
+        emit_result_entry = lambda entry_operands: emit_llvm_elementwise_primitive(
             self.value_emitter,
             primitive_name,
             primitive_params,
@@ -469,27 +472,33 @@ class ArrayEmitter:
             for axis_length in shape_before_reshape[:0:-1]:
                 llvm_axis_length = ir.Constant(I64, axis_length)
                 index_before_reshape.append(
-                    0 if axis_length == 1 else self.builder.urem(memory_offset, llvm_axis_length)
+                    0
+                    if axis_length == 1
+                    else self.llvm_builder.urem(memory_offset, llvm_axis_length)
                 )
                 memory_offset = (
                     memory_offset
                     if axis_length == 1
-                    else self.builder.udiv(memory_offset, llvm_axis_length)
+                    else self.llvm_builder.udiv(memory_offset, llvm_axis_length)
                 )
             return self.get_array_entry(
                 array,
                 (0 if shape_before_reshape[0] == 1 else memory_offset, *index_before_reshape[::-1]),
             )
 
-        long_old_axes = [i for i, axis_length in enumerate(shape_before_reshape) if axis_length > 1]
-        long_new_axes = [i for i, axis_length in enumerate(new_shape) if axis_length > 1]
-        if [shape_before_reshape[i] for i in long_old_axes] == [
-            new_shape[i] for i in long_new_axes
+        nonunit_old_axes = [
+            i for i, axis_length in enumerate(shape_before_reshape) if axis_length > 1
+        ]
+        nonunit_new_axes = [i for i, axis_length in enumerate(new_shape) if axis_length > 1]
+        if [shape_before_reshape[i] for i in nonunit_old_axes] == [
+            new_shape[i] for i in nonunit_new_axes
         ]:  # The shapes differ only by axes of length 1.
 
             def get_reshaped_entry(reshaped_index: EntryIndex) -> LlvmValue:
                 index_by_axis = dict(
-                    zip(long_old_axes, (reshaped_index[i] for i in long_new_axes), strict=True)
+                    zip(
+                        nonunit_old_axes, (reshaped_index[i] for i in nonunit_new_axes), strict=True
+                    )
                 )
                 return self.get_array_entry(
                     array, tuple(index_by_axis.get(i, 0) for i in range(len(shape_before_reshape)))
@@ -504,30 +513,36 @@ class ArrayEmitter:
         """
         if isinstance(i, int):
             return index_start + index_step * i
-        i = i if index_step == 1 else self.builder.mul(i, ir.Constant(I64, index_step))
-        return i if index_start == 0 else self.builder.add(i, ir.Constant(I64, index_start))
+        i = i if index_step == 1 else self.llvm_builder.mul(i, ir.Constant(I64, index_step))
+        return i if index_start == 0 else self.llvm_builder.add(i, ir.Constant(I64, index_start))
 
     def emit_clamped_index(self, i: LlvmValue, last_index: int) -> LlvmValue:
         """Emit the index from 0 to `last_index` that is nearest to `i`, and return its value."""
-        builder, llvm_zero, llvm_last_index = (
-            self.builder,
+        llvm_builder, llvm_zero, llvm_last_index = (
+            self.llvm_builder,
             ir.Constant(I64, 0),
             ir.Constant(I64, last_index),
         )
-        i = builder.select(builder.icmp_signed("<", i, llvm_zero), llvm_zero, i)
-        return builder.select(builder.icmp_signed(">", i, llvm_last_index), llvm_last_index, i)
+        i = llvm_builder.select(llvm_builder.icmp_signed("<", i, llvm_zero), llvm_zero, i)
+        return llvm_builder.select(
+            llvm_builder.icmp_signed(">", i, llvm_last_index), llvm_last_index, i
+        )
 
-    def emit_index_sum(self, entry_index: EntryIndex, offset_index: EntryIndex) -> EntryIndex:
+    def emit_sum_of_indices(self, entry_index: EntryIndex, offset_index: EntryIndex) -> EntryIndex:
         """Emit the sum of two indices of array entries, axis by axis, and return the resulting
         index.
         """
 
-        def add_axis_indices(i: Any, j: Any) -> Any:
+        def emit_axis_index_sum(i: Any, j: Any) -> Any:
             if isinstance(j, int):
                 return self.emit_affine_index(i, j)
-            return self.emit_affine_index(j, i) if isinstance(i, int) else self.builder.add(i, j)
+            return (
+                self.emit_affine_index(j, i) if isinstance(i, int) else self.llvm_builder.add(i, j)
+            )
 
-        return tuple(add_axis_indices(i, j) for i, j in zip(entry_index, offset_index, strict=True))
+        return tuple(
+            emit_axis_index_sum(i, j) for i, j in zip(entry_index, offset_index, strict=True)
+        )
 
     def make_llvm_zero(self, entry_type: ir.Type) -> LlvmValue:
         """Return a constant 0 of type `entry_type` that is the initial value of a sum."""
@@ -545,24 +560,24 @@ class ArrayEmitter:
 _LLVM_FLOAT_TYPES = (ir.FloatType, ir.DoubleType)
 
 
-def has_lanes(aval: Any) -> bool:
+def has_lane_axis(aval: Any) -> bool:
     """Return whether the last axis of an array of the trace is the lane axis."""
     return bool(aval.shape) and aval.shape[-1] == LANE_AXIS_SENTINEL
 
 
 def get_shape_without_lanes(aval: Any) -> tuple[int, ...]:
     """Return the shape, without the lane axis, of an array of the trace."""
-    return aval.shape[:-1] if has_lanes(aval) else aval.shape
+    return aval.shape[:-1] if has_lane_axis(aval) else aval.shape
 
 
-def make_lane_axis_error(array_description: str, aval: Any) -> NotImplementedError:
+def make_lane_axis_error(error_subject: str, aval: Any) -> NotImplementedError:
     """Return the error for an axis that has the length of the lane axis without being the last
     axis.
 
-    - `array_description`: subject of the message, such as "An argument".
+    - `error_subject`: subject of the message, such as "An argument".
     """
     return NotImplementedError(
-        f"{array_description} has the shape {aval.str_short()}: an axis of {LANE_AXIS_SENTINEL} is "
+        f"{error_subject} has the shape {aval.str_short()}: an axis of {LANE_AXIS_SENTINEL} is "
         "the lanes', which come from arguments and stay the last; keep them there, and give other "
         "axes another length."
     )
@@ -608,10 +623,12 @@ def split_into_entry_arrays(
     This function is the inverse of `ArrayEmitter.flatten_array_entries`.
     """
     entry_arrays: list[LlvmArray] = []
-    first_entry = 0
+    first_entry_index = 0
     for aval in avals:
         array_shape = get_shape_without_lanes(aval)
-        end_entry = first_entry + math.prod(array_shape)
-        entry_arrays.append(make_entry_array(array_shape, flat_entries[first_entry:end_entry]))
-        first_entry = end_entry
+        end_entry_index = first_entry_index + math.prod(array_shape)
+        entry_arrays.append(
+            make_entry_array(array_shape, flat_entries[first_entry_index:end_entry_index])
+        )
+        first_entry_index = end_entry_index
     return entry_arrays

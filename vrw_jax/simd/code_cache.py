@@ -26,7 +26,7 @@ from vrw_jax.simd.array_emitter import RegisterLimits
 from vrw_jax.simd.kernel import LANE_KERNEL_NAME, write_llvm_kernel
 from vrw_jax.simd.machine import (
     compile_llvm_for_processor,
-    describe_compilation,
+    describe_compiler_settings,
     require_object_file,
 )
 
@@ -38,19 +38,19 @@ class CodeStore(Protocol):
     The store is an object or a module with two functions.
     """
 
-    def load_bytes(self, record_name: str) -> bytes | None:
-        """Return the bytes that are saved under `record_name`, or None if no undamaged record has
-        that name.
+    def load_cache_record(self, cache_record_name: str) -> bytes | None:
+        """Return the bytes that are saved under `cache_record_name`, or None if no undamaged record
+        has that name.
         """
 
-    def save_bytes(self, record_name: str, record_content: bytes) -> None:
-        """Save `record_content` under the name `record_name`."""
+    def save_cache_record(self, cache_record_name: str, cache_record_content: bytes) -> None:
+        """Save `cache_record_content` under the name `cache_record_name`."""
 
 
 class MachineCode(NamedTuple):
     """Machine code of a function over lanes, which may still be compiled in the background."""
 
-    code_name: str  # digest of the text that LLVM compiles; JAX programs call the code by it
+    ffi_target_name: str  # digest of the text that LLVM compiles; JAX programs call the code by it
     result_shapes_and_dtypes: tuple[
         tuple[tuple[int, ...], np.dtype], ...
     ]  # for each result, the lengths of all axes before the lanes and the dtype
@@ -65,7 +65,7 @@ def get_machine_code(
     lane_function: Callable,
     argument_shapes: Any,
     trace_key: object,
-    group_width: int,
+    lanes_per_group: int,
     code_store: CodeStore | None,
     register_limits: RegisterLimits,
 ) -> MachineCode:
@@ -76,42 +76,42 @@ def get_machine_code(
 
     - `argument_shapes`: shapes and dtypes of the arguments;
     - `trace_key`: object whose `repr` identifies all other inputs of the trace;
-    - `group_width`: number of lanes that the code computes at a time.
+    - `lanes_per_group`: number of lanes that the code computes at a time.
     """
-    index_key = (
+    code_index_key = (
         trace_key,
         argument_shapes,
-        group_width,
+        lanes_per_group,
         register_limits,
         jax.__version__,
-        describe_compilation(),
+        describe_compiler_settings(),
     )
-    index_record_name = f"lanes_index_{_compute_sha256_digest(repr(index_key).encode())}"
-    if index_record_name not in _machine_code_by_name:
-        encoded_code_name = (
-            code_store.load_bytes(index_record_name) if code_store is not None else None
+    code_index_name = f"lanes_index_{_compute_sha256_digest(repr(code_index_key).encode())}"
+    if code_index_name not in _machine_code_by_record_name:
+        encoded_ffi_target_name = (
+            code_store.load_cache_record(code_index_name) if code_store is not None else None
         )
         machine_code = (
-            load_machine_code(encoded_code_name.decode("ascii", "replace"), code_store)
-            if encoded_code_name
+            load_machine_code(encoded_ffi_target_name.decode("ascii", "replace"), code_store)
+            if encoded_ffi_target_name
             else None
         )
-        _machine_code_by_name[index_record_name] = machine_code or _trace_and_compile_function(
+        _machine_code_by_record_name[code_index_name] = machine_code or _trace_and_compile_function(
             lane_function,
             argument_shapes,
-            group_width,
-            index_record_name,
+            lanes_per_group,
+            code_index_name,
             code_store,
             register_limits,
         )
-    return _machine_code_by_name[index_record_name]
+    return _machine_code_by_record_name[code_index_name]
 
 
 def _trace_and_compile_function(
     lane_function: Callable,
     argument_shapes: Any,
-    group_width: int,
-    index_record_name: str,
+    lanes_per_group: int,
+    code_index_name: str,
     code_store: CodeStore | None,
     register_limits: RegisterLimits,
 ) -> MachineCode:
@@ -121,60 +121,63 @@ def _trace_and_compile_function(
     """
     with _jax_tracing_lock, _pause_garbage_collection():
         closed_jaxpr = trace_for_machine_code(lane_function, *argument_shapes)
-        llvm_text = write_llvm_kernel(closed_jaxpr, group_width, register_limits)
+        llvm_text = write_llvm_kernel(closed_jaxpr, lanes_per_group, register_limits)
     encoded_result_types = json.dumps(
         [(aval.shape[:-1], aval.dtype.name) for aval in closed_jaxpr.out_avals]
     )
-    digested_text = f"{encoded_result_types}{describe_compilation()}{llvm_text}"
-    code_name = f"lanes_code_{_compute_sha256_digest(digested_text.encode())}"
-    machine_code = load_machine_code(code_name, code_store)
+    digested_text = f"{encoded_result_types}{describe_compiler_settings()}{llvm_text}"
+    ffi_target_name = f"lanes_code_{_compute_sha256_digest(digested_text.encode())}"
+    machine_code = load_machine_code(ffi_target_name, code_store)
     if machine_code is None:
 
         def compile_and_save_code() -> bytes:
             object_code = compile_llvm_for_processor(llvm_text)
             if code_store is not None:
-                encoded_code = encoded_result_types.encode() + b"\n" + object_code
-                code_store.save_bytes(code_name, encoded_code)
-                code_store.save_bytes(index_record_name, code_name.encode())
+                encoded_machine_code = encoded_result_types.encode() + b"\n" + object_code
+                code_store.save_cache_record(ffi_target_name, encoded_machine_code)
+                code_store.save_cache_record(code_index_name, ffi_target_name.encode())
             return object_code
 
-        machine_code = _machine_code_by_name[code_name] = MachineCode(
-            code_name,
+        machine_code = _machine_code_by_record_name[ffi_target_name] = MachineCode(
+            ffi_target_name,
             _parse_result_shapes_and_dtypes(encoded_result_types),
             _llvm_compiler_pool.submit(compile_and_save_code),
         )
     elif code_store is not None:
-        code_store.save_bytes(index_record_name, code_name.encode())
+        code_store.save_cache_record(code_index_name, ffi_target_name.encode())
     return machine_code
 
 
-def load_machine_code(code_name: str, code_store: CodeStore | None) -> MachineCode | None:
-    """Return the machine code named `code_name` from this process or from `code_store`.
+def load_machine_code(ffi_target_name: str, code_store: CodeStore | None) -> MachineCode | None:
+    """Return the machine code named `ffi_target_name` from this process or from `code_store`.
 
     Return None if neither contains the code.
     """
-    if code_name not in _machine_code_by_name:
-        record_content = code_store.load_bytes(code_name) if code_store is not None else None
-        if record_content is None:
+    if ffi_target_name not in _machine_code_by_record_name:
+        cache_record_content = (
+            code_store.load_cache_record(ffi_target_name) if code_store is not None else None
+        )
+        if cache_record_content is None:
             return None
-        encoded_result_types, _, object_code = record_content.partition(b"\n")
+        encoded_result_types, _, object_code = cache_record_content.partition(b"\n")
         try:
-            parsed_result_types = _parse_result_shapes_and_dtypes(encoded_result_types)
+            result_shapes_and_dtypes = _parse_result_shapes_and_dtypes(encoded_result_types)
             require_object_file(object_code, LANE_KERNEL_NAME)
         except (
             ValueError,
             TypeError,
         ) as damage_error:  # LLVM would end the process on such a file.
             warnings.warn(
-                f"{code_name} holds no machine code ({damage_error}): compiled again.", stacklevel=2
+                f"{ffi_target_name} holds no machine code ({damage_error}): compiled again.",
+                stacklevel=2,
             )
             return None
         object_code_future: Future[bytes] = Future()
         object_code_future.set_result(object_code)
-        _machine_code_by_name[code_name] = MachineCode(
-            code_name, parsed_result_types, object_code_future
+        _machine_code_by_record_name[ffi_target_name] = MachineCode(
+            ffi_target_name, result_shapes_and_dtypes, object_code_future
         )
-    return _machine_code_by_name[code_name]
+    return _machine_code_by_record_name[ffi_target_name]
 
 
 def _compute_sha256_digest(digested_bytes: bytes) -> str:
@@ -182,7 +185,7 @@ def _compute_sha256_digest(digested_bytes: bytes) -> str:
     return hashlib.sha256(digested_bytes).hexdigest()
 
 
-_machine_code_by_name: dict[str, MachineCode] = {}
+_machine_code_by_record_name: dict[str, MachineCode] = {}
 """Machine code of this process, by the name of its index record and by its code name.
 
 Programs that are traced for several batch sizes share the code.
@@ -230,12 +233,12 @@ def trace_for_machine_code(lane_function: Callable, *argument_shapes: Any) -> Cl
 
     During the trace, `targets_machine_code` returns True.
     """
-    context_token = _is_tracing_for_machine_code.set(True)
+    tracing_flag_token = _is_tracing_for_machine_code.set(True)
     try:  # The loops are traced in this mesh, so that JAX's trace cache finds them again.
         with jax.sharding.use_abstract_mesh(jax.sharding.AbstractMesh((), ())):
             return jax.make_jaxpr(lane_function)(*argument_shapes)
     finally:
-        _is_tracing_for_machine_code.reset(context_token)
+        _is_tracing_for_machine_code.reset(tracing_flag_token)
 
 
 _is_tracing_for_machine_code: ContextVar[bool] = ContextVar("_tracing", default=False)

@@ -14,7 +14,7 @@ from vrw_jax.simd.array_emitter import (
     ArrayEmitter,
     PrimitiveCall,
     get_shape_without_lanes,
-    has_lanes,
+    has_lane_axis,
     make_lane_mixing_error,
 )
 from vrw_jax.simd.lazy_arrays import (
@@ -41,7 +41,7 @@ def emit_broadcast_array(
         array, array.shape[:-1], len(array.shape) > len(result_shape)
     )
     if (
-        has_lanes(primitive_call.result_aval)
+        has_lane_axis(primitive_call.result_aval)
         and len(array.shape) == len(axis_positions)
         and axis_positions[-1:] == (len(result_shape),)
     ):
@@ -59,7 +59,7 @@ def emit_broadcast_array(
         return LazyArray(
             result_shape,
             array_emitter.get_entry_type(primitive_call.result_aval),
-            broadcast_array.get_entry_at,
+            broadcast_array.get_entry_at_index,
         )
     return broadcast_array
 
@@ -83,10 +83,10 @@ def emit_transposed_array(
     get_transposed_entry = lambda entry_index: array_emitter.get_array_entry(
         array, tuple(entry_index[i] for i in inverse_axis_order)
     )
-    array_class = (
+    transposed_array_class = (
         TransposedMemoryView if isinstance(array, MemoryArray | TransposedMemoryView) else LazyArray
     )
-    return array_class(
+    return transposed_array_class(
         get_shape_without_lanes(primitive_call.result_aval), array.entry_type, get_transposed_entry
     )
 
@@ -183,48 +183,60 @@ def _concatenate_along_axis(
     if all(isinstance(x, np.ndarray) for x in joined_arrays):
         return np.concatenate(joined_arrays, join_axis)  # type: ignore[arg-type]
     nonempty_arrays = [x for x in joined_arrays if x.shape[join_axis]]
-    part_starts = np.cumsum([0, *(x.shape[join_axis] for x in nonempty_arrays)]).tolist()
+    joined_array_starts = np.cumsum([0, *(x.shape[join_axis] for x in nonempty_arrays)]).tolist()
 
-    def select_part_entry(result_index: EntryIndex) -> LlvmValue:
+    def select_joined_array_entry(result_index: EntryIndex) -> LlvmValue:
         i, selected_entry = result_index[join_axis], None
-        for part_array, part_start in zip(nonempty_arrays, part_starts, strict=False):
-            index_in_part, last_index_in_part = (
-                array_emitter.emit_affine_index(i, -part_start),
-                part_array.shape[join_axis] - 1,
+        for joined_array, joined_array_start in zip(
+            nonempty_arrays, joined_array_starts, strict=False
+        ):
+            index_in_joined_array, last_index_in_joined_array = (
+                array_emitter.emit_affine_index(i, -joined_array_start),
+                joined_array.shape[join_axis] - 1,
             )
             if isinstance(i, int):
-                if 0 <= index_in_part <= last_index_in_part:
+                if 0 <= index_in_joined_array <= last_index_in_joined_array:
                     return array_emitter.get_array_entry(
-                        part_array,
-                        (*result_index[:join_axis], index_in_part, *result_index[join_axis + 1 :]),
+                        joined_array,
+                        (
+                            *result_index[:join_axis],
+                            index_in_joined_array,
+                            *result_index[join_axis + 1 :],
+                        ),
                     )
                 continue
             # Beyond the end of a part any entry is valid, because the select below discards it.
-            index_in_part = (
+            index_in_joined_array = (
                 0
-                if last_index_in_part == 0
-                else array_emitter.emit_clamped_index(index_in_part, last_index_in_part)
+                if last_index_in_joined_array == 0
+                else array_emitter.emit_clamped_index(
+                    index_in_joined_array, last_index_in_joined_array
+                )
             )
-            part_entry = array_emitter.get_array_entry(
-                part_array,
-                (*result_index[:join_axis], index_in_part, *result_index[join_axis + 1 :]),
+            joined_array_entry = array_emitter.get_array_entry(
+                joined_array,
+                (*result_index[:join_axis], index_in_joined_array, *result_index[join_axis + 1 :]),
             )
-            is_index_in_part = array_emitter.builder.icmp_signed(
-                ">=", i, ir.Constant(I64, part_start)
+            is_past_joined_array_start = array_emitter.llvm_builder.icmp_signed(
+                ">=", i, ir.Constant(I64, joined_array_start)
             )
             if selected_entry is None:
-                selected_entry = part_entry
+                selected_entry = joined_array_entry
             else:
-                part_entry, selected_entry = array_emitter.value_emitter.to_scalars_or_vectors(
-                    part_entry, selected_entry
+                joined_array_entry, selected_entry = (
+                    array_emitter.value_emitter.to_scalars_or_vectors(
+                        joined_array_entry, selected_entry
+                    )
                 )
-                selected_entry = array_emitter.builder.select(
-                    is_index_in_part, part_entry, selected_entry
+                selected_entry = array_emitter.llvm_builder.select(
+                    is_past_joined_array_start, joined_array_entry, selected_entry
                 )
         return selected_entry
 
     return LazyArray(
-        result_shape, array_emitter.get_entry_type(primitive_call.result_aval), select_part_entry
+        result_shape,
+        array_emitter.get_entry_type(primitive_call.result_aval),
+        select_joined_array_entry,
     )
 
 
@@ -282,7 +294,7 @@ def emit_dynamic_slice(
     array_emitter: ArrayEmitter,
     primitive_call: PrimitiveCall,
     array: LlvmArray,
-    *axis_starts: LlvmArray,
+    *start_index_arrays: LlvmArray,
 ) -> LlvmArray:
     """Return a part of the array that begins at a computed index, which all lanes share."""
     start_index = _clamp_start_index(
@@ -290,10 +302,10 @@ def emit_dynamic_slice(
         primitive_call.operand_avals,
         array.shape,
         get_shape_without_lanes(primitive_call.result_aval),
-        axis_starts,
+        start_index_arrays,
     )
     get_sliced_entry = lambda entry_index: array_emitter.get_array_entry(
-        array, array_emitter.emit_index_sum(entry_index, start_index)
+        array, array_emitter.emit_sum_of_indices(entry_index, start_index)
     )
     return LazyArray(
         get_shape_without_lanes(primitive_call.result_aval),
@@ -307,25 +319,27 @@ def emit_dynamic_slice_update(
     primitive_call: PrimitiveCall,
     array: LlvmArray,
     update_array: LlvmArray,
-    *axis_starts: LlvmArray,
+    *start_index_arrays: LlvmArray,
 ) -> LlvmArray:
     """Return the array with one part replaced. The part begins at a computed index, the same for
     all lanes.
     """
-    if has_lanes(primitive_call.result_aval) and not has_lanes(primitive_call.operand_avals[1]):
+    if has_lane_axis(primitive_call.result_aval) and not has_lane_axis(
+        primitive_call.operand_avals[1]
+    ):
         raise make_lane_mixing_error(primitive_call.primitive_name)
     start_index = _clamp_start_index(
         array_emitter,
         primitive_call.operand_avals[1:],
         array.shape,
         update_array.shape,
-        axis_starts,
+        start_index_arrays,
     )
     has_repeated_entry = isinstance(array, np.ndarray) and not any(array.strides)
     needs_no_copy = has_repeated_entry or isinstance(array, UninitializedArray)
     return PendingArrayUpdate(
         array_emitter,
-        array if needs_no_copy else array_emitter.store_in_memory(array),
+        array if needs_no_copy else array_emitter.store_array_in_memory(array),
         update_array,
         start_index,
     )
@@ -335,17 +349,17 @@ def _clamp_start_index(
     array_emitter: ArrayEmitter,
     operand_avals: Any,
     array_shape: EntryIndex,
-    part_shape: EntryIndex,
-    axis_starts: Sequence[LlvmArray],
+    slice_shape: EntryIndex,
+    start_index_arrays: Sequence[LlvmArray],
 ) -> tuple[Any, ...]:
-    """Return the index `axis_starts`, clamped so that a part of shape `part_shape` lies inside the
-    array.
+    """Return the index `start_index_arrays`, clamped so that a part of shape `slice_shape` lies
+    inside the array.
     """
     clamped_start_index: list[Any] = []
-    for start_index_aval, n, m, axis_start in zip(
-        operand_avals[1:], array_shape, part_shape, axis_starts, strict=False
+    for start_index_aval, n, m, start_index_array in zip(
+        operand_avals[1:], array_shape, slice_shape, start_index_arrays, strict=False
     ):
-        start_index_value = array_emitter.get_array_entries(axis_start).item()
+        start_index_value = array_emitter.get_array_entries(start_index_array).item()
         if n == m:
             clamped_start_index.append(0)
         elif isinstance(start_index_value, ir.Constant):

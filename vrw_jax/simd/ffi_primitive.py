@@ -13,7 +13,7 @@ from vrw_jax.simd.code_cache import MachineCode
 from vrw_jax.simd.ffi_handler import FFI_HANDLER_NAME
 from vrw_jax.simd.machine import LoadedMachineCode
 
-LOADED_CODE_BY_NAME: dict[str, LoadedMachineCode] = {}
+LOADED_CODE_BY_FFI_TARGET: dict[str, LoadedMachineCode] = {}
 """Loaded machine code by the name under which JAX programs call it.
 
 The code stays loaded, because XLA never releases a registered function.
@@ -25,14 +25,14 @@ def register_machine_code(machine_code: MachineCode) -> None:
     """Load machine code, and make it callable by its name in JAX programs."""
     object_code = machine_code.wait_for_object_code()
     with _loaded_code_lock:
-        if machine_code.code_name not in LOADED_CODE_BY_NAME:
+        if machine_code.ffi_target_name not in LOADED_CODE_BY_FFI_TARGET:
             loaded_code = LoadedMachineCode(object_code)
             jax.ffi.register_ffi_target(
-                machine_code.code_name,
+                machine_code.ffi_target_name,
                 loaded_code.make_function_capsule(FFI_HANDLER_NAME),
                 platform="cpu",
             )
-            LOADED_CODE_BY_NAME[machine_code.code_name] = loaded_code
+            LOADED_CODE_BY_FFI_TARGET[machine_code.ffi_target_name] = loaded_code
 
 
 MACHINE_CODE_PRIMITIVE = Primitive("machine_code")
@@ -45,7 +45,7 @@ MACHINE_CODE_PRIMITIVE.multiple_results = True
 
 @MACHINE_CODE_PRIMITIVE.def_abstract_eval
 def _make_abstract_results(
-    *call_arguments: Any, code: MachineCode, result_shapes: Sequence[jax.ShapeDtypeStruct]
+    *call_arguments: Any, machine_code: MachineCode, result_shapes: Sequence[jax.ShapeDtypeStruct]
 ) -> list[Any]:
     """Return the abstract values (shapes and dtypes) of the results that a machine code call
     returns.
@@ -55,32 +55,34 @@ def _make_abstract_results(
 
 @MACHINE_CODE_PRIMITIVE.def_impl
 def _call_machine_code(
-    *call_arguments: Any, code: MachineCode, result_shapes: Sequence[jax.ShapeDtypeStruct]
+    *call_arguments: Any, machine_code: MachineCode, result_shapes: Sequence[jax.ShapeDtypeStruct]
 ) -> Any:
     """Return the results of a machine code call outside of `jax.jit`."""
     with jax.disable_jit(False):  # Only a compiled program can call machine code.
-        return _make_calling_program(code, tuple(result_shapes))(*call_arguments)
+        return _make_calling_program(machine_code, tuple(result_shapes))(*call_arguments)
 
 
 @functools.cache
 def _make_calling_program(
-    code: MachineCode, result_shapes: tuple[jax.ShapeDtypeStruct, ...]
+    machine_code: MachineCode, result_shapes: tuple[jax.ShapeDtypeStruct, ...]
 ) -> Callable[..., Any]:
-    """Return a compiled JAX program that only calls the machine code `code`."""
+    """Return a compiled JAX program that only calls the machine code `machine_code`."""
     return jax.jit(
-        functools.partial(MACHINE_CODE_PRIMITIVE.bind, code=code, result_shapes=result_shapes)
+        functools.partial(
+            MACHINE_CODE_PRIMITIVE.bind, machine_code=machine_code, result_shapes=result_shapes
+        )
     )
 
 
 def _lower_machine_code_call(
     lowering_context: Any,
     *call_arguments: Any,
-    code: MachineCode,
+    machine_code: MachineCode,
     result_shapes: Sequence[jax.ShapeDtypeStruct],
 ) -> Any:
     """Register the machine code with XLA, and return the lowering of its call."""
-    register_machine_code(code)
-    return jax.ffi.ffi_lowering(code.code_name)(lowering_context, *call_arguments)
+    register_machine_code(machine_code)
+    return jax.ffi.ffi_lowering(machine_code.ffi_target_name)(lowering_context, *call_arguments)
 
 
 def _raise_unsupported_transform(*_: Any, **__: Any) -> Any:

@@ -10,7 +10,7 @@ from vrw_jax.simd.array_emitter import (
     LANE_AXIS_SENTINEL,
     ArrayEmitter,
     RegisterLimits,
-    has_lanes,
+    has_lane_axis,
     make_lane_axis_error,
 )
 from vrw_jax.simd.ffi_handler import add_ffi_handler, read_ffi_api_version
@@ -25,15 +25,15 @@ LANE_KERNEL_NAME = "lanes"
 
 def write_llvm_kernel(
     closed_jaxpr: ClosedJaxpr,
-    group_width: int,
+    lanes_per_group: int,
     register_limits: RegisterLimits = DEFAULT_REGISTER_LIMITS,
 ) -> str:
     """Return the LLVM text of a function that computes the jaxpr for a range of groups of lanes.
 
     The signature is
     `void lanes(const void **inputs, void **outputs, int64 lanes, int64 begin, int64 end)`. The
-    function loops over the groups from `begin` to `end`, each of `group_width` lanes. If
-    `group_width` is 1, the lane is computed twice, in a vector, because LLVM's code for scalars
+    function loops over the groups from `begin` to `end`, each of `lanes_per_group` lanes. If
+    `lanes_per_group` is 1, the lane is computed twice, in a vector, because LLVM's code for scalars
     differs in the last digits.
     """
     _check_lane_axes(closed_jaxpr)
@@ -45,16 +45,20 @@ def write_llvm_kernel(
         LANE_KERNEL_NAME,
     )
     llvm_kernel.attributes.add("nounwind")
-    builder = ir.IRBuilder(llvm_kernel.append_basic_block("entry"))
-    array_emitter = ArrayEmitter(ValueEmitter(builder, max(group_width, 2)), register_limits)
-    input_pointer_table, output_pointer_table, n_lanes, first_group, group_limit = llvm_kernel.args
+    llvm_builder = ir.IRBuilder(llvm_kernel.append_basic_block("entry"))
+    array_emitter = ArrayEmitter(
+        ValueEmitter(llvm_builder, max(lanes_per_group, 2)), register_limits
+    )
+    input_pointer_table, output_pointer_table, n_lanes, first_lane_group, end_lane_group = (
+        llvm_kernel.args
+    )
     argument_avals, result_avals = closed_jaxpr.in_avals, closed_jaxpr.out_avals
 
     def emit_table_pointer_load(pointer_table: LlvmValue, table_index: int) -> LlvmValue:
-        entry_pointer = builder.gep(
+        entry_pointer = llvm_builder.gep(
             pointer_table, [ir.Constant(I64, table_index)], source_etype=llvm_pointer_type
         )
-        return builder.load(entry_pointer, typ=llvm_pointer_type)
+        return llvm_builder.load(entry_pointer, typ=llvm_pointer_type)
 
     input_pointers = [
         emit_table_pointer_load(input_pointer_table, i) for i in range(len(argument_avals))
@@ -63,15 +67,15 @@ def write_llvm_kernel(
         emit_table_pointer_load(output_pointer_table, i) for i in range(len(result_avals))
     ]
 
-    def emit_group_of_lanes(group_index: LlvmValue, _: Any) -> list[LlvmValue]:
-        group_access = _LaneGroupAccess(
+    def emit_lane_group(lane_group_index: LlvmValue, _: Any) -> list[LlvmValue]:
+        lane_group_access = _LaneGroupAccess(
             array_emitter,
-            group_width == 1,
+            lanes_per_group == 1,
             n_lanes,
-            builder.mul(group_index, ir.Constant(I64, group_width)),
+            llvm_builder.mul(lane_group_index, ir.Constant(I64, lanes_per_group)),
         )
         argument_arrays = [
-            group_access.read_argument_array(*pointer_and_aval)
+            lane_group_access.read_argument_array(*pointer_and_aval)
             for pointer_and_aval in zip(input_pointers, argument_avals, strict=True)
         ]
         result_arrays = JaxprLowering(array_emitter, PRIMITIVE_RULES).lower_jaxpr(
@@ -80,17 +84,17 @@ def write_llvm_kernel(
         for output_pointer, aval, result_array in zip(
             output_pointers, result_avals, result_arrays, strict=True
         ):
-            group_access.write_result_array(output_pointer, aval, result_array)
+            lane_group_access.write_result_array(output_pointer, aval, result_array)
         return []
 
-    array_emitter.emit_range_loop(first_group, group_limit, emit_group_of_lanes)
-    builder.ret_void()
+    array_emitter.emit_range_loop(first_lane_group, end_lane_group, emit_lane_group)
+    llvm_builder.ret_void()
     add_ffi_handler(
         llvm_module,
         llvm_kernel,
         len(argument_avals),
         len(result_avals),
-        group_width,
+        lanes_per_group,
         read_ffi_api_version(),
     )
     return str(llvm_module)
@@ -101,15 +105,15 @@ def _check_lane_axes(closed_jaxpr: ClosedJaxpr) -> None:
 
     Raise the error also if another axis of an argument or a result has the length of the lane axis.
     """
-    for array_description, checked_avals in (
+    for error_subject, checked_avals in (
         ("An argument", closed_jaxpr.in_avals),
         ("A result", closed_jaxpr.out_avals),
     ):
         for aval in checked_avals:
             if LANE_AXIS_SENTINEL in aval.shape[:-1]:
-                raise make_lane_axis_error(array_description, aval)
+                raise make_lane_axis_error(error_subject, aval)
     for aval in closed_jaxpr.out_avals:
-        if not has_lanes(aval):
+        if not has_lane_axis(aval):
             raise NotImplementedError(
                 f"A result has the shape {aval.str_short()}, the same for all lanes: compute it "
                 "outside, or add zeros of the lanes."
@@ -127,27 +131,27 @@ class _LaneGroupAccess:
         array_emitter: ArrayEmitter,
         has_single_lane: bool,
         n_lanes: LlvmValue,
-        first_lane: LlvmValue,
+        first_lane_index: LlvmValue,
     ) -> None:
         self.array_emitter, self.has_single_lane = array_emitter, has_single_lane
-        self.n_lanes, self.first_lane = n_lanes, first_lane
+        self.n_lanes, self.first_lane_index = n_lanes, first_lane_index
 
     def read_argument_array(self, base_pointer: LlvmValue, aval: Any) -> LlvmArray:
         """Return the argument at `base_pointer` as an array of LLVM values.
 
         An argument without axes is one number for all lanes.
         """
-        builder = self.array_emitter.builder
+        llvm_builder = self.array_emitter.llvm_builder
 
         def emit_entry_load(entry_index: EntryIndex) -> LlvmValue:
-            entry_address, llvm_stored_type = self.emit_group_address(
+            entry_address, llvm_stored_type = self.emit_lane_group_address(
                 base_pointer, aval, entry_index
             )
-            entry_value = builder.load(
+            entry_value = llvm_builder.load(
                 entry_address, typ=llvm_stored_type, align=aval.dtype.itemsize
             )
             if aval.dtype.kind == "b":
-                entry_value = builder.icmp_signed(
+                entry_value = llvm_builder.icmp_signed(
                     "!=",
                     entry_value,
                     self.array_emitter.value_emitter.make_llvm_constant(llvm_stored_type, 0),
@@ -177,41 +181,46 @@ class _LaneGroupAccess:
         """Emit stores of `result_array`, for the lanes of the group, into the memory at
         `base_pointer`.
         """
-        builder = self.array_emitter.builder
+        llvm_builder = self.array_emitter.llvm_builder
 
         def emit_entry_store(entry_index: EntryIndex, _: Any) -> list[LlvmValue]:
-            entry_address, llvm_stored_type = self.emit_group_address(
+            entry_address, llvm_stored_type = self.emit_lane_group_address(
                 base_pointer, aval, entry_index
             )
             entry_value = self.array_emitter.value_emitter.to_lane_vector(
                 self.array_emitter.get_array_entry(result_array, entry_index)
             )
             if self.has_single_lane:
-                entry_value = builder.extract_element(entry_value, ir.Constant(I64, 0))
+                entry_value = llvm_builder.extract_element(entry_value, ir.Constant(I64, 0))
             if aval.dtype.kind == "b":
-                entry_value = builder.zext(entry_value, llvm_stored_type)
-            builder.store(entry_value, entry_address, align=aval.dtype.itemsize)
+                entry_value = llvm_builder.zext(entry_value, llvm_stored_type)
+            llvm_builder.store(entry_value, entry_address, align=aval.dtype.itemsize)
             return []
 
         self.array_emitter.emit_index_loops(aval.shape[:-1], emit_entry_store)
 
-    def emit_group_address(
+    def emit_lane_group_address(
         self, base_pointer: LlvmValue, aval: Any, entry_index: EntryIndex
     ) -> tuple[LlvmValue, ir.Type]:
         """Return the address of an array entry for the first lane of the group, and the LLVM type
         to load or store there.
         """
-        builder, llvm_element_type = self.array_emitter.builder, LLVM_NUMBER_TYPES[aval.dtype.name]
+        llvm_builder, llvm_element_type = (
+            self.array_emitter.llvm_builder,
+            LLVM_NUMBER_TYPES[aval.dtype.name],
+        )
         llvm_element_type = I8 if llvm_element_type == I1 else llvm_element_type
         if aval.shape == ():
             return base_pointer, llvm_element_type
         entry_offset = self.array_emitter.emit_memory_offset(entry_index, aval.shape[:-1])
-        lane_offset = builder.add(builder.mul(entry_offset, self.n_lanes), self.first_lane)
+        lane_offset = llvm_builder.add(
+            llvm_builder.mul(entry_offset, self.n_lanes), self.first_lane_index
+        )
         llvm_stored_type = (
             llvm_element_type
             if self.has_single_lane
             else self.array_emitter.value_emitter.make_vector_type(llvm_element_type)
         )
-        return builder.gep(
+        return llvm_builder.gep(
             base_pointer, [lane_offset], source_etype=llvm_element_type
         ), llvm_stored_type

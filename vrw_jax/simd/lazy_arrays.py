@@ -17,7 +17,7 @@ EntryIndex = tuple[Any, ...]
 
 class LazyArray:
     """Large array of type `entry_type`, whose entries are computed or loaded by
-    `get_entry_at(index)`.
+    `get_entry_at_index(index)`.
 
     If `entry_type` is a vector, an entry may also be a scalar, which is the same for all lanes.
     """
@@ -26,12 +26,12 @@ class LazyArray:
         self,
         array_shape: Sequence[int],
         entry_type: ir.Type,
-        get_entry_at: Callable[[EntryIndex], LlvmValue],
+        get_entry_at_index: Callable[[EntryIndex], LlvmValue],
     ) -> None:
-        self.shape, self.entry_type, self.get_entry_at = (
+        self.shape, self.entry_type, self.get_entry_at_index = (
             tuple(array_shape),
             entry_type,
-            get_entry_at,
+            get_entry_at_index,
         )
 
 
@@ -69,7 +69,7 @@ class PendingArrayUpdate(LazyArray):
         elsewhere.
         """
         return self.array_emitter.get_array_entry(
-            self.array_emitter.store_in_memory(self), entry_index
+            self.array_emitter.store_array_in_memory(self), entry_index
         )
 
     def store_update_in_memory(self) -> "PendingArrayUpdate":
@@ -82,7 +82,7 @@ class PendingArrayUpdate(LazyArray):
         return PendingArrayUpdate(
             self.array_emitter,
             self.base_array,
-            self.array_emitter.store_in_memory(self.update_array),
+            self.array_emitter.store_array_in_memory(self.update_array),
             self.start_index,
         )
 
@@ -95,7 +95,7 @@ class PendingArrayUpdate(LazyArray):
 
         def store_updated_entry(update_index: EntryIndex, _: Any = None) -> list[LlvmValue]:
             memory_array.emit_entry_store(
-                array_emitter.emit_index_sum(update_index, self.start_index),
+                array_emitter.emit_sum_of_indices(update_index, self.start_index),
                 array_emitter.get_array_entry(self.update_array, update_index),
             )
             return []
@@ -132,13 +132,13 @@ class MemoryArray(LazyArray):
     def emit_entry_address(self, entry_index: EntryIndex) -> LlvmValue:
         """Return the LLVM value of the address of the entry at `entry_index`."""
         memory_offset = self.array_emitter.emit_memory_offset(entry_index, self.shape)
-        return self.array_emitter.builder.gep(
+        return self.array_emitter.llvm_builder.gep(
             self.base_pointer, [memory_offset], source_etype=self.entry_type
         )
 
     def emit_entry_load(self, entry_index: EntryIndex) -> LlvmValue:
         """Emit a load of the entry at `entry_index`, and return its LLVM value."""
-        return self.array_emitter.builder.load(
+        return self.array_emitter.llvm_builder.load(
             self.emit_entry_address(entry_index), typ=self.entry_type
         )
 
@@ -149,7 +149,7 @@ class MemoryArray(LazyArray):
             if isinstance(self.entry_type, ir.VectorType)
             else stored_value
         )
-        self.array_emitter.builder.store(stored_value, self.emit_entry_address(entry_index))
+        self.array_emitter.llvm_builder.store(stored_value, self.emit_entry_address(entry_index))
 
     def get_subarray(self, first_axis_index: LlvmValue) -> "MemoryArray":
         """Return the subarray at one index of the first axis, in the memory of this array."""
@@ -170,7 +170,7 @@ class TransposedMemoryView(LazyArray):
         return LazyArray(
             self.shape[1:],
             self.entry_type,
-            lambda entry_index: self.get_entry_at((first_axis_index, *entry_index)),
+            lambda entry_index: self.get_entry_at_index((first_axis_index, *entry_index)),
         )
 
 
@@ -180,14 +180,14 @@ array.
 """
 
 
-def mark_as_shared(array: LlvmArray) -> LlvmArray:
+def mark_memory_as_shared(array: LlvmArray) -> LlvmArray:
     """Return the array with a mark that other consumers still read it, so that no consumer
     overwrites its memory.
     """
     if isinstance(array, PendingArrayUpdate):
         return PendingArrayUpdate(
             array.array_emitter,
-            mark_as_shared(array.base_array),
+            mark_memory_as_shared(array.base_array),
             array.update_array,
             array.start_index,
         )

@@ -15,7 +15,7 @@ from vrw_jax.simd.lazy_arrays import (
     MemoryArray,
     PendingArrayUpdate,
     TransposedMemoryView,
-    mark_as_shared,
+    mark_memory_as_shared,
 )
 from vrw_jax.simd.llvm_library import ir
 from vrw_jax.simd.lowering import CALLED_JAXPR_PARAMETERS, JaxprLowering
@@ -36,15 +36,17 @@ def emit_while_loop(
         equation_params["body_nconsts"],
     )
     # The constants are shared, because each iteration reads them again.
-    loop_constants = list(map(mark_as_shared, operands[: n_condition_constants + n_body_constants]))
+    loop_constants = list(
+        map(mark_memory_as_shared, operands[: n_condition_constants + n_body_constants])
+    )
     condition_constants = loop_constants[:n_condition_constants]
     body_constants = loop_constants[n_condition_constants:]
-    initial_values = operands[n_condition_constants + n_body_constants :]
+    initial_loop_carry_arrays = operands[n_condition_constants + n_body_constants :]
     loop_carry = _LoopCarry(
         array_emitter,
         equation_params["body_jaxpr"].out_avals,
         array_emitter.register_limits.max_register_entries,
-        initial_values,
+        initial_loop_carry_arrays,
     )
 
     def emit_while_condition(register_values: list[LlvmValue]) -> LlvmValue:
@@ -52,7 +54,7 @@ def emit_while_loop(
             equation_params["cond_jaxpr"],
             [
                 *condition_constants,
-                *map(mark_as_shared, loop_carry.make_carried_arrays(register_values)),
+                *map(mark_memory_as_shared, loop_carry.make_loop_carry_arrays(register_values)),
             ],
         )
         return array_emitter.get_array_entries(condition_results[0]).item()
@@ -60,12 +62,12 @@ def emit_while_loop(
     def emit_while_body(register_values: list[LlvmValue]) -> list[LlvmValue]:
         body_results = jaxpr_lowering.lower_jaxpr(
             equation_params["body_jaxpr"],
-            [*body_constants, *loop_carry.make_carried_arrays(register_values)],
+            [*body_constants, *loop_carry.make_loop_carry_arrays(register_values)],
         )
         return loop_carry.get_next_register_values(body_results)
 
-    initial_registers = loop_carry.store_initial_arrays(initial_values)
-    return loop_carry.make_carried_arrays(
+    initial_registers = loop_carry.store_initial_loop_carry(initial_loop_carry_arrays)
+    return loop_carry.make_loop_carry_arrays(
         array_emitter.value_emitter.emit_llvm_loop(
             initial_registers, emit_while_condition, emit_while_body
         )
@@ -102,7 +104,7 @@ def emit_scan_loop(
         )
     scanned_operands = operands[n_loop_constants + n_carried_arrays :]
     scanned_arrays = [
-        x if isinstance(x, TransposedMemoryView) else array_emitter.store_in_memory(x)
+        x if isinstance(x, TransposedMemoryView) else array_emitter.store_array_in_memory(x)
         for x in scanned_operands
     ]
     stacked_arrays = [
@@ -115,16 +117,19 @@ def emit_scan_loop(
         array_emitter.is_in_innermost_loop,
         not _contains_loop(body_jaxpr.jaxpr),
     )
-    loop_constants = list(map(mark_as_shared, operands[:n_loop_constants]))
-    initial_values = operands[n_loop_constants : n_loop_constants + n_carried_arrays]
+    loop_constants = list(map(mark_memory_as_shared, operands[:n_loop_constants]))
+    initial_loop_carry_arrays = operands[n_loop_constants : n_loop_constants + n_carried_arrays]
     register_limits = array_emitter.register_limits
-    max_registers = (
+    max_register_entries = (
         register_limits.max_innermost_register_entries
         if array_emitter.is_in_innermost_loop
         else register_limits.max_register_entries
     )
     loop_carry = _LoopCarry(
-        array_emitter, body_jaxpr.out_avals[:n_carried_arrays], max_registers, initial_values
+        array_emitter,
+        body_jaxpr.out_avals[:n_carried_arrays],
+        max_register_entries,
+        initial_loop_carry_arrays,
     )
 
     def get_scanned_slice(
@@ -141,30 +146,30 @@ def emit_scan_loop(
         iteration_index: LlvmValue, register_values: list[LlvmValue]
     ) -> list[LlvmValue]:
         if equation_params["reverse"]:
-            iteration_index = array_emitter.builder.sub(
+            iteration_index = array_emitter.llvm_builder.sub(
                 ir.Constant(I64, n_iterations - 1), iteration_index
             )
         scanned_slices = [
-            get_scanned_slice(stacked_array, iteration_index) for stacked_array in scanned_arrays
+            get_scanned_slice(scanned_array, iteration_index) for scanned_array in scanned_arrays
         ]
         body_results = jaxpr_lowering.lower_jaxpr(
             body_jaxpr,
-            [*loop_constants, *loop_carry.make_carried_arrays(register_values), *scanned_slices],
+            [*loop_constants, *loop_carry.make_loop_carry_arrays(register_values), *scanned_slices],
         )
         for stacked_array, stacked_output in zip(
             stacked_arrays, body_results[n_carried_arrays:], strict=True
         ):
-            array_emitter.store_array_into_memory(
+            array_emitter.emit_array_stores(
                 stacked_array.get_subarray(iteration_index), stacked_output
             )
         return loop_carry.get_next_register_values(body_results[:n_carried_arrays])
 
-    initial_registers = loop_carry.store_initial_arrays(initial_values)
-    final_carried_arrays = loop_carry.make_carried_arrays(
+    initial_registers = loop_carry.store_initial_loop_carry(initial_loop_carry_arrays)
+    final_loop_carry_arrays = loop_carry.make_loop_carry_arrays(
         array_emitter.emit_counted_loop(n_iterations, emit_scan_body, initial_registers)
     )
     array_emitter.is_in_innermost_loop = was_in_innermost_loop
-    return [*final_carried_arrays, *stacked_arrays]
+    return [*final_loop_carry_arrays, *stacked_arrays]
 
 
 class _LoopCarry:
@@ -178,49 +183,53 @@ class _LoopCarry:
     def __init__(
         self,
         array_emitter: ArrayEmitter,
-        carried_avals: Sequence[Any],
+        loop_carry_avals: Sequence[Any],
         max_register_entries: int | float,
-        initial_values: Sequence[LlvmArray],
+        initial_loop_carry_arrays: Sequence[LlvmArray],
     ) -> None:
-        self.array_emitter, self.carried_avals = array_emitter, carried_avals
-        self.carried_memory = [
-            self.choose_carried_memory(aval, initial_value)
+        self.array_emitter, self.loop_carry_avals = array_emitter, loop_carry_avals
+        self.loop_carry_memory = [
+            self.choose_loop_carry_memory(aval, initial_loop_carry_array)
             if math.prod(get_shape_without_lanes(aval)) > max_register_entries
             else None
-            for aval, initial_value in zip(carried_avals, initial_values, strict=True)
+            for aval, initial_loop_carry_array in zip(
+                loop_carry_avals, initial_loop_carry_arrays, strict=True
+            )
         ]
 
-    def choose_carried_memory(self, carried_aval: Any, initial_array: LlvmArray) -> MemoryArray:
+    def choose_loop_carry_memory(
+        self, loop_carry_aval: Any, initial_loop_carry_array: LlvmArray
+    ) -> MemoryArray:
         """Return the memory in which the loop carries an array.
 
         It is the memory of the initial array if the loop may overwrite it and its entry type fits,
         else new memory.
         """
-        entry_type = self.array_emitter.get_entry_type(carried_aval)
-        initial_array = (
-            initial_array.base_array
-            if isinstance(initial_array, PendingArrayUpdate)
-            else initial_array
+        entry_type = self.array_emitter.get_entry_type(loop_carry_aval)
+        initial_loop_carry_array = (
+            initial_loop_carry_array.base_array
+            if isinstance(initial_loop_carry_array, PendingArrayUpdate)
+            else initial_loop_carry_array
         )
         if (
-            isinstance(initial_array, MemoryArray)
-            and initial_array.is_overwritable
-            and initial_array.entry_type == entry_type
+            isinstance(initial_loop_carry_array, MemoryArray)
+            and initial_loop_carry_array.is_overwritable
+            and initial_loop_carry_array.entry_type == entry_type
         ):
-            return initial_array
+            return initial_loop_carry_array
         return self.array_emitter.allocate_memory_array(
-            get_shape_without_lanes(carried_aval), entry_type
+            get_shape_without_lanes(loop_carry_aval), entry_type
         )
 
-    def make_carried_arrays(self, register_values: Sequence[LlvmValue]) -> list[LlvmArray]:
+    def make_loop_carry_arrays(self, register_values: Sequence[LlvmValue]) -> list[LlvmArray]:
         """Return the carried arrays at the start of an iteration, or after the last one.
 
         - `register_values`: entries of the arrays that are carried in registers.
         """
         register_avals = [
-            carried_aval
-            for carried_aval, memory_array in zip(
-                self.carried_avals, self.carried_memory, strict=True
+            loop_carry_aval
+            for loop_carry_aval, memory_array in zip(
+                self.loop_carry_avals, self.loop_carry_memory, strict=True
             )
             if memory_array is None
         ]
@@ -236,66 +245,78 @@ class _LoopCarry:
                 memory_array.base_pointer,
                 is_overwritable=True,
             )
-            for memory_array in self.carried_memory
+            for memory_array in self.loop_carry_memory
         ]
 
-    def store_initial_arrays(self, initial_arrays: Sequence[LlvmArray]) -> list[LlvmValue]:
+    def store_initial_loop_carry(
+        self, initial_loop_carry_arrays: Sequence[LlvmArray]
+    ) -> list[LlvmValue]:
         """Emit stores of the initial arrays that are carried in memory, and return the initial
         values of all registers.
         """
-        for initial_array, memory_array in zip(initial_arrays, self.carried_memory, strict=True):
-            if memory_array is None or initial_array is memory_array:
+        for initial_loop_carry_array, memory_array in zip(
+            initial_loop_carry_arrays, self.loop_carry_memory, strict=True
+        ):
+            if memory_array is None or initial_loop_carry_array is memory_array:
                 continue
             if (
-                isinstance(initial_array, PendingArrayUpdate)
-                and initial_array.base_array is memory_array
+                isinstance(initial_loop_carry_array, PendingArrayUpdate)
+                and initial_loop_carry_array.base_array is memory_array
             ):
-                initial_array.store_update_in_memory().emit_update_stores(memory_array)
+                initial_loop_carry_array.store_update_in_memory().emit_update_stores(memory_array)
             else:
-                self.array_emitter.store_array_into_memory(memory_array, initial_array)
-        return self._flatten_register_entries(initial_arrays)
+                self.array_emitter.emit_array_stores(memory_array, initial_loop_carry_array)
+        return self._flatten_register_entries(initial_loop_carry_arrays)
 
-    def get_next_register_values(self, next_arrays: Sequence[LlvmArray]) -> list[LlvmValue]:
+    def get_next_register_values(
+        self, next_loop_carry_arrays: Sequence[LlvmArray]
+    ) -> list[LlvmValue]:
         """Emit stores of the next arrays that are carried in memory, and return the next values of
         all registers.
 
         A next array may depend on every present array, so all next arrays are computed before any
         is stored.
         """
-        register_values = self._flatten_register_entries(next_arrays)
-        pending_copies: list[tuple[MemoryArray, MemoryArray | PendingArrayUpdate]] = []
-        for next_array, memory_array in zip(next_arrays, self.carried_memory, strict=True):
+        register_values = self._flatten_register_entries(next_loop_carry_arrays)
+        pending_memory_copies: list[tuple[MemoryArray, MemoryArray | PendingArrayUpdate]] = []
+        for next_loop_carry_array, memory_array in zip(
+            next_loop_carry_arrays, self.loop_carry_memory, strict=True
+        ):
             if memory_array is None or (
-                isinstance(next_array, MemoryArray)
-                and next_array.base_pointer is memory_array.base_pointer
+                isinstance(next_loop_carry_array, MemoryArray)
+                and next_loop_carry_array.base_pointer is memory_array.base_pointer
             ):
                 continue
             if (
-                isinstance(next_array, PendingArrayUpdate)
-                and getattr(next_array.base_array, "base_pointer", None)
+                isinstance(next_loop_carry_array, PendingArrayUpdate)
+                and getattr(next_loop_carry_array.base_array, "base_pointer", None)
                 is memory_array.base_pointer
             ):
-                pending_copies.append((memory_array, next_array.store_update_in_memory()))
-            elif isinstance(next_array, MemoryArray) and self._uses_separate_memory(next_array):
-                pending_copies.append((memory_array, next_array))
+                pending_memory_copies.append(
+                    (memory_array, next_loop_carry_array.store_update_in_memory())
+                )
+            elif isinstance(next_loop_carry_array, MemoryArray) and self._uses_separate_memory(
+                next_loop_carry_array
+            ):
+                pending_memory_copies.append((memory_array, next_loop_carry_array))
             else:
                 copied_array = self.array_emitter.allocate_memory_array(
                     memory_array.shape, memory_array.entry_type
                 )
-                self.array_emitter.store_array_into_memory(copied_array, next_array)
-                pending_copies.append((memory_array, copied_array))
-        for memory_array, next_memory_content in pending_copies:
-            if isinstance(next_memory_content, PendingArrayUpdate):
-                next_memory_content.emit_update_stores(memory_array)
+                self.array_emitter.emit_array_stores(copied_array, next_loop_carry_array)
+                pending_memory_copies.append((memory_array, copied_array))
+        for memory_array, next_loop_carry_content in pending_memory_copies:
+            if isinstance(next_loop_carry_content, PendingArrayUpdate):
+                next_loop_carry_content.emit_update_stores(memory_array)
             else:
-                self.array_emitter.store_array_into_memory(memory_array, next_memory_content)
+                self.array_emitter.emit_array_stores(memory_array, next_loop_carry_content)
         return register_values
 
     def _uses_separate_memory(self, array: MemoryArray) -> bool:
         """Return whether no carried array uses the memory of `array`."""
         carried_base_pointers = [
             memory_array.base_pointer
-            for memory_array in self.carried_memory
+            for memory_array in self.loop_carry_memory
             if memory_array is not None
         ]
         return (
@@ -303,19 +324,19 @@ class _LoopCarry:
             and array.base_pointer not in carried_base_pointers
         )
 
-    def _flatten_register_entries(self, carried_arrays: Sequence[LlvmArray]) -> list[LlvmValue]:
+    def _flatten_register_entries(self, loop_carry_arrays: Sequence[LlvmArray]) -> list[LlvmValue]:
         """Return a list of the entries of all carried arrays that are in registers."""
-        arrays_avals_memory = zip(
-            carried_arrays, self.carried_avals, self.carried_memory, strict=True
+        arrays_avals_memories = zip(
+            loop_carry_arrays, self.loop_carry_avals, self.loop_carry_memory, strict=True
         )
         register_arrays = [
-            (carried_array, carried_aval)
-            for carried_array, carried_aval, memory_array in arrays_avals_memory
+            (loop_carry_array, loop_carry_aval)
+            for loop_carry_array, loop_carry_aval, memory_array in arrays_avals_memories
             if memory_array is None
         ]
         return self.array_emitter.flatten_array_entries(
-            [carried_array for carried_array, _ in register_arrays],
-            [carried_aval for _, carried_aval in register_arrays],
+            [loop_carry_array for loop_carry_array, _ in register_arrays],
+            [loop_carry_aval for _, loop_carry_aval in register_arrays],
         )
 
 

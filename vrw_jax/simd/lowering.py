@@ -15,7 +15,7 @@ from vrw_jax.simd.array_emitter import (
     make_lane_axis_error,
     split_into_entry_arrays,
 )
-from vrw_jax.simd.lazy_arrays import LlvmArray, mark_as_shared
+from vrw_jax.simd.lazy_arrays import LlvmArray, mark_memory_as_shared
 from vrw_jax.simd.llvm_library import ir
 from vrw_jax.simd.value_emitter import LlvmValue, ValueEmitter
 
@@ -59,12 +59,14 @@ class JaxprLowering:
         self,
         array_emitter: ArrayEmitter,
         primitive_rules: Mapping[str, PrimitiveRule],
-        separate_functions: dict[int, Any] | None = None,
+        llvm_function_by_jaxpr_id: dict[int, Any] | None = None,
     ) -> None:
         self.array_emitter, self.primitive_rules = array_emitter, primitive_rules
         # Separate functions by the `id` of their trace, with the trace, whose reference keeps the
         # `id` valid.
-        self.separate_functions = {} if separate_functions is None else separate_functions
+        self.llvm_function_by_jaxpr_id = (
+            {} if llvm_function_by_jaxpr_id is None else llvm_function_by_jaxpr_id
+        )
 
     def lower_jaxpr(
         self, closed_jaxpr: ClosedJaxpr, argument_arrays: Sequence[LlvmArray]
@@ -73,7 +75,7 @@ class JaxprLowering:
         arrays.
         """
         jaxpr, emit_constant_array = closed_jaxpr.jaxpr, self.array_emitter.emit_constant_array
-        overwriting_equations, array_by_variable = (
+        overwriting_equation_by_variable, array_by_variable = (
             _find_overwriting_equations(jaxpr),
             dict[Any, LlvmArray](),
         )
@@ -85,8 +87,8 @@ class JaxprLowering:
                 jaxpr_variables, assigned_arrays, strict=True
             ):
                 array_by_variable[jaxpr_variable] = (
-                    mark_as_shared(assigned_array)
-                    if overwriting_equations.get(jaxpr_variable) is None
+                    mark_memory_as_shared(assigned_array)
+                    if overwriting_equation_by_variable.get(jaxpr_variable) is None
                     else assigned_array
                 )
 
@@ -103,8 +105,8 @@ class JaxprLowering:
                 return emit_constant_array(np.asarray(jaxpr_atom.val), jaxpr_atom.aval)
             return (
                 array_by_variable[jaxpr_atom]
-                if overwriting_equations[jaxpr_atom] == equation_index
-                else mark_as_shared(array_by_variable[jaxpr_atom])
+                if overwriting_equation_by_variable[jaxpr_atom] == equation_index
+                else mark_memory_as_shared(array_by_variable[jaxpr_atom])
             )
 
         for equation_index, equation in enumerate(jaxpr.eqns):
@@ -141,19 +143,19 @@ class JaxprLowering:
 
         The first call for a jaxpr defines the function.
         """
-        builder = self.array_emitter.builder
-        if id(closed_jaxpr) not in self.separate_functions:
-            self.separate_functions[id(closed_jaxpr)] = (
+        llvm_builder = self.array_emitter.llvm_builder
+        if id(closed_jaxpr) not in self.llvm_function_by_jaxpr_id:
+            self.llvm_function_by_jaxpr_id[id(closed_jaxpr)] = (
                 self._define_separate_function(closed_jaxpr),
                 closed_jaxpr,
             )
-        llvm_function, _ = self.separate_functions[id(closed_jaxpr)]
-        returned_struct = builder.call(
+        llvm_function, _ = self.llvm_function_by_jaxpr_id[id(closed_jaxpr)]
+        returned_struct = llvm_builder.call(
             llvm_function,
             self.array_emitter.flatten_array_entries(argument_arrays, closed_jaxpr.in_avals),
         )
         result_entries = [
-            builder.extract_value(returned_struct, i)
+            llvm_builder.extract_value(returned_struct, i)
             for i in range(len(returned_struct.type.elements))
         ]
         return split_into_entry_arrays(result_entries, closed_jaxpr.out_avals)
@@ -170,7 +172,7 @@ class JaxprLowering:
             for _ in range(math.prod(get_shape_without_lanes(x)))
         ]
         llvm_struct_type = ir.LiteralStructType(list_entry_types(closed_jaxpr.out_avals))
-        llvm_module = self.array_emitter.builder.module
+        llvm_module = self.array_emitter.llvm_builder.module
         llvm_function_type = ir.FunctionType(
             llvm_struct_type, list_entry_types(closed_jaxpr.in_avals)
         )
@@ -180,24 +182,24 @@ class JaxprLowering:
         llvm_function.linkage = "internal"
         for llvm_attribute in ("noinline", "nounwind"):
             llvm_function.attributes.add(llvm_attribute)
-        builder = ir.IRBuilder(llvm_function.append_basic_block("entry"))
+        llvm_builder = ir.IRBuilder(llvm_function.append_basic_block("entry"))
         array_emitter_of_caller = self.array_emitter
-        function_emitter = ArrayEmitter(
-            ValueEmitter(builder, array_emitter_of_caller.value_emitter.n_vector_lanes),
+        array_emitter_of_function = ArrayEmitter(
+            ValueEmitter(llvm_builder, array_emitter_of_caller.value_emitter.n_vector_lanes),
             array_emitter_of_caller.register_limits,
             array_emitter_of_caller.is_in_innermost_loop,
         )
         result_arrays = JaxprLowering(
-            function_emitter, self.primitive_rules, self.separate_functions
+            array_emitter_of_function, self.primitive_rules, self.llvm_function_by_jaxpr_id
         ).lower_jaxpr(
             closed_jaxpr, split_into_entry_arrays(llvm_function.args, closed_jaxpr.in_avals)
         )
         result_struct: LlvmValue = ir.Constant(llvm_struct_type, ir.Undefined)
         for i, result_entry in enumerate(
-            function_emitter.flatten_array_entries(result_arrays, closed_jaxpr.out_avals)
+            array_emitter_of_function.flatten_array_entries(result_arrays, closed_jaxpr.out_avals)
         ):
-            result_struct = builder.insert_value(result_struct, result_entry, i)
-        builder.ret(result_struct)
+            result_struct = llvm_builder.insert_value(result_struct, result_entry, i)
+        llvm_builder.ret(result_struct)
         return llvm_function
 
 
@@ -207,20 +209,22 @@ def _find_overwriting_equations(jaxpr: Any) -> dict[Any, int | None]:
     This equation is the last one that reads the variable, if all earlier readers are loops. A loop
     reads no operand after its end.
     """
-    overwriting_equations: dict[Any, int | None] = {}
+    overwriting_equation_by_variable: dict[Any, int | None] = {}
     is_loop_equation = [equation.primitive.name in LOOP_PRIMITIVE_NAMES for equation in jaxpr.eqns]
     for equation_index, atoms_of_equation in enumerate(
         [*(equation.invars for equation in jaxpr.eqns), jaxpr.outvars]
     ):
         for jaxpr_atom in atoms_of_equation:
             if not isinstance(jaxpr_atom, Literal):
-                previous_equation_index = overwriting_equations.get(jaxpr_atom, -1)
-                may_overwrite = previous_equation_index == -1 or (
+                previous_equation_index = overwriting_equation_by_variable.get(jaxpr_atom, -1)
+                may_equation_overwrite = previous_equation_index == -1 or (
                     previous_equation_index not in (None, equation_index)
                     and is_loop_equation[previous_equation_index]
                 )
-                overwriting_equations[jaxpr_atom] = equation_index if may_overwrite else None
-    return overwriting_equations
+                overwriting_equation_by_variable[jaxpr_atom] = (
+                    equation_index if may_equation_overwrite else None
+                )
+    return overwriting_equation_by_variable
 
 
 def make_call_rule(jaxpr_parameter_name: str) -> PrimitiveRule:

@@ -53,7 +53,7 @@ def describe_processor() -> tuple[str, str, str]:
     return llvm.get_process_triple(), llvm.get_host_cpu_name(), processor_features
 
 
-def describe_compilation() -> str:
+def describe_compiler_settings() -> str:
     """Return a string that identifies everything on which object code depends, except the LLVM
     text.
     """

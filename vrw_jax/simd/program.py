@@ -28,7 +28,7 @@ from vrw_jax.simd.code_cache import (
     trace_for_machine_code,
 )
 from vrw_jax.simd.ffi_primitive import (
-    LOADED_CODE_BY_NAME,
+    LOADED_CODE_BY_FFI_TARGET,
     MACHINE_CODE_PRIMITIVE,
     register_machine_code,
 )
@@ -45,7 +45,7 @@ LANES_PER_256_BITS = {np.dtype(np.float64): 4, np.dtype(np.float32): 8}
 
 A vector has 256 bits, or 512 bits on processors with such registers.
 """
-GROUPS_PER_TASK = 64
+LANE_GROUPS_PER_TASK = 64
 """Number of groups of lanes in one task of a thread.
 
 The value is chosen because the start of a task then takes a negligible time.
@@ -111,7 +111,7 @@ def compile_lane_program(
     - `register_limits`: limits that decide which arrays are in registers.
     """
     # The group has two vectors of 256 bits, so that one computes during the latency of the other.
-    group_width = 2 * LANES_PER_256_BITS[lane_dtype]
+    lanes_per_group = 2 * LANES_PER_256_BITS[lane_dtype]
     argument_shapes = (
         tuple(jax.ShapeDtypeStruct((), scalar_dtype) for scalar_dtype in scalar_dtypes),
         (jax.ShapeDtypeStruct((LANE_AXIS_SENTINEL,), lane_dtype),) * n_lane_arrays,
@@ -119,9 +119,14 @@ def compile_lane_program(
     try:
         return _LoadedLaneProgram(
             get_machine_code(
-                lane_function, argument_shapes, trace_key, group_width, code_store, register_limits
+                lane_function,
+                argument_shapes,
+                trace_key,
+                lanes_per_group,
+                code_store,
+                register_limits,
             ),
-            group_width,
+            lanes_per_group,
         )
     except Exception as compilation_error:
         _reraise_on_tested_release(compilation_error)
@@ -221,11 +226,11 @@ def compile_lane_function(
             )
             argument_leaves = [pad_with_last_lane(x) if jnp.ndim(x) else x for x in argument_leaves]
         padded_result_shapes = [
-            jax.ShapeDtypeStruct((*leading_shape, n_lanes + n_padding_lanes), result_dtype)
-            for leading_shape, result_dtype in machine_code.result_shapes_and_dtypes
+            jax.ShapeDtypeStruct((*shape_without_lanes, n_lanes + n_padding_lanes), result_dtype)
+            for shape_without_lanes, result_dtype in machine_code.result_shapes_and_dtypes
         ]
         padded_results = MACHINE_CODE_PRIMITIVE.bind(
-            *argument_leaves, code=machine_code, result_shapes=tuple(padded_result_shapes)
+            *argument_leaves, machine_code=machine_code, result_shapes=tuple(padded_result_shapes)
         )
         result_structure = jax.tree.structure(
             jax.eval_shape(result_shape_function, *argument_trees)
@@ -244,18 +249,20 @@ def _reraise_on_tested_release(compilation_error: Exception) -> None:
     fallback.disable_machine_code(compilation_error)
 
 
-def load_saved_machine_code(code_names: Sequence[str], code_store: CodeStore | None) -> bool:
-    """Load the saved machine code of all `code_names`, so that JAX programs can call it.
+def load_saved_machine_code(ffi_target_names: Sequence[str], code_store: CodeStore | None) -> bool:
+    """Load the saved machine code of all `ffi_target_names`, so that JAX programs can call it.
 
     Return whether the code of every name is available.
     """
-    for code_name in code_names:
+    for ffi_target_name in ffi_target_names:
         machine_code = (
-            None if code_name in LOADED_CODE_BY_NAME else load_machine_code(code_name, code_store)
+            None
+            if ffi_target_name in LOADED_CODE_BY_FFI_TARGET
+            else load_machine_code(ffi_target_name, code_store)
         )
         if machine_code is not None:
             register_machine_code(machine_code)
-    return all(code_name in LOADED_CODE_BY_NAME for code_name in code_names)
+    return all(ffi_target_name in LOADED_CODE_BY_FFI_TARGET for ffi_target_name in ffi_target_names)
 
 
 class _LoadedLaneProgram:
@@ -279,8 +286,8 @@ class _LoadedLaneProgram:
         self, scalar_arguments: Sequence[Any], lane_arrays: Sequence[np.ndarray]
     ) -> list[np.ndarray]:
         n_lanes = len(lane_arrays[0])
-        n_groups = -(-n_lanes // self.lanes_per_group)
-        n_padded_lanes = n_groups * self.lanes_per_group
+        n_lane_groups = -(-n_lanes // self.lanes_per_group)
+        n_padded_lanes = n_lane_groups * self.lanes_per_group
         # The last lane is repeated until the last group is full.
         padded_lane_arrays = [
             np.concatenate([x, np.full(n_padded_lanes - n_lanes, x[-1])])
@@ -290,25 +297,25 @@ class _LoadedLaneProgram:
         ]
         scalar_arrays = [np.asarray(x) for x in scalar_arguments]
         padded_results = [
-            np.empty((*leading_shape, n_padded_lanes), result_dtype)
-            for leading_shape, result_dtype in self.result_shapes_and_dtypes
+            np.empty((*shape_without_lanes, n_padded_lanes), result_dtype)
+            for shape_without_lanes, result_dtype in self.result_shapes_and_dtypes
         ]
         input_pointer_table = _make_pointer_table([*scalar_arrays, *padded_lane_arrays])
         output_pointer_table = _make_pointer_table(padded_results)
-        run_groups_of_task = lambda first_group: self._run_lane_kernel(
+        compute_lane_groups_of_task = lambda first_lane_group: self._run_lane_kernel(
             input_pointer_table,
             output_pointer_table,
             n_padded_lanes,
-            first_group,
-            min(first_group + GROUPS_PER_TASK, n_groups),
+            first_lane_group,
+            min(first_lane_group + LANE_GROUPS_PER_TASK, n_lane_groups),
         )
-        first_groups_of_tasks = range(0, n_groups, GROUPS_PER_TASK)
-        if len(first_groups_of_tasks) > 1 and _count_available_cores() > 1:
+        first_lane_groups_of_tasks = range(0, n_lane_groups, LANE_GROUPS_PER_TASK)
+        if len(first_lane_groups_of_tasks) > 1 and _count_available_cores() > 1:
             with ThreadPoolExecutor(_count_available_cores()) as thread_pool:
-                list(thread_pool.map(run_groups_of_task, first_groups_of_tasks))
+                list(thread_pool.map(compute_lane_groups_of_task, first_lane_groups_of_tasks))
         else:
-            for first_group in first_groups_of_tasks:
-                run_groups_of_task(first_group)
+            for first_lane_group in first_lane_groups_of_tasks:
+                compute_lane_groups_of_task(first_lane_group)
         return [x[..., :n_lanes] for x in padded_results]
 
 

@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from vrw_jax.simd.arithmetic import emit_llvm_elementwise
+from vrw_jax.simd.arithmetic import emit_llvm_elementwise_primitive
 from vrw_jax.simd.array_emitter import (
     ArrayEmitter,
     PrimitiveCall,
     get_shape_without_lanes,
-    has_lanes,
+    has_lane_axis,
     make_entry_array,
     make_lane_mixing_error,
 )
@@ -29,28 +29,30 @@ def emit_cumulative_sum(
     """Return the cumulative sums along an axis, from its start or, with `reverse`, from its end."""
     if primitive_call.primitive_params["axis"] == len(array.shape):
         raise make_lane_mixing_error(primitive_call.primitive_name)
-    summed_terms = np.moveaxis(
+    entries_along_axis = np.moveaxis(
         array_emitter.get_array_entries(array), primitive_call.primitive_params["axis"], 0
     )
     result_dtype = primitive_call.result_aval.dtype
-    summation_order = range(len(summed_terms))[
+    axis_index_order = range(len(entries_along_axis))[
         :: -1 if primitive_call.primitive_params["reverse"] else 1
     ]
-    emit_sum = lambda x, y: emit_llvm_elementwise(
+    emit_sum = lambda x, y: emit_llvm_elementwise_primitive(
         array_emitter.value_emitter, "add", {}, result_dtype, result_dtype, (x, y)
     )
-    partial_sums = np.empty_like(summed_terms)
-    for summation_position, i in enumerate(summation_order):
+    partial_sums = np.empty_like(entries_along_axis)
+    for n_summed_entries, i in enumerate(axis_index_order):
         sum_and_term_pairs = zip(
-            partial_sums[summation_order[summation_position - 1], ...].ravel(),
-            summed_terms[i, ...].ravel(),
+            partial_sums[axis_index_order[n_summed_entries - 1], ...].ravel(),
+            entries_along_axis[i, ...].ravel(),
             strict=True,
         )
-        partial_sum_entries = [
-            emit_sum(*sum_and_term) if summation_position else sum_and_term[1]
+        cumulative_sum_entries = [
+            emit_sum(*sum_and_term) if n_summed_entries else sum_and_term[1]
             for sum_and_term in sum_and_term_pairs
         ]
-        partial_sums[i, ...] = make_entry_array(summed_terms.shape[1:], partial_sum_entries)
+        partial_sums[i, ...] = make_entry_array(
+            entries_along_axis.shape[1:], cumulative_sum_entries
+        )
     return np.moveaxis(partial_sums, 0, primitive_call.primitive_params["axis"])
 
 
@@ -83,11 +85,11 @@ def emit_array_product(
         y = array_emitter.get_array_entry(
             right_array, (*right_index[:right_axis], k, *right_index[right_axis:])
         )
-        return emit_llvm_elementwise(
+        return emit_llvm_elementwise_primitive(
             array_emitter.value_emitter, "mul", {}, result_dtype, result_dtype, (x, y)
         )
 
-    emit_sum = lambda x, y: emit_llvm_elementwise(
+    emit_sum = lambda x, y: emit_llvm_elementwise_primitive(
         array_emitter.value_emitter, "add", {}, result_dtype, result_dtype, (x, y)
     )
     product_shape, entry_type = (
@@ -108,8 +110,8 @@ def emit_array_product(
             [emit_product_entry(entry_index) for entry_index in np.ndindex(product_shape)],
         )
     left_array, right_array = (
-        array_emitter.store_in_memory(left_array),
-        array_emitter.store_in_memory(right_array),
+        array_emitter.store_array_in_memory(left_array),
+        array_emitter.store_array_in_memory(right_array),
     )
     product_memory = array_emitter.allocate_memory_array(product_shape, entry_type)
 
@@ -140,7 +142,7 @@ def make_reduction_rule(combining_primitive: str) -> Callable[..., LlvmArray]:
         """Return the array reduced along axes. Only `reduce_and` and `reduce_or` also reduce over
         lanes.
         """
-        reduces_over_lanes = has_lanes(primitive_call.operand_avals[0]) and not has_lanes(
+        reduces_over_lanes = has_lane_axis(primitive_call.operand_avals[0]) and not has_lane_axis(
             primitive_call.result_aval
         )
         result_dtype = primitive_call.operand_avals[0].dtype
@@ -151,54 +153,58 @@ def make_reduction_rule(combining_primitive: str) -> Callable[..., LlvmArray]:
         reduced_axes = tuple(
             axis for axis in primitive_call.primitive_params["axes"] if axis < len(array.shape)
         )
-        emit_combination = lambda x, y: emit_llvm_elementwise(
+        emit_combination = lambda x, y: emit_llvm_elementwise_primitive(
             array_emitter.value_emitter, combining_primitive, {}, result_dtype, result_dtype, (x, y)
         )
-        kept_lengths = [n for axis, n in enumerate(array.shape) if axis not in reduced_axes]
-        reduced_lengths = [array.shape[axis] for axis in reduced_axes]
+        result_axis_lengths = [n for axis, n in enumerate(array.shape) if axis not in reduced_axes]
+        reduced_axis_lengths = [array.shape[axis] for axis in reduced_axes]
 
-        def merge_indices(kept_index: EntryIndex, reduced_index: EntryIndex) -> EntryIndex:
-            inner_indices, outer_indices = iter(reduced_index), iter(kept_index)
+        def merge_result_and_reduced_index(
+            result_index: EntryIndex, reduced_index: EntryIndex
+        ) -> EntryIndex:
+            reduced_index_iterator, result_index_iterator = iter(reduced_index), iter(result_index)
             return tuple(
-                next(inner_indices if i in reduced_axes else outer_indices)
+                next(reduced_index_iterator if i in reduced_axes else result_index_iterator)
                 for i in range(len(array.shape))
             )
 
-        def emit_reduced_entry(kept_index: EntryIndex) -> LlvmValue:
-            get_reduced_term = lambda reduced_index: array_emitter.get_array_entry(
-                array, merge_indices(kept_index, reduced_index)
+        def emit_reduced_entry(result_index: EntryIndex) -> LlvmValue:
+            get_entry_to_reduce = lambda reduced_index: array_emitter.get_array_entry(
+                array, merge_result_and_reduced_index(result_index, reduced_index)
             )
-            n_terms = math.prod(reduced_lengths)
+            n_terms = math.prod(reduced_axis_lengths)
             if (
                 isinstance(array, np.ndarray)
                 or n_terms <= array_emitter.register_limits.max_unrolled_reduction_terms
             ):
                 return functools.reduce(
-                    emit_combination, map(get_reduced_term, np.ndindex(*reduced_lengths))
+                    emit_combination, map(get_entry_to_reduce, np.ndindex(*reduced_axis_lengths))
                 )
             # The first entry is counted twice, which changes no reduction except a sum.
-            initial_value = get_reduced_term((0,) * len(reduced_lengths))
+            initial_reduction_value = get_entry_to_reduce((0,) * len(reduced_axis_lengths))
             if combining_primitive == "add":
-                initial_value = array_emitter.make_llvm_zero(array.entry_type)
+                initial_reduction_value = array_emitter.make_llvm_zero(array.entry_type)
             elif isinstance(array.entry_type, ir.VectorType):
-                initial_value = array_emitter.value_emitter.to_lane_vector(initial_value)
+                initial_reduction_value = array_emitter.value_emitter.to_lane_vector(
+                    initial_reduction_value
+                )
             return array_emitter.emit_index_loops(
-                reduced_lengths,
-                lambda i, combined_entries: [
-                    emit_combination(combined_entries[0], get_reduced_term(i))
+                reduced_axis_lengths,
+                lambda i, loop_carried_values: [
+                    emit_combination(loop_carried_values[0], get_entry_to_reduce(i))
                 ],
-                [initial_value],
+                [initial_reduction_value],
             )[0]
 
         reduced_entries = [
-            emit_reduced_entry(kept_index) for kept_index in np.ndindex(*kept_lengths)
+            emit_reduced_entry(result_index) for result_index in np.ndindex(*result_axis_lengths)
         ]
         if reduces_over_lanes:
             reduced_entries = [
                 _emit_any_or_all_lanes(array_emitter, combining_primitive, reduced_entry)
                 for reduced_entry in reduced_entries
             ]
-        return make_entry_array(tuple(kept_lengths), reduced_entries)
+        return make_entry_array(tuple(result_axis_lengths), reduced_entries)
 
     return emit_reduced_array
 
@@ -210,10 +216,12 @@ def _emit_any_or_all_lanes(
 
     Return its LLVM truth value, a scalar.
     """
-    builder = array_emitter.builder
+    llvm_builder = array_emitter.llvm_builder
     if not isinstance(lane_flags.type, ir.VectorType):
         return lane_flags
-    lane_bits = builder.bitcast(lane_flags, ir.IntType(array_emitter.value_emitter.n_vector_lanes))
+    lane_bits = llvm_builder.bitcast(
+        lane_flags, ir.IntType(array_emitter.value_emitter.n_vector_lanes)
+    )
     if combining_primitive == "or":
-        return builder.icmp_unsigned("!=", lane_bits, ir.Constant(lane_bits.type, 0))
-    return builder.icmp_unsigned("==", lane_bits, ir.Constant(lane_bits.type, -1))
+        return llvm_builder.icmp_unsigned("!=", lane_bits, ir.Constant(lane_bits.type, 0))
+    return llvm_builder.icmp_unsigned("==", lane_bits, ir.Constant(lane_bits.type, -1))

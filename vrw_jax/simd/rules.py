@@ -11,7 +11,7 @@ from vrw_jax.simd.arithmetic import ELEMENTWISE_RULES
 from vrw_jax.simd.array_emitter import (
     PrimitiveCall,
     get_llvm_number_type,
-    has_lanes,
+    has_lane_axis,
     make_lane_axis_error,
     make_lane_mixing_error,
 )
@@ -31,14 +31,14 @@ def _make_single_result_rule(emit_single_result: Callable[..., LlvmArray]) -> Pr
       returns the result.
     """
 
-    def emit_checked_result(
+    def emit_result_with_lane_checks(
         jaxpr_lowering: JaxprLowering, equation: Any, operands: list[LlvmArray]
     ) -> list[LlvmArray]:
         primitive_name, result_aval = equation.primitive.name, equation.outvars[0].aval
         operand_avals = [input_atom.aval for input_atom in equation.invars]
         result_has_lanes, operand_has_lanes = (
-            has_lanes(result_aval),
-            any(map(has_lanes, operand_avals)),
+            has_lane_axis(result_aval),
+            any(map(has_lane_axis, operand_avals)),
         )
         if (
             operand_has_lanes
@@ -66,8 +66,8 @@ def _make_single_result_rule(emit_single_result: Callable[..., LlvmArray]) -> Pr
             result_array = jaxpr_lowering.array_emitter.get_array_entries(result_array)
         return [result_array]
 
-    emit_checked_result.__doc__ = emit_single_result.__doc__
-    return emit_checked_result
+    emit_result_with_lane_checks.__doc__ = emit_single_result.__doc__
+    return emit_result_with_lane_checks
 
 
 def _emit_elementwise_result(
@@ -84,7 +84,7 @@ def _emit_optimization_barrier(
     point.
     """
     return [
-        jaxpr_lowering.array_emitter.store_in_memory(x) if isinstance(x, LazyArray) else x
+        jaxpr_lowering.array_emitter.store_array_in_memory(x) if isinstance(x, LazyArray) else x
         for x in operands
     ]
 

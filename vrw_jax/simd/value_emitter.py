@@ -50,13 +50,13 @@ class _LlvmSplatConstant(ir.Constant):
 
 
 class ValueEmitter:
-    """Emitter of LLVM values into the function of `builder`.
+    """Emitter of LLVM values into the function of `llvm_builder`.
 
     An LLVM vector has `n_vector_lanes` lanes.
     """
 
-    def __init__(self, builder: ir.IRBuilder, n_vector_lanes: int) -> None:
-        self.builder, self.n_vector_lanes = builder, n_vector_lanes
+    def __init__(self, llvm_builder: ir.IRBuilder, n_vector_lanes: int) -> None:
+        self.llvm_builder, self.n_vector_lanes = llvm_builder, n_vector_lanes
         # Values computed so far, by operation and operands, because traces contain many
         # repetitions.
         self.emitted_values: dict[tuple, Any] = {}
@@ -97,19 +97,19 @@ class ValueEmitter:
                 )
             return self.llvm_constants[constant_key]
 
-        def emit_equal_lanes() -> LlvmValue:
+        def emit_splat_vector() -> LlvmValue:
             undefined_vector = ir.Constant(llvm_vector_type, ir.Undefined)
-            vector_with_first_lane = self.builder.insert_element(
+            vector_with_first_lane = self.llvm_builder.insert_element(
                 undefined_vector, scalar_value, ir.Constant(I32, 0)
             )
-            zero_lane_order = ir.Constant(
+            zero_shuffle_mask = ir.Constant(
                 ir.VectorType(I32, llvm_vector_type.count), [0] * llvm_vector_type.count
             )
-            return self.builder.shuffle_vector(
-                vector_with_first_lane, undefined_vector, zero_lane_order
+            return self.llvm_builder.shuffle_vector(
+                vector_with_first_lane, undefined_vector, zero_shuffle_mask
             )
 
-        return self.emit_value_once(("spread", id(scalar_value)), emit_equal_lanes)
+        return self.emit_value_once(("spread", id(scalar_value)), emit_splat_vector)
 
     def emit_value_once(self, value_key: tuple, create_llvm_value: Callable[[], Any]) -> Any:
         """Return the value stored under `value_key`; on the first call, `create_llvm_value` creates
@@ -135,7 +135,7 @@ class ValueEmitter:
             f"{result_name} = {llvm_opcode} {llvm_type} {x.get_reference()}, {y.get_reference()}"
         )
         instruction = LlvmBinaryInstruction(result_name, llvm_type, instruction_text)
-        self.builder._insert(instruction)
+        self.llvm_builder._insert(instruction)
         return instruction
 
     def to_scalars_or_vectors(self, *llvm_values: LlvmValue) -> list[LlvmValue]:
@@ -145,19 +145,19 @@ class ValueEmitter:
         return list(llvm_values)
 
     @contextlib.contextmanager
-    def discard_inner_values(self) -> Iterator[None]:
+    def discard_values_after_context(self) -> Iterator[None]:
         """Return a context that, at its end, discards the values stored within it by
         `emit_value_once`.
         """
-        outer_keys, self.recent_value_keys = self.recent_value_keys, []
+        outer_value_keys, self.recent_value_keys = self.recent_value_keys, []
         yield
-        for inner_value_key in self.recent_value_keys:
-            del self.emitted_values[inner_value_key]
-        self.recent_value_keys = outer_keys
+        for recent_value_key in self.recent_value_keys:
+            del self.emitted_values[recent_value_key]
+        self.recent_value_keys = outer_value_keys
 
     def emit_llvm_loop(
         self,
-        initial_values: Sequence[LlvmValue],
+        initial_loop_values: Sequence[LlvmValue],
         emit_loop_condition: Callable[[list[LlvmValue]], LlvmValue],
         emit_loop_body: Callable[[list[LlvmValue]], Sequence[LlvmValue]],
     ) -> list[LlvmValue]:
@@ -165,29 +165,33 @@ class ValueEmitter:
 
         The loop is `while emit_loop_condition(values): values = emit_loop_body(values)`.
         """
-        builder, entry_basic_block = self.builder, self.builder.block
+        llvm_builder, entry_basic_block = self.llvm_builder, self.llvm_builder.block
         head_basic_block, body_basic_block, exit_basic_block = (
-            builder.append_basic_block(basic_block_name)
+            llvm_builder.append_basic_block(basic_block_name)
             for basic_block_name in ("head", "body", "after")
         )
-        builder.branch(head_basic_block)
-        builder.position_at_end(head_basic_block)
-        loop_values: list[LlvmValue] = []
-        for initial_value in initial_values:
-            phi_instruction = builder.phi(initial_value.type)
-            phi_instruction.add_incoming(initial_value, entry_basic_block)
-            loop_values.append(phi_instruction)
-        with self.discard_inner_values():
-            builder.cbranch(emit_loop_condition(loop_values), body_basic_block, exit_basic_block)
-            builder.position_at_end(body_basic_block)
-            next_values = emit_loop_body(loop_values)
-            for phi_instruction, initial_value in zip(loop_values, next_values, strict=True):
-                next_value = (
-                    self.to_lane_vector(initial_value)
+        llvm_builder.branch(head_basic_block)
+        llvm_builder.position_at_end(head_basic_block)
+        loop_carried_values: list[LlvmValue] = []
+        for initial_loop_value in initial_loop_values:
+            phi_instruction = llvm_builder.phi(initial_loop_value.type)
+            phi_instruction.add_incoming(initial_loop_value, entry_basic_block)
+            loop_carried_values.append(phi_instruction)
+        with self.discard_values_after_context():
+            llvm_builder.cbranch(
+                emit_loop_condition(loop_carried_values), body_basic_block, exit_basic_block
+            )
+            llvm_builder.position_at_end(body_basic_block)
+            next_loop_values = emit_loop_body(loop_carried_values)
+            for phi_instruction, next_loop_value in zip(
+                loop_carried_values, next_loop_values, strict=True
+            ):
+                phi_instruction.add_incoming(
+                    self.to_lane_vector(next_loop_value)
                     if isinstance(phi_instruction.type, ir.VectorType)
-                    else initial_value
+                    else next_loop_value,
+                    llvm_builder.block,
                 )
-                phi_instruction.add_incoming(next_value, builder.block)
-            builder.branch(head_basic_block)
-        builder.position_at_end(exit_basic_block)
-        return loop_values
+            llvm_builder.branch(head_basic_block)
+        llvm_builder.position_at_end(exit_basic_block)
+        return loop_carried_values

@@ -29,7 +29,12 @@ from vrw_jax.contact import (
 )
 from vrw_jax.measures import CONTACT_MEASURES, TRAJECTORY_MEASURES, make_labeled_variables
 from vrw_jax.measures import xarray as xr
-from vrw_jax.models import AbstractWheel, Trajectory, complete_line_slopes, separate_next_slope
+from vrw_jax.models import (
+    AbstractWheel,
+    Trajectory,
+    complete_ground_line_slopes,
+    separate_next_slope,
+)
 from vrw_jax.numerics import EngineName, StepOptions, with_default_jax_settings
 from vrw_jax.selection import SELECTION_VARIABLE_ATTRIBUTES
 from vrw_jax.simulation.provenance import collect_provenance_attributes
@@ -125,7 +130,7 @@ def simulate(
         ground_line_slopes = (
             ground_line_slopes if ground_line_slopes.ndim else jnp.full(n_steps, ground_line_slopes)
         )
-        ground_line_slopes = complete_line_slopes(ground_line_slopes, n_steps)
+        ground_line_slopes = complete_ground_line_slopes(ground_line_slopes, n_steps)
         ground_lines = UnevenGroundLines(np.asarray(ground_line_slopes, float), float(s.Mt * s.g))
     trajectory_spec = specify_trajectory(models_and_wheels, options, n_samples)
     sampled_walk = sample_walk_steps(

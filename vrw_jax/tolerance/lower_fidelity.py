@@ -123,12 +123,12 @@ def find_paper_gaits(params: WheelParams, step_options: StepOptions) -> LowerFid
         derivatives=[SECTION_STATE_NAME],
     )
     step_jacobian = jax.tree.map(np.asarray, gait_step.derivatives[SECTION_STATE_NAME])
-    step_end_states = np.asarray(gait_step.section_state)
+    gait_step_end_states = np.asarray(gait_step.section_state)
     step_durations = np.asarray(gait_step.durations)
     has_stepped = np.asarray(gait_step.outcome) == Outcome.STEPPED
     # The feet's distance at touchdown is L0 sin(alpha) / cos(theta-), m.
     leg_span = np.asarray(params_with_gait.locked_length) * np.sin(params_with_gait.leg_angle)
-    foot_distance = leg_span / np.cos(step_end_states[:, 0])
+    foot_distance = leg_span / np.cos(gait_step_end_states[:, 0])
     zero_durations = np.zeros(len(found_wheel_indices))
     step_quantities = np.column_stack(
         [
@@ -136,10 +136,10 @@ def find_paper_gaits(params: WheelParams, step_options: StepOptions) -> LowerFid
             step_durations[:, 1] + step_durations[:, 2],
             zero_durations,
             foot_distance,
-            step_end_states,
+            gait_step_end_states,
         ]
     )
-    step_length_jacobian = (foot_distance * np.tan(step_end_states[:, 0]))[
+    step_length_jacobian = (foot_distance * np.tan(gait_step_end_states[:, 0]))[
         :, None
     ] * step_jacobian.section_state[:, 0]
     dls_duration_jacobian, sls1_duration_jacobian, sls2_duration_jacobian = np.moveaxis(
@@ -157,7 +157,7 @@ def find_paper_gaits(params: WheelParams, step_options: StepOptions) -> LowerFid
     stepped_gaits = _make_lower_fidelity_gaits(
         ModelIndex.VISCOELASTIC,
         section_states[found_wheel_indices],
-        step_end_states,
+        gait_step_end_states,
         step_quantities,
         step_jacobian.section_state,
         step_quantity_jacobian,
@@ -182,7 +182,7 @@ def find_rigid_gaits(params: WheelParams) -> LowerFidelityGaits:
     """
     (
         section_states,
-        step_end_states,
+        gait_step_end_states,
         step_length,
         step_duration,
         return_map_jacobian,
@@ -190,7 +190,7 @@ def find_rigid_gaits(params: WheelParams) -> LowerFidelityGaits:
     ) = map(np.asarray, map_in_batches(_compute_rigid_gaits, batch_sizes.GAIT_BATCH_SIZES, params))
     zero_durations = np.zeros_like(step_duration)
     step_quantities = np.column_stack(
-        [zero_durations, step_duration, zero_durations, step_length, step_end_states]
+        [zero_durations, step_duration, zero_durations, step_length, gait_step_end_states]
     )
     zero_jacobian_row = 0.0 * duration_jacobian
     step_quantity_jacobian = np.concatenate(
@@ -205,7 +205,7 @@ def find_rigid_gaits(params: WheelParams) -> LowerFidelityGaits:
     return _make_lower_fidelity_gaits(
         ModelIndex.RIGID,
         section_states,
-        step_end_states,
+        gait_step_end_states,
         step_quantities,
         return_map_jacobian,
         step_quantity_jacobian,
@@ -224,7 +224,7 @@ def compute_static_leg_contraction(params: WheelParams) -> np.ndarray:
 def _make_lower_fidelity_gaits(
     model_index: int,
     section_states: np.ndarray,
-    step_end_states: np.ndarray,
+    gait_step_end_states: np.ndarray,
     step_quantities: np.ndarray,
     return_map_jacobian: np.ndarray,
     step_quantity_jacobian: np.ndarray,
@@ -233,7 +233,7 @@ def _make_lower_fidelity_gaits(
     with np.errstate(all="ignore"):
         inverse_newton_matrix = np.linalg.inv(np.eye(3) - return_map_jacobian)
     section_state_error = np.einsum(
-        "ijk,ik->ij", inverse_newton_matrix, step_end_states - section_states
+        "ijk,ik->ij", inverse_newton_matrix, gait_step_end_states - section_states
     )
     search_outcomes = np.full(len(section_states), int(Outcome.STEPPED))
     return LowerFidelityGaits(

@@ -11,8 +11,8 @@ from vrw_jax.numerics import StatusCode, describe_step_ending
 from vrw_jax.printing import (
     AbstractPrintable,
     LabelAndText,
+    format_each_batch_element,
     format_outcome_counts,
-    map_text_of_elements,
 )
 from vrw_jax.tolerance.lower_fidelity import MODEL_NAMES
 from vrw_jax.wheel import Outcome
@@ -159,7 +159,7 @@ class MeasureResult(AbstractPrintable):
                 return f"{MODEL_LABELS[int(model_index)]}, {status_meaning}"
             return f"{MODEL_LABELS[int(model_index)]}, {n_steps} steps, {status_meaning}"
 
-        return map_text_of_elements(
+        return format_each_batch_element(
             describe_selection,
             self.models,
             self.statuses,

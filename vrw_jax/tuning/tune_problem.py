@@ -819,7 +819,7 @@ def _check_parameter_bounds(
             f"the range of {parameter_name}", bounds[parameter_name]
         )
         for bound_value in (lower_bound, upper_bound):
-            if not PARAMETER_DOMAINS[parameter_name].contains_value(bound_value):
+            if not PARAMETER_DOMAINS[parameter_name].contains_parameter_value(bound_value):
                 raise ValueError(
                     f"the bounds of {parameter_name} reach {bound_value:g}, but "
                     f"{PARAMETER_DOMAINS[parameter_name].description} must lie "

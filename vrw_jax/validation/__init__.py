@@ -20,8 +20,8 @@ from vrw_jax.validation.checks import (
     require_untraced_arguments,
 )
 from vrw_jax.validation.renamed import (
-    PRESENT_PACKAGE_NAME_BY_OLD_NAME,
+    NEW_PUBLIC_NAME_BY_OLD_NAME,
     describe_renamed_attribute,
-    raise_for_missing_numerics_name,
+    raise_missing_numerics_attribute,
     with_renamed_arguments,
 )

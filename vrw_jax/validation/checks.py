@@ -102,11 +102,11 @@ def _is_single_number(given_value: object) -> bool:
 
 
 def check_int(
-    argument_name: str, given_value: Any, min_value: int = 1, limit_reason: str = ""
+    argument_name: str, given_value: Any, min_value: int = 1, min_value_reason: str = ""
 ) -> int:
     """Return the given integer. Raise an error if it is not an integer of at least `min_value`.
 
-    The clause `limit_reason` explains the limit in the error message.
+    The clause `min_value_reason` explains the limit in the error message.
     """
     raise_if_process_forked()
     is_single_number = _is_single_number(given_value) and not isinstance(
@@ -125,7 +125,7 @@ def check_int(
         raise (ValueError if is_single_number else TypeError)(
             f"{argument_name} is {format_value(given_value)}, but it must be a whole number of at "
             "least "
-            f"{min_value}{limit_reason}: "
+            f"{min_value}{min_value_reason}: "
             f"give {argument_name} = {min_value}, say."
         )
     return int(given_value)
@@ -160,15 +160,15 @@ def check_positive(argument_name: str, given_value: Any) -> float:
     return float(given_value)
 
 
-def check_range(argument_name: str, given_bounds: Any) -> tuple[float, float]:
+def check_range(argument_name: str, given_range: Any) -> tuple[float, float]:
     """Return a lower and an upper bound as floats. Raise an error if the value is not such a
     pair.
     """
     try:
-        lower_bound, upper_bound = given_bounds
+        lower_bound, upper_bound = given_range
     except (TypeError, ValueError):
         raise TypeError(
-            f"{argument_name} is {format_value(given_bounds)}, but it is a lower and an upper "
+            f"{argument_name} is {format_value(given_range)}, but it is a lower and an upper "
             "bound: write "
             f"(lower, upper)."
         ) from None
@@ -274,7 +274,7 @@ def check_choice(argument_name: str, given_value: Any, allowed_names: Sequence[s
 
 
 def check_names(
-    argument_name: str, given_value: Any, example_text: str = '"dls_fraction"'
+    argument_name: str, given_value: Any, example_names_text: str = '"dls_fraction"'
 ) -> tuple[str, ...]:
     """Return the given names as a tuple. A single string is accepted as one name.
 
@@ -285,10 +285,10 @@ def check_names(
         given_names = (given_value,) if isinstance(given_value, str) else tuple(given_value)
     except Exception:  # The value is no collection, an array without axes, or a tracer.
         given_names = (None,)
-    if not all(isinstance(argument_name, str) for argument_name in given_names):
+    if not all(isinstance(given_name, str) for given_name in given_names):
         raise TypeError(
             f"{argument_name} is {format_value(given_value)}, but it holds names: write "
-            f"[{example_text}]."
+            f"[{example_names_text}]."
         )
     return given_names
 
@@ -340,18 +340,16 @@ def has_traced_leaf(*argument_trees: Any) -> bool:
     )
 
 
-def require_untraced_arguments(
-    function_name: str, alternative_text: str, *argument_trees: Any
-) -> None:
+def require_untraced_arguments(function_name: str, remedy_text: str, *argument_trees: Any) -> None:
     """Raise a TypeError if an argument of the function `function_name` is traced.
 
     The function needs concrete values, which `jit`, `vmap` and `grad` do not provide. The end of
-    the error message, `alternative_text`, states what to use instead.
+    the error message, `remedy_text`, states what to use instead.
     """
     raise_if_process_forked()
     if has_traced_leaf(*argument_trees):
         raise TypeError(
             f"{function_name} is called inside jit, vmap or grad, but it runs on known numbers: "
             "call it "
-            f"outside, or {alternative_text}."
+            f"outside, or {remedy_text}."
         )

@@ -4,7 +4,7 @@ import functools
 from collections.abc import Callable, Mapping
 from typing import Any, TypeVar
 
-PRESENT_PACKAGE_NAME_BY_OLD_NAME = {
+NEW_PUBLIC_NAME_BY_OLD_NAME = {
     "Answer": "MeasureResult",
     "Average": "MultifidelityMean",
     "Border": "SpecialPoint",
@@ -23,7 +23,7 @@ PRESENT_PACKAGE_NAME_BY_OLD_NAME = {
 }
 """New names in `vrw_jax`, by old name."""
 
-PRESENT_NUMERICS_NAME_BY_OLD_NAME = {
+NEW_NUMERICS_NAME_BY_OLD_NAME = {
     "AbstractFollowed": "vrw_jax.continuation.AbstractContinuationProblem",
     "Answers": "vrw_jax.hybrid.LCPStatus",
     "Guard": "vrw_jax.hybrid.Guard",
@@ -45,68 +45,68 @@ PRESENT_NUMERICS_NAME_BY_OLD_NAME = {
 """New names of former attributes of `vrw_jax.numerics`, by old name."""
 
 
-def raise_for_missing_numerics_name(missing_name: str) -> Any:
+def raise_missing_numerics_attribute(missing_attribute_name: str) -> Any:
     """Raise an AttributeError for a name that `vrw_jax.numerics` does not have.
 
     If the name was changed, the error message states the new name.
     """
     renaming_hint = (
-        f": it is called {PRESENT_NUMERICS_NAME_BY_OLD_NAME[missing_name]} now"
-        if missing_name in PRESENT_NUMERICS_NAME_BY_OLD_NAME
+        f": it is called {NEW_NUMERICS_NAME_BY_OLD_NAME[missing_attribute_name]} now"
+        if missing_attribute_name in NEW_NUMERICS_NAME_BY_OLD_NAME
         else ""
     )
-    raise AttributeError(f"vrw_jax.numerics has no {missing_name!r}{renaming_hint}.")
+    raise AttributeError(f"vrw_jax.numerics has no {missing_attribute_name!r}{renaming_hint}.")
 
 
 FunctionType = TypeVar("FunctionType", bound=Callable)
 
 
 def describe_renamed_attribute(
-    module_name: str, attribute_name: str, present_name_by_old_name: Mapping[str, str]
+    module_name: str, attribute_name: str, new_name_by_old_name: Mapping[str, str]
 ) -> str | None:
     """Return a sentence that states the new name of a renamed attribute.
 
     Return None if the attribute has not been renamed.
     """
-    if attribute_name not in present_name_by_old_name:
+    if attribute_name not in new_name_by_old_name:
         return None
-    present_name = present_name_by_old_name[attribute_name]
-    return f"{module_name} has no {attribute_name!r}: it is called {present_name} now."
+    new_name = new_name_by_old_name[attribute_name]
+    return f"{module_name} has no {attribute_name!r}: it is called {new_name} now."
 
 
 def with_renamed_arguments(
-    **present_name_by_old_name: str,
+    **new_name_by_old_name: str,
 ) -> Callable[[FunctionType], FunctionType]:
     """Return a decorator for functions and classes whose keyword arguments have been renamed.
 
-    An old keyword raises a TypeError whose message states the new name. `present_name_by_old_name`
+    An old keyword raises a TypeError whose message states the new name. `new_name_by_old_name`
     maps old names to new names.
     """
 
     def reject_renamed_keywords(callable_name: str, given_keywords: Mapping[str, Any]) -> None:
-        for old_name in present_name_by_old_name.keys() & given_keywords.keys():
+        for old_name in new_name_by_old_name.keys() & given_keywords.keys():
             raise TypeError(
                 f"{callable_name} has no argument {old_name!r}: it is called "
-                f"{present_name_by_old_name[old_name]} now."
+                f"{new_name_by_old_name[old_name]} now."
             )
 
-    def reject_old_names_of(decorated_object: Any) -> Any:
+    def decorate_with_keyword_check(decorated_object: Any) -> Any:
         if isinstance(decorated_object, type):
             undecorated_init = decorated_object.__init__  # type: ignore[misc]
 
             @functools.wraps(undecorated_init)
-            def initialize_with_present_names(self: Any, *args: Any, **keywords: Any) -> None:
+            def initialize_with_new_keywords(self: Any, *args: Any, **keywords: Any) -> None:
                 reject_renamed_keywords(decorated_object.__name__, keywords)
                 undecorated_init(self, *args, **keywords)
 
-            decorated_object.__init__ = initialize_with_present_names  # type: ignore[misc]
+            decorated_object.__init__ = initialize_with_new_keywords  # type: ignore[misc]
             return decorated_object
 
         @functools.wraps(decorated_object)
-        def call_with_present_names(*args: Any, **keywords: Any) -> Any:
+        def call_with_new_keywords(*args: Any, **keywords: Any) -> Any:
             reject_renamed_keywords(decorated_object.__name__, keywords)
             return decorated_object(*args, **keywords)
 
-        return call_with_present_names
+        return call_with_new_keywords
 
-    return reject_old_names_of
+    return decorate_with_keyword_check

@@ -35,7 +35,7 @@ from vrw_jax.wheel.phases import (
     AbstractPhase,
     PhaseInstant,
     PhaseMargins,
-    make_phases,
+    make_paper_phases,
 )
 from vrw_jax.wheel.rest import are_coordinates_at_rest, are_rates_negligible, replace_rest_outcome
 from vrw_jax.wheel.transitions import Landing

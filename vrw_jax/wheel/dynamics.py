@@ -279,14 +279,16 @@ class FootForce(NamedTuple):
     normal: Elementwise  # pushing positive: lambda_2 (fore) or lambda_4 (rear)
 
 
-def compute_required_friction(force: FootForce) -> Elementwise:
+def compute_required_friction(foot_force: FootForce) -> Elementwise:
     """Return the ratio of the tangential to the normal force, which is the required friction
     coefficient.
 
     The result is 0 if the normal force is not positive.
     """
-    is_foot_loaded = force.normal > 0.0
-    friction_ratio = jnp.abs(force.tangential) / jnp.where(is_foot_loaded, force.normal, 1.0)
+    is_foot_loaded = foot_force.normal > 0.0
+    friction_ratio = jnp.abs(foot_force.tangential) / jnp.where(
+        is_foot_loaded, foot_force.normal, 1.0
+    )
     return jnp.where(is_foot_loaded, friction_ratio, 0.0)
 
 

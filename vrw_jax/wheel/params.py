@@ -23,28 +23,28 @@ class ParameterDomain(NamedTuple):
     unit: str
     lower_bound: float
     upper_bound: float
-    lower_is_allowed: bool
+    is_lower_bound_allowed: bool
     description: str
 
-    def contains_value(self, parameter_value: Any) -> Any:
+    def contains_parameter_value(self, parameter_value: Any) -> Any:
         """Return whether a value lies in the allowed range. NaN gives False."""
         is_above_lower_bound = (
             parameter_value >= self.lower_bound
-            if self.lower_is_allowed
+            if self.is_lower_bound_allowed
             else parameter_value > self.lower_bound
         )
         return is_above_lower_bound & (parameter_value < self.upper_bound)
 
     def require_value_in_domain(self, parameter_name: str, parameter_value: float) -> None:
         """Raise a `ValueError` if the value of a parameter lies outside the allowed range."""
-        if not self.contains_value(parameter_value):
+        if not self.contains_parameter_value(parameter_value):
             raise ValueError(
                 f"{parameter_name} is {parameter_value:g}, but {self.description} must lie in "
                 f"{self}: give a value in that range."
             )
 
     def __str__(self) -> str:
-        opening_bracket = "[" if self.lower_is_allowed else "("
+        opening_bracket = "[" if self.is_lower_bound_allowed else "("
         unit_suffix = f" {self.unit}" if self.unit else ""
         return f"{opening_bracket}{self.lower_bound:g}, {self.upper_bound:g}){unit_suffix}"
 
@@ -127,7 +127,7 @@ _check_n_legs = functools.partial(
     check_int,
     "n_legs",
     min_value=5,
-    limit_reason=" (with fewer the angle between legs is 90 degrees or more)",
+    min_value_reason=" (with fewer the angle between legs is 90 degrees or more)",
 )
 
 
@@ -211,7 +211,7 @@ class WheelParams(AbstractPrintable):
                 parameter_name, parameter_value
             )
         if len(known_parameter_values) == len(PARAMETER_DOMAINS):
-            for parameter_name, squared_relative_value in _square_relative_values(
+            for parameter_name, squared_relative_value in _square_relative_parameters(
                 known_parameter_values, self.n_legs
             ).items():
                 if not squared_relative_value < MAX_RELATIVE_VALUE**2:
@@ -278,23 +278,23 @@ class WheelParams(AbstractPrintable):
             parameter_name: getattr(self, parameter_name) for parameter_name in PARAMETER_DOMAINS
         }
         if not np.all(self.is_in_domain()):
-            denominator_formatter = lambda parameter_domain: (
+            format_denominator = lambda parameter_domain: (
                 f"{parameter_domain.symbol}, {parameter_domain.unit}"
                 if parameter_domain.unit
                 else parameter_domain.symbol
             )
             return [
                 (
-                    f"by {n} {denominator_formatter(PARAMETER_DOMAINS[n])}",
+                    f"by {n} {format_denominator(PARAMETER_DOMAINS[n])}",
                     format_quantity(parameter_value, ""),
                 )
                 for n, parameter_value in value_by_parameter.items()
             ]
-        printed_rows = [
+        printed_parameter_rows = [
             (f"{n} {PARAMETER_DOMAINS[n].symbol}", format_quantity(x, PARAMETER_DOMAINS[n].unit))
             for n, x in value_by_parameter.items()
         ]
-        return [*printed_rows, ("n_legs", str(self.n_legs))]
+        return [*printed_parameter_rows, ("n_legs", str(self.n_legs))]
 
     @property
     def leg_angle(self) -> float:
@@ -314,10 +314,10 @@ class WheelParams(AbstractPrintable):
             max_value_of_dtype = (
                 float(jnp.finfo(jnp.result_type(value_by_parameter[parameter_name])).max) ** 0.25
             )
-            is_in_all_domains &= parameter_domain.contains_value(
+            is_in_all_domains &= parameter_domain.contains_parameter_value(
                 value_by_parameter[parameter_name]
             ) & (value_by_parameter[parameter_name] < max_value_of_dtype)
-        for squared_relative_value in _square_relative_values(
+        for squared_relative_value in _square_relative_parameters(
             value_by_parameter, self.n_legs
         ).values():
             is_in_all_domains &= squared_relative_value < MAX_RELATIVE_VALUE**2
@@ -384,7 +384,9 @@ class WheelParams(AbstractPrintable):
         )
 
 
-def _square_relative_values(value_by_parameter: Mapping[str, Any], n_legs: int) -> dict[str, Any]:
+def _square_relative_parameters(
+    value_by_parameter: Mapping[str, Any], n_legs: int
+) -> dict[str, Any]:
     """Return the squares of the relative natural length, stiffness and damping, by parameter name.
 
     Relative values are values in units of total mass, locked length and gravity.
@@ -441,7 +443,7 @@ FRICTION_NAME = "friction"
 """Name of the friction coefficient of the ground, which designs and branches may also vary."""
 
 PARAMETER_BY_SYMBOL: dict[str, str] = {
-    **{domain.symbol: name for name, domain in PARAMETER_DOMAINS.items()},
+    **{parameter_domain.symbol: name for name, parameter_domain in PARAMETER_DOMAINS.items()},
     **{"mH": "hub_mass", "L0": "locked_length", "L_s": "natural_length", "Ls": "natural_length"},
     **{"φ": "slope", "n": "n_legs", "mu": FRICTION_NAME, "μ": FRICTION_NAME},
 }

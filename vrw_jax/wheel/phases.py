@@ -49,7 +49,7 @@ class PhaseMargins(NamedTuple):
     rear_stopper_force: Elementwise | None = None  # stopper force on Leg 2 in SLS-II, N
 
     @classmethod
-    def from_values(cls, margin_values: Vector, n_legs: int) -> "PhaseMargins":
+    def from_margin_values(cls, margin_values: Vector, n_legs: int) -> "PhaseMargins":
         """Return the margins, taken from the sequence of all margin values."""
         n_locked_legs = n_legs - 2
         fore_foot_force, contraction, friction, *remaining_margin_values = margin_values
@@ -74,7 +74,7 @@ class AbstractPhase(abc.ABC):
     ground.
     """
 
-    name: ClassVar[str]
+    phase_name: ClassVar[str]
     n_dof: ClassVar[int]
     """Number of degrees of freedom of the phase."""
     guard_outcomes: ClassVar[tuple[Outcome, ...]]
@@ -94,7 +94,7 @@ class AbstractPhase(abc.ABC):
     """
 
     @abc.abstractmethod
-    def complete_motion(
+    def complete_wheel_motion(
         self, sin_theta: Elementwise, cos_theta: Elementwise, q: Vector, v: Vector
     ) -> Motion:
         """Return the full motion.
@@ -122,7 +122,9 @@ class AbstractPhase(abc.ABC):
         """
 
     @abc.abstractmethod
-    def complete_acceleration(self, motion: Motion, phase_acceleration: Vector) -> Acceleration:
+    def complete_wheel_acceleration(
+        self, motion: Motion, phase_acceleration: Vector
+    ) -> Acceleration:
         """Return the accelerations of (theta, L1, L2), computed from those of the phase's
         coordinates.
         """
@@ -179,7 +181,7 @@ class AbstractPhase(abc.ABC):
 
     def compute_motion(self, q: Vector, v: Vector) -> Motion:
         """Return the full motion for the phase's coordinates q and their rates v."""
-        return self.complete_motion(*compute_sine_cosine(q[0]), q, v)
+        return self.complete_wheel_motion(*compute_sine_cosine(q[0]), q, v)
 
     def compute_rear_force(self, motion: Motion, acceleration: Acceleration) -> FootForce | None:
         """Return the force of the ground on the rear foot, N, or None if the foot is in the air."""
@@ -228,7 +230,7 @@ class AbstractPhase(abc.ABC):
         )
 
     @property
-    def margins_counted_at_start(self) -> tuple[bool, ...]:
+    def are_margins_counted_at_start(self) -> tuple[bool, ...]:
         """Return one flag per margin: whether the margin is evaluated at the start of the phase."""
         are_stoppers_counted = (True,) * (self.s.n - 2)
         return (
@@ -264,7 +266,7 @@ class AbstractPhase(abc.ABC):
         )
 
     @classmethod
-    def select_coordinates(cls, theta: Elementwise, motion: Motion) -> tuple[Vector, Vector]:
+    def select_phase_coordinates(cls, theta: Elementwise, motion: Motion) -> tuple[Vector, Vector]:
         """Return the phase's coordinates and their rates for a motion at the angle `theta`."""
         q, v = (theta, motion.L1, motion.L2), (motion.dtheta, motion.dL1, motion.dL2)
         return q[: cls.n_dof], v[: cls.n_dof]
@@ -287,7 +289,7 @@ class PhaseInstant:
         """Return the accelerations of (theta, L1, L2)."""
         if self._phase_acceleration is None:
             return self.phase.solve_acceleration(self.motion)
-        return self.phase.complete_acceleration(self.motion, self._phase_acceleration)
+        return self.phase.complete_wheel_acceleration(self.motion, self._phase_acceleration)
 
     @functools.cached_property
     def rear_force(self) -> FootForce | None:
@@ -308,7 +310,7 @@ class DoubleSupport(AbstractPhase):
     Section 3.3.1 of the paper describes this phase.
     """
 
-    name, n_dof = "DLS", 1
+    phase_name, n_dof = "DLS", 1
     can_come_to_rest = True
     guard_outcomes = (
         Outcome.STEPPED, Outcome.STOPPER_IN_DOUBLE_SUPPORT, Outcome.TOUCHDOWN_BEFORE_STOPPER
@@ -326,7 +328,7 @@ class DoubleSupport(AbstractPhase):
         """Return the equation of motion for a hub on its circle."""
         return dynamics.compute_double_support_equation(self.s, self.phase_constants[0], motion)
 
-    def complete_motion(
+    def complete_wheel_motion(
         self, sin_theta: Elementwise, cos_theta: Elementwise, q: Vector, v: Vector
     ) -> Motion:
         hub_circle, (dtheta,) = self._compute_hub_circle(sin_theta, cos_theta), v
@@ -336,7 +338,9 @@ class DoubleSupport(AbstractPhase):
     def solve_acceleration(self, motion: Motion) -> Acceleration:
         return dynamics.solve_double_support(self.s, self.phase_constants[0], motion)
 
-    def complete_acceleration(self, motion: Motion, phase_acceleration: Vector) -> Acceleration:
+    def complete_wheel_acceleration(
+        self, motion: Motion, phase_acceleration: Vector
+    ) -> Acceleration:
         return dynamics.complete_accelerations_on_hub_circle(
             self._compute_hub_circle(motion.sin_theta, motion.cos_theta),
             motion.dtheta,
@@ -378,12 +382,12 @@ class SingleSupport1(AbstractPhase):
     Section 3.3.2 of the paper describes this phase.
     """
 
-    name, n_dof = "SLS-I", 3
+    phase_name, n_dof = "SLS-I", 3
     guard_outcomes = Outcome.STEPPED, Outcome.TOUCHDOWN_BEFORE_STOPPER
     counts_specific_margins_at_start = (False,)
     has_stiff_start = True
 
-    def complete_motion(
+    def complete_wheel_motion(
         self, sin_theta: Elementwise, cos_theta: Elementwise, q: Vector, v: Vector
     ) -> Motion:
         return Motion(sin_theta, cos_theta, q[1], q[2], *v)
@@ -391,7 +395,9 @@ class SingleSupport1(AbstractPhase):
     def solve_acceleration(self, motion: Motion) -> Acceleration:
         return dynamics.solve_single_support_1(self.s, motion)
 
-    def complete_acceleration(self, motion: Motion, phase_acceleration: Vector) -> Acceleration:
+    def complete_wheel_acceleration(
+        self, motion: Motion, phase_acceleration: Vector
+    ) -> Acceleration:
         return Acceleration(*phase_acceleration)
 
     def compute_dynamics_residual(self, motion: Motion, phase_acceleration: Vector) -> Vector:
@@ -425,11 +431,11 @@ class SingleSupport2(AbstractPhase):
     Section 3.3.3 of the paper describes this phase.
     """
 
-    name, n_dof = "SLS-II", 2
+    phase_name, n_dof = "SLS-II", 2
     guard_outcomes = (Outcome.STEPPED,)
     counts_contraction_at_start, counts_specific_margins_at_start = True, (True, True)
 
-    def complete_motion(
+    def complete_wheel_motion(
         self, sin_theta: Elementwise, cos_theta: Elementwise, q: Vector, v: Vector
     ) -> Motion:
         zero_rate = jnp.zeros_like(q[1])
@@ -438,7 +444,9 @@ class SingleSupport2(AbstractPhase):
     def solve_acceleration(self, motion: Motion) -> Acceleration:
         return dynamics.solve_single_support_2(self.s, motion)
 
-    def complete_acceleration(self, motion: Motion, phase_acceleration: Vector) -> Acceleration:
+    def complete_wheel_acceleration(
+        self, motion: Motion, phase_acceleration: Vector
+    ) -> Acceleration:
         return Acceleration(phase_acceleration[0], phase_acceleration[1], motion.dL2)
 
     def compute_dynamics_residual(self, motion: Motion, phase_acceleration: Vector) -> Vector:
@@ -475,7 +483,7 @@ PAPER_PHASES: tuple[type[AbstractPhase], ...] = (DoubleSupport, SingleSupport1, 
 """Phases of the paper's step, in order."""
 
 
-def make_phases(
+def make_paper_phases(
     s: Symbols, foot_distance: Elementwise, stop_at_lift_off: bool, tilt_sine_cosine: Vector = ()
 ) -> tuple[AbstractPhase, ...]:
     """Return the three phases of a step that begins with feet `foot_distance` m apart.

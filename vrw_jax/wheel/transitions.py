@@ -38,7 +38,7 @@ from vrw_jax.wheel.params import Symbols
 class Landing(NamedTuple):
     """Motion just after the landing of a foot, with the impulses and the energy loss."""
 
-    theta_after: Elementwise  # rad, in the leg labels of the starting step
+    theta_after_landing: Elementwise  # rad, in the leg labels of the starting step
     motion_after: Motion  # just after the impact
     foot_distance: Elementwise  # D, between both feet, m
     is_rear_foot_planted: Bool[Array, "..."]  # whether lambda_I4 >= 0: (A4), else (A3)
@@ -75,7 +75,7 @@ class _BothFeetLanding(NamedTuple):
     ]  # velocity of the landing foot just before the impact, m/s
     mass_matrix: MassMatrix  # in the leg labels of the starting step
     generalized_momentum: tuple[Elementwise, ...]  # generalized momentum about the new foot
-    momentum_per_circle_rate: tuple[
+    momentum_per_hub_circle_rate: tuple[
         Elementwise, ...
     ]  # mass matrix times the tangent of the hub's circle
 
@@ -114,13 +114,13 @@ def _solve_both_feet_landing(
     # (A1) If both feet stay on the ground, the hub can only move on its circle.
     foot_distance = s.L0 * s.sin_alpha / rear_leg.cos
     hub_circle = compute_double_support_circle(s, foot_distance, sin, cos)
-    momentum_per_circle_rate = M.multiply_vector(
+    momentum_per_hub_circle_rate = M.multiply_vector(
         (jnp.ones_like(hub_circle.dL1_dtheta), hub_circle.dL1_dtheta, hub_circle.dL2_dtheta)
     )
     hub_circle_inertia = (
-        momentum_per_circle_rate[0]
-        + hub_circle.dL1_dtheta * momentum_per_circle_rate[1]
-        + hub_circle.dL2_dtheta * momentum_per_circle_rate[2]
+        momentum_per_hub_circle_rate[0]
+        + hub_circle.dL1_dtheta * momentum_per_hub_circle_rate[1]
+        + hub_circle.dL2_dtheta * momentum_per_hub_circle_rate[2]
     )
     dtheta_after = (
         p1 + hub_circle.dL1_dtheta * p2 + hub_circle.dL2_dtheta * p3
@@ -142,7 +142,7 @@ def _solve_both_feet_landing(
         (foot_velocity_x, foot_velocity_z),
         M,
         (p1, p2, p3),
-        momentum_per_circle_rate,
+        momentum_per_hub_circle_rate,
     )
 
 
@@ -169,7 +169,7 @@ def resolve_landing(
         (foot_velocity_x, foot_velocity_z),
         M,
         (p1, p2, p3),
-        momentum_per_circle_rate,
+        momentum_per_hub_circle_rate,
     ) = _solve_both_feet_landing(s, theta, dtheta, dL1)
     sin_theta, cos_theta, L1_before = (
         motion_on_both_feet.sin_theta,
@@ -180,8 +180,8 @@ def resolve_landing(
     rear_impulse = compute_rear_force_from_residual(
         s,
         motion_on_both_feet,
-        momentum_per_circle_rate[1] * dtheta_both_feet - p2,
-        momentum_per_circle_rate[2] * dtheta_both_feet - p3,
+        momentum_per_hub_circle_rate[1] * dtheta_both_feet - p2,
+        momentum_per_hub_circle_rate[2] * dtheta_both_feet - p3,
     )
     is_rear_foot_planted = rear_impulse.normal >= 0.0
 
@@ -208,7 +208,7 @@ def resolve_landing(
         momentum_after_z - momentum_before_z - s.Mt * foot_velocity_z - applied_rear_impulse.normal,
     )
     return Landing(
-        theta_after=theta - s.alpha,
+        theta_after_landing=theta - s.alpha,
         motion_after=motion_after,
         foot_distance=foot_distance,
         is_rear_foot_planted=is_rear_foot_planted,

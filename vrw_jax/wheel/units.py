@@ -71,11 +71,11 @@ class WheelUnits(NamedTuple):
 
     def scale_times_to_seconds(self, options: StepOptions) -> StepOptions:
         """Convert the times in step options from the wheel's own unit to seconds."""
-        select_time_options = lambda o: (o.max_phase_time, o.dt0)
+        select_times_in_options = lambda o: (o.max_phase_time, o.dt0)
         return eqx.tree_at(
-            select_time_options,
+            select_times_in_options,
             options,
-            tuple(self.time_unit * x for x in select_time_options(options)),
+            tuple(self.time_unit * x for x in select_times_in_options(options)),
         )
 
 
@@ -105,12 +105,12 @@ def convert_to_wheel_units(params: WheelParams) -> WheelParams:
     )
 
 
-def compute_wheel_units_of_rows(parameter_rows: np.ndarray, n_legs: int) -> WheelUnits:
+def compute_wheel_units_of_rows(parameter_values_by_row: np.ndarray, n_legs: int) -> WheelUnits:
     """Return the units of many wheels, computed with NumPy. The units of an invalid wheel are 1.
 
-    - `parameter_rows`: parameters of each wheel in the order of `PARAMETER_NAMES`.
+    - `parameter_values_by_row`: parameters of each wheel in the order of `PARAMETER_NAMES`.
     """
-    values_by_name = dict(zip(PARAMETER_NAMES, np.asarray(parameter_rows).T, strict=False))
+    values_by_name = dict(zip(PARAMETER_NAMES, np.asarray(parameter_values_by_row).T, strict=False))
     length_ratio = values_by_name["locked_length"] / TABLE_1_LENGTH_M
     gravity_ratio = values_by_name["gravity"] / TABLE_1_GRAVITY_M_PER_S2
     mass_ratio = (
