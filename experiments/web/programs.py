@@ -14,11 +14,11 @@ from jaxtyping import Array
 
 from vrw_jax import simd
 from vrw_jax.contact import UnilateralWheel
-from vrw_jax.contact.batch_integrator import N_ACCUMULATOR_ROWS, IntervalPoint, unpack_motion
+from vrw_jax.contact.batch_integrator import N_ACCUMULATOR_ROWS, ContactIntervalPoint, unpack_motion
 from vrw_jax.contact.contact_state import ContactState
 from vrw_jax.contact.mechanics import compute_kinetic_energy, compute_potential_energy
 from vrw_jax.contact.section import compute_full_section_size, embed_section_state
-from vrw_jax.contact.single_step import sample_interval
+from vrw_jax.contact.single_step import sample_contact_interval
 from vrw_jax.contact.walk_kernel import BatchWalkSettings, init_lane_states, process_and_integrate
 from vrw_jax.integrator import load_explicit_tableau, sample_batch_phase
 from vrw_jax.measures import MARGIN_MEASURES, STOPPER_MARGIN_MEASURES
@@ -197,15 +197,20 @@ def _on_ground(wheel: Callable[[Array], WheelParams], n_legs: int) -> dict[str, 
         past, after = process_and_integrate(
             walk, columns(parameters, friction), _rebuild_tree(lane, form), waits_for_events=True
         )
-        (q, v, _), stance = past.interval_state.interval_point, past.interval_state.contact_state
-        codes = [stance.contact_modes.astype(float), stance.is_locked.astype(float)]
+        (q, v, _), stance = (
+            past.contact_interval_state.contact_interval_point,
+            past.contact_interval_state.contact_state,
+        )
+        codes = [stance.contact_modes.astype(float), stance.is_leg_locked.astype(float)]
         step = walk.compute_step_result(after, None)
         result = (
             step.durations, step.step_length, step.post_impact, step.slip, step.energy_impacts,
             step.energy_damping, step.energy_friction,
             *(getattr(step.margins, name) for name in STOPPER_MARGIN_MEASURES),
         )  # fmt: skip
-        stretch = jnp.concatenate([q, v, *codes, after.interval_state.time_since_event[None]])
+        stretch = jnp.concatenate(
+            [q, v, *codes, after.contact_interval_state.time_since_event[None]]
+        )
         return _flat(after), stretch, _flat((step.section_state, *result)), after.walk_outcome
 
     def between(tolerance: Array, friction: Array, parameters: Array, stretch: Array) -> tuple:
@@ -218,15 +223,17 @@ def _on_ground(wheel: Callable[[Array], WheelParams], n_legs: int) -> dict[str, 
         locked = stretch[2 * n + n_legs : -1] > 0.5
         walk, none = on(tolerance), locked & False
         stance = ContactState(contact, locked, none, none, none)
-        flow = walk.make_dynamics(columns(parameters, friction), stance)
+        flow = walk.make_lane_contact_dynamics(columns(parameters, friction), stance)
         blank = jnp.zeros((N_ACCUMULATOR_ROWS, *q.shape[1:]), q.dtype)
-        motion = unpack_motion(IntervalPoint(q, v, q))
-        rows = sample_interval(
+        motion = unpack_motion(ContactIntervalPoint(q, v, q))
+        rows = sample_contact_interval(
             flow, motion, blank, stretch[-1], SAMPLES, walk.step_options, tableau
         )
 
         def row(row_values: Array) -> Array:
-            motion = unpack_motion(IntervalPoint(row_values[:n], row_values[n : 2 * n], row_values))
+            motion = unpack_motion(
+                ContactIntervalPoint(row_values[:n], row_values[n : 2 * n], row_values)
+            )
             energies = (
                 compute_kinetic_energy(flow.s, motion),
                 *compute_potential_energy(flow.s, motion),

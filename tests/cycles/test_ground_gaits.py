@@ -353,10 +353,10 @@ def test_independent_rates_and_their_shares_do_not_depend_on_other_batch_element
         np.linalg.qr(method_name[:, : 4 + k % 6])[0] for k, method_name in enumerate(method_names)
     ]
     settled, requested = np.stack([b @ b.T for b in bases]), np.ones((12, 11), bool)
-    joint_result = ground_lanes._IndependentStartRates.from_projection(settled, requested)
+    joint_result = ground_lanes._IndependentStartRates.from_rate_projection(settled, requested)
     for k, basis in enumerate(bases):
         single_result, n = (
-            ground_lanes._IndependentStartRates.from_projection(settled[[k]], requested[[k]]),
+            ground_lanes._IndependentStartRates.from_rate_projection(settled[[k]], requested[[k]]),
             basis.shape[1],
         )
         weights = single_result.combination_weights[0]

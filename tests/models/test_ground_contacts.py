@@ -128,7 +128,7 @@ def select_contacts(q, v, at_stopper, locked, friction, moving):
     allowed = AllowedContactModes(
         allowed_slot_modes=none + ALL_MODES_MASK,
         can_hold_stopper=at_stopper,
-        has_fixed_mode=none > 0,
+        is_foot_mode_fixed=none > 0,
         untested_slot_modes=none,
         is_open_stopper_untested=~at_stopper,
     )

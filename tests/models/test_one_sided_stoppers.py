@@ -73,9 +73,9 @@ def test_a_stopper_impact_releases_legs_whose_stoppers_would_have_to_pull(stoppe
     np.testing.assert_allclose(joined_values, expected, atol=1e-12)
     thrown_values = np.asarray(solution.dL) < -1e-3
     assert thrown_values.any()
-    assert not np.any(thrown_values & np.asarray(change.contact_state.is_locked))
+    assert not np.any(thrown_values & np.asarray(change.contact_state.is_leg_locked))
     assert float(change.stopper_impulse) >= -1e-12
-    assert float(change.energy_lost) > 0.0
+    assert float(change.impact_energy_loss) > 0.0
 
 
 def test_at_a_high_rest_speed_one_sided_stoppers_act_as_two_sided_ones(stopper_impact):

@@ -14,13 +14,13 @@ from scipy.optimize import brentq
 import vrw_jax as vrw
 from vrw_jax.contact.contact_state import (
     ContactState,
-    LossAccumulators,
+    EnergyLossAccumulators,
     compute_airborne_stopper_force,
     compute_forces,
     compute_guard_values,
     evaluate_vector_field,
+    make_contact_mode_dynamics,
     make_guard_layout,
-    make_mode_dynamics,
     pack_state,
     unpack_state,
 )
@@ -266,7 +266,7 @@ def make_contact_state(contact, locked):
 
 def test_a_wheel_on_two_stiff_legs_slides_like_a_block():
     s, friction = TABLE_1.symbols(), 0.2
-    flow = make_mode_dynamics(
+    flow = make_contact_mode_dynamics(
         s,
         jnp.asarray(friction),
         False,
@@ -285,7 +285,7 @@ def test_a_wheel_on_two_stiff_legs_slides_like_a_block():
 
 def test_a_wheel_in_the_air_falls_freely():
     s = TABLE_1.symbols()
-    flow = make_mode_dynamics(
+    flow = make_contact_mode_dynamics(
         s,
         jnp.asarray(0.7),
         False,
@@ -311,10 +311,10 @@ def test_a_vertical_leg_lands_with_its_own_mass_alone():
     change = resolve_event(make_contact_law(s, 0.7), motion, in_the_air, event)
     # The leg's 1 kg stops, the other 17 kg go on; the spring then begins to work.
     assert abs(float(change.normal_impulse[0]) - 1.0 * speed) < 1e-12
-    assert abs(float(change.energy_lost) - 0.5 * speed**2) < 1e-12
+    assert abs(float(change.impact_energy_loss) - 0.5 * speed**2) < 1e-12
     assert abs(float(change.motion.vz) + speed) < 1e-12
     assert abs(float(change.motion.dL[0]) + speed) < 1e-12
-    assert not bool(change.contact_state.is_locked[0])
+    assert not bool(change.contact_state.is_leg_locked[0])
 
 
 def test_a_single_leg_bounces_as_a_damped_oscillator():
@@ -338,7 +338,7 @@ def test_a_single_leg_bounces_as_a_damped_oscillator():
     motion = make_resting_motion(0.0, vz=jnp.asarray(-speed))._replace(
         dL=jnp.zeros(8).at[0].set(-speed)
     )
-    flow = make_mode_dynamics(
+    flow = make_contact_mode_dynamics(
         s,
         jnp.asarray(0.7),
         False,
@@ -346,7 +346,7 @@ def test_a_single_leg_bounces_as_a_damped_oscillator():
     )
     lift = make_guard_layout(8, False).first_liftoff_guard
     watched = GuardsAndMargins(lambda y: compute_guard_values(flow, y)[lift : lift + 1], 1)
-    start = pack_state(motion, LossAccumulators(zero, zero, zero, zero))
+    start = pack_state(motion, EnergyLossAccumulators(zero, zero, zero, zero))
     end = integrate_phase(
         partial(evaluate_vector_field, flow), watched, start, jnp.asarray(True), TIGHT_OPTIONS
     )

@@ -22,10 +22,10 @@ from jax import lax
 from jaxtyping import Array
 
 from vrw_jax.contact.contact_state import (
+    ContactModeDynamics,
     ContactQuantities,
     ContactState,
-    ForceRates,
-    ModeDynamics,
+    NormalForceRates,
     collect_contact_quantities,
     compute_accumulator_rates,
     compute_forces,
@@ -54,8 +54,8 @@ N_CONTACT_QUANTITY_ROWS = 9
 
 The dynamics rows begin with the accelerations, followed by these quantities. If stoppers are
 one-sided, the stopper forces on legs in the air follow. If force peaks are measured, the
-`contact_state.ForceRates` follow. If accumulators are requested, their `N_ACCUMULATOR_ROWS` rates
-are last.
+`contact_state.NormalForceRates` follow. If accumulators are requested, their `N_ACCUMULATOR_ROWS`
+rates are last.
 """
 N_ACCUMULATOR_ROWS = 3
 """Number of accumulators: energy losses in dampers and by sliding, and slip length."""
@@ -108,7 +108,7 @@ class EventSearchOptions:
 EVENT_SEARCH_OPTIONS = EventSearchOptions()
 
 
-class IntervalPoint(NamedTuple):
+class ContactIntervalPoint(NamedTuple):
     """Coordinates, rates and dynamics rows of all batch elements at one time.
 
     The coordinates are the hub position x and z, the angle theta and the leg lengths. The dynamics
@@ -123,20 +123,20 @@ class IntervalPoint(NamedTuple):
 class EventBracket(NamedTuple):
     """Bracket of the earliest event inside a solver step, and the last attempt to locate it."""
 
-    is_search_active: Array
+    is_event_search_active: Array
     is_guard_crossing: Array  # whether a guard crosses zero in the bracket, (guards, batch)
-    low_step_size: Array  # bracket of the event, s from the start of the step
-    high_step_size: Array
+    lower_step_size_bound: Array  # bracket of the event, s from the start of the step
+    upper_step_size_bound: Array
     time_tolerance: Array  # s
     n_iterations: Array
     previous_step_size: Array  # size of the previous attempt, s
     guard_values: Array  # guards at the end of the previous attempt, (guards, batch)
 
 
-class IntervalState(NamedTuple):
+class ContactIntervalState(NamedTuple):
     """State of all batch elements in the interval between two events."""
 
-    interval_point: IntervalPoint
+    contact_interval_point: ContactIntervalPoint
     contact_state: ContactState
     guard_values: Array  # guards at the interval point, (guards, batch)
     guard_offset: Array  # initial value of an initiating guard, minus round-off; else 0
@@ -150,31 +150,33 @@ class IntervalState(NamedTuple):
     n_solver_steps: Array  # number of attempts since the last event
 
 
-def unpack_motion(interval_point: IntervalPoint) -> WheelMotion:
+def unpack_motion(contact_interval_point: ContactIntervalPoint) -> WheelMotion:
     """Return coordinates and rates of the wheel at a point of an interval."""
-    x = interval_point.q[0]
-    z = interval_point.q[1]
-    theta = interval_point.q[2]
-    L = interval_point.q[3:]
+    x = contact_interval_point.q[0]
+    z = contact_interval_point.q[1]
+    theta = contact_interval_point.q[2]
+    L = contact_interval_point.q[3:]
     return WheelMotion(
         x,
         z,
         theta,
-        interval_point.v[0],
-        interval_point.v[1],
-        interval_point.v[2],
+        contact_interval_point.v[0],
+        contact_interval_point.v[1],
+        contact_interval_point.v[2],
         L,
-        interval_point.v[3:],
+        contact_interval_point.v[3:],
     )
 
 
-def make_interval_point(mode_dynamics: ModeDynamics, motion: WheelMotion) -> IntervalPoint:
+def make_contact_interval_point(
+    contact_mode_dynamics: ContactModeDynamics, motion: WheelMotion
+) -> ContactIntervalPoint:
     """Return the interval point for a motion, including its dynamics rows.
 
     The function is the inverse of `unpack_motion`.
     """
     q, v = pack_coordinates(motion)
-    return IntervalPoint(q, v, evaluate_dynamics(mode_dynamics, q, v))
+    return ContactIntervalPoint(q, v, evaluate_dynamics(contact_mode_dynamics, q, v))
 
 
 def pack_coordinates(motion: WheelMotion) -> tuple[Array, Array]:
@@ -183,15 +185,15 @@ def pack_coordinates(motion: WheelMotion) -> tuple[Array, Array]:
     return q, jnp.concatenate([jnp.stack([motion.vx, motion.vz, motion.dtheta]), motion.dL])
 
 
-def evaluate_dynamics(mode_dynamics: ModeDynamics, q: Array, v: Array) -> Array:
+def evaluate_dynamics(contact_mode_dynamics: ContactModeDynamics, q: Array, v: Array) -> Array:
     """Return accelerations, contact quantities and, if requested, accumulator rates as one array.
 
     The axes are (dynamics rows, batch). `q` and `v` are coordinates and rates, (3 + n, batch). Leg
     directions are not among the contact quantities.
     """
-    motion = unpack_motion(IntervalPoint(q, v, q))
-    contact_forces = compute_forces(mode_dynamics, motion)
-    contact_quantities = collect_contact_quantities(mode_dynamics, motion, contact_forces)
+    motion = unpack_motion(ContactIntervalPoint(q, v, q))
+    contact_forces = compute_forces(contact_mode_dynamics, motion)
+    contact_quantities = collect_contact_quantities(contact_mode_dynamics, motion, contact_forces)
     contact_rows = [
         *contact_quantities.normal_forces,
         *contact_quantities.tangential_forces,
@@ -206,8 +208,8 @@ def evaluate_dynamics(mode_dynamics: ModeDynamics, q: Array, v: Array) -> Array:
     )
     if contact_quantities.force_rates is not None:
         optional_dynamics_rows.append(contact_quantities.force_rates)
-    if mode_dynamics.has_accumulators:
-        accumulators = compute_accumulator_rates(mode_dynamics, motion, contact_forces)
+    if contact_mode_dynamics.has_accumulators:
+        accumulators = compute_accumulator_rates(contact_mode_dynamics, motion, contact_forces)
         accumulator_rows = (
             accumulators.damping_loss,
             accumulators.friction_loss,
@@ -226,14 +228,16 @@ def evaluate_dynamics(mode_dynamics: ModeDynamics, q: Array, v: Array) -> Array:
     )
 
 
-def evaluate_guards_at_point(mode_dynamics: ModeDynamics, interval_point: IntervalPoint) -> Array:
+def evaluate_guards_at_point(
+    contact_mode_dynamics: ContactModeDynamics, contact_interval_point: ContactIntervalPoint
+) -> Array:
     """Return the values of all guards in the order of `GuardLayout`, (guards, batch).
 
     The point must be after the start of the contact state, so that no guard has a placeholder
     value.
     """
-    motion = unpack_motion(interval_point)
-    contact_rows = interval_point.dynamics_rows[len(interval_point.q) :]
+    motion = unpack_motion(contact_interval_point)
+    contact_rows = contact_interval_point.dynamics_rows[len(contact_interval_point.q) :]
     (
         first_normal_force,
         second_normal_force,
@@ -246,17 +250,19 @@ def evaluate_guards_at_point(mode_dynamics: ModeDynamics, interval_point: Interv
         painleve_determinant,
     ) = contact_rows[:N_CONTACT_QUANTITY_ROWS]
     airborne_stopper = (
-        contact_rows[N_CONTACT_QUANTITY_ROWS : N_CONTACT_QUANTITY_ROWS + mode_dynamics.s.n]
-        if mode_dynamics.has_one_sided_stoppers
+        contact_rows[N_CONTACT_QUANTITY_ROWS : N_CONTACT_QUANTITY_ROWS + contact_mode_dynamics.s.n]
+        if contact_mode_dynamics.has_one_sided_stoppers
         else None
     )
-    end_of_force_rates = len(contact_rows) - N_ACCUMULATOR_ROWS * mode_dynamics.has_accumulators
+    end_of_force_rates = (
+        len(contact_rows) - N_ACCUMULATOR_ROWS * contact_mode_dynamics.has_accumulators
+    )
     force_rates = (
-        contact_rows[end_of_force_rates - len(ForceRates._fields) : end_of_force_rates]
-        if mode_dynamics.measures_force_peaks
+        contact_rows[end_of_force_rates - len(NormalForceRates._fields) : end_of_force_rates]
+        if contact_mode_dynamics.measures_force_peaks
         else None
     )
-    leg_directions = compute_leg_directions(mode_dynamics.s, motion.theta)
+    leg_directions = compute_leg_directions(contact_mode_dynamics.s, motion.theta)
     slot_pairs = (
         (first_normal_force, second_normal_force),
         (first_tangential_force, second_tangential_force),
@@ -266,37 +272,47 @@ def evaluate_guards_at_point(mode_dynamics: ModeDynamics, interval_point: Interv
     contact_quantities = ContactQuantities(
         leg_directions, *slot_pairs, painleve_determinant, airborne_stopper, force_rates
     )
-    is_after_start = jnp.ones(interval_point.q.shape[-1:], bool)
+    is_after_start = jnp.ones(contact_interval_point.q.shape[-1:], bool)
     return jnp.concatenate(
-        evaluate_guards(mode_dynamics, motion, contact_quantities, is_after_start)
+        evaluate_guards(contact_mode_dynamics, motion, contact_quantities, is_after_start)
     )
 
 
-def compute_guard_rates(mode_dynamics: ModeDynamics, interval_point: IntervalPoint) -> Array:
+def compute_guard_rates(
+    contact_mode_dynamics: ContactModeDynamics, contact_interval_point: ContactIntervalPoint
+) -> Array:
     """Return the time derivatives of all guards during the motion, (guards, batch)."""
 
     def evaluate_guards_of_coordinates(q: Array, v: Array) -> Array:
         return evaluate_guards_at_point(
-            mode_dynamics, IntervalPoint(q, v, evaluate_dynamics(mode_dynamics, q, v))
+            contact_mode_dynamics,
+            ContactIntervalPoint(q, v, evaluate_dynamics(contact_mode_dynamics, q, v)),
         )
 
     return jax.jvp(
         evaluate_guards_of_coordinates,
-        (interval_point.q, interval_point.v),
-        (interval_point.v, interval_point.dynamics_rows[: len(interval_point.q)]),
+        (contact_interval_point.q, contact_interval_point.v),
+        (
+            contact_interval_point.v,
+            contact_interval_point.dynamics_rows[: len(contact_interval_point.q)],
+        ),
     )[1]
 
 
-def find_initiating_guards(mode_dynamics: ModeDynamics) -> Array:
+def find_initiating_guards(contact_mode_dynamics: ContactModeDynamics) -> Array:
     """Return whether each guard is an initiating guard of the contact state, (guards, batch).
 
     An initiating guard was zero at the event that started the contact state.
     """
-    contact_state = mode_dynamics.contact_state
-    has_just_slid = mode_dynamics.contact_slots.gather_slot_flags(contact_state.has_just_slid)
+    contact_state = contact_mode_dynamics.contact_state
+    has_just_slid = contact_mode_dynamics.contact_slots.gather_slot_flags(
+        contact_state.has_just_slid
+    )
     no_slot_flags = jnp.zeros((2, contact_state.contact_modes.shape[-1]), bool)
     airborne_release_flags = (
-        [contact_state.is_locked & False] if mode_dynamics.has_one_sided_stoppers else []
+        [contact_state.is_leg_locked & False]
+        if contact_mode_dynamics.has_one_sided_stoppers
+        else []
     )
     force_rate_flags = (
         [jnp.zeros_like(contact_state.force_rate_signs, bool)]
@@ -320,29 +336,29 @@ def find_initiating_guards(mode_dynamics: ModeDynamics) -> Array:
 
 
 @eqx.filter_jit  # This function is traced once for all call sites.
-def init_interval(
-    mode_dynamics: ModeDynamics,
+def init_contact_interval(
+    contact_mode_dynamics: ContactModeDynamics,
     motion: WheelMotion,
     h: Array,
     search_options: EventSearchOptions = EVENT_SEARCH_OPTIONS,
-) -> IntervalState:
+) -> ContactIntervalState:
     """Return the state of all batch elements at the start of an interval between events.
 
     The status of an element is `LaneStatus.EVENT` if one of its guards falls immediately.
 
     - `h`: size of the first solver step, in the wheel's unit of time.
     """
-    start_point = make_interval_point(mode_dynamics, motion)
-    is_initiating = find_initiating_guards(mode_dynamics)
-    guard_values = evaluate_guards_at_point(mode_dynamics, start_point)
-    guard_rates = compute_guard_rates(mode_dynamics, start_point)
+    start_point = make_contact_interval_point(contact_mode_dynamics, motion)
+    is_initiating = find_initiating_guards(contact_mode_dynamics)
+    guard_values = evaluate_guards_at_point(contact_mode_dynamics, start_point)
+    guard_rates = compute_guard_rates(contact_mode_dynamics, start_point)
     # The guard of a contact released from rest is within round-off for 1e-8 s and longer. A guard
     # that rises from below zero has no event before it falls. Several events at one time leave
     # several such guards.
-    guard_roundoff = compute_guard_scales(mode_dynamics) * (
+    guard_roundoff = compute_guard_scales(contact_mode_dynamics) * (
         GUARD_ROUNDOFF_IN_EPS * jnp.finfo(guard_values.dtype).eps
     )
-    time_unit = compute_wheel_units(mode_dynamics.s).time_unit
+    time_unit = compute_wheel_units(contact_mode_dynamics.s).time_unit
     min_initiating_guard_rate = -guard_roundoff / (
         search_options.max_roundoff_fall_duration * time_unit
     )
@@ -360,15 +376,15 @@ def init_interval(
     guard_offset = jnp.where(is_initiating, guard_values - 2.0 * guard_roundoff, 0.0)
     float_zero_lanes = jnp.zeros_like(motion.x)
     int_zero_lanes = jnp.zeros(motion.x.shape, jnp.int32)
-    return IntervalState(
-        interval_point=start_point,
-        contact_state=mode_dynamics.contact_state,
+    return ContactIntervalState(
+        contact_interval_point=start_point,
+        contact_state=contact_mode_dynamics.contact_state,
         guard_values=guard_values - guard_offset,
         guard_offset=guard_offset,
         interval_accumulators=jnp.zeros(
             (N_ACCUMULATOR_ROWS, *float_zero_lanes.shape), float_zero_lanes.dtype
         )
-        if mode_dynamics.has_accumulators
+        if contact_mode_dynamics.has_accumulators
         else None,
         h=float_zero_lanes + h * time_unit,
         time_since_event=float_zero_lanes,
@@ -390,21 +406,21 @@ def init_interval(
     )
 
 
-DynamicsFn = Callable[[Array], ModeDynamics]
+DynamicsFn = Callable[[Array], ContactModeDynamics]
 """Function that returns the dynamics in the contact states of all batch elements.
 
 Its argument contains wheel parameters, friction and uneven ground, (inputs, batch).
 """
 
 
-def integrate_interval(
-    dynamics_fn: DynamicsFn,
+def integrate_contact_interval(
+    make_contact_dynamics: DynamicsFn,
     input_columns: Array,
-    initial_state: IntervalState,
+    initial_state: ContactIntervalState,
     has_unfinished_walk: Array,
     options: StepOptions,
     tableau: ButcherTableau,
-) -> IntervalState:
+) -> ContactIntervalState:
     """Return the state of all batch elements at their next events or failures.
 
     After `max_attempts_with_waiting_lane` solver steps, the integration ends as soon as an element
@@ -413,14 +429,14 @@ def integrate_interval(
     - `input_columns`: parameters, friction and uneven ground, (inputs, batch);
     - `has_unfinished_walk`: whether the walk of each element is unfinished, (batch,).
     """
-    mode_dynamics = dynamics_fn(input_columns)
-    guard_scales = compute_guard_scales(mode_dynamics)
-    options = compute_wheel_units(mode_dynamics.s).scale_times_to_seconds(options)
+    contact_mode_dynamics = make_contact_dynamics(input_columns)
+    guard_scales = compute_guard_scales(contact_mode_dynamics)
+    options = compute_wheel_units(contact_mode_dynamics.s).scale_times_to_seconds(options)
 
-    def try_solver_step(lane_states: IntervalState) -> IntervalState:
+    def try_solver_step(lane_states: ContactIntervalState) -> ContactIntervalState:
         return advance_running_lanes(
             lane_states,
-            attempt_solver_step(mode_dynamics, tableau, options, lane_states),
+            attempt_solver_step(contact_mode_dynamics, tableau, options, lane_states),
             guard_scales,
             tableau,
             options,
@@ -449,9 +465,9 @@ def iterate_until_stopped(
 
     def should_continue(loop_state: tuple) -> Array:
         lane_states, n_attempts = loop_state
-        is_search_active = is_running(lane_states)
-        has_stopped = jnp.any(has_unfinished_walk & ~is_search_active)
-        return jnp.any(is_search_active) & (
+        is_event_search_active = is_running(lane_states)
+        has_stopped = jnp.any(has_unfinished_walk & ~is_event_search_active)
+        return jnp.any(is_event_search_active) & (
             (n_attempts < max_attempts_with_waiting_lane) | ~has_stopped
         )
 
@@ -465,13 +481,15 @@ def iterate_until_stopped(
 class AttemptedSolverStep(NamedTuple):
     """Result of one solver step of every batch element, before it is accepted or rejected."""
 
-    end_point: IntervalPoint
+    end_point: ContactIntervalPoint
     mean_squared_error: Array  # mean square of the error over the tolerance
     guard_values: Array  # guards at the end of the solver step, (guards, batch)
     guard_parabola_curvature: Array  # curvature of the parabola through each guard, (guards, batch)
     guard_parabola_linear_term: Array
     guard_minimum_fraction: Array  # fraction of the solver step to a negative guard minimum, else 1
-    accumulator_increments: Array | None  # increment of `IntervalState.interval_accumulators`
+    accumulator_increments: (
+        Array | None
+    )  # increment of `ContactIntervalState.interval_accumulators`
 
 
 def compute_stage_state(
@@ -494,19 +512,19 @@ def compute_stage_state(
 
 
 def attempt_solver_step(
-    mode_dynamics: ModeDynamics,
+    contact_mode_dynamics: ContactModeDynamics,
     tableau: ButcherTableau,
     options: StepOptions,
-    lane_states: IntervalState,
+    lane_states: ContactIntervalState,
 ) -> AttemptedSolverStep:
     """Return the result of one attempted solver step of every batch element."""
     h = lane_states.h
-    start_point = lane_states.interval_point
+    start_point = lane_states.contact_interval_point
     last_stage = len(tableau.stage_nodes) - 1
 
     def evaluate_stage_dynamics(i: Array, stage_rows: Array) -> Array:
         stage_row = evaluate_dynamics(
-            mode_dynamics,
+            contact_mode_dynamics,
             *compute_stage_state(tableau, i, start_point.q, start_point.v, stage_rows, h),
         )
         return lax.dynamic_update_index_in_dim(stage_rows, stage_row, i, 0)
@@ -514,14 +532,14 @@ def attempt_solver_step(
     later_stage_rows = jnp.zeros((last_stage, *start_point.dynamics_rows.shape), h.dtype)
     stage_rows = jnp.concatenate([start_point.dynamics_rows[None], later_stage_rows])
     stage_rows = lax.fori_loop(1, last_stage + 1, evaluate_stage_dynamics, stage_rows)
-    return complete_solver_step(mode_dynamics, tableau, options, lane_states, stage_rows)
+    return complete_solver_step(contact_mode_dynamics, tableau, options, lane_states, stage_rows)
 
 
 def complete_solver_step(
-    mode_dynamics: ModeDynamics,
+    contact_mode_dynamics: ContactModeDynamics,
     tableau: ButcherTableau,
     options: StepOptions,
-    lane_states: IntervalState,
+    lane_states: ContactIntervalState,
     stage_rows: Array,
 ) -> AttemptedSolverStep:
     """Return the result of a solver step from the dynamics rows at all stages.
@@ -529,21 +547,21 @@ def complete_solver_step(
     - `stage_rows`: dynamics rows, (stages, rows, batch).
     """
     h = lane_states.h
-    start_point = lane_states.interval_point
+    start_point = lane_states.contact_interval_point
     last_stage = len(tableau.stage_nodes) - 1
     n = len(start_point.q)
-    end_point = IntervalPoint(
+    end_point = ContactIntervalPoint(
         *compute_stage_state(tableau, last_stage, start_point.q, start_point.v, stage_rows, h),
         stage_rows[last_stage],
     )
     accumulator_increments = None
-    if mode_dynamics.has_accumulators:
+    if contact_mode_dynamics.has_accumulators:
         accumulator_increments = h * sum(
             tableau.stage_matrix[last_stage][j] * stage_rows[j, -N_ACCUMULATOR_ROWS:]
             for j in range(last_stage)
         )
     inner_stage_points = {
-        i: IntervalPoint(
+        i: ContactIntervalPoint(
             *compute_stage_state(tableau, i, start_point.q, start_point.v, stage_rows, h),
             stage_rows[i],
         )
@@ -551,18 +569,23 @@ def complete_solver_step(
     }
     guard_points = *inner_stage_points.values(), end_point
     *inner_guard_values, end_guard_values = (
-        evaluate_guards_at_point(mode_dynamics, guard_point) - lane_states.guard_offset
+        evaluate_guards_at_point(contact_mode_dynamics, guard_point) - lane_states.guard_offset
         for guard_point in guard_points
     )
-    sum_stages = lambda weights: sum(
+    sum_weighted_stages = lambda weights: sum(
         float(w) * stage_rows[j, :n] for j, w in enumerate(weights) if w != 0.0
     )
     error_estimates = (
-        h * h * sum_stages(tableau.position_error_weights),
-        h * sum_stages(tableau.rate_error_weights),
+        h * h * sum_weighted_stages(tableau.position_error_weights),
+        h * sum_weighted_stages(tableau.rate_error_weights),
     )
     mean_squared_error = _compute_squared_error(
-        mode_dynamics.s, options, error_estimates, start_point, guard_points[-1], end_guard_values
+        contact_mode_dynamics.s,
+        options,
+        error_estimates,
+        start_point,
+        guard_points[-1],
+        end_guard_values,
     )
     middle_guard_values = (
         inner_guard_values[tableau.guard_stage_indices.index(tableau.middle_stage_index)]
@@ -604,24 +627,26 @@ def is_at_painleve_singularity(
 
 
 def advance_running_lanes(
-    lane_states: IntervalState,
+    lane_states: ContactIntervalState,
     attempted_step: AttemptedSolverStep,
     guard_scales: Array,
     tableau: ButcherTableau,
     options: StepOptions,
     search_options: EventSearchOptions = EVENT_SEARCH_OPTIONS,
-) -> IntervalState:
+) -> ContactIntervalState:
     """Return the state of all batch elements after one attempted solver step.
 
     Each running element accepts the step, repeats it with another size, or stops at an event.
     """
-    start_point = lane_states.interval_point
+    start_point = lane_states.contact_interval_point
     h = lane_states.h
     event_bracket = lane_states.event_bracket
     end_point = attempted_step.end_point
     is_running = lane_states.lane_status == LaneStatus.RUNNING
     is_step_accurate = (
-        is_running & ~event_bracket.is_search_active & (attempted_step.mean_squared_error <= 1.0)
+        is_running
+        & ~event_bracket.is_event_search_active
+        & (attempted_step.mean_squared_error <= 1.0)
     )
     must_retry_step = (
         is_step_accurate
@@ -654,13 +679,13 @@ def advance_running_lanes(
     reached_time = jnp.where(is_accepted, end_time, lane_states.time_since_event)
     next_integration_h = jnp.minimum(h * step_size_ratio, latest_event_time - reached_time)
     next_step_size = jnp.where(
-        event_bracket.is_search_active | has_guard_crossed,
+        event_bracket.is_event_search_active | has_guard_crossed,
         located_event.next_step_size,
         next_integration_h,
     )
 
     event_time_shift = jnp.where(has_reached_event, located_event.event_time_shift, 0.0)
-    end_point = IntervalPoint(
+    end_point = ContactIntervalPoint(
         end_point.q + event_time_shift * end_point.v,
         end_point.v + event_time_shift * end_point.dynamics_rows[: len(end_point.q)],
         end_point.dynamics_rows,
@@ -678,7 +703,7 @@ def advance_running_lanes(
         lane_states.n_solver_steps + 1 >= options.max_solver_steps
     )
     has_step_failed = has_step_failed | (
-        ~event_bracket.is_search_active
+        ~event_bracket.is_event_search_active
         & (lane_states.time_since_event + next_step_size == lane_states.time_since_event)
     )
     painleve_determinant_row = len(start_point.q) + N_CONTACT_QUANTITY_ROWS - 1
@@ -692,7 +717,7 @@ def advance_running_lanes(
     )
     lane_status = jnp.where(is_at_singularity, Outcome.PAINLEVE_PARADOX, lane_status)
     return lane_states._replace(
-        interval_point=select_trees_by_condition(is_state_updated, end_point, start_point),
+        contact_interval_point=select_trees_by_condition(is_state_updated, end_point, start_point),
         guard_values=jnp.where(is_accepted, attempted_step.guard_values, lane_states.guard_values),
         interval_accumulators=interval_accumulators,
         h=jnp.where(is_running, next_step_size, h),
@@ -716,7 +741,7 @@ class _LocatedEvent(NamedTuple):
 
 
 def _iterate_event_search(
-    lane_states: IntervalState,
+    lane_states: ContactIntervalState,
     attempted_step: AttemptedSolverStep,
     has_guard_crossed: Array,
     guard_scales: Array,
@@ -730,7 +755,7 @@ def _iterate_event_search(
     h, event_bracket = lane_states.h, lane_states.event_bracket
     is_guard_negative = attempted_step.guard_values <= 0.0
     is_guard_crossing = jnp.where(
-        event_bracket.is_search_active,
+        event_bracket.is_event_search_active,
         event_bracket.is_guard_crossing | is_guard_negative,
         is_guard_negative,
     )
@@ -745,29 +770,31 @@ def _iterate_event_search(
     secant_step_size, secant_guard = _find_earliest_secant_root(
         event_bracket, attempted_step.guard_values, h, is_guard_crossing
     )
-    uses_secant_step = event_bracket.is_search_active & (
+    uses_secant_step = event_bracket.is_event_search_active & (
         event_bracket.n_iterations >= search_options.n_parabola_iterations
     )
     proposed_step_size = jnp.where(uses_secant_step, secant_step_size, h * root_fraction)
     guard_index = jnp.where(uses_secant_step, secant_guard, guard_index)
     is_past_event = jnp.any(is_guard_crossing & is_guard_negative, axis=0)
-    low_step_size = jnp.where(
-        event_bracket.is_search_active & ~is_past_event, h, event_bracket.low_step_size
+    lower_step_size_bound = jnp.where(
+        event_bracket.is_event_search_active & ~is_past_event,
+        h,
+        event_bracket.lower_step_size_bound,
     )
-    high_step_size = jnp.where(
-        event_bracket.is_search_active & is_past_event, h, event_bracket.high_step_size
+    upper_step_size_bound = jnp.where(
+        event_bracket.is_event_search_active & is_past_event, h, event_bracket.upper_step_size_bound
     )
-    low_step_size = jnp.where(has_guard_crossed, 0.0, low_step_size)
-    high_step_size = jnp.where(has_guard_crossed, h, high_step_size)
+    lower_step_size_bound = jnp.where(has_guard_crossed, 0.0, lower_step_size_bound)
+    upper_step_size_bound = jnp.where(has_guard_crossed, h, upper_step_size_bound)
     time_resolution = 1e3 * jnp.finfo(h.dtype).eps * (lane_states.time_since_event + h)
     time_tolerance = jnp.maximum(
         search_options.event_time_tolerance_factor * options.rtol * h, time_resolution
     )
     time_tolerance = jnp.where(
-        event_bracket.is_search_active, event_bracket.time_tolerance, time_tolerance
+        event_bracket.is_event_search_active, event_bracket.time_tolerance, time_tolerance
     )
-    is_step_in_bracket = (proposed_step_size >= low_step_size - time_tolerance) & (
-        proposed_step_size <= high_step_size + time_tolerance
+    is_step_in_bracket = (proposed_step_size >= lower_step_size_bound - time_tolerance) & (
+        proposed_step_size <= upper_step_size_bound + time_tolerance
     )
     # If a guard is below zero for microseconds only, round-off moves proposals out of the bracket.
     # The bracket is then bisected.
@@ -776,9 +803,9 @@ def _iterate_event_search(
     )
     # An initiating guard falls again soon, or not at all.
     bisection_step_size = jnp.where(
-        (low_step_size == 0.0) & jnp.isinf(proposed_step_size),
-        0.125 * high_step_size,
-        0.5 * (low_step_size + high_step_size),
+        (lower_step_size_bound == 0.0) & jnp.isinf(proposed_step_size),
+        0.125 * upper_step_size_bound,
+        0.5 * (lower_step_size_bound + upper_step_size_bound),
     )
     next_step_size = jnp.where(needs_bisection, bisection_step_size, proposed_step_size)
     event_time_shift = next_step_size - h
@@ -797,21 +824,25 @@ def _iterate_event_search(
         )
         * jnp.finfo(h.dtype).eps
     )
-    is_guard_within_roundoff = event_bracket.is_search_active & (
+    is_guard_within_roundoff = event_bracket.is_event_search_active & (
         jnp.abs(lowest_guard_value) <= guard_roundoff
     )
     event_time_shift = jnp.where(is_guard_within_roundoff, 0.0, event_time_shift)
     guard_index = jnp.where(is_guard_within_roundoff, lowest_guard, guard_index)
-    is_within_tolerance = event_bracket.is_search_active & (
+    is_within_tolerance = event_bracket.is_event_search_active & (
         jnp.abs(event_time_shift) <= time_tolerance
     )
-    n_iterations = jnp.where(event_bracket.is_search_active, event_bracket.n_iterations + 1, 0)
-    is_search_active = (event_bracket.is_search_active | has_guard_crossed) & ~is_within_tolerance
+    n_iterations = jnp.where(
+        event_bracket.is_event_search_active, event_bracket.n_iterations + 1, 0
+    )
+    is_event_search_active = (
+        event_bracket.is_event_search_active | has_guard_crossed
+    ) & ~is_within_tolerance
     next_bracket = EventBracket(
-        is_search_active,
+        is_event_search_active,
         is_guard_crossing,
-        low_step_size,
-        high_step_size,
+        lower_step_size_bound,
+        upper_step_size_bound,
         time_tolerance,
         n_iterations,
         h,
@@ -829,8 +860,8 @@ def _compute_squared_error(
     s: Symbols,
     options: StepOptions,
     error_estimates: tuple[Array, Array],
-    start_point: IntervalPoint,
-    end_point: IntervalPoint,
+    start_point: ContactIntervalPoint,
+    end_point: ContactIntervalPoint,
     guard_values: Array,
 ) -> Array:
     """Return the mean square of the error of a solver step, divided by the tolerance.
@@ -853,7 +884,7 @@ def _compute_squared_error(
     )
 
 
-def _flag_initiating_guards(lane_states: IntervalState) -> Array:
+def _flag_initiating_guards(lane_states: ContactIntervalState) -> Array:
     """Return which guards are initiating guards at the start of their interval, (guards, batch)."""
     return (lane_states.time_since_event == 0.0) & (lane_states.guard_offset != 0.0)
 

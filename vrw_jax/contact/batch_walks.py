@@ -25,7 +25,7 @@ from vrw_jax.contact.step_record import UnilateralStep
 from vrw_jax.contact.unilateral_wheel import UnilateralWheel
 from vrw_jax.contact.walk_kernel import (
     N_PARAMETERS,
-    N_UNEVEN_COLUMNS,
+    N_UNEVEN_GROUND_COLUMNS,
     BatchWalkSettings,
     make_result_template,
     run_walks,
@@ -57,18 +57,24 @@ def walk_batch(
     array contains the wheels.
 
     - `input_columns`: wheel parameters and friction, shape (10, wheels). On uneven ground, the walk
-      has one step, and two more columns follow: see `N_UNEVEN_COLUMNS`;
+      has one step, and two more columns follow: see `N_UNEVEN_GROUND_COLUMNS`;
     - `section_states`: full section states, shape (wheels, 4 + 3 n).
     """
-    static_settings = _make_static_settings(model, options, n_legs, False, len(input_columns))
+    static_walk_settings = _make_static_walk_settings(
+        model, options, n_legs, False, len(input_columns)
+    )
     walk_arguments = [_append_restitution(input_columns, model), section_states.T]
-    walk_result = _run_walk(static_settings, walk_arguments, n_steps, options)
+    walk_result = _run_walk(static_walk_settings, walk_arguments, n_steps, options)
     step_summary = walk_result.step_result
-    result_counts = walk_result.outcome, walk_result.n_stepped, walk_result.n_solver_steps
+    outcome_and_counts = (
+        walk_result.outcome,
+        walk_result.n_stepped,
+        walk_result.n_solver_steps,
+    )
     return (
         step_summary.section_state,
         step_summary.durations,
-        *result_counts,
+        *outcome_and_counts,
         step_summary.step_length,
     )
 
@@ -91,62 +97,64 @@ def step_batch_with_jacobian(
     that cannot vary. These are contact codes, and lengths of legs on their stoppers or with loaded
     feet. Tangents are computed only for independent rates (see `_IndependentStartRates`).
     """
-    static_settings = _make_static_settings(model, options, n_legs, True, len(input_columns))
+    static_walk_settings = _make_static_walk_settings(
+        model, options, n_legs, True, len(input_columns)
+    )
     if len(section_states):  # The longest compilation starts first.
         _compile_walk(
-            static_settings,
+            static_walk_settings,
             input_columns.dtype,
             jax.tree.structure(eqx.filter(options, eqx.is_array)),
         )
     contact_codes = np.round(section_states[:, 4 + 2 * n_legs :]).astype(int)
     step_inputs = np.concatenate([input_columns.T, section_states], 1)
-    needs_tangent = np.ones(step_inputs.shape, bool)
+    is_tangent_needed = np.ones(step_inputs.shape, bool)
     is_off_stopper = contact_codes < LOCKED_CODE_OFFSET
-    is_variable_entry = [
+    is_entry_variable = [
         is_off_stopper & ((contact_codes & (LOCKED_CODE_OFFSET - 1)) == ContactMode.OFF),
         is_off_stopper,
         np.zeros(contact_codes.shape, bool),
     ]
-    needs_tangent[:, len(input_columns) + 4 :] = np.concatenate(is_variable_entry, 1)
+    is_tangent_needed[:, len(input_columns) + 4 :] = np.concatenate(is_entry_variable, 1)
     if input_indices is not None:
-        needs_tangent &= np.isin(np.arange(step_inputs.shape[1]), input_indices)
+        is_tangent_needed &= np.isin(np.arange(step_inputs.shape[1]), input_indices)
     rate_indices = len(input_columns) + np.array([1, 2, 3, *range(4 + n_legs, 4 + 2 * n_legs)])
     section_units = compute_section_units(
         compute_wheel_units_of_rows(input_columns.T, n_legs), n_legs
     )
     rate_units = np.stack(section_units, -1)[:, rate_indices - len(input_columns)]
     projected_units = rate_units[:, [1, 2, 0, *range(3, 3 + n_legs)]]  # as in `pack_coordinates`
-    rate_projection = _project_rates(input_columns, section_states, n_legs) * (
+    rate_projection = _project_start_rates(input_columns, section_states, n_legs) * (
         rate_units[:, None] / projected_units[:, :, None]
     )
-    independent_rates = _IndependentStartRates.from_projection(
-        rate_projection, needs_tangent[:, rate_indices]
+    independent_rates = _IndependentStartRates.from_rate_projection(
+        rate_projection, is_tangent_needed[:, rate_indices]
     ).convert_weights_to_si(rate_units)
-    needs_tangent[:, rate_indices] = independent_rates.flag_independent_rates()
-    wheel_index, input_index = np.nonzero(needs_tangent)
-    lane_index, tangent_position, lane_wheels = _pack_tangents(needs_tangent.sum(1))
+    is_tangent_needed[:, rate_indices] = independent_rates.flag_independent_rates()
+    wheel_index, input_index = np.nonzero(is_tangent_needed)
+    lane_index, tangent_index_in_wheel, lane_wheels = _pack_tangents(is_tangent_needed.sum(1))
     tangent_input_indices = np.full((MAX_TANGENTS_PER_LANE, len(lane_wheels)), -1.0)
-    tangent_input_indices[tangent_position, lane_index] = input_index
+    tangent_input_indices[tangent_index_in_wheel, lane_index] = input_index
     walk_arguments = [
         _append_restitution(input_columns[:, lane_wheels], model),
         section_states[lane_wheels].T,
         tangent_input_indices,
     ]
     walk_result, tangents = _run_walk(
-        static_settings, walk_arguments, 1, options.with_derivative_tolerances()
+        static_walk_settings, walk_arguments, 1, options.with_derivative_tolerances()
     )
-    first_lane = np.searchsorted(lane_wheels, np.arange(len(section_states)))
+    first_lane_of_wheel = np.searchsorted(lane_wheels, np.arange(len(section_states)))
 
     def gather_tangents(leaf: np.ndarray) -> np.ndarray:
         jacobian_rows = np.zeros((*step_inputs.shape, *leaf.shape[2:]), leaf.dtype)
-        jacobian_rows[wheel_index, input_index] = leaf[lane_index, tangent_position]
+        jacobian_rows[wheel_index, input_index] = leaf[lane_index, tangent_index_in_wheel]
         jacobian_rows[:, rate_indices] = independent_rates.expand_tangents_to_all_rates(
             jacobian_rows[:, rate_indices]
         )
         return np.moveaxis(jacobian_rows, 1, -1)
 
     return jax.tree.map(
-        lambda section_state: section_state[first_lane], walk_result.step_result
+        lambda section_state: section_state[first_lane_of_wheel], walk_result.step_result
     ), jax.tree.map(gather_tangents, tangents)
 
 
@@ -171,14 +179,17 @@ def _pack_tangents(n_tangents_by_wheel: np.ndarray) -> tuple[np.ndarray, np.ndar
     The tangents are ordered by wheel.
     """
     n_lanes_by_wheel = np.maximum(-(-n_tangents_by_wheel // MAX_TANGENTS_PER_LANE), 1)
-    first_lane = np.cumsum(n_lanes_by_wheel) - n_lanes_by_wheel
-    tangent_position = np.concatenate([np.arange(n_legs) for n_legs in n_tangents_by_wheel])
+    first_lane_of_wheel = np.cumsum(n_lanes_by_wheel) - n_lanes_by_wheel
+    tangent_index_in_wheel = np.concatenate(
+        [np.arange(n_tangents) for n_tangents in n_tangents_by_wheel]
+    )
     lane_index = (
-        np.repeat(first_lane, n_tangents_by_wheel) + tangent_position // MAX_TANGENTS_PER_LANE
+        np.repeat(first_lane_of_wheel, n_tangents_by_wheel)
+        + tangent_index_in_wheel // MAX_TANGENTS_PER_LANE
     )
     return (
         lane_index,
-        tangent_position % MAX_TANGENTS_PER_LANE,
+        tangent_index_in_wheel % MAX_TANGENTS_PER_LANE,
         np.repeat(np.arange(len(n_tangents_by_wheel)), n_lanes_by_wheel),
     )
 
@@ -203,7 +214,7 @@ class _IndependentStartRates(NamedTuple):
     combination_weights: np.ndarray
 
     @classmethod
-    def from_projection(
+    def from_rate_projection(
         cls, rate_projection: np.ndarray, is_requested: np.ndarray
     ) -> "_IndependentStartRates":
         """Return the independent rates for the projection of all rates at the start of a step.
@@ -308,11 +319,11 @@ class _IndependentStartRates(NamedTuple):
 
         `tangents` contains the tangents with respect to the independent rates.
         """
-        wheel_indices, trailing_axes = np.arange(len(tangents)), (1,) * (tangents.ndim - 2)
+        wheel_indices, trailing_axes_shape = np.arange(len(tangents)), (1,) * (tangents.ndim - 2)
         all_tangents = np.zeros_like(tangents)
         for independent_rate_position in range(self.independent_rate_indices.shape[1]):
             rate_weights = self.combination_weights[:, independent_rate_position].reshape(
-                *self.combination_weights[:, independent_rate_position].shape, *trailing_axes
+                *self.combination_weights[:, independent_rate_position].shape, *trailing_axes_shape
             )
             all_tangents += (
                 rate_weights
@@ -323,7 +334,7 @@ class _IndependentStartRates(NamedTuple):
         return all_tangents
 
 
-def _project_rates(
+def _project_start_rates(
     input_columns: np.ndarray, section_states: np.ndarray, n_legs: int
 ) -> np.ndarray:
     """Return the matrix that projects the rates of a section state onto the contact constraints.
@@ -332,9 +343,9 @@ def _project_rates(
     """
     unit_rates = np.eye(3 + n_legs)
     repeated_states = np.repeat(section_states, 3 + n_legs, 0)
-    tiled_rates = np.tile(unit_rates, (len(section_states), 1))
-    repeated_states[:, 1:4] = tiled_rates[:, :3]
-    repeated_states[:, 4 + n_legs : 4 + 2 * n_legs] = tiled_rates[:, 3:]
+    start_rates_by_unit = np.tile(unit_rates, (len(section_states), 1))
+    repeated_states[:, 1:4] = start_rates_by_unit[:, :3]
+    repeated_states[:, 4 + n_legs : 4 + 2 * n_legs] = start_rates_by_unit[:, 3:]
     lane_rows = [*np.repeat(input_columns[:N_PARAMETERS], 3 + n_legs, 1), *repeated_states.T]
     rates = _evaluate_on_lane_rows(n_legs, "rates at a start", lane_rows).T
     return np.swapaxes(rates.reshape(len(section_states), 3 + n_legs, 3 + n_legs), 1, 2)
@@ -343,7 +354,7 @@ def _project_rates(
 def _project_section_state(s: Symbols, section_state: Array) -> WheelMotion:
     """Return the motion for a section state, projected onto its contact constraints."""
     motion, contact_state = unpack_section_state(s, section_state)
-    return project_motion(s, motion, contact_state.contact_modes, contact_state.is_locked)
+    return project_motion(s, motion, contact_state.contact_modes, contact_state.is_leg_locked)
 
 
 SECTION_STATE_FUNCTIONS: dict[str, Callable[[Symbols, Array], Array]] = {
@@ -385,7 +396,7 @@ def _evaluate_on_lane_rows(
     return np.stack(lane_program([], [np.ascontiguousarray(lane_row) for lane_row in lane_rows]))
 
 
-def _make_static_settings(
+def _make_static_walk_settings(
     model: UnilateralWheel, options: StepOptions, n_legs: int, has_tangents: bool, n_columns: int
 ) -> BatchWalkSettings:
     """Return the walk settings without traced options and number of steps, as a hashable key.
@@ -406,7 +417,7 @@ def _make_static_settings(
     )
 
 
-def _list_input_row_counts(static_settings: BatchWalkSettings) -> tuple[int, ...]:
+def _list_input_row_counts(static_walk_settings: BatchWalkSettings) -> tuple[int, ...]:
     """Return the numbers of entries per wheel in the input columns and in the section state.
 
     If tangents are requested, the number of indices of their inputs follows.
@@ -414,15 +425,15 @@ def _list_input_row_counts(static_settings: BatchWalkSettings) -> tuple[int, ...
     n_columns = (
         N_PARAMETERS
         + 1
-        + N_UNEVEN_COLUMNS * static_settings.has_uneven_ground
-        + static_settings.has_restitution
+        + N_UNEVEN_GROUND_COLUMNS * static_walk_settings.has_uneven_ground
+        + static_walk_settings.has_restitution
     )
-    row_counts = n_columns, compute_full_section_size(static_settings.n_legs)
-    return (*row_counts, MAX_TANGENTS_PER_LANE) if static_settings.is_detailed else row_counts
+    row_counts = n_columns, compute_full_section_size(static_walk_settings.n_legs)
+    return (*row_counts, MAX_TANGENTS_PER_LANE) if static_walk_settings.is_detailed else row_counts
 
 
 def _run_walk(
-    static_settings: BatchWalkSettings,
+    static_walk_settings: BatchWalkSettings,
     input_arrays: list[np.ndarray],
     n_steps: int,
     options: StepOptions,
@@ -436,46 +447,53 @@ def _run_walk(
     # high damping limits the step size by stability.
     lane_order = np.argsort(-input_arrays[0][PARAMETER_NAMES.index("damping")], kind="stable")
     traced_options, options_structure = jax.tree.flatten(eqx.filter(options, eqx.is_array))
-    lane_independent = [np.int32(n_steps), *(np.asarray(leaf, dtype) for leaf in traced_options)]
+    scalar_arguments = [
+        np.int32(n_steps),
+        *(np.asarray(option, dtype) for option in traced_options),
+    ]
     lane_rows = [input_row[lane_order] for input_array in input_arrays for input_row in input_array]
-    result_rows = (
-        _compile_walk(static_settings, dtype, options_structure)(lane_independent, lane_rows)
+    walk_result_rows = (
+        _compile_walk(static_walk_settings, dtype, options_structure)(scalar_arguments, lane_rows)
         if len(lane_order)
         else None
     )
     inverse_lane_order = np.argsort(lane_order, kind="stable")
-    result_leaves, result_tree_structure = _flatten_result_structure(static_settings, dtype)
-    if result_rows is None:
-        result_rows = [np.zeros((*leaf.shape, 0), leaf.dtype) for leaf in result_leaves]
+    walk_result_leaves, result_tree_structure = _flatten_result_structure(
+        static_walk_settings, dtype
+    )
+    if walk_result_rows is None:
+        walk_result_rows = [np.zeros((*leaf.shape, 0), leaf.dtype) for leaf in walk_result_leaves]
     return jax.tree.unflatten(
         result_tree_structure,
         [
-            np.moveaxis(np.asarray(input_array), -1, 0)[inverse_lane_order]
-            for input_array in result_rows
+            np.moveaxis(np.asarray(result_array), -1, 0)[inverse_lane_order]
+            for result_array in walk_result_rows
         ],
     )
 
 
 @functools.cache
 def _flatten_result_structure(
-    static_settings: BatchWalkSettings, dtype: np.dtype
+    static_walk_settings: BatchWalkSettings, dtype: np.dtype
 ) -> tuple[list[Any], Any]:
     """Return the shapes of one batch element's results as leaves, and their tree structure.
 
     If tangents are requested, the tangents of the results follow.
     """
-    result_shapes: Any = jax.eval_shape(
-        lambda: make_result_template(static_settings.n_legs, dtype, static_settings.is_detailed)
+    walk_result_shapes: Any = jax.eval_shape(
+        lambda: make_result_template(
+            static_walk_settings.n_legs, dtype, static_walk_settings.is_detailed
+        )
     )
-    if not static_settings.is_detailed:
-        return jax.tree.flatten(result_shapes)
+    if not static_walk_settings.is_detailed:
+        return jax.tree.flatten(walk_result_shapes)
     float_leaves = eqx.filter(
-        result_shapes.step_result, lambda leaf: jnp.issubdtype(leaf.dtype, jnp.inexact)
+        walk_result_shapes.step_result, lambda leaf: jnp.issubdtype(leaf.dtype, jnp.inexact)
     )
     add_tangent_axis = lambda leaf: jax.ShapeDtypeStruct(
         (MAX_TANGENTS_PER_LANE, *leaf.shape), leaf.dtype
     )
-    return jax.tree.flatten((result_shapes, jax.tree.map(add_tangent_axis, float_leaves)))
+    return jax.tree.flatten((walk_result_shapes, jax.tree.map(add_tangent_axis, float_leaves)))
 
 
 def embed_section_states(
@@ -493,34 +511,34 @@ def embed_section_states(
 
 
 def _compile_walk(
-    static_settings: BatchWalkSettings, dtype: np.dtype, options_structure: Any
+    static_walk_settings: BatchWalkSettings, dtype: np.dtype, options_structure: Any
 ) -> Callable[..., Any]:
     """Return the compiled program for walks, a function of common values and arrays (batch,).
 
     The number of steps is one of the values that are common to the batch.
     """
 
-    def run_compiled_walk(lane_independent: tuple, lane_rows: tuple) -> tuple:
-        n_steps, *traced_options = lane_independent
+    def run_compiled_walk(scalar_arguments: tuple, lane_rows: tuple) -> tuple:
+        n_steps, *traced_options = scalar_arguments
         options = eqx.combine(
-            jax.tree.unflatten(options_structure, traced_options), static_settings.step_options
+            jax.tree.unflatten(options_structure, traced_options), static_walk_settings.step_options
         )
         tableau = load_explicit_tableau(options.solver)
         assert tableau is not None  # The caller has checked the solver.
-        walk_settings = static_settings._replace(
+        walk_settings = static_walk_settings._replace(
             n_steps=n_steps, step_options=options, tableau=tableau
         )
         row_iterator = iter(lane_rows)
         walk_inputs = [
             jnp.stack([next(row_iterator) for _ in range(n_rows)])
-            for n_rows in _list_input_row_counts(static_settings)
+            for n_rows in _list_input_row_counts(static_walk_settings)
         ]
-        if not static_settings.is_detailed:
+        if not static_walk_settings.is_detailed:
             return tuple(jax.tree.leaves(run_walks(walk_settings, *walk_inputs)))
         input_columns, section_state, tangent_input_indices = walk_inputs
         # Batches have no tangent of restitution, which is the last column.
-        n_columns = len(input_columns) - static_settings.has_restitution
-        column_index = [*range(n_columns), *[-2] * static_settings.has_restitution]
+        n_columns = len(input_columns) - static_walk_settings.has_restitution
+        column_index = [*range(n_columns), *[-2] * static_walk_settings.has_restitution]
         input_index = np.array(
             [*column_index, *n_columns + np.arange(len(section_state))], np.int32
         )[:, None]
@@ -539,8 +557,8 @@ def _compile_walk(
     return compile_batch_program(
         run_compiled_walk,
         [np.dtype(np.int32), *[dtype] * options_structure.num_leaves],
-        sum(_list_input_row_counts(static_settings)),
+        sum(_list_input_row_counts(static_walk_settings)),
         dtype,
-        ("walk with unilateral contact", static_settings),
+        ("walk with unilateral contact", static_walk_settings),
         batch_sizes.CONTACT_XLA_BATCH_SIZE,
     )

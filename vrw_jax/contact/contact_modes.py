@@ -66,7 +66,7 @@ Matrix2x2 = tuple[tuple[Any, Any], tuple[Any, Any]]
 """Matrix with two rows and two columns, as nested tuples."""
 
 
-def _solve_2x2(A: Matrix2x2, b: SlotPair) -> SlotPair:
+def _solve_2x2_system(A: Matrix2x2, b: SlotPair) -> SlotPair:
     """Return the solution of A x = b for a 2 x 2 matrix A; NaN if A is singular."""
     determinant = A[0][0] * A[1][1] - A[0][1] * A[1][0]
     inverse_determinant = 1.0 / jnp.where(determinant == 0.0, jnp.nan, determinant)
@@ -76,14 +76,16 @@ def _solve_2x2(A: Matrix2x2, b: SlotPair) -> SlotPair:
     )
 
 
-def _make_matrix(entry_fn: Any) -> Matrix2x2:
-    """Return the 2 x 2 matrix with the entries `entry_fn(i, j)`."""
-    return ((entry_fn(0, 0), entry_fn(0, 1)), (entry_fn(1, 0), entry_fn(1, 1)))
+def _make_slot_matrix(compute_entry: Any) -> Matrix2x2:
+    """Return the 2 x 2 matrix with the entries `compute_entry(i, j)`."""
+    return ((compute_entry(0, 0), compute_entry(0, 1)), (compute_entry(1, 0), compute_entry(1, 1)))
 
 
-def _make_pair(entry_fn: Any) -> SlotPair:
-    """Return the pair (`entry_fn(0)`, `entry_fn(1)`), with one entry for each contact slot."""
-    return entry_fn(0), entry_fn(1)
+def _make_slot_pair(compute_entry: Any) -> SlotPair:
+    """Return the pair (`compute_entry(0)`, `compute_entry(1)`), with one entry for each contact
+    slot.
+    """
+    return compute_entry(0), compute_entry(1)
 
 
 def map_friction(friction_function: Callable[[Any], Any], friction: Friction) -> Any:
@@ -107,8 +109,8 @@ def replace_infinite_friction(friction: Friction) -> Any:
     Coulomb's law then yields no friction on a foot that slides under infinite friction.
     """
     return map_friction(
-        lambda coefficient_value: jnp.where(
-            jnp.isfinite(coefficient_value), coefficient_value, 0.0
+        lambda friction_coefficient: jnp.where(
+            jnp.isfinite(friction_coefficient), friction_coefficient, 0.0
         ),
         friction,
     )
@@ -122,8 +124,8 @@ class _FootEquations(NamedTuple):
     c = 0.
     """
 
-    is_sticking: SlotPair
-    is_loaded: SlotPair
+    is_foot_sticking: SlotPair
+    is_foot_loaded: SlotPair
     unit_force_transverse: SlotPair  # transverse force for c = 1
     unit_force_radial: SlotPair  # force along the leg for c = 1; 0 for a sticking foot
     condition_weight_transverse: SlotPair  # weight of the foot's transverse motion in the condition
@@ -136,21 +138,21 @@ def _make_foot_equations(
     """Return the coefficients of the contact equations for the feet in both contact slots."""
     sin, cos = inverse_inertia.sin, inverse_inertia.cos
     sliding_coefficient = map_friction(
-        lambda coefficient_value: jnp.where(
-            coefficient_value == jnp.inf,
+        lambda friction_coefficient: jnp.where(
+            friction_coefficient == jnp.inf,
             1.0,
-            jnp.where(jnp.isfinite(coefficient_value), coefficient_value, 0.0),
+            jnp.where(jnp.isfinite(friction_coefficient), friction_coefficient, 0.0),
         ),
         friction,
     )
     normal_force_factor = map_friction(
-        lambda coefficient_value: jnp.where(coefficient_value == jnp.inf, 0.0, 1.0), friction
+        lambda friction_coefficient: jnp.where(friction_coefficient == jnp.inf, 0.0, 1.0), friction
     )
-    is_sticking = _make_pair(lambda i: slot_modes[i] == ContactMode.STICK)
-    is_sliding = _make_pair(
+    is_sticking = _make_slot_pair(lambda i: slot_modes[i] == ContactMode.STICK)
+    is_sliding = _make_slot_pair(
         lambda i: (slot_modes[i] == ContactMode.SLIP_DOWN) | (slot_modes[i] == ContactMode.SLIP_UP)
     )
-    friction_factor = _make_pair(
+    friction_factor = _make_slot_pair(
         lambda i: jnp.where(
             slot_modes[i] == ContactMode.SLIP_DOWN,
             -_get_slot_friction(i, sliding_coefficient),
@@ -161,28 +163,30 @@ def _make_foot_equations(
         is_sticking[i], sticking_value, jnp.where(is_sliding[i], sliding_value, 0.0)
     )
     return _FootEquations(
-        is_sticking=is_sticking,
-        is_loaded=_make_pair(lambda i: is_sticking[i] | is_sliding[i]),
-        unit_force_transverse=_make_pair(
+        is_foot_sticking=is_sticking,
+        is_foot_loaded=_make_slot_pair(lambda i: is_sticking[i] | is_sliding[i]),
+        unit_force_transverse=_make_slot_pair(
             lambda i: select_by_mode(
                 i,
                 1.0,
                 friction_factor[i] * cos[i] - _get_slot_friction(i, normal_force_factor) * sin[i],
             )
         ),
-        unit_force_radial=_make_pair(
+        unit_force_radial=_make_slot_pair(
             lambda i: select_by_mode(
                 i,
                 0.0,
                 friction_factor[i] * sin[i] + _get_slot_friction(i, normal_force_factor) * cos[i],
             )
         ),
-        condition_weight_transverse=_make_pair(lambda i: select_by_mode(i, 1.0, -sin[i])),
-        condition_weight_radial=_make_pair(lambda i: select_by_mode(i, 0.0, cos[i] * (1.0 / s.m))),
+        condition_weight_transverse=_make_slot_pair(lambda i: select_by_mode(i, 1.0, -sin[i])),
+        condition_weight_radial=_make_slot_pair(
+            lambda i: select_by_mode(i, 0.0, cos[i] * (1.0 / s.m))
+        ),
     )
 
 
-def _get_identity_entry(i: int, j: int) -> float:
+def _get_identity_matrix_entry(i: int, j: int) -> float:
     """Return the entry (i, j) of the identity matrix."""
     return 1.0 if i == j else 0.0
 
@@ -193,7 +197,7 @@ def _eliminate_stoppers(
     free_motion: FreeMotion,
     is_stopper_holding: Array,
     foot_equations: _FootEquations,
-    unit_divisor: Array,
+    opaque_one: Array,
 ) -> tuple[SlotPair, Matrix2x2]:
     """Return the stopper forces without foot forces, and their change due to c = 1 at each foot.
 
@@ -204,40 +208,44 @@ def _eliminate_stoppers(
     sin, cos, inverse_leg_mass = inverse_inertia.sin, inverse_inertia.cos, 1.0 / s.m
     H = ((inverse_inertia.H[0], inverse_inertia.H[1]), (inverse_inertia.H[2], inverse_inertia.H[3]))
     K = ((inverse_inertia.K[0], inverse_inertia.K[1]), inverse_inertia.K[1:])
-    leg_compliance = _make_pair(
-        lambda i: jnp.where(foot_equations.is_sticking[i], 0.0, inverse_leg_mass)
+    leg_compliance = _make_slot_pair(
+        lambda i: jnp.where(foot_equations.is_foot_sticking[i], 0.0, inverse_leg_mass)
     )
-    N = _make_matrix(
+    N = _make_slot_matrix(
         lambda i, j: jnp.where(
             is_stopper_holding[i],
-            K[i][j] + _get_identity_entry(i, j) * leg_compliance[i],
-            _get_identity_entry(i, j),
+            K[i][j] + _get_identity_matrix_entry(i, j) * leg_compliance[i],
+            _get_identity_matrix_entry(i, j),
         )
     )
-    outward_leg_motion = _make_pair(
+    outward_leg_motion = _make_slot_pair(
         lambda i: (
             sin[i] * free_motion.hub_motion[0]
             + cos[i] * free_motion.hub_motion[1]
             + free_motion.slot_leg_motion[i]
         )
     )
-    free_length_motion = _make_pair(
+    free_length_motion = _make_slot_pair(
         lambda i: (
             outward_leg_motion[i]
-            + jnp.where(foot_equations.is_sticking[i], free_motion.foot_radial_motion[i], 0.0)
+            + jnp.where(foot_equations.is_foot_sticking[i], free_motion.foot_radial_motion[i], 0.0)
         )
     )
-    p = _make_pair(lambda i: jnp.where(is_stopper_holding[i], free_length_motion[i], 0.0))
+    p = _make_slot_pair(lambda i: jnp.where(is_stopper_holding[i], free_length_motion[i], 0.0))
     foot_effect_on_stopper = lambda i, j: (
         H[i][j] * foot_equations.unit_force_transverse[j]
-        - _get_identity_entry(i, j) * foot_equations.unit_force_radial[i] * inverse_leg_mass
+        - _get_identity_matrix_entry(i, j) * foot_equations.unit_force_radial[i] * inverse_leg_mass
     )
-    P = _make_matrix(
+    P = _make_slot_matrix(
         lambda i, j: jnp.where(is_stopper_holding[i], foot_effect_on_stopper(i, j), 0.0)
     )
-    p, P, N = prevent_fusion((p, P, N), unit_divisor)
+    p, P, N = prevent_fusion((p, P, N), opaque_one)
     return prevent_fusion(
-        (_solve_2x2(N, p), _make_pair(lambda j: _solve_2x2(N, (P[0][j], P[1][j])))), unit_divisor
+        (
+            _solve_2x2_system(N, p),
+            _make_slot_pair(lambda j: _solve_2x2_system(N, (P[0][j], P[1][j]))),
+        ),
+        opaque_one,
     )
 
 
@@ -249,14 +257,14 @@ the wheel in Table 1 of the paper, chosen because `painleve_atol` was measured f
 """
 
 
-def _solve_feet(
+def _solve_foot_forces(
     s: Symbols,
     inverse_inertia: ContactInverseInertia,
     free_motion: FreeMotion,
     foot_equations: _FootEquations,
     stopper_without_feet: SlotPair,
     stopper_response: Matrix2x2,
-    unit_divisor: Array,
+    opaque_one: Array,
 ) -> tuple[SlotPair, SlotPair, SlotPair, Any]:
     """Return the stopper forces, the foot forces and the determinant of the foot equations.
 
@@ -270,30 +278,31 @@ def _solve_feet(
     unit_force_radial = foot_equations.unit_force_radial
     G = ((inverse_inertia.G[0], inverse_inertia.G[1]), inverse_inertia.G[1:])
     H = ((inverse_inertia.H[0], inverse_inertia.H[1]), (inverse_inertia.H[2], inverse_inertia.H[3]))
-    R = _make_matrix(
+    R = _make_slot_matrix(
         lambda i, k: (
-            _get_identity_entry(i, k) * condition_weight_radial[i]
+            _get_identity_matrix_entry(i, k) * condition_weight_radial[i]
             - condition_weight_transverse[i] * H[k][i]
         )
     )
-    C = _make_matrix(
+    C = _make_slot_matrix(
         lambda i, j: (
             condition_weight_transverse[i] * G[i][j] * unit_force_transverse[j]
-            + _get_identity_entry(i, j) * condition_weight_radial[i] * unit_force_radial[i]
+            + _get_identity_matrix_entry(i, j) * condition_weight_radial[i] * unit_force_radial[i]
             + R[i][0] * stopper_response[j][0]
             + R[i][1] * stopper_response[j][1]
-            + _get_identity_entry(i, j) * jnp.where(foot_equations.is_loaded[i], 0.0, 1.0)
+            + _get_identity_matrix_entry(i, j)
+            * jnp.where(foot_equations.is_foot_loaded[i], 0.0, 1.0)
         )
     )
-    right_hand_side = _make_pair(
+    right_hand_side = _make_slot_pair(
         lambda i: (
             -condition_weight_transverse[i] * free_motion.foot_transverse_motion[i]
             - condition_weight_radial[i] * s.m * free_motion.foot_radial_motion[i]
         )
     )
-    c = _solve_2x2(
+    c = _solve_2x2_system(
         C,
-        _make_pair(
+        _make_slot_pair(
             lambda i: (
                 right_hand_side[i]
                 - R[i][0] * stopper_without_feet[0]
@@ -301,32 +310,34 @@ def _solve_feet(
             )
         ),
     )
-    stopper_force = _make_pair(
+    stopper_force = _make_slot_pair(
         lambda k: (
             stopper_without_feet[k] + stopper_response[0][k] * c[0] + stopper_response[1][k] * c[1]
         )
     )
-    foot_force_transverse = _make_pair(lambda i: unit_force_transverse[i] * c[i])
-    sticking_force_radial = _make_pair(
+    foot_force_transverse = _make_slot_pair(lambda i: unit_force_transverse[i] * c[i])
+    sticking_force_radial = _make_slot_pair(
         lambda i: -s.m * free_motion.foot_radial_motion[i] - stopper_force[i]
     )
-    foot_force_radial = _make_pair(
+    foot_force_radial = _make_slot_pair(
         lambda i: jnp.where(
-            foot_equations.is_sticking[i], sticking_force_radial[i], unit_force_radial[i] * c[i]
+            foot_equations.is_foot_sticking[i],
+            sticking_force_radial[i],
+            unit_force_radial[i] * c[i],
         )
     )
-    scale_masses = _make_pair(
-        lambda i: jnp.where(foot_equations.is_sticking[i], s.Mt / REFERENCE_MASS_RATIO, s.m)
+    scale_masses = _make_slot_pair(
+        lambda i: jnp.where(foot_equations.is_foot_sticking[i], s.Mt / REFERENCE_MASS_RATIO, s.m)
     )
-    scale_masses = _make_pair(
-        lambda i: jnp.where(foot_equations.is_loaded[i], scale_masses[i], 1.0)
+    scale_masses = _make_slot_pair(
+        lambda i: jnp.where(foot_equations.is_foot_loaded[i], scale_masses[i], 1.0)
     )
     painleve_determinant = (
         scale_masses[0] * scale_masses[1] * (C[0][0] * C[1][1] - C[0][1] * C[1][0])
     )
     return prevent_fusion(
         (stopper_force, foot_force_transverse, foot_force_radial, painleve_determinant),
-        unit_divisor,
+        opaque_one,
     )
 
 
@@ -348,15 +359,17 @@ def solve_combination(
     slip. A leg on its stopper has a constant length. The stopper forces are eliminated first.
     """
     sin, cos, inverse_leg_mass = inverse_inertia.sin, inverse_inertia.cos, 1.0 / s.m
-    unit_divisor = 1.0 + 0.0 * lax.stop_gradient(free_motion.hub_motion[2])
+    opaque_one = 1.0 + 0.0 * lax.stop_gradient(free_motion.hub_motion[2])
     foot_equations = _make_foot_equations(s, inverse_inertia, slot_modes, friction)
     stopper_system = _eliminate_stoppers(
-        s, inverse_inertia, free_motion, is_stopper_holding, foot_equations, unit_divisor
+        s, inverse_inertia, free_motion, is_stopper_holding, foot_equations, opaque_one
     )
-    stopper_force, foot_force_transverse, foot_force_radial, painleve_determinant = _solve_feet(
-        s, inverse_inertia, free_motion, foot_equations, *stopper_system, unit_divisor
+    stopper_force, foot_force_transverse, foot_force_radial, painleve_determinant = (
+        _solve_foot_forces(
+            s, inverse_inertia, free_motion, foot_equations, *stopper_system, opaque_one
+        )
     )
-    leg_pull_forces = _make_pair(lambda i: foot_force_radial[i] + stopper_force[i])
+    leg_pull_forces = _make_slot_pair(lambda i: foot_force_radial[i] + stopper_force[i])
     hub_response_transverse = inverse_inertia.hub_response_transverse
     hub_response_radial = inverse_inertia.hub_response_radial
     hub_motion_with_feet = [
@@ -374,7 +387,7 @@ def solve_combination(
     hub_change_x = vx - free_motion.hub_motion[0]
     hub_change_z = vz - free_motion.hub_motion[1]
     hub_change_theta = hub_motion_theta - free_motion.hub_motion[2]
-    foot_transverse = _make_pair(
+    foot_transverse = _make_slot_pair(
         lambda i: (
             cos[i] * hub_change_x
             - sin[i] * hub_change_z
@@ -382,10 +395,10 @@ def solve_combination(
             + free_motion.foot_transverse_motion[i]
         )
     )
-    foot_radial = _make_pair(
+    foot_radial = _make_slot_pair(
         lambda i: free_motion.foot_radial_motion[i] + leg_pull_forces[i] * inverse_leg_mass
     )
-    free_length_motion = _make_pair(
+    free_length_motion = _make_slot_pair(
         lambda i: (
             sin[i] * vx
             + cos[i] * vz
@@ -394,25 +407,29 @@ def solve_combination(
         )
     )
     return SlotForceSolution(
-        tangential_forces=_make_pair(
+        tangential_forces=_make_slot_pair(
             lambda i: foot_force_transverse[i] * cos[i] + foot_force_radial[i] * sin[i]
         ),
-        normal_forces=_make_pair(
+        normal_forces=_make_slot_pair(
             lambda i: foot_force_radial[i] * cos[i] - foot_force_transverse[i] * sin[i]
         ),
         stopper_forces=stopper_force,
         leg_pull_forces=leg_pull_forces,
         hub_motion=(vx, vz, hub_motion_theta),
-        length_motion=_make_pair(
+        length_motion=_make_slot_pair(
             lambda i: jnp.where(is_stopper_holding[i], 0.0, free_length_motion[i])
         ),
-        foot_motion_x=_make_pair(lambda i: foot_transverse[i] * cos[i] + foot_radial[i] * sin[i]),
-        foot_motion_z=_make_pair(lambda i: foot_radial[i] * cos[i] - foot_transverse[i] * sin[i]),
+        foot_motion_x=_make_slot_pair(
+            lambda i: foot_transverse[i] * cos[i] + foot_radial[i] * sin[i]
+        ),
+        foot_motion_z=_make_slot_pair(
+            lambda i: foot_radial[i] * cos[i] - foot_transverse[i] * sin[i]
+        ),
         painleve_determinant=painleve_determinant,
     )
 
 
-def _enumerate_combinations() -> tuple[np.ndarray, np.ndarray]:
+def _enumerate_mode_combinations() -> tuple[np.ndarray, np.ndarray]:
     """Return contact modes and closed stoppers for all combinations, each of shape (63, 2).
 
     The combinations are sorted by decreasing number of sticking feet, then of sliding feet. Two
@@ -443,7 +460,7 @@ def _enumerate_combinations() -> tuple[np.ndarray, np.ndarray]:
     return np.array([r[0] for r in combinations], np.int32), np.array([r[1] for r in combinations])
 
 
-CONTACT_MODE_TABLE, HELD_STOPPER_TABLE = _enumerate_combinations()
+CONTACT_MODE_TABLE, HELD_STOPPER_TABLE = _enumerate_mode_combinations()
 """Contact modes and closed stoppers for all combinations in order of preference, each (63, 2)."""
 PAPER_RULE_ORDER = np.argsort(
     [
@@ -468,7 +485,7 @@ CombinationMask = tuple[Any, Any]
 """Set of combinations, with one bit per combination in two 32-bit integers."""
 
 
-class _OrderedCombinationTable(NamedTuple):
+class _ModeCombinationTable(NamedTuple):
     """Bit masks that mark the combinations with a given contact mode or closed stopper.
 
     The bits follow one order of the combinations.
@@ -478,7 +495,7 @@ class _OrderedCombinationTable(NamedTuple):
     masks_by_held_stopper: list[CombinationMask]  # indexed by slot
 
     @classmethod
-    def from_indices(cls, indices: np.ndarray) -> "_OrderedCombinationTable":
+    def from_indices(cls, indices: np.ndarray) -> "_ModeCombinationTable":
         """Return the bit masks for the combinations in the order `indices`."""
 
         def pack_bits(is_member: np.ndarray) -> CombinationMask:
@@ -492,12 +509,14 @@ class _OrderedCombinationTable(NamedTuple):
         mode_masks = [
             [pack_bits(slot_values == mode) for mode in ContactMode] for slot_values in slot_modes
         ]
-        return cls(mode_masks, [pack_bits(slot_values) for slot_values in is_stopper_holding])
+        return cls(
+            mode_masks, [pack_bits(is_slot_holding) for is_slot_holding in is_stopper_holding]
+        )
 
 
 _COMBINATION_TABLES = (
-    _OrderedCombinationTable.from_indices(PAPER_RULE_ORDER),
-    _OrderedCombinationTable.from_indices(np.arange(len(CONTACT_MODE_TABLE))),
+    _ModeCombinationTable.from_indices(PAPER_RULE_ORDER),
+    _ModeCombinationTable.from_indices(np.arange(len(CONTACT_MODE_TABLE))),
 )
 
 
@@ -509,17 +528,19 @@ class AllowedContactModes(NamedTuple):
 
     allowed_slot_modes: Int[Array, "2 ..."]  # set of modes allowed for each foot
     can_hold_stopper: Bool[Array, "2 ..."]  # whether the stopper may hold, not only be open
-    has_fixed_mode: Bool[Array, "2 ..."]  # whether the foot keeps its mode for any force
+    is_foot_mode_fixed: Bool[Array, "2 ..."]  # whether the foot keeps its mode for any force
     untested_slot_modes: Int[Array, "2 ..."]  # set of modes that need no test
     is_open_stopper_untested: Bool[Array, "2 ..."]  # whether an open stopper needs no test
 
-    def mask_allowed_combinations(self, ordered_table: _OrderedCombinationTable) -> CombinationMask:
-        """Return the bit mask of the combinations in `ordered_table` that are allowed."""
+    def mask_allowed_combinations(
+        self, mode_combination_table: _ModeCombinationTable
+    ) -> CombinationMask:
+        """Return the bit mask of the combinations in `mode_combination_table` that are allowed."""
 
-        def combine_masks(mask_index: int) -> Array:
+        def combine_combination_masks(mask_index: int) -> Array:
             allowed_mask = jnp.full_like(self.allowed_slot_modes[0], -1, jnp.int32)
             for i in range(2):
-                masks_by_mode = enumerate(ordered_table.masks_by_slot_mode[i])
+                masks_by_mode = enumerate(mode_combination_table.masks_by_slot_mode[i])
                 slot_mode_masks = [
                     jnp.where(
                         is_mode_in_set(self.allowed_slot_modes[i], mode),
@@ -531,7 +552,7 @@ class AllowedContactModes(NamedTuple):
                 stopper_mask = jnp.where(
                     self.can_hold_stopper[i],
                     -1,
-                    ~ordered_table.masks_by_held_stopper[i][mask_index],
+                    ~mode_combination_table.masks_by_held_stopper[i][mask_index],
                 )
                 allowed_mask = (
                     allowed_mask
@@ -545,7 +566,7 @@ class AllowedContactModes(NamedTuple):
                 )
             return allowed_mask
 
-        return combine_masks(0), combine_masks(1)
+        return combine_combination_masks(0), combine_combination_masks(1)
 
 
 def is_mode_in_set(allowed_mode_set: Array, mode: Array | int) -> Bool[Array, "..."]:
@@ -580,16 +601,16 @@ It applies if no combination has all signs correct.
 """
 
 
-class _EnumerationState(NamedTuple):
+class _ModeEnumerationState(NamedTuple):
     """State of the loop over the combinations of a table."""
 
     untested_combination_mask: CombinationMask  # allowed combinations that are not yet examined
     best_combination: CombinationMask  # first admissible combination, else the least violating one
-    lowest_violation: Elementwise
+    lowest_sign_violation: Elementwise
     n_solutions: Int[Array, "..."]
 
 
-def _evaluate_violation(
+def _evaluate_sign_violation(
     s: Symbols,
     inverse_inertia: ContactInverseInertia,
     free_motion: FreeMotion,
@@ -601,12 +622,12 @@ def _evaluate_violation(
 ) -> Array:
     """Return the largest sign violation of a combination, divided by its tolerance."""
     is_friction_infinite = map_friction(
-        lambda coefficient_value: ~jnp.isfinite(coefficient_value), friction
+        lambda friction_coefficient: ~jnp.isfinite(friction_coefficient), friction
     )
     uses_friction_limit = map_friction(
-        lambda coefficient_value: coefficient_value == jnp.inf, friction
+        lambda friction_coefficient: friction_coefficient == jnp.inf, friction
     )
-    coefficient = replace_infinite_friction(friction)
+    slot_friction_coefficient = replace_infinite_friction(friction)
     solution = solve_combination(
         s, inverse_inertia, free_motion, slot_modes, is_stopper_holding, friction
     )
@@ -618,8 +639,8 @@ def _evaluate_violation(
             & (mode != ContactMode.OFF)
             & ((mode == ContactMode.STICK) | _get_slot_friction(i, uses_friction_limit))
         )
-        zero_if_untested = lambda is_untested, coefficient_value: jnp.where(
-            is_untested, 0.0, coefficient_value
+        zero_if_untested = lambda is_untested, friction_coefficient: jnp.where(
+            is_untested, 0.0, friction_coefficient
         )
         is_untested = is_mode_in_set(allowed_modes.untested_slot_modes[i], mode)
         tangential_force, normal_force, foot_motion_x, foot_motion_z = (
@@ -634,7 +655,8 @@ def _evaluate_violation(
         pull_violation = -normal_force / tolerances.force_tolerance
         cone_violation = zero_if_untested(
             _get_slot_friction(i, is_friction_infinite),
-            jnp.abs(tangential_force) - _get_slot_friction(i, coefficient) * normal_force,
+            jnp.abs(tangential_force)
+            - _get_slot_friction(i, slot_friction_coefficient) * normal_force,
         )
         stick_violation = zero_if_untested(
             is_untested, jnp.maximum(pull_violation, cone_violation / tolerances.force_tolerance)
@@ -671,7 +693,8 @@ def _evaluate_violation(
         max_violation = jnp.maximum(
             max_violation,
             jnp.maximum(
-                zero_if_untested(allowed_modes.has_fixed_mode[i], foot_violation), stopper_violation
+                zero_if_untested(allowed_modes.is_foot_mode_fixed[i], foot_violation),
+                stopper_violation,
             ),
         )
         max_violation = jnp.where(
@@ -682,7 +705,7 @@ def _evaluate_violation(
     return jnp.where(holds_along_slope[0] & holds_along_slope[1], jnp.inf, max_violation)
 
 
-def _find_least_violating(
+def _find_least_violating_combination(
     evaluate_combination: Callable[[CombinationMask], Array], combinations: list[CombinationMask]
 ) -> tuple[CombinationMask, Array, Array]:
     """Return the first of the least violating combinations, its violation, and a count.
@@ -697,10 +720,10 @@ def _find_least_violating(
     first_masks, second_masks = (
         jnp.stack(combination_masks) for combination_masks in zip(*combinations, strict=True)
     )
-    violations = jax.vmap(evaluate_combination)((first_masks, second_masks))
-    combination_indices = lax.broadcasted_iota(jnp.int32, violations.shape, 0)
+    sign_violations = jax.vmap(evaluate_combination)((first_masks, second_masks))
+    combination_indices = lax.broadcasted_iota(jnp.int32, sign_violations.shape, 0)
 
-    def pick_less_violating(a: tuple, b: tuple) -> tuple:
+    def pick_less_violating_combination(a: tuple, b: tuple) -> tuple:
         is_first_better = (a[0] < b[0]) | ((a[0] == b[0]) & (a[1] < b[1]))
         return (
             jnp.where(is_first_better, a[0], b[0]),
@@ -708,14 +731,18 @@ def _find_least_violating(
             a[2] + b[2],
         )
 
-    initial_lowest_violation = (
-        np.array(np.inf, violations.dtype),
+    initial_lowest_sign_violation = (
+        np.array(np.inf, sign_violations.dtype),
         np.int32(len(combinations)),
         np.int32(0),
     )
-    reduction_operands = violations, combination_indices, (violations == 0.0).astype(jnp.int32)
+    reduction_operands = (
+        sign_violations,
+        combination_indices,
+        (sign_violations == 0.0).astype(jnp.int32),
+    )
     sign_violation, least_violating_index, n_admissible = lax.reduce(
-        reduction_operands, initial_lowest_violation, pick_less_violating, (0,)
+        reduction_operands, initial_lowest_sign_violation, pick_less_violating_combination, (0,)
     )
     select_combinations = lambda combination_masks: jnp.sum(
         jnp.where(least_violating_index == combination_indices, combination_masks, 0),
@@ -748,59 +775,61 @@ def choose_combination(
     contacts. Otherwise the number of solutions is 0.
     """
     evaluate_modes = functools.partial(
-        _evaluate_violation,
+        _evaluate_sign_violation,
         *lax.stop_gradient((s, inverse_inertia, free_motion, friction)),
         allowed_modes,
         lax.stop_gradient(tolerances),
     )
     uses_paper_rule = map_friction(
-        lambda coefficient_value: coefficient_value == PAPER_RULE_SENTINEL, friction
+        lambda friction_coefficient: friction_coefficient == PAPER_RULE_SENTINEL, friction
     )
     if isinstance(uses_paper_rule, tuple):
         uses_paper_rule = uses_paper_rule[0] & uses_paper_rule[1]
-    ordered_table = jax.tree.map(
+    mode_combination_table = jax.tree.map(
         lambda paper_mask, limit_mask: jnp.where(uses_paper_rule, paper_mask, limit_mask),
         *_COMBINATION_TABLES,
     )
 
-    def decode_combination(combination: CombinationMask) -> tuple[Array, Array]:
-        is_combination_in_mask = lambda mask: (
-            ((combination[0] & mask[0]) | (combination[1] & mask[1])) != 0
+    def decode_mode_combination(combination: CombinationMask) -> tuple[Array, Array]:
+        is_combination_in_mask = lambda combination_mask: (
+            ((combination[0] & combination_mask[0]) | (combination[1] & combination_mask[1])) != 0
         )
         slot_modes = [
             sum(
                 jnp.where(is_combination_in_mask(masks_by_mode[mode]), mode, 0)
                 for mode in range(1, 4)
             )
-            for masks_by_mode in ordered_table.masks_by_slot_mode
+            for masks_by_mode in mode_combination_table.masks_by_slot_mode
         ]
         return jnp.stack(slot_modes).astype(jnp.int32), jnp.stack(
             [
-                is_combination_in_mask(masks_by_mode)
-                for masks_by_mode in ordered_table.masks_by_held_stopper
+                is_combination_in_mask(held_stopper_mask)
+                for held_stopper_mask in mode_combination_table.masks_by_held_stopper
             ]
         )
 
     def evaluate_combination(combination: CombinationMask) -> Array:
         return jnp.where(
             (combination[0] | combination[1]) != 0,
-            evaluate_modes(*decode_combination(combination)),
+            evaluate_modes(*decode_mode_combination(combination)),
             jnp.inf,
         )
 
-    def is_unfinished(enumeration_state: _EnumerationState) -> Array:
+    def is_unfinished(mode_enumeration_state: _ModeEnumerationState) -> Array:
         return (
             (
-                enumeration_state.untested_combination_mask[0]
-                | enumeration_state.untested_combination_mask[1]
+                mode_enumeration_state.untested_combination_mask[0]
+                | mode_enumeration_state.untested_combination_mask[1]
             )
             != 0
-        ) & (counts_all_solutions | (enumeration_state.n_solutions == 0))
+        ) & (counts_all_solutions | (mode_enumeration_state.n_solutions == 0))
 
-    def evaluate_next_combinations(enumeration_state: _EnumerationState) -> _EnumerationState:
+    def evaluate_next_combinations(
+        mode_enumeration_state: _ModeEnumerationState,
+    ) -> _ModeEnumerationState:
         """Return the state of the enumeration after the next few allowed combinations."""
-        (untested_mask, best_combination, lowest_violation, n_solutions), combinations = (
-            enumeration_state,
+        (untested_mask, best_combination, lowest_sign_violation, n_solutions), combinations = (
+            mode_enumeration_state,
             [],
         )
         for _ in range(1 if simd.targets_machine_code() else N_COMBINATIONS_PER_ITERATION):
@@ -810,41 +839,43 @@ def choose_combination(
             )
             untested_mask = untested_mask[0] ^ combination[0], untested_mask[1] ^ combination[1]
             combinations.append(combination)
-        combination, combination_violation, n_admissible = _find_least_violating(
+        combination, combination_sign_violation, n_admissible = _find_least_violating_combination(
             evaluate_combination, combinations
         )
-        best_combination, lowest_violation = select_trees_by_condition(
-            combination_violation < lowest_violation,
-            (combination, combination_violation),
-            (best_combination, lowest_violation),
+        best_combination, lowest_sign_violation = select_trees_by_condition(
+            combination_sign_violation < lowest_sign_violation,
+            (combination, combination_sign_violation),
+            (best_combination, lowest_sign_violation),
         )
         n_solutions = n_solutions + n_admissible
         return select_trees_by_condition(
-            is_unfinished(enumeration_state),
-            _EnumerationState(untested_mask, best_combination, lowest_violation, n_solutions),
-            enumeration_state,
+            is_unfinished(mode_enumeration_state),
+            _ModeEnumerationState(
+                untested_mask, best_combination, lowest_sign_violation, n_solutions
+            ),
+            mode_enumeration_state,
         )
 
-    untested_mask = allowed_modes.mask_allowed_combinations(ordered_table)
-    infinite_violation = jnp.full_like(lax.stop_gradient(free_motion.hub_motion[2]), jnp.inf)
-    initial_state = _EnumerationState(
+    untested_mask = allowed_modes.mask_allowed_combinations(mode_combination_table)
+    infinite_sign_violation = jnp.full_like(lax.stop_gradient(free_motion.hub_motion[2]), jnp.inf)
+    initial_state = _ModeEnumerationState(
         untested_mask,
         (0 * untested_mask[0] + 1, 0 * untested_mask[1]),
-        infinite_violation,
+        infinite_sign_violation,
         0 * untested_mask[0],
     )
-    enumeration_state = lax.while_loop(
-        lambda enumeration_state: jnp.any(is_unfinished(enumeration_state)),
+    mode_enumeration_state = lax.while_loop(
+        lambda mode_enumeration_state: jnp.any(is_unfinished(mode_enumeration_state)),
         evaluate_next_combinations,
         initial_state,
     )
     n_solutions = jnp.maximum(
-        enumeration_state.n_solutions,
-        (enumeration_state.lowest_violation <= MAX_VIOLATION).astype(jnp.int32),
+        mode_enumeration_state.n_solutions,
+        (mode_enumeration_state.lowest_sign_violation <= MAX_VIOLATION).astype(jnp.int32),
     )
     return ChosenModeCombination(
-        *decode_combination(enumeration_state.best_combination),
-        enumeration_state.lowest_violation,
+        *decode_mode_combination(mode_enumeration_state.best_combination),
+        mode_enumeration_state.lowest_sign_violation,
         n_solutions,
     )
 
@@ -853,21 +884,22 @@ def is_release_consistent(
     s: Symbols,
     inverse_inertia: ContactInverseInertia,
     free_motion: FreeMotion,
-    slot_state: tuple[Array, Array],
+    slot_modes_and_stoppers: tuple[Array, Array],
     friction: Friction,
     is_second_slot: Bool[Array, "..."],
     release_direction: Int[Array, "..."],
 ) -> Bool[Array, "..."]:
     """Return whether a foot that is released from its contact mode moves in the release direction.
 
-    - `slot_state`: contact modes of both feet, and flags of both stoppers, in the contact slots;
+    - `slot_modes_and_stoppers`: contact modes of both feet, and flags of both stoppers, in the
+      contact slots;
     - `is_second_slot`: whether the foot is the one in the second contact slot;
     - `release_direction`: 0 off the ground, 1 downhill, -1 uphill.
 
     The margin of the new contact mode must grow with the acceleration in that direction. If the
     margin shrinks, the new mode ends immediately, and the forces jump (Painlevé).
     """
-    slot_modes, is_stopper_holding = slot_state
+    slot_modes, is_stopper_holding = slot_modes_and_stoppers
     slot_weights = jnp.stack([~is_second_slot, is_second_slot]).astype(inverse_inertia.sin[0].dtype)
     sin, cos = (
         slot_weights[0] * slot_pair[0] + slot_weights[1] * slot_pair[1]
@@ -890,7 +922,7 @@ def is_release_consistent(
         if isinstance(friction, tuple)
         else friction
     )
-    coefficient = replace_infinite_friction(slot_friction)
+    slot_friction_coefficient = replace_infinite_friction(slot_friction)
     uses_friction_limit = slot_friction == jnp.inf
     mode = jnp.where(is_second_slot, slot_modes[1], slot_modes[0])
     slides_down = mode == ContactMode.SLIP_DOWN
@@ -912,7 +944,7 @@ def is_release_consistent(
         return jnp.where(
             is_liftoff | uses_friction_limit,
             supporting_force,
-            coefficient * normal + release_direction * tangential,
+            slot_friction_coefficient * normal + release_direction * tangential,
         )
 
     return compute_mode_margin(shifted_free_motion) > compute_mode_margin(free_motion)

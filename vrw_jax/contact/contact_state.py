@@ -51,11 +51,11 @@ PackedState = Float[Array, "dim ..."]
 """Motion and loss accumulators as one vector of 10 + 2 n entries.
 
 The entries are the hub coordinates (x, z, theta), their rates, the leg lengths, their rates, and
-the `LossAccumulators`.
+the `EnergyLossAccumulators`.
 """
 
 
-class LossAccumulators(NamedTuple):
+class EnergyLossAccumulators(NamedTuple):
     """Time, energy losses and slip since the last event, integrated together with the motion."""
 
     time_since_event: Scalar  # time since the last event, s
@@ -64,12 +64,12 @@ class LossAccumulators(NamedTuple):
     slip_length: Scalar  # path length of all sliding feet, m
 
 
-def pack_state(motion: WheelMotion, accumulators: LossAccumulators) -> PackedState:
+def pack_state(motion: WheelMotion, accumulators: EnergyLossAccumulators) -> PackedState:
     """Return the motion and the loss accumulators as one vector of 10 + 2 n entries."""
     return jnp.concatenate([jnp.stack(motion[:6]), motion.L, motion.dL, jnp.stack(accumulators)])
 
 
-def unpack_state(packed_state: PackedState) -> tuple[WheelMotion, LossAccumulators]:
+def unpack_state(packed_state: PackedState) -> tuple[WheelMotion, EnergyLossAccumulators]:
     """Return the motion and the loss accumulators in a packed state.
 
     The function is the inverse of `pack_state`.
@@ -88,7 +88,7 @@ def unpack_state(packed_state: PackedState) -> tuple[WheelMotion, LossAccumulato
         L,
         dL,
     )
-    return motion, LossAccumulators(
+    return motion, EnergyLossAccumulators(
         accumulators[0], accumulators[1], accumulators[2], accumulators[3]
     )
 
@@ -97,22 +97,22 @@ class ContactState(NamedTuple):
     """Contact modes of the feet, stopper flags of the legs, and their changes at the last event."""
 
     contact_modes: Int[Array, " n_legs"]  # `ContactMode` of every foot
-    is_locked: Bool[Array, " n_legs"]  # whether a leg is on its stopper
+    is_leg_locked: Bool[Array, " n_legs"]  # whether a leg is on its stopper
     has_just_lifted: Bool[Array, " n_legs"]  # whether a foot has left the ground at the last event
     has_just_unlocked: Bool[Array, " n_legs"]  # whether a leg has left its stopper then
     has_just_slid: Bool[Array, " n_legs"]  # whether a foot at rest has begun to slide then
-    # sign of each of the `ForceRates` in this state; None if force peaks are not measured
+    # sign of each of the `NormalForceRates` in this state; None if force peaks are not measured
     force_rate_signs: Array | None = None
 
-    def continue_unchanged(self) -> "ContactState":
+    def continue_with_same_contacts(self) -> "ContactState":
         """Return the contact state without changes at the last event, and without signs."""
-        no_leg_flags = self.is_locked & False
+        no_leg_flags = self.is_leg_locked & False
         return ContactState(
-            self.contact_modes, self.is_locked, no_leg_flags, no_leg_flags, no_leg_flags
+            self.contact_modes, self.is_leg_locked, no_leg_flags, no_leg_flags, no_leg_flags
         )
 
 
-class ModeDynamics(NamedTuple):
+class ContactModeDynamics(NamedTuple):
     """Parameters and contact state that determine the dynamics of the wheel between two events."""
 
     s: Symbols
@@ -122,7 +122,7 @@ class ModeDynamics(NamedTuple):
     contact_slots: ContactSlots
     slot_modes: Int[Array, "2"]  # `ContactMode` of the foot in each contact slot
     is_stopper_holding: Bool[Array, "2"]  # whether the leg in each contact slot is on its stopper
-    is_airborne_locked: Bool[Array, " n_legs"]  # whether a leg is in the air on its stopper
+    is_airborne_leg_locked: Bool[Array, " n_legs"]  # whether a leg is in the air on its stopper
     has_accumulators: bool  # whether a batch integrates the accumulators
     tilt: Elementwise | None = None  # angle by which the next line is steeper, rad
 
@@ -137,19 +137,19 @@ class ModeDynamics(NamedTuple):
             self.contact_slots,
             self.slot_modes,
             self.is_stopper_holding,
-            self.is_airborne_locked,
+            self.is_airborne_leg_locked,
         )
         return ContactConfiguration(self.s, motion, self.friction, *contact_slots)
 
 
-def make_mode_dynamics(
+def make_contact_mode_dynamics(
     s: Symbols,
     friction: Friction,
     has_one_sided_stoppers: bool,
     contact_state: ContactState,
     has_accumulators: bool = False,
     tilt: Elementwise | None = None,
-) -> ModeDynamics:
+) -> ContactModeDynamics:
     """Return the dynamics of the wheel in the contact state `contact_state`.
 
     - `friction`: friction coefficient for all feet, or a pair for the foot that landed last and for
@@ -160,10 +160,10 @@ def make_mode_dynamics(
     """
     contact_slots = find_contact_slots(contact_state.contact_modes != ContactMode.OFF)
     slot_modes = contact_slots.gather_slot_codes(contact_state.contact_modes)
-    is_stopper_holding = contact_slots.gather_slot_flags(contact_state.is_locked)
-    is_airborne_locked = contact_state.is_locked & ~contact_slots.is_in_slot
+    is_stopper_holding = contact_slots.gather_slot_flags(contact_state.is_leg_locked)
+    is_airborne_leg_locked = contact_state.is_leg_locked & ~contact_slots.is_in_slot
     friction = select_slot_friction(friction, contact_slots)
-    return ModeDynamics(
+    return ContactModeDynamics(
         s,
         friction,
         has_one_sided_stoppers,
@@ -171,7 +171,7 @@ def make_mode_dynamics(
         contact_slots,
         slot_modes,
         is_stopper_holding,
-        is_airborne_locked,
+        is_airborne_leg_locked,
         has_accumulators,
         tilt,
     )
@@ -186,26 +186,34 @@ class ContactForces(NamedTuple):
     foot_velocity: SlotFootVelocity
 
 
-def compute_forces(mode_dynamics: ModeDynamics, motion: WheelMotion) -> ContactForces:
+def compute_forces(
+    contact_mode_dynamics: ContactModeDynamics, motion: WheelMotion
+) -> ContactForces:
     """Return the forces of ground and stoppers (N), and the resulting accelerations."""
-    unit_divisor = make_opaque_one(motion)
-    posture = make_wheel_posture(mode_dynamics.s, motion, mode_dynamics.contact_slots)
+    opaque_one = make_opaque_one(motion)
+    wheel_posture = make_wheel_posture(
+        contact_mode_dynamics.s, motion, contact_mode_dynamics.contact_slots
+    )
     leg_acceleration = prevent_fusion(
-        compute_free_leg_acceleration(mode_dynamics.s, motion, posture.leg_directions), unit_divisor
+        compute_free_leg_acceleration(
+            contact_mode_dynamics.s, motion, wheel_posture.leg_directions
+        ),
+        opaque_one,
     )
     slot_foot_velocity = prevent_fusion(
-        compute_slot_foot_velocity(motion, mode_dynamics.contact_slots, posture), unit_divisor
+        compute_slot_foot_velocity(motion, contact_mode_dynamics.contact_slots, wheel_posture),
+        opaque_one,
     )
     return ContactForces(
-        posture.leg_directions,
+        wheel_posture.leg_directions,
         leg_acceleration,
-        solve_contact_forces(mode_dynamics.configure_contacts(motion)),
+        solve_contact_forces(contact_mode_dynamics.configure_contacts(motion)),
         slot_foot_velocity,
     )
 
 
 def compute_airborne_stopper_force(
-    mode_dynamics: ModeDynamics, contact_forces: ContactForces
+    contact_mode_dynamics: ContactModeDynamics, contact_forces: ContactForces
 ) -> LegArray:
     """Return the stopper force on each leg in the air, N.
 
@@ -218,12 +226,14 @@ def compute_airborne_stopper_force(
         contact_forces.free_leg_acceleration + sin * hub_acceleration_x + cos * hub_acceleration_z
     )
     return jnp.where(
-        mode_dynamics.is_airborne_locked, mode_dynamics.s.m * free_leg_acceleration, 0.0
+        contact_mode_dynamics.is_airborne_leg_locked,
+        contact_mode_dynamics.s.m * free_leg_acceleration,
+        0.0,
     )
 
 
 def compute_min_stopper_force(
-    mode_dynamics: ModeDynamics, contact_forces: ContactForces
+    contact_mode_dynamics: ContactModeDynamics, contact_forces: ContactForces
 ) -> Elementwise:
     """Return the smallest stopper force on a leg that is in the air on its stopper, N.
 
@@ -231,8 +241,8 @@ def compute_min_stopper_force(
     """
     return jnp.min(
         jnp.where(
-            mode_dynamics.is_airborne_locked,
-            compute_airborne_stopper_force(mode_dynamics, contact_forces),
+            contact_mode_dynamics.is_airborne_leg_locked,
+            compute_airborne_stopper_force(contact_mode_dynamics, contact_forces),
             jnp.inf,
         ),
         axis=0,
@@ -240,40 +250,49 @@ def compute_min_stopper_force(
 
 
 def compute_accumulator_rates(
-    mode_dynamics: ModeDynamics, motion: WheelMotion, contact_forces: ContactForces
-) -> LossAccumulators:
+    contact_mode_dynamics: ContactModeDynamics, motion: WheelMotion, contact_forces: ContactForces
+) -> EnergyLossAccumulators:
     """Return the time derivatives of the loss accumulators.
 
     They are 1 for the time, the powers dissipated in dampers and by sliding in W, and the sum of
     the slip speeds in m/s.
     """
-    slip_signs = compute_slip_signs(mode_dynamics.slot_modes)
-    slip_speeds = [slip_signs[i] * contact_forces.foot_velocity.along_slope[i] for i in range(2)]
+    slip_signs = compute_slip_signs(contact_mode_dynamics.slot_modes)
+    slip_speeds = [
+        slip_signs[i] * contact_forces.foot_velocity.velocity_along_slope[i] for i in range(2)
+    ]
     friction_forces = [
         -contact_forces.force_solution.tangential_forces[i] * slip_signs[i] for i in range(2)
     ]
-    return LossAccumulators(
+    return EnergyLossAccumulators(
         time_since_event=jnp.ones_like(motion.x),
-        damping_loss=mode_dynamics.s.c * sum_over_legs(motion.dL * motion.dL),
+        damping_loss=contact_mode_dynamics.s.c * sum_over_legs(motion.dL * motion.dL),
         friction_loss=friction_forces[0] * slip_speeds[0] + friction_forces[1] * slip_speeds[1],
         slip_length=slip_speeds[0] + slip_speeds[1],
     )
 
 
-def evaluate_vector_field(mode_dynamics: ModeDynamics, packed_state: PackedState) -> PackedState:
-    """Return the time derivative of a packed state in the contact state of `mode_dynamics`."""
+def evaluate_vector_field(
+    contact_mode_dynamics: ContactModeDynamics, packed_state: PackedState
+) -> PackedState:
+    """Return the time derivative of a packed state in the contact state of
+    `contact_mode_dynamics`.
+    """
     motion, _ = unpack_state(packed_state)
-    contact_forces = compute_forces(mode_dynamics, motion)
-    rates = WheelMotion(
+    contact_forces = compute_forces(contact_mode_dynamics, motion)
+    coordinate_rates = WheelMotion(
         motion.vx,
         motion.vz,
         motion.dtheta,
         *contact_forces.force_solution.hub_motion,
-        jnp.where(mode_dynamics.contact_state.is_locked, 0.0, motion.dL),
+        jnp.where(contact_mode_dynamics.contact_state.is_leg_locked, 0.0, motion.dL),
         contact_forces.force_solution.length_motion,
     )
     return prevent_fusion(
-        pack_state(rates, compute_accumulator_rates(mode_dynamics, motion, contact_forces)),
+        pack_state(
+            coordinate_rates,
+            compute_accumulator_rates(contact_mode_dynamics, motion, contact_forces),
+        ),
         make_opaque_one(motion),
     )
 
@@ -292,7 +311,7 @@ class GuardLayout(NamedTuple):
     rolling_rate_guard: int  # rate of rolling, dtheta
     collapse_guard: int  # length of the shortest leg minus a
     first_airborne_release_guard: int  # stopper force in the air, one per leg, if one-sided
-    first_force_rate_guard: int  # absolute value of each of the `ForceRates`, if requested
+    first_force_rate_guard: int  # absolute value of each of the `NormalForceRates`, if requested
     n_guards: int
 
     @property
@@ -328,13 +347,13 @@ def make_guard_layout(
         1,
         1,
         n_legs if has_one_sided_stoppers else 0,
-        len(ForceRates._fields) if measures_force_peaks else 0,
+        len(NormalForceRates._fields) if measures_force_peaks else 0,
     )
     guard_group_offsets = np.concatenate([[0], np.cumsum(guard_group_sizes)])
     return GuardLayout(*(int(guard_offset) for guard_offset in guard_group_offsets))
 
 
-class ForceRates(NamedTuple):
+class NormalForceRates(NamedTuple):
     """Rates of normal forces on the feet.
 
     A rate is zero at an extremum of a force, and the second rate at an extremum of the first rate.
@@ -352,67 +371,75 @@ class NormalForces(NamedTuple):
     total_force: Elementwise  # sum of the forces on all feet, N
 
 
-def compute_normal_forces(mode_dynamics: ModeDynamics, motion: WheelMotion) -> NormalForces:
+def compute_normal_forces(
+    contact_mode_dynamics: ContactModeDynamics, motion: WheelMotion
+) -> NormalForces:
     """Return the normal forces of the ground on the feet, N."""
     first_force, second_force = solve_contact_forces(
-        mode_dynamics.configure_contacts(motion)
+        contact_mode_dynamics.configure_contacts(motion)
     ).normal_forces
     # A loaded fore foot is in the first contact slot.
-    is_fore_loaded = mode_dynamics.contact_state.contact_modes[0] != ContactMode.OFF
+    is_fore_loaded = contact_mode_dynamics.contact_state.contact_modes[0] != ContactMode.OFF
     return NormalForces(jnp.where(is_fore_loaded, first_force, 0.0), first_force + second_force)
 
 
 def compute_normal_force_rates(
-    mode_dynamics: ModeDynamics, motion: WheelMotion
+    contact_mode_dynamics: ContactModeDynamics, motion: WheelMotion
 ) -> tuple[NormalForces, NormalForces]:
     """Return the normal forces on the feet, N, and their rates between two events, N/s."""
     return _differentiate_in_time(
-        lambda motion: compute_normal_forces(mode_dynamics, motion), mode_dynamics, motion
+        lambda motion: compute_normal_forces(contact_mode_dynamics, motion),
+        contact_mode_dynamics,
+        motion,
     )
 
 
-def compute_force_rates(mode_dynamics: ModeDynamics, motion: WheelMotion) -> Array:
-    """Return the `ForceRates` in the motion between two events, as one array (3, ...)."""
+def compute_force_rates(contact_mode_dynamics: ContactModeDynamics, motion: WheelMotion) -> Array:
+    """Return the `NormalForceRates` in the motion between two events, as one array (3, ...)."""
     (_, force_rates), (_, second_rates) = _differentiate_in_time(
-        lambda motion: compute_normal_force_rates(mode_dynamics, motion), mode_dynamics, motion
+        lambda motion: compute_normal_force_rates(contact_mode_dynamics, motion),
+        contact_mode_dynamics,
+        motion,
     )
     return jnp.stack(
-        ForceRates(force_rates.fore_force, force_rates.total_force, second_rates.fore_force)
+        NormalForceRates(force_rates.fore_force, force_rates.total_force, second_rates.fore_force)
     )
 
 
 def _differentiate_in_time(
-    function: Callable[[WheelMotion], Any], mode_dynamics: ModeDynamics, motion: WheelMotion
+    function: Callable[[WheelMotion], Any],
+    contact_mode_dynamics: ContactModeDynamics,
+    motion: WheelMotion,
 ) -> tuple[Any, Any]:
     """Return a function of the motion, and its time derivative in the motion between two events."""
-    force_solution = solve_contact_forces(mode_dynamics.configure_contacts(motion))
-    rates = motion.vx, motion.vz, motion.dtheta
+    force_solution = solve_contact_forces(contact_mode_dynamics.configure_contacts(motion))
+    coordinate_rates = motion.vx, motion.vz, motion.dtheta
     motion_rate = WheelMotion(
-        *rates, *force_solution.hub_motion, motion.dL, force_solution.length_motion
+        *coordinate_rates, *force_solution.hub_motion, motion.dL, force_solution.length_motion
     )
     return jax.jvp(function, (motion,), (motion_rate,))
 
 
 def flag_zero_force_rates(guard_layout: GuardLayout, guard_index: Int[Array, "..."]) -> Array:
-    """Return which of the `ForceRates` is zero at the event of a guard, (3, ...)."""
-    rate_indices = np.arange(len(ForceRates._fields)).reshape(-1, *(1,) * guard_index.ndim)
+    """Return which of the `NormalForceRates` is zero at the event of a guard, (3, ...)."""
+    rate_indices = np.arange(len(NormalForceRates._fields)).reshape(-1, *(1,) * guard_index.ndim)
     return guard_index == guard_layout.first_force_rate_guard + rate_indices
 
 
 def update_force_rate_signs(
-    mode_dynamics: ModeDynamics,
+    contact_mode_dynamics: ContactModeDynamics,
     motion: WheelMotion,
     previous_signs: Array,
     is_rate_zero: Bool[Array, "3 ..."],
 ) -> Array:
-    """Return the sign of each of the `ForceRates` after an event, 1.0 or -1.0, (3, ...).
+    """Return the sign of each of the `NormalForceRates` after an event, 1.0 or -1.0, (3, ...).
 
     The result has no derivatives.
 
     - `previous_signs`: signs before the event;
     - `is_rate_zero`: which rates are zero at the event, and change their sign.
     """
-    force_rates = compute_force_rates(*stop_gradients((mode_dynamics, motion)))
+    force_rates = compute_force_rates(*stop_gradients((contact_mode_dynamics, motion)))
     return jnp.where(is_rate_zero, -previous_signs, jnp.where(force_rates < 0.0, -1.0, 1.0))
 
 
@@ -428,17 +455,19 @@ class ContactQuantities(NamedTuple):
     airborne_stopper_forces: (
         LegArray | None
     )  # stopper force of legs in the air, if stoppers are one-sided
-    force_rates: Array | None = None  # `ForceRates` as one array (3, ...), if peaks are measured
+    force_rates: Array | None = (
+        None  # `NormalForceRates` as one array (3, ...), if peaks are measured
+    )
 
 
 def collect_contact_quantities(
-    mode_dynamics: ModeDynamics, motion: WheelMotion, contact_forces: ContactForces
+    contact_mode_dynamics: ContactModeDynamics, motion: WheelMotion, contact_forces: ContactForces
 ) -> ContactQuantities:
     """Return contact forces and slip speeds from which `evaluate_guards` computes the guards."""
     force_solution = contact_forces.force_solution
     airborne_stopper_forces = (
-        compute_airborne_stopper_force(mode_dynamics, contact_forces)
-        if mode_dynamics.has_one_sided_stoppers
+        compute_airborne_stopper_force(contact_mode_dynamics, contact_forces)
+        if contact_mode_dynamics.has_one_sided_stoppers
         else None
     )
     force_pairs = (
@@ -449,10 +478,12 @@ def collect_contact_quantities(
     return ContactQuantities(
         contact_forces.leg_directions,
         *force_pairs,
-        contact_forces.foot_velocity.along_slope,
+        contact_forces.foot_velocity.velocity_along_slope,
         force_solution.painleve_determinant,
         airborne_stopper_forces,
-        compute_force_rates(mode_dynamics, motion) if mode_dynamics.measures_force_peaks else None,
+        compute_force_rates(contact_mode_dynamics, motion)
+        if contact_mode_dynamics.measures_force_peaks
+        else None,
     )
 
 
@@ -465,7 +496,7 @@ def stack_slot_friction(friction: Friction) -> Array:
 
 
 def evaluate_guards(
-    mode_dynamics: ModeDynamics,
+    contact_mode_dynamics: ContactModeDynamics,
     motion: WheelMotion,
     contact_quantities: ContactQuantities,
     is_after_start: Array,
@@ -478,25 +509,29 @@ def evaluate_guards(
     lifts off, of a leg that leaves its stopper, or of a foot that starts to slide. The value of
     this guard at the start is replaced by 1.
     """
-    s, contact_state = mode_dynamics.s, mode_dynamics.contact_state
+    s, contact_state = contact_mode_dynamics.s, contact_mode_dynamics.contact_state
     unit_guards = jnp.ones_like(motion.L)
     is_airborne = (contact_state.contact_modes == ContactMode.OFF) & (
         is_after_start | ~contact_state.has_just_lifted
     )
-    is_leg_free = ~contact_state.is_locked & (is_after_start | ~contact_state.has_just_unlocked)
-    has_just_slid = mode_dynamics.contact_slots.gather_slot_flags(contact_state.has_just_slid)
-    friction_coefficients = stack_slot_friction(replace_infinite_friction(mode_dynamics.friction))
+    is_leg_free = ~contact_state.is_leg_locked & (is_after_start | ~contact_state.has_just_unlocked)
+    has_just_slid = contact_mode_dynamics.contact_slots.gather_slot_flags(
+        contact_state.has_just_slid
+    )
+    friction_coefficients = stack_slot_friction(
+        replace_infinite_friction(contact_mode_dynamics.friction)
+    )
     normal_forces = jnp.stack(contact_quantities.normal_forces)
     tangential_forces = jnp.stack(contact_quantities.tangential_forces)
     # In the limit of large friction, a resting foot begins to slide when its normal force vanishes
     # (see `impacts.resolve_event`). A sliding foot lifts off when its friction vanishes.
-    uses_friction_limit = stack_slot_friction(mode_dynamics.friction) == jnp.inf
-    slip_signs = jnp.stack(compute_slip_signs(mode_dynamics.slot_modes))
+    uses_friction_limit = stack_slot_friction(contact_mode_dynamics.friction) == jnp.inf
+    slip_signs = jnp.stack(compute_slip_signs(contact_mode_dynamics.slot_modes))
     supporting_force = jnp.where(
         uses_friction_limit & (slip_signs != 0.0), -slip_signs * tangential_forces, normal_forces
     )
-    has_friction_cone = (mode_dynamics.slot_modes == ContactMode.STICK) & jnp.isfinite(
-        stack_slot_friction(mode_dynamics.friction)
+    has_friction_cone = (contact_mode_dynamics.slot_modes == ContactMode.STICK) & jnp.isfinite(
+        stack_slot_friction(contact_mode_dynamics.friction)
     )
     is_sliding = (slip_signs != 0.0) & (is_after_start | ~has_just_slid)
     replace_if_not_evaluated = lambda is_evaluated, guard_value: jnp.where(
@@ -507,7 +542,7 @@ def evaluate_guards(
         if contact_quantities.airborne_stopper_forces is None
         else [
             jnp.where(
-                mode_dynamics.is_airborne_locked,
+                contact_mode_dynamics.is_airborne_leg_locked,
                 contact_quantities.airborne_stopper_forces,
                 unit_guards,
             )
@@ -518,7 +553,7 @@ def evaluate_guards(
         if contact_quantities.force_rates is None or contact_state.force_rate_signs is None
         else [
             replace_if_not_evaluated(
-                _flag_varying_forces(mode_dynamics),
+                _flag_varying_forces(contact_mode_dynamics),
                 contact_state.force_rate_signs * contact_quantities.force_rates,
             )
         ]
@@ -526,11 +561,15 @@ def evaluate_guards(
     return [
         jnp.where(
             is_airborne,
-            compute_foot_heights(motion, contact_quantities.leg_directions, mode_dynamics.tilt),
+            compute_foot_heights(
+                motion, contact_quantities.leg_directions, contact_mode_dynamics.tilt
+            ),
             unit_guards,
         ),
         jnp.where(is_leg_free, s.L0 - motion.L, unit_guards),
-        replace_if_not_evaluated(mode_dynamics.slot_modes != ContactMode.OFF, supporting_force),
+        replace_if_not_evaluated(
+            contact_mode_dynamics.slot_modes != ContactMode.OFF, supporting_force
+        ),
         replace_if_not_evaluated(
             has_friction_cone, friction_coefficients * normal_forces - tangential_forces
         ),
@@ -541,7 +580,7 @@ def evaluate_guards(
             is_sliding, slip_signs * jnp.stack(contact_quantities.slip_speeds)
         ),
         replace_if_not_evaluated(
-            mode_dynamics.is_stopper_holding, jnp.stack(contact_quantities.stopper_forces)
+            contact_mode_dynamics.is_stopper_holding, jnp.stack(contact_quantities.stopper_forces)
         ),
         motion.dtheta[None],
         (jnp.min(motion.L, axis=0) - s.a)[None],
@@ -550,21 +589,21 @@ def evaluate_guards(
     ]
 
 
-def _flag_varying_forces(mode_dynamics: ModeDynamics) -> Array:
-    """Return whether the guard of each of the `ForceRates` is evaluated, (3, ...).
+def _flag_varying_forces(contact_mode_dynamics: ContactModeDynamics) -> Array:
+    """Return whether the guard of each of the `NormalForceRates` is evaluated, (3, ...).
 
     Guards are evaluated for loaded feet. If only the fore foot is loaded, the extrema of its force
     are those of the total force.
     """
-    is_fore_loaded = mode_dynamics.contact_state.contact_modes[0] != ContactMode.OFF
-    is_first_loaded, is_second_loaded = mode_dynamics.slot_modes != ContactMode.OFF
+    is_fore_loaded = contact_mode_dynamics.contact_state.contact_modes[0] != ContactMode.OFF
+    is_first_loaded, is_second_loaded = contact_mode_dynamics.slot_modes != ContactMode.OFF
     is_total_different = is_second_loaded | (is_first_loaded & ~is_fore_loaded)
     return jnp.stack([is_fore_loaded, is_total_different, is_fore_loaded])
 
 
-def compute_guard_scales(mode_dynamics: ModeDynamics) -> Array:
+def compute_guard_scales(contact_mode_dynamics: ContactModeDynamics) -> Array:
     """Return the scale of each guard in the order of `GuardLayout`, in the guard's unit."""
-    s = mode_dynamics.s
+    s = contact_mode_dynamics.s
     force_scale, speed_scale = s.Mt * s.g, jnp.sqrt(s.g * s.L0)
     guard_scales = (
         [s.L0] * 2 * s.n
@@ -573,8 +612,8 @@ def compute_guard_scales(mode_dynamics: ModeDynamics) -> Array:
         + [force_scale] * 2
         + [speed_scale / s.L0, s.L0]
     )
-    guard_scales += [force_scale] * s.n * mode_dynamics.has_one_sided_stoppers
-    if mode_dynamics.measures_force_peaks:
+    guard_scales += [force_scale] * s.n * contact_mode_dynamics.has_one_sided_stoppers
+    if contact_mode_dynamics.measures_force_peaks:
         force_rate_scale = force_scale * speed_scale / s.L0
         guard_scales += [force_rate_scale] * 2 + [force_rate_scale * speed_scale / s.L0]
     return jnp.stack(guard_scales)
@@ -599,20 +638,25 @@ def compute_state_units(s: Symbols) -> tuple[Array, Array]:
 
 
 def is_wheel_at_rest(
-    s: Symbols, rates: Array, accelerations: Iterable[Array], atol: Elementwise
+    s: Symbols,
+    coordinate_rates: Array,
+    coordinate_accelerations: Iterable[Array],
+    atol: Elementwise,
 ) -> Bool[Array, "..."]:
     """Return whether the wheel is at rest, from rates and accelerations of all coordinates.
 
     - `atol`: absolute tolerance in the wheel's units.
     """
     rate_units, time_unit = compute_state_units(s)[1], compute_wheel_units(s).time_unit
-    return are_coordinates_at_rest(rates, accelerations, rate_units, time_unit, atol)
+    return are_coordinates_at_rest(
+        coordinate_rates, coordinate_accelerations, rate_units, time_unit, atol
+    )
 
 
 def choose_stopping_guard(
     guard_layout: GuardLayout,
-    mode_dynamics: ModeDynamics,
-    rates: Array,
+    contact_mode_dynamics: ContactModeDynamics,
+    coordinate_rates: Array,
     guard_index: Int[Array, "..."],
     atol: Elementwise,
 ) -> Int[Array, "..."]:
@@ -623,12 +667,14 @@ def choose_stopping_guard(
     two guards is zero first. After the slide has ended, the friction on the stopped foot determines
     whether the wheel rests or falls back.
     """
-    slip_signs = compute_slip_signs(mode_dynamics.slot_modes)
-    has_just_slid = mode_dynamics.contact_slots.gather_slot_flags(
-        mode_dynamics.contact_state.has_just_slid
+    slip_signs = compute_slip_signs(contact_mode_dynamics.slot_modes)
+    has_just_slid = contact_mode_dynamics.contact_slots.gather_slot_flags(
+        contact_mode_dynamics.contact_state.has_just_slid
     )
     has_slid_to_rest = guard_index == guard_layout.rolling_rate_guard
-    has_slid_to_rest &= are_rates_negligible(rates, compute_state_units(mode_dynamics.s)[1], atol)
+    has_slid_to_rest &= are_rates_negligible(
+        coordinate_rates, compute_state_units(contact_mode_dynamics.s)[1], atol
+    )
     for stopped_slot in reversed(range(2)):
         has_slide_ended = (
             has_slid_to_rest & (slip_signs[stopped_slot] != 0.0) & ~has_just_slid[stopped_slot]
@@ -642,7 +688,7 @@ def choose_stopping_guard(
 def compute_packed_units(s: Symbols) -> PackedState:
     """Return the wheel's unit for each entry of `pack_state`."""
     wheel_units, (position_units, rate_units) = compute_wheel_units(s), compute_state_units(s)
-    accumulator_units = LossAccumulators(
+    accumulator_units = EnergyLossAccumulators(
         wheel_units.time_unit,
         wheel_units.energy_unit,
         wheel_units.energy_unit,
@@ -659,7 +705,7 @@ def compute_packed_units(s: Symbols) -> PackedState:
 
 
 def compute_guard_values(
-    mode_dynamics: ModeDynamics, packed_state: PackedState
+    contact_mode_dynamics: ContactModeDynamics, packed_state: PackedState
 ) -> Float[Array, " n_guards"]:
     """Return the values of all guards for a packed state.
 
@@ -668,9 +714,9 @@ def compute_guard_values(
     """
     motion, accumulators = unpack_state(packed_state)
     contact_quantities = collect_contact_quantities(
-        mode_dynamics, motion, compute_forces(mode_dynamics, motion)
+        contact_mode_dynamics, motion, compute_forces(contact_mode_dynamics, motion)
     )
     guard_groups = evaluate_guards(
-        mode_dynamics, motion, contact_quantities, accumulators.time_since_event > 0.0
+        contact_mode_dynamics, motion, contact_quantities, accumulators.time_since_event > 0.0
     )
     return jnp.concatenate(prevent_fusion(guard_groups, make_opaque_one(motion)))

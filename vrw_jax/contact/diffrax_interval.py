@@ -17,8 +17,8 @@ from jaxtyping import Array, Float
 from vrw_jax.contact.batch_integrator import (
     N_ACCUMULATOR_ROWS,
     N_CONTACT_QUANTITY_ROWS,
-    IntervalPoint,
-    IntervalState,
+    ContactIntervalPoint,
+    ContactIntervalState,
     LaneStatus,
     evaluate_dynamics,
     is_at_painleve_singularity,
@@ -26,9 +26,9 @@ from vrw_jax.contact.batch_integrator import (
     unpack_motion,
 )
 from vrw_jax.contact.contact_state import (
+    ContactModeDynamics,
     ContactState,
-    LossAccumulators,
-    ModeDynamics,
+    EnergyLossAccumulators,
     PackedState,
     compute_forces,
     compute_guard_scales,
@@ -52,7 +52,9 @@ ROLLING_INDEX = 2
 """Index of the rolling rate dtheta among the rates of (hub x, hub z, theta, leg lengths)."""
 
 
-def init_diffrax_interval(mode_dynamics: ModeDynamics, motion: WheelMotion) -> IntervalState:
+def init_diffrax_contact_interval(
+    contact_mode_dynamics: ContactModeDynamics, motion: WheelMotion
+) -> ContactIntervalState:
     """Return the state of a single wheel at the start of an interval between events.
 
     The accelerations are infinite, because only the accelerations at the end of the interval are
@@ -61,18 +63,18 @@ def init_diffrax_interval(mode_dynamics: ModeDynamics, motion: WheelMotion) -> I
     q, v = pack_coordinates(motion)
     n_dynamics_rows = len(q) + N_CONTACT_QUANTITY_ROWS
     int_zero_lanes = jnp.zeros(motion.x.shape, jnp.int32)
-    no_search_field: Any = None
-    return IntervalState(
-        interval_point=IntervalPoint(
+    unused_search_field: Any = None
+    return ContactIntervalState(
+        contact_interval_point=ContactIntervalPoint(
             q, v, jnp.full((n_dynamics_rows, *motion.x.shape), jnp.inf, q.dtype)
         ),
-        contact_state=mode_dynamics.contact_state,
-        guard_values=no_search_field,
-        guard_offset=no_search_field,
+        contact_state=contact_mode_dynamics.contact_state,
+        guard_values=unused_search_field,
+        guard_offset=unused_search_field,
         interval_accumulators=jnp.zeros((N_ACCUMULATOR_ROWS, *motion.x.shape), q.dtype),
-        h=no_search_field,
+        h=unused_search_field,
         time_since_event=jnp.zeros_like(motion.x),
-        event_bracket=no_search_field,
+        event_bracket=unused_search_field,
         lane_status=int_zero_lanes + LaneStatus.RUNNING,
         triggered_guard_index=int_zero_lanes,
         n_solver_steps=int_zero_lanes,
@@ -80,36 +82,39 @@ def init_diffrax_interval(mode_dynamics: ModeDynamics, motion: WheelMotion) -> I
 
 
 def integrate_by_diffrax(
-    make_dynamics: Callable[[Array, ContactState], ModeDynamics],
+    make_lane_contact_dynamics: Callable[[Array, ContactState], ContactModeDynamics],
     input_columns: Array,
-    interval: IntervalState,
+    contact_interval_state: ContactIntervalState,
     options: StepOptions,
-) -> IntervalState:
+) -> ContactIntervalState:
     """Return the state of a running wheel at its next event or failure.
 
     A state that is not running is returned unchanged. All arrays have a last axis of length 1, the
     batch axis.
     """
-    input_columns, interval, options = jax.tree.map(
-        lambda x: x[..., 0], (input_columns, interval, options)
+    input_columns, contact_interval_state, options = jax.tree.map(
+        lambda x: x[..., 0], (input_columns, contact_interval_state, options)
     )
-    mode_dynamics = make_dynamics(input_columns, interval.contact_state)._replace(
-        has_accumulators=False
+    contact_mode_dynamics = make_lane_contact_dynamics(
+        input_columns, contact_interval_state.contact_state
+    )._replace(has_accumulators=False)
+    is_running = contact_interval_state.lane_status == LaneStatus.RUNNING
+    assert contact_interval_state.interval_accumulators is not None
+    start_accumulators = EnergyLossAccumulators(
+        jnp.zeros_like(contact_interval_state.time_since_event),
+        *contact_interval_state.interval_accumulators,
     )
-    is_running = interval.lane_status == LaneStatus.RUNNING
-    assert interval.interval_accumulators is not None
-    start_accumulators = LossAccumulators(
-        jnp.zeros_like(interval.time_since_event), *interval.interval_accumulators
-    )
-    if mode_dynamics.measures_force_peaks:
+    if contact_mode_dynamics.measures_force_peaks:
         raise ValueError(
             "force peaks with unilateral contact are computed by diffrax, but only machine code "
             "locates them, with first derivatives: take StepOptions() on a CPU with llvmlite."
         )
-    guard_layout = make_guard_layout(mode_dynamics.s.n, mode_dynamics.has_one_sided_stoppers)
-    q, v = interval.interval_point[:2]
-    start_rows = evaluate_dynamics(*stop_gradients((mode_dynamics, q, v)))
-    # As in `init_interval`, a wheel that an event leaves rolling backward continues if it
+    guard_layout = make_guard_layout(
+        contact_mode_dynamics.s.n, contact_mode_dynamics.has_one_sided_stoppers
+    )
+    q, v = contact_interval_state.contact_interval_point[:2]
+    start_rows = evaluate_dynamics(*stop_gradients((contact_mode_dynamics, q, v)))
+    # As in `init_contact_interval`, a wheel that an event leaves rolling backward continues if it
     # accelerates forward. The guard is then the rise of the rate.
     end_rates, end_acceleration = lax.stop_gradient(v[ROLLING_INDEX]), start_rows[ROLLING_INDEX]
     guard_offset = jnp.zeros(guard_layout.n_guards, q.dtype)
@@ -117,21 +122,25 @@ def integrate_by_diffrax(
         jnp.where((end_rates < 0.0) & (end_acceleration > 0.0), end_rates, 0.0)
     )
     end_result = integrate_phase_in_scaled_units(
-        partial(evaluate_vector_field, mode_dynamics),
+        partial(evaluate_vector_field, contact_mode_dynamics),
         GuardsAndMargins(
-            lambda packed_state: compute_guard_values(mode_dynamics, packed_state) - guard_offset,
+            lambda packed_state: (
+                compute_guard_values(contact_mode_dynamics, packed_state) - guard_offset
+            ),
             guard_layout.n_guards,
-            guard_scales=compute_guard_scales(mode_dynamics),
+            guard_scales=compute_guard_scales(contact_mode_dynamics),
         ),
-        pack_state(unpack_motion(interval.interval_point), start_accumulators),
+        pack_state(
+            unpack_motion(contact_interval_state.contact_interval_point), start_accumulators
+        ),
         is_running,
         options,
-        compute_packed_units(mode_dynamics.s),
-        compute_wheel_units(mode_dynamics.s).time_unit,
+        compute_packed_units(contact_mode_dynamics.s),
+        compute_wheel_units(contact_mode_dynamics.s).time_unit,
     )
     end_motion, end_accumulators = unpack_state(end_result.state)
     q, v = pack_coordinates(end_motion)
-    end_rows = evaluate_dynamics(*stop_gradients((mode_dynamics, q, v)))
+    end_rows = evaluate_dynamics(*stop_gradients((contact_mode_dynamics, q, v)))
     # At the singularity, forces change sign without passing through zero.
     n_dynamics_rows = len(q) + N_CONTACT_QUANTITY_ROWS
     is_singular = is_at_painleve_singularity(
@@ -143,23 +152,31 @@ def integrate_by_diffrax(
     lane_status = jnp.where(end_result.end_guard_index >= 0, LaneStatus.EVENT, failure_outcome)
     lane_status = jnp.where(is_singular, Outcome.PAINLEVE_PARADOX, lane_status)
     dynamics_rows = jnp.where(
-        is_running, end_rows[:n_dynamics_rows], interval.interval_point.dynamics_rows
+        is_running,
+        end_rows[:n_dynamics_rows],
+        contact_interval_state.contact_interval_point.dynamics_rows,
     )
-    interval = interval._replace(
-        interval_point=IntervalPoint(q, v, dynamics_rows),
+    contact_interval_state = contact_interval_state._replace(
+        contact_interval_point=ContactIntervalPoint(q, v, dynamics_rows),
         interval_accumulators=jnp.stack(end_accumulators[1:]),
-        time_since_event=jnp.where(is_running, end_result.duration, interval.time_since_event),
-        lane_status=jnp.where(is_running, lane_status, interval.lane_status).astype(jnp.int32),
-        triggered_guard_index=jnp.where(
-            is_running, end_result.end_guard_index, interval.triggered_guard_index
+        time_since_event=jnp.where(
+            is_running, end_result.duration, contact_interval_state.time_since_event
         ),
-        n_solver_steps=jnp.where(is_running, end_result.solver_steps, interval.n_solver_steps),
+        lane_status=jnp.where(is_running, lane_status, contact_interval_state.lane_status).astype(
+            jnp.int32
+        ),
+        triggered_guard_index=jnp.where(
+            is_running, end_result.end_guard_index, contact_interval_state.triggered_guard_index
+        ),
+        n_solver_steps=jnp.where(
+            is_running, end_result.solver_steps, contact_interval_state.n_solver_steps
+        ),
     )
-    return jax.tree.map(lambda x: x[..., None], interval)
+    return jax.tree.map(lambda x: x[..., None], contact_interval_state)
 
 
 def sample_by_diffrax(
-    mode_dynamics: ModeDynamics,
+    contact_mode_dynamics: ContactModeDynamics,
     start_state: PackedState,
     duration: Array,
     n_samples: int,
@@ -174,18 +191,20 @@ def sample_by_diffrax(
     """
 
     def compute_foot_forces(packed_state: PackedState) -> tuple[Array, Array]:
-        force_solution = compute_forces(mode_dynamics, unpack_state(packed_state)[0]).force_solution
-        scatter_to_legs = mode_dynamics.contact_slots.scatter_to_legs
+        force_solution = compute_forces(
+            contact_mode_dynamics, unpack_state(packed_state)[0]
+        ).force_solution
+        scatter_to_legs = contact_mode_dynamics.contact_slots.scatter_to_legs
         return scatter_to_legs(force_solution.tangential_forces), scatter_to_legs(
             force_solution.normal_forces
         )
 
     wheel_units = (
-        compute_packed_units(mode_dynamics.s),
-        compute_wheel_units(mode_dynamics.s).time_unit,
+        compute_packed_units(contact_mode_dynamics.s),
+        compute_wheel_units(contact_mode_dynamics.s).time_unit,
     )
     packed_states = sample_phase_in_scaled_units(
-        partial(evaluate_vector_field, mode_dynamics),
+        partial(evaluate_vector_field, contact_mode_dynamics),
         start_state,
         duration,
         n_samples,

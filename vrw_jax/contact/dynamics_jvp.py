@@ -43,12 +43,12 @@ class ContactConfiguration(NamedTuple):
     contact_slots: ContactSlots
     slot_modes: Array  # `ContactMode` of the foot in each contact slot
     is_stopper_holding: Array  # whether the leg in each contact slot is on its stopper
-    is_airborne_locked: Array  # whether a leg is in the air on its stopper
+    is_airborne_leg_locked: Array  # whether a leg is in the air on its stopper
 
     @property
-    def has_fixed_length(self) -> Array:
+    def is_leg_length_fixed(self) -> Array:
         """Return whether the length of each leg is fixed by a stopper."""
-        return self.is_airborne_locked | (
+        return self.is_airborne_leg_locked | (
             self.contact_slots.scatter_to_legs(self.is_stopper_holding) > 0
         )
 
@@ -76,7 +76,7 @@ def compute_slip_signs(slot_modes: Array) -> SlotPair:
     return select_slip_sign(slot_modes[0]), select_slip_sign(slot_modes[1])
 
 
-class _ConstantTerms(NamedTuple):
+class _ConstantMotionTerms(NamedTuple):
     """Accelerations or velocity jumps that the tangent of the residual treats as constants."""
 
     radial_leg_motion: LegArray  # motion of the leg masses relative to the hub, along the legs
@@ -101,7 +101,7 @@ class _EquationTangents(NamedTuple):
 
 _EquationTangentFn = Callable[
     [ContactConfiguration, ContactConfiguration, ContactInverseInertia, WheelForceSolution],
-    tuple[_ConstantTerms, _EquationTangents],
+    tuple[_ConstantMotionTerms, _EquationTangents],
 ]
 
 
@@ -141,7 +141,7 @@ def solve_contact_configuration(
         + inverse_inertia.leg_directions.cos * slot_solution.hub_motion[1]
     )
     length_motion = jnp.where(
-        contact_configuration.has_fixed_length,
+        contact_configuration.is_leg_length_fixed,
         0.0,
         outward_leg_motion - contact_slots.scatter_to_legs(slot_solution.leg_pull_forces) / s.m,
     )
@@ -162,23 +162,26 @@ def _solve_with_free_motion(
     """Return inverse inertia, free motion, and forces or impulses for a contact configuration."""
     s = contact_configuration.s
     motion = contact_configuration.motion
-    unit_divisor = make_opaque_one(contact_configuration.motion)
+    opaque_one = make_opaque_one(contact_configuration.motion)
     inverse_inertia = prevent_fusion(
         make_inverse_inertia(
-            s, motion, contact_configuration.contact_slots, contact_configuration.is_airborne_locked
+            s,
+            motion,
+            contact_configuration.contact_slots,
+            contact_configuration.is_airborne_leg_locked,
         ),
-        unit_divisor,
+        opaque_one,
     )
     free_motion = prevent_fusion(
         free_motion_fn(s, motion, contact_configuration.contact_slots, inverse_inertia),
-        unit_divisor,
+        opaque_one,
     )
     return (
         inverse_inertia,
         free_motion,
         prevent_fusion(
             solve_contact_configuration(contact_configuration, inverse_inertia, free_motion),
-            unit_divisor,
+            opaque_one,
         ),
     )
 
@@ -194,9 +197,9 @@ def _solve_with_jvp_rule(
     side.
     """
     float_leaves, nonarray_leaves = eqx.partition(contact_configuration, eqx.is_inexact_array)
-    other_arrays, nonarray_leaves = eqx.partition(nonarray_leaves, eqx.is_array)
-    assemble_configuration = lambda float_leaves, other_arrays: eqx.combine(
-        float_leaves, other_arrays, nonarray_leaves
+    nonfloat_arrays, nonarray_leaves = eqx.partition(nonarray_leaves, eqx.is_array)
+    assemble_configuration = lambda float_leaves, nonfloat_arrays: eqx.combine(
+        float_leaves, nonfloat_arrays, nonarray_leaves
     )
     solve_from_arrays = jax.custom_jvp(
         lambda *arrays: _solve_with_free_motion(free_motion_fn, assemble_configuration(*arrays))[2]
@@ -204,7 +207,7 @@ def _solve_with_jvp_rule(
 
     @solve_from_arrays.defjvp
     @with_default_jax_settings
-    def solution_jvp(
+    def compute_solution_jvp(
         primals: tuple, tangents: tuple
     ) -> tuple[WheelForceSolution, WheelForceSolution]:
         contact_configuration = assemble_configuration(*primals)
@@ -244,7 +247,7 @@ def _solve_with_jvp_rule(
             ),
         )
 
-    return solve_from_arrays(float_leaves, other_arrays)
+    return solve_from_arrays(float_leaves, nonfloat_arrays)
 
 
 class _ResidualTangent(NamedTuple):
@@ -266,13 +269,13 @@ def _compute_residual_tangent(
     configuration_tangent: ContactConfiguration,
     inverse_inertia: ContactInverseInertia,
     force_solution: WheelForceSolution,
-    constant_terms: _ConstantTerms,
+    constant_motion_terms: _ConstantMotionTerms,
     equation_tangents: _EquationTangents,
 ) -> _ResidualTangent:
     """Return the tangent of the contact equations' residual for a tangent of the configuration.
 
     - `configuration_tangent`: tangent of the configuration;
-    - `constant_terms`: accelerations or velocity jumps that are treated as constants;
+    - `constant_motion_terms`: accelerations or velocity jumps that are treated as constants;
     - `equation_tangents`: tangents of the equations for these constant terms.
     """
     s, ds, contact_slots, (sin, cos), slot_indices = (
@@ -320,12 +323,12 @@ def _compute_residual_tangent(
     ]
 
     (hub_motion_x, hub_motion_z), (hub_motion_tangent_x, hub_motion_tangent_z) = (
-        constant_terms.hub_motion,
+        constant_motion_terms.hub_motion,
         equation_tangents.hub_motion,
     )
     radial_hub_motion = sin * hub_motion_x + cos * hub_motion_z
     transverse_residual = (
-        constant_terms.transverse_leg_motion - cos * hub_motion_x + sin * hub_motion_z
+        constant_motion_terms.transverse_leg_motion - cos * hub_motion_x + sin * hub_motion_z
     )
     length_tangent = (
         (cos * hub_motion_x - sin * hub_motion_z) * dtheta
@@ -338,14 +341,20 @@ def _compute_residual_tangent(
         + (
             equation_tangents.spring_force
             - contact_slots.scatter_to_legs(leg_pull_tangent)
-            + (radial_hub_motion - constant_terms.radial_leg_motion) * ds.m
+            + (radial_hub_motion - constant_motion_terms.radial_leg_motion) * ds.m
         )
         / s.m
     )
-    length_tangent = jnp.where(inverse_inertia.is_released, length_tangent, 0.0)
+    length_tangent = jnp.where(inverse_inertia.is_leg_released, length_tangent, 0.0)
     radial_tangent = length_tangent + equation_tangents.radial_leg_motion
-    x = constant_terms.radial_leg_motion * sin + constant_terms.transverse_leg_motion * cos
-    z = constant_terms.radial_leg_motion * cos - constant_terms.transverse_leg_motion * sin
+    x = (
+        constant_motion_terms.radial_leg_motion * sin
+        + constant_motion_terms.transverse_leg_motion * cos
+    )
+    z = (
+        constant_motion_terms.radial_leg_motion * cos
+        - constant_motion_terms.transverse_leg_motion * sin
+    )
     leg_torque = db * transverse_residual + b * (
         equation_tangents.transverse_leg_motion
         + radial_hub_motion * dtheta
@@ -387,8 +396,8 @@ def _compute_free_motion_tangent(
 ) -> FreeMotion:
     """Return the tangent of the free motion that is equivalent to the tangent of the residual."""
     x, z, rotation = (
-        sum_over_legs(leg_forces) + other_force
-        for leg_forces, other_force in zip(
+        sum_over_legs(residual_by_leg) + residual_without_legs
+        for residual_by_leg, residual_without_legs in zip(
             residual_tangent.hub_residual_by_leg,
             residual_tangent.hub_residual_without_legs,
             strict=True,
@@ -420,7 +429,7 @@ def _compute_motion_equation_tangents(
     configuration_tangent: ContactConfiguration,
     inverse_inertia: ContactInverseInertia,
     force_solution: WheelForceSolution,
-) -> tuple[_ConstantTerms, _EquationTangents]:
+) -> tuple[_ConstantMotionTerms, _EquationTangents]:
     """Return the constant accelerations, and the tangents of the equations of motion."""
     s = contact_configuration.s
     motion = contact_configuration.motion
@@ -436,7 +445,7 @@ def _compute_motion_equation_tangents(
     spring_force_tangent = (
         spring_force_tangent + s.k * (ds.Ls - motion_tangent.L) - s.c * motion_tangent.dL
     )
-    constant_terms = _ConstantTerms(
+    constant_motion_terms = _ConstantMotionTerms(
         radial_leg_motion=force_solution.length_motion - b * squared_angular_rate,
         transverse_leg_motion=doubled_angular_rate * motion.dL + b * ddtheta,
         hub_motion=(
@@ -462,7 +471,7 @@ def _compute_motion_equation_tangents(
         + L[i] * squared_angular_rate_tangent
         for i in range(2)
     ]
-    return constant_terms, _EquationTangents(
+    return constant_motion_terms, _EquationTangents(
         radial_leg_motion=-(db * squared_angular_rate + b * squared_angular_rate_tangent),
         transverse_leg_motion=doubled_angular_rate * motion_tangent.dL
         + motion.dL * doubled_angular_rate_tangent
@@ -479,7 +488,7 @@ def _compute_impact_equation_tangents(
     configuration_tangent: ContactConfiguration,
     inverse_inertia: ContactInverseInertia,
     force_solution: WheelForceSolution,
-) -> tuple[_ConstantTerms, _EquationTangents]:
+) -> tuple[_ConstantMotionTerms, _EquationTangents]:
     """Return the constant velocity jumps, and the tangents of the impact equations."""
     s = contact_configuration.s
     motion = contact_configuration.motion
@@ -487,7 +496,7 @@ def _compute_impact_equation_tangents(
     contact_slots = contact_configuration.contact_slots
     dtheta_after = force_solution.hub_motion[2]
     angular_rate_jump, b = dtheta_after - motion.dtheta, motion.L - s.a
-    constant_terms = _ConstantTerms(
+    constant_motion_terms = _ConstantMotionTerms(
         radial_leg_motion=force_solution.length_motion - motion.dL,
         transverse_leg_motion=b * angular_rate_jump,
         hub_motion=(
@@ -500,7 +509,7 @@ def _compute_impact_equation_tangents(
     foot_transverse = [
         -dtheta_after * dL[i] - slot_length_rates[i] * motion_tangent.theta for i in range(2)
     ]
-    return constant_terms, _EquationTangents(
+    return constant_motion_terms, _EquationTangents(
         radial_leg_motion=-motion_tangent.dL,
         transverse_leg_motion=(motion_tangent.L - configuration_tangent.s.a) * angular_rate_jump
         - b * motion_tangent.dtheta,

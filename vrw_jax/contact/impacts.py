@@ -79,19 +79,19 @@ class ContactEvent(NamedTuple):
         return jnp.any(self.is_foot_landing, axis=0) | jnp.any(self.is_leg_meeting_stopper, axis=0)
 
 
-def _make_leg_indices(n_legs: int, axes_reference: Array) -> np.ndarray:
+def _make_leg_indices(n_legs: int, array_with_same_axes: Array) -> np.ndarray:
     """Return the leg indices 0 ... n - 1 on the first axis, to broadcast over a batch.
 
-    The result has one axis more than `axes_reference`.
+    The result has one axis more than `array_with_same_axes`.
     """
-    return np.arange(n_legs, dtype=np.int32).reshape(-1, *(1,) * jnp.ndim(axes_reference))
+    return np.arange(n_legs, dtype=np.int32).reshape(-1, *(1,) * jnp.ndim(array_with_same_axes))
 
 
 def classify_event(guard_layout: GuardLayout, guard_index: Int[Array, "..."]) -> ContactEvent:
     """Return the kind of the event at which the guard with the index `guard_index` is zero."""
     n_legs = guard_layout.n_legs
-    select_flags = lambda first_index, n_guards: (
-        guard_index == first_index + _make_leg_indices(n_guards, guard_index)
+    select_flags = lambda first_guard_index, n_guards: (
+        guard_index == first_guard_index + _make_leg_indices(n_guards, guard_index)
     )
     is_leg_leaving_stopper = (
         select_flags(guard_layout.first_airborne_release_guard, n_legs)
@@ -165,7 +165,7 @@ the combination of contact modes.
 
 
 def _solve_stopper_lcp(
-    solve_level: _LevelSolver,
+    solve_kinematic_level: _LevelSolver,
     contact_law: ContactLaw,
     motion: WheelMotion,
     is_at_stopper: Array,
@@ -196,7 +196,7 @@ def _solve_stopper_lcp(
 
     def pivot_legs(pivot_state: tuple) -> tuple:
         is_stopper_holding, combination_code, n_attempts, best_solution = pivot_state
-        level_solution = solve_level(
+        level_solution = solve_kinematic_level(
             constant_inputs[0], constant_inputs[1], is_stopper_holding, None
         )
         sign_violation = jnp.where(
@@ -240,15 +240,15 @@ def _solve_stopper_lcp(
 
     int_zeros = jnp.zeros_like(n_combinations)
     slot_zeros = jnp.stack([n_combinations, n_combinations]) * 0
-    infinite_violation = jnp.full_like(constant_inputs[1].theta, jnp.inf)
+    infinite_sign_violation = jnp.full_like(constant_inputs[1].theta, jnp.inf)
     initial_state = (
         is_at_stopper,
         int_zeros - 1,
         int_zeros,
         (
-            infinite_violation,
+            infinite_sign_violation,
             is_at_stopper,
-            ChosenModeCombination(slot_zeros, slot_zeros > 0, infinite_violation, int_zeros),
+            ChosenModeCombination(slot_zeros, slot_zeros > 0, infinite_sign_violation, int_zeros),
         ),
     )
     final_state = lax.while_loop(
@@ -258,7 +258,7 @@ def _solve_stopper_lcp(
     chosen_combination = chosen_combination._replace(
         n_solutions=jnp.where(max_violation <= MAX_VIOLATION, chosen_combination.n_solutions, 0)
     )
-    return solve_level(
+    return solve_kinematic_level(
         contact_law, motion, is_stopper_holding, chosen_combination
     ), is_stopper_holding
 
@@ -268,7 +268,7 @@ class ContactEventResult(NamedTuple):
 
     motion: WheelMotion
     contact_state: ContactState
-    energy_lost: Elementwise  # J
+    impact_energy_loss: Elementwise  # J
     normal_impulse: SlotPair  # impulses on the feet in the contact slots, N s
     tangential_impulse: SlotPair
     stopper_impulse: Elementwise  # minimum over airborne locked legs, N s; inf without impact
@@ -303,7 +303,7 @@ def _apply_restitution(
         contact_law.restitution * foot_speed
         for foot_speed in compute_slot_foot_velocity(
             motion, contact_slots, inverse_inertia
-        ).normal_to_slope
+        ).velocity_normal_to_slope
     ]
     # A foot whose rebound is slower than the rest speed is at rest.
     rebound_speeds = [
@@ -388,7 +388,7 @@ def _solve_velocity_level(
         (contact_state.contact_modes != ContactMode.OFF) | contact_event.is_foot_landing
     )
     friction = select_slot_friction(contact_law.friction, contact_slots)
-    is_at_stopper = contact_state.is_locked | contact_event.is_leg_meeting_stopper
+    is_at_stopper = contact_state.is_leg_locked | contact_event.is_leg_meeting_stopper
     is_loaded = jnp.stack(
         [
             jnp.any(contact_slots.first_slot_mask, axis=0),
@@ -412,7 +412,7 @@ def _solve_velocity_level(
             contact_event.is_impact, allowed_slot_modes, 0
         ),  # Without an impact, no mode is examined.
         can_hold_stopper=is_slot_locked,
-        has_fixed_mode=is_kept_at_rest,
+        is_foot_mode_fixed=is_kept_at_rest,
         untested_slot_modes=jnp.where(is_loaded, 0, 1 << ContactMode.OFF).astype(jnp.int32),
         is_open_stopper_untested=~is_slot_locked,
     )
@@ -420,15 +420,15 @@ def _solve_velocity_level(
         s.m * contact_law.rest_speed / MAX_VIOLATION, contact_law.rest_speed / MAX_VIOLATION
     )
 
-    def solve_level(
+    def solve_kinematic_level(
         contact_law: ContactLaw,
         motion: WheelMotion,
-        is_airborne_locked: Array,
+        is_airborne_leg_locked: Array,
         chosen_combination: ChosenModeCombination | None,
     ) -> _KinematicLevelSolution:
         s, friction = contact_law.s, select_slot_friction(contact_law.friction, contact_slots)
         leg_directions = compute_leg_directions(s, motion.theta)
-        inverse_inertia = make_inverse_inertia(s, motion, contact_slots, is_airborne_locked)
+        inverse_inertia = make_inverse_inertia(s, motion, contact_slots, is_airborne_leg_locked)
         free_motion = compute_free_velocity(s, motion, contact_slots, inverse_inertia)
         rebound_motion = _apply_restitution(
             contact_law, motion, contact_slots, inverse_inertia, free_motion
@@ -450,7 +450,7 @@ def _solve_velocity_level(
             contact_slots,
             chosen_combination.slot_modes,
             chosen_combination.is_stopper_holding,
-            is_airborne_locked,
+            is_airborne_leg_locked,
         )
         force_solution = (
             solve_impact(contact_configuration)
@@ -466,21 +466,26 @@ def _solve_velocity_level(
             chosen_combination, force_solution, contact_impulse, motion_after.dL, motion_after
         )
 
-    is_airborne_locked = is_at_stopper & ~contact_slots.is_in_slot
+    is_airborne_leg_locked = is_at_stopper & ~contact_slots.is_in_slot
     if not contact_law.has_one_sided_stoppers:
         return (
-            solve_level(contact_law, motion, is_airborne_locked, None),
+            solve_kinematic_level(contact_law, motion, is_airborne_leg_locked, None),
             contact_slots,
-            is_airborne_locked,
+            is_airborne_leg_locked,
         )
-    is_stopper_tested = is_airborne_locked & contact_event.is_impact
+    is_stopper_tested = is_airborne_leg_locked & contact_event.is_impact
     level_solution, is_held_airborne = _solve_stopper_lcp(
-        solve_level, contact_law, motion, is_airborne_locked, is_stopper_tested, tolerances
+        solve_kinematic_level,
+        contact_law,
+        motion,
+        is_airborne_leg_locked,
+        is_stopper_tested,
+        tolerances,
     )
     return level_solution, contact_slots, is_held_airborne
 
 
-def _list_following_modes(
+def _list_modes_after_event(
     contact_event: ContactEvent, slot_modes: Array, is_consistent: Array, follows_paper_rule: Array
 ) -> tuple[Int[Array, "2 ..."], Int[Array, "2 ..."]]:
     """Return the contact modes that may follow an event, and the modes that need no test.
@@ -579,13 +584,13 @@ def _solve_acceleration_level(
         FORCE_ROUNDOFF_FRACTION * s.Mt * s.g, FORCE_ROUNDOFF_FRACTION * s.g
     )
 
-    def solve_level(
+    def solve_kinematic_level(
         contact_law: ContactLaw,
         motion: WheelMotion,
-        is_airborne_locked: Array,
+        is_airborne_leg_locked: Array,
         chosen_combination: ChosenModeCombination | None,
     ) -> _KinematicLevelSolution:
-        inverse_inertia = make_inverse_inertia(s, motion, contact_slots, is_airborne_locked)
+        inverse_inertia = make_inverse_inertia(s, motion, contact_slots, is_airborne_leg_locked)
         free_motion = compute_free_acceleration(s, motion, contact_slots, inverse_inertia)
         if chosen_combination is None:
             is_consistent = is_release_consistent(
@@ -597,7 +602,7 @@ def _solve_acceleration_level(
                 is_second_slot,
                 release_direction,
             )
-            possible_modes, untested_slot_modes = _list_following_modes(
+            possible_modes, untested_slot_modes = _list_modes_after_event(
                 contact_event, slot_modes, is_consistent & ~follows_paper_rule, follows_paper_rule
             )
             allowed_contact_modes = AllowedContactModes(
@@ -623,7 +628,7 @@ def _solve_acceleration_level(
             contact_slots,
             chosen_combination.slot_modes,
             chosen_combination.is_stopper_holding,
-            is_airborne_locked,
+            is_airborne_leg_locked,
         )
         force_solution = solve_contact_configuration(
             contact_configuration, inverse_inertia, free_motion
@@ -638,16 +643,23 @@ def _solve_acceleration_level(
             chosen_combination, force_solution, s.m * outward_leg_motion, outward_leg_motion, motion
         )
 
-    is_airborne_locked = is_at_stopper & ~contact_slots.is_in_slot
+    is_airborne_leg_locked = is_at_stopper & ~contact_slots.is_in_slot
     if not contact_law.has_one_sided_stoppers:
         return (
-            solve_level(contact_law, motion, is_airborne_locked, None).chosen_combination,
+            solve_kinematic_level(
+                contact_law, motion, is_airborne_leg_locked, None
+            ).chosen_combination,
             contact_slots,
             was_resting,
-            is_airborne_locked,
+            is_airborne_leg_locked,
         )
     level_solution, is_held_airborne = _solve_stopper_lcp(
-        solve_level, contact_law, motion, is_airborne_locked, is_airborne_locked, tolerances
+        solve_kinematic_level,
+        contact_law,
+        motion,
+        is_airborne_leg_locked,
+        is_airborne_leg_locked,
+        tolerances,
     )
     return level_solution.chosen_combination, contact_slots, was_resting, is_held_airborne
 
@@ -684,9 +696,9 @@ def _bring_slow_contacts_to_rest(
         jnp.where(contact_modes == ContactMode.STICK, ContactMode.STICK, modes_after_rest),
         ContactMode.OFF,
     )
-    is_locked = is_at_stopper | (was_at_stopper & (jnp.abs(motion.dL) < contact_law.rest_speed))
+    is_leg_locked = is_at_stopper | (was_at_stopper & (jnp.abs(motion.dL) < contact_law.rest_speed))
     has_contact_changed = jnp.any(
-        (modes_after_rest != contact_modes) | (is_locked != is_at_stopper), axis=0
+        (modes_after_rest != contact_modes) | (is_leg_locked != is_at_stopper), axis=0
     )
     s, frozen_motion, friction = stop_gradients((contact_law.s, motion, contact_law.friction))
 
@@ -696,26 +708,27 @@ def _bring_slow_contacts_to_rest(
         A foot with reversed slip also comes to rest.
         """
         slip_speed_after, _ = compute_foot_velocities(
-            project_motion(s, frozen_motion, modes_after_rest, is_locked, friction), leg_directions
+            project_motion(s, frozen_motion, modes_after_rest, is_leg_locked, friction),
+            leg_directions,
         )
         return ((modes_after_rest == ContactMode.SLIP_DOWN) & (slip_speed_after < 0.0)) | (
             (modes_after_rest == ContactMode.SLIP_UP) & (slip_speed_after > 0.0)
         )
 
     is_slip_reversed = has_contact_changed & run_if_any_element_active(
-        jnp.any(has_contact_changed), find_reversed_slip, is_locked & False
+        jnp.any(has_contact_changed), find_reversed_slip, is_leg_locked & False
     )
     modes_after_rest = jnp.where(is_slip_reversed, ContactMode.STICK, modes_after_rest)
     return (
         select_trees_by_condition(
             has_contact_changed,
             project_motion(
-                contact_law.s, motion, modes_after_rest, is_locked, contact_law.friction
+                contact_law.s, motion, modes_after_rest, is_leg_locked, contact_law.friction
             ),
             motion,
         ),
         modes_after_rest,
-        is_locked,
+        is_leg_locked,
     )
 
 
@@ -750,7 +763,7 @@ def _merge_touching_contacts(
     )
     has_more_contacts = (bounce_height >= s.L0 - motion.L) & (motion.dL >= -contact_law.rest_speed)
     is_leg_meeting_stopper = contact_event.is_leg_meeting_stopper | (
-        has_more_contacts & ~contact_state.is_locked & contact_event.is_impact
+        has_more_contacts & ~contact_state.is_leg_locked & contact_event.is_impact
     )
     return contact_event._replace(
         is_foot_landing=jnp.where(fits_two_slots, is_foot_landing, contact_event.is_foot_landing),
@@ -778,15 +791,15 @@ def _replace_liftoff_by_slip(
         & (slot_modes == ContactMode.STICK)
         & (stack_slot_friction(friction) == jnp.inf)
     )
-    slot_state = (
+    slot_modes_and_stoppers = (
         contact_slots,
         slot_modes,
-        contact_slots.gather_slot_flags(contact_state.is_locked),
-        contact_state.is_locked & ~contact_slots.is_in_slot,
+        contact_slots.gather_slot_flags(contact_state.is_leg_locked),
+        contact_state.is_leg_locked & ~contact_slots.is_in_slot,
     )
     tangential_forces = lambda _: (
         solve_contact_forces(
-            ContactConfiguration(contact_law.s, motion, friction, *slot_state)
+            ContactConfiguration(contact_law.s, motion, friction, *slot_modes_and_stoppers)
         ).tangential_forces
     )
     zero_slot_flags = jnp.zeros_like(motion.theta), jnp.zeros_like(motion.theta)
@@ -823,7 +836,7 @@ def resolve_event(
     s, is_impact = contact_law.s, contact_event.is_impact
     was_touching = (contact_state.contact_modes != ContactMode.OFF) | contact_event.is_foot_landing
     was_at_stopper = (
-        contact_state.is_locked | contact_event.is_leg_meeting_stopper
+        contact_state.is_leg_locked | contact_event.is_leg_meeting_stopper
     ) & ~contact_event.is_leg_leaving_stopper
     velocity_solution, contact_slots, is_stopper_holding = _solve_velocity_level(
         contact_law, motion, contact_state, contact_event
@@ -860,7 +873,7 @@ def resolve_event(
     )
     leg_directions = compute_leg_directions(s, motion.theta)
     is_without_slot = was_touching & ~contact_slots.is_in_slot
-    energy_lost = compute_kinetic_energy(s, motion) - compute_kinetic_energy(s, motion_after)
+    impact_energy_loss = compute_kinetic_energy(s, motion) - compute_kinetic_energy(s, motion_after)
     stopper_impulse = jnp.where(is_stopper_holding, velocity_solution.stopper_forces, jnp.inf)
 
     acceleration_solution, contact_slots, was_resting, is_stopper_holding = (
@@ -871,7 +884,7 @@ def resolve_event(
     contact_modes = contact_slots.scatter_to_legs(acceleration_solution.slot_modes).astype(
         jnp.int32
     )
-    is_locked = jnp.where(
+    is_leg_locked = jnp.where(
         contact_slots.is_in_slot,
         contact_slots.scatter_to_legs(acceleration_solution.is_stopper_holding) > 0,
         is_at_stopper & is_stopper_holding,
@@ -881,10 +894,10 @@ def resolve_event(
     )
     contact_state = ContactState(
         contact_modes=contact_modes,
-        is_locked=is_locked,
+        is_leg_locked=is_leg_locked,
         has_just_lifted=was_touching & (contact_modes == ContactMode.OFF),
-        has_just_unlocked=(contact_state.is_locked | contact_event.is_leg_meeting_stopper)
-        & ~is_locked,
+        has_just_unlocked=(contact_state.is_leg_locked | contact_event.is_leg_meeting_stopper)
+        & ~is_leg_locked,
         has_just_slid=contact_slots.scatter_to_legs(is_sliding & was_resting) > 0,
     )
     n_impact_solutions = velocity_solution.chosen_combination.n_solutions
@@ -895,11 +908,11 @@ def resolve_event(
     )
     return ContactEventResult(
         motion=motion_after._replace(
-            L=jnp.where(is_locked, s.L0, motion_after.L),
-            dL=jnp.where(is_locked, 0.0, motion_after.dL),
+            L=jnp.where(is_leg_locked, s.L0, motion_after.L),
+            dL=jnp.where(is_leg_locked, 0.0, motion_after.dL),
         ),
         contact_state=contact_state,
-        energy_lost=jnp.where(is_impact, energy_lost, 0.0),
+        impact_energy_loss=jnp.where(is_impact, impact_energy_loss, 0.0),
         normal_impulse=zero_without_impact(velocity_solution.force_solution.normal_forces),
         tangential_impulse=zero_without_impact(velocity_solution.force_solution.tangential_forces),
         stopper_impulse=jnp.where(is_impact, jnp.min(stopper_impulse, axis=0), jnp.inf),
@@ -922,7 +935,7 @@ def project_motion(
     s: Symbols,
     motion: WheelMotion,
     contact_modes: Int[Array, "n ..."],
-    is_locked: Bool[Array, "n ..."],
+    is_leg_locked: Bool[Array, "n ..."],
     friction: Any = None,
 ) -> WheelMotion:
     """Return the motion projected onto the constraints of its contacts.
@@ -935,13 +948,13 @@ def project_motion(
     """
     leg_directions = compute_leg_directions(s, motion.theta)
     L = jnp.where(
-        (contact_modes != ContactMode.OFF) & ~is_locked, motion.z / leg_directions.cos, motion.L
+        (contact_modes != ContactMode.OFF) & ~is_leg_locked, motion.z / leg_directions.cos, motion.L
     )
-    motion = motion._replace(L=jnp.where(is_locked, s.L0, L))
+    motion = motion._replace(L=jnp.where(is_leg_locked, s.L0, L))
     contact_slots = find_contact_slots(contact_modes != ContactMode.OFF)
-    is_airborne_locked = is_locked & ~contact_slots.is_in_slot
+    is_airborne_leg_locked = is_leg_locked & ~contact_slots.is_in_slot
     slot_modes = contact_slots.gather_slot_codes(contact_modes)
-    is_stopper_holding = contact_slots.gather_slot_flags(is_locked)
+    is_stopper_holding = contact_slots.gather_slot_flags(is_leg_locked)
     # Two resting feet on two held legs would constrain the hub twice.
     is_overdetermined = jnp.all((slot_modes == ContactMode.STICK) & is_stopper_holding, axis=0)
     is_stopper_holding = jnp.stack(
@@ -959,7 +972,7 @@ def project_motion(
         contact_slots,
         slot_modes,
         is_stopper_holding,
-        is_airborne_locked,
+        is_airborne_leg_locked,
     )
     projected_motion = _apply_impact_velocities(motion, solve_impact(contact_configuration))
-    return projected_motion._replace(dL=jnp.where(is_locked, 0.0, projected_motion.dL))
+    return projected_motion._replace(dL=jnp.where(is_leg_locked, 0.0, projected_motion.dL))

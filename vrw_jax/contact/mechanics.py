@@ -58,10 +58,10 @@ def compute_leg_directions(s: Symbols, theta: Elementwise) -> LegDirections:
     The angle may include any number of turns.
     """
     leg_angles = (s.alpha * np.arange(s.n)).reshape(-1, *(1,) * jnp.ndim(theta))
-    half_turns = lax.stop_gradient(jnp.floor(theta / math.pi + 0.5))
-    is_half_turn_odd = half_turns - 2.0 * jnp.floor(0.5 * half_turns)
+    n_half_turns = lax.stop_gradient(jnp.floor(theta / math.pi + 0.5))
+    is_half_turn_odd = n_half_turns - 2.0 * jnp.floor(0.5 * n_half_turns)
     sin, cos = (
-        x - 2.0 * is_half_turn_odd * x for x in compute_sine_cosine(theta - math.pi * half_turns)
+        x - 2.0 * is_half_turn_odd * x for x in compute_sine_cosine(theta - math.pi * n_half_turns)
     )
     sin_leg, cos_leg = np.sin(leg_angles), np.cos(leg_angles)
     return LegDirections(sin * cos_leg + cos * sin_leg, cos * cos_leg - sin * sin_leg)
@@ -72,15 +72,15 @@ def sum_over_legs(leg_quantities: Array) -> Array:
     return jnp.sum(leg_quantities, axis=0)
 
 
-def prevent_fusion(tree: Any, unit_divisor: Array) -> Any:
-    """Return the tree with every float array divided by `unit_divisor`, which is 1 at run time.
+def prevent_fusion(tree: Any, opaque_one: Array) -> Any:
+    """Return the tree with every float array divided by `opaque_one`, which is 1 at run time.
 
     When XLA fuses operations on a CPU, it repeats chains of cheap operations for each use. Here the
     repetitions would multiply the number of operations by a hundred. XLA computes a division only
     once.
     """
     is_float_array = lambda leaf: jnp.issubdtype(jnp.result_type(leaf), jnp.floating)
-    return jax.tree.map(lambda leaf: leaf / unit_divisor if is_float_array(leaf) else leaf, tree)
+    return jax.tree.map(lambda leaf: leaf / opaque_one if is_float_array(leaf) else leaf, tree)
 
 
 def make_opaque_one(motion: "WheelMotion") -> Array:
@@ -90,8 +90,8 @@ def make_opaque_one(motion: "WheelMotion") -> Array:
 
 def stop_gradients(tree: Any) -> Any:
     """Return the tree with its float arrays excluded from differentiation."""
-    float_leaves, other_leaves = eqx.partition(tree, eqx.is_inexact_array)
-    return eqx.combine(lax.stop_gradient(float_leaves), other_leaves)
+    float_leaves, nonfloat_leaves = eqx.partition(tree, eqx.is_inexact_array)
+    return eqx.combine(lax.stop_gradient(float_leaves), nonfloat_leaves)
 
 
 class ContactSlots(NamedTuple):
@@ -161,10 +161,10 @@ def select_slot_friction(
     """
     if not isinstance(friction, tuple):
         return friction
-    last_landed_friction, other_friction = friction
+    last_landed_friction, other_feet_friction = friction
     return jnp.where(
-        contact_slots.first_slot_mask[0], last_landed_friction, other_friction
-    ), other_friction
+        contact_slots.first_slot_mask[0], last_landed_friction, other_feet_friction
+    ), other_feet_friction
 
 
 class ContactInverseInertia(NamedTuple):
@@ -172,7 +172,7 @@ class ContactInverseInertia(NamedTuple):
 
     leg_directions: LegDirections
     # whether a leg is eliminated: free in length, or in a contact slot
-    is_released: Bool[Array, " n_legs"]
+    is_leg_released: Bool[Array, " n_legs"]
     inverse_inertia: tuple[Any, ...]  # entries xx, xz, x theta, zz, z theta, theta theta
     sin: SlotPair
     cos: SlotPair
@@ -204,15 +204,15 @@ def multiply_by_inverse_inertia(
 
 
 def _invert_inertia(
-    s: Symbols, leg_directions: LegDirections, b: LegArray, is_released: Array
+    s: Symbols, leg_directions: LegDirections, b: LegArray, is_leg_released: Array
 ) -> tuple[Any, ...]:
     """Return the inverse of the hub's 3 x 3 inertia matrix without the released legs.
 
     The entries are `xx, xz, x theta, zz, z theta, theta theta`. `b` contains the distances of the
     leg masses from the hub, m.
     """
-    sin = jnp.where(is_released, leg_directions.sin, 0.0)
-    cos = jnp.where(is_released, leg_directions.cos, 0.0)
+    sin = jnp.where(is_leg_released, leg_directions.sin, 0.0)
+    cos = jnp.where(is_leg_released, leg_directions.cos, 0.0)
     inertia_xx = s.Mt - s.m * sum_over_legs(sin * sin)
     inertia_xz = -s.m * sum_over_legs(sin * cos)
     inertia_zz = s.Mt - s.m * sum_over_legs(cos * cos)
@@ -258,15 +258,15 @@ def make_wheel_posture(
 
 
 def make_inverse_inertia(
-    s: Symbols, motion: WheelMotion, contact_slots: ContactSlots, is_airborne_locked: Array
+    s: Symbols, motion: WheelMotion, contact_slots: ContactSlots, is_airborne_leg_locked: Array
 ) -> ContactInverseInertia:
     """Return the inverse inertia of the hub and the responses to contact forces for a posture.
 
-    - `is_airborne_locked`: whether a leg is in the air on its stopper.
+    - `is_airborne_leg_locked`: whether a leg is in the air on its stopper.
     """
     leg_directions, sin, cos, L = make_wheel_posture(s, motion, contact_slots)
-    is_released = contact_slots.is_in_slot | ~is_airborne_locked
-    inverse_inertia = _invert_inertia(s, leg_directions, motion.L - s.a, is_released)
+    is_leg_released = contact_slots.is_in_slot | ~is_airborne_leg_locked
+    inverse_inertia = _invert_inertia(s, leg_directions, motion.L - s.a, is_leg_released)
     e = [(cos[i], -sin[i], -L[i]) for i in range(2)]
     u = [(sin[i], cos[i], jnp.zeros_like(sin[i])) for i in range(2)]
     z = (
@@ -281,7 +281,7 @@ def make_inverse_inertia(
     multiply_plane_vectors = lambda a, b: a[0] * b[0] + a[1] * b[1]
     return ContactInverseInertia(
         leg_directions,
-        is_released,
+        is_leg_released,
         inverse_inertia,
         sin,
         cos,
@@ -351,7 +351,7 @@ def compute_free_acceleration(
     leg_acceleration = compute_free_leg_acceleration(s, motion, inverse_inertia.leg_directions)
     coriolis_acceleration = 2.0 * motion.dL * dtheta
     radial_acceleration = (
-        jnp.where(inverse_inertia.is_released, leg_acceleration, 0.0) - centrifugal_acceleration
+        jnp.where(inverse_inertia.is_leg_released, leg_acceleration, 0.0) - centrifugal_acceleration
     )
     hub_force_x = s.Mt * gravity_x + s.m * sum_over_legs(
         radial_acceleration * sin + coriolis_acceleration * cos
@@ -399,7 +399,7 @@ def compute_free_velocity(
     sin, cos = inverse_inertia.leg_directions
     b, dtheta = motion.L - s.a, motion.dtheta
     hub_outward = sin * motion.vx + cos * motion.vz
-    leg_velocity = jnp.where(inverse_inertia.is_released, motion.dL - hub_outward, 0.0)
+    leg_velocity = jnp.where(inverse_inertia.is_leg_released, motion.dL - hub_outward, 0.0)
     radial_velocity = leg_velocity - motion.dL
     transverse_velocity = b * dtheta
     momentum_x = s.Mt * motion.vx + s.m * sum_over_legs(
@@ -433,21 +433,27 @@ def compute_free_velocity(
 class SlotFootVelocity(NamedTuple):
     """Velocities of the feet in the contact slots, tangential and normal to the slope, m/s."""
 
-    along_slope: SlotPair
-    normal_to_slope: SlotPair
+    velocity_along_slope: SlotPair
+    velocity_normal_to_slope: SlotPair
 
 
 def compute_slot_foot_velocity(
-    motion: WheelMotion, contact_slots: ContactSlots, posture: ContactInverseInertia | WheelPosture
+    motion: WheelMotion,
+    contact_slots: ContactSlots,
+    wheel_posture: ContactInverseInertia | WheelPosture,
 ) -> SlotFootVelocity:
     """Return the tangential and normal velocities of the feet in the contact slots, m/s."""
     dL = contact_slots.gather_slot_pair(motion.dL)
     x = [
-        motion.vx - dL[i] * posture.sin[i] - posture.L[i] * motion.dtheta * posture.cos[i]
+        motion.vx
+        - dL[i] * wheel_posture.sin[i]
+        - wheel_posture.L[i] * motion.dtheta * wheel_posture.cos[i]
         for i in range(2)
     ]
     z = [
-        motion.vz - dL[i] * posture.cos[i] + posture.L[i] * motion.dtheta * posture.sin[i]
+        motion.vz
+        - dL[i] * wheel_posture.cos[i]
+        + wheel_posture.L[i] * motion.dtheta * wheel_posture.sin[i]
         for i in range(2)
     ]
     return SlotFootVelocity((x[0], x[1]), (z[0], z[1]))

@@ -149,14 +149,14 @@ def _unpack_leg_posture(
     )
     contact_codes = jnp.floor(contact_codes + 0.5).astype(jnp.int32)
     contact_modes = contact_codes & (LOCKED_CODE_OFFSET - 1)
-    is_locked = contact_codes >= LOCKED_CODE_OFFSET
-    L = jnp.where(is_locked, s.L0, L)
+    is_leg_locked = contact_codes >= LOCKED_CODE_OFFSET
+    L = jnp.where(is_leg_locked, s.L0, L)
     leg_directions = compute_leg_directions(s, theta)
     hub_position = L[0] * leg_directions.sin[0], L[0] * leg_directions.cos[0]
     L = jnp.where(
-        (contact_modes != ContactMode.OFF) & ~is_locked, hub_position[1] / leg_directions.cos, L
+        (contact_modes != ContactMode.OFF) & ~is_leg_locked, hub_position[1] / leg_directions.cos, L
     )
-    return theta, hub_position, L, dL, contact_modes, is_locked
+    return theta, hub_position, L, dL, contact_modes, is_leg_locked
 
 
 def unpack_section_state(s: Symbols, section_state: FullState) -> tuple[WheelMotion, ContactState]:
@@ -166,11 +166,15 @@ def unpack_section_state(s: Symbols, section_state: FullState) -> tuple[WheelMot
     feet are placed on the slope, so that every vector near a section state is valid. The impact at
     landing brings sticking feet to rest.
     """
-    theta, (hub_x, hub_z), L, dL, contact_modes, is_locked = _unpack_leg_posture(s, section_state)
+    theta, (hub_x, hub_z), L, dL, contact_modes, is_leg_locked = _unpack_leg_posture(
+        s, section_state
+    )
     dtheta, vx, vz = section_state[1], section_state[2], section_state[3]
     motion = WheelMotion(hub_x, hub_z, theta, vx, vz, dtheta, L, dL)
-    no_leg_flags = is_locked & False
-    return motion, ContactState(contact_modes, is_locked, no_leg_flags, no_leg_flags, no_leg_flags)
+    no_leg_flags = is_leg_locked & False
+    return motion, ContactState(
+        contact_modes, is_leg_locked, no_leg_flags, no_leg_flags, no_leg_flags
+    )
 
 
 def pack_section_state(
@@ -182,7 +186,7 @@ def pack_section_state(
 
     - `next_line_tilt`: angle by which that line is steeper, rad; None on flat ground.
     """
-    contact_codes = contact_state.contact_modes + LOCKED_CODE_OFFSET * contact_state.is_locked
+    contact_codes = contact_state.contact_modes + LOCKED_CODE_OFFSET * contact_state.is_leg_locked
     theta, vx, vz = motion.theta, motion.vx, motion.vz
     if next_line_tilt is not None:
         sin, cos = jnp.sin(next_line_tilt), jnp.cos(next_line_tilt)

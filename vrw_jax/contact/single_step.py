@@ -18,15 +18,15 @@ from jax import lax
 from jaxtyping import Array
 
 from vrw_jax.contact.batch_integrator import (
-    IntervalPoint,
+    ContactIntervalPoint,
     attempt_solver_step,
-    init_interval,
+    init_contact_interval,
     unpack_motion,
 )
 from vrw_jax.contact.contact_state import (
+    ContactModeDynamics,
     ContactState,
-    LossAccumulators,
-    ModeDynamics,
+    EnergyLossAccumulators,
     pack_state,
     unpack_state,
 )
@@ -36,7 +36,7 @@ from vrw_jax.contact.walk_kernel import (
     STATUS_UNFINISHED,
     BatchWalkResult,
     BatchWalkSettings,
-    StepSummary,
+    GaitStepSummary,
     init_lane_states,
     make_result_template,
     process_and_integrate,
@@ -79,21 +79,21 @@ class ContactStepConfig(NamedTuple):
         - `program_name`: key of the program in the cache of compiled code.
         """
 
-        def evaluate_one_lane(*arrays: Any) -> Any:
+        def evaluate_one_wheel(*arrays: Any) -> Any:
             lane_outputs = lane_function(*jax.tree.map(lambda x: jnp.asarray(x)[..., None], arrays))
             return jax.tree.map(lambda x: x[..., 0], lane_outputs)
 
         if self.uses_diffrax:
-            return evaluate_one_lane
+            return evaluate_one_wheel
         return unbatch(compile_batch_function(lane_function, make_template, program_name))
 
-    def unpack_leaves(self, leaves: tuple[Array, ...]) -> tuple[Array, Array, Any]:
+    def unpack_argument_leaves(self, leaves: tuple[Array, ...]) -> tuple[Array, Array, Any]:
         """Return input columns and section states of the batch, and (wheel, params, options)."""
         wheel, params, x, options = jax.tree.unflatten(self.argument_tree_structure, leaves)
-        uneven_columns = () if wheel.uneven is None else wheel.uneven
+        uneven_ground_columns = () if wheel.uneven is None else wheel.uneven
         restitution = () if wheel.restitution is None else (wheel.restitution.astype(x.dtype),)
         input_columns = jnp.stack(
-            [*stack_parameters(params), wheel.friction, *uneven_columns, *restitution]
+            [*stack_parameters(params), wheel.friction, *uneven_ground_columns, *restitution]
         )
         return input_columns, x, (wheel, params, options)
 
@@ -108,39 +108,44 @@ class ContactStepConfig(NamedTuple):
             wheel.uses_paper_rule,
             self.is_detailed,
         )
-        has_columns = wheel.uneven is not None, wheel.restitution is not None
+        has_column_tangents = wheel.uneven is not None, wheel.restitution is not None
         return BatchWalkSettings(
-            params.n_legs, 1, *contact_rules, options, tableau, *has_columns, self.engine_name,
-            self.measures_force_peaks,
+            params.n_legs, 1, *contact_rules, options, tableau, *has_column_tangents,
+            self.engine_name, self.measures_force_peaks,
         )  # fmt: skip
 
     def make_template(self, *leaves: Array) -> tuple:
-        """Return zeros with the structure of the results of `compute_outputs` for one wheel."""
-        params = self.unpack_leaves(leaves)[2][1]
-        return _partition_result(
+        """Return zeros with the structure of the results of `compute_walk_outputs` for one
+        wheel.
+        """
+        params = self.unpack_argument_leaves(leaves)[2][1]
+        return _partition_walk_result(
             make_result_template(
                 params.n_legs, leaves[0].dtype, self.is_detailed, self.measures_force_peaks
             )
         )
 
-    def compute_outputs(self, *leaves: Array) -> tuple:
-        """Return the results of one step of all batch elements, divided by `_partition_result`.
+    def compute_walk_outputs(self, *leaves: Array) -> tuple:
+        """Return the results of one step of all batch elements, divided by
+        `_partition_walk_result`.
 
         The argument leaves have the batch on their last axis.
         """
-        input_columns, x, gait_step_settings = self.unpack_leaves(leaves)
-        return _partition_result(
+        input_columns, x, gait_step_settings = self.unpack_argument_leaves(leaves)
+        return _partition_walk_result(
             run_walks(self.make_walk_settings(gait_step_settings), input_columns, x)
         )
 
-    def compute_tangents(self, leaves: tuple[Array, ...], tangents: tuple[Array, ...]) -> tuple:
+    def compute_walk_tangents(
+        self, leaves: tuple[Array, ...], tangents: tuple[Array, ...]
+    ) -> tuple:
         """Return the tangents of a step's floating-point results, these results, and other results.
 
         Each batch element has one tangent of its argument leaves.
         """
-        input_columns, x, gait_step_settings = self.unpack_leaves(leaves)
+        input_columns, x, gait_step_settings = self.unpack_argument_leaves(leaves)
         input_column_tangents, section_state_tangents = (
-            tangent_rows[None] for tangent_rows in self.unpack_leaves(tangents)[:2]
+            tangent_rows[None] for tangent_rows in self.unpack_argument_leaves(tangents)[:2]
         )
         n_tangents = jnp.ones_like(input_columns[0], jnp.int32)
         walk_result, result_tangents = walk_with_tangents(
@@ -152,19 +157,19 @@ class ContactStepConfig(NamedTuple):
             n_tangents,
         )
         result_tangents = jax.tree.map(lambda leaf: leaf[0], result_tangents)
-        return _partition_result(walk_result._replace(step_result=result_tangents))[
+        return _partition_walk_result(walk_result._replace(step_result=result_tangents))[
             0
-        ], *_partition_result(walk_result)
+        ], *_partition_walk_result(walk_result)
 
 
-def _partition_result(walk_result: BatchWalkResult) -> tuple[Any, Any]:
+def _partition_walk_result(walk_result: BatchWalkResult) -> tuple[Any, Any]:
     """Return the results of a step, divided into floating-point arrays and other arrays.
 
     If details are requested, the results are those in `UnilateralStep`. Otherwise they are section
     state, durations, outcome and number of solver steps.
     """
     step_result = walk_result.step_result
-    if isinstance(step_result, StepSummary):
+    if isinstance(step_result, GaitStepSummary):
         step_result = (
             step_result.section_state,
             step_result.durations,
@@ -187,7 +192,7 @@ def build_contact_step_function(step_config: ContactStepConfig) -> ForwardFuncti
         step_config.measures_force_peaks,
     )
     return step_config.compile_lane_function(
-        step_config.compute_outputs, step_config.make_template, cache_key
+        step_config.compute_walk_outputs, step_config.make_template, cache_key
     )
 
 
@@ -204,15 +209,15 @@ def build_contact_step_jacobian(
         float_outputs, nonfloat_outputs = step_config.make_template(*leaves)
         return float_outputs, float_outputs, nonfloat_outputs
 
-    structure_name = str(step_config.argument_tree_structure)
+    argument_structure_text = str(step_config.argument_tree_structure)
     cache_key = (
         "step with unilateral contact along directions",
-        structure_name,
+        argument_structure_text,
         step_config.is_detailed,
         step_config.measures_force_peaks,
     )
-    compute_tangents = unbatch(
-        compile_batch_function(step_config.compute_tangents, make_template, cache_key)
+    compute_walk_tangents = unbatch(
+        compile_batch_function(step_config.compute_walk_tangents, make_template, cache_key)
     )
 
     def evaluate_jacobian(*leaves: Array) -> tuple:
@@ -228,7 +233,7 @@ def build_contact_step_jacobian(
             )
         batch_axes = tuple(0 if i in input_indices else None for i in range(len(leaves)))
         jacobian_columns, float_outputs, nonfloat_outputs = jax.vmap(
-            compute_tangents, (None, batch_axes)
+            compute_walk_tangents, (None, batch_axes)
         )(leaves, tuple(tangents))
         float_outputs, nonfloat_outputs = jax.tree.map(
             lambda x: x[0], (float_outputs, nonfloat_outputs)
@@ -241,28 +246,28 @@ def build_contact_step_jacobian(
     return evaluate_jacobian
 
 
-class IntervalLog(NamedTuple):
+class ContactIntervalLog(NamedTuple):
     """Start state and duration of each interval of a step; an interval is between two events."""
 
     start_states: Array  # start of each interval, see `contact_state.PackedState`, (intervals, dim)
     contact_modes: Array  # contact mode of every foot, (intervals, legs)
-    is_locked: Array
+    is_leg_locked: Array
     durations: Array  # s
 
 
-class SampledIntervals(NamedTuple):
+class SampledContactIntervals(NamedTuple):
     """Intervals of a step, each with samples at equally spaced times from start to end."""
 
-    interval_log: IntervalLog
-    step_summary: StepSummary
+    contact_interval_log: ContactIntervalLog
+    step_summary: GaitStepSummary
     step_outcome: Array
     sampled_states: Array  # `contact_state.PackedState`, (intervals, samples, dim)
     tangential_forces: Array  # force on every foot, N, (intervals, samples, legs)
     normal_forces: Array
 
 
-def sample_interval(
-    mode_dynamics: ModeDynamics,
+def sample_contact_interval(
+    contact_mode_dynamics: ContactModeDynamics,
     motion: WheelMotion,
     initial_accumulators: Array,
     duration: Array,
@@ -278,17 +283,17 @@ def sample_interval(
 
     - `duration`: length of the interval, s.
     """
-    initial_interval = init_interval(mode_dynamics, motion, options.dt0)
+    initial_interval = init_contact_interval(contact_mode_dynamics, motion, options.dt0)
 
     def take_sample_step(
-        sample_state: tuple[IntervalPoint, Array], step_size: Array
-    ) -> tuple[tuple[IntervalPoint, Array], Array]:
+        sample_state: tuple[ContactIntervalPoint, Array], step_size: Array
+    ) -> tuple[tuple[ContactIntervalPoint, Array], Array]:
         start_point, accumulators = sample_state
         attempted_step = attempt_solver_step(
-            mode_dynamics,
+            contact_mode_dynamics,
             tableau,
             options,
-            initial_interval._replace(interval_point=start_point, h=step_size),
+            initial_interval._replace(contact_interval_point=start_point, h=step_size),
         )
         assert attempted_step.accumulator_increments is not None
         return (
@@ -296,14 +301,14 @@ def sample_interval(
             accumulators + attempted_step.accumulator_increments,
         ), attempted_step.mean_squared_error
 
-    def pack_sample(sample_state: tuple[IntervalPoint, Array]) -> Array:
+    def pack_sample(sample_state: tuple[ContactIntervalPoint, Array]) -> Array:
         (q, v, dynamics_rows), accumulators = sample_state
         return jnp.concatenate([q, v, accumulators, dynamics_rows[len(q) : len(q) + 4]])
 
     return sample_at_equal_times(
         take_sample_step,
         pack_sample,
-        (initial_interval.interval_point, initial_accumulators),
+        (initial_interval.contact_interval_point, initial_accumulators),
         tableau,
         duration,
         n_samples,
@@ -314,7 +319,7 @@ def sample_interval(
 @functools.cache
 def build_contact_step_sampler(
     step_config: ContactStepConfig, n_samples: int
-) -> Callable[..., SampledIntervals]:
+) -> Callable[..., SampledContactIntervals]:
     """Return a function that samples a step from the leaves of (wheel, params, x, options).
 
     The function has no derivatives.
@@ -323,13 +328,15 @@ def build_contact_step_sampler(
     cache_key = str(step_config.argument_tree_structure)
 
     def init_lane_state(*leaves: Array) -> Any:
-        input_columns, x, gait_step_settings = step_config.unpack_leaves(leaves)
+        input_columns, x, gait_step_settings = step_config.unpack_argument_leaves(leaves)
         return init_lane_states(
             step_config.make_walk_settings(gait_step_settings), input_columns, x
         )[1]
 
-    def advance_to_event(leaves: tuple[Array, ...], lane_state: Any) -> tuple[Any, IntervalLog]:
-        input_columns, x, gait_step_settings = step_config.unpack_leaves(leaves)
+    def advance_to_event(
+        leaves: tuple[Array, ...], lane_state: Any
+    ) -> tuple[Any, ContactIntervalLog]:
+        input_columns, x, gait_step_settings = step_config.unpack_argument_leaves(leaves)
         walk_settings = step_config.make_walk_settings(gait_step_settings)
         state_after_event, lane_state = process_and_integrate(
             walk_settings,
@@ -337,74 +344,78 @@ def build_contact_step_sampler(
             lane_state,
             waits_for_events=True,
         )
-        assert state_after_event.step_loss_accumulators is not None
-        (interval_point, contact_state), zero_time = (
+        assert state_after_event.step_energy_loss_accumulators is not None
+        (contact_interval_point, contact_state), zero_time = (
             (
-                state_after_event.interval_state.interval_point,
-                state_after_event.interval_state.contact_state,
+                state_after_event.contact_interval_state.contact_interval_point,
+                state_after_event.contact_interval_state.contact_state,
             ),
-            jnp.zeros_like(lane_state.interval_state.time_since_event),
+            jnp.zeros_like(lane_state.contact_interval_state.time_since_event),
         )
         start_state = pack_state(
-            unpack_motion(interval_point),
-            LossAccumulators(zero_time, *state_after_event.step_loss_accumulators),
+            unpack_motion(contact_interval_point),
+            EnergyLossAccumulators(zero_time, *state_after_event.step_energy_loss_accumulators),
         )
-        return lane_state, IntervalLog(
+        return lane_state, ContactIntervalLog(
             start_state,
             contact_state.contact_modes,
-            contact_state.is_locked,
-            lane_state.interval_state.time_since_event,
+            contact_state.is_leg_locked,
+            lane_state.contact_interval_state.time_since_event,
         )
 
     def make_logged_dynamics(
-        leaves: tuple[Array, ...], interval_log: IntervalLog
-    ) -> tuple[BatchWalkSettings, ModeDynamics]:
-        input_columns, x, gait_step_settings = step_config.unpack_leaves(leaves)
+        leaves: tuple[Array, ...], contact_interval_log: ContactIntervalLog
+    ) -> tuple[BatchWalkSettings, ContactModeDynamics]:
+        input_columns, x, gait_step_settings = step_config.unpack_argument_leaves(leaves)
         walk_settings = step_config.make_walk_settings(gait_step_settings)
-        no_leg_flags = interval_log.is_locked & False
+        no_leg_flags = contact_interval_log.is_leg_locked & False
         contact_state = ContactState(
-            interval_log.contact_modes,
-            interval_log.is_locked,
+            contact_interval_log.contact_modes,
+            contact_interval_log.is_leg_locked,
             no_leg_flags,
             no_leg_flags,
             no_leg_flags,
         )
-        return walk_settings, walk_settings.make_dynamics(
+        return walk_settings, walk_settings.make_lane_contact_dynamics(
             walk_settings.replace_invalid_lanes(input_columns, x)[0], contact_state
         )
 
-    def sample_with_diffrax(leaves: tuple[Array, ...], interval_log: IntervalLog) -> tuple:
-        walk_settings, mode_dynamics = make_logged_dynamics(leaves, interval_log)
+    def sample_with_diffrax(
+        leaves: tuple[Array, ...], contact_interval_log: ContactIntervalLog
+    ) -> tuple:
+        walk_settings, contact_mode_dynamics = make_logged_dynamics(leaves, contact_interval_log)
         return sample_by_diffrax(
-            mode_dynamics,
-            interval_log.start_states,
-            interval_log.durations,
+            contact_mode_dynamics,
+            contact_interval_log.start_states,
+            contact_interval_log.durations,
             n_samples,
             walk_settings.step_options,
         )
 
-    def sample_intervals(leaves: tuple[Array, ...], interval_log: IntervalLog) -> Array:
-        walk_settings, mode_dynamics = make_logged_dynamics(leaves, interval_log)
-        motion, accumulators = unpack_state(interval_log.start_states)
+    def sample_contact_intervals(
+        leaves: tuple[Array, ...], contact_interval_log: ContactIntervalLog
+    ) -> Array:
+        walk_settings, contact_mode_dynamics = make_logged_dynamics(leaves, contact_interval_log)
+        motion, accumulators = unpack_state(contact_interval_log.start_states)
         assert walk_settings.tableau is not None
         sampling_arguments = (
             jnp.stack(accumulators[1:]),
-            interval_log.durations,
+            contact_interval_log.durations,
             n_samples,
             walk_settings.step_options,
             walk_settings.tableau,
         )
-        return sample_interval(mode_dynamics, motion, *sampling_arguments)
+        return sample_contact_interval(contact_mode_dynamics, motion, *sampling_arguments)
 
-    def sample_whole_step(*leaves: Array) -> SampledIntervals:
+    def sample_whole_step(*leaves: Array) -> SampledContactIntervals:
         wheel, params, *_ = jax.tree.unflatten(argument_tree_structure, leaves)
-        initial_state = compiled_start(*leaves)
-        log_template = jax.eval_shape(compiled_advance, leaves, initial_state)[1]
+        initial_state = begin_compiled_walk(*leaves)
+        log_template = jax.eval_shape(advance_compiled_walk, leaves, initial_state)[1]
         allocate_log_array = lambda leaf: jnp.zeros((wheel.max_events, *leaf.shape), leaf.dtype)
 
         def record_interval_end(loop_state: tuple) -> tuple:
-            previous_state, interval_log = loop_state
-            lane_state, interval_entry = compiled_advance(leaves, previous_state)
+            previous_state, contact_interval_log = loop_state
+            lane_state, interval_entry = advance_compiled_walk(leaves, previous_state)
             entry_index = previous_state.step_counters.n_events
             entry_index = jnp.where(
                 lane_state.step_counters.n_events > entry_index, entry_index, wheel.max_events
@@ -412,21 +423,21 @@ def build_contact_step_sampler(
             write_log_entry = lambda log_leaf, entry_leaf: log_leaf.at[entry_index].set(
                 entry_leaf, mode="drop"
             )
-            return lane_state, jax.tree.map(write_log_entry, interval_log, interval_entry)
+            return lane_state, jax.tree.map(write_log_entry, contact_interval_log, interval_entry)
 
         should_continue = lambda state: make_opaque_loop_condition(
             state[0].walk_outcome == STATUS_UNFINISHED, state[0].step_counters.n_events
         )
-        lane_state, interval_log = lax.while_loop(
+        lane_state, contact_interval_log = lax.while_loop(
             should_continue,
             record_interval_end,
             (initial_state, jax.tree.map(allocate_log_array, log_template)),
         )
         final_state = (
-            unpack_motion(lane_state.interval_state.interval_point),
-            lane_state.interval_state.contact_state,
+            unpack_motion(lane_state.contact_interval_state.contact_interval_point),
+            lane_state.contact_interval_state.contact_state,
         )
-        input_columns, _, gait_step_settings = step_config.unpack_leaves(leaves)
+        input_columns, _, gait_step_settings = step_config.unpack_argument_leaves(leaves)
         walk_settings = step_config.make_walk_settings(gait_step_settings)
         step_summary = walk_settings.summarize_step(
             final_state,
@@ -436,31 +447,32 @@ def build_contact_step_sampler(
         )
         if step_config.uses_diffrax:
             interval_samples = lax.map(
-                lambda interval_log: sample_with_diffrax(leaves, interval_log), interval_log
+                lambda contact_interval_log: sample_with_diffrax(leaves, contact_interval_log),
+                contact_interval_log,
             )
         else:
-            sample_rows = jax.vmap(lambda interval_log: compiled_sampling(leaves, interval_log))(
-                interval_log
-            )
-            interval_samples = _unpack_sample_rows(params.n_legs, interval_log, sample_rows)
-        return SampledIntervals(
-            interval_log, step_summary, lane_state.walk_outcome, *interval_samples
+            sample_rows = jax.vmap(
+                lambda contact_interval_log: sample_compiled_intervals(leaves, contact_interval_log)
+            )(contact_interval_log)
+            interval_samples = _unpack_sample_rows(params.n_legs, contact_interval_log, sample_rows)
+        return SampledContactIntervals(
+            contact_interval_log, step_summary, lane_state.walk_outcome, *interval_samples
         )
 
-    compiled_start = step_config.compile_lane_function(
+    begin_compiled_walk = step_config.compile_lane_function(
         init_lane_state, init_lane_state, ("start with unilateral contact", cache_key)
     )
     make_template = lambda leaves, lane_state: (
         lane_state,
-        IntervalLog(*(lane_state.interval_state.time_since_event,) * 4),
+        ContactIntervalLog(*(lane_state.contact_interval_state.time_since_event,) * 4),
     )
-    compiled_advance = step_config.compile_lane_function(
+    advance_compiled_walk = step_config.compile_lane_function(
         advance_to_event, make_template, ("to the next event", cache_key)
     )
-    compiled_sampling = unbatch(
+    sample_compiled_intervals = unbatch(
         compile_batch_function(
-            sample_intervals,
-            lambda leaves, interval_log: interval_log.durations,
+            sample_contact_intervals,
+            lambda leaves, contact_interval_log: contact_interval_log.durations,
             ("samples with unilateral contact", cache_key, n_samples),
         )
     )
@@ -468,18 +480,19 @@ def build_contact_step_sampler(
 
 
 def _unpack_sample_rows(
-    n_legs: int, interval_log: IntervalLog, sample_rows: Array
+    n_legs: int, contact_interval_log: ContactIntervalLog, sample_rows: Array
 ) -> tuple[Array, Array, Array]:
     """Return packed states, tangential forces (N) and normal forces (N) of all legs, from samples.
 
-    The axes are (intervals, samples, entries). `sample_rows` contains results of `sample_interval`.
+    The axes are (intervals, samples, entries). `sample_rows` contains results of
+    `sample_contact_interval`.
     """
     n_samples, n_coordinates = sample_rows.shape[1], 3 + n_legs
-    time_since_event = jnp.linspace(0.0, 1.0, n_samples) * interval_log.durations[:, None]
+    time_since_event = jnp.linspace(0.0, 1.0, n_samples) * contact_interval_log.durations[:, None]
     q, v, accumulators, slot_forces = jnp.split(
         sample_rows, (n_coordinates, 2 * n_coordinates, 2 * n_coordinates + 3), -1
     )
-    packed_state_parts = [
+    contact_interval_quantities = [
         q[..., :3],
         v[..., :3],
         q[..., 3:],
@@ -489,7 +502,7 @@ def _unpack_sample_rows(
     ]
     contact_slots = jax.vmap(
         lambda contact_modes: find_contact_slots(contact_modes != ContactMode.OFF)
-    )(interval_log.contact_modes)
+    )(contact_interval_log.contact_modes)
     scatter_to_legs = jax.vmap(
         jax.vmap(
             lambda contact_slots, slot_pair: contact_slots.scatter_to_legs(slot_pair), (None, 0)
@@ -498,4 +511,4 @@ def _unpack_sample_rows(
     normal_forces, tangential_forces = (
         scatter_to_legs(contact_slots, slot_forces[..., i : i + 2]) for i in (0, 2)
     )
-    return jnp.concatenate(packed_state_parts, -1), tangential_forces, normal_forces
+    return jnp.concatenate(contact_interval_quantities, -1), tangential_forces, normal_forces

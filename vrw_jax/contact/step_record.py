@@ -17,10 +17,10 @@ from jaxtyping import Array, Bool, Float, Int
 
 from vrw_jax.contact.contact_modes import PAPER_RULE_SENTINEL, Friction
 from vrw_jax.contact.contact_state import (
+    ContactModeDynamics,
     ContactState,
+    EnergyLossAccumulators,
     GuardLayout,
-    LossAccumulators,
-    ModeDynamics,
     compute_normal_force_rates,
 )
 from vrw_jax.contact.impacts import (
@@ -142,7 +142,7 @@ def process_event(
         rest_speed=contact_law.rest_speed * (1 + jnp.maximum(n_events - first_ramp_event, 0))
     )
     motion = project_motion(
-        contact_law.s, motion, contact_state.contact_modes, contact_state.is_locked
+        contact_law.s, motion, contact_state.contact_modes, contact_state.is_leg_locked
     )
     contact_event = classify_event(guard_layout, guard_index)
     event_result = resolve_event(contact_law, motion, contact_state, contact_event)
@@ -164,7 +164,7 @@ class UnilateralMargins(eqx.Module):
     stopper_impulse: Elementwise  # minimum over locked legs in the air, N s
 
 
-class StepCounters(NamedTuple):
+class GaitStepCounters(NamedTuple):
     """Numbers of events and solver steps in a walking step, and durations by loaded feet."""
 
     n_events: Int[Array, "..."]  # number of changes of contacts and stoppers
@@ -172,20 +172,20 @@ class StepCounters(NamedTuple):
     n_solver_steps: Int[Array, "..."]  # number of attempted solver steps
 
 
-def init_step_counters(lane_template: Array) -> StepCounters:
+def init_step_counters(lane_template: Array) -> GaitStepCounters:
     """Return step counters with the value 0, with the batch shape and dtype of `lane_template`."""
     int_zeros = jnp.zeros(lane_template.shape, jnp.int32)
-    return StepCounters(
+    return GaitStepCounters(
         int_zeros, jnp.zeros((3, *lane_template.shape), lane_template.dtype), int_zeros
     )
 
 
-def count_interval(
-    step_counters: StepCounters,
+def count_contact_interval(
+    step_counters: GaitStepCounters,
     contact_state: ContactState,
     duration: Elementwise,
     n_solver_steps: Array,
-) -> StepCounters:
+) -> GaitStepCounters:
     """Return the step counters after one more interval in the contact state `contact_state`.
 
     - `duration`: length of the interval, s;
@@ -200,7 +200,7 @@ def count_interval(
 
 
 def determine_interval_outcome(
-    step_counters: StepCounters,
+    step_counters: GaitStepCounters,
     guard_layout: GuardLayout,
     has_reached_event: Array,
     guard_index: Array,
@@ -233,25 +233,25 @@ class ForcePeakRecord(NamedTuple):
     The extrema are those of the force on the foot of Leg 1, except for the last two fields.
     """
 
-    n_peaks: Int[Array, "..."]  # number of maxima
+    n_force_peaks: Int[Array, "..."]  # number of maxima
     peak_force: Elementwise  # largest maximum, N; -inf without a maximum
     lowest_force_after_peak: Elementwise  # smallest minimum after the largest maximum, N; else inf
     trough_depth: Elementwise  # lower of two maxima minus a minimum between them, largest, N
     second_peak_rate: Elementwise  # largest maximum of the rate after a maximum, N/s; else -inf
-    n_total_peaks: Int[Array, "..."]  # number of maxima of the sum of the forces on all feet
+    n_total_force_peaks: Int[Array, "..."]  # number of maxima of the sum of the forces on all feet
     peak_total_force: Elementwise  # largest maximum of this sum, N; -inf without a maximum
-    n_extrema: Int[Array, "..."]  # number of recorded extrema, rates included
+    n_force_extrema: Int[Array, "..."]  # number of recorded extrema, rates included
 
     def compute_force_measures(self) -> dict[str, Array]:
         """Return the measures of the peaks, by their names in `measures.FORCE_PEAK_MEASURES`."""
         has_second_rate = jnp.isfinite(self.second_peak_rate)
         return {
-            "n_force_peaks": self.n_peaks.astype(self.trough_depth.dtype),
-            "peak_force": jnp.where(self.n_peaks > 0, self.peak_force, 0.0),
+            "n_force_peaks": self.n_force_peaks.astype(self.trough_depth.dtype),
+            "peak_force": jnp.where(self.n_force_peaks > 0, self.peak_force, 0.0),
             "force_trough_depth": self.trough_depth,
             "second_peak_rate": jnp.where(has_second_rate, self.second_peak_rate, jnp.nan),
-            "n_total_force_peaks": self.n_total_peaks.astype(self.trough_depth.dtype),
-            "peak_total_force": jnp.where(self.n_total_peaks > 0, self.peak_total_force, 0.0),
+            "n_total_force_peaks": self.n_total_force_peaks.astype(self.trough_depth.dtype),
+            "peak_total_force": jnp.where(self.n_total_force_peaks > 0, self.peak_total_force, 0.0),
         }
 
 
@@ -259,66 +259,70 @@ def init_force_peak_record(dtype: jnp.dtype) -> ForcePeakRecord:
     """Return the record of one wheel before its first extremum, without a batch axis."""
     float_zero, int_zero = jnp.zeros((), dtype), jnp.zeros((), jnp.int32)
     return ForcePeakRecord(
-        n_peaks=int_zero,
+        n_force_peaks=int_zero,
         peak_force=float_zero - jnp.inf,
         lowest_force_after_peak=float_zero + jnp.inf,
         trough_depth=float_zero,
         second_peak_rate=float_zero - jnp.inf,
-        n_total_peaks=int_zero,
+        n_total_force_peaks=int_zero,
         peak_total_force=float_zero - jnp.inf,
-        n_extrema=int_zero,
+        n_force_extrema=int_zero,
     )
 
 
 def record_force_extremum(
-    record: ForcePeakRecord,
+    force_peak_record: ForcePeakRecord,
     is_rate_zero: Bool[Array, "3 ..."],
-    mode_dynamics: ModeDynamics,
+    contact_mode_dynamics: ContactModeDynamics,
     motion: WheelMotion,
 ) -> ForcePeakRecord:
     """Return the record after an extremum of a force or of its rate.
 
-    - `is_rate_zero`: which of the `ForceRates` is zero; if none is, the record is unchanged;
-    - `mode_dynamics`, `motion`: dynamics before the extremum, and motion at the extremum.
+    - `is_rate_zero`: which of the `NormalForceRates` is zero; if none is, the record is unchanged;
+    - `contact_mode_dynamics`, `motion`: dynamics before the extremum, and motion at the extremum.
     """
     is_fore_extremum, is_total_extremum, is_rate_extremum = is_rate_zero
-    assert mode_dynamics.contact_state.force_rate_signs is not None
+    assert contact_mode_dynamics.contact_state.force_rate_signs is not None
     is_fore_rising, is_total_rising, is_rate_rising = (
-        mode_dynamics.contact_state.force_rate_signs > 0.0
+        contact_mode_dynamics.contact_state.force_rate_signs > 0.0
     )
-    (force, total_force), (rate, _) = compute_normal_force_rates(mode_dynamics, motion)
+    (force, total_force), (rate, _) = compute_normal_force_rates(contact_mode_dynamics, motion)
     is_peak = is_fore_extremum & is_fore_rising
-    is_trough = is_fore_extremum & ~is_fore_rising & (record.n_peaks > 0)
-    is_after_trough = jnp.isfinite(record.lowest_force_after_peak)
+    is_trough = is_fore_extremum & ~is_fore_rising & (force_peak_record.n_force_peaks > 0)
+    is_after_trough = jnp.isfinite(force_peak_record.lowest_force_after_peak)
     trough_depth = jnp.where(
         is_peak & is_after_trough,
-        jnp.minimum(force, record.peak_force)
-        - jnp.where(is_after_trough, record.lowest_force_after_peak, 0.0),
+        jnp.minimum(force, force_peak_record.peak_force)
+        - jnp.where(is_after_trough, force_peak_record.lowest_force_after_peak, 0.0),
         0.0,
     )
-    is_highest_peak = is_peak & (force > record.peak_force)
+    is_highest_peak = is_peak & (force > force_peak_record.peak_force)
     lowest_force_after_peak = jnp.where(
-        is_trough & (force < record.lowest_force_after_peak), force, record.lowest_force_after_peak
+        is_trough & (force < force_peak_record.lowest_force_after_peak),
+        force,
+        force_peak_record.lowest_force_after_peak,
     )
-    is_second_rise = is_rate_extremum & is_rate_rising & (record.n_peaks > 0)
+    is_second_rise = is_rate_extremum & is_rate_rising & (force_peak_record.n_force_peaks > 0)
     # If only the fore foot is loaded, both forces have the same extrema.
-    is_fore_foot_alone = mode_dynamics.slot_modes[1] == ContactMode.OFF
+    is_fore_foot_alone = contact_mode_dynamics.slot_modes[1] == ContactMode.OFF
     is_total_peak = (is_total_extremum & is_total_rising) | (is_peak & is_fore_foot_alone)
     return ForcePeakRecord(
-        n_peaks=record.n_peaks + is_peak,
-        peak_force=jnp.where(is_highest_peak, force, record.peak_force),
+        n_force_peaks=force_peak_record.n_force_peaks + is_peak,
+        peak_force=jnp.where(is_highest_peak, force, force_peak_record.peak_force),
         lowest_force_after_peak=jnp.where(is_highest_peak, jnp.inf, lowest_force_after_peak),
-        trough_depth=jnp.maximum(record.trough_depth, trough_depth),
+        trough_depth=jnp.maximum(force_peak_record.trough_depth, trough_depth),
         second_peak_rate=jnp.where(
-            is_second_rise & (rate > record.second_peak_rate), rate, record.second_peak_rate
+            is_second_rise & (rate > force_peak_record.second_peak_rate),
+            rate,
+            force_peak_record.second_peak_rate,
         ),
-        n_total_peaks=record.n_total_peaks + is_total_peak,
+        n_total_force_peaks=force_peak_record.n_total_force_peaks + is_total_peak,
         peak_total_force=jnp.where(
-            is_total_peak & (total_force > record.peak_total_force),
+            is_total_peak & (total_force > force_peak_record.peak_total_force),
             total_force,
-            record.peak_total_force,
+            force_peak_record.peak_total_force,
         ),
-        n_extrema=record.n_extrema + jnp.any(is_rate_zero, axis=0),
+        n_force_extrema=force_peak_record.n_force_extrema + jnp.any(is_rate_zero, axis=0),
     )
 
 
@@ -365,7 +369,7 @@ def record_event(
 
     - `is_first_event`: whether the event is the first in the walking step.
     """
-    opening_quantities = (
+    step_start_quantities = (
         jnp.stack([event_result.motion.theta, event_result.motion.dtheta]),
         jnp.stack(event_result.normal_impulse),
         jnp.stack(event_result.tangential_impulse),
@@ -376,7 +380,7 @@ def record_event(
         step_details.landing_tangential,
     )
     post_impact, landing_normal, landing_tangential = select_trees_by_condition(
-        is_first_event, opening_quantities, previous_quantities
+        is_first_event, step_start_quantities, previous_quantities
     )
     stopper_impulse = jnp.minimum(
         step_details.margins.stopper_impulse, event_result.stopper_impulse
@@ -385,7 +389,7 @@ def record_event(
         post_impact=post_impact,
         landing_normal=landing_normal,
         landing_tangential=landing_tangential,
-        energy_impacts=step_details.energy_impacts + event_result.energy_lost,
+        energy_impacts=step_details.energy_impacts + event_result.impact_energy_loss,
         margins=UnilateralMargins(step_details.margins.stopper_force, stopper_impulse),
         impacts=step_details.impacts + contact_event.is_impact,
         fewest_solutions=jnp.minimum(step_details.fewest_solutions, event_result.n_solutions),
@@ -393,7 +397,7 @@ def record_event(
     )
 
 
-def record_interval(
+def record_contact_interval(
     step_details: UnilateralStepDetails,
     slot_modes: Int[Array, "2 ..."],
     duration: Elementwise,
@@ -409,13 +413,13 @@ def record_interval(
       The result contains the minimum over all intervals.
     """
     mode_codes = np.arange(4).reshape(-1, *(1,) * jnp.ndim(stopper_force))
-    first_mode_indicator, second_mode_indicator = (
+    is_first_slot_mode, is_second_slot_mode = (
         (mode_codes == slot_modes[i]).astype(jnp.result_type(stopper_force)) for i in range(2)
     )
     stopper_force = jnp.minimum(step_details.margins.stopper_force, stopper_force)
     return step_details._replace(
         mode_durations=step_details.mode_durations
-        + first_mode_indicator[:, None] * second_mode_indicator[None, :] * duration,
+        + is_first_slot_mode[:, None] * is_second_slot_mode[None, :] * duration,
         margins=UnilateralMargins(stopper_force, step_details.margins.stopper_impulse),
     )
 
@@ -501,8 +505,8 @@ def make_final_section_state(
 def make_unilateral_step(
     motion: WheelMotion,
     contact_state: ContactState,
-    accumulators: LossAccumulators,
-    step_counters: StepCounters,
+    accumulators: EnergyLossAccumulators,
+    step_counters: GaitStepCounters,
     step_details: UnilateralStepDetails,
     outcome: Array,
     engine_name: str,
@@ -513,9 +517,9 @@ def make_unilateral_step(
     - `engine_name`: name of the engine that computed the step;
     - `next_line_tilt`: angle by which the next straight line of uneven ground is steeper, rad.
     """
-    landing_place = compute_landing_position(motion.L.shape[0], motion)
-    replace_nonfinite = lambda record_value: jnp.where(
-        jnp.isfinite(record_value), record_value, 0.0
+    landing_foot_position = compute_landing_position(motion.L.shape[0], motion)
+    replace_nonfinite = lambda detail_value: jnp.where(
+        jnp.isfinite(detail_value), detail_value, 0.0
     )
     step_details = step_details._replace(
         margins=jax.tree.map(replace_nonfinite, step_details.margins),
@@ -524,7 +528,7 @@ def make_unilateral_step(
     return UnilateralStep(
         section_state=make_final_section_state(motion, contact_state, outcome, next_line_tilt),
         durations=step_counters.durations,
-        step_length=jnp.where(outcome == Outcome.STEPPED, landing_place, 0.0),
+        step_length=jnp.where(outcome == Outcome.STEPPED, landing_foot_position, 0.0),
         energy_damping=accumulators.damping_loss,
         energy_friction=accumulators.friction_loss,
         slip=accumulators.slip_length,

@@ -90,19 +90,22 @@ class UnevenGround(NamedTuple):
     tilt: Scalar  # angle by which the next line is steeper, rad
 
 
-def _convert_restitution(value: Any) -> Array | None:
+def _convert_restitution(restitution_coefficient: Any) -> Array | None:
     """Return Newton's coefficient of restitution as an array; None if it is None or 0.
 
     A value outside [0, 1] raises a ValueError.
     """
-    if value is None or (isinstance(value, float | int) and value == 0):
+    if restitution_coefficient is None or (
+        isinstance(restitution_coefficient, float | int) and restitution_coefficient == 0
+    ):
         return None
-    restitution = check_reals("restitution", value)
+    restitution = check_reals("restitution", restitution_coefficient)
     if not isinstance(restitution, jax.core.Tracer) and not jnp.all(
         (restitution >= 0.0) & (restitution <= 1.0)
     ):
         raise ValueError(
-            f"restitution is {value}, but it is a ratio of speeds: give a number from 0 to 1."
+            f"restitution is {restitution_coefficient}, but it is a ratio of speeds: give a number "
+            "from 0 to 1."
         )
     return restitution
 
@@ -282,8 +285,10 @@ class UnilateralWheel(AbstractContactWheel):
         """Return the results of one step, and the name of the engine that computed them."""
         leaves, argument_structure = self._flatten_arguments(params, x, options)
         engine = "lanes" if can_use_batch_kernel(options) else "diffrax"
-        compute_step = _compile_step(argument_structure, is_detailed, engine, measures_force_peaks)
-        return eqx.combine(*compute_step(*leaves)), engine
+        compute_compiled_step = _compile_step(
+            argument_structure, is_detailed, engine, measures_force_peaks
+        )
+        return eqx.combine(*compute_compiled_step(*leaves)), engine
 
     def _flatten_arguments(
         self, params: WheelParams, x: FullState, options: StepOptions
@@ -298,21 +303,26 @@ class UnilateralWheel(AbstractContactWheel):
     ) -> UnilateralTrajectory:
         leaves, argument_structure = self._flatten_arguments(params, x, options)
         config = ContactStepConfig(argument_structure, True, not can_use_batch_kernel(options))
-        sampled_intervals = build_contact_step_sampler(config, n_samples)(*leaves)
-        interval_log, step_summary = sampled_intervals.interval_log, sampled_intervals.step_summary
-        start_times = jnp.concatenate([jnp.zeros((1,)), jnp.cumsum(interval_log.durations)[:-1]])
+        sampled_contact_intervals = build_contact_step_sampler(config, n_samples)(*leaves)
+        contact_interval_log, step_summary = (
+            sampled_contact_intervals.contact_interval_log,
+            sampled_contact_intervals.step_summary,
+        )
+        start_times = jnp.concatenate(
+            [jnp.zeros((1,)), jnp.cumsum(contact_interval_log.durations)[:-1]]
+        )
         return UnilateralTrajectory(
             time=start_times[:, None]
-            + jnp.linspace(0.0, 1.0, n_samples) * interval_log.durations[:, None],
-            state=sampled_intervals.sampled_states,
-            contact=interval_log.contact_modes,
-            locked=interval_log.is_locked,
-            tangential=sampled_intervals.tangential_forces,
-            normal=sampled_intervals.normal_forces,
-            duration=interval_log.durations,
+            + jnp.linspace(0.0, 1.0, n_samples) * contact_interval_log.durations[:, None],
+            state=sampled_contact_intervals.sampled_states,
+            contact=contact_interval_log.contact_modes,
+            locked=contact_interval_log.is_leg_locked,
+            tangential=sampled_contact_intervals.tangential_forces,
+            normal=sampled_contact_intervals.normal_forces,
+            duration=contact_interval_log.durations,
             section_state=step_summary.section_state,
             step_length=step_summary.step_length,
-            outcome=sampled_intervals.step_outcome,
+            outcome=sampled_contact_intervals.step_outcome,
         )
 
 
@@ -331,15 +341,17 @@ def _compile_step(
     diffrax_config = ContactStepConfig(
         argument_structure, is_detailed, True, engine, measures_force_peaks
     )
-    step_by_diffrax = build_contact_step_function(diffrax_config)
-    tight_step = lambda *leaves: step_by_diffrax(*diffrax_config.tighten_tolerances(leaves))
+    compute_step_by_diffrax = build_contact_step_function(diffrax_config)
+    step_with_tight_tolerances = lambda *leaves: compute_step_by_diffrax(
+        *diffrax_config.tighten_tolerances(leaves)
+    )
     if engine == "diffrax":
-        return enable_all_ad_modes(step_by_diffrax, tight_step)
+        return enable_all_ad_modes(compute_step_by_diffrax, step_with_tight_tolerances)
     config = ContactStepConfig(
         argument_structure, is_detailed, measures_force_peaks=measures_force_peaks
     )
     return enable_all_ad_modes(
         build_contact_step_function(config),
-        tight_step,
+        step_with_tight_tolerances,
         partial(build_contact_step_jacobian, config),
     )

@@ -4,7 +4,7 @@ All laws of contact and impact are elementwise over the batch. A batch element i
 Each iteration resolves the events of all elements at an event, then integrates all elements
 further. The landing of the foremost foot is an event like any other.
 
-The batch kernel integrates many elements (`integrate_interval`). On a CPU, its loop is one
+The batch kernel integrates many elements (`integrate_contact_interval`). On a CPU, its loop is one
 machine-code program in which few elements are idle. On other devices, XLA compiles the same source.
 diffrax integrates a single element (`integrate_by_diffrax`).
 """
@@ -19,37 +19,37 @@ from jaxtyping import Array
 
 from vrw_jax.contact.batch_integrator import (
     N_ACCUMULATOR_ROWS,
-    IntervalPoint,
-    IntervalState,
+    ContactIntervalPoint,
+    ContactIntervalState,
     LaneStatus,
-    init_interval,
-    integrate_interval,
+    init_contact_interval,
+    integrate_contact_interval,
     pack_coordinates,
     unpack_motion,
 )
 from vrw_jax.contact.contact_modes import Friction
 from vrw_jax.contact.contact_state import (
+    ContactModeDynamics,
     ContactState,
-    ForceRates,
-    LossAccumulators,
-    ModeDynamics,
+    EnergyLossAccumulators,
+    NormalForceRates,
     choose_stopping_guard,
     compute_forces,
     compute_min_stopper_force,
     flag_zero_force_rates,
     is_wheel_at_rest,
+    make_contact_mode_dynamics,
     make_guard_layout,
-    make_mode_dynamics,
     update_force_rate_signs,
 )
-from vrw_jax.contact.diffrax_interval import init_diffrax_interval, integrate_by_diffrax
+from vrw_jax.contact.diffrax_interval import init_diffrax_contact_interval, integrate_by_diffrax
 from vrw_jax.contact.mechanics import WheelMotion, compute_landing_position, stop_gradients
 from vrw_jax.contact.section import pack_section_state, replace_invalid_start, unpack_section_state
 from vrw_jax.contact.step_record import (
-    StepCounters,
+    GaitStepCounters,
     UnilateralStepDetails,
     apply_friction_rule,
-    count_interval,
+    count_contact_interval,
     determine_interval_outcome,
     init_step_counters,
     init_step_details,
@@ -57,9 +57,9 @@ from vrw_jax.contact.step_record import (
     make_final_section_state,
     make_unilateral_step,
     process_event,
+    record_contact_interval,
     record_event,
     record_force_extremum,
-    record_interval,
 )
 from vrw_jax.integrator import ButcherTableau
 from vrw_jax.numerics import (
@@ -79,7 +79,7 @@ from vrw_jax.wheel import (
 
 N_PARAMETERS = len(PARAMETER_NAMES)
 """Number of wheel parameters, the first input columns. The friction coefficient follows."""
-N_UNEVEN_COLUMNS = 2
+N_UNEVEN_GROUND_COLUMNS = 2
 """Number of further input columns on uneven ground.
 
 They are the friction coefficient of the feet that landed earlier, and the angle by which the next
@@ -89,7 +89,7 @@ STATUS_UNFINISHED = -1
 """Value that replaces the outcome code as long as a walk is unfinished."""
 
 
-class StepSummary(NamedTuple):
+class GaitStepSummary(NamedTuple):
     """Section state, durations (s) and length (m) of the last step in a walk, without details."""
 
     section_state: Array
@@ -100,7 +100,7 @@ class StepSummary(NamedTuple):
 class BatchWalkResult(NamedTuple):
     """Results of the walks of all batch elements."""
 
-    step_result: Any  # `StepSummary` or `UnilateralStep` of the last step
+    step_result: Any  # `GaitStepSummary` or `UnilateralStep` of the last step
     outcome: Array
     n_stepped: Array
     n_solver_steps: Array
@@ -111,7 +111,7 @@ def make_result_template(
 ) -> BatchWalkResult:
     """Return zeros with the structure of the walk result of one wheel with `n_legs` legs.
 
-    - `is_detailed`: whether the result contains a `UnilateralStep` instead of a `StepSummary`;
+    - `is_detailed`: whether the result contains a `UnilateralStep` instead of a `GaitStepSummary`;
     - `measures_force_peaks`: whether the `UnilateralStep` contains force peaks.
     """
     float_zero, int_zero = jnp.zeros((), dtype), jnp.zeros((), jnp.int32)
@@ -120,11 +120,11 @@ def make_result_template(
         WheelMotion(*(float_zero,) * 6, leg_zeros, leg_zeros),
         ContactState(airborne_modes, *(airborne_modes > 0,) * 4),
     )
-    step_result: Any = StepSummary(
+    step_result: Any = GaitStepSummary(
         pack_section_state(*final_state), jnp.zeros(3, dtype), float_zero
     )
     if is_detailed:
-        accumulators = LossAccumulators(float_zero, float_zero, float_zero, float_zero)
+        accumulators = EnergyLossAccumulators(float_zero, float_zero, float_zero, float_zero)
         step_result = make_unilateral_step(
             *final_state,
             accumulators,
@@ -142,7 +142,7 @@ class DifferentiableLaneState(NamedTuple):
     q: Array
     v: Array
     # accumulators of this step, and since the last event
-    loss_accumulators: tuple[Array | None, Array | None]
+    energy_loss_accumulators: tuple[Array | None, Array | None]
     time_since_event: Array
     durations: Array
     step_details: Any  # floats of the details
@@ -151,43 +151,50 @@ class DifferentiableLaneState(NamedTuple):
 class LaneState(NamedTuple):
     """State of all batch elements between two iterations of the event loop."""
 
-    interval_state: IntervalState
-    step_counters: StepCounters  # counters of this step; solver steps are counted over the walk
+    contact_interval_state: ContactIntervalState
+    step_counters: GaitStepCounters  # counters of this step; solver steps are counted over the walk
     step_details: UnilateralStepDetails | None  # details of this step, if requested
-    step_loss_accumulators: Array | None  # integrals over this step, rows as in `IntervalState`
+    step_energy_loss_accumulators: (
+        Array | None
+    )  # integrals over this step, rows as in `ContactIntervalState`
     n_stepped: Array
     walk_outcome: Array
 
-    def get_differentiable(self) -> DifferentiableLaneState:
+    def get_differentiable_state(self) -> DifferentiableLaneState:
         """Return the differentiable arrays of the state."""
-        interval_point = self.interval_state.interval_point
+        contact_interval_point = self.contact_interval_state.contact_interval_point
         step_details = eqx.filter(self.step_details, eqx.is_inexact_array)
-        accumulators = self.step_loss_accumulators, self.interval_state.interval_accumulators
+        accumulators = (
+            self.step_energy_loss_accumulators,
+            self.contact_interval_state.interval_accumulators,
+        )
         return DifferentiableLaneState(
-            interval_point.q,
-            interval_point.v,
+            contact_interval_point.q,
+            contact_interval_point.v,
             accumulators,
-            self.interval_state.time_since_event,
+            self.contact_interval_state.time_since_event,
             self.step_counters.durations,
             step_details,
         )
 
-    def replace_differentiable(self, differentiable_state: DifferentiableLaneState) -> "LaneState":
+    def replace_differentiable_state(
+        self, differentiable_state: DifferentiableLaneState
+    ) -> "LaneState":
         """Return the state with its differentiable arrays replaced."""
-        step_accumulators, interval_accumulators = differentiable_state.loss_accumulators
-        interval_point = self.interval_state.interval_point._replace(
+        step_accumulators, interval_accumulators = differentiable_state.energy_loss_accumulators
+        contact_interval_point = self.contact_interval_state.contact_interval_point._replace(
             q=differentiable_state.q, v=differentiable_state.v
         )
-        other_details = eqx.filter(self.step_details, eqx.is_inexact_array, inverse=True)
+        nonfloat_step_details = eqx.filter(self.step_details, eqx.is_inexact_array, inverse=True)
         return self._replace(
-            interval_state=self.interval_state._replace(
-                interval_point=interval_point,
+            contact_interval_state=self.contact_interval_state._replace(
+                contact_interval_point=contact_interval_point,
                 interval_accumulators=interval_accumulators,
                 time_since_event=differentiable_state.time_since_event,
             ),
             step_counters=self.step_counters._replace(durations=differentiable_state.durations),
-            step_details=eqx.combine(differentiable_state.step_details, other_details),
-            step_loss_accumulators=step_accumulators,
+            step_details=eqx.combine(differentiable_state.step_details, nonfloat_step_details),
+            step_energy_loss_accumulators=step_accumulators,
         )
 
 
@@ -202,24 +209,28 @@ class BatchWalkSettings(NamedTuple):
     is_detailed: bool  # whether a `UnilateralStep` is requested
     step_options: StepOptions
     tableau: ButcherTableau | None  # tableau of the batch kernel; None if diffrax integrates
-    has_uneven_ground: bool = False  # whether the input has `N_UNEVEN_COLUMNS`; one step only
+    has_uneven_ground: bool = (
+        False  # whether the input has `N_UNEVEN_GROUND_COLUMNS`; one step only
+    )
     has_restitution: bool = False  # whether the last input column is restitution
     engine_name: str = "lanes"  # name of the engine in the results
     # whether the extrema of normal forces are located; only if details are requested
     measures_force_peaks: bool = False
 
-    def make_dynamics(self, input_columns: Array, contact_state: ContactState) -> ModeDynamics:
+    def make_lane_contact_dynamics(
+        self, input_columns: Array, contact_state: ContactState
+    ) -> ContactModeDynamics:
         """Return the dynamics of all batch elements in their contact states."""
-        s, friction = self.unpack_columns(input_columns)
+        s, friction = self.unpack_input_columns(input_columns)
         dynamics_arguments = (
             self.has_one_sided_stoppers,
             contact_state,
             self.is_detailed,
             self.extract_next_line_tilt(input_columns),
         )
-        return make_mode_dynamics(s, friction, *dynamics_arguments)
+        return make_contact_mode_dynamics(s, friction, *dynamics_arguments)
 
-    def unpack_columns(self, input_columns: Array) -> tuple[Symbols, Friction]:
+    def unpack_input_columns(self, input_columns: Array) -> tuple[Symbols, Friction]:
         """Return wheel symbols and friction coefficients from the input columns, (inputs, batch).
 
         On uneven ground, the second result is a pair: friction of the foot that landed last, and of
@@ -248,43 +259,47 @@ class BatchWalkSettings(NamedTuple):
     def begin_walk(self, input_columns: Array, section_state: Array) -> LaneState:
         """Return the state of all batch elements at the first landing, before the impact."""
         motion, contact_state = unpack_section_state(
-            self.unpack_columns(input_columns)[0], section_state
+            self.unpack_input_columns(input_columns)[0], section_state
         )
         if self.measures_force_peaks:
-            unit_signs = jnp.stack([jnp.ones_like(motion.x)] * len(ForceRates._fields))
+            unit_signs = jnp.stack([jnp.ones_like(motion.x)] * len(NormalForceRates._fields))
             contact_state = contact_state._replace(force_rate_signs=unit_signs)
-        mode_dynamics = self.make_dynamics(input_columns, contact_state)
-        interval_state = make_zeros_like_output(
-            lambda: self.begin_contact_interval(mode_dynamics, motion)
+        contact_mode_dynamics = self.make_lane_contact_dynamics(input_columns, contact_state)
+        contact_interval_state = make_zeros_like_output(
+            lambda: self.begin_contact_interval(contact_mode_dynamics, motion)
         )
         q, v = pack_coordinates(motion)
-        interval_point = IntervalPoint(
-            q, v, jnp.full_like(interval_state.interval_point.dynamics_rows, jnp.inf)
+        contact_interval_point = ContactIntervalPoint(
+            q,
+            v,
+            jnp.full_like(contact_interval_state.contact_interval_point.dynamics_rows, jnp.inf),
         )
-        interval_state = interval_state._replace(
-            interval_point=interval_point,
+        contact_interval_state = contact_interval_state._replace(
+            contact_interval_point=contact_interval_point,
             contact_state=contact_state,
-            lane_status=interval_state.lane_status + LaneStatus.EVENT,
+            lane_status=contact_interval_state.lane_status + LaneStatus.EVENT,
         )
         return LaneState(
-            interval_state,
+            contact_interval_state,
             *self._init_step_records(section_state[0]),
-            interval_state.triggered_guard_index * 0,
-            interval_state.triggered_guard_index * 0 + STATUS_UNFINISHED,
+            contact_interval_state.triggered_guard_index * 0,
+            contact_interval_state.triggered_guard_index * 0 + STATUS_UNFINISHED,
         )
 
     def begin_contact_interval(
-        self, mode_dynamics: ModeDynamics, motion: WheelMotion
-    ) -> IntervalState:
+        self, contact_mode_dynamics: ContactModeDynamics, motion: WheelMotion
+    ) -> ContactIntervalState:
         """Return the state at the start of an interval between events, without derivatives."""
-        mode_dynamics, motion, dt0 = stop_gradients((mode_dynamics, motion, self.step_options.dt0))
+        contact_mode_dynamics, motion, dt0 = stop_gradients(
+            (contact_mode_dynamics, motion, self.step_options.dt0)
+        )
         if self.tableau is None:
-            return init_diffrax_interval(mode_dynamics, motion)
-        return init_interval(mode_dynamics, motion, dt0)
+            return init_diffrax_contact_interval(contact_mode_dynamics, motion)
+        return init_contact_interval(contact_mode_dynamics, motion, dt0)
 
     def _init_step_records(
         self, lane_template: Array
-    ) -> tuple[StepCounters, UnilateralStepDetails | None, Array | None]:
+    ) -> tuple[GaitStepCounters, UnilateralStepDetails | None, Array | None]:
         """Return step counters, step details and loss accumulators at the start of a step.
 
         Details and accumulators are None if no details are requested.
@@ -308,58 +323,65 @@ class BatchWalkSettings(NamedTuple):
 
         If a walk ends, its outcome is set. Running elements are unchanged.
         """
-        interval_state = lane_state.interval_state
+        contact_interval_state = lane_state.contact_interval_state
         guard_layout = make_guard_layout(
             self.n_legs, self.has_one_sided_stoppers, self.measures_force_peaks
         )
-        s, friction = self.unpack_columns(input_columns)
-        dynamics_before = self.make_dynamics(input_columns, interval_state.contact_state)
-        rates = lax.stop_gradient(interval_state.interval_point.v)
-        accelerations = lax.stop_gradient(interval_state.interval_point.dynamics_rows[: len(rates)])
+        s, friction = self.unpack_input_columns(input_columns)
+        dynamics_before = self.make_lane_contact_dynamics(
+            input_columns, contact_interval_state.contact_state
+        )
+        rates = lax.stop_gradient(contact_interval_state.contact_interval_point.v)
+        accelerations = lax.stop_gradient(
+            contact_interval_state.contact_interval_point.dynamics_rows[: len(rates)]
+        )
         is_resting = is_wheel_at_rest(s, rates, accelerations, self.step_options.atol)
         guard_arguments = (
             guard_layout,
             dynamics_before,
             rates,
-            interval_state.triggered_guard_index,
+            contact_interval_state.triggered_guard_index,
             self.step_options.atol,
         )
-        interval_state = interval_state._replace(
+        contact_interval_state = contact_interval_state._replace(
             triggered_guard_index=choose_stopping_guard(*guard_arguments)
         )
-        step_counters = count_interval(
+        step_counters = count_contact_interval(
             lane_state.step_counters,
-            interval_state.contact_state,
-            interval_state.time_since_event,
-            interval_state.n_solver_steps,
+            contact_interval_state.contact_state,
+            contact_interval_state.time_since_event,
+            contact_interval_state.n_solver_steps,
         )
-        step_details, step_accumulators = lane_state.step_details, lane_state.step_loss_accumulators
+        step_details, step_accumulators = (
+            lane_state.step_details,
+            lane_state.step_energy_loss_accumulators,
+        )
         if (
             step_details is not None
             and step_accumulators is not None
-            and interval_state.interval_accumulators is not None
+            and contact_interval_state.interval_accumulators is not None
         ):
             step_details = record_end_stopper_force(
                 step_details,
                 dynamics_before,
-                unpack_motion(interval_state.interval_point),
-                interval_state.time_since_event,
+                unpack_motion(contact_interval_state.contact_interval_point),
+                contact_interval_state.time_since_event,
             )
-            step_accumulators = step_accumulators + interval_state.interval_accumulators
-        is_at_event = interval_state.lane_status == LaneStatus.EVENT
+            step_accumulators = step_accumulators + contact_interval_state.interval_accumulators
+        is_at_event = contact_interval_state.lane_status == LaneStatus.EVENT
         has_landed = is_at_event & (
-            interval_state.triggered_guard_index == guard_layout.foremost_landing_guard
+            contact_interval_state.triggered_guard_index == guard_layout.foremost_landing_guard
         )
         n_events = step_counters.n_events
         if step_details is not None and step_details.force_peaks is not None:
-            n_events = n_events + step_details.force_peaks.n_extrema
+            n_events = n_events + step_details.force_peaks.n_force_extrema
         outcome_arguments = (
             step_counters._replace(n_events=n_events),
             guard_layout,
             is_at_event,
-            interval_state.triggered_guard_index,
+            contact_interval_state.triggered_guard_index,
             has_landed,
-            interval_state.lane_status,
+            contact_interval_state.lane_status,
         )
         outcome = determine_interval_outcome(
             *outcome_arguments, is_resting, self.max_events
@@ -367,33 +389,45 @@ class BatchWalkSettings(NamedTuple):
         n_stepped = lane_state.n_stepped + has_landed
         has_ended = (outcome != Outcome.STEPPED) | (has_landed & (n_stepped >= self.n_steps))
         ended_lane_state = LaneState(
-            interval_state, step_counters, step_details, step_accumulators, n_stepped, outcome
+            contact_interval_state,
+            step_counters,
+            step_details,
+            step_accumulators,
+            n_stepped,
+            outcome,
         )
 
         # A landing of the foremost foot opens the next step. Then every event is processed.
-        begins_step, motion = has_landed & ~has_ended, unpack_motion(interval_state.interval_point)
-        opened_motion, opened_contact_state = unpack_section_state(
-            s, pack_section_state(motion, interval_state.contact_state)
+        begins_step, motion = (
+            has_landed & ~has_ended,
+            unpack_motion(contact_interval_state.contact_interval_point),
         )
-        opened_contact_state = opened_contact_state._replace(
-            force_rate_signs=interval_state.contact_state.force_rate_signs
+        motion_at_step_start, contact_state_at_step_start = unpack_section_state(
+            s, pack_section_state(motion, contact_interval_state.contact_state)
+        )
+        contact_state_at_step_start = contact_state_at_step_start._replace(
+            force_rate_signs=contact_interval_state.contact_state.force_rate_signs
         )
         motion, contact_state = select_trees_by_condition(
             begins_step,
-            (opened_motion, opened_contact_state),
-            (motion, interval_state.contact_state),
+            (motion_at_step_start, contact_state_at_step_start),
+            (motion, contact_interval_state.contact_state),
         )
-        new_counters, *new_records = self._init_step_records(motion.x)
-        new_counters = new_counters._replace(n_solver_steps=step_counters.n_solver_steps)
+        counters_after_event, *records_after_event = self._init_step_records(motion.x)
+        counters_after_event = counters_after_event._replace(
+            n_solver_steps=step_counters.n_solver_steps
+        )
         step_counters, step_details, step_accumulators = select_trees_by_condition(
             begins_step,
-            (new_counters, *new_records),
+            (counters_after_event, *records_after_event),
             (step_counters, step_details, step_accumulators),
         )
         guard_index = jnp.where(
-            begins_step, guard_layout.first_landing_guard, interval_state.triggered_guard_index
+            begins_step,
+            guard_layout.first_landing_guard,
+            contact_interval_state.triggered_guard_index,
         )
-        law_arguments = (
+        contact_law_arguments = (
             s,
             friction,
             self.step_options,
@@ -401,7 +435,7 @@ class BatchWalkSettings(NamedTuple):
             self.is_detailed,
         )
         contact_law = make_contact_law(
-            *law_arguments,
+            *contact_law_arguments,
             self.extract_restitution(input_columns),
             self.extract_next_line_tilt(input_columns),
         )
@@ -425,9 +459,9 @@ class BatchWalkSettings(NamedTuple):
             motion_after, contact_state_after = select_trees_by_condition(
                 is_contact_event,
                 state_after_event,
-                (motion, contact_state.continue_unchanged()),
+                (motion, contact_state.continue_with_same_contacts()),
             )
-            dynamics_after = self.make_dynamics(input_columns, contact_state_after)
+            dynamics_after = self.make_lane_contact_dynamics(input_columns, contact_state_after)
             force_rate_signs = update_force_rate_signs(
                 dynamics_after, motion_after, contact_state.force_rate_signs, is_rate_zero
             )
@@ -435,14 +469,17 @@ class BatchWalkSettings(NamedTuple):
                 motion=motion_after,
                 contact_state=contact_state_after._replace(force_rate_signs=force_rate_signs),
             )
-        mode_dynamics = self.make_dynamics(input_columns, event_result.contact_state)
-        next_interval = self.begin_contact_interval(mode_dynamics, event_result.motion)
+        contact_mode_dynamics = self.make_lane_contact_dynamics(
+            input_columns, event_result.contact_state
+        )
+        next_interval = self.begin_contact_interval(contact_mode_dynamics, event_result.motion)
         q, v = pack_coordinates(event_result.motion)
         lane_status = jnp.where(
             event_outcome != Outcome.STEPPED, event_outcome, next_interval.lane_status
         )
         next_interval = next_interval._replace(
-            interval_point=next_interval.interval_point._replace(q=q, v=v), lane_status=lane_status
+            contact_interval_point=next_interval.contact_interval_point._replace(q=q, v=v),
+            lane_status=lane_status,
         )
         if step_details is not None:
             step_details = record_event(
@@ -450,7 +487,7 @@ class BatchWalkSettings(NamedTuple):
             )
             zero_duration = jnp.zeros_like(motion.x)
             step_details = record_end_stopper_force(
-                step_details, mode_dynamics, event_result.motion, zero_duration
+                step_details, contact_mode_dynamics, event_result.motion, zero_duration
             )
         step_counters = step_counters._replace(n_events=step_counters.n_events + n_contact_events)
         continued_lane_state = LaneState(
@@ -461,7 +498,7 @@ class BatchWalkSettings(NamedTuple):
             n_stepped,
             lane_state.walk_outcome,
         )
-        has_interval_ended = (interval_state.lane_status != LaneStatus.RUNNING) & (
+        has_interval_ended = (contact_interval_state.lane_status != LaneStatus.RUNNING) & (
             lane_state.walk_outcome == STATUS_UNFINISHED
         )
         return select_trees_by_condition(
@@ -473,14 +510,17 @@ class BatchWalkSettings(NamedTuple):
     def compute_step_result(self, lane_state: LaneState, next_line_tilt: Array | None) -> Any:
         """Return the results of the last step of all batch elements, whose walks have ended."""
         final_state = (
-            unpack_motion(lane_state.interval_state.interval_point),
-            lane_state.interval_state.contact_state,
+            unpack_motion(lane_state.contact_interval_state.contact_interval_point),
+            lane_state.contact_interval_state.contact_state,
         )
         outcome = lane_state.walk_outcome
-        if lane_state.step_details is not None and lane_state.step_loss_accumulators is not None:
-            accumulators = LossAccumulators(
-                jnp.zeros_like(lane_state.step_loss_accumulators[0]),
-                *lane_state.step_loss_accumulators,
+        if (
+            lane_state.step_details is not None
+            and lane_state.step_energy_loss_accumulators is not None
+        ):
+            accumulators = EnergyLossAccumulators(
+                jnp.zeros_like(lane_state.step_energy_loss_accumulators[0]),
+                *lane_state.step_energy_loss_accumulators,
             )
             return make_unilateral_step(
                 *final_state,
@@ -496,15 +536,15 @@ class BatchWalkSettings(NamedTuple):
     def summarize_step(
         self,
         final_state: tuple[WheelMotion, ContactState],
-        step_counters: StepCounters,
+        step_counters: GaitStepCounters,
         outcome: Array,
         next_line_tilt: Array | None,
-    ) -> StepSummary:
+    ) -> GaitStepSummary:
         """Return the section state, durations and length of a step that has ended."""
         step_length = jnp.where(
             outcome == Outcome.STEPPED, compute_landing_position(self.n_legs, final_state[0]), 0.0
         )
-        return StepSummary(
+        return GaitStepSummary(
             make_final_section_state(*final_state, outcome, next_line_tilt),
             step_counters.durations,
             step_length,
@@ -541,7 +581,7 @@ class BatchWalkSettings(NamedTuple):
 
 def record_end_stopper_force(
     step_details: UnilateralStepDetails,
-    mode_dynamics: ModeDynamics,
+    contact_mode_dynamics: ContactModeDynamics,
     motion: WheelMotion,
     duration: Array,
 ) -> UnilateralStepDetails:
@@ -549,8 +589,12 @@ def record_end_stopper_force(
 
     - `duration`: duration that is added to the entry for the present contact modes, s.
     """
-    stopper_force = compute_min_stopper_force(mode_dynamics, compute_forces(mode_dynamics, motion))
-    return record_interval(step_details, mode_dynamics.slot_modes, duration, stopper_force)
+    stopper_force = compute_min_stopper_force(
+        contact_mode_dynamics, compute_forces(contact_mode_dynamics, motion)
+    )
+    return record_contact_interval(
+        step_details, contact_mode_dynamics.slot_modes, duration, stopper_force
+    )
 
 
 def init_lane_states(
@@ -581,27 +625,31 @@ def process_and_integrate(
     state_after_events = walk_settings.process_events(input_columns, lane_state)
     tableau = walk_settings.tableau
     if tableau is None:
-        interval_state = integrate_by_diffrax(
-            walk_settings.make_dynamics,
+        contact_interval_state = integrate_by_diffrax(
+            walk_settings.make_lane_contact_dynamics,
             input_columns,
-            state_after_events.interval_state,
+            state_after_events.contact_interval_state,
             walk_settings.step_options,
         )
-        return state_after_events, state_after_events._replace(interval_state=interval_state)
+        return state_after_events, state_after_events._replace(
+            contact_interval_state=contact_interval_state
+        )
     has_unfinished_walk = state_after_events.walk_outcome == STATUS_UNFINISHED
-    dynamics_fn = lambda input_columns_at: walk_settings.make_dynamics(
-        input_columns_at, state_after_events.interval_state.contact_state
+    make_contact_dynamics = lambda input_columns_at: walk_settings.make_lane_contact_dynamics(
+        input_columns_at, state_after_events.contact_interval_state.contact_state
     )
     has_unfinished_walk = has_unfinished_walk & (not waits_for_events)
-    interval_state = integrate_interval(
-        dynamics_fn,
+    contact_interval_state = integrate_contact_interval(
+        make_contact_dynamics,
         input_columns,
-        state_after_events.interval_state,
+        state_after_events.contact_interval_state,
         has_unfinished_walk,
         walk_settings.step_options,
         tableau,
     )
-    return state_after_events, state_after_events._replace(interval_state=interval_state)
+    return state_after_events, state_after_events._replace(
+        contact_interval_state=contact_interval_state
+    )
 
 
 def run_walks(

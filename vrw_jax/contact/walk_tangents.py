@@ -19,9 +19,9 @@ from jaxtyping import Array
 
 from vrw_jax.contact.batch_integrator import (
     N_ACCUMULATOR_ROWS,
+    ContactIntervalPoint,
+    ContactIntervalState,
     DynamicsFn,
-    IntervalPoint,
-    IntervalState,
     LaneStatus,
     advance_running_lanes,
     complete_solver_step,
@@ -30,7 +30,7 @@ from vrw_jax.contact.batch_integrator import (
     evaluate_guards_at_point,
     iterate_until_stopped,
 )
-from vrw_jax.contact.contact_state import ModeDynamics, compute_guard_scales
+from vrw_jax.contact.contact_state import ContactModeDynamics, compute_guard_scales
 from vrw_jax.contact.walk_kernel import (
     STATUS_UNFINISHED,
     BatchWalkResult,
@@ -67,11 +67,11 @@ class _LaneTangent(NamedTuple):
 
         The dynamics rows are accelerations and, if requested, accumulator rates.
         """
-        accumulators, interval_accumulators = lane_tangents.loss_accumulators
+        accumulators, interval_accumulators = lane_tangents.energy_loss_accumulators
         other_tangents: Any = lane_tangents._asdict() | {
             "q": None,
             "v": None,
-            "loss_accumulators": (accumulators, None),
+            "energy_loss_accumulators": (accumulators, None),
             "time_since_event": None,
         }
         return cls(
@@ -85,13 +85,16 @@ class _LaneTangent(NamedTuple):
             DifferentiableLaneState(**other_tangents),
         )
 
-    def to_lane_tangents(self) -> DifferentiableLaneState:
+    def convert_to_lane_tangents(self) -> DifferentiableLaneState:
         """Return the tangent of the differentiable state of each batch element."""
         q, v, interval_accumulators, _, time = self.interval_tangent
         return self.other_tangents._replace(
             q=q,
             v=v,
-            loss_accumulators=(self.other_tangents.loss_accumulators[0], interval_accumulators),
+            energy_loss_accumulators=(
+                self.other_tangents.energy_loss_accumulators[0],
+                interval_accumulators,
+            ),
             time_since_event=time,
         )
 
@@ -102,46 +105,46 @@ class TangentBatch(NamedTuple):
     n_tangents: Array  # number of tangents of each batch element
     n_column_tangents: Array  # number of leading tangents whose columns may vary
     column_tangents: Array
-    # all numbers of a `_LaneTangent`, see `_pack_rows`, (tangents, rows, batch)
+    # all numbers of a `_LaneTangent`, see `_pack_tree_into_rows`, (tangents, rows, batch)
     tangent_rows: Array
 
-    def allocate_rows(self, n_rows: int) -> Array:
+    def allocate_tangent_rows(self, n_rows: int) -> Array:
         """Return an uninitialized array for all tangents, (tangents, n_rows, batch)."""
         return lax.empty(
             (len(self.column_tangents), n_rows, *self.n_tangents.shape), self.column_tangents.dtype
         )
 
-    def map_tangents(
+    def map_tangents_sequentially(
         self,
-        row_function: Callable[[Array, Array], Any],
+        compute_new_rows: Callable[[Array, Array], Any],
         tangent_rows: Array,
-        first_row: Array | int = 0,
+        first_replaced_row: Array | int = 0,
     ) -> Array:
         """Return the tangents after a function has been applied to each, (tangents, rows, batch).
 
-        The results of the function replace the rows from `first_row` onward.
+        The results of the function replace the rows from `first_replaced_row` onward.
 
-        - `row_function`: function of the index of a tangent and its rows that returns a tree of new
-          rows.
+        - `compute_new_rows`: function of the index of a tangent and its rows that returns a tree of
+          new rows.
         """
         should_continue = lambda state: jnp.any(state[0] < self.n_tangents)
 
-        def update_tangent(state: tuple[Array, Array]) -> tuple[Array, Array]:
+        def update_tangent_rows(state: tuple[Array, Array]) -> tuple[Array, Array]:
             k, tangent_rows = state
-            new_rows = _pack_rows(
-                row_function(k, lax.dynamic_index_in_dim(tangent_rows, k, 0, False))
+            new_rows = _pack_tree_into_rows(
+                compute_new_rows(k, lax.dynamic_index_in_dim(tangent_rows, k, 0, False))
             )
             # Stacking row by row keeps the rows in registers.
             new_rows = jnp.stack([new_rows[i] for i in range(len(new_rows))])
-            start_indices = k, jnp.int32(first_row), jnp.int32(0)
+            start_indices = k, jnp.int32(first_replaced_row), jnp.int32(0)
             return k + 1, lax.dynamic_update_slice(tangent_rows, new_rows[None], start_indices)
 
         return lax.while_loop(
-            should_continue, update_tangent, (jnp.zeros((), jnp.int32), tangent_rows)
+            should_continue, update_tangent_rows, (jnp.zeros((), jnp.int32), tangent_rows)
         )[1]
 
 
-def _pack_rows(array_tree: Any) -> Array:
+def _pack_tree_into_rows(array_tree: Any) -> Array:
     """Return all arrays of a tree, concatenated to one array (rows, batch)."""
     return jnp.concatenate(
         [
@@ -151,24 +154,26 @@ def _pack_rows(array_tree: Any) -> Array:
     )
 
 
-def _unpack_rows(tangent_rows: Array, tangent_template: Any) -> Any:
+def _unpack_tree_from_rows(tangent_rows: Array, tangent_template: Any) -> Any:
     """Return the rows of an array as a tree with the structure of `tangent_template`.
 
-    The function is the inverse of `_pack_rows`.
+    The function is the inverse of `_pack_tree_into_rows`.
     """
-    leaves, structure = jax.tree.flatten(tangent_template)
+    leaves, tree_structure = jax.tree.flatten(tangent_template)
     arrays, row_offset = [], 0
     for leaf in leaves:
         n_leaf_rows = math.prod(leaf.shape[:-1])
         leaf_rows = tangent_rows[..., row_offset : row_offset + n_leaf_rows, :]
         arrays.append(leaf_rows.reshape(*tangent_rows.shape[:-2], *leaf.shape))
         row_offset += n_leaf_rows
-    return jax.tree.unflatten(structure, arrays)
+    return jax.tree.unflatten(tree_structure, arrays)
 
 
 def _unpack_tangent(tangent_rows: Array, k: Array, tangent_template: Any) -> Any:
     """Return the tangent with index `k` as a tree with the structure of `tangent_template`."""
-    return _unpack_rows(lax.dynamic_index_in_dim(tangent_rows, k, 0, False), tangent_template)
+    return _unpack_tree_from_rows(
+        lax.dynamic_index_in_dim(tangent_rows, k, 0, False), tangent_template
+    )
 
 
 def walk_with_tangents(
@@ -192,7 +197,7 @@ def walk_with_tangents(
     input_columns, section_state, is_valid = walk_settings.replace_invalid_lanes(
         input_columns, section_state
     )
-    count_rows = lambda array_tree: len(_pack_rows(array_tree))
+    count_rows = lambda array_tree: len(_pack_tree_into_rows(array_tree))
 
     def begin_walk(
         input_columns: Array, section_state: Array
@@ -200,7 +205,7 @@ def walk_with_tangents(
         lane_state = walk_settings.deactivate_invalid_lanes(
             walk_settings.begin_walk(input_columns, section_state), is_valid
         )
-        return lane_state.get_differentiable(), lane_state
+        return lane_state.get_differentiable_state(), lane_state
 
     lane_tangents, pushforward, lane_state = jax.linearize(
         begin_walk, input_columns, section_state, has_aux=True
@@ -226,8 +231,8 @@ def walk_with_tangents(
         dynamics_rows,
     )
     tangents = tangents._replace(
-        tangent_rows=tangents.map_tangents(
-            make_start_tangent, tangents.allocate_rows(count_rows(tangent_template))
+        tangent_rows=tangents.map_tangents_sequentially(
+            make_start_tangent, tangents.allocate_tangent_rows(count_rows(tangent_template))
         )
     )
 
@@ -240,45 +245,47 @@ def walk_with_tangents(
             input_columns: Array, differentiable: DifferentiableLaneState
         ) -> tuple[DifferentiableLaneState, LaneState]:
             next_state = walk_settings.process_events(
-                input_columns, lane_state.replace_differentiable(differentiable)
+                input_columns, lane_state.replace_differentiable_state(differentiable)
             )
-            return next_state.get_differentiable(), next_state
+            return next_state.get_differentiable_state(), next_state
 
         _, pushforward, next_state = jax.linearize(
-            process_events_from, input_columns, lane_state.get_differentiable(), has_aux=True
+            process_events_from, input_columns, lane_state.get_differentiable_state(), has_aux=True
         )
 
-        def push_through_event(k: Array, tangent_row: Array) -> _LaneTangent:
-            tangent = _unpack_rows(tangent_row, tangent_template)
+        def push_tangents_through_event(k: Array, tangent_row: Array) -> _LaneTangent:
+            tangent = _unpack_tree_from_rows(tangent_row, tangent_template)
             return _LaneTangent.from_lane_tangents(
                 pushforward(
                     _unpack_tangent(input_column_tangents, k, input_columns),
-                    tangent.to_lane_tangents(),
+                    tangent.convert_to_lane_tangents(),
                 ),
                 tangent.interval_tangent.dynamics_rows,
             )
 
         tangents = tangents._replace(
-            tangent_rows=tangents.map_tangents(push_through_event, tangents.tangent_rows)
+            tangent_rows=tangents.map_tangents_sequentially(
+                push_tangents_through_event, tangents.tangent_rows
+            )
         )
         is_unfinished = next_state.walk_outcome == STATUS_UNFINISHED
-        dynamics_fn = lambda c: walk_settings.make_dynamics(
-            c, next_state.interval_state.contact_state
+        make_contact_dynamics = lambda c: walk_settings.make_lane_contact_dynamics(
+            c, next_state.contact_interval_state.contact_state
         )
         integration_arguments = (
-            dynamics_fn,
+            make_contact_dynamics,
             input_columns,
-            next_state.interval_state,
+            next_state.contact_interval_state,
             tangents,
             tangent_template.interval_tangent,
             is_unfinished,
             walk_settings.step_options,
             tableau,
         )
-        interval_state, tangent_rows = _integrate_with_tangents(*integration_arguments)
-        return next_state._replace(interval_state=interval_state), tangents._replace(
-            tangent_rows=tangent_rows
-        )
+        contact_interval_state, tangent_rows = _integrate_with_tangents(*integration_arguments)
+        return next_state._replace(
+            contact_interval_state=contact_interval_state
+        ), tangents._replace(tangent_rows=tangent_rows)
 
     should_continue = lambda state: jnp.any(state[0].walk_outcome == STATUS_UNFINISHED)
     lane_state, tangents = lax.while_loop(
@@ -290,14 +297,14 @@ def walk_with_tangents(
     ) -> tuple[Any, Any]:
         return eqx.partition(
             walk_settings.compute_step_result(
-                lane_state.replace_differentiable(differentiable), next_line_tilt
+                lane_state.replace_differentiable_state(differentiable), next_line_tilt
             ),
             eqx.is_inexact_array,
         )
 
-    float_leaves, pushforward, other_leaves = jax.linearize(
+    float_leaves, pushforward, nonfloat_leaves = jax.linearize(
         partition_step_result,
-        lane_state.get_differentiable(),
+        lane_state.get_differentiable_state(),
         walk_settings.extract_next_line_tilt(input_columns),
         has_aux=True,
     )
@@ -305,68 +312,73 @@ def walk_with_tangents(
         _unpack_tangent(input_column_tangents, k, input_columns)
     )
     push_result_tangent = lambda k, _: pushforward(
-        _unpack_tangent(tangents.tangent_rows, k, tangent_template).to_lane_tangents(),
+        _unpack_tangent(tangents.tangent_rows, k, tangent_template).convert_to_lane_tangents(),
         tilt_tangent(k),
     )
-    result_tangents = tangents.map_tangents(
-        push_result_tangent, tangents.allocate_rows(count_rows(float_leaves))
+    result_tangents = tangents.map_tangents_sequentially(
+        push_result_tangent, tangents.allocate_tangent_rows(count_rows(float_leaves))
     )
-    step_result = eqx.combine(float_leaves, other_leaves)
+    step_result = eqx.combine(float_leaves, nonfloat_leaves)
     walk_result = BatchWalkResult(
         step_result,
         lane_state.walk_outcome,
         lane_state.n_stepped,
         lane_state.step_counters.n_solver_steps,
     )
-    return walk_result, _unpack_rows(result_tangents, float_leaves)
+    return walk_result, _unpack_tree_from_rows(result_tangents, float_leaves)
 
 
 def _integrate_with_tangents(
-    dynamics_fn: DynamicsFn,
+    make_contact_dynamics: DynamicsFn,
     input_columns: Array,
-    initial_state: IntervalState,
+    initial_state: ContactIntervalState,
     tangents: TangentBatch,
     tangent_template: _IntervalTangent,
     has_unfinished_walk: Array,
     options: StepOptions,
     tableau: ButcherTableau,
-) -> tuple[IntervalState, Array]:
-    """Return the result of `integrate_interval`, and the tangents at its end.
+) -> tuple[ContactIntervalState, Array]:
+    """Return the result of `integrate_contact_interval`, and the tangents at its end.
 
     The tangents have the shape (tangents, rows, batch).
     """
-    mode_dynamics = dynamics_fn(input_columns)
-    guard_scales, last_stage = compute_guard_scales(mode_dynamics), len(tableau.stage_nodes) - 1
-    options = compute_wheel_units(mode_dynamics.s).scale_times_to_seconds(options)
-    max_stable_step_size = _compute_max_stable_step_size(mode_dynamics, tableau)
+    contact_mode_dynamics = make_contact_dynamics(input_columns)
+    guard_scales, last_stage = (
+        compute_guard_scales(contact_mode_dynamics),
+        len(tableau.stage_nodes) - 1,
+    )
+    options = compute_wheel_units(contact_mode_dynamics.s).scale_times_to_seconds(options)
+    max_stable_step_size = _compute_max_stable_step_size(contact_mode_dynamics, tableau)
 
-    def try_solver_step(state: tuple[IntervalState, Array]) -> tuple[IntervalState, Array]:
-        interval_state, tangent_rows = state
+    def try_solver_step(
+        state: tuple[ContactIntervalState, Array],
+    ) -> tuple[ContactIntervalState, Array]:
+        contact_interval_state, tangent_rows = state
         h = jnp.where(
-            interval_state.event_bracket.is_search_active,
-            interval_state.h,
-            jnp.minimum(interval_state.h, max_stable_step_size),
+            contact_interval_state.event_bracket.is_event_search_active,
+            contact_interval_state.h,
+            jnp.minimum(contact_interval_state.h, max_stable_step_size),
         )
-        interval_state = interval_state._replace(h=h)
-        stage_rows, stage_row_tangents = _evaluate_stages(
-            dynamics_fn,
+        contact_interval_state = contact_interval_state._replace(h=h)
+        stage_rows, stage_row_tangents = _evaluate_solver_stages(
+            make_contact_dynamics,
             input_columns,
-            interval_state,
+            contact_interval_state,
             tangents._replace(tangent_rows=tangent_rows),
             tangent_template,
             tableau,
         )
         attempted_step = complete_solver_step(
-            mode_dynamics, tableau, options, interval_state, stage_rows
+            contact_mode_dynamics, tableau, options, contact_interval_state, stage_rows
         )
         next_interval = advance_running_lanes(
-            interval_state, attempted_step, guard_scales, tableau, options
+            contact_interval_state, attempted_step, guard_scales, tableau, options
         )
-        is_state_updated = next_interval.time_since_event != interval_state.time_since_event
-        n = len(interval_state.interval_point.q)
+        is_state_updated = next_interval.time_since_event != contact_interval_state.time_since_event
+        n = len(contact_interval_state.contact_interval_point.q)
 
         def propagate_to_end(k: Array, tangent_row: Array) -> _IntervalTangent:
-            start_tangent = _unpack_rows(tangent_row, tangent_template)
+            start_tangent = _unpack_tree_from_rows(tangent_row, tangent_template)
             stage_tangents = lax.dynamic_index_in_dim(stage_row_tangents, k, 0, False).reshape(
                 -1, *tangent_template.dynamics_rows.shape
             )
@@ -376,12 +388,12 @@ def _integrate_with_tangents(
                 start_tangent.q,
                 start_tangent.v,
                 stage_tangents[:, :n],
-                interval_state.h,
+                contact_interval_state.h,
             )
             interval_accumulators = start_tangent.interval_accumulators
             if interval_accumulators is not None:
                 weights = tableau.stage_matrix[last_stage]
-                interval_accumulators = interval_accumulators + interval_state.h * sum(
+                interval_accumulators = interval_accumulators + contact_interval_state.h * sum(
                     weights[j] * stage_tangents[j, n:] for j in range(last_stage)
                 )
             end_tangent = _IntervalTangent(
@@ -397,24 +409,29 @@ def _integrate_with_tangents(
                 start_tangent._replace(dynamics_rows=stage_tangents[0]),
             )
 
-        return next_interval, tangents.map_tangents(propagate_to_end, tangent_rows)
+        return next_interval, tangents.map_tangents_sequentially(propagate_to_end, tangent_rows)
 
     is_running = lambda state: state[0].lane_status == LaneStatus.RUNNING
-    interval_state, tangent_rows = iterate_until_stopped(
+    contact_interval_state, tangent_rows = iterate_until_stopped(
         is_running, has_unfinished_walk, try_solver_step, (initial_state, tangents.tangent_rows)
     )
-    return interval_state, tangents.map_tangents(
+    return contact_interval_state, tangents.map_tangents_sequentially(
         _make_event_shift(
-            dynamics_fn, input_columns, initial_state, interval_state, tangents, tangent_template
+            make_contact_dynamics,
+            input_columns,
+            initial_state,
+            contact_interval_state,
+            tangents,
+            tangent_template,
         ),
         tangent_rows,
     )
 
 
-def _evaluate_stages(
-    dynamics_fn: DynamicsFn,
+def _evaluate_solver_stages(
+    make_contact_dynamics: DynamicsFn,
     input_columns: Array,
-    interval_state: IntervalState,
+    contact_interval_state: ContactIntervalState,
     tangents: TangentBatch,
     tangent_template: _IntervalTangent,
     tableau: ButcherTableau,
@@ -424,10 +441,13 @@ def _evaluate_stages(
     The dynamics rows are accelerations, contact quantities and, if requested, accumulator rates.
     The tangents are computed one after another.
     """
-    interval_point, h = interval_state.interval_point, interval_state.h
+    contact_interval_point, h = (
+        contact_interval_state.contact_interval_point,
+        contact_interval_state.h,
+    )
     n_dynamics_rows, last_stage = len(tangent_template.dynamics_rows), len(tableau.stage_nodes) - 1
-    is_at_interval_start = (interval_state.lane_status == LaneStatus.RUNNING) & (
-        interval_state.time_since_event == 0.0
+    is_at_interval_start = (contact_interval_state.lane_status == LaneStatus.RUNNING) & (
+        contact_interval_state.time_since_event == 0.0
     )
 
     def evaluate_stage_with_tangents(
@@ -436,17 +456,17 @@ def _evaluate_stages(
         i, stage_rows, stage_row_tangents = state
 
         stage_coordinates = compute_stage_state(
-            tableau, i, interval_point.q, interval_point.v, stage_rows, h
+            tableau, i, contact_interval_point.q, contact_interval_point.v, stage_rows, h
         )
 
-        def evaluate_rows(input_columns: Array, q: Array, v: Array) -> tuple[Array, Array]:
-            rows = evaluate_dynamics(dynamics_fn(input_columns), q, v)
+        def evaluate_dynamics_rows(input_columns: Array, q: Array, v: Array) -> tuple[Array, Array]:
+            rows = evaluate_dynamics(make_contact_dynamics(input_columns), q, v)
             n_accumulator_rows = n_dynamics_rows - len(q)
             differentiated_rows = rows[: len(q)], rows[len(rows) - n_accumulator_rows :]
             return jnp.concatenate(differentiated_rows), rows
 
         _, pushforward, stage_row = jax.linearize(
-            evaluate_rows, input_columns, *stage_coordinates, has_aux=True
+            evaluate_dynamics_rows, input_columns, *stage_coordinates, has_aux=True
         )
         # A second linearization removes the terms of the inputs, which most tangents keep constant.
         zero_input_tangent = jnp.zeros_like(input_columns)
@@ -454,9 +474,9 @@ def _evaluate_stages(
             lambda q, v: pushforward(zero_input_tangent, q, v), *stage_coordinates
         )
 
-        def propagate_tangent(k: Array, known_rows: Array) -> Array:
+        def propagate_tangent(k: Array, previous_stage_rows: Array) -> Array:
             tangent = _unpack_tangent(tangents.tangent_rows, k, tangent_template)
-            previous_rows = known_rows.reshape(-1, *tangent_template.dynamics_rows.shape)
+            previous_rows = previous_stage_rows.reshape(-1, *tangent_template.dynamics_rows.shape)
             coordinate_tangents = _propagate_stage_coordinates(
                 tableau, i, tangent, previous_rows, h
             )
@@ -473,22 +493,24 @@ def _evaluate_stages(
                 row_tangent,
             )
             return jnp.where(
-                (i > 0) | is_at_interval_start, row_tangent, known_rows[:n_dynamics_rows]
+                (i > 0) | is_at_interval_start, row_tangent, previous_stage_rows[:n_dynamics_rows]
             )
 
-        stage_row = jnp.where(i > 0, stage_row, interval_point.dynamics_rows)
+        stage_row = jnp.where(i > 0, stage_row, contact_interval_point.dynamics_rows)
         stage_rows = lax.dynamic_update_index_in_dim(stage_rows, stage_row, i, 0)
         return (
             i + 1,
             stage_rows,
-            tangents.map_tangents(propagate_tangent, stage_row_tangents, i * n_dynamics_rows),
+            tangents.map_tangents_sequentially(
+                propagate_tangent, stage_row_tangents, i * n_dynamics_rows
+            ),
         )
 
-    later_stage_rows = jnp.zeros((last_stage, *interval_point.dynamics_rows.shape), h.dtype)
-    stage_rows = jnp.concatenate([interval_point.dynamics_rows[None], later_stage_rows])
-    stage_row_tangents = tangents.map_tangents(
+    later_stage_rows = jnp.zeros((last_stage, *contact_interval_point.dynamics_rows.shape), h.dtype)
+    stage_rows = jnp.concatenate([contact_interval_point.dynamics_rows[None], later_stage_rows])
+    stage_row_tangents = tangents.map_tangents_sequentially(
         lambda k, _: _unpack_tangent(tangents.tangent_rows, k, tangent_template).dynamics_rows,
-        tangents.allocate_rows((last_stage + 1) * n_dynamics_rows),
+        tangents.allocate_tangent_rows((last_stage + 1) * n_dynamics_rows),
     )
     # The first stage is the last stage of the previous step, except after an event.
     first_stage = jnp.where(jnp.any(is_at_interval_start), 0, 1).astype(jnp.int32)
@@ -502,7 +524,7 @@ def _propagate_stage_coordinates(
     tableau: ButcherTableau,
     i: Array,
     tangent: _IntervalTangent,
-    known_row_tangents: Array,
+    stage_row_tangents: Array,
     h: Array,
 ) -> tuple[Array, Array]:
     """Return the tangents of `compute_stage_state`, from the tangents at the earlier stages."""
@@ -518,7 +540,7 @@ def _propagate_stage_coordinates(
             lax.dynamic_index_in_dim(flat_matrix, i * n_stages + j, 0, False)
             for flat_matrix in flat_matrices
         )
-        row_tangent = lax.dynamic_index_in_dim(known_row_tangents, j, 0, False)[: len(tangent.q)]
+        row_tangent = lax.dynamic_index_in_dim(stage_row_tangents, j, 0, False)[: len(tangent.q)]
         return j + 1, rate_increment + a * row_tangent, coordinate_increment + b * row_tangent
 
     q, v = tangent.q, tangent.v
@@ -530,7 +552,9 @@ def _propagate_stage_coordinates(
 
 
 def _compute_max_stable_step_size(
-    mode_dynamics: ModeDynamics, tableau: ButcherTableau, stability_safety_factor: float = 0.85
+    contact_mode_dynamics: ContactModeDynamics,
+    tableau: ButcherTableau,
+    stability_safety_factor: float = 0.85,
 ) -> Array:
     """Return the largest step size for which tangents of a leg swinging in the air do not grow, s.
 
@@ -538,21 +562,23 @@ def _compute_max_stable_step_size(
     control is based on the motion alone, in which the leg may be nearly at rest.
     """
     has_swing_leg = jnp.any(
-        ~mode_dynamics.contact_state.is_locked
-        & (mode_dynamics.contact_state.contact_modes == ContactMode.OFF),
+        ~contact_mode_dynamics.contact_state.is_leg_locked
+        & (contact_mode_dynamics.contact_state.contact_modes == ContactMode.OFF),
         axis=0,
     )
     stable_step_factor = stability_safety_factor * compute_real_stability_limit(tableau)
     return jnp.where(
-        has_swing_leg, stable_step_factor * mode_dynamics.s.m / mode_dynamics.s.c, jnp.inf
+        has_swing_leg,
+        stable_step_factor * contact_mode_dynamics.s.m / contact_mode_dynamics.s.c,
+        jnp.inf,
     )
 
 
 def _make_event_shift(
-    dynamics_fn: DynamicsFn,
+    make_contact_dynamics: DynamicsFn,
     input_columns: Array,
-    initial_state: IntervalState,
-    interval_state: IntervalState,
+    initial_state: ContactIntervalState,
+    contact_interval_state: ContactIntervalState,
     tangents: TangentBatch,
     tangent_template: _IntervalTangent,
 ) -> Callable[[Array, Array], _IntervalTangent]:
@@ -560,36 +586,42 @@ def _make_event_shift(
 
     The time of a force extremum is constant for tangents, because the force is stationary there.
     """
-    interval_point, n = interval_state.interval_point, len(interval_state.interval_point.q)
+    contact_interval_point, n = (
+        contact_interval_state.contact_interval_point,
+        len(contact_interval_state.contact_interval_point.q),
+    )
 
     def compute_guards(input_columns: Array, q: Array, v: Array) -> Array:
-        mode_dynamics = dynamics_fn(input_columns)
-        contact_state = mode_dynamics.contact_state._replace(force_rate_signs=None)
-        mode_dynamics = mode_dynamics._replace(contact_state=contact_state)
+        contact_mode_dynamics = make_contact_dynamics(input_columns)
+        contact_state = contact_mode_dynamics.contact_state._replace(force_rate_signs=None)
+        contact_mode_dynamics = contact_mode_dynamics._replace(contact_state=contact_state)
         return evaluate_guards_at_point(
-            mode_dynamics, IntervalPoint(q, v, evaluate_dynamics(mode_dynamics, q, v))
+            contact_mode_dynamics,
+            ContactIntervalPoint(q, v, evaluate_dynamics(contact_mode_dynamics, q, v)),
         )
 
     _, guard_pushforward = jax.linearize(
-        compute_guards, input_columns, interval_point.q, interval_point.v
+        compute_guards, input_columns, contact_interval_point.q, contact_interval_point.v
     )
     guard_rates = guard_pushforward(
-        jnp.zeros_like(input_columns), interval_point.v, interval_point.dynamics_rows[:n]
+        jnp.zeros_like(input_columns),
+        contact_interval_point.v,
+        contact_interval_point.dynamics_rows[:n],
     )
     has_reached_event = (initial_state.lane_status == LaneStatus.RUNNING) & (
-        interval_state.lane_status == LaneStatus.EVENT
+        contact_interval_state.lane_status == LaneStatus.EVENT
     )
 
-    def shift_tangent(k: Array, tangent_row: Array) -> _IntervalTangent:
-        tangent = _unpack_rows(tangent_row, tangent_template)
-        time_tangent = jnp.zeros_like(interval_state.time_since_event)
+    def shift_tangent_to_event(k: Array, tangent_row: Array) -> _IntervalTangent:
+        tangent = _unpack_tree_from_rows(tangent_row, tangent_template)
+        time_tangent = jnp.zeros_like(contact_interval_state.time_since_event)
         guard_tangents = guard_pushforward(
             _unpack_tangent(tangents.column_tangents, k, input_columns), tangent.q, tangent.v
         )
         for guard_index in range(len(guard_tangents)):
             is_at_guard = (
                 has_reached_event
-                & (interval_state.triggered_guard_index == guard_index)
+                & (contact_interval_state.triggered_guard_index == guard_index)
                 & (guard_rates[guard_index] < 0.0)
             )
             time_tangent = jnp.where(
@@ -602,14 +634,14 @@ def _make_event_shift(
         if interval_accumulators is not None:
             interval_accumulators = (
                 interval_accumulators
-                + time_tangent * interval_point.dynamics_rows[-N_ACCUMULATOR_ROWS:]
+                + time_tangent * contact_interval_point.dynamics_rows[-N_ACCUMULATOR_ROWS:]
             )
         return _IntervalTangent(
-            q=tangent.q + time_tangent * interval_point.v,
-            v=tangent.v + time_tangent * interval_point.dynamics_rows[:n],
+            q=tangent.q + time_tangent * contact_interval_point.v,
+            v=tangent.v + time_tangent * contact_interval_point.dynamics_rows[:n],
             interval_accumulators=interval_accumulators,
             dynamics_rows=tangent.dynamics_rows,
             time_since_event=time_tangent,
         )
 
-    return shift_tangent
+    return shift_tangent_to_event
