@@ -221,7 +221,7 @@ class StoredMetadata:
             CHECKSUM_GROUP_NAME: intact_metadata.consolidated_metadata[CHECKSUM_GROUP_NAME]
             | {"attributes": self.mark_attributes}
         }
-        other_metadata = {
+        unrestored_metadata = {
             array_name: array_metadata
             for array_name, array_metadata in self.consolidated_metadata.items()
             if array_name not in restored_metadata
@@ -229,7 +229,7 @@ class StoredMetadata:
         consolidated_metadata_entry = {
             "kind": "inline",
             "must_understand": False,
-            "metadata": restored_metadata | other_metadata,
+            "metadata": restored_metadata | unrestored_metadata,
         }
         restored_root_metadata = intact_metadata.root_metadata | {
             "attributes": self.store_attributes,

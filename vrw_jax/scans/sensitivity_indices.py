@@ -198,16 +198,16 @@ class _SobolIndexEstimator:
         """
         from scipy.stats import sobol_indices as compute_sobol_indices
 
-        resampled_values = self.measure_values[..., saltelli_row_indices]
-        varying_measures = np.flatnonzero(~self.detect_constant_measures(resampled_values))
-        n_samples_per_row, n_measures, _ = resampled_values.shape
+        resampled_measure_values = self.measure_values[..., saltelli_row_indices]
+        varying_measures = np.flatnonzero(~self.detect_constant_measures(resampled_measure_values))
+        n_samples_per_row, n_measures, _ = resampled_measure_values.shape
         sobol_index_estimates = np.zeros((2, n_measures, n_samples_per_row - 2))
         if len(varying_measures):
-            resampled_values = resampled_values[:, varying_measures]
+            resampled_measure_values = resampled_measure_values[:, varying_measures]
             measure_functions = {
-                "f_A": resampled_values[0],
-                "f_B": resampled_values[1],
-                "f_AB": resampled_values[2:],
+                "f_A": resampled_measure_values[0],
+                "f_B": resampled_measure_values[1],
+                "f_AB": resampled_measure_values[2:],
             }
             scipy_result = compute_sobol_indices(
                 func=measure_functions, n=len(saltelli_row_indices)

@@ -98,9 +98,9 @@ class WalkValidationOptions:
     - `n_steps_of_walk`: number of walking steps;
     - `relative_start_displacement`: relative displacement of the start from the limit cycle;
     - `constraint_value_tolerance`: accepted violation of a constraint, as a fraction of its value.
-      This tolerance and the next are chosen because of two effects: the optimum satisfies a
-          constraint within 1e-6 of its change between the bounds, and the start is displaced. Each
-          effect is some thousandths of a take-off margin;
+      This tolerance and the next are chosen because of two effects. The optimum satisfies a
+      constraint within 1e-6 of its change between the bounds, and the start is displaced. Each
+      effect is some thousandths of a take-off margin;
     - `default_margin_tolerance`: accepted violation, as a fraction of the constraint's default
       margin.
     """
