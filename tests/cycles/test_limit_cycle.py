@@ -330,7 +330,7 @@ def test_too_coarse_a_mesh_is_reported_and_a_finer_one_finds_the_gait():
         for options in (None, TIGHT_OPTIONS)
     )
     assert int(coarse.outcome) == Outcome.MESH_TOO_COARSE
-    assert "more steps" in coarse.why
+    assert "more intervals" in coarse.why
     assert int(fine.outcome) == Outcome.STEPPED
 
 
