@@ -980,14 +980,16 @@ def _find_earliest_root(
     root_numerator = jnp.where(
         is_guard_falling, 2.0 * start_guard_values, -parabola_linear_term - sqrt_discriminant
     )
-    root_denominator = jnp.where(
+    parabola_root_denominator = jnp.where(
         is_guard_falling, sqrt_discriminant - parabola_linear_term, 2.0 * parabola_curvature
     )
-    root_fraction = root_numerator / jnp.where(root_denominator == 0.0, 1.0, root_denominator)
+    root_fraction = root_numerator / jnp.where(
+        parabola_root_denominator == 0.0, 1.0, parabola_root_denominator
+    )
     has_guard_root = (
         is_guard_crossing
         & (discriminant >= 0.0)
-        & (root_denominator != 0.0)
+        & (parabola_root_denominator != 0.0)
         & (root_fraction > 0.0)
     )
     has_guard_root = has_guard_root & ~(is_initiating & is_guard_falling)

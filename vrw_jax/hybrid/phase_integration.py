@@ -745,7 +745,7 @@ def _guess_event_step_length(
     # divided by x vanishes.
     linear_coefficient = 3.0 * end_guard_values - 2.0 * start_guard_rates - end_guard_rates
     quadratic_coefficient = start_guard_rates - 2.0 * end_guard_values + end_guard_rates
-    root_denominator = (
+    parabola_root_denominator = (
         jnp.sqrt(
             jnp.maximum(
                 linear_coefficient * linear_coefficient
@@ -756,7 +756,11 @@ def _guess_event_step_length(
         - linear_coefficient
     )
     nonzero_parabola_root = jnp.clip(
-        2.0 * start_guard_rates / jnp.where(root_denominator > 0.0, root_denominator, 1.0), 0.0, 1.0
+        2.0
+        * start_guard_rates
+        / jnp.where(parabola_root_denominator > 0.0, parabola_root_denominator, 1.0),
+        0.0,
+        1.0,
     )
     cubic_rate_function = lambda fraction_to_zero: (
         6.0 * fraction_to_zero * (fraction_to_zero - 1.0) * (start_guard_values - end_guard_values)

@@ -266,18 +266,18 @@ def refine_margin_minima(
                 jnp.abs(step_length - margin_minimum_search.step_length)
                 <= MINIMUM_LOCATION_TOLERANCE * margin_minimum_state.step_length
             )
-            has_smaller_rate = jnp.abs(margin_rate) < jnp.abs(
+            has_smaller_margin_rate = jnp.abs(margin_rate) < jnp.abs(
                 margin_minimum_search.best_margin_rate
             )
             improved_margin_minimum_search = _MarginMinimumSearch(
                 step_length=step_length,
                 best_step_length=jnp.where(
-                    has_smaller_rate,
+                    has_smaller_margin_rate,
                     margin_minimum_search.step_length,
                     margin_minimum_search.best_step_length,
                 ),
                 best_margin_rate=jnp.where(
-                    has_smaller_rate, margin_rate, margin_minimum_search.best_margin_rate
+                    has_smaller_margin_rate, margin_rate, margin_minimum_search.best_margin_rate
                 ),
                 margin_value=margin_value,
                 is_minimum_unresolved=margin_minimum_search.is_minimum_unresolved

@@ -452,14 +452,14 @@ def _make_step_margins(
         phase_sequence.outcome != Outcome.BAD_INPUT,
         has_phase_occurred[2],
     )
-    recorded_minima = [
+    recorded_margin_minima = [
         phase_end.margin_minima
         for phase_end in phase_sequence.phase_end_results
         if phase_end.margin_minima is not None
     ]
     phase_minima = [
         PhaseMargins.from_margin_values(tuple(phase_margins), s.n)
-        for phase_margins in recorded_minima
+        for phase_margins in recorded_margin_minima
     ]
 
     def find_lowest_margin(margin_name: str, *phase_indices: int) -> Array:

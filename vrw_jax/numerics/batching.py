@@ -166,8 +166,8 @@ def select_tree_rows(tree: PyTree, row_indices: Any) -> PyTree:
 def concatenate_tree_rows(*trees: PyTree) -> PyTree:
     """Concatenate trees of arrays along their leading axes, and return NumPy arrays."""
     return jax.tree.map(
-        lambda *leaves_to_join: np.concatenate(
-            [np.asarray(leaf_rows) for leaf_rows in leaves_to_join]
+        lambda *corresponding_leaves: np.concatenate(
+            [np.asarray(leaf_rows) for leaf_rows in corresponding_leaves]
         ),
         *trees,
     )

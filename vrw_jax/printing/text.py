@@ -54,18 +54,18 @@ class AbstractPrintable(eqx.Module):
 
 def format_quantity(quantity_value: object, quantity_unit: str) -> str:
     """Return a number with its unit as text. An array is described by its size and its range."""
-    value_array, quantity_unit = (
+    quantity_values, quantity_unit = (
         np.asarray(quantity_value),
         "" if quantity_unit == "1" else quantity_unit,
     )
-    if value_array.ndim == 0:
-        return f"{float(value_array):.6g} {quantity_unit}".strip()
+    if quantity_values.ndim == 0:
+        return f"{float(quantity_values):.6g} {quantity_unit}".strip()
     value_range_text = (
-        f" from {np.min(value_array):.6g} to {np.max(value_array):.6g} {quantity_unit}"
-        if value_array.size
+        f" from {np.min(quantity_values):.6g} to {np.max(quantity_values):.6g} {quantity_unit}"
+        if quantity_values.size
         else ""
     )
-    return f"{value_array.size} values{value_range_text}".rstrip()
+    return f"{quantity_values.size} values{value_range_text}".rstrip()
 
 
 def format_outcome_counts(outcomes: Any, status_code_class: type[enum.IntEnum]) -> str:
