@@ -510,7 +510,7 @@ def evaluate_guards(
     this guard at the start is replaced by 1.
     """
     s, contact_state = contact_mode_dynamics.s, contact_mode_dynamics.contact_state
-    unit_guards = jnp.ones_like(motion.L)
+    guards_without_event = jnp.ones_like(motion.L)
     is_airborne = (contact_state.contact_modes == ContactMode.OFF) & (
         is_after_start | ~contact_state.has_just_lifted
     )
@@ -544,7 +544,7 @@ def evaluate_guards(
             jnp.where(
                 contact_mode_dynamics.is_airborne_leg_locked,
                 contact_quantities.airborne_stopper_forces,
-                unit_guards,
+                guards_without_event,
             )
         ]
     )
@@ -564,9 +564,9 @@ def evaluate_guards(
             compute_foot_heights(
                 motion, contact_quantities.leg_directions, contact_mode_dynamics.tilt
             ),
-            unit_guards,
+            guards_without_event,
         ),
-        jnp.where(is_leg_free, s.L0 - motion.L, unit_guards),
+        jnp.where(is_leg_free, s.L0 - motion.L, guards_without_event),
         replace_if_not_evaluated(
             contact_mode_dynamics.slot_modes != ContactMode.OFF, supporting_force
         ),

@@ -69,7 +69,7 @@ def locate_event(
     """
     step_length, event_time_rtol = guard_crossing_step.step_length, jnp.sqrt(options.rtol)
     max_extrapolation_time = 0.1 * event_time_rtol * step_length
-    max_short_step_time = 0.3 * jnp.sqrt(event_time_rtol) * step_length
+    max_short_step_duration = 0.3 * jnp.sqrt(event_time_rtol) * step_length
     is_crossing = [
         (guard_crossing_step.crossing_guard_bits >> i) & 1 == 1
         for i in range(len(guard_crossing_step.start_guard_values))
@@ -119,7 +119,7 @@ def locate_event(
             & is_proposal_in_bracket
             & (
                 jnp.abs(time_to_event)
-                <= jnp.where(is_guard_straight, max_short_step_time, max_extrapolation_time)
+                <= jnp.where(is_guard_straight, max_short_step_duration, max_extrapolation_time)
             )
         )
         return EventSearch(
@@ -181,7 +181,7 @@ def locate_event(
         evaluate_acceleration,
         guard_crossing_step,
         search_result,
-        (max_extrapolation_time, max_short_step_time),
+        (max_extrapolation_time, max_short_step_duration),
         options,
     )
 
@@ -202,7 +202,7 @@ def _refine_event_location(
     One short solver step suffices unless a guard grazes zero. The event stays unresolved if
     Newton's method diverges.
     """
-    max_extrapolation_time, max_short_step_time = extrapolation_and_step_limits
+    max_extrapolation_time, max_short_step_duration = extrapolation_and_step_limits
     # During a thousandth of a solver step, a method of order 3 is accurate to round-off.
     low_order_tableau = load_explicit_tableau("Bosh3")
     assert low_order_tableau is not None
@@ -210,7 +210,7 @@ def _refine_event_location(
     def can_take_short_solver_step(
         is_event_distant: Array, remaining_time_to_event: Array
     ) -> Array:
-        return is_event_distant & (jnp.abs(remaining_time_to_event) <= max_short_step_time)
+        return is_event_distant & (jnp.abs(remaining_time_to_event) <= max_short_step_duration)
 
     def take_short_solver_step(loop_carry: tuple) -> tuple:
         (

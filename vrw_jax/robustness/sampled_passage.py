@@ -93,7 +93,7 @@ class PassageSamplingOptions:
 
     The value is chosen because three of four wheels then pass the next error test.
     """
-    min_n_rounds_growth: float = 1.25
+    min_round_count_ratio: float = 1.25
     """Smallest ratio of the numbers of rounds at two successive error tests.
 
     The value is chosen because later error tests need wider confidence intervals.
@@ -526,7 +526,7 @@ def _estimate_failure_probability(
                     n_sampling_rounds
                     * max(
                         sampling_options.n_rounds_safety_factor * sampling_error_ratio**2,
-                        sampling_options.min_n_rounds_growth,
+                        sampling_options.min_round_count_ratio,
                     )
                 )
             )

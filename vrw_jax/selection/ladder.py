@@ -271,9 +271,9 @@ class LadderWheel(AbstractContactWheel):
         # Leg 1 alone must be loaded and at rest, with all other legs on their stoppers.
         is_leg_1 = jnp.arange(params.n_legs) == 0
         locked_leg_code = float(LOCKED_CODE_OFFSET + ContactMode.OFF)
-        embedded_contact_codes = jnp.where(is_leg_1, float(ContactMode.STICK), locked_leg_code)
+        expected_contact_codes = jnp.where(is_leg_1, float(ContactMode.STICK), locked_leg_code)
         is_start_embeddable = jnp.all(
-            jnp.round(x[4 + 2 * params.n_legs :]) == embedded_contact_codes
+            jnp.round(x[4 + 2 * params.n_legs :]) == expected_contact_codes
         )
         viscoelastic_section_state = jnp.stack([x[0], x[1], x[4 + params.n_legs]])
         viscoelastic_result = viscoelastic_model.take_step(

@@ -459,13 +459,13 @@ def specify_phase_trajectory(
     return TrajectorySpecification(
         sample_phase_step,
         tuple(TRAJECTORY_MEASURES),
-        PHASE_SLOPE_POSITION_NAMES,
+        POSITION_NAMES_ALONG_SLOPE,
         {},
         dataset_attributes,
     )
 
 
-PHASE_SLOPE_POSITION_NAMES = ("x", "foot_1_x", "foot_2_x", "hub_x")
+POSITION_NAMES_ALONG_SLOPE = ("x", "foot_1_x", "foot_2_x", "hub_x")
 """Names of the variables that are positions along the slope."""
 
 
