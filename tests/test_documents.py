@@ -202,3 +202,20 @@ def test_every_formula_of_the_measures_page_is_recognized():
 
     page = measures_page()
     assert page.count("$") == 2 * len(re.findall(INLINE, page)) > 0
+
+
+def test_the_sites_of_releases_are_kept_and_the_newest_opens_first(tmp_path):
+    from website.releases import add_release
+
+    site, folder = tmp_path / "site", tmp_path / "releases"
+    site.mkdir()
+    for version in ("0.9.0", "0.10.0", "0.2.0", "0.9.0"):
+        (site / "index.html").write_text(version)
+        add_release(site, folder, version)
+    releases = json.loads((folder / "versions.json").read_text())
+    assert [release["version"] for release in releases] == ["0.10.0", "0.9.0", "0.2.0"]
+    assert [release["aliases"] for release in releases] == [["latest"], [], []]
+    assert "0.10.0/index.html" in (folder / "index.html").read_text()
+    assert all((folder / v / "index.html").read_text() == v for v in ("0.2.0", "0.9.0", "0.10.0"))
+    with pytest.raises(ValueError, match="the version is main, but a released site needs numbers"):
+        add_release(site, folder, "main")

@@ -1,6 +1,7 @@
 """Build the site: `python -m website`, or with `--stored` without executing the notebooks.
 
-With `--pages` only write the pages of `docs/reference` that are generated from the sources.
+With `--pages` only write the pages of `docs/reference` that are generated from the sources. With
+`--release FOLDER` also copy the site to FOLDER/VERSION, beside the sites of earlier releases.
 """
 
 import argparse
@@ -9,12 +10,14 @@ import re
 import shutil
 import subprocess
 import sys
+import tomllib
 from importlib.metadata import version
 from pathlib import Path
 
 from website.links import find_broken_links
 from website.notebooks import page_of
 from website.reference import measures_page, toml_page
+from website.releases import add_release
 
 ROOT = Path(__file__).parent.parent
 DOCS = ROOT / "docs"
@@ -70,11 +73,12 @@ def translate_link(source: Path, link: str) -> str:
     return os.path.relpath(place_in_pages(target), place_in_pages(source).parent)
 
 
-def configuration() -> Path:
+def configuration(*, is_release: bool) -> Path:
     """Write the configuration of the site and return its path.
 
-    The footer of each page states the versions of the libraries that the pages describe. If
-    VRW_SOURCE_URL is set, the pages link to the sources at this address.
+    The footer of each page states the versions of the libraries that the pages describe. The pages
+    of a release offer a choice of releases. If VRW_SOURCE_URL is set, the pages link to the sources
+    at this address.
     """
     text, url = (ROOT / "zensical.toml").read_text(), os.environ.get("VRW_SOURCE_URL")
     versions = ", ".join(f"{name} {version(name)}" for name in ("vrw-jax", "jax", "diffrax"))
@@ -84,6 +88,8 @@ def configuration() -> Path:
             "[project]", f'[project]\nrepo_url = "{url}"\nedit_uri = "blob/HEAD/docs/"'
         )
         text = text.replace("features = [", 'features = [\n  "content.action.edit",')
+    if is_release:  # The theme then reads versions.json, whose format is that of mike.
+        text += '\n[project.extra.version]\nprovider = "mike"\n'
     path = ROOT / "build" / "zensical.toml"
     path.write_text(text.replace('"build/', '"').replace('paths = ["."]', f'paths = ["{ROOT}"]'))
     return path
@@ -94,19 +100,25 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--stored", action="store_true", help="show the notebooks as stored")
     parser.add_argument("--pages", action="store_true", help="only write the generated pages")
+    parser.add_argument("--release", type=Path, metavar="FOLDER", help="add the site to FOLDER")
     arguments = parser.parse_args()
     if arguments.pages:
         write_generated_pages()
         return 0
     prepare(execute=not arguments.stored)
     command = [sys.executable, "-m", "zensical", "build", "--strict", "--clean"]
-    status = subprocess.run([*command, "-f", str(configuration())], cwd=ROOT, check=False)
+    configuration_path = configuration(is_release=arguments.release is not None)
+    status = subprocess.run([*command, "-f", str(configuration_path)], cwd=ROOT, check=False)
     broken_links = list(find_broken_links(SITE))
     for link in broken_links:
         print(f"Broken link on {link}")
     if status.returncode == 0 and not broken_links:
         print(f"The site is in {SITE}. Open {SITE / 'index.html'} in a browser, or serve it, with")
         print(f"its search, by: python -m http.server --directory {SITE.relative_to(ROOT)}")
+        if arguments.release is not None:
+            project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+            add_release(SITE, arguments.release, project["version"])
+            print(f"The release is in {arguments.release / project['version']}.")
     return status.returncode or bool(broken_links)
 
 
