@@ -13,7 +13,7 @@ fronts of energy against double support by `vrw.tune`, and Sobol' indices over t
 in which gaits exist (`experiments/shared/region_indices.py`).
 
 The command writes five tables to `docs/figures/` and two figures, and fills the blocks of
-docs/studies/double_support.md. It takes about half an hour on two cores. The fronts take two
+docs/studies/double_support.md. It takes a quarter of an hour on one core. The fronts take two
 minutes of it.
 """
 
