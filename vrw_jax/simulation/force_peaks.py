@@ -46,9 +46,9 @@ def force_peaks(walk: xr.Dataset) -> xr.Dataset:
     Args:
         walk: a trajectory with at least 9 samples per phase.
 
-    Returns: A dataset of the force measures over `step_index`. Its variables `force`, `force_time`,
-        `force_step` and `is_force_maximum` over `extremum` describe the extrema of the fore foot's
-        force.
+    Returns:
+        A dataset of the force measures over `step`. Its variables `force`, `force_time`,
+        `force_step` and `is_maximum` over `extremum` describe the extrema of the fore foot's force.
 
     Raises:
         TypeError, ValueError: an invalid argument, described in one sentence.
