@@ -165,7 +165,8 @@ cycles, and of margins. Scans also accept derivatives of measures of cycles, as 
 """
 _GROUPS = (
     ("Of a step", STEP_MEASURES,
-        "The table lists measures that `vrw.step`, gaits and scans report."),
+        "Scans and `vrw.step` report the measures of this table. Gaits report some of them; "
+        "`vrw.step` from the section state of a gait reports all."),
     ("Margins", MARGIN_MEASURES, "A margin is positive if its condition holds. "
         "`step.margins` and scans contain the margins of the table."),
     ("Of a step with unilateral contact", UNILATERAL_STEP_MEASURES, "Steps with unilateral "
@@ -178,7 +179,7 @@ _GROUPS = (
         "limit cycles with unilateral contact report the measures of this table. Except for the "
         "impulse, `vrw.force_peaks` returns the same measures for walks."),
     ("Of walks over random slopes", PASSAGE_MEASURES,
-        "Scans with `slope_sd` report the measures of this table."),
+        "Scans with `slope_sd` compute the measures of this table that are requested."),
     ("Of a trajectory", TRAJECTORY_MEASURES,
         "The table lists the coordinates and variables of the result of `vrw.simulate`."),
     ("Of a trajectory with unilateral contact", CONTACT_MEASURES,
