@@ -15,8 +15,11 @@ import numpy as np
 
 from vrw_jax.cycles import is_same_branch
 from vrw_jax.numerics import select_tree_rows
+from vrw_jax.runtime import lazy_import
 from vrw_jax.tuning.objective import GaitEvaluation, compute_max_violation, compute_slack_scales
 from vrw_jax.wheel import Outcome
+
+optax = lazy_import("optax")
 
 
 @dataclass(frozen=True)
@@ -104,8 +107,6 @@ def explore_starts(
         np.median(np.linalg.norm(objective_gradient_norm, axis=1)) if has_active_gait.any() else 1.0
     )
     optimizer_step_lengths = np.full((n_starts, 1), exploration_options.first_optimizer_step_length)
-    import optax  # An import at the top of the module would delay every start of the library.
-
     optimizer = optax.scale_by_adam(
         b1=exploration_options.gradient_decay, b2=exploration_options.squared_gradient_decay
     )

@@ -18,6 +18,7 @@ from vrw_jax.cycles import (
     GaitMeasureReader,
     default_margins,
 )
+from vrw_jax.models import AbstractStep
 from vrw_jax.validation import check_names, check_range, check_real, check_reals, require_known_name
 from vrw_jax.wheel import WheelParams
 
@@ -34,7 +35,7 @@ class WeightedMeasureSum:
     measure_reader: GaitMeasureReader
     measure_weights: tuple[tuple[str, float], ...]
 
-    def __call__(self, cycle: AbstractCycle, step: Any) -> Array:
+    def __call__(self, cycle: AbstractCycle, step: AbstractStep) -> Array:
         weighted_measures = [
             measure_weight * self.measure_reader(measure_name, cycle, step)
             for measure_name, measure_weight in self.measure_weights
@@ -48,7 +49,7 @@ class CycleObjective:
 
     cycle_function: Callable[[Any], Array]
 
-    def __call__(self, cycle: AbstractCycle, step: Any) -> Array:
+    def __call__(self, cycle: AbstractCycle, step: AbstractStep) -> Array:
         return self.cycle_function(cycle)
 
 
@@ -109,7 +110,7 @@ def _check_objective_value(objective_value: Any) -> None:
         )
 
 
-def zero_objective(cycle: AbstractCycle, step: Any) -> Array:
+def zero_objective(cycle: AbstractCycle, step: AbstractStep) -> Array:
     """Return 0 for any gait, in place of an objective that is not compiled."""
     return jnp.zeros(())
 
@@ -127,7 +128,7 @@ class ObjectiveAndConstraints:
     measure_reader: GaitMeasureReader
     constraint_names: tuple[str, ...]
 
-    def __call__(self, cycle: AbstractCycle, step: Any) -> Array:
+    def __call__(self, cycle: AbstractCycle, step: AbstractStep) -> Array:
         objective_value = self.objective_function(cycle, step)
         _check_objective_value(objective_value)
         constraint_values = []
