@@ -5,7 +5,7 @@ import os
 from pathlib import Path
 
 import pytest
-from jaxtyping import install_import_hook
+from support import shape_checks
 
 ROOT = Path(__file__).parent.parent
 UNCHECKED_PACKAGE = os.environ.get("VRW_TEST_UNCHECKED", "simd")
@@ -38,8 +38,9 @@ def pytest_configure(config: pytest.Config) -> None:
     if distributes_tests and not config.getoption("collectonly"):
         return
     gc.set_threshold(20_000, 10, 10)  # what JAX keeps of programs is looked through less often
-    with install_import_hook(PACKAGE_POSITIONS, "beartype.beartype"):
-        import vrw_jax
+    shape_checks.import_with_checks(PACKAGE_POSITIONS)
+    import vrw_jax
+
     vrw_jax.start_jax(os.environ.get("VRW_TEST_CACHE", ROOT / ".jax_cache"))
 
 
@@ -47,3 +48,9 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Run long files first, so that two workers end together."""
     position = {name: index for index, name in enumerate(LONGEST_COMPILATIONS)}
     items.sort(key=lambda item: position.get(item.path.stem, len(position)))
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_protocol() -> None:
+    """Check the first call of each function in every test."""
+    shape_checks.start_test()

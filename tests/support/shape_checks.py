@@ -1,0 +1,61 @@
+"""Check types and shapes of arguments and results in the first call of each function in a test.
+
+A test calls some functions many thousand times, mostly while JAX traces. A check of every call
+takes a third of the time of all tests, and finds no more errors than a check of the first call.
+"""
+
+import dataclasses
+import functools
+import inspect
+from collections.abc import Callable
+from types import CodeType
+from typing import Any
+from unittest.mock import patch
+
+import jaxtyping
+
+FunctionOrClass = Any
+"""A function, or a class whose `__init__` is a function."""
+
+_check_every_call = jaxtyping.jaxtyped
+_checked_code: set[CodeType] = set()
+"""Code of functions that the present test has called."""
+
+
+def start_test() -> None:
+    """Let the next call of each function be checked."""
+    _checked_code.clear()
+
+
+def check_first_calls(
+    *, typechecker: Callable[[FunctionOrClass], FunctionOrClass]
+) -> Callable[[FunctionOrClass], FunctionOrClass]:
+    """Return a decorator that replaces `jaxtyping.jaxtyped` and checks one call per test."""
+
+    def decorate(target: FunctionOrClass) -> FunctionOrClass:
+        if inspect.isclass(target):
+            if dataclasses.is_dataclass(target) and "__init__" in vars(target):
+                target.__init__ = decorate(target.__init__)
+            return target
+        code = target.__code__
+        get_checked = functools.cache(lambda: _check_every_call(target, typechecker=typechecker))
+
+        @functools.wraps(target)
+        def call(*args: object, **kwargs: object) -> object:
+            if code in _checked_code:
+                return target(*args, **kwargs)
+            _checked_code.add(code)
+            return get_checked()(*args, **kwargs)
+
+        return call
+
+    return decorate
+
+
+def import_with_checks(packages: list[str]) -> None:
+    """Import `vrw_jax` so that its functions check their signatures."""
+    with (
+        patch.object(jaxtyping, "jaxtyped", check_first_calls),
+        jaxtyping.install_import_hook(packages, "beartype.beartype"),
+    ):
+        import vrw_jax  # noqa: F401
