@@ -191,17 +191,13 @@ def _solve_checked_fixed_point(
         )
     tolerance = lax.stop_gradient(jnp.asarray(tolerance, start.dtype))
     newton_configuration = (newton_method, function, period_n, max_iterations)
-    newton_arguments = start, tolerance
-    uses_program_cache = isinstance(function, ReturnMap)
-    compiled_newton_program = (
-        get_compiled_program(_find_fixed_point_of_iterate, newton_configuration, *newton_arguments)
-        if uses_program_cache
-        else None
-    )
-    return (
-        compiled_newton_program
-        or functools.partial(_find_fixed_point_of_iterate, newton_configuration)
-    )(*newton_arguments)
+    find_fixed_point = functools.partial(_find_fixed_point_of_iterate, newton_configuration)
+    compiled_program = None
+    if isinstance(function, ReturnMap):
+        compiled_program = get_compiled_program(
+            _find_fixed_point_of_iterate, newton_configuration, start, tolerance
+        )
+    return (compiled_program or find_fixed_point)(start, tolerance)
 
 
 def _find_fixed_point_of_iterate(
@@ -226,16 +222,15 @@ ClosureConvertedMap = Callable[..., Array]
 def _compute_newton_correction(
     closure_converted_map: ClosureConvertedMap, x: Array, closed_over_values: tuple
 ) -> tuple[Array, Array, Array]:
-    """Return Newton's correction, the Jacobian of the map, and the defect map(x) - x."""
+    """Return Newton's correction, the Jacobian of the map, and the largest component of the defect
+    map(x) - x.
+    """
     mapped_point, jacobian = evaluate_with_jacobian(
         lambda y: closure_converted_map(y, *closed_over_values), x
     )
     map_defect = mapped_point - x
-    return (
-        jnp.linalg.solve(jnp.eye(x.size, dtype=x.dtype) - jacobian, map_defect),
-        jacobian,
-        map_defect,
-    )
+    newton_correction = jnp.linalg.solve(jnp.eye(x.size, dtype=x.dtype) - jacobian, map_defect)
+    return newton_correction, jacobian, jnp.max(jnp.abs(map_defect))
 
 
 N_DERIVATIVE_ITERATIONS = 2
@@ -275,7 +270,7 @@ def _run_newton_loop(
         is_searching_iteration = is_newton_searching(correction_norm, n_iterations).astype(
             n_iterations.dtype
         )
-        newton_correction, jacobian, map_defect = _compute_newton_correction(
+        newton_correction, jacobian, residual = _compute_newton_correction(
             closure_converted_map, x, closed_over_values
         )
         # The correction is also checked in the last iterations, because the map may jump near the
@@ -288,7 +283,7 @@ def _run_newton_loop(
             n_iterations + is_searching_iteration,
             n_derivative_iterations + 1 - is_searching_iteration,
             jacobian,
-            jnp.max(jnp.abs(map_defect)),
+            residual,
         )
 
     initial_count, initial_norm = jnp.zeros((), jnp.int32), jnp.ones((), start.dtype)
@@ -329,11 +324,11 @@ def _run_newton_jvp(
 
     def solve_from_fixed_point(*closed_over_values: Any) -> FixedPointResult:
         def iterate_with_derivatives(point: Array, _: None) -> tuple[Array, tuple[Array, Array]]:
-            newton_correction, jacobian, map_defect = _compute_newton_correction(
+            newton_correction, jacobian, residual = _compute_newton_correction(
                 closure_converted_map, point, closed_over_values
             )
             next_point = point + jnp.where(newton_result.converged, newton_correction, 0.0)
-            return next_point, (jacobian, jnp.max(jnp.abs(map_defect)))
+            return next_point, (jacobian, residual)
 
         point, (jacobians, residuals) = lax.scan(
             iterate_with_derivatives, newton_result.x, None, length=N_DERIVATIVE_ITERATIONS

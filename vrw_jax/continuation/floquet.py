@@ -7,6 +7,8 @@ of the matrix entries and always differentiable.
 """
 
 import functools
+import itertools
+import operator
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -57,37 +59,32 @@ MULTIPLIER_TOLERANCES = MultiplierTolerances()
 
 def compute_characteristic_polynomial(matrix: RealSquareMatrix) -> tuple[Array, ...]:
     """Return the coefficients (a_0, ..., a_{n-1}) of det(z - matrix) = z^n + ... + a_1 z + a_0."""
-    matrix_entries = lambda i, j: matrix[..., i, j]
     n = matrix.shape[-1]
     if matrix.shape[-2:] != (n, n) or n not in (1, 2, 3):
         raise ValueError(
             f"the matrix has shape {matrix.shape}, but multipliers are built for 1x1, 2x2 and 3x3."
         )
+    entry = lambda i, j: matrix[..., i, j]
+    compute_minor = lambda rows, columns: (
+        entry(rows[0], columns[0]) * entry(rows[1], columns[1])
+        - entry(rows[0], columns[1]) * entry(rows[1], columns[0])
+    )
+    add_terms = functools.partial(functools.reduce, operator.add)
+    trace = add_terms([entry(i, i) for i in range(n)])
     if n == 1:
-        return (-matrix_entries(0, 0),)
+        return (-trace,)
+    sum_of_principal_minors = add_terms(
+        [compute_minor(pair, pair) for pair in itertools.combinations(range(n), 2)]
+    )
     if n == 2:
-        return matrix_entries(0, 0) * matrix_entries(1, 1) - matrix_entries(0, 1) * matrix_entries(
-            1, 0
-        ), -(matrix_entries(0, 0) + matrix_entries(1, 1))
-    principal_minors = [
-        matrix_entries(i, i) * matrix_entries(j, j) - matrix_entries(i, j) * matrix_entries(j, i)
-        for i, j in ((0, 1), (0, 2), (1, 2))
-    ]
-    cofactors = [
-        matrix_entries(1, 1) * matrix_entries(2, 2) - matrix_entries(1, 2) * matrix_entries(2, 1),
-        matrix_entries(1, 2) * matrix_entries(2, 0) - matrix_entries(1, 0) * matrix_entries(2, 2),
-        matrix_entries(1, 0) * matrix_entries(2, 1) - matrix_entries(1, 1) * matrix_entries(2, 0),
-    ]
-    determinant = (
-        matrix_entries(0, 0) * cofactors[0]
-        + matrix_entries(0, 1) * cofactors[1]
-        + matrix_entries(0, 2) * cofactors[2]
+        return sum_of_principal_minors, -trace
+    determinant = add_terms(
+        [
+            entry(0, column) * compute_minor((1, 2), other_columns)
+            for column, other_columns in enumerate(((1, 2), (2, 0), (0, 1)))
+        ]
     )
-    return (
-        -determinant,
-        principal_minors[0] + principal_minors[1] + principal_minors[2],
-        -(matrix_entries(0, 0) + matrix_entries(1, 1) + matrix_entries(2, 2)),
-    )
+    return -determinant, sum_of_principal_minors, -trace
 
 
 class _EigenvaluePair(NamedTuple):

@@ -12,7 +12,6 @@ import numpy as np
 
 from vrw_jax.continuation.floquet import (
     MULTIPLIER_TOLERANCES,
-    MultiplierTolerances,
     compute_bifurcation_margins,
     floquet_multipliers,
 )
@@ -38,7 +37,7 @@ class RootSearchOptions:
 
 
 ROOT_SEARCH_OPTIONS = RootSearchOptions()
-"""Default options of `locate_function_roots`."""
+"""Options of `locate_function_roots`."""
 
 
 def evaluate_bifurcation_functions(return_map_jacobians: np.ndarray) -> np.ndarray:
@@ -58,19 +57,16 @@ def evaluate_bifurcation_functions(return_map_jacobians: np.ndarray) -> np.ndarr
     return bifurcation_values
 
 
-def has_unit_circle_pair(
-    return_map_jacobian: np.ndarray,
-    multiplier_tolerances: MultiplierTolerances = MULTIPLIER_TOLERANCES,
-) -> bool:
+def has_unit_circle_pair(return_map_jacobian: np.ndarray) -> bool:
     """Return whether a complex pair of multipliers lies on the unit circle.
 
     The test function of the Neimark-Sacker bifurcation also vanishes for two real reciprocal
     multipliers. Such multipliers are no bifurcation.
     """
     multipliers = np.asarray(floquet_multipliers(jnp.asarray(return_map_jacobian)))
-    is_complex_pair = np.abs(multipliers.imag) > multiplier_tolerances.min_imaginary_part
+    is_complex_pair = np.abs(multipliers.imag) > MULTIPLIER_TOLERANCES.min_imaginary_part
     is_on_circle = (
-        np.abs(np.abs(multipliers) - 1.0) < multiplier_tolerances.located_pair_circle_distance
+        np.abs(np.abs(multipliers) - 1.0) < MULTIPLIER_TOLERANCES.located_pair_circle_distance
     )
     return bool(np.any(is_on_circle & is_complex_pair))
 
@@ -113,7 +109,6 @@ def locate_function_roots(
     function: Callable[[np.ndarray, np.ndarray], np.ndarray],
     bracket_end_values: tuple[np.ndarray, np.ndarray],
     max_bracket_width: np.ndarray,
-    options: RootSearchOptions = ROOT_SEARCH_OPTIONS,
 ) -> RootLocations:
     """Locate the roots of functions that have opposite signs at 0 and 1, by Chandrupatla's method.
 
@@ -130,11 +125,8 @@ def locate_function_roots(
     # the newest one.
     bracket_locations = np.outer((0.0, 1.0, 1.0), np.ones_like(max_bracket_width))
     function_values = np.stack([values_at_location_0, values_at_location_1, values_at_location_1])
-    is_sign_jump, n_search_rounds, n_bracket_parts = (
-        np.zeros(len(max_bracket_width), bool),
-        0,
-        options.n_parts_per_jump_bracket,
-    )
+    is_sign_jump, n_search_rounds = np.zeros(len(max_bracket_width), bool), 0
+    n_bracket_parts = ROOT_SEARCH_OPTIONS.n_parts_per_jump_bracket
     while len(
         unresolved_indices := np.flatnonzero(
             np.abs(bracket_locations[0] - bracket_locations[1]) > max_bracket_width
@@ -147,12 +139,8 @@ def locate_function_roots(
             function_values[:, smooth_bracket_indices],
             max_bracket_width[smooth_bracket_indices],
         )
-        bracket_lower_ends, bracket_upper_ends = np.sort(
-            bracket_locations[:2, jump_bracket_indices], 0
-        )
-        bracket_part_ends = np.linspace(
-            bracket_lower_ends, bracket_upper_ends, n_bracket_parts + 1, axis=-1
-        )
+        lower_ends, upper_ends = np.sort(bracket_locations[:2, jump_bracket_indices], 0)
+        bracket_part_ends = np.linspace(lower_ends, upper_ends, n_bracket_parts + 1, axis=-1)
         bracket_indices = np.concatenate(
             [smooth_bracket_indices, np.repeat(jump_bracket_indices, n_bracket_parts - 1)]
         )
@@ -181,9 +169,10 @@ def locate_function_roots(
                 np.where(has_same_sign, opposite_values, newest_values),
                 np.where(has_same_sign, newest_values, opposite_values),
             )
-        bracket_locations[1, smooth_bracket_indices[values_at_proposals == 0.0]] = (
-            proposed_locations[values_at_proposals == 0.0]
-        )
+        is_exact_root = values_at_proposals == 0.0
+        bracket_locations[1, smooth_bracket_indices[is_exact_root]] = proposed_locations[
+            is_exact_root
+        ]
         is_left_side = (
             np.sign(values_at_part_ends)
             != np.sign(values_at_location_1[jump_bracket_indices])[:, None]
@@ -197,16 +186,13 @@ def locate_function_roots(
         is_sign_jump[smooth_bracket_indices] = (
             is_function_undefined[: len(smooth_bracket_indices)]
             | (values_at_proposals == function_values[2, smooth_bracket_indices])
-            | (n_search_rounds >= options.max_search_rounds_per_smooth_bracket)
+            | (n_search_rounds >= ROOT_SEARCH_OPTIONS.max_search_rounds_per_smooth_bracket)
         )
+    is_newest_end_better = np.abs(function_values[0]) < np.abs(function_values[1])
     best_locations = np.where(
         is_sign_jump,
         np.min(bracket_locations[:2], 0),
-        np.where(
-            np.abs(function_values[0]) < np.abs(function_values[1]),
-            bracket_locations[0],
-            bracket_locations[1],
-        ),
+        np.where(is_newest_end_better, bracket_locations[0], bracket_locations[1]),
     )
     return RootLocations(best_locations, *np.sort(bracket_locations[:2], 0))
 
@@ -217,37 +203,35 @@ def _propose_root_location(
     """Return the next trial location in each bracket by Chandrupatla's method (1997,
     doi 10/d9zjj8).
     """
+    newest_location, opposite_location, replaced_location = bracket_locations
+    newest_value, opposite_value, replaced_value = function_values
     with np.errstate(divide="ignore", invalid="ignore"):
-        location_ratio, value_ratio = (
-            (bracket_locations[0] - bracket_locations[1])
-            / (bracket_locations[2] - bracket_locations[1]),
-            (function_values[0] - function_values[1]) / (function_values[2] - function_values[1]),
+        location_ratio = (newest_location - opposite_location) / (
+            replaced_location - opposite_location
         )
+        value_ratio = (newest_value - opposite_value) / (replaced_value - opposite_value)
         is_interpolation_trusted = (1.0 - np.sqrt(1.0 - location_ratio) < value_ratio) & (
             value_ratio < np.sqrt(location_ratio)
         )
         interpolated_fraction = (
-            function_values[0]
-            / (function_values[0] - function_values[1])
-            * function_values[2]
-            / (function_values[2] - function_values[1])
+            newest_value
+            / (newest_value - opposite_value)
+            * replaced_value
+            / (replaced_value - opposite_value)
         )
         interpolated_fraction -= (
-            (bracket_locations[2] - bracket_locations[0])
-            / (bracket_locations[1] - bracket_locations[0])
-            * function_values[0]
-            / (function_values[2] - function_values[0])
-            * function_values[1]
-            / (function_values[1] - function_values[2])
+            (replaced_location - newest_location)
+            / (opposite_location - newest_location)
+            * newest_value
+            / (replaced_value - newest_value)
+            * opposite_value
+            / (opposite_value - replaced_value)
         )
-    bracket_length = bracket_locations[1] - bracket_locations[0]
+    bracket_length = opposite_location - newest_location
     min_bracket_fraction = 0.5 * max_bracket_width / np.abs(bracket_length)
-    return (
-        bracket_locations[0]
-        + np.clip(
-            np.where(is_interpolation_trusted, interpolated_fraction, 0.5),
-            min_bracket_fraction,
-            1.0 - min_bracket_fraction,
-        )
-        * bracket_length
+    bracket_fraction = np.clip(
+        np.where(is_interpolation_trusted, interpolated_fraction, 0.5),
+        min_bracket_fraction,
+        1.0 - min_bracket_fraction,
     )
+    return newest_location + bracket_fraction * bracket_length

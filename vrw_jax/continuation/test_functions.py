@@ -93,26 +93,20 @@ class TestFunctionCurve(AbstractContinuationProblem):
         newton_step = self.test_function.linearize(
             args, z.z, jnp.stack([p, self.compute_second_parameter(z)])
         )
-        derivative_by_first_parameter = newton_step.parameter_gradient[0]
         derivative_by_second_fraction = parameter_range * newton_step.parameter_gradient[1]
         second_fraction_change = -newton_step.test_function_value / derivative_by_second_fraction
-        second_fraction_tangent = -derivative_by_first_parameter / derivative_by_second_fraction
+        second_fraction_tangent = -newton_step.parameter_gradient[0] / derivative_by_second_fraction
         tangent_by_first_parameter, tangent_by_second_parameter = newton_step.tangents_by_parameter
-        combine_fixed_point_tangents = lambda parameter_change: (
-            lambda leaf_by_first_parameter, leaf_by_second_parameter: (
-                leaf_by_first_parameter
-                + parameter_range * parameter_change * leaf_by_second_parameter
-            )
-        )
-        fixed_point_correction = jax.tree.map(
-            combine_fixed_point_tangents(second_fraction_change),
-            newton_step.newton_correction,
+        add_second_tangent = lambda tree, fraction_change: jax.tree.map(
+            lambda leaf, tangent_leaf: leaf + parameter_range * fraction_change * tangent_leaf,
+            tree,
             tangent_by_second_parameter,
         )
-        fixed_point_tangent = jax.tree.map(
-            combine_fixed_point_tangents(second_fraction_tangent),
-            tangent_by_first_parameter,
-            tangent_by_second_parameter,
+        fixed_point_correction = add_second_tangent(
+            newton_step.newton_correction, second_fraction_change
+        )
+        fixed_point_tangent = add_second_tangent(
+            tangent_by_first_parameter, second_fraction_tangent
         )
         # The fraction adds a multiplier of zero, which has no effect.
         padded_return_map_jacobian = jnp.pad(newton_step.return_map_jacobian, (0, 1))
