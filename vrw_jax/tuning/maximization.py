@@ -10,7 +10,7 @@ every free parameter is between 0 and 1.
 import enum
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -45,37 +45,39 @@ class TrialKind(enum.IntEnum):
 
 
 class EvaluatedTrial(NamedTuple):
-    """Trial wheel with its evaluated gait. If the wheel has no gait, all values are NaN."""
+    """Trial wheel with its evaluated gait. If the wheel has no gait, all values are NaN.
+
+    In a batch of trials, every array has a leading axis over the trials.
+    """
 
     normalized_parameters: np.ndarray  # free parameters in widths of their bounds
-    outcome: Outcome
-    is_on_branch: bool
-    objective: float
+    outcome: Any  # an Outcome; in a batch an array of codes
+    is_on_branch: Any
+    objective: Any
     objective_gradient: np.ndarray  # gradient of the objective by normalized parameters
     constraint_slacks: np.ndarray  # constraint values minus their margins, in their own units
     slack_jacobian: np.ndarray  # (n_constraints, n_free_parameters)
-    gait_evaluation: GaitEvaluation | None
+    gait_evaluation: GaitEvaluation
 
     @property
-    def has_gait_on_branch(self) -> bool:
+    def has_gait_on_branch(self) -> Any:
         """Return whether the trial wheel has a gait on the branch of the start."""
-        return self.outcome == Outcome.STEPPED and self.is_on_branch
+        return (self.outcome == Outcome.STEPPED) & self.is_on_branch
 
     @property
-    def has_finite_values(self) -> bool:
+    def has_finite_values(self) -> Any:
         """Return whether the objective, the constraints and their derivatives are finite."""
-        trial_values = (
-            self.objective,
-            self.objective_gradient,
-            self.constraint_slacks,
-            self.slack_jacobian,
+        return (
+            np.isfinite(self.objective)
+            & np.isfinite(self.objective_gradient).all(-1)
+            & np.isfinite(self.constraint_slacks).all(-1)
+            & np.isfinite(self.slack_jacobian).all((-1, -2))
         )
-        return all(bool(np.isfinite(trial_value).all()) for trial_value in trial_values)
 
     @property
-    def is_usable_trial(self) -> bool:
+    def is_usable_trial(self) -> Any:
         """Return whether the maximization may continue from this trial."""
-        return self.has_gait_on_branch and self.has_finite_values
+        return self.has_gait_on_branch & self.has_finite_values
 
     def describe_first_nonfinite_value(
         self,
@@ -87,22 +89,17 @@ class EvaluatedTrial(NamedTuple):
 
         The objective is checked first, then the constraints in their order.
         """
-        objective_and_constraint_values = (
-            self.objective,
-            *map(float, self.constraint_slacks + min_constraint_values),
-        )
-        objective_and_constraint_gradients = self.objective_gradient, *self.slack_jacobian
-        for measure_name, objective_or_constraint_value, objective_or_constraint_gradient in zip(
+        for measure_name, value, gradient in zip(
             (objective_label, *constraint_names),
-            objective_and_constraint_values,
-            objective_and_constraint_gradients,
+            (self.objective, *(self.constraint_slacks + min_constraint_values)),
+            (self.objective_gradient, *self.slack_jacobian),
             strict=True,
         ):
             unprefixed_measure_name = measure_name.removeprefix(UPPER_BOUND_PREFIX)
-            if not np.isfinite(objective_or_constraint_value):
-                measure_value = restore_sign_of_bound(measure_name, objective_or_constraint_value)
+            if not np.isfinite(value):
+                measure_value = restore_sign_of_bound(measure_name, value)
                 return f"{unprefixed_measure_name} is {measure_value:g}"
-            if not np.isfinite(objective_or_constraint_gradient).all():
+            if not np.isfinite(gradient).all():
                 return f"{unprefixed_measure_name} has a derivative that is not finite"
         raise ValueError("Every number of this trial is finite: describe another.")
 
@@ -170,7 +167,10 @@ given, the search for the gait begins at its gait.
 
 
 class _TrialRecord:
-    """Record of all trials in order. Each point is evaluated only once."""
+    """Record of all trials in order. Each point is evaluated only once.
+
+    The keys of `trials` and `kinds` are the bytes of the normalized parameters.
+    """
 
     def __init__(
         self,
@@ -178,9 +178,9 @@ class _TrialRecord:
         start_trial: EvaluatedTrial,
         max_evaluations: int,
     ) -> None:
-        self.evaluated_trials, self.trial_kinds = [start_trial], [TrialKind.START]
         self._evaluate_trial_gait, self._max_evaluations = trial_evaluator, max_evaluations
-        self._trial_index_by_parameters = {start_trial.normalized_parameters.tobytes(): 0}
+        start_key = start_trial.normalized_parameters.tobytes()
+        self.trials, self.kinds = {start_key: start_trial}, {start_key: TrialKind.START}
 
     def evaluate_trial_once(self, normalized_parameters: np.ndarray) -> EvaluatedTrial:
         """Return the trial with these normalized parameters, and evaluate it if it is not yet
@@ -189,25 +189,23 @@ class _TrialRecord:
         Raise an exception if the trial is unusable, or if the allowed number of evaluations is
         reached.
         """
-        trial_index = self._trial_index_by_parameters.get(normalized_parameters.tobytes())
-        if trial_index is None:
-            if len(self.evaluated_trials) >= self._max_evaluations:
+        trial_key = normalized_parameters.tobytes()
+        if trial_key not in self.trials:
+            if len(self.trials) >= self._max_evaluations:
                 raise _EvaluationLimitReachedError
-            nearest_gait = min(
-                (trial for trial in self.evaluated_trials if trial.is_usable_trial),
+            nearest_trial = min(
+                (trial for trial in self.trials.values() if trial.is_usable_trial),
                 key=lambda trial: float(
                     np.linalg.norm(trial.normalized_parameters - normalized_parameters)
                 ),
             )
-            trial_index = len(self.evaluated_trials)
-            self.evaluated_trials.append(
-                self._evaluate_trial_gait(np.array(normalized_parameters), nearest_gait)
+            self.trials[trial_key] = self._evaluate_trial_gait(
+                np.array(normalized_parameters), nearest_trial
             )
-            self.trial_kinds.append(TrialKind.TRIAL)
-            self._trial_index_by_parameters[normalized_parameters.tobytes()] = trial_index
-        trial = self.evaluated_trials[trial_index]
+            self.kinds[trial_key] = TrialKind.TRIAL
+        trial = self.trials[trial_key]
         if not trial.is_usable_trial:
-            self.trial_kinds[trial_index] = (
+            self.kinds[trial_key] = (
                 TrialKind.NOT_FINITE if trial.has_gait_on_branch else TrialKind.LOST
             )
             raise _LostBranchError(trial)
@@ -216,9 +214,9 @@ class _TrialRecord:
     def evaluate_iterate_once(self, normalized_parameters: np.ndarray) -> EvaluatedTrial:
         """Return the trial with these normalized parameters, and record it as an iterate."""
         trial = self.evaluate_trial_once(normalized_parameters)
-        trial_index = self._trial_index_by_parameters[normalized_parameters.tobytes()]
-        if trial_index:
-            self.trial_kinds[trial_index] = TrialKind.ITERATE
+        trial_key = normalized_parameters.tobytes()
+        if self.kinds[trial_key] != TrialKind.START:
+            self.kinds[trial_key] = TrialKind.ITERATE
         return trial
 
 
@@ -228,42 +226,53 @@ def maximize_objective(
     *,
     tolerance: float,
     max_evaluations: int,
-    maximization_options: MaximizationOptions = DEFAULT_MAXIMIZATION_OPTIONS,
 ) -> MaximizationResult:
     """Maximize the objective locally from `start_trial`, subject to slacks of at least 0."""
     from scipy.optimize import minimize  # This import is slow.
 
+    maximization_options = DEFAULT_MAXIMIZATION_OPTIONS
     trial_record = _TrialRecord(trial_evaluator, start_trial, max_evaluations)
     gradient_norm = max(float(np.linalg.norm(start_trial.objective_gradient)), 1e-12)
     slack_scales = compute_slack_scales(start_trial.constraint_slacks, start_trial.slack_jacobian)
 
+    compute_violation_of = lambda trial: compute_max_violation(
+        trial.constraint_slacks, slack_scales
+    )
+    active_bound_tolerance = maximization_options.active_bound_tolerance
+
     def stop_at_optimum(trial: EvaluatedTrial) -> EvaluatedTrial:
         if (
-            compute_max_violation(trial.constraint_slacks, slack_scales)
-            <= maximization_options.active_bound_tolerance
-            and compute_optimality_conditions(trial, maximization_options).kkt_residual <= tolerance
+            compute_violation_of(trial) <= active_bound_tolerance
+            and compute_optimality_conditions(trial).kkt_residual <= tolerance
         ):
             raise _OptimumReachedError(trial)
         return trial
 
-    center_trial, trust_box_radius, max_trust_box_radius = (
-        start_trial,
-        maximization_options.full_trust_box_radius,
-        maximization_options.full_trust_box_radius,
-    )
+    def evaluate_loss(trial_parameters: np.ndarray) -> tuple[float, np.ndarray]:
+        """Return the function that SLSQP minimizes, and its gradient."""
+        trial = trial_record.evaluate_trial_once(trial_parameters)
+        return -trial.objective / gradient_norm, -trial.objective_gradient / gradient_norm
+
+    slack_constraints = {
+        "type": "ineq",
+        "fun": lambda trial_parameters: (
+            trial_record.evaluate_trial_once(trial_parameters).constraint_slacks / slack_scales
+        ),
+        "jac": lambda trial_parameters: (
+            trial_record.evaluate_trial_once(trial_parameters).slack_jacobian
+            / slack_scales[:, None]
+        ),
+    }
+    center_trial = start_trial
+    trust_box_radius = max_trust_box_radius = maximization_options.full_trust_box_radius
     tune_status, n_trials_before_trust_box = TuneStatus.CONVERGED, 0
     while True:
         # If this box had no new evaluation, the next box is smaller, because the search would be
         # repeated.
-        max_trust_box_radius = (
-            max_trust_box_radius
-            if len(trial_record.evaluated_trials) > n_trials_before_trust_box
-            else 0.5 * max_trust_box_radius
-        )
-        n_trials_before_trust_box, trust_box_radius = (
-            len(trial_record.evaluated_trials),
-            min(trust_box_radius, max_trust_box_radius),
-        )
+        if len(trial_record.trials) == n_trials_before_trust_box:
+            max_trust_box_radius *= 0.5
+        n_trials_before_trust_box = len(trial_record.trials)
+        trust_box_radius = min(trust_box_radius, max_trust_box_radius)
         if trust_box_radius < maximization_options.min_trust_box_radius:
             tune_status = TuneStatus.BRANCH_ENDED
             break
@@ -276,26 +285,11 @@ def maximize_objective(
         trust_box_iterates = [center_trial]
         try:
             slsqp_result = minimize(
-                lambda trial_parameters: (
-                    -trial_record.evaluate_trial_once(trial_parameters).objective / gradient_norm
-                ),
+                evaluate_loss,
                 center_trial.normalized_parameters,
-                jac=lambda trial_parameters: (
-                    -trial_record.evaluate_trial_once(trial_parameters).objective_gradient
-                    / gradient_norm
-                ),
+                jac=True,
                 bounds=list(zip(lower_trust_box_side, upper_trust_box_side, strict=True)),
-                constraints={
-                    "type": "ineq",
-                    "fun": lambda trial_parameters: (
-                        trial_record.evaluate_trial_once(trial_parameters).constraint_slacks
-                        / slack_scales
-                    ),
-                    "jac": lambda trial_parameters: (
-                        trial_record.evaluate_trial_once(trial_parameters).slack_jacobian
-                        / slack_scales[:, None]
-                    ),
-                },
+                constraints=slack_constraints,
                 method="SLSQP",
                 options={
                     "ftol": maximization_options.fine_objective_tolerance
@@ -314,14 +308,10 @@ def maximize_objective(
             )
         except _LostBranchError as lost_branch:
             center_trial = trust_box_iterates[-1]
-            trust_box_radius = 0.5 * float(
-                np.max(
-                    np.abs(
-                        lost_branch.lost_trial.normalized_parameters
-                        - center_trial.normalized_parameters
-                    )
-                )
+            distances_to_lost_trial = np.abs(
+                lost_branch.lost_trial.normalized_parameters - center_trial.normalized_parameters
             )
+            trust_box_radius = 0.5 * float(np.max(distances_to_lost_trial))
             continue
         except _OptimumReachedError as reached_optimum:
             center_trial = reached_optimum.optimal_trial
@@ -343,48 +333,27 @@ def maximize_objective(
             if has_reached_inner_box_side.any()
             else maximization_options.full_trust_box_radius
         )
+    if (
+        tune_status == TuneStatus.CONVERGED
+        and compute_violation_of(center_trial) > 10.0 * active_bound_tolerance
+    ):
+        tune_status = TuneStatus.NO_FEASIBLE_GAIT
     best_trial = center_trial
     if tune_status != TuneStatus.CONVERGED:
-        best_trial = _find_best_trial(
-            trial_record, slack_scales, center_trial, maximization_options
+        usable_trials = [trial for trial in trial_record.trials.values() if trial.is_usable_trial]
+        feasible_trials = [
+            trial
+            for trial in (*usable_trials, center_trial)
+            if compute_violation_of(trial) <= active_bound_tolerance
+        ]
+        best_trial = (
+            max(feasible_trials, key=lambda trial: trial.objective)
+            if feasible_trials
+            else min(usable_trials, key=compute_violation_of)
         )
-    elif (
-        compute_max_violation(center_trial.constraint_slacks, slack_scales)
-        > 10.0 * maximization_options.active_bound_tolerance
-    ):
-        best_trial = _find_best_trial(
-            trial_record, slack_scales, center_trial, maximization_options
-        )
-        tune_status = TuneStatus.NO_FEASIBLE_GAIT
     return MaximizationResult(
-        best_trial, tune_status, trial_record.evaluated_trials, trial_record.trial_kinds
+        best_trial, tune_status, [*trial_record.trials.values()], [*trial_record.kinds.values()]
     )
-
-
-def _find_best_trial(
-    trial_record: _TrialRecord,
-    slack_scales: np.ndarray,
-    last_trial: EvaluatedTrial,
-    maximization_options: MaximizationOptions,
-) -> EvaluatedTrial:
-    """Return the best trial that satisfies all constraints.
-
-    If there is none, return the trial with the smallest violation.
-    """
-    usable_trials = [trial for trial in trial_record.evaluated_trials if trial.is_usable_trial]
-    is_trial_feasible = lambda trial: (
-        compute_max_violation(trial.constraint_slacks, slack_scales)
-        <= maximization_options.active_bound_tolerance
-    )
-    feasible_trials = [trial for trial in usable_trials if is_trial_feasible(trial)]
-    if not feasible_trials:
-        return min(
-            usable_trials,
-            key=lambda trial: compute_max_violation(trial.constraint_slacks, slack_scales),
-        )
-    if is_trial_feasible(last_trial):
-        feasible_trials.append(last_trial)
-    return max(feasible_trials, key=lambda trial: trial.objective)
 
 
 class OptimalityConditions(NamedTuple):
@@ -398,66 +367,42 @@ class OptimalityConditions(NamedTuple):
     )
 
 
-def compute_optimality_conditions(
-    trial: EvaluatedTrial, maximization_options: MaximizationOptions = DEFAULT_MAXIMIZATION_OPTIONS
-) -> OptimalityConditions:
+def compute_optimality_conditions(trial: EvaluatedTrial) -> OptimalityConditions:
     """Return the multipliers of the Karush-Kuhn-Tucker conditions for a gait.
 
     They are computed by non-negative least squares.
     """
     from scipy.optimize import nnls  # This import is slow.
 
-    n_free_parameters, active_bound_tolerance = (
-        trial.normalized_parameters.size,
-        maximization_options.active_bound_tolerance,
+    normalized_parameters, slack_scales = (
+        trial.normalized_parameters,
+        compute_slack_scales(trial.constraint_slacks, trial.slack_jacobian),
     )
-    slack_scales = compute_slack_scales(trial.constraint_slacks, trial.slack_jacobian)
-    active_constraint_indices = np.flatnonzero(
-        np.abs(trial.constraint_slacks) <= 10.0 * active_bound_tolerance * slack_scales
-    )
-    active_lower_bound_indices = np.flatnonzero(
-        trial.normalized_parameters <= active_bound_tolerance
-    )
-    active_upper_bound_indices = np.flatnonzero(
-        trial.normalized_parameters >= 1.0 - active_bound_tolerance
-    )
-    identity_matrix = np.eye(n_free_parameters)
-    constraint_normals = np.concatenate(
+    active_bound_tolerance = DEFAULT_MAXIMIZATION_OPTIONS.active_bound_tolerance
+    is_limit_active = np.concatenate(
         [
-            trial.slack_jacobian[active_constraint_indices]
-            / slack_scales[active_constraint_indices, None],
-            identity_matrix[active_lower_bound_indices],
-            -identity_matrix[active_upper_bound_indices],
+            np.abs(trial.constraint_slacks) <= 10.0 * active_bound_tolerance * slack_scales,
+            normalized_parameters <= active_bound_tolerance,
+            normalized_parameters >= 1.0 - active_bound_tolerance,
         ]
-    ).T
+    )
+    identity_matrix = np.eye(normalized_parameters.size)
+    limit_normals = np.concatenate(
+        [trial.slack_jacobian / slack_scales[:, None], identity_matrix, -identity_matrix]
+    )
     gradient_norm = max(float(np.linalg.norm(trial.objective_gradient)), 1e-300)
-    constraint_prices = np.zeros(trial.constraint_slacks.size)
-    lower_bound_prices, upper_bound_prices = (
-        np.zeros(n_free_parameters),
-        np.zeros(n_free_parameters),
+    limit_prices, kkt_residual = np.zeros(len(is_limit_active)), 1.0
+    if is_limit_active.any():
+        limit_prices[is_limit_active], least_squares_residual = nnls(
+            limit_normals[is_limit_active].T, -trial.objective_gradient
+        )
+        kkt_residual = float(least_squares_residual) / gradient_norm
+    scaled_constraint_prices, lower_bound_prices, upper_bound_prices = np.split(
+        limit_prices, [-2 * normalized_parameters.size, -normalized_parameters.size]
     )
-    if not constraint_normals.shape[1]:
-        return OptimalityConditions(constraint_prices, lower_bound_prices, upper_bound_prices, 1.0)
-    constraint_normal_weights, least_squares_residual = nnls(
-        constraint_normals, -trial.objective_gradient
-    )
-    first_lower_bound_weight, first_upper_bound_weight = (
-        len(active_constraint_indices),
-        len(active_constraint_indices) + len(active_lower_bound_indices),
-    )
-    constraint_prices[active_constraint_indices] = (
-        constraint_normal_weights[:first_lower_bound_weight]
-        / slack_scales[active_constraint_indices]
-    )
-    lower_bound_prices[active_lower_bound_indices] = constraint_normal_weights[
-        first_lower_bound_weight:first_upper_bound_weight
-    ]
-    upper_bound_prices[active_upper_bound_indices] = constraint_normal_weights[
-        first_upper_bound_weight:
-    ]
     return OptimalityConditions(
-        constraint_prices,
+        scaled_constraint_prices / slack_scales,
         lower_bound_prices,
         upper_bound_prices,
-        float(least_squares_residual) / gradient_norm,
+        kkt_residual,
     )

@@ -162,12 +162,7 @@ def parse_constraint_margins(
     the smallest allowed value of the negative measure.
     """
     if constraints is None:
-        default_margin_by_name = default_margins(params)
-        return {
-            measure_name: lower_bound
-            for measure_name, lower_bound in default_margin_by_name.items()
-            if gait_finder.supports_cold_start
-        }
+        return dict(default_margins(params)) if gait_finder.supports_cold_start else {}
     constraint_margins: dict[str, float] = {}
     if isinstance(constraints, Mapping):
         for measure_name, lower_bound in constraints.items():
@@ -196,23 +191,24 @@ def _parse_constraint_bound(
     """
     if not isinstance(bound_or_range, tuple):
         return {measure_name: check_real(f"the margin of {measure_name}", bound_or_range)}
-    if len(bound_or_range) != 2 or None not in bound_or_range:
-        lower_bound, upper_bound = check_range(f"the range of {measure_name}", bound_or_range)
-        return {UPPER_BOUND_PREFIX + measure_name: -upper_bound, measure_name: lower_bound}
     if bound_or_range == (None, None):
         raise ValueError(
             f"the range of {measure_name} is (None, None), which bounds nothing: give a lower or "
             "an upper "
             "bound, as in (None, 0.6), or leave the constraint out."
         )
+    if len(bound_or_range) != 2 or None not in bound_or_range:
+        bound_or_range = check_range(f"the range of {measure_name}", bound_or_range)
     lower_limit, upper_limit = bound_or_range
-    if lower_limit is None:
-        return {
-            UPPER_BOUND_PREFIX + measure_name: -check_real(
-                f"the upper end of {measure_name}", upper_limit
-            )
-        }
-    return {measure_name: check_real(f"the lower end of {measure_name}", lower_limit)}
+    constraint_margins = {}
+    if upper_limit is not None:
+        upper_bound = check_real(f"the upper end of {measure_name}", upper_limit)
+        constraint_margins[UPPER_BOUND_PREFIX + measure_name] = -upper_bound
+    if lower_limit is not None:
+        constraint_margins[measure_name] = check_real(
+            f"the lower end of {measure_name}", lower_limit
+        )
+    return constraint_margins
 
 
 def restore_sign_of_bound(constraint_name: str, lower_bound: float) -> float:

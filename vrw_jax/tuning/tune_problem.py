@@ -38,7 +38,7 @@ from vrw_jax.measures import (
     make_measure_attributes,
 )
 from vrw_jax.measures import xarray as xr
-from vrw_jax.numerics import StepOptions, with_default_jax_settings
+from vrw_jax.numerics import StepOptions, select_tree_rows, with_default_jax_settings
 from vrw_jax.simulation import (
     ModelLike,
     collect_provenance_attributes,
@@ -109,6 +109,10 @@ class WalkValidationOptions:
     relative_start_displacement: float = 1e-5
     constraint_value_tolerance: float = 1e-3
     default_margin_tolerance: float = 1e-2
+
+
+WALK_VALIDATION_OPTIONS = WalkValidationOptions()
+"""Options of all walks that validate tuned wheels."""
 
 
 @with_default_jax_settings
@@ -225,7 +229,6 @@ class TuneProblem:
     objective_and_constraints: ObjectiveAndConstraints
     gait_finder: AbstractGaitFinder
     wheel_objective: WheelObjective | None = None
-    validation_options: WalkValidationOptions = WalkValidationOptions()
 
     @property
     def bound_widths(self) -> np.ndarray:
@@ -238,34 +241,31 @@ class TuneProblem:
         return [PARAMETER_NAMES.index(parameter_name) for parameter_name in self.free_parameters]
 
     @property
-    def constraint_names(self) -> tuple[str, ...]:
-        """Return the name of each constrained value.
+    def constraint_limits(self) -> dict[str, float]:
+        """Return the smallest allowed value of each constrained value, by name.
 
         A margin that is defined for each leg, such as the force of its stopper, has one name per
         leg.
         """
-        constraint_names: list[str] = []
-        for measure_name in self.constraint_margins:
+        constraint_limits: dict[str, float] = {}
+        for measure_name, min_value in self.constraint_margins.items():
+            names = [measure_name]
             if get_measure(measure_name).leg_dimension:
-                constraint_names += [
-                    f"{measure_name}[leg {leg_number}]"
-                    for leg_number in range(3, self.params.n_legs + 1)
-                ]
-            else:
-                constraint_names.append(measure_name)
-        return tuple(constraint_names)
+                names = [f"{measure_name}[leg {leg}]" for leg in range(3, self.params.n_legs + 1)]
+            constraint_limits |= dict.fromkeys(names, min_value)
+        return constraint_limits
+
+    @property
+    def constraint_names(self) -> tuple[str, ...]:
+        """Return the name of each constrained value."""
+        return tuple(self.constraint_limits)
 
     @property
     def min_constraint_values(self) -> np.ndarray:
         """Return the smallest allowed value of each constraint, in the order of
         `constraint_names`.
         """
-        return np.array(
-            [
-                self.constraint_margins[constraint_name.partition("[")[0]]
-                for constraint_name in self.constraint_names
-            ]
-        )
+        return np.array([*self.constraint_limits.values()])
 
     def denormalize_parameters(self, normalized_parameters: np.ndarray) -> np.ndarray:
         """Return all floating-point parameters of the wheel with these normalized free parameters.
@@ -273,8 +273,9 @@ class TuneProblem:
         A normalized parameter is its distance from the lower bound divided by the width between the
         bounds.
         """
-        parameter_values = np.array(self.gait_finder.model.collect_parameter_values(self.params))
-        parameter_values[self.free_parameter_indices] = (
+        start_values = np.array(self.gait_finder.model.collect_parameter_values(self.params))
+        parameter_values = np.tile(start_values, (*normalized_parameters.shape[:-1], 1))
+        parameter_values[..., self.free_parameter_indices] = (
             self.lower_bounds + normalized_parameters * self.bound_widths
         )
         return parameter_values
@@ -325,66 +326,104 @@ class TuneProblem:
         If `neighbor_trial` is given, the search for the gait begins at its gait.
         """
         parameter_values = jnp.asarray(self.denormalize_parameters(normalized_parameters))
-        neighbor_evaluation = None if neighbor_trial is None else neighbor_trial.gait_evaluation
         initial_guess = (
             self.gait_finder.make_initial_guess(parameter_values)
-            if neighbor_evaluation is None
-            else neighbor_evaluation.gait.cycle.warm_start
+            if neighbor_trial is None
+            else neighbor_trial.gait_evaluation.gait.cycle.warm_start
         )
         gait = self.gait_finder.find_gait(parameter_values, initial_guess)
         gait_evaluation = GaitEvaluation(
             gait, *evaluate_on_gait(self.objective_and_constraints, gait)
         )
-        gait_outcome, is_on_branch = Outcome(int(gait_evaluation.gait.outcome)), True
-        if (
-            gait_outcome == Outcome.STEPPED
-            and neighbor_trial is not None
-            and neighbor_evaluation is not None
-        ):
-            parameter_change = self.denormalize_parameters(
-                normalized_parameters
-            ) - self.denormalize_parameters(neighbor_trial.normalized_parameters)
+        gait_outcome, is_on_branch = Outcome(int(gait.outcome)), True
+        if gait_outcome == Outcome.STEPPED and neighbor_trial is not None:
             is_on_branch = is_same_branch(
-                neighbor_evaluation.gait.branch_point,
-                gait_evaluation.gait.branch_point,
-                parameter_change,
+                neighbor_trial.gait_evaluation.gait.branch_point,
+                gait.branch_point,
+                self._compute_parameter_change(normalized_parameters, neighbor_trial),
             )
         return self.make_evaluated_trial(
             normalized_parameters, gait_evaluation, gait_outcome, is_on_branch
+        )
+
+    def _evaluate_trial_batch(
+        self, normalized_parameters: np.ndarray, neighbor_trials: EvaluatedTrial | None
+    ) -> EvaluatedTrial:
+        """Evaluate a batch of trials, one for each row of `normalized_parameters`.
+
+        If `neighbor_trials` is given, the searches for the gaits begin at its gaits.
+        """
+        parameter_values = jnp.asarray(self.denormalize_parameters(normalized_parameters))
+        initial_guesses = (
+            self.gait_finder.make_initial_guesses(parameter_values)
+            if neighbor_trials is None
+            else neighbor_trials.gait_evaluation.gait.cycle.warm_start
+        )
+        gaits = self.gait_finder.find_gaits(parameter_values, initial_guesses)
+        gait_evaluations = GaitEvaluation(
+            gaits, *evaluate_on_gaits(self.objective_and_constraints, gaits)
+        )
+        is_on_branch = np.ones(len(normalized_parameters), bool)
+        if neighbor_trials is not None:
+            neighbor_points = neighbor_trials.gait_evaluation.gait.branch_point
+            is_on_branch = np.array(
+                [
+                    is_same_branch(
+                        select_tree_rows(neighbor_points, trial_index),
+                        select_tree_rows(gaits.branch_point, trial_index),
+                        parameter_change,
+                    )
+                    for trial_index, parameter_change in enumerate(
+                        self._compute_parameter_change(normalized_parameters, neighbor_trials)
+                    )
+                ]
+            )
+        return self.make_evaluated_trial(
+            normalized_parameters, gait_evaluations, np.asarray(gaits.outcome), is_on_branch
+        )
+
+    def _compute_parameter_change(
+        self, normalized_parameters: np.ndarray, neighbor_trial: EvaluatedTrial
+    ) -> np.ndarray:
+        """Return the change of all parameters from the neighboring trial."""
+        return self.denormalize_parameters(normalized_parameters) - self.denormalize_parameters(
+            neighbor_trial.normalized_parameters
         )
 
     def make_evaluated_trial(
         self,
         normalized_parameters: np.ndarray,
         gait_evaluation: GaitEvaluation,
-        gait_outcome: Outcome,
-        is_on_branch: bool,
+        gait_outcome: Any,
+        is_on_branch: Any,
     ) -> EvaluatedTrial:
-        """Return the trial for a gait whose objective and constraints have been evaluated."""
-        objective_and_constraint_values = np.array(gait_evaluation.objective_and_constraint_values)
-        free_parameter_jacobian = np.array(gait_evaluation.parameter_jacobian)[
-            self.free_parameter_indices
-        ].T
+        """Return the trial for a gait whose objective and constraints have been evaluated.
+
+        All arguments may have a leading axis over a batch of trials.
+        """
+        values = np.array(gait_evaluation.objective_and_constraint_values)
+        free_jacobian = np.swapaxes(
+            np.array(gait_evaluation.parameter_jacobian)[..., self.free_parameter_indices, :],
+            -1,
+            -2,
+        )
         if self.wheel_objective is not None and gait_outcome == Outcome.STEPPED and is_on_branch:
-            objective_and_constraint_values[0], free_parameter_jacobian[0] = (
-                self.wheel_objective.evaluate_with_gradient(
-                    self.make_wheel(normalized_parameters), self.free_parameters
-                )
+            values[0], free_jacobian[0] = self.wheel_objective.evaluate_with_gradient(
+                self.make_wheel(normalized_parameters), self.free_parameters
             )
-        free_parameter_jacobian = free_parameter_jacobian * self.bound_widths
-        if gait_outcome != Outcome.STEPPED:
-            objective_and_constraint_values, free_parameter_jacobian = (
-                np.full_like(objective_and_constraint_values, np.nan),
-                np.full_like(free_parameter_jacobian, np.nan),
-            )
+        has_gait = np.asarray(gait_outcome == Outcome.STEPPED)[..., None]
+        values = np.where(has_gait, values, np.nan)
+        normalized_jacobian = np.where(
+            has_gait[..., None], free_jacobian * self.bound_widths, np.nan
+        )
         return EvaluatedTrial(
             normalized_parameters,
             gait_outcome,
             is_on_branch,
-            float(objective_and_constraint_values[0]),
-            free_parameter_jacobian[0],
-            objective_and_constraint_values[1:] - self.min_constraint_values,
-            free_parameter_jacobian[1:],
+            values[..., 0][()],  # a number unless it is a batch
+            normalized_jacobian[..., 0, :],
+            values[..., 1:] - self.min_constraint_values,
+            normalized_jacobian[..., 1:, :],
             gait_evaluation,
         )
 
@@ -393,53 +432,8 @@ class TuneProblem:
         random_normalized_starts = np.random.default_rng(seed).uniform(
             size=(n_starts - 1, len(self.free_parameters))
         )
-
-        def denormalize_parameter_changes(normalized_changes: np.ndarray) -> np.ndarray:
-            parameter_changes = np.zeros(
-                (normalized_changes.shape[0], len(self.gait_finder.model.parameter_names))
-            )
-            parameter_changes[:, self.free_parameter_indices] = (
-                normalized_changes * self.bound_widths
-            )
-            return parameter_changes
-
-        exploration_result = explore_starts(
-            self._evaluate_gait_batch,
-            np.vstack([self.normalized_start, random_normalized_starts]),
-            denormalize_parameter_changes,
-            self.free_parameter_indices,
-            self.bound_widths,
-            self.min_constraint_values,
-        )
-        if not np.isfinite(exploration_result.objective).any():
-            raise ValueError(
-                f"none of {n_starts} starts within the bounds has a gait with a finite objective: "
-                "narrow the bounds around wheels that walk, such as WheelParams()."
-            )
-        return exploration_result
-
-    def _evaluate_gait_batch(
-        self, normalized_parameters: np.ndarray, neighbor_evaluation: GaitEvaluation | None
-    ) -> GaitEvaluation:
-        """Find and evaluate the gaits for an array of normalized parameters, shape (starts, free).
-
-        If `neighbor_evaluation` is given, the searches begin at its gaits.
-        """
-        parameter_values = jnp.asarray(
-            [
-                self.denormalize_parameters(normalized_parameter_row)
-                for normalized_parameter_row in normalized_parameters
-            ]
-        )
-        initial_guesses = self.gait_finder.make_initial_guesses(parameter_values)
-        search_guesses = (
-            initial_guesses
-            if neighbor_evaluation is None
-            else neighbor_evaluation.gait.cycle.warm_start
-        )
-        gait_batch = self.gait_finder.find_gaits(parameter_values, search_guesses)
-        return GaitEvaluation(
-            gait_batch, *evaluate_on_gaits(self.objective_and_constraints, gait_batch)
+        return explore_starts(
+            self._evaluate_trial_batch, np.vstack([self.normalized_start, random_normalized_starts])
         )
 
     def make_tune_result(
@@ -453,68 +447,47 @@ class TuneProblem:
         walk.
         """
         best_trial = maximization_result.best_trial
-        assert best_trial.gait_evaluation is not None
         best_gait = best_trial.gait_evaluation.gait
         params = self.make_wheel(best_trial.normalized_parameters)
-        optimality_conditions = compute_optimality_conditions(best_trial)
+        constraint_prices, lower_bound_prices, upper_bound_prices, kkt_residual = (
+            compute_optimality_conditions(best_trial)
+        )
+        limited_names = (*self.constraint_names, *self.free_parameters * 2)
+        limits = [*self.min_constraint_values, *self.lower_bounds, *self.upper_bounds]
+        prices = [
+            *constraint_prices,
+            *(lower_bound_prices / self.bound_widths),
+            *(upper_bound_prices / self.bound_widths),
+        ]
         active_constraints = [
             ActiveConstraint(
-                constraint_name.removeprefix(UPPER_BOUND_PREFIX),
-                restore_sign_of_bound(constraint_name, constraint_limit),
-                get_measure(constraint_name).unit,
-                objective_price,
+                limited_name.removeprefix(UPPER_BOUND_PREFIX),
+                restore_sign_of_bound(limited_name, limit),
+                get_measure(limited_name).unit,
+                float(price),
             )
-            for constraint_name, constraint_limit, objective_price in zip(
-                self.constraint_names,
-                self.min_constraint_values,
-                map(float, optimality_conditions.constraint_prices),
-                strict=True,
-            )
-            if objective_price > 0.0
+            for limited_name, limit, price in zip(limited_names, limits, prices, strict=True)
+            if price > 0.0
         ]
-        bounds_and_prices = (
-            (self.lower_bounds, optimality_conditions.lower_bound_prices),
-            (self.upper_bounds, optimality_conditions.upper_bound_prices),
-        )
-        for bound_values, bound_prices in bounds_and_prices:
-            for parameter_name, constraint_limit, objective_price, bound_width in zip(
-                self.free_parameters, bound_values, bound_prices, self.bound_widths, strict=True
-            ):
-                if objective_price > 0.0:
-                    constraint_limit_unit, price_per_unit = (
-                        get_measure(parameter_name).unit,
-                        float(objective_price / bound_width),
-                    )
-                    active_constraints.append(
-                        ActiveConstraint(
-                            parameter_name,
-                            float(constraint_limit),
-                            constraint_limit_unit,
-                            price_per_unit,
-                        )
-                    )
         end_seconds = time.perf_counter()
         walk_validation = self._validate_tuned_wheel_by_walking(params, best_gait)
         step_measures = best_gait.step.measures()
-        violated_margin_names = [
-            measure_name
-            for measure_name in MARGIN_MEASURES
-            if measure_name in step_measures and np.min(step_measures[measure_name]) < 0.0
-        ]
         return TuneResult(
             params=params,
             status=maximization_result.status,
             objective=self.objective_label,
-            value=best_trial.objective,
-            start_value=maximization_result.evaluated_trials[0].objective,
+            value=float(best_trial.objective),
+            start_value=float(maximization_result.evaluated_trials[0].objective),
             cycle=best_gait.cycle,
             step=best_gait.step,
             active=tuple(active_constraints),
-            kkt_residual=optimality_conditions.kkt_residual,
+            kkt_residual=kkt_residual,
             violated_margins=tuple(
                 measure_name
-                for measure_name in violated_margin_names
-                if measure_name not in self.constraint_margins
+                for measure_name in MARGIN_MEASURES
+                if measure_name in step_measures
+                and measure_name not in self.constraint_margins
+                and np.min(step_measures[measure_name]) < 0.0
             ),
             validation=walk_validation,
             path=self._make_path_dataset(maximization_result),
@@ -533,48 +506,34 @@ class TuneProblem:
         """Simulate a walk that starts near the section state of the gait, and return its
         validation.
         """
-        cycle_section_state, validation_walk_options = (
-            np.array(gait.cycle.section_state),
-            self.validation_options,
-        )
+        options = WALK_VALIDATION_OPTIONS
+        cycle_section_state = np.array(gait.cycle.section_state)
         # The state is scaled down, not up, because no leg may be beyond its stopper.
-        section_state = cycle_section_state * (
-            1.0 - validation_walk_options.relative_start_displacement
-        )
+        section_state = cycle_section_state * (1.0 - options.relative_start_displacement)
         is_gait_feasible, walk_outcome, n_steps_walked = True, Outcome.STEPPED, 0
         default_margins_by_name = default_margins(params)
-        for _ in range(validation_walk_options.n_steps_of_walk):
+        for _ in range(options.n_steps_of_walk):
             step_result = self.gait_finder.take_gait_step(params, jnp.asarray(section_state))
             walk_outcome = Outcome(int(step_result.outcome))
             if walk_outcome != Outcome.STEPPED:
                 break
             n_steps_walked, section_state = n_steps_walked + 1, np.array(step_result.section_state)
-            step_measures = {
-                measure_name: np.asarray(measure_value)
-                for measure_name, measure_value in step_result.measures().items()
-            }
+            step_measures = step_result.measures()
             for constraint_name, min_constraint_value in self.constraint_margins.items():
-                if (
-                    measure_name := constraint_name.removeprefix(UPPER_BOUND_PREFIX)
-                ) in step_measures:
-                    constraint_value = (
-                        step_measures[measure_name]
-                        if measure_name == constraint_name
-                        else -step_measures[measure_name]
-                    )
-                    default_margin = abs(default_margins_by_name.get(constraint_name, 0.0))
-                    violation_tolerance = (
-                        validation_walk_options.constraint_value_tolerance
-                        * np.max(np.abs(constraint_value))
-                    )
-                    violation_tolerance += (
-                        validation_walk_options.default_margin_tolerance * default_margin
-                    )
-                    is_gait_feasible &= bool(
-                        np.all(
-                            constraint_value >= min_constraint_value - violation_tolerance - 1e-9
-                        )
-                    )
+                measure_name = constraint_name.removeprefix(UPPER_BOUND_PREFIX)
+                if measure_name not in step_measures:
+                    continue
+                constraint_value = np.asarray(step_measures[measure_name])
+                if measure_name != constraint_name:
+                    constraint_value = -constraint_value
+                default_margin = abs(default_margins_by_name.get(constraint_name, 0.0))
+                violation_tolerance = (
+                    options.constraint_value_tolerance * np.max(np.abs(constraint_value))
+                    + options.default_margin_tolerance * default_margin
+                )
+                is_gait_feasible &= bool(
+                    np.all(constraint_value >= min_constraint_value - violation_tolerance - 1e-9)
+                )
         final_state_distance = float(np.max(np.abs(section_state - cycle_section_state)))
         return WalkValidation(
             n_steps_walked,
@@ -585,29 +544,18 @@ class TuneProblem:
 
     def _make_path_dataset(self, maximization_result: MaximizationResult) -> xr.Dataset:
         """Return a dataset that lists all trials of a maximization in order."""
-        evaluation_dimension = "evaluation"
-        normalized_parameters = np.array(
-            [trial.normalized_parameters for trial in maximization_result.evaluated_trials]
-        )
+        trials = maximization_result.evaluated_trials
+        normalized_parameters = np.array([trial.normalized_parameters for trial in trials])
         parameter_values = self.lower_bounds + normalized_parameters * self.bound_widths
         min_constraint_values = self.min_constraint_values
-        constraint_values = np.array(
-            [
-                trial.constraint_slacks + min_constraint_values
-                for trial in maximization_result.evaluated_trials
-            ]
-        )
-        start_trial = maximization_result.evaluated_trials[0]
-        slack_scales = compute_slack_scales(
-            start_trial.constraint_slacks, start_trial.slack_jacobian
-        )
+        constraint_slacks = np.array([trial.constraint_slacks for trial in trials])
+        slack_scales = compute_slack_scales(trials[0].constraint_slacks, trials[0].slack_jacobian)
         trial_outcomes = [
-            trial.outcome if trial.is_on_branch else Outcome.NO_CYCLE_FOUND
-            for trial in maximization_result.evaluated_trials
+            trial.outcome if trial.is_on_branch else Outcome.NO_CYCLE_FOUND for trial in trials
         ]
         path_dataset_variables: dict[str, Any] = {
             parameter_name: (
-                evaluation_dimension,
+                "evaluation",
                 parameter_values[:, parameter_index],
                 make_measure_attributes(parameter_name),
             )
@@ -615,45 +563,37 @@ class TuneProblem:
         }
         path_dataset_variables |= {
             "objective": (
-                evaluation_dimension,
-                [trial.objective for trial in maximization_result.evaluated_trials],
+                "evaluation",
+                [trial.objective for trial in trials],
                 {"long_name": self.objective_label},
             ),
             "constraint_value": (
-                (evaluation_dimension, "constraint"),
-                constraint_values.reshape(len(normalized_parameters), min_constraint_values.size),
+                ("evaluation", "constraint"),
+                constraint_slacks + min_constraint_values,
             ),
             "margin": ("constraint", min_constraint_values, {"long_name": "least value allowed"}),
             "breach": (
-                evaluation_dimension,
-                np.array(
-                    [
-                        compute_max_violation(trial.constraint_slacks, slack_scales)
-                        for trial in maximization_result.evaluated_trials
-                    ]
-                ),
+                "evaluation",
+                compute_max_violation(constraint_slacks, slack_scales),
                 {"long_name": "largest breach of a constraint, in widths of the bounds"},
             ),
             "kind": (
-                evaluation_dimension,
+                "evaluation",
                 np.array(maximization_result.trial_kinds, int),
                 make_flag_attributes(trial_kind.name for trial_kind in TrialKind),
             ),
             "outcome": (
-                evaluation_dimension,
+                "evaluation",
                 np.array(trial_outcomes, int),
                 make_measure_attributes("outcome"),
             ),
-            "on_branch": (
-                evaluation_dimension,
-                np.array([trial.is_on_branch for trial in maximization_result.evaluated_trials]),
-            ),
+            "on_branch": ("evaluation", np.array([trial.is_on_branch for trial in trials])),
         }
         constraint_units = [
             get_measure(constraint_name).unit for constraint_name in self.constraint_names
         ]
         path_dataset_coordinates = {
-            evaluation_dimension: np.arange(len(normalized_parameters)),
+            "evaluation": np.arange(len(trials)),
             "constraint": list(self.constraint_names),
             "constraint_unit": ("constraint", constraint_units),
         }
@@ -663,8 +603,8 @@ class TuneProblem:
             "free": " ".join(
                 self.free_parameters
             ),  # It is a text because netCDF has no lists of names.
-            "lower": [float(parameter_bound) for parameter_bound in self.lower_bounds],
-            "upper": [float(parameter_bound) for parameter_bound in self.upper_bounds],
+            "lower": self.lower_bounds.tolist(),
+            "upper": self.upper_bounds.tolist(),
             "ending": maximization_result.status.name,
         }
         provenance_attributes = collect_provenance_attributes(
@@ -818,12 +758,13 @@ def _check_parameter_bounds(
         lower_bound, upper_bound = check_range(
             f"the range of {parameter_name}", bounds[parameter_name]
         )
+        parameter_domain = PARAMETER_DOMAINS[parameter_name]
         for bound_value in (lower_bound, upper_bound):
-            if not PARAMETER_DOMAINS[parameter_name].contains_parameter_value(bound_value):
+            if not parameter_domain.contains_parameter_value(bound_value):
                 raise ValueError(
                     f"the bounds of {parameter_name} reach {bound_value:g}, but "
-                    f"{PARAMETER_DOMAINS[parameter_name].description} must lie "
-                    f"in {PARAMETER_DOMAINS[parameter_name]}: keep them inside."
+                    f"{parameter_domain.description} must lie "
+                    f"in {parameter_domain}: keep them inside."
                 )
         start_parameter_value = float(getattr(params, parameter_name))
         if not lower_bound <= start_parameter_value <= upper_bound:
@@ -831,10 +772,5 @@ def _check_parameter_bounds(
                 f"the start has {parameter_name} {start_parameter_value:g}, outside its bounds "
                 f"({lower_bound:g}, {upper_bound:g}): widen the bounds or start inside them."
             )
-    bound_pairs = np.array(
-        [
-            [float(parameter_bound) for parameter_bound in bounds[parameter_name]]
-            for parameter_name in free_parameters
-        ]
-    )
+    bound_pairs = np.array([bounds[parameter_name] for parameter_name in free_parameters], float)
     return free_parameters, bound_pairs[:, 0], bound_pairs[:, 1]
