@@ -10,10 +10,15 @@ import pytest
 import xarray as xr
 from PIL import Image
 
+import vrw_jax as vrw
 from experiments.shared.color_vision import simulate_color_vision
 from vrw_jax.figures import branch_figures as branch
 from vrw_jax.figures import indicators, save_animation, style
 from vrw_jax.figures.branch_figures import basin_figure
+from vrw_jax.figures.tuning_figures import tuning_figure
+from vrw_jax.tuning import TrialKind
+from vrw_jax.tuning.maximization import TuneStatus
+from vrw_jax.tuning.tune_result import ActiveConstraint, WalkValidation
 from vrw_jax.wheel import Outcome
 
 ROOT = Path(__file__).parents[2]
@@ -125,6 +130,45 @@ def test_the_indicator_figure_shows_its_slope():
     )
     rows = [text.get_text() for text in indicators(gaits).axes[0].texts]
     assert style.format_value_label("slope", 0.3) in rows
+
+
+def test_objective_and_parameters_of_a_tuning_run_are_drawn_over_the_evaluations():
+    path = xr.Dataset(
+        {
+            "damping": ("evaluation", [150.0, 195.0, 200.0]),
+            "objective": ("evaluation", [0.4, np.nan, 0.5], {"long_name": "dls_fraction"}),
+            "constraint_value": (("evaluation", "constraint"), [[1.0], [np.nan], [0.5]]),
+            "margin": ("constraint", [0.0]),
+            "breach": ("evaluation", [0.0, np.nan, 0.0]),
+            "kind": ("evaluation", [TrialKind.START, TrialKind.LOST, TrialKind.ITERATE]),
+        },
+        {"evaluation": range(3), "constraint": ["locked_stopper_force[3]"]},
+        {"free": "damping", "lower": [100.0], "upper": [200.0]},
+    )
+    result = vrw.TuneResult(
+        params=vrw.WheelParams(damping=200.0),
+        status=TuneStatus.CONVERGED,
+        objective="dls_fraction",
+        value=0.5,
+        start_value=0.4,
+        cycle=None,
+        step=None,
+        active=(ActiveConstraint("damping", 200.0, "N s/m", 0.1),),
+        kkt_residual=0.0,
+        violated_margins=(),
+        validation=WalkValidation(10, Outcome.STEPPED, 0.0, True),
+        path=path,
+        n_evaluations=3,
+        n_backtracks=1,
+        seconds=1.0,
+        compile_seconds=0.5,
+    )
+    objective, slack, parameters = tuning_figure(result).axes
+    np.testing.assert_array_equal(objective.lines[0].get_xydata(), [[0.0, 0.4], [2.0, 0.5]])
+    np.testing.assert_array_equal(
+        parameters.lines[0].get_xydata(), [[0.0, 0.5], [1.0, 0.95], [2.0, 1.0]]
+    )
+    assert [bar.get_width() for bar in slack.patches] == [1.0, 0.5]
 
 
 UNIT = r"(s|ms|µs|m|mm|N|J|%|rad|m/s|rad/s|N s/m|N·s/m)"

@@ -62,7 +62,7 @@ def tuning_figure(tuned: TuneResult) -> Figure:
 def _draw_objective_path(axes: Axes, path_dataset: xr.Dataset) -> None:
     """Draw the objective of each evaluated gait."""
     evaluation_numbers, objective_values = (
-        path_dataset.gait_evaluation.values,
+        path_dataset.evaluation.values,
         path_dataset.objective.values,
     )
     is_gait_lost = np.isin(path_dataset.kind.values, (TrialKind.LOST, TrialKind.NOT_FINITE))
@@ -118,7 +118,7 @@ def _draw_parameter_paths(axes: Axes, path_dataset: xr.Dataset) -> None:
             upper_bounds[i] - lower_bounds[i]
         )
         axes.plot(
-            path_dataset.gait_evaluation,
+            path_dataset.evaluation,
             scaled_parameter_values,
             marker=".",
             markersize=4.0,
