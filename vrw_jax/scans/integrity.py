@@ -87,9 +87,13 @@ def digest_coordinate_values(coordinate_values: np.ndarray) -> str:
 def read_metadata_file(metadata_path: Path) -> dict[str, Any]:
     """Return the content of a metadata file, or an empty dictionary if the file cannot be read."""
     try:
-        metadata = json.loads(metadata_path.read_text(encoding="utf-8"))
+        return _ensure_dictionary(json.loads(metadata_path.read_text(encoding="utf-8")))
     except (OSError, ValueError, RecursionError):
         return {}
+
+
+def _ensure_dictionary(metadata: Any) -> dict[str, Any]:
+    """Return `metadata`, or an empty dictionary if damaged metadata are no dictionary."""
     return metadata if isinstance(metadata, dict) else {}
 
 
@@ -99,35 +103,24 @@ class StoredMetadata:
     """
 
     def __init__(self, store_path: Path) -> None:
-        self._store_path, self.root_metadata = (
-            store_path,
-            read_metadata_file(store_path / METADATA_FILE_NAME),
+        self._store_path = store_path
+        self.root_metadata = self._read_array_metadata("")
+        consolidated_metadata_entry = _ensure_dictionary(
+            self.root_metadata.get("consolidated_metadata")
         )
-        root_attributes = self.root_metadata.get("attributes")
-        consolidated_metadata_entry = self.root_metadata.get("consolidated_metadata")
-        consolidated_arrays = (
-            consolidated_metadata_entry.get("metadata")
-            if isinstance(consolidated_metadata_entry, dict)
-            else None
-        )
-        self.consolidated_metadata: dict[str, Any] = (
-            consolidated_arrays if isinstance(consolidated_arrays, dict) else {}
-        )
+        self.consolidated_metadata = _ensure_dictionary(consolidated_metadata_entry.get("metadata"))
         """Metadata of all arrays and groups by name, from the one file for all arrays."""
-        group_metadata_copies = (
-            self.consolidated_metadata.get(CHECKSUM_GROUP_NAME),
-            self._read_array_metadata(CHECKSUM_GROUP_NAME),
-        )
         attribute_copies = [
-            group_metadata.get("attributes")
-            for group_metadata in group_metadata_copies
-            if isinstance(group_metadata, dict)
+            _ensure_dictionary(_ensure_dictionary(group_metadata).get("attributes"))
+            for group_metadata in (
+                self.consolidated_metadata.get(CHECKSUM_GROUP_NAME),
+                self._read_array_metadata(CHECKSUM_GROUP_NAME),
+            )
         ]
         usable_attribute_copies = [
             attribute_copy
             for attribute_copy in attribute_copies
-            if isinstance(attribute_copy, dict)
-            and isinstance(attribute_copy.get(SCAN_VARIABLES_KEY), list)
+            if isinstance(attribute_copy.get(SCAN_VARIABLES_KEY), list)
         ]
         intact_attribute_copies = (
             attribute_copy
@@ -140,13 +133,14 @@ class StoredMetadata:
         """Attributes of the Zarr group of marks, from the intact copy; empty in stores without such
         attributes.
         """
-        self._root_attributes = root_attributes if isinstance(root_attributes, dict) else {}
+        self._root_attributes = _ensure_dictionary(self.root_metadata.get("attributes"))
         self.store_attributes: dict[str, Any] = self._root_attributes | self.mark_attributes.get(
             STORE_ATTRIBUTES_KEY, {}
         )
         """Attributes of the store, completed from the copy in the Zarr group of marks."""
         self._do_mark_attributes_differ = (
-            bool(usable_attribute_copies) and attribute_copies[0] != attribute_copies[-1]
+            bool(self.consolidated_metadata and usable_attribute_copies)
+            and attribute_copies[0] != attribute_copies[1]
         )
 
     @property
@@ -168,10 +162,8 @@ class StoredMetadata:
         if SCAN_VARIABLES_KEY in self.mark_attributes:
             return sorted(self.mark_attributes[SCAN_VARIABLES_KEY])
         stored_manifest = read_scan_manifest(self.store_attributes)
-        measure_names, swept_parameters = (
-            stored_manifest.get("measures", []),
-            stored_manifest.get("design", {}).get("swept", []),
-        )
+        measure_names = stored_manifest.get("measures", [])
+        swept_parameters = stored_manifest.get("design", {}).get("swept", [])
         excluded_array_names = (*self.coordinate_names, *swept_parameters)
         return sorted(
             array_name
@@ -189,20 +181,18 @@ class StoredMetadata:
             array_name
             for array_name, array_metadata in self.consolidated_metadata.items()
             if array_name != CHECKSUM_ARRAY_NAME
-            and isinstance(array_metadata, dict)
-            and array_metadata.get("node_type") == "array"
+            and _ensure_dictionary(array_metadata).get("node_type") == "array"
         ]
         checked_array_names = (
-            [*self.coordinate_names, *self.select_scan_variables(array_names)]
-            if self.consolidated_metadata
-            else []
+            *self.coordinate_names,
+            *self.select_scan_variables(array_names),
+            CHECKSUM_ARRAY_NAME,
         )
-        checked_array_names += [CHECKSUM_ARRAY_NAME] if self.consolidated_metadata else []
-        damaged_array_names = []
-        for array_name in checked_array_names:
-            array_metadata = self._read_array_metadata(array_name)
-            if not array_metadata or array_metadata != self.consolidated_metadata.get(array_name):
-                damaged_array_names.append(array_name)
+        damaged_array_names = [
+            array_name
+            for array_name in (checked_array_names if self.consolidated_metadata else ())
+            if self._read_array_metadata(array_name) != self.consolidated_metadata.get(array_name)
+        ]
         if self._do_mark_attributes_differ:
             damaged_array_names.append(CHECKSUM_GROUP_NAME)
         sealed_attributes = self.mark_attributes.get(STORE_ATTRIBUTES_KEY, {})
@@ -221,19 +211,14 @@ class StoredMetadata:
             CHECKSUM_GROUP_NAME: intact_metadata.consolidated_metadata[CHECKSUM_GROUP_NAME]
             | {"attributes": self.mark_attributes}
         }
-        unrestored_metadata = {
-            array_name: array_metadata
-            for array_name, array_metadata in self.consolidated_metadata.items()
-            if array_name not in restored_metadata
-        }
-        consolidated_metadata_entry = {
-            "kind": "inline",
-            "must_understand": False,
-            "metadata": restored_metadata | unrestored_metadata,
-        }
         restored_root_metadata = intact_metadata.root_metadata | {
             "attributes": self.store_attributes,
-            "consolidated_metadata": consolidated_metadata_entry,
+            "consolidated_metadata": {
+                "kind": "inline",
+                "must_understand": False,
+                # Arrays that the scan did not write come last.
+                "metadata": restored_metadata | self.consolidated_metadata | restored_metadata,
+            },
         }
         for array_name, array_metadata in [
             *restored_metadata.items(),
@@ -272,24 +257,14 @@ class ChunkChecksums:
     def __init__(
         self, store_path: Path, zarr_group: ZarrGroup, stored_metadata: StoredMetadata
     ) -> None:
-        self._store_path, self._zarr_group, self._stored_metadata = (
-            store_path,
-            zarr_group,
-            stored_metadata,
-        )
+        self._store_path, self._zarr_group = store_path, zarr_group
+        self._stored_metadata = stored_metadata
         self._chunk_marks = zarr_group[CHECKSUM_ARRAY_NAME]
-        array_names = [array_name for array_name, _ in zarr_group.arrays()]
         self._variable_arrays = {
             array_name: zarr_group[array_name]
-            for array_name in stored_metadata.select_scan_variables(array_names)
+            for array_name in stored_metadata.select_scan_variables(zarr_group.array_keys())
         }
-        outcome_array = self._variable_arrays["outcome"]
-        self._n_chunks_per_axis = tuple(
-            -(-axis_length // chunk_length)
-            for axis_length, chunk_length in zip(
-                outcome_array.shape, outcome_array.chunks, strict=True
-            )
-        )
+        self._n_chunks_per_axis = self._variable_arrays["outcome"].cdata_shape
         self._settings_digest = ""  # It is empty if marks are digests of the files alone.
         if SCAN_VARIABLES_KEY in stored_metadata.mark_attributes:
             settings_text = json.dumps(
@@ -317,9 +292,7 @@ class ChunkChecksums:
 
     def mark_chunk_as_written(self, chunk_index: int) -> None:
         """Mark a chunk as written, with the digest of its files as the mark."""
-        self._chunk_marks[chunk_index : chunk_index + 1] = self._compute_chunk_digest(chunk_index)[
-            None
-        ]
+        self._chunk_marks[chunk_index] = self._compute_chunk_digest(chunk_index)
 
     def find_damaged_chunks(self) -> list[int]:
         """Return the indices of marked chunks whose files have changed since the mark was written.
@@ -328,13 +301,10 @@ class ChunkChecksums:
         has written the chunk's files.
         """
         chunk_marks = self._read_chunk_marks()
-        is_chunk_intact = lambda chunk_index: bool(
-            (self._compute_chunk_digest(chunk_index) == chunk_marks[chunk_index]).all()
-        )
         return [
-            int(chunk_index)
-            for chunk_index in np.flatnonzero(_are_chunk_marks_set(chunk_marks))
-            if not is_chunk_intact(int(chunk_index))
+            chunk_index
+            for chunk_index in np.flatnonzero(_are_chunk_marks_set(chunk_marks)).tolist()
+            if not np.array_equal(self._compute_chunk_digest(chunk_index), chunk_marks[chunk_index])
         ]
 
     def find_damaged_coordinates(self) -> list[str]:
@@ -343,13 +313,11 @@ class ChunkChecksums:
         In stores without a digest of each coordinate, return all swept parameters if any of their
         values differ from those of the samples.
         """
-        if COORDINATE_DIGESTS_KEY in self._stored_metadata.mark_attributes:
-            coordinate_digests = self._stored_metadata.mark_attributes[
-                COORDINATE_DIGESTS_KEY
-            ].items()
+        coordinate_digests = self._stored_metadata.mark_attributes.get(COORDINATE_DIGESTS_KEY)
+        if coordinate_digests is not None:
             return [
                 coordinate_name
-                for coordinate_name, coordinate_digest in coordinate_digests
+                for coordinate_name, coordinate_digest in coordinate_digests.items()
                 if self._digest_stored_coordinate(coordinate_name) != coordinate_digest
             ]
         design_settings = read_scan_manifest(self._stored_metadata.store_attributes).get(
@@ -382,9 +350,7 @@ class ChunkChecksums:
         chunk_digest = hashlib.blake2b(digest_size=DIGEST_SIZE_BYTES)
         if self._settings_digest:
             chunk_digest.update(f"{self._settings_digest} {chunk_index} ".encode())
-        chunk_indices = tuple(
-            int(i) for i in np.unravel_index(chunk_index, self._n_chunks_per_axis)
-        )
+        chunk_indices = np.unravel_index(chunk_index, self._n_chunks_per_axis)
         for variable_name, variable_array in self._variable_arrays.items():
             chunk_key = variable_array.metadata.encode_chunk_key(
                 (*chunk_indices, *(0,) * (variable_array.ndim - len(chunk_indices)))
@@ -447,9 +413,8 @@ def lock_store(store_path: Path) -> Iterator[None]:
             fcntl.flock(file_descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as lock_error:
             raise ValueError(
-                f"another scan is at work on {store_path}: wait until it has ended, then run "
-                f"the same "
-                "again, or give another place."
+                f"another scan is at work on {store_path}: wait until it has ended, then run the "
+                "same again, or give another place."
             ) from lock_error
         except OSError:
             pass  # The file system has no locks.

@@ -70,10 +70,14 @@ class VariableLayout:
 
     variable_name: str
     dtype: str
-    fill_value: float | int
     variable_attributes: Mapping[str, Any]
     extra_dimension_names: tuple[str, ...] = ()
     extra_shape: tuple[int, ...] = ()
+
+    @property
+    def fill_value(self) -> float | int:
+        """Return the value of a sample without results: NaN, or -1 for an integer."""
+        return -1 if np.dtype(self.dtype).kind == "i" else np.nan
 
     @property
     def bytes_per_sample(self) -> int:
@@ -89,7 +93,7 @@ class ResultLayout:
     sample_shape: tuple[int, ...]
     chunk_shape: tuple[int, ...]
     variable_layouts: tuple[VariableLayout, ...]
-    result_coordinates: Mapping[str, tuple[str, np.ndarray, Mapping[str, Any]]]
+    result_coordinates: Mapping[str, xr.Variable]
 
     @property
     def n_chunks(self) -> int:
@@ -138,14 +142,11 @@ def choose_chunk_shape(sample_shape: tuple[int, ...], max_chunk_samples: int) ->
 
     A chunk spans the whole length of the last axes.
     """
-    chunk_shape, n_remaining_chunk_samples = [1] * len(sample_shape), max_chunk_samples
-    for sample_axis_index in range(len(sample_shape) - 1, -1, -1):
-        chunk_shape[sample_axis_index] = min(
-            sample_shape[sample_axis_index], max(n_remaining_chunk_samples, 1)
-        )
-        n_remaining_chunk_samples //= chunk_shape[sample_axis_index]
-        if chunk_shape[sample_axis_index] < sample_shape[sample_axis_index]:
-            break
+    chunk_shape: list[int] = []
+    for axis_length in reversed(sample_shape):
+        chunk_length = min(axis_length, max_chunk_samples)
+        max_chunk_samples //= chunk_length  # It stays at least 1.
+        chunk_shape.insert(0, chunk_length)
     return tuple(chunk_shape)
 
 
@@ -182,14 +183,18 @@ class MemoryResultStore(AbstractResultStore):
     """Storage of a scan's results in memory."""
 
     def __init__(self, result_layout: ResultLayout, store_attributes: Mapping[str, object]) -> None:
-        self._result_layout, self._store_attributes = result_layout, store_attributes
+        self._result_layout = result_layout
         self._is_chunk_done = np.zeros(result_layout.n_chunks, bool)
         try:
-            self._variable_arrays = {
-                variable_layout.variable_name: np.full(
-                    (*result_layout.sample_shape, *variable_layout.extra_shape),
-                    variable_layout.fill_value,
-                    variable_layout.dtype,
+            dataset_variables = {
+                variable_layout.variable_name: (
+                    (*result_layout.sample_dimension_names, *variable_layout.extra_dimension_names),
+                    np.full(
+                        (*result_layout.sample_shape, *variable_layout.extra_shape),
+                        variable_layout.fill_value,
+                        variable_layout.dtype,
+                    ),
+                    dict(variable_layout.variable_attributes),
                 )
                 for variable_layout in result_layout.variable_layouts
             }
@@ -198,44 +203,26 @@ class MemoryResultStore(AbstractResultStore):
             raise ValueError(
                 f"the result of {n_samples:,} samples takes "
                 f"{n_samples * result_layout.bytes_per_sample / 1e9:,.0f} GB, more than this "
-                f"memory "
-                "holds: give a store, whose chunks go to the disk."
+                "memory holds: give a store, whose chunks go to the disk."
             ) from memory_error
+        self._dataset = xr.Dataset(
+            dataset_variables, dict(result_layout.result_coordinates), store_attributes
+        )
 
     def find_missing_chunks(self) -> list[int]:
-        return [int(chunk_index) for chunk_index in np.flatnonzero(~self._is_chunk_done)]
+        return list(np.flatnonzero(~self._is_chunk_done).tolist())
 
     def write_chunk(self, chunk_index: int, chunk_results: ChunkVariables) -> None:
         chunk_slices = self._result_layout.compute_chunk_region(chunk_index)
-        for variable_name, variable_array in self._variable_arrays.items():
-            variable_array[chunk_slices] = chunk_results[variable_name]
+        for variable_name, variable_array in self._dataset.data_vars.items():
+            variable_array.values[chunk_slices] = chunk_results[str(variable_name)]
         self._is_chunk_done[chunk_index] = True
 
     def open_for_writing(self) -> contextlib.AbstractContextManager[None]:
         return contextlib.nullcontext()
 
     def load_dataset(self) -> xr.Dataset:
-        result_layout = self._result_layout
-        dataset = xr.Dataset(
-            {
-                variable_layout.variable_name: (
-                    (*result_layout.sample_dimension_names, *variable_layout.extra_dimension_names),
-                    self._variable_arrays[variable_layout.variable_name],
-                    dict(variable_layout.variable_attributes),
-                )
-                for variable_layout in result_layout.variable_layouts
-            },
-            coords={
-                coordinate_name: (dimension_name, coordinate_values, dict(coordinate_attributes))
-                for coordinate_name, (
-                    dimension_name,
-                    coordinate_values,
-                    coordinate_attributes,
-                ) in result_layout.result_coordinates.items()
-            },
-            attrs=dict(self._store_attributes),
-        )
-        return _arrange_requested_variables(dataset)
+        return _arrange_requested_variables(self._dataset)
 
 
 class ZarrResultStore(AbstractResultStore):
@@ -247,12 +234,8 @@ class ZarrResultStore(AbstractResultStore):
     def __init__(
         self, store_path: Path, result_layout: ResultLayout, verifies_files: bool = True
     ) -> None:
-        self._store_path, self._result_layout, self.store_location, self._verifies_files = (
-            store_path,
-            result_layout,
-            str(store_path),
-            verifies_files,
-        )
+        self._store_path, self._result_layout = store_path, result_layout
+        self.store_location, self._verifies_files = str(store_path), verifies_files
         self._open_arrays()
         self.damage_description = describe_store_damage(
             store_path, self.damaged_chunks, self._damaged_coordinates, self._damaged_metadata
@@ -284,7 +267,7 @@ class ZarrResultStore(AbstractResultStore):
             return list(range(self._result_layout.n_chunks))
         are_chunks_written = self._chunk_checksums.are_chunks_marked()
         are_chunks_written[np.asarray(self.damaged_chunks, int)] = False
-        return [int(chunk_index) for chunk_index in np.flatnonzero(~are_chunks_written)]
+        return list(np.flatnonzero(~are_chunks_written).tolist())
 
     def write_chunk(self, chunk_index: int, chunk_results: ChunkVariables) -> None:
         chunk_slices = self._result_layout.compute_chunk_region(chunk_index)
@@ -307,21 +290,15 @@ class ZarrResultStore(AbstractResultStore):
             for unfinished_file_path in self._store_path.rglob("*.partial"):
                 unfinished_file_path.unlink(missing_ok=True)
             if self._damaged_metadata:
-                # The metadata are copied from a temporary new store.
                 stored_metadata = StoredMetadata(self._store_path)
-                store_attributes = stored_metadata.store_attributes
-                temporary_store_name = f".{self._store_path.name}.{os.urandom(8).hex()}"
-                temporary_path = self._store_path.parent / temporary_store_name
-                try:
-                    temporary_path.mkdir()
-                    _create_zarr_arrays(temporary_path, self._result_layout, store_attributes)
+                with _build_temporary_store(
+                    self._store_path, self._result_layout, stored_metadata.store_attributes
+                ) as temporary_path:
                     stored_metadata.restore_from_intact_store(StoredMetadata(temporary_path))
-                finally:
-                    shutil.rmtree(temporary_path, ignore_errors=True)
                 self._open_arrays()
             for coordinate_name in self._damaged_coordinates:
                 _select_zarr_array(self._zarr_group, coordinate_name)[:] = (
-                    self._result_layout.result_coordinates[coordinate_name][1]
+                    self._result_layout.result_coordinates[coordinate_name].values
                 )
             self._damaged_coordinates = []
             yield
@@ -365,35 +342,33 @@ def open_scan(path: str | Path, *, verify: bool = True) -> xr.Dataset:
     try:
         zarr_group = _open_zarr_group(Path(path), "r", stored_metadata)
         chunk_checksums = ChunkChecksums(Path(path), zarr_group, stored_metadata)
-        if verify:
-            damage_description = describe_store_damage(
-                path,
-                chunk_checksums.find_damaged_chunks(),
-                chunk_checksums.find_damaged_coordinates(),
-                damaged_metadata,
-            )
-            if damage_description:
-                raise ValueError(f"{damage_description}: {RECOMPUTE_DAMAGED_REMEDY}")
-        dataset = xr.open_zarr(
+        damage_description = verify and describe_store_damage(
             path,
-            consolidated=zarr_group.metadata.consolidated_metadata is not None,
-            chunks=None,
-            mask_and_scale=False,
-            decode_times=False,
+            chunk_checksums.find_damaged_chunks(),
+            chunk_checksums.find_damaged_coordinates(),
+            damaged_metadata,
         )
+        if not damage_description:
+            dataset = xr.open_zarr(
+                path,
+                consolidated=zarr_group.metadata.consolidated_metadata is not None,
+                chunks=None,
+                mask_and_scale=False,
+                decode_times=False,
+            )
     except ZARR_METADATA_ERRORS as metadata_error:
-        if isinstance(metadata_error, ValueError) and RECOMPUTE_DAMAGED_REMEDY in str(
-            metadata_error
-        ):
-            raise
         store_damage_reason = ", ".join(damaged_metadata) or " ".join(
             str(metadata_error).split()
         ).rstrip(".")
         raise ValueError(
             f"{path} can't be opened ({store_damage_reason}): run the scan again, which mends the "
-            f"arrays that "
-            "it wrote, and delete others without dimension names."
+            "arrays that it wrote, and delete others without dimension names."
         ) from metadata_error
+    if damage_description:
+        raise ValueError(
+            f"{damage_description}: run the scan again, which computes these anew, or read the "
+            "rest with open_scan(path, verify=False)."
+        )
     dataset = dataset.assign_attrs(
         {
             attribute_name: attribute_value
@@ -404,10 +379,6 @@ def open_scan(path: str | Path, *, verify: bool = True) -> xr.Dataset:
     return _arrange_requested_variables(dataset)
 
 
-RECOMPUTE_DAMAGED_REMEDY = (
-    "run the scan again, which computes these anew, or read the rest with "
-    "open_scan(path, verify=False)."
-)
 ZARR_METADATA_ERRORS = (
     ArithmeticError, AssertionError, AttributeError, LookupError, OSError, RuntimeError, TypeError,
     ValueError,
@@ -422,21 +393,22 @@ def _open_zarr_group(
     read.
     """
     variable_names = stored_metadata.mark_attributes.get(SCAN_VARIABLES_KEY, ())
-    for uses_consolidated_metadata in (None, False):
-        try:
-            zarr_group = zarr.open_group(
-                store_path,
-                mode=access_mode,
-                zarr_format=3,
-                use_consolidated=uses_consolidated_metadata,
-            )
-            for array_name in (*stored_metadata.coordinate_names, *variable_names, "outcome"):
-                _select_zarr_array(zarr_group, array_name)
-            return zarr_group
-        except ZARR_METADATA_ERRORS:
-            if uses_consolidated_metadata is False:
-                raise
-    raise AssertionError
+
+    def open_with_all_arrays(uses_consolidated_metadata: bool | None) -> zarr.Group:
+        zarr_group = zarr.open_group(
+            store_path,
+            mode=access_mode,
+            zarr_format=3,
+            use_consolidated=uses_consolidated_metadata,
+        )
+        for array_name in (*stored_metadata.coordinate_names, *variable_names, "outcome"):
+            _select_zarr_array(zarr_group, array_name)
+        return zarr_group
+
+    try:
+        return open_with_all_arrays(None)
+    except ZARR_METADATA_ERRORS:
+        return open_with_all_arrays(False)
 
 
 def _arrange_requested_variables(stored_dataset: xr.Dataset) -> xr.Dataset:
@@ -452,31 +424,17 @@ def _arrange_requested_variables(stored_dataset: xr.Dataset) -> xr.Dataset:
         if requested_measures_text
         else read_scan_manifest(stored_dataset.attrs).get("measures", [])
     )
-    requested_name_by_variable = {
-        canonicalize_variable_name(requested_measure): requested_measure
-        for requested_measure in reversed(requested_measures)
-        if canonicalize_variable_name(requested_measure) in stored_dataset
+    requested_name_by_variable: dict[str, str] = {}
+    for requested_measure in requested_measures:
+        requested_name_by_variable.setdefault(
+            canonicalize_variable_name(requested_measure), requested_measure
+        )
+    new_name_by_variable = {
+        variable_name: requested_name_by_variable.get(variable_name, variable_name)
+        for variable_name in (*requested_name_by_variable, *map(str, stored_dataset.data_vars))
+        if variable_name in stored_dataset
     }
-    requested_variable_names = list(
-        dict.fromkeys(map(canonicalize_variable_name, requested_measures))
-    )
-    ordered_variables = dict.fromkeys(
-        [
-            *(
-                variable_name
-                for variable_name in requested_variable_names
-                if variable_name in requested_name_by_variable
-            ),
-            *map(str, stored_dataset.data_vars),
-        ]
-    )
-    return stored_dataset[list(ordered_variables)].rename(
-        {
-            variable_name: requested_name_by_variable[variable_name]
-            for variable_name in requested_name_by_variable
-            if variable_name != requested_name_by_variable[variable_name]
-        }
-    )
+    return stored_dataset[list(new_name_by_variable)].rename(new_name_by_variable)
 
 
 def _read_scan_metadata(store_path: Path) -> StoredMetadata:
@@ -488,12 +446,12 @@ def _read_scan_metadata(store_path: Path) -> StoredMetadata:
     ):
         raise ValueError(
             f"{store_path} is no scan's store: give the folder that `vrw scan` wrote, or a new "
-            f"place."
+            "place."
         )
     if MANIFEST_ATTRIBUTE not in stored_metadata.store_attributes:
         raise ValueError(
             f"{store_path} is a Zarr store, but not a scan's: give the folder that `vrw scan` "
-            f"wrote."
+            "wrote."
         )
     return stored_metadata
 
@@ -528,20 +486,11 @@ def find_first_settings_difference(
     If no setting differs, return ("", None, None).
     """
     if isinstance(stored_settings, dict) and isinstance(current_settings, dict):
-        for setting_name in [
-            *stored_settings,
-            *(
-                setting_name
-                for setting_name in current_settings
-                if setting_name not in stored_settings
-            ),
-        ]:
+        for setting_name in stored_settings | current_settings:
             nested_settings_difference = find_first_settings_difference(
                 stored_settings.get(setting_name),
                 current_settings.get(setting_name),
-                f"{nested_setting_path}.{setting_name}"
-                if nested_setting_path
-                else str(setting_name),
+                f"{nested_setting_path}.{setting_name}".removeprefix("."),
             )
             if nested_settings_difference[0]:
                 return nested_settings_difference
@@ -562,24 +511,32 @@ def create_empty_store(
     """
     try:
         store_path.parent.mkdir(parents=True, exist_ok=True)
-        temporary_path = store_path.parent / f".{store_path.name}.{os.urandom(8).hex()}"
-        temporary_path.mkdir()
+        with _build_temporary_store(store_path, result_layout, store_attributes) as temporary_path:
+            temporary_path.rename(store_path)
     except OSError as creation_error:
-        creation_failure_reason = creation_error.strerror or "no folder can be made there"
-        raise OSError(
-            creation_error.errno,
-            f"no store can be made at {store_path} ({creation_failure_reason}): give a place of "
-            "your own",
-        ) from creation_error
+        if read_stored_manifest(store_path) is None:
+            creation_failure_reason = creation_error.strerror or "no folder can be made there"
+            raise OSError(
+                creation_error.errno,
+                f"no store can be made at {store_path} ({creation_failure_reason}): give a place "
+                "of your own",
+            ) from creation_error
+
+
+@contextlib.contextmanager
+def _build_temporary_store(
+    store_path: Path, result_layout: ResultLayout, store_attributes: Mapping[str, object]
+) -> Iterator[Path]:
+    """Yield the path of an empty store beside `store_path`, and remove what is left of it
+    afterwards.
+    """
+    temporary_path = store_path.parent / f".{store_path.name}.{os.urandom(8).hex()}"
     try:
+        temporary_path.mkdir()
         _create_zarr_arrays(temporary_path, result_layout, store_attributes)
-        temporary_path.rename(store_path)
-    except BaseException as creation_error:
+        yield temporary_path
+    finally:
         shutil.rmtree(temporary_path, ignore_errors=True)
-        if not (
-            isinstance(creation_error, OSError) and read_stored_manifest(store_path) is not None
-        ):
-            raise
 
 
 def _create_zarr_arrays(
@@ -591,27 +548,19 @@ def _create_zarr_arrays(
     from zarr.codecs import Crc32cCodec, ZstdCodec
 
     # xarray reads from this attribute which arrays are coordinates, and removes it on opening.
-    group_attributes = {
-        **store_attributes,
-        "coordinates": " ".join(result_layout.result_coordinates),
-    }
+    result_coordinates = result_layout.result_coordinates
+    group_attributes = {**store_attributes, "coordinates": " ".join(result_coordinates)}
     zarr_group = zarr.create_group(store_path, zarr_format=3, attributes=group_attributes)
     array_compressors = [ZstdCodec(level=3), Crc32cCodec()]  # The checksum reveals damage.
-    for coordinate_name, (
-        dimension_name,
-        coordinate_values,
-        coordinate_attributes,
-    ) in result_layout.result_coordinates.items():
-        coordinate_array = zarr_group.create_array(
+    for coordinate_name, coordinate in result_coordinates.items():
+        zarr_group.create_array(
             coordinate_name,
-            shape=coordinate_values.shape,
-            chunks=coordinate_values.shape,
-            dtype=coordinate_values.dtype,
-            dimension_names=(dimension_name,),
+            data=coordinate.values,
+            chunks=coordinate.shape,
+            dimension_names=map(str, coordinate.dims),
             compressors=array_compressors,
-            attributes=dict(coordinate_attributes),
+            attributes=coordinate.attrs,
         )
-        coordinate_array[:] = coordinate_values
     for variable_layout in result_layout.variable_layouts:
         zarr_group.create_array(
             variable_layout.variable_name,
@@ -626,39 +575,36 @@ def _create_zarr_arrays(
             compressors=array_compressors,
             attributes=dict(variable_layout.variable_attributes),
         )
-    chunk_mark_array_shape = (result_layout.n_chunks, DIGEST_SIZE_BYTES)
+    variable_names = [
+        variable_layout.variable_name for variable_layout in result_layout.variable_layouts
+    ]
     chunk_mark_attributes = add_attribute_seal(
         {
-            SCAN_VARIABLES_KEY: [
-                variable_layout.variable_name for variable_layout in result_layout.variable_layouts
-            ],
+            SCAN_VARIABLES_KEY: variable_names,
             COORDINATE_DIGESTS_KEY: {
-                coordinate_name: digest_coordinate_values(np.asarray(coordinate_values))
-                for coordinate_name, (
-                    _,
-                    coordinate_values,
-                    _,
-                ) in result_layout.result_coordinates.items()
+                coordinate_name: digest_coordinate_values(coordinate.values)
+                for coordinate_name, coordinate in result_coordinates.items()
             },
-            STORE_ATTRIBUTES_KEY: dict(group_attributes),
+            STORE_ATTRIBUTES_KEY: group_attributes,
         }
     )
     zarr_group.create_group(CHECKSUM_GROUP_NAME, attributes=chunk_mark_attributes).create_array(
         "digest",
-        shape=chunk_mark_array_shape,
+        shape=(result_layout.n_chunks, DIGEST_SIZE_BYTES),
         chunks=(1, DIGEST_SIZE_BYTES),
         dtype="u1",
         fill_value=0,
     )
     # All metadata are written into one file in this order, because zarr's function sorts them and
     # warns.
-    array_names = [
-        *result_layout.result_coordinates,
-        *(variable_layout.variable_name for variable_layout in result_layout.variable_layouts),
-    ]
     metadata_by_name = {
         array_name: json.loads((store_path / array_name / METADATA_FILE_NAME).read_text())
-        for array_name in (*array_names, CHECKSUM_GROUP_NAME, CHECKSUM_ARRAY_NAME)
+        for array_name in (
+            *result_coordinates,
+            *variable_names,
+            CHECKSUM_GROUP_NAME,
+            CHECKSUM_ARRAY_NAME,
+        )
     }
     root_metadata_path = store_path / METADATA_FILE_NAME
     root_metadata = json.loads(root_metadata_path.read_text())
