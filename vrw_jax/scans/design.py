@@ -186,15 +186,36 @@ def _merge_mapping_and_keywords(
 ) -> Mapping:
     """Return the parameters of a design as one mapping, given as a mapping or as keywords.
 
-    Raise a TypeError if both `parameter_mapping` and `parameter_keywords` are given.
+    Raise a TypeError if both `parameter_mapping` and `parameter_keywords` are given, and a
+    ValueError if a parameter is unknown or none is given.
     """
     if parameter_mapping is not None and parameter_keywords:
         raise TypeError(
             f"{function_name} has a mapping and the keywords {', '.join(parameter_keywords)}: "
-            f"give either "
-            "one mapping or keywords."
+            "give either one mapping or keywords."
         )
-    return parameter_keywords if parameter_mapping is None else parameter_mapping
+    parameter_mapping = parameter_keywords if parameter_mapping is None else parameter_mapping
+    check_type("the design", parameter_mapping, Mapping, "write {'damping': (100.0, 200.0)}")
+    if not parameter_mapping:
+        raise ValueError(
+            "the design sweeps no parameter, but a scan needs at least one: "
+            f"choose from {', '.join(SWEEPABLE_PARAMETERS)}."
+        )
+    for parameter_name in parameter_mapping:
+        check_parameter_name(parameter_name, SWEEPABLE_PARAMETERS, "parameter that can be swept")
+    return parameter_mapping
+
+
+def _parse_value_columns(
+    function_name: str, parameter_mapping: Mapping | None, parameter_keywords: Mapping
+) -> ParameterSamples:
+    """Return the checked values of each parameter as a vector of floats, by parameter."""
+    return {
+        parameter_name: _convert_to_value_column(parameter_name, parameter_values)
+        for parameter_name, parameter_values in _merge_mapping_and_keywords(
+            function_name, parameter_mapping, parameter_keywords
+        ).items()
+    }
 
 
 def grid(
@@ -219,17 +240,12 @@ def grid(
         >>> vrw.grid(damping=[100.0, 150.0], slope=np.linspace(0.28, 0.32, 5)).shape
         (2, 5)
     """
-    values = _merge_mapping_and_keywords("grid", values, parameters)
-    values_by_swept_parameter = {
-        parameter_name: _convert_to_value_column(parameter_name, parameter_values)
-        for parameter_name, parameter_values in _require_sweepable_parameters(values).items()
-    }
+    values_by_swept_parameter = _parse_value_columns("grid", values, parameters)
     for parameter_name, value_column in values_by_swept_parameter.items():
         if len(np.unique(value_column)) != len(value_column):
             raise ValueError(
                 f"{parameter_name} holds a value twice, but each value of a grid's axis names "
-                f"one place: "
-                "give every value once."
+                "one place: give every value once."
             )
     return GridDesign(values_by_swept_parameter)
 
@@ -258,11 +274,7 @@ def samples(
         >>> vrw.samples({"damping": [100.0, 150.0], "slope": [0.29, 0.30]}).shape
         (2,)
     """
-    values = _merge_mapping_and_keywords("samples", values, parameters)
-    values_by_swept_parameter = {
-        parameter_name: _convert_to_value_column(parameter_name, parameter_values)
-        for parameter_name, parameter_values in _require_sweepable_parameters(values).items()
-    }
+    values_by_swept_parameter = _parse_value_columns("samples", values, parameters)
     column_lengths = {
         parameter_name: len(value_column)
         for parameter_name, value_column in values_by_swept_parameter.items()
@@ -303,16 +315,10 @@ def sobol(
     """
     from scipy.stats import qmc  # This import is slow.
 
-    parameter_names, lower_bounds, upper_bounds, n = _parse_sampling_box(
-        "sobol", ranges, parameters, n
-    )
-    sample_count_log2 = max(int(n - 1).bit_length(), 0)
-    unit_cube_points = qmc.Sobol(
-        len(parameter_names), rng=_make_random_generator(seed)
-    ).random_base2(sample_count_log2)[:n]
-    return _scale_unit_points_to_box(
-        parameter_names, lower_bounds, upper_bounds, unit_cube_points, "sobol"
-    )
+    ranges, n = _parse_sampling_box("sobol", ranges, parameters, n)
+    sobol_sequence = qmc.Sobol(len(ranges), rng=_make_random_generator(seed))
+    unit_cube_points = sobol_sequence.random_base2((n - 1).bit_length())[:n]
+    return _scale_unit_points_to_box(ranges, unit_cube_points, "sobol")
 
 
 def uniform(
@@ -339,13 +345,9 @@ def uniform(
         >>> vrw.uniform({"damping": (100.0, 200.0), "slope": (0.28, 0.32)}, 8).shape
         (8,)
     """
-    parameter_names, lower_bounds, upper_bounds, n = _parse_sampling_box(
-        "uniform", ranges, parameters, n
-    )
-    unit_cube_points = _make_random_generator(seed).random((n, len(parameter_names)))
-    return _scale_unit_points_to_box(
-        parameter_names, lower_bounds, upper_bounds, unit_cube_points, "uniform"
-    )
+    ranges, n = _parse_sampling_box("uniform", ranges, parameters, n)
+    unit_cube_points = _make_random_generator(seed).random((n, len(ranges)))
+    return _scale_unit_points_to_box(ranges, unit_cube_points, "uniform")
 
 
 def saltelli(
@@ -379,50 +381,33 @@ def saltelli(
     """
     from scipy.stats import qmc  # This import is slow.
 
-    parameter_names, lower_bounds, upper_bounds, n = _parse_sampling_box(
-        "saltelli", ranges, parameters, n
-    )
+    ranges, n = _parse_sampling_box("saltelli", ranges, parameters, n)
     if n & (n - 1):
         raise ValueError(
             f"n is {n}, but the rows of a Sobol' sequence are balanced for powers of two: "
             f"give n = {1 << n.bit_length()}, say."
         )
-    n_parameters = len(parameter_names)
-    unit_cube_points = qmc.Sobol(2 * n_parameters, rng=_make_random_generator(seed)).random_base2(
-        n.bit_length() - 1
-    )
-    saltelli_points_a, saltelli_points_b = (
-        unit_cube_points[:, :n_parameters],
-        unit_cube_points[:, n_parameters:],
-    )
+    sobol_sequence = qmc.Sobol(2 * len(ranges), rng=_make_random_generator(seed))
+    points_a, points_b = np.hsplit(sobol_sequence.random_base2(n.bit_length() - 1), 2)
     points_with_swapped_coordinate = [
-        np.where(np.arange(n_parameters) == parameter_index, saltelli_points_b, saltelli_points_a)
-        for parameter_index in range(n_parameters)
+        np.where(is_swapped, points_b, points_a) for is_swapped in np.eye(len(ranges), dtype=bool)
     ]
-    return _scale_unit_points_to_box(
-        parameter_names,
-        lower_bounds,
-        upper_bounds,
-        np.concatenate([saltelli_points_a, saltelli_points_b, *points_with_swapped_coordinate]),
-        SALTELLI_DESIGN_KIND,
-    )
+    unit_cube_points = np.concatenate([points_a, points_b, *points_with_swapped_coordinate])
+    return _scale_unit_points_to_box(ranges, unit_cube_points, SALTELLI_DESIGN_KIND)
 
 
 def _scale_unit_points_to_box(
-    parameter_names: list[str],
-    lower_bounds: np.ndarray,
-    upper_bounds: np.ndarray,
-    unit_cube_points: np.ndarray,
-    design_kind: str,
+    ranges: Mapping[str, ParameterRange], unit_cube_points: np.ndarray, design_kind: str
 ) -> SampleListDesign:
     """Return the design whose samples are points of the unit cube, scaled to the box between the
     bounds.
 
     - `unit_cube_points`: points of the unit cube, shape (samples, parameters).
     """
+    lower_bounds, upper_bounds = np.transpose(list(ranges.values()))
     box_points = lower_bounds + (upper_bounds - lower_bounds) * unit_cube_points
     return SampleListDesign(
-        dict(zip(parameter_names, np.ascontiguousarray(box_points.T), strict=True)), design_kind
+        dict(zip(ranges, np.ascontiguousarray(box_points.T), strict=True)), design_kind
     )
 
 
@@ -436,8 +421,8 @@ def _parse_sampling_box(
     ranges: Mapping[str, ParameterRange] | None,
     parameter_keywords: Mapping[str, ParameterRange],
     n: int | None,
-) -> tuple[list[str], np.ndarray, np.ndarray, int]:
-    """Return parameter names, lower bounds, upper bounds and the number of samples, all checked.
+) -> tuple[dict[str, ParameterRange], int]:
+    """Return the range of each parameter, by name, and the number of samples, all checked.
 
     The number of samples has no default. The ranges are a mapping or keywords.
     """
@@ -452,27 +437,11 @@ def _parse_sampling_box(
             f"n is {n:,}, but a list takes {MAX_LISTED_SAMPLES:,} samples at most: give fewer, or "
             "a grid."
         )
-    bound_pairs = [
-        check_range(f"the range of {parameter_name}", bound_pair)
-        for parameter_name, bound_pair in _require_sweepable_parameters(ranges).items()
-    ]
-    parameter_bounds = np.asarray(bound_pairs)
-    return list(ranges), parameter_bounds[:, 0], parameter_bounds[:, 1], n
-
-
-def _require_sweepable_parameters(values_by_parameter: Mapping[str, object]) -> Mapping:
-    """Return `values_by_parameter`. Raise a ValueError if it is empty or contains an unknown
-    parameter.
-    """
-    check_type("the design", values_by_parameter, Mapping, "write {'damping': (100.0, 200.0)}")
-    if not values_by_parameter:
-        raise ValueError(
-            "the design sweeps no parameter, but a scan needs at least one: "
-            f"choose from {', '.join(SWEEPABLE_PARAMETERS)}."
-        )
-    for parameter_name in values_by_parameter:
-        check_parameter_name(parameter_name, SWEEPABLE_PARAMETERS, "parameter that can be swept")
-    return values_by_parameter
+    checked_ranges = {
+        parameter_name: check_range(f"the range of {parameter_name}", bound_pair)
+        for parameter_name, bound_pair in ranges.items()
+    }
+    return checked_ranges, n
 
 
 def _convert_to_value_column(parameter_name: str, parameter_values: object) -> np.ndarray:
@@ -488,13 +457,13 @@ def _convert_to_value_column(parameter_name: str, parameter_values: object) -> n
     if value_column.dtype.kind not in "fiu" and value_column.size:
         raise TypeError(
             f"{parameter_name} is {format_value(parameter_values)}, but it must be a list of "
-            f"numbers: write [100.0]."
+            "numbers: write [100.0]."
         )
     value_column = value_column.astype(float)
     if value_column.ndim != 1:
         raise ValueError(
             f"{parameter_name} has shape {value_column.shape}, but it must be a list of "
-            f"numbers: give one axis."
+            "numbers: give one axis."
         )
     if not len(value_column):
         raise ValueError(

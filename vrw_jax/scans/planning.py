@@ -16,6 +16,7 @@ import numpy as np
 from vrw_jax import simd
 from vrw_jax.cycles import CycleOptions, make_finder
 from vrw_jax.measures import MARGIN_MEASURES, make_locked_leg_coordinate, make_measure_attributes
+from vrw_jax.measures import xarray as xr
 from vrw_jax.models import AbstractWheel, ModelCapabilities, ViscoelasticWheel
 from vrw_jax.numerics import StepOptions, batch_sizes
 from vrw_jax.runtime import compute_source_digest
@@ -125,41 +126,27 @@ class ScanPlan:
 
         A scan continues a store only if the store contains the same settings.
         """
-        (
-            measure_names,
-            base_wheel,
-            wheel_model,
-            step_options,
-            cycle_options,
-            error_tolerance,
-            slope_standard_deviation,
-        ) = self.evaluation_request
-        fixed_parameters = (
-            parameter_name
-            for parameter_name in PARAMETER_NAMES
-            if parameter_name not in self.design.swept_parameters
-        )
-        return {
+        request, base_wheel = self.evaluation_request, self.evaluation_request.base_wheel
+        scan_settings: dict[str, object] = {
             "design": self.design.describe_design(),
             "wheel": {
                 parameter_name: float(getattr(base_wheel, parameter_name))
-                for parameter_name in fixed_parameters
+                for parameter_name in PARAMETER_NAMES
+                if parameter_name not in self.design.swept_parameters
             }
             | {"n_legs": base_wheel.n_legs},
-            "measures": list(measure_names),
-            "model": _convert_settings_to_json(wheel_model),
-            "options": _convert_settings_to_json(step_options),
-            "cycle_options": _convert_settings_to_json(cycle_options),
+            "measures": list(request.measure_names),
+            "model": _convert_settings_to_json(request.wheel_model),
+            "options": _convert_settings_to_json(request.step_options),
+            "cycle_options": _convert_settings_to_json(request.cycle_options),
             "dtype": str(base_wheel.damping.dtype),
             "chunk": list(self.result_layout.chunk_shape),
-        } | {
-            setting_name: setting_value
-            for setting_name, setting_value in (
-                ("tol", error_tolerance),
-                ("slope_sd", slope_standard_deviation),
-            )
-            if setting_value is not None
         }
+        if request.error_tolerance is not None:
+            scan_settings["tol"] = request.error_tolerance
+        if request.slope_standard_deviation is not None:
+            scan_settings["slope_sd"] = request.slope_standard_deviation
+        return scan_settings
 
     @property
     def store_attributes(self) -> dict[str, object]:
@@ -173,6 +160,10 @@ class ScanPlan:
             REQUESTED_MEASURES_ATTRIBUTE: ", ".join(self.requested_measures),
             "config": self.config_file_text,
         }
+
+    def select_chunk_samples(self, chunk_index: int) -> ParameterSamples:
+        """Return the values of each swept parameter for the samples of a chunk, by parameter."""
+        return self.design.select_samples(self.result_layout.compute_chunk_region(chunk_index))
 
     def build_scan_engine(self) -> SampleEvaluator:
         """Return the engine that computes the samples of this plan."""
@@ -223,7 +214,9 @@ def plan_scan(
             "the design sweeps friction, which does not affect the paper's wheel: give "
             f"model={describe_accepted_models('scan', FRICTION_NAME)}."
         )
-    tol = None if tol is None else _require_reference_model(model, check_positive("tol", tol))
+    if tol is not None:
+        tol = check_positive("tol", tol)
+        _require_reference_model(model)
     if slope_sd is not None:
         slope_sd = check_positive("slope_sd", slope_sd)
         if tol is not None:
@@ -236,32 +229,22 @@ def plan_scan(
         measure_catalog.default_measures if measures is None else check_names("measures", measures)
     )
     measure_names = check_measure_names(requested_measures, measure_catalog)
-    canonical_variable_names = (
-        canonicalize_variable_name(measure_name) for measure_name in requested_measures
-    )
-    variable_names = dict.fromkeys(
-        variable_name
-        for measure_name in canonical_variable_names
-        for variable_name in (measure_name, make_error_variable_name(measure_name))[: 1 + bool(tol)]
-    )
+    variable_names = []
+    for requested_measure in requested_measures:
+        variable_names.append(canonicalize_variable_name(requested_measure))
+        if tol is not None:
+            variable_names.append(make_error_variable_name(requested_measure))
+    variable_names += measure_catalog.always_included_variables
     cycle_options = CycleOptions() if cycle_options is None else cycle_options
     evaluation_request = EvaluationRequest(
         measure_names, base, model, options, cycle_options, tol, slope_sd
     )
-    result_layout = _make_result_layout(
-        design,
-        tuple(variable_names | dict.fromkeys(measure_catalog.always_included_variables)),
-        base,
-        chunk,
-    )
+    result_layout = _make_result_layout(design, tuple(dict.fromkeys(variable_names)), base, chunk)
     return ScanPlan(design, evaluation_request, result_layout, requested_measures, config_text)
 
 
-def _require_reference_model(wheel_model: AbstractWheel, error_tolerance: float) -> float:
-    """Return `error_tolerance`, if errors can be computed with respect to `wheel_model`.
-
-    Otherwise raise a ValueError.
-    """
+def _require_reference_model(wheel_model: AbstractWheel) -> None:
+    """Raise a ValueError unless errors can be computed with respect to `wheel_model`."""
     model_fields: dict[str, Any] = type(wheel_model).__dataclass_fields__
     fields_with_fixed_defaults = wheel_model.capabilities.fields_with_fixed_defaults
     if fields_with_fixed_defaults is None or any(
@@ -270,11 +253,9 @@ def _require_reference_model(wheel_model: AbstractWheel, error_tolerance: float)
     ):
         raise ValueError(
             f"tol is given and model is {wheel_model!r}, but a tolerance refers to unilateral "
-            f"contact "
-            "with no settings other than friction and stoppers: give "
+            "contact with no settings other than friction and stoppers: give "
             "model=vrw.UnilateralWheel(friction=...)."
         )
-    return error_tolerance
 
 
 def describe_computing_environment() -> dict[str, object]:
@@ -334,45 +315,47 @@ def _make_result_layout(
 
     def make_variable_layout(variable_name: str) -> VariableLayout:
         """Return the layout of one variable: its type, missing value and attributes."""
+        variable_dtype = INTEGER_VARIABLE_DTYPES.get(variable_name, parameter_dtype)
         variable_attributes = get_variable_attributes(variable_name)
-        if variable_name in ("outcome", "rung", "reason"):
-            return VariableLayout(variable_name, "int8", -1, variable_attributes)
-        if variable_name == "solver_steps":
-            return VariableLayout(variable_name, "int32", -1, variable_attributes)
         if variable_name in MARGIN_MEASURES and MARGIN_MEASURES[variable_name].leg_dimension:
             return VariableLayout(
                 variable_name,
-                parameter_dtype,
-                np.nan,
+                variable_dtype,
                 variable_attributes,
                 ("leg",),
                 locked_leg_coordinate.shape,
             )
-        return VariableLayout(variable_name, parameter_dtype, np.nan, variable_attributes)
+        return VariableLayout(variable_name, variable_dtype, variable_attributes)
 
     result_coordinates = {
-        coordinate_name: (
+        coordinate_name: xr.Variable(
             dimension_name,
             coordinate_values,
             make_measure_attributes(coordinate_name)
-            if coordinate_name in (*PARAMETER_NAMES, FRICTION_NAME)
-            else {},
+            if coordinate_name in design.swept_parameters
+            else None,
         )
         for coordinate_name, (
             dimension_name,
             coordinate_values,
         ) in design.make_result_coordinates().items()
     }
-    result_coordinates["leg"] = ("leg", locked_leg_coordinate.values, locked_leg_coordinate.attrs)
     return ResultLayout(
         sample_dimension_names=design.dims,
         sample_shape=design.shape,
         chunk_shape=choose_chunk_shape(design.shape, chunk_size),
-        variable_layouts=tuple(
-            make_variable_layout(variable_name) for variable_name in variable_names
-        ),
-        result_coordinates=result_coordinates,
+        variable_layouts=tuple(map(make_variable_layout, variable_names)),
+        result_coordinates=result_coordinates | {"leg": locked_leg_coordinate},
     )
+
+
+INTEGER_VARIABLE_DTYPES = {
+    "outcome": "int8",
+    "rung": "int8",
+    "reason": "int8",
+    "solver_steps": "int32",
+}
+"""Types of the variables that are integers."""
 
 
 def _convert_settings_to_json(settings_object: object) -> dict[str, object]:
@@ -388,14 +371,9 @@ def _convert_settings_to_json(settings_object: object) -> dict[str, object]:
         field_value = getattr(settings_object, field_name)
         if isinstance(field_value, StepOptions | ModelCapabilities):
             continue  # Options are recorded separately, and capabilities are code.
-        if field_value is None or isinstance(field_value, bool | int | str):
-            field_value_by_name[stored_name_by_field.get(field_name, field_name)] = field_value
-        elif isinstance(field_value, tuple):
-            field_value_by_name[stored_name_by_field.get(field_name, field_name)] = list(
-                field_value
-            )
-        else:
-            field_value_by_name[stored_name_by_field.get(field_name, field_name)] = float(
-                field_value
-            )
+        if isinstance(field_value, tuple):
+            field_value = list(field_value)
+        elif field_value is not None and not isinstance(field_value, bool | int | str):
+            field_value = float(field_value)
+        field_value_by_name[stored_name_by_field.get(field_name, field_name)] = field_value
     return field_value_by_name
