@@ -8,7 +8,7 @@ per GPU.
 """
 
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from queue import SimpleQueue
 from threading import Lock
@@ -27,7 +27,11 @@ from vrw_jax.numerics import (
     compile_exported_function,
     with_default_jax_settings,
 )
-from vrw_jax.scans.measure_catalog import DIFFERENTIABLE_MEASURES, parse_derivative
+from vrw_jax.scans.measure_catalog import (
+    DIFFERENTIABLE_MEASURES,
+    MeasureDerivative,
+    parse_derivative,
+)
 from vrw_jax.wheel import PARAMETER_NAMES, Outcome, WheelParams, make_wheel_from_parameters
 
 GaitOutputs = tuple[Array, Array, dict[str, Array]]
@@ -49,6 +53,11 @@ class EvaluationRequest(NamedTuple):
     # standard deviation of random slopes, rad; None for a scan without measures of such walks
     slope_standard_deviation: float | None = None
 
+    @property
+    def requested_derivatives(self) -> tuple[MeasureDerivative, ...]:
+        """Return the measures that are derivatives."""
+        return tuple(filter(None, map(parse_derivative, self.measure_names)))
+
 
 class CollocationScanEngine:
     """Scan engine for the paper's model and a fixed set of measures, compiled on the first call.
@@ -63,45 +72,17 @@ class CollocationScanEngine:
 
         - `n_threads`: number of CPU threads, by default one per core.
         """
-        variable_names, base_wheel, wheel_model = (
-            evaluation_request.measure_names,
-            evaluation_request.base_wheel,
-            evaluation_request.wheel_model,
-        )
-        step_options, cycle_options = (
-            evaluation_request.step_options,
-            evaluation_request.cycle_options,
-        )
+        measure_names, base_wheel, wheel_model, step_options, cycle_options, *_ = evaluation_request
         self._n_threads = count_available_cores() if n_threads is None else n_threads
-        self._base_wheel, self._wheel_model, self._step_options = (
-            base_wheel,
-            wheel_model,
-            step_options,
-        )
-        requested_derivatives = tuple(
-            requested_derivative
-            for variable_name in variable_names
-            if (requested_derivative := parse_derivative(variable_name)) is not None
-        )
-        measure_names = tuple(
-            variable_name
-            for variable_name in variable_names
-            if parse_derivative(variable_name) is None
-        )
-        differentiation_parameters = tuple(
-            dict.fromkeys(
-                requested_derivative.parameter_name
-                for requested_derivative in requested_derivatives
-            )
+        self._base_wheel, self._wheel_model = base_wheel, wheel_model
+        self._step_options = step_options
+        requested_derivatives = evaluation_request.requested_derivatives
+        differentiation_parameters = list(
+            dict.fromkeys(derivative.parameter_name for derivative in requested_derivatives)
         )
         differentiated_parameter_indices = np.asarray(
-            [
-                PARAMETER_NAMES.index(parameter_name)
-                for parameter_name in differentiation_parameters
-            ],
-            int,
+            list(map(PARAMETER_NAMES.index, differentiation_parameters)), int
         )
-
         gait_finder = make_finder(
             wheel_model, base_wheel.n_legs, cycle_options=cycle_options, step_options=step_options
         )
@@ -122,22 +103,20 @@ class CollocationScanEngine:
                     )
                 )
                 return limit_cycle.measures(
-                    requested_derivative.measure_name
-                    for requested_derivative in requested_derivatives
+                    derivative.measure_name for derivative in requested_derivatives
                 ), limit_cycle
 
+            differentiated_parameter_values = parameter_values[differentiated_parameter_indices]
             if not requested_derivatives:
-                return find_measures_and_cycle(parameter_values[differentiated_parameter_indices])[
-                    1
-                ], {}
+                return find_measures_and_cycle(differentiated_parameter_values)[1], {}
             measure_jacobian, limit_cycle = jax.jacfwd(find_measures_and_cycle, has_aux=True)(
-                parameter_values[differentiated_parameter_indices]
+                differentiated_parameter_values
             )
             return limit_cycle, {
-                requested_derivative.variable_name: measure_jacobian[
-                    requested_derivative.measure_name
-                ][differentiation_parameters.index(requested_derivative.parameter_name)]
-                for requested_derivative in requested_derivatives
+                derivative.variable_name: measure_jacobian[derivative.measure_name][
+                    differentiation_parameters.index(derivative.parameter_name)
+                ]
+                for derivative in requested_derivatives
             }
 
         def evaluate_cycle(parameter_values: Array) -> GaitOutputs:
@@ -145,18 +124,16 @@ class CollocationScanEngine:
             parameters.
             """
             limit_cycle, derivatives_by_name = find_cycle_with_derivatives(parameter_values)
-            cycle_measure_names = (
-                *(
-                    measure_name
-                    for measure_name in measure_names
-                    if measure_name in DIFFERENTIABLE_MEASURES
-                ),
-                "spectral_radius",
-            )
+            cycle_measure_names = [
+                measure_name
+                for measure_name in measure_names
+                if measure_name in DIFFERENTIABLE_MEASURES
+            ]
             return (
                 limit_cycle.outcome,
                 limit_cycle.section_state,
-                limit_cycle.measures(cycle_measure_names) | derivatives_by_name,
+                limit_cycle.measures([*cycle_measure_names, "spectral_radius"])
+                | derivatives_by_name,
             )
 
         def evaluate_confirming_step(
@@ -170,20 +147,13 @@ class CollocationScanEngine:
                 section_state,
                 step_options,
             )
-            step_measures = step_result.measures()
-            step_measure_names = (
-                *(
-                    measure_name
-                    for measure_name in measure_names
-                    if measure_name not in DIFFERENTIABLE_MEASURES
-                ),
-                *MARGIN_MEASURES,
-            )
-            return (
-                step_result.outcome,
-                step_result.section_state,
-                {measure_name: step_measures[measure_name] for measure_name in step_measure_names},
-            )
+            step_measures = {
+                measure_name: measure_value
+                for measure_name, measure_value in step_result.measures().items()
+                if measure_name in MARGIN_MEASURES
+                or (measure_name in measure_names and measure_name not in DIFFERENTIABLE_MEASURES)
+            }
+            return step_result.outcome, step_result.section_state, step_measures
 
         self._evaluate_cycle_batch: Callable = jax.vmap(evaluate_cycle)
         self._evaluate_step_batch: Callable = jax.vmap(
@@ -192,7 +162,7 @@ class CollocationScanEngine:
         # The repr of a model omits fields whose value is the default object itself, and a pickled
         # copy is another object.
         model_identity = (type(wheel_model).__name__, *vars(wheel_model).items())
-        self._program_cache_key = (variable_names, base_wheel.n_legs, model_identity, cycle_options)
+        self._program_cache_key = (measure_names, base_wheel.n_legs, model_identity, cycle_options)
         self._batch_size = batch_sizes.choose_batch_size(
             batch_sizes.SCAN_BATCH_SIZE, batch_sizes.GPU_SCAN_BATCH_SIZE
         )
@@ -219,10 +189,8 @@ class CollocationScanEngine:
                 scan_thread_pool.map(self._evaluate_sample_batch, parameter_batches)
             )
         return {
-            variable_name: np.concatenate(
-                [results_of_batch[variable_name] for results_of_batch in results_by_batch]
-            )[: len(parameter_rows)]
-            for variable_name in results_by_batch[0]
+            variable_name: variable_values[: len(parameter_rows)]
+            for variable_name, variable_values in concatenate_results(results_by_batch).items()
         }
 
     @with_default_jax_settings  # It runs in a thread of its own.
@@ -268,45 +236,36 @@ class CollocationScanEngine:
             (self._batch_size, len(PARAMETER_NAMES)), parameter_dtype
         )
         section_states_shape = jax.ShapeDtypeStruct((self._batch_size, 3), parameter_dtype)
-        program_cache_key = self._program_cache_key
         # Threads have separate settings.
         compile_function = with_default_jax_settings(compile_exported_function)
+        step_arguments = (parameter_rows_shape, section_states_shape, self._step_options)
+        functions_and_arguments = {
+            "cycle": (self._evaluate_cycle_batch, (parameter_rows_shape,)),
+            "step": (self._evaluate_step_batch, step_arguments),
+        }
         with ThreadPoolExecutor(2) as scan_thread_pool:
-            step_program_arguments = (
-                parameter_rows_shape,
-                section_states_shape,
-                self._step_options,
+            futures_by_device = {
+                device: [
+                    scan_thread_pool.submit(
+                        compile_function,
+                        batch_function,
+                        arguments,
+                        (program_name, *self._program_cache_key),
+                        device,
+                    )
+                    for program_name, (batch_function, arguments) in functions_and_arguments.items()
+                ]
+                for device in local_devices
+            }
+        for device, program_futures in futures_by_device.items():
+            device_programs = _CompiledDevicePrograms(
+                device, *(program_future.result() for program_future in program_futures)
             )
-            step_programs = [
-                scan_thread_pool.submit(
-                    compile_function,
-                    self._evaluate_step_batch,
-                    step_program_arguments,
-                    ("step", *program_cache_key),
-                    device,
-                )
-                for device in local_devices
-            ]
-            cycle_programs = [
-                scan_thread_pool.submit(
-                    compile_function,
-                    self._evaluate_cycle_batch,
-                    (parameter_rows_shape,),
-                    ("cycle", *program_cache_key),
-                    device,
-                )
-                for device in local_devices
-            ]
-        for device, cycle_program, step_program in zip(
-            local_devices, cycle_programs, step_programs, strict=True
-        ):
             n_device_programs = (
                 self._n_threads if device.platform == "cpu" and len(local_devices) == 1 else 1
             )
             for _ in range(n_device_programs):
-                self._free_programs.put(
-                    _CompiledDevicePrograms(device, cycle_program.result(), step_program.result())
-                )
+                self._free_programs.put(device_programs)
             self._n_workers += n_device_programs
 
 
@@ -336,20 +295,24 @@ def stack_parameter_rows(
     """
     n_samples = len(next(iter(samples_by_parameter.values())))
     base_parameter_values = np.asarray(wheel_model.collect_parameter_values(base_wheel))
-    return np.stack(
-        [
-            np.asarray(
-                samples_by_parameter.get(
-                    parameter_name, np.broadcast_to(base_parameter_value, n_samples)
-                ),
-                base_parameter_values.dtype,
-            )
-            for parameter_name, base_parameter_value in zip(
-                wheel_model.parameter_names, base_parameter_values, strict=True
-            )
-        ],
-        axis=-1,
-    )
+    parameter_rows = np.tile(base_parameter_values, (n_samples, 1))
+    for parameter_name, parameter_samples in samples_by_parameter.items():
+        parameter_rows[:, wheel_model.parameter_names.index(parameter_name)] = parameter_samples
+    return parameter_rows
+
+
+def concatenate_results(
+    results_by_batch: Sequence[Mapping[str, np.ndarray]],
+) -> dict[str, np.ndarray]:
+    """Return the values of each variable for the samples of all batches, by the name of the
+    variable.
+    """
+    return {
+        variable_name: np.concatenate(
+            [results_of_batch[variable_name] for results_of_batch in results_by_batch]
+        )
+        for variable_name in results_by_batch[0]
+    }
 
 
 def mask_failed_samples(

@@ -78,13 +78,11 @@ def connect_dask_workers(scheduler_address: str) -> Iterator[ChunkExecutor]:
                 dask_client = Client(
                     scheduler_address, timeout=DASK_SCHEDULER_TIMEOUT, set_as_default=False
                 )
-            except (
-                Exception
-            ) as connection_error:  # Libraries raise different errors for a wrong address.
+            # Libraries raise different errors for a wrong address.
+            except Exception as connection_error:
                 raise ValueError(
                     f"no dask scheduler answers at {scheduler_address!r}: give the address that "
-                    f"it printed "
-                    "when it started, such as tcp://host:8786, or 'local'."
+                    "it printed when it started, such as tcp://host:8786, or 'local'."
                 ) from connection_error
         exit_stack.enter_context(dask_client)
         yield functools.partial(_compute_chunks_on_cluster, dask_client, scheduler_address)
@@ -126,9 +124,8 @@ def _require_scheduler_response(scheduler_address: str) -> None:
         )
         scheduler_connection.abort()
 
-    with ThreadPoolExecutor(
-        1
-    ) as connection_pool:  # The event loop of a notebook is already running.
+    # The event loop of a notebook is already running.
+    with ThreadPoolExecutor(1) as connection_pool:
         connection_pool.submit(asyncio.run, connect_to_scheduler()).result()
 
 
@@ -140,10 +137,8 @@ def _compute_chunks_on_cluster(
 ) -> Iterator[ChunkResult]:
     """Yield each missing chunk's index and results, in the order of completion."""
     pickled_request = pickle.dumps(scan_plan.evaluation_request)
-    local_computing_environment, remaining_chunks = (
-        describe_computing_environment(),
-        iter(missing_chunks),
-    )
+    local_computing_environment = describe_computing_environment()
+    remaining_chunks = iter(missing_chunks)
     chunk_index_by_future: dict[Future, int] = {}
     completed_futures: SimpleQueue[Future] = SimpleQueue()
 
@@ -155,9 +150,7 @@ def _compute_chunks_on_cluster(
             1, sum(dask_client.nthreads().values())
         ) - len(chunk_index_by_future)
         for chunk_index in itertools.islice(remaining_chunks, max(n_submittable_chunks, 0)):
-            samples_by_parameter = scan_plan.design.select_samples(
-                scan_plan.result_layout.compute_chunk_region(chunk_index)
-            )
+            samples_by_parameter = scan_plan.select_chunk_samples(chunk_index)
             chunk_future = dask_client.submit(
                 _compute_chunk_in_worker, pickled_request, samples_by_parameter, pure=False
             )
@@ -180,8 +173,8 @@ def _compute_chunks_on_cluster(
             if environment_difference_text:
                 raise ValueError(
                     "a worker computes by other means than this process: "
-                    f"{environment_difference_text}. "
-                    "Start the workers from the same installation on machines of one kind."
+                    f"{environment_difference_text}. Start the workers from the same installation "
+                    "on machines of one kind."
                 )
             yield chunk_index_by_future.pop(chunk_future), chunk_results
             del chunk_future  # The cluster can then release the result.
@@ -205,10 +198,8 @@ def _wait_for_completed_future(
         if not has_warned_of_no_workers and not dask_client.nthreads():
             warnings.warn(
                 f"the dask cluster at {scheduler_address} has no workers, so that nothing is "
-                f"computed: start "
-                f"some, as with `dask worker {scheduler_address}`; the scan continues as soon "
-                f"as there is "
-                "one.",
+                f"computed: start some, as with `dask worker {scheduler_address}`; the scan "
+                "continues as soon as there is one.",
                 stacklevel=1,
             )
             has_warned_of_no_workers = True
@@ -236,14 +227,13 @@ def _explain_lost_cluster(
         yield
     except KilledWorker as loss_error:
         raise ValueError(
-            "a chunk was given up because each worker that had it died: see to the "
-            "workers (their memory, say) and run the same again, it goes on from there."
+            "a chunk was given up because each worker that had it died: see to the workers "
+            "(their memory, say) and run the same again, it goes on from there."
         ) from loss_error
     except cluster_loss_errors as loss_error:
         raise ValueError(
             f"the dask cluster at {scheduler_address} is gone: start it again and run the same "
-            f"again, it goes"
-            " on with the chunks that its store lacks."
+            "again, it goes on with the chunks that its store lacks."
         ) from loss_error
 
 

@@ -37,6 +37,7 @@ from vrw_jax.robustness import first_passage
 from vrw_jax.scans.collocation_engine import (
     CollocationScanEngine,
     EvaluationRequest,
+    concatenate_results,
     count_available_cores,
     mask_failed_samples,
     stack_parameter_rows,
@@ -56,42 +57,22 @@ class UnilateralScanEngine:
     """Scan engine for unilateral contact and a fixed set of measures."""
 
     def __init__(self, evaluation_request: EvaluationRequest, n_threads: int | None = None) -> None:
-        variable_names, base_wheel = evaluation_request.measure_names, evaluation_request.base_wheel
-        wheel_model, step_options = evaluation_request.wheel_model, evaluation_request.step_options
-        self._base_wheel, self._wheel_model = base_wheel, wheel_model
+        variable_names, self._base_wheel, self._wheel_model, step_options, *_ = evaluation_request
         self._n_threads = count_available_cores() if n_threads is None else n_threads
-        requested_derivatives = tuple(
-            requested_derivative
-            for variable_name in variable_names
-            if (requested_derivative := parse_derivative(variable_name)) is not None
+        self._requested_derivatives = evaluation_request.requested_derivatives
+        measure_names = [name for name in variable_names if parse_derivative(name) is None]
+        gait_finder: Any = make_finder(
+            self._wheel_model, self._base_wheel.n_legs, step_options=step_options
         )
-        measure_names = (
-            *(
-                variable_name
-                for variable_name in variable_names
-                if parse_derivative(variable_name) is None
-            ),
-            "spectral_radius",
-        )
-
-        gait_finder: Any = make_finder(wheel_model, base_wheel.n_legs, step_options=step_options)
         self._gait_finder = dataclasses.replace(
             gait_finder, gait_batch_sizes=(batch_sizes.GAIT_READ_BATCH_SIZE,)
         )
-        measure_reader = type(gait_finder).read_measure
-        self._measure_reader, self._requested_derivatives = (
-            MeasureReader(measure_reader, measure_names),
-            requested_derivatives,
+        read_measure = type(gait_finder).read_measure
+        self._measure_reader = MeasureReader(read_measure, (*measure_names, "spectral_radius"))
+        differentiated_measures = dict.fromkeys(
+            derivative.measure_name for derivative in self._requested_derivatives
         )
-        self._derivative_reader = MeasureReader(
-            measure_reader,
-            tuple(
-                dict.fromkeys(
-                    requested_derivative.measure_name
-                    for requested_derivative in requested_derivatives
-                )
-            ),
-        )
+        self._derivative_reader = MeasureReader(read_measure, tuple(differentiated_measures))
 
     def __call__(self, samples_by_parameter: ParameterSampleMapping) -> ValuesByVariable:
         """Return the value of each variable for all samples, by the name of the variable.
@@ -105,24 +86,14 @@ class UnilateralScanEngine:
             parameter_rows,
             max(self._n_threads, -(-len(parameter_rows) // batch_sizes.SCAN_TASK_SIZE)),
         )
-        first_parameter_rows, *remaining_parameter_rows = (
-            parameter_rows_of_subset
-            for parameter_rows_of_subset in parameter_row_subsets
-            if len(parameter_rows_of_subset)
-        )
-        results_by_subset = [
-            self._evaluate_sample_subset(first_parameter_rows)
-        ]  # The first call compiles for all threads.
+        # Of few samples, the last subsets are empty. The first call compiles for all threads.
+        first_parameter_rows, *remaining_parameter_rows = filter(len, parameter_row_subsets)
+        results_by_subset = [self._evaluate_sample_subset(first_parameter_rows)]
         with ThreadPoolExecutor(self._n_threads) as scan_thread_pool:
             results_by_subset += scan_thread_pool.map(
                 self._evaluate_sample_subset, remaining_parameter_rows
             )
-        return {
-            variable_name: np.concatenate(
-                [results_of_subset[variable_name] for results_of_subset in results_by_subset]
-            )
-            for variable_name in results_by_subset[0]
-        }
+        return concatenate_results(results_by_subset)
 
     @with_default_jax_settings  # It runs in a thread of its own.
     def _evaluate_sample_subset(self, parameter_rows: np.ndarray) -> ValuesByVariable:
@@ -172,10 +143,10 @@ class UnilateralScanEngine:
                 differentiable_cycles,
             )
             parameter_names = self._wheel_model.parameter_names
-            for requested_derivative in self._requested_derivatives:
-                gait_results[requested_derivative.variable_name] = measure_jacobians[
-                    requested_derivative.measure_name
-                ][:, parameter_names.index(requested_derivative.parameter_name)]
+            for derivative in self._requested_derivatives:
+                gait_results[derivative.variable_name] = measure_jacobians[derivative.measure_name][
+                    :, parameter_names.index(derivative.parameter_name)
+                ]
         gait_results["outcome"] = slow_gaits.outcome
         return {
             variable_name: np.asarray(variable_values)
@@ -211,15 +182,11 @@ class ModelSelectionScanEngine:
     """
 
     def __init__(self, evaluation_request: EvaluationRequest, n_threads: int | None = None) -> None:
-        self._measure_names, self._base_wheel, self._wheel_model = (
-            evaluation_request.measure_names,
-            evaluation_request.base_wheel,
-            evaluation_request.wheel_model,
-        )
+        self._measure_names, self._base_wheel, self._wheel_model, *_ = evaluation_request
         self._paper_model = ViscoelasticWheel()
         paper_measure_names = (
             paper_measure
-            for measure_name in evaluation_request.measure_names
+            for measure_name in self._measure_names
             for paper_measure in PAPER_MEASURES_BY_CONTACT_MEASURE.get(
                 measure_name, (measure_name,)
             )
@@ -229,8 +196,7 @@ class ModelSelectionScanEngine:
         )
         self._paper_engine = CollocationScanEngine(paper_evaluation_request, n_threads)
         self._unilateral_engine = UnilateralScanEngine(
-            evaluation_request._replace(wheel_model=evaluation_request.wheel_model.fallback_model),
-            n_threads,
+            evaluation_request._replace(wheel_model=self._wheel_model.fallback_model), n_threads
         )
 
     def __call__(self, samples_by_parameter: ParameterSampleMapping) -> ValuesByVariable:
@@ -256,17 +222,13 @@ class ModelSelectionScanEngine:
             selection_reasons == 0, ModelCode.VISCOELASTIC, ModelCode.UNILATERAL
         ).astype(np.int8)
         variable_names = (*self._measure_names, "outcome", "spectral_radius")
+        for contact_measure, paper_measures in PAPER_MEASURES_BY_CONTACT_MEASURE.items():
+            if contact_measure in variable_names:
+                paper_results[contact_measure] = sum(
+                    map(paper_results.__getitem__, paper_measures), start=np.zeros(n_samples)
+                )
         sample_results = {
-            variable_name: sum(
-                (
-                    paper_results[paper_measure]
-                    for paper_measure in PAPER_MEASURES_BY_CONTACT_MEASURE[variable_name]
-                ),
-                start=np.zeros(n_samples),
-            )
-            if variable_name in PAPER_MEASURES_BY_CONTACT_MEASURE
-            else paper_results[variable_name]
-            for variable_name in variable_names
+            variable_name: paper_results[variable_name] for variable_name in variable_names
         }
         unilateral_samples = np.flatnonzero(model_codes == ModelCode.UNILATERAL)
         if unilateral_samples.size:
@@ -314,11 +276,7 @@ class ToleranceScanEngine:
 
     def __init__(self, evaluation_request: EvaluationRequest) -> None:
         assert evaluation_request.error_tolerance is not None
-        self._measure_names, self._base_wheel, self._wheel_model = (
-            evaluation_request.measure_names,
-            evaluation_request.base_wheel,
-            evaluation_request.wheel_model,
-        )
+        self._measure_names, self._base_wheel, self._wheel_model, *_ = evaluation_request
         self._error_tolerance = evaluation_request.error_tolerance
 
     def __call__(self, samples_by_parameter: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -332,22 +290,16 @@ class ToleranceScanEngine:
         params = make_wheel_from_parameters(
             tuple(map(jnp.asarray, wheel_parameter_columns)), self._base_wheel.n_legs
         )
-        stoppers = self._wheel_model.stoppers
         measure_result = measure_to_tolerance(
             self._measure_names,
             params,
             self._error_tolerance,
             friction=sample_friction,
-            stoppers=stoppers,
+            stoppers=self._wheel_model.stoppers,
         )
-        sample_results = {
-            measure_name: measure_result.values[:, measure_index]
-            for measure_index, measure_name in enumerate(self._measure_names)
-        }
-        sample_results |= {
-            make_error_variable_name(measure_name): measure_result.errors[:, measure_index]
-            for measure_index, measure_name in enumerate(self._measure_names)
-        }
+        error_names = map(make_error_variable_name, self._measure_names)
+        sample_results = dict(zip(self._measure_names, measure_result.values.T, strict=True))
+        sample_results |= dict(zip(error_names, measure_result.errors.T, strict=True))
         model_codes = np.maximum(measure_result.models - ModelIndex.RIGID, 0).astype(np.int8)
         return mask_failed_samples(measure_result.outcomes, sample_results | {"rung": model_codes})
 
@@ -359,23 +311,15 @@ class PassageScanEngine:
     Samples are computed one after another, each with the same random numbers.
     """
 
-    def __init__(
-        self,
-        evaluation_request: EvaluationRequest,
-        slope_standard_deviation: float,
-        gait_engine: Any,
-    ) -> None:
-        self._base_wheel, self._wheel_model, self._slope_standard_deviation = (
-            evaluation_request.base_wheel,
-            evaluation_request.wheel_model,
-            slope_standard_deviation,
+    def __init__(self, evaluation_request: EvaluationRequest, n_threads: int | None = None) -> None:
+        measure_names, self._base_wheel, self._wheel_model, *_ = evaluation_request
+        self._slope_standard_deviation = evaluation_request.slope_standard_deviation
+        self._passage_measure_names = [name for name in measure_names if name in PASSAGE_MEASURES]
+        gait_measure_names = tuple(name for name in measure_names if name not in PASSAGE_MEASURES)
+        gait_request = evaluation_request._replace(
+            measure_names=gait_measure_names, slope_standard_deviation=None
         )
-        self._passage_measure_names = tuple(
-            measure_name
-            for measure_name in evaluation_request.measure_names
-            if measure_name in PASSAGE_MEASURES
-        )
-        self._gait_engine = gait_engine
+        self._gait_engine: Any = make_scan_engine(gait_request, n_threads)
 
     def __call__(self, samples_by_parameter: ParameterSampleMapping) -> ValuesByVariable:
         """Return the value of each variable for all samples, by the name of the variable.
@@ -445,22 +389,11 @@ def make_scan_engine(
     """
     if evaluation_request.error_tolerance is not None:
         return ToleranceScanEngine(evaluation_request)
-    scan_engine_class: Any = SCAN_ENGINE_CLASSES[
-        evaluation_request.wheel_model.capabilities.gait_method
-    ]
-    if evaluation_request.slope_standard_deviation is None:
-        return scan_engine_class(evaluation_request, n_threads)
-    gait_measure_names = tuple(
-        measure_name
-        for measure_name in evaluation_request.measure_names
-        if measure_name not in PASSAGE_MEASURES
-    )
-    gait_engine = scan_engine_class(
-        evaluation_request._replace(measure_names=gait_measure_names), n_threads
-    )
-    return PassageScanEngine(
-        evaluation_request, evaluation_request.slope_standard_deviation, gait_engine
-    )
+    if evaluation_request.slope_standard_deviation is not None:
+        return PassageScanEngine(evaluation_request, n_threads)
+    gait_method = evaluation_request.wheel_model.capabilities.gait_method
+    scan_engine_class: Any = SCAN_ENGINE_CLASSES[gait_method]
+    return scan_engine_class(evaluation_request, n_threads)
 
 
 SCAN_ENGINE_CLASSES = {

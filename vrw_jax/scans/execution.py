@@ -12,10 +12,8 @@ import errno
 import math
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-
-import numpy as np
 
 from vrw_jax.cycles import CycleOptions
 from vrw_jax.measures import xarray as xr
@@ -200,9 +198,11 @@ def _compute_and_write_chunks(
         chunk_index: scan_plan.result_layout.compute_chunk_sample_shape(chunk_index)
         for chunk_index in missing_chunks
     }
-    n_samples, n_samples_done, n_samples_failed = sum(map(math.prod, chunk_shapes.values())), 0, 0
+    n_samples = sum(map(math.prod, chunk_shapes.values()))
+    scan_progress = ScanProgress(n_samples, 0, 0, scan_plan.design.size - n_samples)
+    n_chunks = scan_plan.result_layout.n_chunks
     if on_progress is not None:
-        on_progress(ScanProgress(n_samples, 0, 0, scan_plan.design.size - n_samples))
+        on_progress(scan_progress)
     try:
         for chunk_index, flat_chunk_results in chunk_executor(scan_plan, missing_chunks):
             chunk_shape = chunk_shapes[chunk_index]
@@ -215,39 +215,29 @@ def _compute_and_write_chunks(
             except OSError as disk_error:
                 if disk_error.errno not in (errno.ENOSPC, errno.EDQUOT):
                     raise
-                n_chunks_done = scan_plan.result_layout.n_chunks - len(
-                    result_store.find_missing_chunks()
-                )
+                n_chunks_done = n_chunks - len(result_store.find_missing_chunks())
                 raise OSError(
                     disk_error.errno,
                     f"no space is left for {result_store.store_location}, where {n_chunks_done} "
-                    f"chunks are "
-                    "complete: make room and run the same again, it goes on from there",
+                    "chunks are complete: make room and run the same again, it goes on from there",
                 ) from disk_error
-            n_samples_done += math.prod(chunk_shape)
-            n_samples_failed += int(
-                np.count_nonzero(flat_chunk_results["outcome"] != Outcome.STEPPED)
+            has_failed = flat_chunk_results["outcome"] != Outcome.STEPPED
+            scan_progress = replace(
+                scan_progress,
+                n_done=scan_progress.n_done + has_failed.size,
+                n_failed=scan_progress.n_failed + int(has_failed.sum()),
             )
             if on_progress is not None:
-                on_progress(
-                    ScanProgress(
-                        n_samples,
-                        n_samples_done,
-                        n_samples_failed,
-                        scan_plan.design.size - n_samples,
-                    )
-                )
+                on_progress(scan_progress)
     except KeyboardInterrupt:
         if isinstance(result_store, MemoryResultStore):
             raise KeyboardInterrupt(
                 "stopped, and nothing is kept: give store=, a folder, to continue another time."
             ) from None
-        n_chunks = scan_plan.result_layout.n_chunks
         n_chunks_done = n_chunks - len(result_store.find_missing_chunks())
         raise KeyboardInterrupt(
             f"stopped: {n_chunks_done} of {n_chunks} chunks are kept in "
-            f"{result_store.store_location}; run "
-            "the same again, it goes on from there."
+            f"{result_store.store_location}; run the same again, it goes on from there."
         ) from None
 
 
@@ -257,14 +247,7 @@ def _compute_chunks_in_process(
     """Yield each missing chunk's index and results, computed one after another in this process."""
     scan_engine = scan_plan.build_scan_engine()
     for chunk_index in missing_chunks:
-        yield (
-            chunk_index,
-            scan_engine(
-                scan_plan.design.select_samples(
-                    scan_plan.result_layout.compute_chunk_region(chunk_index)
-                )
-            ),
-        )
+        yield chunk_index, scan_engine(scan_plan.select_chunk_samples(chunk_index))
 
 
 def open_or_create_store(scan_plan: ScanPlan, store_path: Path) -> ZarrResultStore:
@@ -290,10 +273,9 @@ def open_or_create_store(scan_plan: ScanPlan, store_path: Path) -> ZarrResultSto
         )
         raise ValueError(
             f"{store_path} lacks {n_missing_chunks} of {scan_plan.result_layout.n_chunks} "
-            f"chunks{damaged_chunks_text} and "
-            "was begun by other means, so that its last digits might not fit: "
-            f"{settings_difference_text}. "
-            "Go on with what it was begun with, or begin anew in another place."
+            f"chunks{damaged_chunks_text} and was begun by other means, so that its last digits "
+            f"might not fit: {settings_difference_text}. Go on with what it was begun with, or "
+            "begin anew in another place."
         )
     return zarr_store
 

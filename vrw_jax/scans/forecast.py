@@ -47,7 +47,7 @@ def forecast_scan(scan_plan: ScanPlan, store_path: str | Path | None = None) -> 
         else find_matching_store(scan_plan, Path(store_path), verifies_files=False)
     )
     missing_chunks = (
-        list(range(result_layout.n_chunks))
+        range(result_layout.n_chunks)
         if existing_store is None
         else existing_store.find_missing_chunks()
     )
@@ -100,12 +100,10 @@ def _select_spread_samples(
     design: AbstractSampleDesign, n_selected_samples: int
 ) -> ParameterSamples:
     """Return samples that are spread evenly over a design, as one column per parameter."""
-    flat_sample_indices = (
-        np.linspace(0, design.size - 1, n_selected_samples).round().astype(np.int64)
-    )
+    flat_sample_indices = np.linspace(0, design.size - 1, n_selected_samples).round().astype(int)
     sample_indices = zip(*np.unravel_index(flat_sample_indices, design.shape), strict=True)
     single_samples = [
-        design.select_samples(tuple(slice(int(i), int(i) + 1) for i in sample_index))
+        design.select_samples(tuple(slice(i, i + 1) for i in sample_index))
         for sample_index in sample_indices
     ]
     return {

@@ -82,19 +82,16 @@ def sobol_indices(
     if design_settings.get("kind") != SALTELLI_DESIGN_KIND:
         raise ValueError(
             f"the scan's samples are of kind {design_settings.get('kind')!r}, but Sobol' indices "
-            "need those "
-            "of vrw.saltelli({...}, n), or of a table [saltelli]: scan these."
+            "need those of vrw.saltelli({...}, n), or of a table [saltelli]: scan these."
         )
-    swept_parameters, measure_names = (
-        list(design_settings["swept"]),
-        list(check_names("measures", measures)),
-    )
+    swept_parameters = list(design_settings["swept"])
+    measure_names = list(check_names("measures", measures))
     for measure_name in measure_names:
         if measure_name not in scan or scan[measure_name].dims != ("sample",):
             raise ValueError(
                 f"{measure_name!r} is no measure of this "
-                f"scan{format_name_suggestion(measure_name, map(str, scan))}: "
-                "ask for one that was scanned."
+                f"scan{format_name_suggestion(measure_name, map(str, scan))}: ask for one that was "
+                "scanned."
             )
     sobol_options = SobolOptions()
     n_samples_per_row = 2 + len(swept_parameters)
@@ -103,10 +100,8 @@ def sobol_indices(
     )
     saltelli_rows_with_gaits = np.flatnonzero(has_gaits_in_row)
     n_saltelli_rows = (
-        1 << (len(saltelli_rows_with_gaits).bit_length() - 1)
-        if len(saltelli_rows_with_gaits)
-        else 0
-    )
+        1 << len(saltelli_rows_with_gaits).bit_length() >> 1
+    )  # largest power of 2, or 0
     if n_saltelli_rows < sobol_options.min_saltelli_rows:
         raise ValueError(
             f"only {len(saltelli_rows_with_gaits)} of {len(has_gaits_in_row)} rows walk "
@@ -136,24 +131,23 @@ def sobol_indices(
     if is_constant_measure.any():
         warnings.warn(
             f"{', '.join(np.array(measure_names)[is_constant_measure])}: constant over these "
-            "samples "
-            "but for round-off, so that there is no variance to share, and the indices are 0.",
+            "samples but for round-off, so that there is no variance to share, and the indices are "
+            "0.",
             stacklevel=2,
         )
     sobol_index_variables: dict[str, tuple] = {}
-    for measure_index, (measure_name, sobol_index_label) in enumerate(
-        (("first_order", "first-order"), ("total", "total"))
-    ):
-        sobol_index_attributes = {"units": "1", "long_name": f"{sobol_index_label} Sobol' index"}
-        for variable_name_suffix, interval_bound_values in (
+    for index_position, index_name in enumerate(("first_order", "total")):
+        index_label = index_name.replace("_", "-")
+        index_attributes = {"units": "1", "long_name": f"{index_label} Sobol' index"}
+        for name_suffix, index_values in (
             ("", sobol_index_estimates),
             ("_lower", lower_bounds),
             ("_upper", upper_bounds),
         ):
-            sobol_index_variables[measure_name + variable_name_suffix] = (
+            sobol_index_variables[index_name + name_suffix] = (
                 ("measure", "parameter"),
-                interval_bound_values[measure_index],
-                sobol_index_attributes,
+                index_values[index_position],
+                index_attributes,
             )
     sobol_index_variables["is_constant_measure"] = (
         "measure",
@@ -203,19 +197,13 @@ class _SobolIndexEstimator:
         n_samples_per_row, n_measures, _ = resampled_measure_values.shape
         sobol_index_estimates = np.zeros((2, n_measures, n_samples_per_row - 2))
         if len(varying_measures):
-            resampled_measure_values = resampled_measure_values[:, varying_measures]
-            measure_functions = {
-                "f_A": resampled_measure_values[0],
-                "f_B": resampled_measure_values[1],
-                "f_AB": resampled_measure_values[2:],
-            }
+            values_a, values_b, *values_ab = resampled_measure_values[:, varying_measures]
             scipy_result = compute_sobol_indices(
-                func=measure_functions, n=len(saltelli_row_indices)
+                func={"f_A": values_a, "f_B": values_b, "f_AB": np.array(values_ab)},
+                n=len(saltelli_row_indices),
             )
-            sobol_index_estimates[0, varying_measures] = np.reshape(
-                scipy_result.first_order, (len(varying_measures), -1)
-            )
-            sobol_index_estimates[1, varying_measures] = np.reshape(
-                scipy_result.total_order, (len(varying_measures), -1)
+            # SciPy omits the axis of a single measure.
+            sobol_index_estimates[:, varying_measures] = np.reshape(
+                [scipy_result.first_order, scipy_result.total_order], (2, len(varying_measures), -1)
             )
         return sobol_index_estimates

@@ -55,16 +55,9 @@ class SpecialPointMap(NamedTuple):
     def __str__(self) -> str:
         text_lines = [self.ending]
         for sign_change in self.unexplained_changes:
-            parameter_values = [
-                float(self.scan[parameter_name][sample_index])
-                for parameter_name, sample_index in zip(
-                    self.scan.outcome.dims, sign_change.sample_indices, strict=True
-                )
-            ]
-            text_lines.append(
-                f"    {sign_change.quantity_name} at "
-                f"({parameter_values[0]:.6g}, {parameter_values[1]:.6g})"
-            )
+            sample = self.scan.outcome[tuple(sign_change.sample_indices)]
+            x, y = (float(sample[parameter_name]) for parameter_name in self.scan.outcome.dims)
+            text_lines.append(f"    {sign_change.quantity_name} at ({x:.6g}, {y:.6g})")
         return "\n\n".join([*map(str, self.curves), "\n".join(text_lines)])
 
     def __repr__(self) -> str:
@@ -171,6 +164,5 @@ def require_map_grid(design: AbstractSampleDesign) -> None:
         if len(parameter_values) < 2 or not np.all(np.diff(parameter_values) > 0.0):
             raise ValueError(
                 f"{parameter_name} has the values {parameter_values.tolist()}, but each side of "
-                f"a map has at least two "
-                "ascending ones: sort them, or give more."
+                "a map has at least two ascending ones: sort them, or give more."
             )
