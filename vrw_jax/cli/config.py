@@ -7,7 +7,7 @@ the remedy.
 import contextlib
 import math
 import tomllib
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
@@ -15,15 +15,9 @@ from typing import Any
 import numpy as np
 
 from vrw_jax.cycles import CycleOptions
-from vrw_jax.models import AbstractWheel, GaitMethod
+from vrw_jax.models import AbstractWheel
 from vrw_jax.numerics import StepOptions
-from vrw_jax.scans import (
-    MAX_LISTED_SAMPLES,
-    MEASURE_CATALOGS,
-    TOLERANCE_MEASURE_CATALOG,
-    add_passage_measures,
-    check_measure_names,
-)
+from vrw_jax.scans import MAX_LISTED_SAMPLES, check_measure_names, select_measure_catalog
 from vrw_jax.scans import design as designs
 from vrw_jax.selection import find_model_class, list_model_config_names
 from vrw_jax.validation import check_range, format_name_suggestion, format_value, require_known_name
@@ -53,7 +47,6 @@ CONFIG_TABLE_NAMES = (
     "branch",
     *DESIGN_TABLE_NAMES,
 )
-_STEP_OPTION_KEYS = tuple(StepOptions.__dataclass_fields__)
 PARAMETER_SET_KEY = "parameter_set"
 """Key of `[wheel]` that names a parameter set. Other keys of the table replace values of this
 set.
@@ -67,15 +60,13 @@ MAX_CONFIG_LEGS = 1_000
 """Largest number of legs in a config, chosen because results have one value per leg and sample."""
 
 RENAMED_CONFIG_KEYS = {
-    "[model]": {"rung": "name"},
-    "[options]": {
-        "first_step": "dt0",
-        "event_steps": "max_event_iterations",
-        "monitor_steps": "max_margin_search_iterations",
-    },
-    "[branch]": {"largest_step": "max_ds"},
+    "rung": "name",
+    "first_step": "dt0",
+    "event_steps": "max_event_iterations",
+    "monitor_steps": "max_margin_search_iterations",
+    "largest_step": "max_ds",
 }
-"""New names of renamed keys, by table and old key. A config with an old key raises an error."""
+"""New names of renamed keys, by old key. A config with an old key raises an error."""
 
 
 @dataclass(frozen=True)
@@ -105,42 +96,22 @@ class ScanConfig:
 
         Raise a ValueError if the model does not have a requested measure.
         """
-        _require_known_keys(config_table, cls.__dataclass_fields__, "[scan]", "settings")
-        measure_names = config_table.get("measures")
-        slope_sd = config_table.get("slope_sd")
-        if measure_names is not None:
-            if not (
-                isinstance(measure_names, list)
-                and all(isinstance(measure_name, str) for measure_name in measure_names)
-            ):
-                requirement_text = 'a list of names: write measures = ["dls_fraction", "speed"]'
-                raise _make_value_error("measures", measure_names, requirement_text)
-            measure_catalog = (
-                MEASURE_CATALOGS.get(
-                    model_class.capabilities.gait_method, MEASURE_CATALOGS[GaitMethod.COLLOCATION]
-                )
-                if "tol" not in config_table
-                else TOLERANCE_MEASURE_CATALOG
+        scan_config = cls(
+            **_parse_settings(
+                config_table,
+                "[scan]",
+                measures=_parse_names,
+                chunk=_parse_whole_number,
+                tol=_parse_positive_number,
+                slope_sd=_parse_positive_number,
+                mesh_intervals=lambda _, value: CycleOptions(mesh_intervals=value).mesh_intervals,
             )
-            if slope_sd is not None and "tol" not in config_table:
-                measure_catalog = add_passage_measures(measure_catalog)
-            check_measure_names(measure_names, measure_catalog)
-            measure_names = tuple(measure_names)
-        chunk_size = config_table.get("chunk")
-        error_tolerance = config_table.get("tol")
-        return cls(
-            measure_names,
-            None if chunk_size is None else _parse_whole_number(chunk_size, "chunk", 1),
-            None
-            if error_tolerance is None
-            else _parse_finite_number(error_tolerance, "tol", must_be_positive=True),
-            None
-            if slope_sd is None
-            else _parse_finite_number(slope_sd, "slope_sd", must_be_positive=True),
-            None
-            if "mesh_intervals" not in config_table
-            else CycleOptions(mesh_intervals=config_table["mesh_intervals"]).mesh_intervals,  # type: ignore[arg-type]
         )
+        check_measure_names(
+            scan_config.measures or (),
+            select_measure_catalog(model_class, scan_config.tol, scan_config.slope_sd),
+        )
+        return scan_config
 
     def make_cycle_options(self) -> CycleOptions | None:
         """Return the options of the gait search with the mesh of the config, or None."""
@@ -162,22 +133,11 @@ class GaitConfig:
     @classmethod
     def from_table(cls, config_table: Mapping[str, object]) -> "GaitConfig":
         """Read the settings of the table `[gait]`."""
-        _require_known_keys(config_table, cls.__dataclass_fields__, "[gait]", "settings")
-        n_steps = _parse_whole_number(config_table.get("steps", cls.steps), "steps", 1)
-        start_state = config_table.get("start")
-        if start_state is None:
-            return cls(n_steps)
-        if not (isinstance(start_state, list) and len(start_state) == 3):
-            requirement_text = (
-                "the section state before touchdown, three numbers: angle in rad, angular rate in "
+        return cls(
+            **_parse_settings(
+                config_table, "[gait]", steps=_parse_whole_number, start=_parse_section_state
             )
-            raise _make_value_error(
-                "start", start_state, requirement_text + "rad/s, rate of Leg 1 in m/s"
-            )
-        theta, dtheta, dL1 = (
-            _parse_finite_number(state_component, "start") for state_component in start_state
         )
-        return cls(n_steps, (theta, dtheta, dL1))
 
 
 @dataclass(frozen=True)
@@ -199,50 +159,15 @@ class TuneConfig:
     @classmethod
     def from_table(cls, config_table: Mapping[str, object]) -> "TuneConfig":
         """Read the settings of the table `[tune]` and of its subtables."""
-        _require_known_keys(config_table, cls.__dataclass_fields__, "[tune]", "settings")
-        objective_setting = config_table.get("objective", cls.objective)
-        if isinstance(objective_setting, dict):
-            objective_setting = {
-                key_name: _parse_finite_number(config_value, key_name)
-                for key_name, config_value in objective_setting.items()
-            }
-        elif not isinstance(objective_setting, str):
-            requirement_text = (
-                'a measure or weights of several: write objective = "dls_fraction" or objective = '
-            )
-            raise _make_value_error(
-                "objective",
-                objective_setting,
-                requirement_text + "{ dls_fraction = 1.0, speed = 0.1 }",
-            )
-        bounds_table = config_table.get("bounds")
-        if not isinstance(bounds_table, dict) or not bounds_table:
-            raise ValueError(
-                "[tune] has no free parameter, but it needs at least one: add [tune.bounds] with "
-                "lines such as damping = [20.0, 215.0]."
-            )
-        _require_known_keys(bounds_table, PARAMETER_NAMES, "[tune.bounds]", "parameters")
-        constraints_table = config_table.get("constraints")
-        if constraints_table is not None:
-            if not isinstance(constraints_table, dict):
-                requirement_text = "a table: write [tune.constraints] and below it lines such as "
-                raise _make_value_error(
-                    "constraints", constraints_table, requirement_text + "clearance_sls1 = 0.001"
-                )
-            constraints_table = {
-                key_name: _parse_finite_number(config_value, key_name)
-                for key_name, config_value in constraints_table.items()
-            }
         return cls(
-            objective=objective_setting,
-            bounds={
-                key_name: _parse_parameter_range(key_name, config_value)
-                for key_name, config_value in bounds_table.items()
-            },
-            constraints=constraints_table,
-            evaluations=_parse_whole_number(
-                config_table.get("evaluations", cls.evaluations), "evaluations", 1
-            ),
+            **_parse_settings(
+                {"bounds": {}, **config_table},
+                "[tune]",
+                objective=_parse_objective,
+                bounds=_parse_free_parameters,
+                constraints=_parse_constraints,
+                evaluations=_parse_whole_number,
+            )
         )
 
 
@@ -270,7 +195,6 @@ class BranchConfig:
 
         Its parameter must be one of `allowed_parameter_names`.
         """
-        _reject_renamed_keys(config_table, "[branch]")
         _require_known_keys(config_table, cls.__dataclass_fields__, "[branch]", "settings")
         branch_parameter = config_table.get("parameter")
         check_parameter_name(
@@ -278,28 +202,29 @@ class BranchConfig:
             allowed_parameter_names,
             "parameter that a branch of this model runs along",
         )
-        assert isinstance(branch_parameter, str)
         if "bounds" not in config_table:
             raise ValueError("[branch] has no bounds: write bounds = [4.0, 230.0], say.")
-        parameter_bounds = check_range(
-            "bounds",
-            _parse_parameter_range(
-                "bounds of " + branch_parameter, config_table["bounds"], branch_parameter
-            ),
+        branch_config = cls(
+            **_parse_settings(
+                config_table,
+                "[branch]",
+                parameter=lambda _, value: value,
+                bounds=lambda _, value: check_range(
+                    "bounds",
+                    _parse_parameter_range(
+                        f"bounds of {branch_parameter}", value, str(branch_parameter)
+                    ),
+                ),
+                period=_parse_whole_number,
+                max_ds=_parse_positive_number,
+            )
         )
-        max_ds = None
-        if "max_ds" in config_table:
-            max_ds = _parse_finite_number(config_table["max_ds"], "max_ds", must_be_positive=True)
-            if max_ds > 1.0:
-                raise ValueError(
-                    f"max_ds is {max_ds:g}, but it is a share of the range: give 0.02, say."
-                )
-        return cls(
-            parameter=branch_parameter,
-            bounds=parameter_bounds,
-            period=_parse_whole_number(config_table.get("period", cls.period), "period", 1),
-            max_ds=max_ds,
-        )
+        if branch_config.max_ds is not None and branch_config.max_ds > 1.0:
+            raise ValueError(
+                f"max_ds is {branch_config.max_ds:g}, but it is a share of the range: give 0.02, "
+                "say."
+            )
+        return branch_config
 
 
 @dataclass(frozen=True)
@@ -346,8 +271,7 @@ def load_config(config_path: str | Path) -> Config:
         )
         raise ValueError(
             f"there is no config file {config_path}{name_suggestion}: give the path of a TOML "
-            "file, "
-            "such as configs/quickstart.toml, which `vrw init` writes."
+            "file, such as configs/quickstart.toml, which `vrw init` writes."
         )
     if config_path.is_dir():
         raise ValueError(f"{config_path} is a folder, but a config is a TOML file: give its path.")
@@ -375,7 +299,7 @@ def parse_config(config_text: str, file_name: str = "config") -> Config:
     except RecursionError as config_error:
         raise ValueError(
             f"{file_name}: lists or tables lie in each other too deeply: no key takes more than "
-            f"two."
+            "two."
         ) from config_error
     try:
         return _parse_config_tables(config_tables, config_text, file_name)
@@ -402,45 +326,31 @@ def _parse_config_tables(
             f"[{design_kinds[0]}] and [{design_kinds[1]}] are both given, but a scan has one "
             "design: keep one."
         )
-    model_name, model_settings = _parse_model_table(_get_config_table(config_tables, "model"))
+    tables: dict[str, Any] = {name: {} for name in CONFIG_TABLE_NAMES} | dict(config_tables)
+    model_name, model_settings = _parse_model_table(tables["model"])
     model_class = find_model_class(model_name)
     parameter_names = model_class.parameter_names
-    sample_design = (
-        _parse_design_table(
-            design_kinds[0], _get_config_table(config_tables, design_kinds[0]), parameter_names
-        )
-        if design_kinds
-        else None
-    )
-    wheel_values = _parse_wheel_table(_get_config_table(config_tables, "wheel"))
-    duplicate_parameter_names = [
-        parameter_name
-        for parameter_name in _get_config_table(config_tables, "wheel")
-        if sample_design is not None and parameter_name in sample_design.swept_parameters
-    ]
-    if duplicate_parameter_names:
-        raise ValueError(
-            f"{duplicate_parameter_names[0]} is fixed in [wheel] and swept in "
-            f"[{design_kinds[0]}], but it can only be one: drop one of the two."
-        )
-    options_table = _get_config_table(config_tables, "options")
-    _reject_renamed_keys(options_table, "[options]")
-    _require_known_keys(options_table, _STEP_OPTION_KEYS, "[options]", "options")
-    default_options = {
-        option_name: getattr(StepOptions(), option_name) for option_name in _STEP_OPTION_KEYS
-    }
-    step_option_values = _parse_with_default_types(options_table, default_options)
+    sample_design = None
+    if design_kinds:
+        design_kind = design_kinds[0]
+        sample_design = _parse_design_table(design_kind, tables[design_kind], parameter_names)
+        for parameter_name in sample_design.swept_parameters:
+            if parameter_name in tables["wheel"]:
+                raise ValueError(
+                    f"{parameter_name} is fixed in [wheel] and swept in [{design_kind}], but it "
+                    "can only be one: drop one of the two."
+                )
+    default_options = vars(StepOptions())
+    _require_known_keys(tables["options"], default_options, "[options]", "options")
     checked_config = Config(
-        wheel_values=wheel_values,
+        wheel_values=_parse_wheel_table(tables["wheel"]),
         model_name=model_name,
         model_settings=model_settings,
-        step_option_values=step_option_values,
-        scan=ScanConfig.from_table(_get_config_table(config_tables, "scan"), model_class),
-        gait=GaitConfig.from_table(_get_config_table(config_tables, "gait")),
-        tune=TuneConfig.from_table(_get_config_table(config_tables, "tune"))
-        if "tune" in config_tables
-        else None,
-        branch=BranchConfig.from_table(_get_config_table(config_tables, "branch"), parameter_names)
+        step_option_values=_parse_with_default_types(tables["options"], default_options),
+        scan=ScanConfig.from_table(tables["scan"], model_class),
+        gait=GaitConfig.from_table(tables["gait"]),
+        tune=TuneConfig.from_table(tables["tune"]) if "tune" in config_tables else None,
+        branch=BranchConfig.from_table(tables["branch"], parameter_names)
         if "branch" in config_tables
         else None,
         design=sample_design,
@@ -453,16 +363,8 @@ def _parse_config_tables(
     # The wheel has a setting that no file can contain, such as uneven ground.
     except TypeError as model_error:
         raise ValueError(str(model_error)) from model_error
-    step_options = checked_config.make_options()
-    step_options.check_tolerances(np.dtype(float))
+    checked_config.make_options().check_tolerances(np.dtype(float))
     return checked_config
-
-
-def _get_config_table(config_tables: Mapping[str, object], table_name: str) -> dict[str, object]:
-    """Return a table of the file, or an empty table if the file does not contain this table."""
-    config_table = config_tables.get(table_name, {})
-    assert isinstance(config_table, dict)
-    return config_table
 
 
 def parse_assignment(assignment_text: str) -> tuple[str, float | int]:
@@ -493,7 +395,7 @@ def _parse_wheel_table(config_table: Mapping[str, object]) -> dict[str, float | 
         if parameter_name == PARAMETER_SET_KEY:
             continue
         if parameter_name == "n_legs":
-            parameter_values[parameter_name] = _parse_whole_number(config_value, parameter_name, 5)
+            parameter_values[parameter_name] = _parse_whole_number(parameter_name, config_value, 5)
             if parameter_values[parameter_name] > MAX_CONFIG_LEGS:
                 raise _make_value_error(
                     parameter_name, config_value, f"at most {MAX_CONFIG_LEGS:,}"
@@ -507,7 +409,6 @@ def _parse_model_table(
     config_table: Mapping[str, object],
 ) -> tuple[str, dict[str, float | int | str | bool]]:
     """Return the name of the model in the table `[model]`, and the model's settings."""
-    _reject_renamed_keys(config_table, "[model]")
     model_name = config_table.get("name", Config.model_name)
     require_known_name(model_name, list_model_config_names(), "model")
     assert isinstance(model_name, str)
@@ -535,23 +436,22 @@ def _parse_with_default_types(
     parsed_settings: dict[str, float | int | str | bool] = {}
     for setting_name, config_value in config_table.items():
         default_value = default_setting_values[setting_name]
-        if isinstance(default_value, bool):
-            if not isinstance(config_value, bool):
-                raise _make_value_error(setting_name, config_value, "true or false")
-            parsed_settings[setting_name] = config_value
-        elif isinstance(default_value, str):
-            if not isinstance(config_value, str):
-                raise _make_value_error(setting_name, config_value, f'a name, "{default_value}"')
+        if isinstance(default_value, bool | str):
+            if not isinstance(config_value, type(default_value)):
+                requirement_text = (
+                    "true or false"
+                    if isinstance(default_value, bool)
+                    else f'a name, "{default_value}"'
+                )
+                raise _make_value_error(setting_name, config_value, requirement_text)
             parsed_settings[setting_name] = config_value
         elif isinstance(default_value, int):
-            parsed_settings[setting_name] = _parse_whole_number(config_value, setting_name, 1)
+            parsed_settings[setting_name] = _parse_whole_number(setting_name, config_value)
         elif setting_name == FRICTION_NAME and config_value == math.inf:
             # Infinite friction means that feet do not slip.
             parsed_settings[setting_name] = math.inf
         else:
-            parsed_settings[setting_name] = _parse_finite_number(
-                config_value, setting_name, must_be_positive=True
-            )
+            parsed_settings[setting_name] = _parse_positive_number(setting_name, config_value)
     return parsed_settings
 
 
@@ -578,36 +478,22 @@ def _parse_design_table(
         f"[{design_kind}]",
         "settings",
     )
+    setting_parsers: dict[str, Callable] = {"grid": _parse_grid_axis, "samples": _parse_value_list}
+    parse_setting = setting_parsers.get(design_kind, _parse_parameter_range)
     swept_settings = {
-        parameter_name: config_value
+        parameter_name: parse_setting(parameter_name, config_value)
         for parameter_name, config_value in config_table.items()
         if parameter_name not in design_setting_keys
     }
-    if design_setting_keys:
-        if "n" not in config_table:
-            raise ValueError(f"[{design_kind}] has no number of samples: write n = 4096, say.")
-        n, random_seed = (
-            _parse_whole_number(config_table["n"], "n", 1),
-            _parse_whole_number(config_table.get("seed", 0), "seed", 0),
-        )
-        parameter_ranges = {
-            parameter_name: _parse_parameter_range(parameter_name, config_value)
-            for parameter_name, config_value in swept_settings.items()
-        }
-        return RANDOM_DESIGN_FUNCTIONS[design_kind](parameter_ranges, n, random_seed)
     if design_kind == "grid":
-        return designs.grid(
-            **{
-                parameter_name: _parse_grid_axis(parameter_name, config_value)
-                for parameter_name, config_value in swept_settings.items()
-            }
-        )
-    return designs.samples(
-        {
-            parameter_name: _parse_value_list(parameter_name, config_value)
-            for parameter_name, config_value in swept_settings.items()
-        }
-    )
+        return designs.grid(swept_settings)
+    if design_kind == "samples":
+        return designs.samples(swept_settings)
+    if "n" not in config_table:
+        raise ValueError(f"[{design_kind}] has no number of samples: write n = 4096, say.")
+    n = _parse_whole_number("n", config_table["n"])
+    random_seed = _parse_whole_number("seed", config_table.get("seed", 0), 0)
+    return RANDOM_DESIGN_FUNCTIONS[design_kind](swept_settings, n, random_seed)
 
 
 def _parse_grid_axis(parameter_name: str, grid_axis_setting: object) -> np.ndarray:
@@ -620,24 +506,21 @@ def _parse_grid_axis(parameter_name: str, grid_axis_setting: object) -> np.ndarr
             parameter_name, grid_axis_setting, " or { from = ..., to = ..., count = ... }"
         )
     _require_known_keys(grid_axis_setting, _GRID_AXIS_KEYS, f"the axis of {parameter_name}", "keys")
-    missing_axis_keys = [
-        grid_axis_key for grid_axis_key in _GRID_AXIS_KEYS if grid_axis_key not in grid_axis_setting
-    ]
-    if missing_axis_keys:
-        raise ValueError(
-            f"the axis of {parameter_name} has no '{missing_axis_keys[0]}': "
-            f"write {parameter_name} = {{ from = ..., to = ..., count = ... }}."
-        )
+    for axis_key in _GRID_AXIS_KEYS:
+        if axis_key not in grid_axis_setting:
+            raise ValueError(
+                f"the axis of {parameter_name} has no '{axis_key}': write {parameter_name} = "
+                "{ from = ..., to = ..., count = ... }."
+            )
     first_axis_value, last_axis_value = (
         _parse_parameter_value(parameter_name, grid_axis_setting[grid_axis_key])
         for grid_axis_key in ("from", "to")
     )
-    n_axis_values = _parse_whole_number(grid_axis_setting["count"], f"count of {parameter_name}", 1)
+    n_axis_values = _parse_whole_number(f"count of {parameter_name}", grid_axis_setting["count"])
     if n_axis_values > MAX_LISTED_SAMPLES:
         raise ValueError(
             f"the axis of {parameter_name} has {n_axis_values:,} values, but "
-            f"{MAX_LISTED_SAMPLES:,} is the most: "
-            "give fewer."
+            f"{MAX_LISTED_SAMPLES:,} is the most: give fewer."
         )
     return np.linspace(first_axis_value, last_axis_value, n_axis_values)
 
@@ -678,17 +561,87 @@ def _parse_parameter_value(parameter_name: str, config_value: object) -> float:
 
     Raise a ValueError if it is not in the domain of the parameter.
     """
-    parameter_value = _parse_finite_number(
-        config_value, parameter_name, must_be_positive=parameter_name == FRICTION_NAME
-    )
-    if parameter_name != FRICTION_NAME:
-        PARAMETER_DOMAINS[parameter_name].require_value_in_domain(parameter_name, parameter_value)
+    if parameter_name == FRICTION_NAME:
+        return _parse_positive_number(parameter_name, config_value)
+    parameter_value = _parse_finite_number(parameter_name, config_value)
+    PARAMETER_DOMAINS[parameter_name].require_value_in_domain(parameter_name, parameter_value)
     return parameter_value
 
 
-def _parse_finite_number(
-    config_value: object, setting_name: str, must_be_positive: bool = False
-) -> float:
+def _parse_names(setting_name: str, config_value: object) -> tuple[str, ...]:
+    """Return a list of names as a tuple. Raise a ValueError if it is not a list of names."""
+    if not isinstance(config_value, list) or not all(
+        isinstance(name, str) for name in config_value
+    ):
+        requirement_text = f'a list of names: write {setting_name} = ["dls_fraction", "speed"]'
+        raise _make_value_error(setting_name, config_value, requirement_text)
+    return tuple(config_value)
+
+
+def _parse_section_state(setting_name: str, config_value: object) -> tuple[float, ...]:
+    """Return a list of three numbers as a tuple. Raise a ValueError if it is not such a list."""
+    if not (isinstance(config_value, list) and len(config_value) == 3):
+        requirement_text = (
+            "the section state before touchdown, three numbers: angle in rad, angular rate in "
+            "rad/s, rate of Leg 1 in m/s"
+        )
+        raise _make_value_error(setting_name, config_value, requirement_text)
+    return tuple(_parse_finite_number(setting_name, component) for component in config_value)
+
+
+def _parse_objective(setting_name: str, config_value: object) -> str | dict[str, float]:
+    """Return the name of a measure, or weights of measures. Raise a ValueError for other values."""
+    if isinstance(config_value, str):
+        return config_value
+    requirement_text = (
+        'a measure or weights of several: write objective = "dls_fraction" or objective = '
+        "{ dls_fraction = 1.0, speed = 0.1 }"
+    )
+    return _parse_numbers_by_name(setting_name, config_value, requirement_text)
+
+
+def _parse_constraints(setting_name: str, config_value: object) -> dict[str, float]:
+    """Return the smallest allowed value of each measure in a table, by name."""
+    requirement_text = (
+        "a table: write [tune.constraints] and below it lines such as clearance_sls1 = 0.001"
+    )
+    return _parse_numbers_by_name(setting_name, config_value, requirement_text)
+
+
+def _parse_numbers_by_name(
+    setting_name: str, config_value: object, requirement_text: str
+) -> dict[str, float]:
+    """Return the numbers in a table, by name. Raise a ValueError if the value is no such table."""
+    if not isinstance(config_value, dict):
+        raise _make_value_error(setting_name, config_value, requirement_text)
+    return {name: _parse_finite_number(name, number) for name, number in config_value.items()}
+
+
+def _parse_free_parameters(
+    _setting_name: str, config_value: object
+) -> dict[str, tuple[float, float]]:
+    """Return the bounds of each free parameter of a tuning run, by name."""
+    if not isinstance(config_value, dict) or not config_value:
+        raise ValueError(
+            "[tune] has no free parameter, but it needs at least one: add [tune.bounds] with "
+            "lines such as damping = [20.0, 215.0]."
+        )
+    _require_known_keys(config_value, PARAMETER_NAMES, "[tune.bounds]", "parameters")
+    return {
+        parameter_name: _parse_parameter_range(parameter_name, parameter_bounds)
+        for parameter_name, parameter_bounds in config_value.items()
+    }
+
+
+def _parse_positive_number(setting_name: str, config_value: object) -> float:
+    """Return a value as a float. Raise a ValueError if it is not a positive finite number."""
+    positive_number = _parse_finite_number(setting_name, config_value)
+    if not positive_number > 0:
+        raise ValueError(f"{setting_name} is {positive_number:g}, but it must be positive.")
+    return positive_number
+
+
+def _parse_finite_number(setting_name: str, config_value: object) -> float:
     """Return a value as a finite float. Raise a ValueError if it is not a finite number."""
     finite_number = math.nan
     if isinstance(config_value, int | float) and not isinstance(config_value, bool):
@@ -697,12 +650,10 @@ def _parse_finite_number(
             finite_number = float(config_value)
     if not math.isfinite(finite_number):
         raise _make_value_error(setting_name, config_value, "a finite number")
-    if must_be_positive and not finite_number > 0:
-        raise ValueError(f"{setting_name} is {finite_number:g}, but it must be positive.")
     return finite_number
 
 
-def _parse_whole_number(config_value: object, setting_name: str, min_value: int) -> int:
+def _parse_whole_number(setting_name: str, config_value: object, min_value: int = 1) -> int:
     """Return a value as an integer. Raise a ValueError if it is not an integer of at least
     `min_value`.
     """
@@ -719,30 +670,42 @@ def _parse_whole_number(config_value: object, setting_name: str, min_value: int)
     return config_value
 
 
+def _parse_settings(
+    config_table: Mapping[str, object],
+    table_location: str,
+    **parser_by_key: Callable[[str, Any], Any],
+) -> dict[str, Any]:
+    """Return the parsed settings of a table, by key. Each parser takes the key and the value.
+
+    Raise a ValueError if a key has no parser.
+    """
+    _require_known_keys(config_table, parser_by_key, table_location, "settings")
+    return {
+        config_key: parser_by_key[config_key](config_key, config_value)
+        for config_key, config_value in config_table.items()
+    }
+
+
 def _require_known_keys(
     config_table: Mapping[str, object],
     allowed_keys: Iterable[str],
     table_location: str,
     key_kind: str,
 ) -> None:
-    """Raise a ValueError if a table contains a key that is not allowed."""
+    """Raise a ValueError if a table contains a key that is not allowed, or that has a new name."""
     allowed_keys = tuple(allowed_keys)
     for config_key in config_table:
         raise_for_parameter_symbol(config_key, allowed_keys)
+        new_key = RENAMED_CONFIG_KEYS.get(config_key)
+        if new_key in allowed_keys:
+            raise ValueError(
+                f"{table_location} has the old key '{config_key}': write {new_key} in its place."
+            )
         if config_key not in allowed_keys:
             raise ValueError(
                 f"{table_location} has the unknown key "
                 f"'{config_key}'{format_name_suggestion(config_key, allowed_keys)}: "
                 f"its {key_kind} are {', '.join(allowed_keys)}."
-            )
-
-
-def _reject_renamed_keys(config_table: Mapping[str, object], table_location: str) -> None:
-    """Raise a ValueError if a table contains a key that has a new name."""
-    for old_key, new_key in RENAMED_CONFIG_KEYS[table_location].items():
-        if old_key in config_table:
-            raise ValueError(
-                f"{table_location} has the old key '{old_key}': write {new_key} in its place."
             )
 
 

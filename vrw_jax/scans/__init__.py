@@ -23,10 +23,8 @@ from vrw_jax.scans.forecast import forecast_scan, format_duration
 from vrw_jax.scans.integrity import read_scan_manifest
 from vrw_jax.scans.measure_catalog import (
     DIFFERENTIABLE_MEASURES,
-    MEASURE_CATALOGS,
-    TOLERANCE_MEASURE_CATALOG,
-    add_passage_measures,
     check_measure_names,
+    select_measure_catalog,
 )
 from vrw_jax.scans.planning import ScanPlan, plan_scan
 from vrw_jax.scans.sensitivity_indices import sobol_indices

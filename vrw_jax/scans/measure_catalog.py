@@ -30,28 +30,6 @@ DIFFERENTIABLE_MEASURES = CollocationFinder.cycle_measures
 derivatives.
 """
 
-REQUESTABLE_PAPER_MEASURES = (
-    *DIFFERENTIABLE_MEASURES,
-    *(
-        measure_name
-        for measure_name in STEP_MEASURES
-        if measure_name not in (*DIFFERENTIABLE_MEASURES, "outcome")
-    ),
-)
-
-DEFAULT_SCAN_MEASURES = (
-    "dls_fraction",
-    "speed",
-    "period",
-    "step_length",
-    "duration_dls",
-    "duration_sls1",
-    "duration_sls2",
-    "lambda_I4",
-    "lambda_2_plus",
-    "lambda_4_plus",
-)
-
 
 class MeasureCatalog(NamedTuple):
     """Names of the variables that a scan with one model can compute."""
@@ -74,11 +52,26 @@ _CONTACT_DEFAULT_MEASURES = (
     "energy_lost_impacts",
 )
 PAPER_MEASURE_CATALOG = MeasureCatalog(
-    REQUESTABLE_PAPER_MEASURES,
+    tuple(
+        measure_name
+        for measure_name in dict.fromkeys((*DIFFERENTIABLE_MEASURES, *STEP_MEASURES))
+        if measure_name != "outcome"
+    ),
     ALWAYS_INCLUDED_VARIABLES,
     DIFFERENTIABLE_MEASURES,
     PARAMETER_NAMES,
-    DEFAULT_SCAN_MEASURES,
+    (
+        "dls_fraction",
+        "speed",
+        "period",
+        "step_length",
+        "duration_dls",
+        "duration_sls1",
+        "duration_sls2",
+        "lambda_I4",
+        "lambda_2_plus",
+        "lambda_4_plus",
+    ),
     1024,
 )
 UNILATERAL_MEASURE_CATALOG = MeasureCatalog(
@@ -116,31 +109,25 @@ ERROR_VARIABLE_SUFFIX = "_error"
 
 
 def select_measure_catalog(
-    wheel_model: AbstractWheel,
+    wheel_model: AbstractWheel | type[AbstractWheel],
     error_tolerance: float | None = None,
     slope_standard_deviation: float | None = None,
 ) -> MeasureCatalog:
     """Return the catalog of measures that a scan with `wheel_model` can compute.
 
+    For a model without scans, it is that of the paper's model.
     If `error_tolerance` is given, the catalog is that for scans to a tolerance. If
     `slope_standard_deviation` is given, the catalog also contains measures of walks over random
     slopes.
     """
     if error_tolerance is not None:
         return TOLERANCE_MEASURE_CATALOG
-    measure_catalog = MEASURE_CATALOGS[wheel_model.capabilities.gait_method]
-    return (
-        measure_catalog
-        if slope_standard_deviation is None
-        else add_passage_measures(measure_catalog)
+    measure_catalog = MEASURE_CATALOGS.get(
+        wheel_model.capabilities.gait_method, PAPER_MEASURE_CATALOG
     )
-
-
-def add_passage_measures(measure_catalog: MeasureCatalog) -> MeasureCatalog:
-    """Return `measure_catalog` with the measures of walks over random slopes added.
-
-    Their computation takes about one second per sample.
-    """
+    if slope_standard_deviation is None:
+        return measure_catalog
+    # The measures of such walks take about one second per sample.
     return measure_catalog._replace(
         requestable_measures=(*measure_catalog.requestable_measures, *PASSAGE_MEASURES),
         default_measures=tuple(PASSAGE_MEASURES),
@@ -226,16 +213,14 @@ def check_measure_names(
             if measure_name in PASSAGE_MEASURES and measure_name not in known_variable_names:
                 raise ValueError(
                     f"{measure_name!r} is a measure of walks over random slopes, whose standard "
-                    f"deviation "
-                    "is missing: give slope_sd, in rad, and no tol."
+                    "deviation is missing: give slope_sd, in rad, and no tol."
                 )
             if measure_name not in known_variable_names:
                 raise ValueError(
                     f"{measure_name!r} is no measure of a "
                     f"scan{format_name_suggestion(measure_name, known_variable_names)}: "
                     f"choose from {', '.join(measure_catalog.requestable_measures)}, or a "
-                    f"derivative such as "
-                    "'d dls_fraction / d damping'."
+                    "derivative such as 'd dls_fraction / d damping'."
                 )
             if measure_name not in measure_catalog.always_included_variables:
                 checked_variable_names[measure_name] = None
@@ -243,8 +228,7 @@ def check_measure_names(
         if not measure_catalog.differentiable_measures:
             raise ValueError(
                 f"{measure_name!r} is a derivative, but a scan to a tolerance computes only "
-                f"measures: "
-                "drop it, or scan without tol."
+                "measures: drop it, or scan without tol."
             )
         differentiable_measures = measure_catalog.differentiable_measures
         differentiated_measure_name = requested_derivative.measure_name
@@ -261,8 +245,7 @@ def check_measure_names(
             raise ValueError(
                 f"{measure_name!r} asks for a derivative by {parameter_name!r}"
                 f"{format_name_suggestion(parameter_name, differentiation_parameters)}, but it "
-                "must be by a "
-                f"parameter: choose from {', '.join(differentiation_parameters)}."
+                f"must be by a parameter: choose from {', '.join(differentiation_parameters)}."
             )
         checked_variable_names[requested_derivative.variable_name] = None
     return tuple(checked_variable_names)
@@ -272,10 +255,9 @@ def get_variable_attributes(variable_name: str) -> dict[str, object]:
     """Return unit, long name and description of a variable of a scan, by attribute name."""
     if variable_name in SELECTION_VARIABLE_ATTRIBUTES:
         return dict(SELECTION_VARIABLE_ATTRIBUTES[variable_name])
-    if variable_name.removesuffix(
-        ERROR_VARIABLE_SUFFIX
-    ) in MEASURE_FUNCTIONS and variable_name.endswith(ERROR_VARIABLE_SUFFIX):
-        measure_description = MEASURES[variable_name.removesuffix(ERROR_VARIABLE_SUFFIX)]
+    measure_name = variable_name.removesuffix(ERROR_VARIABLE_SUFFIX)
+    if measure_name != variable_name and measure_name in MEASURE_FUNCTIONS:
+        measure_description = MEASURES[measure_name]
         return {
             "units": measure_description.unit,
             "long_name": f"bound of the error of {measure_description.long_name}",
