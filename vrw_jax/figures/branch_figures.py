@@ -91,16 +91,13 @@ def branch_figure(branch: Branch) -> Figure:
     figure = Figure(figsize=(PAGE_FIGURE_WIDTH_INCHES, 4.0 + 0.16 * n_legend_rows))
     panel_axes = figure.subplots(2, 2, sharex=True)
     has_dls_indicators = "lambda_2_plus" in branch_dataset
-    stability_change_indices = np.flatnonzero(np.diff(branch.stable.astype(int))) + 1
+    stability_changes = (np.flatnonzero(np.diff(branch.stable.astype(int))) + 1).tolist()
     # A piece of equal stability ends at the point where the next piece starts.
     pieces_of_equal_stability = [
-        (
-            np.append(piece_point_indices, piece_point_indices[-1:] + 1)[
-                : branch.values.size - piece_point_indices[0]
-            ],
-            bool(branch.stable[piece_point_indices[0]]),
+        slice(piece_start, next_start + 1)
+        for piece_start, next_start in zip(
+            [0, *stability_changes], [*stability_changes, branch.values.size], strict=True
         )
-        for piece_point_indices in np.split(np.arange(branch.values.size), stability_change_indices)
     ]
     drawn_panels = PAPER_BRANCH_PANELS if has_dls_indicators else OTHER_MODEL_BRANCH_PANELS
     for axes, (panel_label, panel_measure_names), panel_letter in zip(
@@ -108,24 +105,21 @@ def branch_figure(branch: Branch) -> Figure:
     ):
         draw_panel_letter(axes, panel_letter)
         for measure_name, line_color in panel_measure_names.items():
-            plotted_columns = [branch_dataset[measure_name].values]
+            plotted_values = branch_dataset[measure_name].values
             if measure_name == "clearance_sls1":
                 # The clearance is in mm. The line has a gap where the clearance jumps because a
                 # local minimum vanishes.
-                clearance_mm = 1e3 * branch_dataset[measure_name].values
-                clearance_mm[1:][clearance_mm[:-1] * clearance_mm[1:] < 0.0] = np.nan
-                plotted_columns = [clearance_mm]
+                plotted_values = 1e3 * plotted_values
+                plotted_values[1:][plotted_values[:-1] * plotted_values[1:] < 0.0] = np.nan
             if measure_name == "spectral_radius":
-                plotted_columns = list(np.abs(branch.multipliers).T)
-            for plotted_measure_values in plotted_columns:
-                for piece_point_indices, is_stable in pieces_of_equal_stability:
-                    line_style = "-" if is_stable else "--"
-                    axes.plot(
-                        parameter_values[piece_point_indices],
-                        plotted_measure_values[piece_point_indices],
-                        line_style,
-                        color=line_color,
-                    )
+                plotted_values = np.abs(branch.multipliers)
+            for piece in pieces_of_equal_stability:
+                axes.plot(
+                    parameter_values[piece],
+                    plotted_values[piece],
+                    "-" if branch.stable[piece.start] else "--",
+                    color=line_color,
+                )
         _draw_special_points(axes, special_points, draws_numbers=panel_letter in "ab")
         axes.set_ylabel(panel_label)
     panel_axes[0, 1].axhline(1.0, color=DARK_GRAY_COLOR, linewidth=0.5)
@@ -163,7 +157,7 @@ def _draw_special_points(
     """Draw a vertical line at each special point, with its number if `draws_numbers` is true."""
     lower_limit, upper_limit = axes.get_xlim()
     last_number_position = -np.inf
-    for special_point_number, special_point in enumerate(special_points):
+    for special_point_number, special_point in enumerate(special_points, 1):
         axes.axvline(
             special_point.value,
             color=_select_special_point_color(special_point),
@@ -176,7 +170,7 @@ def _draw_special_points(
                 special_point.value, last_number_position + 0.03 * (upper_limit - lower_limit)
             )
             axes.annotate(
-                str(special_point_number + 1),
+                str(special_point_number),
                 (last_number_position, 1.0),
                 xycoords=("data", "axes fraction"),
                 ha="center",
@@ -189,12 +183,10 @@ def _draw_special_points(
 def _add_branch_legend(figure: Figure, special_points: list[SpecialPoint], parameter: str) -> None:
     """Add a legend that explains the special points and the line styles to a figure."""
     legend_handles = []
-    for special_point_number, special_point in enumerate(special_points):
+    for special_point_number, special_point in enumerate(special_points, 1):
+        value_text = format_value_label(parameter, special_point.value, 6)
         violation_text = typeset_greek_symbols(describe_violation(special_point.name))
-        legend_text = f"{format_value_label(parameter, special_point.value, 6)}: {violation_text}"
-        legend_text = f"{special_point_number + 1}  {legend_text}" + (
-            " (ends here)" if special_point.ends_branch else ""
-        )
+        ending_text = " (ends here)" if special_point.ends_branch else ""
         legend_handles.append(
             Line2D(
                 [],
@@ -202,7 +194,7 @@ def _add_branch_legend(figure: Figure, special_points: list[SpecialPoint], param
                 color=_select_special_point_color(special_point),
                 linewidth=0.9,
                 linestyle=SPECIAL_POINT_LINE_STYLE,
-                label=legend_text,
+                label=f"{special_point_number}  {value_text}: {violation_text}{ending_text}",
             )
         )
     legend_handles.append(Line2D([], [], color="black", linestyle="-", label="stable"))
@@ -233,59 +225,48 @@ def basin_figure(results: list[xr.Dataset], titles: list[str]) -> Figure:
     require_variables_of_datasets(
         "results", results, ("outcome", "attractor"), "give vrw.basin(params, grid)"
     )
-    failure_outcome_codes = sorted(
-        {
-            int(outcome_code)
-            for basin_dataset in results
-            for outcome_code in np.unique(basin_dataset.outcome)
-            if outcome_code != Outcome.STEPPED
-        }
+    all_outcome_codes = np.concatenate(
+        [basin_dataset.outcome.values.ravel() for basin_dataset in results]
+    )
+    failure_outcome_codes = np.setdiff1d(all_outcome_codes, Outcome.STEPPED).tolist()
+    steps_to_gait_by_panel = [
+        basin_dataset.steps.where(basin_dataset.attractor >= 0) for basin_dataset in results
+    ]
+    max_n_steps_to_gait = max(
+        float(steps_to_gait.max()) for steps_to_gait in steps_to_gait_by_panel
     )
     figure = Figure(figsize=(PAGE_FIGURE_WIDTH_INCHES, 3.3))
     panel_axes = figure.subplots(1, len(results), sharey=True, squeeze=False)[0]
-    max_n_steps_to_gait = max(
-        float(basin_dataset.steps.where(basin_dataset.attractor >= 0).max())
-        for basin_dataset in results
-    )
-    for axes, basin_dataset, panel_title in zip(panel_axes, results, titles, strict=True):
+    for axes, basin_dataset, steps_to_gait, panel_title in zip(
+        panel_axes, results, steps_to_gait_by_panel, titles, strict=True
+    ):
         vertical_axis_name, horizontal_axis_name = (
             str(axis_name) for axis_name in basin_dataset.attractor.dims
         )
-        steps_to_gait = basin_dataset.steps.where(basin_dataset.attractor >= 0)
+        x, y = basin_dataset[horizontal_axis_name].values, basin_dataset[vertical_axis_name].values
         step_count_image = axes.pcolormesh(
-            basin_dataset[horizontal_axis_name],
-            basin_dataset[vertical_axis_name],
+            x,
+            y,
             steps_to_gait,
             cmap="Greys_r",
             vmin=0.0,
             vmax=2.2 * max_n_steps_to_gait,
+            rasterized=True,
         )
-        step_count_image.set_rasterized(True)
         if failure_outcome_codes:
-            draw_outcome_cells(
-                axes,
-                basin_dataset[horizontal_axis_name].values,
-                basin_dataset[vertical_axis_name].values,
-                basin_dataset.outcome.values,
-                failure_outcome_codes,
-            )
+            draw_outcome_cells(axes, x, y, basin_dataset.outcome.values, failure_outcome_codes)
         if {horizontal_axis_name, vertical_axis_name} <= set(PRE_TOUCHDOWN_COMPONENT_NAMES):
-            orbit_section_states = basin_dataset.orbit_state.values.reshape(
-                -1, len(PRE_TOUCHDOWN_COMPONENT_NAMES)
+            component_indices = list(
+                map(PRE_TOUCHDOWN_COMPONENT_NAMES.index, (horizontal_axis_name, vertical_axis_name))
             )
-            shown_state_columns = [
-                PRE_TOUCHDOWN_COMPONENT_NAMES.index(horizontal_axis_name),
-                PRE_TOUCHDOWN_COMPONENT_NAMES.index(vertical_axis_name),
-            ]
             axes.plot(
-                *orbit_section_states[:, shown_state_columns].T,
+                *basin_dataset.orbit_state.values[..., component_indices].reshape(-1, 2).T,
                 "+",
                 color=OKABE_ITO_YELLOW,
                 markersize=7.0,
                 markeredgewidth=1.6,
             )
-        axes.set_title(panel_title)
-        axes.set_xlabel(format_axis_label(horizontal_axis_name, "{symbol}"))
+        axes.set(title=panel_title, xlabel=format_axis_label(horizontal_axis_name, "{symbol}"))
     panel_axes[0].set_ylabel(format_axis_label(str(results[0].attractor.dims[0]), "{symbol}"))
     color_bar = figure.colorbar(step_count_image, ax=list(panel_axes), aspect=25, pad=0.01)
     color_bar.set_label("steps until the gait is reached")

@@ -1,6 +1,6 @@
 """Motion of the feet for any model, and figures of their contact modes."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -8,11 +8,13 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
+from numpy.typing import ArrayLike
 
 from vrw_jax.figures.style import (
     DARK_GRAY_COLOR,
     LEG_1_COLOR,
     LEG_2_COLOR,
+    LEGEND_BESIDE_PANEL,
     OKABE_ITO_AMBER,
     OKABE_ITO_GREEN,
     OKABE_ITO_PINK,
@@ -32,11 +34,17 @@ CONTACT_MODE_MARKERS = ("o", "o", ">", "<")
 the pink as the same gray.
 """
 
+GROUND_FORCE_NAMES = ("lambda_1", "lambda_2", "lambda_3", "lambda_4")
+"""Names of the ground forces (N) on the feet of Leg 1 and Leg 2."""
+
 OTHER_LEG_COLOR = "#999999"
 """Color of every leg other than Legs 1 and 2."""
 
 LEG_LINE_STYLES = {1: (LEG_1_COLOR, "-"), 2: (LEG_2_COLOR, "--")}
 """Color and line style of Legs 1 and 2 in plots over time."""
+
+STICK_LINE_STYLES: dict[int, Any] = {1: "-", 2: ":"}
+"""Line styles of Legs 1 and 2 in stick diagrams; other legs are dashed."""
 
 OTHER_LEG_LINE_STYLES = (
     (OKABE_ITO_SKY_BLUE, "-."), (OKABE_ITO_PINK, ":"), (OKABE_ITO_AMBER, (0, (8, 3))),
@@ -61,33 +69,30 @@ class HubAndFootMotion(NamedTuple):
     contact_modes: np.ndarray  # (time, leg), contact mode
     step_numbers: np.ndarray  # (time,), number of the gait step of each sample
 
+    def find_stick_samples(self, stick_interval: float) -> np.ndarray:
+        """Return the indices of samples at time intervals of `stick_interval`, s."""
+        return np.searchsorted(
+            self.sample_times, np.arange(0.0, self.sample_times[-1], stick_interval)
+        )
+
     def interpolate_at_time(self, t: float) -> tuple[np.ndarray, np.ndarray, int]:
         """Return the positions of hub and feet at the time `t` (s), and the index of the next
         sample.
 
         Contact modes and forces at this time are those of the next sample.
         """
-        sample_index_after = min(
+        index_after = min(
             int(np.searchsorted(self.sample_times, t, side="right")), self.sample_times.size - 1
         )
-        sample_index_before = max(sample_index_after - 1, 0)
-        sample_interval = (
-            self.sample_times[sample_index_after] - self.sample_times[sample_index_before]
+        index_before = max(index_after - 1, 0)
+        time_before, time_after = self.sample_times[[index_before, index_after]]
+        fraction = (
+            (t - time_before) / (time_after - time_before) if time_after > time_before else 1.0
         )
-        sample_interval_fraction = (
-            (t - self.sample_times[sample_index_before]) / sample_interval
-            if sample_interval > 0.0
-            else 1.0
+        interpolate = lambda sampled_values: (
+            (1.0 - fraction) * sampled_values[index_before] + fraction * sampled_values[index_after]
         )
-        interpolate_samples = lambda sampled_values: (
-            (1.0 - sample_interval_fraction) * sampled_values[sample_index_before]
-            + sample_interval_fraction * sampled_values[sample_index_after]
-        )
-        return (
-            interpolate_samples(self.hub_positions),
-            interpolate_samples(self.foot_positions),
-            sample_index_after,
-        )
+        return interpolate(self.hub_positions), interpolate(self.foot_positions), index_after
 
 
 def reports_contact_modes(walk: xr.Dataset) -> bool:
@@ -116,11 +121,8 @@ def compute_foot_motion(walk: xr.Dataset) -> HubAndFootMotion:
             [np.sin(leg_angles), np.cos(leg_angles)], -1
         )
         foot_forces = np.zeros_like(foot_positions)
-        for leg_number in (1, 2):
-            foot_force_names = f"lambda_{2 * leg_number - 1}", f"lambda_{2 * leg_number}"
-            foot_forces[:, leg_number - 1] = np.stack(
-                [walk[foot_force_name].values for foot_force_name in foot_force_names], -1
-            )
+        ground_forces = [walk[force_name].values for force_name in GROUND_FORCE_NAMES]
+        foot_forces[:, :2] = np.stack(ground_forces, -1).reshape(-1, 2, 2)
         contact_modes = np.full(leg_angles.shape, ContactMode.OFF)
         contact_modes[:, 0] = ContactMode.STICK
         contact_modes[walk.phase.values == 0, 1] = ContactMode.STICK
@@ -132,6 +134,15 @@ def compute_foot_motion(walk: xr.Dataset) -> HubAndFootMotion:
         contact_modes,
         walk.step.values,
     )
+
+
+def insert_landing_gaps(walk: xr.Dataset, sampled_values: ArrayLike) -> np.ndarray:
+    """Return values of the samples of a trajectory, with NaN inserted at each landing.
+
+    The gaps separate steps in plots, because landings relabel the legs.
+    """
+    landing_indices = np.flatnonzero(np.diff(walk.step.values)) + 1
+    return np.insert(np.asarray(sampled_values, float), landing_indices, np.nan)
 
 
 def select_leg_color(leg_number: int) -> str:
@@ -187,12 +198,7 @@ def make_contact_panels(walk: xr.Dataset) -> Figure:
     is_foot_touching = foot_motion.contact_modes != ContactMode.OFF
     touching_legs = _select_marked_legs(is_foot_touching)
     moving_legs = _select_marked_legs(is_foot_touching | ~walk.on_stopper.values.astype(bool))
-    # At landings the legs are relabeled.
-    landing_indices = np.flatnonzero(np.diff(foot_motion.step_numbers)) + 1
-    insert_nan_at_landings = lambda quantity_by_leg: np.insert(
-        np.asarray(quantity_by_leg, float), landing_indices, np.nan
-    )
-    times_with_gaps = insert_nan_at_landings(foot_motion.sample_times)
+    times_with_gaps = insert_landing_gaps(walk, foot_motion.sample_times)
     other_leg_line_styles = iter(OTHER_LEG_LINE_STYLES * len(moving_legs))
     line_style_by_leg = {
         leg_number: LEG_LINE_STYLES.get(leg_number) or next(other_leg_line_styles)
@@ -203,21 +209,21 @@ def make_contact_panels(walk: xr.Dataset) -> Figure:
     panel_axes = figure.subplots(6, 1, sharex=True, height_ratios=panel_height_ratios)
     for axes, panel_letter in zip(panel_axes, "abcdef", strict=True):
         draw_panel_letter(axes, panel_letter)
-    panel_axes[0].plot(times_with_gaps, insert_nan_at_landings(walk.theta), color="black")
-    panel_axes[0].set_ylabel(format_axis_label("theta", "{symbol}"))
+    angle_axes, length_axes, mode_axes, height_axes, normal_axes, tangential_axes = panel_axes
+    angle_axes.plot(times_with_gaps, insert_landing_gaps(walk, walk.theta.values), color="black")
+    angle_axes.set_ylabel(format_axis_label("theta", "{symbol}"))
     leg_panels = (
-        (panel_axes[1], moving_legs, walk.length.values, "$L$ [m]"),
-        (panel_axes[3], touching_legs, foot_motion.foot_positions[..., 1], "height of\nfoot [m]"),
-        (panel_axes[4], touching_legs, foot_motion.foot_forces[..., 1], "normal\nforce [N]"),
-        (panel_axes[5], touching_legs, foot_motion.foot_forces[..., 0], "tangential\nforce [N]"),
+        (length_axes, moving_legs, walk.length, "$L$ [m]"),
+        (height_axes, touching_legs, walk.foot_z, "height of\nfoot [m]"),
+        (normal_axes, touching_legs, walk.normal, "normal\nforce [N]"),
+        (tangential_axes, touching_legs, walk.tangential, "tangential\nforce [N]"),
     )
     for axes, drawn_legs, quantity_by_leg, panel_label in leg_panels:
         for leg_number in drawn_legs:
             line_color, line_style = line_style_by_leg[leg_number]
-            quantity_with_gaps = insert_nan_at_landings(quantity_by_leg[:, leg_number - 1])
             axes.plot(
                 times_with_gaps,
-                quantity_with_gaps,
+                insert_landing_gaps(walk, quantity_by_leg.values[:, leg_number - 1]),
                 color=line_color,
                 linestyle=line_style,
                 label=f"Leg {leg_number}",
@@ -225,10 +231,9 @@ def make_contact_panels(walk: xr.Dataset) -> Figure:
         axes.set_ylabel(panel_label)
     for axes in panel_axes[3:]:
         axes.axhline(0.0, color=DARK_GRAY_COLOR, linewidth=0.4, zorder=0)
-    _draw_contact_mode_bars(panel_axes[2], foot_motion, touching_legs)
-    panel_axes[5].set_xlabel("time [s]")
-    panel_axes[5].set_xlim(foot_motion.sample_times[0], foot_motion.sample_times[-1])
-    panel_axes[1].legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
+    _draw_contact_mode_bars(mode_axes, foot_motion, touching_legs)
+    tangential_axes.set(xlabel="time [s]", xlim=foot_motion.sample_times[[0, -1]])
+    length_axes.legend(**LEGEND_BESIDE_PANEL)
     figure.align_ylabels(panel_axes)
     return figure
 
@@ -242,32 +247,44 @@ def _draw_contact_mode_bars(
         contact_mode_change_indices = (
             np.flatnonzero(np.diff(contact_modes) | np.diff(foot_motion.step_numbers)) + 1
         )
-        for bar_start_index, bar_end_index in zip(
-            np.r_[0, contact_mode_change_indices],
-            np.r_[contact_mode_change_indices, len(contact_modes)],
+        for modes_of_bar, times_of_bar in zip(
+            np.split(contact_modes, contact_mode_change_indices),
+            np.split(foot_motion.sample_times, contact_mode_change_indices),
             strict=True,
         ):
-            if contact_modes[bar_start_index] != ContactMode.OFF:
-                bar_start_and_duration = (
-                    foot_motion.sample_times[bar_start_index],
-                    foot_motion.sample_times[bar_end_index - 1]
-                    - foot_motion.sample_times[bar_start_index],
-                )
+            if modes_of_bar[0] != ContactMode.OFF:
                 axes.broken_barh(
-                    [bar_start_and_duration],
+                    [(times_of_bar[0], times_of_bar[-1] - times_of_bar[0])],
                     (bar_row_index - 0.35, 0.7),
-                    color=CONTACT_MODE_COLORS[contact_modes[bar_start_index]],
+                    color=CONTACT_MODE_COLORS[modes_of_bar[0]],
                 )
     axes.set_yticks(range(len(drawn_legs)), [str(leg_number) for leg_number in drawn_legs])
-    axes.set_ylim(len(drawn_legs) - 0.5, -0.5)
-    axes.set_ylabel("foot on\nthe ground")
+    axes.set(ylabel="foot on\nthe ground", ylim=(len(drawn_legs) - 0.5, -0.5))
     occurring_contact_modes = np.unique(foot_motion.contact_modes[:, np.array(drawn_legs) - 1])
     legend_patches = [
         Patch(color=CONTACT_MODE_COLORS[contact_mode], label=CONTACT_MODE_NAMES[contact_mode])
         for contact_mode in occurring_contact_modes
         if contact_mode != ContactMode.OFF
     ]
-    axes.legend(handles=legend_patches, loc="center left", bbox_to_anchor=(1.0, 0.5))
+    axes.legend(handles=legend_patches, **LEGEND_BESIDE_PANEL)
+
+
+def draw_stick(
+    axes: Axes,
+    foot_motion: HubAndFootMotion,
+    sample_index: int,
+    leg_number: int,
+    stick_color: str,
+    line_width: float,
+) -> None:
+    """Draw the leg with the label `leg_number` at one sample, from its foot to the hub."""
+    foot_position = foot_motion.foot_positions[sample_index, leg_number - 1]
+    axes.plot(
+        *np.stack([foot_position, foot_motion.hub_positions[sample_index]], -1),
+        color=stick_color,
+        linestyle=STICK_LINE_STYLES.get(leg_number, "--"),
+        linewidth=line_width,
+    )
 
 
 def draw_contact_sticks(axes: Axes, walk: xr.Dataset, stick_interval: float) -> None:
@@ -276,46 +293,28 @@ def draw_contact_sticks(axes: Axes, walk: xr.Dataset, stick_interval: float) -> 
     The feet have the colors of their contact modes. `stick_interval` is in s.
     """
     foot_motion = compute_foot_motion(walk)
-    sample_indices = np.searchsorted(
-        foot_motion.sample_times, np.arange(0.0, foot_motion.sample_times[-1], stick_interval)
-    )
+    sample_indices = foot_motion.find_stick_samples(stick_interval)
     is_leg_drawn = foot_motion.contact_modes != ContactMode.OFF
     is_leg_drawn[:, :2] = True
     for sample_index in sample_indices:
-        for leg_number in (np.flatnonzero(is_leg_drawn[sample_index]) + 1).tolist():
-            stick_coordinates = np.stack(
-                [
-                    foot_motion.foot_positions[sample_index, leg_number - 1],
-                    foot_motion.hub_positions[sample_index],
-                ],
-                -1,
-            )
+        drawn_legs = np.flatnonzero(is_leg_drawn[sample_index])
+        for leg_number in (drawn_legs + 1).tolist():
             stick_color = "black" if leg_number < 3 else DARK_GRAY_COLOR
-            axes.plot(
-                *stick_coordinates,
-                color=stick_color,
-                linestyle=_select_stick_line_style(leg_number),
-                linewidth=0.7,
-            )
+            draw_stick(axes, foot_motion, sample_index, leg_number, stick_color, 0.7)
         draw_feet(
             axes,
-            foot_motion.foot_positions[sample_index, is_leg_drawn[sample_index]].T,
-            foot_motion.contact_modes[sample_index, is_leg_drawn[sample_index]],
+            foot_motion.foot_positions[sample_index, drawn_legs].T,
+            foot_motion.contact_modes[sample_index, drawn_legs],
             4.0,
         )
     legend_leg_labels = [(1, "Leg 1"), (2, "Leg 2")]
     if is_leg_drawn[sample_indices, 2:].any():
         legend_leg_labels.append((3, "another leg"))
     for leg_number, legend_text in legend_leg_labels:
-        line_style = _select_stick_line_style(leg_number)
+        line_style = STICK_LINE_STYLES.get(leg_number, "--")
         axes.plot([], [], color="black", linestyle=line_style, linewidth=0.7, label=legend_text)
     axes.plot([], [], color=LEG_2_COLOR, label="hub")
     for legend_handle in make_contact_mode_handles(
         foot_motion.contact_modes[sample_indices][is_leg_drawn[sample_indices]]
     ):
         axes.add_line(legend_handle)
-
-
-def _select_stick_line_style(leg_number: int) -> str:
-    """Return the line style for a leg in a stick diagram."""
-    return {1: "-", 2: ":"}.get(leg_number, "--")

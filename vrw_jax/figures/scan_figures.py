@@ -2,17 +2,18 @@
 0.
 """
 
+import itertools
 import textwrap
 from collections.abc import Mapping, Sequence
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
 from matplotlib.collections import PathCollection
 from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
-from matplotlib.image import AxesImage
 from matplotlib.lines import Line2D
 from matplotlib.patheffects import Normal, Stroke
 
@@ -20,6 +21,7 @@ from vrw_jax.branches import SpecialPointCurve
 from vrw_jax.figures.style import (
     COLUMN_FIGURE_WIDTH_INCHES,
     LIGHT_GRAY_COLOR,
+    MAX_PANELS_PER_ROW,
     OKABE_ITO_AMBER,
     OKABE_ITO_BLUE,
     OUTCOME_LABELS_AND_COLORS,
@@ -30,6 +32,7 @@ from vrw_jax.figures.style import (
     format_axis_label,
     format_value_label,
     make_outcome_patches,
+    make_panel_grid,
     require_dataset_variables,
     select_outcome_style,
     select_special_point_style,
@@ -45,7 +48,9 @@ from vrw_jax.scans import (
 )
 from vrw_jax.wheel import Outcome
 
-PARAMETER_AXIS_ORDER = ("damping", "slope", "stiffness", "natural_length", *SWEEPABLE_PARAMETERS)
+PARAMETER_AXIS_ORDER = dict.fromkeys(
+    ("damping", "slope", "stiffness", "natural_length", *SWEEPABLE_PARAMETERS)
+)
 """Parameters in the order in which figures assign them to the horizontal axis, the vertical axis
 and the panel columns.
 """
@@ -96,17 +101,15 @@ def scan_figures(scan: xr.Dataset) -> dict[str, Figure]:
         ['scan']
     """
     require_dataset_variables("scan", scan, ("outcome",), "give vrw.scan(design)")
-    swept_axis_names = [
-        parameter_name
-        for parameter_name in dict.fromkeys(PARAMETER_AXIS_ORDER)
-        if parameter_name in scan.coords
+    swept_parameters = [
+        parameter_name for parameter_name in PARAMETER_AXIS_ORDER if parameter_name in scan.coords
     ]
+    varied_parameters = [
+        parameter_name
+        for parameter_name in swept_parameters
+        if np.ptp(scan[parameter_name].values) > 0.0
+    ] or swept_parameters
     if "sample" in scan.dims:
-        varied_parameters = [
-            parameter_name
-            for parameter_name in swept_axis_names
-            if np.ptp(scan[parameter_name].values) > 0.0
-        ] or swept_axis_names
         if len(varied_parameters) < 3:
             return {"scan": draw_scan_samples(scan, varied_parameters)}
         figures_by_name = {
@@ -120,21 +123,14 @@ def scan_figures(scan: xr.Dataset) -> dict[str, Figure]:
                 sobol_indices(scan, measure_names)
             )
         return figures_by_name
-    multivalued_axis_names = [
-        parameter_name for parameter_name in swept_axis_names if scan.sizes[parameter_name] > 1
-    ] or swept_axis_names
-    if len(multivalued_axis_names) == 1:
-        return {"scan": draw_measure_curves(scan, multivalued_axis_names[0])}
-    remaining_axis_names = multivalued_axis_names[2:]
-    if not remaining_axis_names:
-        return {
-            "scan": draw_scan_slices(scan, multivalued_axis_names[0], multivalued_axis_names[1])
-        }
+    if len(varied_parameters) == 1:
+        return {"scan": draw_measure_curves(scan, varied_parameters[0])}
+    x, y, *further_parameters = varied_parameters
+    if not further_parameters:
+        return {"scan": draw_scan_slices(scan, x, y)}
     return {
-        f"scan_over_{parameter_name}": draw_scan_slices(
-            scan, multivalued_axis_names[0], multivalued_axis_names[1], parameter_name
-        )
-        for parameter_name in remaining_axis_names
+        f"scan_over_{parameter_name}": draw_scan_slices(scan, x, y, parameter_name)
+        for parameter_name in further_parameters
     }
 
 
@@ -152,106 +148,80 @@ def draw_scan_slices(
     slice_indices = {
         parameter_name: scan.sizes[parameter_name] // 2
         for parameter_name in SWEEPABLE_PARAMETERS
-        if parameter_name in scan.dims
+        if parameter_name in scan.dims and parameter_name not in (x, y, panel_column_parameter)
     }
-    slice_indices = {
-        parameter_name: slice_index
-        for parameter_name, slice_index in slice_indices.items()
-        if parameter_name not in (x, y, panel_column_parameter)
-    }
-    scan_slice = scan.isel(slice_indices)
-    panel_column_datasets = [scan_slice]
+    panel_column_datasets = [scan.isel(slice_indices).transpose(y, x, ...)]
     if panel_column_parameter is not None:
-        n_panel_column_values = scan.sizes[panel_column_parameter]
-        panel_column_indices = np.unique(
-            np.linspace(0, n_panel_column_values - 1, min(n_panel_column_values, MAX_PANEL_COLUMNS))
-            .round()
-            .astype(int)
-        )
+        last_index = scan.sizes[panel_column_parameter] - 1
+        panel_column_indices = np.linspace(0, last_index, min(last_index + 1, MAX_PANEL_COLUMNS))
         panel_column_datasets = [
-            scan_slice.isel({panel_column_parameter: int(panel_column_index)})
-            for panel_column_index in panel_column_indices
+            panel_column_datasets[0].isel({panel_column_parameter: panel_column_index})
+            for panel_column_index in panel_column_indices.round().astype(int)
         ]
+    n_panel_columns = len(panel_column_datasets)
     panel_measures = _list_shown_measures(scan)
-    figure_width = (
-        PAGE_FIGURE_WIDTH_INCHES if len(panel_column_datasets) > 1 else COLUMN_FIGURE_WIDTH_INCHES
-    )
+    figure_width = PAGE_FIGURE_WIDTH_INCHES if n_panel_columns > 1 else COLUMN_FIGURE_WIDTH_INCHES
     figure = Figure(figsize=(figure_width, 1.65 * (len(panel_measures) + 1) + 1.0))
     panel_axes = figure.subplots(
-        len(panel_measures) + 1, len(panel_column_datasets), sharex=True, sharey=True, squeeze=False
+        len(panel_measures) + 1, n_panel_columns, sharex=True, sharey=True, squeeze=False
+    )
+    outcome_codes_by_panel = np.stack(
+        list(map(_compute_displayed_outcome_codes, panel_column_datasets))
     )
     for axes_of_panel_row, measure_name in zip(panel_axes, panel_measures, strict=False):
-        measure_values_by_panel = [
-            panel_column_dataset[measure_name].transpose(y, x).values
-            for panel_column_dataset in panel_column_datasets
-        ]
-        is_stable = [
-            _compute_displayed_outcome_codes(panel_column_dataset).transpose(y, x).values
-            == Outcome.STEPPED
-            for panel_column_dataset in panel_column_datasets
-        ]
-        color_limits = _find_color_limits(measure_values_by_panel, is_stable)
-        color_scale = _make_color_scale(measure_name, color_limits)
-        for axes, panel_column_dataset, measure_values_by_cell in zip(
-            axes_of_panel_row, panel_column_datasets, measure_values_by_panel, strict=True
-        ):
-            cell_mesh = _draw_measure_cells(
-                axes,
-                panel_column_dataset[x].values,
-                panel_column_dataset[y].values,
-                measure_values_by_cell,
-                color_scale,
-            )
-        extended_color_bar_ends = _find_extended_color_bar_ends(
-            measure_values_by_panel, color_limits
+        measure_values_by_panel = np.stack(
+            [panel_column_dataset[measure_name] for panel_column_dataset in panel_column_datasets]
         )
-        color_bar = figure.colorbar(
+        color_scale = _make_color_scale(
+            measure_name, measure_values_by_panel, outcome_codes_by_panel == Outcome.STEPPED
+        )
+        for axes, panel_column_dataset in zip(
+            axes_of_panel_row, panel_column_datasets, strict=True
+        ):
+            axes.set_facecolor(LIGHT_GRAY_COLOR)
+            cell_mesh = axes.pcolormesh(
+                _find_cell_edges(panel_column_dataset[x].values),
+                _find_cell_edges(panel_column_dataset[y].values),
+                panel_column_dataset[measure_name].values,
+                cmap="viridis",
+                norm=color_scale,
+                rasterized=True,
+            )
+        _add_color_bar(
+            figure,
+            axes_of_panel_row.tolist(),
             cell_mesh,
-            ax=axes_of_panel_row.tolist(),
+            measure_values_by_panel,
+            textwrap.fill(format_axis_label(measure_name, "{name}"), 24),
             aspect=12,
             pad=0.01,
-            extend=extended_color_bar_ends,
         )
-        color_bar.set_label(textwrap.fill(format_axis_label(measure_name, "{name}"), 24))
-    outcome_codes = np.unique(
-        [
-            _compute_displayed_outcome_codes(panel_column_dataset).values
-            for panel_column_dataset in panel_column_datasets
-        ]
-    )
-    for axes, panel_column_dataset in zip(panel_axes[-1], panel_column_datasets, strict=True):
-        cell_outcome_codes = (
-            _compute_displayed_outcome_codes(panel_column_dataset).transpose(y, x).values
-        )
+    outcome_codes = np.unique(outcome_codes_by_panel)
+    for axes, panel_column_dataset, outcome_codes_of_panel in zip(
+        panel_axes[-1], panel_column_datasets, outcome_codes_by_panel, strict=True
+    ):
         draw_outcome_cells(
             axes,
             _find_cell_edges(panel_column_dataset[x].values),
             _find_cell_edges(panel_column_dataset[y].values),
-            cell_outcome_codes,
+            outcome_codes_of_panel,
             outcome_codes,
         )
-    legend_lines: dict[str, Line2D] = {}
-    for axes_of_panel_row in panel_axes:
-        for axes, panel_column_dataset in zip(
-            axes_of_panel_row, panel_column_datasets, strict=True
-        ):
-            legend_lines |= _draw_margin_zero_lines(axes, panel_column_dataset, x, y)
-    for axes, panel_column_dataset in zip(panel_axes[0], panel_column_datasets, strict=True):
-        if panel_column_parameter is not None:
-            axes.set_title(
-                format_value_label(
-                    panel_column_parameter, panel_column_dataset[panel_column_parameter].item()
-                )
-            )
-    for axes in panel_axes[-1]:
         axes.set_xlabel(
-            format_axis_label(x)
-            if len(panel_column_datasets) < 3
-            else format_axis_label(x, "{symbol}")
+            format_axis_label(x, "{name} {symbol}" if n_panel_columns < 3 else "{symbol}")
         )
+    legend_lines: dict[str, Line2D] = {}
+    for axes, panel_column_dataset in zip(
+        panel_axes.flat, itertools.cycle(panel_column_datasets), strict=False
+    ):
+        legend_lines |= _draw_margin_zero_lines(axes, panel_column_dataset, x, y)
+    if panel_column_parameter is not None:
+        for axes, panel_column_dataset in zip(panel_axes[0], panel_column_datasets, strict=True):
+            panel_value = panel_column_dataset[panel_column_parameter].item()
+            axes.set_title(format_value_label(panel_column_parameter, panel_value))
     for axes in panel_axes[:, 0]:
         axes.set_ylabel(format_axis_label(y, "{symbol}"))
-    _add_scan_legend(figure, outcome_codes, legend_lines, len(panel_column_datasets))
+    _add_scan_legend(figure, outcome_codes, legend_lines, n_panel_columns)
     if slice_indices:
         fixed_values_text = ", ".join(
             format_value_label(parameter_name, scan[parameter_name].values[slice_index])
@@ -264,25 +234,23 @@ def draw_scan_slices(
 @figure_style()
 def draw_scan_samples(scan: xr.Dataset, parameter_names: Sequence[str]) -> Figure:
     """Return a figure of individual samples over the first two parameters."""
-    x, y = (
-        (parameter_names[0], parameter_names[1])
-        if len(parameter_names) > 1
-        else (parameter_names[0], "sample")
-    )
+    x, y, *_ = (*parameter_names, "sample")
     measure_names = _list_shown_measures(scan)
     marker_size = float(np.clip(3000.0 / max(scan.sizes["sample"], 1), 1.0, 12.0))
     figure = Figure(figsize=(PAGE_FIGURE_WIDTH_INCHES, 2.9))
     panel_axes = figure.subplots(1, len(measure_names) + 1, sharey=True, squeeze=False)[0]
     for axes, measure_name in zip(panel_axes, measure_names, strict=False):
         point_collection = _draw_measure_samples(axes, scan, x, y, measure_name, marker_size)
-        extended_color_bar_ends = _find_extended_color_bar_ends(
-            [scan[measure_name].values], point_collection.get_clim()
+        _add_color_bar(
+            figure,
+            axes,
+            point_collection,
+            scan[measure_name].values,
+            format_axis_label(measure_name),
+            location="top",
+            aspect=25,
         )
-        color_bar = figure.colorbar(
-            point_collection, ax=axes, location="top", aspect=25, extend=extended_color_bar_ends
-        )
-        color_bar.set_label(format_axis_label(measure_name))
-    outcome_codes = _compute_displayed_outcome_codes(scan).values
+    outcome_codes = _compute_displayed_outcome_codes(scan)
     _draw_outcome_samples(
         panel_axes[-1], scan[x].values, scan[y].values, outcome_codes, marker_size
     )
@@ -304,47 +272,40 @@ def draw_parameter_pairs(scan: xr.Dataset, parameter_names: Sequence[str]) -> Fi
     """
     drawn_samples = scan.isel(sample=slice(MAX_DRAWN_SAMPLES))
     measure_name = next(iter(_list_shown_measures(scan)), None)
-    outcome_codes = _compute_displayed_outcome_codes(drawn_samples).values
+    outcome_codes = _compute_displayed_outcome_codes(drawn_samples)
     n_parameters = len(parameter_names)
     marker_size = float(np.clip(8000.0 / len(outcome_codes), 0.6, 8.0))
     figure = Figure(figsize=(PAGE_FIGURE_WIDTH_INCHES, PAGE_FIGURE_WIDTH_INCHES * 0.9))
     panel_axes = figure.subplots(n_parameters, n_parameters, sharex="col", squeeze=False)
     point_collection = None
     for (i, j), axes in np.ndenumerate(panel_axes):
-        x, y = drawn_samples[parameter_names[j]].values, drawn_samples[parameter_names[i]].values
+        x, y = parameter_names[j], parameter_names[i]
+        x_values, y_values = drawn_samples[x].values, drawn_samples[y].values
         if i == j:
-            _draw_stable_fraction(axes, x, outcome_codes == Outcome.STEPPED)
+            _draw_stable_fraction(axes, x_values, outcome_codes == Outcome.STEPPED)
         elif i < j:
-            _draw_outcome_samples(axes, x, y, outcome_codes, marker_size)
+            _draw_outcome_samples(axes, x_values, y_values, outcome_codes, marker_size)
         elif measure_name is not None:
             point_collection = _draw_measure_samples(
-                axes,
-                drawn_samples,
-                parameter_names[j],
-                parameter_names[i],
-                measure_name,
-                marker_size,
+                axes, drawn_samples, x, y, measure_name, marker_size
             )
         if i == n_parameters - 1:
-            axes.set_xlabel(format_axis_label(parameter_names[j], "{symbol}"))
+            axes.set_xlabel(format_axis_label(x, "{symbol}"))
         if j == 0 and i > 0:
-            axes.set_ylabel(format_axis_label(parameter_names[i], "{symbol}"))
+            axes.set_ylabel(format_axis_label(y, "{symbol}"))
         elif i != j:
             axes.tick_params(labelleft=False)
     panel_axes[0, 0].set_ylabel("share that walks")
     if measure_name is not None and point_collection is not None:
-        extended_color_bar_ends = _find_extended_color_bar_ends(
-            [drawn_samples[measure_name].values], point_collection.get_clim()
-        )
-        axes_of_all_panels = panel_axes.ravel().tolist()
-        color_bar = figure.colorbar(
+        _add_color_bar(
+            figure,
+            panel_axes.ravel().tolist(),
             point_collection,
-            ax=axes_of_all_panels,
+            drawn_samples[measure_name].values,
+            format_axis_label(measure_name, "{name}"),
             aspect=40,
             pad=0.01,
-            extend=extended_color_bar_ends,
         )
-        color_bar.set_label(format_axis_label(measure_name, "{name}"))
     _add_scan_legend(figure, np.unique(outcome_codes), {}, 3)
     return figure
 
@@ -358,16 +319,14 @@ def _draw_measure_samples(
     """
     marker_style: dict[str, Any] = {"s": marker_size, "linewidths": 0.0, "rasterized": True}
     has_gait, measure_values = scan.outcome.values == Outcome.STEPPED, scan[measure_name].values
-    color_limits = _find_color_limits(
-        [measure_values], [_compute_displayed_outcome_codes(scan).values == Outcome.STEPPED]
-    )
+    is_stable = _compute_displayed_outcome_codes(scan) == Outcome.STEPPED
     x_values, y_values = scan[x].values, scan[y].values
     axes.scatter(x_values[~has_gait], y_values[~has_gait], color=LIGHT_GRAY_COLOR, **marker_style)
     return axes.scatter(
         x_values[has_gait],
         y_values[has_gait],
         c=measure_values[has_gait],
-        norm=_make_color_scale(measure_name, color_limits),
+        norm=_make_color_scale(measure_name, measure_values, is_stable),
         **marker_style,
     )
 
@@ -399,61 +358,43 @@ def _draw_stable_fraction(axes: Axes, x: np.ndarray, has_stable_gait: np.ndarray
 @figure_style()
 def draw_sobol_indices(indices: xr.Dataset) -> Figure:
     """Return a figure of the Sobol' indices of each measure, with their confidence intervals."""
-    measure_names, parameter_names = (
-        indices.measure.values,
-        [str(parameter_name) for parameter_name in indices.parameter.values],
+    measure_names = indices.measure.values
+    bar_positions = np.arange(indices.sizes["parameter"])
+    figure, panel_axes = make_panel_grid(
+        len(measure_names), 0.26 * len(bar_positions) + 0.5, 0.6, sharex=True, sharey=True
     )
-    n_panel_columns = min(len(measure_names), 3)
-    n_panel_rows = -(-len(measure_names) // n_panel_columns)
-    bar_positions = np.arange(len(parameter_names))
-    figure_height = (0.26 * len(parameter_names) + 0.5) * n_panel_rows + 0.6
-    figure = Figure(figsize=(PAGE_FIGURE_WIDTH_INCHES, figure_height))
-    panel_axes = figure.subplots(
-        n_panel_rows, n_panel_columns, sharex=True, sharey=True, squeeze=False
-    )
-    for axes in panel_axes.ravel()[len(measure_names) :]:
-        axes.set_axis_off()
-    for axes, measure_name in zip(panel_axes.ravel(), measure_names, strict=False):
+    for axes, measure_name in zip(panel_axes, measure_names, strict=True):
         sobol_indices_of_measure = indices.sel(measure=measure_name)
         for sobol_index_name, legend_text, bar_offset, bar_color in (
             ("first_order", "by itself (first order)", -0.19, OKABE_ITO_BLUE),
             ("total", "with all it meets (total)", 0.19, OKABE_ITO_AMBER),
         ):
-            sobol_index_values = sobol_indices_of_measure[sobol_index_name].values
-            lower_confidence_bounds, upper_confidence_bounds = (
-                sobol_indices_of_measure[f"{sobol_index_name}_lower"].values,
-                sobol_indices_of_measure[f"{sobol_index_name}_upper"].values,
+            sobol_index_values, lower_bounds, upper_bounds = (
+                sobol_indices_of_measure[sobol_index_name + name_suffix].values
+                for name_suffix in ("", "_lower", "_upper")
             )
-            confidence_interval_lengths = np.maximum(
-                [
-                    sobol_index_values - lower_confidence_bounds,
-                    upper_confidence_bounds - sobol_index_values,
-                ],
-                0.0,
-            )
-            sobol_bar_style = {"height": 0.36, "color": bar_color, "label": legend_text}
             axes.barh(
                 bar_positions + bar_offset,
                 sobol_index_values,
-                xerr=confidence_interval_lengths,
+                0.36,
+                color=bar_color,
+                label=legend_text,
+                xerr=np.maximum(
+                    [sobol_index_values - lower_bounds, upper_bounds - sobol_index_values], 0.0
+                ),
                 error_kw={"elinewidth": 0.7},
-                **sobol_bar_style,
             )
         if sobol_indices_of_measure.is_constant_measure:
             axes.text(0.5, 0.5, "constant", ha="center", va="center", transform=axes.transAxes)
         axes.set_title(typeset_greek_symbols(MEASURES[str(measure_name)].long_name))
-        axes.set_yticks(
-            bar_positions,
-            [f"${MEASURES[parameter_name].mathtext}$" for parameter_name in parameter_names],
-        )
+        parameter_names = indices.parameter.values
+        axes.set_yticks(bar_positions, [f"${MEASURES[name].mathtext}$" for name in parameter_names])
         axes.set_xlim(0.0, 1.05)
-    panel_axes[0, 0].invert_yaxis()
-    for axes in panel_axes.ravel()[
-        max(len(measure_names) - n_panel_columns, 0) : len(measure_names)
-    ]:
+    panel_axes[0].invert_yaxis()
+    for axes in panel_axes[-MAX_PANELS_PER_ROW:]:
         axes.set_xlabel("share of the variance")
         axes.tick_params(labelbottom=True)
-    legend_handles, legend_texts = panel_axes[0, 0].get_legend_handles_labels()
+    legend_handles, legend_texts = panel_axes[0].get_legend_handles_labels()
     figure.legend(legend_handles, legend_texts, loc="outside lower center", ncols=2)
     omitted_samples_percent = 100.0 * indices.attrs["left_out"]
     omitted_rows_note = (
@@ -480,19 +421,14 @@ def draw_measure_curves(scan: xr.Dataset, x: str) -> Figure:
     figure = Figure(figsize=(COLUMN_FIGURE_WIDTH_INCHES, 1.6 * len(measure_names) + 0.6))
     panel_axes = figure.subplots(len(measure_names), 1, sharex=True, squeeze=False)[:, 0]
     cell_edges = _find_cell_edges(scan[x].values)
-    is_gait_missing = scan.outcome.values != Outcome.STEPPED
+    missing_gait_indices = np.flatnonzero(scan.outcome.values != Outcome.STEPPED)
     for axes, measure_name in zip(panel_axes, measure_names, strict=True):
         axes.plot(scan[x].values, scan[measure_name].values, marker=".", color=OKABE_ITO_BLUE)
         axes.set_yscale("log" if measure_name in LOGARITHMIC_MEASURE_NAMES else "linear")
         axes.set_ylabel(textwrap.fill(format_axis_label(measure_name, "{name}"), 24))
-        for sample_index in np.flatnonzero(is_gait_missing):
-            axes.axvspan(
-                cell_edges[sample_index],
-                cell_edges[sample_index + 1],
-                color=LIGHT_GRAY_COLOR,
-                linewidth=0.0,
-                zorder=0,
-            )
+        for sample_index in missing_gait_indices:
+            cell_ends = cell_edges[sample_index : sample_index + 2]
+            axes.axvspan(*cell_ends, color=LIGHT_GRAY_COLOR, linewidth=0.0, zorder=0)
     panel_axes[-1].set_xlabel(format_axis_label(x))
     return figure
 
@@ -502,78 +438,43 @@ def _list_shown_measures(scan: xr.Dataset) -> list[str]:
     return [measure_name for measure_name in SHOWN_MEASURE_NAMES if measure_name in scan]
 
 
-def _find_color_limits(
-    measure_values_by_panel: Sequence[np.ndarray], is_stable_by_panel: Sequence[np.ndarray]
-) -> tuple[float, float]:
-    """Return the color range for the panels of one measure.
+def _make_color_scale(
+    measure_name: str, measure_values: np.ndarray, is_stable: np.ndarray
+) -> Normalize:
+    """Return the linear or logarithmic color scale for a measure.
 
-    The range is that of the stable gaits, or of all gaits if none is stable. A few distant unstable
+    Its range is that of the stable gaits, or of all gaits if none is stable. A few distant unstable
     gaits would otherwise make the colors of all other gaits equal.
     """
-    finite_values_by_panel = [
-        values_of_panel[np.isfinite(values_of_panel)] for values_of_panel in measure_values_by_panel
-    ]
-    stable_values_by_panel = [
-        v[s & np.isfinite(v)]
-        for v, s in zip(measure_values_by_panel, is_stable_by_panel, strict=True)
-    ]
-    values_in_range = np.concatenate(
-        stable_values_by_panel if any(map(len, stable_values_by_panel)) else finite_values_by_panel
-    )
-    return (
-        (float(values_in_range.min()), float(values_in_range.max()))
-        if len(values_in_range)
-        else (0.0, 1.0)
-    )
+    is_finite = np.isfinite(measure_values)
+    is_in_range = is_finite & is_stable if (is_finite & is_stable).any() else is_finite
+    if not is_in_range.any():
+        return Normalize(0.0, 1.0)
+    min_value, max_value = measure_values[is_in_range].min(), measure_values[is_in_range].max()
+    is_logarithmic = measure_name in LOGARITHMIC_MEASURE_NAMES and min_value > 0.0
+    return (LogNorm if is_logarithmic else Normalize)(min_value, max_value)
 
 
-def _make_color_scale(measure_name: str, color_limits: tuple[float, float]) -> Normalize:
-    """Return the linear or logarithmic color scale for a measure."""
-    if measure_name in LOGARITHMIC_MEASURE_NAMES and color_limits[0] > 0.0:
-        return LogNorm(*color_limits)
-    return Normalize(*color_limits)
-
-
-def _find_extended_color_bar_ends(
-    measure_values_by_panel: Sequence[np.ndarray], color_limits: tuple[float, float]
-) -> Literal["neither", "min", "max", "both"]:
-    """Return the ends of a color bar beyond which values lie: "neither", "min", "max" or "both"."""
-    finite_values_by_panel = np.concatenate(
-        [
-            values_of_panel[np.isfinite(values_of_panel)]
-            for values_of_panel in measure_values_by_panel
-        ]
+def _add_color_bar(
+    figure: Figure,
+    axes: Axes | list[Axes],
+    colored_values: ScalarMappable,
+    measure_values: np.ndarray,
+    label_text: str,
+    **color_bar_settings: Any,
+) -> None:
+    """Add a color bar, whose ends are pointed if finite `measure_values` lie beyond them."""
+    min_shown_value, max_shown_value = colored_values.get_clim()
+    finite_values = measure_values[np.isfinite(measure_values)]
+    pointed_ends = {
+        (False, False): "neither",
+        (True, False): "min",
+        (False, True): "max",
+        (True, True): "both",
+    }[bool((finite_values < min_shown_value).any()), bool((finite_values > max_shown_value).any())]
+    figure.colorbar(colored_values, ax=axes, extend=pointed_ends, **color_bar_settings).set_label(
+        label_text
     )
-    has_values_below, has_values_above = (
-        np.any(finite_values_by_panel < color_limits[0]),
-        np.any(finite_values_by_panel > color_limits[1]),
-    )
-    return (
-        ("both" if has_values_above else "min")
-        if has_values_below
-        else ("max" if has_values_above else "neither")
-    )
-
-
-def _draw_measure_cells(
-    axes: Axes,
-    x: np.ndarray,
-    y: np.ndarray,
-    measure_values_by_cell: np.ndarray,
-    color_scale: Normalize,
-) -> AxesImage:
-    """Draw one colored cell per grid point, without interpolation, and return the mesh of cells."""
-    axes.set_facecolor(LIGHT_GRAY_COLOR)
-    masked_measure_values = np.ma.masked_invalid(measure_values_by_cell)
-    cell_mesh = axes.pcolormesh(
-        _find_cell_edges(x),
-        _find_cell_edges(y),
-        masked_measure_values,
-        cmap="viridis",
-        norm=color_scale,
-    )
-    cell_mesh.set_rasterized(True)
-    return cell_mesh  # type: ignore[return-value]  # A color bar accepts it.
 
 
 def _find_cell_edges(cell_center_positions: np.ndarray) -> np.ndarray:
@@ -584,28 +485,32 @@ def _find_cell_edges(cell_center_positions: np.ndarray) -> np.ndarray:
         )
     inner_cell_edges = 0.5 * (cell_center_positions[1:] + cell_center_positions[:-1])
     first_cell_edge, last_cell_edge = (
-        2.0 * cell_center_positions[0] - inner_cell_edges[0],
-        2.0 * cell_center_positions[-1] - inner_cell_edges[-1],
+        2.0 * cell_center_positions[[0, -1]] - inner_cell_edges[[0, -1]]
     )
-    return np.concatenate([[first_cell_edge], inner_cell_edges, [last_cell_edge]])
+    return np.array([first_cell_edge, *inner_cell_edges, last_cell_edge])
 
 
-def _compute_displayed_outcome_codes(scan: xr.Dataset) -> xr.DataArray:
+def _compute_displayed_outcome_codes(scan: xr.Dataset) -> np.ndarray:
     """Return the outcome codes of a scan, with unstable cycles replaced by `UNSTABLE_CYCLE_CODE`.
 
     They are replaced only if the scan contains the spectral radius.
     """
-    outcome_codes_with_instability = scan.outcome.astype(int)
-    if "spectral_radius" not in scan:
-        return outcome_codes_with_instability
-    return outcome_codes_with_instability.where(~(scan.spectral_radius >= 1.0), UNSTABLE_CYCLE_CODE)
+    outcome_codes = scan.outcome.values.astype(int)
+    if "spectral_radius" in scan:
+        outcome_codes[scan.spectral_radius.values >= 1.0] = UNSTABLE_CYCLE_CODE
+    return outcome_codes
 
 
 def _draw_margin_zero_lines(axes: Axes, scan: xr.Dataset, x: str, y: str) -> dict[str, Line2D]:
-    """Draw the curves on which a margin is 0, and return their legend entries, by margin name."""
-    legend_lines = {}
+    """Draw the curves on which a margin is 0, and return their legend entries, by margin name.
+
+    The first dimension of the margins is `y`.
+    """
+    legend_lines: dict[str, Line2D] = {}
+    if min(scan.sizes[x], scan.sizes[y]) < 2:
+        return legend_lines
     for margin_name in DRAWN_MARGIN_NAMES:
-        if margin_name not in scan or scan.sizes[x] < 2 or scan.sizes[y] < 2:
+        if margin_name not in scan:
             continue
         margin_array = scan[margin_name]
         if MARGIN_MEASURES[margin_name].leg_dimension:
@@ -613,17 +518,12 @@ def _draw_margin_zero_lines(axes: Axes, scan: xr.Dataset, x: str, y: str) -> dic
         if margin_name == "clearance_sls1" and "takeoff_acceleration" in scan:
             # Without missing values the line has no steps.
             margin_array = margin_array.where(scan.takeoff_acceleration >= 0.0)
-        margin_values = margin_array.transpose(y, x).values
-        finite_values_by_panel = margin_values[np.isfinite(margin_values)]
-        if (
-            not len(finite_values_by_panel)
-            or finite_values_by_panel.min() >= 0.0
-            or finite_values_by_panel.max() <= 0.0
-        ):
+        margin_values = margin_array.values
+        if not ((margin_values < 0.0).any() and (margin_values > 0.0).any()):
             continue
         line_color, line_style = select_special_point_style(margin_name)
         axes.contour(
-            scan[x].values, scan[y].values, np.ma.masked_invalid(margin_values), levels=[0.0],
+            scan[x].values, scan[y].values, margin_values, levels=[0.0],
             colors=[line_color], linestyles=[line_style], linewidths=1.4,
         ).set_path_effects([Stroke(linewidth=2.6, foreground="white"), Normal()])  # fmt: skip
         legend_lines[margin_name] = Line2D(
@@ -643,11 +543,8 @@ def _add_scan_legend(
     n_panel_columns: int,
 ) -> None:
     """Add a legend of outcomes and of margin curves below a figure."""
-    margin_lines = [
-        legend_lines[margin_name]
-        for margin_name in DRAWN_MARGIN_NAMES
-        if margin_name in legend_lines
-    ]
+    margin_names = sorted(legend_lines, key=DRAWN_MARGIN_NAMES.index)
+    margin_lines = [legend_lines[margin_name] for margin_name in margin_names]
     figure.legend(
         handles=[*make_outcome_patches(outcome_codes), *margin_lines],
         loc="outside lower center",
@@ -681,9 +578,9 @@ def map_figure(scan: xr.Dataset, measure: str, curves: Sequence[SpecialPointCurv
     x, y = (
         curves[0].parameters
         if curves
-        else [
+        else (
             parameter_name for parameter_name in SWEEPABLE_PARAMETERS if parameter_name in scan.dims
-        ]
+        )
     )
     figure = Figure(figsize=(PAGE_FIGURE_WIDTH_INCHES, 0.62 * PAGE_FIGURE_WIDTH_INCHES))
     axes = figure.subplots()
@@ -700,11 +597,7 @@ def map_figure(scan: xr.Dataset, measure: str, curves: Sequence[SpecialPointCurv
     figure.colorbar(measure_image, ax=axes, aspect=30, pad=0.01).set_label(
         format_axis_label(measure)
     )
-    special_point_names = sorted({special_point_curve.name for special_point_curve in curves})
-    legend_texts = {
-        special_point_name: typeset_greek_symbols(describe_violation(special_point_name))
-        for special_point_name in special_point_names
-    }
+    labeled_special_points: set[str] = set()
     for special_point_curve in curves:
         curve_color, line_style = select_special_point_style(special_point_curve.name)
         is_stable = special_point_curve.dataset.spectral_radius.values < 1.0
@@ -714,24 +607,25 @@ def map_figure(scan: xr.Dataset, measure: str, curves: Sequence[SpecialPointCurv
             curve_points = np.where(
                 is_point_or_next_drawn[:, None], special_point_curve.values, np.nan
             )
-            legend_text = (
-                legend_texts.pop(special_point_curve.name, None) if is_point_drawn.any() else None
-            )
-            line_outline = [Stroke(linewidth=line_width + 1.0, foreground="white"), Normal()]
+            legend_text = None
+            if is_point_drawn.any() and special_point_curve.name not in labeled_special_points:
+                labeled_special_points.add(special_point_curve.name)
+                legend_text = typeset_greek_symbols(describe_violation(special_point_curve.name))
             axes.plot(
-                *curve_points.T, color=curve_color, linestyle=line_style, linewidth=line_width,
+                *curve_points.T,
+                color=curve_color,
+                linestyle=line_style,
+                linewidth=line_width,
                 label=legend_text,
-                path_effects=line_outline,
-            )  # fmt: skip
-    codim2_points = np.array(
-        [
-            codim2_point.values
-            for special_point_curve in curves
-            for codim2_point in special_point_curve.codim2_points
-        ]
-    )
+                path_effects=[Stroke(linewidth=line_width + 1.0, foreground="white"), Normal()],
+            )
+    codim2_points = [
+        codim2_point.values
+        for special_point_curve in curves
+        for codim2_point in special_point_curve.codim2_points
+    ]
     axes.plot(
-        *codim2_points.reshape(-1, 2).T,
+        *np.reshape(codim2_points, (-1, 2)).T,
         "o",
         color="black",
         markersize=2.5,
@@ -739,10 +633,12 @@ def map_figure(scan: xr.Dataset, measure: str, curves: Sequence[SpecialPointCurv
         markeredgewidth=0.6,
         label="two special points at once",
     )
-    axes.set_xlim(*scan[x].values[[0, -1]])
-    axes.set_ylim(*scan[y].values[[0, -1]])
-    axes.set_xlabel(format_axis_label(x))
-    axes.set_ylabel(format_axis_label(y))
+    axes.set(
+        xlabel=format_axis_label(x),
+        ylabel=format_axis_label(y),
+        xlim=scan[x].values[[0, -1]],
+        ylim=scan[y].values[[0, -1]],
+    )
     if curves:
         figure.legend(loc="outside lower center", ncols=2)
     return figure

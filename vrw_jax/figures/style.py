@@ -4,6 +4,7 @@ Figures are created inside `figure_style()`, and `save` writes them to files. No
 matplotlib changes, and no window opens.
 """
 
+import math
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -75,11 +76,19 @@ MATPLOTLIB_SETTINGS: dict[Any, Any] = {
 uses it.
 """
 
+LEGEND_BESIDE_PANEL: dict[str, Any] = {"loc": "center left", "bbox_to_anchor": (1.0, 0.5)}
+"""Settings of a legend that is on the right of its panel."""
+
 COLUMN_FIGURE_WIDTH_INCHES = 3.4
 """Width of a figure in one column, inches, chosen because it is the column width of the journal."""
 
 PAGE_FIGURE_WIDTH_INCHES = 6.9
 """Width of a figure across the page, inches, chosen because it is the text width of the journal."""
+
+MAX_PANELS_PER_ROW = 3
+"""Largest number of panels in a row of bars, chosen because four panels leave no space for
+parameter symbols.
+"""
 
 OUTCOME_LABELS_AND_COLORS: dict[Outcome, tuple[str, str]] = {
     Outcome.STEPPED: ("stable limit cycle", OKABE_ITO_BLUE),
@@ -192,8 +201,7 @@ def require_dataset_variables(
     missing_required_names = [
         variable_name
         for variable_name in required_names
-        if variable_name not in labeled_dataset.variables
-        and variable_name not in labeled_dataset.attrs
+        if variable_name not in (*labeled_dataset.variables, *labeled_dataset.attrs)
     ]
     if missing_required_names:
         raise ValueError(
@@ -242,11 +250,8 @@ def format_axis_label(quantity_name: str, label_format: str = "{name} {symbol}")
         name=typeset_greek_symbols(measure_description.long_name),
         symbol=f"${measure_description.mathtext}$",
     )
-    return (
-        f"{label_text} [{_format_figure_unit(quantity_name)}]"
-        if _format_figure_unit(quantity_name)
-        else label_text
-    )
+    unit_text = _format_figure_unit(quantity_name)
+    return f"{label_text} [{unit_text}]" if unit_text else label_text
 
 
 def format_value_label(
@@ -257,6 +262,22 @@ def format_value_label(
         return f"{quantity_name} = {quantity_value:.{n_significant_digits}g}"
     symbol_text, unit_text = MEASURES[quantity_name].mathtext, _format_figure_unit(quantity_name)
     return f"${symbol_text}$ = {quantity_value:.{n_significant_digits}g} {unit_text}".rstrip()
+
+
+def make_panel_grid(
+    n_panels: int, panel_height: float, legend_height: float, **subplot_settings: Any
+) -> tuple[Figure, np.ndarray]:
+    """Return a figure with rows of up to `MAX_PANELS_PER_ROW` panels, and the axes of its panels.
+
+    The heights are in inches, and `legend_height` is that of the figure without its panels.
+    """
+    n_columns = min(n_panels, MAX_PANELS_PER_ROW)
+    n_rows = math.ceil(n_panels / n_columns)
+    figure = Figure(figsize=(PAGE_FIGURE_WIDTH_INCHES, n_rows * panel_height + legend_height))
+    panel_axes = figure.subplots(n_rows, n_columns, squeeze=False, **subplot_settings).ravel()
+    for axes in panel_axes[n_panels:]:
+        axes.set_axis_off()
+    return figure, panel_axes[:n_panels]
 
 
 def draw_panel_letter(axes: Axes, panel_letter: str) -> None:
@@ -328,10 +349,7 @@ def draw_outcome_cells(
     Cells with codes that are not in `drawn_outcome_codes` are omitted.
     """
     outcome_color_map = ListedColormap(
-        [
-            select_outcome_style(int(drawn_outcome_code))[1]
-            for drawn_outcome_code in drawn_outcome_codes
-        ]
+        [select_outcome_style(int(outcome_code))[1] for outcome_code in drawn_outcome_codes]
     )
     outcome_code_indices = np.ma.masked_where(
         ~np.isin(outcome_codes, drawn_outcome_codes),
@@ -343,15 +361,18 @@ def draw_outcome_cells(
         else None
     )
     axes.pcolormesh(
-        x, y, outcome_code_indices, cmap=outcome_color_map, norm=outcome_color_norm
-    ).set_rasterized(True)
+        x,
+        y,
+        outcome_code_indices,
+        cmap=outcome_color_map,
+        norm=outcome_color_norm,
+        rasterized=True,
+    )
 
 
 def make_outcome_patches(outcome_codes: Iterable[int]) -> list[Patch]:
     """Return a legend entry for each outcome code."""
     return [
         Patch(facecolor=outcome_color, edgecolor="#888888", linewidth=0.4, label=outcome_label)
-        for outcome_label, outcome_color in (
-            select_outcome_style(int(outcome_code)) for outcome_code in outcome_codes
-        )
+        for outcome_label, outcome_color in map(select_outcome_style, map(int, outcome_codes))
     ]

@@ -1,6 +1,5 @@
 """Tornado plots: bars that show the change of each measure per parameter, sorted by length."""
 
-import math
 from collections.abc import Iterable, Mapping
 
 import numpy as np
@@ -14,17 +13,13 @@ from vrw_jax.figures.style import (
     PAGE_FIGURE_WIDTH_INCHES,
     figure_style,
     format_axis_label,
+    make_panel_grid,
     require_dataset_variables,
     typeset_greek_symbols,
 )
 from vrw_jax.measures import MEASURES
 from vrw_jax.validation import check_names, check_positive, require_known_name
 from vrw_jax.wheel import check_parameter_name
-
-MAX_PANELS_PER_ROW = 3
-"""Largest number of panels in a row, chosen because four panels leave no space for parameter
-symbols.
-"""
 
 MAX_DEFAULT_DRAWN_MEASURES = 6
 """Largest number of measures that are drawn by default, chosen because two rows of panels fit a
@@ -94,20 +89,11 @@ def tornado_figure(
         measure_changes = table.derivative.sel(parameter=list(spreads)) * np.array(
             parameter_changes
         )
-    n_panel_columns = min(len(measure_names), MAX_PANELS_PER_ROW)
-    n_panel_rows = math.ceil(len(measure_names) / n_panel_columns)
-    figure_height = (
-        n_panel_rows * (PARAMETER_ROW_HEIGHT_INCHES * measure_changes.sizes["parameter"] + 0.8)
-        + 0.3
-    )
-    figure_width = (
-        PAGE_FIGURE_WIDTH_INCHES if n_panel_columns > 1 else 0.6 * PAGE_FIGURE_WIDTH_INCHES
-    )
-    figure = Figure(figsize=(figure_width, figure_height))
-    panel_axes = figure.subplots(n_panel_rows, n_panel_columns, squeeze=False).ravel()
-    for axes in panel_axes[len(measure_names) :]:
-        axes.set_axis_off()
-    for axes, measure_name in zip(panel_axes, measure_names, strict=False):
+    panel_height = PARAMETER_ROW_HEIGHT_INCHES * measure_changes.sizes["parameter"] + 0.8
+    figure, panel_axes = make_panel_grid(len(measure_names), panel_height, 0.3)
+    if len(measure_names) == 1:
+        figure.set_figwidth(0.6 * PAGE_FIGURE_WIDTH_INCHES)
+    for axes, measure_name in zip(panel_axes, measure_names, strict=True):
         _draw_sorted_bars(axes, measure_changes.sel(measure=measure_name))
         axes.set_title(typeset_greek_symbols(MEASURES[measure_name].long_name))
         change_label = format_axis_label(measure_name, "change of {symbol}")
@@ -115,8 +101,7 @@ def tornado_figure(
     parameter_change_text = "1 %" if spreads is None else "by its spread"
     legend_handles, _ = panel_axes[0].get_legend_handles_labels()
     legend_texts = [
-        f"parameter {change_direction} {parameter_change_text}"
-        for change_direction in ("up", "down")
+        f"parameter {direction} {parameter_change_text}" for direction in ("up", "down")
     ]
     figure.legend(legend_handles, legend_texts, loc="outside lower center", ncols=2)
     return figure

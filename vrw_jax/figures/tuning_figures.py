@@ -10,6 +10,7 @@ from matplotlib.ticker import MaxNLocator
 
 from vrw_jax.figures.style import (
     DARK_GRAY_COLOR,
+    LEGEND_BESIDE_PANEL,
     LIGHT_GRAY_COLOR,
     OKABE_ITO_BLUE,
     OKABE_ITO_ORANGE,
@@ -61,10 +62,8 @@ def tuning_figure(tuned: TuneResult) -> Figure:
 
 def _draw_objective_path(axes: Axes, path_dataset: xr.Dataset) -> None:
     """Draw the objective of each evaluated gait."""
-    evaluation_numbers, objective_values = (
-        path_dataset.evaluation.values,
-        path_dataset.objective.values,
-    )
+    evaluation_numbers = path_dataset.evaluation.values
+    objective_values = path_dataset.objective.values
     is_gait_lost = np.isin(path_dataset.kind.values, (TrialKind.LOST, TrialKind.NOT_FINITE))
     are_constraints_satisfied = (
         path_dataset.breach.values <= DEFAULT_MAXIMIZATION_OPTIONS.active_bound_tolerance
@@ -91,88 +90,63 @@ def _draw_objective_path(axes: Axes, path_dataset: xr.Dataset) -> None:
             markersize=4.0,
             label=marker_text,
         )
-    if is_gait_lost.any():
-        for lost_gait_index, evaluation_number in enumerate(evaluation_numbers[is_gait_lost]):
-            legend_text = (
-                "gait or finite value lost, step shortened" if lost_gait_index == 0 else None
-            )
-            axes.axvline(
-                evaluation_number,
-                color=OKABE_ITO_ORANGE,
-                linewidth=0.8,
-                linestyle=":",
-                label=legend_text,
-            )
+    legend_text: str | None = "gait or finite value lost, step shortened"
+    for evaluation_number in evaluation_numbers[is_gait_lost]:
+        axes.axvline(
+            evaluation_number,
+            color=OKABE_ITO_ORANGE,
+            linewidth=0.8,
+            linestyle=":",
+            label=legend_text,
+        )
+        legend_text = None  # One line is in the legend.
     axes.set_ylabel(format_axis_label(path_dataset.objective.attrs["long_name"], "{name}"))
     axes.legend(loc="best", fontsize=7.0)
 
 
 def _draw_parameter_paths(axes: Axes, path_dataset: xr.Dataset) -> None:
     """Draw the parameters of each evaluated gait, scaled so that their bounds are 0 and 1."""
-    lower_bounds, upper_bounds = (
-        np.asarray(path_dataset.attrs["lower"]),
-        np.asarray(path_dataset.attrs["upper"]),
-    )
-    for i, parameter_name in enumerate(path_dataset.attrs["free"].split()):
-        scaled_parameter_values = (path_dataset[parameter_name].values - lower_bounds[i]) / (
-            upper_bounds[i] - lower_bounds[i]
-        )
+    for parameter_name, lower_bound, upper_bound in zip(
+        path_dataset.attrs["free"].split(),
+        path_dataset.attrs["lower"],
+        path_dataset.attrs["upper"],
+        strict=True,
+    ):
         axes.plot(
             path_dataset.evaluation,
-            scaled_parameter_values,
+            (path_dataset[parameter_name].values - lower_bound) / (upper_bound - lower_bound),
             marker=".",
             markersize=4.0,
             label=f"${MEASURES[parameter_name].mathtext}$",
         )
-    axes.set_ylim(-0.05, 1.05)
     axes.set_yticks([0.0, 1.0], ["lower\nbound", "upper\nbound"])
-    axes.set_xlabel("gaits evaluated")
+    axes.set(xlabel="gaits evaluated", ylim=(-0.05, 1.05))
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-    axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
+    axes.legend(**LEGEND_BESIDE_PANEL)
 
 
 def _draw_constraint_slacks(axes: Axes, tune_result: TuneResult) -> None:
     """Draw bars for the slack of each constraint at the start and at the tuned gait."""
     path_dataset = tune_result.path
-    constraint_names = [str(constraint_name) for constraint_name in path_dataset.constraint.values]
-    constraint_values = path_dataset.constraint_value.values
-    min_constraint_values = path_dataset.margin.values
-    tuned_evaluation_index = np.nanargmin(
-        np.sum(
-            [
-                np.abs(
-                    path_dataset[parameter_name].values
-                    / float(getattr(tune_result.params, parameter_name))
-                    - 1.0
-                )
-                for parameter_name in path_dataset.attrs["free"].split()
-            ],
-            axis=0,
-        )
-    )
+    constraint_names = list(map(str, path_dataset.constraint.values))
+    slacks = path_dataset.constraint_value.values - path_dataset.margin.values
+    relative_parameter_changes = [
+        path_dataset[parameter_name].values / float(getattr(tune_result.params, parameter_name))
+        - 1.0
+        for parameter_name in path_dataset.attrs["free"].split()
+    ]
+    tuned_evaluation_index = np.nanargmin(np.abs(relative_parameter_changes).sum(axis=0))
     with np.errstate(invalid="ignore"):
-        slack_units = np.maximum(
-            np.nanmax(np.abs(constraint_values - min_constraint_values), axis=0), 1e-12
-        )
+        slack_units = np.maximum(np.nanmax(np.abs(slacks), axis=0), 1e-12)
     bar_positions = np.arange(len(constraint_names))[::-1]
     active_constraint_names = {active_constraint.name for active_constraint in tune_result.active}
-    for slack_fraction, vertical_offset, bar_color, legend_text in (
-        (
-            (constraint_values[0] - min_constraint_values) / slack_units,
-            0.19,
-            LIGHT_GRAY_COLOR,
-            "at the start",
-        ),
-        (
-            (constraint_values[tuned_evaluation_index] - min_constraint_values) / slack_units,
-            -0.19,
-            OKABE_ITO_BLUE,
-            "tuned",
-        ),
+    for evaluation_index, vertical_offset, bar_color, legend_text in (
+        (0, 0.19, LIGHT_GRAY_COLOR, "at the start"),
+        (tuned_evaluation_index, -0.19, OKABE_ITO_BLUE, "tuned"),
     ):
         axes.barh(
             bar_positions + vertical_offset,
-            slack_fraction,
+            slacks[evaluation_index] / slack_units,
             0.36,
             color=bar_color,
             label=legend_text,
@@ -192,6 +166,8 @@ def _draw_constraint_slacks(axes: Axes, tune_result: TuneResult) -> None:
         if constraint_name in active_constraint_names:
             tick_label.set_color(OKABE_ITO_ORANGE)
             tick_label.set_fontweight("bold")
-    axes.set_xlim(min(-0.05, axes.get_xlim()[0]), 1.05)
-    axes.set_xlabel("slack, share of the largest on the path\n(active in bold)")
+    axes.set(
+        xlabel="slack, share of the largest on the path\n(active in bold)",
+        xlim=(min(-0.05, axes.get_xlim()[0]), 1.05),
+    )
     axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2)

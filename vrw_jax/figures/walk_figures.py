@@ -8,13 +8,18 @@ import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from numpy.typing import ArrayLike
 from PIL import Image
 
 from vrw_jax.figures.contact_figures import (
+    GROUND_FORCE_NAMES,
+    LEG_LINE_STYLES,
     HubAndFootMotion,
     compute_foot_motion,
     draw_contact_sticks,
     draw_feet,
+    draw_stick,
+    insert_landing_gaps,
     make_contact_mode_handles,
     make_contact_panels,
     reports_contact_modes,
@@ -25,6 +30,7 @@ from vrw_jax.figures.style import (
     DARK_GRAY_COLOR,
     LEG_1_COLOR,
     LEG_2_COLOR,
+    LEGEND_BESIDE_PANEL,
     LIGHT_GRAY_COLOR,
     OKABE_ITO_SKY_BLUE,
     PAGE_FIGURE_WIDTH_INCHES,
@@ -38,13 +44,6 @@ from vrw_jax.figures.style import (
 )
 from vrw_jax.measures import MEASURES, PHASE_NAMES
 from vrw_jax.validation import check_int, check_path, check_positive, check_type
-
-PointCoordinates = float | np.ndarray
-"""x or z coordinates of one or more points, m."""
-
-GROUND_FORCE_NAMES = ("lambda_1", "lambda_2", "lambda_3", "lambda_4")
-"""Names of the ground forces (N) on the feet of Leg 1 and Leg 2."""
-
 
 NO_WALK_REMEDY = "give vrw.simulate(params, model=...), of any model"
 """Remedy in the error message for a dataset that is not a walk."""
@@ -63,8 +62,7 @@ def _require_nonempty_walk(argument_name: str, walk: xr.Dataset) -> None:
     if not walk.sizes["time"]:
         raise ValueError(
             f"{argument_name} has no samples, because the walk ended at once as "
-            f"{walk.attrs['outcome']}: "
-            "give one that takes a step."
+            f"{walk.attrs['outcome']}: give one that takes a step."
         )
 
 
@@ -79,18 +77,6 @@ def find_phase_spans(gait: xr.Dataset) -> list[tuple[float, float, int]]:
     return [
         (phase_sample_times[0], phase_sample_times[-1], int(phase_code))
         for phase_sample_times, phase_code in zip(times_by_phase, phase_codes, strict=True)
-    ]
-
-
-def insert_landing_gaps(gait: xr.Dataset, *variable_names: str) -> list[np.ndarray]:
-    """Return the time and variables of a trajectory, with NaN inserted at each landing.
-
-    The gaps separate steps in plots, because landings relabel the legs.
-    """
-    landing_indices = np.flatnonzero(np.diff(gait.step.values)) + 1
-    return [
-        np.insert(gait[variable_name].values.astype(float), landing_indices, np.nan)
-        for variable_name in ("time", *variable_names)
     ]
 
 
@@ -115,72 +101,63 @@ def gait_panels(gait: xr.Dataset) -> Figure:
     _require_nonempty_walk("gait", gait)
     if reports_contact_modes(gait):
         return make_contact_panels(gait)
-    times_with_gaps, theta, L1, L2, rear_foot_height, *ground_forces = insert_landing_gaps(
-        gait, "theta", "L1", "L2", "foot_2_z", *GROUND_FORCE_NAMES
+    times, theta, L1, L2, rear_foot_height, *ground_forces = (
+        insert_landing_gaps(gait, gait[variable_name].values)
+        for variable_name in ("time", "theta", "L1", "L2", "foot_2_z", *GROUND_FORCE_NAMES)
     )
     rear_load_percent = 100.0 * ground_forces[3] / (ground_forces[1] + ground_forces[3])
+    phase_spans = find_phase_spans(gait)
     figure = Figure(figsize=(0.8 * PAGE_FIGURE_WIDTH_INCHES, 7.4))
     panel_axes = figure.subplots(5, 1, sharex=True, height_ratios=[1, 1, 1, 1, 1.5])
     for axes, panel_letter in zip(panel_axes, "abcde", strict=True):
         draw_panel_letter(axes, panel_letter)
-        for phase_start_time, phase_end_time, phase_code in find_phase_spans(gait):
+        for start_time, end_time, phase_code in phase_spans:
             if phase_code == 0:
-                axes.axvspan(
-                    phase_start_time,
-                    phase_end_time,
-                    color=LIGHT_GRAY_COLOR,
-                    linewidth=0.0,
-                    zorder=0,
-                )
+                axes.axvspan(start_time, end_time, color=LIGHT_GRAY_COLOR, linewidth=0.0, zorder=0)
             if phase_code == 2:
+                dotted = (0, (1, 2))
                 axes.axvline(
-                    phase_start_time,
-                    color=DARK_GRAY_COLOR,
-                    linewidth=0.5,
-                    linestyle=(0, (1, 2)),
-                    zorder=0,
+                    start_time, color=DARK_GRAY_COLOR, linewidth=0.5, linestyle=dotted, zorder=0
                 )
-    panel_axes[0].plot(times_with_gaps, theta, color="black")
-    panel_axes[0].set_ylabel(format_axis_label("theta", "{symbol}"))
-    for phase_start_time, phase_end_time, phase_code in find_phase_spans(gait)[:3]:
-        panel_axes[0].annotate(
+    angle_axes, length_axes, load_axes, height_axes, force_axes = panel_axes
+    leg_1_style, leg_2_style = (
+        {"color": line_color, "linestyle": line_style}
+        for line_color, line_style in LEG_LINE_STYLES.values()
+    )
+    angle_axes.plot(times, theta, color="black")
+    angle_axes.set_ylabel(format_axis_label("theta", "{symbol}"))
+    for start_time, end_time, phase_code in phase_spans[:3]:
+        angle_axes.annotate(
             PHASE_NAMES[phase_code],
-            (0.5 * (phase_start_time + phase_end_time), 1.0),
+            (0.5 * (start_time + end_time), 1.0),
             xycoords=("data", "axes fraction"),
             ha="center",
             va="bottom",
             fontsize=7.5,
             rotation=90 if phase_code == 2 else 0,
         )
-    panel_axes[1].plot(times_with_gaps, L1, color=LEG_1_COLOR, label="Leg 1, $L_1$")
-    panel_axes[1].plot(times_with_gaps, L2, color=LEG_2_COLOR, linestyle="--", label="Leg 2, $L_2$")
-    panel_axes[1].set_ylabel("$L_1,\\ L_2$ [m]")
-    panel_axes[2].plot(
-        times_with_gaps, 100.0 - rear_load_percent, color=LEG_1_COLOR, label="foot 1"
-    )
-    panel_axes[2].plot(
-        times_with_gaps, rear_load_percent, color=LEG_2_COLOR, linestyle="--", label="foot 2"
-    )
-    panel_axes[2].set_ylabel("share of the\nnormal force [%]")
-    panel_axes[3].plot(times_with_gaps, rear_foot_height, color=LEG_2_COLOR, linestyle="--")
-    panel_axes[3].set_ylabel("$z_2$ [m]")
-    for i, ground_force in enumerate(ground_forces):
-        line_color, line_style = (LEG_1_COLOR, "-") if i < 2 else (LEG_2_COLOR, "--")
-        force_label, line_width = f"${MEASURES[GROUND_FORCE_NAMES[i]].mathtext}$", (0.7, 1.4)[i % 2]
-        panel_axes[4].plot(
-            times_with_gaps,
-            ground_force,
-            color=line_color,
-            linestyle=line_style,
-            linewidth=line_width,
-            label=force_label,
+    length_axes.plot(times, L1, label="Leg 1, $L_1$", **leg_1_style)
+    length_axes.plot(times, L2, label="Leg 2, $L_2$", **leg_2_style)
+    length_axes.set_ylabel("$L_1,\\ L_2$ [m]")
+    load_axes.plot(times, 100.0 - rear_load_percent, label="foot 1", **leg_1_style)
+    load_axes.plot(times, rear_load_percent, label="foot 2", **leg_2_style)
+    load_axes.set_ylabel("share of the\nnormal force [%]")
+    height_axes.plot(times, rear_foot_height, **leg_2_style)
+    height_axes.set_ylabel("$z_2$ [m]")
+    for i, force_name in enumerate(GROUND_FORCE_NAMES):
+        force_axes.plot(
+            times,
+            ground_forces[i],
+            linewidth=(0.7, 1.4)[i % 2],
+            label=f"${MEASURES[force_name].mathtext}$",
+            **(leg_1_style if i < 2 else leg_2_style),
         )
-    panel_axes[4].axhline(0.0, color=DARK_GRAY_COLOR, linewidth=0.4)
-    panel_axes[4].set_ylabel("ground reaction\nforce [N]")
-    panel_axes[4].set_xlabel("time [s]")
-    panel_axes[4].set_xlim(times_with_gaps[0], times_with_gaps[-1])
-    for axes in panel_axes[[1, 2, 4]]:
-        axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
+    force_axes.axhline(0.0, color=DARK_GRAY_COLOR, linewidth=0.4)
+    force_axes.set(
+        xlabel="time [s]", ylabel="ground reaction\nforce [N]", xlim=(times[0], times[-1])
+    )
+    for axes in (length_axes, load_axes, force_axes):
+        axes.legend(**LEGEND_BESIDE_PANEL)
     figure.align_ylabels(panel_axes)
     return figure
 
@@ -221,28 +198,19 @@ def sticks(gait: xr.Dataset, interval: float = 0.05) -> Figure:
         ha="right",
         arrowprops={"arrowstyle": "->", "linewidth": 0.6},
     )
-    axes.set_ylim(-0.12, None)
-    axes.set_aspect("equal")
-    axes.set_xlabel("$X$ [m]")
-    axes.set_ylabel("$Z$ [m]")
-    axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
+    axes.set(xlabel="$X$ [m]", ylabel="$Z$ [m]", ylim=(-0.12, None), aspect="equal")
+    axes.legend(**LEGEND_BESIDE_PANEL)
     return figure
 
 
 def _draw_phase_sticks(axes: Axes, gait: xr.Dataset, interval: float) -> None:
     """Draw Legs 1 and 2 in the colors of the phases, at equal time intervals of `interval` s."""
     phase_colors = ("#A0A0A0", OKABE_ITO_SKY_BLUE, "#000000")
-    sample_times = gait.time.values
-    for i in np.searchsorted(sample_times, np.arange(0.0, sample_times[-1], interval)):
-        walk_sample = gait.isel(time=int(i))
-        for foot_number, line_style in ((1, "-"), (2, ":")):
-            axes.plot(
-                [float(walk_sample[f"foot_{foot_number}_x"]), float(walk_sample.hub_x)],
-                [float(walk_sample[f"foot_{foot_number}_z"]), float(walk_sample.hub_z)],
-                color=phase_colors[int(walk_sample.phase)],
-                linestyle=line_style,
-                linewidth=0.8,
-            )
+    foot_motion = compute_foot_motion(gait)
+    for sample_index in foot_motion.find_stick_samples(interval):
+        stick_color = phase_colors[int(gait.phase[sample_index])]
+        for leg_number in (1, 2):
+            draw_stick(axes, foot_motion, sample_index, leg_number, stick_color, 0.8)
     for line_style, leg_name in (("-", "Leg 1"), (":", "Leg 2")):
         axes.plot([], [], color="black", linestyle=line_style, linewidth=0.8, label=leg_name)
     axes.plot([], [], color=LEG_2_COLOR, label="hub")
@@ -280,32 +248,31 @@ def foot_height(gaits: Sequence[xr.Dataset], vary: str = "damping") -> Figure:
     figure = Figure(figsize=(PAGE_FIGURE_WIDTH_INCHES, 2.6))
     step_axes, takeoff_axes = figure.subplots(1, 2)
     for gait, line_style in zip(gaits, GAIT_LINE_STYLES, strict=False):
-        gait_label, min_foot_clearance = (
-            _format_gait_label(gait, vary),
-            1e3 * float(gait.foot_2_z.min()),
-        )
-        clearance_text = (
-            f"lowest −{-min_foot_clearance:.1f} mm" if min_foot_clearance < -1e-6 else "clear"
-        )
+        foot_height_mm = 1e3 * gait.foot_2_z
+        lowest_mm = float(foot_height_mm.min())
+        clearance_text = f"lowest −{-lowest_mm:.1f} mm" if lowest_mm < -1e-6 else "clear"
+        gait_label = _format_gait_label(gait, vary)
         step_axes.plot(gait.time, gait.foot_2_z, linestyle=line_style, label=gait_label)
-        takeoff_axes.plot(
-            gait.time, 1e3 * gait.foot_2_z, linestyle=line_style, label=clearance_text
-        )
+        takeoff_axes.plot(gait.time, foot_height_mm, linestyle=line_style, label=clearance_text)
     for panel_letter, axes in zip("ab", (step_axes, takeoff_axes), strict=True):
         draw_panel_letter(axes, panel_letter)
         axes.axhspan(-1e3, 0.0, color=LIGHT_GRAY_COLOR, linewidth=0.0, zorder=0)
         axes.axhline(0.0, color="black", linewidth=0.5, zorder=1)
         axes.set_xlabel("time since landing [s]")
         axes.legend(loc="upper left")
-    min_foot_clearance = min(float(gait.foot_2_z.min()) for gait in gaits)
+    min_height = min(float(gait.foot_2_z.min()) for gait in gaits)
+    max_height = max(float(gait.foot_2_z.max()) for gait in gaits)
     takeoff_times = [float(gait.time[gait.phase == 1][0]) for gait in gaits]
-    max_foot_height = max(float(gait.foot_2_z.max()) for gait in gaits)
-    step_axes.set_ylim(2.0 * min_foot_clearance - 0.004, 1.05 * max_foot_height)
-    step_axes.set_xlim(0.0, max(float(gait.time.max()) for gait in gaits))
-    step_axes.set_ylabel("height of foot 2, $z_2$ [m]")
-    takeoff_axes.set_ylim(1.3e3 * min_foot_clearance - 0.5, -1.8e3 * min_foot_clearance + 0.5)
-    takeoff_axes.set_xlim(min(takeoff_times) - 0.03, max(takeoff_times) + 0.1)
-    takeoff_axes.set_ylabel("$z_2$ [mm]")
+    step_axes.set(
+        xlim=(0.0, max(float(gait.time.max()) for gait in gaits)),
+        ylim=(2.0 * min_height - 0.004, 1.05 * max_height),
+        ylabel="height of foot 2, $z_2$ [m]",
+    )
+    takeoff_axes.set(
+        xlim=(min(takeoff_times) - 0.03, max(takeoff_times) + 0.1),
+        ylim=(1.3e3 * min_height - 0.5, -1.8e3 * min_height + 0.5),
+        ylabel="$z_2$ [mm]",
+    )
     takeoff_axes.text(
         0.98,
         0.03,
@@ -352,10 +319,12 @@ def rear_force(gaits: Sequence[xr.Dataset], vary: str = "damping") -> Figure:
             markersize=3.5,
             clip_on=False,
         )
-    axes.set_xlim(0.0, None)
-    axes.set_ylim(0.0, None)
-    axes.set_xlabel("time since landing [s]")
-    axes.set_ylabel("normal force on foot 2, $\\lambda_4$ [N]")
+    axes.set(
+        xlim=(0.0, None),
+        ylim=(0.0, None),
+        xlabel="time since landing [s]",
+        ylabel="normal force on foot 2, $\\lambda_4$ [N]",
+    )
     axes.legend(loc="upper right")
     return figure
 
@@ -394,10 +363,9 @@ def indicators(gaits: xr.Dataset, every: int = 4) -> Figure:
     valid_gaits = gaits.where(gaits.settled & (gaits.lambda_2_plus >= 0.0), drop=True)
     is_scuffing = np.minimum(valid_gaits.clearance_sls1, valid_gaits.clearance_sls2).values < 0.0
     parameter_values = valid_gaits[varied_parameter].values
-    is_marker_drawn_at_value = (
-        (parameter_values % every == 0)
-        | (parameter_values == parameter_values.min())
-        | (parameter_values == parameter_values.max())
+    value_range = (parameter_values.min(), parameter_values.max())
+    is_marker_drawn_at_value = (parameter_values % every == 0) | np.isin(
+        parameter_values, value_range
     )
     panel_rows = (
         ((("lambda_I4", LEG_1_COLOR, "o"),), "impulse [N·s]"),
@@ -410,35 +378,29 @@ def indicators(gaits: xr.Dataset, every: int = 4) -> Figure:
     ):
         draw_panel_letter(axes, panel_letter)
         for indicator_name, line_color, marker_symbol in panel_indicators:
-            indicator_values, indicator_symbol = (
-                valid_gaits[indicator_name].values,
-                f"${MEASURES[indicator_name].mathtext}$",
-            )
+            indicator_values = valid_gaits[indicator_name].values
             axes.plot(parameter_values, indicator_values, color=line_color, linewidth=0.7)
-            for is_scuffing_drawn, fill_color in ((False, line_color), (True, "white")):
-                is_marker_drawn = is_marker_drawn_at_value & (is_scuffing == is_scuffing_drawn)
-                legend_text = indicator_symbol + (", scuffing" if is_scuffing_drawn else "")
-                x, y = parameter_values[is_marker_drawn], indicator_values[is_marker_drawn]
+            for is_drawn, fill_color, legend_suffix in (
+                (is_marker_drawn_at_value & ~is_scuffing, line_color, ""),
+                (is_marker_drawn_at_value & is_scuffing, "white", ", scuffing"),
+            ):
                 draw_markers(
                     axes,
-                    x,
-                    y,
+                    parameter_values[is_drawn],
+                    indicator_values[is_drawn],
                     marker_symbol,
                     line_color,
                     fill_color,
-                    label=legend_text,
+                    label=f"${MEASURES[indicator_name].mathtext}${legend_suffix}",
                     clip_on=False,
                 )
-        axes.set_xlim(0.0, parameter_values.max() + 1.0)
-        axes.set_ylim(
-            0.0,
-            1.18
-            * max(
-                float(valid_gaits[indicator_name].max()) for indicator_name, *_ in panel_indicators
-            ),
+        max_indicator = max(valid_gaits[name].max() for name, *_ in panel_indicators)
+        axes.set(
+            xlim=(0.0, value_range[1] + 1.0),
+            ylim=(0.0, 1.18 * max_indicator),
+            xlabel=format_axis_label(varied_parameter, "{symbol}"),
+            ylabel=axis_label,
         )
-        axes.set_xlabel(format_axis_label(varied_parameter, "{symbol}"))
-        axes.set_ylabel(axis_label)
         axes.legend(
             loc="lower right" if panel_letter == "a" else "upper right", ncols=len(panel_indicators)
         )
@@ -449,17 +411,13 @@ def indicators(gaits: xr.Dataset, every: int = 4) -> Figure:
     return figure
 
 
-def _rotate_to_gravity_frame(
-    x: PointCoordinates, z: PointCoordinates, slope: float
-) -> tuple[PointCoordinates, PointCoordinates]:
-    """Return coordinates in a frame whose z axis is vertical, m.
+def _rotate_to_gravity_frame(slope_points: ArrayLike, slope: float) -> np.ndarray:
+    """Return coordinates in a frame whose z axis is vertical, m, shape (2, ...).
 
-    x and z are the coordinates in the slope's frame.
+    The points have the shape (..., 2), with x and z in the slope's frame.
     """
-    return (
-        x * np.cos(slope) + z * np.sin(slope),
-        z * np.cos(slope) - x * np.sin(slope),
-    )
+    x, z = np.moveaxis(np.asarray(slope_points), -1, 0)
+    return np.array([x * np.cos(slope) + z * np.sin(slope), z * np.cos(slope) - x * np.sin(slope)])
 
 
 @figure_style()
@@ -505,11 +463,8 @@ def walk_frames(
         )
         _draw_ground_with_marks(axes, ground_slope, camera_position, hub_distance_per_step)
         sample_index = _draw_wheel_at_time(axes, foot_motion, t, ground_slope)
-        camera_center = [
-            float(v) for v in _rotate_to_gravity_frame(camera_position, 0.75, ground_slope)
-        ]
-        axes.set_xlim(camera_center[0] - 1.35, camera_center[0] + 1.35)
-        axes.set_ylim(camera_center[1] - 1.25, camera_center[1] + 1.225)
+        camera_x, camera_z = _rotate_to_gravity_frame((camera_position, 0.75), ground_slope)
+        axes.set(xlim=(camera_x - 1.35, camera_x + 1.35), ylim=(camera_z - 1.25, camera_z + 1.225))
         if reports_contact_modes(step):
             legend_handles = make_contact_mode_handles(foot_motion.contact_modes)
             axes.legend(handles=legend_handles, loc="lower left", fontsize=8)
@@ -530,12 +485,10 @@ def _draw_wheel_at_time(
     Return the index of the sample whose contact modes are drawn.
     """
     hub_position, foot_positions, sample_index = foot_motion.interpolate_at_time(time)
-    rotate_to_view = lambda slope_points: np.array(
-        _rotate_to_gravity_frame(slope_points[..., 0], slope_points[..., 1], slope)
-    )
+    rotate_to_view = lambda slope_points: _rotate_to_gravity_frame(slope_points, slope)
     for leg_number, foot_position in enumerate(foot_positions, 1):
         axes.plot(
-            *rotate_to_view(np.stack([hub_position, foot_position])),
+            *rotate_to_view([hub_position, foot_position]),
             color=select_leg_color(leg_number),
             linewidth=3.0 if leg_number < 3 else 1.5,
             solid_capstyle="round",
@@ -563,21 +516,14 @@ def _draw_ground_with_marks(
     """Draw the sloping ground with two marks per step, so that the animation loops without a
     jump.
     """
-    ground_ends = np.array([camera_position - 3.0, camera_position + 3.0])
-    axes.plot(
-        *_rotate_to_gravity_frame(ground_ends, 0.0 * ground_ends, slope),
-        color="black",
-        linewidth=1.2,
-    )
+    ground_ends = [(camera_position - 3.0, 0.0), (camera_position + 3.0, 0.0)]
+    axes.plot(*_rotate_to_gravity_frame(ground_ends, slope), color="black", linewidth=1.2)
     mark_spacing = 0.5 * mark_period
     first_mark_number = np.ceil((camera_position - 2.0) / mark_spacing)
     for mark_number in range(int(4.0 / mark_spacing)):
-        x = np.array([0.0, -0.06]) + (first_mark_number + mark_number) * mark_spacing
-        axes.plot(
-            *_rotate_to_gravity_frame(x, np.array([0.0, -0.06]), slope),
-            color="black",
-            linewidth=0.7,
-        )
+        x = (first_mark_number + mark_number) * mark_spacing
+        mark_ends = [(x, 0.0), (x - 0.06, -0.06)]
+        axes.plot(*_rotate_to_gravity_frame(mark_ends, slope), color="black", linewidth=0.7)
 
 
 def save_animation(frames: Sequence[Image.Image], milliseconds: int, path: str | Path) -> Path:
