@@ -13,7 +13,6 @@ from vrw_jax.numerics import with_default_jax_settings
 from vrw_jax.scans.collocation_engine import count_available_cores
 from vrw_jax.scans.design import AbstractSampleDesign, ParameterSamples
 from vrw_jax.scans.execution import find_matching_store
-from vrw_jax.scans.measure_catalog import select_measure_catalog
 from vrw_jax.scans.planning import ScanPlan
 
 SCAN_STARTUP_SECONDS = 5.0
@@ -36,11 +35,7 @@ def forecast_scan(scan_plan: ScanPlan, store_path: str | Path | None = None) -> 
       forecast.
     """
     result_layout, n_samples = scan_plan.result_layout, scan_plan.design.size
-    measure_catalog = select_measure_catalog(
-        scan_plan.evaluation_request.wheel_model,
-        scan_plan.evaluation_request.error_tolerance,
-        scan_plan.evaluation_request.slope_standard_deviation,
-    )
+    measure_catalog = scan_plan.measure_catalog
     existing_store = (
         None
         if store_path is None

@@ -25,6 +25,7 @@ from vrw_jax.scans.design import AbstractSampleDesign, ParameterSamples
 from vrw_jax.scans.engines import make_scan_engine
 from vrw_jax.scans.integrity import MANIFEST_ATTRIBUTE
 from vrw_jax.scans.measure_catalog import (
+    MeasureCatalog,
     canonicalize_variable_name,
     check_measure_names,
     get_variable_attributes,
@@ -116,6 +117,7 @@ class ScanPlan:
 
     design: AbstractSampleDesign
     evaluation_request: EvaluationRequest
+    measure_catalog: MeasureCatalog
     result_layout: ResultLayout
     requested_measures: tuple[str, ...]  # names of the requested measures, as the caller gave them
     config_file_text: str
@@ -240,7 +242,9 @@ def plan_scan(
         measure_names, base, model, options, cycle_options, tol, slope_sd
     )
     result_layout = _make_result_layout(design, tuple(dict.fromkeys(variable_names)), base, chunk)
-    return ScanPlan(design, evaluation_request, result_layout, requested_measures, config_text)
+    return ScanPlan(
+        design, evaluation_request, measure_catalog, result_layout, requested_measures, config_text
+    )
 
 
 def _require_reference_model(wheel_model: AbstractWheel) -> None:

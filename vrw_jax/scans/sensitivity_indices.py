@@ -95,9 +95,8 @@ def sobol_indices(
             )
     sobol_options = SobolOptions()
     n_samples_per_row = 2 + len(swept_parameters)
-    has_gaits_in_row = (
-        (scan.outcome.values == Outcome.STEPPED).reshape(n_samples_per_row, -1).all(axis=0)
-    )
+    has_gait = scan.outcome.values == Outcome.STEPPED
+    has_gaits_in_row = has_gait.reshape(n_samples_per_row, -1).all(axis=0)
     saltelli_rows_with_gaits = np.flatnonzero(has_gaits_in_row)
     n_saltelli_rows = (
         1 << len(saltelli_rows_with_gaits).bit_length() >> 1
@@ -118,16 +117,19 @@ def sobol_indices(
     )
 
     random_generator = np.random.default_rng(0)  # The same scan gives the same intervals.
-    sobol_index_estimator = _SobolIndexEstimator(measure_values, sobol_options.max_roundoff_spread)
-    sobol_index_estimates = sobol_index_estimator(np.arange(n_saltelli_rows))
+    roundoff_spreads = sobol_options.max_roundoff_spread * np.abs(measure_values).max(axis=(0, 2))
+    sobol_index_estimates = _estimate_sobol_indices(measure_values, roundoff_spreads)
+    resampled_rows = random_generator.integers(
+        0, n_saltelli_rows, (sobol_options.n_bootstrap_resamples, n_saltelli_rows)
+    )
     resampled_index_estimates = [
-        sobol_index_estimator(random_generator.integers(0, n_saltelli_rows, n_saltelli_rows))
-        for _ in range(sobol_options.n_bootstrap_resamples)
+        _estimate_sobol_indices(measure_values[..., row_indices], roundoff_spreads)
+        for row_indices in resampled_rows
     ]
     lower_bounds, upper_bounds = np.quantile(
         resampled_index_estimates, sobol_options.confidence_interval_quantiles, axis=0
     )
-    is_constant_measure = sobol_index_estimator.detect_constant_measures(measure_values)
+    is_constant_measure = _detect_constant_measures(measure_values, roundoff_spreads)
     if is_constant_measure.any():
         warnings.warn(
             f"{', '.join(np.array(measure_names)[is_constant_measure])}: constant over these "
@@ -164,46 +166,36 @@ def sobol_indices(
     )
 
 
-class _SobolIndexEstimator:
-    """Estimator of first-order and total Sobol' indices from the rows of a `saltelli` design.
+def _detect_constant_measures(
+    measure_values: np.ndarray, roundoff_spreads: np.ndarray
+) -> np.ndarray:
+    """Return whether each measure varies at most by `roundoff_spreads` between the samples, shape
+    (measures,).
+    """
+    return np.asarray(np.ptp(measure_values[:2], axis=(0, 2)) <= roundoff_spreads)
 
-    - `measure_values`: measures of the samples, shape (2 + parameters, measures, rows);
+
+def _estimate_sobol_indices(measure_values: np.ndarray, roundoff_spreads: np.ndarray) -> np.ndarray:
+    """Return first-order and total Sobol' indices, shape (2, measures, parameters).
+
+    Indices of constant measures are 0.
+
+    - `measure_values`: measures of the samples of a `saltelli` design, shape (2 + parameters,
+      measures, rows);
     - `roundoff_spreads`: largest spread of each measure that counts as round-off.
     """
+    from scipy.stats import sobol_indices as compute_sobol_indices
 
-    def __init__(self, measure_values: np.ndarray, max_roundoff_spread: float) -> None:
-        self.measure_values = measure_values
-        self.roundoff_spreads = max_roundoff_spread * np.abs(measure_values).max(axis=(0, 2))
-
-    def detect_constant_measures(self, sample_values: np.ndarray) -> np.ndarray:
-        """Return whether each measure varies only by round-off between the samples, shape
-        (measures,).
-        """
-        is_value_spread_small: np.ndarray = (
-            np.ptp(sample_values[:2], axis=(0, 2)) <= self.roundoff_spreads
+    n_samples_per_row, n_measures, n_rows = measure_values.shape
+    varying_measures = np.flatnonzero(~_detect_constant_measures(measure_values, roundoff_spreads))
+    sobol_index_estimates = np.zeros((2, n_measures, n_samples_per_row - 2))
+    if len(varying_measures):
+        values_a, values_b, *values_ab = measure_values[:, varying_measures]
+        scipy_result = compute_sobol_indices(
+            func={"f_A": values_a, "f_B": values_b, "f_AB": np.array(values_ab)}, n=n_rows
         )
-        return is_value_spread_small
-
-    def __call__(self, saltelli_row_indices: np.ndarray) -> np.ndarray:
-        """Return the indices, estimated from the rows at `saltelli_row_indices`, shape (2,
-        measures, parameters).
-
-        The first axis contains first-order and total indices. Indices of constant measures are 0.
-        """
-        from scipy.stats import sobol_indices as compute_sobol_indices
-
-        resampled_measure_values = self.measure_values[..., saltelli_row_indices]
-        varying_measures = np.flatnonzero(~self.detect_constant_measures(resampled_measure_values))
-        n_samples_per_row, n_measures, _ = resampled_measure_values.shape
-        sobol_index_estimates = np.zeros((2, n_measures, n_samples_per_row - 2))
-        if len(varying_measures):
-            values_a, values_b, *values_ab = resampled_measure_values[:, varying_measures]
-            scipy_result = compute_sobol_indices(
-                func={"f_A": values_a, "f_B": values_b, "f_AB": np.array(values_ab)},
-                n=len(saltelli_row_indices),
-            )
-            # SciPy omits the axis of a single measure.
-            sobol_index_estimates[:, varying_measures] = np.reshape(
-                [scipy_result.first_order, scipy_result.total_order], (2, len(varying_measures), -1)
-            )
-        return sobol_index_estimates
+        # SciPy omits the axis of a single measure.
+        sobol_index_estimates[:, varying_measures] = np.reshape(
+            [scipy_result.first_order, scipy_result.total_order], (2, len(varying_measures), -1)
+        )
+    return sobol_index_estimates

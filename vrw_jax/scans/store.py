@@ -103,23 +103,15 @@ class ResultLayout:
     @property
     def _chunks_per_axis(self) -> tuple[int, ...]:
         """Return the number of chunks along each sample axis."""
-        return tuple(
-            -(-axis_length // chunk_length)
-            for axis_length, chunk_length in zip(self.sample_shape, self.chunk_shape, strict=True)
-        )
+        n_chunks_by_axis = np.ceil(np.divide(self.sample_shape, self.chunk_shape))
+        return tuple(n_chunks_by_axis.astype(int).tolist())
 
     def compute_chunk_region(self, chunk_index: int) -> ChunkRegion:
         """Return the slices that select the samples of a chunk, one for each sample axis."""
         chunk_indices = np.unravel_index(chunk_index, self._chunks_per_axis)
-        return tuple(
-            slice(
-                int(sample_axis_index) * chunk_length,
-                min((int(sample_axis_index) + 1) * chunk_length, axis_length),
-            )
-            for sample_axis_index, chunk_length, axis_length in zip(
-                chunk_indices, self.chunk_shape, self.sample_shape, strict=True
-            )
-        )
+        chunk_starts = np.multiply(chunk_indices, self.chunk_shape)
+        chunk_ends = np.minimum(chunk_starts + self.chunk_shape, self.sample_shape)
+        return tuple(map(slice, chunk_starts.tolist(), chunk_ends.tolist()))
 
     def compute_chunk_sample_shape(self, chunk_index: int) -> tuple[int, ...]:
         """Return the number of samples in a chunk along each sample axis.
