@@ -30,6 +30,7 @@ from vrw_jax.cli.encoding import replace_unencodable_output
 
 if TYPE_CHECKING:
     from vrw_jax.cli.config import Config
+    from vrw_jax.wheel import WheelParams
 
 MAX_OPTION_INTEGER = 10**9
 """Largest integer that an option accepts, chosen because no scan has more samples."""
@@ -158,12 +159,7 @@ def run_gait_command(
       vrw gait configs/table1.toml --steps 50
     """
     with report_command_errors():
-        gait_config = _start_jax_and_load_config(config)
-        from vrw_jax.cli.config import parse_assignment
-
-        params = gait_config.make_wheel(
-            dict(parse_assignment(assignment_text) for assignment_text in changes or [])
-        )
+        gait_config, params = _load_config_and_wheel(config, changes)
         import jax.numpy as jnp
 
         from vrw_jax.cycles import limit_cycle, make_finder, resolve_model_with_reason
@@ -218,12 +214,9 @@ def run_explore_command(
 ) -> None:
     """Open an interactive page of the wheel in your browser. The browser computes the steps."""
     with report_command_errors():
-        from vrw_jax.cli.config import parse_assignment
         from vrw_jax.web import make_page_address
 
-        params = _start_jax_and_load_config(None).make_wheel(
-            dict(parse_assignment(assignment_text) for assignment_text in changes or [])
-        )
+        _, params = _load_config_and_wheel(None, changes)
         page_address = make_page_address(params, model_name)
         webbrowser.open(page_address)
         print(page_address)
@@ -244,26 +237,17 @@ def run_init_command(
             config_path.name: config_path.read_text(encoding="utf-8")
             for config_path in example_folder.glob("*.toml")
         }
-        existing_config_paths = [
-            folder / config_name
-            for config_name in sorted(example_config_texts)
-            if (folder / config_name).exists()
-        ]
-        for config_path in existing_config_paths:
-            if (
-                config_path.read_text(encoding="utf-8", errors="replace")
-                != example_config_texts[config_path.name]
-            ):
+        missing_config_paths = []
+        for config_name, config_text in sorted(example_config_texts.items()):
+            config_path = folder / config_name
+            if not config_path.exists():
+                missing_config_paths.append(config_path)
+            elif config_path.read_text(encoding="utf-8", errors="replace") != config_text:
                 raise ValueError(
                     f"{config_path} is there already and differs: give another folder."
                 )
         _require_writable_folder(folder)
         folder.mkdir(parents=True, exist_ok=True)
-        missing_config_paths = [
-            folder / config_name
-            for config_name in sorted(example_config_texts)
-            if folder / config_name not in existing_config_paths
-        ]
         for config_path in missing_config_paths:
             config_path.write_text(example_config_texts[config_path.name], encoding="utf-8")
         printing.print_written_paths(missing_config_paths)
@@ -284,8 +268,10 @@ def find_example_config_folder() -> Path:
     )
 
 
-def _require_writable_folder(folder: Path) -> None:
-    """Raise a ValueError if the folder is not writable. No folder is created."""
+def _require_writable_folder(folder: Path, draws_figure: bool = False) -> None:
+    """Raise a ValueError if the folder is not writable, or if figures are to be drawn and the
+    requested matplotlib backend does not exist. No folder is created.
+    """
     existing_parent_folder = folder
     while not existing_parent_folder.exists():
         existing_parent_folder = existing_parent_folder.parent
@@ -297,6 +283,15 @@ def _require_writable_folder(folder: Path) -> None:
             f"nothing can be written to {folder} ({write_error.strerror}): give a place of your "
             "own."
         ) from write_error
+    if not draws_figure:
+        return
+    try:
+        importlib.import_module("vrw_jax.figures")
+    except ValueError as backend_error:
+        raise ValueError(
+            f"MPLBACKEND is {os.environ.get('MPLBACKEND')!r}, which matplotlib doesn't know: unset "
+            "it, or set it to agg."
+        ) from backend_error
 
 
 @app.command("reproduce")
@@ -310,13 +305,9 @@ def run_reproduce_command(
     The command prints the table of facts. It writes figures, and the table with tolerances and
     their reasons. The exit code is 1 if a fact does not hold.
     """
-    from vrw_jax.runtime import start_jax
-
     with report_command_errors():
-        start_jax()
-        _require_enabled_compilation()
-        _require_writable_folder(folder)
-        _require_figure_backend(True)
+        _start_jax_and_load_config(None)
+        _require_writable_folder(folder, draws_figure=True)
     from vrw_jax.paper import reproduce_paper
 
     with (
@@ -394,8 +385,7 @@ def run_scan_command(
         if verify:
             scanning.verify_scan_store(scan_plan, store_path)
             return
-        _require_writable_folder(folder)
-        _require_figure_backend(picture)
+        _require_writable_folder(folder, picture)
     scan_dataset = scanning.compute_scan_with_progress(scan_plan, store_path, dask)
     with report_command_errors(f"stopped; the data are in {store_path}."):
         printing.print_outcome_counts(scan_dataset)
@@ -464,8 +454,7 @@ def run_map_command(
             special_point_map_config, None, SPECIAL_POINT_MEASURES
         )
         require_map_grid(scan_plan.design)
-        _require_writable_folder(folder)
-        _require_figure_backend(True)
+        _require_writable_folder(folder, draws_figure=True)
     scan_dataset = scanning.compute_scan_with_progress(scan_plan, folder / "scan.zarr", None)
 
     with (
@@ -510,8 +499,7 @@ def run_tune_command(
         command_config, folder = _load_config_with_table(config, folder, "tune", "tune")
         tune_config = command_config.tune
         assert tune_config is not None
-        _require_writable_folder(folder)
-        _require_figure_backend(picture)
+        _require_writable_folder(folder, picture)
         from vrw_jax.cli.reports import write_tuning_report
         from vrw_jax.tuning import tune as tune_wheel
 
@@ -557,8 +545,7 @@ def run_continue_command(
         command_config, folder = _load_config_with_table(config, folder, "branch", "branch")
         branch_config = command_config.branch
         assert branch_config is not None
-        _require_writable_folder(folder)
-        _require_figure_backend(picture)
+        _require_writable_folder(folder, picture)
         from vrw_jax.branches import continue_branch
         from vrw_jax.cli.reports import write_branch_report
         from vrw_jax.continuation import ArclengthOptions
@@ -590,38 +577,31 @@ def _start_jax_and_load_config(config_path: Path | None) -> "Config":
     """Start JAX, and return the config in the file `config_path`, or the default config for
     None.
     """
+    import jax
+
     from vrw_jax.runtime import start_jax
 
     start_jax()
-    _require_enabled_compilation()
+    if jax.config.jax_disable_jit:  # type: ignore[attr-defined]
+        # Commands would run for hours.
+        raise ValueError(
+            "JAX_DISABLE_JIT is set, but commands compute with compiled code: unset it."
+        )
     from vrw_jax.cli.config import Config, load_config
 
     return Config() if config_path is None else load_config(config_path)
 
 
-def _require_enabled_compilation() -> None:
-    """Raise a ValueError if compilation is disabled, because commands would then run for hours."""
-    import jax
-
-    if jax.config.jax_disable_jit:  # type: ignore[attr-defined]
-        raise ValueError(
-            "JAX_DISABLE_JIT is set, but commands compute with compiled code: unset it."
-        )
-
-
-def _require_figure_backend(draws_figure: bool) -> None:
-    """Raise a ValueError before any computation if the requested matplotlib backend does not
-    exist.
+def _load_config_and_wheel(
+    config_path: Path | None, changes: list[str] | None
+) -> tuple["Config", "WheelParams"]:
+    """Start JAX, and return a config with its wheel, changed by assignments such as
+    "damping=150".
     """
-    if not draws_figure:
-        return
-    try:
-        importlib.import_module("vrw_jax.figures")
-    except ValueError as backend_error:
-        raise ValueError(
-            f"MPLBACKEND is {os.environ.get('MPLBACKEND')!r}, which matplotlib doesn't know: unset "
-            "it, or set it to agg."
-        ) from backend_error
+    command_config = _start_jax_and_load_config(config_path)
+    from vrw_jax.cli.config import parse_assignment
+
+    return command_config, command_config.make_wheel(dict(map(parse_assignment, changes or [])))
 
 
 MISSING_CONFIG_TABLE_MESSAGES = {
@@ -652,10 +632,7 @@ def _load_config_with_table(
     if command_config.model_name not in supported_models:
         raise ValueError(
             f"{command_config.file_name} names the model {command_config.model_name}, but this "
-            "command takes "
-            f"{', '.join(supported_models)}: write "
+            f"command takes {', '.join(supported_models)}: write "
             f"{'one of these' if len(supported_models) > 1 else 'that'} below [model]."
         )
-    return command_config, Path(
-        "results"
-    ) / config_path.stem if result_folder is None else result_folder
+    return command_config, result_folder or Path("results") / config_path.stem

@@ -58,12 +58,11 @@ def report_command_errors(
             "this asks for more memory than there is: give smaller designs, or fewer at once."
         )
         raise typer.Exit(ExitCode.USER_ERROR) from command_error
-    except (ValueError, OSError) as command_error:
-        print_error_sentence(
-            str(command_error)
-            if isinstance(command_error, ValueError)
-            else _format_system_error(command_error)
-        )
+    except ValueError as command_error:
+        print_error_sentence(str(command_error))
+        raise typer.Exit(ExitCode.USER_ERROR) from command_error
+    except OSError as command_error:
+        print_error_sentence(_format_system_error(command_error))
         raise typer.Exit(ExitCode.USER_ERROR) from command_error
 
 
@@ -75,26 +74,21 @@ def report_stdout_errors() -> Iterator[None]:
     """
     exit_code: Any = 0
     try:
-        yield
-    except SystemExit as system_exit:
-        exit_code = system_exit.code
-    except OSError as output_error:
-        _discard_output_and_exit(output_error)
-    try:
+        try:
+            yield
+        except SystemExit as system_exit:
+            exit_code = system_exit.code
         sys.stdout.flush()
-    except OSError as output_error:
-        _discard_output_and_exit(output_error)
+    except OSError as stdout_error:
+        # Python would still write the rest of the output when it exits.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        # A broken pipe has been closed by its reader on purpose.
+        if not isinstance(stdout_error, BrokenPipeError):
+            print_error_sentence(
+                f"standard output can't be written: {_format_system_error(stdout_error)}"
+            )
+        exit_code = ExitCode.USER_ERROR
     raise SystemExit(exit_code)
-
-
-def _discard_output_and_exit(stdout_error: OSError) -> None:
-    """Discard the output that Python would still write when it exits, and exit with code 2."""
-    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-    if not isinstance(stdout_error, BrokenPipeError):  # The reader has closed the pipe on purpose.
-        print_error_sentence(
-            f"standard output can't be written: {_format_system_error(stdout_error)}"
-        )
-    raise SystemExit(ExitCode.USER_ERROR)
 
 
 def print_error_sentence(error_sentence: str) -> None:
@@ -167,23 +161,23 @@ def print_text_table(
     rich_table = Table(
         title=table_title, title_justify="left", show_header=bool(column_headings), box=None
     )
-    for column_heading in column_headings or ("name", "text"):
+    table_headings = column_headings or ("name", "text")
+    for column_heading in table_headings:
         rich_table.add_column(
-            column_heading, justify="right" if column_heading in right_aligned_headings else "left"
+            column_heading,
+            justify="right" if column_heading in right_aligned_headings else "left",
+            style=None if column_headings or column_heading != "name" else "bold",
         )
-    for table_row_cells in table_rows:
-        encodable_cell_texts = [
-            replace_unencodable_characters(cell_text, stdout_console.encoding)
-            for cell_text in table_row_cells
-        ]
+    for row_cells in table_rows:
         cell_texts = [
-            cell_text if column_heading == "" else escape(cell_text)
-            for column_heading, cell_text in zip(
-                column_headings or ("name", "text"), encodable_cell_texts, strict=True
-            )
+            replace_unencodable_characters(cell_text, stdout_console.encoding)
+            for cell_text in row_cells
         ]
         rich_table.add_row(
-            *(cell_texts if column_headings else (f"[bold]{cell_texts[0]}[/]", *cell_texts[1:]))
+            *(
+                cell_text if column_heading == "" else escape(cell_text)
+                for column_heading, cell_text in zip(table_headings, cell_texts, strict=True)
+            )
         )
     stdout_console.print(rich_table)
 
@@ -219,13 +213,12 @@ def make_progress_bar(task_name: str) -> "Bar":
     from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn
     from rich.progress import Progress as Bar
 
-    progress_bar_columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        *((MofNCompleteColumn(),) if task_name == "scan" else ()),
-        TextColumn("{task.fields[note]}") if task_name == "scan" else TimeElapsedColumn(),
+    last_columns = (
+        (MofNCompleteColumn(), TextColumn("{task.fields[note]}"))
+        if task_name == "scan"
+        else (TimeElapsedColumn(),)
     )
-    return Bar(*progress_bar_columns, console=stderr_console)
+    return Bar(TextColumn("{task.description}"), BarColumn(), *last_columns, console=stderr_console)
 
 
 def make_scan_progress_reporter(
@@ -241,7 +234,7 @@ def make_scan_progress_reporter(
 
     from vrw_jax.scans import format_duration
 
-    first_report_times_and_counts: list[tuple[float, int]] = []
+    times_and_counts: list[tuple[float, int]] = []
 
     def report_progress(scan_progress: "ScanProgress") -> None:
         """Update the progress bar from the progress of the scan."""
@@ -250,8 +243,8 @@ def make_scan_progress_reporter(
             f"{scan_progress.n_reused:,} from an earlier run" if scan_progress.n_reused else ""
         )
         if n_samples_done:
-            first_report_times_and_counts.append((current_seconds, n_samples_done))
-            first_report_seconds, n_samples_at_first_report = first_report_times_and_counts[0]
+            times_and_counts.append((current_seconds, n_samples_done))
+            first_report_seconds, n_samples_at_first_report = times_and_counts[0]
             progress_bar_note = (
                 f"{100 * scan_progress.n_failed / n_samples_done:.0f} % without a gait"
             )
@@ -333,12 +326,9 @@ def print_wheel_and_gait(
         )
         from vrw_jax.measures import MARGIN_MEASURES
 
-        excluded_measure_names = ("outcome", "solver_steps", *MARGIN_MEASURES)
-        shown_measures = {
-            measure_name: measure_value
-            for measure_name, measure_value in step_result.measures().items()
-            if measure_name not in excluded_measure_names
-        }
+        shown_measures = dict(step_result.measures())
+        for measure_name in ("outcome", "solver_steps", *MARGIN_MEASURES):
+            shown_measures.pop(measure_name, None)
         _print_measure_table("Last step", shown_measures)
     else:
         stdout_console.print(
@@ -392,8 +382,7 @@ def _print_limit_cycle(limit_cycle_result: "LimitCycle | ReturnMapCycle") -> Non
     stdout_console.print(
         f"[bold]Limit cycle[/]  {stability_text}: multipliers {multiplier_texts}; period "
         f"{float(limit_cycle_result.period):.5f} s, speed {float(limit_cycle_result.speed):.5f} "
-        "m/s, "
-        f"DLS {100 * float(limit_cycle_result.dls_fraction):.2f} %."
+        f"m/s, DLS {100 * float(limit_cycle_result.dls_fraction):.2f} %."
     )
 
 
@@ -403,19 +392,18 @@ def _print_step_margins(step_result: "StepResult") -> None:
 
     from vrw_jax.measures import MARGIN_MEASURES
 
-    margin_table_rows = []
+    margin_table_rows, n_violated_margins = [], 0
     for margin_name, margin_description in MARGIN_MEASURES.items():
         margin_values = np.atleast_1d(np.asarray(getattr(step_result.margins, margin_name)))
         lowest_margin, margin_label = float(margin_values.min()), margin_description.long_name
-        violation_mark = "[green]holds[/]" if lowest_margin >= 0.0 else "[bold red]broken[/]"
-        if margin_description.leg_dimension and lowest_margin < 0.0:
-            violating_leg_texts = [
-                str(leg_index + 3) for leg_index in np.flatnonzero(margin_values < 0.0)
-            ]
-            margin_label += f" (broken at legs {', '.join(violating_leg_texts)})"
+        is_violated = lowest_margin < 0.0
+        n_violated_margins += is_violated
+        if margin_description.leg_dimension and is_violated:
+            violating_legs = np.flatnonzero(margin_values < 0.0) + 3
+            margin_label += f" (broken at legs {', '.join(map(str, violating_legs))})"
         margin_table_rows.append(
             (
-                violation_mark,
+                "[bold red]broken[/]" if is_violated else "[green]holds[/]",
                 margin_label,
                 margin_description.symbol,
                 f"{lowest_margin:.4g}",
@@ -424,10 +412,7 @@ def _print_step_margins(step_result: "StepResult") -> None:
         )
     column_headings = ("", "margin of", "symbol", "least", "unit")
     print_text_table("Margins of the paper's model", margin_table_rows, column_headings, ("least",))
-    n_margins, n_violated_margins = (
-        len(margin_table_rows),
-        sum("broken[" in violation_mark for violation_mark, *_ in margin_table_rows),
-    )
+    n_margins = len(margin_table_rows)
     stdout_console.print(
         f"{n_margins - n_violated_margins} of {n_margins} margins hold, {n_violated_margins} are "
         "broken. The model walks on regardless: it measures what it does not model."

@@ -19,10 +19,9 @@ from vrw_jax.wheel import PARAMETER_DOMAINS, PARAMETER_NAMES
 
 def write_scan_figures(scan: xr.Dataset, folder: Path) -> list[Path]:
     """Write the figures of a scan into `folder`, and return the paths."""
-    figures_by_name = figures.scan_figures(scan)
     return [
         figure_path
-        for figure_name, figure in figures_by_name.items()
+        for figure_name, figure in figures.scan_figures(scan).items()
         for figure_path in figures.save(figure, folder, figure_name)
     ]
 
@@ -44,16 +43,18 @@ def write_tuning_report(
         unit_comment = f" # {parameter_unit}" if parameter_unit else ""
         toml_lines.append(f"{parameter_name} = {parameter_value!r}{unit_comment}")
     toml_lines += [f"n_legs = {tune_result.params.n_legs}", ""]
-    text_by_file_name = {
-        "wheel.toml": "\n".join(toml_lines),
-        "summary.md": format_tuning_summary(tune_result),
-    }
     written_paths = _write_dataset_and_texts(
-        folder, "path.zarr", tune_result.path, text_by_file_name
+        folder,
+        "path.zarr",
+        tune_result.path,
+        {
+            "wheel.toml": "\n".join(toml_lines),
+            "summary.md": format_tuning_summary(tune_result),
+        },
     )
-    return written_paths + (
-        figures.save(figures.tuning_figure(tune_result), folder, "tuning") if draws_figure else []
-    )
+    if draws_figure:
+        written_paths += figures.save(figures.tuning_figure(tune_result), folder, "tuning")
+    return written_paths
 
 
 def write_branch_report(branch: Branch, folder: Path, draws_figure: bool = True) -> list[Path]:
@@ -73,17 +74,15 @@ def write_branch_report(branch: Branch, folder: Path, draws_figure: bool = True)
                 f"{special_point.point.spectral_radius:.9g}",
             ]
         )
-    text_by_file_name = {
-        "borders.csv": csv_buffer.getvalue(),
-        "summary.md": format_branch_summary(branch),
-    }
     written_paths = _write_dataset_and_texts(
-        folder, "branch.zarr", branch.dataset, text_by_file_name
+        folder,
+        "branch.zarr",
+        branch.dataset,
+        {"borders.csv": csv_buffer.getvalue(), "summary.md": format_branch_summary(branch)},
     )
-    is_figure_drawn = draws_figure and branch.values.size > 0
-    return written_paths + (
-        figures.save(figures.branch_figure(branch), folder, "branch") if is_figure_drawn else []
-    )
+    if draws_figure and branch.values.size:
+        written_paths += figures.save(figures.branch_figure(branch), folder, "branch")
+    return written_paths
 
 
 def write_special_point_map(special_point_map: SpecialPointMap, folder: Path) -> list[Path]:
@@ -93,16 +92,13 @@ def write_special_point_map(special_point_map: SpecialPointMap, folder: Path) ->
     """
     scan_dataset, special_point_curves, _ = special_point_map
     parameter_names = tuple(map(str, scan_dataset.outcome.dims))
-    csv_rows = [
-        [special_point_curve.name, *map("{:.12g}".format, curve_parameter_values)]
-        for special_point_curve in special_point_curves
-        for curve_parameter_values in special_point_curve.values
-    ]
-    csv_text = "\n".join(
-        ",".join(csv_row_cells) for csv_row_cells in [["border", *parameter_names], *csv_rows]
-    )
+    csv_lines = [",".join(("border", *parameter_names))]
+    for special_point_curve in special_point_curves:
+        csv_lines += [
+            f"{special_point_curve.name},{x:.12g},{y:.12g}" for x, y in special_point_curve.values
+        ]
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / "map.csv").write_text(csv_text + "\n", encoding="utf-8")
+    (folder / "map.csv").write_text("\n".join([*csv_lines, ""]), encoding="utf-8")
     (folder / "map.md").write_text(f"{special_point_map}\n", encoding="utf-8")
     measure_name = next(
         variable_name for variable_name in scan_dataset if variable_name in DIFFERENTIABLE_MEASURES
@@ -162,10 +158,8 @@ def format_branch_summary(branch: Branch) -> str:
     summary_lines = [f"# Branch along {branch.parameter}", "", heading_line, ""]
     if not branch.values.size:
         return "\n".join(summary_lines)
-    spectral_radius, dls_fraction = (
-        branch.dataset.spectral_radius.values,
-        branch.dataset.dls_fraction.values,
-    )
+    spectral_radius = branch.dataset.spectral_radius.values
+    dls_fraction = branch.dataset.dls_fraction.values
     special_point_rows = []
     for special_point in branch.special_points:
         special_point_kind = special_point.kind.replace("_", " ")

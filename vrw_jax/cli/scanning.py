@@ -29,9 +29,8 @@ def plan_config_scan(
     assert command_config.design is not None
     measure_names = command_config.scan.measures
     if additional_measures:
-        measure_names = tuple(
-            dict.fromkeys((*(measure_names or ("dls_fraction",)), *additional_measures))
-        )
+        measure_names = measure_names or ("dls_fraction",)
+        measure_names = tuple(dict.fromkeys((*measure_names, *additional_measures)))
     return plan_scan(
         command_config.design,
         measure_names,
@@ -61,10 +60,8 @@ def verify_scan_store(scan_plan: "ScanPlan", store_path: Path) -> None:
             "these again."
         )
         raise typer.Exit(ExitCode.CHECK_FAILED)
-    n_chunks, n_missing_chunks = (
-        scan_plan.result_layout.n_chunks,
-        len(zarr_store.find_missing_chunks()),
-    )
+    n_chunks = scan_plan.result_layout.n_chunks
+    n_missing_chunks = len(zarr_store.find_missing_chunks())
     store_state_text = (
         f"lacks {n_missing_chunks:,} of {n_chunks:,} chunks, the others are"
         if n_missing_chunks
