@@ -63,24 +63,20 @@ def replace_wheel_parameter(
     return dataclasses.replace(params, **value_by_parameter)
 
 
-def walk_into_gait(
-    params: WheelParams,
-    x: SectionState,
-    settling_options: SettlingOptions = DEFAULT_SETTLING_OPTIONS,
-) -> xr.Dataset:
+def walk_into_gait(params: WheelParams, x: SectionState) -> xr.Dataset:
     """Simulate a walk into a gait, and return its section states and their change per step.
 
     The variable `change` of the dataset is the Euclidean distance to the previous section state in
     (rad, rad/s, m/s). `settled` states whether the walk reached a period-1 gait, that is, whether
     each of the last changes is small enough.
     """
+    settling_options = DEFAULT_SETTLING_OPTIONS
     gait_walk = walk(params, x, settling_options.n_steps, model=make_formally_continued_model())
     n_stepped = int(gait_walk.n_stepped)
     section_states = np.concatenate(
         [gait_walk.start[None], gait_walk.steps.section_state[:n_stepped]]
     )
-    section_state_changes = np.full(n_stepped + 1, np.nan)
-    section_state_changes[1:] = np.linalg.norm(np.diff(section_states, axis=0), axis=1)
+    section_state_changes = np.linalg.norm(np.diff(section_states, axis=0), axis=1)
     walk_outcome = Outcome(int(gait_walk.outcome))
     n_settled_steps = settling_options.n_settled_steps
     last_state_change = (
@@ -96,7 +92,7 @@ def walk_into_gait(
             "section_state": (("step", "component"), section_states),
             "change": (
                 "step",
-                section_state_changes,
+                np.append(np.nan, section_state_changes),
                 {"units": "1", "long_name": "change since the step before"},
             ),
         },
@@ -119,24 +115,20 @@ def walk_along_parameter(
     The start of each walk is extrapolated from the last two settled gaits. Walks that fail or do
     not settle are not used for the extrapolation.
     """
-    settled_parameter_values: list[float] = []
-    settled_section_states: list[np.ndarray] = []
+    settled_gaits: list[tuple[float, np.ndarray]] = []
     for parameter_value in parameter_values:
-        start_state = jnp.asarray(settled_section_states[-1]) if settled_section_states else x
-        if len(settled_section_states) > 1:
-            extrapolation_factor = (parameter_value - settled_parameter_values[-1]) / (
-                settled_parameter_values[-1] - settled_parameter_values[-2]
-            )
+        start_state = jnp.asarray(settled_gaits[-1][1]) if settled_gaits else x
+        if len(settled_gaits) > 1:
+            (previous_value, previous_state), (last_value, last_state) = settled_gaits[-2:]
+            extrapolation_factor = (parameter_value - last_value) / (last_value - previous_value)
             start_state = jnp.asarray(
-                settled_section_states[-1]
-                + extrapolation_factor * (settled_section_states[-1] - settled_section_states[-2])
+                last_state + extrapolation_factor * (last_state - previous_state)
             )
         gait_walk = walk_into_gait(
             replace_wheel_parameter(params, parameter_name, parameter_value), start_state
         )
         if gait_walk.settled:
-            settled_parameter_values.append(parameter_value)
-            settled_section_states.append(gait_walk.section_state.values[-1])
+            settled_gaits.append((parameter_value, gait_walk.section_state.values[-1]))
         yield gait_walk
 
 
@@ -154,7 +146,7 @@ def measure_gaits_along_parameter(
 
     - `on_progress`: function that is called with the completed fraction of the work.
     """
-    measures_by_gait: list[dict[str, np.ndarray]] = []
+    measures_by_gait: list[dict[str, Any]] = []
     for parameter_value, gait_walk in zip(
         parameter_values,
         walk_along_parameter(params, parameter_name, parameter_values, x),
@@ -166,54 +158,39 @@ def measure_gaits_along_parameter(
             jnp.asarray(last_section_state),
             model=make_formally_continued_model(),
         )
-        gait_measures = {
-            measure_name: np.asarray(measure_value)
-            for measure_name, measure_value in step_result.measures().items()
-        }
+        gait_measures: dict[str, Any] = dict(step_result.measures())
         if gait_walk.outcome != Outcome.STEPPED.name:
-            gait_measures["outcome"] = np.asarray(int(Outcome[gait_walk.outcome]))
+            gait_measures["outcome"] = int(Outcome[gait_walk.outcome])
         gait_measures["section_state"] = last_section_state
-        gait_measures["change"] = np.asarray(gait_walk.attrs["last_change"])
-        gait_measures["settled"] = np.asarray(bool(gait_walk.settled))
+        gait_measures["change"] = gait_walk.attrs["last_change"]
+        gait_measures["settled"] = bool(gait_walk.settled)
         measures_by_gait.append(gait_measures)
         if on_progress is not None:
             on_progress(len(measures_by_gait) / len(parameter_values))
-    return _make_gait_dataset(
-        params,
-        parameter_name,
-        parameter_values,
-        {
-            measure_name: np.stack([r[measure_name] for r in measures_by_gait])
-            for measure_name in measures_by_gait[0]
-        },
+    stack_measure = lambda measure_name: np.stack(
+        [gait_measures[measure_name] for gait_measures in measures_by_gait]
     )
-
-
-def _make_gait_dataset(
-    params: WheelParams,
-    parameter_name: str,
-    parameter_values: Sequence[float],
-    values_by_measure: dict[str, np.ndarray],
-) -> xr.Dataset:
-    """Return a labeled dataset of measures over a parameter."""
     dataset_variables = make_labeled_variables(
         {
-            measure_name: values_by_measure[measure_name]
+            measure_name: stack_measure(measure_name)
             for measure_name in STEP_MEASURES | MARGIN_MEASURES
         },
         parameter_name,
     )
-    state_change_attributes = {"units": "1", "long_name": "largest change of the last five steps"}
     dataset_variables |= {
         "section_state": xr.Variable(
             (parameter_name, "component"),
-            values_by_measure["section_state"],
+            stack_measure("section_state"),
             {"long_name": "section state"},
         ),
-        "change": xr.Variable(parameter_name, values_by_measure["change"], state_change_attributes),
+        "change": xr.Variable(
+            parameter_name,
+            stack_measure("change"),
+            {"units": "1", "long_name": "largest change of the last five steps"},
+        ),
         "settled": xr.Variable(
             parameter_name,
-            values_by_measure["settled"],
+            stack_measure("settled"),
             {"long_name": "whether the walk settled into a period-1 gait"},
         ),
     }
@@ -228,9 +205,7 @@ def _make_gait_dataset(
     }
     provenance_attributes = collect_provenance_attributes(params, make_formally_continued_model())
     provenance_attributes.pop(f"parameter_{parameter_name}")
-    dataset_attributes = {
-        "title": f"Gaits walked to along {parameter_name}"
-    } | provenance_attributes
-    return xr.Dataset(dataset_variables, dataset_coordinates, dataset_attributes).sortby(
-        parameter_name
-    )
+    dataset_title = {"title": f"Gaits walked to along {parameter_name}"}
+    return xr.Dataset(
+        dataset_variables, dataset_coordinates, dataset_title | provenance_attributes
+    ).sortby(parameter_name)

@@ -10,6 +10,7 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 import xarray as xr
+from jaxtyping import Array
 
 from vrw_jax import figures as plots
 from vrw_jax.paper import facts
@@ -40,13 +41,19 @@ def walk_into_table_1_gait() -> xr.Dataset:
     return walk_into_gait(WheelParams(), paper_start())
 
 
+def find_table_1_section_state() -> Array:
+    """Return the section state of the gait of Table 1 of the paper."""
+    return jnp.asarray(walk_into_table_1_gait().section_state.values[-1])
+
+
 def simulate_table_1_gait(n_steps: int = 3) -> xr.Dataset:
     """Return the trajectory of the gait of Table 1 of the paper, for Figs 6 and 7.
 
     The slope is 0.30 rad.
     """
-    section_state = jnp.asarray(walk_into_table_1_gait().section_state.values[-1])
-    return simulate(WheelParams(), section_state, n_steps, model=make_formally_continued_model())
+    return simulate(
+        WheelParams(), find_table_1_section_state(), n_steps, model=make_formally_continued_model()
+    )
 
 
 def simulate_gaits_at_dampings(dampings: Sequence[float]) -> list[xr.Dataset]:
@@ -55,7 +62,7 @@ def simulate_gaits_at_dampings(dampings: Sequence[float]) -> list[xr.Dataset]:
     The values may be 1 to 219 N s/m. From walk to walk, the damping changes by at most 10 N s/m,
     beginning at that of Table 1 of the paper.
     """
-    start_state = jnp.asarray(walk_into_table_1_gait().section_state.values[-1])
+    start_state = find_table_1_section_state()
     table_1_wheel, gait_trajectories = WheelParams(), []
     for damping in dampings:
         start_damping = float(table_1_wheel.damping)
@@ -83,20 +90,14 @@ def measure_gaits_along_damping(on_progress: Callable[[float], None] | None = No
 
     The dataset also contains the walks for c up to 224 N s/m.
     """
-    params = WheelParams()
-    start_state = jnp.asarray(walk_into_table_1_gait().section_state.values[-1])
-    gaits_below_table_1_damping = measure_gaits_along_parameter(
-        params, "damping", range(200, 0, -1), start_state, on_progress
-    )
-    gaits_above_table_1_damping = measure_gaits_along_parameter(
-        params, "damping", range(201, 225), start_state
-    )
-    return xr.concat(
-        [gaits_below_table_1_damping, gaits_above_table_1_damping],
-        "damping",
-        data_vars="minimal",
-        combine_attrs="override",
-    )
+    params, start_state = WheelParams(), find_table_1_section_state()
+    gaits_on_each_side = [
+        measure_gaits_along_parameter(
+            params, "damping", range(200, 0, -1), start_state, on_progress
+        ),
+        measure_gaits_along_parameter(params, "damping", range(201, 225), start_state),
+    ]
+    return xr.concat(gaits_on_each_side, "damping", data_vars="minimal", combine_attrs="override")
 
 
 def collect_paper_evidence(
@@ -117,10 +118,8 @@ def collect_paper_evidence(
     on_progress(0.65, "gaits at slope 0.10")
     start_state = jnp.asarray(damping_branch.section_state.sel(damping=100.0).values)
     slope_values = [0.01 * i for i in range(30, 9, -1)]
-    medium_damping_wheel, gentle_slope_wheel = (
-        replace_wheel_parameter(table_1_wheel, "damping", 100.0),
-        replace_wheel_parameter(table_1_wheel, "slope", 0.10),
-    )
+    medium_damping_wheel = replace_wheel_parameter(table_1_wheel, "damping", 100.0)
+    gentle_slope_wheel = replace_wheel_parameter(table_1_wheel, "slope", 0.10)
     slope_branch = measure_gaits_along_parameter(
         medium_damping_wheel, "slope", slope_values, start_state
     )

@@ -4,7 +4,7 @@ The equations use the paper's five coordinates q = (x, z, theta, L1, L2). The si
 only the mass matrix and the momentum.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -22,15 +22,19 @@ from vrw_jax.wheel import (
 )
 
 
-@jax.jit
-def _compute_symbols_and_touchdown_length(
-    params: WheelParams, theta: float
-) -> tuple[Symbols, Array]:
-    """Return the parameters by their symbols in the paper, and the length of Leg 1 at touchdown,
-    m.
+def _compute_symbols_and_touchdown_length(params: WheelParams, theta: float) -> tuple[Any, float]:
+    """Return the parameters by their symbols in the paper, and the length of Leg 1 at touchdown, m.
+
+    All numbers are Python floats.
     """
-    s = params.symbols()
-    return s, compute_length_at_touchdown(s, jnp.asarray(theta))
+    compute_symbols_and_length = jax.jit(
+        lambda params, theta: (
+            params.symbols(),
+            compute_length_at_touchdown(params.symbols(), theta),
+        )
+    )
+    symbols, touchdown_length = jax.tree.map(float, compute_symbols_and_length(params, theta))
+    return symbols, touchdown_length
 
 
 def compute_double_support_jacobian(
@@ -42,23 +46,17 @@ def compute_double_support_jacobian(
 
     - `is_as_printed`: whether the entry J43 has the printed sign.
     """
-    zero_column, one_column = np.zeros_like(theta), np.ones_like(theta)
     fore_sine, fore_cosine = np.sin(theta), np.cos(theta)
     rear_sine, rear_cosine = np.sin(theta + alpha), np.cos(theta + alpha)
     printed_entry_sign = -1.0 if is_as_printed else 1.0
-    jacobian_rows = (
-        (one_column, zero_column, zero_column, zero_column, zero_column),
-        (zero_column, one_column, zero_column, zero_column, zero_column),
-        (one_column, zero_column, L1 * fore_cosine - L2 * rear_cosine, fore_sine, -rear_sine),
-        (
-            zero_column,
-            one_column,
-            -L1 * fore_sine + printed_entry_sign * L2 * rear_sine,
-            fore_cosine,
-            -rear_cosine,
-        ),
+    J43 = -L1 * fore_sine + printed_entry_sign * L2 * rear_sine
+    jacobian = np.zeros((*np.shape(theta), 4, 5))
+    jacobian[..., :2, :2] = jacobian[..., 2:, :2] = np.eye(2)
+    jacobian[..., 2, 2:] = np.stack(
+        [L1 * fore_cosine - L2 * rear_cosine, fore_sine, -rear_sine], axis=-1
     )
-    return np.stack([np.stack(jacobian_row, axis=-1) for jacobian_row in jacobian_rows], axis=-2)
+    jacobian[..., 3, 2:] = np.stack([J43, fore_cosine, -rear_cosine], axis=-1)
+    return jacobian
 
 
 def compute_constraint_violation(walk_trajectory: xr.Dataset, is_as_printed: bool) -> float:
@@ -67,18 +65,11 @@ def compute_constraint_violation(walk_trajectory: xr.Dataset, is_as_printed: boo
     The speed is J q' of eq. (2) of the paper, evaluated for all samples of a walk.
     """
     double_support = walk_trajectory.isel(time=walk_trajectory.phase.values == 0)
+    theta, L1, L2 = (double_support[name].values for name in ("theta", "L1", "L2"))
     alpha = 2.0 * np.pi / walk_trajectory.attrs["parameter_n_legs"]
-    J = compute_double_support_jacobian(
-        double_support.theta.values,
-        double_support.L1.values,
-        double_support.L2.values,
-        alpha,
-        is_as_printed,
-    )
-    coordinate_rates = np.stack(
-        [double_support[rate_name].values for rate_name in ("dx", "dz", "dtheta", "dL1", "dL2")],
-        axis=-1,
-    )
+    J = compute_double_support_jacobian(theta, L1, L2, alpha, is_as_printed)
+    rate_names = ("dx", "dz", "dtheta", "dL1", "dL2")
+    coordinate_rates = np.stack([double_support[name].values for name in rate_names], axis=-1)
     return float(np.abs(np.einsum("tij,tj->ti", J, coordinate_rates)).max())
 
 
@@ -95,41 +86,24 @@ class PrintedLandingResult(NamedTuple):
 
 def compute_printed_landing(params: WheelParams, section_state: np.ndarray) -> PrintedLandingResult:
     """Compute collision I in five coordinates from the section state (theta-, dtheta-, dL1-)."""
-    touchdown_angle, touchdown_rate, dL1 = (float(v) for v in section_state)
-    s, touchdown_length = jax.tree.map(
-        float, _compute_symbols_and_touchdown_length(params, touchdown_angle)
-    )
+    touchdown_angle, touchdown_rate, dL1 = section_state
+    s, touchdown_length = _compute_symbols_and_touchdown_length(params, touchdown_angle)
     foot_velocity = compute_landing_foot_velocity(params, section_state, leg_1_rate=dL1)
     coordinate_rates_before = np.array([*foot_velocity, touchdown_rate, 0.0, dL1])
-    theta_after_landing = np.asarray(touchdown_angle - s.alpha)
-    coordinates_after_landing = (
-        theta_after_landing,
-        np.asarray(s.L0),
-        np.asarray(touchdown_length),
-    )
-    J = compute_double_support_jacobian(
-        *coordinates_after_landing, float(s.alpha), is_as_printed=False
-    )
-    M = np.asarray(
-        compute_five_coordinate_mass_matrix(
-            s, jnp.asarray(theta_after_landing), s.L0, jnp.asarray(touchdown_length)
-        )
-    )
+    theta, L1, L2 = map(np.asarray, (touchdown_angle - s.alpha, s.L0, touchdown_length))
+    J = compute_double_support_jacobian(theta, L1, L2, s.alpha, is_as_printed=False)
+    M = np.asarray(compute_five_coordinate_mass_matrix(s, *map(jnp.asarray, (theta, L1, L2))))
     inverse_mass_matrix = np.linalg.inv(M)
     X = J @ inverse_mass_matrix @ J.T
     velocity_projector = np.eye(5) - inverse_mass_matrix @ J.T @ np.linalg.solve(X, J)
-    coordinate_rates_after, landing_impulse = (
-        velocity_projector @ coordinate_rates_before,
-        -np.linalg.solve(X, J @ coordinate_rates_before),
-    )
-    momentum_residual = float(
-        np.abs(M @ (coordinate_rates_after - coordinate_rates_before) - J.T @ landing_impulse).max()
-    )
+    coordinate_rates_after = velocity_projector @ coordinate_rates_before
+    landing_impulse = -np.linalg.solve(X, J @ coordinate_rates_before)
+    momentum_error = M @ (coordinate_rates_after - coordinate_rates_before) - J.T @ landing_impulse
     return PrintedLandingResult(
         coordinate_rates_after,
         landing_impulse,
         velocity_projector @ coordinate_rates_before,
-        momentum_residual,
+        float(np.abs(momentum_error).max()),
     )
 
 
@@ -141,20 +115,16 @@ def compute_five_coordinate_mass_matrix(s: Symbols, theta: Array, L1: Array, L2:
     """
     planted_mass_matrix = compute_mass_matrix(s, L1, L2)
     unit_vectors = jnp.eye(3)
-    internal_mass_block = jnp.stack(
+    internal_mass_block = jnp.array(
+        [planted_mass_matrix.multiply_vector(tuple(unit_vector)) for unit_vector in unit_vectors]
+    )
+    foot_momentum = jnp.array(
         [
-            jnp.stack(planted_mass_matrix.multiply_vector(tuple(unit_vector)))
+            compute_momentum(s, Motion.from_angle(theta, L1, L2, *unit_vector))
             for unit_vector in unit_vectors
         ]
     )
-    foot_momentum = jnp.stack(
-        [
-            jnp.stack(compute_momentum(s, Motion.from_angle(theta, L1, L2, *unit_vector)))
-            for unit_vector in unit_vectors
-        ],
-        axis=-1,
-    )
-    return jnp.block([[s.Mt * jnp.eye(2), foot_momentum], [foot_momentum.T, internal_mass_block]])
+    return jnp.block([[s.Mt * jnp.eye(2), foot_momentum.T], [foot_momentum, internal_mass_block]])
 
 
 def compute_landing_foot_velocity(
@@ -164,11 +134,9 @@ def compute_landing_foot_velocity(
 
     - `leg_1_rate`: time derivative of L1 in these equations, m/s.
     """
-    touchdown_angle, touchdown_rate, _ = (float(v) for v in section_state)
-    s, touchdown_length = jax.tree.map(
-        float, _compute_symbols_and_touchdown_length(params, touchdown_angle)
-    )
-    L0, alpha = float(s.L0), float(s.alpha)
+    touchdown_angle, touchdown_rate, _ = section_state
+    s, touchdown_length = _compute_symbols_and_touchdown_length(params, touchdown_angle)
+    L0, alpha = s.L0, s.alpha
     x = (
         touchdown_length * np.cos(touchdown_angle) - L0 * np.cos(alpha - touchdown_angle)
     ) * touchdown_rate + leg_1_rate * np.sin(touchdown_angle)
@@ -186,16 +154,14 @@ def differentiate_landing_foot_position(
     The result is accurate to 1e-11 m/s.
     """
     h = 1e-6  # The step is in s; the error is proportional to its square.
-    touchdown_angle, touchdown_rate, dL1 = (float(v) for v in section_state)
-    s, touchdown_length = jax.tree.map(
-        float, _compute_symbols_and_touchdown_length(params, touchdown_angle)
-    )
+    touchdown_angle, touchdown_rate, dL1 = section_state
+    s, touchdown_length = _compute_symbols_and_touchdown_length(params, touchdown_angle)
 
     def compute_foot_position(t: float) -> np.ndarray:
         """Return the position (x, z) of the landing foot, m, at the time t, s."""
         wheel_angle, leg_length = touchdown_angle + touchdown_rate * t, touchdown_length + dL1 * t
         hub_position = leg_length * np.array([np.sin(wheel_angle), np.cos(wheel_angle)])
-        landing_angle = wheel_angle - float(s.alpha)
-        return hub_position - float(s.L0) * np.array([np.sin(landing_angle), np.cos(landing_angle)])
+        landing_angle = wheel_angle - s.alpha
+        return hub_position - s.L0 * np.array([np.sin(landing_angle), np.cos(landing_angle)])
 
     return (compute_foot_position(h) - compute_foot_position(-h)) / (2.0 * h)
