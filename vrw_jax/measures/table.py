@@ -429,16 +429,13 @@ def make_labeled_variables(
 
     Measures with one value per leg also have the dimension `leg`.
     """
-    dimension_selector = lambda variable_name: (
-        (row_dimension, MEASURES[variable_name].leg_dimension)
-        if MEASURES[variable_name].leg_dimension
-        else row_dimension
-    )
     return {
         variable_name: xr.Variable(
-            dimension_selector(variable_name), x, make_measure_attributes(variable_name)
+            (row_dimension, "leg") if MEASURES[variable_name].leg_dimension else row_dimension,
+            column_values,
+            make_measure_attributes(variable_name),
         )
-        for variable_name, x in column_by_variable_name.items()
+        for variable_name, column_values in column_by_variable_name.items()
     }
 
 
@@ -454,18 +451,16 @@ def describe_violation(margin_name: str) -> str:
     The name of the margin may end with a leg label, such as "[5]".
     """
     name_without_leg, _, leg_suffix = margin_name.partition("[")
-    if name_without_leg in STEP_MEASURES and not MEASURES[name_without_leg].violation_text:
-        return f"{MEASURES[name_without_leg].long_name} is zero"
-    if name_without_leg not in MEASURES or not MEASURES[name_without_leg].violation_text:
-        return margin_name.replace("_", " ")
-    symbol_text = (
-        f"{MEASURES[name_without_leg].symbol} = 0: " if name_without_leg in STEP_MEASURES else ""
-    )
-    return (
-        symbol_text
-        + MEASURES[name_without_leg].violation_text
-        + (f", leg {leg_suffix[:-1]}" if leg_suffix else "")
-    )
+    measure, is_step_measure = MEASURES.get(name_without_leg), name_without_leg in STEP_MEASURES
+    if measure is None or not measure.violation_text:
+        return (
+            f"{measure.long_name} is zero"
+            if measure is not None and is_step_measure
+            else margin_name.replace("_", " ")
+        )
+    symbol_text = f"{measure.symbol} = 0: " if is_step_measure else ""
+    leg_text = f", leg {leg_suffix[:-1]}" if leg_suffix else ""
+    return symbol_text + measure.violation_text + leg_text
 
 
 def make_measure_attributes(variable_name: str) -> dict[str, object]:

@@ -54,10 +54,8 @@ class AbstractPrintable(eqx.Module):
 
 def format_quantity(quantity_value: object, quantity_unit: str) -> str:
     """Return a number with its unit as text. An array is described by its size and its range."""
-    quantity_values, quantity_unit = (
-        np.asarray(quantity_value),
-        "" if quantity_unit == "1" else quantity_unit,
-    )
+    quantity_values = np.asarray(quantity_value)
+    quantity_unit = "" if quantity_unit == "1" else quantity_unit
     if quantity_values.ndim == 0:
         return f"{float(quantity_values):.6g} {quantity_unit}".strip()
     value_range_text = (
@@ -72,13 +70,13 @@ def format_outcome_counts(outcomes: Any, status_code_class: type[enum.IntEnum]) 
     """Return a text with the shape of an array of outcomes, and the number of times that each
     outcome occurs in it.
     """
-    n_outcomes, outcome_array_shape = np.size(outcomes), np.shape(outcomes)
-    outcome_codes, outcome_counts = np.unique(np.asarray(outcomes), return_counts=True)
     outcome_count_texts = (
         f"{outcome_count:,} {status_code_class(int(status_code)).name}"
-        for status_code, outcome_count in zip(outcome_codes, outcome_counts, strict=True)
+        for status_code, outcome_count in zip(
+            *np.unique(np.asarray(outcomes), return_counts=True), strict=True
+        )
     )
-    return f"{n_outcomes:,} in shape {outcome_array_shape}: {', '.join(outcome_count_texts)}"
+    return f"{np.size(outcomes):,} in shape {np.shape(outcomes)}: {', '.join(outcome_count_texts)}"
 
 
 def format_each_batch_element(format_batch_element: Callable[..., str], *batch_values: Any) -> Any:
@@ -100,17 +98,15 @@ def format_html_table(
     format_table_cell = lambda cell_tag, cell_text: (
         f"<{cell_tag} style='text-align:left'>{escape(cell_text)}</{cell_tag}>"
     )
-    html_row_lines = (
-        ["".join(format_table_cell("th", cell_text) for cell_text in header_cells)]
-        if header_cells
-        else []
-    )
-    html_row_lines += [
-        format_table_cell("th", row_label)
-        + "".join(format_table_cell("td", cell_text) for cell_text in row_cells)
-        for row_label, *row_cells in text_rows
+    cells_by_row = [[format_table_cell("th", cell_text) for cell_text in header_cells]]
+    cells_by_row += [
+        [
+            format_table_cell("td" if column_index else "th", cell_text)
+            for column_index, cell_text in enumerate(row_cells)
+        ]
+        for row_cells in text_rows
     ]
-    html_rows = "".join(f"<tr>{html_row_line}</tr>" for html_row_line in html_row_lines)
+    html_rows = "".join(f"<tr>{''.join(row_cells)}</tr>" for row_cells in cells_by_row if row_cells)
     return f"<table><caption>{escape(table_title)}</caption>{html_rows}</table>"
 
 

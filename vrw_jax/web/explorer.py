@@ -1,10 +1,11 @@
 """Access to the page docs/wheel.html: its address, and a notebook widget that shows it."""
 
 import functools
-import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlencode
+
+import numpy as np
 
 from vrw_jax.selection import list_model_config_names
 from vrw_jax.validation import (
@@ -83,18 +84,15 @@ def make_page_address(params: WheelParams, model_name: str = PAGE_MODEL_NAMES[0]
 
     The address contains the parameters of the wheel that differ from their default values.
     """
-    default_input_values = _make_page_values(WheelParams(), 1.0, PAGE_MODEL_NAMES[0])
-    page_input_values = _make_page_values(
-        params, 1.0, check_choice("model_name", model_name, PAGE_MODEL_NAMES)
-    )
-    changed_input_values = {
-        page_input_name: page_input_value
-        for page_input_name, page_input_value in page_input_values.items()
-        if page_input_value != default_input_values[page_input_name]
+    check_choice("model_name", model_name, PAGE_MODEL_NAMES)
+    default_values = _make_page_values(WheelParams(), 1.0, PAGE_MODEL_NAMES[0])
+    changed_values = {
+        input_name: input_value
+        for input_name, input_value in _make_page_values(params, 1.0, model_name).items()
+        if input_value != default_values[input_name]
     }
-    return find_wheel_page().as_uri() + (
-        f"#{urlencode(changed_input_values)}" if changed_input_values else ""
-    )
+    page_fragment = f"#{urlencode(changed_values)}" if changed_values else ""
+    return find_wheel_page().as_uri() + page_fragment
 
 
 @with_renamed_arguments(rung="model_name")
@@ -138,7 +136,6 @@ def explore(
     check_type("params", params, WheelParams, "write vrw.WheelParams(damping=..., slope=...)")
     require_untraced_arguments("vrw.explore", "it shows one known wheel", params)
     params.require_single_wheel("show one after the other")
-    page_map = {} if dataset is None else _make_page_map(dataset)
     return _make_widget_class()(
         page=find_wheel_page().read_text(encoding="utf-8"),
         values=_make_page_values(
@@ -146,7 +143,7 @@ def explore(
             require_known_friction(friction),
             check_choice("model_name", model_name, PAGE_MODEL_NAMES),
         ),
-        map=page_map,
+        map={} if dataset is None else _make_page_map(dataset),
         height=check_int("height", height),
     )
 
@@ -198,10 +195,8 @@ def _make_widget_class() -> type:
 
         @friction.setter
         def friction(self, friction_coefficient: float) -> None:
-            self.values = {
-                **self.values,
-                FRICTION_NAME: require_known_friction(friction_coefficient),
-            }
+            checked_friction = require_known_friction(friction_coefficient)
+            self.values = self.values | {FRICTION_NAME: checked_friction}
 
         @property
         def model_name(self) -> str:
@@ -210,10 +205,8 @@ def _make_widget_class() -> type:
 
         @model_name.setter
         def model_name(self, value: str) -> None:
-            self.values = {
-                **self.values,
-                "rung": check_choice("model_name", value, PAGE_MODEL_NAMES),
-            }
+            checked_name = check_choice("model_name", value, PAGE_MODEL_NAMES)
+            self.values = self.values | {"rung": checked_name}
 
     return Explorer
 
@@ -253,36 +246,24 @@ def _make_page_map(dataset: "xr.Dataset") -> dict[str, Any]:
             f"the dataset has the axes {', '.join(map(str, dataset.sizes))}, but a map has two "
             "parameters: give a scan of vrw.grid over two of them."
         )
-    measure_values = dataset.isel(
-        {
-            dimension_name: 0
-            for dimension_name in dataset.sizes
-            if dimension_name in PARAMETER_DOMAINS and dimension_name not in map_axis_names
-        }
-    )
+    single_values = {
+        dimension_name: 0
+        for dimension_name in dataset.sizes
+        if dimension_name in PARAMETER_DOMAINS and dimension_name not in map_axis_names
+    }
+    map_dataset = dataset.isel(single_values).transpose(*map_axis_names[::-1], ...)
     map_measures: dict[str, Any] = {}
-    for variable_name, measure_array in measure_values.data_vars.items():
-        dimensions_over_legs = [
-            dimension_name
-            for dimension_name in measure_array.dims
-            if dimension_name not in map_axis_names
-        ]
+    for variable_name, measure_array in map_dataset.data_vars.items():
         if measure_array.dtype.kind == "f" and set(map_axis_names) <= set(measure_array.dims):
-            min_values_over_legs = (
-                measure_array.min(dimensions_over_legs).transpose(*map_axis_names[::-1]).values
-            )
-            map_measures[str(variable_name)] = [
-                [
-                    float(measure_value) if math.isfinite(measure_value) else None
-                    for measure_value in map_row_values
-                ]
-                for map_row_values in min_values_over_legs.tolist()
-            ]
+            min_values_over_legs = measure_array.min(measure_array.dims[2:]).values
+            map_measures[str(variable_name)] = np.where(
+                np.isfinite(min_values_over_legs), min_values_over_legs, np.array(None)
+            ).tolist()
     return {
         "axes": [
-            {"name": map_axis_name, "values": measure_values[map_axis_name].values.tolist()}
+            {"name": map_axis_name, "values": dataset[map_axis_name].values.tolist()}
             for map_axis_name in map_axis_names
         ],
         "measures": map_measures,
-        "outcome": measure_values["outcome"].transpose(*map_axis_names[::-1]).values.tolist(),
+        "outcome": map_dataset["outcome"].values.tolist(),
     }
