@@ -9,6 +9,7 @@ import math
 import tomllib
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, fields
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -135,7 +136,15 @@ class GaitConfig:
         """Read the settings of the table `[gait]`."""
         return cls(
             **_parse_settings(
-                config_table, "[gait]", steps=_parse_whole_number, start=_parse_section_state
+                config_table,
+                "[gait]",
+                steps=_parse_whole_number,
+                start=partial(
+                    _parse_numbers,
+                    length=3,
+                    requirement_text="the section state before touchdown, three numbers: angle in "
+                    "rad, angular rate in rad/s, rate of Leg 1 in m/s",
+                ),
             )
         )
 
@@ -163,9 +172,22 @@ class TuneConfig:
             **_parse_settings(
                 {"bounds": {}, **config_table},
                 "[tune]",
-                objective=_parse_objective,
+                objective=lambda setting_name, value: (
+                    value
+                    if isinstance(value, str)
+                    else _parse_numbers_by_name(
+                        setting_name,
+                        value,
+                        "a measure or weights of several: write objective = "
+                        '"dls_fraction" or objective = { dls_fraction = 1.0, speed = 0.1 }',
+                    )
+                ),
                 bounds=_parse_free_parameters,
-                constraints=_parse_constraints,
+                constraints=partial(
+                    _parse_numbers_by_name,
+                    requirement_text="a table: write [tune.constraints] and below it lines such "
+                    "as clearance_sls1 = 0.001",
+                ),
                 evaluations=_parse_whole_number,
             )
         )
@@ -529,12 +551,13 @@ def _parse_value_list(
     parameter_name: str, config_value_list: object, alternative_text: str = ""
 ) -> np.ndarray:
     """Return an array of numbers from a list. They must lie in the domain of the parameter."""
-    if not isinstance(config_value_list, list):
-        raise _make_value_error(
-            parameter_name, config_value_list, f"a list of numbers{alternative_text}"
-        )
     return np.asarray(
-        [_parse_parameter_value(parameter_name, config_value) for config_value in config_value_list]
+        _parse_numbers(
+            parameter_name,
+            config_value_list,
+            f"a list of numbers{alternative_text}",
+            parse_number=_parse_parameter_value,
+        )
     )
 
 
@@ -545,13 +568,12 @@ def _parse_parameter_range(
 
     The default of `parameter_name` is `range_name`.
     """
-    if not (isinstance(config_range, list) and len(config_range) == 2):
-        raise _make_value_error(
-            range_name, config_range, f"a range of two numbers: write {range_name} = [lower, upper]"
-        )
-    lower_bound, upper_bound = (
-        _parse_parameter_value(parameter_name or range_name, bound_value)
-        for bound_value in config_range
+    lower_bound, upper_bound = _parse_numbers(
+        range_name,
+        config_range,
+        f"a range of two numbers: write {range_name} = [lower, upper]",
+        2,
+        lambda _, bound_value: _parse_parameter_value(parameter_name or range_name, bound_value),
     )
     return lower_bound, upper_bound
 
@@ -578,36 +600,6 @@ def _parse_names(setting_name: str, config_value: object) -> tuple[str, ...]:
     return tuple(config_value)
 
 
-def _parse_section_state(setting_name: str, config_value: object) -> tuple[float, ...]:
-    """Return a list of three numbers as a tuple. Raise a ValueError if it is not such a list."""
-    if not (isinstance(config_value, list) and len(config_value) == 3):
-        requirement_text = (
-            "the section state before touchdown, three numbers: angle in rad, angular rate in "
-            "rad/s, rate of Leg 1 in m/s"
-        )
-        raise _make_value_error(setting_name, config_value, requirement_text)
-    return tuple(_parse_finite_number(setting_name, component) for component in config_value)
-
-
-def _parse_objective(setting_name: str, config_value: object) -> str | dict[str, float]:
-    """Return the name of a measure, or weights of measures. Raise a ValueError for other values."""
-    if isinstance(config_value, str):
-        return config_value
-    requirement_text = (
-        'a measure or weights of several: write objective = "dls_fraction" or objective = '
-        "{ dls_fraction = 1.0, speed = 0.1 }"
-    )
-    return _parse_numbers_by_name(setting_name, config_value, requirement_text)
-
-
-def _parse_constraints(setting_name: str, config_value: object) -> dict[str, float]:
-    """Return the smallest allowed value of each measure in a table, by name."""
-    requirement_text = (
-        "a table: write [tune.constraints] and below it lines such as clearance_sls1 = 0.001"
-    )
-    return _parse_numbers_by_name(setting_name, config_value, requirement_text)
-
-
 def _parse_numbers_by_name(
     setting_name: str, config_value: object, requirement_text: str
 ) -> dict[str, float]:
@@ -631,6 +623,20 @@ def _parse_free_parameters(
         parameter_name: _parse_parameter_range(parameter_name, parameter_bounds)
         for parameter_name, parameter_bounds in config_value.items()
     }
+
+
+def _parse_numbers(
+    setting_name: str,
+    config_value: object,
+    requirement_text: str,
+    length: int | None = None,
+    parse_number: Callable[[str, Any], float] | None = None,
+) -> tuple[float, ...]:
+    """Return a list of numbers as a tuple. Raise a ValueError if it is no list of that length."""
+    if not isinstance(config_value, list) or length not in (None, len(config_value)):
+        raise _make_value_error(setting_name, config_value, requirement_text)
+    parse_number = parse_number or _parse_finite_number
+    return tuple(parse_number(setting_name, number) for number in config_value)
 
 
 def _parse_positive_number(setting_name: str, config_value: object) -> float:

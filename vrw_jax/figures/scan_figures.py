@@ -2,7 +2,6 @@
 0.
 """
 
-import itertools
 import textwrap
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -166,59 +165,42 @@ def draw_scan_slices(
         len(panel_measures) + 1, n_panel_columns, sharex=True, sharey=True, squeeze=False
     )
     outcome_codes_by_panel = np.stack(
-        list(map(_compute_displayed_outcome_codes, panel_column_datasets))
+        [_compute_displayed_outcome_codes(dataset) for dataset in panel_column_datasets]
     )
-    for axes_of_panel_row, measure_name in zip(panel_axes, panel_measures, strict=False):
-        measure_values_by_panel = np.stack(
-            [panel_column_dataset[measure_name] for panel_column_dataset in panel_column_datasets]
-        )
+    outcome_codes = np.unique(outcome_codes_by_panel)
+    cell_edges = _find_cell_edges(scan[x].values), _find_cell_edges(scan[y].values)
+    for axes_of_row, measure_name in zip(panel_axes, panel_measures, strict=False):
+        measure_values = np.stack([dataset[measure_name] for dataset in panel_column_datasets])
         color_scale = _make_color_scale(
-            measure_name, measure_values_by_panel, outcome_codes_by_panel == Outcome.STEPPED
+            measure_name, measure_values, outcome_codes_by_panel == Outcome.STEPPED
         )
-        for axes, panel_column_dataset in zip(
-            axes_of_panel_row, panel_column_datasets, strict=True
-        ):
+        for axes, values_of_panel in zip(axes_of_row, measure_values, strict=True):
             axes.set_facecolor(LIGHT_GRAY_COLOR)
             cell_mesh = axes.pcolormesh(
-                _find_cell_edges(panel_column_dataset[x].values),
-                _find_cell_edges(panel_column_dataset[y].values),
-                panel_column_dataset[measure_name].values,
-                cmap="viridis",
-                norm=color_scale,
-                rasterized=True,
+                *cell_edges, values_of_panel, cmap="viridis", norm=color_scale, rasterized=True
             )
         _add_color_bar(
             figure,
-            axes_of_panel_row.tolist(),
+            axes_of_row.tolist(),
             cell_mesh,
-            measure_values_by_panel,
+            measure_values,
             textwrap.fill(format_axis_label(measure_name, "{name}"), 24),
             aspect=12,
             pad=0.01,
         )
-    outcome_codes = np.unique(outcome_codes_by_panel)
-    for axes, panel_column_dataset, outcome_codes_of_panel in zip(
-        panel_axes[-1], panel_column_datasets, outcome_codes_by_panel, strict=True
+    legend_lines: dict[str, Line2D] = {}
+    for axes_of_column, dataset, codes_of_panel in zip(
+        panel_axes.T, panel_column_datasets, outcome_codes_by_panel, strict=True
     ):
-        draw_outcome_cells(
-            axes,
-            _find_cell_edges(panel_column_dataset[x].values),
-            _find_cell_edges(panel_column_dataset[y].values),
-            outcome_codes_of_panel,
-            outcome_codes,
-        )
-        axes.set_xlabel(
+        draw_outcome_cells(axes_of_column[-1], *cell_edges, codes_of_panel, outcome_codes)
+        for axes in axes_of_column:
+            legend_lines |= _draw_margin_zero_lines(axes, dataset, x, y)
+        if panel_column_parameter is not None:
+            panel_value = dataset[panel_column_parameter].item()
+            axes_of_column[0].set_title(format_value_label(panel_column_parameter, panel_value))
+        axes_of_column[-1].set_xlabel(
             format_axis_label(x, "{name} {symbol}" if n_panel_columns < 3 else "{symbol}")
         )
-    legend_lines: dict[str, Line2D] = {}
-    for axes, panel_column_dataset in zip(
-        panel_axes.flat, itertools.cycle(panel_column_datasets), strict=False
-    ):
-        legend_lines |= _draw_margin_zero_lines(axes, panel_column_dataset, x, y)
-    if panel_column_parameter is not None:
-        for axes, panel_column_dataset in zip(panel_axes[0], panel_column_datasets, strict=True):
-            panel_value = panel_column_dataset[panel_column_parameter].item()
-            axes.set_title(format_value_label(panel_column_parameter, panel_value))
     for axes in panel_axes[:, 0]:
         axes.set_ylabel(format_axis_label(y, "{symbol}"))
     _add_scan_legend(figure, outcome_codes, legend_lines, n_panel_columns)

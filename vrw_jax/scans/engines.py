@@ -7,6 +7,7 @@ model, all samples are first evaluated with the paper's model. Samples that viol
 then evaluated with unilateral contact.
 """
 
+import contextlib
 import dataclasses
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -328,50 +329,32 @@ class PassageScanEngine:
         """
         sample_results: ValuesByVariable = dict(self._gait_engine(samples_by_parameter))
         gait_outcomes = sample_results["outcome"]
-        passage_measures = np.full(
-            (len(self._passage_measure_names), len(gait_outcomes)),
-            np.nan,
-            self._base_wheel.damping.dtype,
-        )
-        for sample_index in (
-            np.flatnonzero(gait_outcomes == Outcome.STEPPED) if self._passage_measure_names else ()
-        ):
-            swept_parameter_values = {
-                parameter_name: float(parameter_samples[sample_index])
-                for parameter_name, parameter_samples in samples_by_parameter.items()
-            }
-            passage_measures[:, sample_index] = self._measure_sample_passage(swept_parameter_values)
-        return sample_results | dict(
-            zip(self._passage_measure_names, passage_measures, strict=True)
-        )
-
-    def _measure_sample_passage(self, swept_parameter_values: Mapping[str, float]) -> list[float]:
-        """Return the first-passage measures of one sample.
-
-        The measures are NaN if hardly any step of the walks succeeds.
-
-        - `swept_parameter_values`: value of each swept parameter for the sample.
-        """
-        wheel_model, params = self._wheel_model, self._base_wheel
-        for parameter_name, parameter_value in swept_parameter_values.items():
-            wheel_model, params = wheel_model.with_parameter(
-                params, parameter_name, jnp.asarray(parameter_value)
-            )
-        try:
-            # mypy takes the name for the module `robustness.first_passage`.
-            passage_result = first_passage(
-                params, self._slope_standard_deviation, model=wheel_model
-            )  # type: ignore[operator]
-        except ValueError:
-            return [np.nan] * len(self._passage_measure_names)
-        measures_by_name = {
-            "mean_steps": passage_result.mean_steps,
-            "mean_steps_error": passage_result.error,
-            "failure_probability": passage_result.failure_probability,
+        passage_measures = {
+            measure_name: np.full(len(gait_outcomes), np.nan, self._base_wheel.damping.dtype)
+            for measure_name in self._passage_measure_names
         }
-        return [
-            float(measures_by_name[measure_name]) for measure_name in self._passage_measure_names
-        ]
+        for sample_index in (
+            np.flatnonzero(gait_outcomes == Outcome.STEPPED) if passage_measures else ()
+        ):
+            wheel_model, params = self._wheel_model, self._base_wheel
+            for parameter_name, parameter_samples in samples_by_parameter.items():
+                wheel_model, params = wheel_model.with_parameter(
+                    params, parameter_name, jnp.asarray(float(parameter_samples[sample_index]))
+                )
+            # Hardly any step of the walks succeeds if `first_passage` raises an error.
+            with contextlib.suppress(ValueError):
+                # mypy takes the name for the module `robustness.first_passage`.
+                passage_result = first_passage(
+                    params, self._slope_standard_deviation, model=wheel_model
+                )  # type: ignore[operator]
+                measures_by_name = {
+                    "mean_steps": passage_result.mean_steps,
+                    "mean_steps_error": passage_result.error,
+                    "failure_probability": passage_result.failure_probability,
+                }
+                for measure_name, measure_values in passage_measures.items():
+                    measure_values[sample_index] = measures_by_name[measure_name]
+        return sample_results | passage_measures
 
 
 def make_scan_engine(

@@ -75,7 +75,10 @@ the default options.
 """
 
 ClaimValues = Mapping[str, Any]
-"""Values that the claims of a group need, by name, computed from the evidence."""
+"""Values that the claims of a group need, by name, computed from the evidence.
+
+Single values of a dataset become numbers before the claims are tested.
+"""
 
 
 @dataclass(frozen=True)
@@ -100,7 +103,10 @@ class PaperClaimGroup:
 
     def make_facts(self, paper_evidence: PaperEvidence) -> list[PaperFact]:
         """Return the facts for the group's claims, computed from the evidence."""
-        claim_values_by_name = self.claim_value_function(paper_evidence)
+        claim_values_by_name = {
+            value_name: claim_value.item() if isinstance(claim_value, xr.DataArray) else claim_value
+            for value_name, claim_value in self.claim_value_function(paper_evidence).items()
+        }
         claim_value_namespace = SimpleNamespace(**claim_values_by_name)
         return [
             PaperFact(
@@ -124,16 +130,8 @@ def make_agreement_test(
     - `published_values_and_tolerances`: pairs of published value and tolerance, by name.
     """
     return lambda n: all(
-        bool(
-            np.all(
-                np.abs(np.asarray(getattr(n, claim_value_name)) - published_value)
-                <= value_tolerance
-            )
-        )
-        for claim_value_name, (
-            published_value,
-            value_tolerance,
-        ) in published_values_and_tolerances.items()
+        np.all(np.abs(np.subtract(getattr(n, value_name), published_value)) <= tolerance)
+        for value_name, (published_value, tolerance) in published_values_and_tolerances.items()
     )
 
 

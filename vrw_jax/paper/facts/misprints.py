@@ -1,7 +1,5 @@
 """Misprints of the paper, each with computed values that show the misprint."""
 
-import math
-
 import numpy as np
 
 from vrw_jax.paper.facts import printed
@@ -21,22 +19,19 @@ def _compute_misprint_values(paper_evidence: PaperEvidence) -> ClaimValues:
 
     The values follow from equations as printed in the paper and from corrected equations.
     """
-    section_state, library_landing_impulse = (
-        paper_evidence.table_1_gait.section_state.values,
-        float(paper_evidence.table_1_gait.lambda_I4),
-    )
+    section_state = paper_evidence.table_1_gait.section_state.values
+    library_landing_impulse = float(paper_evidence.table_1_gait.lambda_I4)
     printed_landing = printed.compute_printed_landing(paper_evidence.params, section_state)
     reference_foot_velocity = printed.differentiate_landing_foot_position(
         paper_evidence.params, section_state
     )
-    foot_velocity_error_function = lambda rate: float(
-        np.abs(
-            printed.compute_landing_foot_velocity(paper_evidence.params, section_state, rate)
-            - reference_foot_velocity
-        ).max()
-    )
+    foot_velocity_error_function = lambda rate: np.abs(
+        printed.compute_landing_foot_velocity(paper_evidence.params, section_state, rate)
+        - reference_foot_velocity
+    ).max()
     gentle_slope_gait = paper_evidence.slope_branch.sel(slope=0.10, method="nearest")
-    has_settled_gait = paper_evidence.gentle_slope_branch.settled.values
+    gentle_slope_branch = paper_evidence.gentle_slope_branch
+    low_damping_gait = paper_evidence.gentle_slope_low_damping_branch.sel(damping=4.0)
     return {
         "wrong": printed.compute_constraint_violation(
             paper_evidence.table_1_trajectory, is_as_printed=True
@@ -45,36 +40,24 @@ def _compute_misprint_values(paper_evidence: PaperEvidence) -> ClaimValues:
             paper_evidence.table_1_trajectory, is_as_printed=False
         ),
         "residual": printed_landing.momentum_residual,
-        "velocities": bool(
-            np.array_equal(
-                printed_landing.impulse_as_printed, printed_landing.coordinate_rates_after
-            )
+        "velocities": np.array_equal(
+            printed_landing.impulse_as_printed, printed_landing.coordinate_rates_after
         ),
         "impulse": printed_landing.corrected_impulse[3],
         "here": library_landing_impulse,
         "off": abs(printed_landing.corrected_impulse[3] - library_landing_impulse),
         "off_new": foot_velocity_error_function(0.0),
-        "off_old": foot_velocity_error_function(float(section_state[2])),
-        "slow_settled": bool(gentle_slope_gait.settled),
-        "share": 100.0 * float(gentle_slope_gait.dls_fraction),
-        "period": float(gentle_slope_gait.period),
-        "rear": float(
-            paper_evidence.gentle_slope_branch.lambda_4_plus.values[has_settled_gait].min()
-        )
-        if has_settled_gait.any()
-        else math.nan,
-        "last": float(paper_evidence.gentle_slope_branch.damping.values[has_settled_gait].max())
-        if has_settled_gait.any()
-        else math.nan,
-        "end": float(paper_evidence.gentle_slope_branch.damping.max()),
-        "end_walks": has_settled_gait[-1],
-        "end_outcome": Outcome(int(paper_evidence.gentle_slope_branch.outcome.values[-1]))
-        .name.lower()
-        .replace("_", " "),
-        "low": float(paper_evidence.gentle_slope_low_damping_branch.lambda_2_plus.sel(damping=4.0)),
-        "low_settled": bool(
-            paper_evidence.gentle_slope_low_damping_branch.settled.sel(damping=4.0)
-        ),
+        "off_old": foot_velocity_error_function(section_state[2]),
+        "slow_settled": gentle_slope_gait.settled,
+        "share": 100.0 * gentle_slope_gait.dls_fraction,
+        "period": gentle_slope_gait.period,
+        "rear": gentle_slope_branch.lambda_4_plus.where(gentle_slope_branch.settled).min(),
+        "last": gentle_slope_branch.damping.where(gentle_slope_branch.settled).max(),
+        "end": gentle_slope_branch.damping.max(),
+        "end_walks": gentle_slope_branch.settled[-1],
+        "end_outcome": Outcome(int(gentle_slope_branch.outcome[-1])).name.lower().replace("_", " "),
+        "low": low_damping_gait.lambda_2_plus,
+        "low_settled": low_damping_gait.settled,
     }
 
 

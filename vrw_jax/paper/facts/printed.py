@@ -21,20 +21,15 @@ from vrw_jax.wheel import (
     compute_momentum,
 )
 
+_compute_length_at_touchdown = jax.jit(compute_length_at_touchdown)
+
 
 def _compute_symbols_and_touchdown_length(params: WheelParams, theta: float) -> tuple[Any, float]:
-    """Return the parameters by their symbols in the paper, and the length of Leg 1 at touchdown, m.
-
-    All numbers are Python floats.
+    """Return the parameters by their symbols in the paper, and the length of Leg 1 at touchdown, m,
+    as Python floats.
     """
-    compute_symbols_and_length = jax.jit(
-        lambda params, theta: (
-            params.symbols(),
-            compute_length_at_touchdown(params.symbols(), theta),
-        )
-    )
-    symbols, touchdown_length = jax.tree.map(float, compute_symbols_and_length(params, theta))
-    return symbols, touchdown_length
+    s = params.symbols()
+    return jax.tree.map(float, s), float(_compute_length_at_touchdown(s, jnp.asarray(theta)))
 
 
 def compute_double_support_jacobian(
