@@ -705,7 +705,8 @@ def _require_known_keys(
         new_key = RENAMED_CONFIG_KEYS.get(config_key)
         if new_key in allowed_keys:
             raise ValueError(
-                f"{table_location} has the old key '{config_key}': write {new_key} in its place."
+                f"{table_location.split()[0]} has the old key '{config_key}': "
+                f"write {new_key} in its place."
             )
         if config_key not in allowed_keys:
             raise ValueError(

@@ -4,7 +4,6 @@ from collections.abc import Iterable, Mapping
 
 import numpy as np
 import xarray as xr
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from vrw_jax.figures.style import (
@@ -94,7 +93,21 @@ def tornado_figure(
     if len(measure_names) == 1:
         figure.set_figwidth(0.6 * PAGE_FIGURE_WIDTH_INCHES)
     for axes, measure_name in zip(panel_axes, measure_names, strict=True):
-        _draw_sorted_bars(axes, measure_changes.sel(measure=measure_name))
+        bars = measure_changes.sel(measure=measure_name)
+        bars = bars[np.isfinite(bars.values)]
+        bars = bars[np.argsort(-np.abs(bars.values), kind="stable")]
+        for change_sign, bar_color in ((1.0, OKABE_ITO_BLUE), (-1.0, OKABE_ITO_AMBER)):
+            axes.barh(
+                range(bars.size),
+                change_sign * bars.values,
+                0.7,
+                color=bar_color,
+                label=str(change_sign),
+            )
+        axes.axvline(0.0, color="black", linewidth=0.6)
+        parameter_symbols = [f"${MEASURES[str(name)].mathtext}$" for name in bars.parameter.values]
+        axes.set_yticks(range(bars.size), parameter_symbols)
+        axes.set_ylim(bars.size - 0.5, -0.5)
         axes.set_title(typeset_greek_symbols(MEASURES[measure_name].long_name))
         change_label = format_axis_label(measure_name, "change of {symbol}")
         axes.set_xlabel("change [%]" if spreads is None else change_label)
@@ -105,25 +118,3 @@ def tornado_figure(
     ]
     figure.legend(legend_handles, legend_texts, loc="outside lower center", ncols=2)
     return figure
-
-
-def _draw_sorted_bars(axes: Axes, measure_changes: xr.DataArray) -> None:
-    """Draw the bars for one measure, with the longest on top."""
-    measure_changes = measure_changes[np.isfinite(measure_changes.values)]
-    measure_changes = measure_changes[np.argsort(-np.abs(measure_changes.values), kind="stable")]
-    bar_positions = np.arange(measure_changes.size)
-    for change_sign, bar_color in ((1.0, OKABE_ITO_BLUE), (-1.0, OKABE_ITO_AMBER)):
-        axes.barh(
-            bar_positions,
-            change_sign * measure_changes.values,
-            0.7,
-            color=bar_color,
-            label=str(change_sign),
-        )
-    axes.axvline(0.0, color="black", linewidth=0.6)
-    parameter_symbols = [
-        f"${MEASURES[str(parameter_name)].mathtext}$"
-        for parameter_name in measure_changes.parameter.values
-    ]
-    axes.set_yticks(bar_positions, parameter_symbols)
-    axes.set_ylim(measure_changes.size - 0.5, -0.5)

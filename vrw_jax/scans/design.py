@@ -209,13 +209,37 @@ def _merge_mapping_and_keywords(
 def _parse_value_columns(
     function_name: str, parameter_mapping: Mapping | None, parameter_keywords: Mapping
 ) -> ParameterSamples:
-    """Return the checked values of each parameter as a vector of floats, by parameter."""
-    return {
-        parameter_name: _convert_to_value_column(parameter_name, parameter_values)
-        for parameter_name, parameter_values in _merge_mapping_and_keywords(
-            function_name, parameter_mapping, parameter_keywords
-        ).items()
-    }
+    """Return the values of each parameter as a vector of floats, by parameter.
+
+    Raise an error if that is impossible.
+    """
+    value_columns: ParameterSamples = {}
+    for parameter_name, parameter_values in _merge_mapping_and_keywords(
+        function_name, parameter_mapping, parameter_keywords
+    ).items():
+        require_untraced_arguments("a design", "use jax.vmap", parameter_values)
+        try:
+            value_column = np.atleast_1d(np.asarray(parameter_values))
+        # Lists may differ in length, and the conversion of a foreign object may raise any error.
+        except Exception:
+            value_column = np.array([None])
+        if value_column.dtype.kind not in "fiu" and value_column.size:
+            raise TypeError(
+                f"{parameter_name} is {format_value(parameter_values)}, but it must be a list of "
+                "numbers: write [100.0]."
+            )
+        value_column = value_column.astype(float)
+        if value_column.ndim != 1:
+            raise ValueError(
+                f"{parameter_name} has shape {value_column.shape}, but it must be a list of "
+                "numbers: give one axis."
+            )
+        if not len(value_column):
+            raise ValueError(
+                f"{parameter_name} has no values, but a scan needs at least one: add some."
+            )
+        value_columns[parameter_name] = value_column
+    return value_columns
 
 
 def grid(
@@ -442,31 +466,3 @@ def _parse_sampling_box(
         for parameter_name, bound_pair in ranges.items()
     }
     return checked_ranges, n
-
-
-def _convert_to_value_column(parameter_name: str, parameter_values: object) -> np.ndarray:
-    """Return the values of one parameter as a vector of floats. Raise an error if that is
-    impossible.
-    """
-    require_untraced_arguments("a design", "use jax.vmap", parameter_values)
-    try:
-        value_column = np.atleast_1d(np.asarray(parameter_values))
-    # Lists may have different lengths, and the conversion of a foreign object may raise any error.
-    except Exception:
-        value_column = np.array([None])
-    if value_column.dtype.kind not in "fiu" and value_column.size:
-        raise TypeError(
-            f"{parameter_name} is {format_value(parameter_values)}, but it must be a list of "
-            "numbers: write [100.0]."
-        )
-    value_column = value_column.astype(float)
-    if value_column.ndim != 1:
-        raise ValueError(
-            f"{parameter_name} has shape {value_column.shape}, but it must be a list of "
-            "numbers: give one axis."
-        )
-    if not len(value_column):
-        raise ValueError(
-            f"{parameter_name} has no values, but a scan needs at least one: add some."
-        )
-    return value_column

@@ -17,7 +17,7 @@ from vrw_jax import simd
 from vrw_jax.cycles import CycleOptions, make_finder
 from vrw_jax.measures import MARGIN_MEASURES, make_locked_leg_coordinate, make_measure_attributes
 from vrw_jax.measures import xarray as xr
-from vrw_jax.models import AbstractWheel, ModelCapabilities, ViscoelasticWheel
+from vrw_jax.models import ModelCapabilities, ViscoelasticWheel
 from vrw_jax.numerics import StepOptions, batch_sizes
 from vrw_jax.runtime import compute_source_digest
 from vrw_jax.scans.collocation_engine import EvaluationRequest
@@ -218,7 +218,17 @@ def plan_scan(
         )
     if tol is not None:
         tol = check_positive("tol", tol)
-        _require_reference_model(model)
+        model_fields: dict[str, Any] = type(model).__dataclass_fields__
+        fixed_fields = model.capabilities.fields_with_fixed_defaults
+        if fixed_fields is None or any(
+            getattr(model, field_name) != model_fields[field_name].default
+            for field_name in fixed_fields
+        ):
+            raise ValueError(
+                f"tol is given and model is {model!r}, but a tolerance refers to unilateral "
+                "contact with no settings other than friction and stoppers: give "
+                "model=vrw.UnilateralWheel(friction=...)."
+            )
     if slope_sd is not None:
         slope_sd = check_positive("slope_sd", slope_sd)
         if tol is not None:
@@ -245,21 +255,6 @@ def plan_scan(
     return ScanPlan(
         design, evaluation_request, measure_catalog, result_layout, requested_measures, config_text
     )
-
-
-def _require_reference_model(wheel_model: AbstractWheel) -> None:
-    """Raise a ValueError unless errors can be computed with respect to `wheel_model`."""
-    model_fields: dict[str, Any] = type(wheel_model).__dataclass_fields__
-    fields_with_fixed_defaults = wheel_model.capabilities.fields_with_fixed_defaults
-    if fields_with_fixed_defaults is None or any(
-        getattr(wheel_model, field_name) != model_fields[field_name].default
-        for field_name in fields_with_fixed_defaults
-    ):
-        raise ValueError(
-            f"tol is given and model is {wheel_model!r}, but a tolerance refers to unilateral "
-            "contact with no settings other than friction and stoppers: give "
-            "model=vrw.UnilateralWheel(friction=...)."
-        )
 
 
 def describe_computing_environment() -> dict[str, object]:
