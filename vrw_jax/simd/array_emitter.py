@@ -69,6 +69,11 @@ class PrimitiveCall(NamedTuple):
     operand_avals: Sequence[Any]  # shapes and types of the operands
     result_aval: Any  # shape and type of the result
 
+    @property
+    def result_shape(self) -> tuple[int, ...]:
+        """Return the shape of the result without the lane axis."""
+        return get_shape_without_lanes(self.result_aval)
+
 
 class ArrayEmitter:
     """Emitter of array operations.
@@ -357,41 +362,26 @@ class ArrayEmitter:
         results.
         """
         primitive_name, primitive_params, operand_avals, result_aval = primitive_call
-        result_shape, operand_dtype = get_shape_without_lanes(result_aval), operand_avals[0].dtype
-        if not result_shape and all(
-            isinstance(x, np.ndarray) and not x.shape for x in operand_arrays
-        ):
-            entry_operands = [x.item() for x in operand_arrays]  # type: ignore[union-attr]
-            return make_entry_array(
-                (),
-                [
-                    emit_llvm_elementwise_primitive(
-                        self.value_emitter,
-                        primitive_name,
-                        primitive_params,
-                        operand_dtype,
-                        result_aval.dtype,
-                        entry_operands,
-                    )
-                ],
-            )
-        if any(x.shape != result_shape for x in operand_arrays):
-            # An operand without lanes may have an extra axis, or fewer axes.
-            operand_arrays = [
-                self.reshape_if_needed(x, x.shape[:-1], len(x.shape) > len(result_shape))
-                for x in operand_arrays
-            ]
-            operand_arrays = [
-                self.broadcast_array(x, result_shape, range(len(x.shape))) for x in operand_arrays
-            ]
+        result_shape = primitive_call.result_shape
         emit_result_entry = lambda entry_operands: emit_llvm_elementwise_primitive(
             self.value_emitter,
             primitive_name,
             primitive_params,
-            operand_dtype,
+            operand_avals[0].dtype,
             result_aval.dtype,
             entry_operands,
         )
+        if not result_shape and all(
+            isinstance(x, np.ndarray) and not x.shape for x in operand_arrays
+        ):
+            entry_operands = [x.item() for x in operand_arrays]  # type: ignore[union-attr]
+            return make_entry_array((), [emit_result_entry(entry_operands)])
+        if any(x.shape != result_shape for x in operand_arrays):
+            # An operand without lanes may have an extra axis, or fewer axes.
+            operand_arrays = [self.drop_extra_axis(x, len(result_shape)) for x in operand_arrays]
+            operand_arrays = [
+                self.broadcast_array(x, result_shape, range(len(x.shape))) for x in operand_arrays
+            ]
         if any(isinstance(x, LazyArray) for x in operand_arrays):
             emit_entry_at_index = lambda entry_index: emit_result_entry(
                 [self.get_array_entry(x, entry_index) for x in operand_arrays]
@@ -414,11 +404,10 @@ class ArrayEmitter:
         )
         return np.broadcast_to(result_entries, result_shape)
 
-    def reshape_if_needed(
-        self, array: LlvmArray, new_shape: tuple[int, ...], needs_reshape: bool
-    ) -> LlvmArray:
-        """Return the array, reshaped to `new_shape` if `needs_reshape` is True."""
-        return self.reshape_array(array, new_shape) if needs_reshape else array
+    def drop_extra_axis(self, array: LlvmArray, n_axes: int) -> LlvmArray:
+        """Return the array without its last axis if it has more than `n_axes` axes."""
+        has_extra_axis = len(array.shape) > n_axes
+        return self.reshape_array(array, array.shape[:-1]) if has_extra_axis else array
 
     def broadcast_array(
         self, array: LlvmArray, broadcast_shape: tuple[int, ...], axis_positions: Sequence[int]
@@ -518,11 +507,10 @@ class ArrayEmitter:
 
     def emit_clamped_index(self, i: LlvmValue, last_index: int) -> LlvmValue:
         """Emit the index from 0 to `last_index` that is nearest to `i`, and return its value."""
-        llvm_builder, llvm_zero, llvm_last_index = (
-            self.llvm_builder,
-            ir.Constant(I64, 0),
-            ir.Constant(I64, last_index),
-        )
+        if last_index == 0:
+            return 0
+        llvm_builder = self.llvm_builder
+        llvm_zero, llvm_last_index = ir.Constant(I64, 0), ir.Constant(I64, last_index)
         i = llvm_builder.select(llvm_builder.icmp_signed("<", i, llvm_zero), llvm_zero, i)
         return llvm_builder.select(
             llvm_builder.icmp_signed(">", i, llvm_last_index), llvm_last_index, i
@@ -543,21 +531,6 @@ class ArrayEmitter:
         return tuple(
             emit_axis_index_sum(i, j) for i, j in zip(entry_index, offset_index, strict=True)
         )
-
-    def make_llvm_zero(self, entry_type: ir.Type) -> LlvmValue:
-        """Return a constant 0 of type `entry_type` that is the initial value of a sum."""
-        llvm_element_type = (
-            entry_type.element if isinstance(entry_type, ir.VectorType) else entry_type
-        )
-        scalar_zero = ir.Constant(
-            llvm_element_type, 0.0 if isinstance(llvm_element_type, _LLVM_FLOAT_TYPES) else 0
-        )
-        if not isinstance(entry_type, ir.VectorType):
-            return scalar_zero
-        return ir.Constant(entry_type, [scalar_zero] * entry_type.count)
-
-
-_LLVM_FLOAT_TYPES = (ir.FloatType, ir.DoubleType)
 
 
 def has_lane_axis(aval: Any) -> bool:

@@ -9,11 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from vrw_jax.simd.arithmetic import convert_llvm_value
+from vrw_jax.simd.arithmetic import emit_llvm_elementwise_primitive
 from vrw_jax.simd.array_emitter import (
     ArrayEmitter,
     PrimitiveCall,
-    get_shape_without_lanes,
     has_lane_axis,
     make_lane_mixing_error,
 )
@@ -35,11 +34,10 @@ def emit_broadcast_array(
     array_emitter: ArrayEmitter, primitive_call: PrimitiveCall, array: LlvmArray, *_: Any
 ) -> LlvmArray:
     """Return the array repeated along new axes, of which the last may be the lane axis."""
-    result_shape = get_shape_without_lanes(primitive_call.result_aval)
+    result_shape = primitive_call.result_shape
+    entry_type = array_emitter.get_entry_type(primitive_call.result_aval)
     axis_positions = tuple(map(int, primitive_call.primitive_params["broadcast_dimensions"]))
-    array = array_emitter.reshape_if_needed(
-        array, array.shape[:-1], len(array.shape) > len(result_shape)
-    )
+    array = array_emitter.drop_extra_axis(array, len(result_shape))
     if (
         has_lane_axis(primitive_call.result_aval)
         and len(array.shape) == len(axis_positions)
@@ -47,20 +45,17 @@ def emit_broadcast_array(
     ):
         # The array is one number for each lane.
         array = array_emitter.reshape_array(array, array.shape[:-1])
-    has_result_type = isinstance(
-        array, MemoryArray
-    ) and array.entry_type == array_emitter.get_entry_type(primitive_call.result_aval)
-    if has_result_type and math.prod(array.shape) == math.prod(result_shape):
+    if (
+        isinstance(array, MemoryArray)
+        and array.entry_type == entry_type
+        and math.prod(array.shape) == math.prod(result_shape)
+    ):
         return array_emitter.reshape_array(array, result_shape)
     broadcast_array = array_emitter.broadcast_array(
         array, result_shape, axis_positions[: len(array.shape)]
     )
     if isinstance(broadcast_array, LazyArray):
-        return LazyArray(
-            result_shape,
-            array_emitter.get_entry_type(primitive_call.result_aval),
-            broadcast_array.get_entry_at_index,
-        )
+        return LazyArray(result_shape, entry_type, broadcast_array.get_entry_at_index)
     return broadcast_array
 
 
@@ -68,15 +63,14 @@ def emit_reshaped_array(
     array_emitter: ArrayEmitter, primitive_call: PrimitiveCall, array: LlvmArray
 ) -> LlvmArray:
     """Return the array in another shape, with the same entries in the same order."""
-    return array_emitter.reshape_array(array, get_shape_without_lanes(primitive_call.result_aval))
+    return array_emitter.reshape_array(array, primitive_call.result_shape)
 
 
 def emit_transposed_array(
     array_emitter: ArrayEmitter, primitive_call: PrimitiveCall, array: LlvmArray
 ) -> LlvmArray:
     """Return the array with its axes in the order of the parameter `permutation`."""
-    axis_order = primitive_call.primitive_params["permutation"]
-    axis_order = axis_order[: len(array.shape)]
+    axis_order = primitive_call.primitive_params["permutation"][: len(array.shape)]
     if isinstance(array, np.ndarray):
         return array.transpose(axis_order)
     inverse_axis_order = np.argsort(axis_order)
@@ -87,7 +81,7 @@ def emit_transposed_array(
         TransposedMemoryView if isinstance(array, MemoryArray | TransposedMemoryView) else LazyArray
     )
     return transposed_array_class(
-        get_shape_without_lanes(primitive_call.result_aval), array.entry_type, get_transposed_entry
+        primitive_call.result_shape, array.entry_type, get_transposed_entry
     )
 
 
@@ -95,18 +89,11 @@ def emit_static_slice(
     array_emitter: ArrayEmitter, primitive_call: PrimitiveCall, array: LlvmArray
 ) -> LlvmArray:
     """Return the entries from a start index to a limit along each axis, with a stride."""
-    slice_strides = primitive_call.primitive_params["strides"] or (1,) * len(
-        primitive_call.primitive_params["start_indices"]
-    )
-    starts_ends_strides = zip(
-        primitive_call.primitive_params["start_indices"],
-        primitive_call.primitive_params["limit_indices"],
-        slice_strides,
-        strict=True,
-    )
-    axis_slices = [slice(*start_end_stride) for start_end_stride in starts_ends_strides][
-        : len(array.shape)
-    ]
+    slice_params = primitive_call.primitive_params
+    slice_starts = slice_params["start_indices"]
+    slice_strides = slice_params["strides"] or (1,) * len(slice_starts)
+    axis_slices = list(map(slice, slice_starts, slice_params["limit_indices"], slice_strides))
+    axis_slices = axis_slices[: len(array.shape)]
     if isinstance(array, np.ndarray):
         return array[tuple(axis_slices)]
 
@@ -120,9 +107,7 @@ def emit_static_slice(
             ),
         )
 
-    return LazyArray(
-        get_shape_without_lanes(primitive_call.result_aval), array.entry_type, get_sliced_entry
-    )
+    return LazyArray(primitive_call.result_shape, array.entry_type, get_sliced_entry)
 
 
 def emit_concatenated_array(
@@ -150,11 +135,7 @@ def emit_unstacked_arrays(
     jaxpr_lowering: JaxprLowering, equation: Any, operands: list[LlvmArray]
 ) -> list[LlvmArray]:
     """Return the arrays of equal shape that result from splitting an array along one axis."""
-    (array,), split_axis, array_emitter = (
-        operands,
-        equation.params["axis"],
-        jaxpr_lowering.array_emitter,
-    )
+    (array,), split_axis = operands, equation.params["axis"]
     if split_axis == len(array.shape):
         raise make_lane_mixing_error("unstack")
 
@@ -162,7 +143,7 @@ def emit_unstacked_arrays(
         slice_shape = (*array.shape[:split_axis], *array.shape[split_axis + 1 :])
         if isinstance(array, np.ndarray):
             return array.take([slice_position], split_axis).reshape(slice_shape)
-        get_slice_entry = lambda entry_index: array_emitter.get_array_entry(
+        get_slice_entry = lambda entry_index: jaxpr_lowering.array_emitter.get_array_entry(
             array, (*entry_index[:split_axis], slice_position, *entry_index[split_axis:])
         )
         return LazyArray(slice_shape, array.entry_type, get_slice_entry)
@@ -177,7 +158,7 @@ def _concatenate_along_axis(
     joined_arrays: Sequence[LlvmArray],
 ) -> LlvmArray:
     """Return the arrays joined along the existing axis `join_axis`."""
-    result_shape = get_shape_without_lanes(primitive_call.result_aval)
+    result_shape = primitive_call.result_shape
     if join_axis == len(result_shape):
         raise make_lane_mixing_error(primitive_call.primitive_name)
     if all(isinstance(x, np.ndarray) for x in joined_arrays):
@@ -190,46 +171,32 @@ def _concatenate_along_axis(
         for joined_array, joined_array_start in zip(
             nonempty_arrays, joined_array_starts, strict=False
         ):
-            index_in_joined_array, last_index_in_joined_array = (
-                array_emitter.emit_affine_index(i, -joined_array_start),
-                joined_array.shape[join_axis] - 1,
-            )
-            if isinstance(i, int):
-                if 0 <= index_in_joined_array <= last_index_in_joined_array:
-                    return array_emitter.get_array_entry(
-                        joined_array,
-                        (
-                            *result_index[:join_axis],
-                            index_in_joined_array,
-                            *result_index[join_axis + 1 :],
-                        ),
-                    )
+            joined_array_length = joined_array.shape[join_axis]
+            index_in_joined_array = array_emitter.emit_affine_index(i, -joined_array_start)
+            if isinstance(i, int) and not 0 <= index_in_joined_array < joined_array_length:
                 continue
             # Beyond the end of a part any entry is valid, because the select below discards it.
-            index_in_joined_array = (
-                0
-                if last_index_in_joined_array == 0
-                else array_emitter.emit_clamped_index(
-                    index_in_joined_array, last_index_in_joined_array
+            if not isinstance(i, int):
+                index_in_joined_array = array_emitter.emit_clamped_index(
+                    index_in_joined_array, joined_array_length - 1
                 )
-            )
             joined_array_entry = array_emitter.get_array_entry(
                 joined_array,
                 (*result_index[:join_axis], index_in_joined_array, *result_index[join_axis + 1 :]),
             )
+            if isinstance(i, int):
+                return joined_array_entry
             is_past_joined_array_start = array_emitter.llvm_builder.icmp_signed(
                 ">=", i, ir.Constant(I64, joined_array_start)
             )
             if selected_entry is None:
                 selected_entry = joined_array_entry
             else:
-                joined_array_entry, selected_entry = (
-                    array_emitter.value_emitter.to_scalars_or_vectors(
-                        joined_array_entry, selected_entry
-                    )
-                )
                 selected_entry = array_emitter.llvm_builder.select(
-                    is_past_joined_array_start, joined_array_entry, selected_entry
+                    is_past_joined_array_start,
+                    *array_emitter.value_emitter.to_scalars_or_vectors(
+                        joined_array_entry, selected_entry
+                    ),
                 )
         return selected_entry
 
@@ -248,18 +215,15 @@ def emit_padded_array(
 ) -> LlvmArray:
     """Return the array with entries `padding_value` added before and after it along each axis."""
     padding_widths = primitive_call.primitive_params["padding_config"]
-    if any(
-        n_entries_before < 0 or n_entries_after < 0 or n_entries_between
-        for n_entries_before, n_entries_after, n_entries_between in padding_widths
-    ):
+    if any(min(widths) < 0 or widths[2] for widths in padding_widths):
         raise NotImplementedError("pad takes entries away or puts some between: slice and stack.")
     padded_array = np.broadcast_to(
         array_emitter.get_array_entries(padding_value).reshape(()),
-        get_shape_without_lanes(primitive_call.result_aval),
+        primitive_call.result_shape,
     ).copy()
     unpadded_slices = tuple(
-        slice(n_entries_before, n_entries_before + n)
-        for (n_entries_before, _, _), n in zip(padding_widths, array.shape, strict=False)
+        slice(n_before, n_before + n)
+        for (n_before, _, _), n in zip(padding_widths, array.shape, strict=False)
     )
     padded_array[unpadded_slices] = array_emitter.get_array_entries(array)
     return padded_array
@@ -274,9 +238,9 @@ def emit_uninitialized_array(
     """
     entry_type = array_emitter.get_entry_type(primitive_call.result_aval)
     return UninitializedArray(
-        get_shape_without_lanes(primitive_call.result_aval),
+        primitive_call.result_shape,
         entry_type,
-        lambda _: array_emitter.make_llvm_zero(entry_type),
+        lambda _: array_emitter.value_emitter.make_llvm_constant(entry_type, 0),
     )
 
 
@@ -301,14 +265,14 @@ def emit_dynamic_slice(
         array_emitter,
         primitive_call.operand_avals,
         array.shape,
-        get_shape_without_lanes(primitive_call.result_aval),
+        primitive_call.result_shape,
         start_index_arrays,
     )
     get_sliced_entry = lambda entry_index: array_emitter.get_array_entry(
         array, array_emitter.emit_sum_of_indices(entry_index, start_index)
     )
     return LazyArray(
-        get_shape_without_lanes(primitive_call.result_aval),
+        primitive_call.result_shape,
         array_emitter.get_entry_type(primitive_call.result_aval),
         get_sliced_entry,
     )
@@ -365,11 +329,13 @@ def _clamp_start_index(
         elif isinstance(start_index_value, ir.Constant):
             clamped_start_index.append(min(max(int(start_index_value.constant), 0), n - m))
         else:
-            start_index_value = convert_llvm_value(
+            start_index_value = emit_llvm_elementwise_primitive(
                 array_emitter.value_emitter,
-                start_index_value,
+                "convert_element_type",
+                {},
                 start_index_aval.dtype,
                 np.dtype(np.int64),
+                (start_index_value,),
             )
             clamped_start_index.append(array_emitter.emit_clamped_index(start_index_value, n - m))
     return tuple(clamped_start_index)

@@ -13,7 +13,6 @@ from vrw_jax.simd.arithmetic import emit_llvm_elementwise_primitive
 from vrw_jax.simd.array_emitter import (
     ArrayEmitter,
     PrimitiveCall,
-    get_shape_without_lanes,
     has_lane_axis,
     make_entry_array,
     make_lane_mixing_error,
@@ -93,7 +92,7 @@ def emit_array_product(
         array_emitter.value_emitter, "add", {}, result_dtype, result_dtype, (x, y)
     )
     product_shape, entry_type = (
-        get_shape_without_lanes(primitive_call.result_aval),
+        primitive_call.result_shape,
         array_emitter.get_entry_type(primitive_call.result_aval),
     )
     if (
@@ -122,7 +121,7 @@ def emit_array_product(
         product_memory.emit_entry_store(
             product_index,
             array_emitter.emit_counted_loop(
-                n_terms, add_term, [array_emitter.make_llvm_zero(entry_type)]
+                n_terms, add_term, [array_emitter.value_emitter.make_llvm_constant(entry_type, 0)]
             )[0],
         )
         return []
@@ -183,7 +182,9 @@ def make_reduction_rule(combining_primitive: str) -> Callable[..., LlvmArray]:
             # The first entry is counted twice, which changes no reduction except a sum.
             initial_reduction_value = get_entry_to_reduce((0,) * len(reduced_axis_lengths))
             if combining_primitive == "add":
-                initial_reduction_value = array_emitter.make_llvm_zero(array.entry_type)
+                initial_reduction_value = array_emitter.value_emitter.make_llvm_constant(
+                    array.entry_type, 0
+                )
             elif isinstance(array.entry_type, ir.VectorType):
                 initial_reduction_value = array_emitter.value_emitter.to_lane_vector(
                     initial_reduction_value
