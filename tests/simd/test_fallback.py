@@ -20,7 +20,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from vrw_jax.simd import fallback, kernel, rules
+from vrw_jax.simd import fallback, ffi_handler, rules
 fallback.LATEST_TESTED_JAX_RELEASE = (0, 1)
 {change}
 import vrw_jax as vrw
@@ -44,7 +44,7 @@ print(json.dumps([in_jit, of_arrays, messages, simd.is_machine_code_available()]
 
 CHANGES = {
     "a primitive is new": 'del rules.PRIMITIVE_RULES["while"]',
-    "the call interface differs": "kernel.read_ffi_api_version = lambda: (7, 0)",
+    "the call interface differs": "ffi_handler.read_ffi_api_version = lambda: (7, 0)",
     "nothing differs": "",
 }
 
@@ -75,9 +75,9 @@ def test_xla_computes_where_an_untested_jax_differs(change, tmp_path):
 WHEEL_PROGRAM = """
 import json, sys, warnings
 import numpy as np
-from vrw_jax.simd import fallback, kernel
+from vrw_jax.simd import fallback, ffi_handler
 fallback.LATEST_TESTED_JAX_RELEASE = (0, 1)
-kernel.read_ffi_api_version = lambda: (7, 0)
+ffi_handler.read_ffi_api_version = lambda: (7, 0)
 import vrw_jax as vrw
 vrw.start_jax(sys.argv[1])
 warnings.simplefilter("ignore")

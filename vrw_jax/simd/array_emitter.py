@@ -198,9 +198,7 @@ class ArrayEmitter:
             if isinstance(i, int):
                 constant_offset += i * axis_stride
                 continue
-            axis_offset = (
-                i if axis_stride == 1 else self.llvm_builder.mul(i, ir.Constant(I64, axis_stride))
-            )
+            axis_offset = self.emit_affine_index(i, 0, axis_stride)
             memory_offset = (
                 axis_offset
                 if memory_offset is None
@@ -208,11 +206,7 @@ class ArrayEmitter:
             )
         if memory_offset is None:
             return ir.Constant(I64, constant_offset)
-        return (
-            self.llvm_builder.add(memory_offset, ir.Constant(I64, constant_offset))
-            if constant_offset
-            else memory_offset
-        )
+        return self.emit_affine_index(memory_offset, constant_offset)
 
     def emit_index_loops(
         self,
@@ -294,26 +288,38 @@ class ArrayEmitter:
             )
         return MemoryArray(self, array_shape, entry_type, base_pointer)
 
-    def emit_array_stores(self, memory_array: MemoryArray, array: LlvmArray) -> None:
-        """Emit stores of all initialized entries of `array` into `memory_array`, which has the same
-        shape.
+    def emit_array_stores(
+        self, memory_array: MemoryArray, array: LlvmArray, start_index: EntryIndex = ()
+    ) -> None:
+        """Emit stores of all initialized entries of `array` into the part of `memory_array` that
+        begins at `start_index`.
+
+        Without a start index, both arrays have the same shape.
         """
-        if isinstance(array, UninitializedArray):
+        if isinstance(array, UninitializedArray) or memory_array.contains_array(array):
             return
+        start_index = start_index or (0,) * len(array.shape)
         if isinstance(array, PendingArrayUpdate):
-            self.emit_array_stores(memory_array, array.base_array)
-            array.emit_update_stores(memory_array)
-            return
-        if isinstance(array, np.ndarray) and any(array.strides):
-            for entry_index in np.ndindex(memory_array.shape):
-                memory_array.emit_entry_store(entry_index, array[entry_index])
+            # New entries may depend on the entries that they replace, so they are computed first.
+            if memory_array.contains_array(array.base_array):
+                array = array.store_update_in_memory()
+            update_start_index = self.emit_sum_of_indices(array.start_index, start_index)
+            self.emit_array_stores(memory_array, array.base_array, start_index)
+            self.emit_array_stores(memory_array, array.update_array, update_start_index)
             return
 
-        def emit_array_entry_store(entry_index: EntryIndex, _: Any) -> list[LlvmValue]:
-            memory_array.emit_entry_store(entry_index, self.get_array_entry(array, entry_index))
+        def emit_entry_copy(entry_index: EntryIndex, _: Any = None) -> list[LlvmValue]:
+            memory_array.emit_entry_store(
+                self.emit_sum_of_indices(entry_index, start_index),
+                self.get_array_entry(array, entry_index),
+            )
             return []
 
-        self.emit_index_loops(memory_array.shape, emit_array_entry_store)
+        if isinstance(array, np.ndarray) and any(array.strides):
+            for entry_index in np.ndindex(array.shape):
+                emit_entry_copy(entry_index)
+        else:
+            self.emit_index_loops(array.shape, emit_entry_copy)
 
     def store_array_in_memory(self, array: LlvmArray) -> MemoryArray:
         """Return the array with all entries computed and stored in memory.
@@ -326,14 +332,8 @@ class ArrayEmitter:
             entry_type = array.entry_type
         else:  # The type is a vector if any entry is one.
             entry_types = [x.type for x in array.ravel()]
-            entry_type = next(
-                (
-                    candidate_entry_type
-                    for candidate_entry_type in entry_types
-                    if isinstance(candidate_entry_type, ir.VectorType)
-                ),
-                entry_types[0],
-            )
+            vector_types = (t for t in entry_types if isinstance(t, ir.VectorType))
+            entry_type = next(vector_types, entry_types[0])
         memory_array = self.allocate_memory_array(array.shape, entry_type)
         self.emit_array_stores(memory_array, array)
         return memory_array
@@ -450,26 +450,17 @@ class ArrayEmitter:
 
         def get_reshaped_entry(reshaped_index: EntryIndex) -> LlvmValue:
             memory_offset = self.emit_memory_offset(reshaped_index, new_shape)
-            constant_offset = (
-                memory_offset.constant if isinstance(memory_offset, ir.Constant) else None
-            )
-            if constant_offset is not None:
-                return self.get_array_entry(
-                    array, tuple(map(int, np.unravel_index(constant_offset, shape_before_reshape)))
-                )
+            if isinstance(memory_offset, ir.Constant):
+                constant_index = np.unravel_index(memory_offset.constant, shape_before_reshape)
+                return self.get_array_entry(array, tuple(map(int, constant_index)))
             index_before_reshape: list[Any] = []
             for axis_length in shape_before_reshape[:0:-1]:
+                if axis_length == 1:
+                    index_before_reshape.append(0)
+                    continue
                 llvm_axis_length = ir.Constant(I64, axis_length)
-                index_before_reshape.append(
-                    0
-                    if axis_length == 1
-                    else self.llvm_builder.urem(memory_offset, llvm_axis_length)
-                )
-                memory_offset = (
-                    memory_offset
-                    if axis_length == 1
-                    else self.llvm_builder.udiv(memory_offset, llvm_axis_length)
-                )
+                index_before_reshape.append(self.llvm_builder.urem(memory_offset, llvm_axis_length))
+                memory_offset = self.llvm_builder.udiv(memory_offset, llvm_axis_length)
             return self.get_array_entry(
                 array,
                 (0 if shape_before_reshape[0] == 1 else memory_offset, *index_before_reshape[::-1]),

@@ -56,10 +56,6 @@ class MachineCode(NamedTuple):
     ]  # for each result, the lengths of all axes before the lanes and the dtype
     object_code_future: Future[bytes]
 
-    def wait_for_object_code(self) -> bytes:
-        """Return the object code. The call blocks until LLVM has compiled the code."""
-        return self.object_code_future.result()
-
 
 def get_machine_code(
     lane_function: Callable,
@@ -88,14 +84,11 @@ def get_machine_code(
     )
     code_index_name = f"lanes_index_{_compute_sha256_digest(repr(code_index_key).encode())}"
     if code_index_name not in _machine_code_by_record_name:
-        encoded_ffi_target_name = (
-            code_store.load_cache_record(code_index_name) if code_store is not None else None
-        )
-        machine_code = (
-            load_machine_code(encoded_ffi_target_name.decode("ascii", "replace"), code_store)
-            if encoded_ffi_target_name
-            else None
-        )
+        machine_code = None
+        encoded_ffi_target_name = code_store and code_store.load_cache_record(code_index_name)
+        if encoded_ffi_target_name:
+            ffi_target_name = encoded_ffi_target_name.decode("ascii", "replace")
+            machine_code = load_machine_code(ffi_target_name, code_store)
         _machine_code_by_record_name[code_index_name] = machine_code or _trace_and_compile_function(
             lane_function,
             argument_shapes,
@@ -154,9 +147,7 @@ def load_machine_code(ffi_target_name: str, code_store: CodeStore | None) -> Mac
     Return None if neither contains the code.
     """
     if ffi_target_name not in _machine_code_by_record_name:
-        cache_record_content = (
-            code_store.load_cache_record(ffi_target_name) if code_store is not None else None
-        )
+        cache_record_content = code_store and code_store.load_cache_record(ffi_target_name)
         if cache_record_content is None:
             return None
         encoded_result_types, _, object_code = cache_record_content.partition(b"\n")

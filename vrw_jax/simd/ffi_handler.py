@@ -40,14 +40,13 @@ def add_ffi_handler(
     n_inputs: int,
     n_outputs: int,
     lanes_per_group: int,
-    ffi_api_version: tuple[int, int],
 ) -> None:
     """Add the function `XLA_FFI_Error *handler(XLA_FFI_CallFrame *)` to the LLVM module.
 
     The function calls `llvm_kernel` with pointers to `n_inputs` arguments and `n_outputs` results,
     which it reads from the call frame. Offsets in the frame are in bytes, from XLA's
     xla/ffi/api/c_api.h, whose structs only grow at their ends. If XLA requests the metadata, the
-    handler reports `ffi_api_version`, for which it is compiled.
+    handler reports the version of the interface for which it is compiled.
     """
     llvm_pointer_type = ir.PointerType()
     llvm_handler = ir.Function(
@@ -83,7 +82,7 @@ def add_ffi_handler(
     llvm_builder.cbranch(is_metadata_request, metadata_basic_block, execute_basic_block)
     llvm_builder.position_at_end(metadata_basic_block)
     metadata_pointer = emit_struct_field_load(extension_pointer, 24)
-    for version_field_offset, version_number in zip((24, 28), ffi_api_version, strict=True):
+    for version_field_offset, version_number in zip((24, 28), read_ffi_api_version(), strict=True):
         llvm_builder.store(
             ir.Constant(I32, version_number),
             emit_struct_field_address(metadata_pointer, version_field_offset),

@@ -23,13 +23,13 @@ _loaded_code_lock = Lock()
 
 def register_machine_code(machine_code: MachineCode) -> None:
     """Load machine code, and make it callable by its name in JAX programs."""
-    object_code = machine_code.wait_for_object_code()
+    object_code = machine_code.object_code_future.result()  # LLVM has compiled it.
     with _loaded_code_lock:
         if machine_code.ffi_target_name not in LOADED_CODE_BY_FFI_TARGET:
             loaded_code = LoadedMachineCode(object_code)
             jax.ffi.register_ffi_target(
                 machine_code.ffi_target_name,
-                loaded_code.make_function_capsule(FFI_HANDLER_NAME),
+                jax.ffi.pycapsule(loaded_code.find_function_address(FFI_HANDLER_NAME)),
                 platform="cpu",
             )
             LOADED_CODE_BY_FFI_TARGET[machine_code.ffi_target_name] = loaded_code

@@ -13,12 +13,12 @@ from vrw_jax.simd.array_emitter import (
     has_lane_axis,
     make_lane_axis_error,
 )
-from vrw_jax.simd.ffi_handler import add_ffi_handler, read_ffi_api_version
-from vrw_jax.simd.lazy_arrays import EntryIndex, LazyArray, LlvmArray
+from vrw_jax.simd.ffi_handler import add_ffi_handler
+from vrw_jax.simd.lazy_arrays import EntryIndex, LazyArray, LlvmArray, MemoryArray
 from vrw_jax.simd.llvm_library import ir
 from vrw_jax.simd.lowering import JaxprLowering
 from vrw_jax.simd.rules import PRIMITIVE_RULES
-from vrw_jax.simd.value_emitter import I1, I8, I64, LLVM_NUMBER_TYPES, LlvmValue, ValueEmitter
+from vrw_jax.simd.value_emitter import I8, I64, LLVM_NUMBER_TYPES, LlvmValue, ValueEmitter
 
 LANE_KERNEL_NAME = "lanes"
 
@@ -54,18 +54,12 @@ def write_llvm_kernel(
     )
     argument_avals, result_avals = closed_jaxpr.in_avals, closed_jaxpr.out_avals
 
-    def emit_table_pointer_load(pointer_table: LlvmValue, table_index: int) -> LlvmValue:
-        entry_pointer = llvm_builder.gep(
-            pointer_table, [ir.Constant(I64, table_index)], source_etype=llvm_pointer_type
-        )
-        return llvm_builder.load(entry_pointer, typ=llvm_pointer_type)
+    def emit_pointer_loads(pointer_table: LlvmValue, n_pointers: int) -> list[LlvmValue]:
+        table = MemoryArray(array_emitter, (n_pointers,), llvm_pointer_type, pointer_table)
+        return [table.emit_entry_load((i,)) for i in range(n_pointers)]
 
-    input_pointers = [
-        emit_table_pointer_load(input_pointer_table, i) for i in range(len(argument_avals))
-    ]
-    output_pointers = [
-        emit_table_pointer_load(output_pointer_table, i) for i in range(len(result_avals))
-    ]
+    input_pointers = emit_pointer_loads(input_pointer_table, len(argument_avals))
+    output_pointers = emit_pointer_loads(output_pointer_table, len(result_avals))
 
     def emit_lane_group(lane_group_index: LlvmValue, _: Any) -> list[LlvmValue]:
         lane_group_access = _LaneGroupAccess(
@@ -74,10 +68,9 @@ def write_llvm_kernel(
             n_lanes,
             llvm_builder.mul(lane_group_index, ir.Constant(I64, lanes_per_group)),
         )
-        argument_arrays = [
-            lane_group_access.read_argument_array(*pointer_and_aval)
-            for pointer_and_aval in zip(input_pointers, argument_avals, strict=True)
-        ]
+        argument_arrays = list(
+            map(lane_group_access.read_argument_array, input_pointers, argument_avals)
+        )
         result_arrays = JaxprLowering(array_emitter, PRIMITIVE_RULES).lower_jaxpr(
             closed_jaxpr, argument_arrays
         )
@@ -95,7 +88,6 @@ def write_llvm_kernel(
         len(argument_avals),
         len(result_avals),
         lanes_per_group,
-        read_ffi_api_version(),
     )
     return str(llvm_module)
 
@@ -205,11 +197,8 @@ class _LaneGroupAccess:
         """Return the address of an array entry for the first lane of the group, and the LLVM type
         to load or store there.
         """
-        llvm_builder, llvm_element_type = (
-            self.array_emitter.llvm_builder,
-            LLVM_NUMBER_TYPES[aval.dtype.name],
-        )
-        llvm_element_type = I8 if llvm_element_type == I1 else llvm_element_type
+        llvm_builder = self.array_emitter.llvm_builder
+        llvm_element_type = I8 if aval.dtype.kind == "b" else LLVM_NUMBER_TYPES[aval.dtype.name]
         if aval.shape == ():
             return base_pointer, llvm_element_type
         entry_offset = self.array_emitter.emit_memory_offset(entry_index, aval.shape[:-1])

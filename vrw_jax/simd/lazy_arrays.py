@@ -86,26 +86,6 @@ class PendingArrayUpdate(LazyArray):
             self.start_index,
         )
 
-    def emit_update_stores(self, memory_array: "MemoryArray") -> None:
-        """Emit stores that overwrite the replaced part of `memory_array`.
-
-        The replacing part must be stored in memory before.
-        """
-        array_emitter = self.array_emitter
-
-        def store_updated_entry(update_index: EntryIndex, _: Any = None) -> list[LlvmValue]:
-            memory_array.emit_entry_store(
-                array_emitter.emit_sum_of_indices(update_index, self.start_index),
-                array_emitter.get_array_entry(self.update_array, update_index),
-            )
-            return []
-
-        if isinstance(self.update_array, np.ndarray) and any(self.update_array.strides):
-            for update_index in np.ndindex(self.update_array.shape):
-                store_updated_entry(update_index)
-        else:
-            array_emitter.emit_index_loops(self.update_array.shape, store_updated_entry)
-
 
 class MemoryArray(LazyArray):
     """Large array whose entries are stored one after another in memory, from `base_pointer` on.
@@ -129,6 +109,10 @@ class MemoryArray(LazyArray):
             is_overwritable,
         )
 
+    def contains_array(self, array: "LlvmArray") -> bool:
+        """Return whether `array` is stored in the memory of this array."""
+        return isinstance(array, MemoryArray) and array.base_pointer is self.base_pointer
+
     def emit_entry_address(self, entry_index: EntryIndex) -> LlvmValue:
         """Return the LLVM value of the address of the entry at `entry_index`."""
         memory_offset = self.array_emitter.emit_memory_offset(entry_index, self.shape)
@@ -144,11 +128,8 @@ class MemoryArray(LazyArray):
 
     def emit_entry_store(self, entry_index: EntryIndex, stored_value: LlvmValue) -> None:
         """Emit a store of `stored_value` into the entry at `entry_index`."""
-        stored_value = (
-            self.array_emitter.value_emitter.to_lane_vector(stored_value)
-            if isinstance(self.entry_type, ir.VectorType)
-            else stored_value
-        )
+        if isinstance(self.entry_type, ir.VectorType):
+            stored_value = self.array_emitter.value_emitter.to_lane_vector(stored_value)
         self.array_emitter.llvm_builder.store(stored_value, self.emit_entry_address(entry_index))
 
     def get_subarray(self, first_axis_index: LlvmValue) -> "MemoryArray":

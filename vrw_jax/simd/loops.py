@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from itertools import compress
 from typing import Any
 
 from vrw_jax.simd.array_emitter import (
@@ -31,17 +32,11 @@ def emit_while_loop(
     lane.
     """
     array_emitter, equation_params = jaxpr_lowering.array_emitter, equation.params
-    n_condition_constants, n_body_constants = (
-        equation_params["cond_nconsts"],
-        equation_params["body_nconsts"],
-    )
+    n_condition_constants = equation_params["cond_nconsts"]
+    n_loop_constants = n_condition_constants + equation_params["body_nconsts"]
     # The constants are shared, because each iteration reads them again.
-    loop_constants = list(
-        map(mark_memory_as_shared, operands[: n_condition_constants + n_body_constants])
-    )
-    condition_constants = loop_constants[:n_condition_constants]
-    body_constants = loop_constants[n_condition_constants:]
-    initial_loop_carry_arrays = operands[n_condition_constants + n_body_constants :]
+    loop_constants = list(map(mark_memory_as_shared, operands[:n_loop_constants]))
+    initial_loop_carry_arrays = operands[n_loop_constants:]
     loop_carry = _LoopCarry(
         array_emitter,
         equation_params["body_jaxpr"].out_avals,
@@ -53,7 +48,7 @@ def emit_while_loop(
         condition_results = jaxpr_lowering.lower_jaxpr(
             equation_params["cond_jaxpr"],
             [
-                *condition_constants,
+                *loop_constants[:n_condition_constants],
                 *map(mark_memory_as_shared, loop_carry.make_loop_carry_arrays(register_values)),
             ],
         )
@@ -62,7 +57,10 @@ def emit_while_loop(
     def emit_while_body(register_values: list[LlvmValue]) -> list[LlvmValue]:
         body_results = jaxpr_lowering.lower_jaxpr(
             equation_params["body_jaxpr"],
-            [*body_constants, *loop_carry.make_loop_carry_arrays(register_values)],
+            [
+                *loop_constants[n_condition_constants:],
+                *loop_carry.make_loop_carry_arrays(register_values),
+            ],
         )
         return loop_carry.get_next_register_values(body_results)
 
@@ -87,22 +85,16 @@ def emit_scan_loop(
         loop_constants, loop_carry, _ = equation_params["ft_in"].unpack()
         n_loop_constants, n_carried_arrays = len(loop_constants), len(loop_carry)
     else:
-        n_loop_constants, n_carried_arrays = (
-            equation_params["num_consts"],
-            equation_params["num_carry"],
-        )
+        n_loop_constants = equation_params["num_consts"]
+        n_carried_arrays = equation_params["num_carry"]
     body_jaxpr, n_iterations = equation_params["jaxpr"], equation_params["length"]
-    stacked_output_avals = [
-        output_variable.aval for output_variable in equation.outvars[n_carried_arrays:]
-    ]
-    if n_iterations == LANE_AXIS_SENTINEL and (
-        stacked_output_avals or len(operands) > n_loop_constants + n_carried_arrays
-    ):
+    stacked_output_avals = [x.aval for x in equation.outvars[n_carried_arrays:]]
+    scanned_operands = operands[n_loop_constants + n_carried_arrays :]
+    if n_iterations == LANE_AXIS_SENTINEL and (stacked_output_avals or scanned_operands):
         raise NotImplementedError(
             f"scan reads or writes along an axis of {LANE_AXIS_SENTINEL}, which is the lanes': "
             "do the same to each lane, and give other axes another length."
         )
-    scanned_operands = operands[n_loop_constants + n_carried_arrays :]
     scanned_arrays = [
         x if isinstance(x, TransposedMemoryView) else array_emitter.store_array_in_memory(x)
         for x in scanned_operands
@@ -196,6 +188,7 @@ class _LoopCarry:
                 loop_carry_avals, initial_loop_carry_arrays, strict=True
             )
         ]
+        self.is_in_registers = [memory_array is None for memory_array in self.loop_carry_memory]
 
     def choose_loop_carry_memory(
         self, loop_carry_aval: Any, initial_loop_carry_array: LlvmArray
@@ -206,11 +199,8 @@ class _LoopCarry:
         else new memory.
         """
         entry_type = self.array_emitter.get_entry_type(loop_carry_aval)
-        initial_loop_carry_array = (
-            initial_loop_carry_array.base_array
-            if isinstance(initial_loop_carry_array, PendingArrayUpdate)
-            else initial_loop_carry_array
-        )
+        if isinstance(initial_loop_carry_array, PendingArrayUpdate):
+            initial_loop_carry_array = initial_loop_carry_array.base_array
         if (
             isinstance(initial_loop_carry_array, MemoryArray)
             and initial_loop_carry_array.is_overwritable
@@ -226,13 +216,7 @@ class _LoopCarry:
 
         - `register_values`: entries of the arrays that are carried in registers.
         """
-        register_avals = [
-            loop_carry_aval
-            for loop_carry_aval, memory_array in zip(
-                self.loop_carry_avals, self.loop_carry_memory, strict=True
-            )
-            if memory_array is None
-        ]
+        register_avals = list(compress(self.loop_carry_avals, self.is_in_registers))
         register_arrays = iter(split_into_entry_arrays(register_values, register_avals))
         # Each call creates new objects, because values cached for the old ones are outdated.
         return [
@@ -257,14 +241,7 @@ class _LoopCarry:
         for initial_loop_carry_array, memory_array in zip(
             initial_loop_carry_arrays, self.loop_carry_memory, strict=True
         ):
-            if memory_array is None or initial_loop_carry_array is memory_array:
-                continue
-            if (
-                isinstance(initial_loop_carry_array, PendingArrayUpdate)
-                and initial_loop_carry_array.base_array is memory_array
-            ):
-                initial_loop_carry_array.store_update_in_memory().emit_update_stores(memory_array)
-            else:
+            if memory_array is not None:
                 self.array_emitter.emit_array_stores(memory_array, initial_loop_carry_array)
         return self._flatten_register_entries(initial_loop_carry_arrays)
 
@@ -278,65 +255,37 @@ class _LoopCarry:
         is stored.
         """
         register_values = self._flatten_register_entries(next_loop_carry_arrays)
-        pending_memory_copies: list[tuple[MemoryArray, MemoryArray | PendingArrayUpdate]] = []
-        for next_loop_carry_array, memory_array in zip(
+        carried_pointers = [m.base_pointer for m in self.loop_carry_memory if m is not None]
+        next_memory_contents: list[tuple[MemoryArray, MemoryArray | PendingArrayUpdate]] = []
+        for next_array, memory_array in zip(
             next_loop_carry_arrays, self.loop_carry_memory, strict=True
         ):
-            if memory_array is None or (
-                isinstance(next_loop_carry_array, MemoryArray)
-                and next_loop_carry_array.base_pointer is memory_array.base_pointer
-            ):
+            if memory_array is None:
                 continue
-            if (
-                isinstance(next_loop_carry_array, PendingArrayUpdate)
-                and getattr(next_loop_carry_array.base_array, "base_pointer", None)
-                is memory_array.base_pointer
+            if isinstance(next_array, PendingArrayUpdate) and memory_array.contains_array(
+                next_array.base_array
             ):
-                pending_memory_copies.append(
-                    (memory_array, next_loop_carry_array.store_update_in_memory())
-                )
-            elif isinstance(next_loop_carry_array, MemoryArray) and self._uses_separate_memory(
-                next_loop_carry_array
+                next_array = next_array.store_update_in_memory()
+            elif not memory_array.contains_array(next_array) and not (
+                isinstance(next_array, MemoryArray)
+                and isinstance(next_array.base_pointer, ir.AllocaInstr)
+                and next_array.base_pointer not in carried_pointers
             ):
-                pending_memory_copies.append((memory_array, next_loop_carry_array))
-            else:
                 copied_array = self.array_emitter.allocate_memory_array(
                     memory_array.shape, memory_array.entry_type
                 )
-                self.array_emitter.emit_array_stores(copied_array, next_loop_carry_array)
-                pending_memory_copies.append((memory_array, copied_array))
-        for memory_array, next_loop_carry_content in pending_memory_copies:
-            if isinstance(next_loop_carry_content, PendingArrayUpdate):
-                next_loop_carry_content.emit_update_stores(memory_array)
-            else:
-                self.array_emitter.emit_array_stores(memory_array, next_loop_carry_content)
+                self.array_emitter.emit_array_stores(copied_array, next_array)
+                next_array = copied_array
+            next_memory_contents.append((memory_array, next_array))
+        for memory_array, next_array in next_memory_contents:
+            self.array_emitter.emit_array_stores(memory_array, next_array)
         return register_values
-
-    def _uses_separate_memory(self, array: MemoryArray) -> bool:
-        """Return whether no carried array uses the memory of `array`."""
-        carried_base_pointers = [
-            memory_array.base_pointer
-            for memory_array in self.loop_carry_memory
-            if memory_array is not None
-        ]
-        return (
-            isinstance(array.base_pointer, ir.AllocaInstr)
-            and array.base_pointer not in carried_base_pointers
-        )
 
     def _flatten_register_entries(self, loop_carry_arrays: Sequence[LlvmArray]) -> list[LlvmValue]:
         """Return a list of the entries of all carried arrays that are in registers."""
-        arrays_avals_memories = zip(
-            loop_carry_arrays, self.loop_carry_avals, self.loop_carry_memory, strict=True
-        )
-        register_arrays = [
-            (loop_carry_array, loop_carry_aval)
-            for loop_carry_array, loop_carry_aval, memory_array in arrays_avals_memories
-            if memory_array is None
-        ]
         return self.array_emitter.flatten_array_entries(
-            [loop_carry_array for loop_carry_array, _ in register_arrays],
-            [loop_carry_aval for _, loop_carry_aval in register_arrays],
+            list(compress(loop_carry_arrays, self.is_in_registers)),
+            list(compress(self.loop_carry_avals, self.is_in_registers)),
         )
 
 

@@ -75,10 +75,8 @@ class JaxprLowering:
         arrays.
         """
         jaxpr, emit_constant_array = closed_jaxpr.jaxpr, self.array_emitter.emit_constant_array
-        overwriting_equation_by_variable, array_by_variable = (
-            _find_overwriting_equations(jaxpr),
-            dict[Any, LlvmArray](),
-        )
+        overwriting_equation_by_variable = _find_overwriting_equations(jaxpr)
+        array_by_variable: dict[Any, LlvmArray] = {}
 
         def assign_jaxpr_variables(
             jaxpr_variables: Sequence[Any], assigned_arrays: Sequence[LlvmArray]
@@ -110,10 +108,7 @@ class JaxprLowering:
             )
 
         for equation_index, equation in enumerate(jaxpr.eqns):
-            if all(
-                jaxpr_variable.aval.dtype == jax.dtypes.float0
-                for jaxpr_variable in equation.outvars
-            ):
+            if all(variable.aval.dtype == jax.dtypes.float0 for variable in equation.outvars):
                 continue  # The derivative of an integer has no value, and no equation reads it.
             equation_results = self._lower_equation(
                 equation, [read_jaxpr_atom(x, equation_index) for x in equation.invars]
@@ -227,21 +222,13 @@ def _find_overwriting_equations(jaxpr: Any) -> dict[Any, int | None]:
     return overwriting_equation_by_variable
 
 
-def make_call_rule(jaxpr_parameter_name: str) -> PrimitiveRule:
-    """Return the rule for a primitive that calls a jaxpr.
-
-    - `jaxpr_parameter_name`: name of the primitive's parameter that contains the jaxpr.
+def emit_called_jaxpr(
+    jaxpr_lowering: JaxprLowering, equation: Any, operands: list[LlvmArray]
+) -> list[LlvmArray]:
+    """Emit the called jaxpr and return its results. The code is inline, or a separate function if
+    `mark_noinline` marks it.
     """
-
-    def emit_called_jaxpr(
-        jaxpr_lowering: JaxprLowering, equation: Any, operands: list[LlvmArray]
-    ) -> list[LlvmArray]:
-        """Emit the called jaxpr and return its results. The code is inline, or a separate function
-        if `mark_noinline` marks it.
-        """
-        closed_jaxpr = equation.params[jaxpr_parameter_name]
-        if equation.params.get("name") == NOINLINE_FUNCTION_NAME:
-            return jaxpr_lowering.emit_separate_function_call(closed_jaxpr, operands)
-        return jaxpr_lowering.lower_jaxpr(closed_jaxpr, operands)
-
-    return emit_called_jaxpr
+    closed_jaxpr = equation.params[CALLED_JAXPR_PARAMETERS[equation.primitive.name]]
+    if equation.params.get("name") == NOINLINE_FUNCTION_NAME:
+        return jaxpr_lowering.emit_separate_function_call(closed_jaxpr, operands)
+    return jaxpr_lowering.lower_jaxpr(closed_jaxpr, operands)

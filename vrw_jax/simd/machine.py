@@ -1,12 +1,11 @@
 """Interface to LLVM: the target processor, object code for it, and loading of code into memory."""
 
-import ctypes
 import functools
 import platform
+import re
 import struct
 import sys
 from enum import IntEnum
-from typing import Any
 
 from vrw_jax.simd.llvm_library import is_llvmlite_installed, llvm
 
@@ -103,10 +102,8 @@ def _emit_object_code(
     llvm_module: "llvm.ModuleRef", llvm_target_machine: "llvm.TargetMachine"
 ) -> bytes:
     """Run the passes in `LLVM_PASS_NAMES` on an LLVM module, and return its object code."""
-    llvm_module.triple, llvm_module.data_layout = (
-        llvm_target_machine.triple,
-        str(llvm_target_machine.target_data),
-    )
+    llvm_module.triple = llvm_target_machine.triple
+    llvm_module.data_layout = str(llvm_target_machine.target_data)
     llvm_pass_manager = llvm.create_new_module_pass_manager()
     for llvm_pass_name in LLVM_PASS_NAMES:
         getattr(llvm_pass_manager, f"add_{llvm_pass_name}_pass")()
@@ -125,10 +122,7 @@ def require_object_file(object_code: bytes, function_name: str) -> None:
     Only files in the ELF format are checked completely. In other formats the check only looks for
     the name.
     """
-    if (
-        f"\0{function_name}\0".encode() not in object_code
-        and f"\0_{function_name}\0".encode() not in object_code
-    ):
+    if not re.search(f"\0_?{function_name}\0".encode(), object_code):
         raise ValueError(f"it has no function {function_name}")
     if llvm.get_object_format() != "ELF" or sys.byteorder != "little":
         return
@@ -171,22 +165,12 @@ class LoadedMachineCode:
         """Return the memory address of a loaded function."""
         return self._llvm_engine.get_function_address(function_name)
 
-    def make_function_capsule(self, function_name: str) -> Any:
-        """Return a PyCapsule that contains the address of a loaded function, by which XLA can call
-        it.
-        """
-        create_py_capsule = ctypes.pythonapi.PyCapsule_New
-        create_py_capsule.restype = ctypes.py_object
-        create_py_capsule.argtypes = [ctypes.c_void_p, ctypes.c_char_p, ctypes.c_void_p]
-        return create_py_capsule(self.find_function_address(function_name), None, None)
-
 
 def _make_llvm_target_machine() -> "llvm.TargetMachine":
     """Return LLVM's target machine for this processor."""
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()
     target_triple, processor_name, processor_features = describe_processor()
-    llvm_target = llvm.Target.from_triple(target_triple)
-    return llvm_target.create_target_machine(
+    return llvm.Target.from_triple(target_triple).create_target_machine(
         cpu=processor_name, features=processor_features, opt=LLVM_OPTIMIZATION_LEVEL, jit=True
     )

@@ -185,19 +185,20 @@ def compile_lane_function(
     def call_compiled_function(*argument_trees: Any) -> Any:
         argument_leaves, argument_structure = jax.tree.flatten(argument_trees)
         n_lanes = argument_leaves[0].shape[-1]
-        for argument_shape in (jnp.shape(x) for x in argument_leaves):
+        for argument_shape in map(jnp.shape, argument_leaves):
             if argument_shape and argument_shape[-1] != n_lanes:
                 raise ValueError(
                     f"An argument has the shape {argument_shape}, but the first one has {n_lanes} "
                     "lanes: give every array the same number on its last axis, or a number without "
                     "axes."
                 )
-        lanes_per_full_group = LANES_PER_256_BITS[np.dtype(argument_leaves[0].dtype)] * (
-            2 if has_512_bit_vectors() else 1
-        )
+        lanes_per_group = LANES_PER_256_BITS[np.dtype(argument_leaves[0].dtype)]
+        if has_512_bit_vectors():
+            lanes_per_group *= 2
         # A single lane has separate code, because a full group would compute lanes that are not
         # needed.
-        lanes_per_group = 1 if n_lanes == 1 else lanes_per_full_group
+        if n_lanes == 1:
+            lanes_per_group = 1
         n_padding_lanes = -n_lanes % lanes_per_group
         lane_argument_shapes = [
             jax.ShapeDtypeStruct(
@@ -225,12 +226,12 @@ def compile_lane_function(
                 [x, jnp.repeat(x[..., -1:], n_padding_lanes, -1)], -1
             )
             argument_leaves = [pad_with_last_lane(x) if jnp.ndim(x) else x for x in argument_leaves]
-        padded_result_shapes = [
+        padded_result_shapes = tuple(
             jax.ShapeDtypeStruct((*shape_without_lanes, n_lanes + n_padding_lanes), result_dtype)
             for shape_without_lanes, result_dtype in machine_code.result_shapes_and_dtypes
-        ]
+        )
         padded_results = MACHINE_CODE_PRIMITIVE.bind(
-            *argument_leaves, machine_code=machine_code, result_shapes=tuple(padded_result_shapes)
+            *argument_leaves, machine_code=machine_code, result_shapes=padded_result_shapes
         )
         result_structure = jax.tree.structure(
             jax.eval_shape(result_shape_function, *argument_trees)
@@ -254,30 +255,21 @@ def load_saved_machine_code(ffi_target_names: Sequence[str], code_store: CodeSto
 
     Return whether the code of every name is available.
     """
-    for ffi_target_name in ffi_target_names:
-        machine_code = (
-            None
-            if ffi_target_name in LOADED_CODE_BY_FFI_TARGET
-            else load_machine_code(ffi_target_name, code_store)
-        )
+    for ffi_target_name in set(ffi_target_names) - LOADED_CODE_BY_FFI_TARGET.keys():
+        machine_code = load_machine_code(ffi_target_name, code_store)
         if machine_code is not None:
             register_machine_code(machine_code)
-    return all(ffi_target_name in LOADED_CODE_BY_FFI_TARGET for ffi_target_name in ffi_target_names)
+    return LOADED_CODE_BY_FFI_TARGET.keys() >= set(ffi_target_names)
 
 
 class _LoadedLaneProgram:
     """Callable that runs loaded machine code on NumPy arrays."""
 
     def __init__(self, machine_code: MachineCode, lanes_per_group: int) -> None:
-        self.result_shapes_and_dtypes, self.lanes_per_group = (
-            machine_code.result_shapes_and_dtypes,
-            lanes_per_group,
-        )
-        self._loaded_code = LoadedMachineCode(machine_code.wait_for_object_code())
-        c_pointer_type, c_count_type = ctypes.c_void_p, ctypes.c_int64
-        c_function_type = ctypes.CFUNCTYPE(
-            None, c_pointer_type, c_pointer_type, c_count_type, c_count_type, c_count_type
-        )
+        self.result_shapes_and_dtypes = machine_code.result_shapes_and_dtypes
+        self.lanes_per_group = lanes_per_group
+        self._loaded_code = LoadedMachineCode(machine_code.object_code_future.result())
+        c_function_type = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * 2, *[ctypes.c_int64] * 3)
         self._run_lane_kernel = c_function_type(
             self._loaded_code.find_function_address(LANE_KERNEL_NAME)
         )

@@ -28,31 +28,13 @@ def emit_cumulative_sum(
     """Return the cumulative sums along an axis, from its start or, with `reverse`, from its end."""
     if primitive_call.primitive_params["axis"] == len(array.shape):
         raise make_lane_mixing_error(primitive_call.primitive_name)
-    entries_along_axis = np.moveaxis(
-        array_emitter.get_array_entries(array), primitive_call.primitive_params["axis"], 0
-    )
-    result_dtype = primitive_call.result_aval.dtype
-    axis_index_order = range(len(entries_along_axis))[
-        :: -1 if primitive_call.primitive_params["reverse"] else 1
-    ]
-    emit_sum = lambda x, y: emit_llvm_elementwise_primitive(
-        array_emitter.value_emitter, "add", {}, result_dtype, result_dtype, (x, y)
-    )
-    partial_sums = np.empty_like(entries_along_axis)
-    for n_summed_entries, i in enumerate(axis_index_order):
-        sum_and_term_pairs = zip(
-            partial_sums[axis_index_order[n_summed_entries - 1], ...].ravel(),
-            entries_along_axis[i, ...].ravel(),
-            strict=True,
-        )
-        cumulative_sum_entries = [
-            emit_sum(*sum_and_term) if n_summed_entries else sum_and_term[1]
-            for sum_and_term in sum_and_term_pairs
-        ]
-        partial_sums[i, ...] = make_entry_array(
-            entries_along_axis.shape[1:], cumulative_sum_entries
-        )
-    return np.moveaxis(partial_sums, 0, primitive_call.primitive_params["axis"])
+    sum_axis, is_reversed = (primitive_call.primitive_params[name] for name in ("axis", "reverse"))
+    array_entries = array_emitter.get_array_entries(array)
+    emit_sum = _make_combination(array_emitter, "add", primitive_call.result_aval.dtype)
+    if is_reversed:
+        array_entries = np.flip(array_entries, sum_axis)
+    partial_sums = np.frompyfunc(emit_sum, 2, 1).accumulate(array_entries, sum_axis, object)
+    return np.flip(partial_sums, sum_axis) if is_reversed else partial_sums
 
 
 def emit_array_product(
@@ -69,11 +51,10 @@ def emit_array_product(
         raise NotImplementedError(
             "dot_general sums over one pair of axes only, without a batch: multiply and sum."
         )
-    (left_axis,), (right_axis,), result_dtype = (
-        contracted_left_axes,
-        contracted_right_axes,
-        primitive_call.result_aval.dtype,
-    )
+    (left_axis,), (right_axis,) = contracted_left_axes, contracted_right_axes
+    result_dtype = primitive_call.result_aval.dtype
+    emit_product = _make_combination(array_emitter, "mul", result_dtype)
+    emit_sum = _make_combination(array_emitter, "add", result_dtype)
     n_terms, n_left_axes = left_array.shape[left_axis], len(left_array.shape) - 1
 
     def emit_product_term(product_index: EntryIndex, k: Any) -> LlvmValue:
@@ -84,17 +65,10 @@ def emit_array_product(
         y = array_emitter.get_array_entry(
             right_array, (*right_index[:right_axis], k, *right_index[right_axis:])
         )
-        return emit_llvm_elementwise_primitive(
-            array_emitter.value_emitter, "mul", {}, result_dtype, result_dtype, (x, y)
-        )
+        return emit_product(x, y)
 
-    emit_sum = lambda x, y: emit_llvm_elementwise_primitive(
-        array_emitter.value_emitter, "add", {}, result_dtype, result_dtype, (x, y)
-    )
-    product_shape, entry_type = (
-        primitive_call.result_shape,
-        array_emitter.get_entry_type(primitive_call.result_aval),
-    )
+    product_shape = primitive_call.result_shape
+    entry_type = array_emitter.get_entry_type(primitive_call.result_aval)
     if (
         n_terms <= array_emitter.register_limits.max_unrolled_reduction_terms
         or array_emitter.is_in_innermost_loop
@@ -105,13 +79,9 @@ def emit_array_product(
         if isinstance(left_array, LazyArray) or isinstance(right_array, LazyArray):
             return LazyArray(product_shape, entry_type, emit_product_entry)
         return make_entry_array(
-            product_shape,
-            [emit_product_entry(entry_index) for entry_index in np.ndindex(product_shape)],
+            product_shape, list(map(emit_product_entry, np.ndindex(product_shape)))
         )
-    left_array, right_array = (
-        array_emitter.store_array_in_memory(left_array),
-        array_emitter.store_array_in_memory(right_array),
-    )
+    left_array, right_array = map(array_emitter.store_array_in_memory, (left_array, right_array))
     product_memory = array_emitter.allocate_memory_array(product_shape, entry_type)
 
     def store_product_entry(product_index: EntryIndex, _: Any) -> list[LlvmValue]:
@@ -152,9 +122,7 @@ def make_reduction_rule(combining_primitive: str) -> Callable[..., LlvmArray]:
         reduced_axes = tuple(
             axis for axis in primitive_call.primitive_params["axes"] if axis < len(array.shape)
         )
-        emit_combination = lambda x, y: emit_llvm_elementwise_primitive(
-            array_emitter.value_emitter, combining_primitive, {}, result_dtype, result_dtype, (x, y)
-        )
+        emit_combination = _make_combination(array_emitter, combining_primitive, result_dtype)
         result_axis_lengths = [n for axis, n in enumerate(array.shape) if axis not in reduced_axes]
         reduced_axis_lengths = [array.shape[axis] for axis in reduced_axes]
 
@@ -197,17 +165,24 @@ def make_reduction_rule(combining_primitive: str) -> Callable[..., LlvmArray]:
                 [initial_reduction_value],
             )[0]
 
-        reduced_entries = [
-            emit_reduced_entry(result_index) for result_index in np.ndindex(*result_axis_lengths)
-        ]
+        reduced_entries = list(map(emit_reduced_entry, np.ndindex(*result_axis_lengths)))
         if reduces_over_lanes:
-            reduced_entries = [
-                _emit_any_or_all_lanes(array_emitter, combining_primitive, reduced_entry)
-                for reduced_entry in reduced_entries
-            ]
+            emit_lane_test = functools.partial(
+                _emit_any_or_all_lanes, array_emitter, combining_primitive
+            )
+            reduced_entries = list(map(emit_lane_test, reduced_entries))
         return make_entry_array(tuple(result_axis_lengths), reduced_entries)
 
     return emit_reduced_array
+
+
+def _make_combination(
+    array_emitter: ArrayEmitter, primitive_name: str, number_dtype: Any
+) -> Callable[[LlvmValue, LlvmValue], LlvmValue]:
+    """Return a function that emits an elementwise primitive of two entries of one type."""
+    return lambda x, y: emit_llvm_elementwise_primitive(
+        array_emitter.value_emitter, primitive_name, {}, number_dtype, number_dtype, (x, y)
+    )
 
 
 def _emit_any_or_all_lanes(

@@ -20,7 +20,7 @@ from vrw_jax.simd.lowering import (
     CALLED_JAXPR_PARAMETERS,
     JaxprLowering,
     PrimitiveRule,
-    make_call_rule,
+    emit_called_jaxpr,
 )
 
 
@@ -36,10 +36,8 @@ def _make_single_result_rule(emit_single_result: Callable[..., LlvmArray]) -> Pr
     ) -> list[LlvmArray]:
         primitive_name, result_aval = equation.primitive.name, equation.outvars[0].aval
         operand_avals = [input_atom.aval for input_atom in equation.invars]
-        result_has_lanes, operand_has_lanes = (
-            has_lane_axis(result_aval),
-            any(map(has_lane_axis, operand_avals)),
-        )
+        result_has_lanes = has_lane_axis(result_aval)
+        operand_has_lanes = any(map(has_lane_axis, operand_avals))
         if (
             operand_has_lanes
             and not result_has_lanes
@@ -53,17 +51,17 @@ def _make_single_result_rule(emit_single_result: Callable[..., LlvmArray]) -> Pr
         ):
             raise make_lane_axis_error(f"The result of {primitive_name}", result_aval)
         get_llvm_number_type(result_aval)  # This call raises an error for unsupported number types.
+        array_emitter = jaxpr_lowering.array_emitter
         result_array = emit_single_result(
-            jaxpr_lowering.array_emitter,
+            array_emitter,
             PrimitiveCall(primitive_name, equation.params, operand_avals, result_aval),
             *operands,
         )
         if (
             isinstance(result_array, LazyArray)
-            and math.prod(result_array.shape)
-            <= jaxpr_lowering.array_emitter.register_limits.max_unrolled_entries
+            and math.prod(result_array.shape) <= array_emitter.register_limits.max_unrolled_entries
         ):
-            result_array = jaxpr_lowering.array_emitter.get_array_entries(result_array)
+            result_array = array_emitter.get_array_entries(result_array)
         return [result_array]
 
     emit_result_with_lane_checks.__doc__ = emit_single_result.__doc__
@@ -89,38 +87,37 @@ def _emit_optimization_barrier(
     ]
 
 
+SINGLE_RESULT_RULES: dict[str, Callable[..., LlvmArray]] = {
+    **dict.fromkeys(ELEMENTWISE_RULES, _emit_elementwise_result),
+    "broadcast_in_dim": data_movement.emit_broadcast_array,
+    "concatenate": data_movement.emit_concatenated_array,
+    "dynamic_slice": data_movement.emit_dynamic_slice,
+    "dynamic_update_slice": data_movement.emit_dynamic_slice_update,
+    "empty": data_movement.emit_uninitialized_array,
+    "expand_dims": data_movement.emit_reshaped_array,
+    "iota": data_movement.emit_index_array,
+    "pad": data_movement.emit_padded_array,
+    "reshape": data_movement.emit_reshaped_array,
+    "slice": data_movement.emit_static_slice,
+    "squeeze": data_movement.emit_reshaped_array,
+    "stack": data_movement.emit_stacked_array,
+    "transpose": data_movement.emit_transposed_array,
+    "cumsum": reductions.emit_cumulative_sum,
+    "dot_general": reductions.emit_array_product,
+    "reduce_and": reductions.make_reduction_rule("and"),
+    "reduce_max": reductions.make_reduction_rule("max"),
+    "reduce_min": reductions.make_reduction_rule("min"),
+    "reduce_or": reductions.make_reduction_rule("or"),
+    "reduce_sum": reductions.make_reduction_rule("add"),
+}
+"""Rules of primitives with one result, by the name of the primitive."""
+
 PRIMITIVE_RULES: dict[str, PrimitiveRule] = {
-    **{
-        primitive_name: _make_single_result_rule(_emit_elementwise_result)
-        for primitive_name in ELEMENTWISE_RULES
-    },
-    "broadcast_in_dim": _make_single_result_rule(data_movement.emit_broadcast_array),
-    "concatenate": _make_single_result_rule(data_movement.emit_concatenated_array),
-    "dynamic_slice": _make_single_result_rule(data_movement.emit_dynamic_slice),
-    "dynamic_update_slice": _make_single_result_rule(data_movement.emit_dynamic_slice_update),
-    "empty": _make_single_result_rule(data_movement.emit_uninitialized_array),
-    "expand_dims": _make_single_result_rule(data_movement.emit_reshaped_array),
-    "iota": _make_single_result_rule(data_movement.emit_index_array),
-    "pad": _make_single_result_rule(data_movement.emit_padded_array),
-    "reshape": _make_single_result_rule(data_movement.emit_reshaped_array),
-    "slice": _make_single_result_rule(data_movement.emit_static_slice),
-    "squeeze": _make_single_result_rule(data_movement.emit_reshaped_array),
-    "stack": _make_single_result_rule(data_movement.emit_stacked_array),
-    "unstack": data_movement.emit_unstacked_arrays,
-    "transpose": _make_single_result_rule(data_movement.emit_transposed_array),
-    "cumsum": _make_single_result_rule(reductions.emit_cumulative_sum),
-    "dot_general": _make_single_result_rule(reductions.emit_array_product),
-    "reduce_and": _make_single_result_rule(reductions.make_reduction_rule("and")),
-    "reduce_max": _make_single_result_rule(reductions.make_reduction_rule("max")),
-    "reduce_min": _make_single_result_rule(reductions.make_reduction_rule("min")),
-    "reduce_or": _make_single_result_rule(reductions.make_reduction_rule("or")),
-    "reduce_sum": _make_single_result_rule(reductions.make_reduction_rule("add")),
-    **{
-        primitive_name: make_call_rule(jaxpr_parameter_name)
-        for primitive_name, jaxpr_parameter_name in CALLED_JAXPR_PARAMETERS.items()
-    },
+    **{name: _make_single_result_rule(rule) for name, rule in SINGLE_RESULT_RULES.items()},
+    **dict.fromkeys(CALLED_JAXPR_PARAMETERS, emit_called_jaxpr),
     "optimization_barrier": _emit_optimization_barrier,
     "scan": loops.emit_scan_loop,
+    "unstack": data_movement.emit_unstacked_arrays,
     "while": loops.emit_while_loop,
 }
 
