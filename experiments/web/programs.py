@@ -303,7 +303,7 @@ def _of_rigid_legs(wheel: Callable[[Array], WheelParams]) -> dict[str, Program]:
         step = RigidWheel().compute_step_elementwise(params, tuple(x), friction + 0.0 * x[0])
         half = 0.5 * params.leg_angle
         share = jnp.arange(SAMPLES)[:, None] * (1.0 / (SAMPLES - 1))
-        roll = RollingMotion(params.symbols(), params.slope, step.post_impact[1])
+        roll = RollingMotion(params.symbols(), params.slope, step.post_impact[1], -half, half)
         theta = half * (2.0 * share - 1.0) + 0.0 * x[0]
         rows = jnp.concatenate(
             [*roll.evaluate_states_at_angles(theta), roll.compute_time_to_angle(theta)[None]]
@@ -330,7 +330,7 @@ def _numbers_of(step: StepResult) -> Array:
 def _advance(
     params: WheelParams, x: tuple[Array, ...], options: StepOptions
 ) -> tuple[tuple, tuple]:
-    step = advance_gait_step(
+    step, _ = advance_gait_step(
         params, x, options, load_explicit_tableau(SOLVER), stop_at_lift_off=True
     )
     return (*step.section_state, *step.durations), (step.outcome, step.solver_steps)

@@ -532,14 +532,10 @@ def _step_lanes_by_kernel(
                 lane_step_inputs[:n_parameters], n_legs, *lane_step_inputs[NEXT_SLOPE_INPUT_INDEX:]
             )
             x = lane_step_inputs[n_parameters:NEXT_SLOPE_INPUT_INDEX]
-            step_result = advance_gait_step(
+            step_result, is_unfinished = advance_gait_step(
                 params, x, traced_options, solver_tableau, stop_at_lift_off, straggler_count
             )
-            step_diagnostics = (
-                step_result.is_unfinished,
-                step_result.outcome,
-                step_result.solver_steps,
-            )
+            step_diagnostics = is_unfinished, step_result.outcome, step_result.solver_steps
             return jnp.stack([*step_result.section_state, *step_result.durations]), step_diagnostics
 
         if not input_indices:

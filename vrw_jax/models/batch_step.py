@@ -6,6 +6,9 @@ one wheel. Under `jax.vmap`, this function runs once for the whole batch.
 """
 
 import dataclasses
+import functools
+import math
+import operator
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -13,7 +16,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Int
+from jaxtyping import Array, Bool
 
 from vrw_jax import simd
 from vrw_jax.integrator import (
@@ -37,7 +40,6 @@ from vrw_jax.models.phase_sequence import (
     make_step_result,
     make_trajectory,
     run_step_phases,
-    select_next_section_state,
 )
 from vrw_jax.models.step_results import (
     AdvanceResult,
@@ -60,7 +62,6 @@ from vrw_jax.wheel import (
     PARAMETER_NAMES,
     AbstractPhase,
     Motion,
-    Outcome,
     PhaseInstant,
     WheelParams,
     compute_wheel_units,
@@ -88,19 +89,7 @@ class StiffStartOptions:
     """
 
 
-DEFAULT_STIFF_START_OPTIONS = StiffStartOptions()
-
-
-class BatchAdvanceResult(NamedTuple):
-    """Results of one walking step for each batch element, without indicators, margins and
-    energies.
-    """
-
-    section_state: Vector  # (theta-, dtheta-, dL1-), three arrays
-    durations: Vector  # durations of DLS, SLS-I, SLS-II, s
-    outcome: Int[Array, " lanes"]  # an Outcome
-    solver_steps: Int[Array, " lanes"]
-    is_unfinished: Bool[Array, " lanes"]  # lanes stopped as stragglers; no other field is valid
+STIFF_START_OPTIONS = StiffStartOptions()
 
 
 class _NextPhaseInputs(NamedTuple):
@@ -149,17 +138,14 @@ def make_batch_phase(
             complete_motion_at_stage(stage), right_hand_side
         ),
     )
-    evaluate_stage_margins = lambda stage: phase.compute_margins(make_phase_instant(stage))
-    recorded_margins = (
-        MarginFunctions(evaluate_stage_margins, phase.are_margins_counted_at_start)
-        if records_margins
-        else None
+    margin_functions = MarginFunctions(
+        lambda stage: phase.compute_margins(make_phase_instant(stage)),
+        phase.are_margins_counted_at_start,
     )
-    evaluate_guards = lambda stage: phase.compute_guards(make_phase_instant(stage))
     return BatchPhase(
         evaluate_acceleration,
-        evaluate_guards,
-        recorded_margins,
+        lambda stage: phase.compute_guards(make_phase_instant(stage)),
+        margin_functions if records_margins else None,
         implicit_dynamics,
         is_compiled_separately,
         phase.coordinate_units,
@@ -173,8 +159,11 @@ def advance_gait_step(
     tableau: ButcherTableau,
     stop_at_lift_off: bool,
     straggler_count: Array | None = None,
-) -> BatchAdvanceResult:
+) -> tuple[AdvanceResult, Array]:
     """Compute one walking step per batch element, without indicators, margins and energies.
+
+    Return the results, and flags of the elements that were stopped as stragglers. No result of
+    these elements is valid.
 
     - `x`: section state of each batch element just before touchdown;
     - `tableau`: Butcher tableau of the explicit solver;
@@ -191,23 +180,11 @@ def advance_gait_step(
         records_margins=False,
         straggler_count=straggler_count,
     )
-    phase_end_results, has_stepped = (
-        phase_sequence.phase_end_results,
-        phase_sequence.outcome == Outcome.STEPPED,
-    )
-    next_state = select_next_section_state(phase_sequence)
-    return BatchAdvanceResult(
-        section_state=tuple(
-            jnp.where(has_stepped, state_component, 0.0) for state_component in next_state
-        ),
-        durations=tuple(phase_end.duration for phase_end in phase_end_results),
-        outcome=phase_sequence.outcome,
-        solver_steps=phase_end_results[0].n_solver_steps
-        + phase_end_results[1].n_solver_steps
-        + phase_end_results[2].n_solver_steps,
-        is_unfinished=phase_end_results[0].next_phase_inputs.is_unfinished
-        | phase_end_results[1].next_phase_inputs.is_unfinished
-        | phase_end_results[2].next_phase_inputs.is_unfinished,
+    is_phase_unfinished = [
+        phase_end.next_phase_inputs.is_unfinished for phase_end in phase_sequence.phase_end_results
+    ]
+    return make_advance_result(phase_sequence, "lanes"), functools.reduce(
+        operator.or_, is_phase_unfinished
     )
 
 
@@ -220,7 +197,6 @@ def run_batch_phases(
     records_margins: bool,
     straggler_count: Array | None = None,
     is_compiled_separately: bool = False,
-    stiff_start_options: StiffStartOptions = DEFAULT_STIFF_START_OPTIONS,
 ) -> PhaseSequenceResult:
     """Integrate all phases of one walking step per batch element and return their starts and ends.
 
@@ -232,12 +208,7 @@ def run_batch_phases(
     - `is_compiled_separately`: see `BatchPhase`.
     """
     phase_runner = _make_phase_runner(
-        options,
-        tableau,
-        records_margins,
-        straggler_count,
-        is_compiled_separately,
-        stiff_start_options,
+        options, tableau, records_margins, straggler_count, is_compiled_separately
     )
     landing_function = with_batched_jvp(transitions.resolve_landing)
     return run_step_phases(phase_runner, params, x, options, stop_at_lift_off, landing_function)
@@ -249,7 +220,6 @@ def _make_phase_runner(
     records_margins: bool,
     straggler_count: Array | None,
     is_compiled_separately: bool,
-    stiff_start_options: StiffStartOptions,
 ) -> PhaseRunner:
     """Return a function that integrates one phase to its end, for all batch elements.
 
@@ -273,11 +243,11 @@ def _make_phase_runner(
                     jnp.log(options.rtol.astype(jnp.float32)) / tableau.convergence_order
                 )
                 max_dt_in_transient_times = (
-                    stiff_start_options.max_first_step_in_transient_times
+                    STIFF_START_OPTIONS.max_first_step_in_transient_times
                     * tolerance_root.astype(dt0.dtype)
                 )
                 max_transient_dt = max_dt_in_transient_times * phase.s.m / phase.s.c
-                dt0 = jnp.minimum(stiff_start_options.max_first_step_ratio * dt0, max_transient_dt)
+                dt0 = jnp.minimum(STIFF_START_OPTIONS.max_first_step_ratio * dt0, max_transient_dt)
                 dt0 = jnp.where(
                     next_phase_inputs.has_phase_occurred, dt0, next_phase_inputs.next_solver_dt
                 )
@@ -336,19 +306,34 @@ def can_use_batch_kernel(options: StepOptions) -> bool:
     return is_solver_explicit and simd.is_machine_code_available() and options.engine != "diffrax"
 
 
-class _StepTraceConfig(NamedTuple):
+class StepTraceConfig(NamedTuple):
     """Static settings on which the traced program of a batch of walking steps depends."""
 
     argument_structure: Any  # tree structure of (params, x, options)
     stop_at_lift_off: bool
-    friction: float | None  # friction of the margins; None for the minimal results
+    friction: float | None = None  # friction of the margins; None for the minimal results
 
-    @property
-    def trace_key(self) -> tuple:
-        """Return the key under which caches store the trace; caches compare keys by their
-        `repr`.
+    def compile_for_one_wheel(
+        self,
+        batch_function: BatchFunction,
+        make_template: BatchFunction,
+        *trace_key: Any,
+        register_limits: simd.RegisterLimits = simd.DEFAULT_REGISTER_LIMITS,
+    ) -> BatchFunction:
+        """Compile a function of a batch of steps, and return it as a function of one wheel.
+
+        - `make_template`: function that returns arrays with the structure of the results;
+        - `trace_key`: objects whose `repr` identifies the function together with these settings.
         """
-        return str(self.argument_structure), self.stop_at_lift_off, self.friction
+        settings_key = str(self.argument_structure), self.stop_at_lift_off, self.friction
+        return unbatch(
+            compile_batch_function(
+                batch_function,
+                make_template,
+                (*trace_key, *settings_key),
+                register_limits=register_limits,
+            )
+        )
 
     def run_lane_phases(
         self, *argument_leaves: Array
@@ -362,8 +347,16 @@ class _StepTraceConfig(NamedTuple):
         tableau = load_explicit_tableau(options.solver)
         assert tableau is not None  # `can_use_batch_kernel` has checked the solver.
         records_margins = self.friction is not None
-        phase_arguments = params, tuple(x), options, tableau, self.stop_at_lift_off, records_margins
-        return run_batch_phases(*phase_arguments, is_compiled_separately=True), tableau, options
+        phase_sequence = run_batch_phases(
+            params,
+            tuple(x),
+            options,
+            tableau,
+            self.stop_at_lift_off,
+            records_margins,
+            is_compiled_separately=True,
+        )
+        return phase_sequence, tableau, options
 
     def compute_step_outputs(self, *argument_leaves: Array) -> tuple:
         """Return the results of a batch of walking steps, split into float arrays and other
@@ -390,108 +383,77 @@ class _StepTraceConfig(NamedTuple):
         """
         x = argument_leaves[0]
         zero_codes = jnp.zeros_like(x, jnp.int32)
-        two_component_template, three_component_template = (
-            jnp.broadcast_to(x, (n, *x.shape)) for n in (2, 3)
-        )
-        step_result_template: Any = AdvanceResult(
-            three_component_template,
-            three_component_template,
-            zero_codes,
-            zero_codes,
-            engine="lanes",
-        )
-        if self.friction is not None:
-            step_result_template = StepResult(
-                section_state=three_component_template,
-                post_impact=two_component_template,
-                durations=three_component_template,
-                step_length=x,
-                indicators=_make_with_equal_fields(DoubleSupportIndicators, x),
-                margins=_make_with_equal_fields(Margins, x),
-                energy=_make_with_equal_fields(EnergyLoss, x),
-                outcome=zero_codes,
-                solver_steps=zero_codes,
-                engine="lanes",
+        template = {
+            "section_state": jnp.broadcast_to(x, (3, *x.shape)),
+            "durations": jnp.broadcast_to(x, (3, *x.shape)),
+            "outcome": zero_codes,
+            "solver_steps": zero_codes,
+            "engine": "lanes",
+        }
+        if self.friction is None:
+            return eqx.partition(AdvanceResult(**template), eqx.is_inexact_array)
+        measure_groups = {
+            name: group(*(x for _ in dataclasses.fields(group)))
+            for name, group in (
+                ("indicators", DoubleSupportIndicators),
+                ("margins", Margins),
+                ("energy", EnergyLoss),
             )
-        return eqx.partition(step_result_template, eqx.is_inexact_array)
+        }
+        post_impact = jnp.broadcast_to(x, (2, *x.shape))
+        return eqx.partition(
+            StepResult(post_impact=post_impact, step_length=x, **measure_groups, **template),
+            eqx.is_inexact_array,
+        )
 
 
-def _make_with_equal_fields(field_class: Any, field_value: Array) -> Any:
-    """Return a record of the class `field_class` whose fields all equal `field_value`."""
-    return field_class(*(field_value for _ in dataclasses.fields(field_class)))
-
-
-def build_step_function(
-    argument_structure: Any, stop_at_lift_off: bool, friction: float | None
-) -> ForwardFunction:
+def build_step_function(step_trace_config: StepTraceConfig) -> ForwardFunction:
     """Return a function that computes the results of a walking step from the leaves of (params, x,
     options).
 
     The results are split into float arrays and other arrays. The function serves as a forward-mode
     rule, from which all AD modes are derived.
-
-    - `argument_structure`: pytree structure of (params, x, options);
-    - `stop_at_lift_off`: see `ViscoelasticWheel`;
-    - `friction`: friction coefficient for the margins, or None for results without margins.
     """
-    step_trace_config = _StepTraceConfig(argument_structure, stop_at_lift_off, friction)
-    trace_key = ("gait step", *step_trace_config.trace_key)
-    return unbatch(
-        compile_batch_function(
-            step_trace_config.compute_step_outputs,
-            step_trace_config.make_output_template,
-            trace_key,
-        )
+    return step_trace_config.compile_for_one_wheel(
+        step_trace_config.compute_step_outputs, step_trace_config.make_output_template, "gait step"
     )
 
 
-def build_step_finisher(
-    argument_structure: Any, phase_index: int, stop_at_lift_off: bool
-) -> BatchFunction:
+def build_step_finisher(step_trace_config: StepTraceConfig, phase_index: int) -> BatchFunction:
     """Return a function that computes the results of `finish_gait_step` from a list of leaves.
 
-    The leaves are those of (params, distance, state, options). The results are split into float
-    arrays and other arrays.
+    The leaves are those of (params, distance, state, options), whose pytree structure is that of
+    `step_trace_config`. The results are split into float arrays and other arrays.
     """
 
     def compute_finish_outputs(*argument_leaves: Array) -> tuple:
         params, foot_distance, phase_state, options = jax.tree.unflatten(
-            argument_structure, argument_leaves
+            step_trace_config.argument_structure, argument_leaves
         )
         tableau = load_explicit_tableau(options.solver)
         assert tableau is not None  # checked by `can_use_batch_kernel`
-        phase_runner = _make_phase_runner(
-            options, tableau, False, None, True, DEFAULT_STIFF_START_OPTIONS
-        )
-        gait_step_settings = options, stop_at_lift_off, "lanes"
         remaining_step_result = finish_gait_step(
-            phase_runner,
+            _make_phase_runner(options, tableau, False, None, is_compiled_separately=True),
             params,
             phase_index,
             foot_distance,
             tuple(phase_state),
-            *gait_step_settings,
+            options,
+            step_trace_config.stop_at_lift_off,
+            "lanes",
         )
         return eqx.partition(remaining_step_result, eqx.is_inexact_array)
 
-    step_trace_config = _StepTraceConfig(argument_structure, stop_at_lift_off, None)
-    trace_key = ("end of a step", phase_index, *step_trace_config.trace_key)
-    return unbatch(
-        compile_batch_function(
-            compute_finish_outputs, step_trace_config.make_output_template, trace_key
-        )
+    return step_trace_config.compile_for_one_wheel(
+        compute_finish_outputs, step_trace_config.make_output_template, "end of a step", phase_index
     )
 
 
-def build_step_sampler(
-    argument_structure: Any, stop_at_lift_off: bool, n_samples: int
-) -> BatchFunction:
+def build_step_sampler(step_trace_config: StepTraceConfig, n_samples: int) -> BatchFunction:
     """Return a function that samples a walking step at `n_samples` equidistant times of each phase.
 
-    The arguments of the function are the leaves of (params, x, options), whose pytree structure is
-    `argument_structure`.
+    The arguments of the function are the leaves of (params, x, options).
     """
-    step_trace_config = _StepTraceConfig(argument_structure, stop_at_lift_off, None)
 
     def sample_lane_steps(*argument_leaves: Array) -> Trajectory:
         phase_sequence, tableau, options = step_trace_config.run_lane_phases(*argument_leaves)
@@ -514,32 +476,18 @@ def build_step_sampler(
         return make_trajectory(phase_sequence, phase_samples)
 
     def make_trajectory_template(x: Array, *_: Array) -> Trajectory:
-        make_sample_array = lambda *n: jnp.broadcast_to(x, (3, *n, *x.shape))
         n = n_samples
-        sample_arrays = (
-            make_sample_array(n),
-            make_sample_array(n, 6),
-            make_sample_array(n, 4),
-            make_sample_array(n, 3),
-        )
-        return Trajectory(
-            *sample_arrays, make_sample_array(), make_sample_array(), jnp.zeros_like(x, jnp.int32)
-        )
+        array_shapes = ((n,), (n, 6), (n, 4), (n, 3), (), ())
+        float_templates = [jnp.broadcast_to(x, (3, *shape, *x.shape)) for shape in array_shapes]
+        return Trajectory(*float_templates, jnp.zeros_like(x, jnp.int32))
 
-    return unbatch(
-        compile_batch_function(
-            sample_lane_steps,
-            make_trajectory_template,
-            ("samples", *step_trace_config.trace_key, n_samples),
-        )
+    return step_trace_config.compile_for_one_wheel(
+        sample_lane_steps, make_trajectory_template, "samples", n_samples
     )
 
 
 def build_step_jacobian(
-    argument_structure: Any,
-    stop_at_lift_off: bool,
-    friction: float | None,
-    input_indices: tuple[int, ...],
+    step_trace_config: StepTraceConfig, input_indices: tuple[int, ...]
 ) -> ForwardFunction:
     """Return a function that computes a walking step and the Jacobian of its results.
 
@@ -547,10 +495,11 @@ def build_step_jacobian(
     the float results, the float results, and all other results. The Jacobian is with respect to the
     leaves at `input_indices`.
     """
-    step_trace_config = _StepTraceConfig(argument_structure, stop_at_lift_off, friction)
 
     def tighten_tolerances(*argument_leaves: Array) -> list[Array]:
-        params, x, options = jax.tree.unflatten(argument_structure, argument_leaves)
+        params, x, options = jax.tree.unflatten(
+            step_trace_config.argument_structure, argument_leaves
+        )
         return jax.tree.leaves((params, x, options.with_derivative_tolerances()))
 
     def make_jacobian_template(*argument_leaves: Array) -> tuple:
@@ -560,21 +509,19 @@ def build_step_jacobian(
     lane_jacobian_function = lambda *leaves: compute_jacobian_columns(
         step_trace_config.compute_step_outputs, leaves, input_indices
     )
-    trace_key = ("gait step with derivatives", *step_trace_config.trace_key, input_indices)
     jacobian_functions_by_size = {
-        n: unbatch(
-            compile_batch_function(
-                lane_jacobian_function,
-                make_jacobian_template,
-                trace_key,
-                register_limits=simd.RegisterLimits(n),
-            )
+        n: step_trace_config.compile_for_one_wheel(
+            lane_jacobian_function,
+            make_jacobian_template,
+            "gait step with derivatives",
+            input_indices,
+            register_limits=simd.RegisterLimits(n),
         )
         for n in (N_STEP_INPUTS, N_STEP_INPUTS + 1)
     }
 
     def evaluate_step_jacobian(*argument_leaves: Array) -> tuple:
-        n_jacobian_columns = sum(int(np.prod(jnp.shape(argument_leaves[i]))) for i in input_indices)
+        n_jacobian_columns = sum(math.prod(jnp.shape(argument_leaves[i])) for i in input_indices)
         jacobian_column_function = jacobian_functions_by_size[
             N_STEP_INPUTS + (n_jacobian_columns > N_STEP_INPUTS)
         ]
@@ -597,19 +544,18 @@ def split_jacobian_by_leaf(
     - `jacobian_columns`: Jacobian, whose leading axis runs over all entries of the selected leaves;
     - `input_indices`: indices of the selected leaves in `argument_leaves`.
     """
-    jacobian_by_leaf, first_column_index = [], 0
+    jacobian_by_leaf, first_column = [], 0
     for i in input_indices:
         leaf_shape = jnp.shape(argument_leaves[i])
-        jacobian_column_slice = slice(
-            first_column_index, first_column_index + int(np.prod(leaf_shape))
+        end_column = first_column + math.prod(leaf_shape)
+        leaf_columns = jax.tree.map(
+            operator.itemgetter(slice(first_column, end_column)), jacobian_columns
         )
-        select_leaf_jacobian = (
-            lambda x, jacobian_column_slice=jacobian_column_slice, leaf_shape=leaf_shape: (
-                jnp.moveaxis(x[jacobian_column_slice], 0, -1).reshape(*x.shape[1:], *leaf_shape)
-            )
+        reshape_columns = lambda x, leaf_shape=leaf_shape: jnp.moveaxis(x, 0, -1).reshape(
+            *x.shape[1:], *leaf_shape
         )
-        jacobian_by_leaf.append(jax.tree.map(select_leaf_jacobian, jacobian_columns))
-        first_column_index = jacobian_column_slice.stop
+        jacobian_by_leaf.append(jax.tree.map(reshape_columns, leaf_columns))
+        first_column = end_column
     return tuple(jacobian_by_leaf)
 
 
@@ -653,21 +599,15 @@ def _make_unit_tangents(selected_leaves: Sequence[Array]) -> list[Array]:
     The leading axis runs over the unit vectors. Each entry of a unit vector is a separate constant
     0 or 1, so that machine code omits products with 0.
     """
-    n_entries_by_leaf = [
-        int(np.prod(selected_leaf.shape[:-1])) for selected_leaf in selected_leaves
-    ]
-    unit_vectors, leaf_tangents, n_previous_entries = np.eye(sum(n_entries_by_leaf)), [], 0
-    for selected_leaf, n_leaf_entries in zip(selected_leaves, n_entries_by_leaf, strict=True):
-        entry_tangents = [
-            jnp.asarray(unit_vectors[:, i], selected_leaf.dtype)[:, None]
-            for i in range(n_previous_entries, n_previous_entries + n_leaf_entries)
-        ]
+    n_entries_by_leaf = [math.prod(leaf.shape[:-1]) for leaf in selected_leaves]
+    n_vectors = sum(n_entries_by_leaf)
+    unit_vectors, leaf_tangents = iter(np.eye(n_vectors)), []
+    for leaf, n_entries in zip(selected_leaves, n_entries_by_leaf, strict=True):
         lane_tangents = [
-            jnp.broadcast_to(entry_tangent, (len(unit_vectors), selected_leaf.shape[-1]))
-            for entry_tangent in entry_tangents
+            jnp.broadcast_to(
+                jnp.asarray(next(unit_vectors), leaf.dtype)[:, None], (n_vectors, leaf.shape[-1])
+            )
+            for _ in range(n_entries)
         ]
-        leaf_tangents.append(
-            lane_tangents[0] if selected_leaf.ndim == 1 else jnp.stack(lane_tangents, 1)
-        )
-        n_previous_entries += n_leaf_entries
+        leaf_tangents.append(lane_tangents[0] if leaf.ndim == 1 else jnp.stack(lane_tangents, 1))
     return leaf_tangents

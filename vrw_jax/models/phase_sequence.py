@@ -129,15 +129,6 @@ def run_step_phases(
     return PhaseSequenceResult(s, landing_result, step_phases, *remaining_phases, next_line_tilt)
 
 
-class _RemainingPhases(NamedTuple):
-    """Starts and ends of the remaining phases of a step. See `PhaseSequenceResult`."""
-
-    phase_start_states: tuple[tuple[Vector, Vector], ...]
-    phase_end_results: tuple[PhaseResult, ...]
-    has_phase_occurred: tuple[Bool[Array, "..."], ...]
-    outcome: Int[Array, "..."]
-
-
 def _run_remaining_phases(
     phase_runner: PhaseRunner,
     remaining_phases: tuple[AbstractPhase, ...],
@@ -146,9 +137,12 @@ def _run_remaining_phases(
     is_valid_step: Array,
     is_phase_active: Array,
     options: StepOptions,
-) -> _RemainingPhases:
+) -> tuple[tuple[tuple[Vector, Vector], ...], tuple[PhaseResult, ...], tuple[Array, ...], Array]:
     """Integrate the remaining phases of a step, starting from a motion in the first remaining
     phase.
+
+    Return the starts and ends of the phases, whether each phase occurred, and the outcome, as in
+    `PhaseSequenceResult`.
 
     - `is_valid_step`: whether the inputs are valid, so that a step takes place;
     - `is_phase_active`: whether the first remaining phase takes place.
@@ -158,6 +152,14 @@ def _run_remaining_phases(
     )
     phase_start_states, has_phase_occurred = [], []
     phase_end_results: list[PhaseResult] = []
+    fallback_theta, *fallback_lengths_and_rates = (
+        jnp.asarray(state_component, jnp.result_type(wheel_angle))
+        for state_component in FALLBACK_SINGLE_SUPPORT_STATE
+    )
+    fallback_state = (
+        fallback_theta,
+        Motion.from_angle(fallback_theta, *fallback_lengths_and_rates),
+    )
     for previous_phase, phase in zip((None, *remaining_phases), remaining_phases, strict=False):
         if previous_phase is not None:
             end_state = (
@@ -168,18 +170,8 @@ def _run_remaining_phases(
                 is_phase_active, end_state, (wheel_angle, wheel_motion)
             )
             is_phase_active = step_outcome == Outcome.STEPPED
-            fallback_theta, *fallback_single_support_lengths_and_rates = (
-                jnp.asarray(state_component, jnp.result_type(wheel_angle))
-                for state_component in FALLBACK_SINGLE_SUPPORT_STATE
-            )
-            replaced_state = (
-                fallback_theta,
-                Motion(
-                    *compute_sine_cosine(fallback_theta), *fallback_single_support_lengths_and_rates
-                ),
-            )
             wheel_angle, wheel_motion = select_trees_by_condition(
-                is_phase_active, (wheel_angle, wheel_motion), replaced_state
+                is_phase_active, (wheel_angle, wheel_motion), fallback_state
             )
             wheel_motion = previous_phase.reset_motion(wheel_motion)
         start_state = phase.select_phase_coordinates(wheel_angle, wheel_motion)
@@ -204,8 +196,11 @@ def _run_remaining_phases(
             if phase is remaining_phases[-1]
             else is_phase_active & (phase_end.duration > 0.0)
         )
-    return _RemainingPhases(
-        tuple(phase_start_states), tuple(phase_end_results), tuple(has_phase_occurred), step_outcome
+    return (
+        tuple(phase_start_states),
+        tuple(phase_end_results),
+        tuple(has_phase_occurred),
+        step_outcome,
     )
 
 
@@ -233,71 +228,60 @@ def finish_gait_step(
     ]
     is_valid_state = params.is_in_domain() & functools.reduce(operator.and_, are_inputs_bounded)
     is_valid_state = is_valid_state & (jnp.abs(phase_state[0]) < 0.5 * jnp.pi)
-    params, (wheel_angle, *single_support_lengths_and_rates) = replace_invalid_inputs(
+    params, phase_state = replace_invalid_inputs(
         is_valid_state, params, phase_state, FALLBACK_SINGLE_SUPPORT_STATE
     )
-    remaining_phases = make_paper_phases(params.symbols(), foot_distance, stop_at_lift_off)[
-        phase_index:
-    ]
-    wheel_motion = Motion.from_angle(wheel_angle, *single_support_lengths_and_rates)
-    remaining_phase_results = _run_remaining_phases(
+    phases = make_paper_phases(params.symbols(), foot_distance, stop_at_lift_off)
+    _, phase_end_results, _, step_outcome = _run_remaining_phases(
         phase_runner,
-        remaining_phases,
-        wheel_angle,
-        wheel_motion,
+        phases[phase_index:],
+        phase_state[0],
+        Motion.from_angle(*phase_state),
         is_valid_state,
         is_valid_state,
         options,
     )
-    phase_end_results, has_stepped = (
-        remaining_phase_results.phase_end_results,
-        remaining_phase_results.outcome == Outcome.STEPPED,
-    )
     section_state = phase_end_results[-1].q[0], *phase_end_results[-1].v
-    phase_durations = [jnp.zeros_like(wheel_angle)] * phase_index + [
-        phase_end.duration for phase_end in phase_end_results
-    ]
-    return AdvanceResult(
-        section_state=jnp.stack([jnp.where(has_stepped, x, 0.0) for x in section_state]),
-        durations=jnp.stack(phase_durations),
-        outcome=remaining_phase_results.outcome,
-        solver_steps=functools.reduce(
-            operator.add, [phase_end.n_solver_steps for phase_end in phase_end_results]
-        ),
-        engine=engine,
+    return _collect_advance_result(
+        section_state, phase_end_results, step_outcome, engine, n_omitted_phases=phase_index
     )
-
-
-def select_next_section_state(phase_sequence: PhaseSequenceResult) -> Vector:
-    """Return (theta-, dtheta-, dL1-) at the end of the step in rad, rad/s and m/s.
-
-    The angle theta- is measured in the frame of the line of the ground at the next landing.
-    """
-    touchdown_angle, touchdown_rates = (
-        phase_sequence.phase_end_results[2].q[0],
-        phase_sequence.phase_end_results[2].v,
-    )
-    return (
-        touchdown_angle
-        if phase_sequence.next_line_tilt is None
-        else touchdown_angle - phase_sequence.next_line_tilt
-    ), *touchdown_rates
 
 
 def make_advance_result(phase_sequence: PhaseSequenceResult, engine: str) -> AdvanceResult:
     """Return the section state after a step, the durations and the outcome.
 
-    All entries of the section state are 0 after a failed step. The result reports the name
-    `engine`.
+    All entries of the section state are 0 after a failed step. The angle is measured in the frame
+    of the line of the ground at the next landing. The result reports the name `engine`.
     """
-    theta, dtheta, dL1 = select_next_section_state(phase_sequence)
-    has_stepped = phase_sequence.outcome == Outcome.STEPPED
-    solver_steps = [phase_end.n_solver_steps for phase_end in phase_sequence.phase_end_results]
+    phase_end_results = phase_sequence.phase_end_results
+    touchdown_angle, touchdown_rates = phase_end_results[2].q[0], phase_end_results[2].v
+    if phase_sequence.next_line_tilt is not None:
+        touchdown_angle = touchdown_angle - phase_sequence.next_line_tilt
+    section_state = touchdown_angle, *touchdown_rates
+    return _collect_advance_result(
+        section_state, phase_end_results, phase_sequence.outcome, engine, n_omitted_phases=0
+    )
+
+
+def _collect_advance_result(
+    section_state: Vector,
+    phase_end_results: Sequence[PhaseResult],
+    step_outcome: Array,
+    engine: str,
+    n_omitted_phases: int,
+) -> AdvanceResult:
+    """Return the result of a step that ends in `section_state`, or in zeros if it failed.
+
+    Phases before the start of the motion have a duration of 0.
+    """
+    has_stepped = step_outcome == Outcome.STEPPED
+    durations = [phase_end.duration for phase_end in phase_end_results]
+    solver_steps = [phase_end.n_solver_steps for phase_end in phase_end_results]
     return AdvanceResult(
-        section_state=jnp.stack([jnp.where(has_stepped, x, 0.0) for x in (theta, dtheta, dL1)]),
-        durations=jnp.stack([phase_end.duration for phase_end in phase_sequence.phase_end_results]),
-        outcome=phase_sequence.outcome,
-        solver_steps=solver_steps[0] + solver_steps[1] + solver_steps[2],
+        section_state=jnp.stack([jnp.where(has_stepped, x, 0.0) for x in section_state]),
+        durations=jnp.stack([jnp.zeros_like(durations[0])] * n_omitted_phases + durations),
+        outcome=step_outcome,
+        solver_steps=functools.reduce(operator.add, solver_steps),
         engine=engine,
     )
 
@@ -317,25 +301,22 @@ def make_step_result(
         phase_sequence.phase_end_results,
     )
     has_step_begun = phase_sequence.outcome != Outcome.BAD_INPUT
-    has_stopper_collision, has_stepped = (
-        phase_sequence.has_phase_occurred[2],
-        phase_sequence.outcome == Outcome.STEPPED,
-    )
+    has_stopper_collision = phase_sequence.has_phase_occurred[2]
+    zero_unless_begun = lambda x: jnp.where(has_step_begun, x, 0.0)
     dls_phase, sls1_phase, sls2_phase = make_paper_phases(
         s, landing_result.foot_distance, stop_at_lift_off=True
     )
     liftoff_motion = dls_phase.compute_motion(phase_end_results[0].q, phase_end_results[0].v)
-    state_before_stopper = [
+    state_before_stopper = tuple(
         jnp.where(has_stopper_collision, x, jnp.asarray(fallback_value, x.dtype))
         for x, fallback_value in zip(
             (*phase_end_results[1].q, *phase_end_results[1].v),
             FALLBACK_SINGLE_SUPPORT_STATE,
             strict=True,
         )
-    ]
+    )
     stopper_collision = transitions.resolve_stopper_collision(
-        s,
-        sls1_phase.compute_motion(tuple(state_before_stopper[:3]), tuple(state_before_stopper[3:])),
+        s, sls1_phase.compute_motion(state_before_stopper[:3], state_before_stopper[3:])
     )
     motion_at_step_end = sls2_phase.compute_motion(phase_end_results[2].q, phase_end_results[2].v)
     initial_energy, final_energy = (
@@ -346,27 +327,26 @@ def make_step_result(
     advance_result = make_advance_result(phase_sequence, engine)
     return StepResult(
         section_state=advance_result.section_state,
-        post_impact=jnp.stack(
-            [
-                jnp.where(has_step_begun, x, 0.0)
-                for x in (landing_result.theta_after_landing, landing_result.motion_after.dtheta)
-            ]
+        post_impact=zero_unless_begun(
+            jnp.stack([landing_result.theta_after_landing, landing_result.motion_after.dtheta])
         ),
         durations=advance_result.durations,
-        step_length=jnp.where(has_step_begun, landing_result.foot_distance, 0.0),
+        step_length=zero_unless_begun(landing_result.foot_distance),
         indicators=DoubleSupportIndicators(
-            lambda_I4=jnp.where(has_step_begun, landing_result.rear_impulse.normal, 0.0),
-            lambda_2=jnp.where(has_step_begun, fore_force.normal, 0.0),
-            lambda_4=jnp.where(has_step_begun, rear_force.normal, 0.0),
+            lambda_I4=zero_unless_begun(landing_result.rear_impulse.normal),
+            lambda_2=zero_unless_begun(fore_force.normal),
+            lambda_4=zero_unless_begun(rear_force.normal),
         ),
         margins=_make_step_margins(
             phase_sequence, rear_force, liftoff_motion, stopper_collision, friction
         ),
         energy=EnergyLoss(
-            landing=jnp.where(has_step_begun, landing_result.energy_loss, 0.0),
+            landing=zero_unless_begun(landing_result.energy_loss),
             stopper=jnp.where(has_stopper_collision, stopper_collision.energy_loss, 0.0),
             damping=jnp.where(
-                has_stepped, initial_energy - final_energy - stopper_collision.energy_loss, 0.0
+                phase_sequence.outcome == Outcome.STEPPED,
+                initial_energy - final_energy - stopper_collision.energy_loss,
+                0.0,
             ),
         ),
         outcome=advance_result.outcome,
@@ -399,8 +379,15 @@ def make_trajectory(
         for arrays_by_phase in zip(*arrays_by_phase_sample, strict=True)
     )
     sample_times = start_times[:, None] + time_fractions * phase_durations[:, None]
-    end_state = advance_result.section_state, phase_durations, advance_result.outcome
-    return Trajectory(sample_times, phase_states, foot_forces, phase_energies, *end_state)
+    return Trajectory(
+        sample_times,
+        phase_states,
+        foot_forces,
+        phase_energies,
+        advance_result.section_state,
+        phase_durations,
+        advance_result.outcome,
+    )
 
 
 def evaluate_phase_states(phase: AbstractPhase, phase_states: Array) -> tuple[Array, Array, Array]:
@@ -409,22 +396,12 @@ def evaluate_phase_states(phase: AbstractPhase, phase_states: Array) -> tuple[Ar
     - `phase_states`: coordinates of the phase, then their rates, on the first axis. The first axis
       of each result holds its components; the other axes are those of `phase_states`.
     """
-    coordinates = tuple(phase_states)
-    wheel_motion = phase.compute_motion(coordinates[: phase.n_dof], coordinates[phase.n_dof :])
+    wheel_motion = phase.unpack_motion(phase_states)
     phase_instant = PhaseInstant(phase, wheel_motion, None)
     zero_force = 0.0 * wheel_motion.L1
     rear_force = phase_instant.rear_force or dynamics.FootForce(zero_force, zero_force)
     return (
-        jnp.stack(
-            [
-                phase_states[0],
-                wheel_motion.L1,
-                wheel_motion.L2,
-                wheel_motion.dtheta,
-                wheel_motion.dL1,
-                wheel_motion.dL2,
-            ]
-        ),
+        jnp.stack([phase_states[0], *wheel_motion.lengths_and_rates]),
         jnp.stack([*phase_instant.fore_force, *rear_force]),
         jnp.stack(dynamics.compute_mechanical_energy(phase.s, wheel_motion)),
     )
@@ -448,18 +425,12 @@ def _make_step_margins(
         phase_sequence.step_start_landing,
         phase_sequence.has_phase_occurred,
     )
-    has_step_begun, has_stopper_collision = (
-        phase_sequence.outcome != Outcome.BAD_INPUT,
-        has_phase_occurred[2],
-    )
-    recorded_margin_minima = [
-        phase_end.margin_minima
+    has_step_begun = phase_sequence.outcome != Outcome.BAD_INPUT
+    has_stopper_collision = has_phase_occurred[2]
+    phase_minima = [
+        PhaseMargins.from_margin_values(tuple(phase_end.margin_minima), s.n)
         for phase_end in phase_sequence.phase_end_results
         if phase_end.margin_minima is not None
-    ]
-    phase_minima = [
-        PhaseMargins.from_margin_values(tuple(phase_margins), s.n)
-        for phase_margins in recorded_margin_minima
     ]
 
     def find_lowest_margin(margin_name: str, *phase_indices: int) -> Array:

@@ -1,6 +1,6 @@
 """Rigid model: all legs are rigid, so a step has a closed form and needs no integration."""
 
-from dataclasses import dataclass
+import dataclasses
 from functools import partial
 from typing import ClassVar, NamedTuple
 
@@ -26,7 +26,12 @@ from vrw_jax.models.step_results import (
     StepResult,
     Trajectory,
 )
-from vrw_jax.numerics import Elementwise, StepOptions, select_trees_by_condition
+from vrw_jax.numerics import (
+    Elementwise,
+    StepOptions,
+    compute_square_root,
+    select_trees_by_condition,
+)
 from vrw_jax.validation import check_bool
 from vrw_jax.wheel import (
     PARAMETER_NAMES,
@@ -41,7 +46,7 @@ from vrw_jax.wheel import (
 )
 
 
-@dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True)
 class MarginMinimumSearchOptions:
     """Options of the search for the minimum of each margin with respect to the angle.
 
@@ -172,35 +177,21 @@ class RigidWheel(AbstractWheel):
         params, x = replace_invalid_inputs(is_valid_step, params, x, (half_angle, 1.0, 0.0))
         s = params.symbols()
         rate_before, rate_after = x[1], self._compute_landing_rate_ratio(s) * x[1]
-        rolling_motion = RollingMotion(
-            s, params.slope, rate_after, None if next_line_tilt is None else end_angle
-        )
+        rolling_motion = RollingMotion(s, params.slope, rate_after, -0.5 * s.alpha, end_angle)
 
         apex_angle = jnp.where(s.sin_phi < jnp.sin(half_angle), -params.slope, -half_angle)
         has_passed_apex = rolling_motion.compute_squared_rate(apex_angle) > 0.0
         margin_minima = rolling_motion.find_margin_minima()
-        has_lifted_off = (margin_minima[0] <= 0.0) & has_passed_apex & self.stop_at_lift_off
-        step_outcome = jnp.where(has_passed_apex, Outcome.STEPPED, Outcome.FELL_BACK).astype(
-            jnp.int32
-        )
-        step_outcome = jnp.where(has_lifted_off, jnp.int32(Outcome.LEG_1_LIFTED_OFF), step_outcome)
+        step_outcome = self._classify_rolling(has_passed_apex, margin_minima[0])
         step_outcome = jnp.where(is_valid_step, step_outcome, jnp.int32(Outcome.BAD_INPUT))
         has_stepped = step_outcome == Outcome.STEPPED
-        fallback_rolling_motion = RollingMotion(
-            s, params.slope, jnp.where(has_passed_apex, rate_after, 10.0)
-        )
-        final_angular_rate, rolling_duration = (
-            jnp.sqrt(fallback_rolling_motion.compute_squared_rate(end_angle)),
-            fallback_rolling_motion.compute_time_to_angle(end_angle),
+        final_angular_rate, rolling_duration = rolling_motion.compute_rate_and_time_at_end(
+            has_passed_apex
         )
 
         zero_like_rate = jnp.zeros_like(rate_before)
-        zero_invalid_steps = lambda step_quantity: jnp.where(
-            is_valid_step, step_quantity, jnp.zeros_like(step_quantity)
-        )
-        zero_unless_stepped = lambda step_quantity: jnp.where(
-            has_stepped, step_quantity, jnp.zeros_like(step_quantity)
-        )
+        zero_invalid_steps = lambda step_quantity: jnp.where(is_valid_step, step_quantity, 0.0)
+        zero_unless_stepped = lambda step_quantity: jnp.where(has_stepped, step_quantity, 0.0)
         rear_impulse, friction_margins, stopper_impulse = self._compute_landing_impulses(
             s, x, rolling_motion, friction
         )
@@ -266,9 +257,7 @@ class RigidWheel(AbstractWheel):
         """
         wheel_angle, angular_rate = phase_state[0], phase_state[3]
         s, half_angle = params.symbols(), jnp.asarray(0.5 * params.leg_angle, wheel_angle.dtype)
-        rolling_motion = RollingMotion(
-            s, params.slope, angular_rate, explicit_first_angle=wheel_angle
-        )
+        rolling_motion = RollingMotion(s, params.slope, angular_rate, wheel_angle, half_angle)
         apex_angle = jnp.maximum(wheel_angle, -params.slope)
         has_passed_apex = (angular_rate > 0.0) & (
             rolling_motion.compute_squared_rate(apex_angle) > 0.0
@@ -279,33 +268,29 @@ class RigidWheel(AbstractWheel):
         lowest_normal_force = jnp.min(
             rolling_motion.compute_foot_force_at_angle(sampled_angles).normal
         )
-        has_lifted_off = has_passed_apex & (lowest_normal_force <= 0.0) & self.stop_at_lift_off
-        step_outcome = jnp.where(has_passed_apex, Outcome.STEPPED, Outcome.FELL_BACK).astype(
-            jnp.int32
-        )
-        step_outcome = jnp.where(has_lifted_off, jnp.int32(Outcome.LEG_1_LIFTED_OFF), step_outcome)
+        step_outcome = self._classify_rolling(has_passed_apex, lowest_normal_force)
         has_stepped, zero_like_angle = step_outcome == Outcome.STEPPED, jnp.zeros_like(angular_rate)
-        fallback_rate = jnp.where(has_stepped, angular_rate, 10.0)
-        fallback_rolling_motion = RollingMotion(
-            s, params.slope, fallback_rate, explicit_first_angle=wheel_angle
+        final_angular_rate, rolling_duration = rolling_motion.compute_rate_and_time_at_end(
+            has_stepped
         )
-        final_angular_rate = jnp.sqrt(fallback_rolling_motion.compute_squared_rate(half_angle))
         section_state = jnp.stack(
             [half_angle + zero_like_angle, final_angular_rate, zero_like_angle]
         )
-        phase_durations = jnp.stack(
-            [
-                zero_like_angle,
-                zero_like_angle,
-                fallback_rolling_motion.compute_time_to_angle(half_angle),
-            ]
-        )
+        phase_durations = jnp.stack([zero_like_angle, zero_like_angle, rolling_duration])
         return AdvanceResult(
             section_state=jnp.where(has_stepped, section_state, 0.0),
             durations=jnp.where(has_stepped, phase_durations, 0.0),
             outcome=step_outcome,
             solver_steps=jnp.zeros_like(step_outcome),
         )
+
+    def _classify_rolling(self, has_passed_apex: Array, lowest_normal_force: Array) -> Array:
+        """Return the outcome of a valid step, which fails if the wheel falls back or lifts off."""
+        step_outcome = jnp.where(
+            has_passed_apex, jnp.int32(Outcome.STEPPED), jnp.int32(Outcome.FELL_BACK)
+        )
+        has_lifted_off = has_passed_apex & (lowest_normal_force <= 0.0) & self.stop_at_lift_off
+        return jnp.where(has_lifted_off, jnp.int32(Outcome.LEG_1_LIFTED_OFF), step_outcome)
 
     def _compute_landing_impulses(
         self,
@@ -327,10 +312,9 @@ class RigidWheel(AbstractWheel):
         hub_velocity_jump = transitions.compute_hub_velocity_jump(
             transitions.compute_motion_before_landing(s, *x), motion_after
         )
-        is_rear_foot_held = self.held_landing
         rear_impulse = (
             transitions.resolve_landing(s, *x).rear_impulse
-            if is_rear_foot_held
+            if self.held_landing
             else dynamics.FootForce(zero_like_rate, zero_like_rate)
         )
         # The impulse at the fore foot is the jump of total momentum, Mt v_hub (the mass centre),
@@ -354,13 +338,15 @@ class RigidWheel(AbstractWheel):
         """Return the motion during a step at equidistant angles, not at equidistant times."""
         step_result = self.take_step(params, x, options)
         params, next_slope = separate_next_slope(params)
-        s, half_angle = params.symbols(), 0.5 * params.leg_angle
+        half_angle = 0.5 * params.leg_angle
         end_angle = half_angle if next_slope is None else half_angle + next_slope - params.slope
-        rolling_motion = RollingMotion(s, params.slope, step_result.post_impact[1])
-        start_angles = jnp.full((n_samples,), -0.5 * s.alpha)
+        rolling_motion = RollingMotion(
+            params.symbols(), params.slope, step_result.post_impact[1], -half_angle, end_angle
+        )
+        start_angles = jnp.full((n_samples,), -half_angle)
         rolling_angles = jnp.where(
             step_result.outcome == Outcome.STEPPED,
-            jnp.linspace(-0.5 * s.alpha, end_angle, n_samples),
+            jnp.linspace(-half_angle, end_angle, n_samples),
             start_angles,
         )
         sampled_angles = jnp.stack([start_angles, start_angles, rolling_angles])
@@ -369,13 +355,14 @@ class RigidWheel(AbstractWheel):
             jnp.moveaxis(sampled_quantity, 0, -1)
             for sampled_quantity in rolling_motion.evaluate_states_at_angles(sampled_angles)
         )
-        end_state = step_result.section_state, step_result.durations, step_result.outcome
         return Trajectory(
             rolling_motion.compute_time_to_angle(sampled_angles),
             sampled_states,
             foot_forces,
             sampled_energies,
-            *end_state,
+            step_result.section_state,
+            step_result.durations,
+            step_result.outcome,
         )
 
 
@@ -446,17 +433,8 @@ class RollingMotion(eqx.Module):
     s: Symbols
     phi: Elementwise  # slope, rad
     initial_rate: Elementwise  # at the first angle, rad/s
-    end_angle: Elementwise | None = None
-    """Angle theta at the next landing, rad; None means alpha/2, as on flat ground."""
-    explicit_first_angle: Elementwise | None = None
-    """First angle theta, rad; None means -alpha/2, as just after a landing."""
-
-    @property
-    def first_angle(self) -> Elementwise | float:
-        """Return the first angle theta, rad."""
-        if self.explicit_first_angle is None:
-            return -0.5 * self.s.alpha
-        return self.explicit_first_angle
+    first_angle: Elementwise  # first angle theta, rad; -alpha/2 just after a landing
+    end_angle: Elementwise  # angle theta at the next landing, rad; alpha/2 on flat ground
 
     def compute_squared_rate(self, theta: Elementwise) -> Elementwise:
         """Return the square of dtheta at the angle theta, rad^2/s^2.
@@ -484,39 +462,43 @@ class RollingMotion(eqx.Module):
         # This is the squared rate at the vertical.
         min_rate_squared = self.initial_rate**2 + kappa * (jnp.cos(2.0 * first_half_angle) - 1.0)
         has_passed_vertical = first_half_angle * last_half_angle < 0.0
+        first_squared, last_squared = first_half_angle**2, last_half_angle**2
         zero_squared_angle = jnp.zeros_like(last_half_angle)
         time_to_end = _compute_rolling_time(
             jnp.where(
-                has_passed_vertical,
-                zero_squared_angle,
-                jnp.minimum(first_half_angle**2, last_half_angle**2),
+                has_passed_vertical, zero_squared_angle, jnp.minimum(first_squared, last_squared)
             ),
-            jnp.where(
-                has_passed_vertical,
-                last_half_angle**2,
-                jnp.maximum(first_half_angle**2, last_half_angle**2),
-            ),
+            jnp.where(has_passed_vertical, last_squared, jnp.maximum(first_squared, last_squared)),
             min_rate_squared,
             kappa,
         )
         time_to_vertical = _compute_rolling_time(
             zero_squared_angle,
-            jnp.where(has_passed_vertical, first_half_angle**2, 0.0),
+            jnp.where(has_passed_vertical, first_squared, 0.0),
             min_rate_squared,
             kappa,
         )
         return time_to_end + time_to_vertical
+
+    def compute_rate_and_time_at_end(self, reaches_end: Array) -> tuple[Elementwise, Elementwise]:
+        """Return the angular rate at the end angle, rad/s, and the time until then, s.
+
+        The results are those of a fast wheel if `reaches_end` is False, so that they are finite.
+        """
+        rolling_motion = dataclasses.replace(
+            self, initial_rate=jnp.where(reaches_end, self.initial_rate, 10.0)
+        )
+        return (
+            jnp.sqrt(rolling_motion.compute_squared_rate(self.end_angle)),
+            rolling_motion.compute_time_to_angle(self.end_angle),
+        )
 
     def compute_motion_at_angle(self, theta: Elementwise) -> Motion:
         """Return the motion at the angle theta. Its angular rate is 0 if the wheel does not reach
         theta.
         """
         zero_like_theta = 0.0 * theta
-        squared_rate = self.compute_squared_rate(theta)
-        is_wheel_moving = squared_rate > 0.0
-        angular_rate = jnp.where(
-            is_wheel_moving, jnp.sqrt(jnp.where(is_wheel_moving, squared_rate, 1.0)), 0.0
-        )
+        angular_rate = compute_square_root(self.compute_squared_rate(theta))
         leg_length = self.s.L0 + zero_like_theta
         return Motion.from_angle(
             theta, leg_length, leg_length, angular_rate, zero_like_theta, zero_like_theta
@@ -541,46 +523,16 @@ class RollingMotion(eqx.Module):
             self.s, self.compute_motion_at_angle(theta), self.compute_acceleration_at_angle(theta)
         )
 
-    def compute_stopper_force_at_angle(
-        self, theta: Elementwise, leg_numbers: range
-    ) -> Float[Array, "n ..."]:
-        """Return the forces on the stoppers of the legs with labels `leg_numbers` at the angle
-        theta, N.
-        """
-        return dynamics.compute_stopper_force(
-            self.s,
-            self.compute_motion_at_angle(theta),
-            self.compute_acceleration_at_angle(theta),
-            leg_numbers,
-        )
-
     def evaluate_states_at_angles(self, theta: Elementwise) -> tuple[Array, Array, Array]:
         """Return coordinates and rates, the forces on both feet (N), and the energies (J) at the
         angles theta.
 
         The first axis of each result holds its components.
         """
-        wheel_motion, foot_force, zero_like_theta = (
-            self.compute_motion_at_angle(theta),
-            self.compute_foot_force_at_angle(theta),
-            0.0 * theta,
-        )
-        coordinates_and_rates = jnp.stack(
-            [
-                theta,
-                wheel_motion.L1,
-                wheel_motion.L2,
-                wheel_motion.dtheta,
-                wheel_motion.dL1,
-                wheel_motion.dL2,
-            ]
-        )
-        foot_forces = jnp.stack(
-            [foot_force.tangential, foot_force.normal, zero_like_theta, zero_like_theta]
-        )
+        wheel_motion, zero_force = self.compute_motion_at_angle(theta), 0.0 * theta
         return (
-            coordinates_and_rates,
-            foot_forces,
+            jnp.stack([theta, *wheel_motion.lengths_and_rates]),
+            jnp.stack([*self.compute_foot_force_at_angle(theta), zero_force, zero_force]),
             jnp.stack(dynamics.compute_mechanical_energy(self.s, wheel_motion)),
         )
 
@@ -591,8 +543,11 @@ class RollingMotion(eqx.Module):
         forces of legs 2 to n (N).
         """
         stopper_forces = [
-            self.compute_stopper_force_at_angle(
-                theta[leg_number], range(leg_number, leg_number + 1)
+            dynamics.compute_stopper_force(
+                self.s,
+                self.compute_motion_at_angle(theta[leg_number]),
+                self.compute_acceleration_at_angle(theta[leg_number]),
+                range(leg_number, leg_number + 1),
             )[0]
             for leg_number in range(2, self.s.n + 1)
         ]
@@ -603,19 +558,14 @@ class RollingMotion(eqx.Module):
             [self.compute_foot_force_at_angle(theta[0]).normal, -required_friction, *stopper_forces]
         )
 
-    def find_margin_minima(
-        self, search_options: MarginMinimumSearchOptions = MARGIN_MINIMUM_SEARCH_OPTIONS
-    ) -> Array:
+    def find_margin_minima(self) -> Array:
         """Return the minima of the margins between two landings, accurate to round-off.
 
         The margins are those of `evaluate_margins_at_angles`. Each minimum is found by repeated
         zooming. Its error is the square of the remaining error of its angle.
         """
-        half_angle = jnp.asarray(0.5 * self.s.alpha, self.initial_rate.dtype)
-        end_angle = half_angle if self.end_angle is None else self.end_angle
-        middle_angle = (
-            0.0 * self.initial_rate if self.end_angle is None else 0.5 * (end_angle - half_angle)
-        )
+        search_options = MARGIN_MINIMUM_SEARCH_OPTIONS
+        middle_angle = 0.5 * (self.first_angle + self.end_angle) + 0.0 * self.initial_rate
 
         def zoom_to_minima(
             zoom_round_index: Array, bracket_centers_and_half_width: tuple[Array, Array]
@@ -628,7 +578,9 @@ class RollingMotion(eqx.Module):
                 angle_offset = half_bracket_width * (
                     i * (2.0 / (search_options.n_angles_per_zoom_round - 1)) - 1.0
                 )
-                candidate_angles = jnp.clip(bracket_centers + angle_offset, -half_angle, end_angle)
+                candidate_angles = jnp.clip(
+                    bracket_centers + angle_offset, self.first_angle, self.end_angle
+                )
                 candidate_margins = self.evaluate_margins_at_angles(candidate_angles)
                 return select_trees_by_condition(
                     candidate_margins < lowest_angles_and_margins[1],
@@ -648,9 +600,7 @@ class RollingMotion(eqx.Module):
             )
 
         bracket_centers = jnp.stack([middle_angle] * (1 + self.s.n))
-        half_bracket_width = (
-            half_angle if self.end_angle is None else 0.5 * (half_angle + end_angle)
-        )
+        half_bracket_width = 0.5 * (self.end_angle - self.first_angle)
         minimum_angles, _ = lax.fori_loop(
             0, search_options.n_zoom_rounds, zoom_to_minima, (bracket_centers, half_bracket_width)
         )
@@ -695,14 +645,7 @@ def _compute_rolling_time(
     has_nonzero_range = last_half_angle_squared > first_half_angle_squared
     smaller_half_angle_squared = jnp.where(has_nonzero_range, first_half_angle_squared, 0.0)
     larger_half_angle_squared = jnp.where(has_nonzero_range, last_half_angle_squared, 1.0)
-    has_nonzero_lower_end = (
-        smaller_half_angle_squared > 0.0
-    )  # The square root has no derivative at 0.
-    smaller_half_angle = jnp.where(
-        has_nonzero_lower_end,
-        jnp.sqrt(jnp.where(has_nonzero_lower_end, smaller_half_angle_squared, 1.0)),
-        0.0,
-    )
+    smaller_half_angle = compute_square_root(smaller_half_angle_squared)
     larger_half_angle = jnp.sqrt(larger_half_angle_squared)
     y1, y2 = jnp.sin(smaller_half_angle), jnp.cos(smaller_half_angle)
     x1, x2 = jnp.sin(larger_half_angle), jnp.cos(larger_half_angle)
@@ -726,14 +669,10 @@ def evaluate_carlson_rf(x: Elementwise, y: Elementwise, z: Elementwise) -> Eleme
     def apply_duplication_step(
         _: object, xyz: tuple[Array, Array, Array]
     ) -> tuple[Array, Array, Array]:
-        x, y, z = xyz
-        sqrt_x, sqrt_y, sqrt_z = jnp.sqrt(x), jnp.sqrt(y), jnp.sqrt(z)
+        sqrt_x, sqrt_y, sqrt_z = map(jnp.sqrt, xyz)
         duplication_shift = sqrt_x * sqrt_y + sqrt_y * sqrt_z + sqrt_z * sqrt_x
-        return (
-            0.25 * (x + duplication_shift),
-            0.25 * (y + duplication_shift),
-            0.25 * (z + duplication_shift),
-        )
+        x, y, z = (0.25 * (argument + duplication_shift) for argument in xyz)
+        return x, y, z
 
     x, y, z = lax.fori_loop(0, 12, apply_duplication_step, (x, y, z))
     mean_argument = (x + y + z) / 3.0

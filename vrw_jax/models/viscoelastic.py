@@ -21,6 +21,7 @@ from vrw_jax.hybrid import (
     sample_phase_in_scaled_units,
 )
 from vrw_jax.models.batch_step import (
+    StepTraceConfig,
     build_step_finisher,
     build_step_function,
     build_step_jacobian,
@@ -70,32 +71,21 @@ def make_diffrax_phase(phase: AbstractPhase, records_margins: bool) -> DiffraxPh
     - `records_margins`: whether the integrator also evaluates margins.
     """
 
-    def unpack_motion(y: StateArray) -> Motion:
-        coordinates = tuple(y)
-        return phase.compute_motion(coordinates[: phase.n_dof], coordinates[phase.n_dof :])
-
     def evaluate_vector_field(y: StateArray) -> StateArray:
-        return jnp.stack(
-            [*y[phase.n_dof :], *phase.solve_acceleration(unpack_motion(y))[: phase.n_dof]]
-        )
+        accelerations = phase.solve_acceleration(phase.unpack_motion(y))
+        return jnp.stack([*y[phase.n_dof :], *accelerations[: phase.n_dof]])
 
     def evaluate_guards_and_margins(y: StateArray) -> Array:
-        phase_instant = PhaseInstant(phase, unpack_motion(y), None)
-        return jnp.stack(
-            [
-                *phase.compute_guards(phase_instant),
-                *(phase.compute_margins(phase_instant) if records_margins else ()),
-            ]
-        )
+        phase_instant = PhaseInstant(phase, phase.unpack_motion(y), None)
+        margins = phase.compute_margins(phase_instant) if records_margins else ()
+        return jnp.stack([*phase.compute_guards(phase_instant), *margins])
 
-    is_margin_counted = phase.are_margins_counted_at_start if records_margins else ()
-    return DiffraxPhaseFunctions(
-        unpack_motion,
-        evaluate_vector_field,
-        GuardsAndMargins(
-            evaluate_guards_and_margins, len(phase.all_guard_outcomes), is_margin_counted
-        ),
+    guards_and_margins = GuardsAndMargins(
+        evaluate_guards_and_margins,
+        len(phase.all_guard_outcomes),
+        phase.are_margins_counted_at_start if records_margins else (),
     )
+    return DiffraxPhaseFunctions(phase.unpack_motion, evaluate_vector_field, guards_and_margins)
 
 
 class ViscoelasticWheel(AbstractWheel):
@@ -158,44 +148,27 @@ class ViscoelasticWheel(AbstractWheel):
     def sample_step(
         self, params: WheelParams, x: SectionState, options: StepOptions, n_samples: int
     ) -> Trajectory:
-        argument_leaves, argument_structure = jax.tree.flatten((params, x, options))
         if can_use_batch_kernel(options):
-            step_sampler = build_step_sampler(argument_structure, self.stop_at_lift_off, n_samples)
-        else:
-            step_sampler = functools.partial(
-                self._sample_with_diffrax, argument_structure, n_samples
-            )
-        return step_sampler(*argument_leaves)
-
-    def _sample_with_diffrax(
-        self, argument_structure: Any, n_samples: int, *argument_leaves: Array
-    ) -> Trajectory:
-        """Return samples of a step that diffrax integrates."""
-        params, x, options = jax.tree.unflatten(argument_structure, argument_leaves)
-        phase_sequence, phase_samples = (
-            self._run_phases(params, x, options, records_margins=False),
-            [],
-        )
+            argument_leaves, argument_structure = jax.tree.flatten((params, x, options))
+            step_trace_config = StepTraceConfig(argument_structure, self.stop_at_lift_off)
+            return build_step_sampler(step_trace_config, n_samples)(*argument_leaves)
+        phase_sequence = self._run_phases(params, x, options, records_margins=False)
+        phase_samples = []
         for phase, phase_start, phase_end in zip(
             phase_sequence.phases,
             phase_sequence.phase_start_states,
             phase_sequence.phase_end_results,
             strict=True,
         ):
-            vector_field = make_diffrax_phase(phase, records_margins=False).vector_field
-            start_vector = jnp.stack([*phase_start[0], *phase_start[1]])
-            state_and_time_units = (
-                jnp.stack(phase.coordinate_units),
-                compute_wheel_units(phase.s).time_unit,
-            )
             phase_samples.append(
                 sample_phase_in_scaled_units(
-                    vector_field,
-                    start_vector,
+                    make_diffrax_phase(phase, records_margins=False).vector_field,
+                    jnp.stack([*phase_start[0], *phase_start[1]]),
                     phase_end.duration,
                     n_samples,
                     options,
-                    *state_and_time_units,
+                    jnp.stack(phase.coordinate_units),
+                    compute_wheel_units(phase.s).time_unit,
                 )
             )
         return make_trajectory(phase_sequence, phase_samples)
@@ -215,23 +188,22 @@ class ViscoelasticWheel(AbstractWheel):
         phase_state: Float[Array, " 6"],
         options: StepOptions,
     ) -> AdvanceResult:
-        argument_leaves, argument_structure = jax.tree.flatten(
-            (params, jnp.asarray(foot_distance), phase_state, options)
-        )
         if can_use_batch_kernel(options):
-            step_finisher = build_step_finisher(
-                argument_structure, phase_index, self.stop_at_lift_off
+            argument_leaves, argument_structure = jax.tree.flatten(
+                (params, jnp.asarray(foot_distance), phase_state, options)
             )
+            step_trace_config = StepTraceConfig(argument_structure, self.stop_at_lift_off)
+            step_finisher = build_step_finisher(step_trace_config, phase_index)
             return eqx.combine(*step_finisher(*argument_leaves))
-        phase_runner = _make_diffrax_phase_runner(options, records_margins=False)
-        gait_step_settings = options, self.stop_at_lift_off, "diffrax"
         return finish_gait_step(
-            phase_runner,
+            _make_diffrax_phase_runner(options, records_margins=False),
             params,
             phase_index,
             foot_distance,
             tuple(phase_state),
-            *gait_step_settings,
+            options,
+            self.stop_at_lift_off,
+            "diffrax",
         )
 
 
@@ -303,13 +275,11 @@ def _compile_step_function(
     )
     if engine_name == "diffrax":
         return enable_all_ad_modes(diffrax_step_function, tight_diffrax_step_function)
-    step_trace_config = (
-        argument_structure,
-        model.stop_at_lift_off,
-        model.friction if records_margins else None,
+    step_trace_config = StepTraceConfig(
+        argument_structure, model.stop_at_lift_off, model.friction if records_margins else None
     )
     return enable_all_ad_modes(
-        build_step_function(*step_trace_config),
+        build_step_function(step_trace_config),
         tight_diffrax_step_function,
-        functools.partial(build_step_jacobian, *step_trace_config),
+        functools.partial(build_step_jacobian, step_trace_config),
     )

@@ -9,7 +9,7 @@ through sin(theta) and cos(theta).
 
 from typing import NamedTuple
 
-from vrw_jax.numerics import Elementwise, compute_sine_cosine
+from vrw_jax.numerics import Elementwise, Vector, compute_sine_cosine
 from vrw_jax.wheel.params import Symbols
 
 
@@ -36,6 +36,11 @@ class Motion(NamedTuple):
     ) -> "Motion":
         """Return the motion for the angle theta (rad), the leg lengths (m), and their rates."""
         return cls(*compute_sine_cosine(theta), L1, L2, dtheta, dL1, dL2)
+
+    @property
+    def lengths_and_rates(self) -> Vector:
+        """Return the leg lengths, and the rates of (theta, L1, L2)."""
+        return self[2:]
 
 
 class SineCosine(NamedTuple):

@@ -183,6 +183,11 @@ class AbstractPhase(abc.ABC):
         """Return the full motion for the phase's coordinates q and their rates v."""
         return self.complete_wheel_motion(*compute_sine_cosine(q[0]), q, v)
 
+    def unpack_motion(self, phase_state: Array) -> Motion:
+        """Return the full motion for a state with the phase's coordinates and then their rates."""
+        state_components = tuple(phase_state)
+        return self.compute_motion(state_components[: self.n_dof], state_components[self.n_dof :])
+
     def compute_rear_force(self, motion: Motion, acceleration: Acceleration) -> FootForce | None:
         """Return the force of the ground on the rear foot, N, or None if the foot is in the air."""
         return None
