@@ -2,12 +2,10 @@
 
 from vrw_jax.integrator import tableaus
 from vrw_jax.integrator.integrate import (
-    BatchPhase,
     integrate_batch_phase,
     sample_at_equal_times,
     sample_batch_phase,
 )
-from vrw_jax.integrator.minima import MarginFunctions
 from vrw_jax.integrator.tableaus import (
     ButcherTableau,
     StageAccelerations,
@@ -18,4 +16,4 @@ from vrw_jax.integrator.tableaus import (
     fit_guard_parabola,
     load_explicit_tableau,
 )
-from vrw_jax.integrator.tangents import ImplicitDynamics, with_batched_jvp
+from vrw_jax.integrator.tangents import BatchPhase, ImplicitDynamics, with_batched_jvp

@@ -1,7 +1,7 @@
 """Locate the earliest root of the guards inside a solver step, for each batch element."""
 
 import functools
-from collections.abc import Callable
+from enum import IntEnum
 from typing import NamedTuple
 
 import jax
@@ -9,29 +9,58 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
-from vrw_jax.integrator.minima import evaluate_with_rates
+from vrw_jax.integrator.minima import MarginMinimaState
 from vrw_jax.integrator.tableaus import (
     ButcherTableau,
-    EvaluateAcceleration,
     StageState,
     TakeStep,
     fit_guard_parabola,
     load_explicit_tableau,
     take_rk_step,
 )
+from vrw_jax.integrator.tangents import BatchPhase
 from vrw_jax.numerics import StepOptions, Vector, select_trees_by_condition
 
 
-class GuardCrossingStep(NamedTuple):
-    """Last solver step of each batch element, with the guards that cross zero during this step."""
+class IntegrationStatus(IntEnum):
+    """Status of a batch element in the integration loop."""
 
-    start_state: StageState  # state at the start of the solver step
-    start_guard_values: Vector  # guards at the start of the solver step
-    middle_guard_values: Vector  # guards at the tableau's stage `middle_stage_index`
-    end_guard_values: Vector  # guards at the end of the solver step
-    step_length: Array
-    crossing_guard_bits: Array  # bit i is set if guard i crosses
-    has_guard_crossed: Array  # whether the step of this batch element contains a crossing
+    RUNNING = 0
+    TIMED_OUT = 1
+    FAILED = 2
+    CROSSED = 3  # The last tried step crosses a guard.
+    IDLE = 4  # The element is inactive, or its start is already an event.
+
+
+class IntegratorState(NamedTuple):
+    """State of the integration loop for each batch element."""
+
+    state: StageState
+    guard_values: Vector  # guards at `state`
+    next_step_length: Array
+    elapsed_time: Array
+    integration_status: Array  # an IntegrationStatus, after the last tried step
+    crossing_guard_bits: Array  # bit i is set if guard i crosses zero in that step
+    middle_guard_values: Vector  # guards at the middle stage of the crossing step
+    end_guard_values: Vector
+    n_tried_steps: Array
+    # number of iterations after which half of the batch had ended
+    n_iterations_until_half_ended: Array
+    n_iterations: Array
+    margin_minima_state: MarginMinimaState | None
+    state_tangents: (
+        Array | None
+    )  # tangents of the state, (directions, components, batch), see `tangents`
+
+    @property
+    def is_running(self) -> Array:
+        """Return whether each batch element needs more solver steps."""
+        return self.integration_status == IntegrationStatus.RUNNING
+
+    @property
+    def has_guard_crossed(self) -> Array:
+        """Return whether the last tried step of each batch element crosses a guard."""
+        return self.integration_status == IntegrationStatus.CROSSED
 
 
 class EventSearch(NamedTuple):
@@ -49,11 +78,10 @@ class EventSearch(NamedTuple):
 
 
 def locate_event(
-    evaluate_guards: Callable[[StageState], Vector],
-    evaluate_acceleration: EvaluateAcceleration,
+    phase: BatchPhase,
     solver_step_function: TakeStep,
     tableau: ButcherTableau,
-    guard_crossing_step: GuardCrossingStep,
+    integrator_state: IntegratorState,
     options: StepOptions,
 ) -> EventSearch:
     """Return, for each batch element, the earliest event inside its crossing solver step.
@@ -67,32 +95,24 @@ def locate_event(
     low order replaces the last corrections. The state is then extrapolated linearly over the
     remaining time.
     """
-    step_length, event_time_rtol = guard_crossing_step.step_length, jnp.sqrt(options.rtol)
+    step_length, event_time_rtol = integrator_state.next_step_length, jnp.sqrt(options.rtol)
     max_extrapolation_time = 0.1 * event_time_rtol * step_length
     max_short_step_duration = 0.3 * jnp.sqrt(event_time_rtol) * step_length
     is_crossing = [
-        (guard_crossing_step.crossing_guard_bits >> i) & 1 == 1
-        for i in range(len(guard_crossing_step.start_guard_values))
+        (integrator_state.crossing_guard_bits >> i) & 1 == 1
+        for i in range(len(integrator_state.guard_values))
     ]
 
     def improve_event_search(event_search: EventSearch) -> EventSearch:
         step_end = solver_step_function(
-            guard_crossing_step.start_state, event_search.event_step_length
+            integrator_state.state, event_search.event_step_length
         ).end_state
-        guard_values, guard_rates = evaluate_with_rates(
-            evaluate_guards, evaluate_acceleration, step_end
-        )
-        time_to_event, guard_index = _propose_earliest_event(
-            guard_values, guard_rates, guard_crossing_step.crossing_guard_bits
-        )
+        guard_values, guard_rates = phase.evaluate_with_rates(phase.evaluate_guards, step_end)
+        time_to_event, guard_index = _propose_earliest_event(guard_values, guard_rates, is_crossing)
         is_before_event = jnp.ones(step_length.shape, bool)
         is_guard_straight = jnp.ones(step_length.shape, bool)
         for start_guard_value, guard_value, guard_rate, is_crossing_guard in zip(
-            guard_crossing_step.start_guard_values,
-            guard_values,
-            guard_rates,
-            is_crossing,
-            strict=True,
+            integrator_state.guard_values, guard_values, guard_rates, is_crossing, strict=True
         ):
             has_crossed, is_guard_curved = _classify_guard_crossing(
                 start_guard_value, guard_value, guard_rate, event_search.event_step_length
@@ -122,6 +142,15 @@ def locate_event(
                 <= jnp.where(is_guard_straight, max_short_step_duration, max_extrapolation_time)
             )
         )
+        end_state, remaining_time_to_event, guard_index = select_trees_by_condition(
+            is_at_event,
+            (step_end, time_to_event, guard_index),
+            (
+                event_search.end_state,
+                event_search.remaining_time_to_event,
+                event_search.guard_index,
+            ),
+        )
         return EventSearch(
             event_step_length=jnp.where(
                 event_search.is_event_unresolved,
@@ -131,20 +160,18 @@ def locate_event(
             lower_step_length_bound=lower_step_length_bound,
             upper_step_length_bound=upper_step_length_bound,
             is_event_unresolved=event_search.is_event_unresolved & ~is_at_event,
-            end_state=select_trees_by_condition(is_at_event, step_end, event_search.end_state),
-            remaining_time_to_event=jnp.where(
-                is_at_event, time_to_event, event_search.remaining_time_to_event
-            ),
-            guard_index=jnp.where(is_at_event, guard_index, event_search.guard_index),
+            end_state=end_state,
+            remaining_time_to_event=remaining_time_to_event,
+            guard_index=guard_index,
             n_tried_steps=event_search.n_tried_steps + event_search.is_event_unresolved,
             n_iterations=event_search.n_iterations + 1,
         )
 
     first_crossing_fraction = jnp.ones_like(step_length)
     stage_values_by_guard = zip(
-        guard_crossing_step.start_guard_values,
-        guard_crossing_step.middle_guard_values,
-        guard_crossing_step.end_guard_values,
+        integrator_state.guard_values,
+        integrator_state.middle_guard_values,
+        integrator_state.end_guard_values,
         strict=True,
     )
     for is_crossing_guard, crossing_values in zip(is_crossing, stage_values_by_guard, strict=True):
@@ -154,149 +181,99 @@ def locate_event(
             jnp.minimum(first_crossing_fraction, fraction_to_zero),
             first_crossing_fraction,
         )
-    initial_indices, zero_duration = (
-        jnp.zeros(step_length.shape, jnp.int32),
-        jnp.zeros_like(step_length),
-    )
-    initial_count = jnp.zeros((), jnp.int32)
+    initial_indices = jnp.zeros(step_length.shape, jnp.int32)
+    zero_duration = jnp.zeros_like(step_length)
     initial_search = EventSearch(
         step_length * first_crossing_fraction,
         zero_duration,
         step_length,
-        guard_crossing_step.has_guard_crossed,
-        guard_crossing_step.start_state,
+        integrator_state.has_guard_crossed,
+        integrator_state.state,
         zero_duration,
         initial_indices,
         initial_indices,
-        initial_count,
+        jnp.zeros((), jnp.int32),
     )
     needs_iteration = lambda event_search: (
         jnp.any(event_search.is_event_unresolved)
         & (event_search.n_iterations < options.max_event_iterations)
     )
-    search_result = lax.while_loop(needs_iteration, improve_event_search, initial_search)
+    event_search = lax.while_loop(needs_iteration, improve_event_search, initial_search)
 
-    return _refine_event_location(
-        evaluate_guards,
-        evaluate_acceleration,
-        guard_crossing_step,
-        search_result,
-        (max_extrapolation_time, max_short_step_duration),
-        options,
-    )
-
-
-def _refine_event_location(
-    evaluate_guards: Callable[[StageState], Vector],
-    evaluate_acceleration: EvaluateAcceleration,
-    guard_crossing_step: GuardCrossingStep,
-    event_search: EventSearch,
-    extrapolation_and_step_limits: tuple[Array, Array],
-    options: StepOptions,
-) -> EventSearch:
-    """Return the search result after short solver steps of low order from a state near the event.
-
-    - `extrapolation_and_step_limits`: largest time of the linear extrapolation, and largest length
-      of a short solver step, s.
-
-    One short solver step suffices unless a guard grazes zero. The event stays unresolved if
-    Newton's method diverges.
-    """
-    max_extrapolation_time, max_short_step_duration = extrapolation_and_step_limits
-    # During a thousandth of a solver step, a method of order 3 is accurate to round-off.
+    # One short solver step suffices unless a guard grazes zero. The event stays unresolved if
+    # Newton's method diverges. A method of order 3 is accurate to round-off during a thousandth of
+    # a solver step.
     low_order_tableau = load_explicit_tableau("Bosh3")
     assert low_order_tableau is not None
 
-    def can_take_short_solver_step(
-        is_event_distant: Array, remaining_time_to_event: Array
-    ) -> Array:
+    def can_take_short_step(is_event_distant: Array, remaining_time_to_event: Array) -> Array:
         return is_event_distant & (jnp.abs(remaining_time_to_event) <= max_short_step_duration)
 
-    def take_short_solver_step(loop_carry: tuple) -> tuple:
-        (
-            step_end,
-            remaining_time_to_event,
-            short_solver_step_length,
-            guard_index,
-            is_event_distant,
-            n_iterations,
-        ) = loop_carry
-        is_short_solver_step_taken = can_take_short_solver_step(
-            is_event_distant, remaining_time_to_event
+    def take_short_step(event_search: EventSearch) -> EventSearch:
+        is_step_taken = can_take_short_step(
+            event_search.is_event_unresolved, event_search.remaining_time_to_event
         )
-        step_end = select_trees_by_condition(
-            is_short_solver_step_taken,
-            take_rk_step(
-                low_order_tableau,
-                evaluate_acceleration,
-                step_end,
-                remaining_time_to_event,
-                computes_error_estimate=False,
-            ).end_state,
-            step_end,
+        short_step = take_rk_step(
+            low_order_tableau,
+            phase.evaluate_acceleration,
+            event_search.end_state,
+            event_search.remaining_time_to_event,
+            computes_error_estimate=False,
         )
-        new_remaining_time_to_event, earliest_guard_index = _propose_earliest_event(
-            *evaluate_with_rates(evaluate_guards, evaluate_acceleration, step_end),
-            guard_crossing_step.crossing_guard_bits,
+        end_state = select_trees_by_condition(
+            is_step_taken, short_step.end_state, event_search.end_state
+        )
+        time_to_event, guard_index = _propose_earliest_event(
+            *phase.evaluate_with_rates(phase.evaluate_guards, end_state), is_crossing
         )
         remaining_time_to_event = jnp.where(
-            is_short_solver_step_taken, new_remaining_time_to_event, remaining_time_to_event
+            is_step_taken, time_to_event, event_search.remaining_time_to_event
         )
-        short_solver_step_length = jnp.where(
-            can_take_short_solver_step(is_short_solver_step_taken, new_remaining_time_to_event),
-            short_solver_step_length + new_remaining_time_to_event,
-            short_solver_step_length,
-        )
-        guard_index = jnp.where(is_short_solver_step_taken, earliest_guard_index, guard_index)
-        return (
-            step_end,
-            remaining_time_to_event,
-            short_solver_step_length,
-            guard_index,
-            is_event_distant & (jnp.abs(remaining_time_to_event) > max_extrapolation_time),
-            n_iterations + 1,
+        return event_search._replace(
+            event_step_length=jnp.where(
+                can_take_short_step(is_step_taken, time_to_event),
+                event_search.event_step_length + time_to_event,
+                event_search.event_step_length,
+            ),
+            is_event_unresolved=event_search.is_event_unresolved
+            & (jnp.abs(remaining_time_to_event) > max_extrapolation_time),
+            end_state=end_state,
+            remaining_time_to_event=remaining_time_to_event,
+            guard_index=jnp.where(is_step_taken, guard_index, event_search.guard_index),
+            n_iterations=event_search.n_iterations + 1,
         )
 
+    needs_short_step = lambda event_search: (
+        jnp.any(
+            can_take_short_step(
+                event_search.is_event_unresolved, event_search.remaining_time_to_event
+            )
+        )
+        & (event_search.n_iterations < options.max_event_iterations)
+    )
     is_event_distant = (
-        guard_crossing_step.has_guard_crossed
+        integrator_state.has_guard_crossed
         & ~event_search.is_event_unresolved
         & (jnp.abs(event_search.remaining_time_to_event) > max_extrapolation_time)
     )
-    initial_loop_carry = (
-        event_search.end_state,
-        event_search.remaining_time_to_event,
-        event_search.event_step_length,
-        event_search.guard_index,
-        is_event_distant,
-        jnp.zeros((), jnp.int32),
+    refined_search = lax.while_loop(
+        needs_short_step,
+        take_short_step,
+        event_search._replace(
+            is_event_unresolved=is_event_distant, n_iterations=jnp.zeros((), jnp.int32)
+        ),
     )
-    needs_iteration = lambda loop_carry: (
-        jnp.any(can_take_short_solver_step(loop_carry[4], loop_carry[1]))
-        & (loop_carry[5] < options.max_event_iterations)
+    extrapolate = lambda x, y: x + refined_search.remaining_time_to_event * y
+    event_state = refined_search.end_state
+    event_state = event_state._replace(
+        q=tuple(map(extrapolate, event_state.q, event_state.v)),
+        v=tuple(map(extrapolate, event_state.v, event_state.acceleration.acceleration)),
     )
-    (
-        event_state,
-        remaining_time_to_event,
-        short_solver_step_length,
-        guard_index,
-        is_event_distant,
-        _,
-    ) = lax.while_loop(needs_iteration, take_short_solver_step, initial_loop_carry)
-    q = tuple(
-        x + remaining_time_to_event * y for x, y in zip(event_state.q, event_state.v, strict=True)
-    )
-    v = tuple(
-        x + remaining_time_to_event * y
-        for x, y in zip(event_state.v, event_state.acceleration.acceleration, strict=False)
-    )
-    event_state = select_trees_by_condition(
-        is_event_distant, guard_crossing_step.start_state, event_state._replace(q=q, v=v)
-    )
-    return event_search._replace(
-        event_step_length=short_solver_step_length,
-        is_event_unresolved=event_search.is_event_unresolved | is_event_distant,
-        end_state=event_state,
-        guard_index=guard_index,
+    return refined_search._replace(
+        is_event_unresolved=event_search.is_event_unresolved | refined_search.is_event_unresolved,
+        end_state=select_trees_by_condition(
+            refined_search.is_event_unresolved, integrator_state.state, event_state
+        ),
     )
 
 
@@ -318,22 +295,20 @@ def _classify_guard_crossing(
 
 
 def _propose_earliest_event(
-    guard_values: Vector, guard_rates: Vector, crossing_guard_bits: Array
+    guard_values: Vector, guard_rates: Vector, is_crossing: list[Array]
 ) -> tuple[Array, Array]:
     """Return the time to the earliest event, s, by one Newton step, and the guard's index.
 
     The time is negative if the event is earlier than the present state. It is minus infinity for a
     guard that is negative and rises, because this guard crossed zero at an unknown earlier time.
-    `crossing_guard_bits` has bit i set if guard i crosses zero.
+    `is_crossing` states for each guard whether it crosses zero.
     """
     time_to_event = jnp.full_like(guard_values[0], jnp.inf)
-    guard_index = jnp.zeros_like(crossing_guard_bits)
-    for candidate_guard_index, (guard_value, guard_rate) in enumerate(
-        zip(guard_values, guard_rates, strict=True)
+    guard_index = jnp.zeros(time_to_event.shape, jnp.int32)
+    for candidate_guard_index, guard in enumerate(
+        zip(is_crossing, guard_values, guard_rates, strict=True)
     ):
-        guard_zero_time = _compute_time_to_zero(
-            (crossing_guard_bits >> candidate_guard_index) & 1 == 1, guard_value, guard_rate
-        )
+        guard_zero_time = _compute_time_to_zero(*guard)
         guard_index = jnp.where(guard_zero_time < time_to_event, candidate_guard_index, guard_index)
         time_to_event = jnp.minimum(guard_zero_time, time_to_event)
     return time_to_event, guard_index

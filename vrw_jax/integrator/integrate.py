@@ -7,7 +7,6 @@ depends on the other elements.
 """
 
 from collections.abc import Callable
-from enum import IntEnum
 from typing import Any, NamedTuple
 
 import jax
@@ -15,21 +14,17 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
-from vrw_jax.integrator.event_location import GuardCrossingStep, locate_event
+from vrw_jax.integrator.event_location import IntegrationStatus, IntegratorState, locate_event
 from vrw_jax.integrator.minima import (
-    MarginFunctions,
     MarginMinimaResult,
-    MarginMinimaState,
     TriedSolverStep,
     compute_margin_minima_jvp,
-    evaluate_with_rates,
     init_margin_minima_state,
     refine_margin_minima,
     update_margin_minima_state,
 )
 from vrw_jax.integrator.tableaus import (
     ButcherTableau,
-    EvaluateAcceleration,
     RKStep,
     StageState,
     TakeStep,
@@ -38,7 +33,8 @@ from vrw_jax.integrator.tableaus import (
     take_rk_step,
 )
 from vrw_jax.integrator.tangents import (
-    ImplicitDynamics,
+    BatchPhase,
+    MakeBatchPhase,
     PhaseTangents,
     apply_batched_jvp_rule,
     stack_directions,
@@ -51,32 +47,6 @@ from vrw_jax.numerics import (
     with_default_jax_settings,
 )
 from vrw_jax.simd import mark_noinline
-
-
-class BatchPhase(NamedTuple):
-    """Functions that define a phase, elementwise for all batch elements.
-
-    The function `evaluate_acceleration` returns the accelerations at a state. The guards are
-    positive inside the phase, and an event occurs when a guard falls through zero. The earliest
-    event ends the phase. If two guards are zero at the same time, the first in the list ends the
-    phase.
-    """
-
-    evaluate_acceleration: EvaluateAcceleration
-    evaluate_guards: Callable[[StageState], Vector]
-    margin_functions: MarginFunctions | None = None  # margins whose minima are computed
-    # equations of motion in implicit form, for derivatives
-    implicit_dynamics: ImplicitDynamics | None = None
-    is_compiled_separately: bool = False
-    """Whether machine code calls the phase's functions instead of inlining them at each use.
-
-    With calls, the code compiles in half of the time and runs a sixth slower than with inlining.
-    """
-    state_units: Vector | None = None
-    """Units of the coordinates `q` and of their rates `v` for the absolute tolerance.
-
-    The default is SI units.
-    """
 
 
 class BatchPhaseEnd(NamedTuple):
@@ -93,46 +63,11 @@ class BatchPhaseEnd(NamedTuple):
     margin_minima: Array | None  # minima of the margins, (margins, batch)
 
 
-class _IntegratorState(NamedTuple):
-    """State of the integration loop for each batch element."""
-
-    state: StageState
-    guard_values: Vector  # guards at `state`
-    next_step_length: Array
-    elapsed_time: Array
-    integration_status: Array  # an IntegrationStatus, after the last tried step
-    crossing_guard_bits: Array  # bit i is set if guard i crosses zero in that step
-    middle_guard_values: Vector  # guards at the middle stage of the crossing step
-    end_guard_values: Vector
-    n_tried_steps: Array
-    # number of iterations after which half of the batch had ended
-    n_iterations_until_half_ended: Array
-    n_iterations: Array
-    margin_minima_state: MarginMinimaState | None
-    state_tangents: (
-        Array | None
-    )  # tangents of the state, (directions, components, batch), see `tangents`
-
-
-class IntegrationStatus(IntEnum):
-    """Status of a batch element in the integration loop."""
-
-    RUNNING = 0
-    TIMED_OUT = 1
-    FAILED = 2
-    CROSSED = 3  # The last tried step crosses a guard.
-    IDLE = 4  # The element is inactive, or its start is already an event.
-
-
 STRAGGLER_ITERATION_FACTOR = 2
 """Ratio of two iteration counts: when stragglers are cut off, and when half of the batch had ended.
 
 The value is chosen because a ratio near 1 would cut off regular elements.
 """
-
-
-MakeBatchPhase = Callable[[Any, Vector], BatchPhase]
-"""Function that returns a phase for its constants, see `tangents.ImplicitDynamicsFn`."""
 
 
 def integrate_batch_phase(
@@ -151,7 +86,7 @@ def integrate_batch_phase(
 
     - `make_phase`: function that returns the phase for `phase_constants` and `held_constants`;
     - `phase_constants`, `held_constants`: constants of the equations, see
-      `tangents.ImplicitDynamicsFn`;
+      `tangents.MakeBatchPhase`;
     - `tableau`: tableau of the Runge-Kutta method;
     - `q`, `v`: tuples of arrays (batch,), one array per coordinate;
     - `is_active`: which elements are integrated, (batch,);
@@ -175,28 +110,19 @@ def integrate_batch_phase(
     def compute_integration_jvp(
         primals: tuple, state_tangents: tuple
     ) -> tuple[BatchPhaseEnd, BatchPhaseEnd]:
-        def make_implicit_dynamics(*phase_constants: Any) -> ImplicitDynamics:
-            implicit_dynamics = make_phase(*phase_constants).implicit_dynamics
-            assert implicit_dynamics is not None
-            return implicit_dynamics
-
         def integrate_with_tangents(
             primals: tuple, directions: tuple
         ) -> tuple[BatchPhaseEnd, tuple]:
             phase_constants_tangents, held_constants, q, v = directions
             start_tangents = stack_directions((*q, *v, *held_constants))
             phase_tangents = PhaseTangents(
-                make_implicit_dynamics,
-                primals[0],
-                primals[1],
-                phase_constants_tangents,
-                start_tangents,
+                make_phase, *primals[:2], phase_constants_tangents, start_tangents
             )
             phase_integration_result = _integrate_to_event(
                 make_phase, tableau, phase_tangents, *primals
             )
             return phase_integration_result.phase_end, _compute_phase_end_jvp(
-                make_phase, tableau, phase_tangents, phase_integration_result
+                tableau, phase_tangents, phase_integration_result
             )
 
         phase_end, (q, v, event_time_tangent, minima_tangents) = apply_batched_jvp_rule(
@@ -219,13 +145,11 @@ class _PhaseIntegrationResult(NamedTuple):
     solver_step_function: TakeStep
     start_state: StageState
     phase_end: BatchPhaseEnd
-    integrator_state: _IntegratorState
-    margin_minima_state: MarginMinimaState | None
+    integrator_state: IntegratorState  # with the minima of the whole phase
     margin_minima_result: MarginMinimaResult | None
 
 
 def _compute_phase_end_jvp(
-    make_phase: MakeBatchPhase,
     tableau: ButcherTableau,
     phase_tangents: PhaseTangents,
     phase_integration_result: _PhaseIntegrationResult,
@@ -235,18 +159,12 @@ def _compute_phase_end_jvp(
     The result contains the tangents of positions, rates, duration and minima of the margins. The
     first axis contains the directions.
     """
-    (
-        solver_step_function,
-        start_state,
-        phase_end,
-        integrator_state,
-        margin_minima_state,
-        margin_minima_result,
-    ) = phase_integration_result
+    solver_step_function, start_state, phase_end, integrator_state, margin_minima_result = (
+        phase_integration_result
+    )
     n = len(start_state.q)
-    has_guard_crossed = integrator_state.integration_status == IntegrationStatus.CROSSED
     last_step_length = jnp.where(
-        has_guard_crossed, phase_end.duration - integrator_state.elapsed_time, 0.0
+        integrator_state.has_guard_crossed, phase_end.duration - integrator_state.elapsed_time, 0.0
     )
     rk_step = solver_step_function(integrator_state.state, last_step_length)
     assert integrator_state.state_tangents is not None
@@ -254,17 +172,10 @@ def _compute_phase_end_jvp(
         tableau, rk_step.stage_states, integrator_state.state_tangents, last_step_length
     )
 
-    end_state, tangents_by_component = (
-        rk_step.end_state,
-        tuple(jnp.moveaxis(end_state_tangents, 1, 0)),
-    )
+    end_state = rk_step.end_state
+    tangents_by_component = tuple(jnp.moveaxis(end_state_tangents, 1, 0))
     event_time_tangent = _compute_event_time_jvp(
-        make_phase,
-        phase_tangents,
-        end_state,
-        end_state_tangents,
-        integrator_state,
-        phase_end.end_guard_index,
+        phase_tangents, end_state, end_state_tangents, integrator_state, phase_end.end_guard_index
     )
     motion_rates = (*end_state.v, *end_state.acceleration.acceleration[:n])
     state_tangents = tuple(
@@ -272,34 +183,26 @@ def _compute_phase_end_jvp(
         for x, y in zip(tangents_by_component[: 2 * n], motion_rates, strict=True)
     )
     minima_tangents = None
+    margin_minima_state = integrator_state.margin_minima_state
     if margin_minima_state is not None and margin_minima_result is not None:
-
-        def make_margins(*phase_constants: Any) -> tuple[MarginFunctions, EvaluateAcceleration]:
-            phase = make_phase(*phase_constants)
-            assert phase.margin_functions is not None
-            return phase.margin_functions, phase.evaluate_acceleration
-
-        start_and_end_states = start_state, phase_end.state
-        end_tangents = jnp.stack([*state_tangents, *tangents_by_component[2 * n :]], 1)
         minima_tangents = compute_margin_minima_jvp(
-            make_margins,
             solver_step_function,
             tableau,
             phase_tangents,
             margin_minima_state,
             margin_minima_result,
-            start_and_end_states,
-            end_tangents,
+            start_state,
+            phase_end.state,
+            jnp.stack([*state_tangents, *tangents_by_component[2 * n :]], 1),
         )
     return state_tangents[:n], state_tangents[n:], event_time_tangent, minima_tangents
 
 
 def _compute_event_time_jvp(
-    make_phase: MakeBatchPhase,
     phase_tangents: PhaseTangents,
     end_state: StageState,
     state_tangents: Array,
-    integrator_state: _IntegratorState,
+    integrator_state: IntegratorState,
     event_guard_index: Array,
 ) -> Array:
     """Return the tangent of the event's time, s, shape (directions, batch).
@@ -312,22 +215,22 @@ def _compute_event_time_jvp(
         phase_constants: Any, held_constants: Vector, q: Vector, v: Vector
     ) -> Vector:
         phase = make_phase(phase_constants, held_constants)
-        return phase.evaluate_guards(StageState(q, v, phase.evaluate_acceleration(q, v)))
+        return phase.evaluate_guards(phase.make_state(q, v))
 
+    make_phase = phase_tangents.make_phase
     phase = make_phase(phase_tangents.phase_constants, phase_tangents.held_constants)
-    _, guard_rates = evaluate_with_rates(
-        phase.evaluate_guards, phase.evaluate_acceleration, end_state
-    )
+    _, guard_rates = phase.evaluate_with_rates(phase.evaluate_guards, end_state)
     guard_tangents = phase_tangents.evaluate_tangents(
         evaluate_perturbed_guards, end_state, state_tangents
     )
-    has_guard_crossed = integrator_state.integration_status == IntegrationStatus.CROSSED
     event_time_tangent = jnp.zeros_like(integrator_state.next_step_length)
     for candidate_guard_index, (guard_rate, guard_tangent) in enumerate(
         zip(guard_rates, guard_tangents, strict=True)
     ):
         is_event_guard = (
-            has_guard_crossed & (event_guard_index == candidate_guard_index) & (guard_rate < 0.0)
+            integrator_state.has_guard_crossed
+            & (event_guard_index == candidate_guard_index)
+            & (guard_rate < 0.0)
         )
         event_time_tangent = jnp.where(
             is_event_guard,
@@ -356,10 +259,8 @@ def _integrate_to_event(
         phase, mark_noinline if phase.is_compiled_separately else jax.jit
     )
     solver_step_function = _make_solver_step_function(phase, tableau)
-    start_state = StageState(q, v, phase.evaluate_acceleration(q, v))
-    guard_values, guard_rates = evaluate_with_rates(
-        phase.evaluate_guards, phase.evaluate_acceleration, start_state
-    )
+    start_state = phase.make_state(q, v)
+    guard_values, guard_rates = phase.evaluate_with_rates(phase.evaluate_guards, start_state)
     is_guard_met_at_start = tuple(
         (guard_value < 0.0) | ((guard_value == 0.0) & (guard_rate <= 0.0))
         for guard_value, guard_rate in zip(guard_values, guard_rates, strict=True)
@@ -384,27 +285,12 @@ def _integrate_to_event(
         straggler_count,
         phase_tangents,
     )
-    has_guard_crossed = integrator_state.integration_status == IntegrationStatus.CROSSED
-    if phase.margin_functions is not None or phase_tangents is not None:
+    has_guard_crossed = integrator_state.has_guard_crossed
+    if phase.margins_include_start or phase_tangents is not None:
         # The functions are called, not inlined, because the program is already long.
         phase = _wrap_each_phase_function(phase, mark_noinline)
         solver_step_function = _make_solver_step_function(phase, tableau)
-    guard_crossing_step = GuardCrossingStep(
-        *integrator_state[:2],
-        integrator_state.middle_guard_values,
-        integrator_state.end_guard_values,
-        integrator_state.next_step_length,
-        integrator_state.crossing_guard_bits,
-        has_guard_crossed,
-    )
-    event_search = locate_event(
-        phase.evaluate_guards,
-        phase.evaluate_acceleration,
-        solver_step_function,
-        tableau,
-        guard_crossing_step,
-        options,
-    )
+    event_search = locate_event(phase, solver_step_function, tableau, integrator_state, options)
     is_crossing_event_unresolved = has_guard_crossed & event_search.is_event_unresolved
     duration = integrator_state.elapsed_time + jnp.where(
         has_guard_crossed, event_search.event_step_length, 0.0
@@ -413,8 +299,7 @@ def _integrate_to_event(
         has_guard_crossed, event_search.end_state, integrator_state.state
     )
     margin_minima_state, margin_minima_result = integrator_state.margin_minima_state, None
-    if phase.margin_functions is not None and margin_minima_state is not None:
-        margin_arguments = phase.margin_functions, phase.evaluate_acceleration
+    if margin_minima_state is not None:
         tried_solver_step = TriedSolverStep(
             integrator_state.state,
             end_state,
@@ -423,15 +308,13 @@ def _integrate_to_event(
             integrator_state.state_tangents,
         )
         margin_minima_state = update_margin_minima_state(
-            *margin_arguments, margin_minima_state, tried_solver_step
+            phase, margin_minima_state, tried_solver_step
         )
-        start_margins = jnp.stack(phase.margin_functions.evaluate_margins(start_state))
         margin_minima_result = refine_margin_minima(
-            phase.margin_functions,
+            phase,
             solver_step_function,
-            phase.evaluate_acceleration,
             margin_minima_state,
-            start_margins,
+            jnp.stack(phase.evaluate_margins(start_state)),
             options,
         )
     is_straggler = (
@@ -450,7 +333,7 @@ def _integrate_to_event(
         ),
         is_timed_out=(integrator_state.integration_status == IntegrationStatus.TIMED_OUT)
         | is_straggler,
-        is_unfinished=integrator_state.integration_status == IntegrationStatus.RUNNING,
+        is_unfinished=integrator_state.is_running,
         n_tried_steps=integrator_state.n_tried_steps
         + jnp.where(has_guard_crossed, event_search.n_tried_steps, 0),
         next_solver_dt=integrator_state.next_step_length,
@@ -462,8 +345,7 @@ def _integrate_to_event(
         solver_step_function,
         start_state,
         phase_end,
-        integrator_state,
-        margin_minima_state,
+        integrator_state._replace(margin_minima_state=margin_minima_state),
         margin_minima_result,
     )
 
@@ -478,15 +360,10 @@ def _make_solver_step_function(phase: BatchPhase, tableau: ButcherTableau) -> Ta
 
 def _wrap_each_phase_function(phase: BatchPhase, wrap_function: Callable) -> BatchPhase:
     """Return a copy of the phase in which `wrap_function` has been applied to each function."""
-    margin_functions = phase.margin_functions
-    if margin_functions is not None:
-        margin_functions = margin_functions._replace(
-            evaluate_margins=wrap_function(margin_functions.evaluate_margins)
-        )
     return phase._replace(
         evaluate_acceleration=wrap_function(phase.evaluate_acceleration),
         evaluate_guards=wrap_function(phase.evaluate_guards),
-        margin_functions=margin_functions,
+        evaluate_margins=wrap_function(phase.evaluate_margins),
     )
 
 
@@ -501,14 +378,14 @@ def _integrate_until_crossing(
     options: StepOptions,
     straggler_count: Array | None,
     phase_tangents: PhaseTangents | None,
-) -> _IntegratorState:
+) -> IntegratorState:
     """Return the state of the integration loop after adaptive solver steps in all batch elements.
 
     An element stops when a guard crosses zero, when it reaches the time limit, or when it fails.
     The loop ends when no element is running, or earlier if it cuts off stragglers.
     """
 
-    def take_one_solver_step(integrator_state: _IntegratorState) -> _IntegratorState:
+    def take_one_solver_step(integrator_state: IntegratorState) -> IntegratorState:
         rk_step = solver_step_function(integrator_state.state, integrator_state.next_step_length)
         stage_guard_values = [
             phase.evaluate_guards(rk_step.stage_states[i]) for i in tableau.guard_stage_indices
@@ -538,7 +415,7 @@ def _integrate_until_crossing(
             (rk_step.end_state, end_guard_values),
             (integrator_state.state, integrator_state.guard_values),
         )
-        was_element_running = integrator_state.integration_status == IntegrationStatus.RUNNING
+        was_element_running = integrator_state.is_running
         middle_guard_values = (
             stage_guard_values[tableau.guard_stage_indices.index(tableau.middle_stage_index)]
             if stage_guard_values
@@ -552,8 +429,7 @@ def _integrate_until_crossing(
         margin_minima_state = integrator_state.margin_minima_state
         state_tangents = integrator_state.state_tangents
         n_iterations_until_half_ended = integrator_state.n_iterations_until_half_ended
-        if phase.margin_functions is not None and margin_minima_state is not None:
-            margin_arguments = phase.margin_functions, phase.evaluate_acceleration
+        if margin_minima_state is not None:
             tried_solver_step = TriedSolverStep(
                 integrator_state.state,
                 rk_step.end_state,
@@ -562,7 +438,7 @@ def _integrate_until_crossing(
                 integrator_state.state_tangents,
             )
             margin_minima_state = update_margin_minima_state(
-                *margin_arguments, margin_minima_state, tried_solver_step
+                phase, margin_minima_state, tried_solver_step
             )
         if phase_tangents is not None and state_tangents is not None:
             state_tangents = phase_tangents.propagate_if_accepted(
@@ -581,7 +457,7 @@ def _integrate_until_crossing(
                 integrator_state.n_iterations + 1,
                 n_iterations_until_half_ended,
             )
-        return _IntegratorState(
+        return IntegratorState(
             state=state,
             guard_values=guard_values,
             next_step_length=next_step_length,
@@ -597,12 +473,11 @@ def _integrate_until_crossing(
             state_tangents=state_tangents,
         )
 
-    def needs_more_steps(integrator_state: _IntegratorState) -> Array:
+    def needs_more_steps(integrator_state: IntegratorState) -> Array:
         """Return whether the loop continues, which depends on the number of running elements."""
-        is_running = integrator_state.integration_status == IntegrationStatus.RUNNING
         if straggler_count is None:
-            return jnp.any(is_running)
-        n_running_elements = jnp.sum(is_running, dtype=jnp.int32)
+            return jnp.any(integrator_state.is_running)
+        n_running_elements = jnp.sum(integrator_state.is_running, dtype=jnp.int32)
         max_iterations = (
             STRAGGLER_ITERATION_FACTOR * integrator_state.n_iterations_until_half_ended + 8
         )
@@ -611,11 +486,13 @@ def _integrate_until_crossing(
             (n_running_elements <= straggler_count) & is_iteration_limit_exceeded
         )
 
-    initial_minima = phase.margin_functions and init_margin_minima_state(
-        phase.margin_functions, phase.evaluate_acceleration, start_state, phase_tangents
+    initial_minima = (
+        init_margin_minima_state(phase, start_state, phase_tangents)
+        if phase.margins_include_start
+        else None
     )
     initial_counts, initial_count = jnp.zeros(initial_dt.shape, jnp.int32), jnp.zeros((), jnp.int32)
-    initial_state = _IntegratorState(
+    initial_state = IntegratorState(
         state=start_state,
         guard_values=guard_values,
         next_step_length=initial_dt,
@@ -637,7 +514,7 @@ def _integrate_until_crossing(
 
 def _classify_solver_step(
     options: StepOptions,
-    integrator_state: _IntegratorState,
+    integrator_state: IntegratorState,
     step_length_factor: Array,
     is_step_rejected: Array,
     end_guard_values: Vector,
@@ -650,7 +527,7 @@ def _classify_solver_step(
     end after the time limit is shortened to end there. An element fails if its next step is too
     short for the time to advance, or if the number of its solver steps reaches the limit.
     """
-    is_running = integrator_state.integration_status == IntegrationStatus.RUNNING
+    is_running = integrator_state.is_running
     is_valid_step = is_running & ~is_step_rejected
     crossing_guard_bits = jnp.zeros_like(integrator_state.crossing_guard_bits)
     for candidate_guard_index, end_guard_value in enumerate(end_guard_values):
@@ -756,9 +633,14 @@ def sample_batch_phase(
         )
 
     pack_sample = lambda phase_state: jnp.stack([*phase_state.q, *phase_state.v])
-    start_state = StageState(q, v, phase.evaluate_acceleration(q, v))
     return sample_at_equal_times(
-        solver_step_function, pack_sample, start_state, tableau, duration, n_samples, options
+        solver_step_function,
+        pack_sample,
+        phase.make_state(q, v),
+        tableau,
+        duration,
+        n_samples,
+        options,
     )
 
 

@@ -7,7 +7,6 @@ another.
 """
 
 import functools
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -16,8 +15,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
-from vrw_jax.integrator.tableaus import ButcherTableau, EvaluateAcceleration, StageState, TakeStep
-from vrw_jax.integrator.tangents import PhaseTangents
+from vrw_jax.integrator.tableaus import ButcherTableau, StageState, TakeStep
+from vrw_jax.integrator.tangents import BatchPhase, PhaseTangents
 from vrw_jax.numerics import (
     MINIMUM_LOCATION_TOLERANCE,
     StepOptions,
@@ -25,14 +24,6 @@ from vrw_jax.numerics import (
     find_cubic_minimum,
     select_trees_by_condition,
 )
-
-
-class MarginFunctions(NamedTuple):
-    """Function that returns all margins at a state, and whether each minimum includes the start."""
-
-    evaluate_margins: Callable[[StageState], Vector]
-    # whether the margin at the phase's start counts, see `hybrid.GuardsAndMargins`
-    includes_phase_start: tuple[bool, ...]
 
 
 class MarginMinimaState(NamedTuple):
@@ -52,29 +43,8 @@ class MarginMinimaState(NamedTuple):
     step_start_tangents: Array | None = None
 
 
-def evaluate_with_rates(
-    evaluate_functions: Callable[[StageState], Vector],
-    evaluate_acceleration: EvaluateAcceleration,
-    motion_state: StageState,
-) -> tuple[Vector, Vector]:
-    """Return the values of `evaluate_functions` at a state, and their time derivatives."""
-    n_coordinates = len(motion_state.q)
-
-    def evaluate_along_motion(q: Vector, v: Vector) -> Vector:
-        return evaluate_functions(StageState(q, v, evaluate_acceleration(q, v)))
-
-    return jax.jvp(
-        evaluate_along_motion,
-        (motion_state.q, motion_state.v),
-        (motion_state.v, motion_state.acceleration.acceleration[:n_coordinates]),
-    )
-
-
 def init_margin_minima_state(
-    margin_functions: MarginFunctions,
-    evaluate_acceleration: EvaluateAcceleration,
-    start_state: StageState,
-    phase_tangents: PhaseTangents | None,
+    phase: BatchPhase, start_state: StageState, phase_tangents: PhaseTangents | None
 ) -> MarginMinimaState:
     """Return the state of the search for minima before the first solver step.
 
@@ -82,10 +52,9 @@ def init_margin_minima_state(
     time derivative at the start is round-off and is replaced by zero.
     """
     margin_values, margin_rates = map(
-        jnp.stack,
-        evaluate_with_rates(margin_functions.evaluate_margins, evaluate_acceleration, start_state),
+        jnp.stack, phase.evaluate_with_rates(phase.evaluate_margins, start_state)
     )
-    includes_phase_start = jnp.asarray(margin_functions.includes_phase_start)[:, None]
+    includes_phase_start = jnp.asarray(phase.margins_include_start)[:, None]
     zero_margins = jnp.zeros_like(margin_values)
     zero_start_coordinates = jnp.zeros(
         (len(margin_values), len(start_state.q), margin_values.shape[-1]), margin_values.dtype
@@ -120,16 +89,12 @@ class TriedSolverStep(NamedTuple):
 
 
 def update_margin_minima_state(
-    margin_functions: MarginFunctions,
-    evaluate_acceleration: EvaluateAcceleration,
-    margin_minima_state: MarginMinimaState,
-    tried_solver_step: TriedSolverStep,
+    phase: BatchPhase, margin_minima_state: MarginMinimaState, tried_solver_step: TriedSolverStep
 ) -> MarginMinimaState:
     """Return the lowest interior minima after one more accepted solver step."""
-    step_start, step_end, step_length, is_accepted, _ = tried_solver_step
+    step_start, step_end, step_length, is_accepted, step_start_tangents = tried_solver_step
     margin_values, margin_rates = map(
-        jnp.stack,
-        evaluate_with_rates(margin_functions.evaluate_margins, evaluate_acceleration, step_end),
+        jnp.stack, phase.evaluate_with_rates(phase.evaluate_margins, step_end)
     )
     margin_minimum_location, margin_minimum = find_cubic_minimum(
         margin_minima_state.margin_values,
@@ -148,35 +113,26 @@ def update_margin_minima_state(
         & has_interior_minimum
         & (margin_minimum < margin_minima_state.lowest_margin_values)
     )
-    replace_if_lower = lambda new_minimum, old_minimum: jnp.where(
-        is_minimum_lower, new_minimum, old_minimum
+
+    def replace_if_lower(old_value: Array, new_value: Array) -> Array:
+        is_lower = is_minimum_lower.reshape(len(old_value), *(1,) * (old_value.ndim - 2), -1)
+        return jnp.where(is_lower, new_value, old_value)
+
+    # The fields of the state begin with the present margins; the others belong to the minimum.
+    lowest_minimum_of_step = (
+        margin_minimum,
+        jnp.stack(step_start.q),
+        jnp.stack(step_start.v),
+        step_length,
+        margin_minimum_location * step_length,
+        margin_minima_state.margin_rates,
+        step_start_tangents,
     )
-    replace_start_if_lower = lambda new_minimum, old_minimum: jnp.where(
-        is_minimum_lower[:, None], jnp.stack(new_minimum), old_minimum
-    )
-    step_start_tangents = margin_minima_state.step_start_tangents
-    if step_start_tangents is not None and tried_solver_step.step_start_tangents is not None:
-        step_start_tangents = jnp.where(
-            is_minimum_lower[:, None, None],
-            tried_solver_step.step_start_tangents[None],
-            step_start_tangents,
-        )
     return MarginMinimaState(
-        margin_values=jnp.where(is_accepted, margin_values, margin_minima_state.margin_values),
-        margin_rates=jnp.where(is_accepted, margin_rates, margin_minima_state.margin_rates),
-        lowest_margin_values=replace_if_lower(
-            margin_minimum, margin_minima_state.lowest_margin_values
+        *select_trees_by_condition(
+            is_accepted, (margin_values, margin_rates), margin_minima_state[:2]
         ),
-        step_start_q=replace_start_if_lower(step_start.q, margin_minima_state.step_start_q),
-        step_start_v=replace_start_if_lower(step_start.v, margin_minima_state.step_start_v),
-        step_length=replace_if_lower(step_length, margin_minima_state.step_length),
-        time_to_minimum=replace_if_lower(
-            margin_minimum_location * step_length, margin_minima_state.time_to_minimum
-        ),
-        step_start_margin_rates=replace_if_lower(
-            margin_minima_state.margin_rates, margin_minima_state.step_start_margin_rates
-        ),
-        step_start_tangents=step_start_tangents,
+        *jax.tree.map(replace_if_lower, margin_minima_state[2:], lowest_minimum_of_step),
     )
 
 
@@ -202,9 +158,8 @@ class _MarginMinimumSearch(NamedTuple):
 
 
 def refine_margin_minima(
-    margin_functions: MarginFunctions,
+    phase: BatchPhase,
     solver_step_function: TakeStep,
-    evaluate_acceleration: EvaluateAcceleration,
     margin_minima_state: MarginMinimaState,
     start_margin_values: Array,
     options: StepOptions,
@@ -220,21 +175,12 @@ def refine_margin_minima(
         _: None, margin_scan_inputs: tuple
     ) -> tuple[None, tuple[Array, Array]]:
         margin_index, margin_minimum_state = margin_scan_inputs
-        q, v = tuple(margin_minimum_state.step_start_q), tuple(margin_minimum_state.step_start_v)
-        minimum_step_start_state = StageState(q, v, evaluate_acceleration(q, v))
+        minimum_step_start_state = phase.make_state(
+            tuple(margin_minimum_state.step_start_q), tuple(margin_minimum_state.step_start_v)
+        )
 
-        def evaluate_selected_margin(state: StageState) -> Array:
-            is_selected_margin = (
-                jnp.arange(len(margin_functions.includes_phase_start)) == margin_index
-            )
-            return jnp.sum(
-                jnp.where(
-                    is_selected_margin[:, None],
-                    jnp.stack(margin_functions.evaluate_margins(state)),
-                    0.0,
-                ),
-                0,
-            )
+        def evaluate_selected_margin(state: StageState) -> Vector:
+            return (_select_margin(jnp.stack(phase.evaluate_margins(state)), margin_index),)
 
         def improve_margin_minimum_search(
             margin_minimum_search: _MarginMinimumSearch,
@@ -242,8 +188,8 @@ def refine_margin_minima(
             step_end = solver_step_function(
                 minimum_step_start_state, margin_minimum_search.step_length
             ).end_state
-            (margin_value,), (margin_rate,) = evaluate_with_rates(
-                lambda state: (evaluate_selected_margin(state),), evaluate_acceleration, step_end
+            (margin_value,), (margin_rate,) = phase.evaluate_with_rates(
+                evaluate_selected_margin, step_end
             )
             length_change = (
                 margin_minimum_search.step_length - margin_minimum_search.best_step_length
@@ -290,30 +236,25 @@ def refine_margin_minima(
                 margin_minimum_search,
             )._replace(n_iterations=margin_minimum_search.n_iterations + 1)
 
-        has_interior_minimum = jnp.isfinite(margin_minimum_state.lowest_margin_values)
         zero_step_length = jnp.zeros_like(margin_minimum_state.step_length)
-        n_iterations = jnp.zeros((), jnp.int32)
         margin_minimum_search = _MarginMinimumSearch(
             margin_minimum_state.time_to_minimum,
             zero_step_length,
             margin_minimum_state.step_start_margin_rates,
             zero_step_length + jnp.inf,
-            has_interior_minimum,
-            n_iterations,
+            jnp.isfinite(margin_minimum_state.lowest_margin_values),
+            jnp.zeros((), jnp.int32),
         )
         needs_iteration = lambda margin_minimum_search: (
             jnp.any(margin_minimum_search.is_minimum_unresolved)
             & (margin_minimum_search.n_iterations < options.max_margin_search_iterations)
         )
-        final_margin_minimum_search = lax.while_loop(
+        final_search = lax.while_loop(
             needs_iteration, improve_margin_minimum_search, margin_minimum_search
         )
-        return None, (
-            final_margin_minimum_search.margin_value,
-            final_margin_minimum_search.step_length,
-        )
+        return None, (final_search.margin_value, final_search.step_length)
 
-    includes_phase_start = np.asarray(margin_functions.includes_phase_start)[:, None]
+    includes_phase_start = np.asarray(phase.margins_include_start)[:, None]
     end_margin_minima = jnp.minimum(
         jnp.where(includes_phase_start, start_margin_values, jnp.inf),
         margin_minima_state.margin_values,
@@ -331,52 +272,50 @@ def refine_margin_minima(
     )
 
 
+def _select_margin(margins: Array, margin_index: Array) -> Array:
+    """Return one margin of an array (..., margins, batch)."""
+    is_selected_margin = jnp.arange(margins.shape[-2]) == margin_index
+    return jnp.sum(jnp.where(is_selected_margin[:, None], margins, 0.0), -2)
+
+
 def compute_margin_minima_jvp(
-    make_margins: Callable[..., tuple[MarginFunctions, EvaluateAcceleration]],
     solver_step_function: TakeStep,
     tableau: ButcherTableau,
     phase_tangents: PhaseTangents,
     margin_minima_state: MarginMinimaState,
     margin_minima_result: MarginMinimaResult,
-    start_and_end_states: tuple[StageState, StageState],
+    start_state: StageState,
+    end_state: StageState,
     end_tangents: Array,
 ) -> Array:
     """Return the tangents of the minima of the margins, shape (directions, margins, batch).
 
     The tangents are those of the margins at fixed times, because the shift of a minimum in time has
-    no first-order effect. `start_and_end_states` are the states at the start and at the end of the
-    phase, and `end_tangents` are the tangents of the end state.
+    no first-order effect. `start_state` and `end_state` are the states at the start and at the end
+    of the phase, and `end_tangents` are the tangents of the end state.
     """
-    margin_functions, evaluate_acceleration = make_margins(
-        phase_tangents.phase_constants, phase_tangents.held_constants
-    )
+    make_phase = phase_tangents.make_phase
+    phase = make_phase(phase_tangents.phase_constants, phase_tangents.held_constants)
 
     def evaluate_margins(
         phase_constants: Any, held_constants: Vector, q: Vector, v: Vector
     ) -> Array:
-        margin_functions, evaluate_acceleration_at = make_margins(phase_constants, held_constants)
-        return jnp.stack(
-            margin_functions.evaluate_margins(StageState(q, v, evaluate_acceleration_at(q, v)))
-        )
+        phase = make_phase(phase_constants, held_constants)
+        return jnp.stack(phase.evaluate_margins(phase.make_state(q, v)))
 
     compute_margin_tangents = functools.partial(phase_tangents.evaluate_tangents, evaluate_margins)
 
     def compute_margin_tangent(_: None, margin_scan_inputs: tuple) -> tuple[None, Array]:
         margin_index, margin_minimum_state, step_length = margin_scan_inputs
-        q, v = tuple(margin_minimum_state.step_start_q), tuple(margin_minimum_state.step_start_v)
-        minimum_step_start_state = StageState(q, v, evaluate_acceleration(q, v))
+        minimum_step_start_state = phase.make_state(
+            tuple(margin_minimum_state.step_start_q), tuple(margin_minimum_state.step_start_v)
+        )
         rk_step = solver_step_function(minimum_step_start_state, step_length)
         state_tangents = phase_tangents.propagate_to_step_end(
             tableau, rk_step.stage_states, margin_minimum_state.step_start_tangents, step_length
         )
-        is_selected_margin = jnp.arange(len(margin_functions.includes_phase_start)) == margin_index
-        return None, jnp.sum(
-            jnp.where(
-                is_selected_margin[:, None],
-                compute_margin_tangents(rk_step.end_state, state_tangents),
-                0.0,
-            ),
-            1,
+        return None, _select_margin(
+            compute_margin_tangents(rk_step.end_state, state_tangents), margin_index
         )
 
     margin_indices = jnp.arange(len(margin_minima_result.phase_margin_minima), dtype=jnp.int32)
@@ -389,8 +328,8 @@ def compute_margin_minima_jvp(
         0,
         1,
     )
-    start_tangents = compute_margin_tangents(start_and_end_states[0], phase_tangents.start_tangents)
-    end_margin_tangents = compute_margin_tangents(start_and_end_states[1], end_tangents)
+    start_tangents = compute_margin_tangents(start_state, phase_tangents.start_tangents)
+    end_margin_tangents = compute_margin_tangents(end_state, end_tangents)
     end_margin_minima_tangents = jnp.where(
         margin_minima_state.margin_values <= margin_minima_result.phase_margin_minima,
         end_margin_tangents,

@@ -25,6 +25,7 @@ from jaxtyping import Array
 
 from vrw_jax.integrator.tableaus import (
     ButcherTableau,
+    EvaluateAcceleration,
     StageAccelerations,
     StageState,
     evaluate_stage,
@@ -46,8 +47,51 @@ class ImplicitDynamics(NamedTuple):
     """Function that returns accelerations for which the left side equals the second argument."""
 
 
-ImplicitDynamicsFn = Callable[[Any, Vector], ImplicitDynamics]
-"""Function that returns the `ImplicitDynamics` for two kinds of constants.
+class BatchPhase(NamedTuple):
+    """Functions that define a phase, elementwise for all batch elements.
+
+    The function `evaluate_acceleration` returns the accelerations at a state. The guards are
+    positive inside the phase, and an event occurs when a guard falls through zero. The earliest
+    event ends the phase. If two guards are zero at the same time, the first in the list ends the
+    phase.
+    """
+
+    evaluate_acceleration: EvaluateAcceleration
+    evaluate_guards: Callable[[StageState], Vector]
+    evaluate_margins: Callable[[StageState], Vector] = lambda stage_state: ()
+    """Function that returns the margins whose minima are computed."""
+    margins_include_start: tuple[bool, ...] = ()
+    """Whether each margin counts at the phase's start, see `hybrid.GuardsAndMargins`."""
+    implicit_dynamics: ImplicitDynamics = None  # type: ignore[assignment]
+    """Equations of motion in implicit form. Only derivatives need them."""
+    is_compiled_separately: bool = False
+    """Whether machine code calls the phase's functions instead of inlining them at each use.
+
+    With calls, the code compiles in half of the time and runs a sixth slower than with inlining.
+    """
+    state_units: Vector | None = None
+    """Units of the coordinates `q` and of their rates `v` for the absolute tolerance.
+
+    The default is SI units.
+    """
+
+    def make_state(self, q: Vector, v: Vector) -> StageState:
+        """Return the state with positions `q`, rates `v` and the accelerations there."""
+        return StageState(q, v, self.evaluate_acceleration(q, v))
+
+    def evaluate_with_rates(
+        self, evaluate_functions: Callable[[StageState], Vector], state: StageState
+    ) -> tuple[Vector, Vector]:
+        """Return the values of `evaluate_functions` at a state, and their time derivatives."""
+        return jax.jvp(
+            lambda q, v: evaluate_functions(self.make_state(q, v)),
+            (state.q, state.v),
+            (state.v, state.acceleration.acceleration[: len(state.q)]),
+        )
+
+
+MakeBatchPhase = Callable[[Any, Vector], BatchPhase]
+"""Function that returns the `BatchPhase` for two kinds of constants.
 
 The first argument is a tree of arrays with few tangent directions. The second argument contains the
 held constants. These are arrays that are constant during the phase and have arbitrary tangents,
@@ -130,33 +174,24 @@ loops again.
 """
 
 
-def _map_sequentially(evaluate_for_direction: Callable[[Any], Any], directions: Any) -> Any:
-    """Return the results of a function for all directions, computed in a loop.
+def _map_directions(
+    evaluate_for_direction: Callable[[Any], Any], directions: Any, is_unrolled: bool = False
+) -> Any:
+    """Return the results of a function for all directions.
 
-    The loop makes the values for one direction fit into registers.
+    They are computed in a loop, which makes the values for one direction fit into registers. With
+    `is_unrolled` there is no loop, so that the compiler removes entries that are known to be zero.
     """
-    leaves, tree_structure = jax.tree.flatten(directions)
-    has_several_directions = [len(x) > 1 for x in leaves]
-
-    def evaluate_selected_direction(varying_leaves: list[Array]) -> Any:
-        remaining_leaves = iter(varying_leaves)
-        leaves_and_flags = zip(leaves, has_several_directions, strict=True)
-        return evaluate_for_direction(
-            jax.tree.unflatten(
-                tree_structure,
-                [
-                    next(remaining_leaves) if has_direction_axis else x[0]
-                    for x, has_direction_axis in leaves_and_flags
-                ],
-            )
-        )
-
-    if not any(has_several_directions):
-        return jax.tree.map(lambda x: x[None], evaluate_selected_direction([]))
-    return lax.map(
-        evaluate_selected_direction,
-        [x for x, n in zip(leaves, has_several_directions, strict=True) if n],
+    varying_tangents, shared_tangents = eqx.partition(directions, lambda x: len(x) > 1)
+    shared_tangents = jax.tree.map(lambda x: x[0], shared_tangents)
+    evaluate_varying = lambda tangents: evaluate_for_direction(
+        eqx.combine(tangents, shared_tangents)
     )
+    if not jax.tree.leaves(varying_tangents):
+        return jax.tree.map(lambda x: x[None], evaluate_varying(varying_tangents))
+    if is_unrolled:
+        return jax.vmap(evaluate_varying)(varying_tangents)
+    return lax.map(evaluate_varying, varying_tangents)
 
 
 def stack_directions(directions: Vector) -> Array:
@@ -176,7 +211,7 @@ class StageJacobians(NamedTuple):
 
 @functools.partial(jax.jit, static_argnums=0)
 def _compute_stage_jacobians(
-    make_implicit_dynamics: ImplicitDynamicsFn,
+    make_phase: MakeBatchPhase,
     phase_constants: Any,
     phase_constants_directions: Any,
     held_constants: Vector,
@@ -188,18 +223,15 @@ def _compute_stage_jacobians(
         # inverse of `_pack_stage_state`
         n = (len(packed_state) - 2) // 3
         state_components = tuple(packed_state)
-        acceleration = StageAccelerations(
-            state_components[2 * n], state_components[2 * n + 1], state_components[2 * n + 2 :]
-        )
+        sin, cos, *accelerations = state_components[2 * n :]
+        acceleration = StageAccelerations(sin, cos, tuple(accelerations))
         stage_state = StageState(state_components[:n], state_components[n : 2 * n], acceleration)
-        implicit_dynamics = make_implicit_dynamics(phase_constants, held_constants)
         implicit_dynamics = ImplicitDynamics(
-            jax.jit(implicit_dynamics.evaluate_residual),
-            jax.jit(implicit_dynamics.solve_for_accelerations),
+            *map(jax.jit, make_phase(phase_constants, held_constants).implicit_dynamics)
         )
-        evaluate_residual = lambda phase_constants, held_constants: make_implicit_dynamics(
-            phase_constants, held_constants
-        ).evaluate_residual(stage_state)
+        evaluate_residual = lambda *constants: make_phase(
+            *constants
+        ).implicit_dynamics.evaluate_residual(stage_state)
         compute_acceleration_derivative = lambda *tangent: _solve_acceleration(
             implicit_dynamics, stage_state, jax.jvp(evaluate_residual, *tangent)[1]
         )
@@ -224,8 +256,8 @@ def _compute_stage_jacobians(
                 (phase_constants, held_constants), (phase_constants_direction, zero_held_constants)
             )
         )
-        return jnp.stack(jacobian_columns, 1), _map_unrolled(
-            differentiate_by_phase_constants, phase_constants_directions
+        return jnp.stack(jacobian_columns, 1), _map_directions(
+            differentiate_by_phase_constants, phase_constants_directions, is_unrolled=True
         )
 
     return StageJacobians(
@@ -233,23 +265,6 @@ def _compute_stage_jacobians(
             linearize_stage, jnp.stack([_pack_stage_state(state) for state in stage_states[:-1]])
         )
     )
-
-
-def _map_unrolled(evaluate_for_direction: Callable[[Any], Array], directions: Any) -> Array:
-    """Return the results of a function for all directions, computed without a loop.
-
-    Without a loop, the compiler removes entries that are known to be zero.
-    """
-    leaves, tree_structure = jax.tree.flatten(directions)
-    if all(len(x) == 1 for x in leaves):
-        return evaluate_for_direction(jax.tree.unflatten(tree_structure, [x[0] for x in leaves]))[
-            None
-        ]
-    leaf_axes = [0 if len(x) > 1 else None for x in leaves]
-    direction_leaves = [x if len(x) > 1 else x[0] for x in leaves]
-    return jax.vmap(
-        lambda *x: evaluate_for_direction(jax.tree.unflatten(tree_structure, x)), leaf_axes
-    )(*direction_leaves)
 
 
 def _pack_stage_state(state: StageState) -> Array:
@@ -316,39 +331,24 @@ def _propagate_tangents(
         start_rate_tangents = tuple(start_tangent[n : 2 * n])
         held_constants_tangents = tuple(start_tangent[2 * n :])
         stage_tangents: list[Vector] = []
+        q, v = start_position_tangents, start_rate_tangents
         for i in range(len(tableau.stage_nodes) - 1):
-            q, v = (
-                evaluate_stage(
-                    tableau, i, start_position_tangents, start_rate_tangents, stage_tangents, h
-                )
-                if i
-                else (start_position_tangents, start_rate_tangents)
-            )
             state_tangents = (*q, *v, *held_constants_tangents)
-            acceleration_terms = [
-                [
+            acceleration_tangents = [
+                functools.reduce(
+                    lax.add,
+                    map(lax.mul, state_jacobian[i, coordinate_index], state_tangents),
                     phase_constants_tangent[i, coordinate_index],
-                    *map(lax.mul, state_jacobian[i, coordinate_index], state_tangents),
-                ]
+                )
                 for coordinate_index in range(n)
             ]
-            stage_tangents.append(
-                tuple(
-                    functools.reduce(lax.add, weighted_terms)
-                    for weighted_terms in acceleration_terms
-                )
+            stage_tangents.append(tuple(acceleration_tangents))
+            q, v = evaluate_stage(
+                tableau, i + 1, start_position_tangents, start_rate_tangents, stage_tangents, h
             )
-        q, v = evaluate_stage(
-            tableau,
-            len(tableau.stage_nodes) - 1,
-            start_position_tangents,
-            start_rate_tangents,
-            stage_tangents,
-            h,
-        )
         return jnp.stack([*q, *v, *held_constants_tangents])
 
-    return _map_sequentially(
+    return _map_directions(
         propagate_tangent_direction,
         (jnp.moveaxis(stage_jacobians.phase_constants_tangents, 1, 0), start_tangents),
     )
@@ -359,7 +359,7 @@ def compute_each_jvp(function: Callable[..., Any], primals: tuple, directions: t
 
     The program is as short as for one direction.
     """
-    return _map_sequentially(lambda direction: jax.jvp(function, primals, direction)[1], directions)
+    return _map_directions(lambda direction: jax.jvp(function, primals, direction)[1], directions)
 
 
 def with_batched_jvp(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -400,7 +400,7 @@ def with_batched_jvp(function: Callable[..., Any]) -> Callable[..., Any]:
 class PhaseTangents(NamedTuple):
     """Tangents of the start state, of the constants and of the held constants of a phase."""
 
-    make_implicit_dynamics: ImplicitDynamicsFn
+    make_phase: MakeBatchPhase
     phase_constants: Any
     held_constants: Vector
     phase_constants_tangents: Any  # tree of the constants, directions first
@@ -419,7 +419,7 @@ class PhaseTangents(NamedTuple):
         `h` is the length of the step, s.
         """
         stage_jacobians = _compute_stage_jacobians(
-            self.make_implicit_dynamics,
+            self.make_phase,
             self.phase_constants,
             self.phase_constants_tangents,
             self.held_constants,

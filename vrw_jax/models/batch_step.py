@@ -23,7 +23,6 @@ from vrw_jax.integrator import (
     BatchPhase,
     ButcherTableau,
     ImplicitDynamics,
-    MarginFunctions,
     StageAccelerations,
     StageState,
     integrate_batch_phase,
@@ -138,14 +137,11 @@ def make_batch_phase(
             complete_motion_at_stage(stage), right_hand_side
         ),
     )
-    margin_functions = MarginFunctions(
-        lambda stage: phase.compute_margins(make_phase_instant(stage)),
-        phase.are_margins_counted_at_start,
-    )
     return BatchPhase(
         evaluate_acceleration,
         lambda stage: phase.compute_guards(make_phase_instant(stage)),
-        margin_functions if records_margins else None,
+        lambda stage: phase.compute_margins(make_phase_instant(stage)),
+        phase.are_margins_counted_at_start if records_margins else (),
         implicit_dynamics,
         is_compiled_separately,
         phase.coordinate_units,
