@@ -20,6 +20,7 @@ from vrw_jax.wheel.geometry import (
     Motion,
     compute_double_support_circle,
     rotate_to_rear_leg,
+    rotate_to_vertical,
 )
 from vrw_jax.wheel.params import Symbols
 
@@ -90,35 +91,29 @@ def compute_equation_terms(s: Symbols, motion: Motion) -> EquationTerms:
     """
     sin, cos, L1, L2, dtheta, dL1, dL2 = motion
     mass_matrix = compute_mass_matrix(s, L1, L2)
-    sin_theta_plus_phi = sin * s.cos_phi + cos * s.sin_phi  # angle theta + phi
-    cos_theta_plus_phi = cos * s.cos_phi - sin * s.sin_phi
-    sin_rear_leg_plus_phi = (
-        sin_theta_plus_phi * s.cos_alpha + cos_theta_plus_phi * s.sin_alpha
-    )  # angle theta + alpha + phi
-    cos_rear_leg_plus_phi = cos_theta_plus_phi * s.cos_alpha - sin_theta_plus_phi * s.sin_alpha
+    fore_leg = rotate_to_vertical(s, sin, cos)  # angle theta + phi
+    rear_leg = rotate_to_rear_leg(s, *fore_leg)  # angle theta + alpha + phi
     half_dM11_dL1 = s.Mh * L1 + _compute_hub_fixed_mass_moment(s, L2)  # half dM11/dL1
     half_dM11_dL2 = s.m * (L2 - s.a) - s.m * s.cos_alpha * L1  # half dM11/dL2
     coriolis_factor = 2.0 * s.m * s.sin_alpha * dtheta
-    fore_gravity_moment, rear_gravity_moment = (
-        s.g * s.m * s.L0 + s.g * s.Mh * L1,
-        s.g * s.m * s.L0 - s.g * s.m * L2,
-    )
+    fore_gravity_moment = s.g * s.m * s.L0 + s.g * s.Mh * L1
+    rear_gravity_moment = s.g * s.m * s.L0 - s.g * s.m * L2
     spring_preload = s.k * s.Ls
     return EquationTerms(
         mass_matrix=mass_matrix,
-        applied_moment_theta=fore_gravity_moment * sin_theta_plus_phi
-        + rear_gravity_moment * sin_rear_leg_plus_phi
+        applied_moment_theta=fore_gravity_moment * fore_leg.sin
+        + rear_gravity_moment * rear_leg.sin
         - 2.0 * (half_dM11_dL1 * dL1 + half_dM11_dL2 * dL2) * dtheta,
         applied_force_L1=(spring_preload - s.k * L1)
         - s.c * dL1
         + half_dM11_dL1 * dtheta * dtheta
         - coriolis_factor * dL2
-        - s.g * s.Mh * cos_theta_plus_phi,
+        - s.g * s.Mh * fore_leg.cos,
         applied_force_L2=(spring_preload - s.k * L2)
         - s.c * dL2
         + half_dM11_dL2 * dtheta * dtheta
         + coriolis_factor * dL1
-        + s.g * s.m * cos_rear_leg_plus_phi,
+        + s.g * s.m * rear_leg.cos,
     )
 
 
@@ -204,19 +199,13 @@ def compute_double_support_equation(
     legs' sines and cosines. Every term is a trigonometric polynomial in the angle of the bisector,
     with coefficients that depend only on the wheel. This form halves the cost of the restriction.
     """
-    hub_circle_diameter, squared_bisector_factor = (
-        foot_distance / s.sin_alpha,
-        1.0 / (1.0 + s.cos_alpha),
-    )
-    weight_factor, sin_squared_rate_coefficient = (
-        s.g * (s.Mh - s.m) * hub_circle_diameter,
-        s.m * s.c0 * hub_circle_diameter,
-    )
-    leg_weight_moment, spring_factor, damping_factor = (
-        s.g * s.m * s.L0,
-        s.k * hub_circle_diameter,
-        s.c * hub_circle_diameter * hub_circle_diameter,
-    )
+    hub_circle_diameter = foot_distance / s.sin_alpha
+    squared_bisector_factor = 1.0 / (1.0 + s.cos_alpha)
+    weight_factor = s.g * (s.Mh - s.m) * hub_circle_diameter
+    sin_squared_rate_coefficient = s.m * s.c0 * hub_circle_diameter
+    leg_weight_moment = s.g * s.m * s.L0
+    spring_factor = s.k * hub_circle_diameter
+    damping_factor = s.c * hub_circle_diameter * hub_circle_diameter
     constant_inertia = hub_circle_diameter * hub_circle_diameter * (s.Mh - s.m) + s.m * (
         2.0 * s.a * s.a + (s.n - 2) * s.c0 * s.c0
     )
@@ -384,16 +373,13 @@ def compute_stopper_force(
     acceleration of the leg's mass reduce the force.
     """
     leg_angles = s.alpha * (np.asarray(leg_numbers).reshape(-1, *(1,) * jnp.ndim(motion.L1)) - 1)
-    radial_hub_acceleration = acceleration.ddL1 - motion.L1 * motion.dtheta * motion.dtheta
-    tangential_hub_acceleration = (
-        2.0 * motion.dL1 * motion.dtheta + motion.L1 * acceleration.ddtheta
-    )
+    fore_leg = rotate_to_vertical(s, motion.sin_theta, motion.cos_theta)
     # Gravity is subtracted from the acceleration of the hub, in the frame of Leg 1.
-    radial_hub_acceleration = radial_hub_acceleration + s.g * (
-        motion.cos_theta * s.cos_phi - motion.sin_theta * s.sin_phi
+    radial_hub_acceleration = (
+        acceleration.ddL1 - motion.L1 * motion.dtheta * motion.dtheta + s.g * fore_leg.cos
     )
-    tangential_hub_acceleration = tangential_hub_acceleration - s.g * (
-        motion.sin_theta * s.cos_phi + motion.cos_theta * s.sin_phi
+    tangential_hub_acceleration = (
+        2.0 * motion.dL1 * motion.dtheta + motion.L1 * acceleration.ddtheta - s.g * fore_leg.sin
     )
     leg_acceleration = radial_hub_acceleration * np.cos(
         leg_angles
@@ -429,12 +415,10 @@ def compute_kinetic_energy(s: Symbols, motion: Motion) -> Elementwise:
 
 def compute_mechanical_energy(s: Symbols, motion: Motion) -> Energy:
     """Return the kinetic, gravitational and elastic energy (eqs 26, 27 of the paper), J."""
-    sin_theta_plus_phi = motion.sin_theta * s.cos_phi + motion.cos_theta * s.sin_phi
-    cos_theta_plus_phi = motion.cos_theta * s.cos_phi - motion.sin_theta * s.sin_phi
-    cos_rear_leg_plus_phi = cos_theta_plus_phi * s.cos_alpha - sin_theta_plus_phi * s.sin_alpha
-    mass_height_moment = (s.Mh * motion.L1 + s.m * s.L0) * cos_theta_plus_phi + s.m * (
+    fore_leg = rotate_to_vertical(s, motion.sin_theta, motion.cos_theta)
+    mass_height_moment = (s.Mh * motion.L1 + s.m * s.L0) * fore_leg.cos + s.m * (
         s.L0 - motion.L2
-    ) * cos_rear_leg_plus_phi
+    ) * rotate_to_rear_leg(s, *fore_leg).cos
     stretch_1, stretch_2, locked_stretch = motion.L1 - s.Ls, motion.L2 - s.Ls, s.L0 - s.Ls
     elastic_energy = 0.5 * s.k * (stretch_1**2 + stretch_2**2 + (s.n - 2) * locked_stretch**2)
     return Energy(compute_kinetic_energy(s, motion), s.g * mass_height_moment, elastic_energy)

@@ -66,6 +66,14 @@ def rotate_to_landing_leg(s: Symbols, sin_theta: Elementwise, cos_theta: Element
     )
 
 
+def rotate_to_vertical(s: Symbols, sin_angle: Elementwise, cos_angle: Elementwise) -> SineCosine:
+    """Return the sine and cosine of an angle plus phi, which is the angle from the vertical."""
+    return SineCosine(
+        sin_angle * s.cos_phi + cos_angle * s.sin_phi,
+        cos_angle * s.cos_phi - sin_angle * s.sin_phi,
+    )
+
+
 def compute_rear_foot_height(s: Symbols, motion: Motion) -> Elementwise:
     """Return the height of foot 2 above the slope, m.
 

@@ -23,8 +23,8 @@ class ParameterDomain(NamedTuple):
     unit: str
     lower_bound: float
     upper_bound: float
-    is_lower_bound_allowed: bool
     description: str
+    is_lower_bound_allowed: bool = True
 
     def contains_parameter_value(self, parameter_value: Any) -> Any:
         """Return whether a value lies in the allowed range. NaN gives False."""
@@ -45,8 +45,7 @@ class ParameterDomain(NamedTuple):
 
     def __str__(self) -> str:
         opening_bracket = "[" if self.is_lower_bound_allowed else "("
-        unit_suffix = f" {self.unit}" if self.unit else ""
-        return f"{opening_bracket}{self.lower_bound:g}, {self.upper_bound:g}){unit_suffix}"
+        return f"{opening_bracket}{self.lower_bound:g}, {self.upper_bound:g}) {self.unit}"
 
 
 MIN_SI_VALUE = 1e-15
@@ -64,28 +63,22 @@ resolves.
 """
 
 PARAMETER_DOMAINS: dict[str, ParameterDomain] = {
-    "hub_mass": ParameterDomain("m_H", "kg", 0.0, MAX_SI_VALUE, True, "mass of the body frame"),
+    "hub_mass": ParameterDomain("m_H", "kg", 0.0, MAX_SI_VALUE, "mass of the body frame"),
     "leg_mass": ParameterDomain(
-        "m", "kg", MIN_SI_VALUE, MAX_SI_VALUE, True, "mass of one leg frame, a point"
+        "m", "kg", MIN_SI_VALUE, MAX_SI_VALUE, "mass of one leg frame, a point"
     ),
-    "leg_com": ParameterDomain(
-        "a", "m", 0.0, MAX_SI_VALUE, True, "distance from foot to the leg's mass"
-    ),
+    "leg_com": ParameterDomain("a", "m", 0.0, MAX_SI_VALUE, "distance from foot to the leg's mass"),
     "locked_length": ParameterDomain(
-        "L_0", "m", MIN_SI_VALUE, MAX_SI_VALUE, True, "length of a leg on its stopper"
+        "L_0", "m", MIN_SI_VALUE, MAX_SI_VALUE, "length of a leg on its stopper"
     ),
     "natural_length": ParameterDomain(
-        "L*", "m", MIN_SI_VALUE, MAX_SI_VALUE, True, "length of the unloaded spring"
+        "L*", "m", MIN_SI_VALUE, MAX_SI_VALUE, "length of the unloaded spring"
     ),
-    "stiffness": ParameterDomain(
-        "k", "N/m", 0.0, MAX_SI_VALUE, True, "spring constant of each leg"
-    ),
-    "damping": ParameterDomain(
-        "c", "N s/m", 0.0, MAX_SI_VALUE, True, "viscous damping of each leg"
-    ),
-    "slope": ParameterDomain("phi", "rad", -math.pi / 2, math.pi / 2, False, "downhill slope"),
+    "stiffness": ParameterDomain("k", "N/m", 0.0, MAX_SI_VALUE, "spring constant of each leg"),
+    "damping": ParameterDomain("c", "N s/m", 0.0, MAX_SI_VALUE, "viscous damping of each leg"),
+    "slope": ParameterDomain("phi", "rad", -math.pi / 2, math.pi / 2, "downhill slope", False),
     "gravity": ParameterDomain(
-        "g", "m/s^2", MIN_SI_VALUE, MAX_SI_VALUE, True, "gravitational acceleration"
+        "g", "m/s^2", MIN_SI_VALUE, MAX_SI_VALUE, "gravitational acceleration"
     ),
 }
 """Domain of each floating-point parameter of `WheelParams`, in the order of its fields."""
@@ -202,9 +195,8 @@ class WheelParams(AbstractPrintable):
     def __check_init__(self) -> None:
         known_parameter_values = {
             parameter_name: float(parameter_value)
-            for parameter_name in PARAMETER_DOMAINS
-            if not isinstance(parameter_value := getattr(self, parameter_name), jax.core.Tracer)
-            and parameter_value.ndim == 0
+            for parameter_name, parameter_value in self._get_parameters().items()
+            if not isinstance(parameter_value, jax.core.Tracer) and parameter_value.ndim == 0
         }
         for parameter_name, parameter_value in known_parameter_values.items():
             PARAMETER_DOMAINS[parameter_name].require_value_in_domain(
@@ -233,15 +225,21 @@ class WheelParams(AbstractPrintable):
                 "is between foot and hub: give leg_com < locked_length."
             )
         parameter_shapes = {
-            parameter_name: parameter_shape
-            for parameter_name in PARAMETER_DOMAINS
-            if (parameter_shape := getattr(self, parameter_name).shape)
+            parameter_name: parameter_value.shape
+            for parameter_name, parameter_value in self._get_parameters().items()
+            if parameter_value.ndim
         }
         if len({parameter_shape[0] for parameter_shape in parameter_shapes.values()}) > 1:
             raise ValueError(
                 f"the parameters have shapes {parameter_shapes}, but a batch has one wheel for "
                 "each element of its axis: give arrays of one length."
             )
+
+    def _get_parameters(self) -> dict[str, Array]:
+        """Return the floating-point parameters by their names, in the order of their fields."""
+        return {
+            parameter_name: getattr(self, parameter_name) for parameter_name in PARAMETER_DOMAINS
+        }
 
     @property
     def in_axes(self) -> "WheelParams":
@@ -254,11 +252,11 @@ class WheelParams(AbstractPrintable):
 
     def require_single_wheel(self, remedy_text: str) -> None:
         """Raise a `ValueError` if a parameter has an axis. The message ends with `remedy_text`."""
-        for parameter_name in PARAMETER_DOMAINS:
-            if parameter_shape := getattr(self, parameter_name).shape:
+        for parameter_name, parameter_value in self._get_parameters().items():
+            if parameter_value.ndim:
                 raise ValueError(
-                    f"{parameter_name} has shape {parameter_shape}, but this is about one wheel: "
-                    f"{remedy_text}."
+                    f"{parameter_name} has shape {parameter_value.shape}, but this is about one "
+                    f"wheel: {remedy_text}."
                 )
 
     @property
@@ -274,25 +272,17 @@ class WheelParams(AbstractPrintable):
 
         A gradient has labels that begin with "by", one for each parameter.
         """
-        value_by_parameter = {
-            parameter_name: getattr(self, parameter_name) for parameter_name in PARAMETER_DOMAINS
-        }
+        parameters_with_domains = [
+            (name, value, PARAMETER_DOMAINS[name]) for name, value in self._get_parameters().items()
+        ]
         if not np.all(self.is_in_domain()):
-            format_denominator = lambda parameter_domain: (
-                f"{parameter_domain.symbol}, {parameter_domain.unit}"
-                if parameter_domain.unit
-                else parameter_domain.symbol
-            )
             return [
-                (
-                    f"by {n} {format_denominator(PARAMETER_DOMAINS[n])}",
-                    format_quantity(parameter_value, ""),
-                )
-                for n, parameter_value in value_by_parameter.items()
+                (f"by {name} {domain.symbol}, {domain.unit}", format_quantity(value, ""))
+                for name, value, domain in parameters_with_domains
             ]
         printed_parameter_rows = [
-            (f"{n} {PARAMETER_DOMAINS[n].symbol}", format_quantity(x, PARAMETER_DOMAINS[n].unit))
-            for n, x in value_by_parameter.items()
+            (f"{name} {domain.symbol}", format_quantity(value, domain.unit))
+            for name, value, domain in parameters_with_domains
         ]
         return [*printed_parameter_rows, ("n_legs", str(self.n_legs))]
 
@@ -307,19 +297,15 @@ class WheelParams(AbstractPrintable):
         The product of any four parameters must also be finite in their floating-point type.
         """
         is_in_all_domains = self.leg_com < self.locked_length
-        value_by_parameter = {
-            parameter_name: getattr(self, parameter_name) for parameter_name in PARAMETER_DOMAINS
-        }
-        for parameter_name, parameter_domain in PARAMETER_DOMAINS.items():
-            max_value_of_dtype = (
-                float(jnp.finfo(jnp.result_type(value_by_parameter[parameter_name])).max) ** 0.25
+        value_by_parameter = self._get_parameters()
+        for parameter_name, parameter_value in value_by_parameter.items():
+            max_value_of_dtype = float(jnp.finfo(jnp.result_type(parameter_value)).max) ** 0.25
+            parameter_domain = PARAMETER_DOMAINS[parameter_name]
+            is_in_all_domains &= parameter_domain.contains_parameter_value(parameter_value) & (
+                parameter_value < max_value_of_dtype
             )
-            is_in_all_domains &= parameter_domain.contains_parameter_value(
-                value_by_parameter[parameter_name]
-            ) & (value_by_parameter[parameter_name] < max_value_of_dtype)
-        for squared_relative_value in _square_relative_parameters(
-            value_by_parameter, self.n_legs
-        ).values():
+        relative_values = _square_relative_parameters(value_by_parameter, self.n_legs)
+        for squared_relative_value in relative_values.values():
             is_in_all_domains &= squared_relative_value < MAX_RELATIVE_VALUE**2
         return is_in_all_domains
 
@@ -364,24 +350,17 @@ class WheelParams(AbstractPrintable):
                     "scale is positive: give 2, say, for twice as much."
                 )
         scaled_parameter_values = {}
-        for parameter_name, parameter_domain in PARAMETER_DOMAINS.items():
-            unit_powers = UNIT_POWERS[parameter_domain.unit]
-            scale_factor = math.prod(
-                checked_scale_factor**unit_power
-                for checked_scale_factor, unit_power in zip(
-                    factor_by_dimension.values(), unit_powers, strict=True
-                )
-            )
-            scaled_parameter_values[parameter_name] = getattr(self, parameter_name) * scale_factor
+        for parameter_name, parameter_value in self._get_parameters().items():
+            unit_powers = UNIT_POWERS[PARAMETER_DOMAINS[parameter_name].unit]
+            scale_factor = math.prod(map(pow, factor_by_dimension.values(), unit_powers))
+            scaled_parameter_values[parameter_name] = parameter_value * scale_factor
         return WheelParams(**scaled_parameter_values, n_legs=self.n_legs)
 
     def symbols(self) -> Symbols:
         """Return the parameters by their symbols in the paper, and quantities that several formulas
         share.
         """
-        return compute_symbols(
-            self.n_legs, *(getattr(self, parameter_name) for parameter_name in PARAMETER_DOMAINS)
-        )
+        return compute_symbols(self.n_legs, **self._get_parameters())
 
 
 def _square_relative_parameters(

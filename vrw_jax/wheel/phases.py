@@ -51,14 +51,11 @@ class PhaseMargins(NamedTuple):
     @classmethod
     def from_margin_values(cls, margin_values: Vector, n_legs: int) -> "PhaseMargins":
         """Return the margins, taken from the sequence of all margin values."""
-        n_locked_legs = n_legs - 2
-        fore_foot_force, contraction, friction, *remaining_margin_values = margin_values
-        locked_stopper_force, optional_margin_values = (
-            tuple(remaining_margin_values[:n_locked_legs]),
-            remaining_margin_values[n_locked_legs:],
-        )
+        n_margins_before_optional = 3 + n_legs - 2  # Legs 3 to n have one margin each.
         return cls(
-            fore_foot_force, contraction, friction, locked_stopper_force, *optional_margin_values
+            *margin_values[:3],
+            margin_values[3:n_margins_before_optional],
+            *margin_values[n_margins_before_optional:],
         )
 
 
@@ -154,16 +151,13 @@ class AbstractPhase(abc.ABC):
         The line begins at the foot of Leg 1. In the frame of this line, the height has the same
         form as on flat ground.
         """
-        return compute_landing_foot_height(self.s, self._rotate_to_next_line(motion))
-
-    def _rotate_to_next_line(self, motion: Motion) -> Motion:
-        """Return the motion, expressed in the frame of the next line of the ground."""
-        if not self.tilt_sine_cosine:
-            return motion
-        tilt_sin, tilt_cos = self.tilt_sine_cosine
-        sin_theta = motion.sin_theta * tilt_cos - motion.cos_theta * tilt_sin
-        cos_theta = motion.cos_theta * tilt_cos + motion.sin_theta * tilt_sin
-        return motion._replace(sin_theta=sin_theta, cos_theta=cos_theta)
+        if self.tilt_sine_cosine:
+            tilt_sin, tilt_cos = self.tilt_sine_cosine
+            motion = motion._replace(
+                sin_theta=motion.sin_theta * tilt_cos - motion.cos_theta * tilt_sin,
+                cos_theta=motion.cos_theta * tilt_cos + motion.sin_theta * tilt_sin,
+            )
+        return compute_landing_foot_height(self.s, motion)
 
     @property
     def coordinate_units(self) -> Vector:
@@ -171,12 +165,9 @@ class AbstractPhase(abc.ABC):
         rates.
         """
         wheel_units = compute_wheel_units(self.s)
-        position_units = (
-            jnp.ones_like(wheel_units.length_unit),
-            wheel_units.length_unit,
-            wheel_units.length_unit,
-        )
-        rate_units = wheel_units.rate_unit, wheel_units.velocity_unit, wheel_units.velocity_unit
+        length_unit, velocity_unit = wheel_units.length_unit, wheel_units.velocity_unit
+        position_units = jnp.ones_like(length_unit), length_unit, length_unit
+        rate_units = wheel_units.rate_unit, velocity_unit, velocity_unit
         return *position_units[: self.n_dof], *rate_units[: self.n_dof]
 
     def compute_motion(self, q: Vector, v: Vector) -> Motion:
@@ -198,16 +189,12 @@ class AbstractPhase(abc.ABC):
         The guards of this phase come first, those of `SHARED_FAILURE_OUTCOMES` last.
         """
         m = phase_instant.motion
-        guard_values = (
+        return (
             self.compute_end_guard(phase_instant),
             *self.compute_specific_guards(phase_instant),
             m.dtheta,
             jnp.minimum(m.L1, m.L2) - self.s.a,
-        )
-        return (
-            (*guard_values, phase_instant.fore_force.normal)
-            if self.stop_at_lift_off
-            else guard_values
+            *((phase_instant.fore_force.normal,) if self.stop_at_lift_off else ()),
         )
 
     @property
@@ -220,29 +207,21 @@ class AbstractPhase(abc.ABC):
     def compute_margins(self, phase_instant: "PhaseInstant") -> Vector:
         """Return the values of all margins, in the order of `PhaseMargins`."""
         s, m = self.s, phase_instant.motion
-        locked_stopper_force = dynamics.compute_stopper_force(
-            s, m, phase_instant.acceleration, range(3, s.n + 1)
-        )
-        shared_margin_values = (
+        return (
             phase_instant.fore_force.normal,
             s.L0 - m.L1,
             -dynamics.compute_required_friction(phase_instant.fore_force),
-        )
-        return (
-            *shared_margin_values,
-            *locked_stopper_force,
+            *dynamics.compute_stopper_force(s, m, phase_instant.acceleration, range(3, s.n + 1)),
             *self.compute_specific_margins(phase_instant),
         )
 
     @property
     def are_margins_counted_at_start(self) -> tuple[bool, ...]:
         """Return one flag per margin: whether the margin is evaluated at the start of the phase."""
-        are_stoppers_counted = (True,) * (self.s.n - 2)
         return (
             True,
             self.counts_contraction_at_start,
-            True,
-            *are_stoppers_counted,
+            *(True,) * (self.s.n - 1),  # friction, and the stoppers of legs 3 to n
             *self.counts_specific_margins_at_start,
         )
 

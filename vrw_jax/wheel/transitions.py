@@ -171,11 +171,6 @@ def resolve_landing(
         (p1, p2, p3),
         momentum_per_hub_circle_rate,
     ) = _solve_both_feet_landing(s, theta, dtheta, dL1)
-    sin_theta, cos_theta, L1_before = (
-        motion_on_both_feet.sin_theta,
-        motion_on_both_feet.cos_theta,
-        motion_before.L1,
-    )
     dtheta_both_feet = motion_on_both_feet.dtheta
     rear_impulse = compute_rear_force_from_residual(
         s,
@@ -194,18 +189,20 @@ def resolve_landing(
     )
     # The impulse at the fore foot is the jump of total momentum minus the impulse at the rear foot.
     momentum_after_x, momentum_after_z = compute_momentum(s, motion_after)
-    motion_of_new_legs = Motion(sin_theta, cos_theta, s.L0, L1_before, dtheta, 0.0 * dtheta, dL1)
-    momentum_before_x, momentum_before_z = compute_momentum(s, motion_of_new_legs)
-    applied_rear_impulse = FootForce(
-        jnp.where(is_rear_foot_planted, rear_impulse.tangential, 0.0),
-        jnp.where(is_rear_foot_planted, rear_impulse.normal, 0.0),
+    motion_of_new_legs = Motion(
+        motion_on_both_feet.sin_theta,
+        motion_on_both_feet.cos_theta,
+        s.L0,
+        motion_before.L1,
+        dtheta,
+        0.0 * dtheta,
+        dL1,
     )
+    momentum_before_x, momentum_before_z = compute_momentum(s, motion_of_new_legs)
+    rear_impulse_x, rear_impulse_z = (jnp.where(is_rear_foot_planted, x, 0.0) for x in rear_impulse)
     fore_impulse = FootForce(
-        momentum_after_x
-        - momentum_before_x
-        - s.Mt * foot_velocity_x
-        - applied_rear_impulse.tangential,
-        momentum_after_z - momentum_before_z - s.Mt * foot_velocity_z - applied_rear_impulse.normal,
+        momentum_after_x - momentum_before_x - s.Mt * foot_velocity_x - rear_impulse_x,
+        momentum_after_z - momentum_before_z - s.Mt * foot_velocity_z - rear_impulse_z,
     )
     return Landing(
         theta_after_landing=theta - s.alpha,
@@ -286,11 +283,9 @@ def compute_hub_velocity_jump(
     motion_before: Motion, motion_after: Motion
 ) -> tuple[Elementwise, Elementwise]:
     """Return the jump of the hub's velocity in the directions x and z, m/s."""
-    (x, z), (velocity_after_x, velocity_after_z) = (
-        compute_hub_velocity(motion_before),
-        compute_hub_velocity(motion_after),
-    )
-    return velocity_after_x - x, velocity_after_z - z
+    velocity_before_x, velocity_before_z = compute_hub_velocity(motion_before)
+    velocity_after_x, velocity_after_z = compute_hub_velocity(motion_after)
+    return velocity_after_x - velocity_before_x, velocity_after_z - velocity_before_z
 
 
 def compute_locked_leg_impulses(

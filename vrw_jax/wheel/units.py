@@ -83,16 +83,10 @@ def compute_wheel_units(s: Symbols) -> WheelUnits:
     """Return a wheel's own units. For the wheel of Table 1 of the paper, they are exactly 1 m, 1 s
     and 1 kg.
     """
-    length_ratio_to_table_1, gravity_ratio_to_table_1 = (
-        s.L0 / TABLE_1_LENGTH_M,
-        s.g / TABLE_1_GRAVITY_M_PER_S2,
-    )
+    length_ratio = s.L0 / TABLE_1_LENGTH_M
+    gravity_ratio = s.g / TABLE_1_GRAVITY_M_PER_S2
     return lax.stop_gradient(
-        WheelUnits(
-            length_ratio_to_table_1,
-            jnp.sqrt(length_ratio_to_table_1 / gravity_ratio_to_table_1),
-            s.Mt / TABLE_1_MASS_KG,
-        )
+        WheelUnits(length_ratio, jnp.sqrt(length_ratio / gravity_ratio), s.Mt / TABLE_1_MASS_KG)
     )
 
 
@@ -118,20 +112,14 @@ def compute_wheel_units_of_rows(parameter_values_by_row: np.ndarray, n_legs: int
     - `parameter_values_by_row`: parameters of each wheel in the order of `PARAMETER_NAMES`.
     """
     values_by_name = dict(zip(PARAMETER_NAMES, np.asarray(parameter_values_by_row).T, strict=False))
-    length_ratio_to_table_1 = values_by_name["locked_length"] / TABLE_1_LENGTH_M
-    gravity_ratio_to_table_1 = values_by_name["gravity"] / TABLE_1_GRAVITY_M_PER_S2
-    mass_ratio_to_table_1 = (
-        values_by_name["hub_mass"] + n_legs * values_by_name["leg_mass"]
-    ) / TABLE_1_MASS_KG
-    is_valid_wheel = np.isfinite(
-        length_ratio_to_table_1 + gravity_ratio_to_table_1 + mass_ratio_to_table_1
-    ) & (np.minimum(length_ratio_to_table_1, gravity_ratio_to_table_1) > 0.0)
-    length_ratio_to_table_1, gravity_ratio_to_table_1, mass_ratio_to_table_1 = (
-        np.where(is_valid_wheel, x, 1.0)
-        for x in (length_ratio_to_table_1, gravity_ratio_to_table_1, mass_ratio_to_table_1)
+    length_ratio = values_by_name["locked_length"] / TABLE_1_LENGTH_M
+    gravity_ratio = values_by_name["gravity"] / TABLE_1_GRAVITY_M_PER_S2
+    total_mass = values_by_name["hub_mass"] + n_legs * values_by_name["leg_mass"]
+    mass_ratio = total_mass / TABLE_1_MASS_KG
+    is_valid_wheel = np.isfinite(length_ratio + gravity_ratio + mass_ratio) & (
+        np.minimum(length_ratio, gravity_ratio) > 0.0
     )
-    return WheelUnits(
-        length_ratio_to_table_1,
-        np.sqrt(length_ratio_to_table_1 / gravity_ratio_to_table_1),
-        mass_ratio_to_table_1,
+    length_ratio, gravity_ratio, mass_ratio = (
+        np.where(is_valid_wheel, x, 1.0) for x in (length_ratio, gravity_ratio, mass_ratio)
     )
+    return WheelUnits(length_ratio, np.sqrt(length_ratio / gravity_ratio), mass_ratio)
