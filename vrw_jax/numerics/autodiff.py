@@ -43,31 +43,26 @@ def enable_all_ad_modes(
     the other outputs. Function and Jacobians are compiled once each: outside of `jit`, forward
     mode, reverse mode and single directions all call the same compiled Jacobian.
     """
-    differentiable_function = (
-        function if function_to_differentiate is None else function_to_differentiate
-    )
     compiled_function = jax.jit(function)
     wrapped_function = jax.custom_jvp(compiled_function)
 
     @functools.cache
     def get_differentiable_jacobian(argnums: tuple[int, ...]) -> ForwardFunction:
-        forward_jacobian = _make_forward_jacobian_function(differentiable_function, argnums)
-        return (
-            enable_all_ad_modes(forward_jacobian)
-            if make_jacobian is None
-            else enable_all_ad_modes(make_jacobian(argnums), forward_jacobian)
+        forward_jacobian = _make_forward_jacobian_function(
+            function_to_differentiate or function, argnums
         )
+        if make_jacobian is None:
+            return enable_all_ad_modes(forward_jacobian)
+        return enable_all_ad_modes(make_jacobian(argnums), forward_jacobian)
 
     @with_default_jax_settings
     def compute_function_jvp(primals: tuple, tangents: tuple) -> tuple:
         perturbed_argnums = tuple(
-            i
-            for i, tangent_or_zero in enumerate(tangents)
-            if not isinstance(tangent_or_zero, SymbolicZero)
+            i for i, tangent in enumerate(tangents) if not isinstance(tangent, SymbolicZero)
         )
         if not perturbed_argnums:
-            jacobian_result = wrapped_function(*primals)
-            return jacobian_result, make_zero_tangent(jacobian_result)
+            function_result = wrapped_function(*primals)
+            return function_result, make_zero_tangent(function_result)
         (argument_jacobians, float_outputs), nonfloat_outputs = get_differentiable_jacobian(
             perturbed_argnums
         )(*primals)
@@ -82,9 +77,8 @@ def enable_all_ad_modes(
     wrapped_function.defjvp(compute_function_jvp, symbolic_zeros=True)
 
     def call_differentiable_function(*arrays: Any) -> tuple:
-        has_traced_argument = any(isinstance(x, jax.core.Tracer) for x in arrays)
         # The rule costs as much as a solver step, so it is applied only to traced arguments.
-        if not has_traced_argument:
+        if not any(isinstance(x, jax.core.Tracer) for x in arrays):
             return compiled_function(*arrays)
         # Inside `jit`, JAX 0.10 rejects a NumPy array that `vmap` maps as an argument of the rule.
         return wrapped_function(
@@ -114,15 +108,8 @@ def _make_forward_jacobian_function(
         output_jacobians, (float_outputs, nonfloat_outputs) = jax.jacfwd(
             evaluate_with_aux, argnums=argnums, has_aux=True
         )(*arrays)
-        jacobians_by_argument = tuple(
-            jax.tree.map(
-                lambda _, argument_jacobian, argument_index=argument_index: argument_jacobian[
-                    argument_index
-                ],
-                float_outputs,
-                output_jacobians,
-            )
-            for argument_index in range(len(argnums))
+        jacobians_by_argument = jax.tree.transpose(
+            jax.tree.structure(float_outputs), jax.tree.structure(argnums), output_jacobians
         )
         return (jacobians_by_argument, float_outputs), nonfloat_outputs
 

@@ -5,6 +5,8 @@ which costs more than all arithmetic of this module. A `lax.cond` prevents this 
 because XLA cannot prove at compile time that the predicate of the `lax.cond` is always true.
 """
 
+import functools
+import operator
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -48,13 +50,13 @@ def apply_matrix(matrix: np.ndarray, x: Array) -> Array:
     weighted_terms = [
         x[j] * matrix[:, j].astype(x.dtype).reshape(broadcast_shape) for j in range(matrix.shape[1])
     ]
-    return sum(weighted_terms[1:], start=weighted_terms[0])
+    return functools.reduce(operator.add, weighted_terms)
 
 
 def sum_with_weights(weights: np.ndarray, x: Array) -> Array:
     """Return the weighted sum of `x` over its leading axis."""
     weighted_terms = [float(weights[j]) * x[j] for j in range(len(weights))]
-    return sum(weighted_terms[1:], start=weighted_terms[0])
+    return functools.reduce(operator.add, weighted_terms)
 
 
 def contract_inner_axis(left_array: Array, right_array: Array) -> Array:
@@ -67,7 +69,7 @@ def contract_inner_axis(left_array: Array, right_array: Array) -> Array:
         left_array[..., s, :][(*broadcast_slices, slice(None))] * right_array[s]
         for s in range(right_array.shape[0])
     ]
-    return sum(product_terms[1:], start=product_terms[0])
+    return functools.reduce(operator.add, product_terms)
 
 
 def invert_small_matrices(matrix: Float[Array, "n n lanes"]) -> Float[Array, "n n lanes"]:
@@ -76,13 +78,9 @@ def invert_small_matrices(matrix: Float[Array, "n n lanes"]) -> Float[Array, "n 
         return 1.0 / matrix
     if matrix.shape[0] == 2:
         determinant = matrix[0, 0] * matrix[1, 1] - matrix[0, 1] * matrix[1, 0]
-        adjugate_2x2 = jnp.stack(
-            [
-                jnp.stack([matrix[1, 1], -matrix[0, 1]]),
-                jnp.stack([-matrix[1, 0], matrix[0, 0]]),
-            ]
-        )
-        return adjugate_2x2 / determinant
+        first_row = jnp.stack([matrix[1, 1], -matrix[0, 1]])
+        second_row = jnp.stack([-matrix[1, 0], matrix[0, 0]])
+        return jnp.stack([first_row, second_row]) / determinant
     if matrix.shape[0] != 3:
         raise ValueError(f"the matrix has {matrix.shape[0]} rows, but only 1, 2 or 3 are built.")
 

@@ -98,29 +98,19 @@ def _run_xla_program_by_blocks(
         straggler_lane_indices = []
         for block_start in range(0, len(unfinished_lane_indices), block_size):
             block_lane_indices = unfinished_lane_indices[block_start : block_start + block_size]
-            padded_lane_indices = np.concatenate(
-                [
-                    block_lane_indices,
-                    np.repeat(block_lane_indices[-1:], block_size - len(block_lane_indices)),
-                ]
-            )
-            block_arguments = (
+            n_lanes = len(block_lane_indices)
+            padded_lane_indices = np.pad(block_lane_indices, (0, block_size - n_lanes), "edge")
+            padded_outputs = xla_program(
                 tuple(scalar_arguments),
                 tuple(x[padded_lane_indices] for x in lane_arrays),
+                *[straggler_count] * can_leave_lanes_unfinished,
             )
-            block_outputs = [
-                np.asarray(x)[..., : len(block_lane_indices)]
-                for x in xla_program(
-                    *block_arguments, *[straggler_count] * can_leave_lanes_unfinished
-                )
-            ]
+            block_outputs = [np.asarray(x)[..., :n_lanes] for x in padded_outputs]
             result_arrays = result_arrays or [
                 np.empty((*x.shape[:-1], len(lane_arrays[0])), x.dtype) for x in block_outputs
             ]
             is_lane_finished = (
-                ~block_outputs[0]
-                if can_leave_lanes_unfinished
-                else np.ones(len(block_lane_indices), bool)
+                ~block_outputs[0] if can_leave_lanes_unfinished else np.ones(n_lanes, bool)
             )
             for result_array, block_output in zip(result_arrays, block_outputs, strict=True):
                 result_array[..., block_lane_indices[is_lane_finished]] = block_output[

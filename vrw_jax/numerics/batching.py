@@ -9,6 +9,7 @@ import bisect
 from collections.abc import Callable
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -39,10 +40,7 @@ def unbatch(function: BatchFunction) -> BatchFunction:
 
         def merge_axis_into_lanes(x: Array, is_batched: bool) -> Array:
             x = x if is_batched else jnp.broadcast_to(x, (axis_size, *x.shape))
-            array_with_lanes_last = jnp.moveaxis(x, 0, -2)
-            return array_with_lanes_last.reshape(
-                *array_with_lanes_last.shape[:-2], axis_size * n_lanes
-            )
+            return jnp.moveaxis(x, 0, -2).reshape(*x.shape[1:-1], axis_size * n_lanes)
 
         def split_lanes(x: Array) -> Array:
             return jnp.moveaxis(x.reshape(*x.shape[:-1], axis_size, n_lanes), -2, 0)
@@ -71,37 +69,24 @@ def apply_function_in_blocks(function: BatchFunction, block_size: int) -> BatchF
     block_size = choose_batch_size(block_size, GPU_GAIT_BATCH_SIZE)
 
     def evaluate_blockwise(*arrays: PyTree) -> PyTree:
-        argument_leaves, tree_structure = jax.tree.flatten(arrays)
-        n_lanes = argument_leaves[0].shape[-1]
+        n_lanes = jax.tree.leaves(arrays)[0].shape[-1]
         if n_lanes <= block_size:
             return function(*arrays)
-        has_lane_axis_by_leaf = [jnp.ndim(x) > 0 for x in argument_leaves]
+        arrays_with_lanes, scalars = eqx.partition(arrays, lambda x: jnp.ndim(x) > 0)
 
         def split_blocks(x: Array) -> Array:  # The last element pads the last block.
             n_padding_elements = -n_lanes % block_size
             padded_array = jnp.concatenate([x, jnp.repeat(x[..., -1:], n_padding_elements, -1)], -1)
             return jnp.moveaxis(padded_array.reshape(*x.shape[:-1], -1, block_size), -2, 0)
 
-        def evaluate_block(block_of_leaves: list[Array]) -> PyTree:
-            leaf_blocks_iterator = iter(block_of_leaves)
-            block_leaves = [
-                next(leaf_blocks_iterator) if has_lane_axis else x
-                for x, has_lane_axis in zip(argument_leaves, has_lane_axis_by_leaf, strict=True)
-            ]
-            return function(*jax.tree.unflatten(tree_structure, block_leaves))
-
         def merge_blocks(x: Array) -> Array:
-            array_with_blocks_last = jnp.moveaxis(x, 0, -2)
-            return array_with_blocks_last.reshape(*array_with_blocks_last.shape[:-2], -1)[
-                ..., :n_lanes
-            ]
+            return jnp.moveaxis(x, 0, -2).reshape(*x.shape[1:-1], -1)[..., :n_lanes]
 
-        leaves_split_into_blocks = [
-            split_blocks(x)
-            for x, has_lane_axis in zip(argument_leaves, has_lane_axis_by_leaf, strict=True)
-            if has_lane_axis
-        ]
-        return jax.tree.map(merge_blocks, lax.map(evaluate_block, leaves_split_into_blocks))
+        block_results = lax.map(
+            lambda block: function(*eqx.combine(block, scalars)),
+            jax.tree.map(split_blocks, arrays_with_lanes),
+        )
+        return jax.tree.map(merge_blocks, block_results)
 
     return evaluate_blockwise
 
@@ -165,12 +150,7 @@ def select_tree_rows(tree: PyTree, row_indices: Any) -> PyTree:
 
 def concatenate_tree_rows(*trees: PyTree) -> PyTree:
     """Concatenate trees of arrays along their leading axes, and return NumPy arrays."""
-    return jax.tree.map(
-        lambda *corresponding_leaves: np.concatenate(
-            [np.asarray(leaf_rows) for leaf_rows in corresponding_leaves]
-        ),
-        *trees,
-    )
+    return jax.tree.map(lambda *leaves: np.concatenate(leaves), *trees)
 
 
 def map_in_batches(function: Callable, batch_sizes: tuple[int, ...], *trees: PyTree) -> PyTree:
@@ -197,9 +177,7 @@ def map_in_numpy_batches(
     batch_start_row = 0
     while batch_start_row < n_rows:
         n_remaining_rows = n_rows - batch_start_row
-        batch_size_index = min(
-            bisect.bisect_left(batch_sizes, n_remaining_rows), len(batch_sizes) - 1
-        )
+        batch_size_index = bisect.bisect_left(batch_sizes[:-1], n_remaining_rows)
         batch_size = batch_sizes[batch_size_index]
         if batch_size_index > 0:
             smaller_batch_size = batch_sizes[batch_size_index - 1]

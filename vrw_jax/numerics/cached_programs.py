@@ -161,11 +161,8 @@ def _load_or_export_trace(
         ffi_target_names = sorted(
             _find_ffi_target_names(flattened_function.trace(*argument_shapes).jaxpr)
         )
-        disabled_export_checks = [
-            export.DisabledSafetyCheck.custom_call(ffi_target_name)
-            for ffi_target_name in ffi_target_names
-        ]
-        exported_trace = export.export(flattened_function, disabled_checks=disabled_export_checks)(
+        disabled_checks = list(map(export.DisabledSafetyCheck.custom_call, ffi_target_names))
+        exported_trace = export.export(flattened_function, disabled_checks=disabled_checks)(
             *argument_shapes
         )
     finally:
@@ -179,13 +176,10 @@ def _load_or_export_trace(
 
 def _find_ffi_target_names(jaxpr: Any) -> set[str]:
     """Return the names of all machine-code functions that a traced program calls."""
-    jaxpr = getattr(jaxpr, "jaxpr", jaxpr)
-    ffi_target_names = {
-        inner_jaxpr_equation.params["machine_code"].ffi_target_name
-        for inner_jaxpr_equation in jaxpr.eqns
-        if inner_jaxpr_equation.primitive is simd.MACHINE_CODE_PRIMITIVE
-    }
-    for jaxpr_equation in jaxpr.eqns:
+    ffi_target_names: set[str] = set()
+    for jaxpr_equation in getattr(jaxpr, "jaxpr", jaxpr).eqns:
+        if jaxpr_equation.primitive is simd.MACHINE_CODE_PRIMITIVE:
+            ffi_target_names.add(jaxpr_equation.params["machine_code"].ffi_target_name)
         for equation_parameter in jax.tree.leaves(list(jaxpr_equation.params.values())):
             if hasattr(getattr(equation_parameter, "jaxpr", equation_parameter), "eqns"):
                 ffi_target_names |= _find_ffi_target_names(equation_parameter)

@@ -146,15 +146,9 @@ def load_cache_record(cache_record_name: str) -> bytes | None:
         return None
     except OSError as read_error:
         distrust_reason, cache_record_bytes = f"can't be read ({read_error.strerror})", b""
-    n_digest_bytes = hashlib.sha256().digest_size
-    stored_record_digest, cache_record_content = (
-        cache_record_bytes[:n_digest_bytes],
-        cache_record_bytes[n_digest_bytes:],
-    )
-    if (
-        not distrust_reason
-        and _compute_cache_record_digest(cache_record_name, cache_record_content)
-        != stored_record_digest
+    cache_record_content = cache_record_bytes[hashlib.sha256().digest_size :]
+    if not distrust_reason and cache_record_bytes != _prepend_digest(
+        cache_record_name, cache_record_content
     ):
         distrust_reason = "is damaged"
     if distrust_reason:
@@ -176,22 +170,17 @@ def save_cache_record(cache_record_name: str, cache_record_content: bytes) -> No
 
     If the cache folder is not writable, no error is raised.
     """
-    if not find_cache_folder():
+    if not (cache_folder := find_cache_folder()):
         return
-    cache_record_path, temporary_path = (
-        Path(find_cache_folder()) / f"{cache_record_name}{CACHE_RECORD_SUFFIX}",
-        None,
-    )
+    cache_record_path = Path(cache_folder) / f"{cache_record_name}{CACHE_RECORD_SUFFIX}"
+    temporary_path = None
     try:
         create_cache_folder(cache_record_path.parent)
         file_descriptor, temporary_path = tempfile.mkstemp(
             dir=cache_record_path.parent, prefix="unfinished_"
         )
         with os.fdopen(file_descriptor, "wb") as cache_record_file:
-            cache_record_file.write(
-                _compute_cache_record_digest(cache_record_name, cache_record_content)
-                + cache_record_content
-            )
+            cache_record_file.write(_prepend_digest(cache_record_name, cache_record_content))
             cache_record_file.flush()
             os.fsync(cache_record_file.fileno())
         if is_shared_cache_trusted():  # Otherwise only the user can read it.
@@ -202,9 +191,10 @@ def save_cache_record(cache_record_name: str, cache_record_content: bytes) -> No
             Path(temporary_path).unlink(missing_ok=True)
 
 
-def _compute_cache_record_digest(cache_record_name: str, cache_record_content: bytes) -> bytes:
-    """Return the digest of a record's name and content."""
-    return hashlib.sha256(cache_record_name.encode() + b"\n" + cache_record_content).digest()
+def _prepend_digest(cache_record_name: str, cache_record_content: bytes) -> bytes:
+    """Return the content of a record after the digest of its name and content."""
+    digested_bytes = cache_record_name.encode() + b"\n" + cache_record_content
+    return hashlib.sha256(digested_bytes).digest() + cache_record_content
 
 
 def _explain_file_distrust(file_stat_result: os.stat_result) -> str:

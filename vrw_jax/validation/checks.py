@@ -88,17 +88,12 @@ def _is_single_number(given_value: object) -> bool:
     """Return whether a value is a single real number. True and False are not numbers in this
     sense.
     """
-    if isinstance(given_value, int) and not isinstance(given_value, bool):
+    if isinstance(given_value, int | float) and not isinstance(given_value, bool):
         return True
-    dtype_kind = (
-        np.asarray(given_value).dtype.kind
-        if isinstance(given_value, float | int | np.generic)
-        else "O"
-    )
-    if isinstance(given_value, jax.Array | np.ndarray) and np.ndim(given_value) == 0:
-        # The dtype of random keys has no kind.
-        dtype_kind = getattr(given_value.dtype, "kind", "O")
-    return dtype_kind in "fiu"
+    is_array_type = isinstance(given_value, jax.Array | np.ndarray | np.generic)
+    # The dtype of random keys has no kind.
+    dtype_kind = getattr(given_value.dtype, "kind", "O") if is_array_type else "O"
+    return dtype_kind in "fiu" and np.ndim(given_value) == 0
 
 
 def check_int(
