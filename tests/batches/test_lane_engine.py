@@ -292,7 +292,7 @@ def test_a_solver_step_has_the_order_of_its_tableau(name, order):
         q, v = (jnp.ones(1),), (jnp.full(1, 0.5),)
         place = StageState(q, v, evaluate(q, v))
         for _ in range(n):
-            place = take_rk_step(tableau, evaluate, place, jnp.full(1, 1.0 / n)).end_state
+            place = take_rk_step(tableau, evaluate, place, jnp.full(1, 1.0 / n))[-1]
         return np.concatenate([*place.q, *place.v])
 
     exact = end(160)

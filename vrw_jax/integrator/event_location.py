@@ -104,9 +104,7 @@ def locate_event(
     ]
 
     def improve_event_search(event_search: EventSearch) -> EventSearch:
-        step_end = solver_step_function(
-            integrator_state.state, event_search.event_step_length
-        ).end_state
+        step_end = solver_step_function(integrator_state.state, event_search.event_step_length)[-1]
         guard_values, guard_rates = phase.evaluate_with_rates(phase.evaluate_guards, step_end)
         time_to_event, guard_index = _propose_earliest_event(guard_values, guard_rates, is_crossing)
         is_before_event = jnp.ones(step_length.shape, bool)
@@ -218,11 +216,8 @@ def locate_event(
             phase.evaluate_acceleration,
             event_search.end_state,
             event_search.remaining_time_to_event,
-            computes_error_estimate=False,
         )
-        end_state = select_trees_by_condition(
-            is_step_taken, short_step.end_state, event_search.end_state
-        )
+        end_state = select_trees_by_condition(is_step_taken, short_step[-1], event_search.end_state)
         time_to_event, guard_index = _propose_earliest_event(
             *phase.evaluate_with_rates(phase.evaluate_guards, end_state), is_crossing
         )

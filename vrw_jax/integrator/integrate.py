@@ -25,10 +25,10 @@ from vrw_jax.integrator.minima import (
 )
 from vrw_jax.integrator.tableaus import (
     ButcherTableau,
-    RKStep,
     StageState,
     TakeStep,
     compute_step_size_factor,
+    estimate_step_error,
     find_earliest_guard_minimum_fraction,
     take_rk_step,
 )
@@ -166,13 +166,13 @@ def _compute_phase_end_jvp(
     last_step_length = jnp.where(
         integrator_state.has_guard_crossed, phase_end.duration - integrator_state.elapsed_time, 0.0
     )
-    rk_step = solver_step_function(integrator_state.state, last_step_length)
+    stage_states = solver_step_function(integrator_state.state, last_step_length)
     assert integrator_state.state_tangents is not None
     end_state_tangents = phase_tangents.propagate_to_step_end(
-        tableau, rk_step.stage_states, integrator_state.state_tangents, last_step_length
+        tableau, stage_states, integrator_state.state_tangents, last_step_length
     )
 
-    end_state = rk_step.end_state
+    end_state = stage_states[-1]
     tangents_by_component = tuple(jnp.moveaxis(end_state_tangents, 1, 0))
     event_time_tangent = _compute_event_time_jvp(
         phase_tangents, end_state, end_state_tangents, integrator_state, phase_end.end_guard_index
@@ -386,13 +386,14 @@ def _integrate_until_crossing(
     """
 
     def take_one_solver_step(integrator_state: IntegratorState) -> IntegratorState:
-        rk_step = solver_step_function(integrator_state.state, integrator_state.next_step_length)
+        step_length = integrator_state.next_step_length
+        stage_states = solver_step_function(integrator_state.state, step_length)
         stage_guard_values = [
-            phase.evaluate_guards(rk_step.stage_states[i]) for i in tableau.guard_stage_indices
+            phase.evaluate_guards(stage_states[i]) for i in tableau.guard_stage_indices
         ]
-        end_guard_values = phase.evaluate_guards(rk_step.end_state)
+        end_guard_values = phase.evaluate_guards(stage_states[-1])
         mean_squared_error = _compute_mean_squared_error(
-            rk_step, integrator_state.state, end_guard_values, options, phase.state_units
+            tableau, stage_states, step_length, end_guard_values, options, phase.state_units
         )
         guard_minimum_fraction = find_earliest_guard_minimum_fraction(
             tableau, [integrator_state.guard_values, *stage_guard_values, end_guard_values]
@@ -400,29 +401,28 @@ def _integrate_until_crossing(
         is_within_tolerance = mean_squared_error <= 1.0
         # A step inside which a guard may be negative is repeated up to the guard's minimum.
         may_cross_inside = is_within_tolerance & (guard_minimum_fraction < 1.0)
-        is_step_rejected = may_cross_inside | ~is_within_tolerance
         controller_factor = compute_step_size_factor(
             tableau, mean_squared_error, guard_minimum_fraction.dtype
         )
-        step_length_factor = jnp.where(may_cross_inside, guard_minimum_fraction, controller_factor)
-        integration_status, crossing_guard_bits, is_accepted, elapsed_time, next_step_length = (
-            _classify_solver_step(
-                options, integrator_state, step_length_factor, is_step_rejected, end_guard_values
-            )
+        next_state, is_accepted = _classify_solver_step(
+            options,
+            integrator_state,
+            jnp.where(may_cross_inside, guard_minimum_fraction, controller_factor),
+            may_cross_inside | ~is_within_tolerance,
+            end_guard_values,
         )
         state, guard_values = select_trees_by_condition(
             is_accepted,
-            (rk_step.end_state, end_guard_values),
+            (stage_states[-1], end_guard_values),
             (integrator_state.state, integrator_state.guard_values),
         )
-        was_element_running = integrator_state.is_running
         middle_guard_values = (
             stage_guard_values[tableau.guard_stage_indices.index(tableau.middle_stage_index)]
             if stage_guard_values
             else integrator_state.guard_values
         )
-        new_middle_guard_values, new_end_guard_values = select_trees_by_condition(
-            was_element_running,
+        middle_guard_values, end_guard_values = select_trees_by_condition(
+            integrator_state.is_running,
             (middle_guard_values, end_guard_values),
             (integrator_state.middle_guard_values, integrator_state.end_guard_values),
         )
@@ -431,42 +431,28 @@ def _integrate_until_crossing(
         n_iterations_until_half_ended = integrator_state.n_iterations_until_half_ended
         if margin_minima_state is not None:
             tried_solver_step = TriedSolverStep(
-                integrator_state.state,
-                rk_step.end_state,
-                integrator_state.next_step_length,
-                is_accepted,
-                integrator_state.state_tangents,
+                integrator_state.state, stage_states[-1], step_length, is_accepted, state_tangents
             )
             margin_minima_state = update_margin_minima_state(
                 phase, margin_minima_state, tried_solver_step
             )
         if phase_tangents is not None and state_tangents is not None:
             state_tangents = phase_tangents.propagate_if_accepted(
-                tableau,
-                rk_step.stage_states,
-                state_tangents,
-                integrator_state.next_step_length,
-                is_accepted,
+                tableau, stage_states, state_tangents, step_length, is_accepted
             )
         if straggler_count is not None:
-            n_running_elements = jnp.sum(
-                integration_status == IntegrationStatus.RUNNING, dtype=jnp.int32
-            )
+            n_running_elements = jnp.sum(next_state.is_running, dtype=jnp.int32)
             n_iterations_until_half_ended = jnp.where(
-                2 * n_running_elements > integration_status.size,
+                2 * n_running_elements > is_accepted.size,
                 integrator_state.n_iterations + 1,
                 n_iterations_until_half_ended,
             )
-        return IntegratorState(
+        return next_state._replace(
             state=state,
             guard_values=guard_values,
-            next_step_length=next_step_length,
-            elapsed_time=elapsed_time,
-            integration_status=integration_status,
-            crossing_guard_bits=crossing_guard_bits,
-            middle_guard_values=new_middle_guard_values,
-            end_guard_values=new_end_guard_values,
-            n_tried_steps=integrator_state.n_tried_steps + was_element_running,
+            middle_guard_values=middle_guard_values,
+            end_guard_values=end_guard_values,
+            n_tried_steps=integrator_state.n_tried_steps + integrator_state.is_running,
             n_iterations_until_half_ended=n_iterations_until_half_ended,
             n_iterations=integrator_state.n_iterations + 1,
             margin_minima_state=margin_minima_state,
@@ -518,12 +504,12 @@ def _classify_solver_step(
     step_length_factor: Array,
     is_step_rejected: Array,
     end_guard_values: Vector,
-) -> tuple[Array, Array, Array, Array, Array]:
-    """Return the outcome of the solver step just taken, for each batch element.
+) -> tuple[IntegratorState, Array]:
+    """Return the status of each batch element after a solver step, and whether it accepts the step.
 
-    The result contains the status, the bits of the crossing guards, whether the step is accepted,
-    the elapsed time, s, and the length of the next solver step, s. If a guard crosses zero within
-    the solver step, the returned length is instead that of the step just taken. A step that would
+    The returned state has a new status, new bits of the crossing guards, the new elapsed time, and
+    the length of the next solver step. If a guard crosses zero within
+    the solver step, the length is instead that of the step just taken. A step that would
     end after the time limit is shortened to end there. An element fails if its next step is too
     short for the time to advance, or if the number of its solver steps reaches the limit.
     """
@@ -558,20 +544,26 @@ def _classify_solver_step(
         IntegrationStatus.TIMED_OUT,
         jnp.where(has_guard_crossed, IntegrationStatus.CROSSED, integration_status),
     )
-    return (
-        jnp.where(is_running, integration_status, integrator_state.integration_status).astype(
-            jnp.int32
-        ),
-        jnp.where(is_running, crossing_guard_bits, integrator_state.crossing_guard_bits),
-        is_accepted,
-        elapsed_time,
-        jnp.where(is_running & ~has_guard_crossed, next_step_length_limit, step_length),
+    integration_status = jnp.where(
+        is_running, integration_status, integrator_state.integration_status
     )
+    next_state = integrator_state._replace(
+        integration_status=integration_status.astype(jnp.int32),
+        crossing_guard_bits=jnp.where(
+            is_running, crossing_guard_bits, integrator_state.crossing_guard_bits
+        ),
+        elapsed_time=elapsed_time,
+        next_step_length=jnp.where(
+            is_running & ~has_guard_crossed, next_step_length_limit, step_length
+        ),
+    )
+    return next_state, is_accepted
 
 
 def _compute_mean_squared_error(
-    rk_step: RKStep,
-    start_state: StageState,
+    tableau: ButcherTableau,
+    stage_states: list[StageState],
+    step_length: Array,
     end_guard_values: Vector,
     options: StepOptions,
     state_units: Vector | None,
@@ -585,17 +577,17 @@ def _compute_mean_squared_error(
     - `state_units`: units of the coordinates and rates for the absolute tolerance; None for SI
       units.
     """
+    start_state, end_state = stage_states[0], stage_states[-1]
     start_state_components = (*start_state.q, *start_state.v)
-    end_state_components = (*rk_step.end_state.q, *rk_step.end_state.v)
     convert_to_float32 = lambda x: x.astype(jnp.float32)
     sum_of_squares: Any = 0.0
     component_units: Any = (
         (1.0,) * len(start_state_components) if state_units is None else state_units
     )
     for component_error, start_component, end_component, component_unit in zip(
-        rk_step.error_estimate,
+        estimate_step_error(tableau, stage_states, step_length),
         start_state_components,
-        end_state_components,
+        (*end_state.q, *end_state.v),
         component_units,
         strict=True,
     ):
@@ -627,9 +619,9 @@ def sample_batch_phase(
     """
 
     def solver_step_function(state: StageState, step_length: Array) -> tuple[StageState, Array]:
-        sampled_step = take_rk_step(tableau, phase.evaluate_acceleration, state, step_length)
-        return sampled_step.end_state, _compute_mean_squared_error(
-            sampled_step, state, (), options, phase.state_units
+        stage_states = take_rk_step(tableau, phase.evaluate_acceleration, state, step_length)
+        return stage_states[-1], _compute_mean_squared_error(
+            tableau, stage_states, step_length, (), options, phase.state_units
         )
 
     pack_sample = lambda phase_state: jnp.stack([*phase_state.q, *phase_state.v])

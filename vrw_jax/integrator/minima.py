@@ -187,7 +187,7 @@ def refine_margin_minima(
         ) -> _MarginMinimumSearch:
             step_end = solver_step_function(
                 minimum_step_start_state, margin_minimum_search.step_length
-            ).end_state
+            )[-1]
             (margin_value,), (margin_rate,) = phase.evaluate_with_rates(
                 evaluate_selected_margin, step_end
             )
@@ -215,7 +215,7 @@ def refine_margin_minima(
             has_smaller_margin_rate = jnp.abs(margin_rate) < jnp.abs(
                 margin_minimum_search.best_margin_rate
             )
-            improved_margin_minimum_search = _MarginMinimumSearch(
+            improved_margin_minimum_search = margin_minimum_search._replace(
                 step_length=step_length,
                 best_step_length=jnp.where(
                     has_smaller_margin_rate,
@@ -228,7 +228,6 @@ def refine_margin_minima(
                 margin_value=margin_value,
                 is_minimum_unresolved=margin_minimum_search.is_minimum_unresolved
                 & ~has_secant_converged,
-                n_iterations=margin_minimum_search.n_iterations,
             )
             return select_trees_by_condition(
                 margin_minimum_search.is_minimum_unresolved,
@@ -310,12 +309,12 @@ def compute_margin_minima_jvp(
         minimum_step_start_state = phase.make_state(
             tuple(margin_minimum_state.step_start_q), tuple(margin_minimum_state.step_start_v)
         )
-        rk_step = solver_step_function(minimum_step_start_state, step_length)
+        stage_states = solver_step_function(minimum_step_start_state, step_length)
         state_tangents = phase_tangents.propagate_to_step_end(
-            tableau, rk_step.stage_states, margin_minimum_state.step_start_tangents, step_length
+            tableau, stage_states, margin_minimum_state.step_start_tangents, step_length
         )
         return None, _select_margin(
-            compute_margin_tangents(rk_step.end_state, state_tangents), margin_index
+            compute_margin_tangents(stage_states[-1], state_tangents), margin_index
         )
 
     margin_indices = jnp.arange(len(margin_minima_result.phase_margin_minima), dtype=jnp.int32)

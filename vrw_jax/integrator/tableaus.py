@@ -70,12 +70,11 @@ def load_explicit_tableau(solver_name: str) -> ButcherTableau | None:
         return None
     tableau_entry = tableaus[solver_name]
     n_stages, has_step_end_stage = len(tableau_entry["b_sol"]), tableau_entry["ssal"]
-    stage_matrix = np.zeros(
-        (n_stages + (not has_step_end_stage), n_stages + (not has_step_end_stage))
-    )
+    n_rows = n_stages + (not has_step_end_stage)
+    stage_matrix = np.zeros((n_rows, n_rows))
     for i, matrix_row in enumerate(tableau_entry["a_lower"]):
         stage_matrix[i + 1, : i + 1] = matrix_row
-    rate_error_weights = np.zeros(len(stage_matrix))
+    rate_error_weights = np.zeros(n_rows)
     rate_error_weights[:n_stages] = tableau_entry["b_error"]
     if not has_step_end_stage:
         stage_matrix[n_stages, :n_stages] = tableau_entry["b_sol"]
@@ -256,7 +255,6 @@ def compute_step_size_factor(
     tableau: ButcherTableau,
     mean_squared_error: Array,
     float_dtype: Any,
-    step_size_controller: StepSizeController = STEP_SIZE_CONTROLLER,
 ) -> Array:
     """Return the ratio of the next step length to the present one, as `float_dtype`.
 
@@ -266,9 +264,9 @@ def compute_step_size_factor(
         jnp.log(jnp.clip(mean_squared_error, 1e-20, 1e20)) * (-0.5 / tableau.convergence_order)
     ).astype(float_dtype)
     return jnp.clip(
-        step_size_controller.safety_factor * error_power,
-        step_size_controller.min_step_length_ratio,
-        jnp.where(mean_squared_error <= 1.0, step_size_controller.max_step_length_ratio, 1.0),
+        STEP_SIZE_CONTROLLER.safety_factor * error_power,
+        STEP_SIZE_CONTROLLER.min_step_length_ratio,
+        jnp.where(mean_squared_error <= 1.0, STEP_SIZE_CONTROLLER.max_step_length_ratio, 1.0),
     )
 
 
@@ -311,16 +309,12 @@ class StageState(NamedTuple):
     acceleration: StageAccelerations
 
 
-class RKStep(NamedTuple):
-    """Result of a Runge-Kutta step: state at the end, error estimate, and states at all stages."""
-
-    end_state: StageState
-    error_estimate: Vector  # error estimates of the positions, then of the rates
-    stage_states: list[StageState]  # the start first, the end last
-
-
 EvaluateAcceleration = Callable[[Vector, Vector], StageAccelerations]
-TakeStep = Callable[[StageState, Array], RKStep]
+TakeStep = Callable[[StageState, Array], list[StageState]]
+"""Function of a state and a step length that returns all stages of a Runge-Kutta step.
+
+The first state is the start of the step, and the last state is its end.
+"""
 
 
 def take_rk_step(
@@ -328,11 +322,10 @@ def take_rk_step(
     evaluate_acceleration: EvaluateAcceleration,
     start_state: StageState,
     h: Array,
-    computes_error_estimate: bool = True,
-) -> RKStep:
-    """Return the result of one Runge-Kutta step of length `h`, s.
+) -> list[StageState]:
+    """Return the states at all stages of one Runge-Kutta step of length `h`, s.
 
-    If `computes_error_estimate` is False, the error estimate is empty.
+    The first state is the start of the step, and the last state is its end.
     """
     n = len(start_state.q)
     stage_states, stage_accelerations = [start_state], [start_state.acceleration.acceleration[:n]]
@@ -341,23 +334,26 @@ def take_rk_step(
         stage_acceleration = evaluate_acceleration(q, v)
         stage_states.append(StageState(q, v, stage_acceleration))
         stage_accelerations.append(stage_acceleration.acceleration[:n])
+    return stage_states
 
-    error_estimate: Vector = ()
-    if computes_error_estimate:
-        accelerations_by_coordinate = [
-            [stage_acceleration[coordinate_index] for stage_acceleration in stage_accelerations]
-            for coordinate_index in range(n)
-        ]
-        position_errors = [
-            h * h * _sum_weighted_terms(tableau.position_error_weights, accelerations)
-            for accelerations in accelerations_by_coordinate
-        ]
-        rate_errors = [
-            h * _sum_weighted_terms(tableau.rate_error_weights, accelerations)
-            for accelerations in accelerations_by_coordinate
-        ]
-        error_estimate = (*position_errors, *rate_errors)
-    return RKStep(stage_states[-1], error_estimate, stage_states)
+
+def estimate_step_error(
+    tableau: ButcherTableau, stage_states: list[StageState], h: Array
+) -> list[Array]:
+    """Return the errors of the positions and then of the rates after a step of length `h`, s."""
+    accelerations_by_coordinate = [
+        [stage_state.acceleration.acceleration[i] for stage_state in stage_states]
+        for i in range(len(stage_states[0].q))
+    ]
+    position_errors = [
+        h * h * _sum_weighted_terms(tableau.position_error_weights, accelerations)
+        for accelerations in accelerations_by_coordinate
+    ]
+    rate_errors = [
+        h * _sum_weighted_terms(tableau.rate_error_weights, accelerations)
+        for accelerations in accelerations_by_coordinate
+    ]
+    return position_errors + rate_errors
 
 
 @functools.partial(jax.jit, static_argnums=(0, 1))  # The function is traced once for all steps.
@@ -384,18 +380,10 @@ def evaluate_stage(
         integrated_acceleration = _sum_weighted_terms(
             tableau.stage_matrix[stage_index], coordinate_accelerations
         )
-        displacement_at_constant_rate = (
-            float(tableau.stage_nodes[stage_index]) * start_rates[coordinate]
-        )
-        stage_positions.append(
-            start_positions[coordinate]
-            + h
-            * (
-                displacement_at_constant_rate
-                if twice_integrated_acceleration is None
-                else displacement_at_constant_rate + h * twice_integrated_acceleration
-            )
-        )
+        displacement_per_time = float(tableau.stage_nodes[stage_index]) * start_rates[coordinate]
+        if twice_integrated_acceleration is not None:
+            displacement_per_time = displacement_per_time + h * twice_integrated_acceleration
+        stage_positions.append(start_positions[coordinate] + h * displacement_per_time)
         stage_rates.append(start_rates[coordinate] + h * integrated_acceleration)
     return tuple(stage_positions), tuple(stage_rates)
 

@@ -83,16 +83,16 @@ class AbstractWheel(eqx.Module):
         """Return the value of each parameter in `parameter_names`, for one wheel on this model's
         ground.
         """
-        parameter_values = [
+        return jnp.stack(
+            [jnp.asarray(x, params.damping.dtype) for x in self._list_parameter_values(params)]
+        )
+
+    def _list_parameter_values(self, params: WheelParams) -> list[Any]:
+        """Return the value of each parameter in `parameter_names`."""
+        return [
             getattr(self if parameter_name == FRICTION_NAME else params, parameter_name)
             for parameter_name in self.parameter_names
         ]
-        return jnp.stack(
-            [
-                jnp.asarray(parameter_value, params.damping.dtype)
-                for parameter_value in parameter_values
-            ]
-        )
 
     def collect_batch_parameter_values(
         self, params: WheelParams
@@ -101,10 +101,7 @@ class AbstractWheel(eqx.Module):
 
         JAX would compile a program for each batch size.
         """
-        parameter_columns = [
-            np.asarray(getattr(self if parameter_name == FRICTION_NAME else params, parameter_name))
-            for parameter_name in self.parameter_names
-        ]
+        parameter_columns = map(np.asarray, self._list_parameter_values(params))
         return np.stack(np.broadcast_arrays(*parameter_columns), -1)
 
     def from_parameter_values(

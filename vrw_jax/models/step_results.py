@@ -212,21 +212,14 @@ class AbstractStep(AbstractPrintable):
         for measure_name, measure_value in measure_values.items():
             if measure_name == "outcome":
                 continue
-            measure_description, lowest_margin = (
-                MEASURES[measure_name],
-                float(np.min(np.asarray(measure_value))),
-            )
-            margin_verdict = ", holds" if lowest_margin >= 0.0 else ", broken"
-            value_text = measure_description.format_with_unit(lowest_margin)
+            measure_description = MEASURES[measure_name]
+            lowest_value = float(np.min(np.asarray(measure_value)))
+            label = measure_description.label_with_symbol
+            value_text = measure_description.format_with_unit(lowest_value)
             if measure_name in MARGIN_MEASURES:
-                text_rows.append(
-                    (
-                        f"margin: {measure_description.label_with_symbol}",
-                        value_text + margin_verdict,
-                    )
-                )
-            else:
-                text_rows.append((measure_description.label_with_symbol, value_text))
+                label = f"margin: {label}"
+                value_text += ", holds" if lowest_value >= 0.0 else ", broken"
+            text_rows.append((label, value_text))
         return text_rows
 
     @abc.abstractmethod

@@ -230,38 +230,29 @@ class ArrayEmitter:
             emit_inner_loop = lambda i, loop_carry: emit_nested_index_loops(
                 (*outer_index, i), loop_carry
             )
-            return self.emit_counted_loop(
-                index_shape[len(outer_index)], emit_inner_loop, loop_carry
+            return self.emit_range_loop(
+                0, index_shape[len(outer_index)], emit_inner_loop, loop_carry
             )
 
         return list(emit_nested_index_loops((), loop_carry))
 
-    def emit_counted_loop(
-        self,
-        n_iterations: int,
-        emit_loop_body: Callable[[LlvmValue, list[LlvmValue]], Sequence[LlvmValue]],
-        initial_loop_carry: Sequence[LlvmValue],
-    ) -> list[LlvmValue]:
-        """Emit a loop of `n_iterations` iterations, and return the loop carry after the last one.
-
-        Iteration i computes `carry = emit_loop_body(i, carry)`.
-        """
-        return self.emit_range_loop(
-            ir.Constant(I64, 0), ir.Constant(I64, n_iterations), emit_loop_body, initial_loop_carry
-        )
-
     def emit_range_loop(
         self,
-        first_iteration: LlvmValue,
-        end_iteration: LlvmValue,
+        first_iteration: Any,
+        end_iteration: Any,
         emit_loop_body: Callable[[LlvmValue, list[LlvmValue]], Sequence[LlvmValue]],
         initial_loop_carry: Sequence[LlvmValue] = (),
     ) -> list[LlvmValue]:
         """Emit a loop over `range(first_iteration, end_iteration)`, and return the loop carry after
         its end.
 
-        Iteration i computes `carry = emit_loop_body(i, carry)`.
+        Iteration i computes `carry = emit_loop_body(i, carry)`. The bounds are integers or LLVM
+        values.
         """
+        first_iteration, end_iteration = (
+            ir.Constant(I64, i) if isinstance(i, int) else i
+            for i in (first_iteration, end_iteration)
+        )
 
         def emit_range_body(loop_carried_values: list[LlvmValue]) -> list[LlvmValue]:
             next_loop_carry = emit_loop_body(loop_carried_values[0], loop_carried_values[1:])
@@ -586,13 +577,7 @@ def split_into_entry_arrays(
 
     This function is the inverse of `ArrayEmitter.flatten_array_entries`.
     """
-    entry_arrays: list[LlvmArray] = []
-    first_entry_index = 0
-    for aval in avals:
-        array_shape = get_shape_without_lanes(aval)
-        end_entry_index = first_entry_index + math.prod(array_shape)
-        entry_arrays.append(
-            make_entry_array(array_shape, flat_entries[first_entry_index:end_entry_index])
-        )
-        first_entry_index = end_entry_index
-    return entry_arrays
+    array_shapes = list(map(get_shape_without_lanes, avals))
+    array_ends = np.cumsum([math.prod(array_shape) for array_shape in array_shapes])
+    flat_arrays = np.split(make_entry_array((len(flat_entries),), flat_entries), array_ends)
+    return [x.reshape(shape) for x, shape in zip(flat_arrays, array_shapes, strict=False)]

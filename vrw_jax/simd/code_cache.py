@@ -83,61 +83,58 @@ def get_machine_code(
         describe_compiler_settings(),
     )
     code_index_name = f"lanes_index_{_compute_sha256_digest(repr(code_index_key).encode())}"
-    if code_index_name not in _machine_code_by_record_name:
-        machine_code = None
-        encoded_ffi_target_name = code_store and code_store.load_cache_record(code_index_name)
-        if encoded_ffi_target_name:
-            ffi_target_name = encoded_ffi_target_name.decode("ascii", "replace")
-            machine_code = load_machine_code(ffi_target_name, code_store)
-        _machine_code_by_record_name[code_index_name] = machine_code or _trace_and_compile_function(
-            lane_function,
-            argument_shapes,
-            lanes_per_group,
-            code_index_name,
-            code_store,
-            register_limits,
+    if code_index_name in _machine_code_by_record_name:
+        return _machine_code_by_record_name[code_index_name]
+    machine_code = None
+    encoded_ffi_target_name = code_store and code_store.load_cache_record(code_index_name)
+    if encoded_ffi_target_name:
+        ffi_target_name = encoded_ffi_target_name.decode("ascii", "replace")
+        machine_code = load_machine_code(ffi_target_name, code_store)
+    if machine_code is None:
+        with _jax_tracing_lock, _pause_garbage_collection():
+            closed_jaxpr = trace_for_machine_code(lane_function, *argument_shapes)
+            llvm_text = write_llvm_kernel(closed_jaxpr, lanes_per_group, register_limits)
+        result_shapes_and_dtypes = [
+            (aval.shape[:-1], aval.dtype.name) for aval in closed_jaxpr.out_avals
+        ]
+        machine_code = _compile_llvm_text(
+            llvm_text, json.dumps(result_shapes_and_dtypes), code_index_name, code_store
         )
-    return _machine_code_by_record_name[code_index_name]
+    _machine_code_by_record_name[code_index_name] = machine_code
+    return machine_code
 
 
-def _trace_and_compile_function(
-    lane_function: Callable,
-    argument_shapes: Any,
-    lanes_per_group: int,
+def _compile_llvm_text(
+    llvm_text: str,
+    encoded_result_types: str,
     code_index_name: str,
     code_store: CodeStore | None,
-    register_limits: RegisterLimits,
 ) -> MachineCode:
-    """Trace a function over lanes and return its machine code.
+    """Return the machine code of a function over lanes.
 
     The compilation runs in the background, unless the cache contains code for the same LLVM text.
     """
-    with _jax_tracing_lock, _pause_garbage_collection():
-        closed_jaxpr = trace_for_machine_code(lane_function, *argument_shapes)
-        llvm_text = write_llvm_kernel(closed_jaxpr, lanes_per_group, register_limits)
-    encoded_result_types = json.dumps(
-        [(aval.shape[:-1], aval.dtype.name) for aval in closed_jaxpr.out_avals]
-    )
     digested_text = f"{encoded_result_types}{describe_compiler_settings()}{llvm_text}"
     ffi_target_name = f"lanes_code_{_compute_sha256_digest(digested_text.encode())}"
     machine_code = load_machine_code(ffi_target_name, code_store)
-    if machine_code is None:
+    if machine_code is not None:
+        if code_store is not None:
+            code_store.save_cache_record(code_index_name, ffi_target_name.encode())
+        return machine_code
 
-        def compile_and_save_code() -> bytes:
-            object_code = compile_llvm_for_processor(llvm_text)
-            if code_store is not None:
-                encoded_machine_code = encoded_result_types.encode() + b"\n" + object_code
-                code_store.save_cache_record(ffi_target_name, encoded_machine_code)
-                code_store.save_cache_record(code_index_name, ffi_target_name.encode())
-            return object_code
+    def compile_and_save_code() -> bytes:
+        object_code = compile_llvm_for_processor(llvm_text)
+        if code_store is not None:
+            encoded_machine_code = encoded_result_types.encode() + b"\n" + object_code
+            code_store.save_cache_record(ffi_target_name, encoded_machine_code)
+            code_store.save_cache_record(code_index_name, ffi_target_name.encode())
+        return object_code
 
-        machine_code = _machine_code_by_record_name[ffi_target_name] = MachineCode(
-            ffi_target_name,
-            _parse_result_shapes_and_dtypes(encoded_result_types),
-            _llvm_compiler_pool.submit(compile_and_save_code),
-        )
-    elif code_store is not None:
-        code_store.save_cache_record(code_index_name, ffi_target_name.encode())
+    machine_code = _machine_code_by_record_name[ffi_target_name] = MachineCode(
+        ffi_target_name,
+        _parse_result_shapes_and_dtypes(encoded_result_types),
+        _llvm_compiler_pool.submit(compile_and_save_code),
+    )
     return machine_code
 
 

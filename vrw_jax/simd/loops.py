@@ -158,7 +158,7 @@ def emit_scan_loop(
 
     initial_registers = loop_carry.store_initial_loop_carry(initial_loop_carry_arrays)
     final_loop_carry_arrays = loop_carry.make_loop_carry_arrays(
-        array_emitter.emit_counted_loop(n_iterations, emit_scan_body, initial_registers)
+        array_emitter.emit_range_loop(0, n_iterations, emit_scan_body, initial_registers)
     )
     array_emitter.is_in_innermost_loop = was_in_innermost_loop
     return [*final_loop_carry_arrays, *stacked_arrays]

@@ -110,25 +110,20 @@ class JaxprLowering:
         for equation_index, equation in enumerate(jaxpr.eqns):
             if all(variable.aval.dtype == jax.dtypes.float0 for variable in equation.outvars):
                 continue  # The derivative of an integer has no value, and no equation reads it.
-            equation_results = self._lower_equation(
-                equation, [read_jaxpr_atom(x, equation_index) for x in equation.invars]
-            )
+            primitive_name = equation.primitive.name
+            if primitive_name not in self.primitive_rules:
+                raise NotImplementedError(
+                    f"{primitive_name} has no machine code: write it by primitives that "
+                    "`simd.describe_supported_primitives()` lists, or give it a rule in "
+                    "`simd/rules.PRIMITIVE_RULES`."
+                )
+            for variable in equation.outvars:
+                if LANE_AXIS_SENTINEL in variable.aval.shape[:-1]:
+                    raise make_lane_axis_error(f"The result of {primitive_name}", variable.aval)
+            operands = [read_jaxpr_atom(x, equation_index) for x in equation.invars]
+            equation_results = self.primitive_rules[primitive_name](self, equation, operands)
             assign_jaxpr_variables(equation.outvars, equation_results)
         return [read_jaxpr_atom(jaxpr_atom, len(jaxpr.eqns)) for jaxpr_atom in jaxpr.outvars]
-
-    def _lower_equation(self, equation: Any, operands: list[LlvmArray]) -> list[LlvmArray]:
-        """Emit one equation of a jaxpr, and return its result arrays."""
-        primitive_name = equation.primitive.name
-        if primitive_name not in self.primitive_rules:
-            raise NotImplementedError(
-                f"{primitive_name} has no machine code: write it by primitives that "
-                "`simd.describe_supported_primitives()` lists, or give it a rule in "
-                "`simd/rules.PRIMITIVE_RULES`."
-            )
-        for result_variable in equation.outvars:
-            if LANE_AXIS_SENTINEL in result_variable.aval.shape[:-1]:
-                raise make_lane_axis_error(f"The result of {primitive_name}", result_variable.aval)
-        return self.primitive_rules[primitive_name](self, equation, operands)
 
     def emit_separate_function_call(
         self, closed_jaxpr: ClosedJaxpr, argument_arrays: Sequence[LlvmArray]

@@ -90,8 +90,11 @@ def emit_array_product(
         ]
         product_memory.emit_entry_store(
             product_index,
-            array_emitter.emit_counted_loop(
-                n_terms, add_term, [array_emitter.value_emitter.make_llvm_constant(entry_type, 0)]
+            array_emitter.emit_range_loop(
+                0,
+                n_terms,
+                add_term,
+                [array_emitter.value_emitter.make_llvm_constant(entry_type, 0)],
             )[0],
         )
         return []

@@ -83,30 +83,22 @@ def with_renamed_arguments(
     maps old names to new names.
     """
 
-    def reject_renamed_keywords(callable_name: str, given_keywords: Mapping[str, Any]) -> None:
-        for old_name in new_name_by_old_name.keys() & given_keywords.keys():
-            raise TypeError(
-                f"{callable_name} has no argument {old_name!r}: it is called "
-                f"{new_name_by_old_name[old_name]} now."
-            )
-
     def decorate_with_keyword_check(decorated_object: Any) -> Any:
-        if isinstance(decorated_object, type):
-            undecorated_init = decorated_object.__init__  # type: ignore[misc]
+        is_class = isinstance(decorated_object, type)
+        original_function = decorated_object.__init__ if is_class else decorated_object
 
-            @functools.wraps(undecorated_init)
-            def initialize_with_new_keywords(self: Any, *args: Any, **keywords: Any) -> None:
-                reject_renamed_keywords(decorated_object.__name__, keywords)
-                undecorated_init(self, *args, **keywords)
-
-            decorated_object.__init__ = initialize_with_new_keywords  # type: ignore[misc]
-            return decorated_object
-
-        @functools.wraps(decorated_object)
+        @functools.wraps(original_function)
         def call_with_new_keywords(*args: Any, **keywords: Any) -> Any:
-            reject_renamed_keywords(decorated_object.__name__, keywords)
-            return decorated_object(*args, **keywords)
+            for old_name in new_name_by_old_name.keys() & keywords.keys():
+                raise TypeError(
+                    f"{decorated_object.__name__} has no argument {old_name!r}: it is called "
+                    f"{new_name_by_old_name[old_name]} now."
+                )
+            return original_function(*args, **keywords)
 
-        return call_with_new_keywords
+        if not is_class:
+            return call_with_new_keywords
+        decorated_object.__init__ = call_with_new_keywords
+        return decorated_object
 
     return decorate_with_keyword_check
