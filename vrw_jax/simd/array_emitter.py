@@ -13,7 +13,7 @@ may combine lanes, except the test whether any or all lanes continue.
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -75,26 +75,22 @@ class PrimitiveCall(NamedTuple):
         return get_shape_without_lanes(self.result_aval)
 
 
+@dataclass(eq=False)
 class ArrayEmitter:
     """Emitter of array operations.
 
     It adds LLVM instructions to the function of its value emitter.
     """
 
-    def __init__(
-        self,
-        value_emitter: ValueEmitter,
-        register_limits: RegisterLimits,
-        is_in_innermost_loop: bool = False,
-    ) -> None:
-        self.value_emitter, self.llvm_builder, self.register_limits = (
-            value_emitter,
-            value_emitter.llvm_builder,
-            register_limits,
-        )
-        self.objects_kept_alive: list[Any] = []  # objects that are identified by `id`
-        # whether the code is in an innermost loop, where constants need no table
-        self.is_in_innermost_loop = is_in_innermost_loop
+    value_emitter: ValueEmitter
+    register_limits: RegisterLimits
+    is_in_innermost_loop: bool = False
+    """Whether the code is in an innermost loop, where constants need no table."""
+    objects_kept_alive: list[Any] = field(default_factory=list)
+    """Objects that are identified by `id`."""
+
+    def __post_init__(self) -> None:
+        self.llvm_builder = self.value_emitter.llvm_builder
 
     def get_entry_type(self, aval: Any) -> ir.Type:
         """Return the LLVM type of an entry of an array with the abstract value `aval`.
@@ -268,7 +264,9 @@ class ArrayEmitter:
             [first_iteration, *initial_loop_carry], emit_range_condition, emit_range_body
         )[1:]
 
-    def allocate_memory_array(self, array_shape: Sequence[int], entry_type: ir.Type) -> MemoryArray:
+    def allocate_memory_array(
+        self, array_shape: tuple[int, ...], entry_type: ir.Type
+    ) -> MemoryArray:
         """Return a new uninitialized array of shape `array_shape` in memory.
 
         The memory is allocated once, at the start of the LLVM function.

@@ -1,6 +1,7 @@
 """LLVM module for a jaxpr: a loop over groups of lanes that reads arguments and writes results."""
 
 import math
+from dataclasses import dataclass
 from typing import Any
 
 from jax.extend.core import ClosedJaxpr
@@ -112,21 +113,17 @@ def _check_lane_axes(closed_jaxpr: ClosedJaxpr) -> None:
             )
 
 
+@dataclass
 class _LaneGroupAccess:
     """Emitter of loads and stores for one group of lanes in the caller's arrays.
 
     The last axis of these arrays is the lane axis.
     """
 
-    def __init__(
-        self,
-        array_emitter: ArrayEmitter,
-        has_single_lane: bool,
-        n_lanes: LlvmValue,
-        first_lane_index: LlvmValue,
-    ) -> None:
-        self.array_emitter, self.has_single_lane = array_emitter, has_single_lane
-        self.n_lanes, self.first_lane_index = n_lanes, first_lane_index
+    array_emitter: ArrayEmitter
+    has_single_lane: bool
+    n_lanes: LlvmValue
+    first_lane_index: LlvmValue
 
     def read_argument_array(self, base_pointer: LlvmValue, aval: Any) -> LlvmArray:
         """Return the argument at `base_pointer` as an array of LLVM values.

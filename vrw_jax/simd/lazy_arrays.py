@@ -3,7 +3,8 @@
 Arrays that emit instructions have a reference to their `ArrayEmitter`.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ EntryIndex = tuple[Any, ...]
 """Index of an array entry. For each axis it contains an integer, or an LLVM value of type I64."""
 
 
+@dataclass(eq=False)
 class LazyArray:
     """Large array of type `entry_type`, whose entries are computed or loaded by
     `get_entry_at_index(index)`.
@@ -22,17 +24,9 @@ class LazyArray:
     If `entry_type` is a vector, an entry may also be a scalar, which is the same for all lanes.
     """
 
-    def __init__(
-        self,
-        array_shape: Sequence[int],
-        entry_type: ir.Type,
-        get_entry_at_index: Callable[[EntryIndex], LlvmValue],
-    ) -> None:
-        self.shape, self.entry_type, self.get_entry_at_index = (
-            tuple(array_shape),
-            entry_type,
-            get_entry_at_index,
-        )
+    shape: tuple[int, ...]
+    entry_type: ir.Type
+    get_entry_at_index: Callable[[EntryIndex], LlvmValue]
 
 
 class UninitializedArray(LazyArray):
@@ -55,12 +49,8 @@ class PendingArrayUpdate(LazyArray):
             else update_array.ravel()[0].type
         )
         super().__init__(base_array.shape, entry_type, self.emit_entry_load)
-        self.array_emitter, self.base_array, self.update_array, self.start_index = (
-            array_emitter,
-            base_array,
-            update_array,
-            start_index,
-        )
+        self.array_emitter, self.base_array = array_emitter, base_array
+        self.update_array, self.start_index = update_array, start_index
 
     def emit_entry_load(self, entry_index: EntryIndex) -> LlvmValue:
         """Return the LLVM value of the entry at `entry_index`.
@@ -97,17 +87,14 @@ class MemoryArray(LazyArray):
     def __init__(
         self,
         array_emitter: Any,
-        array_shape: Sequence[int],
+        array_shape: tuple[int, ...],
         entry_type: ir.Type,
         base_pointer: LlvmValue,
         is_overwritable: bool = False,
     ) -> None:
         super().__init__(array_shape, entry_type, self.emit_entry_load)
-        self.array_emitter, self.base_pointer, self.is_overwritable = (
-            array_emitter,
-            base_pointer,
-            is_overwritable,
-        )
+        self.array_emitter, self.base_pointer = array_emitter, base_pointer
+        self.is_overwritable = is_overwritable
 
     def contains_array(self, array: "LlvmArray") -> bool:
         """Return whether `array` is stored in the memory of this array."""

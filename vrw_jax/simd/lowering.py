@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import jax
@@ -50,23 +51,18 @@ def mark_noinline(function: Callable) -> Callable:
     return jax.jit(noinline)
 
 
+@dataclass
 class JaxprLowering:
     """Lowering of jaxprs into the LLVM function of `array_emitter`, by the rules in
     `primitive_rules`.
     """
 
-    def __init__(
-        self,
-        array_emitter: ArrayEmitter,
-        primitive_rules: Mapping[str, PrimitiveRule],
-        llvm_function_by_jaxpr_id: dict[int, Any] | None = None,
-    ) -> None:
-        self.array_emitter, self.primitive_rules = array_emitter, primitive_rules
-        # Separate functions by the `id` of their trace, with the trace, whose reference keeps the
-        # `id` valid.
-        self.llvm_function_by_jaxpr_id = (
-            {} if llvm_function_by_jaxpr_id is None else llvm_function_by_jaxpr_id
-        )
+    array_emitter: ArrayEmitter
+    primitive_rules: Mapping[str, PrimitiveRule]
+    llvm_function_by_jaxpr_id: dict[int, Any] = field(default_factory=dict)
+    """Separate functions by the `id` of their trace, with the trace, whose reference keeps the `id`
+    valid.
+    """
 
     def lower_jaxpr(
         self, closed_jaxpr: ClosedJaxpr, argument_arrays: Sequence[LlvmArray]

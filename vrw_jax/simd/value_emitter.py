@@ -5,6 +5,7 @@ Instructions that repeat an earlier computation are not emitted again.
 
 import contextlib
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 from vrw_jax.simd.llvm_library import ir
@@ -22,6 +23,7 @@ LLVM_NUMBER_TYPES = {
 }
 
 
+@dataclass(slots=True, eq=False)
 class LlvmBinaryInstruction:
     """LLVM instruction with two operands of one type.
 
@@ -29,10 +31,9 @@ class LlvmBinaryInstruction:
     later, so they take six times as long to create and to write.
     """
 
-    __slots__ = ("name", "text", "type")
-
-    def __init__(self, result_name: str, llvm_type: ir.Type, instruction_text: str) -> None:
-        self.name, self.type, self.text = result_name, llvm_type, instruction_text
+    name: str  # name of the result
+    type: ir.Type
+    text: str
 
     def get_reference(self) -> str:
         """Return the name by which other instructions refer to the result of this instruction."""
@@ -131,10 +132,11 @@ class ValueEmitter:
         """
         self.n_emitted_instructions += 1
         result_name, llvm_type = f"%o{self.n_emitted_instructions}", x.type
-        instruction_text = (
-            f"{result_name} = {llvm_opcode} {llvm_type} {x.get_reference()}, {y.get_reference()}"
+        instruction = LlvmBinaryInstruction(
+            result_name,
+            llvm_type,
+            f"{result_name} = {llvm_opcode} {llvm_type} {x.get_reference()}, {y.get_reference()}",
         )
-        instruction = LlvmBinaryInstruction(result_name, llvm_type, instruction_text)
         self.llvm_builder._insert(instruction)
         return instruction
 

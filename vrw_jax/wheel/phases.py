@@ -133,17 +133,21 @@ class AbstractPhase(abc.ABC):
         The guard is positive before the end.
         """
 
-    @abc.abstractmethod
     def compute_specific_guards(self, phase_instant: "PhaseInstant") -> Vector:
         """Return the guards that only this phase has, except that of its regular end."""
+        return ()
 
-    @abc.abstractmethod
     def compute_specific_margins(self, phase_instant: "PhaseInstant") -> Vector:
         """Return the values of the margins that only this phase has."""
+        return ()
 
-    @abc.abstractmethod
     def reset_motion(self, motion: Motion) -> Motion:
-        """Return the motion just after the regular end of the phase."""
+        """Return the motion just after the regular end of the phase.
+
+        The motion is unchanged at lift-off, because the rear foot is at rest, and at touchdown,
+        which `transitions.resolve_landing` computes.
+        """
+        return motion
 
     def compute_landing_height(self, motion: Motion) -> Elementwise:
         """Return the height of the next foot above the line of the ground on which it lands, m.
@@ -350,15 +354,6 @@ class DoubleSupport(AbstractPhase):
             phase_instant.motion
         )
 
-    def compute_specific_margins(self, phase_instant: PhaseInstant) -> Vector:
-        return ()
-
-    def reset_motion(self, motion: Motion) -> Motion:
-        """Return the motion unchanged, because the rear foot is at rest when it leaves the
-        ground.
-        """
-        return motion
-
 
 class SingleSupport1(AbstractPhase):
     """SLS-I, with the coordinates (theta, L1, L2): Leg 2 moves freely until it meets its stopper.
@@ -445,22 +440,12 @@ class SingleSupport2(AbstractPhase):
     def compute_end_guard(self, phase_instant: PhaseInstant) -> Elementwise:
         return self.compute_landing_height(phase_instant.motion)
 
-    def compute_specific_guards(self, phase_instant: PhaseInstant) -> Vector:
-        return ()
-
     def compute_specific_margins(self, phase_instant: PhaseInstant) -> Vector:
         s, m = self.s, phase_instant.motion
         rear_stopper_force = dynamics.compute_stopper_force(
             s, m, phase_instant.acceleration, range(2, 3)
         )
         return compute_rear_foot_height(s, m), *rear_stopper_force
-
-    def reset_motion(self, motion: Motion) -> Motion:
-        """Return the motion unchanged.
-
-        The next step begins with the touchdown, which `transitions.resolve_landing` computes.
-        """
-        return motion
 
 
 PAPER_PHASES: tuple[type[AbstractPhase], ...] = (DoubleSupport, SingleSupport1, SingleSupport2)
