@@ -166,13 +166,13 @@ def locate_event(
         )
 
     first_crossing_fraction = jnp.ones_like(step_length)
-    stage_values_by_guard = zip(
+    for is_crossing_guard, *crossing_values in zip(
+        is_crossing,
         integrator_state.guard_values,
         integrator_state.middle_guard_values,
         integrator_state.end_guard_values,
         strict=True,
-    )
-    for is_crossing_guard, crossing_values in zip(is_crossing, stage_values_by_guard, strict=True):
+    ):
         fraction_to_zero = _find_parabola_zero(tableau, is_crossing_guard, *crossing_values)
         first_crossing_fraction = jnp.where(
             is_crossing_guard,

@@ -237,16 +237,17 @@ def _make_phase_runner(
             if phase.has_stiff_start:
                 tolerance_root = jnp.exp(
                     jnp.log(options.rtol.astype(jnp.float32)) / tableau.convergence_order
-                )
-                max_dt_in_transient_times = (
+                ).astype(dt0.dtype)
+                max_transient_dt = (
                     STIFF_START_OPTIONS.max_first_step_in_transient_times
-                    * tolerance_root.astype(dt0.dtype)
+                    * tolerance_root
+                    * phase.s.m
+                    / phase.s.c
                 )
-                max_transient_dt = max_dt_in_transient_times * phase.s.m / phase.s.c
-                dt0 = jnp.minimum(STIFF_START_OPTIONS.max_first_step_ratio * dt0, max_transient_dt)
-                dt0 = jnp.where(
-                    next_phase_inputs.has_phase_occurred, dt0, next_phase_inputs.next_solver_dt
+                stiff_dt0 = jnp.minimum(
+                    STIFF_START_OPTIONS.max_first_step_ratio * dt0, max_transient_dt
                 )
+                dt0 = jnp.where(next_phase_inputs.has_phase_occurred, stiff_dt0, dt0)
         float_leaves, nonarray_leaves = eqx.partition(
             (phase.s, phase.tilt_sine_cosine), eqx.is_array
         )
