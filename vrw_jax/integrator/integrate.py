@@ -116,7 +116,7 @@ def integrate_batch_phase(
             phase_constants_tangents, held_constants, q, v = directions
             start_tangents = stack_directions((*q, *v, *held_constants))
             phase_tangents = PhaseTangents(
-                make_phase, *primals[:2], phase_constants_tangents, start_tangents
+                make_phase, primals[0], primals[1], phase_constants_tangents, start_tangents
             )
             phase_integration_result = _integrate_to_event(
                 make_phase, tableau, phase_tangents, *primals
@@ -508,10 +508,10 @@ def _classify_solver_step(
     """Return the status of each batch element after a solver step, and whether it accepts the step.
 
     The returned state has a new status, new bits of the crossing guards, the new elapsed time, and
-    the length of the next solver step. If a guard crosses zero within
-    the solver step, the length is instead that of the step just taken. A step that would
-    end after the time limit is shortened to end there. An element fails if its next step is too
-    short for the time to advance, or if the number of its solver steps reaches the limit.
+    the length of the next solver step. If a guard crosses zero within the solver step, the length
+    is instead that of the step just taken. A step that would end after the time limit is shortened
+    to end there. An element fails if its next step is too short for the time to advance, or if the
+    number of its solver steps reaches the limit.
     """
     is_running = integrator_state.is_running
     is_valid_step = is_running & ~is_step_rejected

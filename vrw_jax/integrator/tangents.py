@@ -226,9 +226,8 @@ def _compute_stage_jacobians(
         sin, cos, *accelerations = state_components[2 * n :]
         acceleration = StageAccelerations(sin, cos, tuple(accelerations))
         stage_state = StageState(state_components[:n], state_components[n : 2 * n], acceleration)
-        implicit_dynamics = ImplicitDynamics(
-            *map(jax.jit, make_phase(phase_constants, held_constants).implicit_dynamics)
-        )
+        implicit_dynamics = make_phase(phase_constants, held_constants).implicit_dynamics
+        implicit_dynamics = ImplicitDynamics(*[jax.jit(f) for f in implicit_dynamics])
         evaluate_residual = lambda *constants: make_phase(
             *constants
         ).implicit_dynamics.evaluate_residual(stage_state)

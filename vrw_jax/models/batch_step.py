@@ -380,7 +380,7 @@ class StepTraceConfig(NamedTuple):
         """
         x = argument_leaves[0]
         zero_codes = jnp.zeros_like(x, jnp.int32)
-        template = {
+        template: dict[str, Any] = {
             "section_state": jnp.broadcast_to(x, (3, *x.shape)),
             "durations": jnp.broadcast_to(x, (3, *x.shape)),
             "outcome": zero_codes,
@@ -389,7 +389,7 @@ class StepTraceConfig(NamedTuple):
         }
         if self.friction is None:
             return eqx.partition(AdvanceResult(**template), eqx.is_inexact_array)
-        measure_groups = {
+        measure_groups: dict[str, Any] = {
             name: group(*(x for _ in dataclasses.fields(group)))
             for name, group in (
                 ("indicators", DoubleSupportIndicators),
@@ -475,8 +475,9 @@ def build_step_sampler(step_trace_config: StepTraceConfig, n_samples: int) -> Ba
     def make_trajectory_template(x: Array, *_: Array) -> Trajectory:
         n = n_samples
         array_shapes = ((n,), (n, 6), (n, 4), (n, 3), (), ())
-        float_templates = [jnp.broadcast_to(x, (3, *shape, *x.shape)) for shape in array_shapes]
-        return Trajectory(*float_templates, jnp.zeros_like(x, jnp.int32))
+        templates = [jnp.broadcast_to(x, (3, *shape, *x.shape)) for shape in array_shapes]
+        templates.append(jnp.zeros_like(x, jnp.int32))
+        return Trajectory(*templates)
 
     return step_trace_config.compile_for_one_wheel(
         sample_lane_steps, make_trajectory_template, "samples", n_samples

@@ -339,7 +339,9 @@ class RigidWheel(AbstractWheel):
         step_result = self.take_step(params, x, options)
         params, next_slope = separate_next_slope(params)
         half_angle = 0.5 * params.leg_angle
-        end_angle = half_angle if next_slope is None else half_angle + next_slope - params.slope
+        end_angle = jnp.asarray(half_angle)
+        if next_slope is not None:
+            end_angle = half_angle + next_slope - params.slope
         rolling_motion = RollingMotion(
             params.symbols(), params.slope, step_result.post_impact[1], -half_angle, end_angle
         )
@@ -433,7 +435,7 @@ class RollingMotion(eqx.Module):
     s: Symbols
     phi: Elementwise  # slope, rad
     initial_rate: Elementwise  # at the first angle, rad/s
-    first_angle: Elementwise  # first angle theta, rad; -alpha/2 just after a landing
+    first_angle: Elementwise | float  # first angle theta, rad; -alpha/2 just after a landing
     end_angle: Elementwise  # angle theta at the next landing, rad; alpha/2 on flat ground
 
     def compute_squared_rate(self, theta: Elementwise) -> Elementwise:

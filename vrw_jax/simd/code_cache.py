@@ -86,7 +86,9 @@ def get_machine_code(
     if code_index_name in _machine_code_by_record_name:
         return _machine_code_by_record_name[code_index_name]
     machine_code = None
-    encoded_ffi_target_name = code_store and code_store.load_cache_record(code_index_name)
+    encoded_ffi_target_name = (
+        code_store.load_cache_record(code_index_name) if code_store is not None else None
+    )
     if encoded_ffi_target_name:
         ffi_target_name = encoded_ffi_target_name.decode("ascii", "replace")
         machine_code = load_machine_code(ffi_target_name, code_store)
@@ -144,7 +146,9 @@ def load_machine_code(ffi_target_name: str, code_store: CodeStore | None) -> Mac
     Return None if neither contains the code.
     """
     if ffi_target_name not in _machine_code_by_record_name:
-        cache_record_content = code_store and code_store.load_cache_record(ffi_target_name)
+        cache_record_content = (
+            code_store.load_cache_record(ffi_target_name) if code_store is not None else None
+        )
         if cache_record_content is None:
             return None
         encoded_result_types, _, object_code = cache_record_content.partition(b"\n")

@@ -256,7 +256,7 @@ class _LoopCarry:
         """
         register_values = self._flatten_register_entries(next_loop_carry_arrays)
         carried_pointers = [m.base_pointer for m in self.loop_carry_memory if m is not None]
-        next_memory_contents: list[tuple[MemoryArray, MemoryArray | PendingArrayUpdate]] = []
+        next_memory_contents: list[tuple[MemoryArray, LlvmArray]] = []
         for next_array, memory_array in zip(
             next_loop_carry_arrays, self.loop_carry_memory, strict=True
         ):

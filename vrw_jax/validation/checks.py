@@ -84,7 +84,7 @@ def format_value(given_value: object) -> str:
     )
 
 
-def _is_single_number(given_value: object) -> bool:
+def _is_single_number(given_value: Any) -> bool:
     """Return whether a value is a single real number. True and False are not numbers in this
     sense.
     """

@@ -235,7 +235,7 @@ class WheelParams(AbstractPrintable):
                 "each element of its axis: give arrays of one length."
             )
 
-    def _get_parameters(self) -> dict[str, Array]:
+    def _get_parameters(self) -> dict[str, Any]:
         """Return the floating-point parameters by their names, in the order of their fields."""
         return {
             parameter_name: getattr(self, parameter_name) for parameter_name in PARAMETER_DOMAINS

@@ -51,12 +51,10 @@ class PhaseMargins(NamedTuple):
     @classmethod
     def from_margin_values(cls, margin_values: Vector, n_legs: int) -> "PhaseMargins":
         """Return the margins, taken from the sequence of all margin values."""
-        n_margins_before_optional = 3 + n_legs - 2  # Legs 3 to n have one margin each.
-        return cls(
-            *margin_values[:3],
-            margin_values[3:n_margins_before_optional],
-            *margin_values[n_margins_before_optional:],
-        )
+        fore_foot_force, contraction, friction, *other_values = margin_values
+        locked_stopper_force = tuple(other_values[: n_legs - 2])
+        optional_margins = other_values[n_legs - 2 :]
+        return cls(fore_foot_force, contraction, friction, locked_stopper_force, *optional_margins)
 
 
 @dataclasses.dataclass(frozen=True)
