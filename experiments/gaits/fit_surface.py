@@ -16,6 +16,7 @@ import numpy as np
 
 import vrw_jax as vrw
 from experiments.shared.command import make_parser, parse_and_start_jax
+from vrw_jax.collocation import N_GAUSS_NODES, CollocationSolution
 from vrw_jax.cycles import collocation_search as search
 from vrw_jax.cycles import gait_surface as surface
 from vrw_jax.numerics import apply_function_in_blocks
@@ -43,7 +44,14 @@ def find_gaits_by_continuation(
         section, durations = (
             jnp.broadcast_to(jnp.asarray(x)[:, None], (len(x), *lanes)) for x in GAIT_OF_TABLE_1
         )
-        start = search.make_start_state(problem, section, durations, jnp.ones(lanes, bool))
+        accelerations = tuple(
+            jnp.zeros((1, mesh.n_intervals, N_GAUSS_NODES, phase.n_coordinates, *lanes))
+            for phase, mesh in zip(problem.phase_sequence.phases, problem.phase_meshes, strict=True)
+        )
+        start = search.CollocationState.make_start(
+            CollocationSolution(section, durations[None], accelerations),
+            jnp.ones((1, *durations.shape)),
+        )
         table_1_parameters = jnp.broadcast_to(table_1_parameters, parameters.shape)
         stages = jnp.int32(N_STAGES)
         pending = jnp.ones(lanes, bool)

@@ -29,13 +29,11 @@ from vrw_jax.continuation import (
     arclength,
 )
 from vrw_jax.cycles import (
-    CollocationState,
     CollocationSystem,
     PeriodMap,
     compute_correction_norm,
     compute_force_peaks,
     compute_takeoff_acceleration,
-    init_search_flags,
     measure_return_map_force_peaks,
     solve_linear_systems,
 )
@@ -184,7 +182,7 @@ class CollocationProblem(AbstractGaitProblem):
         wheel_symbols = make_wheel_from_parameters(
             parameters, self.collocation_system.n_legs
         ).symbols()
-        _, phase_points_by_step = self.collocation_system.evaluate_phase_points(parameters, z)
+        phase_points_by_step = self.collocation_system.evaluate_phase_points(parameters, z)
         takeoff_accelerations = [
             compute_takeoff_acceleration(wheel_symbols, sls1_phase_points)
             for _, sls1_phase_points, _ in phase_points_by_step
@@ -237,11 +235,8 @@ def make_trial_linearizer(
     """
 
     def linearize_trial(parameters: Array, is_phase_active: Array, z: CollocationSolution) -> tuple:
-        collocation_state = CollocationState(
-            z, is_phase_active, *init_search_flags(collocation_system, z.section_state)
-        )
         cycle_linearization = collocation_system.linearize_at(
-            parameters, collocation_state, parameter_indices
+            parameters, z, is_phase_active, parameter_indices
         )
         newton_results = (
             cycle_linearization.newton_correction,

@@ -35,12 +35,10 @@ from vrw_jax.continuation import (
     compute_offset_bifurcation_margins,
 )
 from vrw_jax.cycles import (
-    CollocationState,
     CollocationSystem,
     compute_correction_norm,
     compute_force_peaks,
     compute_takeoff_acceleration,
-    init_search_flags,
 )
 from vrw_jax.measures import MARGIN_MEASURES
 from vrw_jax.models import ViscoelasticWheel
@@ -412,7 +410,7 @@ def _stack_continued_quantities(
 ) -> Array:
     """Return the values of `CONTINUED_QUANTITIES` for a collocated gait, in their order."""
     wheel_symbols = make_wheel_from_parameters(parameters, collocation_system.n_legs).symbols()
-    (phase_points,) = collocation_system.evaluate_phase_points(parameters, z)[1]
+    (phase_points,) = collocation_system.evaluate_phase_points(parameters, z)
     return jnp.stack(list(_compute_continued_quantities(wheel_symbols, phase_points, z).values()))
 
 
@@ -471,10 +469,7 @@ def _compute_trial_monodromy(
     z: CollocationSolution,
 ) -> Array:
     """Return the monodromy matrix at a trial solution."""
-    collocation_state = CollocationState(
-        z, is_phase_active, *init_search_flags(collocation_system, z.section_state)
-    )
-    return collocation_system.linearize_at(parameters, collocation_state).monodromy
+    return collocation_system.linearize_at(parameters, z, is_phase_active).monodromy
 
 
 QUANTITY_FUNCTION_BY_GROUP = {

@@ -10,10 +10,8 @@ from vrw_jax.cycles import (
 from vrw_jax.cycles.attracting_gaits import find_attracting_gaits, find_slow_gaits
 from vrw_jax.cycles.collocation_finder import CollocationFinder
 from vrw_jax.cycles.collocation_search import (
-    CollocationState,
     CollocationSystem,
     compute_correction_norm,
-    init_search_flags,
 )
 from vrw_jax.cycles.cycle import CYCLE_MEASURE_FUNCTIONS, AbstractCycle, format_floquet_multipliers
 from vrw_jax.cycles.finder import (

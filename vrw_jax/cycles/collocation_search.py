@@ -9,7 +9,6 @@ After each attempt, the wheels without a cycle are gathered for the next attempt
 """
 
 import functools
-import operator
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import IntEnum
@@ -22,7 +21,6 @@ from jaxtyping import Array, Bool, Float, Int
 
 from vrw_jax import simd
 from vrw_jax.collocation import (
-    N_GAUSS_NODES,
     CollocationPhase,
     CollocationSolution,
     CycleLinearization,
@@ -42,7 +40,13 @@ from vrw_jax.cycles.phase_sequence import (
     compute_phase_constants,
     make_post_impact_sequence,
 )
-from vrw_jax.numerics import BatchFunction, LaneArray, Vector
+from vrw_jax.numerics import (
+    BatchFunction,
+    LaneArray,
+    Vector,
+    make_zeros_like_output,
+    select_trees_by_condition,
+)
 from vrw_jax.wheel import WheelParams, make_wheel_from_parameters, stack_parameters
 
 LaneParameters = Float[Array, "n_parameters lanes"]
@@ -86,7 +90,6 @@ class CollocationSystem(NamedTuple):
     period_n: int
     cycle_options: CycleOptions
     stop_at_lift_off: bool = True  # whether the normal force must be positive in an admissible gait
-    search_limits: CycleSearchLimits = CYCLE_SEARCH_LIMITS
 
     @property
     def phase_sequence(self) -> PhaseSequence:
@@ -113,10 +116,11 @@ class CollocationSystem(NamedTuple):
     def linearize_at(
         self,
         parameters: LaneParameters,
-        collocation_state: "CollocationState",
+        collocation_solution: CollocationSolution,
+        is_phase_active: LaneArray,
         parameter_indices: tuple[int, ...] = (),
     ) -> CycleLinearization:
-        """Linearize the collocation equations at a collocation state.
+        """Linearize the collocation equations at a collocation solution.
 
         The result contains tangents with respect to the parameters in `parameter_indices`.
         """
@@ -125,39 +129,32 @@ class CollocationSystem(NamedTuple):
             self.phase_meshes,
             self.phase_constants_function,
             parameters,
-            collocation_state.solution,
-            collocation_state.is_phase_active > 0.5,
+            collocation_solution,
+            is_phase_active > 0.5,
             parameter_indices,
         )
 
     def evaluate_phase_points(
         self, parameters: Array, collocation_solution: CollocationSolution
-    ) -> tuple[Vector, list[tuple[PhasePoints, ...]]]:
-        """Return the section state after the last gait step, and the points of all phases in each
-        step.
+    ) -> list[tuple[PhasePoints, ...]]:
+        """Return the points of all phases in each gait step.
 
         The arguments belong to one wheel, or to several wheels on the last axis.
         """
-        phase_constants, section_state = (
-            self.phase_constants_function(*parameters),
-            tuple(collocation_solution.section_state),
-        )
+        phase_constants = self.phase_constants_function(*parameters)
+        section_state: Vector = tuple(collocation_solution.section_state)
         phase_points_of_steps = []
         for step_index in range(self.period_n):
-            phase_durations, accelerations_by_phase = jax.tree.map(
-                lambda x, step_index=step_index: x[step_index],
-                (collocation_solution.durations, collocation_solution.accelerations),
-            )
             section_state, phase_points = reconstruct_gait_step(
                 self.phase_sequence,
                 self.phase_meshes,
                 phase_constants,
                 section_state,
-                phase_durations,
-                accelerations_by_phase,
+                collocation_solution.durations[step_index],
+                tuple(x[step_index] for x in collocation_solution.accelerations),
             )
             phase_points_of_steps.append(phase_points)
-        return section_state, phase_points_of_steps
+        return phase_points_of_steps
 
 
 class CollocationState(NamedTuple):
@@ -174,9 +171,18 @@ class CollocationState(NamedTuple):
     # (lanes,): 1 + index in ADMISSIBILITY_CHECKS of the check that a root fails;
     # plus HOMOTOPY_FAILURE_OFFSET for a root of a wheel on the homotopy; a HomotopyFailure; else 0
     failed_check: LaneArray
-    gait_step_end_states: (
-        LaneArray  # (n, 4, lanes): theta, L1 and their rates at the end of each step
-    )
+    # (n, 4, lanes): theta, L1 and their rates at the end of each step
+    gait_step_end_states: LaneArray
+
+    @classmethod
+    def make_start(
+        cls, collocation_solution: CollocationSolution, is_phase_active: LaneArray
+    ) -> "CollocationState":
+        """Return a start of the search, with zeros in the fields that the search computes."""
+        zero_flag = jnp.zeros_like(collocation_solution.section_state[0])
+        durations = collocation_solution.durations
+        zero_end_states = jnp.zeros((len(durations), 4, *durations.shape[2:]), durations.dtype)
+        return cls(collocation_solution, is_phase_active, zero_flag, zero_flag, zero_end_states)
 
 
 class CycleSearchResult(NamedTuple):
@@ -214,77 +220,17 @@ def predict_start_from_gait_surface(
             sls2_duration,
         ]
     )
-    start_state = make_start_state(
-        collocation_system, predicted_solution.section_state, phase_durations, has_dls
+    is_sls_active = jnp.ones_like(dls_duration)
+    is_phase_active = jnp.stack([jnp.where(has_dls, is_sls_active, 0.0)] + [is_sls_active] * 2)
+    accelerations = tuple(jnp.where(has_dls, x[0], 0.0) for x in predicted_solution.accelerations)
+    # All gait steps have the same start.
+    phase_durations, accelerations, is_phase_active = jax.tree.map(
+        lambda x: jnp.broadcast_to(x, (collocation_system.period_n, *x.shape)),
+        (phase_durations, accelerations, is_phase_active),
     )
-    accelerations_by_phase = tuple(
-        jnp.broadcast_to(
-            jnp.where(has_dls, predicted_accelerations, 0.0), acceleration_template.shape
-        )
-        for predicted_accelerations, acceleration_template in zip(
-            predicted_solution.accelerations, start_state.solution.accelerations, strict=True
-        )
-    )
-    return start_state._replace(
-        solution=start_state.solution._replace(accelerations=accelerations_by_phase)
-    )
-
-
-def make_start_state(
-    collocation_system: CollocationSystem,
-    section_state: Array,
-    phase_durations: Array,
-    has_dls: Array,
-) -> CollocationState:
-    """Build a start of the search in which all accelerations are zero.
-
-    The section state and the phase durations are the same in all gait steps. `has_dls` determines
-    whether double support is an active phase.
-    """
-    period_n, n_phases = collocation_system.period_n, len(collocation_system.phase_sequence.phases)
-    n_lanes = section_state.shape[-1]
-    zero_accelerations = tuple(
-        jnp.zeros(
-            (
-                period_n,
-                phase_mesh.n_intervals,
-                N_GAUSS_NODES,
-                collocation_phase.n_coordinates,
-                n_lanes,
-            ),
-            section_state.dtype,
-        )
-        for collocation_phase, phase_mesh in zip(
-            collocation_system.phase_sequence.phases, collocation_system.phase_meshes, strict=True
-        )
-    )
-    is_dls_active = jnp.where(has_dls, 1.0, 0.0).astype(section_state.dtype)
-    is_sls_active = jnp.ones((period_n, n_phases - 1, n_lanes), section_state.dtype)
-    is_phase_active = jnp.concatenate(
-        [jnp.broadcast_to(is_dls_active, (period_n, 1, n_lanes)), is_sls_active], 1
-    )
-    phase_durations = jnp.broadcast_to(phase_durations, (period_n, n_phases, n_lanes))
-    collocation_solution = CollocationSolution(section_state, phase_durations, zero_accelerations)
-    return CollocationState(
-        collocation_solution, is_phase_active, *init_search_flags(collocation_system, section_state)
-    )
-
-
-def init_search_flags(
-    collocation_system: CollocationSystem, section_state: Array
-) -> tuple[Array, Array, Array]:
-    """Return `has_cycle`, `failed_check` and `gait_step_end_states` before the search, which are
-    zeros.
-    """
-    lane_shape, n_step_end_components = (
-        section_state.shape[1:],
-        2 * collocation_system.phase_sequence.phases[-1].n_coordinates,
-    )
-    make_zeros = lambda *array_shape: jnp.zeros((*array_shape, *lane_shape), section_state.dtype)
-    return (
-        make_zeros(),
-        make_zeros(),
-        make_zeros(collocation_system.period_n, n_step_end_components),
+    return CollocationState.make_start(
+        CollocationSolution(predicted_solution.section_state, phase_durations, accelerations),
+        is_phase_active,
     )
 
 
@@ -323,15 +269,14 @@ def compute_correction_norm(
     The correction of each acceleration is multiplied by the square of the phase's duration, as in
     its effect on positions.
     """
-    max_by_lane = functools.partial(reduce_over_non_lane_axes, jnp.maximum)
+    compute_size = lambda x: reduce_over_non_lane_axes(jnp.maximum, jnp.abs(x))
     correction_norm = jnp.maximum(
-        max_by_lane(jnp.abs(newton_correction.section_state)),
-        max_by_lane(jnp.abs(newton_correction.durations)),
+        compute_size(newton_correction.section_state), compute_size(newton_correction.durations)
     )
     for phase_index, acceleration_change in enumerate(newton_correction.accelerations):
-        phase_duration = max_by_lane(jnp.abs(collocation_solution.durations[:, phase_index]))
+        phase_duration = compute_size(collocation_solution.durations[:, phase_index])
         correction_norm = jnp.maximum(
-            correction_norm, max_by_lane(jnp.abs(acceleration_change)) * phase_duration**2
+            correction_norm, compute_size(acceleration_change) * phase_duration**2
         )
     return correction_norm
 
@@ -344,62 +289,31 @@ def _compute_correction_fraction(
     With this fraction, the changes of the section state and of the durations are within their
     limits.
     """
-    gait_step_duration = jnp.sum(collocation_solution.durations, 1, keepdims=True)
-    max_unknown_changes = jnp.concatenate(
-        [
-            0.15 * jnp.abs(collocation_solution.section_state) + 0.05,
-            (
-                0.25 * jnp.abs(collocation_solution.durations) + 0.02 * jnp.abs(gait_step_duration)
-            ).reshape(-1, collocation_solution.section_state.shape[-1]),
-        ]
-    )
-    proposed_unknown_changes = jnp.concatenate(
-        [
-            newton_correction.section_state,
-            newton_correction.durations.reshape(-1, collocation_solution.section_state.shape[-1]),
-        ]
-    )
-    smallest_float = jnp.finfo(proposed_unknown_changes.dtype).tiny
-    correction_fraction = reduce_over_non_lane_axes(
-        jnp.minimum,
-        max_unknown_changes / jnp.maximum(jnp.abs(proposed_unknown_changes), smallest_float),
-    )
-    return jnp.minimum(1.0, correction_fraction)
+    durations = collocation_solution.durations
+    gait_step_duration = jnp.sum(durations, 1, keepdims=True)
 
+    def compute_least_ratio(max_changes: Array, changes: Array) -> LaneArray:
+        smallest_float = jnp.finfo(changes.dtype).tiny
+        return reduce_over_non_lane_axes(
+            jnp.minimum, max_changes / jnp.maximum(jnp.abs(changes), smallest_float)
+        )
 
-def compute_state_tangents(
-    cycle_linearization: CycleLinearization, collocation_state: CollocationState
-) -> CollocationState:
-    """Return the tangents of a collocation state, computed from the linearization at that state.
-
-    The tangents of the active phases and of the results of admissibility checks are zero.
-    """
-    make_zero_tangents = lambda x: jnp.zeros(
-        (cycle_linearization.gait_step_end_tangents.shape[0], *x.shape), x.dtype
+    section_ratio = compute_least_ratio(
+        0.15 * jnp.abs(collocation_solution.section_state) + 0.05, newton_correction.section_state
     )
-    has_cycle_tangents, failed_check_tangents = (
-        make_zero_tangents(collocation_state.has_cycle),
-        make_zero_tangents(collocation_state.failed_check),
+    duration_ratio = compute_least_ratio(
+        0.25 * jnp.abs(durations) + 0.02 * jnp.abs(gait_step_duration), newton_correction.durations
     )
-    return CollocationState(
-        cycle_linearization.parameter_tangents,
-        make_zero_tangents(collocation_state.is_phase_active),
-        has_cycle_tangents,
-        failed_check_tangents,
-        cycle_linearization.gait_step_end_tangents,
-    )
+    return jnp.minimum(1.0, jnp.minimum(section_ratio, duration_ratio))
 
 
 class _NewtonState(NamedTuple):
     """Loop state of Newton's method for all wheels (lanes)."""
 
     iteration_index: Int[Array, ""]
-    collocation_state: CollocationState
-    monodromy_matrix: LaneArray
-    correction_norm: LaneArray
+    search_result: CycleSearchResult
     has_lane_converged: Bool[Array, " lanes"]
     is_lane_running: Bool[Array, " lanes"]
-    n_newton_iterations: Int[Array, " lanes"]
 
 
 def run_newton_iterations(
@@ -420,14 +334,13 @@ def run_newton_iterations(
     """
     cycle_options = collocation_system.cycle_options
     machine_epsilon = float(jnp.finfo(parameters.dtype).eps)
-    tight_newton_tolerance, loose_newton_tolerance = (
-        max(cycle_options.tolerance, 1e3 * machine_epsilon),
-        CycleOptions.tolerance,
-    )
+    tight_newton_tolerance = max(cycle_options.tolerance, 1e3 * machine_epsilon)
+    loose_newton_tolerance = max(CycleOptions.tolerance, tight_newton_tolerance)
 
     def run_newton_iteration(newton_state: _NewtonState) -> _NewtonState:
+        iteration_index, search_result, has_lane_converged, is_lane_running = newton_state
         homotopy_fraction = jnp.minimum(
-            1.0, (newton_state.iteration_index + 1) / jnp.maximum(homotopy_steps, 1)
+            1.0, (iteration_index + 1) / jnp.maximum(homotopy_steps, 1)
         ).astype(parameters.dtype)
         is_at_target = homotopy_fraction >= 1.0
         current_parameters = jnp.where(
@@ -435,90 +348,67 @@ def run_newton_iterations(
             parameters,
             initial_parameters + homotopy_fraction * (parameters - initial_parameters),
         )
-        collocation_solution = newton_state.collocation_state.solution
+        collocation_state = search_result.collocation_state
         cycle_linearization = collocation_system.linearize_at(
-            current_parameters, newton_state.collocation_state
+            current_parameters, collocation_state.solution, collocation_state.is_phase_active
         )
         newton_correction = cycle_linearization.newton_correction
-        correction_norm = compute_correction_norm(collocation_solution, newton_correction)
-        is_correction_finite = jnp.isfinite(correction_norm)
-        correction_fraction = _compute_correction_fraction(collocation_solution, newton_correction)
-        is_lane_moving = newton_state.is_lane_running & is_correction_finite
-        update_moving_lanes = lambda new_value, old_value: jnp.where(
-            is_lane_moving, new_value, old_value
+        correction_norm = compute_correction_norm(collocation_state.solution, newton_correction)
+        correction_fraction = _compute_correction_fraction(
+            collocation_state.solution, newton_correction
         )
-
-        def apply_correction(unknowns: Array, newton_correction_values: Array) -> Array:
-            return jnp.where(
-                is_lane_moving,
-                unknowns
-                + correction_fraction * jnp.where(is_lane_moving, newton_correction_values, 0.0),
-                unknowns,
-            )
-
-        newton_tolerance = (
-            jnp.where(
-                2.0 * correction_norm > newton_state.correction_norm,
-                loose_newton_tolerance,
-                tight_newton_tolerance,
-            )
-            if tight_newton_tolerance < loose_newton_tolerance
-            else tight_newton_tolerance
+        is_lane_moving = is_lane_running & jnp.isfinite(correction_norm)
+        newton_tolerance = jnp.where(
+            2.0 * correction_norm > search_result.correction_norm,
+            loose_newton_tolerance,
+            tight_newton_tolerance,
         )
-        has_lane_converged = is_lane_moving & is_at_target & (correction_norm < newton_tolerance)
-        collocation_state = newton_state.collocation_state._replace(
-            solution=jax.tree.map(apply_correction, collocation_solution, newton_correction),
-            gait_step_end_states=update_moving_lanes(
-                cycle_linearization.gait_step_end_states,
-                newton_state.collocation_state.gait_step_end_states,
+        has_converged_now = is_lane_moving & is_at_target & (correction_norm < newton_tolerance)
+        corrected_solution = jax.tree.map(
+            lambda unknowns, correction: unknowns + correction_fraction * correction,
+            collocation_state.solution,
+            newton_correction,
+        )
+        corrected_result = search_result._replace(
+            collocation_state=collocation_state._replace(
+                solution=corrected_solution,
+                gait_step_end_states=cycle_linearization.gait_step_end_states,
             ),
+            monodromy_matrix=cycle_linearization.monodromy,
+            correction_norm=correction_norm,
         )
+        search_result = select_trees_by_condition(is_lane_moving, corrected_result, search_result)
         return _NewtonState(
-            iteration_index=newton_state.iteration_index + 1,
-            collocation_state=collocation_state,
-            monodromy_matrix=update_moving_lanes(
-                cycle_linearization.monodromy, newton_state.monodromy_matrix
+            iteration_index + 1,
+            search_result._replace(
+                n_newton_iterations=search_result.n_newton_iterations + is_lane_running
             ),
-            correction_norm=update_moving_lanes(correction_norm, newton_state.correction_norm),
-            has_lane_converged=newton_state.has_lane_converged | has_lane_converged,
-            is_lane_running=is_lane_moving & ~has_lane_converged,
-            n_newton_iterations=newton_state.n_newton_iterations + newton_state.is_lane_running,
+            has_lane_converged | has_converged_now,
+            is_lane_moving & ~has_converged_now,
         )
 
     has_running_lanes = lambda newton_state: (
         jnp.any(newton_state.is_lane_running)
         & (newton_state.iteration_index < max_iterations + homotopy_steps)
     )
-    section_size, float_dtype, n_lanes = (
-        collocation_system.phase_sequence.section_size,
-        start_state.has_cycle.dtype,
-        is_lane_requested.shape[-1],
+    first_search_result = init_search_result(collocation_system, parameters)
+    _, search_result, has_lane_converged, _ = lax.while_loop(
+        has_running_lanes,
+        run_newton_iteration,
+        _NewtonState(
+            jnp.zeros((), jnp.int32),
+            first_search_result._replace(collocation_state=start_state),
+            jnp.zeros_like(is_lane_requested),
+            is_lane_requested,
+        ),
     )
-    first_newton_state = _NewtonState(
-        iteration_index=jnp.zeros((), jnp.int32),
-        collocation_state=start_state,
-        monodromy_matrix=jnp.zeros((section_size, section_size, n_lanes), float_dtype),
-        correction_norm=jnp.ones((n_lanes,), float_dtype),
-        has_lane_converged=jnp.zeros((n_lanes,), bool),
-        is_lane_running=is_lane_requested,
-        n_newton_iterations=jnp.zeros((n_lanes,), jnp.int32),
-    )
-    last_newton_state = lax.while_loop(has_running_lanes, run_newton_iteration, first_newton_state)
-    failed_check = find_first_failed_check(
-        collocation_system, parameters, last_newton_state.collocation_state
-    )
-    has_cycle = (last_newton_state.has_lane_converged & (failed_check == 0.0)).astype(
-        parameters.dtype
-    )
-    failed_check = jnp.where(last_newton_state.has_lane_converged, failed_check, 0.0)
-    collocation_state = last_newton_state.collocation_state._replace(
-        has_cycle=has_cycle, failed_check=failed_check
-    )
-    return CycleSearchResult(
-        collocation_state,
-        last_newton_state.monodromy_matrix,
-        last_newton_state.correction_norm,
-        last_newton_state.n_newton_iterations,
+    collocation_state = search_result.collocation_state
+    failed_check = find_first_failed_check(collocation_system, parameters, collocation_state)
+    return search_result._replace(
+        collocation_state=collocation_state._replace(
+            has_cycle=(has_lane_converged & (failed_check == 0.0)).astype(parameters.dtype),
+            failed_check=jnp.where(has_lane_converged, failed_check, 0.0),
+        )
     )
 
 
@@ -574,33 +464,23 @@ def find_first_failed_check(
             accelerations_by_phase,
         )
         is_check_satisfied: list[Array] = []
-        for phase_index, (collocation_phase, points_of_phase) in enumerate(
-            zip(phase_sequence.phases, phase_points, strict=True)
+        for phase, points_of_phase, is_active, duration in zip(
+            phase_sequence.phases, phase_points, is_phase_active, phase_durations, strict=True
         ):
-            is_check_satisfied.append(
-                ~is_phase_active[phase_index] | (phase_durations[phase_index] > 0.0)
-            )
-            guards_at_phase_end = collocation_phase.guards_function(
-                phase_constants, points_of_phase.phase_end_point
-            )
-            for guard_minimum, end_guard_value in zip(
-                _compute_guard_minima(collocation_phase, phase_constants, points_of_phase),
-                guards_at_phase_end,
-                strict=True,
-            ):
-                is_check_satisfied.append(
-                    ~is_phase_active[phase_index]
-                    | (
-                        (guard_minimum > 0.0)
-                        & (end_guard_value > -collocation_system.search_limits.end_guard_tolerance)
-                    )
-                )
-        is_check_satisfied += [
-            admissibility_margin > 0.0
-            for admissibility_margin in phase_sequence.margins_function(
-                phase_constants, phase_points, is_phase_active
-            )
-        ]
+            end_guards = phase.guards_function(phase_constants, points_of_phase.phase_end_point)
+            guard_minima = _compute_guard_minima(phase, phase_constants, points_of_phase)
+            is_phase_valid = [
+                duration > 0.0,
+                *(
+                    (guard_minimum > 0.0) & (end_guard > -CYCLE_SEARCH_LIMITS.end_guard_tolerance)
+                    for guard_minimum, end_guard in zip(guard_minima, end_guards, strict=True)
+                ),
+            ]
+            is_check_satisfied += [~is_active | is_valid for is_valid in is_phase_valid]
+        transition_margins = phase_sequence.margins_function(
+            phase_constants, phase_points, is_phase_active
+        )
+        is_check_satisfied += [margin > 0.0 for margin in transition_margins]
         for check_index, has_check_passed in enumerate(is_check_satisfied):
             failed_check = jnp.where(
                 (failed_check == 0.0) & ~has_check_passed, 1.0 + check_index, failed_check
@@ -619,21 +499,56 @@ def find_first_failed_check(
     (_, failed_check), _ = lax.scan(check_step_admissibility, loop_carry, step_inputs)
     is_mesh_fine_enough = (
         estimate_mesh_error(phase_sequence, collocation_system.phase_meshes, collocation_solution)
-        < collocation_system.search_limits.max_accepted_mesh_error
+        < CYCLE_SEARCH_LIMITS.max_accepted_mesh_error
     )
     return jnp.where(
         (failed_check == 0.0) & ~is_mesh_fine_enough, float(FAILED_MESH_CHECK_CODE), failed_check
     )
 
 
-def _has_attempt_name(attempt_index: Array, *attempt_names: str) -> Array:
-    """Return whether the attempt at `attempt_index` in the order of attempts has one of the given
-    names.
+class SearchAttempt(NamedTuple):
+    """Description of one attempt of the search, or an array of these values for all attempts."""
+
+    max_newton_iterations: Any
+    starts_from_guess: Any = False  # else from the gait that the stored surface predicts
+    continues_last_attempt: Any = False  # else the attempt has its own start
+    has_dls: Any = True
+    homotopy_steps: Any = 0  # number of iterations from the wheel in Table 1 to the searched wheel
+    # number of the segment of the last homotopy, or 0 for an attempt on the searched wheel
+    homotopy_segment: Any = 0
+    is_second_try: Any = False  # on the same segment
+
+
+def list_search_attempts(cycle_options: CycleOptions) -> list[SearchAttempt]:
+    """Return the attempts of the search in the order in which they run.
+
+    The first two attempts start from the guess, if there is one. The next two start from the gait
+    that the stored surface predicts. The first and the third attempt have few Newton iterations, so
+    that wheels that need more iterations are gathered in separate blocks. A homotopy from the wheel
+    in Table 1 of the paper follows. The next attempt searches for a cycle without double support.
+    Each segment of the last homotopy has two attempts: from the gait of the previous wheel, and
+    without double support.
     """
-    return functools.reduce(
-        operator.or_,
-        [attempt_index == SEARCH_ATTEMPTS.index(attempt_name) for attempt_name in attempt_names],
-    )
+    first_iterations = cycle_options.first_newton_iterations
+    max_iterations = cycle_options.max_newton_iterations
+    search_attempts = [
+        SearchAttempt(first_iterations, starts_from_guess=True),
+        SearchAttempt(max_iterations, continues_last_attempt=True),
+        SearchAttempt(first_iterations),
+        SearchAttempt(max_iterations, continues_last_attempt=True),
+        SearchAttempt(max_iterations, homotopy_steps=cycle_options.homotopy_steps),
+        SearchAttempt(max_iterations, has_dls=False),
+    ]
+    for segment in range(1, 1 + CYCLE_SEARCH_LIMITS.n_homotopy_segments):
+        search_attempts += [
+            SearchAttempt(
+                max_iterations, continues_last_attempt=segment > 1, homotopy_segment=segment
+            ),
+            SearchAttempt(
+                max_iterations, has_dls=False, homotopy_segment=segment, is_second_try=True
+            ),
+        ]
+    return search_attempts
 
 
 def _run_search_attempt(
@@ -648,134 +563,88 @@ def _run_search_attempt(
     - `attempt_index`: index of the attempt in the order of attempts;
     - `search_guess`: guess of the user, or None.
     """
-    cycle_options, n_homotopy_segments = (
-        collocation_system.cycle_options,
-        collocation_system.search_limits.n_homotopy_segments,
+    search_attempt = jax.tree.map(
+        lambda *values: jnp.asarray(values, jnp.int32)[attempt_index],
+        *list_search_attempts(collocation_system.cycle_options),
     )
-    table_1_values = stack_parameters(WheelParams(n_legs=collocation_system.n_legs)).astype(
-        parameters.dtype
+    n_homotopy_segments = CYCLE_SEARCH_LIMITS.n_homotopy_segments
+    is_on_segment = search_attempt.homotopy_segment > 0
+    is_before_target = is_on_segment & (search_attempt.homotopy_segment < n_homotopy_segments)
+    is_second_try = search_attempt.is_second_try == 1
+    table_1_wheel = WheelParams(n_legs=collocation_system.n_legs)
+    table_1_parameters = jnp.broadcast_to(
+        stack_parameters(table_1_wheel).astype(parameters.dtype)[:, None], parameters.shape
     )
-    max_iterations_by_name = dict.fromkeys(SEARCH_ATTEMPTS, cycle_options.max_newton_iterations) | {
-        "guess": cycle_options.first_newton_iterations,
-        "surface": cycle_options.first_newton_iterations,
-    }
-    max_iterations_by_attempt = [
-        max_iterations_by_name[attempt_name] for attempt_name in SEARCH_ATTEMPTS
-    ] + [cycle_options.max_newton_iterations] * (2 * n_homotopy_segments)
-    homotopy_segment_by_attempt = [0] * len(SEARCH_ATTEMPTS) + [
-        1 + homotopy_try_index // 2 for homotopy_try_index in range(2 * n_homotopy_segments)
-    ]
-    select_by_attempt = lambda table_by_attempt: jnp.asarray(table_by_attempt, jnp.int32)[
-        attempt_index
-    ]
-    table_1_parameters = jnp.broadcast_to(table_1_values[:, None], parameters.shape)
-    # Each segment has two tries: from the previous wheel's gait, and without double support.
-    homotopy_segment_number = select_by_attempt(homotopy_segment_by_attempt)
-    is_second_homotopy_try_by_attempt = [0] * len(SEARCH_ATTEMPTS) + [0, 1] * n_homotopy_segments
-    is_second_homotopy_try = select_by_attempt(is_second_homotopy_try_by_attempt) == 1
-    is_homotopy_segment_attempt = homotopy_segment_number > 0
-    is_last_homotopy_segment = ~is_homotopy_segment_attempt | (
-        homotopy_segment_number == n_homotopy_segments
+    homotopy_fraction = (
+        search_attempt.homotopy_segment.astype(parameters.dtype) / n_homotopy_segments
     )
-    homotopy_fraction = homotopy_segment_number.astype(parameters.dtype) / n_homotopy_segments
     target_parameters = jnp.where(
-        is_last_homotopy_segment,
-        parameters,
+        is_before_target,
         table_1_parameters + homotopy_fraction * (parameters - table_1_parameters),
+        parameters,
     )
-    is_homotopy_attempt = _has_attempt_name(attempt_index, "homotopy")
-    start_parameters = jnp.where(is_homotopy_attempt, table_1_parameters, target_parameters)
-    has_dls = jnp.broadcast_to(
-        ~_has_attempt_name(attempt_index, "without DLS") & ~is_second_homotopy_try,
-        parameters.shape[-1:],
+    last_state = search_result.collocation_state
+    start_state = predict_start_from_gait_surface(
+        collocation_system,
+        jnp.where(search_attempt.homotopy_steps > 0, table_1_parameters, target_parameters),
+        search_attempt.has_dls == 1,
     )
-    homotopy_steps = jnp.where(is_homotopy_attempt, cycle_options.homotopy_steps, 0)
-    start_state = predict_start_from_gait_surface(collocation_system, start_parameters, has_dls)
-    continues_previous_segment = _has_attempt_name(attempt_index, "guess, on", "surface, on") | (
-        (homotopy_segment_number > 1) & ~is_second_homotopy_try
-    )
-    start_state = jax.tree.map(
-        lambda surface_value, previous_value: jnp.where(
-            continues_previous_segment, previous_value, surface_value
-        ),
-        start_state,
-        search_result.collocation_state,
+    start_state = select_trees_by_condition(
+        search_attempt.continues_last_attempt == 1, last_state, start_state
     )
     if search_guess is not None:
-        is_guess_attempt = _has_attempt_name(attempt_index, "guess")
-        start_state = jax.tree.map(
-            lambda surface_value, guess_value: jnp.where(
-                is_guess_attempt, guess_value, surface_value
-            ),
-            start_state,
-            search_guess,
+        start_state = select_trees_by_condition(
+            search_attempt.starts_from_guess == 1, search_guess, start_state
         )
-    is_lane_pending = search_result.collocation_state.has_cycle < 0.5
-    is_lane_pending &= ~is_homotopy_segment_attempt | (
-        search_result.collocation_state.failed_check
-        == jnp.where(is_second_homotopy_try, float(HomotopyFailure.FIRST_TRY_FAILED), 0.0)
+    is_lane_pending = (last_state.has_cycle < 0.5) & (
+        ~is_on_segment
+        | (
+            last_state.failed_check
+            == jnp.where(is_second_try, float(HomotopyFailure.FIRST_TRY_FAILED), 0.0)
+        )
     )
     attempt_result = run_newton_iterations(
         collocation_system,
         target_parameters,
         start_state,
         table_1_parameters,
-        homotopy_steps,
-        select_by_attempt(max_iterations_by_attempt),
+        search_attempt.homotopy_steps,
+        search_attempt.max_newton_iterations,
         is_lane_pending,
     )
-    if collocation_system.period_n == 1:
-        # The result for a wheel on the homotopy may decide the search for the wheel at its end.
-        collocation_state = attempt_result.collocation_state
-        failure_code = jnp.where(
-            is_second_homotopy_try,
+    # The result for a wheel on the homotopy may decide the search for the wheel at its end.
+    has_cycle = attempt_result.collocation_state.has_cycle
+    failed_check = attempt_result.collocation_state.failed_check
+    homotopy_check = jnp.where(
+        failed_check > 0.0,
+        failed_check + jnp.where(is_before_target, HOMOTOPY_FAILURE_OFFSET, 0.0),
+        jnp.where(
+            is_second_try,
             float(HomotopyFailure.BOTH_TRIES_FAILED),
             float(HomotopyFailure.FIRST_TRY_FAILED),
-        )
-        has_cycle, failed_check = collocation_state.has_cycle, collocation_state.failed_check
-        continues_homotopy = ~is_last_homotopy_segment & (
-            (has_cycle > 0.5) | (failed_check == FAILED_MESH_CHECK_CODE)
-        )
-        final_failed_check = jnp.where(
-            is_last_homotopy_segment, failed_check, failed_check + HOMOTOPY_FAILURE_OFFSET
-        )
-        failed_check_code = jnp.where(
-            (has_cycle > 0.5) | (failed_check > 0.0), final_failed_check, failure_code
-        )
-        failed_check_code = jnp.where(continues_homotopy, 0.0, failed_check_code)
-        homotopy_state = collocation_state._replace(
-            has_cycle=jnp.where(is_last_homotopy_segment, has_cycle, 0.0),
-            failed_check=failed_check_code,
-        )
-        collocation_state = jax.tree.map(
-            lambda new_value, old_value: jnp.where(
-                is_homotopy_segment_attempt, new_value, old_value
-            ),
-            homotopy_state,
-            attempt_result.collocation_state,
-        )
-        attempt_result = attempt_result._replace(collocation_state=collocation_state)
-    merged_search_result = jax.tree.map(
-        lambda new_value, old_value: jnp.where(is_lane_pending, new_value, old_value),
-        attempt_result,
-        search_result,
+        ),
     )
+    is_segment_solved = (has_cycle > 0.5) | (
+        is_before_target & (failed_check == FAILED_MESH_CHECK_CODE)
+    )
+    homotopy_check = jnp.where(is_segment_solved, 0.0, homotopy_check)
+    attempt_result = attempt_result._replace(
+        collocation_state=attempt_result.collocation_state._replace(
+            has_cycle=jnp.where(is_before_target, 0.0, has_cycle),
+            failed_check=jnp.where(is_on_segment, homotopy_check, failed_check),
+        )
+    )
+    merged_result = select_trees_by_condition(is_lane_pending, attempt_result, search_result)
     # The first inadmissible root is reported, unless a later one fails only the mesh check.
-    failed_check_before, failed_check_after = (
-        search_result.collocation_state.failed_check,
-        merged_search_result.collocation_state.failed_check,
-    )
+    merged_state = merged_result.collocation_state
     failed_check = jnp.where(
-        (failed_check_before <= 0.0) | (failed_check_after == FAILED_MESH_CHECK_CODE),
-        failed_check_after,
-        failed_check_before,
+        (last_state.failed_check <= 0.0) | (merged_state.failed_check == FAILED_MESH_CHECK_CODE),
+        merged_state.failed_check,
+        last_state.failed_check,
     )
-    failed_check = jnp.where(
-        merged_search_result.collocation_state.has_cycle > 0.5, 0.0, failed_check
-    )
-    collocation_state = merged_search_result.collocation_state._replace(failed_check=failed_check)
-    return merged_search_result._replace(
-        collocation_state=collocation_state,
+    failed_check = jnp.where(merged_state.has_cycle > 0.5, 0.0, failed_check)
+    return merged_result._replace(
+        collocation_state=merged_state._replace(failed_check=failed_check),
         n_newton_iterations=search_result.n_newton_iterations + attempt_result.n_newton_iterations,
     )
 
@@ -822,16 +691,18 @@ def search_all_attempts(
     - `run_attempts`: batched form of `run_search_attempts`;
     - `parameters_and_guess`: the parameters and, optionally, a guess.
     """
-    parameters, n_lanes = parameters_and_guess[0], parameters_and_guess[0].shape[-1]
+    parameters = parameters_and_guess[0]
+    n_lanes = parameters.shape[-1]
+    # The first two attempts require a guess.
+    first_attempt_index = jnp.asarray(2 if len(parameters_and_guess) == 1 else 0, jnp.int32)
     # For several gait steps, the homotopy would continue a gait of one step, which decides nothing.
-    n_attempts = len(SEARCH_ATTEMPTS) + 2 * collocation_system.search_limits.n_homotopy_segments * (
-        collocation_system.period_n == 1
-    )
-    first_attempt_index = jnp.asarray(
-        SEARCH_ATTEMPTS.index("surface" if len(parameters_and_guess) == 1 else "guess"), jnp.int32
+    n_attempts = (
+        len(list_search_attempts(collocation_system.cycle_options))
+        if collocation_system.period_n == 1
+        else N_DIRECT_ATTEMPTS
     )
     search_result = init_search_result(collocation_system, parameters)
-    if n_lanes <= collocation_system.search_limits.max_lanes_without_gathering:
+    if n_lanes <= CYCLE_SEARCH_LIMITS.max_lanes_without_gathering:
         return run_attempts(
             parameters,
             search_result,
@@ -855,7 +726,7 @@ def search_all_attempts(
             lambda x: x[..., lane_order_pending_first], (lane_indices, *lane_arrays)
         )
         end_attempt_index = jnp.where(
-            attempt_index < len(SEARCH_ATTEMPTS), attempt_index + 1, n_attempts
+            attempt_index < N_DIRECT_ATTEMPTS, attempt_index + 1, n_attempts
         )
         return (
             end_attempt_index,
@@ -882,11 +753,10 @@ def _can_attempt_change_result(
     attempt_index: Int[Array, ""], search_result: CycleSearchResult
 ) -> Bool[Array, " lanes"]:
     """Return for each wheel (lane) whether an attempt can still change its search result."""
-    is_lane_decided = (search_result.collocation_state.failed_check > 0.0) | (
-        search_result.collocation_state.failed_check == HomotopyFailure.BOTH_TRIES_FAILED
-    )
+    failed_check = search_result.collocation_state.failed_check
+    is_lane_decided = (failed_check > 0.0) | (failed_check == HomotopyFailure.BOTH_TRIES_FAILED)
     return (search_result.collocation_state.has_cycle < 0.5) & (
-        (attempt_index < len(SEARCH_ATTEMPTS)) | ~is_lane_decided
+        (attempt_index < N_DIRECT_ATTEMPTS) | ~is_lane_decided
     )
 
 
@@ -894,20 +764,17 @@ def init_search_result(
     collocation_system: CollocationSystem, parameters: LaneParameters
 ) -> CycleSearchResult:
     """Return the search result of each wheel (lane) before the first attempt."""
-    section_size, n_phases = (
-        collocation_system.phase_sequence.section_size,
-        len(collocation_system.phase_sequence.phases),
-    )
-    make_zeros = lambda *array_shape: jnp.zeros(
-        (*array_shape, parameters.shape[-1]), parameters.dtype
-    )
+    section_size = collocation_system.phase_sequence.section_size
+    zeros = jnp.zeros_like(parameters[0])
     return CycleSearchResult(
-        make_start_state(
-            collocation_system, make_zeros(section_size), make_zeros(n_phases), make_zeros() > 0.0
+        collocation_state=make_zeros_like_output(
+            functools.partial(predict_start_from_gait_surface, collocation_system),
+            parameters,
+            zeros,
         ),
-        make_zeros(section_size, section_size),
-        make_zeros() + jnp.inf,
-        make_zeros().astype(jnp.int32),
+        monodromy_matrix=jnp.zeros((section_size, section_size, *zeros.shape), zeros.dtype),
+        correction_norm=zeros + jnp.inf,
+        n_newton_iterations=zeros.astype(jnp.int32),
     )
 
 
@@ -930,11 +797,7 @@ class HomotopyFailure(IntEnum):
     BOTH_TRIES_FAILED = -2
 
 
-SEARCH_ATTEMPTS = ("guess", "guess, on", "surface", "surface, on", "homotopy", "without DLS")
-"""Names of the attempts in the order in which they run.
-
-The first two attempts start from the guess, if there is one. The next two start from the gait that
-the stored surface predicts. A homotopy from the wheel in Table 1 of the paper follows. The last
-attempt searches for a cycle without double support. The attempts "guess" and "surface" have few
-Newton iterations, so that wheels that need more iterations are gathered in separate blocks.
-"""
+N_DIRECT_ATTEMPTS = sum(
+    search_attempt.homotopy_segment == 0 for search_attempt in list_search_attempts(CycleOptions())
+)
+"""Number of attempts before those of the last homotopy."""

@@ -22,7 +22,6 @@ from vrw_jax.cycles.collocation_search import (
     CollocationSystem,
     CycleSearchResult,
     LaneParameters,
-    compute_state_tangents,
     run_search_attempts,
     search_all_attempts,
 )
@@ -49,15 +48,23 @@ def _compute_collocation_tangents(
 ) -> CollocationState:
     """Return the derivatives of the collocation state with respect to the parameters.
 
-    The parameters are on a leading axis. The derivatives are zero for wheels (lanes) without a
-    cycle.
+    The parameters are on a leading axis. The derivatives of the active phases and of the results of
+    admissibility checks are zero, and all derivatives are zero for wheels (lanes) without a cycle.
     """
     cycle_linearization = collocation_system.linearize_at(
-        parameters, collocation_state, tuple(range(parameters.shape[0]))
+        parameters,
+        collocation_state.solution,
+        collocation_state.is_phase_active,
+        tuple(range(len(parameters))),
     )
-    return _zero_without_cycle(
-        collocation_state, compute_state_tangents(cycle_linearization, collocation_state)
+    zero_tangents = jax.tree.map(
+        lambda x: jnp.zeros((len(parameters), *x.shape), x.dtype), collocation_state
     )
+    state_tangents = zero_tangents._replace(
+        solution=cycle_linearization.parameter_tangents,
+        gait_step_end_states=cycle_linearization.gait_step_end_tangents,
+    )
+    return _zero_without_cycle(collocation_state, state_tangents)
 
 
 def _compute_masked_monodromy(
@@ -68,9 +75,10 @@ def _compute_masked_monodromy(
     """Return the monodromy matrix for each wheel (lane), which is zero if the wheel has
     no cycle.
     """
-    return _zero_without_cycle(
-        collocation_state, collocation_system.linearize_at(parameters, collocation_state).monodromy
+    cycle_linearization = collocation_system.linearize_at(
+        parameters, collocation_state.solution, collocation_state.is_phase_active
     )
+    return _zero_without_cycle(collocation_state, cycle_linearization.monodromy)
 
 
 def _compute_monodromy_tangents(
@@ -90,55 +98,31 @@ def _compute_monodromy_tangents(
       parameters.
     """
     collocation_state, state_tangents = solution_and_tangents
-    hub_mass_index, leg_mass_index = (
-        PARAMETER_NAMES.index(parameter_name) for parameter_name in ("hub_mass", "leg_mass")
-    )
+    hub_mass_index = PARAMETER_NAMES.index("hub_mass")
+    leg_mass_index = PARAMETER_NAMES.index("leg_mass")
     total_mass = parameters[hub_mass_index] + parameters[leg_mass_index]
-    hub_mass_share, leg_mass_share = (
-        parameters[hub_mass_index] / total_mass,
-        parameters[leg_mass_index] / total_mass,
-    )
+    hub_mass_share = parameters[hub_mass_index] / total_mass
+    leg_mass_share = parameters[leg_mass_index] / total_mass
     unscaled_parameter_indices = [
         i
         for i in range(len(parameters))
         if i not in (hub_mass_index, leg_mass_index, *scales.UNIT_SCALING_BY_PARAMETER_INDEX)
     ]
-    unit_weights, zero_weights = jnp.ones_like(total_mass), jnp.zeros_like(total_mass)
-    first_parameter_indices = jnp.asarray([*unscaled_parameter_indices, leg_mass_index])
-    second_parameter_indices = jnp.asarray([*unscaled_parameter_indices, hub_mass_index])
-    mass_direction_weights = (
-        jnp.stack([unit_weights] * len(unscaled_parameter_indices) + [hub_mass_share]),
-        jnp.stack([zero_weights] * len(unscaled_parameter_indices) + [-leg_mass_share]),
-    )
     identity_matrix = jnp.eye(len(parameters), dtype=parameters.dtype)[..., None]
     parameter_tangents = jnp.broadcast_to(identity_matrix, (len(parameters), *parameters.shape))
 
-    def compute_monodromy_tangent(parameter_indices_and_weights: tuple) -> tuple[Array, Array]:
-        (
-            first_parameter_index,
-            second_parameter_index,
-            first_direction_weight,
-            second_direction_weight,
-        ) = parameter_indices_and_weights
-        select_tangent = lambda x, first_parameter_index: lax.dynamic_index_in_dim(
-            x, first_parameter_index, keepdims=False
-        )
-        parameter_indices_and_weights = jax.tree.map(
-            lambda x: (
-                first_direction_weight * select_tangent(x, first_parameter_index)
-                + second_direction_weight * select_tangent(x, second_parameter_index)
-            ),
-            (parameter_tangents, state_tangents),
-        )
-        return jax.jvp(
-            functools.partial(_compute_masked_monodromy, collocation_system),
-            (parameters, collocation_state),
-            parameter_indices_and_weights,
-        )
+    def select_directions(x: Array) -> Array:
+        """Return the tangents in the computed directions. The last one is that of the masses."""
+        mass_tangent = hub_mass_share * x[leg_mass_index] - leg_mass_share * x[hub_mass_index]
+        return jnp.stack([*(x[i] for i in unscaled_parameter_indices), mass_tangent])
 
     monodromy_matrices, monodromy_tangents = lax.map(
-        compute_monodromy_tangent,
-        (first_parameter_indices, second_parameter_indices, *mass_direction_weights),
+        lambda tangents: jax.jvp(
+            functools.partial(_compute_masked_monodromy, collocation_system),
+            (parameters, collocation_state),
+            tangents,
+        ),
+        jax.tree.map(select_directions, (parameter_tangents, state_tangents)),
     )
     tangent_by_parameter = dict(
         zip(unscaled_parameter_indices, monodromy_tangents[:-1], strict=True)
@@ -239,49 +223,35 @@ def _search_in_scaled_units(
     wheel_units = compute_wheel_units(
         compute_symbols(collocation_system.n_legs, *parameters)
     )._replace(mass_unit=1.0)
-    angle_unit, time_unit = jnp.ones_like(wheel_units.time_unit), wheel_units.time_unit
+    time_unit = wheel_units.time_unit
+    angle_unit = jnp.ones_like(time_unit)
     position_units = jnp.stack([angle_unit, wheel_units.length_unit, wheel_units.length_unit])
     section_units = jnp.stack([angle_unit, 1.0 / time_unit])
-    step_end_units = jnp.concatenate([position_units[:2], position_units[:2] / time_unit])
-
-    def convert_units(
-        collocation_state: CollocationState, scale_by_unit: Callable[[Array, Array], Array]
-    ) -> CollocationState:
-        """Convert each array of a collocation state by `scale_by_unit(array, unit)`."""
-        collocation_solution = collocation_state.solution
-        accelerations = tuple(
-            scale_by_unit(x, position_units[: x.shape[-2]] / (time_unit * time_unit))
-            for x in collocation_solution.accelerations
-        )
-        collocation_solution = CollocationSolution(
-            scale_by_unit(collocation_solution.section_state, section_units),
-            scale_by_unit(collocation_solution.durations, time_unit),
-            accelerations,
-        )
-        return collocation_state._replace(
-            solution=collocation_solution,
-            gait_step_end_states=scale_by_unit(
-                collocation_state.gait_step_end_states, step_end_units
-            ),
-        )
-
-    scaled_search_guess = tuple(
-        convert_units(si_guess_state, operator.truediv) for si_guess_state in si_guess
+    acceleration_units = tuple(
+        position_units[: phase.n_coordinates] / (time_unit * time_unit)
+        for phase in collocation_system.phase_sequence.phases
     )
-    parameter_units = [
-        wheel_units.compute_unit_in_si(parameter_domain.unit)
-        for parameter_domain in PARAMETER_DOMAINS.values()
-    ]
+    no_unit: Any = 1.0
+    state_units = CollocationState(
+        solution=CollocationSolution(section_units, time_unit, acceleration_units),
+        is_phase_active=no_unit,
+        has_cycle=no_unit,
+        failed_check=no_unit,
+        gait_step_end_states=jnp.concatenate([position_units[:2], position_units[:2] / time_unit]),
+    )
+    scaled_search_guess = jax.tree.map(operator.truediv, si_guess, (state_units,) * len(si_guess))
     scaled_parameters = [
-        parameter_value / parameter_unit
-        for parameter_value, parameter_unit in zip(parameters, parameter_units, strict=True)
+        parameter_value / wheel_units.compute_unit_in_si(parameter_domain.unit)
+        for parameter_value, parameter_domain in zip(
+            parameters, PARAMETER_DOMAINS.values(), strict=True
+        )
     ]
     search_result = search_all_attempts(
         collocation_system, run_attempts, jnp.stack(scaled_parameters), *scaled_search_guess
     )
     monodromy_matrix = section_units[:, None] * search_result.monodromy_matrix / section_units
     return search_result._replace(
-        collocation_state=convert_units(search_result.collocation_state, operator.mul),
+        collocation_state=jax.tree.map(operator.mul, search_result.collocation_state, state_units),
         monodromy_matrix=monodromy_matrix,
     )
 

@@ -5,7 +5,6 @@ phase. Impacts and changes of phase are no peaks.
 """
 
 import functools
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -39,9 +38,9 @@ def compute_force_peaks(
     Each measure is the largest value over the gait steps of the cycle.
     """
     wheel_symbols = make_wheel_from_parameters(parameters, collocation_system.n_legs).symbols()
-    peaks_by_step, (_, phase_points_by_step) = (
-        [],
-        collocation_system.evaluate_phase_points(parameters, collocation_solution),
+    peaks_by_step = []
+    phase_points_by_step = collocation_system.evaluate_phase_points(
+        parameters, collocation_solution
     )
     for step_index, phase_points in enumerate(phase_points_by_step):
         wheel_phases = make_paper_phases(
@@ -50,7 +49,8 @@ def compute_force_peaks(
             stop_at_lift_off=False,
         )
         phase_durations = collocation_solution.durations[step_index]
-        fore_force_extrema, total_force_extrema = [], []
+        fore_force_extrema = []
+        total_force_extrema = []
         for phase_index, (phase, points_of_phase) in enumerate(
             zip(wheel_phases, phase_points, strict=True)
         ):
@@ -70,20 +70,14 @@ def compute_force_peaks(
                 if has_rear_foot
                 else fore_force_extrema[-1]
             )
-        fore_force_peaks, total_force_peaks = (
-            _summarize_force_extrema(force_extrema, phase_durations)
-            for force_extrema in (fore_force_extrema, total_force_extrema)
-        )
+        total_force_peaks = _summarize_force_extrema(total_force_extrema, phase_durations)
         end_point = phase_points[-1].phase_end_point
         landing_result = transitions.resolve_landing(wheel_symbols, end_point.q[0], *end_point.v)
         peaks_by_step.append(
             {
-                "n_force_peaks": fore_force_peaks.n_peaks,
-                "peak_force": fore_force_peaks.peak_force,
-                "force_trough_depth": fore_force_peaks.force_trough_depth,
-                "second_peak_rate": fore_force_peaks.second_peak_rate,
-                "n_total_force_peaks": total_force_peaks.n_peaks,
-                "peak_total_force": total_force_peaks.peak_force,
+                **_summarize_force_extrema(fore_force_extrema, phase_durations),
+                "n_total_force_peaks": total_force_peaks["n_force_peaks"],
+                "peak_total_force": total_force_peaks["peak_force"],
                 "landing_impulse": landing_result.fore_impulse.normal,
             }
         )
@@ -116,19 +110,13 @@ def _find_force_extrema(
     return find_quantity_extrema(collocated_phase, evaluate_acceleration, evaluate_normal_force)
 
 
-class _ForcePeaks(NamedTuple):
-    """Measures for the peaks of a force in one gait step, as in `measures.FORCE_PEAK_MEASURES`."""
-
-    n_peaks: Scalar
-    peak_force: Scalar
-    force_trough_depth: Scalar
-    second_peak_rate: Scalar
-
-
 def _summarize_force_extrema(
     extrema_of_phases: list[PhaseExtrema], phase_durations: Array
-) -> _ForcePeaks:
-    """Compute the force-peak measures of a gait step from the extrema in its phases."""
+) -> dict[str, Scalar]:
+    """Compute the measures of a gait step for one force, from the extrema in its phases.
+
+    The measures are those of the fore foot in `measures.FORCE_PEAK_MEASURES`, by name.
+    """
     phase_start_times = jnp.cumsum(phase_durations) - phase_durations
     shifted_extrema = [
         step_extrema._replace(
@@ -140,36 +128,32 @@ def _summarize_force_extrema(
     step_extrema = jax.tree.map(
         lambda *values_by_phase: jnp.concatenate(values_by_phase), *shifted_extrema
     )
-    peak_forces = jnp.where(
-        step_extrema.is_quantity_maximum, step_extrema.extremum_values, -jnp.inf
-    )
+    is_peak = step_extrema.is_quantity_maximum
+    peak_forces = jnp.where(is_peak, step_extrema.extremum_values, -jnp.inf)
     extremum_indices = jnp.arange(len(peak_forces))
     find_highest_peak_force = lambda extremum_mask: jnp.max(
         jnp.where(extremum_mask, peak_forces, -jnp.inf), axis=1
     )
-    highest_peak_force_before = find_highest_peak_force(
-        extremum_indices < extremum_indices[:, None]
+    lower_neighbor_peak_force = jnp.minimum(
+        find_highest_peak_force(extremum_indices < extremum_indices[:, None]),
+        find_highest_peak_force(extremum_indices > extremum_indices[:, None]),
     )
-    highest_peak_force_after = find_highest_peak_force(extremum_indices > extremum_indices[:, None])
-    lower_neighbor_peak_force = jnp.minimum(highest_peak_force_before, highest_peak_force_after)
     is_force_trough = step_extrema.is_quantity_minimum & jnp.isfinite(lower_neighbor_peak_force)
     force_trough_depths = jnp.where(
         is_force_trough,
         jnp.where(is_force_trough, lower_neighbor_peak_force, 0.0) - step_extrema.extremum_values,
         0.0,
     )
-    first_peak_time = jnp.min(
-        jnp.where(step_extrema.is_quantity_maximum, step_extrema.extremum_times, jnp.inf)
-    )
+    first_peak_time = jnp.min(jnp.where(is_peak, step_extrema.extremum_times, jnp.inf))
     is_later_rate_maximum = step_extrema.is_rate_maximum & (
         step_extrema.rate_extremum_times > first_peak_time
     )
     largest_force_rate = jnp.max(
         jnp.where(is_later_rate_maximum, step_extrema.rate_extremum_values, -jnp.inf)
     )
-    return _ForcePeaks(
-        n_peaks=jnp.sum(step_extrema.is_quantity_maximum).astype(phase_durations.dtype),
-        peak_force=jnp.where(jnp.any(step_extrema.is_quantity_maximum), jnp.max(peak_forces), 0.0),
-        force_trough_depth=jnp.max(force_trough_depths),
-        second_peak_rate=jnp.where(jnp.any(is_later_rate_maximum), largest_force_rate, jnp.nan),
-    )
+    return {
+        "n_force_peaks": jnp.sum(is_peak).astype(phase_durations.dtype),
+        "peak_force": jnp.where(jnp.any(is_peak), jnp.max(peak_forces), 0.0),
+        "force_trough_depth": jnp.max(force_trough_depths),
+        "second_peak_rate": jnp.where(jnp.any(is_later_rate_maximum), largest_force_rate, jnp.nan),
+    }

@@ -25,7 +25,6 @@ from vrw_jax.cycles.collocation_search import (
     FAILED_MESH_CHECK_CODE,
     CollocationState,
     CollocationSystem,
-    init_search_flags,
 )
 from vrw_jax.cycles.cycle import AbstractCycle
 from vrw_jax.cycles.derivatives import attach_monodromy_derivatives, solve_cycle_with_derivatives
@@ -224,17 +223,14 @@ class LimitCycle(AbstractCycle):
         )
 
     def model_summary_rows(self) -> list[LabelAndText]:
-        landing_indicators = self.indicators
         indicator_text = (
-            f"{format_numbers(landing_indicators.lambda_I4)} N s, "
-            f"{format_numbers(landing_indicators.lambda_2)} N"
+            f"{format_numbers(self.indicators.lambda_I4)} N s, "
+            f"{format_numbers(self.indicators.lambda_2)} N, "
+            f"{format_numbers(self.indicators.lambda_4)} N"
         )
         return [
             ("durations of DLS, SLS-I, SLS-II", f"{format_numbers(self.durations)} s"),
-            (
-                "indicators λ_I4, λ2⁺, λ4⁺",
-                f"{indicator_text}, {format_numbers(landing_indicators.lambda_4)} N",
-            ),
+            ("indicators λ_I4, λ2⁺, λ4⁺", indicator_text),
         ]
 
 
@@ -261,7 +257,7 @@ def _compute_takeoff_acceleration(
 ) -> Array:
     """Return the lowest take-off acceleration over the gait steps of a cycle, m/s^2."""
     s = make_wheel_from_parameters(parameters, collocation_system.n_legs).symbols()
-    _, points_by_step = collocation_system.evaluate_phase_points(
+    points_by_step = collocation_system.evaluate_phase_points(
         parameters, collocation_state.solution
     )
     return jnp.min(
@@ -287,81 +283,64 @@ def _solve_limit_cycle(
 ) -> LimitCycle:
     """Find the cycle of one wheel by the search, outside compiled code."""
     is_in_domain = params.is_in_domain()
-    table_1_params = WheelParams(n_legs=collocation_system.n_legs)
-    in_domain_params = jax.tree.map(
-        lambda given_parameter_value, default_parameter_value: jnp.where(
-            is_in_domain,
-            given_parameter_value,
-            default_parameter_value.astype(given_parameter_value.dtype),
-        ),
-        params,
-        table_1_params,
+    parameters = stack_parameters(params)
+    table_1_parameters = stack_parameters(WheelParams(n_legs=collocation_system.n_legs)).astype(
+        parameters.dtype
     )
-    parameters = stack_parameters(in_domain_params)
+    parameters = jnp.where(is_in_domain, parameters, table_1_parameters)
     collocation_state, (monodromy_value, newton_residual, n_newton_iterations) = (
         solve_cycle_with_derivatives(collocation_system, parameters, cycle_guess)
     )
     has_cycle = is_in_domain & (collocation_state.has_cycle > 0.5)
     # Inputs and outputs are masked, so that measures and derivatives are zero if there is no cycle.
-    zero_without_gait = lambda given_parameter_value: jnp.where(
-        has_cycle, given_parameter_value, 0.0
-    )
-    replace_if_missing = lambda given_parameter_value, default_parameter_value: jnp.where(
-        has_cycle, given_parameter_value, default_parameter_value
-    )
-    parameters = jax.tree.map(
-        replace_if_missing, parameters, stack_parameters(table_1_params).astype(parameters.dtype)
-    )
+    zero_without_gait = lambda value_of_gait: jnp.where(has_cycle, value_of_gait, 0.0)
+    parameters = jnp.where(has_cycle, parameters, table_1_parameters)
 
     wheel_symbols = make_wheel_from_parameters(parameters, collocation_system.n_legs).symbols()
     period_n = collocation_system.period_n
     # The states are theta, its rate and the rate of L1. At touchdown, L1 follows from theta.
-    touchdown_states = jnp.concatenate(
-        [
-            collocation_state.gait_step_end_states[:, :1],
-            collocation_state.gait_step_end_states[:, 2:],
-        ],
-        1,
-    )
+    step_end_states = collocation_state.gait_step_end_states
+    touchdown_states = jnp.concatenate([step_end_states[:, :1], step_end_states[:, 2:]], 1)
     # The landing at the start of a step follows the state at the end of the previous step.
     landing_results = jax.vmap(
-        lambda given_parameter_value: transitions.resolve_landing(
-            wheel_symbols, *given_parameter_value
-        )
+        lambda touchdown_state: transitions.resolve_landing(wheel_symbols, *touchdown_state)
     )(jnp.roll(touchdown_states, 1, 0))
     fore_force, rear_force = jax.vmap(
         lambda landing_result: transitions.compute_landing_forces(wheel_symbols, landing_result)
     )(landing_results)
 
-    def select_step_values(values_by_step: Array) -> Array:
-        return zero_without_gait(values_by_step[0] if period_n == 1 else values_by_step)
-
-    phase_durations = collocation_state.solution.durations
-    outcome_code = jnp.where(
-        collocation_state.failed_check > 0.0, Outcome.EVENT_ORDER_MISMATCH, Outcome.NO_CYCLE_FOUND
+    select_step_values = lambda values_by_step: zero_without_gait(
+        values_by_step[0] if period_n == 1 else values_by_step
     )
-    outcome_code = jnp.where(
-        collocation_state.failed_check == FAILED_MESH_CHECK_CODE,
-        Outcome.MESH_TOO_COARSE,
-        outcome_code,
+    failed_check = collocation_state.failed_check
+    outcome_code = jnp.select(
+        [
+            ~is_in_domain,
+            has_cycle,
+            failed_check > FAILED_MESH_CHECK_CODE,
+            failed_check == FAILED_MESH_CHECK_CODE,
+            failed_check > 0.0,
+        ],
+        [
+            Outcome.BAD_INPUT,
+            Outcome.STEPPED,
+            Outcome.BRANCH_ENDS_BEFORE_TARGET,
+            Outcome.MESH_TOO_COARSE,
+            Outcome.EVENT_ORDER_MISMATCH,
+        ],
+        Outcome.NO_CYCLE_FOUND,
     )
-    outcome_code = jnp.where(
-        collocation_state.failed_check > FAILED_MESH_CHECK_CODE,
-        Outcome.BRANCH_ENDS_BEFORE_TARGET,
-        outcome_code,
-    )
-    outcome_code = jnp.where(has_cycle, Outcome.STEPPED, outcome_code)
     return LimitCycle(
         section_state=zero_without_gait(touchdown_states[-1]),
         post_impact=zero_without_gait(collocation_state.solution.section_state),
-        durations=select_step_values(phase_durations),
+        durations=select_step_values(collocation_state.solution.durations),
         step_length=select_step_values(landing_results.foot_distance),
         indicators=DoubleSupportIndicators(
             lambda_I4=select_step_values(landing_results.rear_impulse.normal),
             lambda_2=select_step_values(fore_force.normal),
             lambda_4=select_step_values(rear_force.normal),
         ),
-        outcome=jnp.where(is_in_domain, outcome_code, Outcome.BAD_INPUT).astype(jnp.int32),
+        outcome=outcome_code.astype(jnp.int32),
         residual=jnp.where(jnp.isfinite(newton_residual), newton_residual, 1.0),
         n_newton_iterations=n_newton_iterations,
         parameters=parameters,
@@ -399,7 +378,8 @@ def sample_walk_in_time(
       fast start of a gait step without double support. Newton's method then fails, for example with
       33 samples at c = 221 N s/m.
     """
-    step_options, wheel_symbols = StepOptions(), params.symbols()
+    step_options = StepOptions()
+    wheel_symbols = params.symbols()
     landing_result = transitions.resolve_landing(wheel_symbols, *section_state)
     post_impact_state = jnp.stack(
         [landing_result.theta_after_landing, landing_result.motion_after.dtheta]
@@ -458,8 +438,7 @@ def guess_cycle_from_walk(
     guessed_solution = CollocationSolution(
         walk_samples.post_impact, walk_samples.phase_durations, phase_accelerations
     )
-    search_flags = init_search_flags(collocation_system, walk_samples.post_impact)
-    return lax.stop_gradient(CollocationState(guessed_solution, is_phase_active, *search_flags))
+    return lax.stop_gradient(CollocationState.make_start(guessed_solution, is_phase_active))
 
 
 @functools.partial(jax.jit, static_argnums=(0, 1))
