@@ -14,9 +14,9 @@ from vrw_jax.collocation.gauss import (
     N_GAUSS_NODES,
     PhaseMesh,
     build_differentiation_matrix,
-    build_mesh_transfer_matrix,
     compute_integration_weights,
     compute_lagrange_weights,
+    transfer_accelerations,
 )
 from vrw_jax.collocation.phase_collocation import (
     CollocationPhase,

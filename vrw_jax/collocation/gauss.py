@@ -2,7 +2,9 @@
 
 from typing import NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 from numpy.polynomial import legendre
 
 N_GAUSS_NODES = 4
@@ -57,15 +59,18 @@ class PhaseMesh(NamedTuple):
         return np.diff(interval_boundary_fractions)
 
     @property
+    def interval_boundary_fractions(self) -> np.ndarray:
+        """Return the time of each interval boundary as a fraction of the phase's duration."""
+        return np.concatenate([[0.0], np.cumsum(self.interval_length_fractions)])
+
+    @property
     def node_time_fractions(self) -> np.ndarray:
         """Return the time of each node as a fraction of the phase's duration.
 
         Times are measured from the start of the phase.
         """
-        interval_starts = np.cumsum(self.interval_length_fractions) - self.interval_length_fractions
-        return (
-            interval_starts[:, None] + self.interval_length_fractions[:, None] * GAUSS_NODES
-        ).ravel()
+        interval_starts = self.interval_boundary_fractions[:-1, None]
+        return (interval_starts + self.interval_length_fractions[:, None] * GAUSS_NODES).ravel()
 
 
 def build_phase_integration_matrices(phase_mesh: PhaseMesh) -> tuple[np.ndarray, ...]:
@@ -75,35 +80,14 @@ def build_phase_integration_matrices(phase_mesh: PhaseMesh) -> tuple[np.ndarray,
     matrices belong to the nodes in the order of time. The last row belongs to the end of the phase.
     """
     n_nodes = phase_mesh.n_intervals * N_GAUSS_NODES
-    rate_integration_matrix, position_integration_matrix = (
-        np.zeros((n_nodes + 1, n_nodes)),
-        np.zeros((n_nodes + 1, n_nodes)),
-    )
-    node_times = np.ones(n_nodes + 1)
-    interval_rate_weights, interval_position_weights, interval_start = (
-        np.zeros(n_nodes),
-        np.zeros(n_nodes),
-        0.0,
-    )
+    integration_matrix = np.zeros((n_nodes + 1, n_nodes))
     for interval_index, h in enumerate(phase_mesh.interval_length_fractions):
-        node_slice = slice(interval_index * N_GAUSS_NODES, (interval_index + 1) * N_GAUSS_NODES)
-        rate_integration_matrix[node_slice] = interval_rate_weights
-        position_integration_matrix[node_slice] = (
-            interval_position_weights + h * GAUSS_NODES[:, None] * interval_rate_weights
-        )
-        rate_integration_matrix[node_slice, node_slice] += h * INTEGRATION_MATRIX
-        position_integration_matrix[node_slice, node_slice] += h * h * DOUBLE_INTEGRATION_MATRIX
-        node_times[node_slice] = interval_start + h * GAUSS_NODES
-        interval_position_weights = interval_position_weights + h * interval_rate_weights
-        interval_position_weights[node_slice] += h * h * DOUBLE_END_WEIGHTS
-        interval_rate_weights = interval_rate_weights.copy()
-        interval_rate_weights[node_slice] += h * END_WEIGHTS
-        interval_start += h
-    rate_integration_matrix[n_nodes], position_integration_matrix[n_nodes] = (
-        interval_rate_weights,
-        interval_position_weights,
-    )
-    return node_times, rate_integration_matrix, position_integration_matrix
+        start, end = interval_index * N_GAUSS_NODES, (interval_index + 1) * N_GAUSS_NODES
+        integration_matrix[start:end, start:end] = h * INTEGRATION_MATRIX
+        integration_matrix[end:, start:end] = h * END_WEIGHTS
+    # Positions are integrals of the rates at the nodes.
+    position_matrix = integration_matrix @ integration_matrix[:-1]
+    return np.append(phase_mesh.node_time_fractions, 1.0), integration_matrix, position_matrix
 
 
 def compute_lagrange_weights(location_in_interval: float) -> np.ndarray:
@@ -130,33 +114,35 @@ def build_mesh_transfer_matrix(source_mesh: PhaseMesh, target_mesh: PhaseMesh) -
     that are cubic polynomials in each interval of the source mesh.
     """
 
-    def compute_interval_boundary_fractions(phase_mesh: PhaseMesh) -> np.ndarray:
-        return np.concatenate([[0.0], np.cumsum(phase_mesh.interval_length_fractions)])
-
-    source_interval_boundaries = compute_interval_boundary_fractions(source_mesh)
-    target_node_fractions = (
-        compute_interval_boundary_fractions(target_mesh)[:-1, None]
-        + target_mesh.interval_length_fractions[:, None] * GAUSS_NODES
-    ).ravel()
-    transfer_matrix = np.zeros(
-        (target_node_fractions.size, source_mesh.n_intervals * N_GAUSS_NODES)
-    )
-    for target_node_index, target_node_fraction in enumerate(target_node_fractions):
-        source_interval_index = int(
-            np.clip(
-                np.searchsorted(source_interval_boundaries, target_node_fraction) - 1,
-                0,
-                source_mesh.n_intervals - 1,
-            )
+    source_boundaries = source_mesh.interval_boundary_fractions
+    target_node_fractions = target_mesh.node_time_fractions
+    transfer_matrix = np.zeros((len(target_node_fractions), len(source_mesh.node_time_fractions)))
+    source_interval_indices = np.searchsorted(source_boundaries[1:-1], target_node_fractions)
+    for node_index, interval_index in enumerate(source_interval_indices):
+        location_in_interval = (
+            target_node_fractions[node_index] - source_boundaries[interval_index]
+        ) / source_mesh.interval_length_fractions[interval_index]
+        first_source_node = interval_index * N_GAUSS_NODES
+        transfer_matrix[node_index, first_source_node : first_source_node + N_GAUSS_NODES] = (
+            compute_lagrange_weights(location_in_interval)
         )
-        location_in_source_interval = (
-            target_node_fraction - source_interval_boundaries[source_interval_index]
-        ) / source_mesh.interval_length_fractions[source_interval_index]
-        transfer_matrix[
-            target_node_index,
-            source_interval_index * N_GAUSS_NODES : (source_interval_index + 1) * N_GAUSS_NODES,
-        ] = compute_lagrange_weights(location_in_source_interval)
     return transfer_matrix
+
+
+def transfer_accelerations(
+    source_mesh: PhaseMesh, target_mesh: PhaseMesh, node_accelerations: Array
+) -> Array:
+    """Return the node accelerations of one phase on another mesh.
+
+    The axes of the accelerations are (interval, node, ...).
+    """
+    transfer_matrix = build_mesh_transfer_matrix(source_mesh, target_mesh)
+    trailing_shape = node_accelerations.shape[2:]
+    return jnp.tensordot(
+        jnp.asarray(transfer_matrix, node_accelerations.dtype),
+        node_accelerations.reshape(-1, *trailing_shape),
+        1,
+    ).reshape(target_mesh.n_intervals, N_GAUSS_NODES, *trailing_shape)
 
 
 def build_differentiation_matrix() -> np.ndarray:

@@ -21,7 +21,7 @@ from vrw_jax.collocation import (
     N_GAUSS_NODES,
     CollocationSolution,
     PhaseMesh,
-    build_mesh_transfer_matrix,
+    transfer_accelerations,
 )
 from vrw_jax.numerics import Elementwise
 from vrw_jax.wheel import PAPER_PHASES, WheelParams
@@ -65,11 +65,10 @@ def compute_surface_coordinates(params: WheelParams) -> tuple[Elementwise, ...]:
     They are the square root of the damping, the stiffness, the natural length and the slope.
     """
     total_mass = params.hub_mass + params.n_legs * params.leg_mass
-    leg_length, gravity = params.locked_length, params.gravity
     return (
         jnp.sqrt(params.damping * compute_time_unit(params) / total_mass),
-        params.stiffness * leg_length / (total_mass * gravity),
-        params.natural_length / leg_length,
+        params.stiffness * params.locked_length / (total_mass * params.gravity),
+        params.natural_length / params.locked_length,
         params.slope,
     )
 
@@ -112,33 +111,26 @@ def predict_gait(params: WheelParams, phase_meshes: tuple[PhaseMesh, ...]) -> Co
         [predicted_surface_values[0], predicted_surface_values[1] / time_unit]
     )
     phase_durations = predicted_surface_values[None, 2:5] * time_unit
-    accelerations_by_phase, first_value_index = [], 5
-    for phase_index, surface_mesh, phase_mesh in zip(
+    # The coordinates are (theta, L1, L2).
+    coordinate_units = jnp.stack(
+        [jnp.ones_like(time_unit), params.locked_length, params.locked_length]
+    )
+    acceleration_units = coordinate_units / time_unit**2
+    accelerations_by_phase = []
+    first_value_index = 5
+    for phase_class, surface_mesh, phase_mesh in zip(
         PAPER_PHASES, GAIT_SURFACE_MESHES, phase_meshes, strict=True
     ):
-        n_coordinates = phase_index.n_dof
-        n_acceleration_values = surface_mesh.n_intervals * N_GAUSS_NODES * n_coordinates
+        n_coordinates = phase_class.n_dof
+        n_values = surface_mesh.n_intervals * N_GAUSS_NODES * n_coordinates
         surface_accelerations = predicted_surface_values[
-            first_value_index : first_value_index + n_acceleration_values
-        ].reshape(-1, n_coordinates, *monomials.shape[1:])
-        first_value_index += n_acceleration_values
-        transfer_matrix = jnp.asarray(
-            build_mesh_transfer_matrix(surface_mesh, phase_mesh), monomials.dtype
-        )
-        # The coordinates are (theta, L1, L2).
-        angular_acceleration_unit = 1.0 / time_unit**2
-        length_acceleration_unit = params.locked_length / time_unit**2
-        acceleration_units = jnp.stack(
-            [angular_acceleration_unit, length_acceleration_unit, length_acceleration_unit][
-                :n_coordinates
-            ]
-        )
-        phase_accelerations = (
-            jnp.tensordot(transfer_matrix, surface_accelerations, 1) * acceleration_units
+            first_value_index : first_value_index + n_values
+        ].reshape(surface_mesh.n_intervals, N_GAUSS_NODES, n_coordinates, *monomials.shape[1:])
+        first_value_index += n_values
+        phase_accelerations = transfer_accelerations(
+            surface_mesh, phase_mesh, surface_accelerations
         )
         accelerations_by_phase.append(
-            phase_accelerations.reshape(
-                1, phase_mesh.n_intervals, N_GAUSS_NODES, *phase_accelerations.shape[1:]
-            )
+            (phase_accelerations * acceleration_units[:n_coordinates])[None]
         )
     return CollocationSolution(section_state, phase_durations, tuple(accelerations_by_phase))

@@ -17,8 +17,8 @@ from jaxtyping import Array, Bool, Float, Int
 from vrw_jax.collocation import (
     N_GAUSS_NODES,
     CollocationSolution,
-    build_mesh_transfer_matrix,
     estimate_mesh_error,
+    transfer_accelerations,
 )
 from vrw_jax.continuation import floquet
 from vrw_jax.cycles.collocation_search import (
@@ -451,26 +451,13 @@ def transfer_solution_to_mesh(
 
     The accelerations in each mesh interval are a polynomial of time.
     """
-    accelerations_by_phase = []
-    for source_mesh, target_mesh, phase_accelerations in zip(
-        source_system.phase_meshes,
-        target_system.phase_meshes,
-        source_solution.accelerations,
-        strict=True,
-    ):
-        transfer_matrix = jnp.asarray(
-            build_mesh_transfer_matrix(source_mesh, target_mesh),
-            source_solution.section_state.dtype,
+    accelerations_by_phase = [
+        jax.vmap(functools.partial(transfer_accelerations, source_mesh, target_mesh))(accelerations)
+        for source_mesh, target_mesh, accelerations in zip(
+            source_system.phase_meshes,
+            target_system.phase_meshes,
+            source_solution.accelerations,
+            strict=True,
         )
-        n_steps, _, _, n_coordinates = phase_accelerations.shape
-        target_accelerations = jnp.einsum(
-            "ij,njd->nid", transfer_matrix, phase_accelerations.reshape(n_steps, -1, n_coordinates)
-        )
-        accelerations_by_phase.append(
-            target_accelerations.reshape(
-                n_steps, target_mesh.n_intervals, N_GAUSS_NODES, n_coordinates
-            )
-        )
-    return CollocationSolution(
-        source_solution.section_state, source_solution.durations, tuple(accelerations_by_phase)
-    )
+    ]
+    return source_solution._replace(accelerations=tuple(accelerations_by_phase))
