@@ -166,7 +166,7 @@ class _LinearizationContext(NamedTuple):
         if not self.parameter_indices:
             return evaluate_with_jvps(
                 lambda *phase_point: function_of_point(*phase_point, *self.phase_constants),
-                phase_point,
+                tuple(phase_point),
                 point_tangents,
             )
         n_duration_tangents = point_tangents[0].shape[0] - self.n_tangents
@@ -185,42 +185,15 @@ class _LinearizationContext(NamedTuple):
         )
 
 
-def _make_linearization_context(
-    section_size: int,
-    parameter_indices: tuple[int, ...],
-    parameters: LaneArray,
-    compute_phase_constants: Callable[..., PhaseConstants],
-) -> _LinearizationContext:
-    """Compute the phase constants and their tangents, and return them in a
-    linearization context.
-    """
-    prevent_fusion = make_fusion_barrier(parameters)
-    dtype, batch_shape = parameters.dtype, parameters.shape[1:]
-    unit_parameter_tangents = np.eye(parameters.shape[0], dtype=dtype)[list(parameter_indices)]
-    parameter_tangents = tuple(
-        jnp.broadcast_to(x[:, None], (len(parameter_indices), *batch_shape))
-        for x in unit_parameter_tangents.T
-    )
-    if parameter_indices:
-        phase_constants, phase_constants_tangents = evaluate_with_jvps(
-            compute_phase_constants, tuple(parameters), parameter_tangents
-        )
-    else:
-        phase_constants, phase_constants_tangents = compute_phase_constants(*parameters), ()
-    return _LinearizationContext(
-        section_size,
-        parameter_indices,
-        parameters,
-        compute_phase_constants,
-        phase_constants,
-        phase_constants_tangents,
-        prevent_fusion,
-    )
+class _PhaseState(NamedTuple):
+    """State at one time of a phase, or the tangents of a state on an additional leading axis."""
+
+    held_constants: LaneArray
+    q: LaneArray
+    v: LaneArray
 
 
-def _stack_phase_point(
-    phase_point: PhasePoint, template_component_array: Array
-) -> tuple[Array, ...]:
+def _stack_phase_point(phase_point: PhasePoint, template_component_array: Array) -> _PhaseState:
     """Stack the held constants, the coordinates and the rates of a point into one array each.
 
     A part without components becomes an empty array. Its trailing shape and type are those of
@@ -229,34 +202,21 @@ def _stack_phase_point(
     array_without_components = jnp.zeros(
         (0, *template_component_array.shape[1:]), template_component_array.dtype
     )
-    return tuple(
-        jnp.stack(components_of_point_part)
-        if components_of_point_part
-        else array_without_components
-        for components_of_point_part in phase_point
+    return _PhaseState(
+        *(
+            jnp.stack(components_of_point_part)
+            if components_of_point_part
+            else array_without_components
+            for components_of_point_part in phase_point
+        )
     )
 
 
-class _PhaseTangentState(NamedTuple):
-    """State at one time of a phase, and its tangents.
+class _StateAndTangents(NamedTuple):
+    """State at one time of a phase, and its tangents."""
 
-    The tangents have an additional leading axis.
-    """
-
-    held_constants: LaneArray
-    q: LaneArray
-    v: LaneArray
-    held_constants_tangents: LaneArray
-    q_tangents: LaneArray
-    v_tangents: LaneArray
-
-
-class _MeshInterval(NamedTuple):
-    """Length and node accelerations of one mesh interval in a phase."""
-
-    interval_length_fraction: Array  # fraction of the phase's duration
-    h: LaneArray  # length, s
-    node_accelerations: LaneArray  # (node, coordinate, batch)
+    state: _PhaseState
+    tangents: _PhaseState
 
 
 def _make_unit_tangent(n_tangents: int, tangent_index: int, float_dtype: Any) -> np.ndarray:
@@ -265,38 +225,53 @@ def _make_unit_tangent(n_tangents: int, tangent_index: int, float_dtype: Any) ->
 
 
 def _evaluate_interval_nodes(
-    tangent_state: _PhaseTangentState, mesh_interval: _MeshInterval
+    start: _StateAndTangents,
+    interval_length_fraction: Array,
+    h: LaneArray,
+    node_accelerations: LaneArray,
 ) -> tuple[Array, ...]:
-    """Return the coordinates, the rates and their tangents at the nodes of a mesh interval."""
-    interval_length_fraction, h, node_accelerations = mesh_interval
-    v, q_tangents, v_tangents = tangent_state.v, tangent_state.q_tangents, tangent_state.v_tangents
+    """Return the coordinates, the rates and their tangents at the nodes of a mesh interval.
+
+    - `interval_length_fraction`: length of the interval as a fraction of the phase's duration;
+    - `h`: length of the interval, s;
+    - `node_accelerations`: shape (node, coordinate, batch).
+    """
+    state, tangents = start
     gauss_nodes_as_column = GAUSS_NODES.astype(h.dtype)[:, None, None]
-    duration_unit_tangent = _make_unit_tangent(q_tangents.shape[0], -1, h.dtype)
+    duration_unit_tangent = _make_unit_tangent(len(tangents.q), -1, h.dtype)
     rate_increments = apply_matrix(INTEGRATION_MATRIX, node_accelerations)
     position_increments = apply_matrix(DOUBLE_INTEGRATION_MATRIX, node_accelerations)
-    node_q = tangent_state.q + h * (gauss_nodes_as_column * v + h * position_increments)
-    node_v = v + h * rate_increments
+    node_q = state.q + h * (gauss_nodes_as_column * state.v + h * position_increments)
+    node_v = state.v + h * rate_increments
     node_q_tangents = (
-        q_tangents[:, None]
-        + (h * gauss_nodes_as_column) * v_tangents[:, None]
+        tangents.q[:, None]
+        + (h * gauss_nodes_as_column) * tangents.v[:, None]
         + duration_unit_tangent
-        * (interval_length_fraction * (gauss_nodes_as_column * v + 2.0 * h * position_increments))
+        * (
+            interval_length_fraction
+            * (gauss_nodes_as_column * state.v + 2.0 * h * position_increments)
+        )
     )
-    node_v_tangents = v_tangents[:, None] + duration_unit_tangent * (
+    node_v_tangents = tangents.v[:, None] + duration_unit_tangent * (
         interval_length_fraction * rate_increments
     )
     return node_q, node_v, node_q_tangents, node_v_tangents
 
 
 def _evaluate_interval_end(
-    tangent_state: _PhaseTangentState,
-    mesh_interval: _MeshInterval,
+    start: _StateAndTangents,
+    interval_length_fraction: Array,
+    h: LaneArray,
+    node_accelerations: LaneArray,
     acceleration_tangents: LaneArray,
-) -> _PhaseTangentState:
-    """Return the state and its tangents at the end of a mesh interval."""
-    interval_length_fraction, h, node_accelerations = mesh_interval
-    _, q, v, _, q_tangents, v_tangents = tangent_state
-    duration_unit_tangent = _make_unit_tangent(q_tangents.shape[0], -1, h.dtype)[:, 0]
+) -> _StateAndTangents:
+    """Return the state and its tangents at the end of a mesh interval.
+
+    The arguments are those of `_evaluate_interval_nodes`, and the tangents of the node
+    accelerations.
+    """
+    (held_constants, q, v), (held_constants_tangents, q_tangents, v_tangents) = start
+    duration_unit_tangent = _make_unit_tangent(len(q_tangents), -1, h.dtype)[:, 0]
     rate_increment = sum_with_weights(END_WEIGHTS, node_accelerations)
     position_increment = sum_with_weights(DOUBLE_END_WEIGHTS, node_accelerations)
     rate_increment_tangents = sum_with_weights(END_WEIGHTS, acceleration_tangents).swapaxes(0, 1)
@@ -313,14 +288,16 @@ def _evaluate_interval_end(
         + h * rate_increment_tangents
         + duration_unit_tangent * (interval_length_fraction * rate_increment)
     )
-    q, v = q + h * v + h * h * position_increment, v + h * rate_increment
-    return tangent_state._replace(q=q, v=v, q_tangents=q_tangents, v_tangents=v_tangents)
+    return _StateAndTangents(
+        _PhaseState(held_constants, q + h * v + h * h * position_increment, v + h * rate_increment),
+        _PhaseState(held_constants_tangents, q_tangents, v_tangents),
+    )
 
 
 def _linearize_residual(
     linearization_context: _LinearizationContext,
     phase: CollocationPhase,
-    tangent_state: _PhaseTangentState,
+    held_constants: LaneArray,
     node_q: LaneArray,
     node_v: LaneArray,
     node_accelerations: LaneArray,
@@ -331,36 +308,29 @@ def _linearize_residual(
     the rates, the accelerations and the held constants. The partial derivatives with respect to the
     parameters are a separate array with the parameters on the leading axis.
     """
-    n_coordinates, n_held_constants = phase.n_coordinates, tangent_state.held_constants.shape[0]
+    n_coordinates = phase.n_coordinates
+    n_state_arguments = 3 * n_coordinates + len(held_constants)
 
     def evaluate_residual_of_arguments(*residual_arguments: Array) -> Vector:
         q, v, a = (
             residual_arguments[i * n_coordinates : (i + 1) * n_coordinates] for i in range(3)
         )
-        held_constants = residual_arguments[3 * n_coordinates :][:n_held_constants]
-        parameters = residual_arguments[3 * n_coordinates :][n_held_constants:]
+        held_constants = residual_arguments[3 * n_coordinates : n_state_arguments]
         phase_constants = (
-            linearization_context.compute_phase_constants(*parameters)
+            linearization_context.compute_phase_constants(*residual_arguments[n_state_arguments:])
             if linearization_context.parameter_indices
             else linearization_context.phase_constants
         )
         return phase.residual_function(phase_constants, PhasePoint(held_constants, q, v), a)
 
+    constant_arguments = [*held_constants]
+    if linearization_context.parameter_indices:
+        constant_arguments += [*linearization_context.parameters]
     residual_arguments = [
         node_array[:, coordinate_index]
         for node_array in (node_q, node_v, node_accelerations)
         for coordinate_index in range(n_coordinates)
-    ]
-    residual_arguments += [
-        jnp.broadcast_to(held_constant, node_q[:, 0].shape)
-        for held_constant in tangent_state.held_constants
-    ]
-    n_state_arguments = len(residual_arguments)
-    if linearization_context.parameter_indices:
-        residual_arguments += [
-            jnp.broadcast_to(parameter_value, node_q[:, 0].shape)
-            for parameter_value in linearization_context.parameters
-        ]
+    ] + [jnp.broadcast_to(x, node_q[:, 0].shape) for x in constant_arguments]
     # The partial derivatives are stacked only after they are computed, because each is a small
     # kernel and stacking copies it.
     dynamics_residual, partial_derivatives_by_output = linearization_context.prevent_fusion(
@@ -389,7 +359,7 @@ def _linearize_residual(
 
 def _assemble_node_system(
     linearization_context: _LinearizationContext,
-    tangent_state: _PhaseTangentState,
+    held_constants_tangents: LaneArray,
     h: LaneArray,
     linearized_residual: tuple,
     state_tangents: LaneArray,
@@ -399,27 +369,23 @@ def _assemble_node_system(
     Return the matrix and the right-hand sides. Each tangent has one right-hand side.
     """
     dynamics_residual, residual_jacobian, parameter_derivatives = linearized_residual
-    n_tangents, n_coordinates, float_dtype = (
-        state_tangents.shape[0],
-        dynamics_residual.shape[1],
-        h.dtype,
-    )
+    n_coordinates = dynamics_residual.shape[1]
+    float_dtype = h.dtype
     tangent_terms = [
         residual_jacobian[:, :, state_index] * state_tangents[:, :, state_index, None]
         for state_index in range(2 * n_coordinates)
     ]
     tangent_terms += [
         residual_jacobian[:, :, 3 * n_coordinates + constant_index]
-        * tangent_state.held_constants_tangents[:, constant_index, None, None]
-        for constant_index in range(tangent_state.held_constants.shape[0])
+        * held_constants_tangents[:, constant_index, None, None]
+        for constant_index in range(held_constants_tangents.shape[1])
     ]
     right_hand_sides = sum(
-        tangent_terms, start=_make_unit_tangent(n_tangents, 0, float_dtype) * dynamics_residual
+        tangent_terms,
+        start=_make_unit_tangent(len(state_tangents), 0, float_dtype) * dynamics_residual,
     )
     if linearization_context.parameter_indices:
-        n_tangents_before_parameters = linearization_context.n_tangents - len(
-            linearization_context.parameter_indices
-        )
+        n_tangents_before_parameters = linearization_context.section_tangent_slice.stop
         right_hand_sides = right_hand_sides + jnp.pad(
             parameter_derivatives, ((n_tangents_before_parameters, 1), *((0, 0),) * 3)
         )
@@ -441,85 +407,75 @@ def _linearize_phase(
     linearization_context: _LinearizationContext,
     phase: CollocationPhase,
     phase_mesh: PhaseMesh,
-    tangent_state: _PhaseTangentState,
+    phase_start: _StateAndTangents,
     phase_duration: LaneArray,
     phase_accelerations: LaneArray,
-) -> tuple[_PhaseTangentState, LaneArray]:
+) -> tuple[_StateAndTangents, LaneArray]:
     """Return the state at the end of a phase, and the tangents of the phase's node accelerations.
 
-    Both have the directions of `tangent_state`, and after them one further direction, that of the
+    Both have the directions of `phase_start`, and after them one further direction, that of the
     phase's duration.
     """
-    append_duration_tangent = lambda x: jnp.concatenate([x, jnp.zeros_like(x[:1])])
-    tangent_state = tangent_state._replace(
-        held_constants_tangents=append_duration_tangent(tangent_state.held_constants_tangents),
-        q_tangents=append_duration_tangent(tangent_state.q_tangents),
-        v_tangents=append_duration_tangent(tangent_state.v_tangents),
-    )
+    prevent_fusion = linearization_context.prevent_fusion
 
     def linearize_mesh_interval(
-        start_state_values: tuple, interval_scan_inputs: tuple
-    ) -> tuple[tuple, Array]:
+        start: _StateAndTangents, interval_scan_inputs: tuple
+    ) -> tuple[_StateAndTangents, Array]:
         node_accelerations, interval_length_fraction = interval_scan_inputs
-        mesh_interval = _MeshInterval(
-            interval_length_fraction, interval_length_fraction * phase_duration, node_accelerations
+        mesh_interval = (
+            interval_length_fraction,
+            interval_length_fraction * phase_duration,
+            node_accelerations,
         )
-        start_state = tangent_state._replace(
-            **dict(zip(PROPAGATED_STATE_FIELDS, start_state_values, strict=True))
-        )
-        node_q, node_v, node_q_tangents, node_v_tangents = linearization_context.prevent_fusion(
-            _evaluate_interval_nodes(start_state, mesh_interval)
+        node_q, node_v, node_q_tangents, node_v_tangents = prevent_fusion(
+            _evaluate_interval_nodes(start, *mesh_interval)
         )
         linearized_residual = _linearize_residual(
-            linearization_context, phase, start_state, node_q, node_v, node_accelerations
+            linearization_context,
+            phase,
+            start.state.held_constants,
+            node_q,
+            node_v,
+            node_accelerations,
         )
         # Axes: (tangent, node, argument, batch).
         state_tangents = jnp.concatenate([node_q_tangents, node_v_tangents], 2)
-        node_system = linearization_context.prevent_fusion(
+        node_system = prevent_fusion(
             _assemble_node_system(
                 linearization_context,
-                start_state,
-                mesh_interval.h,
+                start.tangents.held_constants,
+                mesh_interval[1],
                 linearized_residual,
                 state_tangents,
             )
         )
         # Axes: (node, row, tangent, batch).
-        acceleration_tangents = linearization_context.prevent_fusion(
+        acceleration_tangents = prevent_fusion(
             solve_node_equations(*node_system, linearization_context.parameters)
         )
-        end_state = _evaluate_interval_end(start_state, mesh_interval, acceleration_tangents)
-        end_state_values = tuple(
-            getattr(end_state, field_name) for field_name in PROPAGATED_STATE_FIELDS
+        return (
+            _evaluate_interval_end(start, *mesh_interval, acceleration_tangents),
+            jnp.moveaxis(acceleration_tangents, 2, 0),
         )
-        return end_state_values, jnp.moveaxis(acceleration_tangents, 2, 0)
 
-    start_state_values = tuple(
-        getattr(tangent_state, field_name) for field_name in PROPAGATED_STATE_FIELDS
-    )
+    append_duration_tangent = lambda x: jnp.concatenate([x, jnp.zeros_like(x[:1])])
     interval_length_fractions = jnp.asarray(
         phase_mesh.interval_length_fractions, phase_duration.dtype
     )
-    end_state_values, acceleration_tangents = lax.scan(
+    return lax.scan(
         linearize_mesh_interval,
-        start_state_values,
+        phase_start._replace(tangents=jax.tree.map(append_duration_tangent, phase_start.tangents)),
         (phase_accelerations, interval_length_fractions),
     )
-    end_value_by_field = dict(zip(PROPAGATED_STATE_FIELDS, end_state_values, strict=True))
-    return tangent_state._replace(**end_value_by_field), acceleration_tangents
-
-
-PROPAGATED_STATE_FIELDS = ("q", "v", "q_tangents", "v_tangents")
-"""Names of those fields of `_PhaseTangentState` that change during a phase."""
 
 
 def _eliminate_phase_duration(
     linearization_context: _LinearizationContext,
     phase: CollocationPhase,
-    tangent_state: _PhaseTangentState,
+    phase_end: _StateAndTangents,
     phase_duration: LaneArray,
     is_phase_active: Bool[Array, " lanes"],
-) -> tuple[_PhaseTangentState, LaneArray, Callable[[Array], Array]]:
+) -> tuple[_StateAndTangents, LaneArray, Callable[[Array], Array]]:
     """Eliminate the duration tangent of a phase by the phase's end event, and apply the reset.
 
     Return the state at the start of the next phase, the tangents of the duration, and a function.
@@ -535,16 +491,8 @@ def _eliminate_phase_duration(
             phase.reset_map(phase_constants, phase_end_point), q
         )
 
-    phase_end_point = tangent_state.held_constants, tangent_state.q, tangent_state.v
-    point_tangents = (
-        tangent_state.held_constants_tangents,
-        tangent_state.q_tangents,
-        tangent_state.v_tangents,
-    )
-    (event_value, next_phase_point), (event_tangents, next_point_tangents) = (
-        linearization_context.evaluate_function_with_tangents(
-            evaluate_phase_end, phase_end_point, point_tangents
-        )
+    (event_value, next_state), (event_tangents, next_tangents) = (
+        linearization_context.evaluate_function_with_tangents(evaluate_phase_end, *phase_end)
     )
     newton_correction_unit_tangent, duration_unit_tangent = (
         _make_unit_tangent(event_tangents.shape[0], i, phase_duration.dtype)[:, 0, 0]
@@ -563,10 +511,10 @@ def _eliminate_phase_duration(
         )
         return tangents_with_duration[:-1] + duration_factor * tangents_with_duration[-1:]
 
-    next_state = _PhaseTangentState(
-        *next_phase_point, *(eliminate_duration_tangent(x) for x in next_point_tangents)
+    next_phase_start = _StateAndTangents(
+        next_state, jax.tree.map(eliminate_duration_tangent, next_tangents)
     )
-    return next_state, duration_tangents, eliminate_duration_tangent
+    return next_phase_start, duration_tangents, eliminate_duration_tangent
 
 
 def _linearize_gait_step(
@@ -589,29 +537,27 @@ def _linearize_gait_step(
             phase_sequence.step_start_map(phase_constants, tuple(section_state)), section_state
         )
 
-    phase_start_point, start_tangents = linearization_context.evaluate_function_with_tangents(
-        evaluate_gait_step_start, (section_state,), (section_tangents,)
+    phase_start = _StateAndTangents(
+        *linearization_context.evaluate_function_with_tangents(
+            evaluate_gait_step_start, (section_state,), (section_tangents,)
+        )
     )
-    tangent_state = _PhaseTangentState(*phase_start_point, *start_tangents)
-    duration_tangents, acceleration_tangents = [], []
+    duration_tangents = []
+    acceleration_tangents = []
     for i, collocation_phase in enumerate(phase_sequence.phases):
-        tangent_state, phase_acceleration_tangents = _linearize_phase(
+        phase_end, phase_acceleration_tangents = _linearize_phase(
             linearization_context,
             collocation_phase,
             phase_meshes[i],
-            tangent_state,
+            phase_start,
             phase_durations[i],
             accelerations_by_phase[i],
         )
-        phase_end_state = jnp.concatenate((tangent_state.q, tangent_state.v), -2)
-        phase_end_tangents = jnp.concatenate(
-            (tangent_state.q_tangents, tangent_state.v_tangents), -2
-        )
-        tangent_state, phase_duration_tangents, eliminate_duration_tangent = (
+        phase_start, phase_duration_tangents, eliminate_duration_tangent = (
             _eliminate_phase_duration(
                 linearization_context,
                 collocation_phase,
-                tangent_state,
+                phase_end,
                 phase_durations[i],
                 is_phase_active[i],
             )
@@ -621,15 +567,17 @@ def _linearize_gait_step(
         acceleration_tangents.append(
             eliminate_duration_tangent(jnp.swapaxes(phase_acceleration_tangents, 0, 1))
         )
-        tangent_state = linearization_context.prevent_fusion(tangent_state)
-    # After the loop, the end state and its tangents belong to the last phase.
+        phase_start = linearization_context.prevent_fusion(phase_start)
+    # After the loop, the end belongs to the last phase, and the start to the next gait step.
     gait_step_tangent_outputs = (
-        phase_end_state,
-        eliminate_duration_tangent(phase_end_tangents),
+        jnp.concatenate((phase_end.state.q, phase_end.state.v), -2),
+        eliminate_duration_tangent(
+            jnp.concatenate((phase_end.tangents.q, phase_end.tangents.v), -2)
+        ),
         jnp.stack(duration_tangents, 1),
         tuple(acceleration_tangents),
     )
-    return (tangent_state.q, tangent_state.q_tangents), gait_step_tangent_outputs
+    return (phase_start.state.q, phase_start.tangents.q), gait_step_tangent_outputs
 
 
 def linearize_cycle(
@@ -647,14 +595,33 @@ def linearize_cycle(
     False. Its duration is 0 s, and only its reset is applied. `parameter_indices` selects the
     parameters to which the parameter tangents belong.
     """
-    linearization_context = _make_linearization_context(
-        phase_sequence.section_size, parameter_indices, parameters, compute_phase_constants
+    float_dtype = parameters.dtype
+    phase_constants_tangents: tuple[LaneArray, ...] = ()
+    if parameter_indices:
+        unit_parameter_tangents = np.eye(len(parameters), dtype=float_dtype)[
+            list(parameter_indices)
+        ]
+        phase_constants, phase_constants_tangents = evaluate_with_jvps(
+            compute_phase_constants,
+            tuple(parameters),
+            tuple(
+                jnp.broadcast_to(x[:, None], (len(parameter_indices), *parameters.shape[1:]))
+                for x in unit_parameter_tangents.T
+            ),
+        )
+    else:
+        phase_constants = compute_phase_constants(*parameters)
+    linearization_context = _LinearizationContext(
+        phase_sequence.section_size,
+        parameter_indices,
+        parameters,
+        compute_phase_constants,
+        phase_constants,
+        phase_constants_tangents,
+        make_fusion_barrier(parameters),
     )
-    section_state, float_dtype, n_tangents = (
-        trial_solution.section_state,
-        parameters.dtype,
-        linearization_context.n_tangents,
-    )
+    section_state = trial_solution.section_state
+    n_tangents = linearization_context.n_tangents
     section_unit_tangents = np.eye(n_tangents, dtype=float_dtype)[
         :, linearization_context.section_tangent_slice, None
     ]
@@ -703,15 +670,9 @@ def linearize_cycle(
         The axes (n, tangent, ...) of the argument become (tangent, n, ...).
         """
         open_cycle_tangent = jnp.swapaxes(open_cycle_tangent, 0, 1)
-        broadcast_shape = (-1, *(1,) * (open_cycle_tangent.ndim - 2), *section_state.shape[1:])
         section_tangents = open_cycle_tangent[linearization_context.section_tangent_slice]
-        section_state_contributions = [
-            section_state_tangents[:, section_coordinate].reshape(broadcast_shape)
-            * section_tangents[section_coordinate]
-            for section_coordinate in range(len(section_state))
-        ]
-        return drop_section_tangents(open_cycle_tangent) + sum(
-            section_state_contributions[1:], start=section_state_contributions[0]
+        return drop_section_tangents(open_cycle_tangent) + contract_inner_axis(
+            section_state_tangents, section_tangents
         )
 
     gait_step_end_states, *open_cycle_tangents = linearization_context.prevent_fusion(
@@ -765,9 +726,11 @@ def reconstruct_gait_step(
             float64_weights.astype(phase_durations.dtype)
             for float64_weights in build_phase_integration_matrices(phase_meshes[i])
         )
-        phase_accelerations, phase_duration = accelerations_by_phase[i], phase_durations[i]
+        phase_accelerations = accelerations_by_phase[i]
         phase_accelerations = phase_accelerations.reshape(-1, *phase_accelerations.shape[2:])
-        q, v = jnp.stack(phase_start_point.q), jnp.stack(phase_start_point.v)
+        phase_duration = phase_durations[i]
+        q = jnp.stack(phase_start_point.q)
+        v = jnp.stack(phase_start_point.v)
         node_times = node_times.reshape(-1, *(1,) * q.ndim)
         node_q = q + phase_duration * (
             node_times * v
@@ -806,36 +769,29 @@ def estimate_mesh_error(
       round-off, the estimate bounds the error in tests with random gaits that have periods up to
       10 s. For most gaits the estimate is far above the error.
     """
-    largest_acceleration_jump = jnp.zeros(
-        collocation_solution.section_state.shape[-1], collocation_solution.section_state.dtype
-    )
+    section_state = collocation_solution.section_state
+    float_dtype = section_state.dtype
+    largest_acceleration_jump = jnp.zeros(section_state.shape[-1], float_dtype)
+
+    def interpolate_accelerations(location_in_interval: float, accelerations: Array) -> Array:
+        lagrange_weights = compute_lagrange_weights(location_in_interval)
+        return jnp.tensordot(jnp.asarray(lagrange_weights, float_dtype), accelerations, (0, 2))
+
     for i, phase_mesh in enumerate(phase_meshes):
         if phase_mesh.n_intervals == 1 or not phase_sequence.phases[i].is_motion_smooth:
             continue
-        accelerations_before_boundary, accelerations_after_boundary = (
-            jnp.tensordot(
-                jnp.asarray(
-                    compute_lagrange_weights(location_in_interval), largest_acceleration_jump.dtype
-                ),
-                node_accelerations,
-                (0, 2),
-            )
-            for location_in_interval, node_accelerations in (
-                (1.0, collocation_solution.accelerations[i][:, :-1]),
-                (0.0, collocation_solution.accelerations[i][:, 1:]),
-            )
-        )
-        longer_interval_fraction = np.maximum(
-            phase_mesh.interval_length_fractions[1:], phase_mesh.interval_length_fractions[:-1]
-        )
+        accelerations = collocation_solution.accelerations[i]
+        acceleration_jump = interpolate_accelerations(
+            1.0, accelerations[:, :-1]
+        ) - interpolate_accelerations(0.0, accelerations[:, 1:])
+        interval_fractions = phase_mesh.interval_length_fractions
+        longer_interval_fraction = np.maximum(interval_fractions[1:], interval_fractions[:-1])
         longer_interval_length = (
-            longer_interval_fraction[:, None, None].astype(largest_acceleration_jump.dtype)
+            longer_interval_fraction[:, None, None].astype(float_dtype)
             * collocation_solution.durations[:, None, None, i]
         )
         acceleration_jump = (
-            jnp.abs(accelerations_before_boundary - accelerations_after_boundary)
-            * longer_interval_length
-            * longer_interval_length
+            jnp.abs(acceleration_jump) * longer_interval_length * longer_interval_length
         )
         largest_acceleration_jump = jnp.maximum(
             largest_acceleration_jump, jnp.max(acceleration_jump, axis=(0, 1, 2))
