@@ -2,6 +2,7 @@
 
 import abc
 import dataclasses
+import operator
 from collections.abc import Callable, Iterable
 from typing import Any
 
@@ -78,17 +79,16 @@ class AbstractCycle(AbstractPrintable):
         The result is 0 if there is no gait. It divides `period_n`: a gait that repeats after one
         step also repeats after two steps.
         """
-        step_ends, period_n = self.step_ends, self.period_n
+        step_ends = self.step_ends
+        period_n = self.period_n
         largest_state_coordinate = jnp.max(jnp.abs(step_ends), (-2, -1))
         relative_tolerance = jnp.maximum(
             SAME_STATE_RELATIVE_TOLERANCE, 100.0 * jnp.finfo(step_ends.dtype).eps
         )
         minimal_period = jnp.full(self.outcome.shape, period_n, jnp.int32)
-        for candidate_period in (
-            candidate_period
-            for candidate_period in range(period_n - 1, 0, -1)
-            if period_n % candidate_period == 0
-        ):
+        for candidate_period in range(period_n - 1, 0, -1):
+            if period_n % candidate_period:
+                continue
             state_distance = jnp.max(
                 jnp.abs(jnp.roll(step_ends, candidate_period, -2) - step_ends), (-2, -1)
             )
@@ -111,14 +111,14 @@ class AbstractCycle(AbstractPrintable):
         def apply_nan_weight(x: Array) -> Array:
             return x * nan_weight.astype(x.dtype) if eqx.is_inexact_array(x) else x
 
-        fields_zero_without_gait = [
-            field_name for field_name in FIELDS_ZERO_WITHOUT_GAIT if field_name in vars(self)
-        ]
-        weighted_fields = {
-            field_name: jax.tree.map(apply_nan_weight, getattr(self, field_name))
-            for field_name in fields_zero_without_gait
-        }
-        return dataclasses.replace(self, **weighted_fields)
+        return dataclasses.replace(
+            self,
+            **{
+                field_name: jax.tree.map(apply_nan_weight, getattr(self, field_name))
+                for field_name in FIELDS_ZERO_WITHOUT_GAIT
+                if field_name in vars(self)
+            },
+        )
 
     def _zero_without_gait(self, value_of_gait: Array) -> Array:
         """Return `value_of_gait`, or zero if no gait was found.
@@ -163,14 +163,16 @@ class AbstractCycle(AbstractPrintable):
     @property
     def dls_fraction(self) -> Array:
         """Return the duration of double support divided by the period."""
-        dls_duration, period = self.reduce_over_steps(self.durations[..., 0], jnp.sum), self.period
-        return dls_duration / jnp.where(period > 0.0, period, 1.0)
+        return self._divide_by_period(self.reduce_over_steps(self.durations[..., 0], jnp.sum))
 
     @property
     def speed(self) -> Array:
         """Return the mean speed: the distance per cycle divided by the period, m/s."""
-        cycle_distance, period = self.reduce_over_steps(self.step_length, jnp.sum), self.period
-        return cycle_distance / jnp.where(period > 0.0, period, 1.0)
+        return self._divide_by_period(self.reduce_over_steps(self.step_length, jnp.sum))
+
+    def _divide_by_period(self, sum_over_cycle: Array) -> Array:
+        """Return a sum over the cycle divided by the period, or zero without a gait."""
+        return sum_over_cycle / jnp.where(self.period > 0.0, self.period, 1.0)
 
     @property
     def multipliers(self) -> Complex[Array, "... n"]:
@@ -300,23 +302,15 @@ def format_floquet_multipliers(monodromy_matrix: np.ndarray) -> tuple[float, str
     the text contains only their number.
     """
     floquet_multipliers = sorted(np.linalg.eigvals(monodromy_matrix), key=abs, reverse=True)
-    shown_multipliers = [
-        floquet_multiplier
-        for floquet_multiplier in floquet_multipliers
-        if abs(floquet_multiplier) >= 5e-6
-    ]
-    unlisted_multipliers_text = (
-        f"{len(floquet_multipliers) - len(shown_multipliers)} below 5e-6"
-        if len(shown_multipliers) < len(floquet_multipliers)
-        else ""
-    )
     multiplier_texts = [
-        f"{floquet_multiplier:.5f}" if floquet_multiplier.imag else f"{floquet_multiplier.real:.5f}"
-        for floquet_multiplier in shown_multipliers
+        f"{multiplier:.5f}" if multiplier.imag else f"{multiplier.real:.5f}"
+        for multiplier in floquet_multipliers
+        if abs(multiplier) >= 5e-6
     ]
-    return float(np.abs(floquet_multipliers[0])), ", ".join(
-        [*multiplier_texts, *([unlisted_multipliers_text] if unlisted_multipliers_text else [])]
-    )
+    n_unlisted_multipliers = len(floquet_multipliers) - len(multiplier_texts)
+    if n_unlisted_multipliers:
+        multiplier_texts.append(f"{n_unlisted_multipliers} below 5e-6")
+    return float(np.abs(floquet_multipliers[0])), ", ".join(multiplier_texts)
 
 
 FIELDS_ZERO_WITHOUT_GAIT = (
@@ -331,11 +325,6 @@ FIELDS_ZERO_WITHOUT_GAIT = (
 """Names of the fields of a cycle that are zero if no gait is found."""
 
 
-def _make_property_reader(property_name: str) -> Callable[[AbstractCycle], Array]:
-    """Return a function that reads the property `property_name` of a cycle."""
-    return lambda cycle: getattr(cycle, property_name)
-
-
 def _make_duration_reader(phase_index: int) -> Callable[[AbstractCycle], Array]:
     """Return a function that computes the total duration of one phase over a cycle, s."""
     return lambda cycle: cycle.reduce_over_steps(cycle.durations[..., phase_index], jnp.sum)
@@ -346,15 +335,10 @@ def _make_indicator_reader(indicator_name: str) -> Callable[[Any], Array]:
     return lambda cycle: cycle.reduce_over_steps(getattr(cycle.indicators, indicator_name), jnp.min)
 
 
-def _make_sensitivity_reader(measure_name: str) -> Callable[[Any], Array]:
-    """Return a function that computes the gait sensitivity norm of one measure for a cycle."""
-    return lambda cycle: cycle.gait_sensitivity(measure_name)
-
-
 CYCLE_MEASURE_FUNCTIONS: dict[str, Callable[[AbstractCycle], Array]] = {
-    "dls_fraction": _make_property_reader("dls_fraction"),
-    "period": _make_property_reader("period"),
-    "speed": _make_property_reader("speed"),
+    "dls_fraction": operator.attrgetter("dls_fraction"),
+    "period": operator.attrgetter("period"),
+    "speed": operator.attrgetter("speed"),
     "step_length": lambda cycle: cycle.reduce_over_steps(cycle.step_length, jnp.sum),
     "duration_dls": _make_duration_reader(0),
     "duration_sls1": _make_duration_reader(1),
@@ -367,13 +351,13 @@ CYCLE_MEASURE_FUNCTIONS: dict[str, Callable[[AbstractCycle], Array]] = {
     "lambda_I4": _make_indicator_reader("lambda_I4"),
     "lambda_2_plus": _make_indicator_reader("lambda_2"),
     "lambda_4_plus": _make_indicator_reader("lambda_4"),
-    "spectral_radius": _make_property_reader("spectral_radius"),
-    "spectral_margin": _make_property_reader("spectral_margin"),
-    "stability_margin": _make_property_reader("stability_margin"),
-    "takeoff_acceleration": _make_property_reader("takeoff_acceleration"),
-    "gait_sensitivity_dls_fraction": _make_sensitivity_reader("dls_fraction"),
-    "gait_sensitivity_period": _make_sensitivity_reader("period"),
-    "gait_sensitivity_speed": _make_sensitivity_reader("speed"),
+    "spectral_radius": operator.attrgetter("spectral_radius"),
+    "spectral_margin": operator.attrgetter("spectral_margin"),
+    "stability_margin": operator.attrgetter("stability_margin"),
+    "takeoff_acceleration": operator.attrgetter("takeoff_acceleration"),
+    "gait_sensitivity_dls_fraction": operator.methodcaller("gait_sensitivity", "dls_fraction"),
+    "gait_sensitivity_period": operator.methodcaller("gait_sensitivity", "period"),
+    "gait_sensitivity_speed": operator.methodcaller("gait_sensitivity", "speed"),
     **{
         force_measure_name: lambda cycle, force_measure_name=force_measure_name: cycle.force_peaks[
             force_measure_name

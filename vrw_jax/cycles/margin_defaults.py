@@ -64,7 +64,8 @@ def default_margins(params: WheelParams) -> Mapping[str, float]:
     check_type("params", params, WheelParams, "write vrw.WheelParams(damping=..., slope=...)")
     params.require_single_wheel("take one after the other")
     total_mass = float(params.hub_mass + params.n_legs * params.leg_mass)
-    leg_length, gravity_acceleration = float(params.locked_length), float(params.gravity)
+    leg_length = float(params.locked_length)
+    gravity_acceleration = float(params.gravity)
     margin_unit_values = {
         "N": total_mass * gravity_acceleration,
         "m": leg_length,

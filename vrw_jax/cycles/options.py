@@ -1,6 +1,7 @@
 """Define numerical options of the search for limit cycles."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -54,19 +55,16 @@ class CycleOptions:
     batch_size: int = 64
 
     def __post_init__(self) -> None:
+        set_option = functools.partial(object.__setattr__, self)
         for option_name in (
             "max_newton_iterations",
             "first_newton_iterations",
             "homotopy_steps",
             "batch_size",
         ):
-            object.__setattr__(
-                self, option_name, check_int(option_name, getattr(self, option_name))
-            )
+            set_option(option_name, check_int(option_name, getattr(self, option_name)))
         for option_name in ("mesh_grading", "tolerance"):
-            object.__setattr__(
-                self, option_name, check_positive(option_name, getattr(self, option_name))
-            )
+            set_option(option_name, check_positive(option_name, getattr(self, option_name)))
         if not isinstance(self.mesh_intervals, tuple | list) or len(self.mesh_intervals) != 3:
             raise ValueError(
                 f"mesh_intervals is {format_value(self.mesh_intervals)}, but it counts the "
@@ -78,7 +76,7 @@ class CycleOptions:
             check_int(f"mesh_intervals[{i}]", interval_count)
             for i, interval_count in enumerate(self.mesh_intervals)
         )
-        object.__setattr__(self, "mesh_intervals", mesh_intervals)
+        set_option("mesh_intervals", mesh_intervals)
 
     def check_tolerances(self, parameter_dtype: np.dtype) -> None:
         """Raise ValueError if the number format cannot resolve the tolerance.

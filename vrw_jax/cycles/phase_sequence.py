@@ -62,37 +62,25 @@ def _restore_symbols(n_legs: int, phase_constants: PhaseConstants) -> Symbols:
     return Symbols(*symbol_values)
 
 
-def _has_next_line_tilt(phase_constants: PhaseConstants) -> bool:
-    """Return whether the constants contain the angle by which the next line of the ground is
-    steeper.
-
-    The unit of the angle is rad.
-    """
-    return len(phase_constants) > N_SYMBOL_CONSTANTS
-
-
 def _make_collocation_phase(
     n_legs: int, stop_at_lift_off: bool, phase_index: int
 ) -> CollocationPhase:
     """Describe the phase with index `phase_index` by functions.
 
-    The functions take the constants that `compute_phase_constants` returns.
+    The functions take the constants that `compute_phase_constants` returns. A further constant may
+    follow, the angle by which the next line of the ground is steeper, rad.
     """
     phase_class = PAPER_PHASES[phase_index]
 
     def evaluate_phase_motion(
         phase_constants: PhaseConstants, phase_point: PhasePoint
     ) -> tuple[AbstractPhase, Motion]:
-        next_line_tilt = (
-            compute_sine_cosine(phase_constants[N_SYMBOL_CONSTANTS])
-            if _has_next_line_tilt(phase_constants)
-            else ()
-        )
+        tilt = phase_constants[N_SYMBOL_CONSTANTS:]
         wheel_phase = phase_class(
             _restore_symbols(n_legs, phase_constants),
             phase_point.held_constants,
             True,
-            next_line_tilt,
+            compute_sine_cosine(*tilt) if tilt else (),
         )
         return wheel_phase, wheel_phase.compute_motion(phase_point.q, phase_point.v)
 
@@ -128,11 +116,8 @@ def _make_collocation_phase(
     def reset_to_section(phase_constants: PhaseConstants, phase_point: PhasePoint) -> PhasePoint:
         (theta, _), (dtheta, dL1) = phase_point.q, phase_point.v
         s = _restore_symbols(n_legs, phase_constants)
-        theta = (
-            theta - phase_constants[N_SYMBOL_CONSTANTS]
-            if _has_next_line_tilt(phase_constants)
-            else theta
-        )
+        if tilt := phase_constants[N_SYMBOL_CONSTANTS:]:
+            theta = theta - tilt[0]
         return PhasePoint((), transitions.resolve_two_foot_landing(s, theta, dtheta, dL1), ())
 
     reset_function = reset_to_section if phase_class is PAPER_PHASES[-1] else reset_to_next_phase

@@ -77,15 +77,14 @@ def sensitivities(
     if int(gait_measures.outcome) != Outcome.STEPPED:
         failure_outcome = Outcome(int(gait_measures.outcome))
         raise ValueError(f"there is no gait to differentiate: {failure_outcome.meaning}")
-    measure_derivatives, measure_values = (
-        np.asarray(gait_measures.parameter_jacobian),
-        np.asarray(gait_measures.measure_values),
-    )
+    measure_derivatives = np.asarray(gait_measures.parameter_jacobian)
+    measure_values = np.asarray(gait_measures.measure_values)
     with np.errstate(divide="ignore", invalid="ignore"):
         measure_elasticities = (
             measure_derivatives * np.asarray(parameter_values) / measure_values[:, None]
         )
-    table_axes, parameter_names = ("measure", "parameter"), gait_finder.model.parameter_names
+    table_axes = ("measure", "parameter")
+    parameter_names = gait_finder.model.parameter_names
     return xr.Dataset(
         {
             "value": ("measure", measure_values),
