@@ -75,7 +75,7 @@ def emit_llvm_elementwise_primitive(
 # The rules of sums and products drop terms known to be zero and factors known to be one.
 
 
-def _emit_sum(operation: ElementwiseOperation, x: LlvmValue, y: LlvmValue) -> LlvmValue:
+def emit_sum(operation: ElementwiseOperation, x: LlvmValue, y: LlvmValue) -> LlvmValue:
     """Emit the sum x + y and return its LLVM value. A constant operand 0 needs no instruction."""
     if _equals_llvm_constant(y, 0):
         return x
@@ -84,7 +84,7 @@ def _emit_sum(operation: ElementwiseOperation, x: LlvmValue, y: LlvmValue) -> Ll
     return _emit_binary_instruction("add", operation, x, y)
 
 
-def _emit_difference(operation: ElementwiseOperation, x: LlvmValue, y: LlvmValue) -> LlvmValue:
+def emit_difference(operation: ElementwiseOperation, x: LlvmValue, y: LlvmValue) -> LlvmValue:
     """Emit the difference x - y and return its LLVM value. A constant y = 0 needs no
     instruction.
     """
@@ -93,7 +93,7 @@ def _emit_difference(operation: ElementwiseOperation, x: LlvmValue, y: LlvmValue
     return _emit_binary_instruction("sub", operation, x, y)
 
 
-def _emit_product(operation: ElementwiseOperation, x: LlvmValue, y: LlvmValue) -> LlvmValue:
+def emit_product(operation: ElementwiseOperation, x: LlvmValue, y: LlvmValue) -> LlvmValue:
     """Emit the product x * y and return its LLVM value. A constant factor 0 or 1 needs no
     instruction.
     """
@@ -104,7 +104,7 @@ def _emit_product(operation: ElementwiseOperation, x: LlvmValue, y: LlvmValue) -
     return _emit_binary_instruction("mul", operation, x, y)
 
 
-def _emit_quotient(operation: ElementwiseOperation, x: LlvmValue, y: LlvmValue) -> LlvmValue:
+def emit_quotient(operation: ElementwiseOperation, x: LlvmValue, y: LlvmValue) -> LlvmValue:
     """Emit the quotient x / y of two floats and return its LLVM value."""
     # An integer division by zero would stop the process.
     _require_float_dtype("div", operation)
@@ -118,7 +118,7 @@ def _emit_quotient(operation: ElementwiseOperation, x: LlvmValue, y: LlvmValue) 
     )
 
 
-def _emit_integer_power(operation: ElementwiseOperation, x: LlvmValue) -> LlvmValue:
+def emit_integer_power(operation: ElementwiseOperation, x: LlvmValue) -> LlvmValue:
     """Emit the power of `x` with a constant integer exponent by repeated squaring, and return its
     LLVM value.
     """
@@ -127,26 +127,26 @@ def _emit_integer_power(operation: ElementwiseOperation, x: LlvmValue) -> LlvmVa
     partial_power, repeated_square = one_constant, x
     for i, exponent_bit in enumerate(reversed(f"{abs(exponent):b}")):
         if i:
-            repeated_square = _emit_product(operation, repeated_square, repeated_square)
+            repeated_square = emit_product(operation, repeated_square, repeated_square)
         if exponent_bit == "1":
-            partial_power = _emit_product(operation, partial_power, repeated_square)
+            partial_power = emit_product(operation, partial_power, repeated_square)
     if exponent >= 0:
         return partial_power
     return operation.llvm_builder.fdiv(one_constant, partial_power, flags=FUSED_MULTIPLY_ADD_FLAGS)
 
 
-def _emit_negative(operation: ElementwiseOperation, x: LlvmValue) -> LlvmValue:
+def emit_negative(operation: ElementwiseOperation, x: LlvmValue) -> LlvmValue:
     """Emit -x and return its LLVM value."""
     llvm_builder = operation.llvm_builder
     return (llvm_builder.fneg if operation.operand_dtype.kind == "f" else llvm_builder.neg)(x)
 
 
-def _emit_absolute_value(operation: ElementwiseOperation, x: LlvmValue) -> LlvmValue:
+def emit_absolute_value(operation: ElementwiseOperation, x: LlvmValue) -> LlvmValue:
     """Emit the absolute value of `x` and return its LLVM value."""
     if operation.operand_dtype.kind == "f":
         return _emit_intrinsic_call(operation, "fabs", x)
     zero_constant = operation.value_emitter.make_llvm_constant(x.type, 0)
-    is_negative_value = _emit_comparison("<", operation, x, zero_constant)
+    is_negative_value = emit_comparison("<", operation, x, zero_constant)
     return operation.llvm_builder.select(is_negative_value, operation.llvm_builder.neg(x), x)
 
 
@@ -155,7 +155,7 @@ def _return_operand(operation: ElementwiseOperation, x: LlvmValue) -> LlvmValue:
     return x
 
 
-def _emit_bitwise_operation(
+def emit_bitwise_operation(
     builder_method_name: str, operation: ElementwiseOperation, *operands: LlvmValue
 ) -> LlvmValue:
     """Emit a bitwise instruction by a method of llvmlite's `IRBuilder`, and return its LLVM
@@ -166,7 +166,7 @@ def _emit_bitwise_operation(
     )
 
 
-def _emit_comparison(
+def emit_comparison(
     comparison_operator: str, operation: ElementwiseOperation, x: LlvmValue, y: LlvmValue
 ) -> LlvmValue:
     """Emit the comparison of two operands, and return the LLVM truth value.
@@ -175,19 +175,17 @@ def _emit_comparison(
     """
     llvm_builder, number_kind = operation.llvm_builder, operation.operand_dtype.kind
     if number_kind == "b":  # The signed value of true would be -1.
-        emit_comparison = llvm_builder.icmp_unsigned
+        compare_values = llvm_builder.icmp_unsigned
     elif number_kind != "f":
-        emit_comparison = llvm_builder.icmp_signed
+        compare_values = llvm_builder.icmp_signed
     elif comparison_operator == "!=":
-        emit_comparison = llvm_builder.fcmp_unordered
+        compare_values = llvm_builder.fcmp_unordered
     else:
-        emit_comparison = llvm_builder.fcmp_ordered
-    return emit_comparison(
-        comparison_operator, *operation.value_emitter.to_scalars_or_vectors(x, y)
-    )
+        compare_values = llvm_builder.fcmp_ordered
+    return compare_values(comparison_operator, *operation.value_emitter.to_scalars_or_vectors(x, y))
 
 
-def _emit_extremum(
+def emit_extremum(
     comparison_operator: str, operation: ElementwiseOperation, x: LlvmValue, y: LlvmValue
 ) -> LlvmValue:
     """Emit the maximum (operator ">") or the minimum ("<") of two operands, and return its LLVM
@@ -195,14 +193,14 @@ def _emit_extremum(
     """
     x, y = operation.value_emitter.to_scalars_or_vectors(x, y)
     llvm_builder = operation.llvm_builder
-    extremum = llvm_builder.select(_emit_comparison(comparison_operator, operation, x, y), x, y)
+    extremum = llvm_builder.select(emit_comparison(comparison_operator, operation, x, y), x, y)
     if operation.operand_dtype.kind != "f":
         return extremum
     # The result is NaN if either operand is NaN.
     return llvm_builder.select(llvm_builder.fcmp_unordered("uno", x, x), x, extremum)
 
 
-def _emit_select(
+def emit_select(
     operation: ElementwiseOperation, lane_condition: LlvmValue, *case_values: LlvmValue
 ) -> LlvmValue:
     """Emit the selection of the first case where the condition is false, and of the second where it
@@ -222,13 +220,13 @@ def _emit_select(
     return operation.llvm_builder.select(lane_condition, true_case, false_case)
 
 
-def _emit_finiteness_test(operation: ElementwiseOperation, x: LlvmValue) -> LlvmValue:
+def emit_finiteness_test(operation: ElementwiseOperation, x: LlvmValue) -> LlvmValue:
     """Emit the test whether |x| < infinity, and return its LLVM truth value."""
     infinity = operation.value_emitter.make_llvm_constant(x.type, np.inf)
-    return _emit_comparison("<", operation, _emit_intrinsic_call(operation, "fabs", x), infinity)
+    return emit_comparison("<", operation, _emit_intrinsic_call(operation, "fabs", x), infinity)
 
 
-def _emit_float_function(
+def emit_float_function(
     intrinsic_function_name: str, operation: ElementwiseOperation, x: LlvmValue
 ) -> LlvmValue:
     """Emit a function of a float, such as "sqrt", and return its LLVM value.
@@ -268,7 +266,7 @@ def _emit_binary_instruction(
     )
 
 
-def _emit_conversion(operation: ElementwiseOperation, x: LlvmValue) -> LlvmValue:
+def emit_conversion(operation: ElementwiseOperation, x: LlvmValue) -> LlvmValue:
     """Emit the conversion of `x` to the type of the result, and return its LLVM value."""
     value_emitter, operand_dtype, result_dtype = (
         operation.value_emitter,
@@ -278,7 +276,7 @@ def _emit_conversion(operation: ElementwiseOperation, x: LlvmValue) -> LlvmValue
     if operand_dtype == result_dtype:
         return x
     if result_dtype.kind == "b":
-        return _emit_comparison("!=", operation, x, value_emitter.make_llvm_constant(x.type, 0))
+        return emit_comparison("!=", operation, x, value_emitter.make_llvm_constant(x.type, 0))
     is_result_smaller = result_dtype.itemsize < operand_dtype.itemsize
     builder_method_name = {
         "ff": "fptrunc" if is_result_smaller else "fpext",
@@ -425,39 +423,39 @@ LOGARITHM_COEFFICIENTS = _fit_polynomial(np.log1p, 5)
 POWER_OF_TWO_COEFFICIENTS = _fit_polynomial(np.exp2, 5)
 
 ELEMENTWISE_RULES: dict[str, ElementwiseRule] = {
-    "abs": _emit_absolute_value,
-    "add": _emit_sum,
-    "add_any": _emit_sum,
-    "and": partial(_emit_bitwise_operation, "and_"),
-    "convert_element_type": _emit_conversion,
+    "abs": emit_absolute_value,
+    "add": emit_sum,
+    "add_any": emit_sum,
+    "and": partial(emit_bitwise_operation, "and_"),
+    "convert_element_type": emit_conversion,
     "copy": _return_operand,
-    "cos": partial(_emit_float_function, "cos"),
-    "div": _emit_quotient,
-    "eq": partial(_emit_comparison, "=="),
-    "exp": partial(_emit_float_function, "exp"),
-    "floor": partial(_emit_float_function, "floor"),
-    "ge": partial(_emit_comparison, ">="),
-    "gt": partial(_emit_comparison, ">"),
-    "integer_pow": _emit_integer_power,
-    "is_finite": _emit_finiteness_test,
-    "le": partial(_emit_comparison, "<="),
-    "log": partial(_emit_float_function, "log"),
-    "lt": partial(_emit_comparison, "<"),
-    "max": partial(_emit_extremum, ">"),
-    "min": partial(_emit_extremum, "<"),
-    "mul": _emit_product,
-    "ne": partial(_emit_comparison, "!="),
-    "neg": _emit_negative,
-    "not": partial(_emit_bitwise_operation, "not_"),
-    "or": partial(_emit_bitwise_operation, "or_"),
-    "select_n": _emit_select,
-    "shift_left": partial(_emit_bitwise_operation, "shl"),
-    "shift_right_arithmetic": partial(_emit_bitwise_operation, "ashr"),
-    "shift_right_logical": partial(_emit_bitwise_operation, "lshr"),
-    "sin": partial(_emit_float_function, "sin"),
-    "sqrt": partial(_emit_float_function, "sqrt"),
+    "cos": partial(emit_float_function, "cos"),
+    "div": emit_quotient,
+    "eq": partial(emit_comparison, "=="),
+    "exp": partial(emit_float_function, "exp"),
+    "floor": partial(emit_float_function, "floor"),
+    "ge": partial(emit_comparison, ">="),
+    "gt": partial(emit_comparison, ">"),
+    "integer_pow": emit_integer_power,
+    "is_finite": emit_finiteness_test,
+    "le": partial(emit_comparison, "<="),
+    "log": partial(emit_float_function, "log"),
+    "lt": partial(emit_comparison, "<"),
+    "max": partial(emit_extremum, ">"),
+    "min": partial(emit_extremum, "<"),
+    "mul": emit_product,
+    "ne": partial(emit_comparison, "!="),
+    "neg": emit_negative,
+    "not": partial(emit_bitwise_operation, "not_"),
+    "or": partial(emit_bitwise_operation, "or_"),
+    "select_n": emit_select,
+    "shift_left": partial(emit_bitwise_operation, "shl"),
+    "shift_right_arithmetic": partial(emit_bitwise_operation, "ashr"),
+    "shift_right_logical": partial(emit_bitwise_operation, "lshr"),
+    "sin": partial(emit_float_function, "sin"),
+    "sqrt": partial(emit_float_function, "sqrt"),
     "square": lambda operation, x: _emit_binary_instruction("mul", operation, x, x),
     "stop_gradient": _return_operand,
-    "sub": _emit_difference,
-    "xor": partial(_emit_bitwise_operation, "xor"),
+    "sub": emit_difference,
+    "xor": partial(emit_bitwise_operation, "xor"),
 }
