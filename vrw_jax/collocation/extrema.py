@@ -48,9 +48,9 @@ class ExtremumSearchOptions:
     """Largest number of extrema of R per phase. The value is chosen because R has at most five
     extrema if the legs are stiff and lightly damped.
     """
-    n_bracketing_iterations: int = 12
-    """Number of bracketing iterations on the polynomials. The value is chosen because the error of
-    a root is then only that of the polynomials.
+    n_bisections: int = 24
+    """Number of bisections on the polynomials. The value is chosen because the error of a root in a
+    phase of 20 mesh intervals is then 1e-6 mesh intervals, less than that of the polynomials.
     """
     n_time_corrections: int = 3
     """Number of corrections of the time of an extremum. The value is chosen because each correction
@@ -62,8 +62,7 @@ class ExtremumSearchOptions:
     """
 
 
-DEFAULT_EXTREMUM_SEARCH_OPTIONS = ExtremumSearchOptions()
-"""Default options of `find_quantity_extrema`."""
+EXTREMUM_SEARCH_OPTIONS = ExtremumSearchOptions()
 
 
 class QuantityTimeDerivatives(NamedTuple):
@@ -93,6 +92,18 @@ class PhaseExtrema(NamedTuple):
 
 FunctionOfCoordinatesAndRates = Callable[[Array, Array], Array]
 """Function that maps coordinates and rates, each of shape (coordinates,), to an array."""
+
+
+def find_mesh_intervals(interval_boundary_times: Array, times_in_phase: Array) -> Array:
+    """Return for each time the index of the mesh interval that contains it.
+
+    The times are in s since the start of the phase.
+    """
+    return jnp.clip(
+        jnp.searchsorted(interval_boundary_times, times_in_phase, side="right") - 1,
+        0,
+        len(interval_boundary_times) - 2,
+    )
 
 
 class CollocatedPhaseMotion(NamedTuple):
@@ -147,18 +158,6 @@ class CollocatedPhaseMotion(NamedTuple):
             node_accelerations,
         )
 
-    def find_mesh_interval_at_time(self, time_in_phase: Scalar) -> Array:
-        """Return the index of the mesh interval that contains a time.
-
-        `time_in_phase` is the time since the start of the phase, in s.
-        """
-        last_interval_index = len(self.interval_boundary_times) - 2
-        return jnp.clip(
-            jnp.searchsorted(self.interval_boundary_times, time_in_phase, side="right") - 1,
-            0,
-            last_interval_index,
-        )
-
     def evaluate_states_in_intervals(self, location_in_interval: float) -> tuple[Array, Array]:
         """Return the coordinates and the rates at one relative location in every mesh interval.
 
@@ -170,19 +169,13 @@ class CollocatedPhaseMotion(NamedTuple):
             jnp.einsum("n,ind->id", node_weights, self.node_accelerations)
             for node_weights in (rate_node_weights, position_node_weights)
         )
-        interval_start_q, interval_start_v = (
-            self.interval_boundary_q[:-1],
-            self.interval_boundary_v[:-1],
-        )
-        return interval_start_q + interval_lengths * (
+        interval_start_v = self.interval_boundary_v[:-1]
+        return self.interval_boundary_q[:-1] + interval_lengths * (
             location_in_interval * interval_start_v + interval_lengths * position_increments
         ), interval_start_v + interval_lengths * rate_increments
 
     def integrate_motion_to_time(
-        self,
-        time_in_phase: Scalar,
-        compute_acceleration: FunctionOfCoordinatesAndRates,
-        n_newton_iterations: int,
+        self, time_in_phase: Scalar, compute_acceleration: FunctionOfCoordinatesAndRates
     ) -> tuple[Array, Array]:
         """Return the coordinates and the rates at a time within the phase.
 
@@ -191,13 +184,12 @@ class CollocatedPhaseMotion(NamedTuple):
         method solves for the node accelerations of the additional interval. The result is
         differentiable with respect to the motion, but not with respect to the time.
         """
-        interval_index = self.find_mesh_interval_at_time(time_in_phase)
-        interval_start_time, interval_start_q, interval_start_v = (
-            self.interval_boundary_times[interval_index],
-            self.interval_boundary_q[interval_index],
-            self.interval_boundary_v[interval_index],
+        interval_index = find_mesh_intervals(self.interval_boundary_times, time_in_phase)
+        interval_start_q = self.interval_boundary_q[interval_index]
+        interval_start_v = self.interval_boundary_v[interval_index]
+        partial_interval_length = lax.stop_gradient(
+            time_in_phase - self.interval_boundary_times[interval_index]
         )
-        partial_interval_length = lax.stop_gradient(time_in_phase - interval_start_time)
 
         def compute_dynamics_residual(flat_accelerations: Array) -> Array:
             node_accelerations = flat_accelerations.reshape(N_GAUSS_NODES, -1)
@@ -221,7 +213,9 @@ class CollocatedPhaseMotion(NamedTuple):
 
         initial_accelerations = lax.stop_gradient(self.node_accelerations[interval_index].ravel())
         node_accelerations = lax.scan(
-            refine_node_accelerations, initial_accelerations, length=n_newton_iterations
+            refine_node_accelerations,
+            initial_accelerations,
+            length=EXTREMUM_SEARCH_OPTIONS.n_state_newton_iterations,
         )[0].reshape(N_GAUSS_NODES, -1)
         return interval_start_q + partial_interval_length * (
             interval_start_v + partial_interval_length * (DOUBLE_END_WEIGHTS @ node_accelerations)
@@ -242,9 +236,9 @@ class _PiecewiseQuantityPolynomial(NamedTuple):
         cls,
         phase_motion: CollocatedPhaseMotion,
         compute_quantity: FunctionOfCoordinatesAndRates,
-        n_samples_per_interval: int,
     ) -> "_PiecewiseQuantityPolynomial":
-        """Interpolate `n_samples_per_interval` values of the quantity in each mesh interval."""
+        """Interpolate samples of the quantity in each mesh interval."""
+        n_samples_per_interval = EXTREMUM_SEARCH_OPTIONS.n_samples_per_interval
         chebyshev_angles = (
             np.pi * (np.arange(n_samples_per_interval) + 0.5) / n_samples_per_interval
         )
@@ -253,10 +247,7 @@ class _PiecewiseQuantityPolynomial(NamedTuple):
             phase_motion.evaluate_states_in_intervals(sample_location)
             for sample_location in sample_locations
         ]
-        q, v = (
-            jnp.stack(states_by_location, 1)
-            for states_by_location in zip(*sampled_states, strict=True)
-        )
+        q, v = jax.tree.map(lambda *states: jnp.stack(states, 1), *sampled_states)
         sampled_values = jax.vmap(jax.vmap(compute_quantity))(q, v)
         interpolation_matrix = np.linalg.inv(
             sample_locations[:, None] ** np.arange(n_samples_per_interval)
@@ -272,28 +263,18 @@ class _PiecewiseQuantityPolynomial(NamedTuple):
 
         `derivative_order` is 1 or 2. Times are in s since the start of the phase.
         """
-        last_interval_index = len(self.interval_boundary_times) - 2
-        interval_indices = jnp.clip(
-            jnp.searchsorted(self.interval_boundary_times, evaluation_times, side="right") - 1,
-            0,
-            last_interval_index,
-        )
+        interval_indices = find_mesh_intervals(self.interval_boundary_times, evaluation_times)
         interval_lengths = jnp.diff(self.interval_boundary_times)[interval_indices]
         interval_lengths = jnp.where(interval_lengths > 0.0, interval_lengths, 1.0)
         locations_in_intervals = (
             evaluation_times - self.interval_boundary_times[interval_indices]
         ) / interval_lengths
         derivatives_by_location = jnp.zeros_like(evaluation_times)
-        for monomial_power in range(
-            self.interval_coefficients.shape[1] - 1, derivative_order - 1, -1
-        ):
-            power_derivative_factor = (
-                monomial_power if derivative_order == 1 else monomial_power * (monomial_power - 1)
-            )
+        for power in range(self.interval_coefficients.shape[1] - 1, derivative_order - 1, -1):
+            power_factor = power if derivative_order == 1 else power * (power - 1)
             derivatives_by_location = (
                 derivatives_by_location * locations_in_intervals
-                + power_derivative_factor
-                * self.interval_coefficients[interval_indices, monomial_power]
+                + power_factor * self.interval_coefficients[interval_indices, power]
             )
         return derivatives_by_location / interval_lengths**derivative_order
 
@@ -318,7 +299,6 @@ def find_quantity_extrema(
     phase_motion: CollocatedPhaseMotion,
     compute_acceleration: FunctionOfCoordinatesAndRates,
     compute_quantity: FunctionOfCoordinatesAndRates,
-    search_options: ExtremumSearchOptions = DEFAULT_EXTREMUM_SEARCH_OPTIONS,
 ) -> PhaseExtrema:
     """Find the extrema of a quantity inside a phase.
 
@@ -328,49 +308,42 @@ def find_quantity_extrema(
         phase_motion: motion during the phase.
         compute_acceleration: function that maps coordinates and rates to accelerations.
         compute_quantity: function that maps coordinates and rates to the quantity, a scalar.
-        search_options: numerical options of the search.
     """
     quantity_polynomial = _PiecewiseQuantityPolynomial.interpolate_quantity(
-        phase_motion, compute_quantity, search_options.n_samples_per_interval
+        phase_motion, compute_quantity
     )
-    phase_duration, sample_times_in_phase = (
-        quantity_polynomial.interval_boundary_times[-1],
-        quantity_polynomial.sample_times_in_phase,
-    )
-    sampled_second_rates = quantity_polynomial.evaluate_polynomial_time_derivative(
-        sample_times_in_phase, 2
-    )
+    phase_duration = quantity_polynomial.interval_boundary_times[-1]
+    sample_times = quantity_polynomial.sample_times_in_phase
+    sampled_second_rates = quantity_polynomial.evaluate_polynomial_time_derivative(sample_times, 2)
     last_sample_index = len(sampled_second_rates) - 1
     # An unused bracket has zero length and lies at the end of the phase.
-    has_second_rate_zero = sampled_second_rates[:-1] * sampled_second_rates[1:] < 0.0
     bracket_start_indices = jnp.nonzero(
-        has_second_rate_zero,
-        size=search_options.max_rate_extrema_per_phase,
+        sampled_second_rates[:-1] * sampled_second_rates[1:] < 0.0,
+        size=EXTREMUM_SEARCH_OPTIONS.max_rate_extrema_per_phase,
         fill_value=last_sample_index,
     )[0]
-    bracket_end_indices = jnp.minimum(bracket_start_indices + 1, last_sample_index)
     is_rate_extremum = bracket_start_indices < last_sample_index
-    rate_extremum_times = _find_bracketed_zeros(
+    bracket_indices = jnp.stack(
+        [bracket_start_indices, jnp.minimum(bracket_start_indices + 1, last_sample_index)]
+    )
+    bracket_times = sample_times[bracket_indices]
+    bracket_second_rates = sampled_second_rates[bracket_indices]
+    rate_extremum_times = _bisect_zeros(
         lambda t: quantity_polynomial.evaluate_polynomial_time_derivative(t, 2),
-        (sample_times_in_phase[bracket_start_indices], sample_times_in_phase[bracket_end_indices]),
-        (sampled_second_rates[bracket_start_indices], sampled_second_rates[bracket_end_indices]),
-        search_options.n_bracketing_iterations,
+        bracket_times,
+        bracket_second_rates[0],
     )
-    bracket_lengths = (
-        sample_times_in_phase[bracket_end_indices] - sample_times_in_phase[bracket_start_indices]
+    second_rate_slopes = (bracket_second_rates[1] - bracket_second_rates[0]) / jnp.where(
+        is_rate_extremum, bracket_times[1] - bracket_times[0], 1.0
     )
-    second_rate_slopes = (
-        sampled_second_rates[bracket_end_indices] - sampled_second_rates[bracket_start_indices]
-    ) / jnp.where(is_rate_extremum, bracket_lengths, 1.0)
-    phase_start_and_end_times = jnp.stack([0.0 * phase_duration, phase_duration])
+    # The start and the end of the phase bound the extrema of R.
     rate_extremum_times = jnp.concatenate(
         [
-            phase_start_and_end_times[:1],
+            0.0 * phase_duration[None],
             jnp.where(is_rate_extremum, rate_extremum_times, phase_duration),
-            phase_start_and_end_times[1:],
+            phase_duration[None],
         ]
     )
-    rate_extrema_slice = slice(1, -1)
     inverse_second_rate_slopes = jnp.where(
         is_rate_extremum, 1.0 / jnp.where(second_rate_slopes == 0.0, 1.0, second_rate_slopes), 0.0
     )
@@ -387,9 +360,8 @@ def find_quantity_extrema(
         """
 
         def evaluate_quantity_at_time(time_in_phase: Array) -> QuantityTimeDerivatives:
-            n_newton_iterations = search_options.n_state_newton_iterations
             state_at_time = phase_motion.integrate_motion_to_time(
-                time_in_phase, compute_acceleration, n_newton_iterations
+                time_in_phase, compute_acceleration
             )
             return evaluate_quantity_time_derivatives(
                 compute_quantity, compute_acceleration, *state_at_time
@@ -403,15 +375,11 @@ def find_quantity_extrema(
             corrected_times = jnp.clip(corrected_times - time_corrections, 0.0, phase_duration)
             return (corrected_times, jax.vmap(evaluate_quantity_at_time)(corrected_times)), None
 
-        zero_derivatives = jnp.zeros_like(extremum_times)
-        initial_loop_carry = (
-            extremum_times,
-            QuantityTimeDerivatives(zero_derivatives, zero_derivatives, zero_derivatives),
-        )
+        zero_derivatives = QuantityTimeDerivatives(*jnp.zeros((3, *extremum_times.shape)))
         return lax.scan(
             correct_extremum_times_once,
-            initial_loop_carry,
-            length=search_options.n_time_corrections,
+            (extremum_times, zero_derivatives),
+            length=EXTREMUM_SEARCH_OPTIONS.n_time_corrections,
         )[0]
 
     rate_extremum_times, derivatives_at_rate_extrema = correct_extremum_times(
@@ -420,16 +388,12 @@ def find_quantity_extrema(
         ),
         rate_extremum_times,
     )
-    rate_before_extremum, rate_after_extremum = (
-        derivatives_at_rate_extrema.first_time_derivative[:-1],
-        derivatives_at_rate_extrema.first_time_derivative[1:],
-    )
-    has_extremum = (rate_before_extremum * rate_after_extremum < 0.0) & (phase_duration > 0.0)
-    extremum_times = _find_bracketed_zeros(
+    rates = derivatives_at_rate_extrema.first_time_derivative
+    has_extremum = (rates[:-1] * rates[1:] < 0.0) & (phase_duration > 0.0)
+    extremum_times = _bisect_zeros(
         lambda t: quantity_polynomial.evaluate_polynomial_time_derivative(t, 1),
-        (rate_extremum_times[:-1], rate_extremum_times[1:]),
-        (rate_before_extremum, rate_after_extremum),
-        search_options.n_bracketing_iterations,
+        jnp.stack([rate_extremum_times[:-1], rate_extremum_times[1:]]),
+        rates[:-1],
     )
     compute_newton_correction = lambda derivatives_at_times: jnp.where(
         has_extremum,
@@ -447,10 +411,10 @@ def find_quantity_extrema(
     return PhaseExtrema(
         extremum_times=extremum_times,
         extremum_values=derivatives_at_extrema.quantity_value,
-        is_quantity_maximum=has_extremum & (rate_before_extremum > 0.0),
-        is_quantity_minimum=has_extremum & (rate_before_extremum < 0.0),
-        rate_extremum_times=rate_extremum_times[rate_extrema_slice],
-        rate_extremum_values=derivatives_at_rate_extrema.first_time_derivative[rate_extrema_slice],
+        is_quantity_maximum=has_extremum & (rates[:-1] > 0.0),
+        is_quantity_minimum=has_extremum & (rates[:-1] < 0.0),
+        rate_extremum_times=rate_extremum_times[1:-1],
+        rate_extremum_values=rates[1:-1],
         is_rate_maximum=is_rate_extremum & (second_rate_slopes < 0.0) & (phase_duration > 0.0),
     )
 
@@ -475,66 +439,29 @@ def evaluate_quantity_time_derivatives(
     return QuantityTimeDerivatives(quantity_value, first_time_derivative, second_time_derivative)
 
 
-def _find_bracketed_zeros(
+def _bisect_zeros(
     bracketed_function: Callable[[Array], Array],
-    bracket_end_points: tuple[Array, Array],
-    bracket_values: tuple[Array, Array],
-    n_iterations: int,
+    bracket_end_points: Float[Array, "2 brackets"],
+    bracket_start_values: Float[Array, " brackets"],
 ) -> Array:
     """Return one root of `bracketed_function` in each bracket. The roots carry no derivatives.
 
-    `bracket_values` contains the values of `bracketed_function` at the two ends of each bracket. If
-    the two values of a bracket have the same sign, the start of the bracket is returned. The method
-    is Chandrupatla's (Adv. Eng. Softw. 28, 145-149, 1997).
+    `bracket_start_values` contains the values of `bracketed_function` at the first end of each
+    bracket. Without a sign change in a bracket, the result is an arbitrary point of the bracket.
     """
-    bracket_starts, bracket_ends, bracket_start_values, bracket_end_values = lax.stop_gradient(
-        (*bracket_end_points, *bracket_values)
-    )
-    has_sign_change = bracket_start_values * bracket_end_values < 0.0
-    avoid_zero_division = lambda x: jnp.where(x == 0.0, 1.0, x)
+    start_signs = jnp.sign(bracket_start_values)
 
-    def shrink_root_brackets(loop_carry: tuple, _: None) -> tuple[tuple, None]:
-        a, value_at_a, b, value_at_b, c, value_at_c, next_bracket_fraction = loop_carry
-        x = a + next_bracket_fraction * (b - a)
-        value_at_x = bracketed_function(x)
-        has_same_sign = jnp.sign(value_at_x) == jnp.sign(value_at_a)
-        c, value_at_c = (
-            jnp.where(has_same_sign, a, b),
-            jnp.where(has_same_sign, value_at_a, value_at_b),
-        )
-        b, value_at_b = (
-            jnp.where(has_same_sign, b, a),
-            jnp.where(has_same_sign, value_at_b, value_at_a),
-        )
-        a, value_at_a = x, value_at_x
-        xi = (a - b) / avoid_zero_division(c - b)
-        phi = (value_at_a - value_at_b) / avoid_zero_division(value_at_c - value_at_b)
-        is_interpolation_trusted = (phi * phi < xi) & ((1.0 - phi) * (1.0 - phi) < 1.0 - xi)
-        interpolated_fraction = value_at_a / avoid_zero_division(
-            value_at_b - value_at_a
-        ) * value_at_c / avoid_zero_division(value_at_b - value_at_c) + (
-            c - a
-        ) / avoid_zero_division(b - a) * value_at_a / avoid_zero_division(
-            value_at_c - value_at_a
-        ) * value_at_b / avoid_zero_division(value_at_c - value_at_b)
-        next_bracket_fraction = jnp.where(
-            is_interpolation_trusted, jnp.clip(interpolated_fraction, 0.0, 1.0), 0.5
-        )
-        next_bracket_fraction = jnp.where(value_at_a == 0.0, 0.0, next_bracket_fraction)
-        return (a, value_at_a, b, value_at_b, c, value_at_c, next_bracket_fraction), None
+    def halve_brackets(bracket_end_points: Array, _: None) -> tuple[Array, None]:
+        starts, ends = bracket_end_points
+        middles = 0.5 * (starts + ends)
+        is_root_later = jnp.sign(bracketed_function(middles)) == start_signs
+        return jnp.stack(
+            [jnp.where(is_root_later, middles, starts), jnp.where(is_root_later, ends, middles)]
+        ), None
 
-    initial_loop_carry = (
-        bracket_ends,
-        bracket_end_values,
-        bracket_starts,
-        bracket_start_values,
-        bracket_starts,
-        bracket_start_values,
-        jnp.full_like(bracket_starts, 0.5),
+    final_end_points, _ = lax.scan(
+        halve_brackets,
+        lax.stop_gradient(bracket_end_points),
+        length=EXTREMUM_SEARCH_OPTIONS.n_bisections,
     )
-    a, value_at_a, b, value_at_b, *_ = lax.scan(
-        shrink_root_brackets, initial_loop_carry, None, length=n_iterations
-    )[0]
-    return jnp.where(
-        has_sign_change, jnp.where(jnp.abs(value_at_a) <= jnp.abs(value_at_b), a, b), bracket_starts
-    )
+    return jnp.mean(final_end_points, axis=0)
