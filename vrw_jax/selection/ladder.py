@@ -9,7 +9,7 @@ is violated for every finite stiffness.
 
 import dataclasses
 import enum
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import equinox as eqx
@@ -21,7 +21,6 @@ from vrw_jax.contact import (
     LOCKED_CODE_OFFSET,
     AbstractContactWheel,
     FullState,
-    UnilateralStep,
     UnilateralTrajectory,
     UnilateralWheel,
     embed_section_state,
@@ -115,13 +114,14 @@ class ModelChoice(AbstractPrintable):
                     f"{n_viscoelastic_choices} served by the paper's",
                 )
             ]
-        margin_name_value_pairs = zip(SELECTION_MARGIN_NAMES, np.asarray(self.margins), strict=True)
         margin_text_rows = [
             (
                 MARGIN_MEASURES[margin_name].label_with_symbol,
                 MARGIN_MEASURES[margin_name].format_with_unit(margin_value),
             )
-            for margin_name, margin_value in margin_name_value_pairs
+            for margin_name, margin_value in zip(
+                SELECTION_MARGIN_NAMES, np.asarray(self.margins), strict=True
+            )
         ]
         return [("model", type(self.model).__name__), ("reason", self.why), *margin_text_rows]
 
@@ -171,19 +171,21 @@ def find_selection_reason(
     - `friction_coefficient_change`: friction coefficient of the ground minus that in
       `step_measures`.
     """
-    selection_margins = [
-        step_measures[margin_name]
-        + (friction_coefficient_change if "friction" in margin_name else 0.0)
-        for margin_name in SELECTION_MARGIN_NAMES
-    ]
-    is_margin_violated = ~(jnp.stack(selection_margins, -1) >= 0.0)
+    selection_margins = jnp.stack(
+        [
+            step_measures[margin_name]
+            + (friction_coefficient_change if "friction" in margin_name else 0.0)
+            for margin_name in SELECTION_MARGIN_NAMES
+        ],
+        -1,
+    )
+    is_margin_violated = ~(selection_margins >= 0.0)
     violated_margin_code = jnp.where(
         jnp.any(is_margin_violated, -1), 1 + jnp.argmax(is_margin_violated, -1), 0
     )
     step_outcome = jnp.asarray(step_measures["outcome"], violated_margin_code.dtype)
-    return jnp.where(
-        step_outcome == Outcome.STEPPED, violated_margin_code, -step_outcome
-    ), jnp.stack(selection_margins, -1)
+    reason_code = jnp.where(step_outcome == Outcome.STEPPED, violated_margin_code, -step_outcome)
+    return reason_code, selection_margins
 
 
 class LadderStep(AbstractContactStep):
@@ -267,7 +269,8 @@ class LadderWheel(AbstractContactWheel):
         self, params: WheelParams, x: FullState, options: StepOptions
     ) -> tuple[ModelChoice, StepResult]:
         """Return the selected model, and the step computed with the viscoelastic model."""
-        viscoelastic_model, ground_friction = ViscoelasticWheel(), self.friction.astype(x.dtype)
+        viscoelastic_model = ViscoelasticWheel()
+        ground_friction = self.friction.astype(x.dtype)
         # Leg 1 alone must be loaded and at rest, with all other legs on their stoppers.
         is_leg_1 = jnp.arange(params.n_legs) == 0
         locked_leg_code = float(LOCKED_CODE_OFFSET + ContactMode.OFF)
@@ -291,66 +294,74 @@ class LadderWheel(AbstractContactWheel):
         return ModelChoice(model_code, reason_code, margins, ground_friction), viscoelastic_result
 
     def advance(self, params: WheelParams, x: FullState, options: StepOptions) -> AdvanceResult:
-        model_choice, viscoelastic_result = self.choose_model(params, x, options)
-        is_viscoelastic_valid = model_choice.model_code == ModelCode.VISCOELASTIC
-        unilateral_result = self.unilateral_model.advance(
-            params, jnp.where(is_viscoelastic_valid, jnp.nan, x), options
+        model_choice, step_values = self._compute_step_values(
+            params, x, options, self.unilateral_model.advance
         )
         return AdvanceResult(
-            section_state=jnp.where(
-                is_viscoelastic_valid,
-                _embed_viscoelastic_result(is_viscoelastic_valid, params, viscoelastic_result),
-                unilateral_result.section_state,
-            ),
-            durations=jnp.where(
-                is_viscoelastic_valid,
-                _sort_durations_by_loaded_feet(viscoelastic_result),
-                unilateral_result.durations,
-            ),
-            outcome=jnp.where(
-                is_viscoelastic_valid, viscoelastic_result.outcome, unilateral_result.outcome
-            ),
-            solver_steps=viscoelastic_result.solver_steps + unilateral_result.solver_steps,
+            **step_values,
             model_code=model_choice.model_code,
             reason_code=model_choice.reason_code,
         )
 
     def take_step(self, params: WheelParams, x: FullState, options: StepOptions) -> LadderStep:
+        model_choice, step_values = self._compute_step_values(
+            params, x, options, self.unilateral_model.take_step
+        )
+        return LadderStep(choice=model_choice, **step_values)
+
+    def _compute_step_values(
+        self,
+        params: WheelParams,
+        x: FullState,
+        options: StepOptions,
+        compute_unilateral_step: Callable,
+    ) -> tuple[ModelChoice, dict[str, Any]]:
+        """Return the selected model, and the values of a step by their names in `LadderStep`.
+
+        The values are those that the result of `compute_unilateral_step` has.
+        """
         model_choice, viscoelastic_result = self.choose_model(params, x, options)
         is_viscoelastic_valid = model_choice.model_code == ModelCode.VISCOELASTIC
-        unilateral_result: UnilateralStep = self.unilateral_model.take_step(
+        unilateral_result = compute_unilateral_step(
             params, jnp.where(is_viscoelastic_valid, jnp.nan, x), options
         )
-        leaf_selector = lambda viscoelastic_value, unilateral_value: jnp.where(
-            is_viscoelastic_valid, viscoelastic_value, unilateral_value
+        dls_duration, sls1_duration, sls2_duration = viscoelastic_result.durations
+        durations_by_loaded_feet = [
+            dls_duration,
+            sls1_duration + sls2_duration,
+            jnp.zeros_like(dls_duration),
+        ]
+        # If the viscoelastic model is not valid, the paper's start state is embedded.
+        section_state = viscoelastic_result.section_state
+        valid_params, valid_section_state = replace_invalid_inputs(
+            is_viscoelastic_valid,
+            params,
+            section_state,
+            jnp.asarray(PAPER_START_STATE, section_state.dtype),
         )
-        return LadderStep(
-            choice=model_choice,
-            section_state=leaf_selector(
-                _embed_viscoelastic_result(is_viscoelastic_valid, params, viscoelastic_result),
-                unilateral_result.section_state,
-            ),
-            post_impact=leaf_selector(
-                viscoelastic_result.post_impact, unilateral_result.post_impact
-            ),
-            durations=leaf_selector(
-                _sort_durations_by_loaded_feet(viscoelastic_result), unilateral_result.durations
-            ),
-            step_length=leaf_selector(
-                viscoelastic_result.step_length, unilateral_result.step_length
-            ),
-            energy_impacts=leaf_selector(
-                viscoelastic_result.energy.landing + viscoelastic_result.energy.stopper,
-                unilateral_result.energy_impacts,
-            ),
-            energy_damping=leaf_selector(
-                viscoelastic_result.energy.damping, unilateral_result.energy_damping
-            ),
-            energy_friction=leaf_selector(0.0, unilateral_result.energy_friction),
-            slip=leaf_selector(0.0, unilateral_result.slip),
-            outcome=leaf_selector(viscoelastic_result.outcome, unilateral_result.outcome),
-            solver_steps=viscoelastic_result.solver_steps + unilateral_result.solver_steps,
+        energy_loss = viscoelastic_result.energy
+        viscoelastic_values: dict[str, Any] = {
+            "section_state": embed_section_state(valid_params.symbols(), valid_section_state),
+            "post_impact": viscoelastic_result.post_impact,
+            "durations": jnp.stack(durations_by_loaded_feet),
+            "step_length": viscoelastic_result.step_length,
+            "energy_impacts": energy_loss.landing + energy_loss.stopper,
+            "energy_damping": energy_loss.damping,
+            "energy_friction": 0.0,
+            "slip": 0.0,
+            "outcome": viscoelastic_result.outcome,
+        }
+        step_values = {
+            value_name: jnp.where(
+                is_viscoelastic_valid, viscoelastic_value, getattr(unilateral_result, value_name)
+            )
+            for value_name, viscoelastic_value in viscoelastic_values.items()
+            if hasattr(unilateral_result, value_name)
+        }
+        step_values["solver_steps"] = (
+            viscoelastic_result.solver_steps + unilateral_result.solver_steps
         )
+        return model_choice, step_values
 
     def sample_step(
         self, params: WheelParams, x: FullState, options: StepOptions, n_samples: int
@@ -369,33 +380,3 @@ class LadderWheel(AbstractContactWheel):
         return dataclasses.replace(
             trajectory, model_selection=model_choice.collect_selection_codes()
         )
-
-
-def _embed_viscoelastic_result(
-    is_viscoelastic_valid: Array, params: WheelParams, viscoelastic_result: StepResult
-) -> FullState:
-    """Return the full section state after a step computed with the viscoelastic model.
-
-    If this model is not valid, return the paper's start state in the form of a full section state.
-    """
-    placeholder_section_state = jnp.asarray(
-        PAPER_START_STATE, viscoelastic_result.section_state.dtype
-    )
-    params, x = replace_invalid_inputs(
-        is_viscoelastic_valid, params, viscoelastic_result.section_state, placeholder_section_state
-    )
-    return embed_section_state(params.symbols(), x)
-
-
-def _sort_durations_by_loaded_feet(viscoelastic_result: StepResult) -> Float[Array, "3"]:
-    """Return the durations with two, one and no loaded feet, s, for a step in the paper's
-    phases.
-    """
-    double_support_duration, *single_support_durations = viscoelastic_result.durations
-    return jnp.stack(
-        [
-            double_support_duration,
-            single_support_durations[0] + single_support_durations[1],
-            jnp.zeros_like(double_support_duration),
-        ]
-    )

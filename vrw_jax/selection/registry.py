@@ -55,6 +55,7 @@ def describe_accepted_models(
         else f"vrw.{find_model_class(config_name).__name__}()"
         for config_name in list_model_config_names(command_name, parameter_name)
     ]
-    return " or ".join(
-        [", ".join(model_expressions[:-1]), model_expressions[-1]][not model_expressions[1:] :]
-    )
+    *first_expressions, last_expression = model_expressions
+    if not first_expressions:
+        return last_expression
+    return f"{', '.join(first_expressions)} or {last_expression}"
