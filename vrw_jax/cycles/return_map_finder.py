@@ -84,15 +84,9 @@ class ReturnMapCycle(AbstractCycle):
 
     def _drop_single_step_axis(self, tree_over_steps: Any) -> Any:
         """Return the tree without its axis over the gait steps if the cycle has only one step."""
-        gait_step_axis, is_single_step = self.outcome.ndim, self.period_n == 1
-        return jax.tree.map(
-            lambda array_over_steps: (
-                jnp.squeeze(array_over_steps, gait_step_axis)
-                if is_single_step
-                else array_over_steps
-            ),
-            tree_over_steps,
-        )
+        if self.period_n > 1:
+            return tree_over_steps
+        return jax.tree.map(lambda x: jnp.squeeze(x, self.outcome.ndim), tree_over_steps)
 
     @property
     def indicators(self) -> Any:
@@ -131,10 +125,7 @@ def measure_return_map_force_peaks(
     measures_by_step = jax.vmap(lambda x: model.measure_force_peaks(params, x, options))(
         start_states
     )
-    return {
-        measure_name: jnp.nanmax(values_by_step)
-        for measure_name, values_by_step in measures_by_step.items()
-    }
+    return jax.tree.map(jnp.nanmax, measures_by_step)
 
 
 @eqx.filter_jit
@@ -173,7 +164,8 @@ def find_return_map_cycle(
         x=fixed_point.x * section_units,
         jacobian=section_units[:, None] * fixed_point.jacobian / section_units,
     )
-    section_state, step_results = fixed_point.x, []
+    section_state = fixed_point.x
+    step_results = []
     for _ in range(period_n):
         step_results.append(model.take_step(params, section_state, options))
         section_state = step_results[-1].section_state
@@ -199,9 +191,14 @@ def make_return_map_cycle(
         is_gait_valid, array_over_steps, jnp.zeros_like(array_over_steps)
     )
     gait_steps_of_cycle = jax.tree.map(zero_without_gait, gait_steps_of_cycle)
+    select_step_values = lambda values_by_step: (
+        values_by_step[0] if len(values_by_step) == 1 else values_by_step
+    )
     return ReturnMapCycle(
-        zero_without_gait(fixed_point.x),
-        *summarize_cycle_steps(gait_steps_of_cycle),
+        section_state=zero_without_gait(fixed_point.x),
+        post_impact=gait_steps_of_cycle.post_impact[0],
+        durations=select_step_values(gait_steps_of_cycle.durations),
+        step_length=select_step_values(gait_steps_of_cycle.step_length),
         steps=gait_steps_of_cycle,
         monodromy_value=zero_without_gait(fixed_point.jacobian),
         outcome=jnp.where(is_gait_valid, Outcome.STEPPED, failure_outcome).astype(jnp.int32),
@@ -210,17 +207,6 @@ def make_return_map_cycle(
         params=params,
         model=model,
     )
-
-
-def summarize_cycle_steps(gait_steps_of_cycle: Any) -> tuple[Array, Array, Array]:
-    """Return the post-impact state, the phase durations, s, and the step lengths, m, of a cycle.
-
-    The gait steps of the cycle are on a leading axis.
-    """
-    phase_durations, step_lengths = gait_steps_of_cycle.durations, gait_steps_of_cycle.step_length
-    if len(phase_durations) == 1:
-        phase_durations, step_lengths = phase_durations[0], step_lengths[0]
-    return gait_steps_of_cycle.post_impact[0], phase_durations, step_lengths
 
 
 class AbstractReturnMapFinder(AbstractGaitFinder):
@@ -235,10 +221,20 @@ class AbstractReturnMapFinder(AbstractGaitFinder):
     supports_cold_start: ClassVar[bool] = False
 
     def find_cycle(self, params: WheelParams, cycle_guess: Any = None) -> ReturnMapCycle:
-        newton_search_arguments = prepare_search(self, params, cycle_guess)
         return find_return_map_cycle(
-            *newton_search_arguments, self.period_n, uses_implicit_jvp=False
+            *self.prepare_search(params, cycle_guess), self.period_n, uses_implicit_jvp=False
         )
+
+    def prepare_search(
+        self, params: WheelParams, cycle_guess: Any
+    ) -> tuple[WheelParams, Array, AbstractWheel, StepOptions]:
+        """Return the wheel, the section state, the model and the options for a search near
+        `cycle_guess`.
+        """
+        section_state = getattr(cycle_guess, "section_state", cycle_guess)
+        if section_state is None:
+            section_state = self.model.compute_default_start(params)
+        return convert_step_arguments(params, section_state, self.model, self.step_options)
 
     def make_initial_guess(self, parameter_values: ParameterValues) -> Array:
         """Return the last section state of a walk that begins at the model's default start."""
@@ -286,25 +282,6 @@ class ReturnMapFinder(AbstractReturnMapFinder):
         )
 
 
-def prepare_search(
-    gait_finder: AbstractReturnMapFinder, params: WheelParams, cycle_guess: Any
-) -> tuple[WheelParams, Array, AbstractWheel, StepOptions]:
-    """Return the wheel, the section state, the model and the options for a search near
-    `cycle_guess`.
-    """
-    guess_section_state = (
-        cycle_guess.section_state if isinstance(cycle_guess, AbstractCycle) else cycle_guess
-    )
-    section_state = (
-        gait_finder.model.compute_default_start(params)
-        if guess_section_state is None
-        else guess_section_state
-    )
-    return convert_step_arguments(
-        params, section_state, gait_finder.model, gait_finder.step_options
-    )
-
-
 def make_return_map_gait(
     model: AbstractWheel,
     n_legs: int,
@@ -323,11 +300,12 @@ def make_return_map_gait(
       parameters on the branch, with a leading axis over the parameters.
     """
     n_coordinates = model.count_continuous_section_entries(WheelParams(n_legs=n_legs))
-    gait_coordinates = lambda cycle, event_driven_step: jnp.concatenate(
-        [cycle.section_state[:n_coordinates], event_driven_step.durations]
-    )
     coordinates_and_derivatives = compute_value_and_tangents(
-        gait_coordinates, (cycle, event_driven_step), (cycle_derivatives, step_derivatives)
+        lambda cycle, gait_step: jnp.concatenate(
+            [cycle.section_state[:n_coordinates], gait_step.durations]
+        ),
+        (cycle, event_driven_step),
+        (cycle_derivatives, step_derivatives),
     )
     return_map_jacobian = cycle.monodromy_value[:n_coordinates, :n_coordinates]
     return Gait(

@@ -18,12 +18,12 @@ from jaxtyping import Array
 from vrw_jax.contact import UnilateralWheel, step_batch_with_jacobian
 from vrw_jax.continuation import FixedPointResult
 from vrw_jax.cycles.attracting_gaits import find_slow_gaits
-from vrw_jax.cycles.cycle import AbstractCycle
 from vrw_jax.cycles.finder import (
     Gait,
     GaitMeasures,
     ParameterValues,
     compute_gait_measures,
+    compute_value_and_tangents,
     move_derivative_axis_first,
 )
 from vrw_jax.cycles.gait_walks import stack_section_units
@@ -34,8 +34,6 @@ from vrw_jax.cycles.return_map_finder import (
     find_return_map_cycle,
     make_return_map_cycle,
     make_return_map_gait,
-    prepare_search,
-    summarize_cycle_steps,
 )
 from vrw_jax.measures import FORCE_PEAK_MEASURES, UNILATERAL_DIFFERENTIABLE_NAMES
 from vrw_jax.models import AbstractStep, AbstractWheel
@@ -95,7 +93,7 @@ class UnilateralFinder(AbstractReturnMapFinder):
         traced, the cycle has derivatives by the implicit function theorem, computed from a single
         gait step.
         """
-        params, section_state, model, options = prepare_search(self, params, cycle_guess)
+        params, section_state, model, options = self.prepare_search(params, cycle_guess)
         if has_traced_leaf(params, section_state, model):
             return find_return_map_cycle(
                 params, section_state, model, options, self.period_n, uses_implicit_jvp=True
@@ -173,34 +171,30 @@ class UnilateralFinder(AbstractReturnMapFinder):
         - `needs_parameter_derivatives`: whether the steps are differentiated with respect to
           parameters.
         """
-        newton_search_inputs = (
-            np.asarray(parameter_values),
+        parameter_values = np.asarray(parameter_values)
+        fixed_points = find_contact_fixed_points(
+            PeriodMap(self.model, self.n_legs, self.period_n, parameter_values),
+            self.step_options,
             np.asarray(section_states),
             needs_parameter_derivatives,
-        )
-        fixed_points = find_contact_fixed_points(
-            self.model, self.n_legs, self.step_options, self.period_n, *newton_search_inputs
         )
         evaluate_wheel_batch = functools.partial(
             _evaluate_over_wheels, evaluate_fixed_point, self.model, self.n_legs
         )
         return map_in_batches(
-            evaluate_wheel_batch, self.gait_batch_sizes, newton_search_inputs[0], fixed_points
+            evaluate_wheel_batch, self.gait_batch_sizes, parameter_values, fixed_points
         )
 
     def take_gait_step(self, params: WheelParams, section_state: Array) -> AbstractStep:
-        parameter_value_columns, model = (
+        steps, _ = step_batch_with_jacobian(
             np.asarray(self.model.collect_parameter_values(params))[:, None],
-            self.model,
-        )
-        step_arguments = (
-            parameter_value_columns,
             np.asarray(section_state)[None],
-            model,
+            self.model,
             self.step_options,
             self.n_legs,
+            (),
         )
-        return _remove_batch_axis(step_batch_with_jacobian(*step_arguments, ())[0])
+        return _remove_batch_axis(steps)
 
     def measure_gait(
         self, parameter_values: ParameterValues, cycle_guess: Any, measure_names: tuple[str, ...]
@@ -208,18 +202,13 @@ class UnilateralFinder(AbstractReturnMapFinder):
         """Return measures of a gait and their derivatives, computed from one Jacobian of the gait
         step.
         """
+        section_state = getattr(cycle_guess, "section_state", cycle_guess)
+        if section_state is None:
+            section_state = self.make_initial_guess(parameter_values)
         model, params = self.model.from_parameter_values(
             tuple(jax.device_put(list(np.asarray(parameter_values)))), self.n_legs
         )
-        start_state = (
-            cycle_guess.section_state if isinstance(cycle_guess, AbstractCycle) else cycle_guess
-        )
-        start_state = (
-            self.make_initial_guess(parameter_values) if start_state is None else start_state
-        )
-        _, section_state, _, _ = convert_step_arguments(
-            params, start_state, model, self.step_options
-        )
+        section_state = convert_step_arguments(params, section_state, model, self.step_options)[1]
         return compute_gait_measures(
             self.find_gait(parameter_values, section_state), type(self).read_measure, measure_names
         )
@@ -236,19 +225,6 @@ def _add_batch_axis(x: Array) -> Array:
 def _remove_batch_axis(batched_tree: Any) -> Any:
     """Return the first element of every array, which inverts `_add_batch_axis`."""
     return jax.device_put(select_tree_rows(batched_tree, 0))
-
-
-class _ContactFixedPoints(NamedTuple):
-    """Fixed points of the return maps of many wheels. The fields have a leading axis over the
-    wheels.
-    """
-
-    fixed_section_states: Any
-    gait_steps_of_period: Any  # gait steps from the fixed point, (period_n, ...)
-    step_jacobians: Any  # with respect to parameter values and section state
-    newton_residuals: Any
-    is_gait_found: Any
-    n_newton_iterations: Any
 
 
 class PeriodMap(NamedTuple):
@@ -283,10 +259,9 @@ class PeriodMap(NamedTuple):
 
         The derivatives are with respect to the selected parameter values and to the section states.
         """
-        steps_and_jacobians, (n_parameter_values, n_section_entries) = (
-            [],
-            (self.parameter_values.shape[1], section_states.shape[1]),
-        )
+        steps_and_jacobians = []
+        n_parameter_values = self.parameter_values.shape[1]
+        n_section_entries = section_states.shape[1]
         period_jacobian = np.concatenate(
             [np.zeros((n_section_entries, n_parameter_values)), np.eye(n_section_entries)], 1
         )[None]
@@ -299,7 +274,7 @@ class PeriodMap(NamedTuple):
         )
         input_indices = np.flatnonzero(is_input_differentiated).tolist()
         for _ in range(self.period_n):
-            step_arguments = (
+            step_result, step_result_jacobians = step_batch_with_jacobian(
                 self.parameter_values.T,
                 section_states,
                 self.model,
@@ -307,22 +282,18 @@ class PeriodMap(NamedTuple):
                 self.n_legs,
                 input_indices,
             )
-            steps_and_jacobians.append(step_batch_with_jacobian(*step_arguments))
-            step_result, step_result_jacobians = steps_and_jacobians[-1]
+            steps_and_jacobians.append((step_result, step_result_jacobians))
             is_period_complete &= np.asarray(step_result.outcome) == Outcome.STEPPED
             section_states = np.asarray(step_result.section_state)
             step_jacobian = np.asarray(step_result_jacobians.section_state)
             period_jacobian = step_jacobian[:, :, n_parameter_values:] @ period_jacobian
             period_jacobian[:, :, :n_parameter_values] += step_jacobian[:, :, :n_parameter_values]
-        gait_steps_of_period, stacked_jacobians = (
-            jax.tree.map(
-                lambda *stacked_arrays: np.stack(stacked_arrays, 1), *step_and_jacobian_arrays
-            )
-            for step_and_jacobian_arrays in zip(*steps_and_jacobians, strict=True)
+        gait_steps_of_period, step_jacobians = jax.tree.map(
+            lambda *stacked_arrays: np.stack(stacked_arrays, 1), *steps_and_jacobians
         )
         return PeriodEvaluation(
             gait_steps_of_period,
-            stacked_jacobians,
+            step_jacobians,
             section_states,
             period_jacobian[:, :, :n_parameter_values],
             period_jacobian[:, :, n_parameter_values:],
@@ -348,15 +319,27 @@ class PeriodEvaluation(NamedTuple):
         """Return Newton's correction of the section states, which is zero if a period
         is not complete.
         """
-        newton_correction, is_period_complete = (
-            np.zeros_like(section_states),
-            self.is_period_complete,
+        newton_correction = np.zeros_like(section_states)
+        newton_matrix = (
+            np.eye(section_states.shape[1]) - return_map_jacobian[self.is_period_complete]
         )
-        newton_matrix = np.eye(section_states.shape[1]) - return_map_jacobian[is_period_complete]
-        newton_correction[is_period_complete] = solve_linear_systems(
-            newton_matrix, (self.end_states - section_states)[is_period_complete][..., None]
+        period_defects = (self.end_states - section_states)[self.is_period_complete]
+        newton_correction[self.is_period_complete] = solve_linear_systems(
+            newton_matrix, period_defects[..., None]
         )[..., 0]
         return newton_correction
+
+
+class _ContactFixedPoints(NamedTuple):
+    """Fixed points of the return maps of many wheels. The fields have a leading axis over the
+    wheels.
+    """
+
+    fixed_section_states: Any
+    period_evaluation: PeriodEvaluation  # at the fixed points
+    newton_residuals: Any
+    is_gait_found: Any
+    n_newton_iterations: Any
 
 
 def solve_linear_systems(
@@ -384,14 +367,10 @@ def solve_linear_systems(
 
 
 def find_contact_fixed_points(
-    model: Any,
-    n_legs: int,
+    period_map: PeriodMap,
     step_options: StepOptions,
-    period_n: int,
-    parameter_values: np.ndarray,
     start_states: np.ndarray,
     needs_parameter_derivatives: bool,
-    newton_options: ContactNewtonOptions = CONTACT_NEWTON_OPTIONS,
 ) -> _ContactFixedPoints:
     """Find the fixed points of the return maps near `start_states`.
 
@@ -401,57 +380,46 @@ def find_contact_fixed_points(
     evaluates the gait with all derivatives. If loose steps move away from a state that an exact
     step hardly changes, all steps are exact.
     """
-    period_map = PeriodMap(model, n_legs, period_n, parameter_values)
     loose_step_tolerances = [
-        np.maximum(newton_tolerance, newton_options.step_tolerance_far_from_gait)
-        for newton_tolerance in (step_options.rtol, step_options.atol)
+        np.maximum(step_tolerance, CONTACT_NEWTON_OPTIONS.step_tolerance_far_from_gait)
+        for step_tolerance in (step_options.rtol, step_options.atol)
     ]
     loose_step_options = eqx.tree_at(
         lambda step_options: (step_options.rtol, step_options.atol),
         step_options,
         jax.device_put(loose_step_tolerances),
     )
-    newton_tolerance, is_wheel_requested = (
-        float(compute_newton_tolerance(step_options)),
-        np.ones(len(parameter_values), bool),
-    )
-    loose_fixed_points, return_map_jacobian = _run_contact_newton(
+    max_correction_near_gait = CONTACT_NEWTON_OPTIONS.max_correction_near_gait
+    loose_fixed_points = _run_contact_newton(
         period_map,
         loose_step_options,
         start_states,
         False,
-        newton_options.max_correction_near_gait,
-        is_wheel_requested,
-        newton_options,
+        max_correction_near_gait,
+        np.ones(len(start_states), bool),
     )
     is_near_gait = loose_fixed_points.is_gait_found
     section_states = np.where(
         is_near_gait[:, None], loose_fixed_points.fixed_section_states, start_states
     )
     section_units = period_map.section_units_by_wheel
-    exact_period_evaluation = period_map.evaluate_period(step_options, section_states, False, False)
-    newton_correction = exact_period_evaluation.compute_newton_correction(
-        section_states, return_map_jacobian
+    exact_evaluation = period_map.evaluate_period(step_options, section_states, False, False)
+    newton_correction = exact_evaluation.compute_newton_correction(
+        section_states, loose_fixed_points.period_evaluation.return_map_jacobian
     )
     section_states[is_near_gait] += newton_correction[is_near_gait] * (
         np.abs(newton_correction / section_units)[is_near_gait].max(-1, keepdims=True)
-        < newton_options.max_correction_near_gait
+        < max_correction_near_gait
     )
-    is_near_gait = is_near_gait | (
-        exact_period_evaluation.is_period_complete
-        & (
-            np.abs((exact_period_evaluation.end_states - section_states) / section_units).max(-1)
-            < newton_options.max_correction_near_gait
-        )
-    )
-    exact_fixed_points, _ = _run_contact_newton(
+    period_defects = np.abs((exact_evaluation.end_states - section_states) / section_units).max(-1)
+    exact_fixed_points = _run_contact_newton(
         period_map,
         step_options,
         section_states,
         needs_parameter_derivatives,
-        newton_tolerance,
-        is_near_gait,
-        newton_options,
+        float(compute_newton_tolerance(step_options)),
+        is_near_gait
+        | (exact_evaluation.is_period_complete & (period_defects < max_correction_near_gait)),
         stops_at_small_correction=False,
     )
     return exact_fixed_points._replace(
@@ -468,106 +436,84 @@ def _run_contact_newton(
     needs_parameter_derivatives: bool,
     newton_tolerance: float,
     is_wheel_requested: np.ndarray,
-    newton_options: ContactNewtonOptions,
     stops_at_small_correction: bool = True,
-) -> tuple[_ContactFixedPoints, np.ndarray]:
+) -> _ContactFixedPoints:
     """Run Newton's method on the requested wheels until corrections are small.
 
-    Return the fixed points and the Jacobians of the return map. If no period completes after a
-    correction, the correction is halved. If `stops_at_small_correction` is true, a single small
-    correction ends the iteration. Otherwise the gait is evaluated again at the corrected state. Two
-    small corrections in succession are then needed, because the map may jump between two states if
-    a foot grazes the ground.
+    If no period completes after a correction, the correction is halved. If
+    `stops_at_small_correction` is true, a single small correction ends the iteration. Otherwise the
+    gait is evaluated again at the corrected state. Two small corrections in succession are then
+    needed, because the map may jump between two states if a foot grazes the ground.
     """
-    n_wheels, n_legs = len(start_states), period_map.n_legs
-    section_states, last_section_states, section_units = (
-        start_states.copy(),
-        start_states.copy(),
-        period_map.section_units_by_wheel,
-    )
-    newton_residuals, n_iterations = np.full(n_wheels, np.inf), np.zeros(n_wheels, np.int32)
-    had_small_correction_before, is_gait_found, n_correction_halvings = (
-        np.zeros(n_wheels, float_dtype) for float_dtype in (bool, bool, int)
-    )
-    return_map_jacobian = np.zeros((n_wheels, start_states.shape[1], start_states.shape[1]))
-    active_wheel_indices, stored_steps_and_jacobians = np.arange(n_wheels), None
-    for _ in range(newton_options.max_iterations + newton_options.max_correction_halvings):
-        period_evaluation = period_map.select_wheels(active_wheel_indices).evaluate_period(
-            step_options, section_states[active_wheel_indices], needs_parameter_derivatives
+    options = CONTACT_NEWTON_OPTIONS
+    n_wheels = len(start_states)
+    section_states = start_states.copy()
+    last_section_states = start_states.copy()
+    section_units = period_map.section_units_by_wheel
+    newton_residuals = np.full(n_wheels, np.inf)
+    n_iterations = np.zeros(n_wheels, np.int32)
+    n_correction_halvings = np.zeros(n_wheels, int)
+    had_small_correction = np.zeros(n_wheels, bool)
+    is_gait_found = np.zeros(n_wheels, bool)
+    period_evaluation = None
+    active_wheels = np.arange(n_wheels)
+    for _ in range(options.max_iterations + options.max_correction_halvings):
+        active_states = section_states[active_wheels]
+        active_evaluation = period_map.select_wheels(active_wheels).evaluate_period(
+            step_options, active_states, needs_parameter_derivatives
         )
-        if stored_steps_and_jacobians is None:
-            stored_steps_and_jacobians = jax.tree.map(
-                np.array, (period_evaluation.gait_steps_of_period, period_evaluation.step_jacobians)
-            )
+        if period_evaluation is None:
+            period_evaluation = jax.tree.map(np.array, active_evaluation)
         for stored_array, new_array in zip(
-            jax.tree.leaves(stored_steps_and_jacobians),
-            jax.tree.leaves(period_evaluation[:2]),
-            strict=True,
+            jax.tree.leaves(period_evaluation), jax.tree.leaves(active_evaluation), strict=True
         ):
-            stored_array[active_wheel_indices] = new_array
-        newton_correction = period_evaluation.compute_newton_correction(
-            section_states[active_wheel_indices], period_evaluation.return_map_jacobian
+            stored_array[active_wheels] = new_array
+        newton_correction = active_evaluation.compute_newton_correction(
+            active_states, active_evaluation.return_map_jacobian
         )
-        correction_size = np.abs(newton_correction / section_units[active_wheel_indices]).max(-1)
-        is_correction_valid = period_evaluation.is_period_complete & np.isfinite(
+        correction_size = np.abs(newton_correction / section_units[active_wheels]).max(-1)
+        is_correction_valid = active_evaluation.is_period_complete & np.isfinite(
             newton_correction
         ).all(-1)
-        newton_residuals[active_wheel_indices] = np.abs(
-            (period_evaluation.end_states - section_states[active_wheel_indices])
-            / section_units[active_wheel_indices]
+        newton_residuals[active_wheels] = np.abs(
+            (active_evaluation.end_states - active_states) / section_units[active_wheels]
         ).max(-1)
-        return_map_jacobian[active_wheel_indices] = period_evaluation.return_map_jacobian
-        n_iterations[active_wheel_indices] += 1
-        has_small_correction_now = is_correction_valid & (correction_size <= newton_tolerance)
-        is_wheel_done = (
-            has_small_correction_now
-            & (
-                had_small_correction_before[active_wheel_indices]
-                | (correction_size <= newton_options.clear_convergence_fraction * newton_tolerance)
-            )
-            & (not stops_at_small_correction)
+        n_iterations[active_wheels] += 1
+        has_small_correction = is_correction_valid & (correction_size <= newton_tolerance)
+        has_converged = has_small_correction & (
+            had_small_correction[active_wheels]
+            | (correction_size <= options.clear_convergence_fraction * newton_tolerance)
         )
-        had_small_correction_before[active_wheel_indices] = has_small_correction_now
-        moving_wheel_indices = active_wheel_indices[is_correction_valid & ~is_wheel_done]
-        last_section_states[moving_wheel_indices], n_correction_halvings[moving_wheel_indices] = (
-            section_states[moving_wheel_indices],
-            0,
+        had_small_correction[active_wheels] = has_small_correction
+        is_state_moved = is_correction_valid & (stops_at_small_correction | ~has_converged)
+        moved_wheels = active_wheels[is_state_moved]
+        last_section_states[moved_wheels] = section_states[moved_wheels]
+        section_states[moved_wheels] += newton_correction[is_state_moved]
+        n_correction_halvings[moved_wheels] = 0
+        failed_wheels = active_wheels[~is_correction_valid]
+        section_states[failed_wheels] = 0.5 * (
+            section_states[failed_wheels] + last_section_states[failed_wheels]
         )
-        section_states[moving_wheel_indices] += newton_correction[
-            is_correction_valid & ~is_wheel_done
+        # Discrete codes are not halved.
+        section_states[failed_wheels, -period_map.n_legs :] = last_section_states[
+            failed_wheels, -period_map.n_legs :
         ]
-        failed_wheel_indices = active_wheel_indices[~is_correction_valid]
-        section_states[failed_wheel_indices] = 0.5 * (
-            section_states[failed_wheel_indices] + last_section_states[failed_wheel_indices]
-        )
-        n_correction_halvings[failed_wheel_indices] += 1
-        section_states[failed_wheel_indices, -n_legs:] = last_section_states[
-            failed_wheel_indices, -n_legs:
-        ]
-        is_gait_found[active_wheel_indices] = is_wheel_requested[active_wheel_indices] & (
-            had_small_correction_before[active_wheel_indices]
-            if stops_at_small_correction
-            else is_wheel_done
+        n_correction_halvings[failed_wheels] += 1
+        is_gait_found[active_wheels] = is_wheel_requested[active_wheels] & (
+            has_small_correction if stops_at_small_correction else has_converged
         )
         has_wheel_failed = (
-            (n_correction_halvings > newton_options.max_correction_halvings)
-            | (n_iterations > newton_options.max_iterations)
+            (n_correction_halvings > options.max_correction_halvings)
+            | (n_iterations > options.max_iterations)
             | ~is_wheel_requested
         )
-        active_wheel_indices = active_wheel_indices[
-            ~is_gait_found[active_wheel_indices] & ~has_wheel_failed[active_wheel_indices]
-        ]
-        if not len(active_wheel_indices):
+        active_wheels = active_wheels[~(is_gait_found | has_wheel_failed)[active_wheels]]
+        if not len(active_wheels):
             break
-    assert stored_steps_and_jacobians is not None
+    assert period_evaluation is not None
     return _ContactFixedPoints(
-        section_states,
-        stored_steps_and_jacobians[0],
-        stored_steps_and_jacobians[1],
-        newton_residuals,
-        is_gait_found,
-        n_iterations,
-    ), return_map_jacobian
+        section_states, period_evaluation, newton_residuals, is_gait_found, n_iterations
+    )
 
 
 @eqx.filter_jit
@@ -588,40 +534,21 @@ def _evaluate_over_wheels(
     )(parameter_values, fixed_points)
 
 
-def _compute_return_map_jacobian_of_steps(
-    fixed_points: _ContactFixedPoints, n_parameter_values: int
-) -> Array:
-    """Return the Jacobian of the return map over one period, as a product of the Jacobians of its
-    steps.
-
-    - `n_parameter_values`: number of parameter values. Their columns precede those of the
-      section state.
-    """
-    return_map_jacobian = jnp.eye(
-        fixed_points.fixed_section_states.shape[0], dtype=fixed_points.fixed_section_states.dtype
-    )
-    for step_jacobian in fixed_points.step_jacobians.section_state:
-        return_map_jacobian = step_jacobian[:, n_parameter_values:] @ return_map_jacobian
-    return return_map_jacobian
-
-
 def _make_contact_cycle(
     model: AbstractWheel, n_legs: int, parameter_values: Array, fixed_points: _ContactFixedPoints
 ) -> ReturnMapCycle:
     """Build the cycle that belongs to a fixed point."""
-    newton_diagnostics = (
+    period_evaluation: Any = fixed_points.period_evaluation
+    wheel_model, params = model.from_parameter_values(parameter_values, n_legs)
+    fixed_point = FixedPointResult(
+        fixed_points.fixed_section_states,
+        period_evaluation.return_map_jacobian,
         fixed_points.newton_residuals,
         fixed_points.is_gait_found,
         fixed_points.n_newton_iterations,
     )
-    wheel_model, params = model.from_parameter_values(parameter_values, n_legs)
-    fixed_point = FixedPointResult(
-        fixed_points.fixed_section_states,
-        _compute_return_map_jacobian_of_steps(fixed_points, len(parameter_values)),
-        *newton_diagnostics,
-    )
     return make_return_map_cycle(
-        params, wheel_model, fixed_point, fixed_points.gait_steps_of_period
+        params, wheel_model, fixed_point, period_evaluation.gait_steps_of_period
     )
 
 
@@ -631,34 +558,29 @@ def _make_contact_gait(
     """Build the gait that belongs to a fixed point, with derivatives by the implicit
     function theorem.
     """
-    n_parameter_values = parameter_values.shape[0]
-    identity_matrix = jnp.eye(
-        fixed_points.fixed_section_states.shape[0], dtype=fixed_points.fixed_section_states.dtype
-    )
-    parameter_jacobian = jnp.zeros(
-        (len(identity_matrix), n_parameter_values), identity_matrix.dtype
-    )
-    return_map_jacobian = _compute_return_map_jacobian_of_steps(fixed_points, n_parameter_values)
-    for step_jacobian in fixed_points.step_jacobians.section_state:
-        parameter_jacobian = (
-            step_jacobian[:, :n_parameter_values]
-            + step_jacobian[:, n_parameter_values:] @ parameter_jacobian
-        )
+    period_evaluation = fixed_points.period_evaluation
+    n_parameter_values = len(parameter_values)
+    section_state = fixed_points.fixed_section_states
+    identity_matrix = jnp.eye(len(section_state), dtype=section_state.dtype)
     newton_matrix = jnp.where(
-        fixed_points.is_gait_found, identity_matrix - return_map_jacobian, identity_matrix
+        fixed_points.is_gait_found,
+        identity_matrix - period_evaluation.return_map_jacobian,
+        identity_matrix,
     )
-    section_state_derivatives = jnp.linalg.solve(newton_matrix, parameter_jacobian)
-
-    state_derivatives, derivatives_by_step = section_state_derivatives, []
-    for step_index in range(len(fixed_points.step_jacobians.section_state)):
+    section_state_derivatives = jnp.linalg.solve(
+        newton_matrix, period_evaluation.parameter_jacobian
+    )
+    state_derivatives = section_state_derivatives
+    derivatives_by_step = []
+    for step_index in range(len(period_evaluation.step_jacobians.section_state)):
         input_tangents = jnp.concatenate(
             [jnp.eye(n_parameter_values, dtype=identity_matrix.dtype), state_derivatives]
         )
         step_tangents = jax.tree.map(
-            lambda array_over_steps, step_index=step_index, input_tangents=input_tangents: (
-                array_over_steps[step_index] @ input_tangents
+            lambda step_jacobian, step_index=step_index, input_tangents=input_tangents: (
+                step_jacobian[step_index] @ input_tangents
             ),
-            fixed_points.step_jacobians,
+            period_evaluation.step_jacobians,
         )
         derivatives_by_step.append(move_derivative_axis_first(step_tangents))
         state_derivatives = step_tangents.section_state
@@ -666,38 +588,33 @@ def _make_contact_gait(
         lambda *stacked_arrays: jnp.stack(stacked_arrays, 1), *derivatives_by_step
     )
 
-    cycle = _make_contact_cycle(model, n_legs, parameter_values, fixed_points)
     # The derivative of the Jacobian is unknown, so measures of the Jacobian are not in
     # `differentiable_measures`.
-    float_cycle_fields = eqx.filter(cycle, eqx.is_inexact_array)
-    zero_derivatives = jax.tree.map(
-        lambda x: jnp.zeros((n_parameter_values, *x.shape), x.dtype), float_cycle_fields
-    )
-    make_cycle_inputs = lambda parameter_values: eqx.filter(
-        model.from_parameter_values(parameter_values, n_legs), eqx.is_inexact_array
-    )
-    model_derivatives, params_derivatives = move_derivative_axis_first(
-        jax.jacfwd(make_cycle_inputs)(parameter_values)
-    )
-    cycle_derivatives = eqx.tree_at(
-        lambda c: (
-            c.section_state, c.steps, c.model, c.params, c.post_impact, c.durations, c.step_length
-        ),
-        zero_derivatives,
+    def make_cycle(parameter_values: Array, section_state: Array, gait_steps: Any) -> Any:
+        return _make_contact_cycle(
+            model,
+            n_legs,
+            parameter_values,
+            fixed_points._replace(
+                fixed_section_states=section_state,
+                period_evaluation=period_evaluation._replace(gait_steps_of_period=gait_steps),
+            ),
+        )
+
+    _, cycle_derivatives = compute_value_and_tangents(
+        lambda *inputs: eqx.filter(make_cycle(*inputs), eqx.is_inexact_array),
+        (parameter_values, section_state, period_evaluation.gait_steps_of_period),
         (
+            jnp.eye(n_parameter_values, dtype=parameter_values.dtype),
             section_state_derivatives.T,
             step_derivatives,
-            model_derivatives,
-            params_derivatives,
-            *jax.vmap(summarize_cycle_steps)(step_derivatives),
         ),
-    )  # fmt: skip
-    first_gait_step = jax.tree.map(
-        lambda array_over_steps: array_over_steps[0], fixed_points.gait_steps_of_period
-    )
-    first_gait_step_derivatives = jax.tree.map(
-        lambda array_over_steps: array_over_steps[:, 0], step_derivatives
     )
     return make_return_map_gait(
-        model, n_legs, cycle, first_gait_step, cycle_derivatives, first_gait_step_derivatives
+        model,
+        n_legs,
+        _make_contact_cycle(model, n_legs, parameter_values, fixed_points),
+        jax.tree.map(lambda x: x[0], period_evaluation.gait_steps_of_period),
+        cycle_derivatives,
+        jax.tree.map(lambda x: x[:, 0], step_derivatives),
     )
