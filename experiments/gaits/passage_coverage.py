@@ -90,7 +90,6 @@ def sample_reference(
         float(gait.spectral_radius),
         REFERENCE_ERROR,
         MAX_REFERENCE_STEPS,
-        REFERENCE_OPTIONS,
     )
     return 1.0 / sample.failure_probability, sample.relative_error
 

@@ -1,7 +1,5 @@
 """First passage: published values, extended precision, counts, gradients and bad input."""
 
-import dataclasses
-
 import equinox as eqx
 import jax
 import numpy as np
@@ -184,7 +182,7 @@ def test_a_life_of_millions_of_steps_depends_on_no_choice_of_the_sampling():
     groups = WalkerGroups(
         params, start, slope_sd, vrw.ViscoelasticWheel(), vrw.StepOptions(), 8192, random, options
     )
-    sample = sample_passage(groups, float(gait.spectral_radius), 0.03, 2_000_000, options)
+    sample = sample_passage(groups, float(gait.spectral_radius), 0.03, 2_000_000)
     error = sample.relative_error + float(passage.error / passage.mean_steps)
     mean = float(passage.mean_steps)
     assert 5e7 < mean < 8e7
@@ -211,7 +209,6 @@ def test_the_error_keeps_its_level_although_the_error_ends_the_sampling():
             start_effect_decay=(0.0, 1),
             relative_tolerance=tol,
             max_steps=10_000,
-            sampling_options=PASSAGE_SAMPLING_OPTIONS,
         )
         assert error <= tol
         n_covered += abs(estimate / probability - 1.0) <= error
@@ -224,7 +221,9 @@ def test_the_error_keeps_its_level_although_the_error_ends_the_sampling():
 def test_sampling_ends_if_the_effect_of_the_start_exceeds_the_tolerance():
     """More walks from the same walkers cannot reduce this effect."""
     random, tol, decay_factor, n_steps = np.random.default_rng(0), 0.02, 0.9, 20
-    groups = WalkerGroups(BYL, np.zeros(1), 0.01, RIGID, vrw.StepOptions(), 32, random)
+    # Each of 32 weights per round is one failure.
+    options = PassageSamplingOptions(min_effective_failures=1.0)
+    groups = WalkerGroups(BYL, np.zeros(1), 0.01, RIGID, vrw.StepOptions(), 32, random, options)
     start_effect = decay_factor ** (n_steps + 1)  # 0.11
 
     def run_rounds(are_walkers_advanced):
@@ -241,9 +240,6 @@ def test_sampling_ends_if_the_effect_of_the_start_exceeds_the_tolerance():
             start_effect_decay=(decay_factor, n_steps),
             relative_tolerance=tol,
             max_steps=10_000,
-            sampling_options=dataclasses.replace(
-                PASSAGE_SAMPLING_OPTIONS, min_effective_failures=1.0
-            ),  # Each of 32 weights per round is one failure.
             are_walkers_advanced=are_walkers_advanced,
         )
         return error, remaining_effect, groups.n_steps

@@ -155,26 +155,19 @@ class GaussianMixture:
         """Return the logarithm of each Gaussian's density times its weight, shape (components,
         samples).
         """
-        gaussian_log_densities = []
-        for gaussian_weight, gaussian_mean, covariance_cholesky_factor in zip(
-            self.gaussian_weights,
-            self.gaussian_means,
-            self.covariance_cholesky_factors,
-            strict=True,
-        ):
-            whitened_deviations = np.linalg.solve(
-                covariance_cholesky_factor, (slope_deviations - gaussian_mean).T
-            )
-            log_cholesky_determinant = np.sum(np.log(np.diag(covariance_cholesky_factor)))
-            log_normalization = (
-                np.log(gaussian_weight)
-                - log_cholesky_determinant
-                - 0.5 * len(gaussian_mean) * np.log(2.0 * np.pi)
-            )
-            gaussian_log_densities.append(
-                log_normalization - 0.5 * np.sum(whitened_deviations**2, 0)
-            )
-        return np.stack(gaussian_log_densities)
+        centered_deviations = slope_deviations - self.gaussian_means[:, None]
+        whitened_deviations = np.linalg.solve(
+            self.covariance_cholesky_factors, centered_deviations.transpose(0, 2, 1)
+        )
+        log_determinants = np.log(
+            np.diagonal(self.covariance_cholesky_factors, axis1=1, axis2=2)
+        ).sum(1)
+        log_normalizations = (
+            np.log(self.gaussian_weights)
+            - log_determinants
+            - 0.5 * self.gaussian_means.shape[1] * np.log(2.0 * np.pi)
+        )
+        return log_normalizations[:, None] - 0.5 * np.sum(whitened_deviations**2, 1)
 
     def compute_log_density(self, slope_deviations: np.ndarray) -> np.ndarray:
         """Return the logarithm of the mixture's density at each sample, shape (samples,)."""
@@ -185,9 +178,8 @@ class GaussianMixture:
 
     def draw_samples(self, n_samples: int, random_generator: np.random.Generator) -> np.ndarray:
         """Return independent samples from the mixture, shape (samples, dimensions)."""
-        return self.map_uniform_numbers(
-            random_generator.random((n_samples, 1 + self.gaussian_means.shape[1]))
-        )
+        n_dimensions = self.gaussian_means.shape[1]
+        return self.map_uniform_numbers(random_generator.random((n_samples, 1 + n_dimensions)))
 
     def map_uniform_numbers(self, uniform_numbers: np.ndarray) -> np.ndarray:
         """Return samples from the mixture, shape (samples, dimensions).
@@ -204,12 +196,10 @@ class GaussianMixture:
             np.clip(uniform_numbers[:, 1:], MIN_UNIFORM_NUMBER, 1.0 - MIN_UNIFORM_NUMBER)
         )
         slope_deviations = self.gaussian_means[gaussian_indices]
-        for gaussian_index, covariance_cholesky_factor in enumerate(
-            self.covariance_cholesky_factors
-        ):
-            is_sample_from_gaussian = gaussian_indices == gaussian_index
-            slope_deviations[is_sample_from_gaussian] += (
-                normal_samples[is_sample_from_gaussian] @ covariance_cholesky_factor.T
+        for gaussian_index, cholesky_factor in enumerate(self.covariance_cholesky_factors):
+            is_from_gaussian = gaussian_indices == gaussian_index
+            slope_deviations[is_from_gaussian] += (
+                normal_samples[is_from_gaussian] @ cholesky_factor.T
             )
         return slope_deviations
 
@@ -217,7 +207,6 @@ class GaussianMixture:
 def fit_gaussian_mixture(
     slope_deviations: np.ndarray,
     random_generator: np.random.Generator,
-    density_options: FailureDensityOptions,
 ) -> GaussianMixture:
     """Return a Gaussian mixture, fitted to samples by expectation maximization.
 
@@ -226,58 +215,38 @@ def fit_gaussian_mixture(
     - `slope_deviations`: samples, shape (samples, dimensions).
     """
     n_samples, n_dimensions = slope_deviations.shape
-    covariance_floor = density_options.min_gaussian_variance * np.eye(n_dimensions)
+    covariance_floor = FAILURE_DENSITY_OPTIONS.min_gaussian_variance * np.eye(n_dimensions)
     gaussian_means = slope_deviations[random_generator.integers(n_samples)][None]
-    for _ in range(density_options.n_gaussians - 1):
-        squared_distances_to_means = np.min(
-            np.sum((slope_deviations[:, None] - gaussian_means) ** 2, -1), 1
+    for _ in range(FAILURE_DENSITY_OPTIONS.n_gaussians - 1):
+        squared_distances = np.min(np.sum((slope_deviations[:, None] - gaussian_means) ** 2, -1), 1)
+        total_distance = np.sum(squared_distances)
+        next_mean_index = random_generator.choice(
+            n_samples, p=squared_distances / total_distance if total_distance > 0.0 else None
         )
-        total_squared_distance = np.sum(squared_distances_to_means)
-        mean_selection_probabilities = (
-            squared_distances_to_means / total_squared_distance
-            if total_squared_distance > 0.0
-            else None
-        )
-        gaussian_means = np.concatenate(
-            [
-                gaussian_means,
-                slope_deviations[
-                    random_generator.choice(n_samples, p=mean_selection_probabilities)
-                ][None],
-            ]
-        )
-    weighted_covariance = (
-        np.cov(slope_deviations.T).reshape(n_dimensions, n_dimensions) + covariance_floor
-    )
-    cholesky_factors = np.tile(np.linalg.cholesky(weighted_covariance), (len(gaussian_means), 1, 1))
+        gaussian_means = np.concatenate([gaussian_means, slope_deviations[next_mean_index][None]])
+    covariance = np.cov(slope_deviations.T).reshape(n_dimensions, n_dimensions) + covariance_floor
+    n_gaussians = len(gaussian_means)
     gaussian_mixture = GaussianMixture(
-        np.full(len(gaussian_means), 1.0 / len(gaussian_means)), gaussian_means, cholesky_factors
+        np.full(n_gaussians, 1.0 / n_gaussians),
+        gaussian_means,
+        np.tile(np.linalg.cholesky(covariance), (n_gaussians, 1, 1)),
     )
-    for _ in range(density_options.n_em_iterations):
-        gaussian_log_densities = gaussian_mixture.compute_gaussian_log_densities(slope_deviations)
-        membership_probabilities = np.exp(
-            gaussian_log_densities - np.logaddexp.reduce(gaussian_log_densities, 0)
-        )
+    for _ in range(FAILURE_DENSITY_OPTIONS.n_em_iterations):
+        log_densities = gaussian_mixture.compute_gaussian_log_densities(slope_deviations)
+        membership_probabilities = np.exp(log_densities - np.logaddexp.reduce(log_densities, 0))
         # The additional sample prevents an empty Gaussian.
-        effective_gaussian_sizes = np.sum(membership_probabilities, 1) + 1.0
+        effective_sizes = np.sum(membership_probabilities, 1) + 1.0
         gaussian_means = (
             membership_probabilities @ slope_deviations + gaussian_mixture.gaussian_means
-        ) / effective_gaussian_sizes[:, None]
-        cholesky_factors = np.empty_like(gaussian_mixture.covariance_cholesky_factors)
-        for gaussian_index, (gaussian_membership, gaussian_mean) in enumerate(
-            zip(membership_probabilities, gaussian_means, strict=True)
-        ):
-            centered_slope_deviations = slope_deviations - gaussian_mean
-            weighted_covariance = (
-                gaussian_membership * centered_slope_deviations.T
-            ) @ centered_slope_deviations / effective_gaussian_sizes[
-                gaussian_index
-            ] + covariance_floor
-            cholesky_factors[gaussian_index] = np.linalg.cholesky(weighted_covariance)
+        ) / effective_sizes[:, None]
+        centered_deviations = slope_deviations - gaussian_means[:, None]
+        covariances = (
+            membership_probabilities[:, None] * centered_deviations.transpose(0, 2, 1)
+        ) @ centered_deviations / effective_sizes[:, None, None] + covariance_floor
         gaussian_mixture = GaussianMixture(
-            effective_gaussian_sizes / np.sum(effective_gaussian_sizes),
+            effective_sizes / np.sum(effective_sizes),
             gaussian_means,
-            cholesky_factors,
+            np.linalg.cholesky(covariances),
         )
     return gaussian_mixture
 
@@ -286,22 +255,26 @@ def fit_failure_density(
     run_walks: DeviationWalkFunction,
     n_dimensions: int,
     random_generator: np.random.Generator,
-    density_options: FailureDensityOptions = FAILURE_DENSITY_OPTIONS,
+    max_walks_per_stage: int = FAILURE_DENSITY_OPTIONS.max_walks_per_stage,
 ) -> GaussianMixture | None:
     """Return a density of standardized slopes on which walks often fail in their last step.
 
     The nominal density of standardized slopes is the standard normal density. The returned mixture
     includes it with the weight `nominal_walk_fraction`. The result is None if no walk fails.
 
-    - `n_dimensions`: number of slopes per walk.
+    - `n_dimensions`: number of slopes per walk;
+    - `max_walks_per_stage`: a smaller limit than that of the options.
     """
-    nominal_density = GaussianMixture.make_isotropic_gaussian(n_dimensions, 1.0)
-    n_inflation_test_walks = min(
-        density_options.max_inflation_test_walks, density_options.max_walks_per_stage
+    density_options = FAILURE_DENSITY_OPTIONS
+    nominal_walk_fraction = density_options.nominal_walk_fraction
+    n_walks = min(density_options.max_walks_per_stage, max_walks_per_stage)
+    n_inflation_test_walks = min(density_options.max_inflation_test_walks, n_walks)
+    make_isotropic_gaussian = lambda standard_deviation: GaussianMixture.make_isotropic_gaussian(
+        n_dimensions, standard_deviation
     )
     slope_inflation = 1.0
     while True:
-        proposal_density = GaussianMixture.make_isotropic_gaussian(n_dimensions, slope_inflation)
+        proposal_density = make_isotropic_gaussian(slope_inflation)
         _, has_walk_failed = run_walks(
             proposal_density.draw_samples(n_inflation_test_walks, random_generator)
         )
@@ -312,36 +285,32 @@ def fit_failure_density(
             return None
     n_finished_fits = 0
     while True:
-        slope_deviations = proposal_density.draw_samples(
-            density_options.max_walks_per_stage, random_generator
-        )
+        slope_deviations = proposal_density.draw_samples(n_walks, random_generator)
         has_failed_in_last_step, _ = run_walks(slope_deviations)
         if not np.any(has_failed_in_last_step):
             return None
         failing_deviations = slope_deviations[has_failed_in_last_step]
-        log_proposal_density = proposal_density.compute_log_density(failing_deviations)
-        next_slope_inflation, failure_importance_weights = _find_next_slope_inflation(
-            failing_deviations, log_proposal_density, slope_inflation, density_options
+        next_slope_inflation, failure_weights = _find_next_slope_inflation(
+            failing_deviations,
+            proposal_density.compute_log_density(failing_deviations),
+            slope_inflation,
         )
-        resampled_failure_indices = random_generator.choice(
-            len(failing_deviations), density_options.n_em_samples, p=failure_importance_weights
+        resampled_indices = random_generator.choice(
+            len(failing_deviations), density_options.n_em_samples, p=failure_weights
         )
         fitted_mixture = fit_gaussian_mixture(
-            failing_deviations[resampled_failure_indices], random_generator, density_options
+            failing_deviations[resampled_indices], random_generator
         )
-        widened_mixture = fitted_mixture.widen_gaussians(density_options.widening_factor)
         fitted_mixture = fitted_mixture.add_mixture(
-            widened_mixture, density_options.wide_walk_fraction
+            fitted_mixture.widen_gaussians(density_options.widening_factor),
+            density_options.wide_walk_fraction,
         )
         n_finished_fits += slope_inflation == 1.0
         if n_finished_fits == density_options.n_uninflated_fits:
-            return fitted_mixture.add_mixture(
-                nominal_density, density_options.nominal_walk_fraction
-            )
+            return fitted_mixture.add_mixture(make_isotropic_gaussian(1.0), nominal_walk_fraction)
         slope_inflation = next_slope_inflation
         proposal_density = fitted_mixture.add_mixture(
-            GaussianMixture.make_isotropic_gaussian(n_dimensions, slope_inflation),
-            density_options.nominal_walk_fraction,
+            make_isotropic_gaussian(slope_inflation), nominal_walk_fraction
         )
 
 
@@ -349,7 +318,6 @@ def _find_next_slope_inflation(
     failing_deviations: np.ndarray,
     log_proposal_density: np.ndarray,
     slope_inflation: float,
-    density_options: FailureDensityOptions,
 ) -> tuple[float, np.ndarray]:
     """Return the next inflation factor, and the normalized importance weights of the failures at
     that inflation.
@@ -362,32 +330,22 @@ def _find_next_slope_inflation(
     """
 
     def compute_importance_weights(target_slope_inflation: float) -> np.ndarray:
-        log_target_density = GaussianMixture.make_isotropic_gaussian(
+        target_density = GaussianMixture.make_isotropic_gaussian(
             failing_deviations.shape[1], target_slope_inflation
-        ).compute_log_density(failing_deviations)
-        log_importance_weights = log_target_density - log_proposal_density
-        unnormalized_importance_weights = np.exp(
-            log_importance_weights - np.max(log_importance_weights)
         )
-        normalized_importance_weights: np.ndarray = unnormalized_importance_weights / np.sum(
-            unnormalized_importance_weights
-        )
-        return normalized_importance_weights
+        log_weights = target_density.compute_log_density(failing_deviations) - log_proposal_density
+        unnormalized_weights = np.exp(log_weights - np.max(log_weights))
+        return unnormalized_weights / np.sum(unnormalized_weights)
 
     min_effective_samples = min(
-        density_options.min_effective_failures_per_dimension * failing_deviations.shape[1],
+        FAILURE_DENSITY_OPTIONS.min_effective_failures_per_dimension * failing_deviations.shape[1],
         0.3 * len(failing_deviations),
-    )
-    has_enough_effective_samples = lambda failure_importance_weights: (
-        1.0 / np.sum(failure_importance_weights**2) >= min_effective_samples
     )
     next_slope_inflation = slope_inflation
     while next_slope_inflation > 1.0:
-        candidate_slope_inflation = max(next_slope_inflation / 1.05, 1.0)
-        if (
-            not has_enough_effective_samples(compute_importance_weights(candidate_slope_inflation))
-            and next_slope_inflation < slope_inflation
-        ):
+        candidate_inflation = max(next_slope_inflation / 1.05, 1.0)
+        n_effective_samples = 1.0 / np.sum(compute_importance_weights(candidate_inflation) ** 2)
+        if n_effective_samples < min_effective_samples and next_slope_inflation < slope_inflation:
             break
-        next_slope_inflation = candidate_slope_inflation
+        next_slope_inflation = candidate_inflation
     return next_slope_inflation, compute_importance_weights(next_slope_inflation)

@@ -130,21 +130,18 @@ class FirstPassage(AbstractPrintable):
 
     def summary_rows(self) -> list[LabelAndText]:
         """Return pairs of label and text for means, failure probability, outcomes and status."""
-        outcome_fractions = zip(self.end_names, np.asarray(self.end_fractions), strict=True)
-        sampled_steps_text = f"{self.n_steps:,}" if self.n_steps else "none: quadrature"
+        end_texts = [
+            f"{outcome_name} {100 * outcome_fraction:.3g} %"
+            for outcome_name, outcome_fraction in zip(
+                self.end_names, np.asarray(self.end_fractions), strict=True
+            )
+        ]
         return [
             ("mean steps", f"{float(self.mean_steps):,.6g} (error {float(self.error):.2g})"),
             ("from the gait", f"{float(self.mean_steps_from_gait):,.6g}"),
             ("failure probability of a step", f"{float(self.failure_probability):.6g}"),
-            (
-                "ends",
-                ", ".join(
-                    f"{outcome_name} {100 * outcome_fraction:.3g} %"
-                    for outcome_name, outcome_fraction in outcome_fractions
-                )
-                or "none",
-            ),
-            ("sampled steps", sampled_steps_text),
+            ("ends", ", ".join(end_texts) or "none"),
+            ("sampled steps", f"{self.n_steps:,}" if self.n_steps else "none: quadrature"),
             ("status", self.ending),
         ]
 
@@ -270,22 +267,17 @@ def _differentiate_passage(
     params, slope_sd = primals
     require_untraced_arguments("vrw.first_passage", SAMPLED_TRACING_REMEDY, params, slope_sd)
     params_tangent, slope_sd_tangent = tangents
+    tangent_by_name = {name: getattr(params_tangent, name) for name in PARAMETER_NAMES}
     tangent_by_name = {
-        parameter_name: getattr(params_tangent, parameter_name)
-        for parameter_name in PARAMETER_NAMES
-    }
-    tangent_by_name["slope_sd"] = slope_sd_tangent
-    tangent_by_name = {
-        parameter_name: parameter_tangent
-        for parameter_name, parameter_tangent in tangent_by_name.items()
-        if not isinstance(parameter_tangent, SymbolicZero)
+        name: tangent
+        for name, tangent in (tangent_by_name | {"slope_sd": slope_sd_tangent}).items()
+        if not isinstance(tangent, SymbolicZero)
     }
     sampled_passage, derivative_by_name = estimate_passage(
         params, float(slope_sd), differentiated_parameter_names=tuple(tangent_by_name)
     )
     log_mean_steps_tangent = sum(
-        derivative_by_name[parameter_name] * parameter_tangent
-        for parameter_name, parameter_tangent in tangent_by_name.items()
+        derivative_by_name[name] * tangent for name, tangent in tangent_by_name.items()
     )
     passage_tangent = eqx.tree_at(
         lambda p: (p.mean_steps, p.mean_steps_from_gait, p.failure_probability),
@@ -321,37 +313,36 @@ def _solve_passage_by_quadrature(
             f"slope is {float(params.slope):g} rad, on which this rigid wheel has no gait: give a "
             "steeper one."
         )
-    coarse_passage = solve_rigid_passage(params, slope_sd, model, n_nodes // 2)
+    passage = solve_rigid_passage(params, slope_sd, model, n_nodes // 2)
     while True:
-        fine_passage = solve_rigid_passage(params, slope_sd, model, n_nodes)
-        mean_steps_estimates = [
-            1.0 / rigid_passage_result.survival_analysis.failure_probability
-            for rigid_passage_result in (coarse_passage, fine_passage)
-        ]
-        mean_steps_error = lax.stop_gradient(
-            jnp.abs(mean_steps_estimates[1] - mean_steps_estimates[0])
+        coarse_passage, passage = passage, solve_rigid_passage(params, slope_sd, model, n_nodes)
+        coarse_mean_steps, mean_steps = (
+            1.0 / rigid_passage.survival_analysis.failure_probability
+            for rigid_passage in (coarse_passage, passage)
         )
-        is_within_tolerance = mean_steps_error <= relative_tolerance * mean_steps_estimates[1]
+        error = lax.stop_gradient(jnp.abs(mean_steps - coarse_mean_steps))
+        is_within_tolerance = error <= relative_tolerance * mean_steps
         if (
             has_traced_leaf(params, slope_sd)
             or bool(is_within_tolerance)
             or n_nodes >= MAX_QUADRATURE_NODES
         ):
             break
-        coarse_passage, n_nodes = fine_passage, 2 * n_nodes
-    passage_status = jnp.where(
+        n_nodes *= 2
+    status = jnp.where(
         is_within_tolerance, PassageStatus.CONVERGED, PassageStatus.TOLERANCE_NOT_MET
     )
+    survival_analysis = passage.survival_analysis
     return FirstPassage(
-        mean_steps=mean_steps_estimates[1],
-        mean_steps_from_gait=fine_passage.mean_steps_from_gait,
-        failure_probability=fine_passage.survival_analysis.failure_probability,
-        kappa_2=fine_passage.survival_analysis.kappa_2,
-        error=mean_steps_error,
-        states=fine_passage.squared_rate_nodes[:, None],
-        weights=fine_passage.survival_analysis.quasi_stationary_weights,
-        status=passage_status.astype(jnp.int32),
-        end_fractions=jnp.ones(1, mean_steps_estimates[1].dtype),
+        mean_steps=mean_steps,
+        mean_steps_from_gait=passage.mean_steps_from_gait,
+        failure_probability=survival_analysis.failure_probability,
+        kappa_2=survival_analysis.kappa_2,
+        error=error,
+        states=passage.squared_rate_nodes[:, None],
+        weights=survival_analysis.quasi_stationary_weights,
+        status=status.astype(jnp.int32),
+        end_fractions=jnp.ones(1, mean_steps.dtype),
         end_names=(Outcome.FELL_BACK.name,),
     )
 
@@ -381,10 +372,14 @@ def _estimate_passage_by_sampling(
             "this wheel has no gait from which a walk could begin: "
             f"{limit_cycle_result.why} Take a wheel for which vrw.limit_cycle finds a gait."
         )
-    random_generator = np.random.default_rng(seed)
-    section_state = np.asarray(limit_cycle_result.section_state)
     walker_groups = WalkerGroups(
-        params, section_state, slope_sd, model, options, n_walkers, random_generator
+        params,
+        np.asarray(limit_cycle_result.section_state),
+        slope_sd,
+        model,
+        options,
+        n_walkers,
+        np.random.default_rng(seed),
     )
     try:
         sampled_passage = sample_passage(
@@ -402,33 +397,30 @@ def _estimate_passage_by_sampling(
         )
     failure_probability = sampled_passage.failure_probability
     mean_steps = 1.0 / failure_probability if failure_probability else np.inf
-    is_within_tolerance = sampled_passage.relative_error <= relative_tolerance
-    passage_status = (
-        PassageStatus.CONVERGED if is_within_tolerance else PassageStatus.TOLERANCE_NOT_MET
-    )
-    if not np.isfinite(sampled_passage.relative_error):
-        passage_status = PassageStatus.UNKNOWN_ERROR
-    if sampled_passage.start_effect > relative_tolerance:
+    if not failure_probability:
+        passage_status = PassageStatus.NO_FAILURE
+    elif sampled_passage.start_effect > relative_tolerance:
         passage_status = PassageStatus.START_NOT_FORGOTTEN
-    passage_status = passage_status if failure_probability else PassageStatus.NO_FAILURE
-    convert_to_float_array = lambda float_values: jnp.asarray(float_values, params.damping.dtype)
+    elif not np.isfinite(sampled_passage.relative_error):
+        passage_status = PassageStatus.UNKNOWN_ERROR
+    elif sampled_passage.relative_error > relative_tolerance:
+        passage_status = PassageStatus.TOLERANCE_NOT_MET
+    else:
+        passage_status = PassageStatus.CONVERGED
+    n_states = len(sampled_passage.quasi_stationary_states)
+    passage_numbers = {
+        "mean_steps": mean_steps,
+        "mean_steps_from_gait": sampled_passage.mean_steps_from_gait,
+        "failure_probability": failure_probability,
+        "kappa_2": sampled_passage.kappa_2,
+        "error": mean_steps * sampled_passage.relative_error,
+        "states": sampled_passage.quasi_stationary_states,
+        "weights": np.full(n_states, 1.0 / n_states),
+        "end_fractions": np.array(list(sampled_passage.fraction_by_outcome.values())),
+    }
     first_passage_result = FirstPassage(
-        mean_steps=convert_to_float_array(mean_steps),
-        mean_steps_from_gait=convert_to_float_array(sampled_passage.mean_steps_from_gait),
-        failure_probability=convert_to_float_array(failure_probability),
-        kappa_2=convert_to_float_array(sampled_passage.kappa_2),
-        error=convert_to_float_array(
-            mean_steps * sampled_passage.relative_error if failure_probability else np.inf
-        ),
-        states=convert_to_float_array(sampled_passage.quasi_stationary_states),
-        weights=convert_to_float_array(
-            np.full(
-                len(sampled_passage.quasi_stationary_states),
-                1.0 / len(sampled_passage.quasi_stationary_states),
-            )
-        ),
+        **jax.tree.map(lambda x: jnp.asarray(x, params.damping.dtype), passage_numbers),
         status=jnp.asarray(int(passage_status), jnp.int32),
-        end_fractions=convert_to_float_array(list(sampled_passage.fraction_by_outcome.values())),
         end_names=tuple(sampled_passage.fraction_by_outcome),
         n_steps=sampled_passage.n_sampled_steps,
     )

@@ -12,11 +12,9 @@ failure radius, times the derivative of the failure radius.
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from vrw_jax.batches import step_batch
 from vrw_jax.cycles import limit_cycle
 from vrw_jax.robustness.failure_density import GaussianMixture
 from vrw_jax.robustness.sampled_passage import WalkerGroups, run_biased_walks
@@ -64,12 +62,45 @@ class FailingWalks(NamedTuple):
     slope_deviation_directions: np.ndarray  # unit vectors of slope deviations, (walks, lines)
     slope_deviation_norms: np.ndarray  # norms of the slope deviations, (walks,)
 
+    def test_failures(
+        self, walker_groups: WalkerGroups, params: WheelParams, norms: np.ndarray
+    ) -> np.ndarray:
+        """Return whether each walk of the wheel `params` fails if its slope deviations are scaled
+        to `norms`, shape (walks,).
+        """
+        walk_results = walker_groups.run_changed_walks(
+            params,
+            self.section_states,
+            self.start_slopes,
+            norms[:, None] * self.slope_deviation_directions,
+        )
+        return walk_results.outcome != Outcome.STEPPED
+
+    def bisect_failure_radii(
+        self,
+        walker_groups: WalkerGroups,
+        params: WheelParams,
+        lower_radii: np.ndarray,
+        upper_radii: np.ndarray,
+        n_bisections: int,
+    ) -> np.ndarray:
+        """Return the failure radius of each walk, shape (walks,), by bisection.
+
+        - `lower_radii`: radii at which the walks do not fail;
+        - `upper_radii`: radii at which the walks fail.
+        """
+        for _ in range(n_bisections):
+            middle_radii = 0.5 * (lower_radii + upper_radii)
+            has_failed = self.test_failures(walker_groups, params, middle_radii)
+            lower_radii = np.where(has_failed, lower_radii, middle_radii)
+            upper_radii = np.where(has_failed, middle_radii, upper_radii)
+        return 0.5 * (lower_radii + upper_radii)
+
 
 def differentiate_log_mean_steps(
     walker_groups: WalkerGroups,
     walk_density: GaussianMixture,
     parameter_names: tuple[str, ...],
-    gradient_options: PassageGradientOptions = PASSAGE_GRADIENT_OPTIONS,
 ) -> dict[str, float]:
     """Return the derivatives of the logarithm of the mean number of gait steps, by parameter name.
 
@@ -82,29 +113,22 @@ def differentiate_log_mean_steps(
     from scipy import stats  # This import is slow.
 
     params, slope_sd = walker_groups.params, walker_groups.slope_sd
-    failing_walks = _draw_failing_walks(walker_groups, walk_density, gradient_options)
-    lower_failure_radii, upper_failure_radii = (
-        np.zeros_like(failing_walks.slope_deviation_norms),
-        failing_walks.slope_deviation_norms,
-    )
-    survives_on_mean_slopes = ~_test_walk_failures(
-        walker_groups, params, failing_walks, lower_failure_radii
-    )
-    failure_radii = _bisect_failure_radii(
+    failing_walks = _draw_failing_walks(walker_groups, walk_density)
+    zero_radii = np.zeros_like(failing_walks.slope_deviation_norms)
+    survives_on_mean_slopes = ~failing_walks.test_failures(walker_groups, params, zero_radii)
+    failure_radii = failing_walks.bisect_failure_radii(
         walker_groups,
         params,
-        failing_walks,
-        lower_failure_radii,
-        upper_failure_radii,
-        gradient_options.n_bisections,
+        zero_radii,
+        failing_walks.slope_deviation_norms,
+        PASSAGE_GRADIENT_OPTIONS.n_bisections,
     )
     radius_distribution = stats.chi(failing_walks.slope_deviation_directions.shape[1])
     hazard_rates = np.exp(
         radius_distribution.logpdf(failure_radii) - radius_distribution.logsf(failure_radii)
     )
     hazard_rates = np.where(survives_on_mean_slopes, hazard_rates, 0.0)
-    bracket_half_width = gradient_options.bracket_half_width
-    gait_section_state = walker_groups.gait_states[0]
+    bracket_half_width = PASSAGE_GRADIENT_OPTIONS.bracket_half_width
 
     def differentiate_failure_radii(parameter_name: str) -> np.ndarray:
         """Return the derivatives of all failure radii with respect to one parameter, shape
@@ -113,9 +137,9 @@ def differentiate_log_mean_steps(
         if parameter_name == "slope_sd":
             return -failure_radii / slope_sd
         parameter_value = float(getattr(params, parameter_name))
-        parameter_change_size = gradient_options.relative_parameter_step * abs(parameter_value)
+        change_size = PASSAGE_GRADIENT_OPTIONS.relative_parameter_step * abs(parameter_value)
         changed_failure_radii = []
-        for parameter_change in (parameter_change_size, -parameter_change_size):
+        for parameter_change in (change_size, -change_size):
             _, changed_params = walker_groups.model.with_parameter(
                 params,
                 parameter_name,
@@ -127,21 +151,20 @@ def differentiate_log_mean_steps(
             walks_of_changed_wheel = failing_walks._replace(
                 section_states=failing_walks.section_states
                 + np.asarray(changed_cycle.section_state)
-                - gait_section_state,
+                - walker_groups.gait_state,
                 start_slopes=failing_walks.start_slopes
                 + (parameter_change if parameter_name == "slope" else 0.0),
             )
             changed_failure_radii.append(
-                _bisect_failure_radii(
+                walks_of_changed_wheel.bisect_failure_radii(
                     walker_groups,
                     changed_params,
-                    walks_of_changed_wheel,
                     np.maximum(failure_radii - bracket_half_width, 0.0),
                     failure_radii + bracket_half_width,
-                    gradient_options.n_changed_wheel_bisections,
+                    PASSAGE_GRADIENT_OPTIONS.n_changed_wheel_bisections,
                 )
             )
-        return (changed_failure_radii[0] - changed_failure_radii[1]) / (2.0 * parameter_change_size)
+        return (changed_failure_radii[0] - changed_failure_radii[1]) / (2.0 * change_size)
 
     n_differentiated_walks = np.sum(survives_on_mean_slopes)
     return {
@@ -153,105 +176,39 @@ def differentiate_log_mean_steps(
     }
 
 
-def _draw_failing_walks(
-    walker_groups: WalkerGroups,
-    walk_density: GaussianMixture,
-    gradient_options: PassageGradientOptions,
-) -> FailingWalks:
+def _draw_failing_walks(walker_groups: WalkerGroups, walk_density: GaussianMixture) -> FailingWalks:
     """Return failing walks with equal weights, resampled from many walks.
 
     The slopes of the many walks are drawn from `walk_density`. Raise ValueError if no walk fails in
     its last step.
     """
-    n_walks, effective_number_of_walks = gradient_options.n_failing_walks, 0.0
-    sampling_rounds: list[tuple[np.ndarray, np.ndarray]] = []
+    n_walks, n_effective_walks = PASSAGE_GRADIENT_OPTIONS.n_failing_walks, 0.0
+    n_walkers = walker_groups.n_walkers
+    deviations_by_round: list[np.ndarray] = []
+    weights_by_round: list[np.ndarray] = []
     while (
-        effective_number_of_walks < n_walks
-        and len(sampling_rounds) < gradient_options.max_sampling_rounds
+        n_effective_walks < n_walks
+        and len(weights_by_round) < PASSAGE_GRADIENT_OPTIONS.max_sampling_rounds
     ):
-        drawn_deviations = walk_density.draw_samples(
-            len(walker_groups.states), walker_groups.random
-        )
-        sampling_rounds.append(
-            (drawn_deviations, run_biased_walks(walker_groups, walk_density, drawn_deviations))
-        )
-        slope_deviations, failure_importance_weights = map(
-            np.concatenate, zip(*sampling_rounds, strict=True)
-        )
-        effective_number_of_walks = (
-            np.sum(failure_importance_weights) ** 2 / np.sum(failure_importance_weights**2)
-            if np.any(failure_importance_weights)
-            else 0.0
-        )
-    if effective_number_of_walks == 0.0:
+        drawn_deviations = walk_density.draw_samples(n_walkers, walker_groups.random)
+        deviations_by_round.append(drawn_deviations)
+        weights_by_round.append(run_biased_walks(walker_groups, walk_density, drawn_deviations))
+        walk_weights = np.concatenate(weights_by_round)
+        if np.any(walk_weights):
+            n_effective_walks = np.sum(walk_weights) ** 2 / np.sum(walk_weights**2)
+    if n_effective_walks == 0.0:
         raise ValueError(
             f"no sampled walk failed with slope_sd {walker_groups.slope_sd:g} rad, so that the "
             "mean number of steps has no derivative: give a larger slope_sd or n_walkers."
         )
-    resampled_walk_indices = walker_groups.random.choice(
-        len(failure_importance_weights),
-        n_walks,
-        p=failure_importance_weights / np.sum(failure_importance_weights),
+    walk_indices = walker_groups.random.choice(
+        len(walk_weights), n_walks, p=walk_weights / np.sum(walk_weights)
     )
-    walker_indices = resampled_walk_indices % len(walker_groups.states)
-    slope_deviation_norms = np.linalg.norm(slope_deviations[resampled_walk_indices], axis=1)
+    slope_deviations = np.concatenate(deviations_by_round)[walk_indices]
+    slope_deviation_norms = np.linalg.norm(slope_deviations, axis=1)
     return FailingWalks(
-        walker_groups.states[walker_indices],
-        walker_groups.slopes[walker_indices],
-        slope_deviations[resampled_walk_indices] / slope_deviation_norms[:, None],
+        walker_groups.states[walk_indices % n_walkers],
+        walker_groups.slopes[walk_indices % n_walkers],
+        slope_deviations / slope_deviation_norms[:, None],
         slope_deviation_norms,
     )
-
-
-def _test_walk_failures(
-    walker_groups: WalkerGroups,
-    params: WheelParams,
-    failing_walks: FailingWalks,
-    slope_deviation_norms: np.ndarray,
-) -> np.ndarray:
-    """Return whether each walk fails if its slope deviations are scaled to norm
-    `slope_deviation_norms`.
-
-    The result has the shape (walks,).
-    """
-    landing_slopes = (
-        float(params.slope)
-        + walker_groups.slope_sd
-        * slope_deviation_norms[:, None]
-        * failing_walks.slope_deviation_directions
-    )
-    ground_line_slopes = np.concatenate([failing_walks.start_slopes[:, None], landing_slopes], 1)
-    walk_results = step_batch(
-        eqx.tree_at(lambda wheel_on_lines: wheel_on_lines.slope, params, ground_line_slopes),
-        failing_walks.section_states,
-        landing_slopes.shape[1],
-        model=walker_groups.model,
-        options=walker_groups.step_options,
-    )
-    has_walk_failed: np.ndarray = walk_results.outcome != Outcome.STEPPED
-    return has_walk_failed
-
-
-def _bisect_failure_radii(
-    walker_groups: WalkerGroups,
-    params: WheelParams,
-    failing_walks: FailingWalks,
-    lower_failure_radii: np.ndarray,
-    upper_failure_radii: np.ndarray,
-    n_bisections: int,
-) -> np.ndarray:
-    """Return the failure radius of each walk, shape (walks,), by bisection.
-
-    - `lower_failure_radii`: radii at which the walks do not fail;
-    - `upper_failure_radii`: radii at which the walks fail.
-    """
-    for _ in range(n_bisections):
-        middle_failure_radii = 0.5 * (lower_failure_radii + upper_failure_radii)
-        has_walk_failed = _test_walk_failures(
-            walker_groups, params, failing_walks, middle_failure_radii
-        )
-        lower_failure_radii, upper_failure_radii = (
-            np.where(has_walk_failed, lower_failure_radii, middle_failure_radii),
-            np.where(has_walk_failed, middle_failure_radii, upper_failure_radii),
-        )
-    return 0.5 * (lower_failure_radii + upper_failure_radii)

@@ -8,7 +8,7 @@ give the probability of that failure without bias. Groups are independent, so th
 between groups gives the error.
 """
 
-import dataclasses
+import collections
 import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -19,11 +19,7 @@ import numpy as np
 
 from vrw_jax.batches import StepBatchResult, step_batch
 from vrw_jax.numerics import StepOptions
-from vrw_jax.robustness.failure_density import (
-    FAILURE_DENSITY_OPTIONS,
-    GaussianMixture,
-    fit_failure_density,
-)
+from vrw_jax.robustness.failure_density import GaussianMixture, fit_failure_density
 from vrw_jax.wheel import Outcome, WheelParams
 
 
@@ -172,79 +168,88 @@ class SampledPassage(NamedTuple):
     walk_density: GaussianMixture
 
 
+class StepTransition(NamedTuple):
+    """States of all walkers before and after one gait step, with the slope as last component."""
+
+    states_before_step: np.ndarray
+    is_walker_alive: np.ndarray
+    slope_deviations: np.ndarray  # of the slopes on which the step ends
+    states_after_step: np.ndarray
+
+
+@dataclass
 class WalkerGroups:
     """Groups of walkers (simulated wheels) on random slopes, simulated as one batch.
 
-    At first, the state of every walker is the section state of the gait.
+    At first, the state of every walker is the section state of the gait. The number of walkers per
+    group is rounded up to a power of two, because a digital net has such a number of points.
     """
 
-    def __init__(
-        self,
-        params: WheelParams,
-        section_state: np.ndarray,
-        slope_sd: float,
-        model: Any,
-        step_options: StepOptions,
-        n_walkers: int,
-        random_generator: np.random.Generator,
-        options: PassageSamplingOptions = PASSAGE_SAMPLING_OPTIONS,
-    ) -> None:
-        self.params, self.model, self.step_options = params, model, step_options
-        self.mean_slope, self.slope_sd, self.random = (
-            float(params.slope),
-            slope_sd,
-            random_generator,
-        )
-        self.n_groups, self.n_continuous_entries = (
-            options.n_walker_groups,
-            int(model.count_continuous_section_entries(params)),
-        )
-        # A digital net has a power of two points.
-        n_walkers_per_group = 1 << (-(-n_walkers // self.n_groups) - 1).bit_length()
-        self.states = self.gait_states = np.tile(
-            section_state, (self.n_groups * n_walkers_per_group, 1)
-        )
-        self.slopes = np.full(len(self.states), self.mean_slope)
+    params: WheelParams
+    gait_state: np.ndarray
+    slope_sd: float
+    model: Any
+    step_options: StepOptions
+    n_walkers: int
+    random: np.random.Generator
+    options: PassageSamplingOptions = PASSAGE_SAMPLING_OPTIONS
+
+    def __post_init__(self) -> None:
+        self.n_groups = self.options.n_walker_groups
+        self.n_walkers_per_group = 1 << (-(-self.n_walkers // self.n_groups) - 1).bit_length()
+        self.n_walkers = self.n_groups * self.n_walkers_per_group
         self.n_steps = 0
-        self.weight_by_outcome: dict[int, float] = {}
+        self.weight_by_outcome: Any = collections.Counter()  # total weight of walks that failed
+        self.restart_at_gait()
 
-    def run_walks(self, slope_deviations: np.ndarray) -> StepBatchResult:
-        """Return the results of walks that begin at the current states of the walkers.
+    def run_walks(
+        self, slope_deviations: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, StepBatchResult]:
+        """Return whether walks fail in their last step, whether they fail, and their results.
 
-        Walk i begins at walker i modulo the number of walkers.
+        The walks begin at the current states of the walkers. Walk i begins at walker i modulo the
+        number of walkers.
 
         - `slope_deviations`: standardized deviations of the slopes on which the wheels land, shape
           (walks, lines).
         """
-        landing_slopes = self.mean_slope + self.slope_sd * slope_deviations
-        walker_indices = np.arange(len(slope_deviations)) % len(self.states)
-        ground_line_slopes = np.concatenate([self.slopes[walker_indices, None], landing_slopes], 1)
-        wheels_on_lines = eqx.tree_at(
-            lambda wheel_params: wheel_params.slope, self.params, ground_line_slopes
+        walker_indices = np.arange(len(slope_deviations)) % self.n_walkers
+        walk_results = self.run_changed_walks(
+            self.params, self.states[walker_indices], self.slopes[walker_indices], slope_deviations
         )
-        walk_results = step_batch(
-            wheels_on_lines,
-            self.states[walker_indices],
+        has_failed = walk_results.outcome != Outcome.STEPPED
+        self.n_steps += int(np.sum(walk_results.n_stepped) + np.sum(has_failed))
+        is_in_last_step = walk_results.n_stepped == slope_deviations.shape[1] - 1
+        return has_failed & is_in_last_step, has_failed, walk_results
+
+    def run_changed_walks(
+        self,
+        params: WheelParams,
+        section_states: np.ndarray,
+        start_slopes: np.ndarray,
+        slope_deviations: np.ndarray,
+    ) -> StepBatchResult:
+        """Return the results of walks of the wheel `params` from given states and slopes."""
+        landing_slopes = float(params.slope) + self.slope_sd * slope_deviations
+        ground_line_slopes = np.concatenate([start_slopes[:, None], landing_slopes], 1)
+        return step_batch(
+            eqx.tree_at(lambda wheel_on_lines: wheel_on_lines.slope, params, ground_line_slopes),
+            section_states,
             slope_deviations.shape[1],
             model=self.model,
             options=self.step_options,
         )
-        self.n_steps += int(np.sum(walk_results.n_stepped)) + int(
-            np.sum(walk_results.outcome != Outcome.STEPPED)
-        )
-        return walk_results
 
     def add_failure_weights(self, walk_outcomes: np.ndarray, walk_weights: np.ndarray) -> None:
         """Add the weights of failed walks to `weight_by_outcome`, the total for each outcome."""
         for outcome_code in np.unique(walk_outcomes[walk_weights > 0.0]):
             outcome_weight = float(np.sum(walk_weights[walk_outcomes == outcome_code]))
-            self.weight_by_outcome[int(outcome_code)] = (
-                self.weight_by_outcome.get(int(outcome_code), 0.0) + outcome_weight
-            )
+            self.weight_by_outcome[int(outcome_code)] += outcome_weight
 
     def restart_at_gait(self) -> None:
         """Reset all walkers to the section state of the gait, on ground of the mean slope."""
-        self.states, self.slopes = self.gait_states, np.full(len(self.gait_states), self.mean_slope)
+        self.states = np.tile(self.gait_state, (self.n_walkers, 1))
+        self.slopes = np.full(self.n_walkers, float(self.params.slope))
 
     def stack_states_and_slopes(self) -> np.ndarray:
         """Return section states with the slope as last component, shape (walkers, components).
@@ -254,33 +259,31 @@ class WalkerGroups:
         """
         return np.concatenate([self.states, self.slopes[:, None]], 1)
 
-    def step_and_replace_failures(self) -> tuple[np.ndarray, np.ndarray]:
+    def step_and_replace_failures(self) -> StepTransition:
         """Simulate one gait step of every walker, and replace walkers that fail by copies of
         survivors.
 
-        Return whether each walker survived, and the standardized deviations of the slopes on which
-        the walkers landed. The two arrays have the shape (walkers,). Raise `ExtinctGroupError` if
-        no walker of a group survived.
+        Raise `ExtinctGroupError` if no walker of a group survived.
         """
-        n_walkers = len(self.states)
-        slope_deviations = self.random.standard_normal((n_walkers, 1))
-        walk_results = self.run_walks(slope_deviations)
-        is_walker_alive: np.ndarray = walk_results.outcome == Outcome.STEPPED
-        self.add_failure_weights(walk_results.outcome, (~is_walker_alive).astype(float))
-        source_walker_indices = np.arange(n_walkers).reshape(self.n_groups, -1)
-        for walker_indices_of_group, is_alive_in_group in zip(
-            source_walker_indices, is_walker_alive.reshape(source_walker_indices.shape), strict=True
+        states_before_step = self.stack_states_and_slopes()
+        slope_deviations = self.random.standard_normal((self.n_walkers, 1))
+        _, has_failed, walk_results = self.run_walks(slope_deviations)
+        self.add_failure_weights(walk_results.outcome, has_failed.astype(float))
+        source_indices = np.arange(self.n_walkers).reshape(self.n_groups, -1)
+        for indices_of_group, has_failed_in_group in zip(
+            source_indices, has_failed.reshape(source_indices.shape), strict=True
         ):
-            if not np.any(is_alive_in_group):
+            if np.all(has_failed_in_group):
                 raise ExtinctGroupError
-            walker_indices_of_group[~is_alive_in_group] = self.random.choice(
-                walker_indices_of_group[is_alive_in_group], np.sum(~is_alive_in_group)
+            indices_of_group[has_failed_in_group] = self.random.choice(
+                indices_of_group[~has_failed_in_group], np.sum(has_failed_in_group)
             )
-        self.states = walk_results.section_state[source_walker_indices.ravel()]
-        self.slopes = (
-            self.mean_slope + self.slope_sd * slope_deviations[source_walker_indices.ravel(), 0]
+        self.states = walk_results.section_state[source_indices.ravel()]
+        landing_slopes = float(self.params.slope) + self.slope_sd * slope_deviations[:, 0]
+        self.slopes = landing_slopes[source_indices.ravel()]
+        return StepTransition(
+            states_before_step, ~has_failed, slope_deviations[:, 0], self.stack_states_and_slopes()
         )
-        return is_walker_alive, slope_deviations[:, 0]
 
 
 def sample_passage(
@@ -288,7 +291,6 @@ def sample_passage(
     spectral_radius: float,
     relative_tolerance: float,
     max_steps: int,
-    sampling_options: PassageSamplingOptions = PASSAGE_SAMPLING_OPTIONS,
 ) -> SampledPassage:
     """Return first-passage times, estimated from walks of groups of walkers.
 
@@ -299,57 +301,55 @@ def sample_passage(
         spectral_radius: spectral radius of the gait.
         relative_tolerance: relative error at which the sampling ends.
         max_steps: number of gait steps after which no further walks begin.
-        sampling_options: numerical options of the sampling.
 
     Raises:
         ExtinctGroupError: if no walker of a group survives a step.
     """
+    options = walker_groups.options
     count_decay_steps = lambda remaining_start_effect, decay_factor: int(
         np.ceil(np.log(remaining_start_effect) / np.log(np.clip(decay_factor, 0.01, 0.99)))
     )
     n_biased_ground_lines = min(
-        count_decay_steps(sampling_options.negligible_ground_line_effect, spectral_radius),
-        sampling_options.max_biased_ground_lines,
+        count_decay_steps(options.negligible_ground_line_effect, spectral_radius),
+        options.max_biased_ground_lines,
     )
-    max_start_effect = sampling_options.max_start_effect_per_tol * relative_tolerance
+    max_start_effect = options.max_start_effect_per_tol * relative_tolerance
     n_forgetting_steps = int(
         np.clip(
             count_decay_steps(max_start_effect, spectral_radius),
-            sampling_options.min_forgetting_steps,
-            sampling_options.max_forgetting_steps,
+            options.min_forgetting_steps,
+            options.max_forgetting_steps,
         )
     )
     surviving_fractions, step_transitions = _step_until_start_is_forgotten(
-        walker_groups, n_forgetting_steps, relative_tolerance, sampling_options
+        walker_groups, n_forgetting_steps, relative_tolerance
     )
     while True:
         n_forgetting_steps = len(step_transitions)
         late_transitions = step_transitions[
-            -max(sampling_options.n_kappa_2_steps, n_forgetting_steps // 2) :
+            -max(options.n_kappa_2_steps, n_forgetting_steps // 2) :
         ]
-        kappa_1 = float(np.mean([is_walker_alive for _, is_walker_alive, _, _ in late_transitions]))
+        kappa_1 = float(np.mean([transition.is_walker_alive for transition in late_transitions]))
         kappa_2 = _estimate_kappa_2(
-            late_transitions, walker_groups.n_continuous_entries, sampling_options
+            late_transitions,
+            int(walker_groups.model.count_continuous_section_entries(walker_groups.params)),
         )
         # The effect of the start, divided by the survival probability, decays by this factor.
         start_effect_factor = 1.0 if np.isnan(kappa_2) else max(kappa_2 / kappa_1, spectral_radius)
+        n_decay_steps = count_decay_steps(max_start_effect, start_effect_factor) + 1
         # The number of steps is at most doubled, because more transitions improve kappa_2.
-        n_missing_steps = (
-            min(
-                count_decay_steps(max_start_effect, start_effect_factor)
-                + 1
-                - n_biased_ground_lines,
-                sampling_options.max_forgetting_steps,
-                2 * n_forgetting_steps,
-            )
-            - n_forgetting_steps
+        n_required_steps = min(
+            n_decay_steps - n_biased_ground_lines,
+            options.max_forgetting_steps,
+            2 * n_forgetting_steps,
         )
-        if n_missing_steps <= 0:
+        if n_required_steps <= n_forgetting_steps:
             break
-        for _ in range(n_missing_steps):
-            step_transitions.append(_record_transition(walker_groups))
+        for _ in range(n_required_steps - n_forgetting_steps):
+            step_transitions.append(walker_groups.step_and_replace_failures())
             surviving_fractions = np.append(
-                surviving_fractions, surviving_fractions[-1] * np.mean(step_transitions[-1][1])
+                surviving_fractions,
+                surviving_fractions[-1] * np.mean(step_transitions[-1].is_walker_alive),
             )
     walker_groups.weight_by_outcome.clear()
     walk_density = GaussianMixture.make_isotropic_gaussian(n_biased_ground_lines, 1.0)
@@ -359,32 +359,35 @@ def sample_passage(
         start_effect_decay=(start_effect_factor, n_forgetting_steps - 1),
         relative_tolerance=relative_tolerance,
         max_steps=max_steps,
-        sampling_options=sampling_options,
     )
-    count_failures = lambda: (~walker_groups.step_and_replace_failures()[0]).astype(float)
+    count_failures = lambda: (~walker_groups.step_and_replace_failures().is_walker_alive).astype(
+        float
+    )
     failure_probability, relative_error, start_effect = 0.0, np.inf, 0.0
     n_effective_lines = count_decay_steps(
-        sampling_options.negligible_ground_line_effect, start_effect_factor
+        options.negligible_ground_line_effect, start_effect_factor
     )
-    are_failures_counted = (
-        n_effective_lines * np.mean(~step_transitions[-1][1])
-        > sampling_options.min_failures_for_counting
-    )
+    n_failures_over_lines = n_effective_lines * np.mean(~step_transitions[-1].is_walker_alive)
+    are_failures_counted = n_failures_over_lines > options.min_failures_for_counting
     if not are_failures_counted:
-        failure_density = _fit_density_of_failures(walker_groups, n_biased_ground_lines)
+        failure_density = fit_failure_density(
+            lambda slope_deviations: walker_groups.run_walks(slope_deviations)[:2],
+            n_biased_ground_lines,
+            walker_groups.random,
+            max_walks_per_stage=walker_groups.n_walkers,
+        )
         if failure_density is not None:
             walk_density = failure_density
             failure_probability, relative_error, start_effect = estimate_probability(
                 _make_weight_sampler(walker_groups, walk_density), n_biased_ground_lines
             )
             if np.isfinite(relative_error) and _has_missed_failures(
-                walker_groups, failure_probability * (1.0 + relative_error), sampling_options
+                walker_groups, failure_probability * (1.0 + relative_error)
             ):
                 relative_error = np.inf
         n_expected_failures = failure_probability * (max_steps - walker_groups.n_steps)
         are_failures_counted = (
-            not np.isfinite(relative_error)
-            and n_expected_failures > sampling_options.min_effective_failures
+            not np.isfinite(relative_error) and n_expected_failures > options.min_effective_failures
         )
     if are_failures_counted:
         walker_groups.weight_by_outcome.clear()
@@ -398,7 +401,6 @@ def sample_passage(
         mean_steps_from_gait = float(
             np.sum(surviving_fractions[1:-1]) + surviving_fractions[-1] / failure_probability
         )
-    total_failure_weight = sum(walker_groups.weight_by_outcome.values())
     return SampledPassage(
         failure_probability=failure_probability,
         relative_error=relative_error,
@@ -407,11 +409,8 @@ def sample_passage(
         kappa_2=kappa_2,
         quasi_stationary_states=walker_groups.stack_states_and_slopes(),
         fraction_by_outcome={
-            Outcome(outcome_code).name: outcome_weight / total_failure_weight
-            for outcome_code, outcome_weight in sorted(
-                walker_groups.weight_by_outcome.items(),
-                key=lambda outcome_and_weight: -outcome_and_weight[1],
-            )
+            Outcome(outcome_code).name: outcome_weight / walker_groups.weight_by_outcome.total()
+            for outcome_code, outcome_weight in walker_groups.weight_by_outcome.most_common()
         },
         n_sampled_steps=walker_groups.n_steps,
         walk_density=walk_density,
@@ -426,7 +425,6 @@ def _estimate_failure_probability(
     start_effect_decay: tuple[float, int],
     relative_tolerance: float,
     max_steps: int,
-    sampling_options: PassageSamplingOptions,
     are_walkers_advanced: bool = False,
 ) -> tuple[float, float, float]:
     """Return the failure probability of a gait step, the relative error of that probability, and
@@ -447,7 +445,8 @@ def _estimate_failure_probability(
     """
     from scipy import stats  # This import is slow.
 
-    first_fractions = sampling_options.first_error_test_fractions
+    options = walker_groups.options
+    first_fractions = options.first_error_test_fractions
 
     def compute_student_t_quantile(error_test_number: int) -> float:
         n_later_tests = error_test_number - len(first_fractions)
@@ -456,30 +455,30 @@ def _estimate_failure_probability(
             if n_later_tests > 0
             else first_fractions[error_test_number - 1]
         )
-        miss_probability = (1.0 - sampling_options.confidence_level) * miss_fraction
+        miss_probability = (1.0 - options.confidence_level) * miss_fraction
         return float(stats.t.isf(0.5 * miss_probability, walker_groups.n_groups - 1))
 
     weight_sum_by_group, n_sampling_rounds = np.zeros(walker_groups.n_groups), 0
-    failure_weight_sum, squared_weight_sum, n_failing_walks = 0.0, 0.0, 0
+    weight_moments = np.zeros(3)
     failure_probability, relative_error = 0.0, np.inf
     start_effect_factor, n_steps_before_walks = start_effect_decay
     start_effect = start_effect_factor ** (n_steps_before_walks + n_ground_lines)
-    n_error_tests, n_rounds_at_error_test = 0, sampling_options.min_sampling_rounds
+    n_error_tests, n_rounds_at_error_test = 0, options.min_sampling_rounds
     while n_sampling_rounds == 0 or (
         relative_error > relative_tolerance and walker_groups.n_steps < max_steps
     ):
         while n_sampling_rounds < n_rounds_at_error_test and (
-            n_sampling_rounds < sampling_options.min_sampling_rounds
-            or walker_groups.n_steps < max_steps
+            n_sampling_rounds < options.min_sampling_rounds or walker_groups.n_steps < max_steps
         ):
-            failure_importance_weights = failure_weight_sampler()
-            weight_sum_by_group += failure_importance_weights.reshape(
-                walker_groups.n_groups, -1
-            ).mean(1)
-            failure_weight_sum += float(np.sum(failure_importance_weights))
-            squared_weight_sum += float(np.sum(failure_importance_weights**2))
-            n_failing_walks += int(np.sum(failure_importance_weights > 0.0))
+            walk_weights = failure_weight_sampler()
+            weight_sum_by_group += walk_weights.reshape(walker_groups.n_groups, -1).mean(1)
+            weight_moments += (
+                np.sum(walk_weights),
+                np.sum(walk_weights**2),
+                np.sum(walk_weights > 0.0),
+            )
             n_sampling_rounds += 1
+        failure_weight_sum, squared_weight_sum, n_failing_walks = weight_moments
         n_rounds_at_error_test = 2 * n_sampling_rounds
         if failure_weight_sum == 0.0:
             continue
@@ -488,11 +487,9 @@ def _estimate_failure_probability(
             last_step_failure_probability, n_ground_lines
         )
         n_effective_failures = failure_weight_sum**2 / squared_weight_sum
-        if n_effective_failures < (
-            sampling_options.min_effective_failure_fraction * n_failing_walks
-        ):
+        if n_effective_failures < (options.min_effective_failure_fraction * n_failing_walks):
             return failure_probability, np.inf, start_effect
-        if n_effective_failures < sampling_options.min_effective_failures:
+        if n_effective_failures < options.min_effective_failures:
             continue
         n_error_tests += 1
         relative_standard_error = (
@@ -525,36 +522,19 @@ def _estimate_failure_probability(
                 np.ceil(
                     n_sampling_rounds
                     * max(
-                        sampling_options.n_rounds_safety_factor * sampling_error_ratio**2,
-                        sampling_options.min_round_count_ratio,
+                        options.n_rounds_safety_factor * sampling_error_ratio**2,
+                        options.min_round_count_ratio,
                     )
                 )
             )
     return failure_probability, relative_error, start_effect
 
 
-def _record_transition(walker_groups: WalkerGroups) -> tuple[np.ndarray, ...]:
-    """Simulate one gait step of every walker, replace failed walkers, and return the transition.
-
-    The transition is a tuple of states before the step, survival, deviations of the slopes on which
-    the step ends, and states after the step. States have the slope as last component.
-    """
-    states_before_step = walker_groups.stack_states_and_slopes()
-    is_walker_alive, slope_deviations = walker_groups.step_and_replace_failures()
-    return (
-        states_before_step,
-        is_walker_alive,
-        slope_deviations,
-        walker_groups.stack_states_and_slopes(),
-    )
-
-
 def _step_until_start_is_forgotten(
     walker_groups: WalkerGroups,
     n_steps: int,
     relative_tolerance: float,
-    sampling_options: PassageSamplingOptions,
-) -> tuple[np.ndarray, list[tuple[np.ndarray, ...]]]:
+) -> tuple[np.ndarray, list[StepTransition]]:
     """Return the fractions of walks from the gait that survive 0, 1, ..., `n_steps` gait steps, and
     the transitions of the walkers in each of these steps.
 
@@ -565,58 +545,29 @@ def _step_until_start_is_forgotten(
     """
     from scipy import stats  # This import is slow.
 
+    options = walker_groups.options
     max_relative_variance = (
-        relative_tolerance / stats.norm.isf(0.5 * (1.0 - sampling_options.confidence_level))
+        relative_tolerance / stats.norm.isf(0.5 * (1.0 - options.confidence_level))
     ) ** 2
-    surviving_fractions_by_round: list[np.ndarray] = []
-    step_transitions: list[tuple[np.ndarray, ...]] = []
+    fractions_by_round: list[np.ndarray] = []
     relative_variance_sum = 0.0
-    while len(surviving_fractions_by_round) < sampling_options.max_rounds_from_gait and (
-        not surviving_fractions_by_round
-        or relative_variance_sum > max_relative_variance * len(surviving_fractions_by_round) ** 2
+    while not fractions_by_round or (
+        len(fractions_by_round) < options.max_rounds_from_gait
+        and relative_variance_sum > max_relative_variance * len(fractions_by_round) ** 2
     ):
         walker_groups.restart_at_gait()
-        step_transitions = [_record_transition(walker_groups) for _ in range(n_steps)]
-        alive_walker_fractions = np.array(
-            [np.mean(step_transition[1]) for step_transition in step_transitions]
+        step_transitions = [walker_groups.step_and_replace_failures() for _ in range(n_steps)]
+        alive_fractions = np.array(
+            [np.mean(transition.is_walker_alive) for transition in step_transitions]
         )
-        surviving_fractions_by_round.append(np.cumprod([1.0, *alive_walker_fractions]))
+        fractions_by_round.append(np.cumprod([1.0, *alive_fractions]))
         relative_variance_sum += float(
-            np.sum((1.0 - alive_walker_fractions) / alive_walker_fractions)
-            / len(walker_groups.states)
+            np.sum((1.0 - alive_fractions) / alive_fractions) / walker_groups.n_walkers
         )
-    return np.mean(surviving_fractions_by_round, 0), step_transitions
+    return np.mean(fractions_by_round, 0), step_transitions
 
 
-def _fit_density_of_failures(
-    walker_groups: WalkerGroups, n_ground_lines: int
-) -> GaussianMixture | None:
-    """Return a density of slope deviations for which walks often fail in their last step.
-
-    Each walk has `n_ground_lines` steps. The result is None if no walk fails.
-    """
-
-    def find_last_step_failures(slope_deviations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        walk_results = walker_groups.run_walks(slope_deviations)
-        has_walk_failed = walk_results.outcome != Outcome.STEPPED
-        return has_walk_failed & (walk_results.n_stepped == n_ground_lines - 1), has_walk_failed
-
-    density_options = dataclasses.replace(
-        FAILURE_DENSITY_OPTIONS,
-        max_walks_per_stage=min(
-            FAILURE_DENSITY_OPTIONS.max_walks_per_stage, len(walker_groups.states)
-        ),
-    )
-    return fit_failure_density(
-        find_last_step_failures, n_ground_lines, walker_groups.random, density_options
-    )
-
-
-def _has_missed_failures(
-    walker_groups: WalkerGroups,
-    max_failure_probability: float,
-    sampling_options: PassageSamplingOptions,
-) -> bool:
+def _has_missed_failures(walker_groups: WalkerGroups, max_failure_probability: float) -> bool:
     """Return whether some outcome occurs in more simulated steps than importance sampling predicts.
 
     Importance sampling may miss an outcome that no large slope causes. For example, a landing may
@@ -626,24 +577,23 @@ def _has_missed_failures(
     """
     from scipy import stats  # This import is slow.
 
-    importance_weight_by_outcome = walker_groups.weight_by_outcome
-    walker_groups.weight_by_outcome = {}
-    for _ in range(sampling_options.n_failure_check_steps):
+    options = walker_groups.options
+    importance_weight_by_outcome = walker_groups.weight_by_outcome.copy()
+    walker_groups.weight_by_outcome.clear()
+    for _ in range(options.n_failure_check_steps):
         walker_groups.step_and_replace_failures()
     n_failures_by_outcome = walker_groups.weight_by_outcome
     walker_groups.weight_by_outcome = importance_weight_by_outcome
     max_failure_count = (
-        max_failure_probability * sampling_options.n_failure_check_steps * len(walker_groups.states)
+        max_failure_probability * options.n_failure_check_steps * walker_groups.n_walkers
     )
-    total_failure_weight = sum(importance_weight_by_outcome.values())
+    total_failure_weight = importance_weight_by_outcome.total()
     return any(
         stats.poisson.sf(
             n_failures - 1.0,
-            max_failure_count
-            * importance_weight_by_outcome.get(outcome_code, 0.0)
-            / total_failure_weight,
+            max_failure_count * importance_weight_by_outcome[outcome_code] / total_failure_weight,
         )
-        < sampling_options.min_failure_check_probability
+        < options.min_failure_check_probability
         for outcome_code, n_failures in n_failures_by_outcome.items()
     )
 
@@ -663,12 +613,14 @@ def _make_weight_sampler(
     group_nets = [
         qmc.Sobol(1 + n_ground_lines, rng=random_generator) for _ in range(walker_groups.n_groups)
     ]
-    n_walkers_per_group = len(walker_groups.states) // walker_groups.n_groups
 
     def sample_failure_weights() -> np.ndarray:
         # The permutation lets each walker meet all parts of the space of slopes.
         net_points = np.concatenate(
-            [random_generator.permutation(net.random(n_walkers_per_group)) for net in group_nets]
+            [
+                random_generator.permutation(net.random(walker_groups.n_walkers_per_group))
+                for net in group_nets
+            ]
         )
         return run_biased_walks(
             walker_groups, walk_density, walk_density.map_uniform_numbers(net_points)
@@ -688,12 +640,8 @@ def run_biased_walks(
     - `walk_density`: density from which the slope deviations are drawn;
     - `slope_deviations`: standardized deviations of the slopes, shape (walkers, lines).
     """
-    n_ground_lines = slope_deviations.shape[1]
-    walk_results = walker_groups.run_walks(slope_deviations)
-    has_failed_in_last_step = (walk_results.outcome != Outcome.STEPPED) & (
-        walk_results.n_stepped == n_ground_lines - 1
-    )
-    nominal_density = GaussianMixture.make_isotropic_gaussian(n_ground_lines, 1.0)
+    has_failed_in_last_step, _, walk_results = walker_groups.run_walks(slope_deviations)
+    nominal_density = GaussianMixture.make_isotropic_gaussian(slope_deviations.shape[1], 1.0)
     likelihood_ratios = np.exp(
         nominal_density.compute_log_density(slope_deviations)
         - walk_density.compute_log_density(slope_deviations)
@@ -725,9 +673,7 @@ def _solve_failure_probability(
 
 
 def _estimate_kappa_2(
-    step_transitions: Sequence[tuple[np.ndarray, ...]],
-    n_continuous_entries: int,
-    sampling_options: PassageSamplingOptions = PASSAGE_SAMPLING_OPTIONS,
+    step_transitions: Sequence[tuple[np.ndarray, ...]], n_continuous_entries: int
 ) -> float:
     """Return kappa_2, the second eigenvalue of the survival operator's projection on quadratic
     functions.
@@ -740,21 +686,21 @@ def _estimate_kappa_2(
     exceeds kappa_1, a linear projection replaces it. The result is NaN if the second eigenvalue of
     the linear projection exceeds kappa_1 too, because no second eigenvalue exceeds the leading one.
 
-    - `step_transitions`: transitions that `_record_transition` returns, one for each gait step;
+    - `step_transitions`: `StepTransition` of each gait step;
     - `n_continuous_entries`: number of continuous components of a section state.
     """
     states_before_step, is_walker_alive, landing_deviations, states_after_step = (
         np.concatenate(arrays_by_step) for arrays_by_step in zip(*step_transitions, strict=True)
     )
-    mean_state_before_step = states_before_step.mean(0)
-    varying_coordinate_indices = [
+    varying_components = [
         i
         for i in (*range(n_continuous_entries), states_before_step.shape[1] - 1)
         if np.ptp(states_before_step[:, i])
     ]
-    state_standard_deviations = states_before_step[:, varying_coordinate_indices].std(0)
+    mean_state = states_before_step.mean(0)
+    standard_deviations = states_before_step[:, varying_components].std(0)
     standardize_states = lambda states: (
-        (states - mean_state_before_step)[:, varying_coordinate_indices] / state_standard_deviations
+        (states - mean_state)[:, varying_components] / standard_deviations
     )
     _, singular_values, principal_directions = np.linalg.svd(
         standardize_states(states_before_step), full_matrices=False
@@ -779,15 +725,10 @@ def _estimate_kappa_2(
 
         def evaluate_state_features(states: np.ndarray) -> np.ndarray:
             z = standardize_states(states) @ principal_directions.T
-            coordinate_products = z[:, first_coordinate_indices] * z[:, second_coordinate_indices]
-            return np.concatenate(
-                [
-                    np.ones((len(z), 1)),
-                    z,
-                    *([coordinate_products] if has_quadratic_features else []),
-                ],
-                1,
-            )
+            features = [np.ones((len(z), 1)), z]
+            if has_quadratic_features:
+                features.append(z[:, first_coordinate_indices] * z[:, second_coordinate_indices])
+            return np.concatenate(features, 1)
 
         state_features_before_step = evaluate_state_features(states_before_step)
         linear_state_features = state_features_before_step[:, : 1 + len(principal_directions)]
@@ -799,7 +740,7 @@ def _estimate_kappa_2(
             1,
         )
         if has_quadratic_features and len(regressor_matrix) < (
-            sampling_options.min_transitions_per_regressor * regressor_matrix.shape[1]
+            PASSAGE_SAMPLING_OPTIONS.min_transitions_per_regressor * regressor_matrix.shape[1]
         ):
             return np.nan
         state_features_after_step = np.where(
