@@ -12,7 +12,13 @@ from jaxtyping import Array, Float, Int
 
 from vrw_jax.cycles import AbstractCycle
 from vrw_jax.models import AbstractWheel, AdvanceResult
-from vrw_jax.numerics import StepOptions, batch_sizes, map_in_batches, with_default_jax_settings
+from vrw_jax.numerics import (
+    StepOptions,
+    batch_sizes,
+    map_in_batches,
+    select_tree_rows,
+    with_default_jax_settings,
+)
 from vrw_jax.printing import AbstractPrintable, LabelAndText
 from vrw_jax.robustness.gait_arrival import StableGait, walk_until_on_gait
 from vrw_jax.simulation import ModelLike
@@ -192,37 +198,15 @@ def smallest_disturbance(
     return compute_smallest_disturbance(stable_gait, max_size, max_steps)
 
 
-class _GaitStep(NamedTuple):
-    """Times and states that sample one step of a gait, with axes over phases and samples."""
+class _DisturbedGait(NamedTuple):
+    """Gait of one step, sampled within the step, and the limits of the search."""
 
+    stable_gait: StableGait
     sample_times: np.ndarray  # after the landing, s, (phase, sample)
     sampled_states: np.ndarray  # (theta, L1, L2) and their rates, (phase, sample, 6)
-    indices_of_occurring_phases: tuple[int, ...]  # indices of the phases with a duration above zero
     foot_distance: Array  # between the feet in double support, m
-
-
-def compute_smallest_disturbance(
-    stable_gait: StableGait,
-    max_size: float | None,
-    max_steps: int,
-    search_options: DisturbanceSearchOptions = DISTURBANCE_SEARCH_OPTIONS,
-) -> SmallestDisturbance:
-    """Return the `SmallestDisturbance` for a gait of one step and for checked arguments."""
-    params, model, options, section_states = stable_gait
-    start_state = jnp.asarray(section_states[0])
-    step_trajectory = model.sample_step(
-        params, start_state, options, search_options.n_phase_samples
-    )
-    foot_distance = jnp.asarray(model.take_step(params, start_state, options).step_length)
-    gait_step = _GaitStep(
-        np.asarray(step_trajectory.time),
-        np.asarray(step_trajectory.state),
-        tuple(int(i) for i in np.flatnonzero(np.asarray(step_trajectory.durations) > 0.0)),
-        foot_distance,
-    )
-    if max_size is None:
-        max_size = 2.0 * float(gait_step.sampled_states[..., ANGULAR_VELOCITY_INDEX].max())
-    return _search_disturbance_instants(stable_gait, gait_step, max_size, max_steps, search_options)
+    max_size: float  # largest tried change, rad/s
+    max_steps: int  # largest number of gait steps after the disturbance
 
 
 class _DirectedInstants(NamedTuple):
@@ -251,254 +235,174 @@ class _ExitSizeBrackets(NamedTuple):
         return 0.5 * (self.lower_disturbance_sizes + self.upper_disturbance_sizes)
 
 
-def _search_disturbance_instants(
-    stable_gait: StableGait,
-    gait_step: _GaitStep,
-    max_size: float,
-    max_steps: int,
-    search_options: DisturbanceSearchOptions,
+def compute_smallest_disturbance(
+    stable_gait: StableGait, max_size: float | None, max_steps: int
 ) -> SmallestDisturbance:
-    """Return the smallest disturbance over all instants of a gait step.
+    """Return the `SmallestDisturbance` for a gait of one step and for checked arguments.
 
     Each pass of the search considers instants that are closer to each other than in the pass
     before.
     """
-    phases_and_signs = [
-        (phase_index, disturbance_sign)
-        for phase_index in gait_step.indices_of_occurring_phases
-        for disturbance_sign in DISTURBANCE_SIGNS
-    ]
-    sample_window_centers = dict.fromkeys(phases_and_signs, search_options.n_phase_samples // 2)
-    half_intervals = search_options.n_intervals_per_pass // 2
-    first_pass_result = best_instant_index = None
-    for sample_stride in search_options.sample_strides:
-        sample_offsets = sample_stride * np.arange(-half_intervals, half_intervals + 1)
-        sample_windows = [
-            np.clip(
-                sample_window_centers[phase_and_sign] + sample_offsets,
-                0,
-                search_options.n_phase_samples - 1,
-            )
-            for phase_and_sign in phases_and_signs
-        ]
-        n_instants = len(sample_offsets)
-        directed_instants = _DirectedInstants(
-            np.repeat([phase_index for phase_index, _ in phases_and_signs], n_instants),
-            np.concatenate(sample_windows),
-            np.repeat([disturbance_sign for _, disturbance_sign in phases_and_signs], n_instants),
-        )
-        is_last_pass = sample_stride == search_options.sample_strides[-1]
-        disturbance_size_tolerance = (
-            search_options.final_disturbance_tolerance
-            if is_last_pass
-            else search_options.early_disturbance_tolerance
-        )
-        exit_size_brackets = _bracket_exit_sizes(
-            stable_gait,
-            gait_step,
-            directed_instants,
-            max_size,
-            max_steps,
-            disturbance_size_tolerance,
-            search_options,
-        )
-        exit_sizes = exit_size_brackets.middle_disturbance_sizes.reshape(
-            len(phases_and_signs), n_instants
-        )
-        best_instant_indices = exit_sizes.argmin(1)
-        sample_window_centers = {
-            phase_and_sign: sample_windows[i][best_instant_indices[i]]
-            for i, phase_and_sign in enumerate(phases_and_signs)
-        }
-        first_pass_result = first_pass_result or (directed_instants, exit_size_brackets)
-        best_instant_index = int(exit_size_brackets.middle_disturbance_sizes.argmin())
-    assert first_pass_result is not None
-    assert best_instant_index is not None
-    smallest_disturbance_size, phase_index = (
-        float(exit_size_brackets.middle_disturbance_sizes[best_instant_index]),
-        int(directed_instants.phase_indices[best_instant_index]),
+    params, model, step_options, section_states = stable_gait
+    options = DISTURBANCE_SEARCH_OPTIONS
+    n_phase_samples = options.n_phase_samples
+    start_state = jnp.asarray(section_states[0])
+    trajectory = model.sample_step(params, start_state, step_options, n_phase_samples)
+    sampled_states = np.asarray(trajectory.state)
+    if max_size is None:
+        max_size = 2.0 * float(sampled_states[..., ANGULAR_VELOCITY_INDEX].max())
+    gait = _DisturbedGait(
+        stable_gait,
+        np.asarray(trajectory.time),
+        sampled_states,
+        jnp.asarray(model.take_step(params, start_state, step_options).step_length),
+        max_size,
+        max_steps,
     )
-    size_error = 0.0
-    if np.isfinite(smallest_disturbance_size):
-        size_error = float(
-            exit_size_brackets.upper_disturbance_sizes[best_instant_index]
-            - exit_size_brackets.lower_disturbance_sizes[best_instant_index]
+    occurring_phases = np.flatnonzero(np.asarray(trajectory.durations) > 0.0)
+    # Each pass considers a window of samples for each phase and direction.
+    n_windows = len(occurring_phases) * len(DISTURBANCE_SIGNS)
+    window_centers = np.full(n_windows, n_phase_samples // 2)
+    half_intervals = options.n_intervals_per_pass // 2
+    first_pass_result = None
+    for sample_stride in options.sample_strides:
+        sample_offsets = sample_stride * np.arange(-half_intervals, half_intervals + 1)
+        n_instants = len(sample_offsets)
+        window_samples = np.clip(window_centers[:, None] + sample_offsets, 0, n_phase_samples - 1)
+        instants = _DirectedInstants(
+            np.repeat(occurring_phases, len(DISTURBANCE_SIGNS) * n_instants),
+            window_samples.ravel(),
+            np.tile(np.repeat(DISTURBANCE_SIGNS, n_instants), len(occurring_phases)),
         )
-        if directed_instants.sample_indices[best_instant_index] not in (
-            0,
-            search_options.n_phase_samples - 1,
-        ):
+        is_last_pass = sample_stride == options.sample_strides[-1]
+        brackets = _bracket_exit_sizes(
+            gait,
+            instants,
+            options.final_disturbance_tolerance
+            if is_last_pass
+            else options.early_disturbance_tolerance,
+        )
+        exit_sizes = brackets.middle_disturbance_sizes.reshape(n_windows, n_instants)
+        window_centers = window_samples[np.arange(n_windows), exit_sizes.argmin(1)]
+        first_pass_result = first_pass_result or (instants, brackets)
+    assert first_pass_result is not None
+    best_instant = int(exit_sizes.argmin())
+    window_index, instant_index = divmod(best_instant, n_instants)
+    size = float(exit_sizes[window_index, instant_index])
+    phase_index = int(instants.phase_indices[best_instant])
+    sample_index = instants.sample_indices[best_instant]
+    size_error = 0.0
+    if np.isfinite(size):
+        size_error = float(
+            brackets.upper_disturbance_sizes[best_instant]
+            - brackets.lower_disturbance_sizes[best_instant]
+        )
+        if sample_index not in (0, n_phase_samples - 1):
             # Sizes at the neighboring instants of the last pass bound the change between two
             # instants.
-            phase_and_sign_index, instant_index = divmod(best_instant_index, n_instants)
-            neighbor_exit_sizes = exit_sizes[
-                phase_and_sign_index, max(instant_index - 1, 0) : instant_index + 2
-            ]
-            size_error += float(
-                np.max(neighbor_exit_sizes[np.isfinite(neighbor_exit_sizes)])
-                - smallest_disturbance_size
-            )
-    is_backward_disturbance = first_pass_result[0].disturbance_signs < 0.0
-    profile_phase_indices, profile_sample_indices = (
-        sample_indices_of_pass[is_backward_disturbance]
-        for sample_indices_of_pass in (
-            first_pass_result[0].phase_indices,
-            first_pass_result[0].sample_indices,
-        )
-    )
+            neighbor_sizes = exit_sizes[window_index, max(instant_index - 1, 0) : instant_index + 2]
+            size_error += float(np.max(neighbor_sizes[np.isfinite(neighbor_sizes)]) - size)
+    profile_instants, profile_brackets = first_pass_result
+    is_backward = profile_instants.disturbance_signs < 0.0
+    profile_phase_indices = profile_instants.phase_indices[is_backward]
+    profile_sizes = profile_brackets.middle_disturbance_sizes
     return SmallestDisturbance(
-        size=smallest_disturbance_size,
+        size=size,
         size_error=size_error,
-        direction=int(directed_instants.disturbance_signs[best_instant_index]),
-        time=float(
-            gait_step.sample_times[
-                phase_index, directed_instants.sample_indices[best_instant_index]
-            ]
-        ),
+        direction=int(instants.disturbance_signs[best_instant]),
+        time=float(gait.sample_times[phase_index, sample_index]),
         phase_index=phase_index,
-        outcome=np.asarray(exit_size_brackets.exit_outcomes[best_instant_index]),
-        profile_times=gait_step.sample_times[profile_phase_indices, profile_sample_indices],
+        outcome=np.asarray(brackets.exit_outcomes[best_instant]),
+        profile_times=gait.sample_times[
+            profile_phase_indices, profile_instants.sample_indices[is_backward]
+        ],
         profile_phase_indices=profile_phase_indices,
-        backward_sizes=first_pass_result[1].middle_disturbance_sizes[is_backward_disturbance],
-        forward_sizes=first_pass_result[1].middle_disturbance_sizes[~is_backward_disturbance],
+        backward_sizes=profile_sizes[is_backward],
+        forward_sizes=profile_sizes[~is_backward],
         max_size=max_size,
     )
 
 
 def _bracket_exit_sizes(
-    stable_gait: StableGait,
-    gait_step: _GaitStep,
-    directed_instants: _DirectedInstants,
-    max_size: float,
-    max_steps: int,
-    disturbance_size_tolerance: float,
-    search_options: DisturbanceSearchOptions,
+    gait: _DisturbedGait, instants: _DirectedInstants, size_tolerance: float
 ) -> _ExitSizeBrackets:
     """Return, for each instant and direction, a bracket of the smallest disturbance size that takes
     the state out of the basin.
 
-    - `disturbance_size_tolerance`: width of the final brackets, relative to the size.
+    - `size_tolerance`: width of the final brackets, relative to the size.
     """
-    n_directed_instants = len(directed_instants.disturbance_signs)
-    lower_disturbance_sizes, upper_disturbance_sizes = (
-        np.zeros(n_directed_instants),
-        np.full(n_directed_instants, np.inf),
-    )
-    exit_outcomes = np.full(n_directed_instants, int(Outcome.STEPPED))
-    max_size_fractions = (
-        np.arange(1, search_options.n_disturbance_grid_sizes + 1)
-        / search_options.n_disturbance_grid_sizes
-    )
-    unresolved_instant_indices, tried_disturbance_sizes = (
-        np.arange(n_directed_instants),
-        np.tile(max_size * max_size_fractions, (n_directed_instants, 1)),
-    )
-    while len(unresolved_instant_indices):
-        unresolved_instants = _DirectedInstants(
-            *(instant_array[unresolved_instant_indices] for instant_array in directed_instants)
-        )
+    n_instants = len(instants.disturbance_signs)
+    n_grid_sizes = DISTURBANCE_SEARCH_OPTIONS.n_disturbance_grid_sizes
+    n_sizes_per_bisection = DISTURBANCE_SEARCH_OPTIONS.n_sizes_per_bisection
+    lower_sizes, upper_sizes = np.zeros(n_instants), np.full(n_instants, np.inf)
+    exit_outcomes = np.full(n_instants, int(Outcome.STEPPED))
+    unresolved = np.arange(n_instants)
+    grid_fractions = np.arange(1, n_grid_sizes + 1) / n_grid_sizes
+    bisection_fractions = np.arange(1, n_sizes_per_bisection + 1) / (n_sizes_per_bisection + 1.0)
+    tried_sizes = np.tile(gait.max_size * grid_fractions, (n_instants, 1))
+    while len(unresolved):
         leaves_basin, walk_outcomes = _walk_after_disturbance(
-            stable_gait, gait_step, unresolved_instants, tried_disturbance_sizes, max_steps
+            gait, select_tree_rows(instants, unresolved), tried_sizes
         )
-        has_exit_size, first_exit_index = leaves_basin.any(1), leaves_basin.argmax(1)
-        row_indices = np.arange(len(unresolved_instant_indices))
-        last_index_inside_basin = (
-            np.where(has_exit_size, first_exit_index, tried_disturbance_sizes.shape[1]) - 1
-        )
-        largest_size_inside_basin = np.where(
-            last_index_inside_basin >= 0,
-            tried_disturbance_sizes[row_indices, last_index_inside_basin],
-            lower_disturbance_sizes[unresolved_instant_indices],
-        )
-        upper_disturbance_sizes[unresolved_instant_indices] = np.where(
-            has_exit_size,
-            tried_disturbance_sizes[row_indices, first_exit_index],
-            upper_disturbance_sizes[unresolved_instant_indices],
-        )
-        exit_outcomes[unresolved_instant_indices] = np.where(
-            has_exit_size,
-            walk_outcomes[row_indices, first_exit_index],
-            exit_outcomes[unresolved_instant_indices],
-        )
-        lower_disturbance_sizes[unresolved_instant_indices] = np.where(
-            np.isfinite(upper_disturbance_sizes[unresolved_instant_indices]),
-            largest_size_inside_basin,
-            max_size,
-        )
-        exit_bracket_width = np.where(
-            np.isfinite(upper_disturbance_sizes),
-            upper_disturbance_sizes - lower_disturbance_sizes,
-            0.0,
-        )
-        unresolved_instant_indices = np.flatnonzero(
-            exit_bracket_width > disturbance_size_tolerance * upper_disturbance_sizes
-        )
-        bracket_fractions = np.arange(1, search_options.n_sizes_per_bisection + 1) / (
-            search_options.n_sizes_per_bisection + 1.0
-        )
-        tried_disturbance_sizes = (
-            lower_disturbance_sizes[unresolved_instant_indices, None]
-            + exit_bracket_width[unresolved_instant_indices, None] * bracket_fractions
+        has_exit, first_exit = leaves_basin.any(1), leaves_basin.argmax(1)
+        n_sizes_inside = np.where(has_exit, first_exit, tried_sizes.shape[1])
+        sizes_from_lower = np.column_stack([lower_sizes[unresolved], tried_sizes])
+        lower_sizes[unresolved] = sizes_from_lower[np.arange(len(unresolved)), n_sizes_inside]
+        upper_sizes[unresolved[has_exit]] = tried_sizes[has_exit, first_exit[has_exit]]
+        exit_outcomes[unresolved[has_exit]] = walk_outcomes[has_exit, first_exit[has_exit]]
+        bracket_widths = np.where(np.isfinite(upper_sizes), upper_sizes - lower_sizes, 0.0)
+        unresolved = np.flatnonzero(bracket_widths > size_tolerance * upper_sizes)
+        tried_sizes = (
+            lower_sizes[unresolved, None] + bracket_widths[unresolved, None] * bisection_fractions
         )
     return _ExitSizeBrackets(
-        np.where(np.isfinite(upper_disturbance_sizes), lower_disturbance_sizes, np.inf),
-        upper_disturbance_sizes,
-        exit_outcomes,
+        np.where(np.isfinite(upper_sizes), lower_sizes, np.inf), upper_sizes, exit_outcomes
     )
 
 
 def _walk_after_disturbance(
-    stable_gait: StableGait,
-    gait_step: _GaitStep,
-    directed_instants: _DirectedInstants,
-    disturbance_sizes: np.ndarray,
-    max_steps: int,
+    gait: _DisturbedGait, instants: _DirectedInstants, disturbance_sizes: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return whether each walk after a disturbance misses the gait, and the `Outcome` of the walk.
 
     The two arrays have the shape of `disturbance_sizes`, (instants, sizes). The unit of the sizes
     is rad/s.
     """
-    n_disturbance_sizes = disturbance_sizes.shape[1]
+    stable_gait, n_sizes = gait.stable_gait, disturbance_sizes.shape[1]
+    phase_indices = np.repeat(instants.phase_indices, n_sizes)
     disturbed_states = np.repeat(
-        gait_step.sampled_states[directed_instants.phase_indices, directed_instants.sample_indices],
-        n_disturbance_sizes,
-        0,
+        gait.sampled_states[instants.phase_indices, instants.sample_indices], n_sizes, 0
     )
     disturbed_states[:, ANGULAR_VELOCITY_INDEX] += (
-        directed_instants.disturbance_signs[:, None] * disturbance_sizes
+        instants.disturbance_signs[:, None] * disturbance_sizes
     ).ravel()
-    phase_indices = np.repeat(directed_instants.phase_indices, n_disturbance_sizes)
     walk_outcomes = np.empty(len(phase_indices), int)
     section_states = np.empty((len(phase_indices), stable_gait.section_states.shape[1]))
     for phase_index in np.unique(phase_indices):
-        is_instant_in_phase = phase_indices == phase_index
+        is_in_phase = phase_indices == phase_index
         finish_disturbed_batch = functools.partial(
             _finish_disturbed_steps,
             stable_gait.model,
             stable_gait.step_options,
             stable_gait.params,
             int(phase_index),
-            gait_step.foot_distance,
+            gait.foot_distance,
         )
         step_results: Any = map_in_batches(
             finish_disturbed_batch,
             batch_sizes.DISTURBANCE_BATCH_SIZES,
-            disturbed_states[is_instant_in_phase],
+            disturbed_states[is_in_phase],
         )
-        section_states[is_instant_in_phase] = step_results.section_state
-        walk_outcomes[is_instant_in_phase] = step_results.outcome
+        section_states[is_in_phase] = step_results.section_state
+        walk_outcomes[is_in_phase] = step_results.outcome
     leaves_basin = np.ones(len(phase_indices), bool)
     has_stepped = np.flatnonzero(walk_outcomes == Outcome.STEPPED)
     if len(has_stepped):
-        arrival_result = walk_until_on_gait(stable_gait, section_states[has_stepped], max_steps)
-        walk_outcomes[has_stepped], leaves_basin[has_stepped] = (
-            arrival_result.walk_outcomes,
-            ~arrival_result.is_on_gait,
-        )
-    return leaves_basin.reshape(disturbance_sizes.shape), walk_outcomes.reshape(
-        disturbance_sizes.shape
-    )
+        arrival = walk_until_on_gait(stable_gait, section_states[has_stepped], gait.max_steps)
+        walk_outcomes[has_stepped] = arrival.walk_outcomes
+        leaves_basin[has_stepped] = ~arrival.is_on_gait
+    shape = disturbance_sizes.shape
+    return leaves_basin.reshape(shape), walk_outcomes.reshape(shape)
 
 
 @eqx.filter_jit
