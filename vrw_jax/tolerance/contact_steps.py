@@ -1,6 +1,7 @@
 """Batched walking steps with unilateral contact, and their Jacobians."""
 
 import dataclasses
+from collections.abc import Iterable
 from typing import Any, NamedTuple
 
 import jax
@@ -8,7 +9,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from vrw_jax.contact import (
-    LOCKED_CODE_OFFSET,
     UnilateralWheel,
     compute_min_bounce_height,
     embed_section_states,
@@ -46,6 +46,14 @@ STEP_TOLERANCES = StepTolerances()
 """Solver tolerances for all measures."""
 
 
+def replace_rows(
+    arrays: Iterable[np.ndarray], row_indices: np.ndarray, new_arrays: Iterable[np.ndarray]
+) -> None:
+    """Replace, in place, the rows with the indices `row_indices` of each array by new rows."""
+    for array, new_array in zip(arrays, new_arrays, strict=True):
+        array[row_indices] = new_array
+
+
 class StepQuantities(NamedTuple):
     """Section states, step quantities and outcomes of walking steps, one for each wheel."""
 
@@ -63,7 +71,6 @@ class ContactWheelBatch:
     n_legs: int  # number of legs of each wheel
     contact_model: UnilateralWheel
     step_options: StepOptions
-    step_tolerances: StepTolerances = STEP_TOLERANCES
 
     @classmethod
     def from_params(
@@ -78,21 +85,17 @@ class ContactWheelBatch:
         return cls(np.stack(parameter_matrix), params.n_legs, contact_model, options)
 
     def embed_paper_states(
-        self, wheel_indices: np.ndarray, section_states: np.ndarray, has_rigid_legs: Any = False
+        self, wheel_indices: np.ndarray, section_states: np.ndarray
     ) -> np.ndarray:
         """Return full section states, (wheels, 4 + 3 n), for states of the paper, (wheels, 3).
 
-        `wheel_indices` selects the wheels. Leg 1 is on its stopper where `has_rigid_legs` is True.
+        `wheel_indices` selects the wheels.
         """
-        contact_section_states = np.array(
+        return np.array(
             embed_section_states(
                 self.parameter_matrix[:, wheel_indices], section_states, self.n_legs
             )
         )
-        contact_section_states[:, 4 + 2 * self.n_legs] += np.where(
-            has_rigid_legs, LOCKED_CODE_OFFSET, 0
-        )
-        return contact_section_states
 
     def take_steps(
         self, wheel_indices: np.ndarray, section_states: np.ndarray, n_steps: int = 1
@@ -101,9 +104,8 @@ class ContactWheelBatch:
 
         The section states are full, (wheels, 4 + 3 n). `wheel_indices` selects the wheels.
         """
-        parameter_matrix = self.parameter_matrix[:, wheel_indices]
         end_states, durations, step_outcomes, *_, step_length = walk_batch(
-            parameter_matrix,
+            self.parameter_matrix[:, wheel_indices],
             section_states,
             n_steps,
             self.contact_model,
@@ -159,7 +161,7 @@ class ContactWheelBatch:
 
     def make_walk_batch(self) -> "ContactWheelBatch":
         """Return a copy of the batch with the looser solver tolerance for walks."""
-        solver_tolerance = self.step_tolerances.walk_tolerance
+        solver_tolerance = STEP_TOLERANCES.walk_tolerance
         return dataclasses.replace(
             self,
             step_options=StepOptions(solver="Tsit5", rtol=solver_tolerance, atol=solver_tolerance),
@@ -168,9 +170,9 @@ class ContactWheelBatch:
     def make_comparison_batches(self) -> list["ContactWheelBatch"]:
         """Return a copy of the batch for each solver tolerance at which steps are compared."""
         comparison_tolerances = (
-            self.step_tolerances.very_tight_comparison_tolerances
-            if float(self.step_options.rtol) < 0.5 * self.step_tolerances.tight_tolerance
-            else self.step_tolerances.tight_comparison_tolerances
+            STEP_TOLERANCES.very_tight_comparison_tolerances
+            if float(self.step_options.rtol) < 0.5 * STEP_TOLERANCES.tight_tolerance
+            else STEP_TOLERANCES.tight_comparison_tolerances
         )
         return [
             dataclasses.replace(
@@ -184,13 +186,14 @@ class ContactWheelBatch:
 
         It is the flight time of the smallest bounce that the solver resolves.
         """
-        get_parameter_values = lambda parameter_name: self.parameter_matrix[
-            PARAMETER_NAMES.index(parameter_name)
-        ]
         # A scalar is used because JAX would compile a program for each batch size.
         relative_bounce_height = float(compute_min_bounce_height(jnp.ones(()), self.step_options))
-        bounce_height = relative_bounce_height * get_parameter_values("locked_length")
-        return np.sqrt(8.0 * bounce_height / get_parameter_values("gravity"))[wheel_indices]
+        locked_length, gravity = (
+            self.parameter_matrix[PARAMETER_NAMES.index(parameter_name)]
+            for parameter_name in ("locked_length", "gravity")
+        )
+        bounce_height = relative_bounce_height * locked_length
+        return np.sqrt(8.0 * bounce_height / gravity)[wheel_indices]
 
     def list_paper_state_indices(self) -> np.ndarray:
         """Return the indices of theta-, dtheta- and dL1- in a full section state."""

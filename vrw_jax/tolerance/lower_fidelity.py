@@ -21,6 +21,7 @@ from vrw_jax.numerics import (
     map_in_batches,
     select_tree_rows,
 )
+from vrw_jax.tolerance.contact_steps import replace_rows
 from vrw_jax.tolerance.step_quantities import N_STEP_QUANTITIES
 from vrw_jax.wheel import Outcome, WheelParams
 
@@ -62,9 +63,8 @@ class LowerFidelityGaits(NamedTuple):
     inverse_newton_matrix: np.ndarray  # (wheels, 3, 3): (I - DP)^-1, where P is the return map
     # (wheels, 7, 3): derivatives of the step quantities with respect to the section state
     step_quantity_jacobian: np.ndarray
-    section_state_error: (
-        np.ndarray
-    )  # (wheels, 3): `inverse_newton_matrix` times the defect of the return map
+    # (wheels, 3): `inverse_newton_matrix` times the defect of the return map
+    section_state_error: np.ndarray
     search_outcomes: np.ndarray
 
 
@@ -81,14 +81,9 @@ def make_empty_gaits(n_wheels: int) -> LowerFidelityGaits:
     )
 
 
-def replace_gaits(
-    stepped_gaits: LowerFidelityGaits,
-    replaced_gait_indices: np.ndarray,
-    new_gaits: LowerFidelityGaits,
-) -> None:
-    """Replace, in place, the gaits with the indices `replaced_gait_indices` by `new_gaits`."""
-    for gait_array, new_gait_array in zip(stepped_gaits, new_gaits, strict=True):
-        gait_array[replaced_gait_indices] = new_gait_array
+def select_wheels(params: WheelParams, wheel_indices: np.ndarray) -> WheelParams:
+    """Return the parameters of the wheels with the indices `wheel_indices`."""
+    return jax.device_put(select_tree_rows(params, wheel_indices))
 
 
 def find_paper_gaits(params: WheelParams, step_options: StepOptions) -> LowerFidelityGaits:
@@ -115,7 +110,7 @@ def find_paper_gaits(params: WheelParams, step_options: StepOptions) -> LowerFid
     (found_wheel_indices,) = np.nonzero(search_outcomes == Outcome.STEPPED)
     if not len(found_wheel_indices):
         return gaits_of_all_wheels
-    params_with_gait = jax.device_put(select_tree_rows(params, found_wheel_indices))
+    params_with_gait = select_wheels(params, found_wheel_indices)
     gait_step = step_batch(
         params_with_gait,
         section_states[found_wheel_indices],
@@ -129,43 +124,33 @@ def find_paper_gaits(params: WheelParams, step_options: StepOptions) -> LowerFid
     # The feet's distance at touchdown is L0 sin(alpha) / cos(theta-), m.
     leg_span = np.asarray(params_with_gait.locked_length) * np.sin(params_with_gait.leg_angle)
     foot_distance = leg_span / np.cos(gait_step_end_states[:, 0])
-    zero_durations = np.zeros(len(found_wheel_indices))
     step_quantities = np.column_stack(
         [
             step_durations[:, 0],
             step_durations[:, 1] + step_durations[:, 2],
-            zero_durations,
+            np.zeros(len(found_wheel_indices)),
             foot_distance,
             gait_step_end_states,
         ]
     )
-    step_length_jacobian = (foot_distance * np.tan(gait_step_end_states[:, 0]))[
-        :, None
-    ] * step_jacobian.section_state[:, 0]
-    dls_duration_jacobian, sls1_duration_jacobian, sls2_duration_jacobian = np.moveaxis(
-        step_jacobian.durations, 1, 0
-    )
+    dls_jacobian, sls1_jacobian, sls2_jacobian = np.moveaxis(step_jacobian.durations, 1, 0)
+    foot_distance_rate = foot_distance * np.tan(gait_step_end_states[:, 0])
     quantity_jacobian_rows = [
-        dls_duration_jacobian,
-        sls1_duration_jacobian + sls2_duration_jacobian,
-        0.0 * dls_duration_jacobian,
-        step_length_jacobian,
+        dls_jacobian,
+        sls1_jacobian + sls2_jacobian,
+        0.0 * dls_jacobian,
+        foot_distance_rate[:, None] * step_jacobian.section_state[:, 0],
     ]
-    step_quantity_jacobian = np.concatenate(
-        [np.stack(quantity_jacobian_rows, 1), step_jacobian.section_state], 1
-    )
     stepped_gaits = _make_lower_fidelity_gaits(
         ModelIndex.VISCOELASTIC,
         section_states[found_wheel_indices],
-        gait_step_end_states,
         step_quantities,
-        step_jacobian.section_state,
-        step_quantity_jacobian,
+        np.concatenate([np.stack(quantity_jacobian_rows, 1), step_jacobian.section_state], 1),
     )
-    replace_gaits(
+    replace_rows(
         gaits_of_all_wheels,
         found_wheel_indices[has_stepped],
-        LowerFidelityGaits(*(gait_array[has_stepped] for gait_array in stepped_gaits)),
+        select_tree_rows(stepped_gaits, has_stepped),
     )
     gaits_of_all_wheels.search_outcomes[found_wheel_indices[~has_stepped]] = np.asarray(
         gait_step.outcome
@@ -180,35 +165,11 @@ def find_rigid_gaits(params: WheelParams) -> LowerFidelityGaits:
     unilateral contact approach this gait. If the rear foot stays on the ground at landing, as in
     the paper, the gait is half as fast again.
     """
-    (
-        section_states,
-        gait_step_end_states,
-        step_length,
-        step_duration,
-        return_map_jacobian,
-        duration_jacobian,
-    ) = map(np.asarray, map_in_batches(_compute_rigid_gaits, batch_sizes.GAIT_BATCH_SIZES, params))
-    zero_durations = np.zeros_like(step_duration)
-    step_quantities = np.column_stack(
-        [zero_durations, step_duration, zero_durations, step_length, gait_step_end_states]
-    )
-    zero_jacobian_row = 0.0 * duration_jacobian
-    step_quantity_jacobian = np.concatenate(
-        [
-            np.stack(
-                [zero_jacobian_row, duration_jacobian, zero_jacobian_row, zero_jacobian_row], 1
-            ),
-            return_map_jacobian,
-        ],
-        1,
-    )
     return _make_lower_fidelity_gaits(
         ModelIndex.RIGID,
-        section_states,
-        gait_step_end_states,
-        step_quantities,
-        return_map_jacobian,
-        step_quantity_jacobian,
+        *map(
+            np.asarray, map_in_batches(_compute_rigid_gaits, batch_sizes.GAIT_BATCH_SIZES, params)
+        ),
     )
 
 
@@ -224,16 +185,18 @@ def compute_static_leg_contraction(params: WheelParams) -> np.ndarray:
 def _make_lower_fidelity_gaits(
     model_index: int,
     section_states: np.ndarray,
-    gait_step_end_states: np.ndarray,
     step_quantities: np.ndarray,
-    return_map_jacobian: np.ndarray,
     step_quantity_jacobian: np.ndarray,
 ) -> LowerFidelityGaits:
-    """Return the gaits of one model from the start, end and Jacobians of their walking steps."""
+    """Return the gaits of one model from the starts, results and Jacobians of their walking
+    steps.
+
+    The last step quantities are the section state after the step.
+    """
     with np.errstate(all="ignore"):
-        inverse_newton_matrix = np.linalg.inv(np.eye(3) - return_map_jacobian)
+        inverse_newton_matrix = np.linalg.inv(np.eye(3) - step_quantity_jacobian[:, -3:])
     section_state_error = np.einsum(
-        "ijk,ik->ij", inverse_newton_matrix, gait_step_end_states - section_states
+        "ijk,ik->ij", inverse_newton_matrix, step_quantities[:, -3:] - section_states
     )
     search_outcomes = np.full(len(section_states), int(Outcome.STEPPED))
     return LowerFidelityGaits(
@@ -249,30 +212,19 @@ def _make_lower_fidelity_gaits(
 
 @jax.jit
 def _compute_rigid_gaits(params: WheelParams) -> tuple:
-    """Return section states, step lengths, durations and Jacobians for the gaits of rigid wheels.
-
-    The result is (section states, section states after one walking step, step lengths in m,
-    durations in s, Jacobians of the return map, Jacobians of the durations).
-    """
+    """Return section states of the gaits of rigid wheels, step quantities and their Jacobians."""
     rigid_model, step_options = RigidWheel(stop_at_lift_off=False), StepOptions()
 
     def compute_rigid_gait(params: WheelParams) -> tuple:
-        def take_rigid_step(x: jax.Array) -> tuple:
+        def compute_step_quantities(x: jax.Array) -> jax.Array:
             gait_step = rigid_model.take_step(params, x, step_options)
-            return gait_step.section_state, gait_step.step_length, jnp.sum(gait_step.durations)
+            no_time = jnp.zeros_like(gait_step.step_length)
+            step_duration = jnp.sum(gait_step.durations)
+            return jnp.stack(
+                [no_time, step_duration, no_time, gait_step.step_length, *gait_step.section_state]
+            )
 
         section_state = rigid_model.compute_default_start(params)
-        (
-            (next_section_state, step_length, step_duration),
-            (return_map_jacobian, _, duration_jacobian),
-        ) = evaluate_with_jacobian(take_rigid_step, section_state)
-        return (
-            section_state,
-            next_section_state,
-            step_length,
-            step_duration,
-            return_map_jacobian,
-            duration_jacobian,
-        )
+        return section_state, *evaluate_with_jacobian(compute_step_quantities, section_state)
 
     return jax.vmap(compute_rigid_gait)(params)

@@ -87,14 +87,9 @@ class MeasureResult(AbstractPrintable):
         If a single name was requested, return the array or number for that measure.
         """
         values_by_measure_name = {
-            measure_name: measure_values[..., measure_index]
-            for measure_index, measure_name in enumerate(self.names)
+            measure_name: measure_values[..., i] if self.models.ndim else float(measure_values[i])
+            for i, measure_name in enumerate(self.names)
         }
-        if not self.models.ndim:
-            values_by_measure_name = {
-                measure_name: float(measure_value)  # type: ignore[misc]
-                for measure_name, measure_value in values_by_measure_name.items()
-            }
         return values_by_measure_name[self.names[0]] if self.is_single else values_by_measure_name
 
     @property
@@ -181,20 +176,14 @@ class MeasureResult(AbstractPrintable):
     def summary_rows(self) -> list[LabelAndText]:
         if not self.models.ndim:
             return []
-        model_names = [str(model_name) for model_name in self.model]
         model_counts_text = ", ".join(
-            f"{model_names.count(model_name)} {MODEL_LABELS[model_index]}"
-            for model_index, model_name in enumerate(MODEL_NAMES)
+            f"{np.sum(self.models == model_index)} {model_label}"
+            for model_index, model_label in enumerate(MODEL_LABELS)
         )
-        compute_max_error = lambda measure_index: np.max(
-            self.errors[self.found][:, measure_index], initial=0.0
-        )
+        max_errors = np.max(self.errors[self.found], axis=0, initial=0.0)
         error_text_rows = [
-            (
-                f"largest error of {measure_name}",
-                _format_rounded_number(compute_max_error(measure_index)),
-            )
-            for measure_index, measure_name in enumerate(self.names)
+            (f"largest error of {measure_name}", _format_rounded_number(max_error))
+            for measure_name, max_error in zip(self.names, max_errors, strict=True)
         ]
         return [
             ("models", model_counts_text),

@@ -16,16 +16,15 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import equinox as eqx
-import jax
 import numpy as np
 
 from vrw_jax.measures import MEASURES
 from vrw_jax.numerics import StepOptions, select_tree_rows, with_default_jax_settings
 from vrw_jax.printing import AbstractPrintable, LabelAndText
 from vrw_jax.tolerance.contact_steps import ContactWheelBatch
-from vrw_jax.tolerance.lower_fidelity import LowerFidelityGaits, ModelIndex, find_paper_gaits
+from vrw_jax.tolerance.lower_fidelity import ModelIndex, find_paper_gaits, select_wheels
 from vrw_jax.tolerance.measure_result import MeasureResult
-from vrw_jax.tolerance.refinement import estimate_measures
+from vrw_jax.tolerance.refinement import estimate_measures_from_lower_gaits
 from vrw_jax.tolerance.step_quantities import MEASURE_FUNCTIONS, evaluate_measures
 from vrw_jax.tolerance.tolerance_request import broadcast_params_and_friction, measure_to_tolerance
 from vrw_jax.validation import (
@@ -187,7 +186,7 @@ def multifidelity_mean(
     check_type("measure", measure, str, "give the name of one, 'speed', say")
     require_known_name(measure, tuple(MEASURE_FUNCTIONS), "measure that every model has")
     check_choice("stoppers", stoppers, ("bilateral", "one-sided"))
-    sampling_options, min_pilot_gaits = SAMPLING_OPTIONS, SAMPLING_OPTIONS.min_pilot_gaits
+    min_pilot_gaits = SAMPLING_OPTIONS.min_pilot_gaits
     tol = check_positive("tol", tol)
     pilot = check_int("pilot", pilot, min_pilot_gaits, ", to estimate a variance")
     seed = check_int("seed", seed, 0)
@@ -202,11 +201,8 @@ def multifidelity_mean(
         )
     measured_wheels = _MeasuredWheels(measure, params, friction_by_wheel, stoppers)
     wheel_permutation = np.random.default_rng(seed).permutation(n_wheels)
-    pilot_wheel_indices, remaining_wheel_indices = (
-        wheel_permutation[:pilot],
-        wheel_permutation[pilot:],
-    )
-    gait_measure_tolerance = sampling_options.gait_error_fraction * tol
+    pilot_wheel_indices, remaining_wheel_indices = np.split(wheel_permutation, [pilot])
+    gait_measure_tolerance = SAMPLING_OPTIONS.gait_error_fraction * tol
     pilot_measure_results = measured_wheels.measure_selected_wheels(
         pilot_wheel_indices, gait_measure_tolerance
     )
@@ -217,17 +213,15 @@ def multifidelity_mean(
             f"a mean needs {min_pilot_gaits}: give other wheels, or a larger pilot."
         )
     pilot_sample = _SampledMeasures.from_results(pilot_measure_results)
-    control_regressors = [
-        _stack_control_regressors(
-            measured_wheels.evaluate_control_variate(pilot_wheel_indices, control_index)
-        )
-        for control_index in range(len(CONTROL_VARIATES))
-    ]
     sampling_plans = [
         _plan_sampling(
-            control_index, pilot_sample, x, tol, len(remaining_wheel_indices), sampling_options
+            control_index,
+            pilot_sample,
+            measured_wheels.evaluate_control_regressors(pilot_wheel_indices, control_index),
+            tol,
+            len(remaining_wheel_indices),
         )
-        for control_index, x in enumerate(control_regressors)
+        for control_index in range(len(CONTROL_VARIATES))
     ]
     sampling_plan = min(
         sampling_plans, key=lambda sampling_plan: sampling_plan.expected_cost_in_steps
@@ -239,10 +233,8 @@ def multifidelity_mean(
         sampling_plan,
         pilot_sample,
         _SampledMeasures.from_results(drawn_measure_results),
-        _stack_control_regressors(
-            measured_wheels.evaluate_control_variate(
-                remaining_wheel_indices, sampling_plan.control_index
-            )
+        measured_wheels.evaluate_control_regressors(
+            remaining_wheel_indices, sampling_plan.control_index
         ),
     )
     gait_error_bounds = np.concatenate(
@@ -253,7 +245,7 @@ def multifidelity_mean(
     )
     return MultifidelityMean(
         value=estimated_mean,
-        error=sampling_options.n_standard_errors * standard_error
+        error=SAMPLING_OPTIONS.n_standard_errors * standard_error
         + float(np.mean(gait_error_bounds)),
         n_gaits=float(len(gait_error_bounds)),
         n_high_fidelity=float(pilot + sampling_plan.n_drawn_wheels),
@@ -277,10 +269,9 @@ class _SampledMeasures(NamedTuple):
     @classmethod
     def from_results(cls, measure_results: MeasureResult) -> "_SampledMeasures":
         """Return the sampled measures from the result of `measure_to_tolerance`."""
-        has_gait = measure_results.found.astype(float)
         return cls(
             np.where(measure_results.found, measure_results.value, 0.0),
-            has_gait,
+            measure_results.found.astype(float),
             float(np.mean(measure_results.n_steps)),
         )
 
@@ -293,80 +284,56 @@ class _MeasuredWheels(NamedTuple):
     friction_coefficients: np.ndarray
     stoppers: str
 
-    def select_wheel_params(self, wheel_indices: np.ndarray) -> WheelParams:
-        """Return the parameters of the wheels with the indices `wheel_indices`."""
-        return jax.device_put(select_tree_rows(self.params, wheel_indices))
-
     def measure_selected_wheels(
         self, wheel_indices: np.ndarray, measure_tolerance: float
     ) -> MeasureResult:
         """Return the measure with unilateral contact for the selected wheels."""
-        measure_arguments = (
-            self.measure_name,
-            self.select_wheel_params(wheel_indices),
-            measure_tolerance,
-        )
         return measure_to_tolerance(
-            *measure_arguments,
+            self.measure_name,
+            select_wheels(self.params, wheel_indices),
+            measure_tolerance,
             friction=self.friction_coefficients[wheel_indices],
             stoppers=self.stoppers,
         )
 
-    def evaluate_control_variate(self, wheel_indices: np.ndarray, control_index: int) -> np.ndarray:
-        """Return one control variate for the selected wheels, shape (wheels,).
+    def evaluate_control_regressors(
+        self, wheel_indices: np.ndarray, control_index: int
+    ) -> np.ndarray:
+        """Return the two regressors for the regression on a control variate, shape (wheels, 2).
 
-        The value is NaN for a wheel for which the paper's model has no gait. `control_index` is an
-        index in `CONTROL_VARIATES`.
+        The first column is the control variate, or zero for a wheel for which the paper's model has
+        no gait. The second column is 1 for a wheel with a finite control variate and 0 otherwise.
+        `control_index` is an index in `CONTROL_VARIATES`.
         """
         control_values = np.full(len(wheel_indices), np.nan)
-        if not control_index:
-            return control_values
-        step_options = StepOptions()
-        paper_gaits = find_paper_gaits(self.select_wheel_params(wheel_indices), step_options)
-        (found_wheel_indices,) = np.nonzero(paper_gaits.model_index != ModelIndex.NONE)
-        paper_gaits = LowerFidelityGaits(
-            *(gait_array[found_wheel_indices] for gait_array in paper_gaits)
+        if control_index:
+            step_options = StepOptions()
+            paper_gaits = find_paper_gaits(select_wheels(self.params, wheel_indices), step_options)
+            (found_wheel_indices,) = np.nonzero(paper_gaits.model_index != ModelIndex.NONE)
+            paper_gaits = select_tree_rows(paper_gaits, found_wheel_indices)
+            measure_values = evaluate_measures([self.measure_name], paper_gaits.step_quantities)
+            if control_index == len(CONTROL_VARIATES) - 1:
+                wheel_indices_of_gaits = wheel_indices[found_wheel_indices]
+                wheel_batch = ContactWheelBatch.from_params(
+                    select_wheels(self.params, wheel_indices_of_gaits),
+                    self.friction_coefficients[wheel_indices_of_gaits],
+                    self.stoppers,
+                    step_options,
+                )
+                gait_indices = np.arange(len(wheel_indices_of_gaits))
+                *_, measure_estimates = estimate_measures_from_lower_gaits(
+                    wheel_batch, gait_indices, paper_gaits, [self.measure_name]
+                )
+                measure_values = np.where(
+                    measure_estimates.has_same_leg_codes[:, None],
+                    measure_estimates.measure_values,
+                    measure_values,
+                )
+            control_values[found_wheel_indices] = measure_values[:, 0]
+        is_control_finite = np.isfinite(control_values)
+        return np.column_stack(
+            [np.where(is_control_finite, control_values, 0.0), is_control_finite]
         )
-        measure_values = evaluate_measures([self.measure_name], paper_gaits.step_quantities)[:, 0]
-        if control_index == len(CONTROL_VARIATES) - 1:
-            wheel_indices_of_gaits = wheel_indices[found_wheel_indices]
-            wheel_batch = ContactWheelBatch.from_params(
-                self.select_wheel_params(wheel_indices_of_gaits),
-                self.friction_coefficients[wheel_indices_of_gaits],
-                self.stoppers,
-                step_options,
-            )
-            gait_indices = np.arange(len(wheel_indices_of_gaits))
-            section_states = wheel_batch.embed_paper_states(
-                gait_indices, paper_gaits.section_states
-            )
-            measure_estimates = estimate_measures(
-                wheel_batch,
-                gait_indices,
-                section_states,
-                wheel_batch.take_steps(gait_indices, section_states),
-                paper_gaits.inverse_newton_matrix,
-                paper_gaits.step_quantity_jacobian,
-                [self.measure_name],
-                wheel_batch.list_paper_state_indices(),
-            )
-            measure_values = np.where(
-                measure_estimates.has_same_leg_codes,
-                measure_estimates.measure_values[:, 0],
-                measure_values,
-            )
-        control_values[found_wheel_indices] = measure_values
-        return control_values
-
-
-def _stack_control_regressors(control_values: np.ndarray) -> np.ndarray:
-    """Return the two regressors for the regression on a control variate, shape (wheels, 2).
-
-    The first column is the control variate, or zero for a wheel without a finite control variate.
-    The second column is 1 for a finite control variate and 0 otherwise.
-    """
-    is_control_finite = np.isfinite(control_values)
-    return np.column_stack([np.where(is_control_finite, control_values, 0.0), is_control_finite])
 
 
 def _plan_sampling(
@@ -375,7 +342,6 @@ def _plan_sampling(
     control_regressors: np.ndarray,
     mean_tolerance: float,
     n_remaining_wheels: int,
-    sampling_options: SamplingOptions,
 ) -> _SamplingPlan:
     """Return the sampling plan for a mean to within `mean_tolerance`, with one control variate.
 
@@ -395,7 +361,7 @@ def _plan_sampling(
     control_weights, _, matrix_rank, _ = np.linalg.lstsq(
         centered_control_regressors,
         centered_measure_values,
-        rcond=sampling_options.singular_value_tolerance,
+        rcond=SAMPLING_OPTIONS.singular_value_tolerance,
     )
     residual_sum_of_squares = float(
         np.sum((centered_measure_values - centered_control_regressors @ control_weights) ** 2)
@@ -403,16 +369,16 @@ def _plan_sampling(
     residual_variance = residual_sum_of_squares / (
         len(centered_measure_values) - 1 - int(matrix_rank)
     )
-    sampling_tolerance = (1.0 - sampling_options.gait_error_fraction) * mean_tolerance
+    sampling_tolerance = (1.0 - SAMPLING_OPTIONS.gait_error_fraction) * mean_tolerance
     n_required_wheels = (
         residual_variance
-        * (sampling_options.n_standard_errors / (sampling_tolerance * fraction_of_wheels_with_gait))
+        * (SAMPLING_OPTIONS.n_standard_errors / (sampling_tolerance * fraction_of_wheels_with_gait))
         ** 2
     )
     n_drawn_wheels = min(
         n_remaining_wheels,
         max(
-            sampling_options.min_pilot_gaits,
+            SAMPLING_OPTIONS.min_pilot_gaits,
             math.ceil(n_required_wheels / (1.0 + n_required_wheels / n_remaining_wheels)),
         ),
     )

@@ -13,8 +13,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from vrw_jax.contact import LOCKED_CODE_OFFSET
 from vrw_jax.cycles import solve_linear_systems
 from vrw_jax.tolerance.contact_steps import ContactWheelBatch, StepQuantities
+from vrw_jax.tolerance.lower_fidelity import LowerFidelityGaits, ModelIndex
 from vrw_jax.tolerance.step_quantities import (
     N_DURATIONS,
     N_STEP_QUANTITIES,
@@ -102,7 +104,6 @@ def estimate_measures(
     step_quantity_jacobian: np.ndarray,
     measure_names: Sequence[str],
     section_coordinates: Any = slice(None),
-    refinement_options: RefinementOptions = REFINEMENT_OPTIONS,
 ) -> MeasureEstimates:
     """Return estimated measures of the gaits near section states, each from one walking step.
 
@@ -117,7 +118,6 @@ def estimate_measures(
             state, (gaits, 7, coordinates).
         measure_names: names of the measures.
         section_coordinates: indices of the corrected coordinates of a section state.
-        refinement_options: options with the factors of the error bounds.
     """
     n_continuous_entries = section_states.shape[1] - wheel_batch.n_legs
     has_same_leg_codes = np.all(
@@ -138,7 +138,7 @@ def estimate_measures(
         correction_effect_on_measures = np.einsum(
             "ijk,ik->ij", section_state_sensitivity, np.abs(newton_correction)
         )
-        step_error_bound = refinement_options.step_error_in_tolerances * float(
+        step_error_bound = REFINEMENT_OPTIONS.step_error_in_tolerances * float(
             wheel_batch.step_options.rtol
         )
         total_quantity_sensitivity = np.abs(measure_jacobian).sum(-1) + np.sum(
@@ -147,7 +147,7 @@ def estimate_measures(
         # An unresolved contact adds its time to one duration and takes the time from another.
         duration_sensitivity_range = np.ptp(measure_jacobian[:, :, :N_DURATIONS], axis=-1)
         missed_contact_duration = (
-            refinement_options.n_presumed_missed_contacts
+            REFINEMENT_OPTIONS.n_presumed_missed_contacts
             * wheel_batch.compute_min_contact_duration(wheel_indices)
         )
         return MeasureEstimates(
@@ -159,6 +159,34 @@ def estimate_measures(
             step_error_bound * total_quantity_sensitivity,
             missed_contact_duration[:, None] * duration_sensitivity_range,
         )
+
+
+def estimate_measures_from_lower_gaits(
+    wheel_batch: ContactWheelBatch,
+    wheel_indices: np.ndarray,
+    lower_gaits: LowerFidelityGaits,
+    measure_names: Sequence[str],
+) -> tuple[np.ndarray, StepQuantities, MeasureEstimates]:
+    """Return estimated measures of the gaits near gaits of a lower model, from one step each.
+
+    The result is (full section states at which the steps begin, results of the steps, estimates).
+    """
+    section_states = wheel_batch.embed_paper_states(wheel_indices, lower_gaits.section_states)
+    section_states[lower_gaits.model_index == ModelIndex.RIGID, 4 + 2 * wheel_batch.n_legs] += (
+        LOCKED_CODE_OFFSET  # Leg 1 of a rigid wheel is on its stopper.
+    )
+    contact_step = wheel_batch.take_steps(wheel_indices, section_states)
+    measure_estimates = estimate_measures(
+        wheel_batch,
+        wheel_indices,
+        section_states,
+        contact_step,
+        lower_gaits.inverse_newton_matrix,
+        lower_gaits.step_quantity_jacobian,
+        measure_names,
+        wheel_batch.list_paper_state_indices(),
+    )
+    return section_states, contact_step, measure_estimates
 
 
 class RefinedGaits(NamedTuple):
@@ -199,7 +227,6 @@ def refine_gaits(
     measure_names: Sequence[str],
     compute_error_goal: Callable[[np.ndarray], np.ndarray],
     is_every_gait_compared: bool,
-    refinement_options: RefinementOptions = REFINEMENT_OPTIONS,
 ) -> RefinedGaits:
     """Return the gaits near full section states, with their measures and bounds for the errors.
 
@@ -213,11 +240,18 @@ def refine_gaits(
     Newton's corrections of a gait end when the remaining error is below the allowed error.
     """
     n_gaits, n_coordinates = section_states.shape
-    gait_section_states = section_states.copy()
     measure_values = np.full((n_gaits, len(measure_names)), np.nan)
-    remaining_error_bounds, numerical_error_bounds = np.full((2, *measure_values.shape), np.inf)
-    is_found, needs_tolerance_comparison = np.zeros((2, n_gaits), bool)
-    walking_speed, n_steps = np.full(n_gaits, np.nan), np.zeros(n_gaits, int)
+    gaits = RefinedGaits(
+        is_found=np.zeros(n_gaits, bool),
+        is_attracting=np.zeros(n_gaits, bool),
+        measure_values=measure_values,
+        measure_error_bounds=np.full_like(measure_values, np.inf),
+        n_steps=np.zeros(n_gaits, int),
+        section_states=section_states.copy(),
+        walking_speed=np.full(n_gaits, np.nan),
+    )
+    numerical_error_bounds = np.full_like(measure_values, np.inf)
+    needs_tolerance_comparison = np.zeros(n_gaits, bool)
     inverse_newton_matrix = np.zeros((n_gaits, n_coordinates, n_coordinates))
     step_quantity_jacobian = np.zeros((n_gaits, N_STEP_QUANTITIES, n_coordinates))
 
@@ -227,7 +261,7 @@ def refine_gaits(
         return estimate_measures(
             stepping_batch,
             wheel_indices[gait_indices],
-            gait_section_states[gait_indices],
+            gaits.section_states[gait_indices],
             contact_step,
             inverse_newton_matrix[gait_indices],
             step_quantity_jacobian[gait_indices],
@@ -235,30 +269,30 @@ def refine_gaits(
         )
 
     next_gait_indices = np.arange(n_gaits)
-    for _ in range(refinement_options.max_jacobians_per_gait):
+    for _ in range(REFINEMENT_OPTIONS.max_jacobians_per_gait):
         if not len(next_gait_indices):
             break
         gait_indices, next_gait_indices = next_gait_indices, next_gait_indices[:0]
         contact_step, return_map_jacobian, step_quantity_jacobian[gait_indices] = (
             wheel_batch.linearize_steps(
-                wheel_indices[gait_indices], gait_section_states[gait_indices]
+                wheel_indices[gait_indices], gaits.section_states[gait_indices]
             )
         )
         inverse_newton_matrix[gait_indices] = solve_linear_systems(
             np.eye(n_coordinates) - return_map_jacobian,
             np.broadcast_to(np.eye(n_coordinates), return_map_jacobian.shape),
         )
-        n_steps[gait_indices] += refinement_options.jacobian_cost_in_steps
+        gaits.n_steps[gait_indices] += REFINEMENT_OPTIONS.jacobian_cost_in_steps
         previous_correction_length = np.full(len(gait_indices), np.inf)
-        for n_corrections in range(refinement_options.max_corrections_per_jacobian):
+        for n_corrections in range(REFINEMENT_OPTIONS.max_corrections_per_jacobian):
             measure_estimates = estimate_gait_measures(wheel_batch, gait_indices, contact_step)
             correction_length = np.linalg.norm(measure_estimates.newton_correction, axis=1)
             contraction_rate = correction_length / np.maximum(
                 previous_correction_length, np.finfo(float).tiny
             )
-            is_contraction_slow = contraction_rate > refinement_options.max_contraction_rate
+            is_contraction_slow = contraction_rate > REFINEMENT_OPTIONS.max_contraction_rate
             error_bound = (
-                refinement_options.error_safety_factor
+                REFINEMENT_OPTIONS.error_safety_factor
                 * measure_estimates.correction_effect_on_measures
             )
             error_bound_goal = compute_error_goal(measure_estimates.measure_values)
@@ -272,42 +306,43 @@ def refine_gaits(
             )
             is_correction_at_stall_length = (
                 correction_length
-                <= refinement_options.stall_length_in_tolerances
+                <= REFINEMENT_OPTIONS.stall_length_in_tolerances
                 * float(wheel_batch.step_options.rtol)
             )
             is_refinement_finished = measure_estimates.has_same_leg_codes & np.where(
                 is_contraction_slow, is_correction_at_stall_length, is_error_within_goal
             )
             finished_gait_indices = gait_indices[is_refinement_finished]
-            is_found[finished_gait_indices] = True
-            measure_values[finished_gait_indices] = measure_estimates.measure_values[
-                is_refinement_finished
-            ]
-            remaining_error_bounds[finished_gait_indices] = error_bound[is_refinement_finished]
-            numerical_error_bounds[finished_gait_indices] = (
-                measure_estimates.numerical_error_bound
-                + measure_estimates.missed_contact_error_bound
-            )[is_refinement_finished]
-            walking_speed[finished_gait_indices] = evaluate_measures(
-                ("speed",), contact_step.step_quantities[is_refinement_finished]
-            )[:, 0]
-            needs_tolerance_comparison[finished_gait_indices] = (
-                is_every_gait_compared
-                | np.any(
-                    measure_estimates.missed_contact_error_bound
-                    > refinement_options.max_presumed_error_fraction * error_bound_goal,
-                    axis=1,
-                )[is_refinement_finished]
+            gaits.is_found[finished_gait_indices] = True
+            has_large_presumed_error = np.any(
+                measure_estimates.missed_contact_error_bound
+                > REFINEMENT_OPTIONS.max_presumed_error_fraction * error_bound_goal,
+                axis=1,
             )
+            for gait_results, new_results in (
+                (gaits.measure_values, measure_estimates.measure_values),
+                (gaits.measure_error_bounds, error_bound),
+                (
+                    numerical_error_bounds,
+                    measure_estimates.numerical_error_bound
+                    + measure_estimates.missed_contact_error_bound,
+                ),
+                (
+                    gaits.walking_speed,
+                    evaluate_measures(("speed",), contact_step.step_quantities)[:, 0],
+                ),
+                (needs_tolerance_comparison, is_every_gait_compared | has_large_presumed_error),
+            ):
+                gait_results[finished_gait_indices] = new_results[is_refinement_finished]
             is_refinement_continued = (
                 ~is_refinement_finished
                 & (contact_step.step_outcomes == Outcome.STEPPED)
-                & (correction_length <= refinement_options.max_correction_length)
+                & (correction_length <= REFINEMENT_OPTIONS.max_correction_length)
                 & (contraction_rate < 1.0)
             )
-            gait_section_states[gait_indices[is_refinement_continued]] = np.where(
+            gaits.section_states[gait_indices[is_refinement_continued]] = np.where(
                 measure_estimates.has_same_leg_codes[:, None],
-                gait_section_states[gait_indices] + measure_estimates.newton_correction,
+                gaits.section_states[gait_indices] + measure_estimates.newton_correction,
                 contact_step.section_states,
             )[is_refinement_continued]
             needs_new_jacobian = is_refinement_continued & (
@@ -320,21 +355,21 @@ def refine_gaits(
             if not len(gait_indices):
                 break
             contact_step = wheel_batch.take_steps(
-                wheel_indices[gait_indices], gait_section_states[gait_indices]
+                wheel_indices[gait_indices], gaits.section_states[gait_indices]
             )
-            n_steps[gait_indices] += 1
+            gaits.n_steps[gait_indices] += 1
     compared_gait_indices = np.flatnonzero(needs_tolerance_comparison)
     error_bounds_by_tolerance = [np.zeros((len(compared_gait_indices), len(measure_names)))]
     for comparison_batch in wheel_batch.make_comparison_batches():
         # The duration of the shortest resolved contact depends on the tolerance.
         contact_step = comparison_batch.take_steps(
-            wheel_indices[compared_gait_indices], gait_section_states[compared_gait_indices]
+            wheel_indices[compared_gait_indices], gaits.section_states[compared_gait_indices]
         )
         measure_estimates = estimate_gait_measures(
             comparison_batch, compared_gait_indices, contact_step
         )
-        error_bound = refinement_options.error_safety_factor * np.abs(
-            measure_estimates.measure_values - measure_values[compared_gait_indices]
+        error_bound = REFINEMENT_OPTIONS.error_safety_factor * np.abs(
+            measure_estimates.measure_values - gaits.measure_values[compared_gait_indices]
         )
         error_bound += np.minimum(
             measure_estimates.numerical_error_bound, numerical_error_bounds[compared_gait_indices]
@@ -343,22 +378,16 @@ def refine_gaits(
         error_bounds_by_tolerance.append(
             np.where(measure_estimates.has_same_leg_codes[:, None], error_bound, np.inf)
         )
-        n_steps[compared_gait_indices] += 1
+        gaits.n_steps[compared_gait_indices] += 1
     numerical_error_bounds[compared_gait_indices] = np.max(error_bounds_by_tolerance, axis=0)
-    total_error_bounds = remaining_error_bounds + numerical_error_bounds
-    is_found &= np.isfinite(total_error_bounds).all(1)
+    measure_error_bounds = gaits.measure_error_bounds + numerical_error_bounds
     # All multipliers are inside the unit circle if all eigenvalues of (I - DP)^-1 have real parts
     # above a half.
     inverse_newton_eigenvalues = np.linalg.eigvals(
         np.nan_to_num(inverse_newton_matrix, posinf=0.0, neginf=0.0)
     )
-    is_attracting = inverse_newton_eigenvalues.real.min(-1) > 0.5
-    return RefinedGaits(
-        is_found,
-        is_attracting,
-        measure_values,
-        total_error_bounds,
-        n_steps,
-        gait_section_states,
-        walking_speed,
+    return gaits._replace(
+        is_found=gaits.is_found & np.isfinite(measure_error_bounds).all(1),
+        is_attracting=inverse_newton_eigenvalues.real.min(-1) > 0.5,
+        measure_error_bounds=measure_error_bounds,
     )

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vrw_jax.tolerance.contact_steps import ContactWheelBatch, StepQuantities
+from vrw_jax.tolerance.contact_steps import ContactWheelBatch, StepQuantities, replace_rows
 from vrw_jax.wheel import Outcome
 
 
@@ -64,7 +64,6 @@ def walk_until_settled(
     wheel_batch: ContactWheelBatch,
     wheel_indices: np.ndarray,
     section_states: np.ndarray,
-    leap_options: LeapOptions = LEAP_OPTIONS,
 ) -> WalkEnds:
     """Return the ends of walks that start at full section states, (walks, 4 + 3 n).
 
@@ -80,8 +79,8 @@ def walk_until_settled(
     )
     active_walk_indices, start_states = np.arange(n_walks), section_states
     n_steps_before_leaps = (
-        leap_options.n_warmup_steps,
-        *leap_options.max_leaps * (leap_options.steps_per_leap,),
+        LEAP_OPTIONS.n_warmup_steps,
+        *LEAP_OPTIONS.max_leaps * (LEAP_OPTIONS.steps_per_leap,),
     )
     for leap_index, n_steps_before_leap in enumerate(n_steps_before_leaps):
         if not len(active_walk_indices):
@@ -100,83 +99,57 @@ def walk_until_settled(
                 n_steps_before_leap - 2,
             )
             third_last_step = StepQuantities(*map(np.array, third_last_step))
-            for third_last_step_array, retried_step_array in zip(
-                third_last_step, retried_step, strict=True
-            ):
-                third_last_step_array[failed_walk_indices] = retried_step_array
-        second_last_step = loose_step_batch.take_steps(
-            active_wheel_indices, third_last_step.section_states
-        )
-        last_step = loose_step_batch.take_steps(
-            active_wheel_indices, second_last_step.section_states
-        )
-        step_outcomes = np.stack(
-            [third_last_step.step_outcomes, second_last_step.step_outcomes, last_step.step_outcomes]
-        )
+            replace_rows(third_last_step, failed_walk_indices, retried_step)
+        last_steps = [third_last_step]
+        for _ in range(2):
+            last_steps.append(
+                loose_step_batch.take_steps(active_wheel_indices, last_steps[-1].section_states)
+            )
+        step_outcomes = np.stack([step.step_outcomes for step in last_steps])
         has_stepped = np.all(step_outcomes == Outcome.STEPPED, axis=0)
         first_failed_step_index = np.argmax(step_outcomes != Outcome.STEPPED, axis=0)
         walk_ends.walk_outcomes[active_walk_indices] = step_outcomes[
             first_failed_step_index, np.arange(len(active_walk_indices))
         ]
         active_walk_indices = active_walk_indices[has_stepped]
-        walk_ends.section_states[active_walk_indices] = last_step.section_states[has_stepped]
+        last_states = np.stack([step.section_states[has_stepped] for step in last_steps])
+        walk_ends.section_states[active_walk_indices] = last_states[-1]
         walk_ends.has_settled[active_walk_indices], leap_vectors, fade_distance = (
-            _extrapolate_drift(
-                third_last_step.section_states[has_stepped],
-                second_last_step.section_states[has_stepped],
-                last_step.section_states[has_stepped],
-                n_continuous_entries,
-                leap_options,
-            )
+            _extrapolate_drift(last_states, n_continuous_entries)
         )
-        n_remaining_leaps = leap_options.max_leaps - leap_index
+        n_remaining_leaps = LEAP_OPTIONS.max_leaps - leap_index
         is_walk_continued = ~walk_ends.has_settled[active_walk_indices] & (
-            (n_remaining_leaps > leap_options.max_leaps_left_to_give_up)
+            (n_remaining_leaps > LEAP_OPTIONS.max_leaps_left_to_give_up)
             | (
                 fade_distance
-                <= leap_options.max_fade_distance_ratio
-                * leap_options.max_leap_distance
+                <= LEAP_OPTIONS.max_fade_distance_ratio
+                * LEAP_OPTIONS.max_leap_distance
                 * n_remaining_leaps
             )
         )
-        active_walk_indices, leap_vectors = (
-            walk_array[is_walk_continued] for walk_array in (active_walk_indices, leap_vectors)
-        )
+        active_walk_indices = active_walk_indices[is_walk_continued]
         start_states = walk_ends.section_states[active_walk_indices]
         # Each walking step first places loaded feet on the slope, so a leap ends at a valid start.
-        start_states[:, :n_continuous_entries] += leap_vectors
+        start_states[:, :n_continuous_entries] += leap_vectors[is_walk_continued]
     return walk_ends
 
 
 def _extrapolate_drift(
-    states_two_steps_before: np.ndarray,
-    states_one_step_before: np.ndarray,
-    current_states: np.ndarray,
-    n_continuous_entries: int,
-    leap_options: LeapOptions,
+    last_states: np.ndarray, n_continuous_entries: int
 ) -> tuple[np.ndarray, ...]:
     """Return whether each walk has settled, the leap of each walk, and the fade distance.
 
-    The arguments are three successive section states of each walk, (walks, 4 + 3 n). The first
-    `n_continuous_entries` entries are continuous. A leap starts at the last of the three states.
-    The fade distance is the distance from this state to the predicted limit of the drift. The leap
-    and the fade distance are zero if the contact codes of the legs change.
+    The first `n_continuous_entries` entries of a section state are continuous. A leap starts at the
+    last state. The fade distance is the distance from this state to the predicted limit of the
+    drift. The leap and the fade distance are zero if the contact codes of the legs change.
+
+    - `last_states`: last three section states of each walk, (3, walks, 4 + 3 n).
     """
-    has_same_leg_codes = np.all(
-        (
-            states_two_steps_before[:, n_continuous_entries:]
-            == current_states[:, n_continuous_entries:]
-        )
-        & (
-            states_one_step_before[:, n_continuous_entries:]
-            == current_states[:, n_continuous_entries:]
-        ),
-        axis=1,
+    leg_codes = last_states[:, :, n_continuous_entries:]
+    has_same_leg_codes = np.all(leg_codes == leg_codes[-1], axis=(0, 2))
+    earlier_state_change, last_state_change = np.diff(
+        last_states[:, :, :n_continuous_entries], axis=0
     )
-    earlier_state_change = (states_one_step_before - states_two_steps_before)[
-        :, :n_continuous_entries
-    ]
-    last_state_change = (current_states - states_one_step_before)[:, :n_continuous_entries]
     drift_per_step = np.abs(last_state_change).max(1)
     with np.errstate(all="ignore"):
         decay_rate = np.nan_to_num(
@@ -185,20 +158,20 @@ def _extrapolate_drift(
         )
         n_steps_to_fade = np.where(decay_rate < 1.0, decay_rate / (1.0 - decay_rate), np.inf)
         fade_distance = np.where(
-            drift_per_step < leap_options.drift_noise_level,
+            drift_per_step < LEAP_OPTIONS.drift_noise_level,
             0.0,
             np.abs(n_steps_to_fade) * drift_per_step,
         )
         n_leap_steps = np.where(
             drift_per_step > 0.0,
-            np.minimum(n_steps_to_fade, leap_options.max_leap_distance / drift_per_step),
+            np.minimum(n_steps_to_fade, LEAP_OPTIONS.max_leap_distance / drift_per_step),
             0.0,
         )
     # A drift that changes sign at each step leads to a gait of two steps.
     has_settled = (
         has_same_leg_codes
-        & (fade_distance < leap_options.max_settled_drift)
-        & (drift_per_step < leap_options.max_settled_drift)
+        & (fade_distance < LEAP_OPTIONS.max_settled_drift)
+        & (drift_per_step < LEAP_OPTIONS.max_settled_drift)
     )
     has_leap_vector = has_same_leg_codes & ~has_settled & (decay_rate > 0.0)
     return (

@@ -19,18 +19,21 @@ import numpy as np
 
 from vrw_jax.cycles import GaitChoice, compute_walk_starts, parse_gait_choice
 from vrw_jax.numerics import StepOptions, select_tree_rows, with_default_jax_settings
-from vrw_jax.tolerance.contact_steps import STEP_TOLERANCES, ContactWheelBatch
+from vrw_jax.tolerance.contact_steps import STEP_TOLERANCES, ContactWheelBatch, replace_rows
 from vrw_jax.tolerance.lower_fidelity import (
-    LowerFidelityGaits,
     ModelIndex,
     compute_static_leg_contraction,
     find_paper_gaits,
     find_rigid_gaits,
     make_empty_gaits,
-    replace_gaits,
+    select_wheels,
 )
 from vrw_jax.tolerance.measure_result import MeasureResult, MeasureStatus
-from vrw_jax.tolerance.refinement import RefinedGaits, estimate_measures, refine_gaits
+from vrw_jax.tolerance.refinement import (
+    RefinedGaits,
+    estimate_measures_from_lower_gaits,
+    refine_gaits,
+)
 from vrw_jax.tolerance.settling import walk_until_settled
 from vrw_jax.tolerance.step_quantities import MEASURE_FUNCTIONS, evaluate_measures
 from vrw_jax.validation import (
@@ -140,13 +143,8 @@ def measure_to_tolerance(
         else STEP_TOLERANCES.very_tight_tolerance
     )
     step_options = StepOptions(rtol=solver_tolerance, atol=solver_tolerance)
-    measure_request = _MeasureRequest(
-        measure_names,
-        tol,
-        relative,
-        ContactWheelBatch.from_params(params, friction_by_wheel, stoppers, step_options),
-        params,
-    )
+    wheel_batch = ContactWheelBatch.from_params(params, friction_by_wheel, stoppers, step_options)
+    measure_request = _MeasureRequest(measure_names, tol, relative, wheel_batch, params)
     if gait_rank is None:
         measure_request.try_rigid_model()
         measure_request.try_paper_model()
@@ -195,31 +193,22 @@ def broadcast_params_and_friction(
     )
 
 
-GAIT_RESULT_NAMES = ("values", "errors", "model_errors", "numerical_errors", "states")
-"""Names of the results that depend on the gait, as keys of `_MeasureRequest.result_arrays`."""
-
-
+@dataclass
 class _MeasureRequest:
     """State of the computation of measures for a batch of wheels, with the results so far."""
 
-    def __init__(
-        self,
-        measure_names: tuple[str, ...],
-        tol: float,
-        relative: bool,
-        wheel_batch: ContactWheelBatch,
-        params: WheelParams,
-        request_options: MeasureRequestOptions = REQUEST_OPTIONS,
-    ) -> None:
-        n_wheels, n_measures = len(wheel_batch.parameter_matrix.T), len(measure_names)
-        self.measure_names = measure_names
-        self.tol = tol
-        self.relative = relative
-        self.request_options = request_options
-        self.wheel_batch = wheel_batch
-        self.params = params
+    measure_names: tuple[str, ...]
+    tol: float
+    relative: bool
+    wheel_batch: ContactWheelBatch
+    params: WheelParams
+
+    def __post_init__(self) -> None:
+        n_wheels = self.wheel_batch.parameter_matrix.shape[1]
         self.lower_gaits = make_empty_gaits(n_wheels)
-        make_measure_array = lambda fill_value: np.full((n_wheels, n_measures), fill_value)
+        make_measure_array = lambda fill_value: np.full(
+            (n_wheels, len(self.measure_names)), fill_value
+        )
         self.result_arrays = {
             "values": make_measure_array(np.nan),
             "errors": make_measure_array(np.inf),
@@ -230,7 +219,9 @@ class _MeasureRequest:
             "n_steps": np.zeros(n_wheels, int),
             "outcomes": np.full(n_wheels, int(Outcome.NO_CYCLE_FOUND)),
             "n_gaits": np.zeros(n_wheels, int),
-            "states": wheel_batch.embed_paper_states(np.arange(n_wheels), np.zeros((n_wheels, 3))),
+            "states": self.wheel_batch.embed_paper_states(
+                np.arange(n_wheels), np.zeros((n_wheels, 3))
+            ),
         }
 
     def compute_error_goal(self, measure_values: np.ndarray) -> np.ndarray:
@@ -247,21 +238,15 @@ class _MeasureRequest:
         """Compute rigid gaits of wheels with stiff legs, and store measures to within `tol`."""
         with np.errstate(all="ignore"):
             wheel_indices = np.flatnonzero(
-                self.request_options.error_safety_factor
-                * compute_static_leg_contraction(self.params)
+                REQUEST_OPTIONS.error_safety_factor * compute_static_leg_contraction(self.params)
                 <= self.tol
             )
         if not len(wheel_indices):
             return
-        replace_gaits(
-            self.lower_gaits,
-            wheel_indices,
-            find_rigid_gaits(self._select_wheel_params(wheel_indices)),
-        )
-        wheel_indices = wheel_indices[
-            np.isfinite(self.lower_gaits.step_quantities[wheel_indices]).all(1)
-        ]
-        self._correct_lower_gaits(wheel_indices, are_rejected_gaits_refined=False)
+        rigid_gaits = find_rigid_gaits(select_wheels(self.params, wheel_indices))
+        replace_rows(self.lower_gaits, wheel_indices, rigid_gaits)
+        has_gait = np.isfinite(rigid_gaits.step_quantities).all(1)
+        self._correct_lower_gaits(wheel_indices[has_gait], are_rejected_gaits_refined=False)
 
     def try_paper_model(self) -> None:
         """Compute gaits of the paper's model, and store measures to within `tol`.
@@ -272,32 +257,25 @@ class _MeasureRequest:
         wheel_indices = self.find_unfinished_indices()
         if not len(wheel_indices):
             return
-        replace_gaits(
-            self.lower_gaits,
-            wheel_indices,
-            find_paper_gaits(
-                self._select_wheel_params(wheel_indices), self.wheel_batch.step_options
-            ),
+        paper_gaits = find_paper_gaits(
+            select_wheels(self.params, wheel_indices), self.wheel_batch.step_options
         )
-        self._correct_lower_gaits(
-            wheel_indices[self.lower_gaits.model_index[wheel_indices] != ModelIndex.NONE],
-            are_rejected_gaits_refined=True,
-        )
+        replace_rows(self.lower_gaits, wheel_indices, paper_gaits)
+        has_gait = paper_gaits.model_index != ModelIndex.NONE
+        self._correct_lower_gaits(wheel_indices[has_gait], are_rejected_gaits_refined=True)
 
     def walk_to_gaits(self) -> None:
         """Compute walks of wheels without a result, and store the measures of the gaits reached."""
         wheel_indices = self.find_unfinished_indices()
         has_lower_gait = self.lower_gaits.model_index[wheel_indices] != ModelIndex.NONE
-        lower_section_states = self.lower_gaits.section_states[wheel_indices[has_lower_gait]]
         self._walk_and_record_gaits(
             wheel_indices[has_lower_gait],
-            lower_section_states,
+            self.lower_gaits.section_states[wheel_indices[has_lower_gait]],
             MeasureStatus.REACHED_FROM_LOWER_GAIT,
         )
         wheel_indices = wheel_indices[~has_lower_gait]
-        for walk_start in compute_walk_starts(self._select_wheel_params(wheel_indices))[
-            : self.request_options.n_cold_starts
-        ]:
+        walk_starts = compute_walk_starts(select_wheels(self.params, wheel_indices))
+        for walk_start in walk_starts[: REQUEST_OPTIONS.n_cold_starts]:
             is_gait_missing = self.result_arrays["models"][wheel_indices] == ModelIndex.NONE
             self._walk_and_record_gaits(
                 wheel_indices[is_gait_missing],
@@ -330,10 +308,6 @@ class _MeasureRequest:
             MeasureStatus.SELECTED_BY_RANK,
         )
 
-    def _select_wheel_params(self, wheel_indices: np.ndarray) -> WheelParams:
-        """Return the parameters of the wheels with the indices `wheel_indices`."""
-        return jax.device_put(select_tree_rows(self.params, wheel_indices))
-
     def _correct_lower_gaits(
         self, wheel_indices: np.ndarray, are_rejected_gaits_refined: bool
     ) -> None:
@@ -343,22 +317,9 @@ class _MeasureRequest:
         `are_rejected_gaits_refined` is True, the other lower gaits are the initial guesses for
         gaits with unilateral contact, whose measures are stored as well.
         """
-        lower_gaits = LowerFidelityGaits(
-            *(gait_array[wheel_indices] for gait_array in self.lower_gaits)
-        )
-        section_states = self.wheel_batch.embed_paper_states(
-            wheel_indices, lower_gaits.section_states, lower_gaits.model_index == ModelIndex.RIGID
-        )
-        contact_step = self.wheel_batch.take_steps(wheel_indices, section_states)
-        measure_estimates = estimate_measures(
-            self.wheel_batch,
-            wheel_indices,
-            section_states,
-            contact_step,
-            lower_gaits.inverse_newton_matrix,
-            lower_gaits.step_quantity_jacobian,
-            self.measure_names,
-            self.wheel_batch.list_paper_state_indices(),
+        lower_gaits = select_tree_rows(self.lower_gaits, wheel_indices)
+        section_states, contact_step, measure_estimates = estimate_measures_from_lower_gaits(
+            self.wheel_batch, wheel_indices, lower_gaits, self.measure_names
         )
         lower_measure_values = evaluate_measures(self.measure_names, lower_gaits.step_quantities)
         with np.errstate(all="ignore"):
@@ -383,48 +344,50 @@ class _MeasureRequest:
             )
             error_bound = (
                 np.abs(model_error)
-                + (self.request_options.error_safety_factor - 1.0) * total_measure_change
+                + (REQUEST_OPTIONS.error_safety_factor - 1.0) * total_measure_change
                 + numerical_error
             )
             is_estimate_accepted = measure_estimates.has_same_leg_codes & np.all(
                 error_bound <= self.compute_error_goal(lower_measure_values), axis=1
             )
         self.result_arrays["n_steps"][wheel_indices] += 1
+        lower_results = {
+            "models": lower_gaits.model_index,
+            "values": lower_measure_values,
+            "errors": error_bound,
+            "model_errors": model_error,
+            "numerical_errors": numerical_error,
+            "states": section_states,
+        }
         self._record_results(
             wheel_indices[is_estimate_accepted],
-            lower_gaits.model_index[is_estimate_accepted],
+            select_tree_rows(lower_results, is_estimate_accepted),
             MeasureStatus.CHECKED_BY_ONE_STEP,
-            lower_measure_values[is_estimate_accepted],
-            error_bound[is_estimate_accepted],
-            model_error[is_estimate_accepted],
-            numerical_error[is_estimate_accepted],
-            section_states[is_estimate_accepted],
         )
-        rejected_gait_indices = np.flatnonzero(
+        is_gait_refined = (
             are_rejected_gaits_refined
             & ~is_estimate_accepted
             & measure_estimates.has_same_leg_codes
         )
+        wheel_indices = wheel_indices[is_gait_refined]
         refined_gaits = refine_gaits(
             self.wheel_batch,
-            wheel_indices[rejected_gait_indices],
-            contact_step.section_states[rejected_gait_indices],
+            wheel_indices,
+            contact_step.section_states[is_gait_refined],
             self.measure_names,
             self.compute_error_goal,
             is_every_gait_compared=False,
         )
-        self.result_arrays["n_steps"][wheel_indices[rejected_gait_indices]] += refined_gaits.n_steps
+        self.result_arrays["n_steps"][wheel_indices] += refined_gaits.n_steps
+        state_differences = refined_gaits.section_states - section_states[is_gait_refined]
         gait_distance = np.linalg.norm(
-            (refined_gaits.section_states - section_states[rejected_gait_indices])[
-                :, self.wheel_batch.list_paper_state_indices()
-            ],
-            axis=1,
+            state_differences[:, self.wheel_batch.list_paper_state_indices()], axis=1
         )
-        max_gait_distance = self.request_options.max_gait_distance_ratio * np.linalg.norm(
-            measure_estimates.newton_correction[rejected_gait_indices], axis=1
+        max_gait_distance = REQUEST_OPTIONS.max_gait_distance_ratio * np.linalg.norm(
+            measure_estimates.newton_correction[is_gait_refined], axis=1
         )
         self._record_gaits(
-            wheel_indices[rejected_gait_indices],
+            wheel_indices,
             refined_gaits,
             refined_gaits.is_found & (gait_distance <= max_gait_distance),
             MeasureStatus.CONTINUES_LOWER_GAIT,
@@ -491,35 +454,27 @@ class _MeasureRequest:
         - `selected_gait_indices`: indices or mask of the selected gaits.
         """
         wheel_indices = wheel_indices_of_gaits[selected_gait_indices]
-        refined_gaits = RefinedGaits(
-            *(gait_array[selected_gait_indices] for gait_array in refined_gaits)
+        refined_gaits = select_tree_rows(refined_gaits, selected_gait_indices)
+        lower_measure_values = evaluate_measures(
+            self.measure_names, self.lower_gaits.step_quantities[wheel_indices]
         )
-        self._record_results(
-            wheel_indices,
-            np.full(len(wheel_indices), ModelIndex.UNILATERAL),
-            status,
-            refined_gaits.measure_values,
-            refined_gaits.measure_error_bounds,
-            evaluate_measures(self.measure_names, self.lower_gaits.step_quantities[wheel_indices])
-            - refined_gaits.measure_values,
-            refined_gaits.measure_error_bounds,
-            refined_gaits.section_states,
-        )
+        gait_results = {
+            "models": ModelIndex.UNILATERAL,
+            "values": refined_gaits.measure_values,
+            "errors": refined_gaits.measure_error_bounds,
+            "model_errors": lower_measure_values - refined_gaits.measure_values,
+            "numerical_errors": refined_gaits.measure_error_bounds,
+            "states": refined_gaits.section_states,
+        }
+        self._record_results(wheel_indices, gait_results, status)
 
     def _record_results(
-        self,
-        wheel_indices: np.ndarray,
-        model_index: np.ndarray,
-        status: MeasureStatus,
-        *gait_results: np.ndarray,
+        self, wheel_indices: np.ndarray, results: dict[str, Any], status: MeasureStatus
     ) -> None:
         """Store the results of the wheels with the indices `wheel_indices`.
 
-        `gait_results` contains the arrays in the order of `GAIT_RESULT_NAMES`. `model_index` and
-        `status` are the model and the method of the results.
+        The keys of `results` are those of `result_arrays`. `status` is the method of the results.
         """
-        for result_name, new_result_values in zip(GAIT_RESULT_NAMES, gait_results, strict=True):
+        results = results | {"statuses": status, "outcomes": Outcome.STEPPED}
+        for result_name, new_result_values in results.items():
             self.result_arrays[result_name][wheel_indices] = new_result_values
-        self.result_arrays["models"][wheel_indices] = model_index
-        self.result_arrays["statuses"][wheel_indices] = status
-        self.result_arrays["outcomes"][wheel_indices] = Outcome.STEPPED
