@@ -8,11 +8,14 @@ import numpy as np
 from jaxtyping import Float
 
 from vrw_jax.cycles import AbstractCycle
-from vrw_jax.measures import POST_LANDING_COMPONENT_NAMES, PRE_TOUCHDOWN_COMPONENT_NAMES
 from vrw_jax.numerics import StepOptions, with_default_jax_settings
 from vrw_jax.printing import AbstractPrintable, LabelAndText
 from vrw_jax.robustness.gait_arrival import StableGait, walk_until_on_gait
-from vrw_jax.simulation import ModelLike, invert_landing_map
+from vrw_jax.simulation import (
+    ModelLike,
+    compute_section_states_of_starts,
+    select_start_components,
+)
 from vrw_jax.validation import check_choice, check_int, check_range, check_real, check_type
 from vrw_jax.wheel import Outcome, WheelParams
 
@@ -58,23 +61,19 @@ class BasinShare(AbstractPrintable):
 
     def summary_rows(self) -> list[LabelAndText]:
         """Return pairs of label and text for the shares, with their standard errors."""
-        n = len(self.walking_share)
-        final_walking_share, final_walking_share_error = (
-            self.walking_share[-1],
-            self.walking_share_error[-1],
-        )
-        share_text_rows = [
-            ("ends up on the gait", f"{self.share:.4f} (standard error {self.share_error:.4f})"),
+        format_share = lambda share, error: f"{share:.4f} (standard error {error:.4f})"
+        return [
+            ("ends up on the gait", format_share(self.share, self.share_error)),
             (
-                f"walks after {n} steps",
-                f"{final_walking_share:.4f} (standard error {final_walking_share_error:.4f})",
+                f"walks after {len(self.walking_share)} steps",
+                format_share(self.walking_share[-1], self.walking_share_error[-1]),
             ),
+            *(
+                (outcome_name, f"{share:.4f}")
+                for outcome_name, share in self.failure_shares.items()
+            ),
+            ("starts", f"{self.n_starts:,}"),
         ]
-        share_text_rows += [
-            (outcome_name, f"{failure_share:.4f}")
-            for outcome_name, failure_share in self.failure_shares.items()
-        ]
-        return [*share_text_rows, ("starts", f"{self.n_starts:,}")]
 
 
 @with_default_jax_settings
@@ -162,31 +161,21 @@ def compute_basin_share(
 
         sobol_sampler = qmc.Sobol(n_start_components, rng=random_generator)
         unit_cube_points = sobol_sampler.random_base2((n_starts - 1).bit_length())[:n_starts]
-    start_states = (
+    starts = (
         box_bounds.lower_bounds
         + (box_bounds.upper_bounds - box_bounds.lower_bounds) * unit_cube_points
     )
-    if box_bounds.start_component_names == POST_LANDING_COMPONENT_NAMES:
-        start_states = invert_landing_map(stable_gait.params, start_states)
-    is_start_reachable = np.isfinite(start_states).all(-1)
-    is_on_gait, n_steps_walked = np.zeros(n_starts, bool), np.zeros(n_starts, int)
-    walk_outcomes = np.full(n_starts, int(Outcome.BAD_INPUT))
-    if is_start_reachable.any():
-        arrival_result = walk_until_on_gait(
-            stable_gait, start_states[is_start_reachable], max_steps
-        )
-        is_on_gait[is_start_reachable], walk_outcomes[is_start_reachable] = (
-            arrival_result.is_on_gait,
-            arrival_result.walk_outcomes,
-        )
-        n_steps_walked[is_start_reachable] = arrival_result.n_steps_walked
+    start_states = compute_section_states_of_starts(
+        stable_gait.params, box_bounds.start_component_names, starts
+    )
+    is_on_gait, walk_outcomes, n_steps_walked = walk_until_on_gait(
+        stable_gait, start_states, max_steps
+    )
     n_steps_walked[is_on_gait] = max_steps
     walking_share = np.mean(n_steps_walked[:, None] >= np.arange(1, max_steps + 1), 0)
-    share_by_failure = {
-        outcome_code.name: float(np.mean(walk_outcomes == outcome_code))
-        for outcome_code in Outcome
-        if outcome_code
-    }
+    failure_codes, n_failures = np.unique(
+        walk_outcomes[walk_outcomes != Outcome.STEPPED], return_counts=True
+    )
     arrival_share = float(is_on_gait.mean())
     return BasinShare(
         share=arrival_share,
@@ -195,9 +184,8 @@ def compute_basin_share(
         walking_share_error=compute_share_error(walking_share, n_starts),
         elsewhere_share=float(np.mean((walk_outcomes == Outcome.STEPPED) & ~is_on_gait)),
         failure_shares={
-            outcome_name: outcome_share
-            for outcome_name, outcome_share in share_by_failure.items()
-            if outcome_share > 0.0
+            Outcome(failure_code).name: float(n / n_starts)
+            for failure_code, n in zip(failure_codes, n_failures, strict=True)
         },
         n_starts=n_starts,
     )
@@ -220,22 +208,12 @@ def parse_start_box(box: StartBox) -> StartBoxBounds:
     components of one kind of start.
     """
     check_type("box", box, Mapping, "write {'theta_touchdown': 0.1, 'dtheta_touchdown': (1, 2)...}")
-    for start_component_names in (PRE_TOUCHDOWN_COMPONENT_NAMES, POST_LANDING_COMPONENT_NAMES):
-        if set(box) == set(start_component_names):
-            break
-    else:
-        raise ValueError(
-            f"the box contains {', '.join(map(str, box)) or 'nothing'}, but it must contain all of "
-            f"{', '.join(PRE_TOUCHDOWN_COMPONENT_NAMES)}, or all of "
-            f"{', '.join(POST_LANDING_COMPONENT_NAMES)}: give "
-            "each a number or two bounds."
-        )
-    is_fixed_value = lambda box_entry: np.ndim(box_entry) == 0
+    start_component_names = select_start_components("box", box, "a number or two bounds")
     bounds_of_start_component = [
-        (check_real(start_component_name, box[start_component_name]),) * 2
-        if is_fixed_value(box[start_component_name])
-        else check_range(start_component_name, box[start_component_name])
-        for start_component_name in start_component_names
+        (check_real(component_name, box[component_name]),) * 2
+        if np.ndim(box[component_name]) == 0
+        else check_range(component_name, box[component_name])
+        for component_name in start_component_names
     ]
     lower_bounds, upper_bounds = np.array(bounds_of_start_component).T
     return StartBoxBounds(start_component_names, lower_bounds, upper_bounds)

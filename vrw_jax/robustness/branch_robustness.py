@@ -74,41 +74,42 @@ def measure_basins(
         >>> vrw.measure_basins(branch, n_points=2).smallest_disturbance.values.round(3).tolist()
         [0.126, 0.109]
     """
-    checked_model, checked_step_options = (
-        convert_model_argument(model),
-        convert_step_options(options),
-    )
+    checked_model = convert_model_argument(model)
+    checked_step_options = convert_step_options(options)
     n_starts, max_steps = check_int("n_starts", n_starts), check_int("max_steps", max_steps)
     box_bounds = None if box is None else parse_start_box(box)
     point_indices = _select_branch_points(branch, checked_model, n_points)
-    values_by_variable: dict[str, np.ndarray] = {}
+    can_start_within_gait_step = checked_model.capabilities.can_start_within_gait_step
+    variable_names = [
+        *(["basin_share", "basin_share_error"] if box_bounds else []),
+        *(
+            ["smallest_disturbance", "smallest_disturbance_error"]
+            if can_start_within_gait_step
+            else []
+        ),
+    ]
 
-    def store_variable_value(variable_name: str, result_index: int, variable_value: float) -> None:
-        values_by_variable.setdefault(variable_name, np.full(len(point_indices), np.nan))[
-            result_index
-        ] = variable_value
-
-    for result_index, point_index in enumerate(point_indices):
-        if not branch.stable[point_index]:
-            continue
-        stable_gait = _load_branch_gait(
-            branch, int(point_index), checked_model, checked_step_options
-        )
-        if box_bounds is not None:
-            basin_share_result = compute_basin_share(stable_gait, box_bounds, n_starts, max_steps)
-            store_variable_value("basin_share", result_index, basin_share_result.share)
-            store_variable_value("basin_share_error", result_index, basin_share_result.share_error)
-        if checked_model.capabilities.can_start_within_gait_step:
+    def measure_point(stable_gait: StableGait) -> list[float]:
+        values_at_point = []
+        if box_bounds:
+            share_result = compute_basin_share(stable_gait, box_bounds, n_starts, max_steps)
+            values_at_point += [share_result.share, share_result.share_error]
+        if can_start_within_gait_step:
             disturbance_result = compute_smallest_disturbance(stable_gait, None, max_steps)
-            store_variable_value("smallest_disturbance", result_index, disturbance_result.size)
-            store_variable_value(
-                "smallest_disturbance_error", result_index, disturbance_result.size_error
-            )
+            values_at_point += [disturbance_result.size, disturbance_result.size_error]
+        return values_at_point
+
+    point_values = [
+        measure_point(_load_branch_gait(branch, i, checked_model, checked_step_options))
+        if branch.stable[i]
+        else [np.nan] * len(variable_names)
+        for i in point_indices
+    ]
     return _make_point_dataset(
         branch,
         point_indices,
-        values_by_variable,
-        BASIN_VARIABLE_ATTRS,
+        point_values,
+        {variable_name: BASIN_VARIABLE_ATTRS[variable_name] for variable_name in variable_names},
         f"Basins of the gaits along {branch.parameter}",
     )
 
@@ -152,24 +153,23 @@ def measure_gait_sensitivity(
     checked_model = convert_model_argument(model)
     measure_names = check_names("measures", measures)
     point_indices = _select_branch_points(branch, checked_model, n_points)
-    sensitivity_norms = np.full((len(point_indices), len(measure_names)), np.nan)
-    for result_index, point_index in enumerate(point_indices):
-        branch_gait = _load_branch_gait(branch, int(point_index), checked_model, StepOptions())
-        cycle_finder = resolve_finder(branch_gait.params, branch_gait.model, options)
+    point_norms: list[Any] = []
+    for i in point_indices:
+        branch_gait = _load_branch_gait(branch, i, checked_model, StepOptions())
+        params, point_model = branch_gait.params, branch_gait.model
+        cycle_finder = resolve_finder(params, point_model, options)
         parse_sensitivity_measures(cycle_finder, measure_names)
-        point_cycle: Any = limit_cycle(
-            branch_gait.params,
-            guess=branch_gait.section_states[0],
-            model=branch_gait.model,
-            options=options,
+        guess = branch_gait.section_states[0]
+        cycle: Any = limit_cycle(params, guess=guess, model=point_model, options=options)
+        is_same_gait = (
+            int(cycle.outcome) == Outcome.STEPPED
+            and branch_gait.is_on_gait(np.asarray(cycle.section_state)[None])[0]
         )
-        if (
-            int(point_cycle.outcome) == Outcome.STEPPED
-            and branch_gait.is_on_gait(np.asarray(point_cycle.section_state)[None])[0]
-        ):
-            sensitivity_norms[result_index] = compute_gait_sensitivity(
-                cycle_finder, branch_gait.params, point_cycle, measure_names
-            ).norm
+        point_norms.append(
+            compute_gait_sensitivity(cycle_finder, params, cycle, measure_names).norm
+            if is_same_gait
+            else [np.nan] * len(measure_names)
+        )
     variable_attrs = {
         f"gait_sensitivity_{measure_name}": (
             f"{MEASURES[measure_name].unit} per rad",
@@ -180,7 +180,7 @@ def measure_gait_sensitivity(
     return _make_point_dataset(
         branch,
         point_indices,
-        dict(zip(variable_attrs, sensitivity_norms.T, strict=True)),
+        point_norms,
         variable_attrs,
         f"Gait sensitivity norms along {branch.parameter}",
     )
@@ -200,36 +200,36 @@ def _select_branch_points(branch: Branch, model: AbstractWheel, n_points: int | 
             f"{model!r}: give the model of the branch."
         )
     n_branch_points = len(branch.values)
-    if n_branch_points == 0:
+    if not n_branch_points:
         raise ValueError(
             f"the branch has no gait: {branch.ending} Take a wheel for which vrw.limit_cycle finds "
             "a gait."
         )
     if n_points is not None:
-        n_branch_points = min(check_int("n_points", n_points), n_branch_points)
-    return np.unique(np.linspace(0, len(branch.values) - 1, n_branch_points).round().astype(int))
+        n_points = min(check_int("n_points", n_points), n_branch_points)
+    return np.unique(
+        np.linspace(0, n_branch_points - 1, n_points or n_branch_points).round().astype(int)
+    )
 
 
 def _make_point_dataset(
     branch: Branch,
     point_indices: np.ndarray,
-    values_by_variable: dict[str, np.ndarray],
+    point_values: list[Any],
     variable_attrs: dict[str, tuple[str, str]],
     title: str,
 ) -> xr.Dataset:
     """Return a dataset of variables at points of a branch, with the parameter as coordinate.
 
     - `point_indices`: indices of the points of the branch, shape (points,);
-    - `values_by_variable`: values of each variable, shape (points,);
+    - `point_values`: values of all variables at each point;
     - `variable_attrs`: unit and meaning of each variable.
     """
     point_variables = {
-        variable_name: xr.Variable(
-            "point",
-            variable_values,
-            dict(zip(("units", "long_name"), variable_attrs[variable_name], strict=True)),
+        variable_name: xr.Variable("point", values, {"units": unit, "long_name": meaning})
+        for (variable_name, (unit, meaning)), values in zip(
+            variable_attrs.items(), np.array(point_values, float).T, strict=True
         )
-        for variable_name, variable_values in values_by_variable.items()
     }
     branch_coordinates = {
         branch.parameter: xr.Variable(
@@ -253,8 +253,9 @@ def _load_branch_gait(
         if f"parameter_{parameter_name}" in branch_attrs
     }
     params = WheelParams(**parameter_values, n_legs=branch_attrs["parameter_n_legs"])
-    branch_parameter_value = jnp.asarray(branch.values[point_index], float_dtype)
-    point_model, params = model.with_parameter(params, branch.parameter, branch_parameter_value)
+    point_model, params = model.with_parameter(
+        params, branch.parameter, jnp.asarray(branch.values[point_index], float_dtype)
+    )
     section_state = np.asarray(branch.dataset.section_state.values[point_index])[None]
     stable_gait = StableGait(params, point_model, options, section_state)
     next_section_state = step_batch(

@@ -100,9 +100,7 @@ class StableGait(NamedTuple):
             )
         return stable_gait
 
-    def is_on_gait(
-        self, section_states: np.ndarray, arrival_options: ArrivalOptions = ARRIVAL_OPTIONS
-    ) -> np.ndarray:
+    def is_on_gait(self, section_states: np.ndarray) -> np.ndarray:
         """Return whether each section state agrees with a section state of the gait, shape
         (states,).
 
@@ -111,12 +109,10 @@ class StableGait(NamedTuple):
         state_units = self.model.collect_section_units(
             compute_wheel_units(self.params.symbols()), self.params.n_legs
         )
-        n_continuous_entries = self.model.count_continuous_section_entries(self.params)
-        scaled_state_differences = (
-            section_states[:, None, :n_continuous_entries]
-            - self.section_states[:, :n_continuous_entries]
-        ) / np.asarray(state_units)[:n_continuous_entries]
-        return np.abs(scaled_state_differences).max(-1).min(-1) <= arrival_options.max_gait_distance
+        n_entries = self.model.count_continuous_section_entries(self.params)
+        state_differences = section_states[:, None, :n_entries] - self.section_states[:, :n_entries]
+        scaled_differences = state_differences / np.asarray(state_units)[:n_entries]
+        return np.abs(scaled_differences).max(-1).min(-1) <= ARRIVAL_OPTIONS.max_gait_distance
 
 
 class ArrivalWalkResult(NamedTuple):
@@ -131,40 +127,38 @@ def walk_until_on_gait(
     stable_gait: StableGait,
     start_states: np.ndarray,
     max_steps: int,
-    arrival_options: ArrivalOptions = ARRIVAL_OPTIONS,
 ) -> ArrivalWalkResult:
     """Return the results of walks of at most `max_steps` gait steps from `start_states`.
 
     - `start_states`: section states before the first landing, shape (starts, components).
     """
     n_starts = len(start_states)
-    is_on_gait, walk_outcomes = np.zeros(n_starts, bool), np.full(n_starts, int(Outcome.STEPPED))
-    n_steps_by_walk = np.zeros(n_starts, int)
+    result = ArrivalWalkResult(
+        np.zeros(n_starts, bool),
+        np.full(n_starts, int(Outcome.STEPPED)),
+        np.zeros(n_starts, int),
+    )
     embed_section_states: Any = jax.vmap(
         functools.partial(stable_gait.model.complete_section_state, stable_gait.params)
     )
-    section_states = np.array(embed_section_states(jnp.asarray(start_states)))
-    walking_start_indices, n_steps_walked = np.arange(n_starts), 0
-    while len(walking_start_indices) and n_steps_walked < max_steps:
-        n_steps_to_test = min(arrival_options.steps_per_arrival_test, max_steps - n_steps_walked)
+    walking_indices = np.arange(n_starts)
+    section_states = np.asarray(embed_section_states(jnp.asarray(start_states)))
+    for first_step in range(0, max_steps, ARRIVAL_OPTIONS.steps_per_arrival_test):
+        if not len(walking_indices):
+            break
         walk_results = step_batch(
             stable_gait.params,
-            section_states[walking_start_indices],
-            n_steps_to_test,
+            section_states,
+            min(ARRIVAL_OPTIONS.steps_per_arrival_test, max_steps - first_step),
             model=stable_gait.model,
             options=stable_gait.step_options,
         )
-        section_states[walking_start_indices], walk_outcomes[walking_start_indices] = (
-            walk_results.section_state,
-            walk_results.outcome,
-        )
-        n_steps_by_walk[walking_start_indices] += walk_results.n_stepped
         has_stepped = walk_results.outcome == Outcome.STEPPED
-        is_on_gait[walking_start_indices] = has_stepped & stable_gait.is_on_gait(
-            walk_results.section_state, arrival_options
-        )
-        walking_start_indices = walking_start_indices[
-            has_stepped & ~is_on_gait[walking_start_indices]
-        ]
-        n_steps_walked += n_steps_to_test
-    return ArrivalWalkResult(is_on_gait, walk_outcomes, n_steps_by_walk)
+        is_on_gait = has_stepped & stable_gait.is_on_gait(walk_results.section_state)
+        result.is_on_gait[walking_indices] = is_on_gait
+        result.walk_outcomes[walking_indices] = walk_results.outcome
+        result.n_steps_walked[walking_indices] += walk_results.n_stepped
+        is_walking = has_stepped & ~is_on_gait
+        walking_indices = walking_indices[is_walking]
+        section_states = walk_results.section_state[is_walking]
+    return result

@@ -1,6 +1,10 @@
 """Simulation of single steps, walks, trajectories, attractors and basins."""
 
-from vrw_jax.simulation.basins import basin, invert_landing_map
+from vrw_jax.simulation.basins import (
+    basin,
+    compute_section_states_of_starts,
+    select_start_components,
+)
 from vrw_jax.simulation.force_peaks import SAMPLED_FORCE_PEAK_MEASURES, force_peaks
 from vrw_jax.simulation.provenance import collect_provenance_attributes
 from vrw_jax.simulation.stepping import (

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +12,6 @@ import numpy as np
 
 from vrw_jax.measures import (
     MARGIN_MEASURES,
-    MEASURES,
     POST_LANDING_COMPONENT_NAMES,
     PRE_TOUCHDOWN_COMPONENT_NAMES,
     make_measure_attributes,
@@ -99,9 +99,7 @@ def basin(
     """
     require_untraced_arguments("vrw.basin", "map vrw.walk over the starts", params, options)
     require_single_wheel(params, "compute one basin after the other")
-    model = convert_model_argument(
-        model
-    ).fallback_model  # The fallback model is valid for any start.
+    model = convert_model_argument(model).fallback_model  # It is valid for any start.
     options = convert_step_options(options)
     options.check_tolerances(np.dtype(params.damping.dtype))
     options = options.with_engine(engine)
@@ -109,57 +107,39 @@ def basin(
     max_period = check_int("max_period", max_period)
     start_component_values = _parse_start_grid(grid)
     start_component_names = tuple(start_component_values)
-    start_grid_axis_names = [
-        start_component_name
-        for start_component_name in start_component_names
-        if np.ndim(grid[start_component_name]) > 0
-    ]
-    start_grid_shape = tuple(
-        len(start_component_values[start_component_name])
-        for start_component_name in start_grid_axis_names
+    axis_names = [x for x in start_component_names if np.ndim(grid[x]) > 0]
+    grid_shape = tuple(len(start_component_values[axis_name]) for axis_name in axis_names)
+    coordinate_grids = np.meshgrid(*start_component_values.values(), indexing="ij")
+    start_states = compute_section_states_of_starts(
+        params, start_component_names, np.stack([x.ravel() for x in coordinate_grids], -1)
     )
-    start_coordinate_grids = np.meshgrid(*start_component_values.values(), indexing="ij")
-    start_grid_points = np.stack(
-        [start_coordinate_grid.ravel() for start_coordinate_grid in start_coordinate_grids], -1
-    )
-    start_states = (
-        start_grid_points
-        if start_component_names == PRE_TOUCHDOWN_COMPONENT_NAMES
-        else invert_landing_map(params, start_grid_points)
-    )
-    is_start_reachable = np.isfinite(start_states).all(-1)
-    start_states = np.where(is_start_reachable[:, None], start_states, np.nan)
     start_embedder = functools.partial(model.complete_section_state, params)
     start_states = np.asarray(jax.vmap(start_embedder)(jnp.asarray(start_states)))
     walk_ends = walk_until_periodic(params, start_states, model, options, max_steps, max_period)
     distinct_orbits = find_distinct_orbits(walk_ends)
 
-    walk_variables = {
-        "attractor": xr.Variable(
-            start_grid_axis_names,
-            distinct_orbits.orbit_indices.reshape(start_grid_shape),
+    walk_columns: dict[str, tuple[np.ndarray, dict[str, object]]] = {
+        "attractor": (
+            distinct_orbits.orbit_indices,
             {"long_name": "orbit that the walk settles on", "flag_none": -1},
         ),
-        "outcome": xr.Variable(
-            start_grid_axis_names,
-            walk_ends.outcome.reshape(start_grid_shape),
-            make_measure_attributes("outcome"),
-        ),
-        "steps": xr.Variable(
-            start_grid_axis_names,
-            walk_ends.n_steps_to_orbit.reshape(start_grid_shape),
+        "outcome": (walk_ends.outcome, make_measure_attributes("outcome")),
+        "steps": (
+            walk_ends.n_steps_to_orbit,
             {"units": "1", "long_name": "steps until the orbit is reached, or the fall"},
         ),
     }
+    walk_variables = {
+        variable_name: xr.Variable(axis_names, values.reshape(grid_shape), attributes)
+        for variable_name, (values, attributes) in walk_columns.items()
+    }
     start_dataset_coordinates = {
-        start_component_name: xr.Variable(
-            (start_component_name,) if start_component_name in start_grid_axis_names else (),
-            start_component_values[start_component_name]
-            if start_component_name in start_grid_axis_names
-            else start_component_values[start_component_name][0],
-            dict(MEASURES[start_component_name].variable_attributes),
+        component_name: xr.Variable(
+            (component_name,) if component_name in axis_names else (),
+            values if component_name in axis_names else values[0],
+            make_measure_attributes(component_name),
         )
-        for start_component_name in start_component_names
+        for component_name, values in start_component_values.items()
     }
     orbit_variables = _make_orbit_variables(
         params, distinct_orbits.orbit_states, max_period, model, options
@@ -185,40 +165,51 @@ def _parse_start_grid(grid: StartGrid) -> dict[str, np.ndarray]:
     after landing. Each component is a number or an array with one axis.
     """
     check_type("grid", grid, Mapping, "write {'theta_touchdown': 0.09, 'dtheta_touchdown': ...}")
-    for start_component_names in (PRE_TOUCHDOWN_COMPONENT_NAMES, POST_LANDING_COMPONENT_NAMES):
-        if set(grid) == set(start_component_names):
-            break
-    else:
-        raise ValueError(
-            f"the grid contains {', '.join(grid) or 'nothing'}, but it must contain all of "
-            f"{', '.join(PRE_TOUCHDOWN_COMPONENT_NAMES)}, or all of "
-            f"{', '.join(POST_LANDING_COMPONENT_NAMES)}: give "
-            "each a number or an axis."
-        )
     start_component_values = {
-        start_component_name: np.asarray(
-            check_reals(start_component_name, grid[start_component_name]), float
-        )
-        for start_component_name in start_component_names
+        component_name: np.asarray(check_reals(component_name, grid[component_name]), float)
+        for component_name in select_start_components("grid", grid, "a number or an axis")
     }
-    for start_component_name, start_component_array in start_component_values.items():
-        if start_component_array.ndim > 1 or not start_component_array.size:
+    for component_name, values in start_component_values.items():
+        if values.ndim > 1 or not values.size:
             raise ValueError(
-                f"{start_component_name} has shape {start_component_array.shape}, but it must be "
+                f"{component_name} has shape {values.shape}, but it must be "
                 "a number, or a list of at least one: give one axis of values."
             )
     return {
-        start_component_name: np.atleast_1d(start_component_array)
-        for start_component_name, start_component_array in start_component_values.items()
+        component_name: np.atleast_1d(values)
+        for component_name, values in start_component_values.items()
     }
 
 
-def invert_landing_map(params: WheelParams, post_landing_states: np.ndarray) -> np.ndarray:
-    """Return section states with dL1- = 0 whose landings result in given (theta+, dtheta+).
+def select_start_components(
+    argument_name: str, values_by_component: Mapping[str, Any], value_text: str
+) -> tuple[str, ...]:
+    """Return the names of the components of starts before touchdown or of starts after landing.
 
-    The states are NaN where no such section state exists. For dL1- = 0, the angular rates before
-    and after the landing are proportional.
+    Raise a ValueError unless the names in `values_by_component` are either all of the former or all
+    of the latter. The message contains `argument_name`, and the form `value_text` of a value.
     """
+    for start_component_names in (PRE_TOUCHDOWN_COMPONENT_NAMES, POST_LANDING_COMPONENT_NAMES):
+        if set(values_by_component) == set(start_component_names):
+            return start_component_names
+    raise ValueError(
+        f"the {argument_name} contains {', '.join(map(str, values_by_component)) or 'nothing'}, "
+        f"but it must contain all of {', '.join(PRE_TOUCHDOWN_COMPONENT_NAMES)}, or all of "
+        f"{', '.join(POST_LANDING_COMPONENT_NAMES)}: give each {value_text}."
+    )
+
+
+def compute_section_states_of_starts(
+    params: WheelParams, start_component_names: tuple[str, ...], starts: np.ndarray
+) -> np.ndarray:
+    """Return section states for starts before touchdown or after landing, shape (starts, 3).
+
+    A start after landing is (theta+, dtheta+). Its section state is that with dL1- = 0 whose
+    landing results in this start. The angular rates before and after this landing are proportional.
+    A section state is NaN if no landing leads to the start.
+    """
+    if start_component_names == PRE_TOUCHDOWN_COMPONENT_NAMES:
+        return np.where(np.isfinite(starts).all(-1, keepdims=True), starts, np.nan)
     s = params.symbols()
 
     def find_section_state_before(post_landing_state: jax.Array) -> jax.Array:
@@ -234,7 +225,8 @@ def invert_landing_map(params: WheelParams, post_landing_states: np.ndarray) -> 
             jnp.nan,
         )
 
-    return np.asarray(jax.vmap(find_section_state_before)(jnp.asarray(post_landing_states)))
+    section_states = np.asarray(jax.vmap(find_section_state_before)(jnp.asarray(starts)))
+    return np.where(np.isfinite(section_states).all(-1, keepdims=True), section_states, np.nan)
 
 
 def _make_orbit_variables(
@@ -247,21 +239,18 @@ def _make_orbit_variables(
     """Return the dataset variables for the orbits: states, periods, DLS fractions and minimum
     margins.
     """
-    n_orbits = len(orbit_states)
-    padded_orbit_states = np.full(
-        (n_orbits, max_period, model.count_section_entries(params)), np.nan
-    )
-    margin_names = MARGIN_MEASURES if model.count_section_entries(params) == 3 else ()
-    dls_fractions, min_margins = (
-        np.zeros(n_orbits),
-        {margin_name: np.zeros(n_orbits) for margin_name in margin_names},
-    )
+    n_orbits, n_entries = len(orbit_states), model.count_section_entries(params)
+    padded_orbit_states = np.full((n_orbits, max_period, n_entries), np.nan)
+    margin_names = MARGIN_MEASURES if n_entries == 3 else ()
+    orbit_measures = {name: np.zeros(n_orbits) for name in ("dls_fraction", *margin_names)}
     for i, states_of_one_orbit in enumerate(orbit_states):
         padded_orbit_states[i, : len(states_of_one_orbit)] = states_of_one_orbit
         step_measures = measure_orbit_steps(params, states_of_one_orbit, model, options)
-        dls_fractions[i] = step_measures["duration_dls"].sum() / step_measures["period"].sum()
+        orbit_measures["dls_fraction"][i] = (
+            step_measures["duration_dls"].sum() / step_measures["period"].sum()
+        )
         for margin_name in margin_names:
-            min_margins[margin_name][i] = step_measures[margin_name].min()
+            orbit_measures[margin_name][i] = step_measures[margin_name].min()
     return {
         "orbit_state": xr.Variable(
             ("attractor_index", "orbit_step", "component"),
@@ -273,16 +262,11 @@ def _make_orbit_variables(
             np.array([len(states_of_one_orbit) for states_of_one_orbit in orbit_states], int),
             {"units": "1", "long_name": "steps until the orbit repeats"},
         ),
-        "orbit_dls_fraction": xr.Variable(
-            "attractor_index", dls_fractions, dict(MEASURES["dls_fraction"].variable_attributes)
-        ),
         **{
-            f"orbit_{margin_name}": xr.Variable(
-                "attractor_index",
-                min_margin_by_orbit,
-                dict(MARGIN_MEASURES[margin_name].variable_attributes),
+            f"orbit_{measure_name}": xr.Variable(
+                "attractor_index", measure_values, make_measure_attributes(measure_name)
             )
-            for margin_name, min_margin_by_orbit in min_margins.items()
+            for measure_name, measure_values in orbit_measures.items()
         },
     }
 
