@@ -24,7 +24,6 @@ from vrw_jax.batches.contact_step import CONTACT_STEP_INPUT_NAMES, step_batch_wi
 from vrw_jax.batches.stiffness import (
     SOLVER_SELECTION_OPTIONS,
     SolverIndex,
-    SolverSelectionOptions,
     select_cheapest_solver,
 )
 from vrw_jax.batches.walk_batch import (
@@ -39,7 +38,6 @@ from vrw_jax.integrator import load_explicit_tableau
 from vrw_jax.models import (
     N_STEP_INPUTS,
     AbstractWheel,
-    AdvanceResult,
     advance_gait_step,
     complete_jacobian_columns,
     compute_jacobian_columns,
@@ -150,10 +148,8 @@ def step_batch(
         "vrw.step_batch", "map vrw.return_map over the lanes", params, states, durations
     )
     check_type("params", params, WheelParams, "write vrw.WheelParams(damping=..., slope=...)")
-    checked_model, options = (
-        convert_model_argument(model, allows_friction_arrays=True),
-        convert_step_options(options),
-    )
+    checked_model = convert_model_argument(model, allows_friction_arrays=True)
+    options = convert_step_options(options)
     check_choice("engine", engine, BATCH_ENGINE_NAMES)
     n_steps = check_int("n_steps", n_steps)
     derivatives = check_names("derivatives", derivatives, '"section_state", "damping"')
@@ -163,6 +159,19 @@ def step_batch(
     )
     checked_section_states = checked_section_states.astype(values_by_parameter[0].dtype, copy=False)
     has_contact_kernel = checked_model.batch_kernel == "legs"
+    known_input_names = CONTACT_STEP_INPUT_NAMES if has_contact_kernel else PAPER_STEP_INPUT_NAMES
+    for derivative_name in derivatives:
+        if derivative_name not in known_input_names:
+            raise ValueError(
+                f"derivatives contain {derivative_name!r}, but a step depends on "
+                f"{', '.join(known_input_names)}: "
+                "give names of these."
+            )
+    if derivatives and engine == "collocation":
+        raise ValueError(
+            "derivatives are given, but batches have none with engine 'collocation': take "
+            "engine='lanes', or jax.jacfwd of vrw.return_map."
+        )
     step_arguments = (
         checked_model,
         values_by_parameter,
@@ -171,40 +180,11 @@ def step_batch(
         options,
         engine,
         params.n_legs,
-    )
-    derivative_names = _check_derivative_names(
         derivatives,
-        CONTACT_STEP_INPUT_NAMES if has_contact_kernel else PAPER_STEP_INPUT_NAMES,
-        engine,
     )
-    return (
-        step_batch_with_contact(*step_arguments, derivative_names)
-        if has_contact_kernel
-        else _step_batch_without_contact(*step_arguments, durations, derivative_names)
-    )
-
-
-def _check_derivative_names(
-    requested_derivatives: Sequence[str], known_input_names: tuple[str, ...], requested_engine: str
-) -> list[str]:
-    """Return the names of the inputs with respect to which derivatives are requested, as a list.
-
-    Raise ValueError if a derivative is not available.
-    """
-    derivative_names = list(requested_derivatives)
-    for derivative_name in derivative_names:
-        if derivative_name not in known_input_names:
-            raise ValueError(
-                f"derivatives contain {derivative_name!r}, but a step depends on "
-                f"{', '.join(known_input_names)}: "
-                "give names of these."
-            )
-    if derivative_names and requested_engine == "collocation":
-        raise ValueError(
-            "derivatives are given, but batches have none with engine 'collocation': take "
-            "engine='lanes', or jax.jacfwd of vrw.return_map."
-        )
-    return derivative_names
+    if has_contact_kernel:
+        return step_batch_with_contact(*step_arguments)
+    return _step_batch_without_contact(*step_arguments, durations)
 
 
 def _check_parameter_shapes(
@@ -220,19 +200,15 @@ def _check_parameter_shapes(
     The slope, and with unilateral contact the friction, may have a second axis over gait steps.
     Raise ValueError if the shapes of states and parameters do not fit.
     """
-    allowed_section_sizes = [3]
-    if section_states.ndim != 2 or section_states.shape[1] != 3:
-        allowed_section_sizes = sorted({3, model.count_section_entries(params)})
+    allowed_section_sizes = sorted({3, model.count_section_entries(params)})
     if section_states.ndim != 2 or section_states.shape[1] not in allowed_section_sizes:
         raise ValueError(
             f"states have shape {section_states.shape}, but section states have the shape "
             f"(elements, "
             f"{' or '.join(map(str, allowed_section_sizes))}): write states[None] for a single one."
         )
-    n_section_states, values_by_parameter = (
-        len(section_states),
-        [getattr(params, parameter_name) for parameter_name in PARAMETER_NAMES],
-    )
+    n_section_states = len(section_states)
+    values_by_parameter = [getattr(params, parameter_name) for parameter_name in PARAMETER_NAMES]
     parameter_dtype = np.result_type(
         *(parameter_values.dtype for parameter_values in values_by_parameter)
     )
@@ -246,11 +222,10 @@ def _check_parameter_shapes(
         is_parameter_stepwise = (
             parameter_name in ("slope", FRICTION_NAME) and np.ndim(parameter_values) == 2
         )
-        allowed_stepwise_shapes = [
-            (n_section_states, n_steps),
-            (n_section_states, n_steps + 1),
-        ] * is_parameter_stepwise
-        if np.shape(parameter_values) not in ((), (n_section_states,), *allowed_stepwise_shapes):
+        allowed_shapes: list[tuple[int, ...]] = [(), (n_section_states,)]
+        if is_parameter_stepwise:
+            allowed_shapes += [(n_section_states, n_steps), (n_section_states, n_steps + 1)]
+        if np.shape(parameter_values) not in allowed_shapes:
             stepwise_advice = f" and {n_steps} or {n_steps + 1} of each over its steps"
             raise ValueError(
                 f"{parameter_name} has shape {np.shape(parameter_values)}, but there are "
@@ -271,153 +246,104 @@ def _step_batch_without_contact(
     options: StepOptions,
     requested_engine: str,
     n_legs: int,
-    phase_durations: Any,
     derivative_names: Sequence[str],
-    selection_options: SolverSelectionOptions = SOLVER_SELECTION_OPTIONS,
+    phase_durations: Any,
 ) -> StepBatchResult:
     """Return the result of `step_batch` for a model without unilateral contact."""
-    ground_slopes, stepwise_parameters = _split_slopes_by_step(
-        values_by_parameter[SLOPE_INPUT_INDEX], n_steps, requested_engine
-    )
+    n_wheels = len(section_states)
+    element_slopes = values_by_parameter[SLOPE_INPUT_INDEX]
+    ground_slopes: Any = [element_slopes]
+    stepwise_parameters = {}
+    is_ground_uneven = element_slopes.ndim == 2
+    if is_ground_uneven:
+        if requested_engine == "collocation":
+            raise ValueError(
+                "engine is 'collocation', which takes one slope, but slope is an array over steps: "
+                "take 'auto', 'lanes' or 'diffrax'."
+            )
+        ground_slopes = complete_slopes_over_steps(element_slopes, n_steps)
+        n_slopes = element_slopes.shape[1]
+        stepwise_parameters["slope"] = StepwiseParameter(
+            (SLOPE_INPUT_INDEX, NEXT_SLOPE_INPUT_INDEX),
+            n_slopes,
+            lambda k: ((0, k, 1.0), (1, min(k + 1, n_slopes - 1), 1.0)),
+        )
     values_by_parameter = [
         ground_slopes[0] if i == SLOPE_INPUT_INDEX else x for i, x in enumerate(values_by_parameter)
     ]
-    wheel_order_by_work = order_wheels_by_work(values_by_parameter, section_states)
-    parameter_matrix = np.empty(
-        (len(values_by_parameter), len(section_states)), section_states.dtype
+    wheel_order = order_wheels_by_work(values_by_parameter, section_states)
+    parameter_matrix = np.stack(
+        [np.broadcast_to(x, n_wheels)[wheel_order] for x in values_by_parameter]
     )
-    for sorted_parameter_values, parameter_values in zip(
-        parameter_matrix, values_by_parameter, strict=True
-    ):
-        sorted_parameter_values[:] = (
-            parameter_values[wheel_order_by_work] if parameter_values.ndim else parameter_values
-        )
-    is_ground_uneven = bool(stepwise_parameters)
-    ground_slopes = (
-        ground_slopes.take(wheel_order_by_work, -1) if is_ground_uneven else ground_slopes
-    )
+    if is_ground_uneven:
+        ground_slopes = ground_slopes.take(wheel_order, -1)
     walk_batch = WalkBatch(
-        section_states.T.take(wheel_order_by_work, -1),
+        section_states.T.take(wheel_order, -1),
         derivative_names,
         PARAMETER_NAMES,
         stepwise_parameters,
     )
-    engine_selection_arguments = n_legs, walk_batch.input_indices
-    engine_by_solver = {
-        SolverIndex.REQUESTED_SOLVER: _select_batch_engine(
-            requested_engine, model, options, *engine_selection_arguments
-        )
-    }
-    solver_indices = np.full(len(section_states), SolverIndex.REQUESTED_SOLVER, np.int32)
+    select_engine = functools.partial(_select_batch_engine, model, n_legs, walk_batch.input_indices)
+    engine_by_solver = {SolverIndex.REQUESTED_SOLVER: select_engine(requested_engine, options)}
+    solver_indices = np.full(n_wheels, SolverIndex.REQUESTED_SOLVER, np.int32)
     solver_names: tuple[str, ...] = (options.solver,)
     engine_name = engine_by_solver[SolverIndex.REQUESTED_SOLVER].engine_name
     if requested_engine == "auto" and engine_name == "lanes":
-        solver_names = (
-            options.solver,
-            selection_options.stable_solver,
-            selection_options.implicit_solver,
-        )
-        stable_solver_options = (
-            options.with_derivative_tolerances() if derivative_names else options
-        )
+        stable_solver = SOLVER_SELECTION_OPTIONS.stable_solver
+        implicit_solver = SOLVER_SELECTION_OPTIONS.implicit_solver
+        solver_names = (options.solver, stable_solver, implicit_solver)
         solver_indices = select_cheapest_solver(
-            parameter_matrix, stable_solver_options, selection_options
+            parameter_matrix, options.with_derivative_tolerances() if derivative_names else options
         )
-    if np.any(solver_indices != SolverIndex.REQUESTED_SOLVER):
-        implicit_solver_options = dataclasses.replace(
-            options, solver=selection_options.implicit_solver
-        )
-        tightened_step_options = dataclasses.replace(
-            options, solver=selection_options.stable_solver
-        )
-        tightened_step_options = tightened_step_options.with_tightened_tolerances(
-            selection_options.stable_solver_tightening_factor
-        )
-        engine_by_solver[SolverIndex.STABLE_SOLVER] = _select_batch_engine(
-            "lanes", model, tightened_step_options, *engine_selection_arguments
-        )
-        engine_by_solver[SolverIndex.IMPLICIT_SOLVER] = _select_batch_engine(
-            "diffrax", model, implicit_solver_options, *engine_selection_arguments
-        )
+        if np.any(solver_indices != SolverIndex.REQUESTED_SOLVER):
+            stable_options = dataclasses.replace(options, solver=stable_solver)
+            engine_by_solver[SolverIndex.STABLE_SOLVER] = select_engine(
+                "lanes",
+                stable_options.with_tightened_tolerances(
+                    SOLVER_SELECTION_OPTIONS.stable_solver_tightening_factor
+                ),
+            )
+            engine_by_solver[SolverIndex.IMPLICIT_SOLVER] = select_engine(
+                "diffrax", dataclasses.replace(options, solver=implicit_solver)
+            )
     if requested_engine == "collocation":
         engine_name = requested_engine
-        if phase_durations is None or np.shape(phase_durations) != section_states.shape:
-            expected_durations_shape = (
-                None if phase_durations is None else np.shape(phase_durations)
-            )
+        durations_shape = None if phase_durations is None else np.shape(phase_durations)
+        if durations_shape != section_states.shape:
             raise ValueError(
-                f"durations have shape {expected_durations_shape}, but collocation needs those of "
+                f"durations have shape {durations_shape}, but collocation needs those of "
                 "DLS, SLS-I and SLS-II to some per cent, shape (elements, 3): give those of a "
                 "limit cycle, or take 'lanes'."
             )
         expected_durations = check_numpy_reals("durations", phase_durations)
-        walk_batch.durations[:] = expected_durations.astype(parameter_matrix.dtype).T.take(
-            wheel_order_by_work, -1
-        )
+        walk_batch.durations[:] = expected_durations.T.take(wheel_order, -1)
     for k in range(n_steps):
         active_lanes = walk_batch.find_walking_lanes()
         if is_ground_uneven:
             parameter_matrix[SLOPE_INPUT_INDEX] = ground_slopes[k]
-        if requested_engine == "collocation" and len(active_lanes):
-            lane_selection = select_lanes(active_lanes, walk_batch)
-            collocation_inputs = (
-                parameter_matrix[:, lane_selection],
-                walk_batch.section_state[:, lane_selection],
-                walk_batch.durations[:, lane_selection],
-            )
-            collocation_result = _step_lanes_by_collocation(
-                engine_by_solver[SolverIndex.REQUESTED_SOLVER], model, n_legs, *collocation_inputs
-            )
-            walk_batch.store_lane_steps(active_lanes, *collocation_result)
-            continue
         for solver_index, selected_engine in engine_by_solver.items():
             lane_indices = active_lanes[solver_indices[active_lanes] == solver_index]
-            if len(lane_indices) > 0:
-                lane_selection = select_lanes(lane_indices, walk_batch)
-                next_slopes = (ground_slopes[k + 1][lane_selection],) if is_ground_uneven else ()
-                step_outputs = selected_engine.take_lane_steps(
-                    parameter_matrix[:, lane_selection],
-                    walk_batch.section_state[:, lane_selection],
-                    *next_slopes,
+            if not len(lane_indices):
+                continue
+            lanes = select_lanes(lane_indices, walk_batch)
+            lane_inputs = parameter_matrix[:, lanes], walk_batch.section_state[:, lanes]
+            if requested_engine == "collocation":
+                collocation_result = _step_lanes_by_collocation(
+                    selected_engine, model, n_legs, *lane_inputs, walk_batch.durations[:, lanes]
                 )
-                if solver_index == SolverIndex.STABLE_SOLVER:
-                    # A phase may last longer than `select_cheapest_solver` assumes. The implicit
-                    # solver, which is next, then repeats the step.
-                    has_solver_failed = step_outputs[2] == Outcome.SOLVER_FAILED
-                    solver_indices[lane_indices[has_solver_failed]] = SolverIndex.IMPLICIT_SOLVER
-                    lane_indices = lane_indices[~has_solver_failed]
-                    step_outputs = tuple(
-                        step_output[..., ~has_solver_failed] for step_output in step_outputs
-                    )
-                walk_batch.store_lane_steps(
-                    lane_indices, step_outputs, np.zeros(len(lane_indices), bool)
-                )
-    return walk_batch.make_batch_result(
-        wheel_order_by_work, solver_indices, engine_name, solver_names
-    )
-
-
-def _split_slopes_by_step(
-    element_slopes: np.ndarray, n_steps: int, requested_engine: str
-) -> tuple[Any, dict[str, StepwiseParameter]]:
-    """Return the slopes of the ground for all gait steps, and a mapping from "slope" to its
-    `StepwiseParameter`.
-
-    On flat ground, return a list with one slope, and an empty mapping.
-    """
-    if element_slopes.ndim < 2:
-        return [element_slopes], {}
-    if requested_engine == "collocation":
-        raise ValueError(
-            "engine is 'collocation', which takes one slope, but slope is an array over steps: "
-            "take 'auto', 'lanes' or 'diffrax'."
-        )
-    n_stepwise_slopes = element_slopes.shape[1]
-    slope_chain_rule_terms = lambda k: ((0, k, 1.0), (1, min(k + 1, n_stepwise_slopes - 1), 1.0))
-    stepwise_slope = StepwiseParameter(
-        (SLOPE_INPUT_INDEX, NEXT_SLOPE_INPUT_INDEX), n_stepwise_slopes, slope_chain_rule_terms
-    )
-    return complete_slopes_over_steps(element_slopes, n_steps), {"slope": stepwise_slope}
+                walk_batch.store_lane_steps(lane_indices, *collocation_result)
+                continue
+            next_slopes = (ground_slopes[k + 1][lanes],) if is_ground_uneven else ()
+            step_outputs = selected_engine.take_lane_steps(*lane_inputs, *next_slopes)
+            if solver_index == SolverIndex.STABLE_SOLVER:
+                # A phase may last longer than `select_cheapest_solver` assumes. The implicit
+                # solver, which is next, then repeats the step.
+                has_solver_failed = step_outputs[2] == Outcome.SOLVER_FAILED
+                solver_indices[lane_indices[has_solver_failed]] = SolverIndex.IMPLICIT_SOLVER
+                lane_indices = lane_indices[~has_solver_failed]
+                step_outputs = tuple(x[..., ~has_solver_failed] for x in step_outputs)
+            walk_batch.store_lane_steps(lane_indices, step_outputs)
+    return walk_batch.make_batch_result(wheel_order, solver_indices, engine_name, solver_names)
 
 
 def order_wheels_by_work(
@@ -431,26 +357,17 @@ def order_wheels_by_work(
     from a fit to measured numbers of solver steps, for states near the gaits and far from them
     (`python -m experiments.speed.straggler_steps`).
     """
-    parameters_by_name = dict(zip(PARAMETER_NAMES, values_by_parameter, strict=True))
-    get_float32_parameter = lambda parameter_name: np.asarray(
-        parameters_by_name[parameter_name], np.float32
-    )
+    float32_values = [np.asarray(x, np.float32) for x in values_by_parameter]
+    p = dict(zip(PARAMETER_NAMES, float32_values, strict=True))
+    theta, dtheta = section_states.T[:2].astype(np.float32)
     with np.errstate(all="ignore"):
-        theta, dtheta = section_states.T[:2].astype(np.float32)
-        locked_length, leg_mass = (
-            get_float32_parameter("locked_length"),
-            get_float32_parameter("leg_mass"),
-        )
-        log_solver_work = np.log(get_float32_parameter("damping") / leg_mass) - 0.25 * np.log(
-            get_float32_parameter("stiffness") / leg_mass
-        )
         log_solver_work = (
-            log_solver_work
+            np.log(p["damping"] / p["leg_mass"])
+            - 0.25 * np.log(p["stiffness"] / p["leg_mass"])
             + 0.8 * np.log(dtheta)
-            + 0.65 * np.log(locked_length / get_float32_parameter("gravity"))
-        )
-        log_solver_work = (
-            log_solver_work + theta - 7.0 * get_float32_parameter("natural_length") / locked_length
+            + 0.65 * np.log(p["locked_length"] / p["gravity"])
+            + theta
+            - 7.0 * p["natural_length"] / p["locked_length"]
         )
     return np.argsort(log_solver_work)
 
@@ -471,11 +388,11 @@ class _BatchEngine(NamedTuple):
 
 
 def _select_batch_engine(
-    requested_engine: str,
     model: Any,
-    options: StepOptions,
     n_legs: int,
     input_indices: tuple[int, ...],
+    requested_engine: str,
+    options: StepOptions,
 ) -> _BatchEngine:
     """Return the requested engine, or the fastest engine that supports the model and the solver if
     "auto" is requested.
@@ -597,11 +514,12 @@ def _step_lanes_by_collocation(
 
     def step_lanes(_: Any, lane_step_inputs: Any) -> tuple:
         params = make_wheel_from_parameters(lane_step_inputs[:n_parameters], n_legs)
-        x, expected_durations = (
+        collocation_step = take_collocation_step(
+            params,
             tuple(lane_step_inputs[n_parameters:-3]),
             tuple(lane_step_inputs[-3:]),
+            stop_at_lift_off,
         )
-        collocation_step = take_collocation_step(params, x, expected_durations, stop_at_lift_off)
         step_outputs = jnp.stack(
             [*collocation_step.section_state, *collocation_step.phase_durations]
         )
@@ -650,13 +568,7 @@ def _step_lanes_by_diffrax(
     )
     derivative_step_options = convert_options_dtype(options.with_derivative_tolerances())
     options = convert_options_dtype(options)
-    step_input_matrix = np.concatenate(
-        [
-            parameter_matrix,
-            section_states,
-            *(next_slope_values[None] for next_slope_values in next_slopes),
-        ]
-    ).T
+    step_input_matrix = np.vstack([parameter_matrix, section_states, *next_slopes]).T
 
     def step_all_elements(
         step_input_matrix: np.ndarray, options: StepOptions, input_indices: tuple[int, ...]
@@ -681,26 +593,19 @@ def _step_lanes_by_diffrax(
                 step_input_matrix, options, input_indices
             )
         except eqx.EquinoxRuntimeError:
-            *step_outputs, n_solver_steps = step_all_elements(
-                step_input_matrix, derivative_step_options, ()
-            )
+            step_outputs = step_all_elements(step_input_matrix, derivative_step_options, ())
             step_outcomes = step_outputs[2]
-            step_jacobian = np.zeros(
-                (len(input_indices), 6, len(step_input_matrix)), parameter_matrix.dtype
-            )
-            step_result_arrays = (*step_outputs, n_solver_steps, step_jacobian)
+            n_elements = len(step_input_matrix)
+            step_jacobian = np.zeros((len(input_indices), 6, n_elements), parameter_matrix.dtype)
+            step_result_arrays = (*step_outputs, step_jacobian)
             stepped_element_indices = np.flatnonzero(step_outcomes == Outcome.STEPPED)
-            if len(stepped_element_indices) < len(step_input_matrix):
+            if len(stepped_element_indices) < n_elements:
                 retried_element_blocks = [stepped_element_indices]
-            elif len(step_input_matrix) > 1:
+            elif n_elements > 1:
                 retried_element_blocks = np.array_split(stepped_element_indices, 2)
             else:
                 retried_element_blocks, step_outcomes[:] = [], Outcome.SOLVER_FAILED
-            for element_indices in (
-                element_indices
-                for element_indices in retried_element_blocks
-                if len(element_indices)
-            ):
+            for element_indices in filter(len, retried_element_blocks):
                 block_step_results = step_elements_with_jacobian(step_input_matrix[element_indices])
                 for full_result_array, block_result_array in zip(
                     step_result_arrays, block_step_results, strict=True
@@ -734,7 +639,7 @@ def _step_elements_by_vmap(
     n_parameters = len(PARAMETER_NAMES)
 
     def step_one_element(step_inputs: Array) -> tuple[Array, ...]:
-        def step_with_varied_inputs(varied_inputs: Array) -> tuple[Array, AdvanceResult]:
+        def step_with_varied_inputs(varied_inputs: Array) -> tuple[Array, tuple[Array, ...]]:
             updated_step_inputs = step_inputs.at[np.array(input_indices, int)].set(varied_inputs)
             next_slope = updated_step_inputs[NEXT_SLOPE_INPUT_INDEX:]
             params = make_wheel_from_parameters(
@@ -742,25 +647,18 @@ def _step_elements_by_vmap(
             )
             x = updated_step_inputs[n_parameters:NEXT_SLOPE_INPUT_INDEX]
             step_result = model.advance(params, x, options)
-            return jnp.concatenate([step_result.section_state, step_result.durations]), step_result
-
-        varied_inputs = step_inputs[np.array(input_indices, int)]
-        if not input_indices:
-            _, step_result = step_with_varied_inputs(varied_inputs)
-            return (
+            return jnp.concatenate([step_result.section_state, step_result.durations]), (
                 step_result.section_state,
                 step_result.durations,
                 step_result.outcome,
                 step_result.solver_steps,
             )
-        step_jacobian, step_result = jax.jacfwd(step_with_varied_inputs, has_aux=True)(
+
+        varied_inputs = step_inputs[np.array(input_indices, int)]
+        if not input_indices:
+            return step_with_varied_inputs(varied_inputs)[1]
+        step_jacobian, step_outputs = jax.jacfwd(step_with_varied_inputs, has_aux=True)(
             varied_inputs
-        )
-        step_outputs = (
-            step_result.section_state,
-            step_result.durations,
-            step_result.outcome,
-            step_result.solver_steps,
         )
         return *step_outputs, step_jacobian
 

@@ -17,7 +17,7 @@ lane that fails a check of these indicators.
 
 import functools
 import operator
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -169,110 +169,85 @@ class _SolvedMeshInterval(NamedTuple):
     nonlinear_accelerations: NodeAccelerations  # the part that the linearized equations omit
 
 
+class _PhaseProgress(NamedTuple):
+    """State at the end of a mesh interval, with the accuracy indicators of all intervals so far."""
+
+    q: Vector
+    v: Vector
+    estimated_rate_correction: Array
+    largest_start_rate_error: Array
+    lowest_guard_value: Array
+    guard_values: Vector
+    nonlinear_accelerations: NodeAccelerations
+
+
 def solve_phase_by_collocation(
-    phase: AbstractPhase,
-    q: Vector,
-    v: Vector,
-    expected_duration: Array,
-    phase_mesh: PhaseMesh,
-    options: CollocationStepOptions = COLLOCATION_STEP_OPTIONS,
+    phase: AbstractPhase, q: Vector, v: Vector, expected_duration: Array, phase_mesh: PhaseMesh
 ) -> CollocatedPhaseEnd:
     """Return the state at the end of a phase that starts with coordinates `q` and rates `v`.
 
     The phase ends at the root of its event guard that is near `expected_duration`.
     """
-    interval_length_fractions, lane_zeros = (
-        phase_mesh.interval_length_fractions,
-        jnp.zeros_like(expected_duration),
-    )
+    length_fractions = phase_mesh.interval_length_fractions
     # The nonlinear part scales with the squared ratio of successive interval lengths.
-    nonlinear_growth_factor = float(
-        interval_length_fractions[-1] / interval_length_fractions[0]
-    ) ** (2.0 / max(phase_mesh.n_intervals - 1, 1))
+    nonlinear_growth_factor = float(length_fractions[-1] / length_fractions[0]) ** (
+        2.0 / max(phase_mesh.n_intervals - 1, 1)
+    )
 
     def advance_interval(
-        interval_carry: tuple, interval_length_fraction: Array
-    ) -> tuple[tuple, None]:
-        (
-            q,
-            v,
-            rate_correction,
-            start_rate_error,
-            lowest_guard_value,
-            end_guard_values,
-            nonlinear_accelerations,
-        ) = interval_carry
-        h = interval_length_fraction * expected_duration
-        solved_mesh_interval = _solve_mesh_interval(
-            phase, q, v, h, nonlinear_accelerations, options
+        progress: _PhaseProgress, length_fraction: Any, ends_at_event: bool = False
+    ) -> tuple[_PhaseProgress, _SolvedMeshInterval]:
+        interval = _solve_mesh_interval(
+            phase,
+            progress.q,
+            progress.v,
+            length_fraction * expected_duration,
+            jax.tree.map(lambda x: nonlinear_growth_factor * x, progress.nonlinear_accelerations),
+            ends_at_event,
         )
-        lowest_interval_guard_value, end_guard_values = _find_lowest_guard_value(
-            phase, q, v, solved_mesh_interval, end_guard_values, 0
+        lowest_guard_value, end_guard_values = _find_lowest_guard_value(
+            phase, progress.q, progress.v, interval, progress.guard_values, int(ends_at_event)
         )
-        interval_carry = (
-            *solved_mesh_interval.interval_end_state,
+        return _PhaseProgress(
+            *interval.interval_end_state,
             jnp.maximum(
-                rate_correction, _estimate_next_correction(solved_mesh_interval.newton_sweep_state)
+                progress.estimated_rate_correction,
+                _estimate_next_correction(interval.newton_sweep_state),
             ),
-            jnp.maximum(start_rate_error, solved_mesh_interval.largest_start_rate_error),
-            jnp.minimum(lowest_guard_value, lowest_interval_guard_value),
+            jnp.maximum(progress.largest_start_rate_error, interval.largest_start_rate_error),
+            jnp.minimum(progress.lowest_guard_value, lowest_guard_value),
             end_guard_values,
-            tuple(
-                tuple(nonlinear_growth_factor * x for x in node_acceleration)
-                for node_acceleration in solved_mesh_interval.nonlinear_accelerations
-            ),
-        )
-        return interval_carry, None
+            interval.nonlinear_accelerations,
+        ), interval
 
-    start_guard_values = phase.compute_guards(PhaseInstant(phase, phase.compute_motion(q, v), None))
-    interval_carry = (
+    lane_zeros = jnp.zeros_like(expected_duration)
+    progress = _PhaseProgress(
         q,
         v,
         lane_zeros,
         lane_zeros,
         lane_zeros + jnp.inf,
-        start_guard_values,
+        phase.compute_guards(PhaseInstant(phase, phase.compute_motion(q, v), None)),
         ((lane_zeros,) * len(q),) * N_GAUSS_NODES,
     )
-    if len(interval_length_fractions) > 1:
-        interval_carry, _ = lax.scan(
-            advance_interval,
-            interval_carry,
-            jnp.asarray(interval_length_fractions[:-1], expected_duration.dtype),
-        )
-    (
-        q,
-        v,
-        estimated_rate_correction,
-        largest_start_rate_error,
-        lowest_guard_value,
-        start_guard_values,
-        nonlinear_accelerations,
-    ) = interval_carry
-    h = float(interval_length_fractions[-1]) * expected_duration
-    last_mesh_interval = _solve_mesh_interval(
-        phase, q, v, h, nonlinear_accelerations, options, ends_at_event=True
+    progress, _ = lax.scan(
+        lambda progress, length_fraction: (advance_interval(progress, length_fraction)[0], None),
+        progress,
+        jnp.asarray(length_fractions[:-1], expected_duration.dtype),
     )
-    lowest_interval_guard_value, _ = _find_lowest_guard_value(
-        phase, q, v, last_mesh_interval, start_guard_values, 1
-    )
+    last_length_fraction = float(length_fractions[-1])
+    progress, last_interval = advance_interval(progress, last_length_fraction, ends_at_event=True)
+    last_interval_length = last_interval.newton_sweep_state.interval_length
     return CollocatedPhaseEnd(
-        *last_mesh_interval.interval_end_state,
-        phase_duration=float(1.0 - interval_length_fractions[-1]) * expected_duration
-        + last_mesh_interval.newton_sweep_state.interval_length
-        + last_mesh_interval.last_duration_correction,
-        estimated_rate_correction=jnp.maximum(
-            estimated_rate_correction,
-            _estimate_next_correction(last_mesh_interval.newton_sweep_state),
-        ),
-        last_duration_correction=jnp.abs(last_mesh_interval.last_duration_correction),
-        largest_start_rate_error=jnp.maximum(
-            largest_start_rate_error, last_mesh_interval.largest_start_rate_error
-        ),
-        lowest_guard_value=jnp.minimum(
-            jnp.minimum(lowest_guard_value, lowest_interval_guard_value),
-            last_mesh_interval.newton_sweep_state.interval_length,
-        ),
+        progress.q,
+        progress.v,
+        phase_duration=(1.0 - last_length_fraction) * expected_duration
+        + last_interval_length
+        + last_interval.last_duration_correction,
+        estimated_rate_correction=progress.estimated_rate_correction,
+        last_duration_correction=jnp.abs(last_interval.last_duration_correction),
+        largest_start_rate_error=progress.largest_start_rate_error,
+        lowest_guard_value=jnp.minimum(progress.lowest_guard_value, last_interval_length),
     )
 
 
@@ -286,64 +261,42 @@ def _estimate_next_correction(newton_sweep_state: _NewtonSweepState) -> Array:
     return newton_sweep_state.rate_correction * jnp.minimum(rate_correction_ratio, 1.0)
 
 
-def _sum_weighted_accelerations(
-    acceleration_weights: np.ndarray, node_accelerations: NodeAccelerations, coordinate_index: int
-) -> Any:
-    """Return the sum of one coordinate's accelerations at all nodes, weighted by
-    `acceleration_weights`.
-    """
-    return sum(
-        float(node_weight) * node_acceleration[coordinate_index]
-        for node_weight, node_acceleration in zip(
-            acceleration_weights, node_accelerations, strict=True
+def _sum_over_nodes(node_weights: np.ndarray, node_accelerations: NodeAccelerations) -> Vector:
+    """Return the weighted sum of the accelerations at all nodes, for each coordinate."""
+    return tuple(
+        sum(
+            float(node_weight) * acceleration
+            for node_weight, acceleration in zip(node_weights, accelerations, strict=True)
         )
+        for accelerations in zip(*node_accelerations, strict=True)
     )
 
 
-def _compute_interval_end_state(
-    q: Vector, v: Vector, h: Array, node_accelerations: NodeAccelerations
+def _compute_interval_state(
+    q: Vector,
+    v: Vector,
+    h: Array,
+    node_accelerations: NodeAccelerations,
+    length_fraction: float,
+    integration_weights: np.ndarray,
+    double_integration_weights: np.ndarray,
 ) -> tuple[Vector, Vector]:
-    """Return coordinates and rates at the end of a mesh interval of length `h` that starts at
+    """Return coordinates and rates at one location in a mesh interval of length `h` that starts at
     (q, v).
-    """
-    n = range(len(q))
-    return (
-        tuple(
-            q[d]
-            + h
-            * (v[d] + h * _sum_weighted_accelerations(DOUBLE_END_WEIGHTS, node_accelerations, d))
-            for d in n
-        ),
-        tuple(
-            v[d] + h * _sum_weighted_accelerations(END_WEIGHTS, node_accelerations, d) for d in n
-        ),
-    )
 
-
-def _compute_node_state(
-    node_index: int, q: Vector, v: Vector, h: Array, node_accelerations: NodeAccelerations
-) -> tuple:
-    """Return coordinates and rates at one node of a mesh interval of length `h` that starts at
-    (q, v).
+    - `length_fraction`: time from the start of the interval to the location, divided by `h`;
+    - `integration_weights`, `double_integration_weights`: weights of the node values in the single
+      and the double integral up to the location.
     """
-    n, node_fraction = range(len(q)), float(GAUSS_NODES[node_index])
     return (
-        tuple(
-            q[d]
-            + h
-            * (
-                node_fraction * v[d]
-                + h
-                * _sum_weighted_accelerations(
-                    DOUBLE_INTEGRATION_MATRIX[node_index], node_accelerations, d
-                )
-            )
-            for d in n
+        jax.tree.map(
+            lambda q, v, a: q + h * (length_fraction * v + h * a),
+            q,
+            v,
+            _sum_over_nodes(double_integration_weights, node_accelerations),
         ),
-        tuple(
-            v[d]
-            + h * _sum_weighted_accelerations(INTEGRATION_MATRIX[node_index], node_accelerations, d)
-            for d in n
+        jax.tree.map(
+            lambda v, a: v + h * a, v, _sum_over_nodes(integration_weights, node_accelerations)
         ),
     )
 
@@ -354,8 +307,7 @@ def _solve_mesh_interval(
     v: Vector,
     h: Array,
     nonlinear_accelerations: NodeAccelerations,
-    options: CollocationStepOptions,
-    ends_at_event: bool = False,
+    ends_at_event: bool,
 ) -> _SolvedMeshInterval:
     """Return the solution of the collocation equations in one mesh interval by Newton sweeps.
 
@@ -365,92 +317,70 @@ def _solve_mesh_interval(
     linearized at the middle, plus the `nonlinear_accelerations` of the previous interval. If the
     length changes, the new node accelerations are values of the polynomial through the old ones.
     """
-    n_dof = len(q)
-    interval_start_acceleration = phase.solve_acceleration(phase.compute_motion(q, v))[:n_dof]
-    coordinate_indices = range(n_dof)
-    interval_midpoint_state = (
-        tuple(
-            q[d] + 0.5 * h * (v[d] + 0.25 * h * interval_start_acceleration[d])
-            for d in coordinate_indices
-        ),
-        tuple(v[d] + 0.5 * h * interval_start_acceleration[d] for d in coordinate_indices),
+    start_acceleration = phase.solve_acceleration(phase.compute_motion(q, v))[: len(q)]
+    midpoint_state = (
+        jax.tree.map(lambda q, v, a: q + 0.5 * h * (v + 0.25 * h * a), q, v, start_acceleration),
+        jax.tree.map(lambda v, a: v + 0.5 * h * a, v, start_acceleration),
     )
-    dynamics_residual, residual_jacobian_q, residual_jacobian_v, residual_jacobian_a = (
-        _linearize_dynamics_residual(phase, *interval_midpoint_state, interval_start_acceleration)
+    dynamics_residual, jacobian_q, jacobian_v, jacobian_a = _linearize_dynamics_residual(
+        phase, *midpoint_state, start_acceleration
     )
     inverse_stage_matrices = [
-        _invert_stage_matrix(
-            complex(gauss_eigenvalue),
-            h,
-            residual_jacobian_q,
-            residual_jacobian_v,
-            residual_jacobian_a,
-        )
+        _invert_stage_matrix(complex(gauss_eigenvalue), h, jacobian_q, jacobian_v, jacobian_a)
         for gauss_eigenvalue in INTEGRATION_MATRIX_EIGENVALUES
     ]
 
     def apply_projected_correction(
         node_accelerations: NodeAccelerations, h: Array, residual_projections: list
     ) -> tuple[NodeAccelerations, Array]:
-        eigenvector_corrections = []
-        for inverse_stage_matrix, residual_projection in zip(
-            inverse_stage_matrices, residual_projections, strict=True
-        ):
-            matrix_products = [
-                [
-                    _multiply_complex_pairs(matrix_entry, x)
-                    for matrix_entry, x in zip(matrix_row, residual_projection, strict=True)
-                ]
-                for matrix_row in inverse_stage_matrix
-            ]
-            eigenvector_corrections.append(
-                [_add_complex_pairs(matrix_row) for matrix_row in matrix_products]
+        eigenvector_corrections = [
+            [_multiply_and_sum(matrix_row, residual_projection) for matrix_row in inverse_matrix]
+            for inverse_matrix, residual_projection in zip(
+                inverse_stage_matrices, residual_projections, strict=True
             )
+        ]
         return _correct_node_accelerations(node_accelerations, eigenvector_corrections, h)
 
     def run_newton_sweep(
         newton_sweep_state: _NewtonSweepState, _: None
     ) -> tuple[_NewtonSweepState, None]:
+        interval_length, node_accelerations, rate_correction = newton_sweep_state[:3]
         node_residuals = []
-        for node_index in range(N_GAUSS_NODES):
-            Q, V = _compute_node_state(
-                node_index,
+        for node_index, acceleration in enumerate(node_accelerations):
+            node_state = _compute_interval_state(
                 q,
                 v,
-                newton_sweep_state.interval_length,
-                newton_sweep_state.node_accelerations,
+                interval_length,
+                node_accelerations,
+                float(GAUSS_NODES[node_index]),
+                INTEGRATION_MATRIX[node_index],
+                DOUBLE_INTEGRATION_MATRIX[node_index],
             )
             node_residuals.append(
-                phase.compute_dynamics_residual(
-                    phase.compute_motion(Q, V), newton_sweep_state.node_accelerations[node_index]
-                )
+                phase.compute_dynamics_residual(phase.compute_motion(*node_state), acceleration)
             )
         # The projections have the sign of a correction.
         residual_projections = [
-            [
-                (
-                    _sum_weighted_accelerations(
-                        -eigenvector_weights.real, tuple(node_residuals), d
-                    ),
-                    _sum_weighted_accelerations(
-                        -eigenvector_weights.imag, tuple(node_residuals), d
-                    ),
+            list(
+                map(
+                    _ComplexNumber,
+                    _sum_over_nodes(-eigenvector_weights.real, tuple(node_residuals)),
+                    _sum_over_nodes(-eigenvector_weights.imag, tuple(node_residuals)),
                 )
-                for d in range(len(node_residuals[0]))
-            ]
+            )
             for eigenvector_weights in EIGENVECTOR_PROJECTION_MATRIX
         ]
         node_accelerations, largest_rate_correction = apply_projected_correction(
-            newton_sweep_state.node_accelerations,
-            newton_sweep_state.interval_length,
-            residual_projections,
+            node_accelerations, interval_length, residual_projections
         )
         return _NewtonSweepState(
-            newton_sweep_state.interval_length,
-            node_accelerations,
-            largest_rate_correction,
-            newton_sweep_state.rate_correction,
+            interval_length, node_accelerations, largest_rate_correction, rate_correction
         ), None
+
+    def compute_end_state(newton_sweep_state: _NewtonSweepState) -> tuple[Vector, Vector]:
+        return _compute_interval_state(
+            q, v, *newton_sweep_state[:2], 1.0, END_WEIGHTS, DOUBLE_END_WEIGHTS
+        )
 
     def evaluate_event_guard(q: Vector, v: Vector) -> tuple[Array, Vector]:
         phase_instant = PhaseInstant(phase, phase.compute_motion(q, v), None)
@@ -460,21 +390,14 @@ def _solve_mesh_interval(
         """Return the time from the end of the interval to the event, estimated by one Newton step,
         in the unit of `h`.
         """
-        interval_end_q, interval_end_v = _compute_interval_end_state(
-            q, v, newton_sweep_state.interval_length, newton_sweep_state.node_accelerations
-        )
-        _, interval_end_acceleration = evaluate_event_guard(interval_end_q, interval_end_v)
+        end_state = compute_end_state(newton_sweep_state)
+        _, end_acceleration = evaluate_event_guard(*end_state)
         (guard_value, _), (guard_rate, _) = jax.jvp(
-            evaluate_event_guard,
-            (interval_end_q, interval_end_v),
-            (interval_end_v, interval_end_acceleration),
+            evaluate_event_guard, end_state, (end_state[1], end_acceleration)
         )
         time_to_event = -guard_value / jnp.where(guard_rate < 0.0, guard_rate, -jnp.inf)
-        return jnp.clip(
-            time_to_event,
-            -0.5 * newton_sweep_state.interval_length,
-            0.5 * newton_sweep_state.interval_length,
-        )
+        half_length = 0.5 * newton_sweep_state.interval_length
+        return jnp.clip(time_to_event, -half_length, half_length)
 
     def correct_interval_duration(
         sweep_state_and_correction: tuple[_NewtonSweepState, Array], _: None
@@ -491,27 +414,22 @@ def _solve_mesh_interval(
             run_newton_sweep,
             newton_sweep_state,
             None,
-            length=options.n_sweeps_per_duration_correction,
+            length=COLLOCATION_STEP_OPTIONS.n_sweeps_per_duration_correction,
         )
         return (newton_sweep_state, compute_time_to_event(newton_sweep_state)), None
 
     linearized_solution, largest_rate_correction = apply_projected_correction(
-        (interval_start_acceleration,) * N_GAUSS_NODES,
+        (start_acceleration,) * N_GAUSS_NODES,
         h,
         _project_linearized_residuals(
-            dynamics_residual,
-            residual_jacobian_q,
-            residual_jacobian_v,
-            v,
-            interval_start_acceleration,
-            h,
+            dynamics_residual, jacobian_q, jacobian_v, v, start_acceleration, h
         ),
     )
-    initial_node_accelerations = _add_node_accelerations(
-        linearized_solution, nonlinear_accelerations, 1.0
-    )
     newton_sweep_state = _NewtonSweepState(
-        h, initial_node_accelerations, largest_rate_correction, largest_rate_correction
+        h,
+        jax.tree.map(operator.add, linearized_solution, nonlinear_accelerations),
+        largest_rate_correction,
+        largest_rate_correction,
     )
     duration_correction = jnp.zeros_like(h)
     if ends_at_event:
@@ -519,59 +437,34 @@ def _solve_mesh_interval(
             correct_interval_duration,
             (newton_sweep_state, compute_time_to_event(newton_sweep_state)),
             None,
-            length=options.n_duration_corrections,
+            length=COLLOCATION_STEP_OPTIONS.n_duration_corrections,
         )
     else:
         newton_sweep_state, _ = lax.scan(
-            run_newton_sweep, newton_sweep_state, None, length=options.n_sweeps_per_interval
+            run_newton_sweep,
+            newton_sweep_state,
+            None,
+            length=COLLOCATION_STEP_OPTIONS.n_sweeps_per_interval,
         )
+    node_accelerations = newton_sweep_state.node_accelerations
     start_rate_errors = [
-        jnp.abs(
-            _sum_weighted_accelerations(
-                START_EXTRAPOLATION_WEIGHTS, newton_sweep_state.node_accelerations, d
-            )
-            - interval_start_acceleration[d]
+        jnp.abs(extrapolated_acceleration - acceleration)
+        for extrapolated_acceleration, acceleration in zip(
+            _sum_over_nodes(START_EXTRAPOLATION_WEIGHTS, node_accelerations),
+            start_acceleration,
+            strict=True,
         )
-        for d in coordinate_indices
     ]
-    start_rate_error = newton_sweep_state.interval_length * functools.reduce(
-        jnp.maximum, start_rate_errors
-    )
     # The end state is extrapolated by the last correction of the duration, whose square is
     # negligible.
-    Q, V = _compute_interval_end_state(
-        q, v, newton_sweep_state.interval_length, newton_sweep_state.node_accelerations
-    )
-    interval_end_state = (
-        tuple(Q[d] + duration_correction * V[d] for d in coordinate_indices),
-        tuple(
-            V[d]
-            + duration_correction
-            * _sum_weighted_accelerations(
-                END_EXTRAPOLATION_WEIGHTS, newton_sweep_state.node_accelerations, d
-            )
-            for d in coordinate_indices
-        ),
-    )
+    Q, V = compute_end_state(newton_sweep_state)
+    end_acceleration = _sum_over_nodes(END_EXTRAPOLATION_WEIGHTS, node_accelerations)
     return _SolvedMeshInterval(
         newton_sweep_state,
-        interval_end_state,
+        jax.tree.map(lambda x, rate: x + duration_correction * rate, (Q, V), (V, end_acceleration)),
         duration_correction,
-        start_rate_error,
-        _add_node_accelerations(newton_sweep_state.node_accelerations, linearized_solution, -1.0),
-    )
-
-
-def _add_node_accelerations(
-    node_accelerations: NodeAccelerations,
-    added_accelerations: NodeAccelerations,
-    acceleration_factor: float,
-) -> NodeAccelerations:
-    """Return `node_accelerations` plus `acceleration_factor` times `added_accelerations`."""
-    node_acceleration_pairs = zip(node_accelerations, added_accelerations, strict=True)
-    return tuple(
-        tuple(x + acceleration_factor * y for x, y in zip(*node_acceleration_pair, strict=True))
-        for node_acceleration_pair in node_acceleration_pairs
+        newton_sweep_state.interval_length * functools.reduce(jnp.maximum, start_rate_errors),
+        jax.tree.map(operator.sub, node_accelerations, linearized_solution),
     )
 
 
@@ -579,25 +472,15 @@ def _stretch_node_accelerations(
     node_accelerations: NodeAccelerations, relative_length_change: Array
 ) -> NodeAccelerations:
     """Return the node accelerations of the interval after a small relative change of its length."""
-    coordinate_indices = range(len(node_accelerations[0]))
-    return tuple(
-        tuple(
-            node_accelerations[node_index][coordinate_index]
-            + relative_length_change
-            * (
-                _sum_weighted_accelerations(
-                    INTERVAL_STRETCH_WEIGHTS[node_index], node_accelerations, coordinate_index
-                )
-                + relative_length_change
-                * _sum_weighted_accelerations(
-                    INTERVAL_STRETCH_CURVATURE_WEIGHTS[node_index],
-                    node_accelerations,
-                    coordinate_index,
-                )
-            )
-            for coordinate_index in coordinate_indices
-        )
-        for node_index in range(N_GAUSS_NODES)
+    first_derivatives, second_derivatives = (
+        tuple(_sum_over_nodes(node_weights, node_accelerations) for node_weights in weight_matrix)
+        for weight_matrix in (INTERVAL_STRETCH_WEIGHTS, INTERVAL_STRETCH_CURVATURE_WEIGHTS)
+    )
+    return jax.tree.map(
+        lambda a, da, dda: a + relative_length_change * (da + relative_length_change * dda),
+        node_accelerations,
+        first_derivatives,
+        second_derivatives,
     )
 
 
@@ -618,29 +501,34 @@ def _linearize_dynamics_residual(phase: AbstractPhase, q: Vector, v: Vector, a: 
     return dynamics_residual, *(derivative_columns[i * n : (i + 1) * n] for i in range(3))
 
 
-ComplexNumberPair = tuple[Array, Array]
+@dataclass(frozen=True)
+class _ComplexNumber:
+    """Complex number. Machine code has no complex type."""
 
+    real: Any
+    imag: Any
 
-def _multiply_complex_pairs(x: ComplexNumberPair, y: ComplexNumberPair) -> ComplexNumberPair:
-    """Return the product of two complex numbers as a pair (real part, imaginary part)."""
-    return x[0] * y[0] - x[1] * y[1], x[0] * y[1] + x[1] * y[0]
+    def __add__(self, other: "_ComplexNumber") -> "_ComplexNumber":
+        return _ComplexNumber(self.real + other.real, self.imag + other.imag)
 
+    def __neg__(self) -> "_ComplexNumber":
+        return _ComplexNumber(-self.real, -self.imag)
 
-def _subtract_complex_pairs(x: ComplexNumberPair, y: ComplexNumberPair) -> ComplexNumberPair:
-    """Return the difference x - y of two complex numbers as a pair (real part, imaginary part)."""
-    return x[0] - y[0], x[1] - y[1]
+    def __sub__(self, other: "_ComplexNumber") -> "_ComplexNumber":
+        return _ComplexNumber(self.real - other.real, self.imag - other.imag)
 
-
-def _add_complex_pairs(complex_numbers: Sequence[ComplexNumberPair]) -> ComplexNumberPair:
-    """Return the sum of all `complex_numbers` as a pair (real part, imaginary part)."""
-    first_complex_number, *remaining_complex_numbers = complex_numbers
-    real_part, imaginary_part = first_complex_number
-    for complex_number in remaining_complex_numbers:
-        real_part, imaginary_part = (
-            real_part + complex_number[0],
-            imaginary_part + complex_number[1],
+    def __mul__(self, other: "_ComplexNumber") -> "_ComplexNumber":
+        return _ComplexNumber(
+            self.real * other.real - self.imag * other.imag,
+            self.real * other.imag + self.imag * other.real,
         )
-    return real_part, imaginary_part
+
+
+def _multiply_and_sum(
+    left_factors: Iterable[_ComplexNumber], right_factors: Iterable[_ComplexNumber]
+) -> _ComplexNumber:
+    """Return the sum of the products of corresponding factors."""
+    return functools.reduce(operator.add, map(operator.mul, left_factors, right_factors))
 
 
 def _invert_stage_matrix(
@@ -649,81 +537,55 @@ def _invert_stage_matrix(
     residual_jacobian_q: Any,
     residual_jacobian_v: Any,
     residual_jacobian_a: Any,
-) -> Any:
-    """Return the inverse of the complex stage matrix A + h e V + (h e)^2 Q as nested lists of
-    complex pairs.
+) -> list[list[_ComplexNumber]]:
+    """Return the inverse of the complex stage matrix A + h e V + (h e)^2 Q as nested lists.
 
     Here e is `gauss_eigenvalue`, and h is the length of the interval. A, V and Q are the
     derivatives of the residual with respect to accelerations, rates and coordinates.
     """
     n, squared_eigenvalue = len(residual_jacobian_q), gauss_eigenvalue * gauss_eigenvalue
-    scaled_eigenvalue = (h * gauss_eigenvalue.real, h * gauss_eigenvalue.imag)
-    scaled_squared_eigenvalue = (h * h * squared_eigenvalue.real, h * h * squared_eigenvalue.imag)
-    stage_matrix: list[list[ComplexNumberPair]] = [
+    scaled_eigenvalue = _ComplexNumber(h * gauss_eigenvalue.real, h * gauss_eigenvalue.imag)
+    scaled_square = _ComplexNumber(h * h * squared_eigenvalue.real, h * h * squared_eigenvalue.imag)
+    stage_matrix = [
         [
-            (
+            _ComplexNumber(
                 residual_jacobian_a[j][i]
-                + scaled_eigenvalue[0] * residual_jacobian_v[j][i]
-                + scaled_squared_eigenvalue[0] * residual_jacobian_q[j][i],
-                scaled_eigenvalue[1] * residual_jacobian_v[j][i]
-                + scaled_squared_eigenvalue[1] * residual_jacobian_q[j][i],
+                + scaled_eigenvalue.real * residual_jacobian_v[j][i]
+                + scaled_square.real * residual_jacobian_q[j][i],
+                scaled_eigenvalue.imag * residual_jacobian_v[j][i]
+                + scaled_square.imag * residual_jacobian_q[j][i],
             )
             for j in range(n)
         ]
         for i in range(n)
     ]
-    adjugate_matrix, stage_determinant = _compute_adjugate_and_determinant(stage_matrix)
-
-    squared_determinant_modulus = (
-        stage_determinant[0] * stage_determinant[0] + stage_determinant[1] * stage_determinant[1]
-    )
-    inverse_determinant = (
-        stage_determinant[0] / squared_determinant_modulus,
-        -stage_determinant[1] / squared_determinant_modulus,
+    adjugate_matrix, determinant = _compute_adjugate_and_determinant(stage_matrix)
+    squared_modulus = determinant.real * determinant.real + determinant.imag * determinant.imag
+    inverse_determinant = _ComplexNumber(
+        determinant.real / squared_modulus, -determinant.imag / squared_modulus
     )
     return [
-        [_multiply_complex_pairs(inverse_determinant, matrix_entry) for matrix_entry in matrix_row]
+        [inverse_determinant * matrix_entry for matrix_entry in matrix_row]
         for matrix_row in adjugate_matrix
     ]
 
 
 def _compute_adjugate_and_determinant(
-    complex_matrix: list[list[ComplexNumberPair]],
-) -> tuple[Any, ComplexNumberPair]:
-    """Return the adjugate, as nested lists, and the determinant of a complex square matrix.
+    m: list[list[_ComplexNumber]],
+) -> tuple[list[list[_ComplexNumber]], _ComplexNumber]:
+    """Return the adjugate and the determinant of a matrix `m` with one, two or three rows."""
+    if len(m) == 1:
+        return [[_ComplexNumber(1.0, 0.0)]], m[0][0]
+    if len(m) == 2:
+        return [[m[1][1], -m[0][1]], [-m[1][0], m[0][0]]], m[0][0] * m[1][1] - m[0][1] * m[1][0]
 
-    The matrix has one, two or three rows of complex pairs.
-    """
-    n = len(complex_matrix)
-    if n == 1:
-        complex_one = (
-            jnp.ones_like(complex_matrix[0][0][0]),
-            jnp.zeros_like(complex_matrix[0][0][0]),
-        )
-        return [[complex_one]], complex_matrix[0][0]
-    if n == 2:
-        negate_complex_pair = lambda x: (-x[0], -x[1])
-        adjugate_rows = [
-            [complex_matrix[1][1], negate_complex_pair(complex_matrix[0][1])],
-            [negate_complex_pair(complex_matrix[1][0]), complex_matrix[0][0]],
-        ]
-        return adjugate_rows, _subtract_complex_pairs(
-            _multiply_complex_pairs(complex_matrix[0][0], complex_matrix[1][1]),
-            _multiply_complex_pairs(complex_matrix[0][1], complex_matrix[1][0]),
-        )
-
-    def compute_cofactor(i: int, j: int) -> ComplexNumberPair:
+    def compute_cofactor(i: int, j: int) -> _ComplexNumber:
         (a, b), (c, d) = ((i + 1) % 3, (i + 2) % 3), ((j + 1) % 3, (j + 2) % 3)
-        return _subtract_complex_pairs(
-            _multiply_complex_pairs(complex_matrix[a][c], complex_matrix[b][d]),
-            _multiply_complex_pairs(complex_matrix[a][d], complex_matrix[b][c]),
-        )
+        return m[a][c] * m[b][d] - m[a][d] * m[b][c]
 
     adjugate_rows = [[compute_cofactor(j, i) for j in range(3)] for i in range(3)]
-    first_row_products = [
-        _multiply_complex_pairs(complex_matrix[0][k], adjugate_rows[k][0]) for k in range(3)
-    ]
-    return adjugate_rows, _add_complex_pairs(first_row_products)
+    first_column = [adjugate_row[0] for adjugate_row in adjugate_rows]
+    return adjugate_rows, _multiply_and_sum(m[0], first_column)
 
 
 def _project_linearized_residuals(
@@ -733,9 +595,8 @@ def _project_linearized_residuals(
     v: Vector,
     a: Vector,
     h: Array,
-) -> list[list[ComplexNumberPair]]:
-    """Return the projections of the negative node residuals onto all eigenvectors, as complex
-    pairs.
+) -> list[list[_ComplexNumber]]:
+    """Return the projections of the negative node residuals onto all eigenvectors.
 
     The residuals are those of constant accelerations `a` in the equations of motion that are
     linearized about the middle of the interval.
@@ -747,68 +608,60 @@ def _project_linearized_residuals(
     damping_term = multiply_by_columns(residual_jacobian_v, a)
     stiffness_rate_term = multiply_by_columns(residual_jacobian_q, v)
     stiffness_acceleration_term = multiply_by_columns(residual_jacobian_q, a)
-    residual_projections = []
-    for eigenvector_weights in EIGENVECTOR_PROJECTION_MATRIX:
-        weight_of_constant_term, weight_of_linear_term, weight_of_quadratic_term = (
-            -complex(np.sum(eigenvector_weights * node_fraction_powers))
-            for node_fraction_powers in (
-                np.ones(N_GAUSS_NODES),
-                GAUSS_NODES - 0.5,
-                0.5 * GAUSS_NODES * GAUSS_NODES - 0.125,
+
+    node_fraction_powers = np.stack(
+        [np.ones(N_GAUSS_NODES), GAUSS_NODES - 0.5, 0.5 * GAUSS_NODES * GAUSS_NODES - 0.125]
+    )
+    projected_powers = np.sum(EIGENVECTOR_PROJECTION_MATRIX[:, None] * node_fraction_powers, -1)
+
+    def sum_weighted_terms(term_weights: np.ndarray) -> Vector:
+        constant_weight, linear_weight, quadratic_weight = map(float, term_weights)
+        return tuple(
+            constant_weight * midpoint_residual[i]
+            + h
+            * (
+                linear_weight * (stiffness_rate_term[i] + damping_term[i])
+                + quadratic_weight * h * stiffness_acceleration_term[i]
             )
+            for i in n
         )
-        residual_projections.append(
-            [
-                tuple(
-                    take_real_or_imaginary_part(weight_of_constant_term) * midpoint_residual[i]
-                    + h
-                    * (
-                        take_real_or_imaginary_part(weight_of_linear_term)
-                        * (stiffness_rate_term[i] + damping_term[i])
-                        + take_real_or_imaginary_part(weight_of_quadratic_term)
-                        * h
-                        * stiffness_acceleration_term[i]
-                    )
-                    for take_real_or_imaginary_part in (lambda x: x.real, lambda x: x.imag)
-                )
-                for i in n
-            ]
-        )
-    return residual_projections
+
+    return [
+        list(map(_ComplexNumber, sum_weighted_terms(-w.real), sum_weighted_terms(-w.imag)))
+        for w in projected_powers
+    ]
 
 
 def _correct_node_accelerations(
     node_accelerations: NodeAccelerations,
-    eigenvector_corrections: list[list[ComplexNumberPair]],
+    eigenvector_corrections: list[list[_ComplexNumber]],
     h: Array,
 ) -> tuple[NodeAccelerations, Array]:
     """Return the corrected node accelerations, and the largest change of a rate that results."""
-    corrected_accelerations, largest_acceleration_change = [], jnp.zeros_like(h)
-    for node_index in range(N_GAUSS_NODES):
-        corrected_node_acceleration = []
-        for coordinate_index in range(len(node_accelerations[0])):
-            acceleration_change = sum(
-                float(2.0 * EIGENVECTOR_COLUMNS[node_index, eigenvalue_index].real)
-                * eigenvector_correction[coordinate_index][0]
-                - float(2.0 * EIGENVECTOR_COLUMNS[node_index, eigenvalue_index].imag)
-                * eigenvector_correction[coordinate_index][1]
-                for eigenvalue_index, eigenvector_correction in enumerate(eigenvector_corrections)
+    acceleration_changes = tuple(
+        tuple(
+            sum(
+                float(2.0 * eigenvector_entry.real) * correction.real
+                - float(2.0 * eigenvector_entry.imag) * correction.imag
+                for eigenvector_entry, correction in zip(
+                    eigenvector_entries, coordinate_corrections, strict=True
+                )
             )
-            corrected_node_acceleration.append(
-                node_accelerations[node_index][coordinate_index] + acceleration_change
-            )
-            largest_acceleration_change = jnp.maximum(
-                largest_acceleration_change, jnp.abs(acceleration_change)
-            )
-        corrected_accelerations.append(tuple(corrected_node_acceleration))
-    return tuple(corrected_accelerations), h * largest_acceleration_change
+            for coordinate_corrections in zip(*eigenvector_corrections, strict=True)
+        )
+        for eigenvector_entries in EIGENVECTOR_COLUMNS
+    )
+    largest_change = functools.reduce(
+        jnp.maximum, map(jnp.abs, jax.tree.leaves(acceleration_changes))
+    )
+    return jax.tree.map(operator.add, node_accelerations, acceleration_changes), h * largest_change
 
 
 def _find_lowest_guard_value(
     phase: AbstractPhase,
     q: Vector,
     v: Vector,
-    solved_mesh_interval: _SolvedMeshInterval,
+    interval: _SolvedMeshInterval,
     start_guard_values: Vector,
     n_event_guards: int,
 ) -> tuple[Array, Vector]:
@@ -822,46 +675,24 @@ def _find_lowest_guard_value(
     - `n_event_guards`: 1 in the last interval, whose first guard is that of the event and has the
       value 0 at the end; otherwise 0.
     """
-    newton_sweep_state, coordinate_indices = solved_mesh_interval.newton_sweep_state, range(len(q))
-    midpoint_acceleration = tuple(
-        _sum_weighted_accelerations(
-            MIDPOINT_INTERPOLATION_WEIGHTS, newton_sweep_state.node_accelerations, i
+    interval_length, node_accelerations, *_ = interval.newton_sweep_state
+    midpoint_state = _compute_interval_state(
+        q, v, interval_length, node_accelerations, 0.5, *MIDPOINT_INTEGRATION_WEIGHTS
+    )
+    midpoint_guard_values, end_guard_values = (
+        phase.compute_guards(
+            PhaseInstant(
+                phase,
+                phase.compute_motion(*interval_state),
+                _sum_over_nodes(acceleration_weights, node_accelerations),
+            )
         )
-        for i in coordinate_indices
-    )
-    interval_end_acceleration = tuple(
-        _sum_weighted_accelerations(
-            END_EXTRAPOLATION_WEIGHTS, newton_sweep_state.node_accelerations, i
+        for interval_state, acceleration_weights in (
+            (midpoint_state, MIDPOINT_INTERPOLATION_WEIGHTS),
+            (interval.interval_end_state, END_EXTRAPOLATION_WEIGHTS),
         )
-        for i in coordinate_indices
     )
-    velocity_integral, position_integral = (
-        tuple(
-            _sum_weighted_accelerations(w, newton_sweep_state.node_accelerations, i)
-            for i in coordinate_indices
-        )
-        for w in MIDPOINT_INTEGRATION_WEIGHTS
-    )
-    interval_midpoint_state = (
-        tuple(
-            q[i]
-            + newton_sweep_state.interval_length
-            * (0.5 * v[i] + newton_sweep_state.interval_length * position_integral[i])
-            for i in coordinate_indices
-        ),
-        tuple(
-            v[i] + newton_sweep_state.interval_length * velocity_integral[i]
-            for i in coordinate_indices
-        ),
-    )
-    evaluate_phase_guards = lambda q, v, a: phase.compute_guards(
-        PhaseInstant(phase, phase.compute_motion(q, v), a)
-    )
-    midpoint_guard_values = evaluate_phase_guards(*interval_midpoint_state, midpoint_acceleration)
-    end_guard_values = evaluate_phase_guards(
-        *solved_mesh_interval.interval_end_state, interval_end_acceleration
-    )
-    lowest_of_all_guard_values = jnp.full_like(newton_sweep_state.interval_length, jnp.inf)
+    lowest_of_all_guard_values = jnp.full_like(interval_length, jnp.inf)
     for i, (start_guard_value, midpoint_guard_value, end_guard_value) in enumerate(
         zip(start_guard_values, midpoint_guard_values, end_guard_values, strict=True)
     ):
@@ -891,34 +722,24 @@ def take_collocation_step(
     x: Vector,
     expected_durations: Vector,
     stop_at_lift_off: bool,
-    options: CollocationStepOptions = COLLOCATION_STEP_OPTIONS,
 ) -> CollocationStep:
     """Return the result of one gait step of every lane, computed near expected phase durations.
 
     - `x`: components of the section states, arrays over lanes, rad, rad/s, m/s;
-    - `expected_durations`: expected durations of DLS, SLS-I and SLS-II, arrays over lanes, s;
-    - `options`: amount of work and limits, in units of the wheel.
+    - `expected_durations`: expected durations of DLS, SLS-I and SLS-II, arrays over lanes, s.
     """
+    options = COLLOCATION_STEP_OPTIONS
     is_start_state_valid = is_valid_start_state(params, x)
     params, x = replace_invalid_inputs(is_start_state_valid, params, x, PAPER_START_STATE)
     wheel_units = compute_wheel_units(params.symbols())
     state_units: tuple[Any, ...] = (1.0, wheel_units.rate_unit, wheel_units.velocity_unit)
     params = convert_to_wheel_units(params)
-    x = tuple(
-        state_component / state_unit
-        for state_component, state_unit in zip(x, state_units, strict=True)
-    )
+    x = tuple(a / state_unit for a, state_unit in zip(x, state_units, strict=True))
+    expected_durations = tuple(duration / wheel_units.time_unit for duration in expected_durations)
+    for duration in expected_durations:
+        is_start_state_valid &= (duration > 0.0) & (duration < options.max_expected_duration)
     expected_durations = tuple(
-        expected_duration / wheel_units.time_unit for expected_duration in expected_durations
-    )
-    has_valid_duration = [
-        (expected_duration > 0.0) & (expected_duration < options.max_expected_duration)
-        for expected_duration in expected_durations
-    ]
-    is_start_state_valid = functools.reduce(operator.and_, has_valid_duration, is_start_state_valid)
-    expected_durations = tuple(
-        jnp.where(is_start_state_valid, expected_duration, 0.1)
-        for expected_duration in expected_durations
+        jnp.where(is_start_state_valid, duration, 0.1) for duration in expected_durations
     )
     s = params.symbols()
     landing_result = transitions.resolve_landing(s, *x)
@@ -935,7 +756,7 @@ def take_collocation_step(
     ):
         phase_start_state = collocated_phase.select_phase_coordinates(wheel_angle, wheel_motion)
         phase_end = solve_phase_by_collocation(
-            collocated_phase, *phase_start_state, expected_duration, phase_mesh, options
+            collocated_phase, *phase_start_state, expected_duration, phase_mesh
         )
         is_collocation_trusted = (
             is_collocation_trusted
@@ -944,29 +765,14 @@ def take_collocation_step(
             & (phase_end.largest_start_rate_error <= max_start_rate_error)
             & (phase_end.lowest_guard_value > 0.0)
         )
-        wheel_angle, wheel_motion = (
-            phase_end.q[0],
-            collocated_phase.reset_motion(
-                collocated_phase.compute_motion(phase_end.q, phase_end.v)
-            ),
-        )
+        end_motion = collocated_phase.compute_motion(phase_end.q, phase_end.v)
+        wheel_angle, wheel_motion = phase_end.q[0], collocated_phase.reset_motion(end_motion)
         phase_durations.append(phase_end.phase_duration)
 
-    def convert_trusted_lanes_to_si(
-        lane_result_arrays: Iterable[Array], si_units: Iterable[Any]
-    ) -> Vector:
-        """Return the arrays in SI units, with the value 0 in lanes that failed a check."""
-        return tuple(
-            jnp.where(is_collocation_trusted, dimensionless_array * si_unit, 0.0)
-            for dimensionless_array, si_unit in zip(lane_result_arrays, si_units, strict=True)
-        )
-
-    return CollocationStep(
-        convert_trusted_lanes_to_si(
-            (wheel_angle, wheel_motion.dtheta, wheel_motion.dL1), state_units
-        ),
-        convert_trusted_lanes_to_si(
-            phase_durations, [wheel_units.time_unit] * len(phase_durations)
-        ),
-        is_collocation_trusted,
+    results = (wheel_angle, wheel_motion.dtheta, wheel_motion.dL1, *phase_durations)
+    si_units = (*state_units, *(wheel_units.time_unit,) * len(phase_durations))
+    trusted_results = tuple(
+        jnp.where(is_collocation_trusted, x * si_unit, 0.0)
+        for x, si_unit in zip(results, si_units, strict=True)
     )
+    return CollocationStep(trusted_results[:3], trusted_results[3:], is_collocation_trusted)

@@ -70,25 +70,18 @@ def step_batch_with_contact(
         ]
     )
     section_states = embed_section_states(parameter_matrix, section_states, n_legs)
-    zeros_by_element = np.zeros(len(section_states), np.int32)
+    solver_indices = np.zeros(len(section_states), np.int32)
     if not derivative_names and not is_ground_uneven:
-        kernel_walk_result = walk_batch(
-            parameter_matrix, section_states, n_steps, model, options, n_legs
-        )
-        x, phase_durations, step_outcomes, n_stepped, n_solver_steps, _ = map(
-            np.asarray, kernel_walk_result
-        )
-        kernel_result_arrays = (
-            x,
-            phase_durations,
-            step_outcomes,
-            n_stepped,
-            n_solver_steps,
-            zeros_by_element > 0,
-            zeros_by_element,
+        *step_results, _ = map(
+            np.asarray,
+            walk_batch(parameter_matrix, section_states, n_steps, model, options, n_legs),
         )
         return StepBatchResult(
-            *kernel_result_arrays, engine="lanes", solver_names=(options.solver,)
+            *step_results,
+            is_collocated=solver_indices > 0,
+            solver_index=solver_indices,
+            engine="lanes",
+            solver_names=(options.solver,),
         )
     parameter_names: tuple[str, ...] = CONTACT_PARAMETER_NAMES
     stepwise_parameters: dict[str, StepwiseParameter] = {}
@@ -98,55 +91,38 @@ def step_batch_with_contact(
     active_walks = WalkBatch(
         section_states.T.copy(), derivative_names, parameter_names, stepwise_parameters
     )
+    input_indices = list(active_walks.input_indices)
     for k in range(n_steps):
         active_lanes = active_walks.find_walking_lanes()
         if not len(active_lanes):
             break
-        parameter_matrix = (
-            stepwise_ground.make_parameters_of_step(k, parameter_matrix)
-            if is_ground_uneven
-            else parameter_matrix
-        )
-        step_arguments = (
-            parameter_matrix[:, active_lanes],
-            active_walks.section_state[:, active_lanes].T,
-            model,
-            options,
-            n_legs,
-        )
-        if not derivative_names:
-            kernel_walk_result = walk_batch(
-                step_arguments[0], step_arguments[1], 1, *step_arguments[2:]
+        if is_ground_uneven:
+            parameter_matrix = stepwise_ground.make_parameters_of_step(k, parameter_matrix)
+        parameters_of_lanes = parameter_matrix[:, active_lanes]
+        start_states = active_walks.section_state[:, active_lanes].T
+        step_outputs: tuple[Any, ...]
+        if derivative_names:
+            step_result, step_jacobian = step_batch_with_jacobian(
+                parameters_of_lanes, start_states, model, options, n_legs, input_indices
             )
-            x, phase_durations, step_outcomes, _, n_solver_steps, _ = map(
-                np.asarray, kernel_walk_result
+            output_jacobian = np.concatenate(
+                [step_jacobian.section_state, step_jacobian.durations], 1
             )
-            active_walks.store_lane_steps(
-                active_lanes,
-                (x.T, phase_durations.T, step_outcomes, n_solver_steps),
-                zeros_by_element[active_lanes] > 0,
+            step_outputs = (
+                step_result.section_state,
+                step_result.durations,
+                step_result.outcome,
+                step_result.solver_steps,
+                output_jacobian[:, :, input_indices],
             )
-            continue
-        contact_step_result, step_jacobian = step_batch_with_jacobian(
-            *step_arguments, active_walks.input_indices
-        )
-        jacobian_of_all_inputs = np.concatenate(
-            [step_jacobian.section_state, step_jacobian.durations], 1
-        )
-        input_jacobian = jacobian_of_all_inputs[:, :, list(active_walks.input_indices)]
-        step_outputs = (
-            contact_step_result.section_state,
-            contact_step_result.durations,
-            contact_step_result.outcome,
-            contact_step_result.solver_steps,
-        )
-        active_walks.store_lane_steps(
-            active_lanes,
-            tuple(np.asarray(x).T for x in (*step_outputs, input_jacobian)),
-            zeros_by_element[active_lanes] > 0,
-        )
+        else:
+            x, phase_durations, step_outcomes, _, n_solver_steps, _ = walk_batch(
+                parameters_of_lanes, start_states, 1, model, options, n_legs
+            )
+            step_outputs = x, phase_durations, step_outcomes, n_solver_steps
+        active_walks.store_lane_steps(active_lanes, tuple(np.asarray(x).T for x in step_outputs))
     return active_walks.make_batch_result(
-        np.arange(len(section_states)), zeros_by_element, "lanes", (options.solver,)
+        np.arange(len(section_states)), solver_indices, "lanes", (options.solver,)
     )
 
 
@@ -170,9 +146,7 @@ class _StepwiseGround(NamedTuple):
         )
 
         def repeat_parameter_over_steps(x: np.ndarray, n_repetitions: int) -> np.ndarray:
-            return (
-                x if x.ndim == 2 else np.tile(np.broadcast_to(x, n_elements), (n_repetitions, 1)).T
-            )
+            return x if x.ndim == 2 else np.broadcast_to(x, (n_repetitions, n_elements)).T
 
         slopes_by_step = complete_slopes_over_steps(
             repeat_parameter_over_steps(element_slopes, n_steps + 1), n_steps
@@ -188,21 +162,12 @@ class _StepwiseGround(NamedTuple):
 
         The last two parameters are `UNEVEN_GROUND_PARAMETER_NAMES`.
         """
-        parameter_matrix = np.concatenate(
-            [
-                parameter_matrix[: len(CONTACT_PARAMETER_NAMES)],
-                np.empty((2, parameter_matrix.shape[1])),
-            ]
-        )
-        parameter_matrix[CONTACT_SLOPE_INDEX], parameter_matrix[CONTACT_FRICTION_INDEX] = (
-            self.slopes_by_step[k],
-            self.friction_by_step[k],
-        )
-        parameter_matrix[-2:] = (
-            self.friction_by_step[max(k - 1, 0)],
-            self.slopes_by_step[k + 1] - self.slopes_by_step[k],
-        )
-        return parameter_matrix
+        parameter_matrix = parameter_matrix[: len(CONTACT_PARAMETER_NAMES)].copy()
+        parameter_matrix[CONTACT_SLOPE_INDEX] = self.slopes_by_step[k]
+        parameter_matrix[CONTACT_FRICTION_INDEX] = self.friction_by_step[k]
+        previous_friction = self.friction_by_step[max(k - 1, 0)]
+        tilt = self.slopes_by_step[k + 1] - self.slopes_by_step[k]
+        return np.vstack([parameter_matrix, previous_friction, tilt])
 
     def make_stepwise_parameters(self) -> dict[str, StepwiseParameter]:
         """Return a mapping from parameter names to the terms by which the parameters enter the
@@ -212,24 +177,24 @@ class _StepwiseGround(NamedTuple):
         """
         previous_friction_input_index = len(CONTACT_PARAMETER_NAMES)
         tilt_input_index = previous_friction_input_index + 1
-        n_stepwise_slopes, n_stepwise_frictions = self.n_stepwise_slopes, self.n_stepwise_frictions
+        last_slope_index = (self.n_stepwise_slopes or 1) - 1
+        last_friction_index = (self.n_stepwise_frictions or 1) - 1
 
         def list_slope_chain_terms(k: int) -> tuple[tuple[int, int, float], ...]:
-            return (0, k, 1.0), (1, k, -1.0), (1, min(k + 1, (n_stepwise_slopes or 1) - 1), 1.0)
+            return (0, k, 1.0), (1, k, -1.0), (1, min(k + 1, last_slope_index), 1.0)
 
         def list_friction_chain_terms(k: int) -> tuple[tuple[int, int, float], ...]:
-            if n_stepwise_frictions is None:
-                return (0, 0, 1.0), (1, 0, 1.0)
+            k = min(k, last_friction_index)
             return (0, k, 1.0), (1, max(k - 1, 0), 1.0)
 
         stepwise_friction = StepwiseParameter(
             (CONTACT_FRICTION_INDEX, previous_friction_input_index),
-            n_stepwise_frictions,
+            self.n_stepwise_frictions,
             list_friction_chain_terms,
         )
-        if n_stepwise_slopes is None:
+        if self.n_stepwise_slopes is None:
             return {"friction": stepwise_friction}
         stepwise_slope = StepwiseParameter(
-            (CONTACT_SLOPE_INDEX, tilt_input_index), n_stepwise_slopes, list_slope_chain_terms
+            (CONTACT_SLOPE_INDEX, tilt_input_index), self.n_stepwise_slopes, list_slope_chain_terms
         )
         return {"slope": stepwise_slope, "friction": stepwise_friction}

@@ -48,11 +48,7 @@ class SolverSelectionOptions:
 SOLVER_SELECTION_OPTIONS = SolverSelectionOptions()
 
 
-def select_cheapest_solver(
-    parameter_matrix: np.ndarray,
-    options: StepOptions,
-    selection_options: SolverSelectionOptions = SOLVER_SELECTION_OPTIONS,
-) -> np.ndarray:
+def select_cheapest_solver(parameter_matrix: np.ndarray, options: StepOptions) -> np.ndarray:
     """Return the `SolverIndex` of the cheapest solver for each lane, shape (lanes,).
 
     Let c be the damping of a leg and m its mass. If legs are light, the airborne leg's fast mode
@@ -86,13 +82,16 @@ def select_cheapest_solver(
             )
 
         _, requested_solver_cost = estimate_solver_cost(options.solver)
-        n_solver_steps, stable_solver_cost = estimate_solver_cost(selection_options.stable_solver)
+        n_solver_steps, stable_solver_cost = estimate_solver_cost(
+            SOLVER_SELECTION_OPTIONS.stable_solver
+        )
         stable_solver_tolerance = (
-            relative_tolerance / selection_options.stable_solver_tightening_factor
+            relative_tolerance / SOLVER_SELECTION_OPTIONS.stable_solver_tightening_factor
         )
         is_stability_limited = n_solver_steps > stable_solver_tolerance**-0.2
         implicit_solver_cost = (
-            selection_options.implicit_solver_cost_evaluations * (1e-6 / relative_tolerance) ** 0.17
+            SOLVER_SELECTION_OPTIONS.implicit_solver_cost_evaluations
+            * (1e-6 / relative_tolerance) ** 0.17
         )
         solver_costs = (
             requested_solver_cost,

@@ -1,6 +1,5 @@
 """Results of batches of walks, and derivatives with respect to their starts and parameters."""
 
-import itertools
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -135,39 +134,31 @@ class WalkBatch:
           name.
         """
         section_state_size, n_lanes = section_states.shape
-        self.section_state, self.durations = (
-            section_states,
-            np.zeros((3, n_lanes), section_states.dtype),
-        )
+        self.section_state = section_states
+        self.durations = np.zeros((3, n_lanes), section_states.dtype)
         self.outcome, self.n_stepped, self.solver_steps = np.zeros((3, n_lanes), np.int32)
         self.is_collocated = np.zeros(n_lanes, bool)
-        # Axis 0 of the Jacobian contains the requested parameters, and then the start.
         self.derivative_names = derivative_names
-        self.differentiated_parameter_names = [
-            input_name for input_name in derivative_names if input_name != START_INPUT_NAME
-        ]
-        self.has_flat_ground = not stepwise_parameters
-        make_single_input = lambda input_name: StepwiseParameter(
-            (step_parameter_names.index(input_name),), None, lambda _: ((0, 0, 1.0),)
-        )
-        self.differentiated_parameters = [
-            stepwise_parameters.get(input_name, make_single_input(input_name))
-            for input_name in self.differentiated_parameter_names
-        ]
+        self.differentiated_parameters = {
+            input_name: stepwise_parameters.get(input_name)
+            or StepwiseParameter(
+                (step_parameter_names.index(input_name),), None, lambda _: ((0, 0, 1.0),)
+            )
+            for input_name in derivative_names
+            if input_name != START_INPUT_NAME
+        }
         parameter_input_indices = [
             i
-            for stepwise_parameter in self.differentiated_parameters
+            for stepwise_parameter in self.differentiated_parameters.values()
             for i in stepwise_parameter.input_indices
         ]
-        state_input_indices = range(
-            len(step_parameter_names), len(step_parameter_names) + section_state_size
-        )
-        self.input_indices = (
-            (*parameter_input_indices, *state_input_indices) if derivative_names else ()
+        state_input_indices = len(step_parameter_names) + np.arange(section_state_size)
+        self.input_indices: tuple[int, ...] = (
+            (*parameter_input_indices, *state_input_indices.tolist()) if derivative_names else ()
         )
         n_jacobian_rows_by_parameter = [
             stepwise_parameter.n_stepwise_values or 1
-            for stepwise_parameter in self.differentiated_parameters
+            for stepwise_parameter in self.differentiated_parameters.values()
         ]
         # The first index of each parameter on axis 0 of the Jacobian, and then that of the start.
         self.first_jacobian_rows = np.cumsum([0, *n_jacobian_rows_by_parameter])
@@ -195,18 +186,20 @@ class WalkBatch:
         """
         inverse_lane_order = np.empty_like(lane_order)
         inverse_lane_order[lane_order] = np.arange(len(lane_order))
-        restore_lane_order = lambda x: x.take(inverse_lane_order, -1).T
+        lane_arrays = (
+            self.section_state,
+            self.durations,
+            self.outcome,
+            self.n_stepped,
+            self.solver_steps,
+            self.is_collocated,
+            solver_index,
+        )
         return StepBatchResult(
-            restore_lane_order(self.section_state),
-            restore_lane_order(self.durations),
-            restore_lane_order(self.outcome),
-            restore_lane_order(self.n_stepped),
-            restore_lane_order(self.solver_steps),
-            restore_lane_order(self.is_collocated),
-            restore_lane_order(solver_index),
-            engine,
-            solver_names,
-            self.split_jacobian_by_input(inverse_lane_order),
+            *(x.take(inverse_lane_order, -1).T for x in lane_arrays),
+            engine=engine,
+            solver_names=solver_names,
+            derivatives=self.split_jacobian_by_input(inverse_lane_order),
         )
 
     def split_jacobian_by_input(self, inverse_lane_order: np.ndarray) -> dict[str, StepSensitivity]:
@@ -218,39 +211,29 @@ class WalkBatch:
         if not self.derivative_names:
             return {}
         self.walk_jacobian[..., self.outcome != Outcome.STEPPED] = 0.0
-        jacobian_in_batch_order, section_state_size = (
-            self.walk_jacobian.take(inverse_lane_order, -1).T,
-            len(self.section_state),
+        jacobian_blocks = np.split(
+            self.walk_jacobian.take(inverse_lane_order, -1).T, self.first_jacobian_rows[1:], -1
         )
-        jacobian_rows_by_input: dict[str, Any] = {
-            START_INPUT_NAME: slice(self.first_jacobian_rows[-1], None)
-        }
-        for input_name, stepwise_parameter, first_jacobian_row in zip(
-            self.differentiated_parameter_names,
-            self.differentiated_parameters,
-            self.first_jacobian_rows[:-1],
-            strict=True,
-        ):
-            n_stepwise_values = stepwise_parameter.n_stepwise_values
-            jacobian_rows_by_input[input_name] = (
-                first_jacobian_row
-                if n_stepwise_values is None
-                else slice(first_jacobian_row, first_jacobian_row + n_stepwise_values)
-            )
-        jacobian_by_input = {
-            input_name: jacobian_in_batch_order[:, :, jacobian_rows_by_input[input_name]]
-            for input_name in self.derivative_names
-        }
+        jacobian_by_input = dict(
+            zip((*self.differentiated_parameters, START_INPUT_NAME), jacobian_blocks, strict=True)
+        )
+        for input_name, stepwise_parameter in self.differentiated_parameters.items():
+            if stepwise_parameter.n_stepwise_values is None:
+                jacobian_by_input[input_name] = jacobian_by_input[input_name][..., 0]
+        n_components = len(self.section_state)
         return {
-            input_name: StepSensitivity(x[:, :section_state_size], x[:, section_state_size:])
-            for input_name, x in jacobian_by_input.items()
+            input_name: StepSensitivity(
+                jacobian_by_input[input_name][:, :n_components],
+                jacobian_by_input[input_name][:, n_components:],
+            )
+            for input_name in self.derivative_names
         }
 
     def store_lane_steps(
         self,
         lane_indices: np.ndarray,
         step_outputs: tuple[np.ndarray, ...],
-        is_collocated: np.ndarray,
+        is_collocated: np.ndarray | bool = False,
     ) -> None:
         """Store the results of one gait step of the lanes at `lane_indices`.
 
@@ -258,94 +241,47 @@ class WalkBatch:
         derivatives are requested, Jacobians.
         """
         section_state, phase_durations, outcome, n_solver_steps, *step_jacobian = step_outputs
-        lane_selection = select_lanes(lane_indices, self)
+        lanes = select_lanes(lane_indices, self)
         if step_jacobian:
-            self.walk_jacobian = _replace_lane_values(
-                self.walk_jacobian,
-                lane_selection,
-                self._chain_walk_jacobian(lane_selection, *step_jacobian),
-            )
-        self.section_state = _replace_lane_values(self.section_state, lane_selection, section_state)
-        self.durations = _replace_lane_values(self.durations, lane_selection, phase_durations)
-        self.outcome = _replace_lane_values(self.outcome, lane_selection, outcome)
-        self.is_collocated = _replace_lane_values(self.is_collocated, lane_selection, is_collocated)
-        self.n_stepped[lane_selection] += outcome == Outcome.STEPPED
-        self.solver_steps[lane_selection] += n_solver_steps
+            self.walk_jacobian[..., lanes] = self._chain_walk_jacobian(lanes, *step_jacobian)
+        self.section_state[:, lanes] = section_state
+        self.durations[:, lanes] = phase_durations
+        self.outcome[lanes] = outcome
+        self.is_collocated[lanes] = is_collocated
+        self.n_stepped[lanes] += outcome == Outcome.STEPPED
+        self.solver_steps[lanes] += n_solver_steps
 
-    def _chain_walk_jacobian(self, lane_selection: Any, step_jacobian: np.ndarray) -> np.ndarray:
+    def _chain_walk_jacobian(self, lanes: Any, step_jacobian: np.ndarray) -> np.ndarray:
         """Return the Jacobian of the walk after the last gait step, shape (inputs, outputs, lanes).
 
-        The products are summed one after another, so that a lane's digits do not depend on the
-        batch.
+        Axis 0 has one index for each value of a parameter that varies over gait steps. The products
+        are summed one after another, so that a lane's digits do not depend on the batch.
         """
-        if not self.has_flat_ground:
-            return self._chain_stepwise_jacobian(lane_selection, step_jacobian)
-        n_parameters, section_state_size = (
-            len(self.differentiated_parameter_names),
-            len(self.section_state),
-        )
-        if not self.n_stepped[lane_selection].any():
-            return step_jacobian
-        previous_walk_jacobian = self.walk_jacobian[:, :section_state_size, lane_selection]
-        chained_walk_jacobian = sum(
-            step_jacobian[n_parameters + i] * previous_walk_jacobian[:, i, None]
-            for i in range(section_state_size)
-        )
-        chained_walk_jacobian[:n_parameters] += step_jacobian[:n_parameters]
-        return chained_walk_jacobian
-
-    def _chain_stepwise_jacobian(
-        self, lane_selection: Any, step_jacobian: np.ndarray
-    ) -> np.ndarray:
-        """Return the Jacobian of the walk, shape (inputs, outputs, lanes), if some parameters vary
-        over gait steps.
-
-        Axis 0 has one index for each value of such a parameter. The derivatives with respect to
-        values of later steps are still 0.
-        """
-        section_state_size, first_start_state_row = (
-            len(self.section_state),
-            self.first_jacobian_rows[-1],
-        )
-        n_step_inputs = len(step_jacobian) - section_state_size
-        k = int(np.max(self.n_stepped[lane_selection], initial=0))
+        n_components = len(self.section_state)
+        state_jacobian = step_jacobian[-n_components:]
+        k = int(np.max(self.n_stepped[lanes], initial=0))
         walk_jacobian_shape = len(self.walk_jacobian), *step_jacobian.shape[1:]
         chained_walk_jacobian = np.zeros(walk_jacobian_shape, step_jacobian.dtype)
         if k == 0:
-            chained_walk_jacobian[first_start_state_row:] = step_jacobian[n_step_inputs:]
+            chained_walk_jacobian[-n_components:] = state_jacobian
         else:
-            nonzero_jacobian_row_ranges = [
-                range(first_jacobian_row, min(first_jacobian_row + k + 1, next_jacobian_row))
-                for first_jacobian_row, next_jacobian_row in itertools.pairwise(
-                    self.first_jacobian_rows
-                )
-            ]
-            nonzero_jacobian_rows = np.array(
-                [
-                    *itertools.chain(*nonzero_jacobian_row_ranges),
-                    *range(first_start_state_row, len(chained_walk_jacobian)),
-                ]
+            # The derivatives with respect to values of later steps are still 0.
+            nonzero_rows = np.flatnonzero(self.walk_jacobian.any((1, 2)))
+            previous_jacobian = self.walk_jacobian[nonzero_rows, :n_components][..., lanes]
+            chained_walk_jacobian[nonzero_rows] = sum(
+                state_jacobian[i] * previous_jacobian[:, i, None] for i in range(n_components)
             )
-            previous_walk_jacobian = self.walk_jacobian[nonzero_jacobian_rows, :section_state_size][
-                ..., lane_selection
-            ]
-            chained_walk_jacobian[nonzero_jacobian_rows] = sum(
-                step_jacobian[n_step_inputs + i] * previous_walk_jacobian[:, i, None]
-                for i in range(section_state_size)
-            )
-        first_parameter_input_row = 0
+        first_input_row = 0
         for stepwise_parameter, first_jacobian_row in zip(
-            self.differentiated_parameters, self.first_jacobian_rows[:-1], strict=True
+            self.differentiated_parameters.values(), self.first_jacobian_rows[:-1], strict=True
         ):
-            for (
-                input_position,
-                stepwise_value_index,
-                input_derivative,
-            ) in stepwise_parameter.list_chain_rule_terms(k):
-                chained_walk_jacobian[first_jacobian_row + stepwise_value_index] += (
-                    input_derivative * step_jacobian[first_parameter_input_row + input_position]
+            for input_position, value_index, derivative in stepwise_parameter.list_chain_rule_terms(
+                k
+            ):
+                chained_walk_jacobian[first_jacobian_row + value_index] += (
+                    derivative * step_jacobian[first_input_row + input_position]
                 )
-            first_parameter_input_row += len(stepwise_parameter.input_indices)
+            first_input_row += len(stepwise_parameter.input_indices)
         return chained_walk_jacobian
 
 
@@ -355,16 +291,3 @@ def select_lanes(lane_indices: np.ndarray, walk_batch: WalkBatch) -> Any:
     If these are all lanes, the index is a slice, which copies nothing.
     """
     return slice(None) if len(lane_indices) == len(walk_batch.outcome) else lane_indices
-
-
-def _replace_lane_values(
-    lane_values: np.ndarray, lane_selection: Any, new_lane_values: np.ndarray
-) -> np.ndarray:
-    """Return `lane_values` with new values of the selected lanes.
-
-    Unless all lanes are selected, the array is changed in place.
-    """
-    if isinstance(lane_selection, slice):
-        return new_lane_values
-    lane_values[..., lane_selection] = new_lane_values
-    return lane_values
