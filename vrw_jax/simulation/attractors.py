@@ -46,7 +46,7 @@ class AttractorOptions:
     """
 
 
-DEFAULT_ATTRACTOR_OPTIONS = AttractorOptions()
+ATTRACTOR_OPTIONS = AttractorOptions()
 
 
 class PeriodicWalkEnds(NamedTuple):
@@ -83,23 +83,20 @@ def _simulate_starts_with_contact(
     The arrays have the shapes (starts, steps, m) and (starts, steps), where m is the number of
     entries of a section state. The batch kernel computes the steps for any number of starts.
     """
-    n_legs, parameter_rows = (
-        params.n_legs,
-        np.asarray(jax.vmap(model.collect_parameter_values)(params)).T,
-    )
-    x = embed_section_states(parameter_rows, np.asarray(x), n_legs)
-    states_by_step, outcomes_by_step = list[np.ndarray](), list[np.ndarray]()
+    parameter_rows = _stack_contact_parameters(model, params)
+    x = embed_section_states(parameter_rows, np.asarray(x), params.n_legs)
+    states_by_step, outcomes_by_step = list[np.ndarray](), [np.zeros(len(x), np.int32)]
     for _ in range(n_steps):
-        x, _, step_outcomes, *_ = walk_batch(parameter_rows, x, 1, model, options, n_legs)
-        # A wheel that fell has no section state, so its outcome does not change.
-        step_outcomes = (
-            step_outcomes
-            if not outcomes_by_step
-            else np.where(outcomes_by_step[-1] > 0, outcomes_by_step[-1], step_outcomes)
-        )
+        x, _, step_outcomes, *_ = walk_batch(parameter_rows, x, 1, model, options, params.n_legs)
         states_by_step.append(x)
-        outcomes_by_step.append(step_outcomes)
-    return np.stack(states_by_step, 1), np.stack(outcomes_by_step, 1)
+        # A wheel that fell has no section state, so its outcome does not change.
+        outcomes_by_step.append(np.where(outcomes_by_step[-1], outcomes_by_step[-1], step_outcomes))
+    return np.stack(states_by_step, 1), np.stack(outcomes_by_step[1:], 1)
+
+
+def _stack_contact_parameters(model: Any, params: WheelParams) -> np.ndarray:
+    """Return the parameters of wheels with unilateral contact, shape (parameters, wheels)."""
+    return np.asarray(jax.vmap(model.collect_parameter_values)(params)).T
 
 
 def walk_until_periodic(
@@ -109,7 +106,6 @@ def walk_until_periodic(
     options: StepOptions,
     max_steps: int,
     max_period: int,
-    attractor_options: AttractorOptions = DEFAULT_ATTRACTOR_OPTIONS,
 ) -> PeriodicWalkEnds:
     """Simulate the walk from each start until it is periodic or has failed, and return its end.
 
@@ -118,99 +114,78 @@ def walk_until_periodic(
     - `max_period`: longest period that is detected, in steps.
     """
     n_starts = len(start_states)
-    start_axis_broadcaster = lambda x: np.broadcast_to(np.asarray(x), n_starts)
-    repeated_wheels = jax.tree.map(start_axis_broadcaster, params)
-    n_steps_of_round = attractor_options.n_steps_per_round
-    n_walk_rounds = -(-max_steps // n_steps_of_round)
+    repeated_wheels = jax.tree.map(lambda x: np.broadcast_to(np.asarray(x), n_starts), params)
+    n_steps_of_round = ATTRACTOR_OPTIONS.n_steps_per_round
+    n_rounds = -(-max_steps // n_steps_of_round)
     state_history = np.full(
-        (n_starts, 1 + n_walk_rounds * n_steps_of_round, start_states.shape[1]), np.nan
+        (n_starts, 1 + n_rounds * n_steps_of_round, start_states.shape[1]), np.nan
     )
     state_history[:, 0] = start_states
     walk_outcomes = np.full(n_starts, int(Outcome.STEPPED))
     orbit_periods, n_steps_to_orbit = np.zeros(n_starts, int), np.zeros(n_starts, int)
     unsettled_walk_indices = np.arange(n_starts)
-    walk_round_simulator: Callable[..., tuple]
+    simulate_round: Callable[..., tuple]
     if model.batch_kernel == "legs":
-        walk_round_simulator = functools.partial(
+        simulate_round = functools.partial(
             _simulate_starts_with_contact, model, options, n_steps_of_round
         )
     else:
-        start_block_walker = functools.partial(
-            _simulate_block_of_starts, model, options, n_steps_of_round
+        simulate_round = functools.partial(
+            map_in_batches,
+            functools.partial(_simulate_block_of_starts, model, options, n_steps_of_round),
+            (batch_sizes.ATTRACTOR_BATCH_SIZE,),
         )
-        walk_round_simulator = functools.partial(
-            map_in_batches, start_block_walker, (batch_sizes.ATTRACTOR_BATCH_SIZE,)
+    for first_step in range(0, n_rounds * n_steps_of_round, n_steps_of_round):
+        last_step = first_step + n_steps_of_round
+        section_states, step_outcomes = map(
+            np.asarray,
+            simulate_round(
+                select_tree_rows(repeated_wheels, unsettled_walk_indices),
+                state_history[unsettled_walk_indices, first_step],
+            ),
         )
-    for k in range(n_walk_rounds):
-        step_slice_of_round = slice(1 + k * n_steps_of_round, 1 + (k + 1) * n_steps_of_round)
-        walk_arguments_of_round = (
-            select_tree_rows(repeated_wheels, unsettled_walk_indices),
-            state_history[unsettled_walk_indices, k * n_steps_of_round],
-        )
-        section_states_of_round, step_outcomes = map(
-            np.asarray, walk_round_simulator(*walk_arguments_of_round)
-        )
-        (
-            state_history[unsettled_walk_indices, step_slice_of_round],
-            walk_outcomes[unsettled_walk_indices],
-        ) = (
-            section_states_of_round,
-            step_outcomes[:, -1],
-        )
-        n_steps_to_orbit[unsettled_walk_indices] = k * n_steps_of_round + np.sum(
+        state_history[unsettled_walk_indices, first_step + 1 : last_step + 1] = section_states
+        walk_outcomes[unsettled_walk_indices] = step_outcomes[:, -1]
+        n_steps_to_orbit[unsettled_walk_indices] = first_step + np.sum(
             step_outcomes == Outcome.STEPPED, 1
         )
-        n_steps_taken = (k + 1) * n_steps_of_round
-        orbit_periods[unsettled_walk_indices] = _detect_walk_periods(
-            state_history[unsettled_walk_indices, : n_steps_taken + 1],
-            max_period,
-            attractor_options.periodicity_tolerance,
+        is_walking = step_outcomes[:, -1] == Outcome.STEPPED
+        detected_periods = is_walking * _detect_walk_periods(
+            state_history[unsettled_walk_indices, : last_step + 1], max_period
         )
-        orbit_periods[walk_outcomes != Outcome.STEPPED] = 0
-        unsettled_walk_indices = unsettled_walk_indices[
-            (walk_outcomes[unsettled_walk_indices] == Outcome.STEPPED)
-            & (orbit_periods[unsettled_walk_indices] == 0)
-        ]
+        orbit_periods[unsettled_walk_indices] = detected_periods
+        unsettled_walk_indices = unsettled_walk_indices[is_walking & (detected_periods == 0)]
         if not len(unsettled_walk_indices):
             break
     orbit_states = np.full((n_starts, max_period, start_states.shape[1]), np.nan)
     for i in np.flatnonzero(orbit_periods):
-        last_period_states = state_history[
-            i, n_steps_to_orbit[i] + 1 - orbit_periods[i] : n_steps_to_orbit[i] + 1
-        ]
+        states_of_walk = state_history[i, : n_steps_to_orbit[i] + 1]
+        last_period_states = states_of_walk[-orbit_periods[i] :]
         orbit_states[i, : orbit_periods[i]] = np.roll(
             last_period_states, -int(np.argmin(last_period_states[:, 1])), axis=0
         )
-        orbit_distances = np.linalg.norm(
-            state_history[i, : n_steps_to_orbit[i] + 1, None] - last_period_states[None], axis=-1
-        ).min(1)
-        distant_state_indices = np.flatnonzero(
-            orbit_distances > attractor_options.max_distance_on_arrival
+        orbit_distances = np.linalg.norm(states_of_walk[:, None] - last_period_states, axis=-1).min(
+            1
         )
-        n_steps_to_orbit[i] = distant_state_indices[-1] + 1 if len(distant_state_indices) else 0
+        distant_states = np.flatnonzero(orbit_distances > ATTRACTOR_OPTIONS.max_distance_on_arrival)
+        n_steps_to_orbit[i] = distant_states[-1] + 1 if len(distant_states) else 0
     return PeriodicWalkEnds(walk_outcomes, orbit_periods, n_steps_to_orbit, orbit_states)
 
 
-def _detect_walk_periods(
-    state_history: np.ndarray, max_period: int, periodicity_tolerance: float
-) -> np.ndarray:
+def _detect_walk_periods(state_history: np.ndarray, max_period: int) -> np.ndarray:
     """Return the shortest period that the last two periods of each walk confirm, in steps, or 0.
 
-    - `state_history`: section states, (starts, steps, entries);
-    - `periodicity_tolerance`: see `AttractorOptions`.
+    - `state_history`: section states, (starts, steps, entries).
     """
     detected_periods = np.zeros(len(state_history), int)
-    n_walked_states = state_history.shape[1]
-    for candidate_period in range(min(max_period, (n_walked_states - 1) // 3), 0, -1):
-        state_changes_over_period = np.abs(
-            state_history[:, n_walked_states - 2 * candidate_period :]
-            - state_history[
-                :, n_walked_states - 3 * candidate_period : n_walked_states - candidate_period
-            ]
+    n_states = state_history.shape[1]
+    for period in range(min(max_period, (n_states - 1) // 3), 0, -1):
+        state_changes = np.abs(
+            state_history[:, n_states - 2 * period :]
+            - state_history[:, n_states - 3 * period : n_states - period]
         )
-        detected_periods[state_changes_over_period.max((1, 2)) < periodicity_tolerance] = (
-            candidate_period
-        )
+        is_periodic = state_changes.max((1, 2)) < ATTRACTOR_OPTIONS.periodicity_tolerance
+        detected_periods[is_periodic] = period
     return detected_periods
 
 
@@ -224,9 +199,7 @@ class DistinctOrbits(NamedTuple):
     orbit_states: list[np.ndarray]  # section states of each orbit, (period, m)
 
 
-def find_distinct_orbits(
-    walk_ends: PeriodicWalkEnds, attractor_options: AttractorOptions = DEFAULT_ATTRACTOR_OPTIONS
-) -> DistinctOrbits:
+def find_distinct_orbits(walk_ends: PeriodicWalkEnds) -> DistinctOrbits:
     """Return the distinct orbits that the walks reach.
 
     Two orbits are compared state by state, beginning with the state that has the lowest dtheta-.
@@ -239,7 +212,7 @@ def find_distinct_orbits(
             if (
                 len(distinct_orbit_states) == len(orbit_states)
                 and np.abs(distinct_orbit_states - orbit_states).max()
-                < attractor_options.same_orbit_distance
+                < ATTRACTOR_OPTIONS.same_orbit_distance
             ):
                 orbit_indices[i] = j
                 break
@@ -273,17 +246,19 @@ def measure_orbit_steps(
     n_states = len(section_states)
     repeated_wheels = jax.tree.map(lambda x: np.broadcast_to(np.asarray(x), n_states), params)
     if model.batch_kernel == "legs":
-        parameter_rows = np.asarray(jax.vmap(model.collect_parameter_values)(repeated_wheels)).T
-        unilateral_model = cast(UnilateralWheel, model)
         step_results, _ = step_batch_with_jacobian(
-            parameter_rows, section_states, unilateral_model, options, params.n_legs, ()
+            _stack_contact_parameters(model, repeated_wheels),
+            section_states,
+            cast(UnilateralWheel, model),
+            options,
+            params.n_legs,
+            (),
         )
         return jax.tree.map(np.asarray, jax.tree.map(jnp.asarray, step_results).measures())
-    start_block_measurer = functools.partial(_measure_steps_of_block, model, options)
     return jax.tree.map(
         np.asarray,
         map_in_batches(
-            start_block_measurer,
+            functools.partial(_measure_steps_of_block, model, options),
             (batch_sizes.ATTRACTOR_BATCH_SIZE,),
             repeated_wheels,
             section_states,

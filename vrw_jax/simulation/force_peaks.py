@@ -71,45 +71,34 @@ def force_peaks(walk: xr.Dataset) -> xr.Dataset:
             f"walk holds {', '.join(map(str, walk)) or 'nothing'}, but no normal force of the "
             "feet: give the result of vrw.simulate."
         )
-    sample_times = walk.time.values
+    sample_times, sample_steps = walk.time.values, walk.step.values
     # The time of an event is listed twice, up to round-off.
     time_roundoff = 4.0 * np.finfo(float).eps * np.max(sample_times)
-    is_interval_end = (np.diff(sample_times) <= time_roundoff) | (np.diff(walk.step.values) != 0)
+    is_interval_end = (np.diff(sample_times) <= time_roundoff) | (np.diff(sample_steps) != 0)
     interval_starts = np.flatnonzero(is_interval_end) + 1
     sampled_intervals = np.split(np.arange(len(sample_times)), interval_starts)
-    min_samples_per_phase, n_samples = (
-        FORCE_PEAK_OPTIONS.spline_degree + 2,
-        max(map(len, sampled_intervals)),
-    )
+    min_samples_per_phase = FORCE_PEAK_OPTIONS.spline_degree + 2
+    n_samples = max(map(len, sampled_intervals))
     if n_samples < min_samples_per_phase:
         raise ValueError(
             f"the phases of the walk have {n_samples} samples, but its peaks need at least "
             f"{min_samples_per_phase}: give simulate(..., n_samples={min_samples_per_phase}) or "
             "more."
         )
-    step_indices, step_index_by_sample = np.unique(walk.step.values), walk.step.values
-    intervals_by_step = [
-        [
+    step_indices = np.unique(sample_steps)
+    fore_force_extrema, measures_by_step = [], []
+    for step_index in step_indices:
+        intervals_of_step = [
             sample_indices
             for sample_indices in sampled_intervals
-            if len(sample_indices) == n_samples
-            and step_index_by_sample[sample_indices[0]] == step_index
+            if len(sample_indices) == n_samples and sample_steps[sample_indices[0]] == step_index
         ]
-        for step_index in step_indices
-    ]
-    fore_force_extrema, total_force_extrema = (
-        [
-            _find_force_extrema(walk.time.values, normal_force, sampled_intervals)
-            for sampled_intervals in intervals_by_step
-        ]
-        for normal_force in (fore_force, total_force)
-    )
-    measures_by_step = [
-        _summarize_force_extrema(fore_extrema_of_step, total_extrema_of_step)
-        for fore_extrema_of_step, total_extrema_of_step in zip(
-            fore_force_extrema, total_force_extrema, strict=True
+        fore_extrema, total_extrema = (
+            _find_force_extrema(sample_times, normal_force, intervals_of_step)
+            for normal_force in (fore_force, total_force)
         )
-    ]
+        fore_force_extrema.append(fore_extrema)
+        measures_by_step.append(_summarize_force_extrema(fore_extrema, total_extrema))
     dataset_variables = {
         measure_name: (
             "step",
@@ -118,23 +107,17 @@ def force_peaks(walk: xr.Dataset) -> xr.Dataset:
         )
         for measure_name in SAMPLED_FORCE_PEAK_MEASURES
     }
-    walk_extremum_arrays = [
-        np.concatenate(force_extremum_arrays)
-        for force_extremum_arrays in zip(*fore_force_extrema, strict=True)
-    ]
-    walk_force_extrema = _ForceExtrema(*walk_extremum_arrays)
+    extremum_times, extremum_forces, is_maximum, _ = map(
+        np.concatenate, zip(*fore_force_extrema, strict=True)
+    )
     step_index_by_extremum = np.repeat(
         step_indices, [len(extrema_of_step.time) for extrema_of_step in fore_force_extrema]
     )
     dataset_variables |= {
-        "force": ("extremum", walk_force_extrema.force, make_measure_attributes("lambda_2")),
-        "force_time": ("extremum", walk_force_extrema.time, make_measure_attributes("time")),
+        "force": ("extremum", extremum_forces, make_measure_attributes("lambda_2")),
+        "force_time": ("extremum", extremum_times, make_measure_attributes("time")),
         "force_step": ("extremum", step_index_by_extremum, make_measure_attributes("step")),
-        "is_maximum": (
-            "extremum",
-            walk_force_extrema.is_extremum_maximum,
-            {"long_name": "whether a maximum"},
-        ),
+        "is_maximum": ("extremum", is_maximum, {"long_name": "whether a maximum"}),
     }
     return xr.Dataset(dataset_variables, {"step": step_indices}, dict(walk.attrs))
 
@@ -160,19 +143,13 @@ def _find_force_extrema(
     """
     from scipy.interpolate import PPoly, make_interp_spline  # This import is slow.
 
-    (
-        times_by_interval,
-        forces_by_interval,
-        maximum_flags_by_interval,
-        force_rate_maximum_times,
-        force_rate_maxima,
-    ) = (
-        [],
-        [],
-        [],
-        [],
-        [],
-    )
+    extrema_by_interval = [(np.zeros(0), np.zeros(0), np.zeros(0, bool))]
+    rate_maxima_by_interval = [(np.zeros(0), np.zeros(0))]
+
+    def find_interior_roots(polynomial: Any) -> np.ndarray:
+        roots = PPoly.from_spline(polynomial).roots()
+        return roots[(roots > 0.0) & (roots < 1.0)]
+
     min_extremum_height = FORCE_PEAK_OPTIONS.min_extremum_height_fraction * np.max(
         np.abs(sampled_forces)
     )
@@ -185,55 +162,37 @@ def _find_force_extrema(
         force_spline = make_interp_spline(
             time_fractions, sampled_forces[sample_indices], FORCE_PEAK_OPTIONS.spline_degree
         )
-        interior_fraction_selector = lambda extremum_time_fractions: extremum_time_fractions[
-            (extremum_time_fractions > 0.0) & (extremum_time_fractions < 1.0)
-        ]
-        extremum_time_fractions = interior_fraction_selector(
-            PPoly.from_spline(force_spline.derivative(1)).roots()
-        )
+        extremum_fractions = find_interior_roots(force_spline.derivative(1))
         forces_at_extrema_and_ends = force_spline(
-            np.concatenate([[0.0], extremum_time_fractions, [1.0]])
+            np.concatenate([[0.0], extremum_fractions, [1.0]])
         )
-        force_changes_between_extrema = np.abs(np.diff(forces_at_extrema_and_ends))
-        extremum_time_fractions = extremum_time_fractions[
-            np.minimum(force_changes_between_extrema[:-1], force_changes_between_extrema[1:])
-            > min_extremum_height
+        force_changes = np.abs(np.diff(forces_at_extrema_and_ends))
+        extremum_fractions = extremum_fractions[
+            np.minimum(force_changes[:-1], force_changes[1:]) > min_extremum_height
         ]
-        times_by_interval.append(interval_start + interval_duration * extremum_time_fractions)
-        forces_by_interval.append(force_spline(extremum_time_fractions))
-        maximum_flags_by_interval.append(force_spline(extremum_time_fractions, 2) < 0.0)
-        rate_maximum_time_fractions = interior_fraction_selector(
-            PPoly.from_spline(force_spline.derivative(2)).roots()
+        extrema_by_interval.append(
+            (
+                interval_start + interval_duration * extremum_fractions,
+                force_spline(extremum_fractions),
+                force_spline(extremum_fractions, 2) < 0.0,
+            )
         )
-        rate_maximum_time_fractions = rate_maximum_time_fractions[
-            force_spline(rate_maximum_time_fractions, 3) < 0.0
+        rate_maximum_fractions = find_interior_roots(force_spline.derivative(2))
+        rate_maximum_fractions = rate_maximum_fractions[
+            force_spline(rate_maximum_fractions, 3) < 0.0
         ]
-        force_rate_maximum_times.append(
-            interval_start + interval_duration * rate_maximum_time_fractions
+        rate_maxima_by_interval.append(
+            (
+                interval_start + interval_duration * rate_maximum_fractions,
+                force_spline(rate_maximum_fractions, 1) / interval_duration,
+            )
         )
-        force_rate_maxima.append(force_spline(rate_maximum_time_fractions, 1) / interval_duration)
-    interval_array_joiner = lambda arrays_by_interval: np.concatenate(
-        [np.zeros(0), *arrays_by_interval]
-    )
-    sorted_extremum_times, sorted_maximum_flags = (
-        interval_array_joiner(times_by_interval),
-        interval_array_joiner(maximum_flags_by_interval).astype(bool),
-    )
-    first_peak_time = np.min(sorted_extremum_times[sorted_maximum_flags], initial=np.inf)
-    rates_after_first_peak = interval_array_joiner(force_rate_maxima)[
-        interval_array_joiner(force_rate_maximum_times) > first_peak_time
-    ]
-    max_rate_after_first_peak = (
-        np.array([np.max(rates_after_first_peak)])
-        if rates_after_first_peak.size
-        else np.array([np.nan])
-    )
-    return _ForceExtrema(
-        sorted_extremum_times,
-        interval_array_joiner(forces_by_interval),
-        sorted_maximum_flags,
-        max_rate_after_first_peak,
-    )
+    times, forces, is_maximum = map(np.concatenate, zip(*extrema_by_interval, strict=True))
+    rate_times, rate_maxima = map(np.concatenate, zip(*rate_maxima_by_interval, strict=True))
+    first_peak_time = np.min(times[is_maximum], initial=np.inf)
+    later_rate_maxima = rate_maxima[rate_times > first_peak_time]
+    max_later_rate = np.max(later_rate_maxima) if later_rate_maxima.size else np.nan
+    return _ForceExtrema(times, forces, is_maximum, np.array([max_later_rate]))
 
 
 def _summarize_force_extrema(
@@ -244,30 +203,19 @@ def _summarize_force_extrema(
     The measures are computed from the extrema of the normal force on the fore foot and of the total
     normal force.
     """
+    forces, is_maximum = fore_force_extrema.force, fore_force_extrema.is_extremum_maximum
+    total_peaks = total_force_extrema.force[total_force_extrema.is_extremum_maximum]
     force_trough_depth = 0.0
-    for i in np.flatnonzero(~fore_force_extrema.is_extremum_maximum):
-        earlier_peak_forces, later_peak_forces = (
-            extremum_forces[is_force_maximum]
-            for extremum_forces, is_force_maximum in (
-                (fore_force_extrema.force[:i], fore_force_extrema.is_extremum_maximum[:i]),
-                (fore_force_extrema.force[i:], fore_force_extrema.is_extremum_maximum[i:]),
-            )
-        )
-        if earlier_peak_forces.size and later_peak_forces.size:
-            force_trough_depth = max(
-                force_trough_depth,
-                min(earlier_peak_forces.max(), later_peak_forces.max())
-                - fore_force_extrema.force[i],
-            )
+    for i in np.flatnonzero(~is_maximum):
+        earlier_peaks, later_peaks = forces[:i][is_maximum[:i]], forces[i:][is_maximum[i:]]
+        if earlier_peaks.size and later_peaks.size:
+            lower_peak = min(earlier_peaks.max(), later_peaks.max())
+            force_trough_depth = max(force_trough_depth, lower_peak - forces[i])
     return {
-        "n_force_peaks": int(np.sum(fore_force_extrema.is_extremum_maximum)),
-        "peak_force": np.max(
-            fore_force_extrema.force[fore_force_extrema.is_extremum_maximum], initial=0.0
-        ),
+        "n_force_peaks": int(np.sum(is_maximum)),
+        "peak_force": np.max(forces[is_maximum], initial=0.0),
         "force_trough_depth": force_trough_depth,
         "second_peak_rate": fore_force_extrema.max_rate_after_first_peak[0],
-        "n_total_force_peaks": int(np.sum(total_force_extrema.is_extremum_maximum)),
-        "peak_total_force": np.max(
-            total_force_extrema.force[total_force_extrema.is_extremum_maximum], initial=0.0
-        ),
+        "n_total_force_peaks": len(total_peaks),
+        "peak_total_force": np.max(total_peaks, initial=0.0),
     }

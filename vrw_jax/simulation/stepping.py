@@ -42,6 +42,9 @@ from vrw_jax.selection import LadderStep, LadderWheel, ModelChoice, describe_acc
 from vrw_jax.validation import check_int, check_reals, check_type, format_value
 from vrw_jax.wheel import Outcome, WheelParams
 
+BATCH_REMEDY_TEXT = "map over batches of parameters with jax.vmap, or use vrw.scan"
+"""Advice in the error message for a batch of wheels."""
+
 SectionStateLike = Array | np.ndarray | Sequence[float]
 """Section state in any form that users may pass.
 
@@ -173,11 +176,9 @@ def convert_step_arguments(
 
     Raise a `TypeError` or a `ValueError` if an argument is invalid.
     """
-    require_single_wheel(params, "map over batches of parameters with jax.vmap, or use vrw.scan")
-    model, options = (
-        convert_model_argument(model),
-        StepOptions.with_engine(convert_step_options(options), engine),
-    )
+    require_single_wheel(params, BATCH_REMEDY_TEXT)
+    model = convert_model_argument(model)
+    options = StepOptions.with_engine(convert_step_options(options), engine)
     section_state = convert_section_state(x)
     section_size = model.count_section_entries(params)
     if section_state.shape == (3,) and section_size != 3:
@@ -195,18 +196,13 @@ def convert_step_arguments(
     common_dtype = jnp.result_type(section_state, params.damping)
     StepOptions.check_tolerances(options, common_dtype)
 
-    def convert_to_common_dtype(array_tree: Any) -> Any:
-        """Return the tree with all leaves converted to the common floating-point type."""
-        if all(tree_leaf.dtype == common_dtype for tree_leaf in jax.tree.leaves(array_tree)):
-            return array_tree
-        return jax.tree.map(lambda tree_leaf: tree_leaf.astype(common_dtype), array_tree)
-
-    return (
-        convert_to_common_dtype(params),
-        convert_to_common_dtype(section_state),
-        model,
-        convert_to_common_dtype(options),
-    )
+    converted_arguments = params, section_state, options
+    if any(leaf.dtype != common_dtype for leaf in jax.tree.leaves(converted_arguments)):
+        converted_arguments = jax.tree.map(
+            lambda leaf: leaf.astype(common_dtype), converted_arguments
+        )
+    params, section_state, options = converted_arguments
+    return params, section_state, model, options
 
 
 @overload
@@ -394,12 +390,10 @@ def _simulate_walk_by_scan(
         """
         x, outcome = state_and_outcome
         is_walking = outcome == Outcome.STEPPED
-        model_and_params = (
+        step_model, step_params = (
             (model, params) if step_ground is None else model.with_step_ground(params, step_ground)
         )
-        step_result = model_and_params[0].advance(
-            model_and_params[1], jnp.where(is_walking, x, jnp.nan), options
-        )
+        step_result = step_model.advance(step_params, jnp.where(is_walking, x, jnp.nan), options)
         outcome = jnp.where(is_walking, step_result.outcome, outcome)
         step_result = dataclasses.replace(
             step_result,
@@ -409,10 +403,9 @@ def _simulate_walk_by_scan(
         )
         return (step_result.section_state, outcome), step_result
 
-    initial_state_and_outcome = (x, jnp.int32(Outcome.STEPPED))
     step_results: AdvanceResult
     _, step_results = lax.scan(
-        advance_walk_by_one_step, initial_state_and_outcome, stepwise_ground, length=n_steps
+        advance_walk_by_one_step, (x, jnp.int32(Outcome.STEPPED)), stepwise_ground, length=n_steps
     )
     return Walk(x, step_results, jnp.sum(step_results.outcome == Outcome.STEPPED))
 
@@ -460,15 +453,9 @@ def walk(
         (5, (5, 3))
     """
     n_steps = check_int("n_steps", n_steps)
-    checked_model, params, stepwise_ground = split_stepwise_ground(params, model, n_steps)
-    params, section_state, checked_model, options = convert_step_arguments(
-        params, x, checked_model, options, engine
+    params, section_state, checked_model, options, stepwise_ground = convert_walk_arguments(
+        params, x, n_steps, model, options, engine
     )
-    if stepwise_ground is not None:
-        stepwise_ground = tuple(
-            ground_quantity_by_step.astype(section_state.dtype)
-            for ground_quantity_by_step in stepwise_ground
-        )
     return _simulate_walk_by_scan(
         checked_model, params, section_state, options, n_steps, stepwise_ground
     )
@@ -478,17 +465,43 @@ def _convert_single_step_arguments(
     params: Any, x: object, model: ModelLike | None, options: StepOptions | None, engine: EngineName
 ) -> tuple[WheelParams, Array, AbstractWheel, StepOptions]:
     """Return the wheel, the section state, the model and the options of one step on its ground."""
-    model, params, stepwise_ground = split_stepwise_ground(params, model, 1)
-    params, section_state, model, options = convert_step_arguments(
-        params, x, model, options, engine
+    params, section_state, model, options, stepwise_ground = convert_walk_arguments(
+        params, x, 1, model, options, engine
     )
     if stepwise_ground is not None:
-        step_ground = tuple(
-            ground_quantity_by_step[0].astype(section_state.dtype)
-            for ground_quantity_by_step in stepwise_ground
-        )
-        model, params = model.with_step_ground(params, step_ground)
+        model, params = model.with_step_ground(params, tuple(x[0] for x in stepwise_ground))
     return params, section_state, model, options
+
+
+def convert_walk_arguments(
+    params: Any,
+    x: object | None,
+    n_steps: int,
+    model: ModelLike | None,
+    options: StepOptions | None,
+    engine: EngineName,
+    batch_remedy_text: str = BATCH_REMEDY_TEXT,
+) -> tuple[WheelParams, Array, AbstractWheel, StepOptions, StepGroundValues | None]:
+    """Return wheel, section state, model and options of a walk, and the ground of each step.
+
+    They are converted to one floating-point type. The wheel and the model are those on the ground
+    of the first step. If `x` is None, the section state is the default start of the model. On flat
+    ground, the ground of the steps is None.
+
+    - `batch_remedy_text`: advice with which the error message for a batch of wheels ends.
+    """
+    checked_model, params, stepwise_ground = split_stepwise_ground(params, model, n_steps)
+    require_single_wheel(params, batch_remedy_text)
+    if x is None:
+        x = checked_model.compute_default_start(params)
+    params, section_state, checked_model, options = convert_step_arguments(
+        params, x, checked_model, options, engine
+    )
+    if stepwise_ground is not None:
+        stepwise_ground = tuple(
+            ground_by_step.astype(section_state.dtype) for ground_by_step in stepwise_ground
+        )
+    return params, section_state, checked_model, options, stepwise_ground
 
 
 def split_stepwise_ground(

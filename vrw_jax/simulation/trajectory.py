@@ -7,8 +7,7 @@ landing.
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -41,9 +40,7 @@ from vrw_jax.simulation.provenance import collect_provenance_attributes
 from vrw_jax.simulation.stepping import (
     ModelLike,
     SectionStateLike,
-    convert_step_arguments,
-    require_single_wheel,
-    split_stepwise_ground,
+    convert_walk_arguments,
 )
 from vrw_jax.validation import check_int, require_untraced_arguments
 from vrw_jax.wheel import (
@@ -104,38 +101,25 @@ def simulate(
     """
     require_untraced_arguments("vrw.simulate", "use vrw.walk", params, x)
     n_steps, n_samples = check_int("n_steps", n_steps), check_int("n_samples", n_samples, 2)
-    params_with_all_slopes = params
-    checked_model, params, stepwise_ground = split_stepwise_ground(params, model, n_steps)
-    require_single_wheel(params, "simulate one at a time")
-    start_state = checked_model.compute_default_start(params) if x is None else x
-    params, x, model, options = convert_step_arguments(
-        params, start_state, checked_model, options, engine
+    given_params = params
+    params, x, model, options, stepwise_ground = convert_walk_arguments(
+        params, x, n_steps, model, options, engine, "simulate one at a time"
     )
+    s = jax.tree.map(float, params).symbols()
+    line_slopes = given_params.slope if given_params.slope.ndim else jnp.full(n_steps, params.slope)
+    ground_line_slopes = complete_ground_line_slopes(line_slopes, n_steps)
+    ground_lines = GroundLines(np.asarray(ground_line_slopes, float), float(s.Mt * s.g))
+    models_and_wheels = [(model, params)]
+    if stepwise_ground is not None:
+        models_and_wheels = [
+            model.with_step_ground(params, step_ground)
+            for step_ground in zip(*stepwise_ground, strict=True)
+        ]
     specify_trajectory = (
         specify_contact_trajectory if model.reports_contacts else specify_phase_trajectory
     )
-    s, models_and_wheels, ground_lines = (
-        jax.tree.map(float, params).symbols(),
-        [(model, params)],
-        None,
-    )
-    if stepwise_ground is not None:
-        ground_by_step = zip(
-            *(step_ground.astype(x.dtype) for step_ground in stepwise_ground), strict=True
-        )
-        models_and_wheels = [
-            model.with_step_ground(params, step_ground) for step_ground in ground_by_step
-        ]
-        ground_line_slopes = params_with_all_slopes.slope
-        ground_line_slopes = (
-            ground_line_slopes if ground_line_slopes.ndim else jnp.full(n_steps, ground_line_slopes)
-        )
-        ground_line_slopes = complete_ground_line_slopes(ground_line_slopes, n_steps)
-        ground_lines = UnevenGroundLines(np.asarray(ground_line_slopes, float), float(s.Mt * s.g))
     trajectory_spec = specify_trajectory(models_and_wheels, options, n_samples)
-    sampled_walk = sample_walk_steps(
-        trajectory_spec, x, n_steps, float(s.Mt * s.g * s.sin_phi), ground_lines
-    )
+    sampled_walk = sample_walk_steps(trajectory_spec, x, n_steps, ground_lines)
     sampled_columns = sampled_walk.sampled_columns
     dataset_variables = make_labeled_variables(
         {
@@ -158,10 +142,10 @@ def simulate(
     provenance_attributes = trajectory_spec.dataset_attributes | collect_provenance_attributes(
         params, model, options
     )
-    if ground_lines is not None:
+    if stepwise_ground is not None:
         provenance_attributes |= {
             "frame": UNEVEN_GROUND_FRAME_TEXT,
-            "slopes": ground_lines.ground_line_slopes.tolist(),
+            "slopes": ground_lines.slopes.tolist(),
         }
         del provenance_attributes["parameter_slope"]
     dataset_index_coordinates = {
@@ -177,15 +161,16 @@ def simulate(
 
 
 class SampledStep(NamedTuple):
-    """Samples of one step in each interval between two events."""
+    """Samples of one step in each interval between two events.
+
+    Besides the variables of the trajectory, `sampled_columns` contains `landing_foot_x` and
+    `landing_foot_z`. Their last values are the position (m) at which the next foot lands.
+    """
 
     sampled_columns: dict[str, np.ndarray]  # (interval, sample, ...), time in s since the landing
     durations: np.ndarray  # duration of each interval, s; 0 if it did not occur
     outcome: Outcome
     next_section_state: Array  # section state at the end of the step
-    period: float  # s
-    step_length: float  # distance of the landings along the step's line, m
-    landing_normal_offset: float  # landing distance normal to that line, m; 0 on flat ground
 
 
 class TrajectorySpecification(NamedTuple):
@@ -223,138 +208,84 @@ UNEVEN_GROUND_FRAME_TEXT = (
 """Text for the attribute `frame` of a trajectory on uneven ground."""
 
 
-class UnevenGroundLines(NamedTuple):
-    """Slopes of all lines of uneven ground, and the weight of the wheel."""
+class GroundLines(NamedTuple):
+    """Slopes of all lines of the ground, and the weight of the wheel."""
 
-    ground_line_slopes: np.ndarray  # rad
+    slopes: np.ndarray  # rad
     wheel_weight: float  # N
-
-    def convert_to_walk_frame(
-        self,
-        step_columns: dict[str, np.ndarray],
-        position_variable_names: Sequence[str],
-        k: int,
-        foothold: np.ndarray,
-    ) -> None:
-        """Convert the positions (m) and energies (J) in step k to the frame of line 0 of the
-        ground.
-
-        The arrays in `step_columns` are replaced by converted arrays. Before the conversion, they
-        are in the frame of the line of the ground under both feet in double support.
-
-        - `step_columns`: sampled variables of the step, by name;
-        - `position_variable_names`: names of the variables that are positions along the slope;
-        - `k`: index of the step;
-        - `foothold`: position of the first foot of step k in the frame of line 0, m.
-        """
-        for sampled_column_name in position_variable_names:
-            normal_column_name = f"{sampled_column_name[:-1]}z"
-            x, z = self.rotate_to_line_0(
-                k, step_columns[sampled_column_name], step_columns[normal_column_name]
-            )
-            step_columns[sampled_column_name], step_columns[normal_column_name] = (
-                x + foothold[0],
-                z + foothold[1],
-            )
-        first_ground_line_slope = self.ground_line_slopes[0]
-        foothold_height = foothold[1] * np.cos(first_ground_line_slope) - foothold[0] * np.sin(
-            first_ground_line_slope
-        )
-        for sampled_column_name in step_columns.keys() & HEIGHT_DEPENDENT_ENERGIES:
-            step_columns[sampled_column_name] = (
-                step_columns[sampled_column_name] + self.wheel_weight * foothold_height
-            )
 
     def rotate_to_line_0(self, k: int, x: Any, z: Any) -> tuple[Any, Any]:
         """Return the components of a vector in the frame of line 0 of the ground.
 
         - `k`: index of the line of the ground in whose frame x and z are components of the vector.
         """
-        angle_from_line_0 = self.ground_line_slopes[k] - self.ground_line_slopes[0]
+        angle_from_line_0 = self.slopes[k] - self.slopes[0]
         sine_of_angle, cosine_of_angle = np.sin(angle_from_line_0), np.cos(angle_from_line_0)
         return x * cosine_of_angle + z * sine_of_angle, z * cosine_of_angle - x * sine_of_angle
 
+    def compute_potential_energy(self, x: float, z: float) -> float:
+        """Return the potential energy of the wheel's weight at (x, z) in the frame of line 0, J."""
+        height = z * np.cos(self.slopes[0]) - x * np.sin(self.slopes[0])
+        return self.wheel_weight * height
+
 
 def sample_walk_steps(
-    trajectory_spec: TrajectorySpecification,
-    x: Array,
-    n_steps: int,
-    downslope_weight: float,
-    ground_lines: UnevenGroundLines | None = None,
+    trajectory_spec: TrajectorySpecification, x: Array, n_steps: int, ground_lines: GroundLines
 ) -> SampledWalk:
     """Return samples of the walk from the section state x. The walk ends at the first failed step.
 
-    Positions along the slope (m) are measured from the first foothold.
-
-    - `downslope_weight`: component of the weight parallel to the slope, N. On flat ground, the
-      energies in `HEIGHT_DEPENDENT_ENERGIES` decrease by this weight times the traveled distance;
-    - `ground_lines`: slopes of uneven ground, or None on flat ground. On uneven ground,
-      `UnevenGroundLines.convert_to_walk_frame` converts positions and energies.
+    Positions (m) and energies (J) are converted from the frame of the line of the ground under both
+    feet in double support to the frame of line 0, in which the first foothold is the origin.
     """
-    sampled_columns_by_step: list[dict[str, np.ndarray]] = []
-    walk_outcome, n_stepped, step_start_time, traveled_distance = Outcome.STEPPED, 0, 0.0, 0.0
-    foothold_position = np.zeros(2)
-    while walk_outcome == Outcome.STEPPED and n_stepped < n_steps:
-        sampled_step = trajectory_spec.step_sampler(x, n_stepped)
-        has_interval_occurred, step_columns = sampled_step.durations > 0.0, dict[str, np.ndarray]()
-        # A full slice copies nothing.
-        occurred_interval_selection = (
-            slice(None) if has_interval_occurred.all() else has_interval_occurred
-        )
-        for sampled_column_name, column_samples in sampled_step.sampled_columns.items():
-            step_columns[sampled_column_name] = column_samples[occurred_interval_selection].reshape(
-                -1, *column_samples.shape[2:]
+    columns_by_step: list[dict[str, np.ndarray]] = []
+    walk_outcome, k, step_start_time = Outcome.STEPPED, 0, 0.0
+    foothold_x, foothold_z = 0.0, 0.0
+    is_ground_uneven = np.ptp(ground_lines.slopes) > 0.0
+    while walk_outcome == Outcome.STEPPED and k < n_steps:
+        sampled_step = trajectory_spec.step_sampler(x, k)
+        has_occurred = sampled_step.durations > 0.0
+        columns = {
+            name: samples[has_occurred].reshape(-1, *samples.shape[2:])
+            for name, samples in sampled_step.sampled_columns.items()
+        }
+        landing_foot_x = columns.pop("landing_foot_x")
+        landing_foot_z = columns.pop("landing_foot_z")
+        for name in trajectory_spec.slope_position_names:
+            normal_name = f"{name[:-1]}z"
+            position_x, position_z = ground_lines.rotate_to_line_0(
+                k, columns[name], columns[normal_name]
             )
-        if ground_lines is None:
-            for sampled_column_name in trajectory_spec.slope_position_names:
-                step_columns[sampled_column_name] = (
-                    step_columns[sampled_column_name] + traveled_distance
-                )
-            for sampled_column_name in step_columns.keys() & HEIGHT_DEPENDENT_ENERGIES:
-                step_columns[sampled_column_name] = (
-                    step_columns[sampled_column_name] - downslope_weight * traveled_distance
-                )
-        else:
-            ground_lines.convert_to_walk_frame(
-                step_columns, trajectory_spec.slope_position_names, n_stepped, foothold_position
+            columns[name], columns[normal_name] = position_x + foothold_x, position_z + foothold_z
+        for name in columns.keys() & HEIGHT_DEPENDENT_ENERGIES:
+            columns[name] = columns[name] + ground_lines.compute_potential_energy(
+                foothold_x, foothold_z
             )
-            foothold_displacement = ground_lines.rotate_to_line_0(
-                n_stepped, sampled_step.step_length, sampled_step.landing_normal_offset
-            )
-            foothold_position = foothold_position + foothold_displacement
-        step_columns["time"] = step_columns["time"] + step_start_time
-        step_columns["step"] = np.full(len(step_columns["time"]), n_stepped)
-        sampled_columns_by_step.append(step_columns)
+        columns["time"] = columns["time"] + step_start_time
+        columns["step"] = np.full(len(columns["time"]), k)
+        columns_by_step.append(columns)
         walk_outcome = sampled_step.outcome
         if walk_outcome == Outcome.STEPPED:
-            n_stepped += 1
-            step_start_time += sampled_step.period
-            traveled_distance += sampled_step.step_length
+            # On even ground, the height of a foot that lands is a numerical error.
+            displacement_x, displacement_z = ground_lines.rotate_to_line_0(
+                k, float(landing_foot_x[-1]), float(landing_foot_z[-1]) * is_ground_uneven
+            )
+            foothold_x, foothold_z = foothold_x + displacement_x, foothold_z + displacement_z
+            k += 1
+            step_start_time += float(sampled_step.durations.sum())
             x = sampled_step.next_section_state
     walk_columns = {
-        sampled_column_name: np.concatenate(
-            [step_columns[sampled_column_name] for step_columns in sampled_columns_by_step]
-        )
-        for sampled_column_name in sampled_columns_by_step[0]
+        name: np.concatenate([columns[name] for columns in columns_by_step])
+        for name in columns_by_step[0]
     }
-    return SampledWalk(walk_columns, n_stepped, walk_outcome)
+    return SampledWalk(walk_columns, k, walk_outcome)
 
 
-@functools.cache
-def _compile_step_sampler(
-    model: AbstractWheel, argument_structure: Any, n_samples: int
-) -> Callable[..., Trajectory]:
-    """Return a compiled function that samples a step.
-
-    Its arguments are the section state and the leaves of (params, options), whose pytree structure
-    is `argument_structure`.
-    """
-
-    def sample_paper_step(x: Array, *argument_leaves: Array) -> Trajectory:
-        params, options = jax.tree.unflatten(argument_structure, argument_leaves)
-        return model.sample_step(params, x, options, n_samples)
-
-    return jax.jit(sample_paper_step)
+@eqx.filter_jit
+def _sample_step(
+    model: AbstractWheel, params: WheelParams, x: Array, options: StepOptions, n_samples: int
+) -> Trajectory:
+    """Return samples of a step."""
+    return model.sample_step(params, x, options, n_samples)
 
 
 def _make_phase_columns(s: Symbols, trajectory: Trajectory) -> dict[str, np.ndarray]:
@@ -364,41 +295,24 @@ def _make_phase_columns(s: Symbols, trajectory: Trajectory) -> dict[str, np.ndar
     additional entries, `landing_foot_x` and `landing_foot_z`, contain the position (m) of the foot
     that lands next.
     """
-    theta, L1, L2, dtheta, dL1, dL2 = np.moveaxis(np.asarray(trajectory.state), -1, 0)
-    kinetic_energy, gravitational_energy, elastic_energy = np.moveaxis(
-        np.asarray(trajectory.energy), -1, 0
-    )
+    state = np.moveaxis(np.asarray(trajectory.state), -1, 0)
+    energies = np.moveaxis(np.asarray(trajectory.energy), -1, 0)
     foot_forces = np.moveaxis(np.asarray(trajectory.forces), -1, 0)
-    wheel_motion = Motion.from_angle(theta, L1, L2, dtheta, dL1, dL2)
-    rear_leg_direction = rotate_to_rear_leg(s, wheel_motion.sin_theta, wheel_motion.cos_theta)
-    hub_x, hub_z, zero_coordinates = (
-        L1 * wheel_motion.sin_theta,
-        L1 * wheel_motion.cos_theta,
-        np.zeros_like(L1),
-    )
-    landing_leg_direction = rotate_to_landing_leg(s, wheel_motion.sin_theta, wheel_motion.cos_theta)
+    motion = Motion.from_angle(*state)
+    rear_leg_direction = rotate_to_rear_leg(s, motion.sin_theta, motion.cos_theta)
+    landing_leg_direction = rotate_to_landing_leg(s, motion.sin_theta, motion.cos_theta)
+    hub_x, hub_z = motion.L1 * motion.sin_theta, motion.L1 * motion.cos_theta
+    zero_names = ("x", "z", "dx", "dz", "foot_1_x", "foot_1_z")
     return {
+        **dict.fromkeys(zero_names, np.zeros_like(hub_x)),
+        **dict(zip(("theta", "L1", "L2", "dtheta", "dL1", "dL2"), state, strict=True)),
         "time": np.array(trajectory.time),
-        "x": zero_coordinates,
-        "z": zero_coordinates,
-        "theta": theta,
-        "L1": L1,
-        "L2": L2,
-        "dx": zero_coordinates,
-        "dz": zero_coordinates,
-        "dtheta": dtheta,
-        "dL1": dL1,
-        "dL2": dL2,
         **{f"lambda_{i + 1}": foot_force for i, foot_force in enumerate(foot_forces)},
-        "kinetic_energy": kinetic_energy,
-        "gravitational_energy": gravitational_energy,
-        "elastic_energy": elastic_energy,
-        "total_energy": kinetic_energy + gravitational_energy + elastic_energy,
-        "damping_power": compute_damping_power(s, wheel_motion),
-        "foot_1_x": zero_coordinates,
-        "foot_1_z": zero_coordinates,
-        "foot_2_x": hub_x - L2 * rear_leg_direction.sin,
-        "foot_2_z": hub_z - L2 * rear_leg_direction.cos,
+        **dict(zip(ENERGY_NAMES, energies, strict=True)),
+        "total_energy": sum(energies),
+        "damping_power": compute_damping_power(s, motion),
+        "foot_2_x": hub_x - motion.L2 * rear_leg_direction.sin,
+        "foot_2_z": hub_z - motion.L2 * rear_leg_direction.cos,
         "hub_x": hub_x,
         "hub_z": hub_z,
         "landing_foot_x": hub_x - s.L0 * landing_leg_direction.sin,
@@ -415,41 +329,22 @@ def specify_phase_trajectory(
 ) -> TrajectorySpecification:
     """Return the trajectory specification for a model whose steps have the paper's phases."""
 
-    def prepare_step_sampler(model: AbstractWheel, params: WheelParams) -> tuple:
-        argument_leaves, argument_structure = jax.tree.flatten((params, options))
-        s = jax.tree.map(float, separate_next_slope(params)[0]).symbols()
-        return s, _compile_step_sampler(model, argument_structure, n_samples), argument_leaves
-
-    prepared_samplers = [
-        prepare_step_sampler(*step_model_and_wheel) for step_model_and_wheel in models_and_wheels
+    symbols_by_step = [
+        jax.tree.map(float, separate_next_slope(params)[0]).symbols()
+        for _, params in models_and_wheels
     ]
 
     def sample_phase_step(x: Array, k: int) -> SampledStep:
-        s, step_sampler, argument_leaves = prepared_samplers[k if len(prepared_samplers) > 1 else 0]
-        trajectory = step_sampler(x, *argument_leaves)
-        step_columns, phase_durations = (
-            _make_phase_columns(s, trajectory),
-            np.asarray(trajectory.durations),
-        )
-        landing_foot_columns = (
-            step_columns.pop("landing_foot_x"),
-            step_columns.pop("landing_foot_z"),
-        )
+        i = min(k, len(models_and_wheels) - 1)
+        trajectory = _sample_step(*models_and_wheels[i], x, options, n_samples)
+        phase_durations = np.asarray(trajectory.durations)
+        step_columns = _make_phase_columns(symbols_by_step[i], trajectory)
         step_columns["phase"] = np.tile(np.arange(len(phase_durations))[:, None], (1, n_samples))
-        occurred_phase_indices = np.flatnonzero(phase_durations > 0.0)
-        step_length, landing_normal_offset = 0.0, 0.0
-        if occurred_phase_indices.size:
-            step_length, landing_normal_offset = (
-                float(x[occurred_phase_indices[-1], -1]) for x in landing_foot_columns
-            )
         return SampledStep(
             step_columns,
             phase_durations,
             Outcome(int(trajectory.outcome)),
             trajectory.section_state,
-            float(phase_durations.sum()),
-            step_length,
-            landing_normal_offset,
         )
 
     dataset_attributes: dict[str, object] = {
@@ -470,7 +365,7 @@ POSITION_NAMES_ALONG_SLOPE = ("x", "foot_1_x", "foot_2_x", "hub_x")
 
 
 CONTACT_MOTION_NAMES = ("time", "step", "hub_x", "hub_z", "theta", "dtheta")
-CONTACT_ENERGY_NAMES = ("kinetic_energy", "gravitational_energy", "elastic_energy")
+ENERGY_NAMES = ("kinetic_energy", "gravitational_energy", "elastic_energy")
 
 
 @eqx.filter_jit
@@ -526,44 +421,37 @@ def specify_contact_trajectory(
     n_legs = models_and_wheels[0][1].n_legs
 
     def sample_contact_step(x: Array, k: int) -> SampledStep:
-        step_model_and_wheel = models_and_wheels[k if len(models_and_wheels) > 1 else 0]
+        step_model_and_wheel = models_and_wheels[min(k, len(models_and_wheels) - 1)]
         trajectory, step_columns = jax.tree.map(
             np.array, _compute_contact_columns(*step_model_and_wheel, x, options, n_samples)
         )
         sample_shape = (len(trajectory.duration), n_samples)
-        leg_value_repeater = lambda values_by_leg: np.repeat(
+        repeat_over_samples = lambda values_by_leg: np.repeat(
             values_by_leg[:, None], n_samples, axis=1
         )
         step_columns |= {
             "time": trajectory.time,
-            "contact": leg_value_repeater(trajectory.contact),
+            "contact": repeat_over_samples(trajectory.contact),
+            "on_stopper": repeat_over_samples(trajectory.locked),
+            "landing_foot_x": np.full(sample_shape, trajectory.step_length),
+            "landing_foot_z": step_columns["foot_z"][..., -1],  # The foremost foot has landed.
         }
         step_columns |= {
             variable_name: np.full(sample_shape, int(model_selection_code))
             for variable_name, model_selection_code in trajectory.model_selection.items()
         }
-        step_columns["on_stopper"] = leg_value_repeater(trajectory.locked)
-        occurred_interval_indices = np.flatnonzero(trajectory.duration > 0.0)
-        landing_normal_offset = 0.0
-        if occurred_interval_indices.size:  # The foremost foot has landed.
-            landing_normal_offset = float(
-                step_columns["foot_z"][occurred_interval_indices[-1], -1, -1]
-            )
         return SampledStep(
             step_columns,
             trajectory.duration,
             Outcome(int(trajectory.outcome)),
             jnp.asarray(trajectory.section_state),
-            float(trajectory.duration.sum()),
-            float(trajectory.step_length),
-            landing_normal_offset,
         )
 
     dataset_attributes: dict[str, object] = {
         "frame": "x downhill along the slope, z normal to it, first landing at the origin",
         "friction": friction_by_step[0] if len(set(friction_by_step)) == 1 else friction_by_step,
     }
-    variable_names = (*CONTACT_MOTION_NAMES, *CONTACT_ENERGY_NAMES, *CONTACT_MEASURES)
+    variable_names = (*CONTACT_MOTION_NAMES, *ENERGY_NAMES, *CONTACT_MEASURES)
     leg_number_coordinate = {"leg": np.arange(1, n_legs + 1)}
     return TrajectorySpecification(
         sample_contact_step,
