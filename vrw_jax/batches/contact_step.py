@@ -72,16 +72,20 @@ def step_batch_with_contact(
     section_states = embed_section_states(parameter_matrix, section_states, n_legs)
     solver_indices = np.zeros(len(section_states), np.int32)
     if not derivative_names and not is_ground_uneven:
-        *step_results, _ = map(
+        x, phase_durations, step_outcomes, n_stepped, n_solver_steps, _ = map(
             np.asarray,
             walk_batch(parameter_matrix, section_states, n_steps, model, options, n_legs),
         )
         return StepBatchResult(
-            *step_results,
-            is_collocated=solver_indices > 0,
-            solver_index=solver_indices,
-            engine="lanes",
-            solver_names=(options.solver,),
+            x,
+            phase_durations,
+            step_outcomes,
+            n_stepped,
+            n_solver_steps,
+            solver_indices > 0,
+            solver_indices,
+            "lanes",
+            (options.solver,),
         )
     parameter_names: tuple[str, ...] = CONTACT_PARAMETER_NAMES
     stepwise_parameters: dict[str, StepwiseParameter] = {}

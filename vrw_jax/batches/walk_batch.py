@@ -115,6 +115,17 @@ def complete_slopes_over_steps(known_slopes_by_step: np.ndarray, n_steps: int) -
     )
 
 
+LANE_ARRAY_NAMES = (
+    "section_state",
+    "durations",
+    "outcome",
+    "n_stepped",
+    "solver_steps",
+    "is_collocated",
+)
+"""Names of the arrays that a `WalkBatch` has in common with its `StepBatchResult`."""
+
+
 class WalkBatch:
     """State of a batch of walks, with lanes on the last axis of every array."""
 
@@ -186,17 +197,13 @@ class WalkBatch:
         """
         inverse_lane_order = np.empty_like(lane_order)
         inverse_lane_order[lane_order] = np.arange(len(lane_order))
-        lane_arrays = (
-            self.section_state,
-            self.durations,
-            self.outcome,
-            self.n_stepped,
-            self.solver_steps,
-            self.is_collocated,
-            solver_index,
-        )
+        restore_order = lambda x: x.take(inverse_lane_order, -1).T
+        lane_arrays: dict[str, Any] = {
+            name: restore_order(getattr(self, name)) for name in LANE_ARRAY_NAMES
+        }
         return StepBatchResult(
-            *(x.take(inverse_lane_order, -1).T for x in lane_arrays),
+            **lane_arrays,
+            solver_index=restore_order(solver_index),
             engine=engine,
             solver_names=solver_names,
             derivatives=self.split_jacobian_by_input(inverse_lane_order),
