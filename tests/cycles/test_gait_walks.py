@@ -19,7 +19,7 @@ def walk_by_linear_map(monkeypatch, multiplier, last_step=10**9):
     """
     n_taken = 0
 
-    def take_steps(finder, values, states, n_steps, options):
+    def take_steps(finder, values, states, n_steps):
         nonlocal n_taken
         n_taken += n_steps if n_steps > finder.period_n else 0
         outcome = vrw.Outcome.STEPPED if n_taken <= last_step else vrw.Outcome.FELL_BACK

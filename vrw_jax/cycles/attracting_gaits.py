@@ -11,8 +11,7 @@ import numpy as np
 from vrw_jax.cycles.gait_walks import (
     compute_fallback_walk_starts,
     compute_walk_starts,
-    count_section_coordinates,
-    stack_section_units,
+    scale_section_states,
     walk_to_gaits,
 )
 from vrw_jax.numerics import concatenate_tree_rows, select_tree_rows, with_default_jax_settings
@@ -51,14 +50,12 @@ def find_attracting_gaits(gait_finder: Any, parameter_values: Any) -> tuple[np.n
     fallback_wheel_indices, fallback_gaits = _find_gaits_from_starts(
         gait_finder, parameter_values[wheels_without_gait], compute_fallback_walk_starts
     )
-    is_fallback_found = np.asarray(fallback_gaits.outcome) == Outcome.STEPPED
-    wheels_with_gait = wheels_without_gait[fallback_wheel_indices[is_fallback_found]]
-    is_first_gait_kept = ~np.isin(gait_wheel_indices, wheels_with_gait)
     merged_gaits = concatenate_tree_rows(
-        select_tree_rows(gaits_from_first_starts, is_first_gait_kept),
-        select_tree_rows(fallback_gaits, is_fallback_found),
+        select_tree_rows(gaits_from_first_starts, ~is_gait_missing), fallback_gaits
     )
-    gait_wheel_indices = np.concatenate([gait_wheel_indices[is_first_gait_kept], wheels_with_gait])
+    gait_wheel_indices = np.concatenate(
+        [gait_wheel_indices[~is_gait_missing], wheels_without_gait[fallback_wheel_indices]]
+    )
     gait_sort_order = np.argsort(gait_wheel_indices, kind="stable")
     return gait_wheel_indices[gait_sort_order], jax.device_put(
         select_tree_rows(merged_gaits, gait_sort_order)
@@ -90,73 +87,53 @@ def _find_gaits_from_starts(
     # NumPy is used, because JAX would compile each operation for every number of wheels.
     is_gait_attracting = np.abs(np.linalg.eigvals(candidate_gaits.monodromy_value)).max(-1) < 1.0
     is_gait_valid = (np.asarray(candidate_gaits.outcome) == Outcome.STEPPED) & is_gait_attracting
-    gait_step_end_states = np.asarray(
-        candidate_gaits.steps.section_state
-    )  # section states at the ends of all gait steps
-    sum_over_steps = lambda walk_states: (
-        np.asarray(walk_states).reshape(len(candidate_wheel_indices), -1).sum(-1)
+    sum_over_steps = lambda values_by_step: (
+        np.asarray(values_by_step).reshape(len(candidate_wheel_indices), -1).sum(-1)
     )
     candidate_gait_speeds = sum_over_steps(candidate_gaits.step_length) / np.where(
         is_gait_valid, sum_over_steps(candidate_gaits.durations), 1.0
     )
-    section_units = stack_section_units(
-        gait_finder.model, np.asarray(parameter_values)[candidate_wheel_indices], gait_finder.n_legs
+    scaled_step_end_states = np.stack(
+        [
+            scale_section_states(
+                gait_finder, parameter_values[candidate_wheel_indices], step_end_states
+            )
+            for step_end_states in np.asarray(candidate_gaits.steps.section_state).swapaxes(0, 1)
+        ],
+        1,
     )
-    scaled_step_end_states = (gait_step_end_states / section_units[:, None])[
-        :, :, : count_section_coordinates(gait_finder)
-    ]
     # A gait that repeats after fewer steps is a gait of a shorter period.
     state_distances_to_last_step = np.abs(
         scaled_step_end_states[:, :-1] - scaled_step_end_states[:, -1:]
     ).max(-1)
     is_gait_valid &= ~(state_distances_to_last_step < DUPLICATE_GAIT_DISTANCE).any(1)
     selected_gait_indices: list[int] = []
-    for candidate_gait_indices in np.split(
+    for wheel_candidates in np.split(
         np.arange(len(candidate_wheel_indices)),
         find_slowest_gait_indices(candidate_wheel_indices, n_wheels)[1:],
     ):
-        n_gaits_selected_before = len(selected_gait_indices)
-        for candidate_gait_index in sorted(
-            candidate_gait_indices[is_gait_valid[candidate_gait_indices]],
-            key=lambda candidate_gait_index: candidate_gait_speeds[candidate_gait_index],
-        ):
-            step_match_flags = (
-                np.abs(
-                    scaled_step_end_states[selected_gait_index]
-                    - scaled_step_end_states[candidate_gait_index, -1]
-                ).max(-1)
-                < DUPLICATE_GAIT_DISTANCE
-                for selected_gait_index in selected_gait_indices[n_gaits_selected_before:]
-            )
-            if not any(is_step_matching.any() for is_step_matching in step_match_flags):
-                selected_gait_indices.append(int(candidate_gait_index))
-        selected_gait_indices += (
-            []
-            if len(selected_gait_indices) > n_gaits_selected_before
-            else [int(candidate_gait_indices[0])]
-        )
+        valid_candidates = wheel_candidates[is_gait_valid[wheel_candidates]]
+        gaits_of_wheel: list[int] = []
+        order_of_speeds = np.argsort(candidate_gait_speeds[valid_candidates], kind="stable")
+        for candidate in valid_candidates[order_of_speeds]:
+            distances_to_gaits = np.abs(
+                scaled_step_end_states[gaits_of_wheel] - scaled_step_end_states[candidate, -1]
+            ).max(-1)
+            if not (distances_to_gaits < DUPLICATE_GAIT_DISTANCE).any():
+                gaits_of_wheel.append(candidate)
+        selected_gait_indices += gaits_of_wheel or [wheel_candidates[0]]
     # The cycle of a wheel without a valid candidate contains zeros and has a failure as outcome.
     selected_gaits = select_tree_rows(candidate_gaits, selected_gait_indices)
-    is_selected_gait_missing = ~is_gait_valid[selected_gait_indices]
-    broadcast_missing_mask = lambda gait_array: is_selected_gait_missing.reshape(
-        -1, *[1] * (gait_array.ndim - 1)
-    )
-    masked_gaits = jax.tree.map(
-        lambda gait_array: np.where(
-            broadcast_missing_mask(gait_array), np.zeros_like(gait_array), gait_array
-        ),
-        selected_gaits,
-    )
+    is_gait_missing = ~is_gait_valid[selected_gait_indices]
     outcome_codes = np.where(
-        selected_gaits.outcome == Outcome.STEPPED, Outcome.NO_CYCLE_FOUND, selected_gaits.outcome
-    )
-    outcome_codes = np.where(
-        is_selected_gait_missing, outcome_codes, selected_gaits.outcome
+        is_gait_missing & (selected_gaits.outcome == Outcome.STEPPED),
+        Outcome.NO_CYCLE_FOUND,
+        selected_gaits.outcome,
     ).astype(np.int32)
-    masked_gaits = eqx.tree_at(
-        lambda gaits_of_candidates: gaits_of_candidates.outcome, masked_gaits, outcome_codes
-    )
-    return candidate_wheel_indices[selected_gait_indices], jax.device_put(masked_gaits)
+    for gait_array in jax.tree.leaves(selected_gaits):
+        gait_array[is_gait_missing] = 0
+    selected_gaits = eqx.tree_at(lambda gaits: gaits.outcome, selected_gaits, outcome_codes)
+    return candidate_wheel_indices[selected_gait_indices], jax.device_put(selected_gaits)
 
 
 def find_slow_gaits(gait_finder: Any, parameter_values: Any) -> Any:

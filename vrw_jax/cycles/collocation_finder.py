@@ -29,7 +29,6 @@ from vrw_jax.cycles.limit_cycle_result import (
     guess_cycle_from_walk,
     sample_walk_in_time,
     solve_limit_cycle,
-    transfer_solution_to_mesh,
 )
 from vrw_jax.cycles.options import CycleOptions
 from vrw_jax.cycles.slope_response import COLLOCATION_RESPONSE_MEASURES, SlopeResponse
@@ -103,11 +102,7 @@ class CollocationFinder(AbstractGaitFinder):
         At a scuffing take-off the clearance in SLS-I jumps, and the clearance in SLS-II is returned
         instead. Callers must therefore also check `takeoff_acceleration`.
         """
-        measure_value = (
-            cycle.measure(measure_name)
-            if measure_name in cls.cycle_measures
-            else step.measures()[measure_name]
-        )
+        measure_value = super().read_measure(measure_name, cycle, step)
         if measure_name == "clearance_sls1":
             is_takeoff_scuffing = cycle.measure("takeoff_acceleration") < 0.0
             return jnp.where(is_takeoff_scuffing, step.measures()["clearance_sls2"], measure_value)
@@ -117,15 +112,9 @@ class CollocationFinder(AbstractGaitFinder):
         if isinstance(cycle_guess, LimitCycle) and cycle_guess.system == self.collocation_system:
             cycle_guess = cycle_guess.collocation_state
         elif cycle_guess is not None and not isinstance(cycle_guess, CollocationState):
-            section_state = (
-                cycle_guess.section_state if isinstance(cycle_guess, AbstractCycle) else cycle_guess
-            )
-            params, collocation_state, _, _ = convert_step_arguments(
-                params, section_state, None, None
-            )
-            cycle_guess = self.guess_cycle_from_state(
-                *lax.stop_gradient((params, collocation_state))
-            )
+            section_state = getattr(cycle_guess, "section_state", cycle_guess)
+            params, section_state, _, _ = convert_step_arguments(params, section_state, None, None)
+            cycle_guess = self.guess_cycle_from_state(*lax.stop_gradient((params, section_state)))
         return dataclasses.replace(
             solve_limit_cycle(params, self.collocation_system, cycle_guess), model=self.model
         )
@@ -148,31 +137,15 @@ class CollocationFinder(AbstractGaitFinder):
         landing_result = transitions.resolve_landing(
             params.symbols(), previous_end_state[0], *previous_end_state[2:]
         )
-        collocation_solution, is_phase_active, step_ends = jax.tree.map(
-            lambda x: jnp.roll(x, -first_step_index, 0),
-            (
-                collocation_state.solution,
-                collocation_state.is_phase_active,
-                collocation_state.gait_step_end_states,
-            ),
+        shifted_state = jax.tree.map(
+            lambda x: jnp.roll(x, -first_step_index, 0) if x.ndim else x, collocation_state
         )
         section_state = jnp.stack(
             [landing_result.theta_after_landing, landing_result.motion_after.dtheta]
         )
-        return collocation_state._replace(
-            solution=collocation_solution._replace(section_state=section_state),
-            is_phase_active=is_phase_active,
-            gait_step_end_states=step_ends,
+        return shifted_state._replace(
+            solution=shifted_state.solution._replace(section_state=section_state)
         )
-
-    def transfer_state_to_mesh(
-        self, source_system: CollocationSystem, collocation_state: CollocationState
-    ) -> CollocationState:
-        """Transfer a collocation state from the mesh of `source_system` to this finder's mesh."""
-        transferred_solution = transfer_solution_to_mesh(
-            source_system, self.collocation_system, collocation_state.solution
-        )
-        return collocation_state._replace(solution=transferred_solution)
 
     @eqx.filter_jit
     def make_initial_guess(self, parameter_values: ParameterValues) -> CollocationState:
@@ -185,28 +158,24 @@ class CollocationFinder(AbstractGaitFinder):
         cycle, cycle_derivatives = compute_cycle_and_derivatives(
             self.collocation_system, parameter_values, cycle_guess
         )
-        section_state, section_state_derivatives = (
-            cycle.section_state,
-            cycle_derivatives.section_state,
-        )
         step, step_derivatives = compute_step_and_derivatives(
             self.model,
             self.n_legs,
             parameter_values,
-            section_state,
-            section_state_derivatives,
+            cycle.section_state,
+            cycle_derivatives.section_state,
             self.step_options,
         )
-        gait_coordinates = lambda cycle: jnp.concatenate([cycle.section_state, cycle.durations], -1)
-        branch_point_fields = (
-            gait_coordinates(cycle),
-            gait_coordinates(cycle_derivatives),
+        stack_coordinates = lambda cycle: jnp.concatenate(
+            [cycle.section_state, cycle.durations], -1
+        )
+        branch_point = GaitBranchPoint(
+            stack_coordinates(cycle),
+            stack_coordinates(cycle_derivatives),
             cycle.collocation_state.is_phase_active,
             cycle.monodromy_value,
         )
-        return Gait(
-            cycle, step, cycle_derivatives, step_derivatives, GaitBranchPoint(*branch_point_fields)
-        )
+        return Gait(cycle, step, cycle_derivatives, step_derivatives, branch_point)
 
     def refine_cycle_guess(
         self, parameter_values: ParameterValues, cycle_guess: Any
@@ -293,7 +262,7 @@ def compute_step_and_derivatives(
     parameters.
     """
 
-    n_parameter_values = parameter_values.shape[0]
+    n_parameter_values = len(parameter_values)
     take_step = lambda step_inputs: model.take_step(
         make_wheel_from_parameters(step_inputs[:n_parameter_values], n_legs),
         step_inputs[n_parameter_values:],
@@ -302,12 +271,8 @@ def compute_step_and_derivatives(
     step, step_input_jacobian = evaluate_with_jacobian(
         take_step, jnp.concatenate([parameter_values, section_state])
     )
-    step_input_tangents = jnp.concatenate(
+    input_derivatives = jnp.concatenate(
         [jnp.eye(n_parameter_values, dtype=section_state.dtype), section_state_derivatives], axis=1
     )
-    return step, move_derivative_axis_first(
-        jax.tree.map(
-            lambda step_input_derivative: step_input_derivative @ step_input_tangents.T,
-            step_input_jacobian,
-        )
-    )
+    step_derivatives = jax.tree.map(lambda x: x @ input_derivatives.T, step_input_jacobian)
+    return step, move_derivative_axis_first(step_derivatives)

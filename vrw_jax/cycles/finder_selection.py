@@ -26,7 +26,7 @@ from vrw_jax.simulation import (
     convert_step_options,
     require_single_wheel,
 )
-from vrw_jax.validation import check_type, has_traced_leaf
+from vrw_jax.validation import check_int, check_type, has_traced_leaf
 from vrw_jax.wheel import WheelParams
 
 UserCycleGuess = LimitCycle | ReturnMapCycle | Array | np.ndarray | Sequence[float]
@@ -87,9 +87,12 @@ def resolve_model_with_reason(
     sentence.
     """
     selected_model: Any = convert_model_argument(model)
-    if selected_model.fallback_model is selected_model or not isinstance(params, WheelParams):
-        return model, None
-    if has_traced_leaf(params, model) or params.damping.ndim:
+    if (
+        selected_model.fallback_model is selected_model
+        or not isinstance(params, WheelParams)
+        or has_traced_leaf(params, model)
+        or params.damping.ndim
+    ):
         return model, None
     paper_cycle: Any = make_finder(None, params.n_legs).find_cycle(params)
     if not bool(paper_cycle.found):
@@ -134,7 +137,7 @@ def resolve_finder(
     gait_finder = make_finder(
         model,
         params.n_legs,
-        period_n=period_n,
+        period_n=check_int("period_n", period_n),
         cycle_options=options if has_cycle_options else None,  # type: ignore[arg-type]
         step_options=None if has_cycle_options else options,  # type: ignore[arg-type]
     )

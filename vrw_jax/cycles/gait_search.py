@@ -35,7 +35,7 @@ from vrw_jax.cycles.gait_walks import (
     measure_period_defects,
     walk_to_gaits,
 )
-from vrw_jax.cycles.limit_cycle_result import LimitCycle
+from vrw_jax.cycles.limit_cycle_result import LimitCycle, transfer_solution_to_mesh
 from vrw_jax.cycles.options import CycleOptions
 from vrw_jax.cycles.return_map_finder import ReturnMapCycle
 from vrw_jax.numerics import (
@@ -48,7 +48,6 @@ from vrw_jax.numerics import (
 from vrw_jax.simulation import ModelLike
 from vrw_jax.validation import (
     check_choice,
-    check_int,
     check_real,
     check_type,
     has_traced_leaf,
@@ -183,7 +182,7 @@ def limit_cycle(
     """
     parse_gait_choice(which)
     model = resolve_model(params, model)
-    gait_finder = resolve_finder(params, model, options, check_int("period_n", period_n))
+    gait_finder = resolve_finder(params, model, options, period_n)
     fills_missing_gait_with_nan = check_choice("on_failure", on_failure, FAILURE_FILLS) == "nan"
     if guess is None and period_n > 1 and not gait_finder.is_multistable:
         raise ValueError(
@@ -234,7 +233,7 @@ def limit_cycles(
     batch_shape = np.broadcast_shapes(*(np.shape(x) for x in jax.tree.leaves(params)))
     if not batch_shape:
         model = resolve_model(params, model)
-        gait_finder = resolve_finder(params, model, options, check_int("period_n", period_n))
+        gait_finder = resolve_finder(params, model, options, period_n)
         if gait_finder.is_multistable:
             require_untraced_arguments("vrw.limit_cycles", "give vrw.limit_cycle a guess", params)
             return find_attracting_gaits(
@@ -254,9 +253,7 @@ def limit_cycles(
     else:  # NumPy is used because JAX would compile a program for each batch size.
         params = jax.tree.map(lambda x: np.broadcast_to(np.asarray(x), batch_shape), params)
         params, first_wheel_params = jax.device_put((params, select_tree_rows(params, 0)))
-    gait_finder = resolve_finder(
-        first_wheel_params, model, options, check_int("period_n", period_n)
-    )
+    gait_finder = resolve_finder(first_wheel_params, model, options, period_n)
     cycle: Any = _search_with_fallbacks(gait_finder, params, None, options is None, which)
     return cycle
 
@@ -277,7 +274,8 @@ def parse_gait_choice(which: GaitChoice) -> int:
 
 def _find_chosen_gaits(gait_finder: Any, params: WheelParams, gait_choice: GaitChoice) -> Any:
     """Find for each wheel the attracting gait that `gait_choice` selects."""
-    n_wheels, gait_rank = params.damping.shape[0], parse_gait_choice(gait_choice)
+    n_wheels = len(params.damping)
+    gait_rank = parse_gait_choice(gait_choice)
     gait_wheel_indices, attracting_gaits = find_attracting_gaits(
         gait_finder, gait_finder.model.collect_batch_parameter_values(params)
     )
@@ -312,32 +310,28 @@ def _search_with_fallbacks(
     """
     has_batch_axis = params.damping.ndim > 0
     params_without_tangents = lax.stop_gradient(params)
-    is_batch_empty, are_params_concrete = (
-        has_traced_leaf(params_without_tangents),
-        not has_traced_leaf(params),
-    )
-    if gait_finder.is_multistable and cycle_guess is None and not is_batch_empty:
-        cycle = _find_chosen_gaits(
-            gait_finder,
-            params_without_tangents
-            if has_batch_axis
-            else _take_wheels_on_device(params_without_tangents, None),
-            gait_choice,
+    are_params_concrete = not has_traced_leaf(params)
+    add_batch_axis = lambda tree: tree if has_batch_axis else _take_wheels_on_device(tree, None)
+    drop_added_axis = lambda tree: tree if has_batch_axis else _take_wheels_on_device(tree, 0)
+    if (
+        gait_finder.is_multistable
+        and cycle_guess is None
+        and not has_traced_leaf(params_without_tangents)
+    ):
+        cycle = drop_added_axis(
+            _find_chosen_gaits(gait_finder, add_batch_axis(params_without_tangents), gait_choice)
         )
-        cycle = cycle if has_batch_axis else _take_wheels_on_device(cycle, 0)
         return (
             cycle
             if are_params_concrete
             else _search_without_fallbacks(gait_finder, params, cycle.section_state)
         )
     cycle = _search_without_fallbacks(gait_finder, params, cycle_guess)
-    params_and_cycle = lax.stop_gradient(
-        (params, cycle)
-    )  # Differentiated arrays also have concrete values.
+    # Differentiated arrays also have concrete values.
+    params_and_cycle: tuple[WheelParams, Any] = lax.stop_gradient((params, cycle))
     if not gait_finder.supports_cold_start or has_traced_leaf(params_and_cycle):
         return cycle
-    if not has_batch_axis:
-        params_and_cycle = _take_wheels_on_device(params_and_cycle, None)
+    params_and_cycle = add_batch_axis(params_and_cycle)
     section_state = None
     if cycle_guess is not None:
         if isinstance(cycle_guess, CollocationState):
@@ -360,22 +354,17 @@ def _search_with_fallbacks(
         return cycle
     gait_finder, collocation_state = finder_and_starts
     if are_params_concrete:
-        retried_cycle = map_in_batches(
-            gait_finder.find_cycles,
-            batch_sizes.GAIT_BATCH_SIZES,
-            params_and_cycle[0],
-            collocation_state,
+        retried_cycle = drop_added_axis(
+            map_in_batches(
+                gait_finder.find_cycles,
+                batch_sizes.GAIT_BATCH_SIZES,
+                params_and_cycle[0],
+                collocation_state,
+            )
         )  # a compiled program
-        retried_cycle = (
-            retried_cycle if has_batch_axis else _take_wheels_on_device(retried_cycle, 0)
-        )
     else:
         retried_cycle = _search_without_fallbacks(
-            gait_finder,
-            params,
-            jax.device_put(collocation_state)
-            if has_batch_axis
-            else _take_wheels_on_device(collocation_state, 0),
+            gait_finder, params, jax.device_put(drop_added_axis(collocation_state))
         )
     return _restore_first_failure_reason(cycle, retried_cycle)
 
@@ -387,26 +376,18 @@ def _restore_first_failure_reason(cycle: LimitCycle, retried_cycle: LimitCycle) 
     functions therefore report the same reason, whether fallbacks are used or not, and for any
     batch.
     """
-    failure_reason_getter = lambda cycle: (cycle.outcome, cycle.collocation_state.failed_check)
-    first_failure_reason, last_failure_reason = (
-        failure_reason_getter(cycle),
-        failure_reason_getter(retried_cycle),
-    )
-    wheel_value_selector: Any = jnp.where
+    get_failure_reason = lambda cycle: (cycle.outcome, cycle.collocation_state.failed_check)
+    failure_reasons = get_failure_reason(cycle), get_failure_reason(retried_cycle)
     # NumPy compiles nothing for a new batch size.
-    if not has_traced_leaf((first_failure_reason, last_failure_reason)):
-        first_failure_reason, last_failure_reason = jax.tree.map(
-            np.asarray, (first_failure_reason, last_failure_reason)
-        )
-        wheel_value_selector = lambda *arrays: jax.device_put(np.where(*arrays))
-    is_gait_missing = (first_failure_reason[0] != Outcome.STEPPED) & (
-        last_failure_reason[0] != Outcome.STEPPED
+    array_module: Any = jnp if has_traced_leaf(failure_reasons) else np
+    first_reason, last_reason = jax.tree.map(array_module.asarray, failure_reasons)
+    is_gait_missing = (first_reason[0] != Outcome.STEPPED) & (last_reason[0] != Outcome.STEPPED)
+    failure_reason = jax.tree.map(
+        lambda first, last: array_module.where(is_gait_missing, first, last),
+        first_reason,
+        last_reason,
     )
-    failure_reason = [
-        wheel_value_selector(is_gait_missing, *failure_reason_pair)
-        for failure_reason_pair in zip(first_failure_reason, last_failure_reason, strict=True)
-    ]
-    return eqx.tree_at(failure_reason_getter, retried_cycle, tuple(failure_reason))
+    return eqx.tree_at(get_failure_reason, retried_cycle, jax.device_put(failure_reason))
 
 
 def _search_without_fallbacks(
@@ -459,24 +440,18 @@ def _find_walk_end_states(
     solver_indices = select_cheapest_solver(parameter_matrix, StepOptions())
     is_solver_explicit = solver_indices != SolverIndex.IMPLICIT_SOLVER
     unsettled_wheel_indices = np.flatnonzero(is_walk_needed & is_solver_explicit)
-    parameter_values, walk_end_states = (
-        parameter_matrix.T,
-        np.full((len(is_walk_needed), 3), np.nan),
-    )
+    parameter_values = parameter_matrix.T
+    walk_end_states = np.full((len(is_walk_needed), 3), np.nan)
     smallest_period_defects = np.full(
         len(is_walk_needed), GAIT_WALK_OPTIONS.max_newton_start_defect
     )
     if guess_states_by_wheel is not None:
-        guess_section_states = guess_states_by_wheel[unsettled_wheel_indices]
-        is_guess_usable = (
-            measure_period_defects(
-                gait_finder, parameter_values[unsettled_wheel_indices], guess_section_states
-            )
-            < GAIT_WALK_OPTIONS.max_newton_start_defect
+        guess_states = guess_states_by_wheel[unsettled_wheel_indices]
+        guess_defects = measure_period_defects(
+            gait_finder, parameter_values[unsettled_wheel_indices], guess_states
         )
-        walk_end_states[unsettled_wheel_indices[is_guess_usable]] = guess_section_states[
-            is_guess_usable
-        ]
+        is_guess_usable = guess_defects < GAIT_WALK_OPTIONS.max_newton_start_defect
+        walk_end_states[unsettled_wheel_indices[is_guess_usable]] = guess_states[is_guess_usable]
         unsettled_wheel_indices = unsettled_wheel_indices[~is_guess_usable]
     for start_state_function in (compute_walk_starts, compute_fallback_walk_starts):
         if not len(unsettled_wheel_indices):
@@ -488,10 +463,8 @@ def _find_walk_end_states(
             unsettled_wheel_indices[walk_ends.wheel_indices], *walk_ends[1:], strict=True
         ):
             if period_defect < smallest_period_defects[wheel_index]:
-                smallest_period_defects[wheel_index], walk_end_states[wheel_index] = (
-                    period_defect,
-                    walk_end_state,
-                )
+                smallest_period_defects[wheel_index] = period_defect
+                walk_end_states[wheel_index] = walk_end_state
         has_not_settled = (
             smallest_period_defects[unsettled_wheel_indices] >= GAIT_WALK_OPTIONS.max_settled_defect
         )
@@ -537,13 +510,20 @@ def _make_search_starts(
     )
 
 
+def _has_large_mesh_error(cycle: LimitCycle) -> np.ndarray:
+    """Return for each wheel whether its mesh error is too large without a finer mesh."""
+    mesh_errors = map_in_batches(
+        lambda cycle: cycle.mesh_error, batch_sizes.GAIT_BATCH_SIZES, cycle
+    )
+    return np.asarray(mesh_errors) > SEARCH_FALLBACK_OPTIONS.max_unrefined_mesh_error
+
+
 def _find_fallback_starts(
     gait_finder: CollocationFinder,
     params: WheelParams,
     cycle: LimitCycle,
     guess_states_by_wheel: np.ndarray | None,
     can_refine_mesh: bool,
-    fallback_options: SearchFallbackOptions = SEARCH_FALLBACK_OPTIONS,
 ) -> tuple[CollocationFinder, CollocationState] | None:
     """Return a finder and the starts from which it finds more gaits of a batch.
 
@@ -553,12 +533,7 @@ def _find_fallback_starts(
     - `can_refine_mesh`: whether a finer mesh may be used.
     """
     search_outcomes = np.asarray(cycle.outcome)
-    mesh_errors = map_in_batches(
-        lambda cycle: cycle.mesh_error, batch_sizes.GAIT_BATCH_SIZES, cycle
-    )
-    has_large_mesh_error = can_refine_mesh & (
-        np.asarray(mesh_errors) > fallback_options.max_unrefined_mesh_error
-    )
+    has_large_mesh_error = can_refine_mesh & _has_large_mesh_error(cycle)
     is_gait_missing = np.isin(search_outcomes, RETRY_OUTCOMES)
     needs_better_gait = is_gait_missing | has_large_mesh_error
     if not needs_better_gait.any():
@@ -567,19 +542,26 @@ def _find_fallback_starts(
         gait_finder, params, is_gait_missing, guess_states_by_wheel
     )
     # `collocation_state` contains the best start so far of each wheel, on the last finder's mesh.
-    collocation_state, has_known_state = cycle.collocation_state, has_large_mesh_error.copy()
+    collocation_state = cycle.collocation_state
+    has_known_state = has_large_mesh_error.copy()
     is_mesh_too_coarse = search_outcomes == Outcome.MESH_TOO_COARSE
     best_finder_and_starts = None
-    for refinement_index in range(1 + fallback_options.max_mesh_refinements * can_refine_mesh):
+    n_refinements = SEARCH_FALLBACK_OPTIONS.max_mesh_refinements if can_refine_mesh else 0
+    for refinement_index in range(1 + n_refinements):
         if refinement_index:
-            coarser_finder, gait_finder = gait_finder, gait_finder.with_finer_mesh()
-            transfer_solution = jax.vmap(
-                functools.partial(
-                    gait_finder.transfer_state_to_mesh, coarser_finder.collocation_system
-                )
+            coarser_finder = gait_finder
+            gait_finder = coarser_finder.with_finer_mesh()
+            transfer_solution = functools.partial(
+                transfer_solution_to_mesh,
+                coarser_finder.collocation_system,
+                gait_finder.collocation_system,
             )
-            collocation_state = map_in_batches(
-                transfer_solution, batch_sizes.GAIT_BATCH_SIZES, collocation_state
+            collocation_state = collocation_state._replace(
+                solution=map_in_batches(
+                    jax.vmap(transfer_solution),
+                    batch_sizes.GAIT_BATCH_SIZES,
+                    collocation_state.solution,
+                )
             )
         # The search without walks has already used this mesh. One finer mesh is always used.
         is_retry_promising = (
@@ -602,32 +584,22 @@ def _find_fallback_starts(
         retried_cycle = map_in_batches(
             gait_finder.find_cycles, batch_sizes.GAIT_BATCH_SIZES, retried_params, start_states
         )
-        is_gait_found = np.asarray(retried_cycle.outcome) == Outcome.STEPPED
-        mesh_errors = np.asarray(
-            map_in_batches(
-                lambda cycle: cycle.mesh_error, batch_sizes.GAIT_BATCH_SIZES, retried_cycle
-            )
-        )
+        is_gait_found = np.asarray(retried_cycle.found)
+        found_wheel_indices = retried_wheel_indices[is_gait_found]
         collocation_state = _replace_wheels(
             collocation_state,
-            retried_wheel_indices[is_gait_found],
+            found_wheel_indices,
             _take_wheels_on_device(retried_cycle.collocation_state, is_gait_found),
         )
-        if is_gait_found.any():
+        if len(found_wheel_indices):
             best_finder_and_starts = gait_finder, collocation_state
-        has_known_state[retried_wheel_indices[is_gait_found]] = True
+        has_known_state[found_wheel_indices] = True
         is_mesh_too_coarse[retried_wheel_indices] = (
             np.asarray(retried_cycle.outcome) == Outcome.MESH_TOO_COARSE
         )
-        needs_better_gait[
-            retried_wheel_indices[
-                is_gait_found
-                & (
-                    (mesh_errors <= fallback_options.max_unrefined_mesh_error)
-                    | (not can_refine_mesh)
-                )
-            ]
-        ] = False
+        needs_better_gait[found_wheel_indices] = (
+            can_refine_mesh & _has_large_mesh_error(retried_cycle)[is_gait_found]
+        )
     return best_finder_and_starts
 
 
@@ -655,41 +627,24 @@ def _retry_from_other_steps(
     cycle: LimitCycle,
     section_states: np.ndarray,
 ) -> tuple[CollocationFinder, CollocationState] | None:
-    """Search for the same gaits with another gait step as the first step.
+    """Search for the same gait of one wheel with another gait step as the first step.
 
-    Return a finder and the gaits, or None if no gait is found. A guess contains the accelerations
-    of all gait steps, whose errors accumulate. A gait step without double support is the most
+    Return a finder and the gait, or None if no gait is found. A guess contains the accelerations of
+    all gait steps, whose errors accumulate. A gait step without double support is the most
     sensitive step. If it is the first or the last step, the search may fail.
     """
-    wheels_without_gait = np.flatnonzero(np.isin(np.asarray(cycle.outcome), RETRY_OUTCOMES))
-    if not len(wheels_without_gait):
+    if int(cycle.outcome[0]) not in RETRY_OUTCOMES:
         return None
-    params_without_gait = _take_wheels_on_device(params, wheels_without_gait)
-    section_states = np.array(section_states[wheels_without_gait])
-    best_finder_and_starts = None
-    collocation_state = cycle.collocation_state
     for _ in range(1, gait_finder.period_n):
         section_states = np.asarray(
-            step_batch(params_without_gait, section_states, model=gait_finder.model).section_state
+            step_batch(params, section_states, model=gait_finder.model).section_state
         )
         retried_cycle = map_in_batches(
-            gait_finder.find_cycles,
-            batch_sizes.GAIT_BATCH_SIZES,
-            params_without_gait,
-            section_states,
+            gait_finder.find_cycles, batch_sizes.GAIT_BATCH_SIZES, params, section_states
         )
-        found_gait_positions = np.flatnonzero(
-            np.asarray(retried_cycle.found)
-            & (np.asarray(collocation_state.has_cycle)[wheels_without_gait] < 0.5)
-        )
-        if len(found_gait_positions):
-            collocation_state = _replace_wheels(
-                collocation_state,
-                wheels_without_gait[found_gait_positions],
-                _take_wheels_on_device(retried_cycle.collocation_state, found_gait_positions),
-            )
-            best_finder_and_starts = gait_finder, collocation_state
-    return best_finder_and_starts
+        if retried_cycle.found[0]:
+            return gait_finder, retried_cycle.collocation_state
+    return None
 
 
 def _align_first_step(
@@ -699,31 +654,17 @@ def _align_first_step(
     start_section_states: np.ndarray,
     finder_and_starts: tuple[CollocationFinder, CollocationState] | None,
 ) -> tuple[CollocationFinder, CollocationState] | None:
-    """Return a finder and the same gaits, with the first step selected by its section state.
+    """Return a finder and the same gait of one wheel, with the first step selected by its state.
 
     The first step is the gait step that starts nearest to `start_section_states`.
     """
     gait_finder, collocation_state = finder_and_starts or (gait_finder, cycle.collocation_state)
-    end_states = np.asarray(collocation_state.gait_step_end_states)[:, :, [0, 2, 3]]
-    state_distances_to_start = np.abs(
-        np.roll(end_states, 1, axis=1) - start_section_states[:, None]
-    ).max(-1)
-    state_distances_to_start = np.where(
-        np.asarray(collocation_state.has_cycle)[:, None] > 0.5, state_distances_to_start, 0.0
+    end_states = np.asarray(collocation_state.gait_step_end_states)[0][:, [0, 2, 3]]
+    distances_to_start = np.abs(np.roll(end_states, 1, axis=0) - start_section_states).max(-1)
+    first_step_index = int(np.argmin(distances_to_start))
+    if not first_step_index or collocation_state.has_cycle[0] < 0.5:
+        return finder_and_starts
+    shift_to_first_step = jax.vmap(
+        functools.partial(gait_finder.shift_first_step, first_step_index)
     )
-    for step_index in range(1, gait_finder.period_n):
-        shifted_wheel_indices = np.flatnonzero(np.argmin(state_distances_to_start, 1) == step_index)
-        if len(shifted_wheel_indices):
-            shift_to_first_step = jax.vmap(
-                functools.partial(gait_finder.shift_first_step, step_index)
-            )
-            collocation_state = _replace_wheels(
-                collocation_state,
-                shifted_wheel_indices,
-                shift_to_first_step(
-                    _take_wheels_on_device(params, shifted_wheel_indices),
-                    _take_wheels_on_device(collocation_state, shifted_wheel_indices),
-                ),
-            )
-            finder_and_starts = gait_finder, collocation_state
-    return finder_and_starts
+    return gait_finder, shift_to_first_step(params, jax.device_put(collocation_state))

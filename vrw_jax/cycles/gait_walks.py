@@ -3,7 +3,6 @@
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import jax
@@ -12,7 +11,7 @@ import numpy as np
 from vrw_jax.batches import step_batch
 from vrw_jax.contact import embed_section_states
 from vrw_jax.numerics import StepOptions
-from vrw_jax.wheel import PARAMETER_NAMES, Outcome, WheelParams, compute_wheel_units_of_rows
+from vrw_jax.wheel import Outcome, WheelParams, compute_wheel_units_of_rows
 
 
 @dataclass(frozen=True)
@@ -73,29 +72,21 @@ def compute_walk_starts(params: WheelParams) -> np.ndarray:
     """Return the section states that WALK_STARTS describe for each wheel, shape
     (starts, wheels, 3).
     """
-    numpy_params, slope_sine, slope_cosine = (
-        _convert_params_to_numpy(params),
-        math.sin(params.leg_angle),
-        math.cos(params.leg_angle),
-    )
+    wheels = _convert_params_to_numpy(params)
+    leg_angle_sine = math.sin(wheels.leg_angle)
+    leg_angle_cosine = math.cos(wheels.leg_angle)
     weight_normal_to_slope = (
-        (numpy_params.hub_mass + params.n_legs * numpy_params.leg_mass)
-        * numpy_params.gravity
-        * np.cos(numpy_params.slope)
+        (wheels.hub_mass + wheels.n_legs * wheels.leg_mass) * wheels.gravity * np.cos(wheels.slope)
     )
     static_length_ratio = (
-        numpy_params.natural_length - weight_normal_to_slope / numpy_params.stiffness
-    ) / numpy_params.locked_length
-    leg_lengths = [
-        np.clip(1.0 + contraction_share * (static_length_ratio - 1.0), slope_cosine + 0.02, 1.0)
-        for contraction_share, _ in WALK_STARTS
-    ]
-    touchdown_angles = [
-        np.arctan((leg_length - slope_cosine) / slope_sine) for leg_length in leg_lengths
-    ]
-    return _make_section_states(
-        params, touchdown_angles, [rolling_rate_share for _, rolling_rate_share in WALK_STARTS]
+        wheels.natural_length - weight_normal_to_slope / wheels.stiffness
+    ) / wheels.locked_length
+    contraction_shares, rate_shares = np.array(WALK_STARTS).T[..., None]
+    leg_lengths = np.clip(
+        1.0 + contraction_shares * (static_length_ratio - 1.0), leg_angle_cosine + 0.02, 1.0
     )
+    touchdown_angles = np.arctan((leg_lengths - leg_angle_cosine) / leg_angle_sine)
+    return _make_section_states(wheels, touchdown_angles, rate_shares)
 
 
 def compute_fallback_walk_starts(params: WheelParams) -> np.ndarray:
@@ -103,51 +94,38 @@ def compute_fallback_walk_starts(params: WheelParams) -> np.ndarray:
 
     The shape is (starts, wheels, 3).
     """
-    touchdown_angles = [
-        np.full(np.shape(params.slope), touchdown_angle_share * params.leg_angle)
-        for touchdown_angle_share, _ in FALLBACK_WALK_STARTS
-    ]
-    return _make_section_states(
-        params,
-        touchdown_angles,
-        [rolling_rate_share for _, rolling_rate_share in FALLBACK_WALK_STARTS],
-    )
+    wheels = _convert_params_to_numpy(params)
+    angle_shares, rate_shares = np.array(FALLBACK_WALK_STARTS).T[..., None]
+    return _make_section_states(wheels, angle_shares * wheels.leg_angle, rate_shares)
 
 
 def _convert_params_to_numpy(params: WheelParams) -> Any:
-    """Return the parameters as NumPy arrays.
+    """Return the wheels with parameters that are NumPy arrays.
 
     With JAX arrays, each operation would be compiled for every number of wheels.
     """
-    return SimpleNamespace(**{name: np.asarray(getattr(params, name)) for name in PARAMETER_NAMES})
+    return jax.tree.map(np.asarray, params)
 
 
 def _make_section_states(
-    params: WheelParams, touchdown_angles: list[np.ndarray], rolling_rate_shares: list[float]
+    wheels: WheelParams, touchdown_angles: np.ndarray, rolling_rate_shares: np.ndarray
 ) -> np.ndarray:
     """Build section states from touchdown angles (rad) and rates, shape (starts, wheels, 3).
 
     - `rolling_rate_shares`: rate of the hub as a fraction of its rate in the rigid rolling gait,
       for each start.
     """
-    numpy_params, leg_angle = _convert_params_to_numpy(params), params.leg_angle
     rigid_leg_rate = np.sqrt(
         4.0
-        * numpy_params.gravity
-        / numpy_params.locked_length
-        * np.sin(0.5 * leg_angle)
-        * np.sin(numpy_params.slope)
+        * wheels.gravity
+        / wheels.locked_length
+        * np.sin(0.5 * wheels.leg_angle)
+        * np.sin(wheels.slope)
     )
-    rolling_rate, leg_rate = (
-        rigid_leg_rate / np.sin(leg_angle),
-        -0.1 * np.sqrt(numpy_params.gravity * numpy_params.locked_length) / 3.0,
-    )
-    touchdown_angles_and_shares = zip(touchdown_angles, rolling_rate_shares, strict=True)
+    rolling_rate = rigid_leg_rate / np.sin(wheels.leg_angle)
+    leg_rate = -0.1 * np.sqrt(wheels.gravity * wheels.locked_length) / 3.0
     return np.stack(
-        [
-            np.stack([theta, rolling_rate_share * rolling_rate, leg_rate], -1)
-            for theta, rolling_rate_share in touchdown_angles_and_shares
-        ]
+        np.broadcast_arrays(touchdown_angles, rolling_rate_shares * rolling_rate, leg_rate), -1
     )
 
 
@@ -159,14 +137,18 @@ def stack_section_units(model: Any, parameter_values: np.ndarray, n_legs: int) -
     )
 
 
-def count_section_coordinates(gait_finder: Any) -> int:
-    """Return the number of continuous components in a section state.
+def scale_section_states(
+    gait_finder: Any, parameter_values: np.ndarray, section_states: np.ndarray
+) -> np.ndarray:
+    """Return the continuous components of the section state of each wheel, in units of the wheel.
 
     The remaining components are discrete codes.
     """
-    return int(
-        gait_finder.model.count_continuous_section_entries(WheelParams(n_legs=gait_finder.n_legs))
+    section_units = stack_section_units(gait_finder.model, parameter_values, gait_finder.n_legs)
+    n_coordinates = gait_finder.model.count_continuous_section_entries(
+        WheelParams(n_legs=gait_finder.n_legs)
     )
+    return (section_states / section_units)[:, :n_coordinates]
 
 
 class DistinctWalkEnds(NamedTuple):
@@ -181,7 +163,6 @@ def walk_to_gaits(
     gait_finder: Any,
     parameter_values: np.ndarray,
     start_state_function: Callable[[WheelParams], np.ndarray],
-    walk_options: GaitWalkOptions = GAIT_WALK_OPTIONS,
 ) -> DistinctWalkEnds:
     """Simulate walks of each wheel, and return the distinct states at their ends.
 
@@ -195,37 +176,33 @@ def walk_to_gaits(
             of `AbstractWheel.collect_parameter_values`.
         start_state_function: function that maps wheels to section states, shape (starts, wheels,
             3).
-        walk_options: numerical options of the walks.
     """
     start_section_states = start_state_function(
         _split_parameter_values(gait_finder, parameter_values)[1]
     )
-    n_wheels, n_coordinates = len(parameter_values), count_section_coordinates(gait_finder)
+    n_wheels = len(parameter_values)
     walk_wheel_indices = np.tile(np.arange(n_wheels), len(start_section_states))
-    parameter_values_by_walk, section_states = (
-        parameter_values[walk_wheel_indices],
-        np.concatenate(start_section_states),
-    )
+    parameter_values_by_walk = parameter_values[walk_wheel_indices]
+    section_states = np.concatenate(start_section_states)
     if gait_finder.model.batch_kernel == "legs":
         section_states = np.array(
             embed_section_states(parameter_values_by_walk.T, section_states, gait_finder.n_legs)
         )
     period_defects = np.full(len(walk_wheel_indices), np.inf)
     is_walk_duplicate = np.zeros(len(walk_wheel_indices), bool)
-    section_units = stack_section_units(
-        gait_finder.model, parameter_values_by_walk, gait_finder.n_legs
-    )
-    section_state_scaler = lambda section_states: (section_states / section_units)[
-        :, :n_coordinates
-    ]
     active_walk_indices = np.arange(len(walk_wheel_indices))
-    for n_steps in walk_options.n_steps_by_round:
+    find_duplicates = lambda max_settled_defect: _find_duplicate_walks(
+        scale_section_states(gait_finder, parameter_values_by_walk, section_states),
+        period_defects,
+        n_wheels,
+        max_settled_defect,
+    )
+    for n_steps in GAIT_WALK_OPTIONS.n_steps_by_round:
         end_states, walk_outcomes = _simulate_wheel_walks(
             gait_finder,
             parameter_values_by_walk[active_walk_indices],
             section_states[active_walk_indices],
             n_steps,
-            walk_options,
         )
         is_walking = walk_outcomes == Outcome.STEPPED
         active_walk_indices = active_walk_indices[is_walking]
@@ -234,29 +211,17 @@ def walk_to_gaits(
             gait_finder,
             parameter_values_by_walk[active_walk_indices],
             section_states[active_walk_indices],
-            walk_options,
         )
-        is_walk_duplicate |= _find_duplicate_walks(
-            section_state_scaler(section_states),
-            period_defects,
-            n_wheels,
-            walk_options.max_settled_defect,
-            walk_options,
-        )
-        has_not_settled = period_defects >= walk_options.max_settled_defect
+        is_walk_duplicate |= find_duplicates(GAIT_WALK_OPTIONS.max_settled_defect)
+        has_not_settled = period_defects >= GAIT_WALK_OPTIONS.max_settled_defect
         active_walk_indices = active_walk_indices[
             (has_not_settled & ~is_walk_duplicate)[active_walk_indices]
         ]
         if not len(active_walk_indices):
             break
-    is_walk_duplicate = _find_duplicate_walks(
-        section_state_scaler(section_states),
-        period_defects,
-        n_wheels,
-        walk_options.max_newton_start_defect,
-        walk_options,
-    )
-    is_walk_selected = ~is_walk_duplicate & (period_defects < walk_options.max_newton_start_defect)
+    is_walk_duplicate = find_duplicates(GAIT_WALK_OPTIONS.max_newton_start_defect)
+    is_near_gait = period_defects < GAIT_WALK_OPTIONS.max_newton_start_defect
+    is_walk_selected = ~is_walk_duplicate & is_near_gait
     # If a wheel has no usable walk, its first start is selected.
     is_walk_selected[np.setdiff1d(np.arange(n_wheels), walk_wheel_indices[is_walk_selected])] = True
     selected_walk_indices = np.flatnonzero(is_walk_selected)
@@ -274,18 +239,17 @@ def measure_period_defects(
     gait_finder: Any,
     parameter_values: np.ndarray,
     section_states: np.ndarray,
-    walk_options: GaitWalkOptions = GAIT_WALK_OPTIONS,
 ) -> np.ndarray:
     """Return the largest change of each section state over one period, shape (wheels,).
 
     Changes are in units of the wheel. The result is infinite if a gait step fails.
     """
     end_states, period_outcomes = _simulate_wheel_walks(
-        gait_finder, parameter_values, section_states, gait_finder.period_n, walk_options
+        gait_finder, parameter_values, section_states, gait_finder.period_n
     )
-    section_units = stack_section_units(gait_finder.model, parameter_values, gait_finder.n_legs)
-    period_defects = np.abs((end_states - section_states) / section_units)
-    period_defects = period_defects[:, : count_section_coordinates(gait_finder)].max(-1)
+    period_defects = np.abs(
+        scale_section_states(gait_finder, parameter_values, end_states - section_states)
+    ).max(-1)
     return np.where(period_outcomes == Outcome.STEPPED, period_defects, np.inf)
 
 
@@ -294,12 +258,13 @@ def _simulate_wheel_walks(
     parameter_values: np.ndarray,
     section_states: np.ndarray,
     n_steps: int,
-    walk_options: GaitWalkOptions,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the section state after `n_steps` gait steps for each wheel, and the outcomes."""
     model, params = _split_parameter_values(gait_finder, parameter_values)
     step_options = StepOptions(
-        solver="Tsit5", rtol=walk_options.walk_step_tolerance, atol=walk_options.walk_step_tolerance
+        solver="Tsit5",
+        rtol=GAIT_WALK_OPTIONS.walk_step_tolerance,
+        atol=GAIT_WALK_OPTIONS.walk_step_tolerance,
     )
     # For the stiffest wheels, the implicit solver would take minutes per walk.
     walk_result = step_batch(
@@ -325,7 +290,6 @@ def _find_duplicate_walks(
     period_defects: np.ndarray,
     n_wheels: int,
     max_settled_defect: float,
-    walk_options: GaitWalkOptions,
 ) -> np.ndarray:
     """Return whether each walk is a duplicate of another walk of the same wheel.
 
@@ -335,28 +299,22 @@ def _find_duplicate_walks(
     defect is also allowed. The axes of the arguments are starts, wheels and, for states,
     coordinates.
     """
-    scaled_walk_states, period_defects = (
-        scaled_walk_states.reshape(-1, n_wheels, scaled_walk_states.shape[-1]),
-        period_defects.reshape(-1, n_wheels),
-    )
-    start_indices = np.arange(len(scaled_walk_states))[:, None]
+    scaled_walk_states = scaled_walk_states.reshape(-1, n_wheels, scaled_walk_states.shape[-1])
+    period_defects = period_defects.reshape(-1, n_wheels)
     is_walk_duplicate = np.zeros(period_defects.shape, bool)
-    for compared_start_index in range(len(scaled_walk_states)):
-        has_smaller_defect = (period_defects[compared_start_index] < period_defects) | (
-            (period_defects[compared_start_index] == period_defects)
-            & (compared_start_index < start_indices)
+    for start_index, (other_states, other_defects) in enumerate(
+        zip(scaled_walk_states, period_defects, strict=True)
+    ):
+        is_later_start = np.arange(len(period_defects))[:, None] > start_index
+        has_smaller_defect = (other_defects < period_defects) | (
+            (other_defects == period_defects) & is_later_start
         )
-        state_distances = np.abs(scaled_walk_states - scaled_walk_states[compared_start_index]).max(
-            -1
+        merge_distances = np.where(
+            other_defects < max_settled_defect,
+            np.maximum(GAIT_WALK_OPTIONS.walk_merge_distance, 3.0 * period_defects),
+            GAIT_WALK_OPTIONS.walk_merge_distance,
         )
-        is_end_state_same = state_distances <= np.where(
-            period_defects[compared_start_index] < max_settled_defect,
-            np.maximum(walk_options.walk_merge_distance, 3.0 * period_defects),
-            walk_options.walk_merge_distance,
-        )
-        is_walk_duplicate |= (
-            has_smaller_defect
-            & is_end_state_same
-            & (period_defects < walk_options.max_newton_start_defect)
-        )
-    return is_walk_duplicate.ravel()
+        is_end_state_same = np.abs(scaled_walk_states - other_states).max(-1) <= merge_distances
+        is_walk_duplicate |= has_smaller_defect & is_end_state_same
+    is_near_gait = period_defects < GAIT_WALK_OPTIONS.max_newton_start_defect
+    return (is_walk_duplicate & is_near_gait).ravel()
