@@ -4,6 +4,7 @@ A gait finder finds, checks and differentiates the gaits of one model.
 """
 
 import abc
+import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
@@ -63,9 +64,11 @@ class Gait(eqx.Module):
 
         The step is also treated as a failure if it ends at another section state.
         """
-        cycle, step = self.cycle, self.step
         return confirm_outcome_by_step(
-            cycle.outcome, cycle.section_state, step.outcome, step.section_state
+            self.cycle.outcome,
+            self.cycle.section_state,
+            self.step.outcome,
+            self.step.section_state,
         )
 
 
@@ -85,12 +88,9 @@ def is_same_branch(
     predicted_coordinate_change = parameter_change @ (
         0.5 * (first_gait_point.coordinate_derivatives + second_gait_point.coordinate_derivatives)
     )
-    coordinate_prediction_error = np.linalg.norm(
-        second_gait_point.gait_coordinates
-        - first_gait_point.gait_coordinates
-        - predicted_coordinate_change
-    )
-    if coordinate_prediction_error > 0.5 * np.linalg.norm(predicted_coordinate_change) + 1e-6:
+    coordinate_change = second_gait_point.gait_coordinates - first_gait_point.gait_coordinates
+    prediction_error = np.linalg.norm(coordinate_change - predicted_coordinate_change)
+    if prediction_error > 0.5 * np.linalg.norm(predicted_coordinate_change) + 1e-6:
         return False
     fold_test_function = lambda branch_point: np.linalg.det(
         np.eye(len(branch_point.return_map_jacobian)) - branch_point.return_map_jacobian
@@ -108,18 +108,15 @@ def confirm_outcome_by_step(
 
     A step confirms its cycle if its start in `section_states` equals its end in `end_states`.
     """
-    is_section_state_reproduced = (
-        np.max(np.abs(np.asarray(end_states) - np.asarray(section_states)), axis=-1)
-        <= STATE_AGREEMENT_TOLERANCE
-    )
-    confirmed_outcome = np.where(
-        is_section_state_reproduced, Outcome.STEPPED, Outcome.MESH_TOO_COARSE
-    )
-    confirmed_outcome = np.where(
-        np.asarray(step_outcomes) == Outcome.STEPPED, confirmed_outcome, np.asarray(step_outcomes)
-    )
-    return np.where(
-        np.asarray(cycle_outcomes) == Outcome.STEPPED, confirmed_outcome, np.asarray(cycle_outcomes)
+    state_changes = np.max(np.abs(np.asarray(end_states) - np.asarray(section_states)), axis=-1)
+    return np.select(
+        [
+            np.asarray(cycle_outcomes) != Outcome.STEPPED,
+            np.asarray(step_outcomes) != Outcome.STEPPED,
+            state_changes <= STATE_AGREEMENT_TOLERANCE,
+        ],
+        [np.asarray(cycle_outcomes), np.asarray(step_outcomes), Outcome.STEPPED],
+        Outcome.MESH_TOO_COARSE,
     )
 
 
@@ -197,10 +194,8 @@ class AbstractGaitFinder(eqx.Module):
         """Compute one event-driven step from a section state, by a program that is
         already compiled.
         """
-        event_driven_step: AbstractStep = self.model.take_step(
-            params, section_state, self.step_options
-        )
-        return event_driven_step
+        gait_step: AbstractStep = self.model.take_step(params, section_state, self.step_options)
+        return gait_step
 
     def find_cycle_from_values(
         self, parameter_values: ParameterValues, cycle_guess: Any = None
@@ -335,12 +330,7 @@ def evaluate_on_gaits(function_of_cycle_and_step: Callable, gait: Gait) -> tuple
 
     Return the values and their derivatives on the branches of gaits.
     """
-    cycles_and_steps = (gait.cycle, gait.step), (gait.cycle_derivatives, gait.step_derivatives)
-    return eqx.filter_vmap(
-        lambda cycles_and_steps, tangents: compute_value_and_tangents(
-            function_of_cycle_and_step, cycles_and_steps, tangents
-        )
-    )(*cycles_and_steps)
+    return eqx.filter_vmap(functools.partial(evaluate_on_gait, function_of_cycle_and_step))(gait)
 
 
 GaitFunction = Callable[[AbstractCycle, AbstractStep], Array]
