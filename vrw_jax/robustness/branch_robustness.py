@@ -186,8 +186,8 @@ def measure_gait_sensitivity(
     )
 
 
-def _select_branch_points(branch: Branch, model: AbstractWheel, n_points: int | None) -> np.ndarray:
-    """Return the indices of at most `n_points` points of a branch, evenly spaced, shape (points,).
+def _select_branch_points(branch: Branch, model: AbstractWheel, n_points: int | None) -> list[int]:
+    """Return the indices of at most `n_points` points of a branch, evenly spaced.
 
     Both ends are included. If `n_points` is None, the result contains all points. Raise TypeError
     or ValueError if an argument is invalid, if the branch has another model or no point.
@@ -207,21 +207,21 @@ def _select_branch_points(branch: Branch, model: AbstractWheel, n_points: int | 
         )
     if n_points is not None:
         n_points = min(check_int("n_points", n_points), n_branch_points)
-    return np.unique(
-        np.linspace(0, n_branch_points - 1, n_points or n_branch_points).round().astype(int)
-    )
+    spaced_points = np.linspace(0, n_branch_points - 1, n_points or n_branch_points)
+    point_indices: list[int] = np.unique(spaced_points.round().astype(int)).tolist()
+    return point_indices
 
 
 def _make_point_dataset(
     branch: Branch,
-    point_indices: np.ndarray,
+    point_indices: list[int],
     point_values: list[Any],
     variable_attrs: dict[str, tuple[str, str]],
     title: str,
 ) -> xr.Dataset:
     """Return a dataset of variables at points of a branch, with the parameter as coordinate.
 
-    - `point_indices`: indices of the points of the branch, shape (points,);
+    - `point_indices`: indices of the points of the branch;
     - `point_values`: values of all variables at each point;
     - `variable_attrs`: unit and meaning of each variable.
     """
