@@ -234,8 +234,9 @@ def sample_walk_steps(
 ) -> SampledWalk:
     """Return samples of the walk from the section state x. The walk ends at the first failed step.
 
-    Positions (m) and energies (J) are converted from the frame of the line of the ground under both
-    feet in double support to the frame of line 0, in which the first foothold is the origin.
+    The samples of a step are in the frame of the line of the ground under both feet in double
+    support. Positions (m) and energies (J) are converted to the frame of line 0. Its origin is the
+    first foothold.
     """
     columns_by_step: list[dict[str, np.ndarray]] = []
     walk_outcome, k, step_start_time = Outcome.STEPPED, 0, 0.0
