@@ -32,7 +32,7 @@ SLOW_EXAMPLES = {
     "measure_to_tolerance", "MeasureResult", "multifidelity_mean", "MultifidelityMean",
     "gait_sensitivity", "WheelObjective", "measure_basins", "FirstPassage", "SmallestDisturbance",
 }  # fmt: skip
-"""Names whose examples compile for a minute, or compute for seven seconds what other tests cover."""
+"""Names whose examples compile for a minute, or compute for seconds what other tests cover."""
 
 
 def get_documentation(name):

@@ -404,43 +404,16 @@ def test_a_damaged_coordinate_that_is_not_swept_is_written_again(complete_store:
     assert list_files(complete_store) == whole
 
 
-def as_before_marks_covered_settings(complete_store: Path) -> None:
-    """Convert a store to the format after version 0.1: no attributes of marks, and marks of files
-    only."""
+def test_a_store_without_a_list_of_its_variables_is_refused_and_unchanged(
+    complete_store: Path,
+) -> None:
     edited_root(complete_store, lambda root: inline(root, "bookkeeping").update(attributes={}))
     book = complete_store / "bookkeeping" / "zarr.json"
     book.write_text(json.dumps(json.loads(book.read_text()) | {"attributes": {}}, indent=2))
-    group, metadata = (
-        zarr.open_group(complete_store, mode="r+"),
-        soundness.StoredMetadata(complete_store),
-    )
-    books = soundness.ChunkChecksums(complete_store, group, metadata)
-    for index in range(make_plan().result_layout.n_chunks):
-        books.mark_chunk_as_written(index)
-
-
-@pytest.mark.parametrize("what", [None, *DAMAGE_CASES])
-def test_a_store_whose_marks_cover_files_alone_opens_and_its_damage_is_seen(
-    complete_store: Path, what: str | None
-) -> None:
-    before = open_scan(complete_store).load()
-    as_before_marks_covered_settings(complete_store)
-    whole = list_files(complete_store)
-    xr.testing.assert_identical(open_scan(complete_store).load(), before)
-    run_plan(make_plan(), complete_store, evaluate=CountingEngine(1))
-    (xr.Dataset({"mine": 2.0 * before.speed}, attrs=before.attrs)).to_zarr(complete_store, mode="a")
-    assert "mine" in open_scan(complete_store)
-    if what is not None:
-        DAMAGE_CASES[what](complete_store / "speed" / CHUNK_FILE)
-        with pytest.raises(ValueError, match=r"1 damaged chunk \(number 1\)"):
-            open_scan(complete_store)
-        with pytest.warns(UserWarning, match="1 damaged chunk"):
-            run_plan(make_plan(), complete_store, evaluate=evaluate_arithmetically)
-    (complete_store / "speed" / "zarr.json").unlink()
-    with pytest.warns(UserWarning, match=r"damaged metadata \(speed"):
-        run_plan(make_plan(), complete_store, evaluate=CountingEngine(1))
-    shutil.rmtree(complete_store / "mine")
-    kept = list_files(complete_store)
-    assert {n: x for n, x in kept.items() if "/c/" in n} == {
-        n: x for n, x in whole.items() if "/c/" in n
-    }
+    before = list_files(complete_store)
+    sentence = "has no list of its variables.* run the scan into a new folder"
+    with pytest.raises(ValueError, match=sentence):
+        open_scan(complete_store)
+    with pytest.raises(ValueError, match=sentence):
+        run_plan(make_plan(), complete_store, evaluate=evaluate_arithmetically)
+    assert list_files(complete_store) == before

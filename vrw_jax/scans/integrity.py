@@ -4,7 +4,7 @@ The mark of a chunk is a digest of the scan's settings, of the chunk's index and
 contain its variables. A mark states that the chunk is written, and reveals a damaged, truncated,
 deleted or moved file. All marks are in one Zarr group. The attributes of this group list the scan's
 variables, so that variables of other origin are ignored. The attributes also contain a copy of the
-store's attributes. In stores without the list of variables, a mark is a digest of the files alone.
+store's attributes.
 """
 
 from __future__ import annotations
@@ -12,14 +12,11 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-
-from vrw_jax.scans.design import digest_sample_columns
-from vrw_jax.scans.measure_catalog import get_variable_attributes, parse_derivative
 
 ZarrGroup = Any
 """Zarr group; the type is `Any` because only the module `store` imports zarr."""
@@ -130,8 +127,8 @@ class StoredMetadata:
         self.mark_attributes: dict[str, Any] = next(
             intact_attribute_copies, (*usable_attribute_copies, {})[0]
         )
-        """Attributes of the Zarr group of marks, from the intact copy; empty in stores without such
-        attributes.
+        """Attributes of the Zarr group of marks, from the intact copy; empty if both copies are
+        lost.
         """
         self._root_attributes = _ensure_dictionary(self.root_metadata.get("attributes"))
         self.store_attributes: dict[str, Any] = self._root_attributes | self.mark_attributes.get(
@@ -144,48 +141,23 @@ class StoredMetadata:
         )
 
     @property
-    def coordinate_names(self) -> list[str]:
-        """Return the names of the coordinates of the labeled result."""
-        coordinate_digests = self.mark_attributes.get(COORDINATE_DIGESTS_KEY)
-        return (
-            list(coordinate_digests)
-            if coordinate_digests
-            else str(self.store_attributes.get("coordinates", "")).split()
-        )
+    def coordinate_digests(self) -> dict[str, str]:
+        """Return the digests of the coordinates by their names."""
+        return _ensure_dictionary(self.mark_attributes.get(COORDINATE_DIGESTS_KEY))
 
-    def select_scan_variables(self, array_names: Iterable[str]) -> list[str]:
-        """Return the names of the arrays that the scan wrote, without coordinates, sorted.
-
-        - `array_names`: names of all arrays in the store, including arrays that the scan did not
-          write.
-        """
-        if SCAN_VARIABLES_KEY in self.mark_attributes:
-            return sorted(self.mark_attributes[SCAN_VARIABLES_KEY])
-        stored_manifest = read_scan_manifest(self.store_attributes)
-        measure_names = stored_manifest.get("measures", [])
-        swept_parameters = stored_manifest.get("design", {}).get("swept", [])
-        excluded_array_names = (*self.coordinate_names, *swept_parameters)
-        return sorted(
-            array_name
-            for array_name in array_names
-            if array_name not in excluded_array_names
-            and (array_name in measure_names or _is_scan_measure_name(array_name))
-        )
+    @property
+    def scan_variable_names(self) -> list[str]:
+        """Return the names of the arrays that the scan wrote, without coordinates, sorted."""
+        return sorted(self.mark_attributes.get(SCAN_VARIABLES_KEY, ()))
 
     def find_damaged_metadata(self) -> list[str]:
         """Return the names of the arrays whose two copies of the metadata differ.
 
         The list contains "attributes" if the two copies of the store's attributes differ.
         """
-        array_names = [
-            array_name
-            for array_name, array_metadata in self.consolidated_metadata.items()
-            if array_name != CHECKSUM_ARRAY_NAME
-            and _ensure_dictionary(array_metadata).get("node_type") == "array"
-        ]
         checked_array_names = (
-            *self.coordinate_names,
-            *self.select_scan_variables(array_names),
+            *self.coordinate_digests,
+            *self.scan_variable_names,
             CHECKSUM_ARRAY_NAME,
         )
         damaged_array_names = [
@@ -236,16 +208,6 @@ class StoredMetadata:
         return read_metadata_file(self._store_path / array_name / METADATA_FILE_NAME)
 
 
-def _is_scan_measure_name(variable_name: str) -> bool:
-    """Return whether `variable_name` is the name of a measure that a scan can compute."""
-    try:
-        return parse_derivative(variable_name) is None and bool(
-            get_variable_attributes(variable_name)
-        )
-    except (KeyError, ValueError):
-        return False
-
-
 def _compute_hex_digest(digested_bytes: bytes) -> str:
     """Return the digest of `digested_bytes` in hexadecimal digits."""
     return hashlib.blake2b(digested_bytes, digest_size=DIGEST_SIZE_BYTES).hexdigest()
@@ -261,16 +223,13 @@ class ChunkChecksums:
         self._stored_metadata = stored_metadata
         self._chunk_marks = zarr_group[CHECKSUM_ARRAY_NAME]
         self._variable_arrays = {
-            array_name: zarr_group[array_name]
-            for array_name in stored_metadata.select_scan_variables(zarr_group.array_keys())
+            array_name: zarr_group[array_name] for array_name in stored_metadata.scan_variable_names
         }
         self._n_chunks_per_axis = self._variable_arrays["outcome"].cdata_shape
-        self._settings_digest = ""  # It is empty if marks are digests of the files alone.
-        if SCAN_VARIABLES_KEY in stored_metadata.mark_attributes:
-            settings_text = json.dumps(
-                read_scan_manifest(stored_metadata.store_attributes), sort_keys=True
-            )
-            self._settings_digest = _compute_hex_digest(settings_text.encode())
+        settings_text = json.dumps(
+            read_scan_manifest(stored_metadata.store_attributes), sort_keys=True
+        )
+        self._settings_digest = _compute_hex_digest(settings_text.encode())
 
     def are_chunks_marked(self) -> np.ndarray:
         """Return whether each chunk has a mark, shape (chunks,)."""
@@ -308,35 +267,16 @@ class ChunkChecksums:
         ]
 
     def find_damaged_coordinates(self) -> list[str]:
-        """Return the names of coordinates whose stored values differ from those that were written.
-
-        In stores without a digest of each coordinate, return all swept parameters if any of their
-        values differ from those of the samples.
+        """Return the names of coordinates whose stored values differ from those that were
+        written.
         """
-        coordinate_digests = self._stored_metadata.mark_attributes.get(COORDINATE_DIGESTS_KEY)
-        if coordinate_digests is not None:
-            return [
-                coordinate_name
-                for coordinate_name, coordinate_digest in coordinate_digests.items()
-                if self._digest_stored_coordinate(coordinate_name) != coordinate_digest
-            ]
-        design_settings = read_scan_manifest(self._stored_metadata.store_attributes).get(
-            "design", {}
-        )
-        if "digest" not in design_settings:
-            return []
-        try:
-            coordinate_values = {
-                coordinate_name: np.asarray(self._zarr_group[coordinate_name][:])
-                for coordinate_name in design_settings["swept"]
-            }
-            are_coordinates_intact = (
-                digest_sample_columns(design_settings["kind"], coordinate_values)
-                == design_settings["digest"]
+        return [
+            coordinate_name
+            for coordinate_name, coordinate_digest in (
+                self._stored_metadata.coordinate_digests.items()
             )
-        except (KeyError, *ZARR_READ_ERRORS):
-            are_coordinates_intact = False
-        return [] if are_coordinates_intact else list(design_settings["swept"])
+            if self._digest_stored_coordinate(coordinate_name) != coordinate_digest
+        ]
 
     def _digest_stored_coordinate(self, coordinate_name: str) -> str:
         """Return the digest of a coordinate's stored values, or "" if the values cannot be read."""
@@ -348,8 +288,7 @@ class ChunkChecksums:
     def _compute_chunk_digest(self, chunk_index: int) -> np.ndarray:
         """Return the digest of a chunk's files as an array of bytes, shape (bytes of a mark,)."""
         chunk_digest = hashlib.blake2b(digest_size=DIGEST_SIZE_BYTES)
-        if self._settings_digest:
-            chunk_digest.update(f"{self._settings_digest} {chunk_index} ".encode())
+        chunk_digest.update(f"{self._settings_digest} {chunk_index} ".encode())
         chunk_indices = np.unravel_index(chunk_index, self._n_chunks_per_axis)
         for variable_name, variable_array in self._variable_arrays.items():
             chunk_key = variable_array.metadata.encode_chunk_key(

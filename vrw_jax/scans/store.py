@@ -384,7 +384,6 @@ def _open_zarr_group(
     """Return the Zarr group of a store, opened with the first copy of the metadata that can be
     read.
     """
-    variable_names = stored_metadata.mark_attributes.get(SCAN_VARIABLES_KEY, ())
 
     def open_with_all_arrays(uses_consolidated_metadata: bool | None) -> zarr.Group:
         zarr_group = zarr.open_group(
@@ -393,7 +392,10 @@ def _open_zarr_group(
             zarr_format=3,
             use_consolidated=uses_consolidated_metadata,
         )
-        for array_name in (*stored_metadata.coordinate_names, *variable_names, "outcome"):
+        for array_name in (
+            *stored_metadata.coordinate_digests,
+            *stored_metadata.scan_variable_names,
+        ):
             _select_zarr_array(zarr_group, array_name)
         return zarr_group
 
@@ -444,6 +446,11 @@ def _read_scan_metadata(store_path: Path) -> StoredMetadata:
         raise ValueError(
             f"{store_path} is a Zarr store, but not a scan's: give the folder that `vrw scan` "
             "wrote."
+        )
+    if not stored_metadata.mark_attributes:
+        raise ValueError(
+            f"{store_path} has no list of its variables, because its metadata are lost or an "
+            "earlier version wrote it: run the scan into a new folder."
         )
     return stored_metadata
 
