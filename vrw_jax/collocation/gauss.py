@@ -140,7 +140,7 @@ def transfer_accelerations(
     trailing_shape = node_accelerations.shape[2:]
     return jnp.tensordot(
         jnp.asarray(transfer_matrix, node_accelerations.dtype),
-        node_accelerations.reshape(-1, *trailing_shape),
+        node_accelerations.reshape(len(source_mesh.node_time_fractions), *trailing_shape),
         1,
     ).reshape(target_mesh.n_intervals, N_GAUSS_NODES, *trailing_shape)
 
