@@ -60,9 +60,8 @@ def enumerate_lcp_solutions(
         or not 0 < n_contacts <= MAX_LCP_CONTACTS
     ):
         raise ValueError(
-            f"matrix has shape {matrix.shape} and free_gap {free_gap.shape}, but they must be (n, "
-            f"n) and "
-            f"(n,) with n from 1 to {MAX_LCP_CONTACTS}."
+            f"matrix has shape {matrix.shape} and free_gap {free_gap.shape}, but they must be "
+            f"(n, n) and (n,) with n from 1 to {MAX_LCP_CONTACTS}."
         )
     if not has_traced_leaf(matrix, free_gap) and not np.isfinite(np.append(matrix, free_gap)).all():
         raise ValueError(

@@ -8,11 +8,17 @@ The margins are refined one after another.
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from vrw_jax.numerics import MINIMUM_LOCATION_TOLERANCE, Scalar, find_cubic_minimum
+from vrw_jax.numerics import (
+    MINIMUM_LOCATION_TOLERANCE,
+    Scalar,
+    find_cubic_minimum,
+    select_trees_by_condition,
+)
 
 StateArray = Float[Array, " dim"]
 EvaluateGuardsAndMargins = Callable[[StateArray], Float[Array, " n_guards_and_margins"]]
@@ -112,6 +118,23 @@ class SolverStepEnd(NamedTuple):
     guard_and_margin_rates: Float[Array, " n_guards_and_margins"]
 
 
+def interpolate_by_cubics(
+    step_start: SolverStepEnd, step_end: SolverStepEnd, step_length: Scalar
+) -> tuple[Array, Array, Array, Array]:
+    """Return the cubics through all guards and margins at both ends of a solver step.
+
+    The result contains the four arguments of `evaluate_cubic`, without derivatives.
+    """
+    return lax.stop_gradient(
+        (
+            step_start.guard_and_margin_values,
+            step_start.guard_and_margin_rates * step_length,
+            step_end.guard_and_margin_values,
+            step_end.guard_and_margin_rates * step_length,
+        )
+    )
+
+
 class InteriorMarginMinima(NamedTuple):
     """Lowest interior minimum of each margin so far, and the solver step that contains it."""
 
@@ -176,13 +199,11 @@ def update_interior_margin_minima(
     """
     if not guards_and_margins.includes_phase_start:
         return interior_margin_minima
-    start_margin_values, start_margin_rates, end_margin_values, end_margin_rates = (
-        lax.stop_gradient(v)[guards_and_margins.n_guards :]
-        for v in (
-            step_start.guard_and_margin_values,
-            step_start.guard_and_margin_rates,
-            step_end.guard_and_margin_values,
-            step_end.guard_and_margin_rates,
+    start_margin_rates, end_margin_rates, step_length = lax.stop_gradient(
+        (
+            step_start.guard_and_margin_rates[guards_and_margins.n_guards :],
+            step_end.guard_and_margin_rates[guards_and_margins.n_guards :],
+            step_length,
         )
     )
     is_zero_at_phase_start = (step_start.end_time == 0.0) & ~jnp.asarray(
@@ -191,12 +212,12 @@ def update_interior_margin_minima(
     start_margin_rates = jnp.where(
         is_zero_at_phase_start, jnp.maximum(start_margin_rates, 0.0), start_margin_rates
     )
-    step_length = lax.stop_gradient(step_length)
+    start_margin_values, _, end_margin_values, end_margin_changes = (
+        x[guards_and_margins.n_guards :]
+        for x in interpolate_by_cubics(step_start, step_end, step_length)
+    )
     minimum_fractions, cubic_minimum_values = find_cubic_minimum(
-        start_margin_values,
-        start_margin_rates * step_length,
-        end_margin_values,
-        end_margin_rates * step_length,
+        start_margin_values, start_margin_rates * step_length, end_margin_values, end_margin_changes
     )
     cubic_minimum_values = jnp.where(
         jnp.isfinite(cubic_minimum_values),
@@ -209,22 +230,19 @@ def update_interior_margin_minima(
         & (end_margin_rates >= 0.0)
         & (cubic_minimum_values < interior_margin_minima.interior_minimum_values)
     )
-    return InteriorMarginMinima(
-        jnp.where(
-            is_minimum_lower, cubic_minimum_values, interior_margin_minima.interior_minimum_values
+    minima_in_step = InteriorMarginMinima(
+        cubic_minimum_values,
+        step_start.state,
+        step_length,
+        minimum_fractions * step_length,
+        start_margin_rates,
+    )
+    return jax.tree.map(
+        lambda new, previous: jnp.where(
+            is_minimum_lower.reshape(-1, *(1,) * (previous.ndim - 1)), new, previous
         ),
-        jnp.where(
-            is_minimum_lower[:, None], step_start.state, interior_margin_minima.step_start_state
-        ),
-        jnp.where(is_minimum_lower, step_length, interior_margin_minima.step_length),
-        jnp.where(
-            is_minimum_lower,
-            minimum_fractions * step_length,
-            interior_margin_minima.time_to_minimum,
-        ),
-        jnp.where(
-            is_minimum_lower, start_margin_rates, interior_margin_minima.step_start_margin_rates
-        ),
+        minima_in_step,
+        interior_margin_minima,
     )
 
 
@@ -296,10 +314,11 @@ def advance_margin_minimum_refinement(
     is_margin_refined = is_refining & (
         (n_iterations == max_iterations) | (has_secant_converged & (n_iterations >= min_iterations))
     )
-    has_smaller_margin_rate = jnp.abs(margin_rate_value) < jnp.abs(
-        margin_minimum_refinement.best_margin_rate
+    best_step_length, best_margin_rate = select_trees_by_condition(
+        jnp.abs(margin_rate_value) < jnp.abs(margin_minimum_refinement.best_margin_rate),
+        (step_length_value, margin_rate_value),
+        (margin_minimum_refinement.best_step_length, margin_minimum_refinement.best_margin_rate),
     )
-
     margin_indices = jnp.arange(margin_values.shape[0])
     lowest_margin_values = jnp.where(
         is_margin_refined & (margin_indices == margin_index),
@@ -322,28 +341,17 @@ def advance_margin_minimum_refinement(
             select_entry_by_mask(margin_index, interior_margin_minima.step_start_margin_rates),
         )
     )
+    n_iterations, best_step_length, best_margin_rate = select_trees_by_condition(
+        is_next_margin_selected,
+        (0, 0.0, step_start_margin_rate),
+        (n_iterations, best_step_length, best_margin_rate),
+    )
     next_margin_minimum_refinement = MarginMinimumRefinement(
-        margin_index=margin_index,
-        n_iterations=jnp.where(is_next_margin_selected, 0, n_iterations),
-        best_step_length=jnp.where(
-            is_next_margin_selected,
-            0.0,
-            jnp.where(
-                has_smaller_margin_rate,
-                step_length_value,
-                margin_minimum_refinement.best_step_length,
-            ),
-        ),
-        best_margin_rate=jnp.where(
-            is_next_margin_selected,
-            step_start_margin_rate,
-            jnp.where(
-                has_smaller_margin_rate,
-                margin_rate_value,
-                margin_minimum_refinement.best_margin_rate,
-            ),
-        ),
-        lowest_margin_values=jnp.where(is_phase_start, start_margin_values, lowest_margin_values),
+        margin_index,
+        n_iterations,
+        best_step_length,
+        best_margin_rate,
+        jnp.where(is_phase_start, start_margin_values, lowest_margin_values),
     )
     return (
         next_margin_minimum_refinement,

@@ -28,6 +28,7 @@ from vrw_jax.hybrid.minima import (
     StateArray,
     advance_margin_minimum_refinement,
     find_guards_met_at_start,
+    interpolate_by_cubics,
     is_guard_at_roundoff,
     make_empty_interior_margin_minima,
     select_entry_by_mask,
@@ -227,13 +228,10 @@ class _SolverStepper(NamedTuple):
         )
 
 
-def _make_stepper(
-    vector_field: VectorField, options: StepOptions, max_solver_step_growth: float
-) -> _SolverStepper:
+def _make_stepper(vector_field: VectorField, options: StepOptions) -> _SolverStepper:
     """Return the solver and step-size controller that `options` select for a vector field.
 
-    `max_solver_step_growth` is the largest ratio of successive step lengths. The solver is
-    configured for forward-mode derivatives.
+    The solver is configured for forward-mode derivatives.
     """
     diffrax_solver_class = getattr(diffrax, options.solver)
     field_names = diffrax_solver_class.__dataclass_fields__
@@ -247,7 +245,9 @@ def _make_stepper(
         vector_field=vector_field,
         diffrax_solver=diffrax_solver_class(**solver_arguments),
         step_size_controller=diffrax.PIDController(
-            rtol=options.rtol, atol=options.atol, factormax=max_solver_step_growth
+            rtol=options.rtol,
+            atol=options.atol,
+            factormax=EVENT_SEARCH_OPTIONS.max_solver_step_growth,
         ),
         ode_term=diffrax.ODETerm(lambda t, y, args: vector_field(y)),
     )
@@ -259,7 +259,6 @@ def integrate_phase(
     start_state: StateArray,
     is_active: Bool[Array, ""],
     options: StepOptions,
-    event_options: EventSearchOptions = EVENT_SEARCH_OPTIONS,
 ) -> PhaseEnd:
     """Return the end of the phase that begins at `start_state`, where a guard first falls to zero.
 
@@ -274,8 +273,7 @@ def integrate_phase(
     the phase. If `is_active` is False, nothing is integrated. Errors are those of the solver for
     the tolerances of `options`.
     """
-    solver_stepper = _make_stepper(vector_field, options, event_options.max_solver_step_growth)
-    phase_context = _PhaseContext(solver_stepper, guards_and_margins, options, event_options)
+    phase_context = _PhaseContext(_make_stepper(vector_field, options), guards_and_margins, options)
     phase_state = lax.while_loop(
         lambda phase_state: make_opaque_loop_condition(
             phase_state.step_purpose != StepPurpose.DONE, phase_state.n_tried_steps
@@ -304,7 +302,6 @@ class _PhaseContext(NamedTuple):
     solver_stepper: _SolverStepper
     guards_and_margins: GuardsAndMargins
     step_options: StepOptions
-    event_options: EventSearchOptions
 
 
 def _init_phase_state(
@@ -315,7 +312,7 @@ def _init_phase_state(
     All arrays that the loop batches or differentiates are batched or differentiated from the start.
     Otherwise JAX would trace the loop again for each array that becomes batched or differentiated.
     """
-    solver_stepper, guards_and_margins, options, _ = phase_context
+    solver_stepper, guards_and_margins, options = phase_context
     zero_duration = 0.0 * start_state[0]
     initial_count = jnp.where(is_active, 0, 0).astype(jnp.int32)
     initial_values = (
@@ -365,12 +362,10 @@ def _advance_phase_state(phase_context: _PhaseContext, phase_state: _PhaseState)
 
     The searches for the event and for minima of margins are updated.
     """
-    _, guards_and_margins, options, event_options = phase_context
+    _, guards_and_margins, options = phase_context
     n_guards, event_search = guards_and_margins.n_guards, phase_state.event_search
-    previous_step_end, step_length = (
-        phase_state.last_accepted_step_end,
-        phase_state.next_step_length,
-    )
+    previous_step_end = phase_state.last_accepted_step_end
+    step_length = phase_state.next_step_length
     is_phase_start = phase_state.step_purpose == StepPurpose.START
     is_searching_event = phase_state.step_purpose == StepPurpose.EVENT_SEARCH
     tried_step_end, error_estimate = _try_solver_step(phase_context, phase_state)
@@ -388,21 +383,25 @@ def _advance_phase_state(phase_context: _PhaseContext, phase_state: _PhaseState)
     step_assessment = _assess_solver_step(
         phase_context, phase_state, tried_step_end, error_estimate
     )
-    event_proposal = _propose_event_time(event_search, guard_values, guard_rates, step_length)
+    proposed_step_length, proposing_guard_index, event_search = _propose_event_time(
+        event_search, guard_values, guard_rates, step_length
+    )
     # A try confirms the event if it changes the event's time by little compared with the step. For
     # an event much earlier than the step's end, the change is also compared with the time since the
     # phase began. The comparison is skipped if the change is only the guard's round-off.
     proposed_step_length_value, step_length_value, start_time = lax.stop_gradient(
-        (event_proposal.proposed_step_length, step_length, previous_step_end.end_time)
+        (proposed_step_length, step_length, previous_step_end.end_time)
     )
     event_time_correction = jnp.abs(proposed_step_length_value - step_length_value)
     is_time_correction_small = (
         event_time_correction
-        <= event_options.max_confirming_time_correction * (start_time + proposed_step_length_value)
+        <= EVENT_SEARCH_OPTIONS.max_confirming_time_correction
+        * (start_time + proposed_step_length_value)
     )
     is_search_stalled = (
         event_time_correction
-        >= event_options.min_stalled_correction_ratio * event_search.last_event_time_correction
+        >= EVENT_SEARCH_OPTIONS.min_stalled_correction_ratio
+        * event_search.last_event_time_correction
     )
     is_event_confirmed = (event_time_correction <= event_search.time_tolerance) & (
         is_time_correction_small | is_search_stalled
@@ -410,16 +409,12 @@ def _advance_phase_state(phase_context: _PhaseContext, phase_state: _PhaseState)
     is_guard_at_zero, lowest_guard_index = is_guard_at_roundoff(
         guards_and_margins, event_search.is_guard_crossing, guard_values
     )
-    event_proposal = event_proposal._replace(
-        proposing_guard_index=jnp.where(
-            is_guard_at_zero, lowest_guard_index, event_proposal.proposing_guard_index
-        )
-    )
+    event_guard_index = jnp.where(is_guard_at_zero, lowest_guard_index, proposing_guard_index)
     n_confirming_steps = event_search.n_confirming_steps + (
         is_searching_event & (is_event_confirmed | is_guard_at_zero)
     )
     is_at_event = is_searching_event & (
-        n_confirming_steps >= event_options.n_required_confirming_steps
+        n_confirming_steps >= EVENT_SEARCH_OPTIONS.n_required_confirming_steps
     )
 
     is_timed_out = step_assessment.is_accepted & (tried_step_end.end_time >= options.max_phase_time)
@@ -438,7 +433,7 @@ def _advance_phase_state(phase_context: _PhaseContext, phase_state: _PhaseState)
         is_start_event_searched, 0.0, lax.stop_gradient(step_assessment.following_step_length)
     )
     following_step_length = jnp.where(
-        is_searching_event, event_proposal.proposed_step_length, following_step_length
+        is_searching_event, proposed_step_length, following_step_length
     )
     is_guard_crossing = jnp.where(
         step_assessment.has_guard_crossed,
@@ -488,12 +483,12 @@ def _advance_phase_state(phase_context: _PhaseContext, phase_state: _PhaseState)
                 is_start_event_searched, is_first_met_guard, is_guard_crossing
             ),
             lower_step_length_bound=jnp.where(
-                is_event_search_started, 0.0, event_proposal.lower_step_length_bound
+                is_event_search_started, 0.0, event_search.lower_step_length_bound
             ),
             upper_step_length_bound=jnp.where(
                 is_event_search_started,
                 lax.stop_gradient(step_length),
-                event_proposal.upper_step_length_bound,
+                event_search.upper_step_length_bound,
             ),
             time_tolerance=jnp.where(
                 step_assessment.has_guard_crossed,
@@ -513,7 +508,7 @@ def _advance_phase_state(phase_context: _PhaseContext, phase_state: _PhaseState)
             first_met_guard_index,
             jnp.where(
                 is_at_event & ~is_timed_out,
-                event_proposal.proposing_guard_index,
+                event_guard_index,
                 phase_state.triggered_guard_index,
             ),
         ),
@@ -531,7 +526,7 @@ def _try_solver_step(
     All purposes of a solver step share this call of the solver and of the monitored functions, so
     this code is compiled once.
     """
-    solver_stepper, guards_and_margins, options, _ = phase_context
+    solver_stepper, guards_and_margins, options = phase_context
     start_state = (
         phase_state.last_accepted_step_end.state,
         phase_state.last_accepted_step_end.solver_state,
@@ -592,7 +587,7 @@ def _assess_solver_step(
 
     A guard may cross zero at the end of the solver step or inside it.
     """
-    solver_stepper, guards_and_margins, options, _ = phase_context
+    solver_stepper, guards_and_margins, options = phase_context
     n_guards = guards_and_margins.n_guards
     previous_step_end = phase_state.last_accepted_step_end
     step_length = phase_state.next_step_length
@@ -608,12 +603,11 @@ def _assess_solver_step(
     )
     is_within_tolerance = is_within_tolerance & is_integrating
     is_guard_crossing = tried_step_end.guard_and_margin_values[:n_guards] <= 0.0
+    guard_cubics = tuple(
+        x[:n_guards] for x in interpolate_by_cubics(previous_step_end, tried_step_end, step_length)
+    )
     minimum_fractions, may_have_minimum = _find_guard_minima(
-        previous_step_end,
-        tried_step_end.guard_and_margin_values,
-        tried_step_end.guard_and_margin_rates,
-        step_length,
-        n_guards,
+        guard_cubics, lax.stop_gradient(step_length), previous_step_end.end_time
     )
     step_length_to_minimum = step_length * jnp.min(
         jnp.where(may_have_minimum & ~is_guard_crossing, minimum_fractions, 1.0)
@@ -633,13 +627,8 @@ def _assess_solver_step(
     # The last step ends at the time limit.
     remaining_phase_time = lax.stop_gradient(options.max_phase_time - end_time)
     following_step_length = jnp.minimum(following_step_length, remaining_phase_time)
-    event_step_length_guess = _guess_event_step_length(
-        previous_step_end,
-        tried_step_end.guard_and_margin_values,
-        tried_step_end.guard_and_margin_rates,
-        step_length,
-        n_guards,
-        is_guard_crossing,
+    event_step_length_guess = lax.stop_gradient(step_length) * _guess_event_fraction(
+        guard_cubics, is_guard_crossing
     )
     time_resolution = 1e3 * jnp.finfo(step_length.dtype).eps * tried_step_end.end_time
     return _StepAssessment(
@@ -659,97 +648,50 @@ def _assess_solver_step(
 
 
 def _find_guard_minima(
-    previous_step_end: SolverStepEnd,
-    guard_values: Array,
-    guard_rates: Array,
-    step_length: Scalar,
-    n_guards: int,
+    guard_cubics: tuple[Array, ...], step_length: Scalar, start_time: Scalar
 ) -> tuple[Array, Array]:
     """Return the location of each guard's minimum, and whether the guard may be negative there.
 
     The location is a fraction of the solver step, at most nine tenths. It is the minimum of the
-    cubic through the guard's values and time derivatives at both ends of the step. The cubic is
+    guard's cubic, whose coefficients are those of `interpolate_by_cubics`. The cubic is
     nowhere below the smallest of its Bernstein coefficients, so a guard with positive coefficients
     stays positive. For any other guard, the caller repeats the solver step up to the location. In
     shorter steps, the coefficients are closer to the guard. The caller stops when the coefficients
     are positive or the guard is negative at the end of a step.
     """
-    start_guard_values, start_guard_rates, end_guard_values, end_guard_rates = lax.stop_gradient(
-        (
-            previous_step_end.guard_and_margin_values,
-            previous_step_end.guard_and_margin_rates,
-            guard_values,
-            guard_rates,
-        )
+    start_values, start_rates, end_values, end_rates = guard_cubics
+    minimum_fractions, _ = find_cubic_minimum(*guard_cubics)
+    minimum_fractions = jnp.clip(minimum_fractions, 0.1, 0.9)
+    does_step_advance_time = start_time + minimum_fractions * step_length > start_time
+    lowest_bernstein_coefficient = jnp.minimum(
+        start_values + start_rates / 3.0, end_values - end_rates / 3.0
     )
-    start_guard_values = start_guard_values[:n_guards]
-    start_guard_rates = start_guard_rates[:n_guards]
-    end_guard_values = end_guard_values[:n_guards]
-    end_guard_rates = end_guard_rates[:n_guards]
-    step_length = lax.stop_gradient(step_length)
-    first_bernstein_coefficient = start_guard_values + start_guard_rates * step_length / 3.0
-    second_bernstein_coefficient = end_guard_values - end_guard_rates * step_length / 3.0
-    minimum_fractions = jnp.clip(
-        find_cubic_minimum(
-            start_guard_values,
-            start_guard_rates * step_length,
-            end_guard_values,
-            end_guard_rates * step_length,
-        )[0],
-        0.1,
-        0.9,
-    )
-    does_step_advance_time = (
-        previous_step_end.end_time + minimum_fractions * step_length > previous_step_end.end_time
-    )
-    may_be_negative = (
-        jnp.minimum(first_bernstein_coefficient, second_bernstein_coefficient) <= 0.0
-    ) & (end_guard_rates >= 0.0)
+    may_be_negative = (lowest_bernstein_coefficient <= 0.0) & (end_rates >= 0.0)
     return minimum_fractions, may_be_negative & does_step_advance_time
 
 
-def _guess_event_step_length(
-    previous_step_end: SolverStepEnd,
-    guard_values: Array,
-    guard_rates: Array,
-    step_length: Scalar,
-    n_guards: int,
-    is_guard_crossing: Array,
-) -> Scalar:
-    """Return the time from the start of a solver step to the earliest root of a guard, s.
+def _guess_event_fraction(guard_cubics: tuple[Array, ...], is_guard_crossing: Array) -> Scalar:
+    """Return the earliest root of a crossing guard's cubic, as a fraction of the solver step.
 
-    Each guard is approximated by the cubic through its values and time derivatives. The secant
-    method, followed by Newton's method, locates the root of the cubic.
+    The secant method, followed by Newton's method, locates the root of each cubic.
     """
-    start_guard_values, start_guard_rates, end_guard_values, end_guard_rates = lax.stop_gradient(
-        (
-            previous_step_end.guard_and_margin_values,
-            previous_step_end.guard_and_margin_rates * step_length,
-            guard_values,
-            guard_rates * step_length,
-        )
-    )
-    start_guard_values = start_guard_values[:n_guards]
-    start_guard_rates = start_guard_rates[:n_guards]
-    end_guard_values = end_guard_values[:n_guards]
-    end_guard_rates = end_guard_rates[:n_guards]
+    start_values, start_rates, end_values, end_rates = guard_cubics
     guard_decrease = jnp.where(
-        is_guard_crossing & (start_guard_values > end_guard_values),
-        start_guard_values - end_guard_values,
+        is_guard_crossing & (start_values > end_values),
+        start_values - end_values,
         1.0,
     )
     fraction_to_zero = jnp.where(
-        is_guard_crossing, jnp.clip(start_guard_values / guard_decrease, 0.0, 1.0), 1.0
+        is_guard_crossing, jnp.clip(start_values / guard_decrease, 0.0, 1.0), 1.0
     )
     # A guard that rises from zero, or from round-off above it, has its other zero where the cubic
     # divided by x vanishes.
-    linear_coefficient = 3.0 * end_guard_values - 2.0 * start_guard_rates - end_guard_rates
-    quadratic_coefficient = start_guard_rates - 2.0 * end_guard_values + end_guard_rates
+    linear_coefficient = 3.0 * end_values - 2.0 * start_rates - end_rates
+    quadratic_coefficient = start_rates - 2.0 * end_values + end_rates
     parabola_root_denominator = (
         jnp.sqrt(
             jnp.maximum(
-                linear_coefficient * linear_coefficient
-                - 4.0 * start_guard_rates * quadratic_coefficient,
+                linear_coefficient * linear_coefficient - 4.0 * start_rates * quadratic_coefficient,
                 0.0,
             )
         )
@@ -757,57 +699,42 @@ def _guess_event_step_length(
     )
     nonzero_parabola_root = jnp.clip(
         2.0
-        * start_guard_rates
+        * start_rates
         / jnp.where(parabola_root_denominator > 0.0, parabola_root_denominator, 1.0),
         0.0,
         1.0,
     )
     cubic_rate_function = lambda fraction_to_zero: (
-        6.0 * fraction_to_zero * (fraction_to_zero - 1.0) * (start_guard_values - end_guard_values)
-        + (1.0 - fraction_to_zero) * (1.0 - 3.0 * fraction_to_zero) * start_guard_rates
-        + fraction_to_zero * (3.0 * fraction_to_zero - 2.0) * end_guard_rates
+        6.0 * fraction_to_zero * (fraction_to_zero - 1.0) * (start_values - end_values)
+        + (1.0 - fraction_to_zero) * (1.0 - 3.0 * fraction_to_zero) * start_rates
+        + fraction_to_zero * (3.0 * fraction_to_zero - 2.0) * end_rates
     )
     does_guard_rise_from_zero = (
         is_guard_crossing
-        & (start_guard_rates > 0.0)
-        & ((start_guard_values == 0.0) | (cubic_rate_function(fraction_to_zero) >= 0.0))
+        & (start_rates > 0.0)
+        & ((start_values == 0.0) | (cubic_rate_function(fraction_to_zero) >= 0.0))
     )
     fraction_to_zero = jnp.where(does_guard_rise_from_zero, nonzero_parabola_root, fraction_to_zero)
     for _ in range(3):
         is_guard_falling = (cubic_rate_value := cubic_rate_function(fraction_to_zero)) < 0.0
-        fraction_change = evaluate_cubic(
-            fraction_to_zero,
-            start_guard_values,
-            start_guard_rates,
-            end_guard_values,
-            end_guard_rates,
-        ) / jnp.where(is_guard_falling, cubic_rate_value, 1.0)
+        fraction_change = evaluate_cubic(fraction_to_zero, *guard_cubics) / jnp.where(
+            is_guard_falling, cubic_rate_value, 1.0
+        )
         fraction_to_zero = jnp.where(
             is_guard_crossing & is_guard_falling,
             jnp.clip(fraction_to_zero - fraction_change, 0.0, 1.0),
             fraction_to_zero,
         )
-    return lax.stop_gradient(step_length) * jnp.min(
-        jnp.where(is_guard_crossing, fraction_to_zero, 1.0)
-    )
-
-
-class _EventProposal(NamedTuple):
-    """Next estimate of an event's time by Newton's method, and the remaining bracket.
-
-    The times are in s from the start of the solver step.
-    """
-
-    proposed_step_length: Scalar
-    proposing_guard_index: Int[Array, ""]
-    lower_step_length_bound: Scalar
-    upper_step_length_bound: Scalar
+    return jnp.min(jnp.where(is_guard_crossing, fraction_to_zero, 1.0))
 
 
 def _propose_event_time(
     event_search: _EventSearch, guard_values: Array, guard_rates: Array, step_length: Scalar
-) -> _EventProposal:
+) -> tuple[Scalar, Array, _EventSearch]:
     """Return the earliest event time that Newton's method proposes for the crossing guards.
+
+    The result is (time from the start of the solver step, s, index of the proposing guard, search
+    with the remaining bracket).
 
     A proposal outside the bracket is replaced by the bracket's midpoint. The proposal has
     derivatives. After k proposals in the range of quadratic convergence, derivatives are accurate
@@ -857,9 +784,11 @@ def _propose_event_time(
     next_step_length = jnp.where(
         is_proposal_in_bracket, finite_proposed_step_length, bisected_step_length
     )
-    return _EventProposal(
-        next_step_length, proposing_guard_index, lower_step_length_bound, upper_step_length_bound
+    event_search = event_search._replace(
+        lower_step_length_bound=lower_step_length_bound,
+        upper_step_length_bound=upper_step_length_bound,
     )
+    return next_step_length, proposing_guard_index, event_search
 
 
 def sample_phase(
@@ -875,9 +804,7 @@ def sample_phase(
     between two samples is integrated with adaptive solver steps. The last of these solver steps
     ends exactly at the time of the sample.
     """
-    solver_stepper = _make_stepper(
-        vector_field, options, EVENT_SEARCH_OPTIONS.max_solver_step_growth
-    )
+    solver_stepper = _make_stepper(vector_field, options)
     sample_interval = duration / (n_samples - 1)
 
     def take_adaptive_step(loop_carry: tuple) -> tuple:

@@ -138,10 +138,7 @@ def _make_cache_key(keyed_value: Any, ids_of_enclosing_objects: frozenset) -> Ha
     if isinstance(keyed_value, tuple | list):
         return value_type, tuple(map(make_inner_key, keyed_value))
     if isinstance(keyed_value, dict):
-        return value_type, tuple(
-            (make_inner_key(dictionary_key), make_inner_key(x))
-            for dictionary_key, x in keyed_value.items()
-        )
+        return value_type, make_inner_key(tuple(keyed_value.items()))
     if isinstance(keyed_value, types.FunctionType):
         return value_type, _make_function_key(
             keyed_value, ids_of_enclosing_objects | {id(keyed_value)}
@@ -153,14 +150,10 @@ def _make_cache_key(keyed_value: Any, ids_of_enclosing_objects: frozenset) -> Ha
     ):
         return _IdentityKey(keyed_value)
     if isinstance(keyed_value, functools.partial):
-        partial_function_parts = (keyed_value.func, keyed_value.args, keyed_value.keywords)
-        return value_type, tuple(map(make_inner_key, partial_function_parts))
+        function_parts = keyed_value.func, keyed_value.args, keyed_value.keywords
+        return value_type, make_inner_key(function_parts)
     if isinstance(keyed_value, types.MethodType):
-        return (
-            value_type,
-            make_inner_key(keyed_value.__func__),
-            make_inner_key(keyed_value.__self__),
-        )
+        return value_type, make_inner_key((keyed_value.__func__, keyed_value.__self__))
     # A function with a derivative rule, as from jax.custom_jvp, refers to the values of the user's
     # function.
     if hasattr(keyed_value, "__wrapped__") and not _is_in_unchanging_package(

@@ -59,7 +59,7 @@ class ReturnMap:
         If no return ends early, the result is the termination of the last return.
         """
         x = lax.stop_gradient(x)
-        termination = jnp.full((), int(Termination.MAX_EVENTS_REACHED), jnp.int32)
+        termination = jnp.full((), Termination.MAX_EVENTS_REACHED, jnp.int32)
         for _ in range(period_n):
             solution = self.simulate(x)
             termination = jnp.where(

@@ -61,14 +61,12 @@ def segment_maps(
     if start.ndim != 1 or field_output_shape.shape != start.shape:
         raise ValueError(
             f"the field gives shape {field_output_shape.shape} for a start of shape {start.shape}, "
-            f"but both must "
-            "be one row of the same length."
+            "but both must be one row of the same length."
         )
     if not (0 < n_tangents <= start.size and n_segments > 0):
         raise ValueError(
             f"directions is {n_tangents} and n_segments {n_segments}, but the first must be "
-            f"from 1 to "
-            f"{start.size} and the other positive."
+            f"from 1 to {start.size} and the other positive."
         )
     static_arguments = (field, n_segments, n_tangents)
     duration = jnp.asarray(duration, start.dtype)

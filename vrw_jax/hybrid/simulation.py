@@ -400,42 +400,49 @@ def _simulate_modes(
         has_exhausted_solver_steps = phase_end.solver_steps >= options.max_solver_steps
         termination = jnp.where(
             solution.n_events + 1 >= events,
-            int(Termination.MAX_EVENTS_REACHED),
+            Termination.MAX_EVENTS_REACHED,
             STATUS_RUNNING_CODE,
         )
         termination = jnp.where(
-            n_events_without_progress > max_simultaneous_events, int(Termination.ZENO), termination
+            n_events_without_progress > max_simultaneous_events, Termination.ZENO, termination
         )
         failure_termination = jnp.where(
             phase_end.is_timed_out,
-            int(Termination.MAX_TIME_REACHED),
-            int(Termination.STEP_SIZE_UNDERFLOW),
+            Termination.MAX_TIME_REACHED,
+            Termination.STEP_SIZE_UNDERFLOW,
         )
         failure_termination = jnp.where(
             phase_end.has_integration_failed & has_exhausted_solver_steps,
-            int(Termination.MAX_STEPS_REACHED),
+            Termination.MAX_STEPS_REACHED,
             failure_termination,
         )
         termination = jnp.where(
             has_event,
             termination,
-            jnp.where(
-                is_guard_violated, int(Termination.GUARD_VIOLATED_AT_ENTRY), failure_termination
-            ),
+            jnp.where(is_guard_violated, Termination.GUARD_VIOLATED_AT_ENTRY, failure_termination),
         )
         event_index = jnp.where(has_event, solution.n_events, events)
-        write_event_entry = lambda quantity_by_event, quantity_of_event: quantity_by_event.at[
-            event_index
-        ].set(quantity_of_event, mode="drop")
+        event_entries = (
+            time,
+            *event_time_errors,
+            phase_end.state,
+            next_state,
+            solution.mode,
+            phase_end.end_guard_index,
+        )
+        times, time_tolerance, time_roundoff, states_before, states_after, modes, guards = (
+            record.at[event_index].set(entry, mode="drop")
+            for record, entry in zip(solution[: len(event_entries)], event_entries, strict=True)
+        )
         return (
             HybridSolution(
-                times=write_event_entry(solution.times, time),
-                time_tolerance=write_event_entry(solution.time_tolerance, event_time_errors[0]),
-                time_roundoff=write_event_entry(solution.time_roundoff, event_time_errors[1]),
-                states_before=write_event_entry(solution.states_before, phase_end.state),
-                states_after=write_event_entry(solution.states_after, next_state),
-                modes=write_event_entry(solution.modes, solution.mode),
-                guards=write_event_entry(solution.guards, phase_end.end_guard_index),
+                times,
+                time_tolerance,
+                time_roundoff,
+                states_before,
+                states_after,
+                modes,
+                guards,
                 n_events=solution.n_events + has_event,
                 time=time,
                 state=jnp.where(has_event, next_state, phase_end.state),
