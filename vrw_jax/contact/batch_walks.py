@@ -63,20 +63,13 @@ def walk_batch(
     static_walk_settings = _make_static_walk_settings(
         model, options, n_legs, False, len(input_columns)
     )
-    walk_arguments = [_append_restitution(input_columns, model), section_states.T]
-    walk_result = _run_walk(static_walk_settings, walk_arguments, n_steps, options)
-    step_summary = walk_result.step_result
-    outcome_and_counts = (
-        walk_result.outcome,
-        walk_result.n_stepped,
-        walk_result.n_solver_steps,
+    (section_state, durations, step_length), *outcome_and_counts = _run_walk(
+        static_walk_settings,
+        [_append_restitution(input_columns, model), section_states.T],
+        n_steps,
+        options,
     )
-    return (
-        step_summary.section_state,
-        step_summary.durations,
-        *outcome_and_counts,
-        step_summary.step_length,
-    )
+    return section_state, durations, *outcome_and_counts, step_length
 
 
 def step_batch_with_jacobian(
@@ -221,75 +214,34 @@ class _IndependentStartRates(NamedTuple):
 
         The axes of `rate_projection` are (wheels, projected rates, rates). Among the rates for
         which `is_requested` is True, the one with the largest remainder is selected repeatedly.
+        The remainder is the part of a projection that is orthogonal to the selected ones.
         """
         requested_projection = np.nan_to_num(rate_projection) * is_requested[:, None]
-        projection_remainder = requested_projection.copy()
-        wheel_indices = np.arange(len(is_requested))
-        largest_rate_norm = np.sqrt(np.sum(projection_remainder**2, 1)).max(-1)
-        independent_rate_indices: list[np.ndarray] = []
-        is_rate_used: list[np.ndarray] = []
-        projection_directions: list[np.ndarray] = []
-        for _ in range(int(is_requested.sum(1).max(initial=0))):
-            remainder_norms = np.sqrt(np.sum(projection_remainder**2, 1))
-            largest_remainder_index = remainder_norms.argmax(-1)
-            is_remainder_significant = (
-                remainder_norms[wheel_indices, largest_remainder_index]
-                > RATE_RANK_TOLERANCE * largest_rate_norm
+        projection_remainder = requested_projection
+        n_wheels, n_projected_rates, _ = rate_projection.shape
+        n_selected = int(is_requested.sum(1).max(initial=0))
+        rate_indices = np.zeros((n_wheels, n_selected), int)
+        is_rate_used = np.zeros((n_wheels, n_selected), bool)
+        directions = np.zeros((n_wheels, n_selected, n_projected_rates))
+        smallest_norm = RATE_RANK_TOLERANCE * np.linalg.norm(requested_projection, axis=1).max(-1)
+        for i in range(n_selected):
+            remainder_norms = np.linalg.norm(projection_remainder, axis=1)
+            rate_indices[:, i] = remainder_norms.argmax(-1)
+            is_rate_used[:, i] = remainder_norms.max(-1) > smallest_norm
+            selected_remainder = np.take_along_axis(
+                projection_remainder, rate_indices[:, i, None, None], 2
+            )[:, :, 0]
+            selected_norm = np.where(is_rate_used[:, i], remainder_norms.max(-1), np.inf)
+            directions[:, i] = selected_remainder / selected_norm[:, None]
+            direction = directions[:, i, :, None]
+            projection_remainder = projection_remainder - direction * np.sum(
+                direction * projection_remainder, 1, keepdims=True
             )
-            if not is_remainder_significant.any():
-                break
-            projection_direction = (
-                projection_remainder[wheel_indices, :, largest_remainder_index]
-                / np.where(
-                    is_remainder_significant,
-                    remainder_norms[wheel_indices, largest_remainder_index],
-                    np.inf,
-                )[:, None]
-            )
-            projection_remainder = (
-                projection_remainder
-                - projection_direction[:, :, None]
-                * np.sum(projection_direction[:, :, None] * projection_remainder, 1)[:, None]
-            )
-            independent_rate_indices = [*independent_rate_indices, largest_remainder_index]
-            is_rate_used = [*is_rate_used, is_remainder_significant]
-            projection_directions = [*projection_directions, projection_direction]
-        if not independent_rate_indices:
-            empty_indices = np.zeros((len(is_requested), 0), int)
-            return cls(
-                empty_indices,
-                empty_indices > 0,
-                np.zeros((len(is_requested), 0, is_requested.shape[1])),
-            )
-        independent_rate_index_array = np.stack(independent_rate_indices, 1)
-        is_remainder_significant = np.stack(is_rate_used, 1)
-        projection_components = np.stack(
-            [
-                np.sum(projection_direction[:, :, None] * requested_projection, 1)
-                for projection_direction in projection_directions
-            ],
-            1,
-        )
-        combination_weights = np.zeros_like(projection_components)
-        for i in reversed(
-            range(len(independent_rate_indices))
-        ):  # Each direction is the remainder of one rate.
-            remaining_projection = projection_components[:, i].copy()
-            for j in range(i + 1, len(independent_rate_indices)):
-                remaining_projection -= (
-                    projection_components[wheel_indices, i, independent_rate_index_array[:, j]][
-                        :, None
-                    ]
-                    * combination_weights[:, j]
-                )
-            remainder_norms = projection_components[
-                wheel_indices, i, independent_rate_index_array[:, i]
-            ]
-            combination_weights[:, i] = (
-                remaining_projection
-                / np.where(is_remainder_significant[:, i], remainder_norms, np.inf)[:, None]
-            )
-        return cls(independent_rate_index_array, is_remainder_significant, combination_weights)
+        components = directions @ requested_projection
+        # Each direction is the remainder of one rate, so the matrix is triangular.
+        triangular_matrix = np.triu(np.take_along_axis(components, rate_indices[:, None], 2))
+        triangular_matrix += np.eye(n_selected) * ~is_rate_used[:, None]
+        return cls(rate_indices, is_rate_used, np.linalg.solve(triangular_matrix, components))
 
     def convert_weights_to_si(self, rate_units: np.ndarray) -> "_IndependentStartRates":
         """Return the independent rates with weights for SI units.
@@ -319,19 +271,12 @@ class _IndependentStartRates(NamedTuple):
 
         `tangents` contains the tangents with respect to the independent rates.
         """
-        wheel_indices, trailing_axes_shape = np.arange(len(tangents)), (1,) * (tangents.ndim - 2)
-        all_tangents = np.zeros_like(tangents)
-        for independent_rate_position in range(self.independent_rate_indices.shape[1]):
-            rate_weights = self.combination_weights[:, independent_rate_position].reshape(
-                *self.combination_weights[:, independent_rate_position].shape, *trailing_axes_shape
-            )
-            all_tangents += (
-                rate_weights
-                * tangents[
-                    wheel_indices, self.independent_rate_indices[:, independent_rate_position]
-                ][:, None]
-            )
-        return all_tangents
+        wheel_indices = np.arange(len(tangents))[:, None]
+        return np.einsum(
+            "wir,wi...->wr...",
+            self.combination_weights,
+            tangents[wheel_indices, self.independent_rate_indices],
+        )
 
 
 def _project_start_rates(
