@@ -22,6 +22,7 @@ from vrw_jax.contact.mechanics import (
     compute_free_velocity,
     find_contact_slots,
     make_inverse_inertia,
+    select_slot_friction,
 )
 from vrw_jax.wheel import ContactMode
 
@@ -124,6 +125,7 @@ def select_contacts(q, v, at_stopper, locked, friction, moving):
         compute_free_velocity(s, motion, slots, hub),
     )
     free = jax.tree.map(lambda a, b: jnp.where(moving, a, b), *levels)
+    friction = select_slot_friction(friction, slots)
     none = jnp.zeros(2, jnp.int32)
     allowed = AllowedContactModes(
         allowed_slot_modes=none + ALL_MODES_MASK,

@@ -15,7 +15,6 @@ import vrw_jax as vrw
 from vrw_jax.contact.contact_state import (
     ContactState,
     EnergyLossAccumulators,
-    compute_airborne_stopper_force,
     compute_forces,
     compute_guard_values,
     evaluate_vector_field,
@@ -298,9 +297,7 @@ def test_a_wheel_in_the_air_falls_freely():
         jnp.stack(contact_forces.force_solution.hub_motion), expected, atol=1e-12
     )
     # Preload and spin press each leg on its stopper: 500 * 0.02 + 0.7 * 3^2 N.
-    np.testing.assert_allclose(
-        compute_airborne_stopper_force(flow, contact_forces), 10.0 + 6.3, atol=1e-12
-    )
+    np.testing.assert_allclose(contact_forces.airborne_stopper_forces, 10.0 + 6.3, atol=1e-12)
 
 
 def test_a_vertical_leg_lands_with_its_own_mass_alone():

@@ -5,14 +5,18 @@ serves both the integration and the event search. If a guard crosses zero in a s
 repeats this step with smaller sizes until it ends at the earliest event. No computation in this
 module combines values of different lanes.
 
-Arrays of accelerations and contact forces have one row per quantity, the *dynamics rows*. The
+Arrays of accelerations and contact forces have one row per quantity, the *dynamics rows*. They
+begin with the accelerations and Painlevé's determinant, followed by the
+`contact_state.ContactQuantities`. If accumulators are requested, their rates are last. The
 *initiating guard* of a contact state is the guard that was zero at the event before this state. An
 example is the guard for the normal force on a foot that has just lifted off.
 """
 
+import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import IntEnum
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -35,7 +39,6 @@ from vrw_jax.contact.contact_state import (
 )
 from vrw_jax.contact.mechanics import (
     WheelMotion,
-    compute_leg_directions,
     make_opaque_one,
     prevent_fusion,
 )
@@ -49,14 +52,6 @@ from vrw_jax.integrator import (
 from vrw_jax.numerics import StepOptions, select_trees_by_condition
 from vrw_jax.wheel import Outcome, Symbols, compute_wheel_units
 
-N_CONTACT_QUANTITY_ROWS = 9
-"""Number of contact forces and slip speeds among the dynamics rows.
-
-The dynamics rows begin with the accelerations, followed by these quantities. If stoppers are
-one-sided, the stopper forces on legs in the air follow. If force peaks are measured, the
-`contact_state.NormalForceRates` follow. If accumulators are requested, their `N_ACCUMULATOR_ROWS`
-rates are last.
-"""
 N_ACCUMULATOR_ROWS = 3
 """Number of accumulators: energy losses in dampers and by sliding, and slip length."""
 
@@ -111,13 +106,12 @@ EVENT_SEARCH_OPTIONS = EventSearchOptions()
 class ContactIntervalPoint(NamedTuple):
     """Coordinates, rates and dynamics rows of all batch elements at one time.
 
-    The coordinates are the hub position x and z, the angle theta and the leg lengths. The dynamics
-    rows are accelerations, contact quantities and, if requested, accumulator rates.
+    The coordinates are the hub position x and z, the angle theta and the leg lengths.
     """
 
     q: Array  # (3 + n, batch)
     v: Array
-    dynamics_rows: Array  # accelerations, contact rows: (3 + n + 9 [+ n] [+ 3], batch)
+    dynamics_rows: Array  # accelerations and contact quantities, (rows, batch)
 
 
 class EventBracket(NamedTuple):
@@ -152,31 +146,10 @@ class ContactIntervalState(NamedTuple):
 
 def unpack_motion(contact_interval_point: ContactIntervalPoint) -> WheelMotion:
     """Return coordinates and rates of the wheel at a point of an interval."""
-    x = contact_interval_point.q[0]
-    z = contact_interval_point.q[1]
-    theta = contact_interval_point.q[2]
-    L = contact_interval_point.q[3:]
-    return WheelMotion(
-        x,
-        z,
-        theta,
-        contact_interval_point.v[0],
-        contact_interval_point.v[1],
-        contact_interval_point.v[2],
-        L,
-        contact_interval_point.v[3:],
-    )
-
-
-def make_contact_interval_point(
-    contact_mode_dynamics: ContactModeDynamics, motion: WheelMotion
-) -> ContactIntervalPoint:
-    """Return the interval point for a motion, including its dynamics rows.
-
-    The function is the inverse of `unpack_motion`.
-    """
-    q, v = pack_coordinates(motion)
-    return ContactIntervalPoint(q, v, evaluate_dynamics(contact_mode_dynamics, q, v))
+    q, v, _ = contact_interval_point
+    x, z, theta = q[:3]
+    vx, vz, dtheta = v[:3]
+    return WheelMotion(x, z, theta, vx, vz, dtheta, q[3:], v[3:])
 
 
 def pack_coordinates(motion: WheelMotion) -> tuple[Array, Array]:
@@ -186,46 +159,24 @@ def pack_coordinates(motion: WheelMotion) -> tuple[Array, Array]:
 
 
 def evaluate_dynamics(contact_mode_dynamics: ContactModeDynamics, q: Array, v: Array) -> Array:
-    """Return accelerations, contact quantities and, if requested, accumulator rates as one array.
+    """Return the dynamics rows, (rows, batch).
 
-    The axes are (dynamics rows, batch). `q` and `v` are coordinates and rates, (3 + n, batch). Leg
-    directions are not among the contact quantities.
+    `q` and `v` are coordinates and rates, (3 + n, batch).
     """
     motion = unpack_motion(ContactIntervalPoint(q, v, q))
     contact_forces = compute_forces(contact_mode_dynamics, motion)
+    force_solution = contact_forces.force_solution
     contact_quantities = collect_contact_quantities(contact_mode_dynamics, motion, contact_forces)
-    contact_rows = [
-        *contact_quantities.normal_forces,
-        *contact_quantities.tangential_forces,
-        *contact_quantities.stopper_forces,
-        *contact_quantities.slip_speeds,
-        contact_quantities.painleve_determinant,
+    row_blocks = [
+        jnp.stack(force_solution.hub_motion),
+        force_solution.length_motion,
+        force_solution.painleve_determinant[None],
+        *jax.tree.leaves(contact_quantities),
     ]
-    optional_dynamics_rows = (
-        []
-        if contact_quantities.airborne_stopper_forces is None
-        else [contact_quantities.airborne_stopper_forces]
-    )
-    if contact_quantities.force_rates is not None:
-        optional_dynamics_rows.append(contact_quantities.force_rates)
     if contact_mode_dynamics.has_accumulators:
-        accumulators = compute_accumulator_rates(contact_mode_dynamics, motion, contact_forces)
-        accumulator_rows = (
-            accumulators.damping_loss,
-            accumulators.friction_loss,
-            accumulators.slip_length,
-        )
-        optional_dynamics_rows.append(
-            jnp.stack(prevent_fusion(accumulator_rows, make_opaque_one(motion)))
-        )
-    return jnp.concatenate(
-        [
-            jnp.stack(contact_forces.force_solution.hub_motion),
-            contact_forces.force_solution.length_motion,
-            jnp.stack(contact_rows),
-            *optional_dynamics_rows,
-        ]
-    )
+        _, *loss_rates = compute_accumulator_rates(contact_mode_dynamics, motion, contact_forces)
+        row_blocks.append(jnp.stack(prevent_fusion(loss_rates, make_opaque_one(motion.theta))))
+    return jnp.concatenate(row_blocks)
 
 
 def evaluate_guards_at_point(
@@ -236,45 +187,29 @@ def evaluate_guards_at_point(
     The point must be after the start of the contact state, so that no guard has a placeholder
     value.
     """
+    row_counts = [2] * 4
+    row_counts += [contact_mode_dynamics.s.n * contact_mode_dynamics.has_one_sided_stoppers]
+    row_counts += [len(NormalForceRates._fields) * contact_mode_dynamics.measures_force_peaks]
+    contact_rows = contact_interval_point.dynamics_rows[len(contact_interval_point.q) + 1 :]
+    row_blocks: list[Any] = [
+        contact_rows[row_end - row_count : row_end] if row_count else None
+        for row_count, row_end in zip(row_counts, itertools.accumulate(row_counts), strict=True)
+    ]
+    contact_quantities = ContactQuantities(*row_blocks)
     motion = unpack_motion(contact_interval_point)
-    contact_rows = contact_interval_point.dynamics_rows[len(contact_interval_point.q) :]
-    (
-        first_normal_force,
-        second_normal_force,
-        first_tangential_force,
-        second_tangential_force,
-        first_stopper_force,
-        second_stopper_force,
-        first_slip_speed,
-        second_slip_speed,
-        painleve_determinant,
-    ) = contact_rows[:N_CONTACT_QUANTITY_ROWS]
-    airborne_stopper = (
-        contact_rows[N_CONTACT_QUANTITY_ROWS : N_CONTACT_QUANTITY_ROWS + contact_mode_dynamics.s.n]
-        if contact_mode_dynamics.has_one_sided_stoppers
-        else None
-    )
-    end_of_force_rates = (
-        len(contact_rows) - N_ACCUMULATOR_ROWS * contact_mode_dynamics.has_accumulators
-    )
-    force_rates = (
-        contact_rows[end_of_force_rates - len(NormalForceRates._fields) : end_of_force_rates]
-        if contact_mode_dynamics.measures_force_peaks
-        else None
-    )
-    leg_directions = compute_leg_directions(contact_mode_dynamics.s, motion.theta)
-    slot_pairs = (
-        (first_normal_force, second_normal_force),
-        (first_tangential_force, second_tangential_force),
-        (first_stopper_force, second_stopper_force),
-        (first_slip_speed, second_slip_speed),
-    )
-    contact_quantities = ContactQuantities(
-        leg_directions, *slot_pairs, painleve_determinant, airborne_stopper, force_rates
-    )
     is_after_start = jnp.ones(contact_interval_point.q.shape[-1:], bool)
     return jnp.concatenate(
         evaluate_guards(contact_mode_dynamics, motion, contact_quantities, is_after_start)
+    )
+
+
+def evaluate_guards_of_coordinates(
+    contact_mode_dynamics: ContactModeDynamics, q: Array, v: Array
+) -> Array:
+    """Return the values of all guards for coordinates and rates, (guards, batch)."""
+    return evaluate_guards_at_point(
+        contact_mode_dynamics,
+        ContactIntervalPoint(q, v, evaluate_dynamics(contact_mode_dynamics, q, v)),
     )
 
 
@@ -282,20 +217,11 @@ def compute_guard_rates(
     contact_mode_dynamics: ContactModeDynamics, contact_interval_point: ContactIntervalPoint
 ) -> Array:
     """Return the time derivatives of all guards during the motion, (guards, batch)."""
-
-    def evaluate_guards_of_coordinates(q: Array, v: Array) -> Array:
-        return evaluate_guards_at_point(
-            contact_mode_dynamics,
-            ContactIntervalPoint(q, v, evaluate_dynamics(contact_mode_dynamics, q, v)),
-        )
-
+    q, v, dynamics_rows = contact_interval_point
     return jax.jvp(
-        evaluate_guards_of_coordinates,
-        (contact_interval_point.q, contact_interval_point.v),
-        (
-            contact_interval_point.v,
-            contact_interval_point.dynamics_rows[: len(contact_interval_point.q)],
-        ),
+        partial(evaluate_guards_of_coordinates, contact_mode_dynamics),
+        (q, v),
+        (v, dynamics_rows[: len(q)]),
     )[1]
 
 
@@ -305,32 +231,17 @@ def find_initiating_guards(contact_mode_dynamics: ContactModeDynamics) -> Array:
     An initiating guard was zero at the event that started the contact state.
     """
     contact_state = contact_mode_dynamics.contact_state
-    has_just_slid = contact_mode_dynamics.contact_slots.gather_slot_flags(
-        contact_state.has_just_slid
-    )
-    no_slot_flags = jnp.zeros((2, contact_state.contact_modes.shape[-1]), bool)
-    airborne_release_flags = (
-        [contact_state.is_leg_locked & False]
-        if contact_mode_dynamics.has_one_sided_stoppers
-        else []
-    )
-    force_rate_flags = (
-        [jnp.zeros_like(contact_state.force_rate_signs, bool)]
-        if contact_state.force_rate_signs is not None
-        else []
+    guard_layout = contact_mode_dynamics.guard_layout
+    make_false_flags = lambda n_guards: jnp.zeros(
+        (n_guards, contact_state.contact_modes.shape[-1]), bool
     )
     return jnp.concatenate(
         [
             contact_state.has_just_lifted,
             contact_state.has_just_unlocked,
-            no_slot_flags,
-            no_slot_flags,
-            no_slot_flags,
-            has_just_slid,
-            no_slot_flags,
-            no_slot_flags,
-            *airborne_release_flags,
-            *force_rate_flags,
+            make_false_flags(guard_layout.first_slip_end_guard - guard_layout.first_liftoff_guard),
+            contact_mode_dynamics.contact_slots.gather_flags_from_legs(contact_state.has_just_slid),
+            make_false_flags(guard_layout.n_guards - guard_layout.first_stopper_release_guard),
         ]
     )
 
@@ -340,7 +251,6 @@ def init_contact_interval(
     contact_mode_dynamics: ContactModeDynamics,
     motion: WheelMotion,
     h: Array,
-    search_options: EventSearchOptions = EVENT_SEARCH_OPTIONS,
 ) -> ContactIntervalState:
     """Return the state of all batch elements at the start of an interval between events.
 
@@ -348,7 +258,8 @@ def init_contact_interval(
 
     - `h`: size of the first solver step, in the wheel's unit of time.
     """
-    start_point = make_contact_interval_point(contact_mode_dynamics, motion)
+    q, v = pack_coordinates(motion)
+    start_point = ContactIntervalPoint(q, v, evaluate_dynamics(contact_mode_dynamics, q, v))
     is_initiating = find_initiating_guards(contact_mode_dynamics)
     guard_values = evaluate_guards_at_point(contact_mode_dynamics, start_point)
     guard_rates = compute_guard_rates(contact_mode_dynamics, start_point)
@@ -360,7 +271,7 @@ def init_contact_interval(
     )
     time_unit = compute_wheel_units(contact_mode_dynamics.s).time_unit
     min_initiating_guard_rate = -guard_roundoff / (
-        search_options.max_roundoff_fall_duration * time_unit
+        EVENT_SEARCH_OPTIONS.max_roundoff_fall_duration * time_unit
     )
     is_initiating = is_initiating | (
         (guard_values <= guard_roundoff) & (guard_rates > min_initiating_guard_rate)
@@ -368,11 +279,6 @@ def init_contact_interval(
     is_guard_triggered = ~is_initiating & (
         (guard_values < 0.0) | ((guard_values == 0.0) & (guard_rates <= 0.0))
     )
-    triggered_guard_index = jnp.zeros(is_guard_triggered.shape[1:], jnp.int32)
-    for guard_index in reversed(range(len(is_guard_triggered))):
-        triggered_guard_index = jnp.where(
-            is_guard_triggered[guard_index], guard_index, triggered_guard_index
-        )
     guard_offset = jnp.where(is_initiating, guard_values - 2.0 * guard_roundoff, 0.0)
     float_zero_lanes = jnp.zeros_like(motion.x)
     int_zero_lanes = jnp.zeros(motion.x.shape, jnp.int32)
@@ -401,7 +307,7 @@ def init_contact_interval(
         lane_status=jnp.where(
             jnp.any(is_guard_triggered, axis=0), LaneStatus.EVENT, LaneStatus.RUNNING
         ).astype(jnp.int32),
-        triggered_guard_index=triggered_guard_index,
+        triggered_guard_index=_find_first_guard(is_guard_triggered),
         n_solver_steps=int_zero_lanes,
     )
 
@@ -455,12 +361,11 @@ def iterate_until_stopped(
     has_unfinished_walk: Array,
     advance_state: Callable,
     initial_state: Any,
-    max_attempts_with_waiting_lane: int = EVENT_SEARCH_OPTIONS.max_attempts_with_waiting_lane,
 ) -> Any:
     """Return the loop state after `advance_state` was applied until no element is running.
 
-    After `max_attempts_with_waiting_lane` applications, the loop ends as soon as an element with an
-    unfinished walk has stopped.
+    After `EventSearchOptions.max_attempts_with_waiting_lane` applications, the loop ends as soon as
+    an element with an unfinished walk has stopped.
     """
 
     def should_continue(loop_state: tuple) -> Array:
@@ -468,7 +373,7 @@ def iterate_until_stopped(
         is_event_search_active = is_running(lane_states)
         has_stopped = jnp.any(has_unfinished_walk & ~is_event_search_active)
         return jnp.any(is_event_search_active) & (
-            (n_attempts < max_attempts_with_waiting_lane) | ~has_stopped
+            (n_attempts < EVENT_SEARCH_OPTIONS.max_attempts_with_waiting_lane) | ~has_stopped
         )
 
     initial_attempt_count = jnp.zeros((), jnp.int32)
@@ -560,17 +465,16 @@ def complete_solver_step(
             tableau.stage_matrix[last_stage][j] * stage_rows[j, -N_ACCUMULATOR_ROWS:]
             for j in range(last_stage)
         )
-    inner_stage_points = {
-        i: ContactIntervalPoint(
+    inner_stage_points = [
+        ContactIntervalPoint(
             *compute_stage_state(tableau, i, start_point.q, start_point.v, stage_rows, h),
             stage_rows[i],
         )
         for i in tableau.guard_stage_indices
-    }
-    guard_points = *inner_stage_points.values(), end_point
+    ]
     *inner_guard_values, end_guard_values = (
         evaluate_guards_at_point(contact_mode_dynamics, guard_point) - lane_states.guard_offset
-        for guard_point in guard_points
+        for guard_point in (*inner_stage_points, end_point)
     )
     sum_weighted_stages = lambda weights: sum(
         float(w) * stage_rows[j, :n] for j, w in enumerate(weights) if w != 0.0
@@ -584,7 +488,7 @@ def complete_solver_step(
         options,
         error_estimates,
         start_point,
-        guard_points[-1],
+        end_point,
         end_guard_values,
     )
     middle_guard_values = (
@@ -614,15 +518,16 @@ def is_at_painleve_singularity(
     determinant_before: Array,
     determinant_after: Array,
     options: StepOptions,
-    search_options: EventSearchOptions = EVENT_SEARCH_OPTIONS,
 ) -> Array:
     """Return whether a contact determinant vanishes between two times, at Painlevé's singularity.
 
     - `determinant_before`, `determinant_after`: determinants at the two times.
     """
-    painleve_atol = search_options.painleve_atol
-    painleve_rtol_factor = search_options.painleve_rtol_factor
-    is_near_zero = jnp.abs(determinant_after) <= painleve_atol + painleve_rtol_factor * options.rtol
+    zero_tolerance = (
+        EVENT_SEARCH_OPTIONS.painleve_atol
+        + EVENT_SEARCH_OPTIONS.painleve_rtol_factor * options.rtol
+    )
+    is_near_zero = jnp.abs(determinant_after) <= zero_tolerance
     return (determinant_before * determinant_after <= 0.0) | is_near_zero
 
 
@@ -632,38 +537,30 @@ def advance_running_lanes(
     guard_scales: Array,
     tableau: ButcherTableau,
     options: StepOptions,
-    search_options: EventSearchOptions = EVENT_SEARCH_OPTIONS,
 ) -> ContactIntervalState:
     """Return the state of all batch elements after one attempted solver step.
 
     Each running element accepts the step, repeats it with another size, or stops at an event.
     """
     start_point = lane_states.contact_interval_point
-    h = lane_states.h
+    h, start_time = lane_states.h, lane_states.time_since_event
     event_bracket = lane_states.event_bracket
+    is_searching = event_bracket.is_event_search_active
     end_point = attempted_step.end_point
     is_running = lane_states.lane_status == LaneStatus.RUNNING
-    is_step_accurate = (
-        is_running
-        & ~event_bracket.is_event_search_active
-        & (attempted_step.mean_squared_error <= 1.0)
-    )
+    is_step_accurate = is_running & ~is_searching & (attempted_step.mean_squared_error <= 1.0)
     must_retry_step = (
         is_step_accurate
         & (attempted_step.guard_minimum_fraction < 1.0)
-        & (
-            lane_states.time_since_event + h * attempted_step.guard_minimum_fraction
-            > lane_states.time_since_event
-        )
+        & (start_time + h * attempted_step.guard_minimum_fraction > start_time)
     )
     has_guard_crossed = (
         is_step_accurate & ~must_retry_step & jnp.any(attempted_step.guard_values <= 0.0, axis=0)
     )
     is_accepted = is_step_accurate & ~must_retry_step & ~has_guard_crossed
-    next_bracket, located_event = _iterate_event_search(
-        lane_states, attempted_step, has_guard_crossed, guard_scales, options, search_options
+    next_bracket, search_step_size, event_time_shift, has_reached_event, event_guard = (
+        _iterate_event_search(lane_states, attempted_step, has_guard_crossed, guard_scales, options)
     )
-    has_reached_event = located_event.has_reached_event
     step_size_ratio = jnp.where(
         must_retry_step,
         attempted_step.guard_minimum_fraction,
@@ -672,19 +569,19 @@ def advance_running_lanes(
     # The last step ends exactly at the time limit.
     latest_event_time = options.max_phase_time
     end_time = jnp.where(
-        is_accepted & (h == latest_event_time - lane_states.time_since_event),
+        is_accepted & (h == latest_event_time - start_time),
         latest_event_time,
-        lane_states.time_since_event + h,
+        start_time + h,
     )
-    reached_time = jnp.where(is_accepted, end_time, lane_states.time_since_event)
+    reached_time = jnp.where(is_accepted, end_time, start_time)
     next_integration_h = jnp.minimum(h * step_size_ratio, latest_event_time - reached_time)
     next_step_size = jnp.where(
-        event_bracket.is_event_search_active | has_guard_crossed,
-        located_event.next_step_size,
+        is_searching | has_guard_crossed,
+        search_step_size,
         next_integration_h,
     )
 
-    event_time_shift = jnp.where(has_reached_event, located_event.event_time_shift, 0.0)
+    event_time_shift = jnp.where(has_reached_event, event_time_shift, 0.0)
     end_point = ContactIntervalPoint(
         end_point.q + event_time_shift * end_point.v,
         end_point.v + event_time_shift * end_point.dynamics_rows[: len(end_point.q)],
@@ -696,24 +593,23 @@ def advance_running_lanes(
         interval_accumulators = interval_accumulators + jnp.where(
             is_state_updated, attempted_step.accumulator_increments, 0.0
         )
-    time = jnp.where(is_state_updated, end_time + event_time_shift, lane_states.time_since_event)
+    time = jnp.where(is_state_updated, end_time + event_time_shift, start_time)
     is_past_time_limit = is_accepted & (time >= latest_event_time)
     is_past_time_limit = is_past_time_limit | (has_reached_event & (time > latest_event_time))
     has_step_failed = (next_bracket.n_iterations >= options.max_event_iterations) | (
         lane_states.n_solver_steps + 1 >= options.max_solver_steps
     )
     has_step_failed = has_step_failed | (
-        ~event_bracket.is_event_search_active
-        & (lane_states.time_since_event + next_step_size == lane_states.time_since_event)
+        ~is_searching & (start_time + next_step_size == start_time)
     )
-    painleve_determinant_row = len(start_point.q) + N_CONTACT_QUANTITY_ROWS - 1
+    painleve_determinant_row = len(start_point.q)
     determinant_before = start_point.dynamics_rows[painleve_determinant_row]
     determinant_after = end_point.dynamics_rows[painleve_determinant_row]
     lane_status = jnp.where(has_step_failed, Outcome.SOLVER_FAILED, LaneStatus.RUNNING)
     lane_status = jnp.where(has_reached_event, LaneStatus.EVENT, lane_status)
     lane_status = jnp.where(is_past_time_limit, Outcome.NO_TOUCHDOWN_IN_TIME, lane_status)
     is_at_singularity = is_state_updated & is_at_painleve_singularity(
-        determinant_before, determinant_after, options, search_options
+        determinant_before, determinant_after, options
     )
     lane_status = jnp.where(is_at_singularity, Outcome.PAINLEVE_PARADOX, lane_status)
     return lane_states._replace(
@@ -725,19 +621,10 @@ def advance_running_lanes(
         event_bracket=select_trees_by_condition(is_running, next_bracket, event_bracket),
         lane_status=jnp.where(is_running, lane_status, lane_states.lane_status).astype(jnp.int32),
         triggered_guard_index=jnp.where(
-            has_reached_event, located_event.guard_index, lane_states.triggered_guard_index
+            has_reached_event, event_guard, lane_states.triggered_guard_index
         ),
         n_solver_steps=lane_states.n_solver_steps + is_running,
     )
-
-
-class _LocatedEvent(NamedTuple):
-    """Result of one iteration of the search for the earliest event inside a solver step."""
-
-    next_step_size: Array  # step size of the next attempt, s
-    event_time_shift: Array  # correction from this step size to that of the event, s
-    has_reached_event: Array  # whether the event is within tolerance
-    guard_index: Array
 
 
 def _iterate_event_search(
@@ -746,16 +633,19 @@ def _iterate_event_search(
     has_guard_crossed: Array,
     guard_scales: Array,
     options: StepOptions,
-    search_options: EventSearchOptions,
-) -> tuple[EventBracket, _LocatedEvent]:
+) -> tuple[EventBracket, Array, Array, Array, Array]:
     """Return the event bracket after one more iteration, and the event if it has been located.
+
+    The result is (bracket, step size of the next attempt in s, correction from this step size to
+    that of the event in s, whether the event is within tolerance, index of its guard).
 
     The next step size is the earliest root of the parabolas or secants through the guards.
     """
     h, event_bracket = lane_states.h, lane_states.event_bracket
+    is_searching = event_bracket.is_event_search_active
     is_guard_negative = attempted_step.guard_values <= 0.0
     is_guard_crossing = jnp.where(
-        event_bracket.is_event_search_active,
+        is_searching,
         event_bracket.is_guard_crossing | is_guard_negative,
         is_guard_negative,
     )
@@ -770,29 +660,27 @@ def _iterate_event_search(
     secant_step_size, secant_guard = _find_earliest_secant_root(
         event_bracket, attempted_step.guard_values, h, is_guard_crossing
     )
-    uses_secant_step = event_bracket.is_event_search_active & (
-        event_bracket.n_iterations >= search_options.n_parabola_iterations
+    uses_secant_step = is_searching & (
+        event_bracket.n_iterations >= EVENT_SEARCH_OPTIONS.n_parabola_iterations
     )
     proposed_step_size = jnp.where(uses_secant_step, secant_step_size, h * root_fraction)
     guard_index = jnp.where(uses_secant_step, secant_guard, guard_index)
     is_past_event = jnp.any(is_guard_crossing & is_guard_negative, axis=0)
     lower_step_size_bound = jnp.where(
-        event_bracket.is_event_search_active & ~is_past_event,
+        is_searching & ~is_past_event,
         h,
         event_bracket.lower_step_size_bound,
     )
     upper_step_size_bound = jnp.where(
-        event_bracket.is_event_search_active & is_past_event, h, event_bracket.upper_step_size_bound
+        is_searching & is_past_event, h, event_bracket.upper_step_size_bound
     )
     lower_step_size_bound = jnp.where(has_guard_crossed, 0.0, lower_step_size_bound)
     upper_step_size_bound = jnp.where(has_guard_crossed, h, upper_step_size_bound)
     time_resolution = 1e3 * jnp.finfo(h.dtype).eps * (lane_states.time_since_event + h)
     time_tolerance = jnp.maximum(
-        search_options.event_time_tolerance_factor * options.rtol * h, time_resolution
+        EVENT_SEARCH_OPTIONS.event_time_tolerance_factor * options.rtol * h, time_resolution
     )
-    time_tolerance = jnp.where(
-        event_bracket.is_event_search_active, event_bracket.time_tolerance, time_tolerance
-    )
+    time_tolerance = jnp.where(is_searching, event_bracket.time_tolerance, time_tolerance)
     is_step_in_bracket = (proposed_step_size >= lower_step_size_bound - time_tolerance) & (
         proposed_step_size <= upper_step_size_bound + time_tolerance
     )
@@ -818,26 +706,18 @@ def _iterate_event_search(
     guard_roundoff = (
         GUARD_ROUNDOFF_IN_EPS
         * jnp.where(
-            event_bracket.n_iterations < search_options.min_iterations_of_initiating_guard,
+            event_bracket.n_iterations < EVENT_SEARCH_OPTIONS.min_iterations_of_initiating_guard,
             1.0,
             3.0,
         )
         * jnp.finfo(h.dtype).eps
     )
-    is_guard_within_roundoff = event_bracket.is_event_search_active & (
-        jnp.abs(lowest_guard_value) <= guard_roundoff
-    )
+    is_guard_within_roundoff = is_searching & (jnp.abs(lowest_guard_value) <= guard_roundoff)
     event_time_shift = jnp.where(is_guard_within_roundoff, 0.0, event_time_shift)
     guard_index = jnp.where(is_guard_within_roundoff, lowest_guard, guard_index)
-    is_within_tolerance = event_bracket.is_event_search_active & (
-        jnp.abs(event_time_shift) <= time_tolerance
-    )
-    n_iterations = jnp.where(
-        event_bracket.is_event_search_active, event_bracket.n_iterations + 1, 0
-    )
-    is_event_search_active = (
-        event_bracket.is_event_search_active | has_guard_crossed
-    ) & ~is_within_tolerance
+    is_within_tolerance = is_searching & (jnp.abs(event_time_shift) <= time_tolerance)
+    n_iterations = jnp.where(is_searching, event_bracket.n_iterations + 1, 0)
+    is_event_search_active = (is_searching | has_guard_crossed) & ~is_within_tolerance
     next_bracket = EventBracket(
         is_event_search_active,
         is_guard_crossing,
@@ -848,12 +728,8 @@ def _iterate_event_search(
         h,
         attempted_step.guard_values,
     )
-    return next_bracket, _LocatedEvent(
-        next_step_size,
-        event_time_shift,
-        is_within_tolerance & (lane_states.lane_status == LaneStatus.RUNNING),
-        guard_index,
-    )
+    has_reached_event = is_within_tolerance & (lane_states.lane_status == LaneStatus.RUNNING)
+    return next_bracket, next_step_size, event_time_shift, has_reached_event, guard_index
 
 
 def _compute_squared_error(
@@ -909,6 +785,14 @@ def _find_earliest_minimum(
     )
 
 
+def _find_first_guard(guard_flags: Array) -> Array:
+    """Return the index of the first guard whose flag is True, or 0 if there is none."""
+    first_guard = jnp.zeros(guard_flags.shape[1:], jnp.int32)
+    for guard_index in reversed(range(len(guard_flags))):
+        first_guard = jnp.where(guard_flags[guard_index], guard_index, first_guard)
+    return first_guard
+
+
 def _find_lowest_guard(
     guard_values: Array, is_candidate: Array, index_without_candidate: Array | None = None
 ) -> tuple[Array, Array]:
@@ -941,22 +825,13 @@ def _find_earliest_secant_root(
     guard_secant_rate = (guard_values - event_bracket.guard_values) / jnp.where(
         h == event_bracket.previous_step_size, jnp.inf, h - event_bracket.previous_step_size
     )
-    earliest_step_size, earliest_guard = jnp.full_like(h, jnp.inf), jnp.zeros(h.shape, jnp.int32)
-    for guard_index in range(len(guard_values)):
-        is_guard_falling = is_guard_crossing[guard_index] & (guard_secant_rate[guard_index] < 0.0)
-        root_step_size = h - guard_values[guard_index] / jnp.where(
-            is_guard_falling, guard_secant_rate[guard_index], 1.0
-        )
-        is_already_negative = (
-            is_guard_crossing[guard_index] & ~is_guard_falling & (guard_values[guard_index] < 0.0)
-        )
-        root_step_size = jnp.where(is_already_negative, -jnp.inf, root_step_size)
-        is_root_earlier = (is_guard_falling | is_already_negative) & (
-            root_step_size < earliest_step_size
-        )
-        earliest_step_size = jnp.where(is_root_earlier, root_step_size, earliest_step_size)
-        earliest_guard = jnp.where(is_root_earlier, guard_index, earliest_guard)
-    return earliest_step_size, earliest_guard
+    is_guard_falling = is_guard_crossing & (guard_secant_rate < 0.0)
+    root_step_size = h - guard_values / jnp.where(is_guard_falling, guard_secant_rate, 1.0)
+    is_already_negative = is_guard_crossing & ~is_guard_falling & (guard_values < 0.0)
+    return _find_lowest_guard(
+        jnp.where(is_already_negative, -jnp.inf, root_step_size),
+        is_guard_falling | is_already_negative,
+    )
 
 
 def _find_earliest_root(
@@ -1000,9 +875,4 @@ def _find_earliest_root(
     )
     root_fraction = jnp.where(is_already_negative, -jnp.inf, root_fraction)
     has_guard_root = has_guard_root | is_already_negative
-    first_crossing_guard = jnp.zeros(root_fraction.shape[1:], jnp.int32)
-    for guard_index in reversed(range(len(root_fraction))):
-        first_crossing_guard = jnp.where(
-            is_guard_crossing[guard_index], guard_index, first_crossing_guard
-        )
-    return _find_lowest_guard(root_fraction, has_guard_root, first_crossing_guard)
+    return _find_lowest_guard(root_fraction, has_guard_root, _find_first_guard(is_guard_crossing))

@@ -5,6 +5,7 @@ contact state is constant between two events.
 """
 
 from collections.abc import Callable, Iterable
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -13,7 +14,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from vrw_jax.contact.contact_modes import Friction, replace_infinite_friction
+from vrw_jax.contact.contact_modes import replace_infinite_friction
 from vrw_jax.contact.dynamics_jvp import (
     ContactConfiguration,
     WheelForceSolution,
@@ -22,17 +23,18 @@ from vrw_jax.contact.dynamics_jvp import (
 )
 from vrw_jax.contact.mechanics import (
     ContactSlots,
+    Friction,
     LegArray,
-    LegDirections,
-    SlotFootVelocity,
-    SlotPair,
+    PlaneVelocities,
+    SlotArray,
     WheelMotion,
+    align_with_batch,
     compute_foot_heights,
     compute_free_leg_acceleration,
-    compute_slot_foot_velocity,
+    compute_leg_directions,
+    compute_slot_foot_velocities,
     find_contact_slots,
     make_opaque_one,
-    make_wheel_posture,
     prevent_fusion,
     select_slot_friction,
     stop_gradients,
@@ -75,22 +77,10 @@ def unpack_state(packed_state: PackedState) -> tuple[WheelMotion, EnergyLossAccu
     The function is the inverse of `pack_state`.
     """
     n_legs = (packed_state.shape[0] - 10) // 2
-    L = packed_state[6 : 6 + n_legs]
-    dL = packed_state[6 + n_legs : 6 + 2 * n_legs]
-    accumulators = packed_state[6 + 2 * n_legs :]
-    motion = WheelMotion(
-        packed_state[0],
-        packed_state[1],
-        packed_state[2],
-        packed_state[3],
-        packed_state[4],
-        packed_state[5],
-        L,
-        dL,
-    )
-    return motion, EnergyLossAccumulators(
-        accumulators[0], accumulators[1], accumulators[2], accumulators[3]
-    )
+    x, z, theta, vx, vz, dtheta = packed_state[:6]
+    L, dL = packed_state[6 : 6 + n_legs], packed_state[6 + n_legs : 6 + 2 * n_legs]
+    motion = WheelMotion(x, z, theta, vx, vz, dtheta, L, dL)
+    return motion, EnergyLossAccumulators(*packed_state[6 + 2 * n_legs :])
 
 
 class ContactState(NamedTuple):
@@ -104,19 +94,18 @@ class ContactState(NamedTuple):
     # sign of each of the `NormalForceRates` in this state; None if force peaks are not measured
     force_rate_signs: Array | None = None
 
-    def continue_with_same_contacts(self) -> "ContactState":
+    @classmethod
+    def without_changes(cls, contact_modes: Array, is_leg_locked: Array) -> "ContactState":
         """Return the contact state without changes at the last event, and without signs."""
-        no_leg_flags = self.is_leg_locked & False
-        return ContactState(
-            self.contact_modes, self.is_leg_locked, no_leg_flags, no_leg_flags, no_leg_flags
-        )
+        no_leg_flags = is_leg_locked & False
+        return cls(contact_modes, is_leg_locked, no_leg_flags, no_leg_flags, no_leg_flags)
 
 
 class ContactModeDynamics(NamedTuple):
     """Parameters and contact state that determine the dynamics of the wheel between two events."""
 
     s: Symbols
-    friction: Friction  # friction coefficient of the feet in the contact slots
+    friction: SlotArray  # friction coefficient of the feet in the contact slots
     has_one_sided_stoppers: bool  # whether legs in the air may leave their stoppers
     contact_state: ContactState
     contact_slots: ContactSlots
@@ -130,6 +119,11 @@ class ContactModeDynamics(NamedTuple):
     def measures_force_peaks(self) -> bool:
         """Return whether guards detect the extrema of normal forces."""
         return self.contact_state.force_rate_signs is not None
+
+    @property
+    def guard_layout(self) -> "GuardLayout":
+        """Return the positions of the guards in the result of `evaluate_guards`."""
+        return make_guard_layout(self.s.n, self.has_one_sided_stoppers, self.measures_force_peaks)
 
     def configure_contacts(self, motion: WheelMotion) -> ContactConfiguration:
         """Return the contact configuration for this motion, from which the forces are computed."""
@@ -159,8 +153,8 @@ def make_contact_mode_dynamics(
     - `tilt`: angle by which the next straight line of uneven ground is steeper, rad.
     """
     contact_slots = find_contact_slots(contact_state.contact_modes != ContactMode.OFF)
-    slot_modes = contact_slots.gather_slot_codes(contact_state.contact_modes)
-    is_stopper_holding = contact_slots.gather_slot_flags(contact_state.is_leg_locked)
+    slot_modes = contact_slots.gather_from_legs(contact_state.contact_modes)
+    is_stopper_holding = contact_slots.gather_flags_from_legs(contact_state.is_leg_locked)
     is_airborne_leg_locked = contact_state.is_leg_locked & ~contact_slots.is_in_slot
     friction = select_slot_friction(friction, contact_slots)
     return ContactModeDynamics(
@@ -178,75 +172,35 @@ def make_contact_mode_dynamics(
 
 
 class ContactForces(NamedTuple):
-    """Contact forces and accelerations, with the leg directions and foot velocities."""
+    """Contact forces and accelerations, with the foot velocities."""
 
-    leg_directions: LegDirections
-    free_leg_acceleration: LegArray  # see `compute_free_leg_acceleration`, m/s^2
     force_solution: WheelForceSolution
-    foot_velocity: SlotFootVelocity
+    slot_foot_velocities: PlaneVelocities
+    # stopper force on each leg, N; 0 for a leg with a loaded foot or not on its stopper
+    airborne_stopper_forces: LegArray
 
 
 def compute_forces(
     contact_mode_dynamics: ContactModeDynamics, motion: WheelMotion
 ) -> ContactForces:
     """Return the forces of ground and stoppers (N), and the resulting accelerations."""
-    opaque_one = make_opaque_one(motion)
-    wheel_posture = make_wheel_posture(
-        contact_mode_dynamics.s, motion, contact_mode_dynamics.contact_slots
-    )
+    s, opaque_one = contact_mode_dynamics.s, make_opaque_one(motion.theta)
+    sin, cos = leg_directions = compute_leg_directions(s, motion.theta)
     leg_acceleration = prevent_fusion(
-        compute_free_leg_acceleration(
-            contact_mode_dynamics.s, motion, wheel_posture.leg_directions
-        ),
+        compute_free_leg_acceleration(s, motion, leg_directions), opaque_one
+    )
+    slot_foot_velocities = prevent_fusion(
+        compute_slot_foot_velocities(motion, leg_directions, contact_mode_dynamics.contact_slots),
         opaque_one,
     )
-    slot_foot_velocity = prevent_fusion(
-        compute_slot_foot_velocity(motion, contact_mode_dynamics.contact_slots, wheel_posture),
-        opaque_one,
-    )
-    return ContactForces(
-        wheel_posture.leg_directions,
-        leg_acceleration,
-        solve_contact_forces(contact_mode_dynamics.configure_contacts(motion)),
-        slot_foot_velocity,
-    )
-
-
-def compute_airborne_stopper_force(
-    contact_mode_dynamics: ContactModeDynamics, contact_forces: ContactForces
-) -> LegArray:
-    """Return the stopper force on each leg in the air, N.
-
-    The force is 0 for legs with loaded feet and for legs that are not on their stoppers.
-    """
-    sin, cos = contact_forces.leg_directions
-    hub_acceleration_x, hub_acceleration_z, _ = contact_forces.force_solution.hub_motion
+    force_solution = solve_contact_forces(contact_mode_dynamics.configure_contacts(motion))
+    hub_acceleration_x, hub_acceleration_z, _ = force_solution.hub_motion
     # This is the acceleration of each leg's length without forces of slots and stoppers, m/s^2.
-    free_leg_acceleration = (
-        contact_forces.free_leg_acceleration + sin * hub_acceleration_x + cos * hub_acceleration_z
+    free_leg_acceleration = leg_acceleration + sin * hub_acceleration_x + cos * hub_acceleration_z
+    airborne_stopper_forces = jnp.where(
+        contact_mode_dynamics.is_airborne_leg_locked, s.m * free_leg_acceleration, 0.0
     )
-    return jnp.where(
-        contact_mode_dynamics.is_airborne_leg_locked,
-        contact_mode_dynamics.s.m * free_leg_acceleration,
-        0.0,
-    )
-
-
-def compute_min_stopper_force(
-    contact_mode_dynamics: ContactModeDynamics, contact_forces: ContactForces
-) -> Elementwise:
-    """Return the smallest stopper force on a leg that is in the air on its stopper, N.
-
-    The result is infinite if there is no such leg.
-    """
-    return jnp.min(
-        jnp.where(
-            contact_mode_dynamics.is_airborne_leg_locked,
-            compute_airborne_stopper_force(contact_mode_dynamics, contact_forces),
-            jnp.inf,
-        ),
-        axis=0,
-    )
+    return ContactForces(force_solution, slot_foot_velocities, airborne_stopper_forces)
 
 
 def compute_accumulator_rates(
@@ -258,17 +212,13 @@ def compute_accumulator_rates(
     the slip speeds in m/s.
     """
     slip_signs = compute_slip_signs(contact_mode_dynamics.slot_modes)
-    slip_speeds = [
-        slip_signs[i] * contact_forces.foot_velocity.velocity_along_slope[i] for i in range(2)
-    ]
-    friction_forces = [
-        -contact_forces.force_solution.tangential_forces[i] * slip_signs[i] for i in range(2)
-    ]
+    slip_speeds = slip_signs * contact_forces.slot_foot_velocities.along_slope
+    friction_forces = -contact_forces.force_solution.tangential_forces * slip_signs
     return EnergyLossAccumulators(
         time_since_event=jnp.ones_like(motion.x),
         damping_loss=contact_mode_dynamics.s.c * sum_over_legs(motion.dL * motion.dL),
-        friction_loss=friction_forces[0] * slip_speeds[0] + friction_forces[1] * slip_speeds[1],
-        slip_length=slip_speeds[0] + slip_speeds[1],
+        friction_loss=jnp.sum(friction_forces * slip_speeds, axis=0),
+        slip_length=jnp.sum(slip_speeds, axis=0),
     )
 
 
@@ -293,7 +243,7 @@ def evaluate_vector_field(
             coordinate_rates,
             compute_accumulator_rates(contact_mode_dynamics, motion, contact_forces),
         ),
-        make_opaque_one(motion),
+        make_opaque_one(motion.theta),
     )
 
 
@@ -387,19 +337,13 @@ def compute_normal_force_rates(
     contact_mode_dynamics: ContactModeDynamics, motion: WheelMotion
 ) -> tuple[NormalForces, NormalForces]:
     """Return the normal forces on the feet, N, and their rates between two events, N/s."""
-    return _differentiate_in_time(
-        lambda motion: compute_normal_forces(contact_mode_dynamics, motion),
-        contact_mode_dynamics,
-        motion,
-    )
+    return _differentiate_in_time(compute_normal_forces, contact_mode_dynamics, motion)
 
 
 def compute_force_rates(contact_mode_dynamics: ContactModeDynamics, motion: WheelMotion) -> Array:
     """Return the `NormalForceRates` in the motion between two events, as one array (3, ...)."""
     (_, force_rates), (_, second_rates) = _differentiate_in_time(
-        lambda motion: compute_normal_force_rates(contact_mode_dynamics, motion),
-        contact_mode_dynamics,
-        motion,
+        compute_normal_force_rates, contact_mode_dynamics, motion
     )
     return jnp.stack(
         NormalForceRates(force_rates.fore_force, force_rates.total_force, second_rates.fore_force)
@@ -407,7 +351,7 @@ def compute_force_rates(contact_mode_dynamics: ContactModeDynamics, motion: Whee
 
 
 def _differentiate_in_time(
-    function: Callable[[WheelMotion], Any],
+    function: Callable[[ContactModeDynamics, WheelMotion], Any],
     contact_mode_dynamics: ContactModeDynamics,
     motion: WheelMotion,
 ) -> tuple[Any, Any]:
@@ -417,12 +361,12 @@ def _differentiate_in_time(
     motion_rate = WheelMotion(
         *coordinate_rates, *force_solution.hub_motion, motion.dL, force_solution.length_motion
     )
-    return jax.jvp(function, (motion,), (motion_rate,))
+    return jax.jvp(partial(function, contact_mode_dynamics), (motion,), (motion_rate,))
 
 
 def flag_zero_force_rates(guard_layout: GuardLayout, guard_index: Int[Array, "..."]) -> Array:
     """Return which of the `NormalForceRates` is zero at the event of a guard, (3, ...)."""
-    rate_indices = np.arange(len(NormalForceRates._fields)).reshape(-1, *(1,) * guard_index.ndim)
+    rate_indices = align_with_batch(np.arange(len(NormalForceRates._fields)), guard_index)
     return guard_index == guard_layout.first_force_rate_guard + rate_indices
 
 
@@ -446,12 +390,10 @@ def update_force_rate_signs(
 class ContactQuantities(NamedTuple):
     """Contact forces and slip speeds that the guards depend on in addition to the motion."""
 
-    leg_directions: LegDirections
-    normal_forces: SlotPair
-    tangential_forces: SlotPair
-    stopper_forces: SlotPair
-    slip_speeds: SlotPair  # tangential speeds of the feet in the contact slots, m/s
-    painleve_determinant: Array  # see `contact_modes.SlotForceSolution`
+    normal_forces: SlotArray
+    tangential_forces: SlotArray
+    stopper_forces: SlotArray
+    slip_speeds: SlotArray  # tangential speeds of the feet in the contact slots, m/s
     airborne_stopper_forces: (
         LegArray | None
     )  # stopper force of legs in the air, if stoppers are one-sided
@@ -465,34 +407,18 @@ def collect_contact_quantities(
 ) -> ContactQuantities:
     """Return contact forces and slip speeds from which `evaluate_guards` computes the guards."""
     force_solution = contact_forces.force_solution
-    airborne_stopper_forces = (
-        compute_airborne_stopper_force(contact_mode_dynamics, contact_forces)
-        if contact_mode_dynamics.has_one_sided_stoppers
-        else None
-    )
-    force_pairs = (
+    return ContactQuantities(
         force_solution.normal_forces,
         force_solution.tangential_forces,
         force_solution.stopper_forces,
-    )
-    return ContactQuantities(
-        contact_forces.leg_directions,
-        *force_pairs,
-        contact_forces.foot_velocity.velocity_along_slope,
-        force_solution.painleve_determinant,
-        airborne_stopper_forces,
+        contact_forces.slot_foot_velocities.along_slope,
+        contact_forces.airborne_stopper_forces
+        if contact_mode_dynamics.has_one_sided_stoppers
+        else None,
         compute_force_rates(contact_mode_dynamics, motion)
         if contact_mode_dynamics.measures_force_peaks
         else None,
     )
-
-
-def stack_slot_friction(friction: Friction) -> Array:
-    """Return the friction coefficients for both contact slots as one array (2, ...).
-
-    A common coefficient is returned unchanged.
-    """
-    return jnp.stack(friction) if isinstance(friction, tuple) else friction
 
 
 def evaluate_guards(
@@ -510,28 +436,26 @@ def evaluate_guards(
     this guard at the start is replaced by 1.
     """
     s, contact_state = contact_mode_dynamics.s, contact_mode_dynamics.contact_state
-    guards_without_event = jnp.ones_like(motion.L)
     is_airborne = (contact_state.contact_modes == ContactMode.OFF) & (
         is_after_start | ~contact_state.has_just_lifted
     )
     is_leg_free = ~contact_state.is_leg_locked & (is_after_start | ~contact_state.has_just_unlocked)
-    has_just_slid = contact_mode_dynamics.contact_slots.gather_slot_flags(
+    has_just_slid = contact_mode_dynamics.contact_slots.gather_flags_from_legs(
         contact_state.has_just_slid
     )
-    friction_coefficients = stack_slot_friction(
-        replace_infinite_friction(contact_mode_dynamics.friction)
-    )
-    normal_forces = jnp.stack(contact_quantities.normal_forces)
-    tangential_forces = jnp.stack(contact_quantities.tangential_forces)
+    friction = contact_mode_dynamics.friction
+    friction_coefficients = replace_infinite_friction(friction)
+    normal_forces = contact_quantities.normal_forces
+    tangential_forces = contact_quantities.tangential_forces
     # In the limit of large friction, a resting foot begins to slide when its normal force vanishes
     # (see `impacts.resolve_event`). A sliding foot lifts off when its friction vanishes.
-    uses_friction_limit = stack_slot_friction(contact_mode_dynamics.friction) == jnp.inf
-    slip_signs = jnp.stack(compute_slip_signs(contact_mode_dynamics.slot_modes))
+    uses_friction_limit = friction == jnp.inf
+    slip_signs = compute_slip_signs(contact_mode_dynamics.slot_modes)
     supporting_force = jnp.where(
         uses_friction_limit & (slip_signs != 0.0), -slip_signs * tangential_forces, normal_forces
     )
     has_friction_cone = (contact_mode_dynamics.slot_modes == ContactMode.STICK) & jnp.isfinite(
-        stack_slot_friction(contact_mode_dynamics.friction)
+        friction
     )
     is_sliding = (slip_signs != 0.0) & (is_after_start | ~has_just_slid)
     replace_if_not_evaluated = lambda is_evaluated, guard_value: jnp.where(
@@ -541,10 +465,9 @@ def evaluate_guards(
         []
         if contact_quantities.airborne_stopper_forces is None
         else [
-            jnp.where(
+            replace_if_not_evaluated(
                 contact_mode_dynamics.is_airborne_leg_locked,
                 contact_quantities.airborne_stopper_forces,
-                guards_without_event,
             )
         ]
     )
@@ -559,14 +482,13 @@ def evaluate_guards(
         ]
     )
     return [
-        jnp.where(
+        replace_if_not_evaluated(
             is_airborne,
             compute_foot_heights(
-                motion, contact_quantities.leg_directions, contact_mode_dynamics.tilt
+                motion, compute_leg_directions(s, motion.theta), contact_mode_dynamics.tilt
             ),
-            guards_without_event,
         ),
-        jnp.where(is_leg_free, s.L0 - motion.L, guards_without_event),
+        replace_if_not_evaluated(is_leg_free, s.L0 - motion.L),
         replace_if_not_evaluated(
             contact_mode_dynamics.slot_modes != ContactMode.OFF, supporting_force
         ),
@@ -576,11 +498,9 @@ def evaluate_guards(
         replace_if_not_evaluated(
             has_friction_cone, friction_coefficients * normal_forces + tangential_forces
         ),
+        replace_if_not_evaluated(is_sliding, slip_signs * contact_quantities.slip_speeds),
         replace_if_not_evaluated(
-            is_sliding, slip_signs * jnp.stack(contact_quantities.slip_speeds)
-        ),
-        replace_if_not_evaluated(
-            contact_mode_dynamics.is_stopper_holding, jnp.stack(contact_quantities.stopper_forces)
+            contact_mode_dynamics.is_stopper_holding, contact_quantities.stopper_forces
         ),
         motion.dtheta[None],
         (jnp.min(motion.L, axis=0) - s.a)[None],
@@ -654,7 +574,6 @@ def is_wheel_at_rest(
 
 
 def choose_stopping_guard(
-    guard_layout: GuardLayout,
     contact_mode_dynamics: ContactModeDynamics,
     coordinate_rates: Array,
     guard_index: Int[Array, "..."],
@@ -667,8 +586,9 @@ def choose_stopping_guard(
     two guards is zero first. After the slide has ended, the friction on the stopped foot determines
     whether the wheel rests or falls back.
     """
+    guard_layout = contact_mode_dynamics.guard_layout
     slip_signs = compute_slip_signs(contact_mode_dynamics.slot_modes)
-    has_just_slid = contact_mode_dynamics.contact_slots.gather_slot_flags(
+    has_just_slid = contact_mode_dynamics.contact_slots.gather_flags_from_legs(
         contact_mode_dynamics.contact_state.has_just_slid
     )
     has_slid_to_rest = guard_index == guard_layout.rolling_rate_guard
@@ -719,4 +639,4 @@ def compute_guard_values(
     guard_groups = evaluate_guards(
         contact_mode_dynamics, motion, contact_quantities, accumulators.time_since_event > 0.0
     )
-    return jnp.concatenate(prevent_fusion(guard_groups, make_opaque_one(motion)))
+    return jnp.concatenate(prevent_fusion(guard_groups, make_opaque_one(motion.theta)))

@@ -16,7 +16,6 @@ from jaxtyping import Array, Float
 
 from vrw_jax.contact.batch_integrator import (
     N_ACCUMULATOR_ROWS,
-    N_CONTACT_QUANTITY_ROWS,
     ContactIntervalPoint,
     ContactIntervalState,
     LaneStatus,
@@ -35,7 +34,6 @@ from vrw_jax.contact.contact_state import (
     compute_guard_values,
     compute_packed_units,
     evaluate_vector_field,
-    make_guard_layout,
     pack_state,
     unpack_state,
 )
@@ -45,7 +43,7 @@ from vrw_jax.hybrid import (
     integrate_phase_in_scaled_units,
     sample_phase_in_scaled_units,
 )
-from vrw_jax.numerics import StepOptions
+from vrw_jax.numerics import StepOptions, select_trees_by_condition
 from vrw_jax.wheel import Outcome, compute_wheel_units
 
 ROLLING_INDEX = 2
@@ -57,17 +55,15 @@ def init_diffrax_contact_interval(
 ) -> ContactIntervalState:
     """Return the state of a single wheel at the start of an interval between events.
 
-    The accelerations are infinite, because only the accelerations at the end of the interval are
-    used. The fields for the event search of the batch integrator are None.
+    The dynamics rows contain only accelerations. They are infinite, because only the accelerations
+    at the end of the interval are used. The fields for the event search of the batch integrator are
+    None.
     """
     q, v = pack_coordinates(motion)
-    n_dynamics_rows = len(q) + N_CONTACT_QUANTITY_ROWS
     int_zero_lanes = jnp.zeros(motion.x.shape, jnp.int32)
     unused_search_field: Any = None
     return ContactIntervalState(
-        contact_interval_point=ContactIntervalPoint(
-            q, v, jnp.full((n_dynamics_rows, *motion.x.shape), jnp.inf, q.dtype)
-        ),
+        contact_interval_point=ContactIntervalPoint(q, v, jnp.full_like(q, jnp.inf)),
         contact_state=contact_mode_dynamics.contact_state,
         guard_values=unused_search_field,
         guard_offset=unused_search_field,
@@ -109,9 +105,7 @@ def integrate_by_diffrax(
             "force peaks with unilateral contact are computed by diffrax, but only machine code "
             "locates them, with first derivatives: take StepOptions() on a CPU with llvmlite."
         )
-    guard_layout = make_guard_layout(
-        contact_mode_dynamics.s.n, contact_mode_dynamics.has_one_sided_stoppers
-    )
+    guard_layout = contact_mode_dynamics.guard_layout
     q, v = contact_interval_state.contact_interval_point[:2]
     start_rows = evaluate_dynamics(*stop_gradients((contact_mode_dynamics, q, v)))
     # As in `init_contact_interval`, a wheel that an event leaves rolling backward continues if it
@@ -142,35 +136,22 @@ def integrate_by_diffrax(
     q, v = pack_coordinates(end_motion)
     end_rows = evaluate_dynamics(*stop_gradients((contact_mode_dynamics, q, v)))
     # At the singularity, forces change sign without passing through zero.
-    n_dynamics_rows = len(q) + N_CONTACT_QUANTITY_ROWS
-    is_singular = is_at_painleve_singularity(
-        start_rows[n_dynamics_rows - 1], end_rows[n_dynamics_rows - 1], options
-    )
+    is_singular = is_at_painleve_singularity(start_rows[len(q)], end_rows[len(q)], options)
     failure_outcome = jnp.where(
         end_result.is_timed_out, Outcome.NO_TOUCHDOWN_IN_TIME, Outcome.SOLVER_FAILED
     )
     lane_status = jnp.where(end_result.end_guard_index >= 0, LaneStatus.EVENT, failure_outcome)
     lane_status = jnp.where(is_singular, Outcome.PAINLEVE_PARADOX, lane_status)
-    dynamics_rows = jnp.where(
-        is_running,
-        end_rows[:n_dynamics_rows],
-        contact_interval_state.contact_interval_point.dynamics_rows,
-    )
-    contact_interval_state = contact_interval_state._replace(
-        contact_interval_point=ContactIntervalPoint(q, v, dynamics_rows),
+    next_interval_state = contact_interval_state._replace(
+        contact_interval_point=ContactIntervalPoint(q, v, end_rows[: len(q)]),
         interval_accumulators=jnp.stack(end_accumulators[1:]),
-        time_since_event=jnp.where(
-            is_running, end_result.duration, contact_interval_state.time_since_event
-        ),
-        lane_status=jnp.where(is_running, lane_status, contact_interval_state.lane_status).astype(
-            jnp.int32
-        ),
-        triggered_guard_index=jnp.where(
-            is_running, end_result.end_guard_index, contact_interval_state.triggered_guard_index
-        ),
-        n_solver_steps=jnp.where(
-            is_running, end_result.solver_steps, contact_interval_state.n_solver_steps
-        ),
+        time_since_event=end_result.duration,
+        lane_status=lane_status.astype(jnp.int32),
+        triggered_guard_index=end_result.end_guard_index,
+        n_solver_steps=end_result.solver_steps,
+    )
+    contact_interval_state = select_trees_by_condition(
+        is_running, next_interval_state, contact_interval_state
     )
     return jax.tree.map(lambda x: x[..., None], contact_interval_state)
 

@@ -13,14 +13,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from vrw_jax.contact.contact_modes import Friction, replace_infinite_friction, solve_combination
+from vrw_jax.contact.contact_modes import replace_infinite_friction, solve_combination
 from vrw_jax.contact.mechanics import (
     ContactInverseInertia,
     ContactSlots,
     FreeMotion,
     HubVector,
     LegArray,
-    SlotPair,
+    SlotArray,
     WheelMotion,
     compute_free_acceleration,
     compute_free_velocity,
@@ -39,7 +39,7 @@ class ContactConfiguration(NamedTuple):
 
     s: Symbols
     motion: WheelMotion
-    friction: Friction  # friction coefficient of the feet in the contact slots
+    friction: SlotArray  # friction coefficient of the feet in the contact slots
     contact_slots: ContactSlots
     slot_modes: Array  # `ContactMode` of the foot in each contact slot
     is_stopper_holding: Array  # whether the leg in each contact slot is on its stopper
@@ -59,21 +59,22 @@ class WheelForceSolution(NamedTuple):
     The fields are described in `contact_modes.SlotForceSolution`.
     """
 
-    tangential_forces: SlotPair
-    normal_forces: SlotPair
-    stopper_forces: SlotPair
-    leg_pull_forces: SlotPair
+    tangential_forces: SlotArray
+    normal_forces: SlotArray
+    stopper_forces: SlotArray
+    leg_pull_forces: SlotArray
     hub_motion: HubVector
     painleve_determinant: Array
     length_motion: LegArray  # accelerations of the legs' lengths, or rates after an impact
 
 
-def compute_slip_signs(slot_modes: Array) -> SlotPair:
+def compute_slip_signs(slot_modes: Array) -> SlotArray:
     """Return the slip direction of each foot in contact: 1 downhill, -1 uphill, 0 for no slip."""
-    select_slip_sign = lambda mode: jnp.where(
-        mode == ContactMode.SLIP_DOWN, 1.0, jnp.where(mode == ContactMode.SLIP_UP, -1.0, 0.0)
+    return jnp.where(
+        slot_modes == ContactMode.SLIP_DOWN,
+        1.0,
+        jnp.where(slot_modes == ContactMode.SLIP_UP, -1.0, 0.0),
     )
-    return select_slip_sign(slot_modes[0]), select_slip_sign(slot_modes[1])
 
 
 class _ConstantMotionTerms(NamedTuple):
@@ -82,7 +83,7 @@ class _ConstantMotionTerms(NamedTuple):
     radial_leg_motion: LegArray  # motion of the leg masses relative to the hub, along the legs
     # motion of the leg masses relative to the hub, transverse to the legs
     transverse_leg_motion: LegArray
-    hub_motion: SlotPair  # motion of the hub without gravity
+    hub_motion: tuple[Array, Array]  # motion of the hub along x and z without gravity
 
 
 class _EquationTangents(NamedTuple):
@@ -93,16 +94,10 @@ class _EquationTangents(NamedTuple):
 
     radial_leg_motion: LegArray
     transverse_leg_motion: LegArray
-    hub_motion: SlotPair
+    hub_motion: tuple[Array, Array]
     spring_force: LegArray | float  # N
-    foot_transverse_motion: SlotPair
-    foot_radial_motion: SlotPair
-
-
-_EquationTangentFn = Callable[
-    [ContactConfiguration, ContactConfiguration, ContactInverseInertia, WheelForceSolution],
-    tuple[_ConstantMotionTerms, _EquationTangents],
-]
+    foot_transverse_motion: SlotArray
+    foot_radial_motion: SlotArray
 
 
 @eqx.filter_jit  # This function is traced once for all call sites.
@@ -160,20 +155,14 @@ def _solve_with_free_motion(
     free_motion_fn: Callable[..., FreeMotion], contact_configuration: ContactConfiguration
 ) -> tuple[ContactInverseInertia, FreeMotion, WheelForceSolution]:
     """Return inverse inertia, free motion, and forces or impulses for a contact configuration."""
-    s = contact_configuration.s
-    motion = contact_configuration.motion
-    opaque_one = make_opaque_one(contact_configuration.motion)
+    s, motion, _, contact_slots, _, _, is_airborne_leg_locked = contact_configuration
+    opaque_one = make_opaque_one(motion.theta)
     inverse_inertia = prevent_fusion(
-        make_inverse_inertia(
-            s,
-            motion,
-            contact_configuration.contact_slots,
-            contact_configuration.is_airborne_leg_locked,
-        ),
+        make_inverse_inertia(s, motion, contact_slots, is_airborne_leg_locked),
         opaque_one,
     )
     free_motion = prevent_fusion(
-        free_motion_fn(s, motion, contact_configuration.contact_slots, inverse_inertia),
+        free_motion_fn(s, motion, contact_slots, inverse_inertia),
         opaque_one,
     )
     return (
@@ -188,7 +177,7 @@ def _solve_with_free_motion(
 
 def _solve_with_jvp_rule(
     free_motion_fn: Callable[..., FreeMotion],
-    equation_tangent_fn: _EquationTangentFn,
+    equation_tangent_fn: Callable[..., tuple[_ConstantMotionTerms, _EquationTangents]],
     contact_configuration: ContactConfiguration,
 ) -> WheelForceSolution:
     """Return the forces or impulses for a contact configuration, with a JVP rule.
@@ -234,17 +223,9 @@ def _solve_with_jvp_rule(
             (free_motion,),
             (free_motion_tangents,),
         )
-        add_slot_pairs = lambda first_pair, second_pair: (
-            first_pair[0] + second_pair[0],
-            first_pair[1] + second_pair[1],
-        )
         return force_solution, solution_tangent._replace(
-            tangential_forces=add_slot_pairs(
-                solution_tangent.tangential_forces, residual_tangent.friction_force
-            ),
-            leg_pull_forces=add_slot_pairs(
-                solution_tangent.leg_pull_forces, residual_tangent.leg_pull_forces
-            ),
+            tangential_forces=solution_tangent.tangential_forces + residual_tangent.friction_force,
+            leg_pull_forces=solution_tangent.leg_pull_forces + residual_tangent.leg_pull_forces,
         )
 
     return solve_from_arrays(float_leaves, nonfloat_arrays)
@@ -258,10 +239,10 @@ class _ResidualTangent(NamedTuple):
         LegArray, LegArray, LegArray
     ]  # effect of each leg on the hub's equations
     hub_residual_without_legs: HubVector  # effect on the hub's equations without the legs
-    foot_transverse_motion: SlotPair
-    foot_radial_motion: SlotPair
-    friction_force: SlotPair  # tangent of the friction force by its coefficient
-    leg_pull_forces: SlotPair  # tangent due to friction and rotation of the legs in contact
+    foot_transverse_motion: SlotArray
+    foot_radial_motion: SlotArray
+    friction_force: SlotArray  # tangent of the friction force by its coefficient
+    leg_pull_forces: SlotArray  # tangent due to friction and rotation of the legs in contact
 
 
 def _compute_residual_tangent(
@@ -278,49 +259,24 @@ def _compute_residual_tangent(
     - `constant_motion_terms`: accelerations or velocity jumps that are treated as constants;
     - `equation_tangents`: tangents of the equations for these constant terms.
     """
-    s, ds, contact_slots, (sin, cos), slot_indices = (
-        contact_configuration.s,
-        configuration_tangent.s,
-        contact_configuration.contact_slots,
-        inverse_inertia.leg_directions,
-        range(2),
+    s, motion, friction, contact_slots, slot_modes, *_ = contact_configuration
+    ds, motion_tangent, friction_tangent, *_ = configuration_tangent
+    sin, cos = inverse_inertia.leg_directions
+    b, db, dtheta = motion.L - s.a, motion_tangent.L - ds.a, motion_tangent.theta
+    _, friction_coefficient_tangent = jax.jvp(
+        replace_infinite_friction, (friction,), (friction_tangent,)
     )
-    b = contact_configuration.motion.L - s.a
-    db = configuration_tangent.motion.L - ds.a
-    dtheta = configuration_tangent.motion.theta
-    slip_signs = compute_slip_signs(contact_configuration.slot_modes)
-    friction_coefficient_tangent = jax.jvp(
-        replace_infinite_friction,
-        (contact_configuration.friction,),
-        (configuration_tangent.friction,),
-    )[1]
-    friction_coefficient_tangent = (
-        friction_coefficient_tangent
-        if isinstance(friction_coefficient_tangent, tuple)
-        else (friction_coefficient_tangent, friction_coefficient_tangent)
+    t, n = force_solution.tangential_forces, force_solution.normal_forces
+    slot_sin, slot_cos = inverse_inertia.sin, inverse_inertia.cos
+    friction_force_tangents = -compute_slip_signs(slot_modes) * friction_coefficient_tangent * n
+    transverse_forces = t * slot_cos - n * slot_sin
+    radial_forces = t * slot_sin + n * slot_cos
+    leg_pull_tangent = friction_force_tangents * slot_sin + transverse_forces * dtheta
+    foot_moments = contact_slots.gather_from_legs(
+        motion_tangent.L
+    ) * transverse_forces + inverse_inertia.L * (
+        friction_force_tangents * slot_cos - radial_forces * dtheta
     )
-    t = force_solution.tangential_forces
-    n = force_solution.normal_forces
-    L = inverse_inertia.L
-    dL = contact_slots.gather_slot_pair(configuration_tangent.motion.L)
-    friction_force_tangents = [
-        -slip_signs[i] * friction_coefficient_tangent[i] * n[i] for i in slot_indices
-    ]
-    transverse_forces = [
-        t[i] * inverse_inertia.cos[i] - n[i] * inverse_inertia.sin[i] for i in slot_indices
-    ]
-    radial_forces = [
-        t[i] * inverse_inertia.sin[i] + n[i] * inverse_inertia.cos[i] for i in slot_indices
-    ]
-    leg_pull_tangent = [
-        friction_force_tangents[i] * inverse_inertia.sin[i] + transverse_forces[i] * dtheta
-        for i in slot_indices
-    ]
-    foot_moments = [
-        dL[i] * transverse_forces[i]
-        + L[i] * (friction_force_tangents[i] * inverse_inertia.cos[i] - radial_forces[i] * dtheta)
-        for i in slot_indices
-    ]
 
     (hub_motion_x, hub_motion_z), (hub_motion_tangent_x, hub_motion_tangent_z) = (
         constant_motion_terms.hub_motion,
@@ -384,8 +340,8 @@ def _compute_residual_tangent(
         ),
         foot_transverse_motion=equation_tangents.foot_transverse_motion,
         foot_radial_motion=equation_tangents.foot_radial_motion,
-        friction_force=(friction_force_tangents[0], friction_force_tangents[1]),
-        leg_pull_forces=(leg_pull_tangent[0], leg_pull_tangent[1]),
+        friction_force=friction_force_tangents,
+        leg_pull_forces=leg_pull_tangent,
     )
 
 
@@ -406,21 +362,14 @@ def _compute_free_motion_tangent(
     hub_motion_tangent = multiply_by_inverse_inertia(
         inverse_inertia.inverse_inertia, (x, z, rotation)
     )
-    slot_length_tangents = contact_slots.gather_slot_pair(residual_tangent.leg_length_residual)
-    u, v = residual_tangent.foot_radial_motion
-    e = [
-        inverse_inertia.cos[i] * hub_motion_tangent[0]
-        - inverse_inertia.sin[i] * hub_motion_tangent[1]
-        - inverse_inertia.L[i] * hub_motion_tangent[2]
-        for i in range(2)
-    ]
-    e = [e[i] + residual_tangent.foot_transverse_motion[i] for i in range(2)]
+    slot_length_tangents = contact_slots.gather_from_legs(residual_tangent.leg_length_residual)
     return FreeMotion(
         hub_motion_tangent,
         residual_tangent.leg_length_residual,
         slot_length_tangents,
-        (e[0], e[1]),
-        (u - slot_length_tangents[0], v - slot_length_tangents[1]),
+        inverse_inertia.compute_transverse_foot_motion(hub_motion_tangent)
+        + residual_tangent.foot_transverse_motion,
+        residual_tangent.foot_radial_motion - slot_length_tangents,
     )
 
 
@@ -431,12 +380,9 @@ def _compute_motion_equation_tangents(
     force_solution: WheelForceSolution,
 ) -> tuple[_ConstantMotionTerms, _EquationTangents]:
     """Return the constant accelerations, and the tangents of the equations of motion."""
-    s = contact_configuration.s
-    motion = contact_configuration.motion
-    contact_slots = contact_configuration.contact_slots
-    ds = configuration_tangent.s
-    motion_tangent = configuration_tangent.motion
-    dtheta = configuration_tangent.motion.theta
+    s, motion, _, contact_slots, *_ = contact_configuration
+    ds, motion_tangent, *_ = configuration_tangent
+    dtheta = motion_tangent.theta
     b, db, ddtheta = motion.L - s.a, motion_tangent.L - ds.a, force_solution.hub_motion[2]
     squared_angular_rate, doubled_angular_rate = motion.dtheta * motion.dtheta, 2.0 * motion.dtheta
     squared_angular_rate_tangent = doubled_angular_rate * motion_tangent.dtheta
@@ -453,24 +399,21 @@ def _compute_motion_equation_tangents(
             force_solution.hub_motion[1] + s.g * s.cos_phi,
         ),
     )
-    L, dL, slot_length_rates, slot_length_rate_tangents = (
-        inverse_inertia.L,
-        *map(contact_slots.gather_slot_pair, (motion_tangent.L, motion.dL, motion_tangent.dL)),
+    length_tangents, length_rates, length_rate_tangents, length_accelerations = map(
+        contact_slots.gather_from_legs,
+        (motion_tangent.L, motion.dL, motion_tangent.dL, force_solution.length_motion),
     )
-    slot_accelerations = contact_slots.gather_slot_pair(force_solution.length_motion)
-    foot_transverse = [
-        (L[i] * squared_angular_rate - slot_accelerations[i]) * dtheta
-        - doubled_angular_rate * slot_length_rate_tangents[i]
-        - slot_length_rates[i] * doubled_angular_rate_tangent
-        - ddtheta * dL[i]
-        for i in range(2)
-    ]
-    foot_radial = [
-        (doubled_angular_rate * slot_length_rates[i] + ddtheta * L[i]) * dtheta
-        + squared_angular_rate * dL[i]
-        + L[i] * squared_angular_rate_tangent
-        for i in range(2)
-    ]
+    foot_transverse = (
+        (inverse_inertia.L * squared_angular_rate - length_accelerations) * dtheta
+        - doubled_angular_rate * length_rate_tangents
+        - length_rates * doubled_angular_rate_tangent
+        - ddtheta * length_tangents
+    )
+    foot_radial = (
+        (doubled_angular_rate * length_rates + ddtheta * inverse_inertia.L) * dtheta
+        + squared_angular_rate * length_tangents
+        + inverse_inertia.L * squared_angular_rate_tangent
+    )
     return constant_motion_terms, _EquationTangents(
         radial_leg_motion=-(db * squared_angular_rate + b * squared_angular_rate_tangent),
         transverse_leg_motion=doubled_angular_rate * motion_tangent.dL
@@ -478,8 +421,8 @@ def _compute_motion_equation_tangents(
         + ddtheta * db,
         hub_motion=(-ds.g * s.sin_phi - s.g * ds.sin_phi, ds.g * s.cos_phi + s.g * ds.cos_phi),
         spring_force=spring_force_tangent,
-        foot_transverse_motion=(foot_transverse[0], foot_transverse[1]),
-        foot_radial_motion=(foot_radial[0], foot_radial[1]),
+        foot_transverse_motion=foot_transverse,
+        foot_radial_motion=foot_radial,
     )
 
 
@@ -490,10 +433,8 @@ def _compute_impact_equation_tangents(
     force_solution: WheelForceSolution,
 ) -> tuple[_ConstantMotionTerms, _EquationTangents]:
     """Return the constant velocity jumps, and the tangents of the impact equations."""
-    s = contact_configuration.s
-    motion = contact_configuration.motion
-    motion_tangent = configuration_tangent.motion
-    contact_slots = contact_configuration.contact_slots
+    s, motion, _, contact_slots, *_ = contact_configuration
+    ds, motion_tangent, *_ = configuration_tangent
     dtheta_after = force_solution.hub_motion[2]
     angular_rate_jump, b = dtheta_after - motion.dtheta, motion.L - s.a
     constant_motion_terms = _ConstantMotionTerms(
@@ -504,20 +445,16 @@ def _compute_impact_equation_tangents(
             force_solution.hub_motion[1] - motion.vz,
         ),
     )
-    slot_length_rates = contact_slots.gather_slot_pair(force_solution.length_motion)
-    dL = contact_slots.gather_slot_pair(motion_tangent.L)
-    foot_transverse = [
-        -dtheta_after * dL[i] - slot_length_rates[i] * motion_tangent.theta for i in range(2)
-    ]
+    slot_length_rates, slot_length_tangents = map(
+        contact_slots.gather_from_legs, (force_solution.length_motion, motion_tangent.L)
+    )
     return constant_motion_terms, _EquationTangents(
         radial_leg_motion=-motion_tangent.dL,
-        transverse_leg_motion=(motion_tangent.L - configuration_tangent.s.a) * angular_rate_jump
+        transverse_leg_motion=(motion_tangent.L - ds.a) * angular_rate_jump
         - b * motion_tangent.dtheta,
         hub_motion=(-motion_tangent.vx, -motion_tangent.vz),
         spring_force=0.0,
-        foot_transverse_motion=(foot_transverse[0], foot_transverse[1]),
-        foot_radial_motion=(
-            inverse_inertia.L[0] * dtheta_after * motion_tangent.theta,
-            inverse_inertia.L[1] * dtheta_after * motion_tangent.theta,
-        ),
+        foot_transverse_motion=-dtheta_after * slot_length_tangents
+        - slot_length_rates * motion_tangent.theta,
+        foot_radial_motion=inverse_inertia.L * dtheta_after * motion_tangent.theta,
     )

@@ -5,7 +5,7 @@ All functions work elementwise, for one wheel or a batch.
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -20,11 +20,10 @@ from vrw_jax.contact.contact_modes import (
     AllowedContactModes,
     ChosenModeCombination,
     ContactSignTolerances,
-    Friction,
     choose_combination,
     is_release_consistent,
 )
-from vrw_jax.contact.contact_state import ContactState, GuardLayout, stack_slot_friction
+from vrw_jax.contact.contact_state import ContactState, GuardLayout
 from vrw_jax.contact.dynamics_jvp import (
     ContactConfiguration,
     WheelForceSolution,
@@ -36,16 +35,18 @@ from vrw_jax.contact.mechanics import (
     ContactInverseInertia,
     ContactSlots,
     FreeMotion,
+    Friction,
     LegArray,
-    SlotPair,
+    SlotArray,
     WheelMotion,
+    align_with_batch,
     compute_foot_heights,
     compute_foot_velocities,
     compute_free_acceleration,
     compute_free_velocity,
     compute_kinetic_energy,
     compute_leg_directions,
-    compute_slot_foot_velocity,
+    compute_slot_foot_velocities,
     find_contact_slots,
     make_inverse_inertia,
     select_slot_friction,
@@ -79,19 +80,11 @@ class ContactEvent(NamedTuple):
         return jnp.any(self.is_foot_landing, axis=0) | jnp.any(self.is_leg_meeting_stopper, axis=0)
 
 
-def _make_leg_indices(n_legs: int, array_with_same_axes: Array) -> np.ndarray:
-    """Return the leg indices 0 ... n - 1 on the first axis, to broadcast over a batch.
-
-    The result has one axis more than `array_with_same_axes`.
-    """
-    return np.arange(n_legs, dtype=np.int32).reshape(-1, *(1,) * jnp.ndim(array_with_same_axes))
-
-
 def classify_event(guard_layout: GuardLayout, guard_index: Int[Array, "..."]) -> ContactEvent:
     """Return the kind of the event at which the guard with the index `guard_index` is zero."""
     n_legs = guard_layout.n_legs
     select_flags = lambda first_guard_index, n_guards: (
-        guard_index == first_guard_index + _make_leg_indices(n_guards, guard_index)
+        guard_index == first_guard_index + align_with_batch(np.arange(n_guards), guard_index)
     )
     is_leg_leaving_stopper = (
         select_flags(guard_layout.first_airborne_release_guard, n_legs)
@@ -154,24 +147,13 @@ class _KinematicLevelSolution(NamedTuple):
     motion_after_impact: WheelMotion  # motion after the impact
 
 
-_LevelSolver = Callable[
-    [ContactLaw, WheelMotion, Array, ChosenModeCombination | None], _KinematicLevelSolution
-]
-"""Function that solves for velocities or accelerations, for an assumed set of closed stoppers.
-
-The arguments are the contact law, the motion, the flags of the closed stoppers and, if it is known,
-the combination of contact modes.
-"""
-
-
 def _solve_stopper_lcp(
-    solve_kinematic_level: _LevelSolver,
+    solve_kinematic_level: Callable[..., _KinematicLevelSolution],
     contact_law: ContactLaw,
     motion: WheelMotion,
     is_at_stopper: Array,
     is_stopper_tested: Array,
     tolerances: ContactSignTolerances,
-    pivot_options: StopperPivotOptions = STOPPER_PIVOT_OPTIONS,
 ) -> tuple[_KinematicLevelSolution, Array]:
     """Return the solution with complementary stopper forces, and whether each stopper is closed.
 
@@ -180,15 +162,24 @@ def _solve_stopper_lcp(
     these legs, which prevents cycles. The method is principal pivoting, which is finite if no
     friction couples the legs (Murty 1974, Kostreva 1978).
 
+    - `solve_kinematic_level`: function that solves for velocities or accelerations, for an assumed
+      set of closed stoppers. Its arguments are the contact law, the motion, the flags of the closed
+      stoppers and, if it is known, the combination of contact modes, else None.
+
+    If stoppers are bilateral, all stoppers in `is_at_stopper` are closed and may pull.
+
     If pivoting fails, all combinations are enumerated, and the solution with the smallest violation
     is returned. This solution is admissible if its violation is at most `MAX_VIOLATION`.
     """
+    if not contact_law.has_one_sided_stoppers:
+        return solve_kinematic_level(contact_law, motion, is_at_stopper, None), is_at_stopper
     constant_inputs = stop_gradients((contact_law, motion))
     tested_leg_rank = jnp.cumsum(is_stopper_tested.astype(jnp.int32), axis=0) - 1
     n_combinations = 1 << jnp.minimum(
-        jnp.sum(is_stopper_tested, axis=0, dtype=jnp.int32), pivot_options.max_enumerated_legs
+        jnp.sum(is_stopper_tested, axis=0, dtype=jnp.int32),
+        STOPPER_PIVOT_OPTIONS.max_enumerated_legs,
     )
-    leg_index = _make_leg_indices(len(is_at_stopper), n_combinations)
+    leg_index = align_with_batch(np.arange(len(is_at_stopper), dtype=np.int32), n_combinations)
 
     def is_unfinished(pivot_state: tuple) -> Array:
         _, combination_code, n_attempts, best_solution = pivot_state
@@ -216,12 +207,15 @@ def _solve_stopper_lcp(
         )
         is_last_wrong_leg = leg_index == jnp.max(jnp.where(has_wrong_sign, leg_index, -1), axis=0)
         switched_legs = is_stopper_holding ^ jnp.where(
-            n_attempts < pivot_options.max_block_pivots, has_wrong_sign, is_last_wrong_leg
+            n_attempts < STOPPER_PIVOT_OPTIONS.max_block_pivots, has_wrong_sign, is_last_wrong_leg
         )
         is_pivoting = (
             (combination_code < 0)
             & jnp.any(has_wrong_sign, axis=0)
-            & (n_attempts < pivot_options.max_block_pivots + pivot_options.max_single_pivots)
+            & (
+                n_attempts
+                < STOPPER_PIVOT_OPTIONS.max_block_pivots + STOPPER_PIVOT_OPTIONS.max_single_pivots
+            )
         )
         combination_code = jnp.where(is_pivoting, combination_code, combination_code + 1)
         enumerated_legs = jnp.where(
@@ -269,8 +263,8 @@ class ContactEventResult(NamedTuple):
     motion: WheelMotion
     contact_state: ContactState
     impact_energy_loss: Elementwise  # J
-    normal_impulse: SlotPair  # impulses on the feet in the contact slots, N s
-    tangential_impulse: SlotPair
+    normal_impulse: SlotArray  # impulses on the feet in the contact slots, N s
+    tangential_impulse: SlotArray
     stopper_impulse: Elementwise  # minimum over airborne locked legs, N s; inf without impact
     n_solutions: Int[Array, "..."]  # number of admissible combinations: minimum of both levels
     is_painleve_paradox: Bool[Array, "..."]  # whether no forces can continue the motion
@@ -299,26 +293,18 @@ def _apply_restitution(
     """
     if contact_law.restitution is None:
         return free_motion
-    rebound_speeds = [
-        contact_law.restitution * foot_speed
-        for foot_speed in compute_slot_foot_velocity(
-            motion, contact_slots, inverse_inertia
-        ).velocity_normal_to_slope
-    ]
+    rebound_speeds = (
+        contact_law.restitution
+        * compute_slot_foot_velocities(
+            motion, inverse_inertia.leg_directions, contact_slots
+        ).normal_to_slope
+    )
     # A foot whose rebound is slower than the rest speed is at rest.
-    rebound_speeds = [
-        jnp.where(foot_speed < -contact_law.rest_speed, foot_speed, 0.0)
-        for foot_speed in rebound_speeds
-    ]
+    rebound_speeds = jnp.where(rebound_speeds < -contact_law.rest_speed, rebound_speeds, 0.0)
     return free_motion._replace(
-        foot_transverse_motion=(
-            free_motion.foot_transverse_motion[0] - inverse_inertia.sin[0] * rebound_speeds[0],
-            free_motion.foot_transverse_motion[1] - inverse_inertia.sin[1] * rebound_speeds[1],
-        ),
-        foot_radial_motion=(
-            free_motion.foot_radial_motion[0] + inverse_inertia.cos[0] * rebound_speeds[0],
-            free_motion.foot_radial_motion[1] + inverse_inertia.cos[1] * rebound_speeds[1],
-        ),
+        foot_transverse_motion=free_motion.foot_transverse_motion
+        - inverse_inertia.sin * rebound_speeds,
+        foot_radial_motion=free_motion.foot_radial_motion + inverse_inertia.cos * rebound_speeds,
     )
 
 
@@ -389,19 +375,12 @@ def _solve_velocity_level(
     )
     friction = select_slot_friction(contact_law.friction, contact_slots)
     is_at_stopper = contact_state.is_leg_locked | contact_event.is_leg_meeting_stopper
-    is_loaded = jnp.stack(
-        [
-            jnp.any(contact_slots.first_slot_mask, axis=0),
-            jnp.any(contact_slots.second_slot_mask, axis=0),
-        ]
-    )
-    is_slot_locked = contact_slots.gather_slot_flags(is_at_stopper)
-    slot_modes = contact_slots.gather_slot_codes(contact_state.contact_modes)
+    is_loaded = jnp.any(contact_slots.slot_masks, axis=1)
+    is_slot_locked = contact_slots.gather_flags_from_legs(is_at_stopper)
+    slot_modes = contact_slots.gather_from_legs(contact_state.contact_modes)
     is_landing = jnp.any(contact_event.is_foot_landing, axis=0)
     is_kept_at_rest = (
-        (slot_modes == ContactMode.STICK)
-        & ~is_landing
-        & (stack_slot_friction(friction) == PAPER_RULE_SENTINEL)
+        (slot_modes == ContactMode.STICK) & ~is_landing & (friction == PAPER_RULE_SENTINEL)
     )
     allowed_slot_modes = jnp.where(is_loaded, ALL_MODES_MASK, 1 << ContactMode.OFF).astype(
         jnp.int32
@@ -448,8 +427,7 @@ def _solve_velocity_level(
             motion,
             friction,
             contact_slots,
-            chosen_combination.slot_modes,
-            chosen_combination.is_stopper_holding,
+            *chosen_combination[:2],
             is_airborne_leg_locked,
         )
         force_solution = (
@@ -467,12 +445,6 @@ def _solve_velocity_level(
         )
 
     is_airborne_leg_locked = is_at_stopper & ~contact_slots.is_in_slot
-    if not contact_law.has_one_sided_stoppers:
-        return (
-            solve_kinematic_level(contact_law, motion, is_airborne_leg_locked, None),
-            contact_slots,
-            is_airborne_leg_locked,
-        )
     is_stopper_tested = is_airborne_leg_locked & contact_event.is_impact
     level_solution, is_held_airborne = _solve_stopper_lcp(
         solve_kinematic_level,
@@ -563,18 +535,16 @@ def _solve_acceleration_level(
     contact_law, motion = stop_gradients((contact_law, motion))
     s, contact_slots = contact_law.s, find_contact_slots(contact_modes != ContactMode.OFF)
     friction = select_slot_friction(contact_law.friction, contact_slots)
-    slot_modes = contact_slots.gather_slot_codes(contact_modes)
-    is_slot_locked = contact_slots.gather_slot_flags(is_at_stopper)
+    slot_modes = contact_slots.gather_from_legs(contact_modes)
+    is_slot_locked = contact_slots.gather_flags_from_legs(is_at_stopper)
     was_resting = (slot_modes == ContactMode.STICK) | contact_event.is_stopping_to_slide
     # When such a foot is released, its tangential force jumps to zero.
-    follows_paper_rule = (slot_modes == ContactMode.STICK) & (
-        stack_slot_friction(friction) == PAPER_RULE_SENTINEL
-    )
+    follows_paper_rule = (slot_modes == ContactMode.STICK) & (friction == PAPER_RULE_SENTINEL)
     is_starting_to_slide_up = contact_event.is_starting_to_slide_up
     is_starting_to_slide_down = contact_event.is_starting_to_slide_down
-    is_second_slot = (
+    is_released = (
         contact_event.is_foot_lifting_off | is_starting_to_slide_up | is_starting_to_slide_down
-    )[1]
+    )
     is_in_any_slot = lambda event_flags: jnp.any(event_flags, axis=0).astype(jnp.int32)
     release_direction = is_in_any_slot(is_starting_to_slide_down) - is_in_any_slot(
         is_starting_to_slide_up
@@ -599,7 +569,7 @@ def _solve_acceleration_level(
                 free_motion,
                 (slot_modes, is_slot_locked),
                 friction,
-                is_second_slot,
+                is_released,
                 release_direction,
             )
             possible_modes, untested_slot_modes = _list_modes_after_event(
@@ -626,8 +596,7 @@ def _solve_acceleration_level(
             motion,
             friction,
             contact_slots,
-            chosen_combination.slot_modes,
-            chosen_combination.is_stopper_holding,
+            *chosen_combination[:2],
             is_airborne_leg_locked,
         )
         force_solution = solve_contact_configuration(
@@ -644,15 +613,6 @@ def _solve_acceleration_level(
         )
 
     is_airborne_leg_locked = is_at_stopper & ~contact_slots.is_in_slot
-    if not contact_law.has_one_sided_stoppers:
-        return (
-            solve_kinematic_level(
-                contact_law, motion, is_airborne_leg_locked, None
-            ).chosen_combination,
-            contact_slots,
-            was_resting,
-            is_airborne_leg_locked,
-        )
     level_solution, is_held_airborne = _solve_stopper_lcp(
         solve_kinematic_level,
         contact_law,
@@ -748,7 +708,7 @@ def _merge_touching_contacts(
     bounce_height = contact_law.rest_speed**2 / (2.0 * s.g)
     foot_heights = compute_foot_heights(motion, leg_directions, contact_law.next_line_tilt)
     is_touching = (foot_heights <= bounce_height) & (
-        compute_foot_velocities(motion, leg_directions)[1] <= contact_law.rest_speed
+        compute_foot_velocities(motion, leg_directions).normal_to_slope <= contact_law.rest_speed
     )
     is_foot_landing = contact_event.is_foot_landing | (
         is_touching & (contact_state.contact_modes == ContactMode.OFF) & contact_event.is_impact
@@ -785,16 +745,16 @@ def _replace_liftoff_by_slip(
     contact_law, motion = stop_gradients((contact_law, motion))
     contact_slots = find_contact_slots(contact_state.contact_modes != ContactMode.OFF)
     friction = select_slot_friction(contact_law.friction, contact_slots)
-    slot_modes = contact_slots.gather_slot_codes(contact_state.contact_modes)
+    slot_modes = contact_slots.gather_from_legs(contact_state.contact_modes)
     is_starting_to_slide = (
         contact_event.is_foot_lifting_off
         & (slot_modes == ContactMode.STICK)
-        & (stack_slot_friction(friction) == jnp.inf)
+        & (friction == jnp.inf)
     )
     slot_modes_and_stoppers = (
         contact_slots,
         slot_modes,
-        contact_slots.gather_slot_flags(contact_state.is_leg_locked),
+        contact_slots.gather_flags_from_legs(contact_state.is_leg_locked),
         contact_state.is_leg_locked & ~contact_slots.is_in_slot,
     )
     tangential_forces = lambda _: (
@@ -802,12 +762,9 @@ def _replace_liftoff_by_slip(
             ContactConfiguration(contact_law.s, motion, friction, *slot_modes_and_stoppers)
         ).tangential_forces
     )
-    zero_slot_flags = jnp.zeros_like(motion.theta), jnp.zeros_like(motion.theta)
     is_force_uphill = (
-        jnp.stack(
-            run_if_any_element_active(
-                jnp.any(is_starting_to_slide), tangential_forces, zero_slot_flags
-            )
+        run_if_any_element_active(
+            jnp.any(is_starting_to_slide), tangential_forces, jnp.zeros_like(friction)
         )
         > 0.0
     )
@@ -902,10 +859,7 @@ def resolve_event(
     )
     n_impact_solutions = velocity_solution.chosen_combination.n_solutions
     n_force_solutions = acceleration_solution.n_solutions
-    zero_without_impact = lambda slot_pair: (
-        jnp.where(is_impact, slot_pair[0], 0.0),
-        jnp.where(is_impact, slot_pair[1], 0.0),
-    )
+    zero_without_impact = lambda slot_impulses: jnp.where(is_impact, slot_impulses, 0.0)
     return ContactEventResult(
         motion=motion_after._replace(
             L=jnp.where(is_leg_locked, s.L0, motion_after.L),
@@ -924,7 +878,8 @@ def resolve_event(
             is_impact, jnp.maximum(n_impact_solutions, n_force_solutions), n_force_solutions
         ),
         has_third_foot=jnp.any(
-            is_without_slot & (compute_foot_velocities(motion_after, leg_directions)[1] < 0.0),
+            is_without_slot
+            & (compute_foot_velocities(motion_after, leg_directions).normal_to_slope < 0.0),
             axis=0,
         )
         & is_impact,
@@ -936,7 +891,7 @@ def project_motion(
     motion: WheelMotion,
     contact_modes: Int[Array, "n ..."],
     is_leg_locked: Bool[Array, "n ..."],
-    friction: Any = None,
+    friction: Friction | float = 0.0,
 ) -> WheelMotion:
     """Return the motion projected onto the constraints of its contacts.
 
@@ -944,7 +899,7 @@ def project_motion(
     impulses without friction project the velocities. A motion that satisfies the constraints is
     returned unchanged within round-off.
 
-    - `friction`: friction coefficient for sliding feet in the projection; None means 0.
+    - `friction`: friction coefficient for sliding feet in the projection.
     """
     leg_directions = compute_leg_directions(s, motion.theta)
     L = jnp.where(
@@ -953,22 +908,17 @@ def project_motion(
     motion = motion._replace(L=jnp.where(is_leg_locked, s.L0, L))
     contact_slots = find_contact_slots(contact_modes != ContactMode.OFF)
     is_airborne_leg_locked = is_leg_locked & ~contact_slots.is_in_slot
-    slot_modes = contact_slots.gather_slot_codes(contact_modes)
-    is_stopper_holding = contact_slots.gather_slot_flags(is_leg_locked)
+    slot_modes = contact_slots.gather_from_legs(contact_modes)
+    is_stopper_holding = contact_slots.gather_flags_from_legs(is_leg_locked)
     # Two resting feet on two held legs would constrain the hub twice.
     is_overdetermined = jnp.all((slot_modes == ContactMode.STICK) & is_stopper_holding, axis=0)
     is_stopper_holding = jnp.stack(
         [is_stopper_holding[0], is_stopper_holding[1] & ~is_overdetermined]
     )
-    slot_coefficients = (
-        jnp.zeros_like(motion.theta)
-        if friction is None
-        else select_slot_friction(friction, contact_slots)
-    )
     contact_configuration = ContactConfiguration(
         s,
         motion,
-        slot_coefficients,
+        select_slot_friction(friction, contact_slots),
         contact_slots,
         slot_modes,
         is_stopper_holding,

@@ -19,7 +19,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int
+from jax.typing import ArrayLike
+from jaxtyping import Array, Bool, Float, Shaped
 
 from vrw_jax.numerics import Elementwise, Scalar, compute_sine_cosine
 from vrw_jax.wheel import Symbols
@@ -28,8 +29,12 @@ LegArray = Float[Array, "n_legs ..."]
 """Array with one entry per leg on the first axis."""
 HubVector = tuple[Any, Any, Any]
 """Components of a generalized vector for the coordinates hub x, hub z and theta."""
-SlotPair = tuple[Any, Any]
-"""Pair of quantities, one for the leg in each of the two contact slots."""
+SlotArray = Float[Array, "2 ..."]
+"""Array with one entry for the leg in each of the two contact slots on the first axis."""
+
+
+Friction = Elementwise | tuple[Any, Any]
+"""Friction coefficient for all feet, or a pair for the foot that landed last and all other feet."""
 
 
 class WheelMotion(NamedTuple):
@@ -57,7 +62,7 @@ def compute_leg_directions(s: Symbols, theta: Elementwise) -> LegDirections:
 
     The angle may include any number of turns.
     """
-    leg_angles = (s.alpha * np.arange(s.n)).reshape(-1, *(1,) * jnp.ndim(theta))
+    leg_angles = align_with_batch(s.alpha * np.arange(s.n), theta)
     n_half_turns = lax.stop_gradient(jnp.floor(theta / math.pi + 0.5))
     is_half_turn_odd = n_half_turns - 2.0 * jnp.floor(0.5 * n_half_turns)
     sin, cos = (
@@ -65,6 +70,14 @@ def compute_leg_directions(s: Symbols, theta: Elementwise) -> LegDirections:
     )
     sin_leg, cos_leg = np.sin(leg_angles), np.cos(leg_angles)
     return LegDirections(sin * cos_leg + cos * sin_leg, cos * cos_leg - sin * sin_leg)
+
+
+def align_with_batch(values: ArrayLike, batch_template: ArrayLike) -> np.ndarray:
+    """Return values with further axes of length 1, which broadcast over a batch.
+
+    - `batch_template`: array whose axes are those of the batch.
+    """
+    return np.reshape(values, (*np.shape(values), *(1,) * jnp.ndim(batch_template)))
 
 
 def sum_over_legs(leg_quantities: Array) -> Array:
@@ -83,9 +96,9 @@ def prevent_fusion(tree: Any, opaque_one: Array) -> Any:
     return jax.tree.map(lambda leaf: leaf / opaque_one if is_float_array(leaf) else leaf, tree)
 
 
-def make_opaque_one(motion: "WheelMotion") -> Array:
-    """Return an array of ones with the shape of `theta` that no compiler can simplify."""
-    return lax.stop_gradient(1.0 + 0.0 * motion.theta)
+def make_opaque_one(batch_template: Array) -> Array:
+    """Return an array of ones with the shape of `batch_template` that no compiler can simplify."""
+    return lax.stop_gradient(1.0 + 0.0 * batch_template)
 
 
 def stop_gradients(tree: Any) -> Any:
@@ -100,89 +113,76 @@ class ContactSlots(NamedTuple):
     The feet of these legs may be loaded. The mask of an empty slot is False for all legs.
     """
 
-    first_slot_mask: Bool[Array, "n_legs ..."]
-    second_slot_mask: Bool[Array, "n_legs ..."]
+    slot_masks: Bool[Array, "2 n_legs ..."]
 
     @property
     def is_in_slot(self) -> Bool[Array, "n_legs ..."]:
         """Return whether each leg is in one of the two contact slots, shape (n_legs, ...)."""
-        return self.first_slot_mask | self.second_slot_mask
+        return self.slot_masks[0] | self.slot_masks[1]
 
-    def gather_slot_codes(self, leg_quantities: Array) -> Int[Array, "2 ..."]:
-        """Return the integers of the legs in both contact slots, (2, ...), from an integer per leg.
-
-        The result for an empty slot is 0.
-        """
-        return jnp.stack(self.gather_slot_pair(leg_quantities))
-
-    def gather_slot_flags(self, leg_quantities: Array) -> Bool[Array, "2 ..."]:
-        """Return the flags of the legs in both contact slots, (2, ...), from a flag per leg.
-
-        The result for an empty slot is False.
-        """
-        return self.gather_slot_codes(leg_quantities.astype(jnp.int32)) > 0
-
-    def gather_slot_pair(self, leg_quantities: Array) -> SlotPair:
+    def gather_from_legs(self, leg_quantities: Array) -> Shaped[Array, "2 ..."]:
         """Return the entries of `leg_quantities` for the legs in both contact slots.
 
         The result for an empty slot is 0.
         """
-        zero_slot_values = jnp.zeros_like(leg_quantities)
-        return (
-            sum_over_legs(jnp.where(self.first_slot_mask, leg_quantities, zero_slot_values)),
-            sum_over_legs(jnp.where(self.second_slot_mask, leg_quantities, zero_slot_values)),
-        )
+        zero_leg_values = jnp.zeros_like(leg_quantities)
+        return jnp.sum(jnp.where(self.slot_masks, leg_quantities, zero_leg_values), axis=1)
 
-    def scatter_to_legs(self, slot_pair: Any) -> LegArray:
-        """Return an array over all legs with the entries of `slot_pair` at the legs in contact.
+    def gather_flags_from_legs(self, leg_flags: Array) -> Bool[Array, "2 ..."]:
+        """Return the flags of the legs in both contact slots; False for an empty slot."""
+        return jnp.any(self.slot_masks & leg_flags, axis=1)
 
-        Other legs have the entry 0. The function is the inverse of `gather_slot_pair`.
+    def scatter_to_legs(self, slot_quantities: Shaped[Array, "2 ..."]) -> LegArray:
+        """Return an array over all legs with the entries of `slot_quantities` at legs in contact.
+
+        Other legs have the entry 0. The function is the inverse of `gather_from_legs`.
         """
-        return jnp.where(self.first_slot_mask, slot_pair[0], 0.0) + jnp.where(
-            self.second_slot_mask, slot_pair[1], 0.0
-        )
+        return jnp.sum(jnp.where(self.slot_masks, slot_quantities[:, None], 0.0), axis=0)
 
 
 def find_contact_slots(is_foot_touching: Bool[Array, "n_legs ..."]) -> ContactSlots:
     """Return contact slots with the first two legs whose feet touch the ground."""
     touching_leg_rank = jnp.cumsum(is_foot_touching.astype(jnp.int32), axis=0)
     return ContactSlots(
-        is_foot_touching & (touching_leg_rank == 1), is_foot_touching & (touching_leg_rank == 2)
+        jnp.stack([is_foot_touching & (touching_leg_rank == rank) for rank in (1, 2)])
     )
 
 
-def select_slot_friction(
-    friction: Elementwise | SlotPair, contact_slots: ContactSlots
-) -> Elementwise | SlotPair:
+def select_slot_friction(friction: Friction | float, contact_slots: ContactSlots) -> SlotArray:
     """Return the friction coefficient for the foot in each contact slot.
 
-    If `friction` is a pair, it contains the coefficient for the foot of Leg 1, which landed last,
-    and that for all other feet. A single coefficient applies to all feet and is returned unchanged.
+    In a pair, the first coefficient applies to the foot of Leg 1, which landed last.
     """
-    if not isinstance(friction, tuple):
-        return friction
-    last_landed_friction, other_feet_friction = friction
-    return jnp.where(
-        contact_slots.first_slot_mask[0], last_landed_friction, other_feet_friction
-    ), other_feet_friction
+    last_landed_friction, other_friction = (
+        friction if isinstance(friction, tuple) else (friction, friction)
+    )
+    return jnp.where(contact_slots.slot_masks[:, 0], last_landed_friction, other_friction)
 
 
 class ContactInverseInertia(NamedTuple):
-    """Inverse inertia of the hub, and responses of hub, feet and legs to contact forces."""
+    """Inverse inertia of the hub, and responses of hub, feet and legs to contact forces.
+
+    In a matrix, the first index is the slot of the response, and the second that of the force.
+    """
 
     leg_directions: LegDirections
     # whether a leg is eliminated: free in length, or in a contact slot
     is_leg_released: Bool[Array, " n_legs"]
     inverse_inertia: tuple[Any, ...]  # entries xx, xz, x theta, zz, z theta, theta theta
-    sin: SlotPair
-    cos: SlotPair
-    L: SlotPair
-    # response of the hub to a unit transverse force
-    hub_response_transverse: tuple[HubVector, HubVector]
-    hub_response_radial: tuple[HubVector, HubVector]  # response of the hub to a unit stopper force
-    G: tuple[Any, Any, Any]  # entries 11, 12, 22: response of the feet to transverse forces
-    H: tuple[Any, Any, Any, Any]  # entries 11, 12, 21, 22: response of the feet to stopper forces
-    K: tuple[Any, Any, Any]  # entries 11, 12, 22: response of the legs to stopper forces
+    sin: SlotArray
+    cos: SlotArray
+    L: SlotArray
+    hub_response_transverse: (
+        HubVector  # response of the hub to unit transverse forces, `SlotArray`s
+    )
+    hub_response_radial: HubVector  # response of the hub to unit stopper forces, `SlotArray`s
+    G: Float[Array, "2 2 ..."]  # response of the feet to transverse forces, symmetric
+    H: Float[Array, "2 2 ..."]  # response of the legs to transverse forces
+    K: Float[Array, "2 2 ..."]  # response of the legs to stopper forces, symmetric
+
+    def compute_transverse_foot_motion(self, hub_motion: HubVector) -> SlotArray:
+        """Return the part of the feet's motion transverse to the legs that is due to the hub."""
+        return self.cos * hub_motion[0] - self.sin * hub_motion[1] - self.L * hub_motion[2]
 
 
 def multiply_by_inverse_inertia(
@@ -190,16 +190,11 @@ def multiply_by_inverse_inertia(
 ) -> HubVector:
     """Return the product of the symmetric inverse inertia matrix and a generalized force."""
     inverse_xx, inverse_xz, inverse_xt, inverse_zz, inverse_zt, inverse_tt = inverse_inertia
+    force_x, force_z, torque = generalized_force
     return (
-        inverse_xx * generalized_force[0]
-        + inverse_xz * generalized_force[1]
-        + inverse_xt * generalized_force[2],
-        inverse_xz * generalized_force[0]
-        + inverse_zz * generalized_force[1]
-        + inverse_zt * generalized_force[2],
-        inverse_xt * generalized_force[0]
-        + inverse_zt * generalized_force[1]
-        + inverse_tt * generalized_force[2],
+        inverse_xx * force_x + inverse_xz * force_z + inverse_xt * torque,
+        inverse_xz * force_x + inverse_zz * force_z + inverse_zt * torque,
+        inverse_xt * force_x + inverse_zt * force_z + inverse_tt * torque,
     )
 
 
@@ -235,26 +230,9 @@ def _invert_inertia(
     )
 
 
-class WheelPosture(NamedTuple):
-    """Directions of all legs, and the directions and lengths of the legs in the contact slots."""
-
-    leg_directions: LegDirections
-    sin: SlotPair
-    cos: SlotPair
-    L: SlotPair
-
-
-def make_wheel_posture(
-    s: Symbols, motion: WheelMotion, contact_slots: ContactSlots
-) -> WheelPosture:
-    """Return the directions of all legs, and the lengths of the legs in the contact slots."""
-    leg_directions = compute_leg_directions(s, motion.theta)
-    return WheelPosture(
-        leg_directions,
-        contact_slots.gather_slot_pair(leg_directions.sin),
-        contact_slots.gather_slot_pair(leg_directions.cos),
-        contact_slots.gather_slot_pair(motion.L),
-    )
+def _make_exactly_symmetric(matrix: Array) -> Array:
+    """Return a 2 x 2 matrix with its lower entry replaced by the upper one."""
+    return jnp.stack([matrix[0], matrix[:, 1]])
 
 
 def make_inverse_inertia(
@@ -264,21 +242,13 @@ def make_inverse_inertia(
 
     - `is_airborne_leg_locked`: whether a leg is in the air on its stopper.
     """
-    leg_directions, sin, cos, L = make_wheel_posture(s, motion, contact_slots)
+    leg_directions = compute_leg_directions(s, motion.theta)
+    sin, cos, L = map(contact_slots.gather_from_legs, (*leg_directions, motion.L))
     is_leg_released = contact_slots.is_in_slot | ~is_airborne_leg_locked
     inverse_inertia = _invert_inertia(s, leg_directions, motion.L - s.a, is_leg_released)
-    e = [(cos[i], -sin[i], -L[i]) for i in range(2)]
-    u = [(sin[i], cos[i], jnp.zeros_like(sin[i])) for i in range(2)]
-    z = (
-        multiply_by_inverse_inertia(inverse_inertia, e[0]),
-        multiply_by_inverse_inertia(inverse_inertia, e[1]),
-    )
-    y = (
-        multiply_by_inverse_inertia(inverse_inertia, u[0]),
-        multiply_by_inverse_inertia(inverse_inertia, u[1]),
-    )
-    multiply_hub_vectors = lambda a, b: a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-    multiply_plane_vectors = lambda a, b: a[0] * b[0] + a[1] * b[1]
+    e, u = (cos, -sin, -L), (sin, cos, jnp.zeros_like(sin))
+    z, y = (multiply_by_inverse_inertia(inverse_inertia, direction) for direction in (e, u))
+    multiply_plane_vectors = lambda a, b: a[0][:, None] * b[0] + a[1][:, None] * b[1]
     return ContactInverseInertia(
         leg_directions,
         is_leg_released,
@@ -288,22 +258,9 @@ def make_inverse_inertia(
         L,
         hub_response_transverse=z,
         hub_response_radial=y,
-        G=(
-            multiply_hub_vectors(e[0], z[0]),
-            multiply_hub_vectors(e[0], z[1]),
-            multiply_hub_vectors(e[1], z[1]),
-        ),
-        H=(
-            multiply_plane_vectors(u[0], z[0]),
-            multiply_plane_vectors(u[0], z[1]),
-            multiply_plane_vectors(u[1], z[0]),
-            multiply_plane_vectors(u[1], z[1]),
-        ),
-        K=(
-            multiply_plane_vectors(u[0], y[0]),
-            multiply_plane_vectors(u[0], y[1]),
-            multiply_plane_vectors(u[1], y[1]),
-        ),
+        G=_make_exactly_symmetric(multiply_plane_vectors(e, z) + e[2][:, None] * z[2]),
+        H=multiply_plane_vectors(u, z),
+        K=_make_exactly_symmetric(multiply_plane_vectors(u, y)),
     )
 
 
@@ -312,9 +269,9 @@ class FreeMotion(NamedTuple):
 
     hub_motion: HubVector
     leg_motion: LegArray  # motion of each released leg's length, minus the part u . hub
-    slot_leg_motion: SlotPair  # the same for the legs in the contact slots
-    foot_transverse_motion: SlotPair  # motion of the feet in contact, transverse to the leg
-    foot_radial_motion: SlotPair  # motion of the feet in contact, along the leg
+    slot_leg_motion: SlotArray  # the same for the legs in the contact slots
+    foot_transverse_motion: SlotArray  # motion of the feet in contact, transverse to the leg
+    foot_radial_motion: SlotArray  # motion of the feet in contact, along the leg
 
 
 def compute_free_leg_acceleration(
@@ -365,24 +322,14 @@ def compute_free_acceleration(
     hub_acceleration = multiply_by_inverse_inertia(
         inverse_inertia.inverse_inertia, (hub_force_x, hub_force_z, hub_torque)
     )
-    slot_coriolis = contact_slots.gather_slot_pair(coriolis_acceleration)
-    slot_leg_acceleration = contact_slots.gather_slot_pair(leg_acceleration)
-    foot_transverse = [
-        inverse_inertia.cos[i] * hub_acceleration[0]
-        - inverse_inertia.sin[i] * hub_acceleration[1]
-        - inverse_inertia.L[i] * hub_acceleration[2]
-        - slot_coriolis[i]
-        for i in range(2)
-    ]
-    foot_radial = [
-        inverse_inertia.L[i] * dtheta * dtheta - slot_leg_acceleration[i] for i in range(2)
-    ]
+    slot_leg_acceleration = contact_slots.gather_from_legs(leg_acceleration)
     return FreeMotion(
         hub_acceleration,
         leg_acceleration,
         slot_leg_acceleration,
-        (foot_transverse[0], foot_transverse[1]),
-        (foot_radial[0], foot_radial[1]),
+        inverse_inertia.compute_transverse_foot_motion(hub_acceleration)
+        - contact_slots.gather_from_legs(coriolis_acceleration),
+        inverse_inertia.L * dtheta * dtheta - slot_leg_acceleration,
     )
 
 
@@ -414,49 +361,14 @@ def compute_free_velocity(
     hub_velocity = multiply_by_inverse_inertia(
         inverse_inertia.inverse_inertia, (momentum_x, momentum_z, angular_momentum)
     )
-    slot_leg_velocity = contact_slots.gather_slot_pair(leg_velocity)
-    foot_transverse = [
-        inverse_inertia.cos[i] * hub_velocity[0]
-        - inverse_inertia.sin[i] * hub_velocity[1]
-        - inverse_inertia.L[i] * hub_velocity[2]
-        for i in range(2)
-    ]
+    slot_leg_velocity = contact_slots.gather_from_legs(leg_velocity)
     return FreeMotion(
         hub_velocity,
         leg_velocity,
         slot_leg_velocity,
-        (foot_transverse[0], foot_transverse[1]),
-        (-slot_leg_velocity[0], -slot_leg_velocity[1]),
+        inverse_inertia.compute_transverse_foot_motion(hub_velocity),
+        -slot_leg_velocity,
     )
-
-
-class SlotFootVelocity(NamedTuple):
-    """Velocities of the feet in the contact slots, tangential and normal to the slope, m/s."""
-
-    velocity_along_slope: SlotPair
-    velocity_normal_to_slope: SlotPair
-
-
-def compute_slot_foot_velocity(
-    motion: WheelMotion,
-    contact_slots: ContactSlots,
-    wheel_posture: ContactInverseInertia | WheelPosture,
-) -> SlotFootVelocity:
-    """Return the tangential and normal velocities of the feet in the contact slots, m/s."""
-    dL = contact_slots.gather_slot_pair(motion.dL)
-    x = [
-        motion.vx
-        - dL[i] * wheel_posture.sin[i]
-        - wheel_posture.L[i] * motion.dtheta * wheel_posture.cos[i]
-        for i in range(2)
-    ]
-    z = [
-        motion.vz
-        - dL[i] * wheel_posture.cos[i]
-        + wheel_posture.L[i] * motion.dtheta * wheel_posture.sin[i]
-        for i in range(2)
-    ]
-    return SlotFootVelocity((x[0], x[1]), (z[0], z[1]))
 
 
 def compute_foot_heights(
@@ -478,18 +390,36 @@ def compute_foot_heights(
     return jnp.concatenate([foot_heights[:-1], foremost_height[None]])
 
 
-def compute_foot_velocities(
-    motion: WheelMotion, leg_directions: LegDirections
-) -> tuple[LegArray, LegArray]:
-    """Return the tangential and the normal velocity of every foot relative to the slope, m/s."""
-    transverse_velocity = motion.L * motion.dtheta
-    tangential_speed = (
-        motion.vx - motion.dL * leg_directions.sin - transverse_velocity * leg_directions.cos
+class PlaneVelocities(NamedTuple):
+    """Velocities of several points, tangential and normal to the slope, m/s."""
+
+    along_slope: Array
+    normal_to_slope: Array
+
+
+def _compute_point_velocities(
+    motion: WheelMotion, leg_directions: LegDirections, distances: Array, distance_rates: Array
+) -> PlaneVelocities:
+    """Return the velocities of points at given distances from the hub along the legs."""
+    sin, cos = leg_directions
+    transverse_velocity = distances * motion.dtheta
+    return PlaneVelocities(
+        motion.vx - distance_rates * sin - transverse_velocity * cos,
+        motion.vz - distance_rates * cos + transverse_velocity * sin,
     )
-    return (
-        tangential_speed,
-        motion.vz - motion.dL * leg_directions.cos + transverse_velocity * leg_directions.sin,
-    )
+
+
+def compute_foot_velocities(motion: WheelMotion, leg_directions: LegDirections) -> PlaneVelocities:
+    """Return the velocity of every foot."""
+    return _compute_point_velocities(motion, leg_directions, motion.L, motion.dL)
+
+
+def compute_slot_foot_velocities(
+    motion: WheelMotion, leg_directions: LegDirections, contact_slots: ContactSlots
+) -> PlaneVelocities:
+    """Return the velocities of the feet in the contact slots."""
+    sin, cos, L, dL = map(contact_slots.gather_from_legs, (*leg_directions, motion.L, motion.dL))
+    return _compute_point_velocities(motion, LegDirections(sin, cos), L, dL)
 
 
 def compute_foot_positions(motion: WheelMotion, leg_directions: LegDirections) -> LegArray:
@@ -497,23 +427,22 @@ def compute_foot_positions(motion: WheelMotion, leg_directions: LegDirections) -
     return motion.x - motion.L * leg_directions.sin
 
 
-def compute_landing_position(n_legs: int, motion: WheelMotion) -> Elementwise:
-    """Return the downhill position of the foremost foot of a wheel with `n_legs` legs, m."""
+def compute_landing_position(motion: WheelMotion) -> Elementwise:
+    """Return the downhill position of the foremost foot, m."""
+    n_legs = len(motion.L)
     foremost_angle = motion.theta + (n_legs - 1) * 2.0 * math.pi / n_legs
-    return motion.x - motion.L[n_legs - 1] * jnp.sin(foremost_angle)
+    return motion.x - motion.L[-1] * jnp.sin(foremost_angle)
 
 
 def compute_kinetic_energy(s: Symbols, motion: WheelMotion) -> Elementwise:
     """Return the kinetic energy of the hub and all leg masses, J."""
     leg_directions = compute_leg_directions(s, motion.theta)
-    transverse_velocity = (motion.L - s.a) * motion.dtheta
-    x = motion.vx - motion.dL * leg_directions.sin - transverse_velocity * leg_directions.cos
-    z = motion.vz - motion.dL * leg_directions.cos + transverse_velocity * leg_directions.sin
+    x, z = _compute_point_velocities(motion, leg_directions, motion.L - s.a, motion.dL)
     hub_mass = s.Mt - s.n * s.m
     return 0.5 * (hub_mass * (motion.vx**2 + motion.vz**2) + s.m * sum_over_legs(x * x + z * z))
 
 
-def compute_potential_energy(s: Symbols, motion: WheelMotion) -> SlotPair:
+def compute_potential_energy(s: Symbols, motion: WheelMotion) -> tuple[Elementwise, Elementwise]:
     """Return the gravitational energy and the elastic energy of all springs, J.
 
     The gravitational energy is relative to the origin.

@@ -43,14 +43,10 @@ def compute_section_units(wheel_units: WheelUnits, n_legs: int) -> list[Elementw
     Angles and contact codes have the unit 1.
     """
     angle_unit = wheel_units.length_unit / wheel_units.length_unit
-    hub_units = [
+    return [
         angle_unit,
         wheel_units.rate_unit,
-        wheel_units.velocity_unit,
-        wheel_units.velocity_unit,
-    ]
-    return [
-        *hub_units,
+        *[wheel_units.velocity_unit] * 2,
         *[wheel_units.length_unit] * n_legs,
         *[wheel_units.velocity_unit] * n_legs,
         *[angle_unit] * n_legs,
@@ -171,10 +167,7 @@ def unpack_section_state(s: Symbols, section_state: FullState) -> tuple[WheelMot
     )
     dtheta, vx, vz = section_state[1], section_state[2], section_state[3]
     motion = WheelMotion(hub_x, hub_z, theta, vx, vz, dtheta, L, dL)
-    no_leg_flags = is_leg_locked & False
-    return motion, ContactState(
-        contact_modes, is_leg_locked, no_leg_flags, no_leg_flags, no_leg_flags
-    )
+    return motion, ContactState.without_changes(contact_modes, is_leg_locked)
 
 
 def pack_section_state(

@@ -13,8 +13,8 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import lax
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
 from vrw_jax.contact.batch_integrator import (
@@ -32,11 +32,11 @@ from vrw_jax.contact.contact_state import (
 )
 from vrw_jax.contact.diffrax_interval import sample_by_diffrax
 from vrw_jax.contact.mechanics import WheelMotion, find_contact_slots
+from vrw_jax.contact.step_record import GaitStepSummary
 from vrw_jax.contact.walk_kernel import (
     STATUS_UNFINISHED,
     BatchWalkResult,
     BatchWalkSettings,
-    GaitStepSummary,
     init_lane_states,
     make_result_template,
     process_and_integrate,
@@ -64,6 +64,11 @@ class ContactStepConfig(NamedTuple):
     engine_name: str = "lanes"  # name of the engine in the results
     measures_force_peaks: bool = False
 
+    def make_program_key(self, *program_name: Any) -> tuple[Any, ...]:
+        """Return the key of a program in the cache of compiled code."""
+        configuration_key = str(self.argument_tree_structure), self.is_detailed
+        return (*program_name, *configuration_key, self.measures_force_peaks)
+
     def tighten_tolerances(self, leaves: tuple[Array, ...]) -> tuple[Array, ...]:
         """Return the argument leaves with the tighter solver tolerances for derivatives."""
         *traced_settings, options = jax.tree.unflatten(self.argument_tree_structure, leaves)
@@ -87,41 +92,42 @@ class ContactStepConfig(NamedTuple):
             return evaluate_one_wheel
         return unbatch(compile_batch_function(lane_function, make_template, program_name))
 
-    def unpack_argument_leaves(self, leaves: tuple[Array, ...]) -> tuple[Array, Array, Any]:
-        """Return input columns and section states of the batch, and (wheel, params, options)."""
+    def unpack_argument_leaves(
+        self, leaves: tuple[Array, ...]
+    ) -> tuple[BatchWalkSettings, Array, Array]:
+        """Return the settings of walks of one step, and input columns and section states."""
         wheel, params, x, options = jax.tree.unflatten(self.argument_tree_structure, leaves)
         uneven_ground_columns = () if wheel.uneven is None else wheel.uneven
         restitution = () if wheel.restitution is None else (wheel.restitution.astype(x.dtype),)
         input_columns = jnp.stack(
             [*stack_parameters(params), wheel.friction, *uneven_ground_columns, *restitution]
         )
-        return input_columns, x, (wheel, params, options)
-
-    def make_walk_settings(self, gait_step_settings: Any) -> BatchWalkSettings:
-        """Return the settings for a batch of walks of one step each."""
-        wheel, params, options = gait_step_settings
         tableau = None if self.uses_diffrax else load_explicit_tableau(options.solver)
         assert self.uses_diffrax or tableau is not None  # The caller has checked the solver.
-        contact_rules = (
+        walk_settings = BatchWalkSettings(
+            params.n_legs,
+            1,
             wheel.max_events,
             wheel.has_one_sided_stoppers,
             wheel.uses_paper_rule,
             self.is_detailed,
+            options,
+            tableau,
+            wheel.uneven is not None,
+            wheel.restitution is not None,
+            self.engine_name,
+            self.measures_force_peaks,
         )
-        has_column_tangents = wheel.uneven is not None, wheel.restitution is not None
-        return BatchWalkSettings(
-            params.n_legs, 1, *contact_rules, options, tableau, *has_column_tangents,
-            self.engine_name, self.measures_force_peaks,
-        )  # fmt: skip
+        return walk_settings, input_columns, x
 
     def make_template(self, *leaves: Array) -> tuple:
         """Return zeros with the structure of the results of `compute_walk_outputs` for one
         wheel.
         """
-        params = self.unpack_argument_leaves(leaves)[2][1]
+        n_legs = self.unpack_argument_leaves(leaves)[0].n_legs
         return _partition_walk_result(
             make_result_template(
-                params.n_legs, leaves[0].dtype, self.is_detailed, self.measures_force_peaks
+                n_legs, leaves[0].dtype, self.is_detailed, self.measures_force_peaks
             )
         )
 
@@ -131,10 +137,7 @@ class ContactStepConfig(NamedTuple):
 
         The argument leaves have the batch on their last axis.
         """
-        input_columns, x, gait_step_settings = self.unpack_argument_leaves(leaves)
-        return _partition_walk_result(
-            run_walks(self.make_walk_settings(gait_step_settings), input_columns, x)
-        )
+        return _partition_walk_result(run_walks(*self.unpack_argument_leaves(leaves)))
 
     def compute_walk_tangents(
         self, leaves: tuple[Array, ...], tangents: tuple[Array, ...]
@@ -143,18 +146,15 @@ class ContactStepConfig(NamedTuple):
 
         Each batch element has one tangent of its argument leaves.
         """
-        input_columns, x, gait_step_settings = self.unpack_argument_leaves(leaves)
-        input_column_tangents, section_state_tangents = (
-            tangent_rows[None] for tangent_rows in self.unpack_argument_leaves(tangents)[:2]
-        )
-        n_tangents = jnp.ones_like(input_columns[0], jnp.int32)
+        walk_settings, input_columns, x = self.unpack_argument_leaves(leaves)
+        _, input_column_tangents, section_state_tangents = self.unpack_argument_leaves(tangents)
         walk_result, result_tangents = walk_with_tangents(
-            self.make_walk_settings(gait_step_settings),
+            walk_settings,
             input_columns,
             x,
-            input_column_tangents,
-            section_state_tangents,
-            n_tangents,
+            input_column_tangents[None],
+            section_state_tangents[None],
+            n_tangents=jnp.ones_like(input_columns[0], jnp.int32),
         )
         result_tangents = jax.tree.map(lambda leaf: leaf[0], result_tangents)
         return _partition_walk_result(walk_result._replace(step_result=result_tangents))[
@@ -185,14 +185,10 @@ def build_contact_step_function(step_config: ContactStepConfig) -> ForwardFuncti
     The results are divided into floating-point arrays and other arrays. All AD modes are built from
     this function.
     """
-    cache_key = (
-        "step with unilateral contact",
-        str(step_config.argument_tree_structure),
-        step_config.is_detailed,
-        step_config.measures_force_peaks,
-    )
     return step_config.compile_lane_function(
-        step_config.compute_walk_outputs, step_config.make_template, cache_key
+        step_config.compute_walk_outputs,
+        step_config.make_template,
+        step_config.make_program_key("step with unilateral contact"),
     )
 
 
@@ -209,28 +205,18 @@ def build_contact_step_jacobian(
         float_outputs, nonfloat_outputs = step_config.make_template(*leaves)
         return float_outputs, float_outputs, nonfloat_outputs
 
-    argument_structure_text = str(step_config.argument_tree_structure)
-    cache_key = (
-        "step with unilateral contact along directions",
-        argument_structure_text,
-        step_config.is_detailed,
-        step_config.measures_force_peaks,
-    )
+    program_key = step_config.make_program_key("step with unilateral contact along directions")
     compute_walk_tangents = unbatch(
-        compile_batch_function(step_config.compute_walk_tangents, make_template, cache_key)
+        compile_batch_function(step_config.compute_walk_tangents, make_template, program_key)
     )
 
     def evaluate_jacobian(*leaves: Array) -> tuple:
         leaves = step_config.tighten_tolerances(leaves)
-        unit_tangents = np.eye(sum(np.size(leaves[i]) for i in input_indices))
-        tangents, leaf_offset = [jnp.zeros_like(leaf) for leaf in leaves], 0
-        for i in input_indices:
-            leaf_tangents = unit_tangents[
-                :, leaf_offset : (leaf_offset := leaf_offset + np.size(leaves[i]))
-            ]
-            tangents[i] = jnp.asarray(
-                leaf_tangents.reshape(-1, *jnp.shape(leaves[i])), leaves[i].dtype
-            )
+        selected_entries, unravel = ravel_pytree([leaves[i] for i in input_indices])
+        unit_vectors = jnp.eye(selected_entries.size, dtype=selected_entries.dtype)
+        tangents = [jnp.zeros_like(leaf) for leaf in leaves]
+        for i, leaf_tangents in zip(input_indices, jax.vmap(unravel)(unit_vectors), strict=True):
+            tangents[i] = leaf_tangents
         batch_axes = tuple(0 if i in input_indices else None for i in range(len(leaves)))
         jacobian_columns, float_outputs, nonfloat_outputs = jax.vmap(
             compute_walk_tangents, (None, batch_axes)
@@ -253,17 +239,6 @@ class ContactIntervalLog(NamedTuple):
     contact_modes: Array  # contact mode of every foot, (intervals, legs)
     is_leg_locked: Array
     durations: Array  # s
-
-
-class SampledContactIntervals(NamedTuple):
-    """Intervals of a step, each with samples at equally spaced times from start to end."""
-
-    contact_interval_log: ContactIntervalLog
-    step_summary: GaitStepSummary
-    step_outcome: Array
-    sampled_states: Array  # `contact_state.PackedState`, (intervals, samples, dim)
-    tangential_forces: Array  # force on every foot, N, (intervals, samples, legs)
-    normal_forces: Array
 
 
 def sample_contact_interval(
@@ -303,7 +278,8 @@ def sample_contact_interval(
 
     def pack_sample(sample_state: tuple[ContactIntervalPoint, Array]) -> Array:
         (q, v, dynamics_rows), accumulators = sample_state
-        return jnp.concatenate([q, v, accumulators, dynamics_rows[len(q) : len(q) + 4]])
+        slot_forces = dynamics_rows[len(q) + 1 : len(q) + 5]
+        return jnp.concatenate([q, v, accumulators, slot_forces])
 
     return sample_at_equal_times(
         take_sample_step,
@@ -319,25 +295,22 @@ def sample_contact_interval(
 @functools.cache
 def build_contact_step_sampler(
     step_config: ContactStepConfig, n_samples: int
-) -> Callable[..., SampledContactIntervals]:
+) -> Callable[..., tuple]:
     """Return a function that samples a step from the leaves of (wheel, params, x, options).
 
-    The function has no derivatives.
+    The function returns (log, summary and outcome of the step, states, tangential forces, normal
+    forces). The states are packed, (intervals, samples, entries), and the forces on all feet are in
+    N, (intervals, samples, legs). The samples are at equally spaced times from the start to the end
+    of each interval. The function has no derivatives.
     """
-    argument_tree_structure = step_config.argument_tree_structure
-    cache_key = str(step_config.argument_tree_structure)
 
     def init_lane_state(*leaves: Array) -> Any:
-        input_columns, x, gait_step_settings = step_config.unpack_argument_leaves(leaves)
-        return init_lane_states(
-            step_config.make_walk_settings(gait_step_settings), input_columns, x
-        )[1]
+        return init_lane_states(*step_config.unpack_argument_leaves(leaves))[1]
 
     def advance_to_event(
         leaves: tuple[Array, ...], lane_state: Any
     ) -> tuple[Any, ContactIntervalLog]:
-        input_columns, x, gait_step_settings = step_config.unpack_argument_leaves(leaves)
-        walk_settings = step_config.make_walk_settings(gait_step_settings)
+        walk_settings, input_columns, x = step_config.unpack_argument_leaves(leaves)
         state_after_event, lane_state = process_and_integrate(
             walk_settings,
             walk_settings.replace_invalid_lanes(input_columns, x)[0],
@@ -345,80 +318,59 @@ def build_contact_step_sampler(
             waits_for_events=True,
         )
         assert state_after_event.step_energy_loss_accumulators is not None
-        (contact_interval_point, contact_state), zero_time = (
-            (
-                state_after_event.contact_interval_state.contact_interval_point,
-                state_after_event.contact_interval_state.contact_state,
-            ),
-            jnp.zeros_like(lane_state.contact_interval_state.time_since_event),
-        )
+        start_interval = state_after_event.contact_interval_state
+        duration = lane_state.contact_interval_state.time_since_event
         start_state = pack_state(
-            unpack_motion(contact_interval_point),
-            EnergyLossAccumulators(zero_time, *state_after_event.step_energy_loss_accumulators),
+            unpack_motion(start_interval.contact_interval_point),
+            EnergyLossAccumulators(
+                jnp.zeros_like(duration), *state_after_event.step_energy_loss_accumulators
+            ),
         )
         return lane_state, ContactIntervalLog(
             start_state,
-            contact_state.contact_modes,
-            contact_state.is_leg_locked,
-            lane_state.contact_interval_state.time_since_event,
+            start_interval.contact_state.contact_modes,
+            start_interval.contact_state.is_leg_locked,
+            duration,
         )
 
-    def make_logged_dynamics(
+    def sample_logged_interval(
         leaves: tuple[Array, ...], contact_interval_log: ContactIntervalLog
-    ) -> tuple[BatchWalkSettings, ContactModeDynamics]:
-        input_columns, x, gait_step_settings = step_config.unpack_argument_leaves(leaves)
-        walk_settings = step_config.make_walk_settings(gait_step_settings)
-        no_leg_flags = contact_interval_log.is_leg_locked & False
-        contact_state = ContactState(
-            contact_interval_log.contact_modes,
-            contact_interval_log.is_leg_locked,
-            no_leg_flags,
-            no_leg_flags,
-            no_leg_flags,
+    ) -> Any:
+        walk_settings, input_columns, x = step_config.unpack_argument_leaves(leaves)
+        start_states, contact_modes, is_leg_locked, durations = contact_interval_log
+        contact_mode_dynamics = walk_settings.make_lane_contact_dynamics(
+            walk_settings.replace_invalid_lanes(input_columns, x)[0],
+            ContactState.without_changes(contact_modes, is_leg_locked),
         )
-        return walk_settings, walk_settings.make_lane_contact_dynamics(
-            walk_settings.replace_invalid_lanes(input_columns, x)[0], contact_state
-        )
-
-    def sample_with_diffrax(
-        leaves: tuple[Array, ...], contact_interval_log: ContactIntervalLog
-    ) -> tuple:
-        walk_settings, contact_mode_dynamics = make_logged_dynamics(leaves, contact_interval_log)
-        return sample_by_diffrax(
+        options, tableau = walk_settings.step_options, walk_settings.tableau
+        if tableau is None:
+            return sample_by_diffrax(
+                contact_mode_dynamics, start_states, durations, n_samples, options
+            )
+        motion, (_, *loss_accumulators) = unpack_state(start_states)
+        return sample_contact_interval(
             contact_mode_dynamics,
-            contact_interval_log.start_states,
-            contact_interval_log.durations,
+            motion,
+            jnp.stack(loss_accumulators),
+            durations,
             n_samples,
-            walk_settings.step_options,
+            options,
+            tableau,
         )
 
-    def sample_contact_intervals(
-        leaves: tuple[Array, ...], contact_interval_log: ContactIntervalLog
-    ) -> Array:
-        walk_settings, contact_mode_dynamics = make_logged_dynamics(leaves, contact_interval_log)
-        motion, accumulators = unpack_state(contact_interval_log.start_states)
-        assert walk_settings.tableau is not None
-        sampling_arguments = (
-            jnp.stack(accumulators[1:]),
-            contact_interval_log.durations,
-            n_samples,
-            walk_settings.step_options,
-            walk_settings.tableau,
-        )
-        return sample_contact_interval(contact_mode_dynamics, motion, *sampling_arguments)
-
-    def sample_whole_step(*leaves: Array) -> SampledContactIntervals:
-        wheel, params, *_ = jax.tree.unflatten(argument_tree_structure, leaves)
+    def sample_whole_step(*leaves: Array) -> tuple:
+        walk_settings, input_columns, _ = step_config.unpack_argument_leaves(leaves)
+        max_events = walk_settings.max_events
         initial_state = begin_compiled_walk(*leaves)
         log_template = jax.eval_shape(advance_compiled_walk, leaves, initial_state)[1]
-        allocate_log_array = lambda leaf: jnp.zeros((wheel.max_events, *leaf.shape), leaf.dtype)
+        allocate_log_array = lambda leaf: jnp.zeros((max_events, *leaf.shape), leaf.dtype)
 
         def record_interval_end(loop_state: tuple) -> tuple:
             previous_state, contact_interval_log = loop_state
             lane_state, interval_entry = advance_compiled_walk(leaves, previous_state)
             entry_index = previous_state.step_counters.n_events
             entry_index = jnp.where(
-                lane_state.step_counters.n_events > entry_index, entry_index, wheel.max_events
+                lane_state.step_counters.n_events > entry_index, entry_index, max_events
             )
             write_log_entry = lambda log_leaf, entry_leaf: log_leaf.at[entry_index].set(
                 entry_leaf, mode="drop"
@@ -433,47 +385,39 @@ def build_contact_step_sampler(
             record_interval_end,
             (initial_state, jax.tree.map(allocate_log_array, log_template)),
         )
-        final_state = (
-            unpack_motion(lane_state.contact_interval_state.contact_interval_point),
-            lane_state.contact_interval_state.contact_state,
-        )
-        input_columns, _, gait_step_settings = step_config.unpack_argument_leaves(leaves)
-        walk_settings = step_config.make_walk_settings(gait_step_settings)
         step_summary = walk_settings.summarize_step(
-            final_state,
-            lane_state.step_counters,
-            lane_state.walk_outcome,
-            walk_settings.extract_next_line_tilt(input_columns),
+            lane_state, walk_settings.extract_next_line_tilt(input_columns)
         )
         if step_config.uses_diffrax:
             interval_samples = lax.map(
-                lambda contact_interval_log: sample_with_diffrax(leaves, contact_interval_log),
-                contact_interval_log,
+                functools.partial(sample_logged_interval, leaves), contact_interval_log
             )
         else:
-            sample_rows = jax.vmap(
-                lambda contact_interval_log: sample_compiled_intervals(leaves, contact_interval_log)
-            )(contact_interval_log)
-            interval_samples = _unpack_sample_rows(params.n_legs, contact_interval_log, sample_rows)
-        return SampledContactIntervals(
-            contact_interval_log, step_summary, lane_state.walk_outcome, *interval_samples
-        )
+            sample_rows = jax.vmap(functools.partial(sample_compiled_intervals, leaves))(
+                contact_interval_log
+            )
+            interval_samples = _unpack_sample_rows(
+                walk_settings.n_legs, contact_interval_log, sample_rows
+            )
+        return contact_interval_log, step_summary, lane_state.walk_outcome, *interval_samples
 
     begin_compiled_walk = step_config.compile_lane_function(
-        init_lane_state, init_lane_state, ("start with unilateral contact", cache_key)
+        init_lane_state,
+        init_lane_state,
+        step_config.make_program_key("start with unilateral contact"),
     )
     make_template = lambda leaves, lane_state: (
         lane_state,
         ContactIntervalLog(*(lane_state.contact_interval_state.time_since_event,) * 4),
     )
     advance_compiled_walk = step_config.compile_lane_function(
-        advance_to_event, make_template, ("to the next event", cache_key)
+        advance_to_event, make_template, step_config.make_program_key("to the next event")
     )
     sample_compiled_intervals = unbatch(
         compile_batch_function(
-            sample_contact_intervals,
+            sample_logged_interval,
             lambda leaves, contact_interval_log: contact_interval_log.durations,
-            ("samples with unilateral contact", cache_key, n_samples),
+            step_config.make_program_key("samples with unilateral contact", n_samples),
         )
     )
     return jax.jit(sample_whole_step)

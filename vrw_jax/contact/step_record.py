@@ -15,12 +15,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from vrw_jax.contact.contact_modes import PAPER_RULE_SENTINEL, Friction
+from vrw_jax.contact.contact_modes import PAPER_RULE_SENTINEL
 from vrw_jax.contact.contact_state import (
     ContactModeDynamics,
     ContactState,
-    EnergyLossAccumulators,
     GuardLayout,
+    compute_forces,
     compute_normal_force_rates,
 )
 from vrw_jax.contact.impacts import (
@@ -31,8 +31,11 @@ from vrw_jax.contact.impacts import (
     project_motion,
     resolve_event,
 )
-from vrw_jax.contact.mechanics import WheelMotion, compute_landing_position
-from vrw_jax.contact.section import FullState, pack_section_state
+from vrw_jax.contact.mechanics import (
+    WheelMotion,
+    align_with_batch,
+)
+from vrw_jax.contact.section import FullState
 from vrw_jax.models import AbstractContactStep
 from vrw_jax.numerics import Elementwise, StepOptions, select_trees_by_condition
 from vrw_jax.wheel import ContactMode, Outcome, Symbols, replace_rest_outcome
@@ -62,16 +65,17 @@ class BounceRestOptions:
 BOUNCE_REST_OPTIONS = BounceRestOptions()
 
 
-def compute_min_bounce_height(
-    L0: Elementwise, options: StepOptions, rest_options: BounceRestOptions = BOUNCE_REST_OPTIONS
-) -> Array:
+def compute_min_bounce_height(L0: Elementwise, options: StepOptions) -> Array:
     """Return the smallest height of a foot's bounce that a step resolves, m.
 
     - `L0`: leg length, m;
     - `options`: options whose absolute tolerance determines the height.
     """
-    roundoff_height = rest_options.min_bounce_height_in_eps * jnp.finfo(L0.dtype).eps
-    return jnp.maximum(rest_options.min_bounce_height_per_atol * options.atol, roundoff_height) * L0
+    roundoff_height = BOUNCE_REST_OPTIONS.min_bounce_height_in_eps * jnp.finfo(L0.dtype).eps
+    return (
+        jnp.maximum(BOUNCE_REST_OPTIONS.min_bounce_height_per_atol * options.atol, roundoff_height)
+        * L0
+    )
 
 
 def apply_friction_rule(friction: Elementwise, uses_paper_rule: bool) -> Elementwise:
@@ -88,33 +92,9 @@ def apply_friction_rule(friction: Elementwise, uses_paper_rule: bool) -> Element
     )
 
 
-def make_contact_law(
-    s: Symbols,
-    friction: Friction,
-    options: StepOptions,
-    has_one_sided_stoppers: bool,
-    counts_all_solutions: bool,
-    restitution: Elementwise | None = None,
-    next_line_tilt: Elementwise | None = None,
-) -> ContactLaw:
-    """Return the contact law for a walk.
-
-    The rest speed is the landing speed after the smallest resolved bounce.
-
-    - `counts_all_solutions`: whether the number of all admissible solutions of an event is
-      determined;
-    - `next_line_tilt`: angle by which the next straight line of uneven ground is steeper, rad.
-    """
-    rest_speed = jnp.sqrt(2.0 * s.g * compute_min_bounce_height(s.L0, options))
-    return ContactLaw(
-        s,
-        friction,
-        has_one_sided_stoppers,
-        counts_all_solutions,
-        rest_speed,
-        restitution,
-        next_line_tilt,
-    )
+def compute_rest_speed(s: Symbols, options: StepOptions) -> Elementwise:
+    """Return the landing speed after the smallest resolved bounce, m/s."""
+    return jnp.sqrt(2.0 * s.g * compute_min_bounce_height(s.L0, options))
 
 
 def process_event(
@@ -125,7 +105,6 @@ def process_event(
     guard_index: Int[Array, "..."],
     n_events: Int[Array, "..."],
     max_events: int,
-    rest_options: BounceRestOptions = BOUNCE_REST_OPTIONS,
 ) -> tuple[ContactEventResult, ContactEvent, Int[Array, "..."]]:
     """Return the result of an event, its kind, and its outcome (STEPPED if the event is resolved).
 
@@ -137,7 +116,7 @@ def process_event(
     off the ground. The height of a foot that lifts off grows with the third power of time. Without
     the projection, the foot would land again immediately.
     """
-    first_ramp_event = max(rest_options.n_events_before_rest_speed_ramp, max_events // 4)
+    first_ramp_event = max(BOUNCE_REST_OPTIONS.n_events_before_rest_speed_ramp, max_events // 4)
     contact_law = contact_law._replace(
         rest_speed=contact_law.rest_speed * (1 + jnp.maximum(n_events - first_ramp_event, 0))
     )
@@ -200,7 +179,7 @@ def count_contact_interval(
 
 
 def determine_interval_outcome(
-    step_counters: GaitStepCounters,
+    n_events: Int[Array, "..."],
     guard_layout: GuardLayout,
     has_reached_event: Array,
     guard_index: Array,
@@ -216,9 +195,7 @@ def determine_interval_outcome(
     If the interval did not end at an event, the result is `failure_outcome`. If the wheel is at
     rest, the result is CAME_TO_REST.
     """
-    outcome = jnp.where(
-        step_counters.n_events >= max_events, Outcome.TOO_MANY_EVENTS, Outcome.STEPPED
-    )
+    outcome = jnp.where(n_events >= max_events, Outcome.TOO_MANY_EVENTS, Outcome.STEPPED)
     outcome = jnp.where(guard_index == guard_layout.rolling_rate_guard, Outcome.FELL_BACK, outcome)
     outcome = jnp.where(guard_index == guard_layout.collapse_guard, Outcome.COLLAPSED, outcome)
     outcome = jnp.where(
@@ -255,9 +232,9 @@ class ForcePeakRecord(NamedTuple):
         }
 
 
-def init_force_peak_record(dtype: jnp.dtype) -> ForcePeakRecord:
-    """Return the record of one wheel before its first extremum, without a batch axis."""
-    float_zero, int_zero = jnp.zeros((), dtype), jnp.zeros((), jnp.int32)
+def init_force_peak_record(lane_template: Array) -> ForcePeakRecord:
+    """Return the record before the first extremum, with the batch shape of `lane_template`."""
+    float_zero, int_zero = jnp.zeros_like(lane_template), jnp.zeros_like(lane_template, jnp.int32)
     return ForcePeakRecord(
         n_force_peaks=int_zero,
         peak_force=float_zero - jnp.inf,
@@ -326,6 +303,14 @@ def record_force_extremum(
     )
 
 
+class GaitStepSummary(NamedTuple):
+    """Section state, durations (s) and length (m) of the last step in a walk, without details."""
+
+    section_state: Array
+    durations: Array  # (3, batch)
+    step_length: Array
+
+
 class UnilateralStepDetails(NamedTuple):
     """Detailed results of a walking step; the fields are described in `UnilateralStep`."""
 
@@ -341,13 +326,16 @@ class UnilateralStepDetails(NamedTuple):
     force_peaks: ForcePeakRecord | None
 
 
-def init_step_details(dtype: jnp.dtype, measures_force_peaks: bool) -> UnilateralStepDetails:
-    """Return the step details of one wheel at the start of a walking step, without a batch axis."""
-    float_zero, int_zero = jnp.zeros((), dtype), jnp.zeros((), jnp.int32)
-    zero_pair = jnp.zeros((2,), dtype)
+def init_step_details(lane_template: Array, measures_force_peaks: bool) -> UnilateralStepDetails:
+    """Return the step details at the start of a walking step.
+
+    The batch shape and the dtype are those of `lane_template`.
+    """
+    float_zero, int_zero = jnp.zeros_like(lane_template), jnp.zeros_like(lane_template, jnp.int32)
+    zero_pair = jnp.stack([float_zero, float_zero])
     return UnilateralStepDetails(
         post_impact=zero_pair,
-        mode_durations=jnp.zeros((4, 4), dtype),
+        mode_durations=jnp.zeros((4, 4, *lane_template.shape), lane_template.dtype),
         landing_normal=zero_pair,
         landing_tangential=zero_pair,
         energy_impacts=float_zero,
@@ -355,7 +343,7 @@ def init_step_details(dtype: jnp.dtype, measures_force_peaks: bool) -> Unilatera
         impacts=int_zero,
         fewest_solutions=int_zero + jnp.iinfo(jnp.int32).max,
         most_solutions=int_zero,
-        force_peaks=init_force_peak_record(dtype) if measures_force_peaks else None,
+        force_peaks=init_force_peak_record(lane_template) if measures_force_peaks else None,
     )
 
 
@@ -371,8 +359,8 @@ def record_event(
     """
     step_start_quantities = (
         jnp.stack([event_result.motion.theta, event_result.motion.dtheta]),
-        jnp.stack(event_result.normal_impulse),
-        jnp.stack(event_result.tangential_impulse),
+        event_result.normal_impulse,
+        event_result.tangential_impulse,
     )
     previous_quantities = (
         step_details.post_impact,
@@ -399,20 +387,24 @@ def record_event(
 
 def record_contact_interval(
     step_details: UnilateralStepDetails,
-    slot_modes: Int[Array, "2 ..."],
+    contact_mode_dynamics: ContactModeDynamics,
+    motion: WheelMotion,
     duration: Elementwise,
-    stopper_force: Elementwise,
 ) -> UnilateralStepDetails:
-    """Return the step details after one more interval.
+    """Return the step details updated at one end of an interval.
 
-    The duration is added to the entry of `mode_durations` for the contact modes `slot_modes`.
+    The minimum of the stopper force on legs in the air is updated. The duration is added to the
+    entry of `mode_durations` for the present contact modes.
 
-    - `slot_modes`: contact mode of the foot in each contact slot;
-    - `duration`: length of the interval, s;
-    - `stopper_force`: smallest stopper force on legs in the air at the ends of this interval, N.
-      The result contains the minimum over all intervals.
+    - `motion`: motion at this end of the interval;
+    - `duration`: length of the interval, s, at one of its ends, and 0 at the other.
     """
-    mode_codes = np.arange(4).reshape(-1, *(1,) * jnp.ndim(stopper_force))
+    slot_modes = contact_mode_dynamics.slot_modes
+    stopper_forces = compute_forces(contact_mode_dynamics, motion).airborne_stopper_forces
+    stopper_force = jnp.min(
+        jnp.where(contact_mode_dynamics.is_airborne_leg_locked, stopper_forces, jnp.inf), axis=0
+    )
+    mode_codes = align_with_batch(np.arange(4), stopper_force)
     is_first_slot_mode, is_second_slot_mode = (
         (mode_codes == slot_modes[i]).astype(jnp.result_type(stopper_force)) for i in range(2)
     )
@@ -488,36 +480,20 @@ class UnilateralStep(AbstractContactStep):
         }
 
 
-def make_final_section_state(
-    motion: WheelMotion,
-    contact_state: ContactState,
-    outcome: Array,
-    next_line_tilt: Elementwise | None = None,
-) -> FullState:
-    """Return the full section state at the end of a walking step, or zeros if the step failed.
-
-    On uneven ground, `next_line_tilt` is the angle by which the next straight line is steeper, rad.
-    """
-    section_state = pack_section_state(motion, contact_state, next_line_tilt)
-    return jnp.where(outcome == Outcome.STEPPED, section_state, jnp.zeros_like(section_state))
-
-
 def make_unilateral_step(
-    motion: WheelMotion,
-    contact_state: ContactState,
-    accumulators: EnergyLossAccumulators,
+    step_summary: GaitStepSummary,
+    loss_accumulators: Array,
     step_counters: GaitStepCounters,
     step_details: UnilateralStepDetails,
     outcome: Array,
     engine_name: str,
-    next_line_tilt: Elementwise | None = None,
 ) -> UnilateralStep:
-    """Return the results of a walking step from its final state and its records.
+    """Return the results of a walking step from its records.
 
-    - `engine_name`: name of the engine that computed the step;
-    - `next_line_tilt`: angle by which the next straight line of uneven ground is steeper, rad.
+    - `loss_accumulators`: losses in dampers and by sliding, J, and slip length, m, (3, ...);
+    - `engine_name`: name of the engine that computed the step.
     """
-    landing_foot_position = compute_landing_position(motion.L.shape[0], motion)
+    damping_loss, friction_loss, slip_length = loss_accumulators
     replace_nonfinite = lambda detail_value: jnp.where(
         jnp.isfinite(detail_value), detail_value, 0.0
     )
@@ -526,12 +502,10 @@ def make_unilateral_step(
         fewest_solutions=jnp.where(step_counters.n_events > 0, step_details.fewest_solutions, 0),
     )
     return UnilateralStep(
-        section_state=make_final_section_state(motion, contact_state, outcome, next_line_tilt),
-        durations=step_counters.durations,
-        step_length=jnp.where(outcome == Outcome.STEPPED, landing_foot_position, 0.0),
-        energy_damping=accumulators.damping_loss,
-        energy_friction=accumulators.friction_loss,
-        slip=accumulators.slip_length,
+        **step_summary._asdict(),
+        energy_damping=damping_loss,
+        energy_friction=friction_loss,
+        slip=slip_length,
         events=step_counters.n_events,
         outcome=outcome,
         solver_steps=step_counters.n_solver_steps,

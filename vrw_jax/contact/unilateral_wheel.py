@@ -303,26 +303,23 @@ class UnilateralWheel(AbstractContactWheel):
     ) -> UnilateralTrajectory:
         leaves, argument_structure = self._flatten_arguments(params, x, options)
         config = ContactStepConfig(argument_structure, True, not can_use_batch_kernel(options))
-        sampled_contact_intervals = build_contact_step_sampler(config, n_samples)(*leaves)
-        contact_interval_log, step_summary = (
-            sampled_contact_intervals.contact_interval_log,
-            sampled_contact_intervals.step_summary,
+        contact_interval_log, step_summary, outcome, states, tangential_forces, normal_forces = (
+            build_contact_step_sampler(config, n_samples)(*leaves)
         )
-        start_times = jnp.concatenate(
-            [jnp.zeros((1,)), jnp.cumsum(contact_interval_log.durations)[:-1]]
-        )
+        durations = contact_interval_log.durations
+        start_times = jnp.concatenate([jnp.zeros((1,)), jnp.cumsum(durations)[:-1]])
+        sample_times = jnp.linspace(0.0, 1.0, n_samples) * durations[:, None]
         return UnilateralTrajectory(
-            time=start_times[:, None]
-            + jnp.linspace(0.0, 1.0, n_samples) * contact_interval_log.durations[:, None],
-            state=sampled_contact_intervals.sampled_states,
+            time=start_times[:, None] + sample_times,
+            state=states,
             contact=contact_interval_log.contact_modes,
             locked=contact_interval_log.is_leg_locked,
-            tangential=sampled_contact_intervals.tangential_forces,
-            normal=sampled_contact_intervals.normal_forces,
-            duration=contact_interval_log.durations,
+            tangential=tangential_forces,
+            normal=normal_forces,
+            duration=durations,
             section_state=step_summary.section_state,
             step_length=step_summary.step_length,
-            outcome=sampled_contact_intervals.step_outcome,
+            outcome=outcome,
         )
 
 
@@ -347,9 +344,7 @@ def _compile_step(
     )
     if engine == "diffrax":
         return enable_all_ad_modes(compute_step_by_diffrax, step_with_tight_tolerances)
-    config = ContactStepConfig(
-        argument_structure, is_detailed, measures_force_peaks=measures_force_peaks
-    )
+    config = diffrax_config._replace(uses_diffrax=False)
     return enable_all_ad_modes(
         build_contact_step_function(config),
         step_with_tight_tolerances,

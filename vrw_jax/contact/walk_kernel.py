@@ -12,7 +12,6 @@ diffrax integrates a single element (`integrate_by_diffrax`).
 from typing import Any, NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
@@ -27,34 +26,40 @@ from vrw_jax.contact.batch_integrator import (
     pack_coordinates,
     unpack_motion,
 )
-from vrw_jax.contact.contact_modes import Friction
 from vrw_jax.contact.contact_state import (
     ContactModeDynamics,
     ContactState,
-    EnergyLossAccumulators,
     NormalForceRates,
     choose_stopping_guard,
-    compute_forces,
-    compute_min_stopper_force,
     flag_zero_force_rates,
     is_wheel_at_rest,
     make_contact_mode_dynamics,
-    make_guard_layout,
     update_force_rate_signs,
 )
 from vrw_jax.contact.diffrax_interval import init_diffrax_contact_interval, integrate_by_diffrax
-from vrw_jax.contact.mechanics import WheelMotion, compute_landing_position, stop_gradients
-from vrw_jax.contact.section import pack_section_state, replace_invalid_start, unpack_section_state
+from vrw_jax.contact.impacts import ContactLaw
+from vrw_jax.contact.mechanics import (
+    Friction,
+    WheelMotion,
+    compute_landing_position,
+    stop_gradients,
+)
+from vrw_jax.contact.section import (
+    compute_full_section_size,
+    pack_section_state,
+    replace_invalid_start,
+    unpack_section_state,
+)
 from vrw_jax.contact.step_record import (
     GaitStepCounters,
+    GaitStepSummary,
     UnilateralStepDetails,
     apply_friction_rule,
+    compute_rest_speed,
     count_contact_interval,
     determine_interval_outcome,
     init_step_counters,
     init_step_details,
-    make_contact_law,
-    make_final_section_state,
     make_unilateral_step,
     process_event,
     record_contact_interval,
@@ -89,14 +94,6 @@ STATUS_UNFINISHED = -1
 """Value that replaces the outcome code as long as a walk is unfinished."""
 
 
-class GaitStepSummary(NamedTuple):
-    """Section state, durations (s) and length (m) of the last step in a walk, without details."""
-
-    section_state: Array
-    durations: Array  # (3, batch)
-    step_length: Array
-
-
 class BatchWalkResult(NamedTuple):
     """Results of the walks of all batch elements."""
 
@@ -115,21 +112,15 @@ def make_result_template(
     - `measures_force_peaks`: whether the `UnilateralStep` contains force peaks.
     """
     float_zero, int_zero = jnp.zeros((), dtype), jnp.zeros((), jnp.int32)
-    leg_zeros, airborne_modes = jnp.zeros(n_legs, dtype), jnp.zeros(n_legs, jnp.int32)
-    final_state = (
-        WheelMotion(*(float_zero,) * 6, leg_zeros, leg_zeros),
-        ContactState(airborne_modes, *(airborne_modes > 0,) * 4),
-    )
     step_result: Any = GaitStepSummary(
-        pack_section_state(*final_state), jnp.zeros(3, dtype), float_zero
+        jnp.zeros(compute_full_section_size(n_legs), dtype), jnp.zeros(3, dtype), float_zero
     )
     if is_detailed:
-        accumulators = EnergyLossAccumulators(float_zero, float_zero, float_zero, float_zero)
         step_result = make_unilateral_step(
-            *final_state,
-            accumulators,
+            step_result,
+            jnp.zeros(N_ACCUMULATOR_ROWS, dtype),
             init_step_counters(float_zero),
-            init_step_details(dtype, measures_force_peaks),
+            init_step_details(float_zero, measures_force_peaks),
             int_zero,
             "lanes",
         )
@@ -141,9 +132,9 @@ class DifferentiableLaneState(NamedTuple):
 
     q: Array
     v: Array
-    # accumulators of this step, and since the last event
-    energy_loss_accumulators: tuple[Array | None, Array | None]
+    interval_accumulators: Array | None
     time_since_event: Array
+    step_accumulators: Array | None
     durations: Array
     step_details: Any  # floats of the details
 
@@ -162,38 +153,34 @@ class LaneState(NamedTuple):
 
     def get_differentiable_state(self) -> DifferentiableLaneState:
         """Return the differentiable arrays of the state."""
-        contact_interval_point = self.contact_interval_state.contact_interval_point
-        step_details = eqx.filter(self.step_details, eqx.is_inexact_array)
-        accumulators = (
-            self.step_energy_loss_accumulators,
-            self.contact_interval_state.interval_accumulators,
-        )
+        interval_state = self.contact_interval_state
         return DifferentiableLaneState(
-            contact_interval_point.q,
-            contact_interval_point.v,
-            accumulators,
-            self.contact_interval_state.time_since_event,
+            interval_state.contact_interval_point.q,
+            interval_state.contact_interval_point.v,
+            interval_state.interval_accumulators,
+            interval_state.time_since_event,
+            self.step_energy_loss_accumulators,
             self.step_counters.durations,
-            step_details,
+            eqx.filter(self.step_details, eqx.is_inexact_array),
         )
 
     def replace_differentiable_state(
         self, differentiable_state: DifferentiableLaneState
     ) -> "LaneState":
         """Return the state with its differentiable arrays replaced."""
-        step_accumulators, interval_accumulators = differentiable_state.energy_loss_accumulators
-        contact_interval_point = self.contact_interval_state.contact_interval_point._replace(
-            q=differentiable_state.q, v=differentiable_state.v
+        q, v, interval_accumulators, time_since_event, step_accumulators, durations, details = (
+            differentiable_state
         )
-        nonfloat_step_details = eqx.filter(self.step_details, eqx.is_inexact_array, inverse=True)
+        nonfloat_details = eqx.filter(self.step_details, eqx.is_inexact_array, inverse=True)
+        interval_state = self.contact_interval_state
         return self._replace(
-            contact_interval_state=self.contact_interval_state._replace(
-                contact_interval_point=contact_interval_point,
+            contact_interval_state=interval_state._replace(
+                contact_interval_point=interval_state.contact_interval_point._replace(q=q, v=v),
                 interval_accumulators=interval_accumulators,
-                time_since_event=differentiable_state.time_since_event,
+                time_since_event=time_since_event,
             ),
-            step_counters=self.step_counters._replace(durations=differentiable_state.durations),
-            step_details=eqx.combine(differentiable_state.step_details, nonfloat_step_details),
+            step_counters=self.step_counters._replace(durations=durations),
+            step_details=eqx.combine(details, nonfloat_details),
             step_energy_loss_accumulators=step_accumulators,
         )
 
@@ -222,13 +209,14 @@ class BatchWalkSettings(NamedTuple):
     ) -> ContactModeDynamics:
         """Return the dynamics of all batch elements in their contact states."""
         s, friction = self.unpack_input_columns(input_columns)
-        dynamics_arguments = (
+        return make_contact_mode_dynamics(
+            s,
+            friction,
             self.has_one_sided_stoppers,
             contact_state,
             self.is_detailed,
             self.extract_next_line_tilt(input_columns),
         )
-        return make_contact_mode_dynamics(s, friction, *dynamics_arguments)
 
     def unpack_input_columns(self, input_columns: Array) -> tuple[Symbols, Friction]:
         """Return wheel symbols and friction coefficients from the input columns, (inputs, batch).
@@ -265,25 +253,22 @@ class BatchWalkSettings(NamedTuple):
             unit_signs = jnp.stack([jnp.ones_like(motion.x)] * len(NormalForceRates._fields))
             contact_state = contact_state._replace(force_rate_signs=unit_signs)
         contact_mode_dynamics = self.make_lane_contact_dynamics(input_columns, contact_state)
-        contact_interval_state = make_zeros_like_output(
+        interval_state = make_zeros_like_output(
             lambda: self.begin_contact_interval(contact_mode_dynamics, motion)
         )
         q, v = pack_coordinates(motion)
-        contact_interval_point = ContactIntervalPoint(
-            q,
-            v,
-            jnp.full_like(contact_interval_state.contact_interval_point.dynamics_rows, jnp.inf),
-        )
-        contact_interval_state = contact_interval_state._replace(
-            contact_interval_point=contact_interval_point,
+        infinite_rows = jnp.full_like(interval_state.contact_interval_point.dynamics_rows, jnp.inf)
+        interval_state = interval_state._replace(
+            contact_interval_point=ContactIntervalPoint(q, v, infinite_rows),
             contact_state=contact_state,
-            lane_status=contact_interval_state.lane_status + LaneStatus.EVENT,
+            lane_status=interval_state.lane_status + LaneStatus.EVENT,
         )
+        int_zero_lanes = jnp.zeros_like(interval_state.triggered_guard_index)
         return LaneState(
-            contact_interval_state,
+            interval_state,
             *self._init_step_records(section_state[0]),
-            contact_interval_state.triggered_guard_index * 0,
-            contact_interval_state.triggered_guard_index * 0 + STATUS_UNFINISHED,
+            int_zero_lanes,
+            int_zero_lanes + STATUS_UNFINISHED,
         )
 
     def begin_contact_interval(
@@ -306,15 +291,9 @@ class BatchWalkSettings(NamedTuple):
         """
         if not self.is_detailed:
             return init_step_counters(lane_template), None, None
-        broadcast_to_lanes = lambda leaf: jnp.broadcast_to(
-            leaf[..., None], (*leaf.shape, *lane_template.shape)
-        )
-        step_details = jax.tree.map(
-            broadcast_to_lanes, init_step_details(lane_template.dtype, self.measures_force_peaks)
-        )
         return (
             init_step_counters(lane_template),
-            step_details,
+            init_step_details(lane_template, self.measures_force_peaks),
             jnp.zeros((N_ACCUMULATOR_ROWS, *lane_template.shape), lane_template.dtype),
         )
 
@@ -323,125 +302,96 @@ class BatchWalkSettings(NamedTuple):
 
         If a walk ends, its outcome is set. Running elements are unchanged.
         """
-        contact_interval_state = lane_state.contact_interval_state
-        guard_layout = make_guard_layout(
-            self.n_legs, self.has_one_sided_stoppers, self.measures_force_peaks
-        )
+        interval_state = lane_state.contact_interval_state
+        motion = unpack_motion(interval_state.contact_interval_point)
         s, friction = self.unpack_input_columns(input_columns)
         dynamics_before = self.make_lane_contact_dynamics(
-            input_columns, contact_interval_state.contact_state
+            input_columns, interval_state.contact_state
         )
-        rates = lax.stop_gradient(contact_interval_state.contact_interval_point.v)
-        accelerations = lax.stop_gradient(
-            contact_interval_state.contact_interval_point.dynamics_rows[: len(rates)]
+        guard_layout = dynamics_before.guard_layout
+        _, rates, dynamics_rows = lax.stop_gradient(interval_state.contact_interval_point)
+        is_resting = is_wheel_at_rest(s, rates, dynamics_rows[: len(rates)], self.step_options.atol)
+        guard_index = choose_stopping_guard(
+            dynamics_before, rates, interval_state.triggered_guard_index, self.step_options.atol
         )
-        is_resting = is_wheel_at_rest(s, rates, accelerations, self.step_options.atol)
-        guard_arguments = (
-            guard_layout,
-            dynamics_before,
-            rates,
-            contact_interval_state.triggered_guard_index,
-            self.step_options.atol,
-        )
-        contact_interval_state = contact_interval_state._replace(
-            triggered_guard_index=choose_stopping_guard(*guard_arguments)
-        )
+        interval_state = interval_state._replace(triggered_guard_index=guard_index)
         step_counters = count_contact_interval(
             lane_state.step_counters,
-            contact_interval_state.contact_state,
-            contact_interval_state.time_since_event,
-            contact_interval_state.n_solver_steps,
+            interval_state.contact_state,
+            interval_state.time_since_event,
+            interval_state.n_solver_steps,
         )
-        step_details, step_accumulators = (
-            lane_state.step_details,
-            lane_state.step_energy_loss_accumulators,
-        )
+        step_details = lane_state.step_details
+        step_accumulators = lane_state.step_energy_loss_accumulators
         if (
             step_details is not None
             and step_accumulators is not None
-            and contact_interval_state.interval_accumulators is not None
+            and interval_state.interval_accumulators is not None
         ):
-            step_details = record_end_stopper_force(
-                step_details,
-                dynamics_before,
-                unpack_motion(contact_interval_state.contact_interval_point),
-                contact_interval_state.time_since_event,
+            step_details = record_contact_interval(
+                step_details, dynamics_before, motion, interval_state.time_since_event
             )
-            step_accumulators = step_accumulators + contact_interval_state.interval_accumulators
-        is_at_event = contact_interval_state.lane_status == LaneStatus.EVENT
-        has_landed = is_at_event & (
-            contact_interval_state.triggered_guard_index == guard_layout.foremost_landing_guard
-        )
+            step_accumulators = step_accumulators + interval_state.interval_accumulators
+        force_peaks = None if step_details is None else step_details.force_peaks
+        is_at_event = interval_state.lane_status == LaneStatus.EVENT
+        has_landed = is_at_event & (guard_index == guard_layout.foremost_landing_guard)
         n_events = step_counters.n_events
-        if step_details is not None and step_details.force_peaks is not None:
-            n_events = n_events + step_details.force_peaks.n_force_extrema
-        outcome_arguments = (
-            step_counters._replace(n_events=n_events),
+        if force_peaks is not None:
+            n_events = n_events + force_peaks.n_force_extrema
+        outcome = determine_interval_outcome(
+            n_events,
             guard_layout,
             is_at_event,
-            contact_interval_state.triggered_guard_index,
+            guard_index,
             has_landed,
-            contact_interval_state.lane_status,
-        )
-        outcome = determine_interval_outcome(
-            *outcome_arguments, is_resting, self.max_events
+            interval_state.lane_status,
+            is_resting,
+            self.max_events,
         ).astype(jnp.int32)
         n_stepped = lane_state.n_stepped + has_landed
         has_ended = (outcome != Outcome.STEPPED) | (has_landed & (n_stepped >= self.n_steps))
         ended_lane_state = LaneState(
-            contact_interval_state,
-            step_counters,
-            step_details,
-            step_accumulators,
-            n_stepped,
-            outcome,
+            interval_state, step_counters, step_details, step_accumulators, n_stepped, outcome
         )
 
         # A landing of the foremost foot opens the next step. Then every event is processed.
-        begins_step, motion = (
-            has_landed & ~has_ended,
-            unpack_motion(contact_interval_state.contact_interval_point),
-        )
+        begins_step = has_landed & ~has_ended
         motion_at_step_start, contact_state_at_step_start = unpack_section_state(
-            s, pack_section_state(motion, contact_interval_state.contact_state)
+            s, pack_section_state(motion, interval_state.contact_state)
         )
         contact_state_at_step_start = contact_state_at_step_start._replace(
-            force_rate_signs=contact_interval_state.contact_state.force_rate_signs
+            force_rate_signs=interval_state.contact_state.force_rate_signs
         )
         motion, contact_state = select_trees_by_condition(
             begins_step,
             (motion_at_step_start, contact_state_at_step_start),
-            (motion, contact_interval_state.contact_state),
+            (motion, interval_state.contact_state),
         )
-        counters_after_event, *records_after_event = self._init_step_records(motion.x)
-        counters_after_event = counters_after_event._replace(
-            n_solver_steps=step_counters.n_solver_steps
-        )
+        initial_counters, *initial_records = self._init_step_records(motion.x)
+        initial_counters = initial_counters._replace(n_solver_steps=step_counters.n_solver_steps)
         step_counters, step_details, step_accumulators = select_trees_by_condition(
             begins_step,
-            (counters_after_event, *records_after_event),
+            (initial_counters, *initial_records),
             (step_counters, step_details, step_accumulators),
         )
-        guard_index = jnp.where(
-            begins_step,
-            guard_layout.first_landing_guard,
-            contact_interval_state.triggered_guard_index,
-        )
-        contact_law_arguments = (
+        guard_index = jnp.where(begins_step, guard_layout.first_landing_guard, guard_index)
+        contact_law = ContactLaw(
             s,
             friction,
-            self.step_options,
             self.has_one_sided_stoppers,
             self.is_detailed,
-        )
-        contact_law = make_contact_law(
-            *contact_law_arguments,
+            compute_rest_speed(s, self.step_options),
             self.extract_restitution(input_columns),
             self.extract_next_line_tilt(input_columns),
         )
-        event_law_arguments = guard_index, step_counters.n_events, self.max_events
         event_result, contact_event, event_outcome = process_event(
-            contact_law, guard_layout, motion, contact_state, *event_law_arguments
+            contact_law,
+            guard_layout,
+            motion,
+            contact_state,
+            guard_index,
+            step_counters.n_events,
+            self.max_events,
         )
         # At the extremum of a force, motion and contacts continue without change.
         n_contact_events: Any = 1
@@ -455,11 +405,10 @@ class BatchWalkSettings(NamedTuple):
                 )
             )
             event_outcome = jnp.where(is_contact_event, event_outcome, Outcome.STEPPED)
-            state_after_event = event_result.motion, event_result.contact_state
             motion_after, contact_state_after = select_trees_by_condition(
                 is_contact_event,
-                state_after_event,
-                (motion, contact_state.continue_with_same_contacts()),
+                (event_result.motion, event_result.contact_state),
+                (motion, ContactState.without_changes(*contact_state[:2])),
             )
             dynamics_after = self.make_lane_contact_dynamics(input_columns, contact_state_after)
             force_rate_signs = update_force_rate_signs(
@@ -474,31 +423,29 @@ class BatchWalkSettings(NamedTuple):
         )
         next_interval = self.begin_contact_interval(contact_mode_dynamics, event_result.motion)
         q, v = pack_coordinates(event_result.motion)
-        lane_status = jnp.where(
-            event_outcome != Outcome.STEPPED, event_outcome, next_interval.lane_status
-        )
         next_interval = next_interval._replace(
             contact_interval_point=next_interval.contact_interval_point._replace(q=q, v=v),
-            lane_status=lane_status,
+            lane_status=jnp.where(
+                event_outcome != Outcome.STEPPED, event_outcome, next_interval.lane_status
+            ),
         )
         if step_details is not None:
             step_details = record_event(
                 step_details, step_counters.n_events == 0, event_result, contact_event
             )
             zero_duration = jnp.zeros_like(motion.x)
-            step_details = record_end_stopper_force(
+            step_details = record_contact_interval(
                 step_details, contact_mode_dynamics, event_result.motion, zero_duration
             )
-        step_counters = step_counters._replace(n_events=step_counters.n_events + n_contact_events)
         continued_lane_state = LaneState(
             next_interval,
-            step_counters,
+            step_counters._replace(n_events=step_counters.n_events + n_contact_events),
             step_details,
             step_accumulators,
             n_stepped,
             lane_state.walk_outcome,
         )
-        has_interval_ended = (contact_interval_state.lane_status != LaneStatus.RUNNING) & (
+        has_interval_ended = (interval_state.lane_status != LaneStatus.RUNNING) & (
             lane_state.walk_outcome == STATUS_UNFINISHED
         )
         return select_trees_by_condition(
@@ -509,58 +456,47 @@ class BatchWalkSettings(NamedTuple):
 
     def compute_step_result(self, lane_state: LaneState, next_line_tilt: Array | None) -> Any:
         """Return the results of the last step of all batch elements, whose walks have ended."""
-        final_state = (
-            unpack_motion(lane_state.contact_interval_state.contact_interval_point),
-            lane_state.contact_interval_state.contact_state,
+        step_summary = self.summarize_step(lane_state, next_line_tilt)
+        if lane_state.step_details is None or lane_state.step_energy_loss_accumulators is None:
+            return step_summary
+        return make_unilateral_step(
+            step_summary,
+            lane_state.step_energy_loss_accumulators,
+            lane_state.step_counters,
+            lane_state.step_details,
+            lane_state.walk_outcome,
+            self.engine_name,
         )
-        outcome = lane_state.walk_outcome
-        if (
-            lane_state.step_details is not None
-            and lane_state.step_energy_loss_accumulators is not None
-        ):
-            accumulators = EnergyLossAccumulators(
-                jnp.zeros_like(lane_state.step_energy_loss_accumulators[0]),
-                *lane_state.step_energy_loss_accumulators,
-            )
-            return make_unilateral_step(
-                *final_state,
-                accumulators,
-                lane_state.step_counters,
-                lane_state.step_details,
-                outcome,
-                self.engine_name,
-                next_line_tilt,
-            )
-        return self.summarize_step(final_state, lane_state.step_counters, outcome, next_line_tilt)
 
     def summarize_step(
-        self,
-        final_state: tuple[WheelMotion, ContactState],
-        step_counters: GaitStepCounters,
-        outcome: Array,
-        next_line_tilt: Array | None,
+        self, lane_state: LaneState, next_line_tilt: Array | None
     ) -> GaitStepSummary:
-        """Return the section state, durations and length of a step that has ended."""
-        step_length = jnp.where(
-            outcome == Outcome.STEPPED, compute_landing_position(self.n_legs, final_state[0]), 0.0
+        """Return the section state, durations and length of a step that has ended.
+
+        If the step failed, section state and length are zero.
+        """
+        motion = unpack_motion(lane_state.contact_interval_state.contact_interval_point)
+        contact_state = lane_state.contact_interval_state.contact_state
+        section_state = pack_section_state(motion, contact_state, next_line_tilt)
+        zero_unless_stepped = lambda value: jnp.where(
+            lane_state.walk_outcome == Outcome.STEPPED, value, 0.0
         )
         return GaitStepSummary(
-            make_final_section_state(*final_state, outcome, next_line_tilt),
-            step_counters.durations,
-            step_length,
+            zero_unless_stepped(section_state),
+            lane_state.step_counters.durations,
+            zero_unless_stepped(compute_landing_position(motion)),
         )
 
     def replace_invalid_lanes(
         self, input_columns: Array, section_state: Array
     ) -> tuple[Array, Array, Array]:
         """Return inputs and section states with invalid elements replaced, and validity flags."""
-        start_arguments = (
+        is_valid, params, friction, section_state = replace_invalid_start(
             make_wheel_from_parameters(input_columns[:N_PARAMETERS], self.n_legs),
             input_columns[N_PARAMETERS],
             section_state,
             self.extract_next_line_tilt(input_columns),
         )
-        is_valid, params, friction, section_state = replace_invalid_start(*start_arguments)
         column_rows = [*stack_parameters(params), friction]
         if self.has_uneven_ground:
             previous_friction, next_line_tilt = input_columns[N_PARAMETERS + 1 : N_PARAMETERS + 3]
@@ -571,30 +507,6 @@ class BatchWalkSettings(NamedTuple):
         if self.has_restitution:
             column_rows.append(input_columns[-1])
         return jnp.stack(column_rows), section_state, is_valid
-
-    def deactivate_invalid_lanes(self, lane_state: LaneState, is_valid: Array) -> LaneState:
-        """Return the state with the outcome BAD_INPUT for invalid batch elements."""
-        return lane_state._replace(
-            walk_outcome=jnp.where(is_valid, lane_state.walk_outcome, Outcome.BAD_INPUT)
-        )
-
-
-def record_end_stopper_force(
-    step_details: UnilateralStepDetails,
-    contact_mode_dynamics: ContactModeDynamics,
-    motion: WheelMotion,
-    duration: Array,
-) -> UnilateralStepDetails:
-    """Return the step details updated with the stopper force at one end of an interval.
-
-    - `duration`: duration that is added to the entry for the present contact modes, s.
-    """
-    stopper_force = compute_min_stopper_force(
-        contact_mode_dynamics, compute_forces(contact_mode_dynamics, motion)
-    )
-    return record_contact_interval(
-        step_details, contact_mode_dynamics.slot_modes, duration, stopper_force
-    )
 
 
 def init_lane_states(
@@ -607,8 +519,9 @@ def init_lane_states(
     input_columns, section_state, is_valid = walk_settings.replace_invalid_lanes(
         input_columns, section_state
     )
-    return input_columns, walk_settings.deactivate_invalid_lanes(
-        walk_settings.begin_walk(input_columns, section_state), is_valid
+    lane_state = walk_settings.begin_walk(input_columns, section_state)
+    return input_columns, lane_state._replace(
+        walk_outcome=jnp.where(is_valid, lane_state.walk_outcome, Outcome.BAD_INPUT)
     )
 
 
@@ -623,33 +536,26 @@ def process_and_integrate(
     - `waits_for_events`: whether every element is integrated to its next event.
     """
     state_after_events = walk_settings.process_events(input_columns, lane_state)
-    tableau = walk_settings.tableau
-    if tableau is None:
-        contact_interval_state = integrate_by_diffrax(
+    interval_state = state_after_events.contact_interval_state
+    if walk_settings.tableau is None:
+        interval_state = integrate_by_diffrax(
             walk_settings.make_lane_contact_dynamics,
             input_columns,
-            state_after_events.contact_interval_state,
+            interval_state,
             walk_settings.step_options,
         )
-        return state_after_events, state_after_events._replace(
-            contact_interval_state=contact_interval_state
+    else:
+        has_unfinished_walk = state_after_events.walk_outcome == STATUS_UNFINISHED
+        contact_state = interval_state.contact_state
+        interval_state = integrate_contact_interval(
+            lambda columns: walk_settings.make_lane_contact_dynamics(columns, contact_state),
+            input_columns,
+            interval_state,
+            has_unfinished_walk & (not waits_for_events),
+            walk_settings.step_options,
+            walk_settings.tableau,
         )
-    has_unfinished_walk = state_after_events.walk_outcome == STATUS_UNFINISHED
-    make_contact_dynamics = lambda input_columns_at: walk_settings.make_lane_contact_dynamics(
-        input_columns_at, state_after_events.contact_interval_state.contact_state
-    )
-    has_unfinished_walk = has_unfinished_walk & (not waits_for_events)
-    contact_interval_state = integrate_contact_interval(
-        make_contact_dynamics,
-        input_columns,
-        state_after_events.contact_interval_state,
-        has_unfinished_walk,
-        walk_settings.step_options,
-        tableau,
-    )
-    return state_after_events, state_after_events._replace(
-        contact_interval_state=contact_interval_state
-    )
+    return state_after_events, state_after_events._replace(contact_interval_state=interval_state)
 
 
 def run_walks(

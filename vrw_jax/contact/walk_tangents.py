@@ -19,7 +19,6 @@ from jaxtyping import Array
 
 from vrw_jax.contact.batch_integrator import (
     N_ACCUMULATOR_ROWS,
-    ContactIntervalPoint,
     ContactIntervalState,
     DynamicsFn,
     LaneStatus,
@@ -27,7 +26,7 @@ from vrw_jax.contact.batch_integrator import (
     complete_solver_step,
     compute_stage_state,
     evaluate_dynamics,
-    evaluate_guards_at_point,
+    evaluate_guards_of_coordinates,
     iterate_until_stopped,
 )
 from vrw_jax.contact.contact_state import ContactModeDynamics, compute_guard_scales
@@ -37,6 +36,7 @@ from vrw_jax.contact.walk_kernel import (
     BatchWalkSettings,
     DifferentiableLaneState,
     LaneState,
+    init_lane_states,
 )
 from vrw_jax.integrator import ButcherTableau, compute_real_stability_limit
 from vrw_jax.numerics import StepOptions, run_if_any_element_active, select_trees_by_condition
@@ -44,69 +44,32 @@ from vrw_jax.wheel import ContactMode, compute_wheel_units
 
 
 class _IntervalTangent(NamedTuple):
-    """Tangent of the state of each batch element during an interval."""
+    """Tangent of the state of each batch element during an interval.
 
+    After the first field, the fields are the first fields of `DifferentiableLaneState`.
+    """
+
+    dynamics_rows: Array  # tangents of accelerations and, if requested, accumulator rates
     q: Array
     v: Array
     interval_accumulators: Array | None
-    dynamics_rows: Array  # tangents of accelerations and, if requested, accumulator rates
     time_since_event: Array  # tangent of the time, s
 
 
-class _LaneTangent(NamedTuple):
-    """Tangent of the differentiable state of each batch element."""
-
-    interval_tangent: _IntervalTangent
-    other_tangents: DifferentiableLaneState  # tangents of what is not in the interval
-
-    @classmethod
-    def from_lane_tangents(
-        cls, lane_tangents: DifferentiableLaneState, dynamics_rows: Array
-    ) -> "_LaneTangent":
-        """Return the tangent from tangents of the differentiable state and of the dynamics rows.
-
-        The dynamics rows are accelerations and, if requested, accumulator rates.
-        """
-        accumulators, interval_accumulators = lane_tangents.energy_loss_accumulators
-        other_tangents: Any = lane_tangents._asdict() | {
-            "q": None,
-            "v": None,
-            "energy_loss_accumulators": (accumulators, None),
-            "time_since_event": None,
-        }
-        return cls(
-            _IntervalTangent(
-                lane_tangents.q,
-                lane_tangents.v,
-                interval_accumulators,
-                dynamics_rows,
-                lane_tangents.time_since_event,
-            ),
-            DifferentiableLaneState(**other_tangents),
-        )
-
-    def convert_to_lane_tangents(self) -> DifferentiableLaneState:
-        """Return the tangent of the differentiable state of each batch element."""
-        q, v, interval_accumulators, _, time = self.interval_tangent
-        return self.other_tangents._replace(
-            q=q,
-            v=v,
-            energy_loss_accumulators=(
-                self.other_tangents.energy_loss_accumulators[0],
-                interval_accumulators,
-            ),
-            time_since_event=time,
-        )
-
-
 class TangentBatch(NamedTuple):
-    """Tangents of all batch elements; the first axis contains tangents, the last the batch."""
+    """Tangents of the input columns of all batch elements, and functions of all tangents.
+
+    The first axis of an array contains tangents, and the last axis the batch. Arrays of *tangent
+    rows* contain the tangents of the dynamics rows and of the `DifferentiableLaneState`.
+    """
 
     n_tangents: Array  # number of tangents of each batch element
     n_column_tangents: Array  # number of leading tangents whose columns may vary
-    column_tangents: Array
-    # all numbers of a `_LaneTangent`, see `_pack_tree_into_rows`, (tangents, rows, batch)
-    tangent_rows: Array
+    column_tangents: Array  # tangents of the input columns
+
+    def get_input_tangent(self, k: Array) -> Array:
+        """Return the tangent of the input columns with index `k`."""
+        return lax.dynamic_index_in_dim(self.column_tangents, k, 0, keepdims=False)
 
     def allocate_tangent_rows(self, n_rows: int) -> Array:
         """Return an uninitialized array for all tangents, (tangents, n_rows, batch)."""
@@ -147,20 +110,17 @@ class TangentBatch(NamedTuple):
 def _pack_tree_into_rows(array_tree: Any) -> Array:
     """Return all arrays of a tree, concatenated to one array (rows, batch)."""
     return jnp.concatenate(
-        [
-            section_state.reshape(-1, section_state.shape[-1])
-            for section_state in jax.tree.leaves(array_tree)
-        ]
+        [leaf.reshape(-1, leaf.shape[-1]) for leaf in jax.tree.leaves(array_tree)]
     )
 
 
-def _unpack_tree_from_rows(tangent_rows: Array, tangent_template: Any) -> Any:
-    """Return the rows of an array as a tree with the structure of `tangent_template`.
+def _unpack_tree_from_rows(tangent_rows: Array, tangent_template: Any, first_row: int = 0) -> Any:
+    """Return the rows from `first_row` onward as a tree with the structure of `tangent_template`.
 
     The function is the inverse of `_pack_tree_into_rows`.
     """
     leaves, tree_structure = jax.tree.flatten(tangent_template)
-    arrays, row_offset = [], 0
+    arrays, row_offset = [], first_row
     for leaf in leaves:
         n_leaf_rows = math.prod(leaf.shape[:-1])
         leaf_rows = tangent_rows[..., row_offset : row_offset + n_leaf_rows, :]
@@ -169,10 +129,12 @@ def _unpack_tree_from_rows(tangent_rows: Array, tangent_template: Any) -> Any:
     return jax.tree.unflatten(tree_structure, arrays)
 
 
-def _unpack_tangent(tangent_rows: Array, k: Array, tangent_template: Any) -> Any:
+def _unpack_tangent(
+    tangent_rows: Array, k: Array, tangent_template: Any, first_row: int = 0
+) -> Any:
     """Return the tangent with index `k` as a tree with the structure of `tangent_template`."""
     return _unpack_tree_from_rows(
-        lax.dynamic_index_in_dim(tangent_rows, k, 0, False), tangent_template
+        lax.dynamic_index_in_dim(tangent_rows, k, 0, False), tangent_template, first_row
     )
 
 
@@ -194,52 +156,40 @@ def walk_with_tangents(
     """
     tableau = walk_settings.tableau
     assert tableau is not None  # diffrax differentiates in another way.
-    input_columns, section_state, is_valid = walk_settings.replace_invalid_lanes(
-        input_columns, section_state
-    )
     count_rows = lambda array_tree: len(_pack_tree_into_rows(array_tree))
 
     def begin_walk(
         input_columns: Array, section_state: Array
-    ) -> tuple[DifferentiableLaneState, LaneState]:
-        lane_state = walk_settings.deactivate_invalid_lanes(
-            walk_settings.begin_walk(input_columns, section_state), is_valid
-        )
-        return lane_state.get_differentiable_state(), lane_state
+    ) -> tuple[DifferentiableLaneState, tuple[Array, LaneState]]:
+        input_columns, lane_state = init_lane_states(walk_settings, input_columns, section_state)
+        return lane_state.get_differentiable_state(), (input_columns, lane_state)
 
-    lane_tangents, pushforward, lane_state = jax.linearize(
+    tangent_template, pushforward, (input_columns, lane_state) = jax.linearize(
         begin_walk, input_columns, section_state, has_aux=True
     )
-    dynamics_rows = jnp.zeros(
-        (len(lane_tangents.q) + N_ACCUMULATOR_ROWS * walk_settings.is_detailed, *n_tangents.shape),
-        section_state.dtype,
-    )
-    tangent_template = _LaneTangent.from_lane_tangents(lane_tangents, dynamics_rows)
+    n_dynamics_rows = len(tangent_template.q) + N_ACCUMULATOR_ROWS * walk_settings.is_detailed
+    zero_dynamics_rows = jnp.zeros((n_dynamics_rows, *n_tangents.shape), section_state.dtype)
+    interval_template = _IntervalTangent(zero_dynamics_rows, *tangent_template[:4])
     n_column_tangents = jnp.zeros_like(n_tangents)
     for k in range(len(input_column_tangents)):
         n_column_tangents = jnp.where(
             jnp.any(input_column_tangents[k] != 0.0, axis=0), k + 1, n_column_tangents
         )
-    tangents = TangentBatch(
-        n_tangents, n_column_tangents, input_column_tangents, input_column_tangents
-    )
-    make_start_tangent = lambda k, _: _LaneTangent.from_lane_tangents(
+    tangents = TangentBatch(n_tangents, n_column_tangents, input_column_tangents)
+    push_start_tangent = lambda k, _: (
+        zero_dynamics_rows,
         pushforward(
-            _unpack_tangent(input_column_tangents, k, input_columns),
-            _unpack_tangent(section_state_tangents, k, section_state),
+            tangents.get_input_tangent(k),
+            lax.dynamic_index_in_dim(section_state_tangents, k, 0, keepdims=False),
         ),
-        dynamics_rows,
     )
-    tangents = tangents._replace(
-        tangent_rows=tangents.map_tangents_sequentially(
-            make_start_tangent, tangents.allocate_tangent_rows(count_rows(tangent_template))
-        )
+    n_rows = n_dynamics_rows + count_rows(tangent_template)
+    tangent_rows = tangents.map_tangents_sequentially(
+        push_start_tangent, tangents.allocate_tangent_rows(n_rows)
     )
 
-    def process_and_integrate(
-        state: tuple[LaneState, TangentBatch],
-    ) -> tuple[LaneState, TangentBatch]:
-        lane_state, tangents = state
+    def process_and_integrate(state: tuple[LaneState, Array]) -> tuple[LaneState, Array]:
+        lane_state, tangent_rows = state
 
         def process_events_from(
             input_columns: Array, differentiable: DifferentiableLaneState
@@ -253,43 +203,31 @@ def walk_with_tangents(
             process_events_from, input_columns, lane_state.get_differentiable_state(), has_aux=True
         )
 
-        def push_tangents_through_event(k: Array, tangent_row: Array) -> _LaneTangent:
-            tangent = _unpack_tree_from_rows(tangent_row, tangent_template)
-            return _LaneTangent.from_lane_tangents(
-                pushforward(
-                    _unpack_tangent(input_column_tangents, k, input_columns),
-                    tangent.convert_to_lane_tangents(),
-                ),
-                tangent.interval_tangent.dynamics_rows,
-            )
-
-        tangents = tangents._replace(
-            tangent_rows=tangents.map_tangents_sequentially(
-                push_tangents_through_event, tangents.tangent_rows
-            )
+        push_event_tangent = lambda k, tangent_row: pushforward(
+            tangents.get_input_tangent(k),
+            _unpack_tree_from_rows(tangent_row, tangent_template, n_dynamics_rows),
+        )
+        tangent_rows = tangents.map_tangents_sequentially(
+            push_event_tangent, tangent_rows, n_dynamics_rows
         )
         is_unfinished = next_state.walk_outcome == STATUS_UNFINISHED
-        make_contact_dynamics = lambda c: walk_settings.make_lane_contact_dynamics(
-            c, next_state.contact_interval_state.contact_state
-        )
-        integration_arguments = (
-            make_contact_dynamics,
+        contact_state = next_state.contact_interval_state.contact_state
+        interval_state, tangent_rows = _integrate_with_tangents(
+            lambda columns: walk_settings.make_lane_contact_dynamics(columns, contact_state),
             input_columns,
             next_state.contact_interval_state,
             tangents,
-            tangent_template.interval_tangent,
+            tangent_rows,
+            interval_template,
             is_unfinished,
             walk_settings.step_options,
             tableau,
         )
-        contact_interval_state, tangent_rows = _integrate_with_tangents(*integration_arguments)
-        return next_state._replace(
-            contact_interval_state=contact_interval_state
-        ), tangents._replace(tangent_rows=tangent_rows)
+        return next_state._replace(contact_interval_state=interval_state), tangent_rows
 
     should_continue = lambda state: jnp.any(state[0].walk_outcome == STATUS_UNFINISHED)
-    lane_state, tangents = lax.while_loop(
-        should_continue, process_and_integrate, (lane_state, tangents)
+    lane_state, tangent_rows = lax.while_loop(
+        should_continue, process_and_integrate, (lane_state, tangent_rows)
     )
 
     def partition_step_result(
@@ -308,12 +246,9 @@ def walk_with_tangents(
         walk_settings.extract_next_line_tilt(input_columns),
         has_aux=True,
     )
-    tilt_tangent = lambda k: walk_settings.extract_next_line_tilt(
-        _unpack_tangent(input_column_tangents, k, input_columns)
-    )
     push_result_tangent = lambda k, _: pushforward(
-        _unpack_tangent(tangents.tangent_rows, k, tangent_template).convert_to_lane_tangents(),
-        tilt_tangent(k),
+        _unpack_tangent(tangent_rows, k, tangent_template, n_dynamics_rows),
+        walk_settings.extract_next_line_tilt(tangents.get_input_tangent(k)),
     )
     result_tangents = tangents.map_tangents_sequentially(
         push_result_tangent, tangents.allocate_tangent_rows(count_rows(float_leaves))
@@ -333,6 +268,7 @@ def _integrate_with_tangents(
     input_columns: Array,
     initial_state: ContactIntervalState,
     tangents: TangentBatch,
+    start_tangent_rows: Array,
     tangent_template: _IntervalTangent,
     has_unfinished_walk: Array,
     options: StepOptions,
@@ -343,10 +279,8 @@ def _integrate_with_tangents(
     The tangents have the shape (tangents, rows, batch).
     """
     contact_mode_dynamics = make_contact_dynamics(input_columns)
-    guard_scales, last_stage = (
-        compute_guard_scales(contact_mode_dynamics),
-        len(tableau.stage_nodes) - 1,
-    )
+    guard_scales = compute_guard_scales(contact_mode_dynamics)
+    last_stage = len(tableau.stage_nodes) - 1
     options = compute_wheel_units(contact_mode_dynamics.s).scale_times_to_seconds(options)
     max_stable_step_size = _compute_max_stable_step_size(contact_mode_dynamics, tableau)
 
@@ -364,7 +298,8 @@ def _integrate_with_tangents(
             make_contact_dynamics,
             input_columns,
             contact_interval_state,
-            tangents._replace(tangent_rows=tangent_rows),
+            tangents,
+            tangent_rows,
             tangent_template,
             tableau,
         )
@@ -397,10 +332,10 @@ def _integrate_with_tangents(
                     weights[j] * stage_tangents[j, n:] for j in range(last_stage)
                 )
             end_tangent = _IntervalTangent(
+                stage_tangents[last_stage],
                 q,
                 v,
                 interval_accumulators,
-                stage_tangents[last_stage],
                 start_tangent.time_since_event,
             )
             return select_trees_by_condition(
@@ -413,7 +348,7 @@ def _integrate_with_tangents(
 
     is_running = lambda state: state[0].lane_status == LaneStatus.RUNNING
     contact_interval_state, tangent_rows = iterate_until_stopped(
-        is_running, has_unfinished_walk, try_solver_step, (initial_state, tangents.tangent_rows)
+        is_running, has_unfinished_walk, try_solver_step, (initial_state, start_tangent_rows)
     )
     return contact_interval_state, tangents.map_tangents_sequentially(
         _make_event_shift(
@@ -433,6 +368,7 @@ def _evaluate_solver_stages(
     input_columns: Array,
     contact_interval_state: ContactIntervalState,
     tangents: TangentBatch,
+    tangent_rows: Array,
     tangent_template: _IntervalTangent,
     tableau: ButcherTableau,
 ) -> tuple[Array, Array]:
@@ -441,10 +377,8 @@ def _evaluate_solver_stages(
     The dynamics rows are accelerations, contact quantities and, if requested, accumulator rates.
     The tangents are computed one after another.
     """
-    contact_interval_point, h = (
-        contact_interval_state.contact_interval_point,
-        contact_interval_state.h,
-    )
+    contact_interval_point = contact_interval_state.contact_interval_point
+    h = contact_interval_state.h
     n_dynamics_rows, last_stage = len(tangent_template.dynamics_rows), len(tableau.stage_nodes) - 1
     is_at_interval_start = (contact_interval_state.lane_status == LaneStatus.RUNNING) & (
         contact_interval_state.time_since_event == 0.0
@@ -475,12 +409,12 @@ def _evaluate_solver_stages(
         )
 
         def propagate_tangent(k: Array, previous_stage_rows: Array) -> Array:
-            tangent = _unpack_tangent(tangents.tangent_rows, k, tangent_template)
+            tangent = _unpack_tangent(tangent_rows, k, tangent_template)
             previous_rows = previous_stage_rows.reshape(-1, *tangent_template.dynamics_rows.shape)
             coordinate_tangents = _propagate_stage_coordinates(
                 tableau, i, tangent, previous_rows, h
             )
-            input_tangent = _unpack_tangent(tangents.column_tangents, k, input_columns)
+            input_tangent = tangents.get_input_tangent(k)
             has_input_tangent = jnp.any(k < tangents.n_column_tangents)
             row_tangent = run_if_any_element_active(
                 ~has_input_tangent,
@@ -509,7 +443,7 @@ def _evaluate_solver_stages(
     later_stage_rows = jnp.zeros((last_stage, *contact_interval_point.dynamics_rows.shape), h.dtype)
     stage_rows = jnp.concatenate([contact_interval_point.dynamics_rows[None], later_stage_rows])
     stage_row_tangents = tangents.map_tangents_sequentially(
-        lambda k, _: _unpack_tangent(tangents.tangent_rows, k, tangent_template).dynamics_rows,
+        lambda k, _: _unpack_tangent(tangent_rows, k, tangent_template).dynamics_rows,
         tangents.allocate_tangent_rows((last_stage + 1) * n_dynamics_rows),
     )
     # The first stage is the last stage of the previous step, except after an event.
@@ -586,28 +520,17 @@ def _make_event_shift(
 
     The time of a force extremum is constant for tangents, because the force is stationary there.
     """
-    contact_interval_point, n = (
-        contact_interval_state.contact_interval_point,
-        len(contact_interval_state.contact_interval_point.q),
-    )
+    end_q, end_v, end_rows = contact_interval_state.contact_interval_point
+    end_accelerations = end_rows[: len(end_q)]
 
     def compute_guards(input_columns: Array, q: Array, v: Array) -> Array:
         contact_mode_dynamics = make_contact_dynamics(input_columns)
         contact_state = contact_mode_dynamics.contact_state._replace(force_rate_signs=None)
         contact_mode_dynamics = contact_mode_dynamics._replace(contact_state=contact_state)
-        return evaluate_guards_at_point(
-            contact_mode_dynamics,
-            ContactIntervalPoint(q, v, evaluate_dynamics(contact_mode_dynamics, q, v)),
-        )
+        return evaluate_guards_of_coordinates(contact_mode_dynamics, q, v)
 
-    _, guard_pushforward = jax.linearize(
-        compute_guards, input_columns, contact_interval_point.q, contact_interval_point.v
-    )
-    guard_rates = guard_pushforward(
-        jnp.zeros_like(input_columns),
-        contact_interval_point.v,
-        contact_interval_point.dynamics_rows[:n],
-    )
+    _, guard_pushforward = jax.linearize(compute_guards, input_columns, end_q, end_v)
+    guard_rates = guard_pushforward(jnp.zeros_like(input_columns), end_v, end_accelerations)
     has_reached_event = (initial_state.lane_status == LaneStatus.RUNNING) & (
         contact_interval_state.lane_status == LaneStatus.EVENT
     )
@@ -615,9 +538,7 @@ def _make_event_shift(
     def shift_tangent_to_event(k: Array, tangent_row: Array) -> _IntervalTangent:
         tangent = _unpack_tree_from_rows(tangent_row, tangent_template)
         time_tangent = jnp.zeros_like(contact_interval_state.time_since_event)
-        guard_tangents = guard_pushforward(
-            _unpack_tangent(tangents.column_tangents, k, input_columns), tangent.q, tangent.v
-        )
+        guard_tangents = guard_pushforward(tangents.get_input_tangent(k), tangent.q, tangent.v)
         for guard_index in range(len(guard_tangents)):
             is_at_guard = (
                 has_reached_event
@@ -633,14 +554,12 @@ def _make_event_shift(
         interval_accumulators = tangent.interval_accumulators
         if interval_accumulators is not None:
             interval_accumulators = (
-                interval_accumulators
-                + time_tangent * contact_interval_point.dynamics_rows[-N_ACCUMULATOR_ROWS:]
+                interval_accumulators + time_tangent * end_rows[-N_ACCUMULATOR_ROWS:]
             )
-        return _IntervalTangent(
-            q=tangent.q + time_tangent * contact_interval_point.v,
-            v=tangent.v + time_tangent * contact_interval_point.dynamics_rows[:n],
+        return tangent._replace(
+            q=tangent.q + time_tangent * end_v,
+            v=tangent.v + time_tangent * end_accelerations,
             interval_accumulators=interval_accumulators,
-            dynamics_rows=tangent.dynamics_rows,
             time_since_event=time_tangent,
         )
 
