@@ -3,11 +3,11 @@ each model.
 """
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
@@ -19,7 +19,6 @@ from vrw_jax.branches.continuation_problems import (
     ContactGaitProblem,
     ReturnMapProblem,
 )
-from vrw_jax.collocation import CollocationSolution
 from vrw_jax.continuation import ContinuationPoint
 from vrw_jax.cycles import (
     CycleOptions,
@@ -54,47 +53,38 @@ class BranchStart(NamedTuple):
     wheels: BranchWheel
     start_unknowns: Any
     start_outcomes: np.ndarray  # outcomes of the first gaits
-    make_cycle_finder: CycleFinderFactory
+    make_cycle_finder: CycleFinderFactory | None = None  # None if no finder is known
     start_cycles: Any = None  # the first gaits
     # None for a problem without a mesh
     finer_cycle_options: CycleOptions | None = None
 
 
-@dataclasses.dataclass(frozen=True)
-class LimitCycleFinder:
-    """Function without arguments that finds the gait at a special point. It can be pickled.
+def find_special_cycle(
+    gait_finder: Any,
+    model: AbstractWheel,
+    parameter_name: str,
+    start_params: WheelParams,
+    start_cycle: LimitCycle,
+    point_beside_special_point: ContinuationPoint,
+) -> LimitCycle:
+    """Find the limit cycle at a special point, from the collocation solution at the point next to
+    it.
 
     - `gait_finder`, `model`: finder and model of the branch's gaits;
     - `parameter_name`: name of the continued parameter;
-    - `start_params`, `start_cycle`: wheel and gait at the start of the branch;
-    - `solution_beside_point`, `parameter_value_beside_point`: collocation solution and parameter
-      value at the point next to the special point.
+    - `start_params`, `start_cycle`: wheel and gait at the start of the branch.
     """
-
-    gait_finder: Any
-    model: AbstractWheel
-    parameter_name: str
-    start_params: WheelParams
-    start_cycle: LimitCycle
-    solution_beside_point: CollocationSolution
-    parameter_value_beside_point: Any
-
-    def __call__(self) -> LimitCycle:
-        """Find the limit cycle at the special point."""
-        params, guess_cycle = jax.device_put((self.start_params, self.start_cycle))
-        collocation_state = guess_cycle.collocation_state._replace(
-            solution=jax.tree.map(jnp.asarray, self.solution_beside_point)
-        )
-        guess_cycle = dataclasses.replace(
-            guess_cycle,
-            collocation_state=collocation_state,
-            system=self.gait_finder.collocation_system,
-        )
-        _, params = self.model.with_parameter(
-            params, self.parameter_name, jnp.asarray(self.parameter_value_beside_point)
-        )
-        limit_cycle: LimitCycle = self.gait_finder.find_cycle(params, guess_cycle)
-        return limit_cycle
+    params, guess_cycle, branch_point = jax.device_put(
+        (start_params, start_cycle, point_beside_special_point)
+    )
+    guess_cycle = dataclasses.replace(
+        guess_cycle,
+        collocation_state=guess_cycle.collocation_state._replace(solution=branch_point.z),
+        system=gait_finder.collocation_system,
+    )
+    _, params = model.with_parameter(params, parameter_name, branch_point.p)
+    limit_cycle: LimitCycle = gait_finder.find_cycle(params, guess_cycle)
+    return limit_cycle
 
 
 def find_collocation_starts(branch_request: BranchRequest, known_start_cycle: Any) -> BranchStart:
@@ -132,16 +122,19 @@ def find_collocation_starts(branch_request: BranchRequest, known_start_cycle: An
     )
     collocation_system = gait_finder.collocation_system
 
-    def make_cycle_finder(wheel_index: int, branch_point: ContinuationPoint) -> LimitCycleFinder:
-        start_cycle_of_wheel, start_params = select_tree_rows((start_cycle, params), wheel_index)
-        return LimitCycleFinder(
+    def make_cycle_finder(
+        wheel_index: int, branch_point: ContinuationPoint
+    ) -> Callable[[], LimitCycle]:
+        start_params, start_cycle_of_wheel = select_tree_rows((params, start_cycle), wheel_index)
+        # A partial call can be pickled.
+        return functools.partial(
+            find_special_cycle,
             gait_finder,
             branch_request.model,
             parameter_name,
             start_params,
             start_cycle_of_wheel,
-            branch_point.z,
-            branch_point.p,
+            branch_point,
         )
 
     return BranchStart(
@@ -192,15 +185,8 @@ def find_return_map_starts(branch_request: BranchRequest, known_start_cycle: Any
         period_n=branch_request.period_n,
         n_coordinates=model.count_continuous_section_entries(params),
     )
-    is_phase_active = jnp.ones(
-        (*branch_request.parameter_values.shape, 1, 1), branch_request.parameter_values.dtype
-    )
     return BranchStart(
-        return_map_problem,
-        BranchWheel(params, is_phase_active),
-        section_states,
-        np.asarray(outcomes),
-        lambda wheel_index, branch_point: None,
+        return_map_problem, BranchWheel(params), section_states, np.asarray(outcomes)
     )
 
 
@@ -216,12 +202,7 @@ def find_contact_gait_starts(branch_request: BranchRequest, start_cycle: Any) ->
     )
     if not gait_finder.is_multistable:  # The model has no batched engine.
         return find_return_map_starts(branch_request, start_cycle)
-    wheels = BranchWheel(
-        params,
-        jnp.ones(
-            (*branch_request.parameter_values.shape, 1, 1), branch_request.parameter_values.dtype
-        ),
-    )
+    wheels = BranchWheel(params)
     contact_gait_problem = ContactGaitProblem(
         model=model,
         step_options=step_options,
@@ -238,14 +219,8 @@ def find_contact_gait_starts(branch_request: BranchRequest, start_cycle: Any) ->
         start_cycle = gait_finder.find_cycles_near(
             parameter_values, gait_finder.make_initial_guesses(parameter_values)
         )
-
-    outcomes = np.asarray(start_cycle.outcome)
     return BranchStart(
-        contact_gait_problem,
-        wheels,
-        start_cycle.section_state,
-        outcomes,
-        lambda wheel_index, branch_point: None,
+        contact_gait_problem, wheels, start_cycle.section_state, np.asarray(start_cycle.outcome)
     )
 
 

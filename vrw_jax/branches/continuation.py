@@ -24,9 +24,9 @@ from vrw_jax.branches.branch_location import (
     QuantitiesByName,
     continue_and_locate_special_points,
 )
+from vrw_jax.branches.branch_points import SECOND_PEAK_RATE_NAME
 from vrw_jax.branches.branch_starts import START_FUNCTION_BY_METHOD, BranchRequest
 from vrw_jax.branches.continuation_problems import FRICTION_SURPLUS_COLUMN_NAME, BranchWheel
-from vrw_jax.branches.multiplicity import SECOND_PEAK_RATE_NAME
 from vrw_jax.continuation import (
     ArclengthOptions,
     ContinuationPoint,
@@ -43,7 +43,6 @@ from vrw_jax.cycles import (
 )
 from vrw_jax.measures import (
     FORCE_PEAK_MEASURES,
-    LIMIT_CYCLE_MEASURES,
     MARGIN_MEASURES,
     STEP_MEASURES,
     UNILATERAL_STEP_MEASURES,
@@ -106,8 +105,8 @@ class GaitContinuationOptions:
     max_mesh_refinements: int = 3
 
 
-DEFAULT_GAIT_CONTINUATION_OPTIONS = GaitContinuationOptions()
-"""Default options for the continuation of gaits."""
+GAIT_CONTINUATION_OPTIONS = GaitContinuationOptions()
+"""Options for the continuation of all gaits."""
 
 
 @dataclass(frozen=True)
@@ -117,7 +116,6 @@ class GaitContinuation(AbstractContinuation):
     model: AbstractWheel
     step_options: StepOptions
     n_legs: int
-    continuation_options: GaitContinuationOptions = DEFAULT_GAIT_CONTINUATION_OPTIONS
 
     branch_ending_quantities: ClassVar[tuple[str, ...]] = (
         *BRANCH_ENDING_QUANTITIES,
@@ -152,10 +150,9 @@ class GaitContinuation(AbstractContinuation):
         )
         for measure_name, margin_measure in MARGIN_MEASURES.items():
             if margin_measure.leg_dimension and measure_name in quantity_table:
-                leg_positions = enumerate(range(3, self.n_legs + 1))
                 quantity_table |= {
-                    f"{measure_name}[{leg_number}]": quantity_table[measure_name][:, leg_position]
-                    for leg_position, leg_number in leg_positions
+                    f"{measure_name}[{leg_number}]": quantity_table[measure_name][:, leg_number - 3]
+                    for leg_number in range(3, self.n_legs + 1)
                 }
         return quantity_table
 
@@ -165,7 +162,7 @@ class GaitContinuation(AbstractContinuation):
         """Return whether period and step length are about equal before and after each jump."""
         is_measure_similar = super().is_same_gait(table_before, table_after)
         for measure_name in ("period", "step_length"):
-            max_measure_change = self.continuation_options.max_measure_change_at_jump * np.abs(
+            max_measure_change = GAIT_CONTINUATION_OPTIONS.max_measure_change_at_jump * np.abs(
                 table_before[measure_name]
             )
             is_measure_similar &= (
@@ -386,7 +383,6 @@ def _continue_gait_branches(
     arclength_options: ArclengthOptions,
     parameter_bounds: np.ndarray,
     n_wheels: int,
-    continuation_options: GaitContinuationOptions = DEFAULT_GAIT_CONTINUATION_OPTIONS,
 ) -> tuple[np.ndarray, list[BranchData | None]]:
     """Continue the branches of the first `n_wheels` wheels from their start gaits.
 
@@ -395,7 +391,8 @@ def _continue_gait_branches(
     limits no branch.
     """
     can_refine_mesh = branch_request.cycle_options is None
-    for refinement_index in range(1 + continuation_options.max_mesh_refinements):
+    max_mesh_refinements = GAIT_CONTINUATION_OPTIONS.max_mesh_refinements
+    for refinement_index in range(1 + max_mesh_refinements):
         branch_start = START_FUNCTION_BY_METHOD[branch_request.model.capabilities.gait_method](
             branch_request, start_cycle
         )
@@ -407,14 +404,13 @@ def _continue_gait_branches(
             branch_request.model,
             branch_request.step_options,
             branch_request.params.n_legs,
-            continuation_options,
         )
         has_branch_start = branch_start.start_outcomes == Outcome.STEPPED
         has_branch_start &= np.arange(len(has_branch_start)) < n_wheels
         is_finest_mesh = (
             not can_refine_mesh
             or branch_start.finer_cycle_options is None
-            or refinement_index == continuation_options.max_mesh_refinements
+            or refinement_index == max_mesh_refinements
         )
         branch_data_by_wheel = continue_and_locate_special_points(
             branch_continuation,
@@ -474,19 +470,13 @@ def _make_labeled_gait_branch(
             coords={parameter_name: ("point", np.zeros(0))}, attrs=branch_attrs
         )
         return Branch(parameter_name, empty_dataset, (), ("", ""), branch_outcome)
-    measure_names = (
-        measure_name
-        for measure_name in STEP_MEASURES
-        | MARGIN_MEASURES
-        | UNILATERAL_STEP_MEASURES
-        | FORCE_PEAK_MEASURES
-        if measure_name not in MEASURES_OUTSIDE_BRANCHES
-    )
+    measures = STEP_MEASURES | MARGIN_MEASURES | UNILATERAL_STEP_MEASURES | FORCE_PEAK_MEASURES
     branch_variables = make_labeled_variables(
         {
-            variable_name: branch_data.quantity_table[variable_name]
-            for variable_name in measure_names
-            if variable_name in branch_data.quantity_table
+            measure_name: branch_data.quantity_table[measure_name]
+            for measure_name in measures
+            if measure_name in branch_data.quantity_table
+            and measure_name not in MEASURES_OUTSIDE_BRANCHES
         },
         "point",
     )
@@ -539,30 +529,19 @@ def _make_stability_variables(return_map_jacobians: np.ndarray) -> dict[str, xr.
         floquet_multipliers, (batch_sizes.POINT_BATCH_SIZE,), return_map_jacobians
     )
     spectral_radius = np.max(np.abs(multiplier_values), -1)
-    multiplier_parts = {
-        "multiplier_real": multiplier_values.real,
-        "multiplier_imag": multiplier_values.imag,
+    multiplier_parts = (
+        ("multiplier_real", multiplier_values.real, "real part of a multiplier"),
+        ("multiplier_imag", multiplier_values.imag, "imaginary part"),
+    )
+    multiplier_variables = {
+        variable_name: xr.Variable(
+            ("point", "multiplier"), multiplier_part, {"units": "1", "long_name": long_name}
+        )
+        for variable_name, multiplier_part, long_name in multiplier_parts
     }
-    return {
-        **{
-            variable_name: xr.Variable(
-                ("point", "multiplier"), multiplier_part, {"units": "1", "long_name": long_name}
-            )
-            for (variable_name, multiplier_part), long_name in zip(
-                multiplier_parts.items(),
-                ("real part of a multiplier", "imaginary part"),
-                strict=True,
-            )
-        },
-        "spectral_radius": xr.Variable(
-            "point", spectral_radius, LIMIT_CYCLE_MEASURES["spectral_radius"].variable_attributes
-        ),
-        "spectral_margin": xr.Variable(
-            "point",
-            1.0 - spectral_radius,
-            LIMIT_CYCLE_MEASURES["spectral_margin"].variable_attributes,
-        ),
-    }
+    return multiplier_variables | make_labeled_variables(
+        {"spectral_radius": spectral_radius, "spectral_margin": 1.0 - spectral_radius}, "point"
+    )
 
 
 class MapContinuation(AbstractContinuation):
@@ -639,7 +618,6 @@ def continue_map(
         add_batch_axis(x),
         add_batch_axis(p),
         np.array([True]),
-        lambda map_continuation, point: None,
     )
     if branch_data is None:
         empty_dataset = xr.Dataset(coords={name: ("point", np.zeros(0))})

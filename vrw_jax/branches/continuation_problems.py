@@ -16,9 +16,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool
 
-from vrw_jax.branches.multiplicity import CONTACT_ORDER_COLUMN
+from vrw_jax.branches.branch_points import CONTACT_ORDER_COLUMN
 from vrw_jax.collocation import CollocationSolution, estimate_mesh_error
 from vrw_jax.continuation import (
     AbstractContinuationProblem,
@@ -69,7 +69,8 @@ class BranchWheel(NamedTuple):
     """
 
     params: WheelParams
-    is_phase_active: Float[Array, "n n_phases"]  # 1 if the phase occurs in the cycle, else 0
+    # 1 if the phase occurs in the cycle, else 0, shape (n, n_phases); () without collocation
+    is_phase_active: Any = ()
 
 
 class AbstractGaitProblem(AbstractContinuationProblem):
@@ -321,8 +322,14 @@ class AbstractReturnMapProblem(AbstractGaitProblem):
     def interpolate_unknowns(
         self, left_point: ProblemUnknowns, right_point: ProblemUnknowns, location_fraction: Scalar
     ) -> ProblemUnknowns:
-        return interpolate_section_states(
-            left_point, right_point, location_fraction, self.n_coordinates
+        """Interpolate the first components of two section states.
+
+        The discrete codes are those of the nearer section state.
+        """
+        nearer_point = jnp.where(location_fraction < 0.5, left_point, right_point)
+        interpolated_point = left_point + location_fraction * (right_point - left_point)
+        return jnp.concatenate(
+            [interpolated_point[: self.n_coordinates], nearer_point[self.n_coordinates :]]
         )
 
     def is_smooth_between(
@@ -522,25 +529,6 @@ def _combine_period_measures(
         step_results.section_state[-1],
         jax.vmap(lambda step_result: step_result.measures())(step_results),
         section_states,
-    )
-
-
-def interpolate_section_states(
-    left_state: Array, right_state: Array, interpolation_fraction: Scalar, n_coordinates: int
-) -> Array:
-    """Interpolate linearly between two section states, at the fraction `interpolation_fraction`.
-
-    The first `n_coordinates` components are interpolated. The remaining components are discrete
-    codes, which are those of the nearer state.
-    """
-    nearer_contact_codes = jnp.where(interpolation_fraction < 0.5, left_state, right_state)[
-        n_coordinates:
-    ]
-    return jnp.concatenate(
-        [
-            (left_state + interpolation_fraction * (right_state - left_state))[:n_coordinates],
-            nearer_contact_codes,
-        ]
     )
 
 

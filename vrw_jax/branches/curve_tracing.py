@@ -21,9 +21,10 @@ from vrw_jax.branches.branch_location import (
     QuantitiesByName,
     continue_and_locate_special_points,
 )
+from vrw_jax.branches.branch_points import BRANCH_POINT_KIND
 from vrw_jax.branches.continuation import (
     BRANCH_ENDING_QUANTITIES,
-    DEFAULT_GAIT_CONTINUATION_OPTIONS,
+    GAIT_CONTINUATION_OPTIONS,
     GaitContinuation,
     continue_branches,
 )
@@ -41,7 +42,6 @@ from vrw_jax.branches.gait_test_functions import (
     locate_jump_onset,
     select_test_quantity,
 )
-from vrw_jax.branches.multiplicity import BRANCH_POINT_KIND
 from vrw_jax.collocation import CollocationSolution
 from vrw_jax.continuation import (
     BIFURCATION_NAMES,
@@ -415,7 +415,7 @@ class CurveTracer(NamedTuple):
             sorted({curve_seed.special_point_name for curve_seed in curve_seeds})
         )
         self.report_stage(f"following special points: {special_point_names}")
-        max_mesh_refinements = DEFAULT_GAIT_CONTINUATION_OPTIONS.max_mesh_refinements
+        max_mesh_refinements = GAIT_CONTINUATION_OPTIONS.max_mesh_refinements
         for refinement_index in range(1 + max_mesh_refinements):
             is_finest_mesh = refinement_index == max_mesh_refinements
             branch_data_and_systems = self._continue_curves_of_batch(

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
+from vrw_jax.branches.branch_points import SECOND_PEAK_RATE_NAME
 from vrw_jax.branches.continuation import (
     DOUBLE_SUPPORT_INDICATOR_NAMES,
     GaitContinuation,
@@ -25,7 +26,6 @@ from vrw_jax.branches.continuation_problems import (
     make_trial_linearizer,
     measure_gait_period,
 )
-from vrw_jax.branches.multiplicity import SECOND_PEAK_RATE_NAME
 from vrw_jax.collocation import CollocationSolution, PhasePoints
 from vrw_jax.continuation import (
     BIFURCATION_NAMES,

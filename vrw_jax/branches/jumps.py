@@ -5,7 +5,6 @@ effects of two impacts do not commute. No continuation step leads to the gait be
 however short the step is.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -37,35 +36,30 @@ class JumpOptions:
     min_chord_steepness_factor: float = 5.0
 
 
-DEFAULT_JUMP_OPTIONS = JumpOptions()
-"""Default options for the continuation beyond jumps."""
+JUMP_OPTIONS = JumpOptions()
+"""Options for the continuation beyond all jumps."""
 
 
 def continue_beyond_jumps(
     branch_continuation: Any,
-    branch_continuer: Callable[..., Any],
     wheels: Any,
     results_by_direction: ContinuationResult,
-    jump_options: JumpOptions = DEFAULT_JUMP_OPTIONS,
 ) -> ContinuationResult:
     """Continue stalled branches beyond jumps, and return the points of all branches.
 
     The search for the gait beyond a jump starts from the last gait. It uses the smallest change of
-    the parameter that leads to a similar gait. `branch_continuer` is the function that continues
-    the branches of `branch_continuation` from given starts.
+    the parameter that leads to a similar gait.
     """
-    branch_indices, parameter_bounds = (
-        np.arange(len(results_by_direction.n_points)),
-        np.asarray(branch_continuation.parameter_bounds),
-    )
+    branch_indices = np.arange(len(results_by_direction.n_points))
+    lower_bound, upper_bound = branch_continuation.parameter_bounds
     wheel_indices, has_search_failed = branch_indices // 2, np.zeros(len(branch_indices), bool)
-    for _ in range(jump_options.max_jumps_per_direction):
-        n_points, branch_statuses = (
-            np.asarray(results_by_direction.n_points),
-            np.asarray(results_by_direction.status),
+    for _ in range(JUMP_OPTIONS.max_jumps_per_direction):
+        n_points = np.asarray(results_by_direction.n_points)
+        is_branch_stalled = (
+            (results_by_direction.status == int(ContinuationStatus.STEP_SIZE_UNDERFLOW))
+            & (n_points > 1)
+            & ~has_search_failed
         )
-        is_branch_stalled = branch_statuses == int(ContinuationStatus.STEP_SIZE_UNDERFLOW)
-        is_branch_stalled = is_branch_stalled & (n_points > 1) & ~has_search_failed
         if not is_branch_stalled.any():
             break
         branch_end_points = select_tree_rows(
@@ -75,43 +69,35 @@ def continue_beyond_jumps(
         branch_end_quantities = branch_continuation.make_quantity_table(
             branch_end_points, wheel_indices
         )
-        for parameter_change_fraction in jump_options.parameter_change_fractions:
+        for parameter_change_fraction in JUMP_OPTIONS.parameter_change_fractions:
             parameter_values = branch_end_points.p + direction_signs * parameter_change_fraction * (
-                parameter_bounds[1] - parameter_bounds[0]
+                upper_bound - lower_bound
             )
             is_branch_requested = (
                 is_branch_stalled
-                & (parameter_values > parameter_bounds[0])
-                & (parameter_values < parameter_bounds[1])
+                & (parameter_values > lower_bound)
+                & (parameter_values < upper_bound)
             )
             if not is_branch_requested.any():
                 continue
-            continuation_arguments = jax.device_put(
-                (
-                    wheels,
-                    branch_end_points.z,
-                    parameter_values,
-                    parameter_bounds,
-                    direction_signs,
-                    is_branch_requested,
-                )
+            new_branch_results = branch_continuation.continue_branches(
+                wheels, branch_end_points.z, parameter_values, direction_signs, is_branch_requested
             )
-            new_branch_results = jax.tree.map(np.asarray, branch_continuer(*continuation_arguments))
-            first_points_beyond_jump = select_tree_rows(
-                new_branch_results.points, (branch_indices, 0)
-            )
-            is_gait_found = is_branch_requested & (np.asarray(new_branch_results.n_points) > 1)
             first_quantities_beyond_jump = branch_continuation.make_quantity_table(
-                first_points_beyond_jump, wheel_indices
+                select_tree_rows(new_branch_results.points, (branch_indices, 0)), wheel_indices
             )
-            is_gait_found = is_gait_found & branch_continuation.is_same_gait(
-                branch_end_quantities, first_quantities_beyond_jump
+            is_gait_found = (
+                is_branch_requested
+                & (new_branch_results.n_points > 1)
+                & branch_continuation.is_same_gait(
+                    branch_end_quantities, first_quantities_beyond_jump
+                )
             )
             results_by_direction = append_branch_results(
                 results_by_direction, new_branch_results, is_gait_found
             )
-            is_branch_stalled = is_branch_stalled & ~is_gait_found
-        has_search_failed = has_search_failed | is_branch_stalled
+            is_branch_stalled &= ~is_gait_found
+        has_search_failed |= is_branch_stalled
     return results_by_direction
 
 
@@ -126,29 +112,27 @@ def append_branch_results(
     """
     if not is_branch_extended.any():
         return results_by_direction
-    n_points = results_by_direction.n_points + np.where(
-        is_branch_extended, new_branch_results.n_points, 0
+    n_old_points, capacity = results_by_direction.n_points, results_by_direction.points.p.shape[1]
+    n_points = n_old_points + np.where(is_branch_extended, new_branch_results.n_points, 0)
+    n_buffer_points = max(int(np.max(n_points)), capacity)
+    # In the joined buffers of a branch, the new points follow the whole buffer of the old points.
+    positions, first_new_position = np.arange(n_buffer_points), n_old_points[:, None]
+    source_positions = np.where(
+        positions < first_new_position, positions, capacity + positions - first_new_position
     )
-    n_buffer_points = max(int(np.max(n_points)), results_by_direction.points.p.shape[1])
-
-    def append_branch_points(points: np.ndarray, new_points: np.ndarray) -> np.ndarray:
-        point_buffer = np.zeros((len(points), n_buffer_points, *points.shape[2:]), points.dtype)
-        point_buffer[:, : points.shape[1]] = points
-        for branch_index in np.flatnonzero(is_branch_extended):
-            point_buffer[
-                branch_index, results_by_direction.n_points[branch_index] : n_points[branch_index]
-            ] = new_points[branch_index, : new_branch_results.n_points[branch_index]]
-        return point_buffer
-
-    appended_points: Any = jax.tree.map(
-        append_branch_points, results_by_direction.points, new_branch_results.points
+    n_joined_points = capacity + new_branch_results.points.p.shape[1]
+    source_positions = np.minimum(source_positions, n_joined_points - 1)
+    branch_indices = np.arange(len(n_points))[:, None]
+    append_points = lambda points, new_points: np.concatenate([points, new_points], 1)[
+        branch_indices, source_positions
+    ]
+    joined_results: Any = (
+        jax.tree.map(append_points, results_by_direction.points, new_branch_results.points),
+        n_points,
+        np.where(is_branch_extended, new_branch_results.status, results_by_direction.status),
+        results_by_direction.n_linearizations + new_branch_results.n_linearizations,
     )
-    branch_status: Any = np.where(
-        is_branch_extended, new_branch_results.status, results_by_direction.status
-    )
-    point_counts: Any = n_points
-    n_linearizations = results_by_direction.n_linearizations + new_branch_results.n_linearizations
-    return ContinuationResult(appended_points, point_counts, branch_status, n_linearizations)
+    return ContinuationResult(*joined_results)
 
 
 def find_state_jumps(
@@ -156,7 +140,6 @@ def find_state_jumps(
     parameter_fractions: np.ndarray,
     fraction_rates: np.ndarray,
     point_pairs: list[tuple[int, int]],
-    jump_options: JumpOptions = DEFAULT_JUMP_OPTIONS,
 ) -> list[tuple[int, int]]:
     """Return the pairs of points between which the section state jumps.
 
@@ -178,7 +161,7 @@ def find_state_jumps(
         # Across a fold the rates have opposite signs, and both parameters may be equal.
         has_same_direction = fraction_rates[left_index] * fraction_rates[right_index] > 0.0
         is_chord_steeper = (
-            jump_options.min_chord_steepness_factor * abs(parameter_fraction_change)
+            JUMP_OPTIONS.min_chord_steepness_factor * abs(parameter_fraction_change)
             < min_parameter_fraction_change
         )
         return bool(has_same_direction and is_chord_steeper)

@@ -16,6 +16,7 @@ import numpy as np
 
 from vrw_jax.branches.branch import SpecialPointCurve
 from vrw_jax.branches.branch_location import COARSE_MESH_END_NAME
+from vrw_jax.branches.branch_points import SECOND_PEAK_RATE_NAME
 from vrw_jax.branches.continuation import BRANCH_ENDING_QUANTITIES
 from vrw_jax.branches.curve_tracing import (
     DEFAULT_CURVE_OPTIONS,
@@ -25,7 +26,6 @@ from vrw_jax.branches.curve_tracing import (
     compute_distances_to_polyline,
 )
 from vrw_jax.branches.gait_test_functions import DLS_VANISHING_NAME, LINEAR_MARGIN_SUBSTITUTES
-from vrw_jax.branches.multiplicity import SECOND_PEAK_RATE_NAME
 from vrw_jax.continuation import BIFURCATION_NAMES
 from vrw_jax.measures import MARGIN_MEASURES
 from vrw_jax.measures import xarray as xr

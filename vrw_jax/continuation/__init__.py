@@ -8,6 +8,7 @@ from vrw_jax.continuation.arclength import (
     ArclengthOptions,
     ContinuationPoint,
     ContinuationResult,
+    ContinuationSetup,
     ContinuationStatus,
     CorrectorPlane,
     FixedPointProblem,
@@ -17,8 +18,7 @@ from vrw_jax.continuation.arclength import (
 )
 from vrw_jax.continuation.batched_continuation import (
     continue_branches_uncompiled,
-    solve_on_many_planes,
-    solve_on_plane,
+    solve_on_planes,
 )
 from vrw_jax.continuation.fixed_points import (
     FixedPointResult,

@@ -177,16 +177,13 @@ def compute_fixed_point_newton_step(
     )
     map_defect = mapped_point - z
     right_hand_sides = jnp.stack([map_defect[:n_continuous], jacobian_by_p], -1)
-    correction_and_tangent_columns = jnp.linalg.solve(
+    correction, tangent = jnp.linalg.solve(
         jnp.eye(n_continuous, dtype=z.dtype) - jacobian_by_z, right_hand_sides
-    )
+    ).T
     discrete_code_corrections = map_defect[n_continuous:]
-    branch_tangent = jnp.concatenate(
-        [correction_and_tangent_columns[:, 1], jnp.zeros_like(discrete_code_corrections)]
-    )
     return NewtonStep(
-        jnp.concatenate([correction_and_tangent_columns[:, 0], discrete_code_corrections]),
-        branch_tangent,
+        jnp.concatenate([correction, discrete_code_corrections]),
+        jnp.concatenate([tangent, jnp.zeros_like(discrete_code_corrections)]),
         jacobian_by_z,
     )
 
@@ -271,42 +268,61 @@ class CorrectorState(NamedTuple):
     return_map_jacobian: Float[Array, "n n"]
 
 
-def evaluate_newton_step_at_fraction(
-    problem: AbstractContinuationProblem,
-    args: Any,
-    parameter_bounds: Array,
-    z: ProblemUnknowns,
-    parameter_fraction: Scalar,
-) -> NewtonStep:
-    """Evaluate the Newton step at the unknowns z and at a fraction of the parameter's range."""
-    return problem.linearize(
-        args,
-        z,
-        parameter_bounds[0] + (parameter_bounds[1] - parameter_bounds[0]) * parameter_fraction,
-    )
+class ContinuationSetup(eqx.Module):
+    """Continuation problem with its options and the bounds of the continued parameter.
+
+    Parameter fractions are fractions of the range between the bounds.
+    """
+
+    problem: AbstractContinuationProblem
+    options: ArclengthOptions = eqx.field(static=True)
+    parameter_bounds: Float[Array, "2"]
+
+    @property
+    def parameter_range(self) -> Scalar:
+        """Return the difference between the bounds."""
+        return self.parameter_bounds[1] - self.parameter_bounds[0]
+
+    def compute_parameter_fraction(self, p: Array) -> Array:
+        """Return the parameter as a fraction of its range."""
+        return (p - self.parameter_bounds[0]) / self.parameter_range
+
+    def compute_parameter(self, parameter_fraction: Array) -> Array:
+        """Return the parameter at a fraction of its range.
+
+        Fractions 0 and 1 return the exact bounds.
+        """
+        p = self.parameter_bounds[0] + self.parameter_range * parameter_fraction
+        return jnp.where(parameter_fraction == 1.0, self.parameter_bounds[1], p)
+
+    def linearize_at_fraction(
+        self, args: Any, z: ProblemUnknowns, parameter_fraction: Scalar
+    ) -> NewtonStep:
+        """Return the Newton step at the unknowns z and at a fraction of the parameter's range."""
+        p = self.parameter_bounds[0] + self.parameter_range * parameter_fraction
+        return self.problem.linearize(args, z, p)
 
 
 def correct_trial_point(
-    problem: AbstractContinuationProblem,
+    setup: ContinuationSetup,
     newton_step: NewtonStep,
-    parameter_bounds: Array,
     corrector_plane: CorrectorPlane,
     z: ProblemUnknowns,
     parameter_fraction: Scalar,
 ) -> CorrectorState:
     """Apply one Newton iteration within the corrector plane, and return the new corrector state."""
-    parameter_range = parameter_bounds[1] - parameter_bounds[0]
+    section_state_of = setup.problem.section_state
     fraction_tangent = jax.tree.map(
-        lambda tangent_leaf: parameter_range * tangent_leaf, newton_step.branch_tangent
+        lambda tangent_leaf: setup.parameter_range * tangent_leaf, newton_step.branch_tangent
     )
-    section_state = problem.section_state(z) + problem.section_state(newton_step.newton_correction)
+    section_state = section_state_of(z) + section_state_of(newton_step.newton_correction)
     plane_residual = corrector_plane.normal_section_part @ (
         section_state - corrector_plane.plane_section_state
     ) + corrector_plane.normal_parameter_part * (
         parameter_fraction - corrector_plane.plane_parameter_fraction
     )
     parameter_fraction_correction = -plane_residual / (
-        corrector_plane.normal_section_part @ problem.section_state(fraction_tangent)
+        corrector_plane.normal_section_part @ section_state_of(fraction_tangent)
         + corrector_plane.normal_parameter_part
     )
     dz = jax.tree.map(
@@ -317,7 +333,7 @@ def correct_trial_point(
         fraction_tangent,
     )
     correction_norm = jnp.maximum(
-        problem.correction_norm(z, dz), jnp.abs(parameter_fraction_correction)
+        setup.problem.correction_norm(z, dz), jnp.abs(parameter_fraction_correction)
     )
     return CorrectorState(
         jax.tree.map(jnp.add, z, dz),
@@ -326,20 +342,6 @@ def correct_trial_point(
         fraction_tangent,
         newton_step.return_map_jacobian,
     )
-
-
-def _compute_parameter_fraction(p: Array, parameter_bounds: Array) -> Array:
-    """Return the parameter as a fraction of its range."""
-    return (p - parameter_bounds[0]) / (parameter_bounds[1] - parameter_bounds[0])
-
-
-def compute_parameter_from_fraction(parameter_fraction: Array, parameter_bounds: Array) -> Array:
-    """Return the parameter at a fraction of its range.
-
-    Fractions 0 and 1 return the exact bounds.
-    """
-    p = parameter_bounds[0] + (parameter_bounds[1] - parameter_bounds[0]) * parameter_fraction
-    return jnp.where(parameter_fraction == 1.0, parameter_bounds[1], p)
 
 
 class _TrialPoint(NamedTuple):
@@ -353,12 +355,11 @@ class _TrialPoint(NamedTuple):
 
 
 def _predict_trial_point(
-    problem: AbstractContinuationProblem,
+    setup: ContinuationSetup,
     previous_point: ContinuationPoint,
     current_point: ContinuationPoint,
     has_previous_point: Bool[Array, ""],
     ds: Scalar,
-    parameter_bounds: Array,
 ) -> _TrialPoint:
     """Predict the trial point one continuation step ahead, or at the end of the range if it is
     nearer.
@@ -367,7 +368,8 @@ def _predict_trial_point(
     points and their tangents. Its error is two orders smaller than the error of a prediction by the
     tangent. This saves one of three Newton iterations.
     """
-    parameter_fraction = _compute_parameter_fraction(current_point.p, parameter_bounds)
+    problem = setup.problem
+    parameter_fraction = setup.compute_parameter_fraction(current_point.p)
     fraction_rate = current_point.fraction_rate
     range_end_fraction = jnp.where(fraction_rate > 0.0, 1.0, 0.0)
     is_parameter_stationary = fraction_rate == 0.0
@@ -390,21 +392,19 @@ def _predict_trial_point(
         jnp.where(is_range_end, 0.0, section_tangent),
         jnp.where(is_range_end, 1.0, fraction_rate),
     )
-    previous_parameter_fraction = _compute_parameter_fraction(previous_point.p, parameter_bounds)
+    previous_parameter_fraction = setup.compute_parameter_fraction(previous_point.p)
     point_displacement = jnp.append(
         section_state - problem.section_state(previous_point.z),
         parameter_fraction - previous_parameter_fraction,
     )
-    has_previous_point = has_previous_point & problem.is_smooth_between(
-        previous_point.z, current_point.z
-    )
+    squared_chord_length = point_displacement @ point_displacement
     # After a kink, the previous and the current point are equal up to round-off.
-    has_previous_point = has_previous_point & (
-        point_displacement @ point_displacement > (1e-9 * ds) ** 2
+    has_previous_point = (
+        has_previous_point
+        & problem.is_smooth_between(previous_point.z, current_point.z)
+        & (squared_chord_length > (1e-9 * ds) ** 2)
     )
-    chord_length = jnp.where(
-        has_previous_point, jnp.sqrt(point_displacement @ point_displacement), 1.0
-    )
+    chord_length = jnp.where(has_previous_point, jnp.sqrt(squared_chord_length), 1.0)
 
     def extrapolate_cubic(
         previous_leaf: Array, previous_rate: Array, current_leaf: Array, current_rate: Array
@@ -419,23 +419,14 @@ def _predict_trial_point(
             + jnp.where(has_previous_point, predicted_arc_length**2 * cubic_coefficient, 0.0)
         )
 
-    z = jax.tree.map(
+    z, parameter_fraction = jax.tree.map(
         extrapolate_cubic,
-        previous_point.z,
-        previous_point.arclength_tangent,
-        current_point.z,
-        current_point.arclength_tangent,
+        (previous_point.z, previous_parameter_fraction),
+        (previous_point.arclength_tangent, previous_point.fraction_rate),
+        (current_point.z, parameter_fraction),
+        (current_point.arclength_tangent, fraction_rate),
     )
-    parameter_fraction = jnp.where(
-        is_range_end,
-        range_end_fraction,
-        extrapolate_cubic(
-            previous_parameter_fraction,
-            previous_point.fraction_rate,
-            parameter_fraction,
-            fraction_rate,
-        ),
-    )
+    parameter_fraction = jnp.where(is_range_end, range_end_fraction, parameter_fraction)
     return _TrialPoint(corrector_plane, z, parameter_fraction, predicted_arc_length, is_range_end)
 
 
@@ -469,64 +460,52 @@ class ContinuationState(NamedTuple):
     @classmethod
     def from_start(
         cls,
-        problem: AbstractContinuationProblem,
-        options: ArclengthOptions,
-        parameter_bounds: Array,
+        setup: ContinuationSetup,
         z: ProblemUnknowns,
         p: Scalar,
         direction_sign: Scalar,
     ) -> "ContinuationState":
         """Return the initial state of one branch, whose first trial point is (z, p)."""
-        section_state = problem.section_state(z)
+        section_state = setup.problem.section_state(z)
         n_section_coordinates, float_dtype = section_state.shape[0], section_state.dtype
         initial_arc_length, initial_count = jnp.zeros((), float_dtype), jnp.zeros((), jnp.int32)
         initial_flag = jnp.asarray(False)
-        initial_tangent = jax.tree.map(jnp.zeros_like, z)
-        parameter_fraction = _compute_parameter_fraction(p, parameter_bounds)
+        parameter_fraction = setup.compute_parameter_fraction(p)
         initial_point = ContinuationPoint(
             z,
             p,
-            initial_tangent,
+            jax.tree.map(jnp.zeros_like, z),
             initial_arc_length + direction_sign,
             jnp.zeros((n_section_coordinates, n_section_coordinates), float_dtype),
             initial_flag,
         )
-        trial_point = _TrialPoint(
-            CorrectorPlane(
-                section_state,
-                parameter_fraction,
-                jnp.zeros_like(section_state),
-                initial_arc_length + 1.0,
-            ),
-            z,
+        corrector_plane = CorrectorPlane(
+            section_state,
             parameter_fraction,
-            initial_arc_length,
-            initial_flag,
+            jnp.zeros_like(section_state),
+            initial_arc_length + 1.0,
         )
-        running_status = initial_count + int(ContinuationStatus.RUNNING)
-        jump_suspicion = BranchJumpSuspicion(initial_arc_length, initial_flag)
-        initial_ds = initial_arc_length + options.initial_ds
         return cls(
             initial_point,
             initial_point,
             initial_point,
-            initial_ds,
-            trial_point,
-            jump_suspicion,
+            initial_arc_length + setup.options.initial_ds,
+            _TrialPoint(corrector_plane, z, parameter_fraction, initial_arc_length, initial_flag),
+            BranchJumpSuspicion(initial_arc_length, initial_flag),
             initial_count,
             initial_count,
-            running_status,
+            initial_count + int(ContinuationStatus.RUNNING),
             initial_count,
         )
 
     def assess_trial(
         self,
-        problem: AbstractContinuationProblem,
-        options: ArclengthOptions,
+        setup: ContinuationSetup,
         corrector_state: CorrectorState,
         direction_sign: Scalar,
     ) -> _TrialVerdict:
         """Assess a trial point after one Newton iteration, and return the verdict."""
+        problem, options = setup.problem, setup.options
         current_point, trial_point = self.current_point, self.trial_point
         is_first_point = self.n_points == 0
         trial_distance = jnp.maximum(
@@ -560,8 +539,8 @@ class ContinuationState(NamedTuple):
             has_trial_converged
             & ~is_turn_small
             & (self.ds < options.kink_step_factor * options.min_ds)
+            & problem.has_kinks
         )
-        is_trial_kink = is_trial_kink & problem.has_kinks
         is_trial_accepted = has_trial_converged & (is_turn_small | is_trial_kink)
         has_trial_failed = ~is_trial_accepted & (
             ~is_trial_valid
@@ -602,11 +581,7 @@ class ContinuationState(NamedTuple):
         )
         return can_trial_be_suspicious & ~is_multiplier_change_explained_by_bifurcations
 
-    def choose_next_ds(
-        self,
-        options: ArclengthOptions,
-        trial_verdict: _TrialVerdict,
-    ) -> Scalar:
+    def choose_next_ds(self, options: ArclengthOptions, trial_verdict: _TrialVerdict) -> Scalar:
         """Return the length of the next continuation step.
 
         The continuation step is lengthened after few Newton iterations, shortened after many, and
@@ -636,10 +611,7 @@ class ContinuationState(NamedTuple):
         `ds` is the proposed length of the next continuation step. `next_arc_length` is its
         predicted arc length, which is shorter at the end of the range.
         """
-        is_trial_accepted, has_trial_failed = (
-            trial_verdict.is_trial_accepted,
-            trial_verdict.has_trial_failed,
-        )
+        is_trial_accepted, has_trial_failed, *_ = trial_verdict
         n_points, branch_status_code = self.n_points + is_trial_accepted, self.status_code
         for has_branch_ended, status_code in (
             (ds < options.min_ds, ContinuationStatus.STEP_SIZE_UNDERFLOW),
@@ -663,22 +635,17 @@ class ContinuationState(NamedTuple):
 
 
 def _is_curve_closed(
-    problem: AbstractContinuationProblem,
+    setup: ContinuationSetup,
     start_point: ContinuationPoint,
     current_point: ContinuationPoint,
     next_point: ContinuationPoint,
-    parameter_bounds: Array,
 ) -> Bool[Array, ""]:
     """Return whether the start of the branch lies on the segment between two successive points."""
-    stack_arclength_coordinates = lambda point: jnp.append(
-        problem.section_state(point.z), _compute_parameter_fraction(point.p, parameter_bounds)
+    start, current, next_coordinates = (
+        jnp.append(setup.problem.section_state(point.z), setup.compute_parameter_fraction(point.p))
+        for point in (start_point, current_point, next_point)
     )
-    chord_vector = stack_arclength_coordinates(next_point) - stack_arclength_coordinates(
-        current_point
-    )
-    offset_to_start = stack_arclength_coordinates(start_point) - stack_arclength_coordinates(
-        current_point
-    )
+    chord_vector, offset_to_start = next_coordinates - current, start - current
     squared_chord_length = chord_vector @ chord_vector
     chord_fraction = (
         offset_to_start
@@ -698,11 +665,9 @@ BranchBatch = tuple[ContinuationState, ContinuationPoint]
 
 
 def init_branches(
-    problem: AbstractContinuationProblem,
-    options: ArclengthOptions,
+    setup: ContinuationSetup,
     z: ProblemUnknowns,
     p: Array,
-    parameter_bounds: Array,
     direction_signs: Array,
     is_branch_requested: Array,
 ) -> BranchBatch:
@@ -710,16 +675,18 @@ def init_branches(
 
     A branch starts only if its element of `is_branch_requested` is true.
     """
-    continuation_states = jax.vmap(
-        functools.partial(ContinuationState.from_start, problem, options, parameter_bounds)
-    )(z, p, direction_signs)
+    continuation_states = jax.vmap(functools.partial(ContinuationState.from_start, setup))(
+        z, p, direction_signs
+    )
     initial_status = jnp.where(
         is_branch_requested,
         continuation_states.status_code,
         int(ContinuationStatus.START_NOT_FOUND),
     )
     continuation_states = continuation_states._replace(status_code=initial_status.astype(jnp.int32))
-    allocate_buffer = lambda x: jnp.zeros((x.shape[0], options.max_points, *x.shape[1:]), x.dtype)
+    allocate_buffer = lambda x: jnp.zeros(
+        (x.shape[0], setup.options.max_points, *x.shape[1:]), x.dtype
+    )
     return continuation_states, jax.tree.map(
         allocate_buffer, continuation_states.current_point._replace(arclength_tangent=())
     )
@@ -731,10 +698,8 @@ def are_branches_active(branch_batch: BranchBatch) -> Array:
 
 
 def iterate_branches(
-    problem: AbstractContinuationProblem,
-    options: ArclengthOptions,
+    setup: ContinuationSetup,
     args_by_branch: Any,
-    parameter_bounds: Array,
     direction_signs: Array,
     branch_buffer_indices: Array,
     branch_batch: BranchBatch,
@@ -744,6 +709,7 @@ def iterate_branches(
 
     Accepted points of branch i are stored in the buffer with index `branch_buffer_indices[i]`.
     """
+    problem, options = setup.problem, setup.options
 
     def iterate_branch(
         args: Any,
@@ -753,23 +719,19 @@ def iterate_branches(
     ) -> tuple[ContinuationState, ContinuationPoint, Bool[Array, ""]]:
         trial_point = continuation_state.trial_point
         corrector_state = correct_trial_point(
-            problem,
+            setup,
             newton_step,
-            parameter_bounds,
             trial_point.corrector_plane,
             trial_point.z,
             trial_point.parameter_fraction,
         )
-        trial_verdict = continuation_state.assess_trial(
-            problem, options, corrector_state, direction_sign
-        )
-        accepted_parameter = compute_parameter_from_fraction(
+        trial_verdict = continuation_state.assess_trial(setup, corrector_state, direction_sign)
+        accepted_parameter = setup.compute_parameter(
             jnp.where(
                 trial_point.is_range_end,
                 trial_point.corrector_plane.plane_parameter_fraction,
                 corrector_state.parameter_fraction,
-            ),
-            parameter_bounds,
+            )
         )
         is_admissible = problem.is_admissible(args, corrector_state.z, accepted_parameter)
         arclength_tangent = jax.tree.map(
@@ -806,15 +768,15 @@ def iterate_branches(
             trial_verdict.is_trial_accepted, previous_point, continuation_state.previous_point
         )
         n_points = continuation_state.n_points + trial_verdict.is_trial_accepted
-        ds = continuation_state.choose_next_ds(options, trial_verdict)
-        jump_suspicion = continuation_state.jump_suspicion.update_after_trial(
-            is_trial_suspicious, continuation_state.ds
-        )
-        jump_suspicion, ds = jump_suspicion.choose_trial_ds(
-            trial_verdict.is_trial_accepted, ds, options.min_ds
+        jump_suspicion, ds = continuation_state.jump_suspicion.update_after_trial(
+            is_trial_suspicious,
+            trial_verdict.is_trial_accepted,
+            continuation_state.ds,
+            continuation_state.choose_next_ds(options, trial_verdict),
+            options.min_ds,
         )
         next_trial_point = _predict_trial_point(
-            problem, previous_point, current_point, n_points > 1, ds, parameter_bounds
+            setup, previous_point, current_point, n_points > 1, ds
         )
         is_trial_finished = trial_verdict.is_trial_accepted | trial_verdict.has_trial_failed
         next_trial_point = select_trees_by_condition(
@@ -825,7 +787,7 @@ def iterate_branches(
             ),
         )
         is_curve_closed = _is_curve_closed(
-            problem, first_point, continuation_state.current_point, new_point, parameter_bounds
+            setup, first_point, continuation_state.current_point, new_point
         )
         next_status = continuation_state.compute_next_status_code(
             options,
@@ -838,7 +800,6 @@ def iterate_branches(
         next_n_newton_iterations = jnp.where(
             is_trial_finished, 0, continuation_state.n_newton_iterations + 1
         )
-        next_counters = n_points, next_status, continuation_state.n_linearizations + 1
         next_continuation_state = ContinuationState(
             previous_point,
             current_point,
@@ -847,7 +808,9 @@ def iterate_branches(
             next_trial_point,
             jump_suspicion,
             next_n_newton_iterations,
-            *next_counters,
+            n_points,
+            next_status,
+            continuation_state.n_linearizations + 1,
         )
         return next_continuation_state, new_point, trial_verdict.is_trial_accepted
 
@@ -919,9 +882,9 @@ def continue_from(
             direction_signs[None],
         )
         return jax.tree.map(lambda x: x[0], batched_continuation_result)
-    is_branch_requested = (
-        jnp.ones(p.shape, bool) if is_branch_requested is None else is_branch_requested
-    )
+    if is_branch_requested is None:
+        is_branch_requested = jnp.ones(p.shape, bool)
+    setup = ContinuationSetup(problem, options, parameter_bounds)
 
     def advance_concurrent_branches(branch_batch: BranchBatch) -> BranchBatch:
         concurrent_branch_indices = jnp.argsort(~are_branches_active(branch_batch), stable=True)[
@@ -936,17 +899,15 @@ def continue_from(
         )
 
         def advance_group_once(branch_batch: BranchBatch) -> BranchBatch:
-            linearize_trial = lambda args, trial_point: evaluate_newton_step_at_fraction(
-                problem, args, parameter_bounds, trial_point.z, trial_point.parameter_fraction
+            linearize_trial = lambda args, trial_point: setup.linearize_at_fraction(
+                args, trial_point.z, trial_point.parameter_fraction
             )
             newton_steps = jax.vmap(linearize_trial)(
                 concurrent_branch_args, branch_batch[0].trial_point
             )
             return iterate_branches(
-                problem,
-                options,
+                setup,
                 concurrent_branch_args,
-                parameter_bounds,
                 concurrent_directions,
                 concurrent_branch_indices,
                 branch_batch,
@@ -967,9 +928,7 @@ def continue_from(
             concurrent_branch_states,
         ), point_buffers
 
-    branch_batch = init_branches(
-        problem, options, z, p, parameter_bounds, direction_signs, is_branch_requested
-    )
+    branch_batch = init_branches(setup, z, p, direction_signs, is_branch_requested)
     return make_continuation_result(
         lax.while_loop(
             lambda branch_batch: jnp.any(are_branches_active(branch_batch)),

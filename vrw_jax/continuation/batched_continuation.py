@@ -19,14 +19,13 @@ from vrw_jax.continuation.arclength import (
     ArclengthOptions,
     ContinuationPoint,
     ContinuationResult,
+    ContinuationSetup,
     CorrectorPlane,
     CorrectorState,
     NewtonStep,
     ProblemUnknowns,
     are_branches_active,
-    compute_parameter_from_fraction,
     correct_trial_point,
-    evaluate_newton_step_at_fraction,
     init_branches,
     iterate_branches,
     make_continuation_result,
@@ -71,9 +70,7 @@ def needs_newton_iteration(
 
 
 def iterate_plane_newton(
-    problem: AbstractContinuationProblem,
-    options: ArclengthOptions,
-    parameter_bounds: Array,
+    setup: ContinuationSetup,
     corrector_plane: CorrectorPlane,
     plane_newton_state: PlaneNewtonState,
     newton_step: NewtonStep,
@@ -81,9 +78,8 @@ def iterate_plane_newton(
     """Apply one Newton iteration in a plane, and return the new state of Newton's method."""
     corrector_state = plane_newton_state.corrector_state
     next_corrector_state = correct_trial_point(
-        problem,
+        setup,
         newton_step,
-        parameter_bounds,
         corrector_plane,
         corrector_state.z,
         corrector_state.parameter_fraction,
@@ -94,6 +90,7 @@ def iterate_plane_newton(
         is_correction_valid, next_corrector_state, corrector_state
     )._replace(correction_norm=next_corrector_state.correction_norm)
     # If the correction is negligible, the last Jacobian is exact and no other iteration follows.
+    options = setup.options
     negligible_correction_norm = options.jacobian_reuse_fraction * options.tolerance
     n_added_converged_iterations = jnp.where(
         next_corrector_state.correction_norm < negligible_correction_norm, 2, 1
@@ -109,9 +106,8 @@ def iterate_plane_newton(
 
 
 def make_plane_newton_point(
-    problem: AbstractContinuationProblem,
+    setup: ContinuationSetup,
     args: Any,
-    parameter_bounds: Array,
     corrector_plane: CorrectorPlane,
     plane_newton_state: PlaneNewtonState,
 ) -> tuple[ContinuationPoint, Bool[Array, ""]]:
@@ -119,14 +115,10 @@ def make_plane_newton_point(
 
     The sign of the point's `fraction_rate` follows the direction of the plane's normal.
     """
-    corrector_state, p = (
-        plane_newton_state.corrector_state,
-        compute_parameter_from_fraction(
-            plane_newton_state.corrector_state.parameter_fraction, parameter_bounds
-        ),
-    )
-    is_admissible = problem.is_admissible(args, corrector_state.z, p)
-    section_tangent = problem.section_state(corrector_state.fraction_tangent)
+    corrector_state = plane_newton_state.corrector_state
+    p = setup.compute_parameter(corrector_state.parameter_fraction)
+    is_admissible = setup.problem.is_admissible(args, corrector_state.z, p)
+    section_tangent = setup.problem.section_state(corrector_state.fraction_tangent)
     normal_alignment = (
         corrector_plane.normal_section_part @ section_tangent
         + corrector_plane.normal_parameter_part
@@ -139,14 +131,8 @@ def make_plane_newton_point(
     return continuation_point, plane_newton_state.n_converged_iterations >= 1
 
 
-@eqx.filter_jit
 def solve_on_plane(
-    problem: AbstractContinuationProblem,
-    options: ArclengthOptions,
-    args: Any,
-    z: ProblemUnknowns,
-    corrector_plane: CorrectorPlane,
-    parameter_bounds: Float[Array, "2"],
+    setup: ContinuationSetup, args: Any, z: ProblemUnknowns, corrector_plane: CorrectorPlane
 ) -> tuple[ContinuationPoint, Bool[Array, ""]]:
     """Solve for the point at which a branch crosses a plane.
 
@@ -156,24 +142,18 @@ def solve_on_plane(
     """
 
     def iterate_plane_newton_once(plane_newton_state: PlaneNewtonState) -> PlaneNewtonState:
-        newton_step = evaluate_newton_step_at_fraction(
-            problem,
-            args,
-            parameter_bounds,
-            plane_newton_state.corrector_state.z,
-            plane_newton_state.corrector_state.parameter_fraction,
+        corrector_state = plane_newton_state.corrector_state
+        newton_step = setup.linearize_at_fraction(
+            args, corrector_state.z, corrector_state.parameter_fraction
         )
-        return iterate_plane_newton(
-            problem, options, parameter_bounds, corrector_plane, plane_newton_state, newton_step
-        )
+        return iterate_plane_newton(setup, corrector_plane, plane_newton_state, newton_step)
 
-    needs_more_iterations = functools.partial(needs_newton_iteration, options)
     plane_newton_state = lax.while_loop(
-        needs_more_iterations, iterate_plane_newton_once, init_plane_newton(z, corrector_plane)
+        functools.partial(needs_newton_iteration, setup.options),
+        iterate_plane_newton_once,
+        init_plane_newton(z, corrector_plane),
     )
-    return make_plane_newton_point(
-        problem, args, parameter_bounds, corrector_plane, plane_newton_state
-    )
+    return make_plane_newton_point(setup, args, corrector_plane, plane_newton_state)
 
 
 def continue_branches_uncompiled(
@@ -190,25 +170,16 @@ def continue_branches_uncompiled(
 
     The arguments and the result are those of `arclength.continue_from`.
     """
-    branch_batch = init_branches(
-        problem, options, z, p, parameter_bounds, direction_signs, is_branch_requested
-    )
+    setup = ContinuationSetup(problem, options, parameter_bounds)
+    branch_batch = init_branches(setup, z, p, direction_signs, is_branch_requested)
     branch_buffer_indices = jnp.arange(len(p))
     while np.any(is_branch_unfinished := np.asarray(_are_branches_active_jit(branch_batch))):
-        trial_point = branch_batch[0].trial_point
         newton_steps = _linearize_selected_branches(
-            problem,
-            args_by_branch,
-            parameter_bounds,
-            trial_point.z,
-            trial_point.parameter_fraction,
-            is_branch_unfinished,
+            setup, args_by_branch, branch_batch[0].trial_point, is_branch_unfinished
         )
         branch_batch = _iterate_branches_jit(
-            problem,
-            options,
+            setup,
             args_by_branch,
-            parameter_bounds,
             direction_signs,
             branch_buffer_indices,
             branch_batch,
@@ -218,82 +189,69 @@ def continue_branches_uncompiled(
 
 
 def _linearize_selected_branches(
-    problem: AbstractContinuationProblem,
-    args_by_branch: Any,
-    parameter_bounds: Array,
-    z: ProblemUnknowns,
-    parameter_fractions: Array,
-    is_branch_selected: Any,
+    setup: ContinuationSetup, args_by_branch: Any, trials: Any, is_branch_selected: np.ndarray
 ) -> NewtonStep:
-    """Return the Newton steps for the selected branches. All other branches receive NaN."""
-    lower_bound, upper_bound = np.asarray(parameter_bounds)
-    parameter_values = lower_bound + (upper_bound - lower_bound) * np.asarray(parameter_fractions)
-    selected_newton_steps = problem.linearize(
-        *jax.device_put(select_tree_rows((args_by_branch, z, parameter_values), is_branch_selected))
+    """Return the Newton steps for the selected branches. All other branches receive NaN.
+
+    `trials` contains the trial unknowns z and the trial parameter fractions of all branches.
+    """
+    lower_bound, upper_bound = np.asarray(setup.parameter_bounds)
+    p = lower_bound + (upper_bound - lower_bound) * np.asarray(trials.parameter_fraction)
+    selected_newton_steps = setup.problem.linearize(
+        *jax.device_put(select_tree_rows((args_by_branch, trials.z, p), is_branch_selected))
     )
-    fill_with_nan = lambda selected_leaf: np.full(
-        (len(is_branch_selected), *selected_leaf.shape[1:]), np.nan
-    )
-    newton_steps_of_all_branches = jax.tree.map(fill_with_nan, selected_newton_steps)
-    for leaf_of_all_branches, selected_leaf in zip(
-        jax.tree.leaves(newton_steps_of_all_branches),
-        jax.tree.leaves(selected_newton_steps),
-        strict=True,
-    ):
+
+    def insert_rows(selected_leaf: Any) -> np.ndarray:
+        leaf_of_all_branches = np.full((len(p), *selected_leaf.shape[1:]), np.nan)
         leaf_of_all_branches[is_branch_selected] = selected_leaf
-    return jax.device_put(newton_steps_of_all_branches)
+        return leaf_of_all_branches
+
+    newton_steps: NewtonStep = jax.device_put(jax.tree.map(insert_rows, selected_newton_steps))
+    return newton_steps
 
 
-def solve_on_many_planes(
-    problem: AbstractContinuationProblem,
-    options: ArclengthOptions,
+def solve_on_planes(
+    setup: ContinuationSetup,
     args_by_branch: Any,
     z: ProblemUnknowns,
     corrector_planes: CorrectorPlane,
-    parameter_bounds: Float[Array, "2"],
 ) -> tuple[ContinuationPoint, Bool[Array, " many"]]:
     """Solve for the points at which many branches cross planes.
 
     Return the points, and whether Newton's method converged for each branch. Every array has a
     leading axis over the branches; see `solve_on_plane`.
     """
-    plane_newton_states = _init_plane_newton_jit(z, corrector_planes)
+    points_and_convergence: tuple[ContinuationPoint, Bool[Array, " many"]]
+    if setup.problem.is_traceable:
+        points_and_convergence = _solve_on_planes_jit(setup, args_by_branch, z, corrector_planes)
+        return points_and_convergence
+    states = _init_plane_newton_jit(z, corrector_planes)
     while np.any(
-        is_solve_unfinished := np.asarray(_needs_newton_iteration_jit(options, plane_newton_states))
+        is_solve_unfinished := np.asarray(_needs_newton_iteration_jit(setup.options, states))
     ):
-        newton_step = _linearize_selected_branches(
-            problem,
-            args_by_branch,
-            parameter_bounds,
-            plane_newton_states.corrector_state.z,
-            plane_newton_states.corrector_state.parameter_fraction,
-            is_solve_unfinished,
+        newton_steps = _linearize_selected_branches(
+            setup, args_by_branch, states.corrector_state, is_solve_unfinished
         )
-        plane_newton_states = _iterate_unfinished_plane_newton(
-            problem, options, parameter_bounds, corrector_planes, plane_newton_states, newton_step
-        )
-    points_and_convergence: tuple[ContinuationPoint, Bool[Array, " many"]] = (
-        _make_plane_newton_points_jit(
-            problem, args_by_branch, parameter_bounds, corrector_planes, plane_newton_states
-        )
+        states = _iterate_unfinished_plane_newton(setup, corrector_planes, states, newton_steps)
+    points_and_convergence = _make_plane_newton_points_jit(
+        setup, args_by_branch, corrector_planes, states
     )
     return points_and_convergence
 
 
+_solve_on_planes_jit: Any = eqx.filter_jit(eqx.filter_vmap(solve_on_plane, in_axes=(None, 0, 0, 0)))
 _are_branches_active_jit: Any = eqx.filter_jit(are_branches_active)
 _iterate_branches_jit: Any = eqx.filter_jit(iterate_branches)
 _init_plane_newton_jit: Any = eqx.filter_jit(jax.vmap(init_plane_newton))
 _needs_newton_iteration_jit: Any = eqx.filter_jit(needs_newton_iteration)
 _make_plane_newton_points_jit: Any = eqx.filter_jit(
-    eqx.filter_vmap(make_plane_newton_point, in_axes=(None, 0, None, 0, 0))
+    eqx.filter_vmap(make_plane_newton_point, in_axes=(None, 0, 0, 0))
 )
 
 
 @eqx.filter_jit
 def _iterate_unfinished_plane_newton(
-    problem: AbstractContinuationProblem,
-    options: Any,
-    parameter_bounds: Array,
+    setup: ContinuationSetup,
     corrector_planes: CorrectorPlane,
     plane_newton_states: PlaneNewtonState,
     newton_steps: NewtonStep,
@@ -307,12 +265,9 @@ def _iterate_unfinished_plane_newton(
         plane_newton_state: PlaneNewtonState,
         newton_step: NewtonStep,
     ) -> PlaneNewtonState:
-        next_plane_newton_state = iterate_plane_newton(
-            problem, options, parameter_bounds, corrector_plane, plane_newton_state, newton_step
-        )
         return select_trees_by_condition(
-            needs_newton_iteration(options, plane_newton_state),
-            next_plane_newton_state,
+            needs_newton_iteration(setup.options, plane_newton_state),
+            iterate_plane_newton(setup, corrector_plane, plane_newton_state, newton_step),
             plane_newton_state,
         )
 

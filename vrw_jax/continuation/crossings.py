@@ -14,7 +14,6 @@ from jaxtyping import Array, Bool, Float
 from vrw_jax.continuation.floquet import (
     MAX_CLOSED_FORM_SIZE,
     MULTIPLIER_TOLERANCES,
-    MultiplierTolerances,
     compute_bifurcation_margins,
     floquet_multipliers,
 )
@@ -25,7 +24,6 @@ def is_multiplier_change_explained(
     previous_point_jacobian: Float[Array, "n n"],
     next_point_jacobian: Float[Array, "n n"],
     has_parameter_turned_back: Bool[Array, ""],
-    multiplier_tolerances: MultiplierTolerances = MULTIPLIER_TOLERANCES,
 ) -> Bool[Array, ""]:
     """Return whether bifurcations explain the change of the multipliers between two points.
 
@@ -42,21 +40,17 @@ def is_multiplier_change_explained(
         return (
             ~has_crossed_other_branch
         )  # JAX computes eigenvalues of larger matrices only on CPUs.
-    n_explained_multipliers = has_margin_sign_change[0].astype(int) + has_margin_sign_change[1]
-    n_explained_multipliers = n_explained_multipliers + (
-        2 * has_margin_sign_change[2] if len(has_margin_sign_change) > 2 else 0
-    )
+    # A Neimark-Sacker bifurcation explains two multipliers.
+    n_explained_multipliers = jnp.sum(has_margin_sign_change) + jnp.sum(has_margin_sign_change[2:])
 
     def count_unstable_multipliers(return_map_jacobian: Array) -> tuple[Array, Array]:
         """Return the least and the largest possible number of multipliers outside the
         unit circle.
         """
-        multiplier_moduli, circle_distance_tolerance = (
-            jnp.abs(floquet_multipliers(return_map_jacobian)),
-            multiplier_tolerances.unit_circle_distance,
-        )
-        return jnp.sum(multiplier_moduli > 1.0 + circle_distance_tolerance), jnp.sum(
-            multiplier_moduli > 1.0 - circle_distance_tolerance
+        multiplier_moduli = jnp.abs(floquet_multipliers(return_map_jacobian))
+        tolerance = MULTIPLIER_TOLERANCES.unit_circle_distance
+        return jnp.sum(multiplier_moduli > 1.0 + tolerance), jnp.sum(
+            multiplier_moduli > 1.0 - tolerance
         )
 
     min_n_unstable_at_previous, max_n_unstable_at_previous = count_unstable_multipliers(
@@ -84,31 +78,30 @@ class BranchJumpSuspicion(NamedTuple):
     accepts_any_multipliers: Bool[Array, ""]
 
     def update_after_trial(
-        self, is_trial_suspicious: Bool[Array, ""], trial_ds: Scalar
-    ) -> "BranchJumpSuspicion":
-        """Return the suspicion after a trial whose continuation step has the length `trial_ds`."""
-        is_first_suspicion = is_trial_suspicious & (self.suspicious_ds == 0.0)
-        return self._replace(
-            suspicious_ds=jnp.where(is_first_suspicion, trial_ds, self.suspicious_ds)
-        )
-
-    def choose_trial_ds(
-        self, is_trial_accepted: Bool[Array, ""], proposed_ds: Scalar, min_ds: float
+        self,
+        is_trial_suspicious: Bool[Array, ""],
+        is_trial_accepted: Bool[Array, ""],
+        trial_ds: Scalar,
+        proposed_ds: Scalar,
+        min_ds: float,
     ) -> tuple["BranchJumpSuspicion", Scalar]:
-        """Return the suspicion before the next trial, and the length of the next continuation step.
+        """Return the suspicion after a trial, and the length of the next continuation step.
 
-        The length is `proposed_ds`, or `suspicious_ds` if `proposed_ds` is below `min_ds`.
+        `trial_ds` is the length of the continuation step of the trial. The next length is
+        `proposed_ds`, or `suspicious_ds` if `proposed_ds` is below `min_ds`.
         """
+        is_first_suspicion = is_trial_suspicious & (self.suspicious_ds == 0.0)
+        suspicious_ds = jnp.where(is_first_suspicion, trial_ds, self.suspicious_ds)
         is_below_min_ds = (
-            (self.suspicious_ds > 0.0) & ~self.accepts_any_multipliers & (proposed_ds < min_ds)
+            (suspicious_ds > 0.0) & ~self.accepts_any_multipliers & (proposed_ds < min_ds)
         )
-        trial_ds = jnp.where(is_below_min_ds, self.suspicious_ds, proposed_ds)
+        next_ds = jnp.where(is_below_min_ds, suspicious_ds, proposed_ds)
         has_passed_suspicious_ds = is_trial_accepted & (
-            self.accepts_any_multipliers | (trial_ds >= self.suspicious_ds)
+            self.accepts_any_multipliers | (next_ds >= suspicious_ds)
         )
         accepts_any_multipliers = jnp.where(
             is_trial_accepted, False, self.accepts_any_multipliers | is_below_min_ds
         )
         return BranchJumpSuspicion(
-            jnp.where(has_passed_suspicious_ds, 0.0, self.suspicious_ds), accepts_any_multipliers
-        ), trial_ds
+            jnp.where(has_passed_suspicious_ds, 0.0, suspicious_ds), accepts_any_multipliers
+        ), next_ds
