@@ -5,7 +5,7 @@ as accurate as the gaits. If a curve meets another special point, a new curve is
 meeting point.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
 
@@ -51,7 +51,7 @@ from vrw_jax.continuation import (
     TestFunctionPoint,
 )
 from vrw_jax.cycles import CollocationSystem, LimitCycle, transfer_solution_to_mesh
-from vrw_jax.measures import MARGIN_MEASURES, make_measure_attributes
+from vrw_jax.measures import MARGIN_MEASURES, make_labeled_variables
 from vrw_jax.measures import xarray as xr
 from vrw_jax.models import ViscoelasticWheel
 from vrw_jax.numerics import StepOptions, batch_sizes
@@ -89,8 +89,8 @@ class CurveTracingOptions:
     dls_duration_guess: float = 0.1
 
 
-DEFAULT_CURVE_TRACING_OPTIONS = CurveTracingOptions()
-"""Default options for the tracing of curves."""
+CURVE_TRACING_OPTIONS = CurveTracingOptions()
+"""Options for the tracing of all curves."""
 
 
 @dataclass(frozen=True)
@@ -119,14 +119,7 @@ class CurveContinuation(AbstractContinuation):
     def evaluate_point_quantities(
         self, wheels: TestFunctionWheel, points: ContinuationPoint
     ) -> QuantitiesByName:
-        z, second_parameter_fractions = points.z
-        (lower_bound, upper_bound), second_parameter_fractions = (
-            self.continuation_problem.second_parameter_bounds,
-            np.asarray(second_parameter_fractions),
-        )
-        second_parameter_values = (
-            lower_bound + (upper_bound - lower_bound) * second_parameter_fractions
-        )
+        second_parameter_values = self.continuation_problem.compute_second_parameter(points.z)
         get_second_parameter_value = lambda params: getattr(params, self.second_parameter_name)
         gait_wheels = wheels.branch_wheel._replace(
             params=eqx.tree_at(
@@ -134,23 +127,18 @@ class CurveContinuation(AbstractContinuation):
             )
         )
         quantity_table = self.gait_continuation.evaluate_point_quantities(
-            gait_wheels, points._replace(z=z)
+            gait_wheels, points._replace(z=points.z.z)
         )
         # Without double support, the rear foot's force must not be positive.
         rear_force_sign = np.where(wheels.branch_wheel.is_phase_active[:, 0, 0] > 0.5, 1.0, -1.0)
-        curve_quantities = {
+        second_parameter_fractions = np.asarray(points.z.second_parameter_fraction)
+        return quantity_table | {
             "lambda_4_plus": rear_force_sign * quantity_table["lambda_4_plus"],
             "second": second_parameter_values,
+            RANGE_EDGE_COLUMN: np.minimum(
+                second_parameter_fractions, 1.0 - second_parameter_fractions
+            ),
         }
-        return (
-            quantity_table
-            | curve_quantities
-            | {
-                RANGE_EDGE_COLUMN: np.minimum(
-                    second_parameter_fractions, 1.0 - second_parameter_fractions
-                )
-            }
-        )
 
     def mask_undefined_quantities(
         self, quantity_table: QuantitiesByName, wheel_indices: np.ndarray
@@ -159,52 +147,36 @@ class CurveContinuation(AbstractContinuation):
 
         - `wheel_indices`: index of the curve to which each point belongs.
         """
-        special_point_name_by_point = np.array(self.special_point_names)[wheel_indices]
-        is_dls_vanishing = special_point_name_by_point == DLS_VANISHING_NAME
-        is_quantity_discontinuous = np.isin(
-            special_point_name_by_point, (*DISCONTINUOUS_QUANTITIES, DLS_VANISHING_NAME)
+        special_point_names = np.array(self.special_point_names)[wheel_indices]
+        is_dls_vanishing = special_point_names == DLS_VANISHING_NAME
+        is_step_discontinuous = np.isin(
+            special_point_names, (*DISCONTINUOUS_QUANTITIES, DLS_VANISHING_NAME)
         )
-        step_measure_names = {
-            quantity_name
-            for quantity_name in quantity_table
-            if quantity_name.partition("[")[0] in MARGIN_MEASURES
-        } - set(CONTINUED_QUANTITIES)
-        is_undefined_by_name = {
-            quantity_name: special_point_name_by_point == quantity_name
-            for quantity_name in {*self.special_point_names} & {*quantity_table}
+
+        def is_undefined(quantity_name: str) -> np.ndarray:
+            if quantity_name == INITIAL_FORCE_FALL_NAME:
+                return ~is_dls_vanishing
+            is_step_margin = quantity_name.partition("[")[0] in MARGIN_MEASURES
+            substituted_names = [
+                margin_name
+                for margin_name, substitute_name in LINEAR_MARGIN_SUBSTITUTES.items()
+                if substitute_name == quantity_name
+            ]
+            is_zero_on_curve = np.isin(special_point_names, [quantity_name, *substituted_names])
+            if quantity_name == "lambda_4_plus":
+                return is_zero_on_curve | is_dls_vanishing
+            if is_step_margin and quantity_name not in CONTINUED_QUANTITIES:
+                return is_zero_on_curve | is_step_discontinuous
+            return is_zero_on_curve
+
+        # A transposed array has its points on the last axis.
+        masked_quantities = {
+            quantity_name: np.where(is_undefined(quantity_name), np.nan, quantity_values.T).T
+            for quantity_name, quantity_values in quantity_table.items()
         }
-        is_undefined_by_name |= {
-            substitute_name: special_point_name_by_point == quantity_name
-            for quantity_name, substitute_name in LINEAR_MARGIN_SUBSTITUTES.items()
-        }
-        is_undefined_by_name |= {
-            quantity_name: is_quantity_discontinuous
-            | is_undefined_by_name.get(quantity_name, False)
-            for quantity_name in step_measure_names
-        }
-        is_rear_force_undefined = (
-            is_undefined_by_name.get("lambda_4_plus", False) | is_dls_vanishing
-        )
-        is_undefined_by_name |= {
-            "lambda_4_plus": is_rear_force_undefined,
-            INITIAL_FORCE_FALL_NAME: ~is_dls_vanishing,
-        }
-        quantity_table = quantity_table | {
-            quantity_name: np.where(
-                is_undefined_by_quantity
-                if quantity_table[quantity_name].ndim == 1
-                else is_undefined_by_quantity[:, None],
-                np.nan,
-                quantity_table[quantity_name],
-            )
-            for quantity_name, is_undefined_by_quantity in is_undefined_by_name.items()
-        }
-        step_outcomes = np.where(
-            is_quantity_discontinuous, Outcome.STEPPED, quantity_table["outcome"]
-        )
-        return quantity_table | {
-            "outcome": step_outcomes,
-            "closure": np.where(is_quantity_discontinuous, 0.0, quantity_table["closure"]),
+        return masked_quantities | {
+            "outcome": np.where(is_step_discontinuous, Outcome.STEPPED, quantity_table["outcome"]),
+            "closure": np.where(is_step_discontinuous, 0.0, quantity_table["closure"]),
         }
 
     def are_points_admissible(self, quantity_table: QuantitiesByName) -> np.ndarray:
@@ -236,6 +208,17 @@ class TracedCurve(NamedTuple):
     scaled_vertices: np.ndarray
     meeting_seeds: tuple[CurveSeed, ...]
 
+    def contains_points(self, special_point_name: str, scaled_points: np.ndarray) -> bool:
+        """Return whether all points lie on this curve, and the curve is that of the named special
+        point.
+
+        The rows of `scaled_points` are points in the coordinates of `scaled_vertices`.
+        """
+        if special_point_name != self.special_point_curve.name:
+            return False
+        distances = compute_distances_to_polyline(scaled_points, self.scaled_vertices)
+        return bool(np.max(distances) < CURVE_TRACING_OPTIONS.max_distance_on_same_curve)
+
 
 class CurveTracer(NamedTuple):
     """Tracer of curves of special points within the ranges of two parameters."""
@@ -246,7 +229,6 @@ class CurveTracer(NamedTuple):
     arclength_options: ArclengthOptions
     step_options: StepOptions
     stage_reporter: Callable[[str], None] | None = None
-    tracing_options: CurveTracingOptions = DEFAULT_CURVE_TRACING_OPTIONS
     measures_force_peaks: bool = False  # whether branches measure the peaks of the gait's force
 
     def report_stage(self, stage_description: str) -> None:
@@ -255,14 +237,14 @@ class CurveTracer(NamedTuple):
             self.stage_reporter(stage_description)
 
     def with_parameters(
-        self, params: WheelParams, parameter_values: Mapping[str, float]
+        self, params: WheelParams, parameter_values: Iterable[float]
     ) -> WheelParams:
         """Return the wheel with new values of the two parameters."""
-        for parameter_name, parameter_value in parameter_values.items():
-            params = self.model.with_parameter(
-                params, parameter_name, jnp.asarray(parameter_value)
-            )[1]
-        return params
+        get_values = lambda params: [getattr(params, name) for name in self.parameter_names]
+        changed_params: WheelParams = eqx.tree_at(
+            get_values, params, [jnp.asarray(value) for value in parameter_values]
+        )
+        return changed_params
 
     def compute_parameter_fractions(self, parameter_values: np.ndarray) -> np.ndarray:
         """Return the two parameters as fractions of their ranges, on the last axis."""
@@ -276,7 +258,7 @@ class CurveTracer(NamedTuple):
         `parameter_index` selects the parameter. `start_cycles` contains the gaits of the wheels, if
         they are known.
         """
-        parameter_name, curve_seeds = self.parameter_names[parameter_index], []
+        parameter_name = self.parameter_names[parameter_index]
         lower_bound, upper_bound = self.parameter_ranges[parameter_index]
         self.report_stage(f"following {len(params.damping)} branches along {parameter_name}")
         branches = continue_branches(
@@ -287,11 +269,12 @@ class CurveTracer(NamedTuple):
             model=self.model,
             force_peaks=self.measures_force_peaks,
         )
-        for branch in branches:
-            for special_point in branch.special_points:
-                if can_continue_special_point(special_point.name):
-                    curve_seeds.append(self._make_seed(special_point))
-        return curve_seeds
+        return [
+            self._make_seed(special_point)
+            for branch in branches
+            for special_point in branch.special_points
+            if can_continue_special_point(special_point.name)
+        ]
 
     def _make_seed(self, special_point: SpecialPoint) -> CurveSeed:
         """Return the seed from which the curve of a special point is traced."""
@@ -303,7 +286,7 @@ class CurveTracer(NamedTuple):
         branch_wheel = BranchWheel(params, limit_cycle.collocation_state.is_phase_active)
         z = limit_cycle.collocation_state.solution
         special_point_name = choose_continued_special_point_name(
-            special_point.name, branch_wheel, z, self.tracing_options
+            special_point.name, branch_wheel, z
         )
         return CurveSeed(
             special_point_name,
@@ -318,51 +301,33 @@ class CurveTracer(NamedTuple):
     ) -> list[TracedCurve]:
         """Trace the curves through all seeds that lie on no known curve."""
         new_curves: list[TracedCurve] = []
-        new_seeds = [
-            curve_seed
-            for curve_seed in curve_seeds
-            if not any(self._is_on_curve(curve_seed, known_curve) for known_curve in known_curves)
-        ]
-        quantity_groups = {
-            find_test_quantity_group(
-                curve_seed.special_point_name, curve_seed.collocation_system.n_legs
-            )
-            for curve_seed in new_seeds
-        }
-        for quantity_group in sorted(quantity_groups):
-            remaining_seeds = [
-                curve_seed
-                for curve_seed in new_seeds
-                if find_test_quantity_group(
+        seeds_by_group: dict[tuple[str, ...], list[CurveSeed]] = {}
+        for curve_seed in curve_seeds:
+            if not any(self._is_on_curve(curve_seed, known_curve) for known_curve in known_curves):
+                quantity_group = find_test_quantity_group(
                     curve_seed.special_point_name, curve_seed.collocation_system.n_legs
                 )
-                == quantity_group
-            ]
+                seeds_by_group.setdefault(quantity_group, []).append(curve_seed)
+        for quantity_group in sorted(seeds_by_group):
+            remaining_seeds = seeds_by_group[quantity_group]
             while remaining_seeds:
-                batch_seeds: list[CurveSeed] = []
                 # A batch has one seed per name, because seeds of one name may lie on one curve.
+                first_seed_by_name: dict[str, CurveSeed] = {}
                 for curve_seed in remaining_seeds:
-                    if (
-                        curve_seed.special_point_name
-                        not in {curve_seed.special_point_name for curve_seed in batch_seeds}
-                        and len(batch_seeds) < batch_sizes.CURVE_BATCH_SIZE
-                    ):
-                        batch_seeds.append(curve_seed)
-                accepted_curves: list[TracedCurve] = []
+                    first_seed_by_name.setdefault(curve_seed.special_point_name, curve_seed)
+                batch_seeds = [*first_seed_by_name.values()][: batch_sizes.CURVE_BATCH_SIZE]
                 for candidate_curve in self._trace_curves_of_batch(quantity_group, batch_seeds):
                     if not any(
                         self.are_same_curve(candidate_curve, compared_curve)
-                        for compared_curve in (*known_curves, *new_curves, *accepted_curves)
+                        for compared_curve in (*known_curves, *new_curves)
                     ):
-                        accepted_curves.append(candidate_curve)
-                new_curves += accepted_curves
+                        new_curves.append(candidate_curve)
                 remaining_seeds = [
                     curve_seed
                     for curve_seed in remaining_seeds
                     if not any(curve_seed is batch_seed for batch_seed in batch_seeds)
                     and not any(
-                        self._is_on_curve(curve_seed, accepted_curve)
-                        for accepted_curve in accepted_curves
+                        self._is_on_curve(curve_seed, new_curve) for new_curve in new_curves
                     )
                 ]
         return new_curves
@@ -373,32 +338,17 @@ class CurveTracer(NamedTuple):
             curve_seed.z.section_state,
             self.compute_parameter_fractions(np.array(curve_seed.parameter_values)),
         )
-        has_same_special_point_name = (
-            curve_seed.special_point_name == traced_curve.special_point_curve.name
-        )
-        max_curve_distance = self.tracing_options.max_distance_on_same_curve
-        return has_same_special_point_name and bool(
-            compute_distances_to_polyline(seed_point[None], traced_curve.scaled_vertices)[0]
-            < max_curve_distance
-        )
+        return traced_curve.contains_points(curve_seed.special_point_name, seed_point[None])
 
-    def are_same_curve(self, traced_curve: TracedCurve, compared_curve: TracedCurve) -> bool:
+    @staticmethod
+    def are_same_curve(traced_curve: TracedCurve, compared_curve: TracedCurve) -> bool:
         """Return whether two curves are the same curve.
 
         The special points must have the same name, and all points of the first curve must lie on
         the second curve.
         """
-        has_same_special_point_name = (
-            traced_curve.special_point_curve.name == compared_curve.special_point_curve.name
-        )
-        max_curve_distance = self.tracing_options.max_distance_on_same_curve
-        return has_same_special_point_name and bool(
-            np.max(
-                compute_distances_to_polyline(
-                    traced_curve.scaled_vertices, compared_curve.scaled_vertices
-                )
-            )
-            < max_curve_distance
+        return compared_curve.contains_points(
+            traced_curve.special_point_curve.name, traced_curve.scaled_vertices
         )
 
     def _trace_curves_of_batch(
@@ -418,13 +368,11 @@ class CurveTracer(NamedTuple):
         max_mesh_refinements = GAIT_CONTINUATION_OPTIONS.max_mesh_refinements
         for refinement_index in range(1 + max_mesh_refinements):
             is_finest_mesh = refinement_index == max_mesh_refinements
-            branch_data_and_systems = self._continue_curves_of_batch(
+            branch_data_by_seed, collocation_system = self._continue_curves_of_batch(
                 quantity_group, curve_seeds, is_finest_mesh
             )
             mesh_limited_seeds = []
-            for curve_seed, (branch_data, collocation_system) in zip(
-                curve_seeds, branch_data_and_systems, strict=True
-            ):
+            for curve_seed, branch_data in zip(curve_seeds, branch_data_by_seed, strict=True):
                 if branch_data is not None and branch_data.is_mesh_limited and not is_finest_mesh:
                     options = collocation_system.cycle_options.refine_mesh()
                     mesh_limited_seeds.append(
@@ -457,8 +405,8 @@ class CurveTracer(NamedTuple):
 
     def _continue_curves_of_batch(
         self, quantity_group: tuple[str, ...], curve_seeds: list[CurveSeed], is_finest_mesh: bool
-    ) -> list[tuple[BranchData | None, CollocationSystem]]:
-        """Continue the curve through each seed, and return its data and its collocation system.
+    ) -> tuple[list[BranchData | None], CollocationSystem]:
+        """Continue the curve through each seed, and return its data and the collocation system.
 
         The collocation system has the finest mesh that any of the seeds has.
         """
@@ -476,37 +424,28 @@ class CurveTracer(NamedTuple):
         test_function = GaitTestFunction(
             collocation_system, self.parameter_names, quantity_group, self.model, self.step_options
         )
-        tree_stacker = lambda *trees_of_seeds: jax.tree.map(lambda *x: np.stack(x), *trees_of_seeds)
-        quantity_names = [
-            select_test_quantity(
-                curve_seed.special_point_name,
-                bool(curve_seed.branch_wheel.is_phase_active[0, 0] > 0.5),
-            )
-            for curve_seed in padded_seeds
-        ]
-        quantity_indices = [
-            jnp.asarray(quantity_group.index(quantity_name)) for quantity_name in quantity_names
-        ]
-        test_function_arguments = tree_stacker(
-            *(
-                TestFunctionWheel(curve_seed.branch_wheel, quantity_index)
-                for curve_seed, quantity_index in zip(padded_seeds, quantity_indices, strict=True)
-            )
-        )
         lower_bound, upper_bound = map(float, self.parameter_ranges[1])
-        compute_second_fraction = lambda curve_seed: jnp.asarray(
-            (curve_seed.parameter_values[1] - lower_bound) / (upper_bound - lower_bound)
-        )
-        z = tree_stacker(
-            *(
-                TestFunctionPoint(curve_seed.z, compute_second_fraction(curve_seed))
-                for curve_seed in padded_seeds
+
+        def make_start(curve_seed: CurveSeed) -> tuple[TestFunctionWheel, TestFunctionPoint, float]:
+            has_double_support = bool(curve_seed.branch_wheel.is_phase_active[0, 0] > 0.5)
+            quantity_name = select_test_quantity(curve_seed.special_point_name, has_double_support)
+            first_parameter_value, second_parameter_value = curve_seed.parameter_values
+            second_fraction = (second_parameter_value - lower_bound) / (upper_bound - lower_bound)
+            return (
+                TestFunctionWheel(
+                    curve_seed.branch_wheel, jnp.asarray(quantity_group.index(quantity_name))
+                ),
+                TestFunctionPoint(curve_seed.z, jnp.asarray(second_fraction)),
+                first_parameter_value,
             )
+
+        wheels, z, first_parameter_values = jax.tree.map(
+            lambda *leaves: np.stack(leaves), *map(make_start, padded_seeds)
         )
         gait_continuation = GaitContinuation(
             test_function.gait_problem,
             self.arclength_options,
-            test_function_arguments.branch_wheel,
+            wheels.branch_wheel,
             self.parameter_ranges[0],
             self.model,
             self.step_options,
@@ -515,28 +454,22 @@ class CurveTracer(NamedTuple):
         branch_continuation = CurveContinuation(
             TestFunctionCurve(test_function, (lower_bound, upper_bound)),
             self.arclength_options,
-            test_function_arguments,
+            wheels,
             self.parameter_ranges[0],
             self.parameter_names[1],
             tuple(curve_seed.special_point_name for curve_seed in padded_seeds),
             gait_continuation,
         )
-        first_parameter_values = jnp.asarray(
-            [curve_seed.parameter_values[0] for curve_seed in padded_seeds]
-        )
         is_seed_requested = np.arange(len(padded_seeds)) < len(curve_seeds)
         branch_data_by_seed = continue_and_locate_special_points(
             branch_continuation,
             z,
-            first_parameter_values,
+            jnp.asarray(first_parameter_values),
             is_seed_requested,
             lambda wheel_index, point: lambda: point,
             is_finest_mesh,
         )
-        return [
-            (branch_data_of_seed, collocation_system)
-            for branch_data_of_seed in branch_data_by_seed[: len(curve_seeds)]
-        ]
+        return branch_data_by_seed[: len(curve_seeds)], collocation_system
 
     def _make_traced_curve(self, curve_seed: CurveSeed, branch_data: BranchData) -> TracedCurve:
         """Build a labeled curve, and seeds at the special points that the curve meets."""
@@ -554,19 +487,13 @@ class CurveTracer(NamedTuple):
             if special_point.name == RANGE_EDGE_COLUMN:
                 continue
             point_beside_root = special_point.cycle
-            meeting_parameter_values = (
-                special_point.value,
-                float(
-                    self.parameter_ranges[1, 0]
-                    + np.ptp(self.parameter_ranges[1])
-                    * point_beside_root.z.second_parameter_fraction
-                ),
+            second_fraction = point_beside_root.z.second_parameter_fraction
+            second_parameter_value = float(
+                self.parameter_ranges[1, 0] + np.ptp(self.parameter_ranges[1]) * second_fraction
             )
+            meeting_parameter_values = special_point.value, second_parameter_value
             special_point_name = choose_continued_special_point_name(
-                special_point.name,
-                curve_seed.branch_wheel,
-                point_beside_root.z.z,
-                self.tracing_options,
+                special_point.name, curve_seed.branch_wheel, point_beside_root.z.z
             )
             if {special_point_name, curve_seed.special_point_name} == {
                 "lambda_4_plus",
@@ -585,23 +512,19 @@ class CurveTracer(NamedTuple):
                         meeting_parameter_values,
                     )
                 )
-                parameter_text_replacement = (
-                    f"{special_point.value:.9g}",
-                    f"{meeting_parameter_values[0]:.9g}",
+                first_reason, last_reason = (
+                    end_reason.replace(
+                        f"{special_point.value:.9g}", f"{meeting_parameter_values[0]:.9g}"
+                    )
+                    for end_reason in end_reasons
                 )
-                end_reasons = (
-                    end_reasons[0].replace(*parameter_text_replacement),
-                    end_reasons[1].replace(*parameter_text_replacement),
-                )
+                end_reasons = first_reason, last_reason
             elif can_continue_special_point(special_point_name):
-                seed_parameter_values = float(point_beside_root.p), meeting_parameter_values[1]
                 new_seeds.append(
-                    CurveSeed(
-                        special_point_name,
-                        seed_parameter_values,
-                        curve_seed.collocation_system,
-                        curve_seed.branch_wheel,
-                        point_beside_root.z.z,
+                    curve_seed._replace(
+                        special_point_name=special_point_name,
+                        parameter_values=(float(point_beside_root.p), second_parameter_value),
+                        z=point_beside_root.z.z,
                     )
                 )
             codim2_points.append(
@@ -633,7 +556,7 @@ class CurveTracer(NamedTuple):
             jnp.asarray(start_parameter_values),
         )
         is_onset_found = (
-            last_relative_parameter_change < self.tracing_options.relative_codim2_tolerance
+            last_relative_parameter_change < CURVE_TRACING_OPTIONS.relative_codim2_tolerance
         )
         first_parameter_value, second_parameter_value = (
             onset_parameter_values if is_onset_found else start_parameter_values
@@ -664,7 +587,7 @@ class CurveTracer(NamedTuple):
             parameter_points[::curve_traversal_sign],
         )
         z = jax.tree.map(lambda x: x[::curve_traversal_sign], z)
-        overrun_distance = self.tracing_options.codim2_overrun_distance
+        overrun_distance = CURVE_TRACING_OPTIONS.codim2_overrun_distance
         distances_to_meeting = np.linalg.norm(scaled_vertices - scaled_vertices[0], axis=1)
         point_index = int(
             np.argmax(distances_to_meeting >= min(overrun_distance, distances_to_meeting[-1]))
@@ -677,15 +600,13 @@ class CurveTracer(NamedTuple):
         dls_duration = (
             0.0
             if special_point_name == DLS_VANISHING_NAME
-            else self.tracing_options.dls_duration_guess
+            else CURVE_TRACING_OPTIONS.dls_duration_guess
         )
         z = z._replace(durations=z.durations.at[0, 0].set(dls_duration))
-        return CurveSeed(
-            special_point_name,
-            (first_parameter_value, second_parameter_value),
-            curve_seed.collocation_system,
-            curve_seed.branch_wheel,
-            z,
+        return curve_seed._replace(
+            special_point_name=special_point_name,
+            parameter_values=(first_parameter_value, second_parameter_value),
+            z=z,
         )
 
     def _make_labeled_curve(
@@ -697,23 +618,19 @@ class CurveTracer(NamedTuple):
         ).max(-1)
         quantity_table = branch_data.quantity_table | {"spectral_radius": spectral_radius}
         column_names = ("duration_dls", "duration_sls1", "duration_sls2", "spectral_radius")
-        curve_variables: dict[str, Any] = {
-            column_name: (
-                "point",
-                quantity_table[column_name],
-                make_measure_attributes(column_name),
-            )
-            for column_name in column_names
-        }
+        curve_variables: dict[str, Any] = make_labeled_variables(
+            {column_name: quantity_table[column_name] for column_name in column_names}, "point"
+        )
         curve_variables["mesh_error"] = ("point", quantity_table["mesh_error"])
         curve_variables["section_state"] = (("point", "component"), quantity_table["section_state"])
-        parameter_values = np.asarray(branch_data.points.p), quantity_table["second"]
-        curve_coordinates = {
-            parameter_name: ("point", parameter_value, make_measure_attributes(parameter_name))
-            for parameter_name, parameter_value in zip(
-                self.parameter_names, parameter_values, strict=True
-            )
-        }
+        first_parameter_name, second_parameter_name = self.parameter_names
+        curve_coordinates = make_labeled_variables(
+            {
+                first_parameter_name: np.asarray(branch_data.points.p),
+                second_parameter_name: quantity_table["second"],
+            },
+            "point",
+        )
         start_provenance = collect_provenance_attributes(
             curve_seed.branch_wheel.params, self.model, self.step_options
         )
@@ -756,7 +673,6 @@ def choose_continued_special_point_name(
     special_point_name: str,
     branch_wheel: BranchWheel,
     z: CollocationSolution,
-    tracing_options: CurveTracingOptions = DEFAULT_CURVE_TRACING_OPTIONS,
 ) -> str:
     """Return the name under which a special point of a gait is continued as a curve.
 
@@ -773,7 +689,7 @@ def choose_continued_special_point_name(
         return special_point_name
     dls_vanishes = (
         special_point_name != INITIAL_FORCE_FALL_NAME
-        and z.durations[0, 0] < tracing_options.max_zero_dls_duration
+        and z.durations[0, 0] < CURVE_TRACING_OPTIONS.max_zero_dls_duration
     )
     return DLS_VANISHING_NAME if dls_vanishes else "lambda_4_plus"
 

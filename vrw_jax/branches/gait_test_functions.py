@@ -111,6 +111,10 @@ class TestFunctionOptions:
     relative_difference_step: float = 1e-6
 
 
+TEST_FUNCTION_OPTIONS = TestFunctionOptions()
+"""Options of all test functions of gaits."""
+
+
 def select_test_quantity(special_point_name: str, has_double_support: bool) -> str:
     """Return the name of the quantity that vanishes at the named special point.
 
@@ -128,20 +132,17 @@ def select_test_quantity(special_point_name: str, has_double_support: bool) -> s
 def find_test_quantity_group(quantity_name: str, n_legs: int) -> tuple[str, ...]:
     """Return the names of all quantities that are evaluated together with `quantity_name`."""
     leg_suffixes = [f"[{leg_number}]" for leg_number in range(3, n_legs + 1)]
-    step_quantity_names = [
-        quantity_name + leg_suffix
-        for quantity_name, margin_measure in MARGIN_MEASURES.items()
+    step_quantity_names = tuple(
+        margin_name + leg_suffix
+        for margin_name, margin_measure in MARGIN_MEASURES.items()
         for leg_suffix in (leg_suffixes if margin_measure.leg_dimension else [""])
-    ]
+        if margin_name not in CONTINUED_QUANTITIES
+    )
     quantity_groups = (
         BIFURCATION_NAMES,
         CONTINUED_QUANTITIES,
         FORCE_QUANTITY_NAMES,
-        tuple(
-            quantity_name
-            for quantity_name in step_quantity_names
-            if quantity_name not in CONTINUED_QUANTITIES
-        ),
+        step_quantity_names,
     )
     return next(
         quantity_group
@@ -171,9 +172,6 @@ class GaitTestFunction(AbstractTestFunction):
     quantity_names: tuple[str, ...] = eqx.field(static=True)  # names of the quantities in one group
     model: ViscoelasticWheel
     step_options: StepOptions
-    test_function_options: TestFunctionOptions = eqx.field(
-        static=True, default=TestFunctionOptions()
-    )
 
     def linearize(
         self, wheel: TestFunctionWheel, z: CollocationSolution, p: Array
@@ -187,16 +185,16 @@ class GaitTestFunction(AbstractTestFunction):
             parameter_indices,
             QUANTITY_FUNCTION_BY_GROUP.get(self.quantity_names),
         )
-        trial_arguments = (
-            stack_parameters(self.with_parameters(branch_wheel, p).params),
-            branch_wheel.is_phase_active,
-            z,
+        newton_correction, stacked_tangents, monodromy_matrix, *quantities_and_gradients = (
+            linearize_trial(
+                stack_parameters(self.with_parameters(branch_wheel, p).params),
+                branch_wheel.is_phase_active,
+                z,
+            )
         )
-        newton_correction, tangents_by_parameter, monodromy_matrix, *quantities_and_gradients = (
-            linearize_trial(*trial_arguments)
-        )
-        tangent_by_first_parameter, tangent_by_second_parameter = (
-            jax.tree.map(lambda x, i=i: x[i], tangents_by_parameter) for i in range(2)
+        tangents_by_parameter = (
+            jax.tree.map(lambda x: x[0], stacked_tangents),
+            jax.tree.map(lambda x: x[1], stacked_tangents),
         )
         if quantities_and_gradients:
             quantity_values, parameter_gradients = quantities_and_gradients
@@ -213,15 +211,11 @@ class GaitTestFunction(AbstractTestFunction):
             )
         else:
             quantity_values, parameter_gradients = self._differentiate_step_quantities(
-                branch_wheel,
-                z,
-                p,
-                newton_correction,
-                (tangent_by_first_parameter, tangent_by_second_parameter),
+                branch_wheel, z, p, newton_correction, tangents_by_parameter
             )
         return TestFunctionNewtonStep(
             newton_correction,
-            (tangent_by_first_parameter, tangent_by_second_parameter),
+            tangents_by_parameter,
             monodromy_matrix,
             quantity_values[wheel.quantity_index],
             parameter_gradients[:, wheel.quantity_index],
@@ -260,19 +254,14 @@ class GaitTestFunction(AbstractTestFunction):
 
         def measure_gait_at_offset(basis_offset: Array) -> Array:
             parameter_change = basis_coefficients @ (basis_offset - correction_coordinates)
-            displace_leaf = lambda x, correction_leaf, first_tangent_leaf, second_tangent_leaf: (
-                x
-                + correction_leaf
-                + parameter_change[0] * first_tangent_leaf
-                + parameter_change[1] * second_tangent_leaf
+            displaced_solution = displace_solution(
+                z, newton_correction, tangents_by_parameter, parameter_change
             )
             return self.measure_step_quantities(
-                branch_wheel,
-                jax.tree.map(displace_leaf, z, newton_correction, *tangents_by_parameter),
-                p + parameter_change,
+                branch_wheel, displaced_solution, p + parameter_change
             )
 
-        difference_step = self.test_function_options.relative_difference_step
+        difference_step = TEST_FUNCTION_OPTIONS.relative_difference_step
         quantities_at_offsets = jax.vmap(measure_gait_at_offset)(
             difference_step * jnp.eye(3, 2, -1, p.dtype)
         )
@@ -286,10 +275,8 @@ class GaitTestFunction(AbstractTestFunction):
 
     def with_parameters(self, branch_wheel: BranchWheel, p: Array) -> BranchWheel:
         """Return the wheel with the two parameters replaced by the components of p."""
-        params = branch_wheel.params
-        for parameter_name, parameter_value in zip(self.parameter_names, p, strict=True):
-            params = self.model.with_parameter(params, parameter_name, parameter_value)[1]
-        return branch_wheel._replace(params=params)
+        get_values = lambda params: [getattr(params, name) for name in self.parameter_names]
+        return branch_wheel._replace(params=eqx.tree_at(get_values, branch_wheel.params, [*p]))
 
     @property
     def gait_problem(self) -> CollocationProblem:
@@ -336,8 +323,29 @@ class GaitTestFunction(AbstractTestFunction):
         return unbatch(compute_correction_norm)(z, newton_correction)
 
     def is_admissible(self, wheel: TestFunctionWheel, z: CollocationSolution, p: Array) -> Array:
-        are_durations_nonnegative = z.durations > -self.test_function_options.max_duration_roundoff
+        are_durations_nonnegative = z.durations > -TEST_FUNCTION_OPTIONS.max_duration_roundoff
         return jnp.all(are_durations_nonnegative | (wheel.branch_wheel.is_phase_active < 0.5))
+
+
+def displace_solution(
+    z: CollocationSolution,
+    newton_correction: CollocationSolution,
+    tangents_by_parameter: tuple[CollocationSolution, CollocationSolution],
+    parameter_change: Array,
+) -> CollocationSolution:
+    """Return a corrected solution, displaced along its tangents by a change of two parameters."""
+    displaced_solution: CollocationSolution = jax.tree.map(
+        lambda x, correction_leaf, first_tangent_leaf, second_tangent_leaf: (
+            x
+            + correction_leaf
+            + parameter_change[0] * first_tangent_leaf
+            + parameter_change[1] * second_tangent_leaf
+        ),
+        z,
+        newton_correction,
+        *tangents_by_parameter,
+    )
+    return displaced_solution
 
 
 @eqx.filter_jit
@@ -366,38 +374,24 @@ def locate_jump_onset(
             test_function.linearize(TestFunctionWheel(branch_wheel, quantity_index), z, p)
             for quantity_index in quantity_indices
         )
-        quantity_gradients = jnp.stack(
-            [force_newton_step.parameter_gradient, force_fall_newton_step.parameter_gradient]
-        )
+        newton_steps = force_newton_step, force_fall_newton_step
         parameter_change = -jnp.linalg.solve(
-            quantity_gradients,
-            jnp.stack(
-                [force_newton_step.test_function_value, force_fall_newton_step.test_function_value]
-            ),
+            jnp.stack([newton_step.parameter_gradient for newton_step in newton_steps]),
+            jnp.stack([newton_step.test_function_value for newton_step in newton_steps]),
         )
-        displace_leaf = (
-            lambda x, correction_leaf, tangent_by_first_parameter, tangent_by_second_parameter: (
-                x
-                + correction_leaf
-                + parameter_change[0] * tangent_by_first_parameter
-                + parameter_change[1] * tangent_by_second_parameter
-            )
+        z = displace_solution(
+            z,
+            force_newton_step.newton_correction,
+            force_newton_step.tangents_by_parameter,
+            parameter_change,
         )
-        return (
-            jax.tree.map(
-                displace_leaf,
-                z,
-                force_newton_step.newton_correction,
-                *force_newton_step.tangents_by_parameter,
-            ),
-            p + parameter_change,
-        ), parameter_change / p
+        return (z, p + parameter_change), parameter_change / p
 
     (_, p), relative_parameter_changes = lax.scan(
         take_newton_step,
         (z, p),
         None,
-        length=test_function.test_function_options.n_codim2_iterations,
+        length=TEST_FUNCTION_OPTIONS.n_codim2_iterations,
     )
     return p, jnp.max(jnp.abs(relative_parameter_changes[-1]))
 

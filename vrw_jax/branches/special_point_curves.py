@@ -139,16 +139,14 @@ def continue_special_points(
             curve_seeds = curve_tracer.find_seeds(
                 parameter_index, *select_tree_rows((params, cycle), None)
             )
-            start_parameter_value = float(getattr(params, parameter_name))
-            seed_order_by_distance = np.argsort(
-                [
-                    -abs(curve_seed.parameter_values[parameter_index] - start_parameter_value)
-                    for curve_seed in curve_seeds
-                ]
+            start_value = float(getattr(params, parameter_name))
+            compute_distance = lambda seed, index=parameter_index, start_value=start_value: abs(
+                seed.parameter_values[index] - start_value
             )
+            # The nearest seed of each name comes last and replaces the others.
             seeds_by_name = {
-                curve_seeds[seed_index].special_point_name: curve_seeds[seed_index]
-                for seed_index in seed_order_by_distance
+                curve_seed.special_point_name: curve_seed
+                for curve_seed in sorted(curve_seeds, key=compute_distance, reverse=True)
             } | seeds_by_name
     missing_special_point_names = sorted(set(names) - set(seeds_by_name))
     if missing_special_point_names:

@@ -6,6 +6,7 @@ between the samples. A curve that is not traced yet is found on branches through
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -54,8 +55,8 @@ class SpecialPointMapOptions:
     min_distance_to_examined: float = 5.0
 
 
-DEFAULT_SPECIAL_POINT_MAP_OPTIONS = SpecialPointMapOptions()
-"""Default options of the map of special points."""
+SPECIAL_POINT_MAP_OPTIONS = SpecialPointMapOptions()
+"""Options of all maps of special points."""
 
 GAIT_CHANGE_NAME = "gait"
 """Name of the change between a sample with a gait and a sample without a gait."""
@@ -98,7 +99,6 @@ def trace_special_points(
     params: WheelParams,
     model: ViscoelasticWheel,
     on_stage: Callable[[str], None] | None = None,
-    map_options: SpecialPointMapOptions = DEFAULT_SPECIAL_POINT_MAP_OPTIONS,
 ) -> tuple[tuple[SpecialPointCurve, ...], tuple[ScanSignChange, ...]]:
     """Trace the curves of special points in the two parameters of a scan.
 
@@ -109,11 +109,7 @@ def trace_special_points(
     """
     parameter_names = tuple(map(str, scan_dataset.outcome.dims))
     parameter_ranges = np.array(
-        [
-            (scan_dataset[parameter_name].values[0], scan_dataset[parameter_name].values[-1])
-            for parameter_name in parameter_names
-        ],
-        float,
+        [scan_dataset[parameter_name].values[[0, -1]] for parameter_name in parameter_names], float
     )
     curve_tracer = CurveTracer(
         (parameter_names[0], parameter_names[1]),
@@ -124,47 +120,44 @@ def trace_special_points(
         on_stage,
         measures_force_peaks=SECOND_PEAK_RATE_NAME in scan_dataset,
     )
-    curve_seeds = find_seeds_on_parallel_lines(curve_tracer, params, map_options)
-    traced_curves = _trace_curves_and_meetings(curve_tracer, curve_seeds, [], map_options)
+    curve_seeds = find_seeds_on_parallel_lines(curve_tracer, params)
+    traced_curves = _trace_curves_and_meetings(curve_tracer, curve_seeds, [])
     sign_changes = find_sign_changes_in_scan(scan_dataset, curve_tracer.parameter_names)
     examined_sign_changes: list[ScanSignChange] = []
     find_remaining_sign_changes = lambda: find_unexplained_sign_changes(
         sign_changes,
         [traced_curve.special_point_curve for traced_curve in traced_curves],
         scan_dataset,
-        map_options,
     )
-    for _ in range(map_options.max_search_rounds):
+    for _ in range(SPECIAL_POINT_MAP_OPTIONS.max_search_rounds):
         new_sign_changes = _select_distant_sign_changes(
-            find_remaining_sign_changes(), examined_sign_changes, map_options
+            find_remaining_sign_changes(), examined_sign_changes
         )
         if not new_sign_changes:
             break
         examined_sign_changes += new_sign_changes
         curve_seeds = []
         for parameter_index in range(2):
-            wheels_beside_sign_change = []
-            for sign_change in new_sign_changes:
-                if sign_change.parameter_index == parameter_index:
-                    parameter_sample_indices = zip(
-                        curve_tracer.parameter_names, sign_change.sample_indices, strict=True
-                    )
-                    sample_parameters = {
-                        parameter_name: float(scan_dataset[parameter_name][sample_index])
-                        for parameter_name, sample_index in parameter_sample_indices
-                    }
-                    wheels_beside_sign_change.append(
-                        curve_tracer.with_parameters(params, sample_parameters)
-                    )
+            wheels_beside_sign_change = [
+                curve_tracer.with_parameters(
+                    params,
+                    [
+                        float(scan_dataset[parameter_name][sample_index])
+                        for parameter_name, sample_index in zip(
+                            curve_tracer.parameter_names, sign_change.sample_indices, strict=True
+                        )
+                    ],
+                )
+                for sign_change in new_sign_changes
+                if sign_change.parameter_index == parameter_index
+            ]
             curve_seeds += _find_seeds_in_batches(
                 curve_tracer,
                 parameter_index,
                 wheels_beside_sign_change,
-                map_options.n_parallel_branches,
+                SPECIAL_POINT_MAP_OPTIONS.n_parallel_branches,
             )
-        traced_curves = _trace_curves_and_meetings(
-            curve_tracer, curve_seeds, traced_curves, map_options
-        )
+        traced_curves = _trace_curves_and_meetings(curve_tracer, curve_seeds, traced_curves)
     return tuple(traced_curve.special_point_curve for traced_curve in traced_curves), tuple(
         find_remaining_sign_changes()
     )
@@ -174,13 +167,12 @@ def _trace_curves_and_meetings(
     curve_tracer: CurveTracer,
     curve_seeds: list[CurveSeed],
     traced_curves: list[TracedCurve],
-    map_options: SpecialPointMapOptions,
 ) -> list[TracedCurve]:
     """Trace the curves through the seeds, and the curves through special points on new curves.
 
     Return these curves together with the known curves.
     """
-    for _ in range(map_options.n_meeting_rounds):
+    for _ in range(SPECIAL_POINT_MAP_OPTIONS.n_meeting_rounds):
         new_curves = curve_tracer.trace_curves(curve_seeds, traced_curves)
         known_curves = [
             traced_curve
@@ -199,33 +191,24 @@ def _trace_curves_and_meetings(
 def find_seeds_on_parallel_lines(
     curve_tracer: CurveTracer,
     params: WheelParams,
-    map_options: SpecialPointMapOptions = DEFAULT_SPECIAL_POINT_MAP_OPTIONS,
 ) -> list[CurveSeed]:
     """Find seeds on parallel branches in each of the two parameters.
 
     A branch in one parameter starts at the middle of that parameter's range. The branches differ by
     evenly spaced values of the other parameter.
     """
-    curve_seeds, parameter_range_midpoints, n_parallel_lines = (
-        [],
-        curve_tracer.parameter_ranges.mean(1),
-        map_options.n_parallel_branches,
-    )
-    for parameter_index, parameter_name in enumerate(curve_tracer.parameter_names):
+    curve_seeds, n_parallel_lines = [], SPECIAL_POINT_MAP_OPTIONS.n_parallel_branches
+    for parameter_index in range(2):
         lower_bound, upper_bound = curve_tracer.parameter_ranges[1 - parameter_index]
         line_parameter_values = lower_bound + (
             np.arange(n_parallel_lines) + 0.5
         ) / n_parallel_lines * (upper_bound - lower_bound)
-        other_parameter_name = curve_tracer.parameter_names[1 - parameter_index]
+        start_values = np.empty((n_parallel_lines, 2))
+        start_values[:, parameter_index] = curve_tracer.parameter_ranges[parameter_index].mean()
+        start_values[:, 1 - parameter_index] = line_parameter_values
         wheels_on_line = [
-            curve_tracer.with_parameters(
-                params,
-                {
-                    parameter_name: parameter_range_midpoints[parameter_index],
-                    other_parameter_name: line_parameter_value,
-                },
-            )
-            for line_parameter_value in line_parameter_values
+            curve_tracer.with_parameters(params, start_values_on_line)
+            for start_values_on_line in start_values
         ]
         curve_seeds += _find_seeds_in_batches(
             curve_tracer, parameter_index, wheels_on_line, n_parallel_lines
@@ -258,27 +241,20 @@ def _collect_signed_quantities(
 ) -> dict[str, np.ndarray]:
     """Return by name the quantities whose signs may change, as arrays over the two parameters."""
     signed_quantities = {
-        "lambda_4_plus": scan_dataset.lambda_4_plus.transpose(*parameter_names).values
+        STABILITY_CHANGE_NAME: 1.0
+        - scan_dataset[STABILITY_CHANGE_NAME].transpose(*parameter_names).values
     }
-    signed_quantities[STABILITY_CHANGE_NAME] = (
-        1.0 - scan_dataset[STABILITY_CHANGE_NAME].transpose(*parameter_names).values
-    )
-    if SECOND_PEAK_RATE_NAME in scan_dataset:
-        second_peak_rate = scan_dataset[SECOND_PEAK_RATE_NAME].transpose(*parameter_names)
-        signed_quantities[SECOND_PEAK_RATE_NAME] = second_peak_rate.values
-    for measure_name in (
-        measure_name
-        for measure_name in MARGIN_MEASURES
-        if measure_name not in LINEAR_MARGIN_SUBSTITUTES
-    ):
-        measure_values = scan_dataset[measure_name].transpose(*parameter_names, ...).values
-        leg_numbers = scan_dataset.leg.values if MARGIN_MEASURES[measure_name].leg_dimension else []
-        signed_quantities |= {
-            f"{measure_name}[{leg_number}]": measure_values[..., i]
-            for i, leg_number in enumerate(leg_numbers)
-        }
-        if not MARGIN_MEASURES[measure_name].leg_dimension:
-            signed_quantities[measure_name] = measure_values
+    margin_names = [name for name in MARGIN_MEASURES if name not in LINEAR_MARGIN_SUBSTITUTES]
+    peak_names = [SECOND_PEAK_RATE_NAME] if SECOND_PEAK_RATE_NAME in scan_dataset else []
+    for measure_name in ("lambda_4_plus", *peak_names, *margin_names):
+        measure = scan_dataset[measure_name].transpose(*parameter_names, ...)
+        if "leg" in measure.dims:
+            signed_quantities |= {
+                f"{measure_name}[{leg_number}]": measure.values[..., i]
+                for i, leg_number in enumerate(scan_dataset.leg.values)
+            }
+        else:
+            signed_quantities[measure_name] = measure.values
     return signed_quantities
 
 
@@ -290,10 +266,8 @@ def find_sign_changes_in_scan(
     A sign change of a measure is ignored if exactly one of the two samples has double support.
     """
     outcome_codes = scan_dataset.outcome.transpose(*parameter_names).values
-    has_gait_at_sample, has_coarse_mesh_at_sample = (
-        outcome_codes == Outcome.STEPPED,
-        outcome_codes == Outcome.MESH_TOO_COARSE,
-    )
+    has_gait_at_sample = outcome_codes == Outcome.STEPPED
+    has_coarse_mesh_at_sample = outcome_codes == Outcome.MESH_TOO_COARSE
     signed_quantities, sign_changes = _collect_signed_quantities(scan_dataset, parameter_names), []
     signed_quantities[GAIT_CHANGE_NAME] = np.where(
         has_gait_at_sample, 1.0, np.where(has_coarse_mesh_at_sample, np.nan, -1.0)
@@ -305,13 +279,6 @@ def find_sign_changes_in_scan(
         get_neighbor_values = lambda x, parameter_index=parameter_index: (
             np.moveaxis(x, parameter_index, 0)[:-1],
             np.moveaxis(x, parameter_index, 0)[1:],
-        )
-        parameter_axis_mover = (
-            lambda first_neighbor_values, second_neighbor_values, parameter_index=parameter_index: (
-                (first_neighbor_values, second_neighbor_values)
-                if parameter_index == 0
-                else (second_neighbor_values, first_neighbor_values)
-            )
         )
         has_first_sample_gait, has_second_sample_gait = get_neighbor_values(has_gait_at_sample)
         has_same_double_support = np.equal(
@@ -326,19 +293,18 @@ def find_sign_changes_in_scan(
                     & has_second_sample_gait
                     & (has_same_double_support | (quantity_name == "lambda_4_plus"))
                 )
-            for i, j in np.argwhere(has_sign_change):
+            for i, j in np.argwhere(has_sign_change).tolist():
                 sign_change_fraction = first_sample_values[i, j] / (
                     first_sample_values[i, j] - second_sample_values[i, j]
                 )
-                sample_indices = parameter_axis_mover(
-                    int(i if has_first_sample_gait[i, j] else i + 1), int(j)
-                )
+                sample_indices = (i if has_first_sample_gait[i, j] else i + 1), j
+                position_in_cells = float(i + sign_change_fraction), float(j)
+                if parameter_index == 1:  # The first index is that of the second parameter.
+                    sample_indices = sample_indices[::-1]
+                    position_in_cells = position_in_cells[::-1]
                 sign_changes.append(
                     ScanSignChange(
-                        quantity_name,
-                        parameter_index,
-                        sample_indices,
-                        parameter_axis_mover(float(i + sign_change_fraction), float(j)),
+                        quantity_name, parameter_index, sample_indices, position_in_cells
                     )
                 )
     return sign_changes
@@ -348,7 +314,6 @@ def find_unexplained_sign_changes(
     sign_changes: Sequence[ScanSignChange],
     special_point_curves: Sequence[SpecialPointCurve],
     scan_dataset: xr.Dataset,
-    map_options: SpecialPointMapOptions = DEFAULT_SPECIAL_POINT_MAP_OPTIONS,
 ) -> list[ScanSignChange]:
     """Return the sign changes that are not near any curve that explains them."""
     unexplained_sign_changes = []
@@ -389,7 +354,7 @@ def find_unexplained_sign_changes(
             for sign_change, curve_distance in zip(
                 sign_changes_of_quantity, curve_distances, strict=True
             )
-            if curve_distance > map_options.max_distance_to_explaining_curve
+            if curve_distance > SPECIAL_POINT_MAP_OPTIONS.max_distance_to_explaining_curve
         ]
     return unexplained_sign_changes
 
@@ -397,7 +362,6 @@ def find_unexplained_sign_changes(
 def _select_distant_sign_changes(
     unexplained_sign_changes: Sequence[ScanSignChange],
     examined_sign_changes: Sequence[ScanSignChange],
-    map_options: SpecialPointMapOptions,
 ) -> list[ScanSignChange]:
     """Select sign changes of each quantity that are distant from each other.
 
@@ -405,20 +369,13 @@ def _select_distant_sign_changes(
     """
     selected_sign_changes: list[ScanSignChange] = []
     for sign_change in unexplained_sign_changes:
-        sign_changes_of_same_kind = [
-            compared_sign_change
-            for compared_sign_change in (*examined_sign_changes, *selected_sign_changes)
-            if (compared_sign_change.quantity_name, compared_sign_change.parameter_index)
-            == (sign_change.quantity_name, sign_change.parameter_index)
-        ]
-        if all(
-            np.hypot(
-                *np.subtract(
-                    compared_sign_change.scan_position_in_cells, sign_change.scan_position_in_cells
-                )
-            )
-            > map_options.min_distance_to_examined
-            for compared_sign_change in sign_changes_of_same_kind
-        ):
+        is_close_to_examined = any(
+            compared.quantity_name == sign_change.quantity_name
+            and compared.parameter_index == sign_change.parameter_index
+            and math.dist(compared.scan_position_in_cells, sign_change.scan_position_in_cells)
+            <= SPECIAL_POINT_MAP_OPTIONS.min_distance_to_examined
+            for compared in (*examined_sign_changes, *selected_sign_changes)
+        )
+        if not is_close_to_examined:
             selected_sign_changes.append(sign_change)
     return selected_sign_changes
