@@ -304,7 +304,7 @@ class AbstractContinuation(abc.ABC):
         )
         if self.continuation_problem.has_kinks:
             results = continue_beyond_jumps(self, wheels, results)
-        return jax.tree.map(lambda x: x.reshape(-1, 2, *x.shape[1:]), results)
+        return jax.tree.map(lambda x: x.reshape(len(x) // 2, 2, *x.shape[1:]), results)
 
     def make_point_table(self, results_by_direction: ContinuationResult) -> BranchPointTable:
         """Return the points of branches that were continued in two directions from their starts.
