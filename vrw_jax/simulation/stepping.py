@@ -481,18 +481,19 @@ def convert_walk_arguments(
     options: StepOptions | None,
     engine: EngineName,
     batch_remedy_text: str = BATCH_REMEDY_TEXT,
+    allows_default_start: bool = False,
 ) -> tuple[WheelParams, Array, AbstractWheel, StepOptions, StepGroundValues | None]:
     """Return wheel, section state, model and options of a walk, and the ground of each step.
 
     They are converted to one floating-point type. The wheel and the model are those on the ground
-    of the first step. If `x` is None, the section state is the default start of the model. On flat
-    ground, the ground of the steps is None.
+    of the first step. On flat ground, the ground of the steps is None.
 
-    - `batch_remedy_text`: advice with which the error message for a batch of wheels ends.
+    - `batch_remedy_text`: advice with which the error message for a batch of wheels ends;
+    - `allows_default_start`: whether None as `x` is the default start of the model.
     """
     checked_model, params, stepwise_ground = split_stepwise_ground(params, model, n_steps)
     require_single_wheel(params, batch_remedy_text)
-    if x is None:
+    if x is None and allows_default_start:
         x = checked_model.compute_default_start(params)
     params, section_state, checked_model, options = convert_step_arguments(
         params, x, checked_model, options, engine

@@ -103,7 +103,14 @@ def simulate(
     n_steps, n_samples = check_int("n_steps", n_steps), check_int("n_samples", n_samples, 2)
     given_params = params
     params, x, model, options, stepwise_ground = convert_walk_arguments(
-        params, x, n_steps, model, options, engine, "simulate one at a time"
+        params,
+        x,
+        n_steps,
+        model,
+        options,
+        engine,
+        "simulate one at a time",
+        allows_default_start=True,
     )
     s = jax.tree.map(float, params).symbols()
     line_slopes = given_params.slope if given_params.slope.ndim else jnp.full(n_steps, params.slope)
