@@ -27,7 +27,6 @@ from vrw_jax.continuation.fixed_points import (
 )
 from vrw_jax.continuation.floquet import (
     MULTIPLIER_TOLERANCES,
-    MultiplierTolerances,
     floquet_multipliers,
 )
 from vrw_jax.continuation.sign_changes import (
