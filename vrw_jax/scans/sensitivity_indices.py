@@ -98,12 +98,11 @@ def sobol_indices(
     has_gait = scan.outcome.values == Outcome.STEPPED
     has_gaits_in_row = has_gait.reshape(n_samples_per_row, -1).all(axis=0)
     saltelli_rows_with_gaits = np.flatnonzero(has_gaits_in_row)
-    n_saltelli_rows = (
-        1 << len(saltelli_rows_with_gaits).bit_length() >> 1
-    )  # largest power of 2, or 0
+    n_rows_with_gaits = len(saltelli_rows_with_gaits)
+    n_saltelli_rows = (1 << n_rows_with_gaits.bit_length()) >> 1  # largest power of 2, or 0
     if n_saltelli_rows < sobol_options.min_saltelli_rows:
         raise ValueError(
-            f"only {len(saltelli_rows_with_gaits)} of {len(has_gaits_in_row)} rows walk "
+            f"only {n_rows_with_gaits} of {len(has_gaits_in_row)} rows walk "
             f"throughout, but indices need {sobol_options.min_saltelli_rows}: narrow the ranges to "
             "where there are gaits, or take more rows."
         )
@@ -119,12 +118,12 @@ def sobol_indices(
     random_generator = np.random.default_rng(0)  # The same scan gives the same intervals.
     roundoff_spreads = sobol_options.max_roundoff_spread * np.abs(measure_values).max(axis=(0, 2))
     sobol_index_estimates = _estimate_sobol_indices(measure_values, roundoff_spreads)
-    resampled_rows = random_generator.integers(
-        0, n_saltelli_rows, (sobol_options.n_bootstrap_resamples, n_saltelli_rows)
-    )
     resampled_index_estimates = [
-        _estimate_sobol_indices(measure_values[..., row_indices], roundoff_spreads)
-        for row_indices in resampled_rows
+        _estimate_sobol_indices(
+            measure_values[..., random_generator.integers(0, n_saltelli_rows, n_saltelli_rows)],
+            roundoff_spreads,
+        )
+        for _ in range(sobol_options.n_bootstrap_resamples)
     ]
     lower_bounds, upper_bounds = np.quantile(
         resampled_index_estimates, sobol_options.confidence_interval_quantiles, axis=0
@@ -140,7 +139,7 @@ def sobol_indices(
     sobol_index_variables: dict[str, tuple] = {}
     for index_position, index_name in enumerate(("first_order", "total")):
         index_label = index_name.replace("_", "-")
-        index_attributes = {"units": "1", "long_name": f"{index_label} Sobol' index"}
+        sobol_index_attributes = {"units": "1", "long_name": f"{index_label} Sobol' index"}
         for name_suffix, index_values in (
             ("", sobol_index_estimates),
             ("_lower", lower_bounds),
@@ -149,7 +148,7 @@ def sobol_indices(
             sobol_index_variables[index_name + name_suffix] = (
                 ("measure", "parameter"),
                 index_values[index_position],
-                index_attributes,
+                sobol_index_attributes,
             )
     sobol_index_variables["is_constant_measure"] = (
         "measure",
@@ -161,7 +160,7 @@ def sobol_indices(
         coords={"measure": measure_names, "parameter": swept_parameters},
         attrs={
             "rows": n_saltelli_rows,
-            "left_out": 1.0 - len(saltelli_rows_with_gaits) / len(has_gaits_in_row),
+            "left_out": 1.0 - n_rows_with_gaits / len(has_gaits_in_row),
         },
     )
 
