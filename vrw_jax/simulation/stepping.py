@@ -42,9 +42,6 @@ from vrw_jax.selection import LadderStep, LadderWheel, ModelChoice, describe_acc
 from vrw_jax.validation import check_int, check_reals, check_type, format_value
 from vrw_jax.wheel import Outcome, WheelParams
 
-BATCH_REMEDY_TEXT = "map over batches of parameters with jax.vmap, or use vrw.scan"
-"""Advice in the error message for a batch of wheels."""
-
 SectionStateLike = Array | np.ndarray | Sequence[float]
 """Section state in any form that users may pass.
 
@@ -171,14 +168,21 @@ def convert_step_arguments(
     model: ModelLike | None,
     options: StepOptions | None,
     engine: EngineName = "auto",
+    batch_remedy_text: str = "map over batches of parameters with jax.vmap, or use vrw.scan",
+    allows_default_start: bool = False,
 ) -> tuple[WheelParams, Array, AbstractWheel, StepOptions]:
     """Return wheel, section state, model and options, converted to one floating-point type.
 
     Raise a `TypeError` or a `ValueError` if an argument is invalid.
+
+    - `batch_remedy_text`: advice with which the error message for a batch of wheels ends;
+    - `allows_default_start`: whether None as `x` is the default start of the model.
     """
-    require_single_wheel(params, BATCH_REMEDY_TEXT)
+    require_single_wheel(params, batch_remedy_text)
     model = convert_model_argument(model)
     options = StepOptions.with_engine(convert_step_options(options), engine)
+    if x is None and allows_default_start:
+        x = model.compute_default_start(params)
     section_state = convert_section_state(x)
     section_size = model.count_section_entries(params)
     if section_state.shape == (3,) and section_size != 3:
@@ -480,23 +484,18 @@ def convert_walk_arguments(
     model: ModelLike | None,
     options: StepOptions | None,
     engine: EngineName,
-    batch_remedy_text: str = BATCH_REMEDY_TEXT,
-    allows_default_start: bool = False,
+    **start_checks: Any,
 ) -> tuple[WheelParams, Array, AbstractWheel, StepOptions, StepGroundValues | None]:
     """Return wheel, section state, model and options of a walk, and the ground of each step.
 
     They are converted to one floating-point type. The wheel and the model are those on the ground
     of the first step. On flat ground, the ground of the steps is None.
 
-    - `batch_remedy_text`: advice with which the error message for a batch of wheels ends;
-    - `allows_default_start`: whether None as `x` is the default start of the model.
+    - `start_checks`: further arguments of `convert_step_arguments`.
     """
     checked_model, params, stepwise_ground = split_stepwise_ground(params, model, n_steps)
-    require_single_wheel(params, batch_remedy_text)
-    if x is None and allows_default_start:
-        x = checked_model.compute_default_start(params)
     params, section_state, checked_model, options = convert_step_arguments(
-        params, x, checked_model, options, engine
+        params, x, checked_model, options, engine, **start_checks
     )
     if stepwise_ground is not None:
         stepwise_ground = tuple(

@@ -109,7 +109,7 @@ def simulate(
         model,
         options,
         engine,
-        "simulate one at a time",
+        batch_remedy_text="simulate one at a time",
         allows_default_start=True,
     )
     s = jax.tree.map(float, params).symbols()
@@ -252,8 +252,11 @@ def sample_walk_steps(
     while walk_outcome == Outcome.STEPPED and k < n_steps:
         sampled_step = trajectory_spec.step_sampler(x, k)
         has_occurred = sampled_step.durations > 0.0
+        occurred_intervals = (
+            slice(None) if has_occurred.all() else has_occurred
+        )  # slices copy nothing
         columns = {
-            name: samples[has_occurred].reshape(-1, *samples.shape[2:])
+            name: samples[occurred_intervals].reshape(-1, *samples.shape[2:])
             for name, samples in sampled_step.sampled_columns.items()
         }
         landing_foot_x = columns.pop("landing_foot_x")
