@@ -11,7 +11,7 @@ import vrw_jax as vrw
 from vrw_jax.cycles import make_finder
 from vrw_jax.cycles.margin_defaults import DEFAULT_MARGIN_NAMES, default_margins
 from vrw_jax.measures.table import MARGIN_MEASURES
-from vrw_jax.tuning.maximization import DEFAULT_MAXIMIZATION_OPTIONS, TrialKind, TuneStatus
+from vrw_jax.tuning.maximization import MAXIMIZATION_OPTIONS, TrialKind, TuneStatus
 from vrw_jax.tuning.objective import (
     compute_max_violation,
     compute_slack_scales,
@@ -79,7 +79,7 @@ def test_the_optimum_meets_the_first_order_condition_and_every_margin(max_dls_re
             retained.constraint_slacks,
             compute_slack_scales(retained.constraint_slacks, retained.slack_jacobian),
         )
-        <= 1.01 * DEFAULT_MAXIMIZATION_OPTIONS.active_bound_tolerance
+        <= 1.01 * MAXIMIZATION_OPTIONS.active_bound_tolerance
     )
 
 

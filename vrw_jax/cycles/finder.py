@@ -76,28 +76,35 @@ def is_same_branch(
     first_gait_point: GaitBranchPoint,
     second_gait_point: GaitBranchPoint,
     parameter_change: np.ndarray,
-) -> bool:
+) -> np.ndarray:
     """Return whether a branch connects two gaits whose parameters differ by `parameter_change`.
 
     The mean of the tangents at the two gaits must predict most of the distance between the gaits.
-    The same phases must occur in the two gaits, and no multiplier may cross 1 between them.
+    The same phases must occur in the two gaits, and no multiplier may cross 1 between them. The
+    arguments may have a leading axis over a batch of pairs.
     """
     first_gait_point, second_gait_point = select_tree_rows(
         (first_gait_point, second_gait_point), ...
     )
-    predicted_coordinate_change = parameter_change @ (
-        0.5 * (first_gait_point.coordinate_derivatives + second_gait_point.coordinate_derivatives)
+    mean_derivatives = 0.5 * (
+        first_gait_point.coordinate_derivatives + second_gait_point.coordinate_derivatives
     )
+    predicted_coordinate_change = (parameter_change[..., None, :] @ mean_derivatives)[..., 0, :]
     coordinate_change = second_gait_point.gait_coordinates - first_gait_point.gait_coordinates
-    prediction_error = np.linalg.norm(coordinate_change - predicted_coordinate_change)
-    if prediction_error > 0.5 * np.linalg.norm(predicted_coordinate_change) + 1e-6:
-        return False
+    prediction_error = np.linalg.norm(coordinate_change - predicted_coordinate_change, axis=-1)
+    max_prediction_error = 0.5 * np.linalg.norm(predicted_coordinate_change, axis=-1) + 1e-6
+    is_phase_equal = first_gait_point.is_phase_active == second_gait_point.is_phase_active
     fold_test_function = lambda branch_point: np.linalg.det(
-        np.eye(len(branch_point.return_map_jacobian)) - branch_point.return_map_jacobian
+        np.eye(branch_point.return_map_jacobian.shape[-1]) - branch_point.return_map_jacobian
     )
-    return bool(
-        np.array_equal(first_gait_point.is_phase_active, second_gait_point.is_phase_active)
-        and fold_test_function(first_gait_point) * fold_test_function(second_gait_point) > 0.0
+    with np.errstate(invalid="ignore"):  # A missing gait has NaN in its Jacobian.
+        has_no_fold = (
+            fold_test_function(first_gait_point) * fold_test_function(second_gait_point) > 0.0
+        )
+    return np.asarray(
+        (prediction_error <= max_prediction_error)
+        & is_phase_equal.reshape(*parameter_change.shape[:-1], -1).all(-1)
+        & has_no_fold
     )
 
 

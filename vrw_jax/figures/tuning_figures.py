@@ -21,7 +21,7 @@ from vrw_jax.figures.style import (
     typeset_greek_symbols,
 )
 from vrw_jax.measures import MEASURES
-from vrw_jax.tuning import DEFAULT_MAXIMIZATION_OPTIONS, TrialKind, TuneResult
+from vrw_jax.tuning import MAXIMIZATION_OPTIONS, TrialKind, TuneResult
 from vrw_jax.validation import check_type
 
 
@@ -66,7 +66,7 @@ def _draw_objective_path(axes: Axes, path_dataset: xr.Dataset) -> None:
     objective_values = path_dataset.objective.values
     is_gait_lost = np.isin(path_dataset.kind.values, (TrialKind.LOST, TrialKind.NOT_FINITE))
     are_constraints_satisfied = (
-        path_dataset.breach.values <= DEFAULT_MAXIMIZATION_OPTIONS.active_bound_tolerance
+        path_dataset.breach.values <= MAXIMIZATION_OPTIONS.active_bound_tolerance
     )
     axes.plot(
         evaluation_numbers[~is_gait_lost],

@@ -38,7 +38,7 @@ class ExplorationOptions:
     penalty_weight: float = 4.0
 
 
-DEFAULT_EXPLORATION_OPTIONS = ExplorationOptions()
+EXPLORATION_OPTIONS = ExplorationOptions()
 """Options of the exploration that `vrw.tune` uses."""
 
 
@@ -71,7 +71,7 @@ def explore_starts(
     - `evaluate_trials`: function that evaluates a batch of trials;
     - `normalized_starts`: normalized parameters of the starts, (n_starts, n_free_parameters).
     """
-    exploration_options, n_starts = DEFAULT_EXPLORATION_OPTIONS, len(normalized_starts)
+    n_starts = len(normalized_starts)
     current_trials = evaluate_trials(normalized_starts, None)
     has_active_gait = current_trials.is_usable_trial
     if not has_active_gait.any():
@@ -88,18 +88,18 @@ def explore_starts(
     objective_gradient_norm = np.median(
         np.linalg.norm(current_trials.objective_gradient[has_active_gait], axis=1)
     )
-    optimizer_step_lengths = np.full((n_starts, 1), exploration_options.first_optimizer_step_length)
+    optimizer_step_lengths = np.full((n_starts, 1), EXPLORATION_OPTIONS.first_optimizer_step_length)
     optimizer = optax.scale_by_adam(
-        b1=exploration_options.gradient_decay, b2=exploration_options.squared_gradient_decay
+        b1=EXPLORATION_OPTIONS.gradient_decay, b2=EXPLORATION_OPTIONS.squared_gradient_decay
     )
     optimizer_state = optimizer.init(jnp.asarray(normalized_starts))
     constraint_multipliers = np.zeros((n_starts, len(slack_scales)))
     n_lost_trials = np.zeros(n_starts, int)
-    for step_index in range(exploration_options.n_first_order_steps):
+    for step_index in range(EXPLORATION_OPTIONS.n_first_order_steps):
         penalty_weights = np.maximum(
             0.0,
             constraint_multipliers
-            - exploration_options.penalty_weight * current_trials.constraint_slacks / slack_scales,
+            - EXPLORATION_OPTIONS.penalty_weight * current_trials.constraint_slacks / slack_scales,
         )
         constraint_multipliers = np.where(
             has_active_gait[:, None], penalty_weights, constraint_multipliers
@@ -118,7 +118,7 @@ def explore_starts(
         trial_step_lengths = (
             optimizer_step_lengths
             * 0.5
-            * (1.0 + np.cos(np.pi * step_index / exploration_options.n_first_order_steps))
+            * (1.0 + np.cos(np.pi * step_index / EXPLORATION_OPTIONS.n_first_order_steps))
         )
         trial_parameters = np.clip(
             current_trials.normalized_parameters + trial_step_lengths * np.asarray(adam_update),
@@ -136,9 +136,9 @@ def explore_starts(
     max_violations = compute_max_violation(current_trials.constraint_slacks, slack_scales)
     penalized_objectives = (
         end_objectives
-        - exploration_options.penalty_weight * np.abs(end_objectives) * max_violations
+        - EXPLORATION_OPTIONS.penalty_weight * np.abs(end_objectives) * max_violations
     )
-    n_evaluations = n_starts * (exploration_options.n_first_order_steps + 1)
+    n_evaluations = n_starts * (EXPLORATION_OPTIONS.n_first_order_steps + 1)
     return ExplorationResult(
         normalized_starts,
         current_trials.normalized_parameters,
@@ -154,9 +154,9 @@ def _select_trials(
     is_new_trial_selected: np.ndarray, new_trials: EvaluatedTrial, old_trials: EvaluatedTrial
 ) -> EvaluatedTrial:
     """Select each trial of a batch from `new_trials` or from `old_trials`."""
-    # A transposed array has its trials on the last axis.
+    # A transposed array has its trials on the last axis. JAX would compile each transposition.
     select_rows = lambda new_leaf, old_leaf: (
-        np.where(is_new_trial_selected, np.transpose(new_leaf), np.transpose(old_leaf)).T
+        np.where(is_new_trial_selected, np.asarray(new_leaf).T, np.asarray(old_leaf).T).T
     )
     selected_trials: EvaluatedTrial = jax.tree.map(select_rows, new_trials, old_trials)
     return selected_trials

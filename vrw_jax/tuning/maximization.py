@@ -51,7 +51,7 @@ class EvaluatedTrial(NamedTuple):
     """
 
     normalized_parameters: np.ndarray  # free parameters in widths of their bounds
-    outcome: Any  # an Outcome; in a batch an array of codes
+    outcome: Any  # code of an `Outcome`
     is_on_branch: Any
     objective: Any
     objective_gradient: np.ndarray  # gradient of the objective by normalized parameters
@@ -157,7 +157,7 @@ class MaximizationOptions:
     active_bound_tolerance: float = 1e-6
 
 
-DEFAULT_MAXIMIZATION_OPTIONS = MaximizationOptions()
+MAXIMIZATION_OPTIONS = MaximizationOptions()
 """Options of the maximization that `vrw.tune` uses."""
 
 TrialEvaluator = Callable[[np.ndarray, EvaluatedTrial | None], EvaluatedTrial]
@@ -230,7 +230,7 @@ def maximize_objective(
     """Maximize the objective locally from `start_trial`, subject to slacks of at least 0."""
     from scipy.optimize import minimize  # This import is slow.
 
-    maximization_options = DEFAULT_MAXIMIZATION_OPTIONS
+    maximization_options = MAXIMIZATION_OPTIONS
     trial_record = _TrialRecord(trial_evaluator, start_trial, max_evaluations)
     gradient_norm = max(float(np.linalg.norm(start_trial.objective_gradient)), 1e-12)
     slack_scales = compute_slack_scales(start_trial.constraint_slacks, start_trial.slack_jacobian)
@@ -343,7 +343,7 @@ def maximize_objective(
         usable_trials = [trial for trial in trial_record.trials.values() if trial.is_usable_trial]
         feasible_trials = [
             trial
-            for trial in (*usable_trials, center_trial)
+            for trial in usable_trials
             if compute_violation_of(trial) <= active_bound_tolerance
         ]
         best_trial = (
@@ -378,7 +378,7 @@ def compute_optimality_conditions(trial: EvaluatedTrial) -> OptimalityConditions
         trial.normalized_parameters,
         compute_slack_scales(trial.constraint_slacks, trial.slack_jacobian),
     )
-    active_bound_tolerance = DEFAULT_MAXIMIZATION_OPTIONS.active_bound_tolerance
+    active_bound_tolerance = MAXIMIZATION_OPTIONS.active_bound_tolerance
     is_limit_active = np.concatenate(
         [
             np.abs(trial.constraint_slacks) <= 10.0 * active_bound_tolerance * slack_scales,

@@ -38,7 +38,7 @@ from vrw_jax.measures import (
     make_measure_attributes,
 )
 from vrw_jax.measures import xarray as xr
-from vrw_jax.numerics import StepOptions, select_tree_rows, with_default_jax_settings
+from vrw_jax.numerics import StepOptions, with_default_jax_settings
 from vrw_jax.simulation import (
     ModelLike,
     collect_provenance_attributes,
@@ -302,9 +302,10 @@ class TuneProblem:
         """
         start_trial = self.evaluate_trial(normalized_parameters, None)
         if not start_trial.has_gait_on_branch:
+            start_outcome = Outcome(int(start_trial.outcome))
             raise ValueError(
-                f"the start has no gait to tune ({start_trial.outcome.name}: "
-                f"{start_trial.outcome.meaning[:-1]}"
+                f"the start has no gait to tune ({start_outcome.name}: "
+                f"{start_outcome.meaning[:-1]}"
                 "): start from a wheel that walks, such as WheelParams()."
             )
         if not start_trial.has_finite_values:
@@ -321,73 +322,38 @@ class TuneProblem:
     def evaluate_trial(
         self, normalized_parameters: np.ndarray, neighbor_trial: EvaluatedTrial | None
     ) -> EvaluatedTrial:
-        """Evaluate the trial with these normalized parameters.
+        """Evaluate one trial, or a batch with one trial for each row of `normalized_parameters`.
 
         If `neighbor_trial` is given, the search for the gait begins at its gait.
         """
-        parameter_values = jnp.asarray(self.denormalize_parameters(normalized_parameters))
+        gait_finder = self.gait_finder
+        make_guess, find_gait, evaluate_measures = (
+            (gait_finder.make_initial_guess, gait_finder.find_gait, evaluate_on_gait)
+            if normalized_parameters.ndim == 1
+            else (gait_finder.make_initial_guesses, gait_finder.find_gaits, evaluate_on_gaits)
+        )
+        numpy_values = self.denormalize_parameters(normalized_parameters)
+        parameter_values = jnp.asarray(numpy_values)
         initial_guess = (
-            self.gait_finder.make_initial_guess(parameter_values)
+            make_guess(parameter_values)
             if neighbor_trial is None
             else neighbor_trial.gait_evaluation.gait.cycle.warm_start
         )
-        gait = self.gait_finder.find_gait(parameter_values, initial_guess)
+        gait = find_gait(parameter_values, initial_guess)
         gait_evaluation = GaitEvaluation(
-            gait, *evaluate_on_gait(self.objective_and_constraints, gait)
+            gait, *evaluate_measures(self.objective_and_constraints, gait)
         )
-        gait_outcome, is_on_branch = Outcome(int(gait.outcome)), True
-        if gait_outcome == Outcome.STEPPED and neighbor_trial is not None:
-            is_on_branch = is_same_branch(
+        gait_outcome = np.asarray(gait.outcome)
+        is_on_branch = np.ones(gait_outcome.shape, bool)
+        if neighbor_trial is not None:
+            # A trial without a gait has a failure of its own.
+            is_on_branch = (gait_outcome != Outcome.STEPPED) | is_same_branch(
                 neighbor_trial.gait_evaluation.gait.branch_point,
                 gait.branch_point,
-                self._compute_parameter_change(normalized_parameters, neighbor_trial),
+                numpy_values - self.denormalize_parameters(neighbor_trial.normalized_parameters),
             )
         return self.make_evaluated_trial(
             normalized_parameters, gait_evaluation, gait_outcome, is_on_branch
-        )
-
-    def _evaluate_trial_batch(
-        self, normalized_parameters: np.ndarray, neighbor_trials: EvaluatedTrial | None
-    ) -> EvaluatedTrial:
-        """Evaluate a batch of trials, one for each row of `normalized_parameters`.
-
-        If `neighbor_trials` is given, the searches for the gaits begin at its gaits.
-        """
-        parameter_values = jnp.asarray(self.denormalize_parameters(normalized_parameters))
-        initial_guesses = (
-            self.gait_finder.make_initial_guesses(parameter_values)
-            if neighbor_trials is None
-            else neighbor_trials.gait_evaluation.gait.cycle.warm_start
-        )
-        gaits = self.gait_finder.find_gaits(parameter_values, initial_guesses)
-        gait_evaluations = GaitEvaluation(
-            gaits, *evaluate_on_gaits(self.objective_and_constraints, gaits)
-        )
-        is_on_branch = np.ones(len(normalized_parameters), bool)
-        if neighbor_trials is not None:
-            neighbor_points = neighbor_trials.gait_evaluation.gait.branch_point
-            is_on_branch = np.array(
-                [
-                    is_same_branch(
-                        select_tree_rows(neighbor_points, trial_index),
-                        select_tree_rows(gaits.branch_point, trial_index),
-                        parameter_change,
-                    )
-                    for trial_index, parameter_change in enumerate(
-                        self._compute_parameter_change(normalized_parameters, neighbor_trials)
-                    )
-                ]
-            )
-        return self.make_evaluated_trial(
-            normalized_parameters, gait_evaluations, np.asarray(gaits.outcome), is_on_branch
-        )
-
-    def _compute_parameter_change(
-        self, normalized_parameters: np.ndarray, neighbor_trial: EvaluatedTrial
-    ) -> np.ndarray:
-        """Return the change of all parameters from the neighboring trial."""
-        return self.denormalize_parameters(normalized_parameters) - self.denormalize_parameters(
-            neighbor_trial.normalized_parameters
         )
 
     def make_evaluated_trial(
@@ -433,7 +399,7 @@ class TuneProblem:
             size=(n_starts - 1, len(self.free_parameters))
         )
         return explore_starts(
-            self._evaluate_trial_batch, np.vstack([self.normalized_start, random_normalized_starts])
+            self.evaluate_trial, np.vstack([self.normalized_start, random_normalized_starts])
         )
 
     def make_tune_result(
