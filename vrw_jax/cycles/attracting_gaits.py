@@ -50,12 +50,14 @@ def find_attracting_gaits(gait_finder: Any, parameter_values: Any) -> tuple[np.n
     fallback_wheel_indices, fallback_gaits = _find_gaits_from_starts(
         gait_finder, parameter_values[wheels_without_gait], compute_fallback_walk_starts
     )
+    is_fallback_found = np.asarray(fallback_gaits.outcome) == Outcome.STEPPED
+    wheels_with_gait = wheels_without_gait[fallback_wheel_indices[is_fallback_found]]
+    is_first_gait_kept = ~np.isin(gait_wheel_indices, wheels_with_gait)
     merged_gaits = concatenate_tree_rows(
-        select_tree_rows(gaits_from_first_starts, ~is_gait_missing), fallback_gaits
+        select_tree_rows(gaits_from_first_starts, is_first_gait_kept),
+        select_tree_rows(fallback_gaits, is_fallback_found),
     )
-    gait_wheel_indices = np.concatenate(
-        [gait_wheel_indices[~is_gait_missing], wheels_without_gait[fallback_wheel_indices]]
-    )
+    gait_wheel_indices = np.concatenate([gait_wheel_indices[is_first_gait_kept], wheels_with_gait])
     gait_sort_order = np.argsort(gait_wheel_indices, kind="stable")
     return gait_wheel_indices[gait_sort_order], jax.device_put(
         select_tree_rows(merged_gaits, gait_sort_order)
@@ -93,15 +95,11 @@ def _find_gaits_from_starts(
     candidate_gait_speeds = sum_over_steps(candidate_gaits.step_length) / np.where(
         is_gait_valid, sum_over_steps(candidate_gaits.durations), 1.0
     )
-    scaled_step_end_states = np.stack(
-        [
-            scale_section_states(
-                gait_finder, parameter_values[candidate_wheel_indices], step_end_states
-            )
-            for step_end_states in np.asarray(candidate_gaits.steps.section_state).swapaxes(0, 1)
-        ],
-        1,
-    )
+    scaled_step_end_states = scale_section_states(
+        gait_finder,
+        parameter_values[candidate_wheel_indices],
+        np.asarray(candidate_gaits.steps.section_state).swapaxes(0, 1),
+    ).swapaxes(0, 1)
     # A gait that repeats after fewer steps is a gait of a shorter period.
     state_distances_to_last_step = np.abs(
         scaled_step_end_states[:, :-1] - scaled_step_end_states[:, -1:]

@@ -584,7 +584,9 @@ def _find_fallback_starts(
         retried_cycle = map_in_batches(
             gait_finder.find_cycles, batch_sizes.GAIT_BATCH_SIZES, retried_params, start_states
         )
-        is_gait_found = np.asarray(retried_cycle.found)
+        # JAX would compile a comparison for every number of wheels.
+        retried_outcomes = np.asarray(retried_cycle.outcome)
+        is_gait_found = retried_outcomes == Outcome.STEPPED
         found_wheel_indices = retried_wheel_indices[is_gait_found]
         collocation_state = _replace_wheels(
             collocation_state,
@@ -594,9 +596,7 @@ def _find_fallback_starts(
         if len(found_wheel_indices):
             best_finder_and_starts = gait_finder, collocation_state
         has_known_state[found_wheel_indices] = True
-        is_mesh_too_coarse[retried_wheel_indices] = (
-            np.asarray(retried_cycle.outcome) == Outcome.MESH_TOO_COARSE
-        )
+        is_mesh_too_coarse[retried_wheel_indices] = retried_outcomes == Outcome.MESH_TOO_COARSE
         needs_better_gait[found_wheel_indices] = (
             can_refine_mesh & _has_large_mesh_error(retried_cycle)[is_gait_found]
         )

@@ -142,13 +142,14 @@ def scale_section_states(
 ) -> np.ndarray:
     """Return the continuous components of the section state of each wheel, in units of the wheel.
 
-    The remaining components are discrete codes.
+    The remaining components are discrete codes. The last two axes of `section_states` are
+    (wheels, components).
     """
     section_units = stack_section_units(gait_finder.model, parameter_values, gait_finder.n_legs)
     n_coordinates = gait_finder.model.count_continuous_section_entries(
         WheelParams(n_legs=gait_finder.n_legs)
     )
-    return (section_states / section_units)[:, :n_coordinates]
+    return (section_states / section_units)[..., :n_coordinates]
 
 
 class DistinctWalkEnds(NamedTuple):
