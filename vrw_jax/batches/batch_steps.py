@@ -357,10 +357,10 @@ def order_wheels_by_work(
     from a fit to measured numbers of solver steps, for states near the gaits and far from them
     (`python -m experiments.speed.straggler_steps`).
     """
-    float32_values = [np.asarray(x, np.float32) for x in values_by_parameter]
-    p = dict(zip(PARAMETER_NAMES, float32_values, strict=True))
-    theta, dtheta = section_states.T[:2].astype(np.float32)
     with np.errstate(all="ignore"):
+        float32_values = [np.asarray(x, np.float32) for x in values_by_parameter]
+        p = dict(zip(PARAMETER_NAMES, float32_values, strict=True))
+        theta, dtheta = section_states.T[:2].astype(np.float32)
         log_solver_work = (
             np.log(p["damping"] / p["leg_mass"])
             - 0.25 * np.log(p["stiffness"] / p["leg_mass"])
