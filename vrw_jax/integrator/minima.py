@@ -118,22 +118,20 @@ def update_margin_minima_state(
         is_lower = is_minimum_lower.reshape(len(old_value), *(1,) * (old_value.ndim - 2), -1)
         return jnp.where(is_lower, new_value, old_value)
 
-    # The fields of the state begin with the present margins; the others belong to the minimum.
-    lowest_minimum_of_step = (
-        margin_minimum,
-        jnp.stack(step_start.q),
-        jnp.stack(step_start.v),
-        step_length,
-        margin_minimum_location * step_length,
-        margin_minima_state.margin_rates,
-        step_start_tangents,
+    minimum_of_step = margin_minima_state._replace(
+        lowest_margin_values=margin_minimum,
+        step_start_q=jnp.stack(step_start.q),
+        step_start_v=jnp.stack(step_start.v),
+        step_length=step_length,
+        time_to_minimum=margin_minimum_location * step_length,
+        step_start_margin_rates=margin_minima_state.margin_rates,
+        step_start_tangents=step_start_tangents,
     )
-    return MarginMinimaState(
-        *select_trees_by_condition(
-            is_accepted, (margin_values, margin_rates), margin_minima_state[:2]
-        ),
-        *jax.tree.map(replace_if_lower, margin_minima_state[2:], lowest_minimum_of_step),
+    margin_values, margin_rates = select_trees_by_condition(
+        is_accepted, (margin_values, margin_rates), margin_minima_state[:2]
     )
+    lowest_minimum = jax.tree.map(replace_if_lower, margin_minima_state, minimum_of_step)
+    return lowest_minimum._replace(margin_values=margin_values, margin_rates=margin_rates)
 
 
 class MarginMinimaResult(NamedTuple):
@@ -272,7 +270,7 @@ def refine_margin_minima(
 
 
 def _select_margin(margins: Array, margin_index: Array) -> Array:
-    """Return one margin of an array (..., margins, batch)."""
+    """Return the margin with the given index, from margins of shape (..., margins, batch)."""
     is_selected_margin = jnp.arange(margins.shape[-2]) == margin_index
     return jnp.sum(jnp.where(is_selected_margin[:, None], margins, 0.0), -2)
 

@@ -306,7 +306,7 @@ def can_use_batch_kernel(options: StepOptions) -> bool:
 class StepTraceConfig(NamedTuple):
     """Static settings on which the traced program of a batch of walking steps depends."""
 
-    argument_structure: Any  # tree structure of (params, x, options)
+    argument_structure: Any  # tree structure of the arguments, such as (params, x, options)
     stop_at_lift_off: bool
     friction: float | None = None  # friction of the margins; None for the minimal results
 

@@ -36,6 +36,7 @@ from vrw_jax.numerics import (
 )
 from vrw_jax.wheel import (
     MAX_SI_VALUE,
+    PAPER_PHASES,
     AbstractPhase,
     Landing,
     Motion,
@@ -242,9 +243,7 @@ def finish_gait_step(
         options,
     )
     section_state = phase_end_results[-1].q[0], *phase_end_results[-1].v
-    return _collect_advance_result(
-        section_state, phase_end_results, step_outcome, engine, n_omitted_phases=phase_index
-    )
+    return _collect_advance_result(section_state, phase_end_results, step_outcome, engine)
 
 
 def make_advance_result(phase_sequence: PhaseSequenceResult, engine: str) -> AdvanceResult:
@@ -258,9 +257,7 @@ def make_advance_result(phase_sequence: PhaseSequenceResult, engine: str) -> Adv
     if phase_sequence.next_line_tilt is not None:
         touchdown_angle = touchdown_angle - phase_sequence.next_line_tilt
     section_state = touchdown_angle, *touchdown_rates
-    return _collect_advance_result(
-        section_state, phase_end_results, phase_sequence.outcome, engine, n_omitted_phases=0
-    )
+    return _collect_advance_result(section_state, phase_end_results, phase_sequence.outcome, engine)
 
 
 def _collect_advance_result(
@@ -268,12 +265,12 @@ def _collect_advance_result(
     phase_end_results: Sequence[PhaseResult],
     step_outcome: Array,
     engine: str,
-    n_omitted_phases: int,
 ) -> AdvanceResult:
     """Return the result of a step that ends in `section_state`, or in zeros if it failed.
 
     Phases before the start of the motion have a duration of 0.
     """
+    n_omitted_phases = len(PAPER_PHASES) - len(phase_end_results)
     has_stepped = step_outcome == Outcome.STEPPED
     durations = [phase_end.duration for phase_end in phase_end_results]
     solver_steps = [phase_end.n_solver_steps for phase_end in phase_end_results]

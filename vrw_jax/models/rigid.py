@@ -41,6 +41,7 @@ from vrw_jax.wheel import (
     WheelParams,
     compute_rear_foot_height,
     dynamics,
+    geometry,
     require_known_friction,
     transitions,
 )
@@ -444,9 +445,9 @@ class RollingMotion(eqx.Module):
         The value is negative if the wheel does not reach theta.
         """
         s = self.s
-        height_drop = _compute_cos_theta_plus_phi(
-            s, self.first_angle
-        ) - _compute_cos_theta_plus_phi(s, theta)
+        height_drop = (
+            _rotate_to_vertical(s, self.first_angle).cos - _rotate_to_vertical(s, theta).cos
+        )
         return self.initial_rate**2 + 2.0 * _compute_gravity_stiffness(s) * height_drop
 
     def compute_time_to_angle(self, theta: Elementwise) -> Elementwise:
@@ -512,9 +513,8 @@ class RollingMotion(eqx.Module):
         Only the angular acceleration (rad/s^2) due to gravity differs from 0.
         """
         zero_like_theta = 0.0 * theta
-        sin_theta_plus_phi = jnp.sin(theta) * self.s.cos_phi + jnp.cos(theta) * self.s.sin_phi
         return dynamics.Acceleration(
-            _compute_gravity_stiffness(self.s) * sin_theta_plus_phi,
+            _compute_gravity_stiffness(self.s) * _rotate_to_vertical(self.s, theta).sin,
             zero_like_theta,
             zero_like_theta,
         )
@@ -627,9 +627,9 @@ def _compute_gravity_stiffness(s: Symbols) -> Elementwise:
     return s.Mt * s.g * s.L0 / _compute_foot_inertia(s)
 
 
-def _compute_cos_theta_plus_phi(s: Symbols, theta: Elementwise | float) -> Elementwise:
-    """Return the cosine of the angle between the stance leg and the vertical, theta + phi."""
-    return jnp.cos(theta) * s.cos_phi - jnp.sin(theta) * s.sin_phi
+def _rotate_to_vertical(s: Symbols, theta: Elementwise | float) -> geometry.SineCosine:
+    """Return the sine and cosine of theta + phi, the angle of the stance leg from the vertical."""
+    return geometry.rotate_to_vertical(s, jnp.sin(theta), jnp.cos(theta))
 
 
 def _compute_rolling_time(

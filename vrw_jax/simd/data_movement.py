@@ -3,6 +3,7 @@
 Each rule returns an array of LLVM values.
 """
 
+import bisect
 import math
 from collections.abc import Sequence
 from typing import Any
@@ -164,40 +165,36 @@ def _concatenate_along_axis(
     if all(isinstance(x, np.ndarray) for x in joined_arrays):
         return np.concatenate(joined_arrays, join_axis)  # type: ignore[arg-type]
     nonempty_arrays = [x for x in joined_arrays if x.shape[join_axis]]
-    joined_array_starts = np.cumsum([0, *(x.shape[join_axis] for x in nonempty_arrays)]).tolist()
+    part_starts = np.cumsum([0, *(x.shape[join_axis] for x in nonempty_arrays)]).tolist()
 
     def select_joined_array_entry(result_index: EntryIndex) -> LlvmValue:
-        i, selected_entry = result_index[join_axis], None
-        for joined_array, joined_array_start in zip(
-            nonempty_arrays, joined_array_starts, strict=False
-        ):
-            joined_array_length = joined_array.shape[join_axis]
-            index_in_joined_array = array_emitter.emit_affine_index(i, -joined_array_start)
-            if isinstance(i, int) and not 0 <= index_in_joined_array < joined_array_length:
-                continue
-            # Beyond the end of a part any entry is valid, because the select below discards it.
-            if not isinstance(i, int):
-                index_in_joined_array = array_emitter.emit_clamped_index(
-                    index_in_joined_array, joined_array_length - 1
-                )
-            joined_array_entry = array_emitter.get_array_entry(
-                joined_array,
-                (*result_index[:join_axis], index_in_joined_array, *result_index[join_axis + 1 :]),
+        def get_part_entry(part: LlvmArray, index_in_part: Any) -> LlvmValue:
+            return array_emitter.get_array_entry(
+                part, (*result_index[:join_axis], index_in_part, *result_index[join_axis + 1 :])
             )
-            if isinstance(i, int):
-                return joined_array_entry
-            is_past_joined_array_start = array_emitter.llvm_builder.icmp_signed(
-                ">=", i, ir.Constant(I64, joined_array_start)
+
+        i, selected_entry = result_index[join_axis], None
+        if isinstance(i, int):
+            part_position = bisect.bisect_right(part_starts, i) - 1
+            return get_part_entry(nonempty_arrays[part_position], i - part_starts[part_position])
+        for part, part_start in zip(nonempty_arrays, part_starts, strict=False):
+            # Beyond the end of a part any entry is valid, because the select below discards it.
+            part_entry = get_part_entry(
+                part,
+                array_emitter.emit_clamped_index(
+                    array_emitter.emit_affine_index(i, -part_start), part.shape[join_axis] - 1
+                ),
             )
             if selected_entry is None:
-                selected_entry = joined_array_entry
-            else:
-                selected_entry = array_emitter.llvm_builder.select(
-                    is_past_joined_array_start,
-                    *array_emitter.value_emitter.to_scalars_or_vectors(
-                        joined_array_entry, selected_entry
-                    ),
-                )
+                selected_entry = part_entry
+                continue
+            is_past_start = array_emitter.llvm_builder.icmp_signed(
+                ">=", i, ir.Constant(I64, part_start)
+            )
+            selected_entry = array_emitter.llvm_builder.select(
+                is_past_start,
+                *array_emitter.value_emitter.to_scalars_or_vectors(part_entry, selected_entry),
+            )
         return selected_entry
 
     return LazyArray(

@@ -23,7 +23,7 @@ _loaded_code_lock = Lock()
 
 def register_machine_code(machine_code: MachineCode) -> None:
     """Load machine code, and make it callable by its name in JAX programs."""
-    object_code = machine_code.object_code_future.result()  # LLVM has compiled it.
+    object_code = machine_code.object_code_future.result()  # waits until LLVM has compiled it
     with _loaded_code_lock:
         if machine_code.ffi_target_name not in LOADED_CODE_BY_FFI_TARGET:
             loaded_code = LoadedMachineCode(object_code)

@@ -262,15 +262,16 @@ class _LoopCarry:
         ):
             if memory_array is None:
                 continue
+            has_separate_memory = (
+                isinstance(next_array, MemoryArray)
+                and isinstance(next_array.base_pointer, ir.AllocaInstr)
+                and next_array.base_pointer not in carried_pointers
+            )
             if isinstance(next_array, PendingArrayUpdate) and memory_array.contains_array(
                 next_array.base_array
             ):
                 next_array = next_array.store_update_in_memory()
-            elif not memory_array.contains_array(next_array) and not (
-                isinstance(next_array, MemoryArray)
-                and isinstance(next_array.base_pointer, ir.AllocaInstr)
-                and next_array.base_pointer not in carried_pointers
-            ):
+            elif not (has_separate_memory or memory_array.contains_array(next_array)):
                 copied_array = self.array_emitter.allocate_memory_array(
                     memory_array.shape, memory_array.entry_type
                 )
