@@ -334,8 +334,11 @@ def _solve_mesh_interval(
         node_accelerations: NodeAccelerations, h: Array, residual_projections: list
     ) -> tuple[NodeAccelerations, Array]:
         eigenvector_corrections = [
-            [_multiply_and_sum(matrix_row, residual_projection) for matrix_row in inverse_matrix]
-            for inverse_matrix, residual_projection in zip(
+            [
+                _multiply_and_sum(matrix_row, residual_projection)
+                for matrix_row in inverse_stage_matrix
+            ]
+            for inverse_stage_matrix, residual_projection in zip(
                 inverse_stage_matrices, residual_projections, strict=True
             )
         ]
@@ -612,7 +615,9 @@ def _project_linearized_residuals(
     node_fraction_powers = np.stack(
         [np.ones(N_GAUSS_NODES), GAUSS_NODES - 0.5, 0.5 * GAUSS_NODES * GAUSS_NODES - 0.125]
     )
-    projected_powers = np.sum(EIGENVECTOR_PROJECTION_MATRIX[:, None] * node_fraction_powers, -1)
+    projected_node_fraction_powers = np.sum(
+        EIGENVECTOR_PROJECTION_MATRIX[:, None] * node_fraction_powers, -1
+    )
 
     def sum_weighted_terms(term_weights: np.ndarray) -> Vector:
         constant_weight, linear_weight, quadratic_weight = map(float, term_weights)
@@ -628,7 +633,7 @@ def _project_linearized_residuals(
 
     return [
         list(map(_ComplexNumber, sum_weighted_terms(-w.real), sum_weighted_terms(-w.imag)))
-        for w in projected_powers
+        for w in projected_node_fraction_powers
     ]
 
 

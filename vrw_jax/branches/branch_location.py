@@ -862,7 +862,7 @@ def continue_and_locate_special_points(
 
     for admissible_range in admissible_ranges:
         wheel_index = admissible_range.wheel_index
-        inner_roots_of_wheel = sorted(
+        roots_between_ends = sorted(
             (
                 located_root
                 for located_root in inner_special_points
@@ -872,7 +872,7 @@ def continue_and_locate_special_points(
                 located_root.request.point_pair[0] + located_root.chord_fraction
             ),
         )
-        special_points = [make_special_point(root, False) for root in inner_roots_of_wheel]
+        special_points = [make_special_point(root, False) for root in roots_between_ends]
         end_reasons = []
         for range_end_index, status_code in enumerate(results_by_direction.status[wheel_index]):
             located_end = located_ends.get((wheel_index, range_end_index))

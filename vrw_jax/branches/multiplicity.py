@@ -117,12 +117,12 @@ def add_multiple_bifurcations(
         point_pair[0] <= root.request.point_pair[0] and root.request.point_pair[1] <= point_pair[1]
     )
     multiplier_moduli = point_table.quantity_table[MULTIPLIER_MODULI_COLUMN]
-    rank_requests = []
+    root_requests = []
     for point_pair in point_pairs:
         n_explained_crossings = sum(
             root.n_multipliers for root in located_roots if is_root_between(root, point_pair)
         )
-        rank_requests += [
+        root_requests += [
             request_mean_modulus_root(point_pair, range(rank, rank + 1))
             for rank in find_unexplained_ranks(
                 multiplier_moduli[list(point_pair)], n_explained_crossings
@@ -130,7 +130,7 @@ def add_multiple_bifurcations(
         ]
     # Each group contains the roots for ranks that may cross the unit circle together.
     root_groups: list[list[LocatedRoot]] = []
-    for root in locate_roots(rank_requests):
+    for root in locate_roots(root_requests):
         if not root.vanishes_at_root(point_table.quantity_table):
             continue
         last_root = root_groups[-1][-1] if root_groups else None

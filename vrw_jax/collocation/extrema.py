@@ -63,6 +63,7 @@ class ExtremumSearchOptions:
 
 
 EXTREMUM_SEARCH_OPTIONS = ExtremumSearchOptions()
+"""Options of `find_quantity_extrema`."""
 
 
 class QuantityTimeDerivatives(NamedTuple):

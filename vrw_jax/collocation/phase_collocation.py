@@ -422,11 +422,8 @@ def _linearize_phase(
         start: _StateAndTangents, interval_scan_inputs: tuple
     ) -> tuple[_StateAndTangents, Array]:
         node_accelerations, interval_length_fraction = interval_scan_inputs
-        mesh_interval = (
-            interval_length_fraction,
-            interval_length_fraction * phase_duration,
-            node_accelerations,
-        )
+        h = interval_length_fraction * phase_duration
+        mesh_interval = interval_length_fraction, h, node_accelerations
         node_q, node_v, node_q_tangents, node_v_tangents = prevent_fusion(
             _evaluate_interval_nodes(start, *mesh_interval)
         )
@@ -444,7 +441,7 @@ def _linearize_phase(
             _assemble_node_system(
                 linearization_context,
                 start.tangents.held_constants,
-                mesh_interval[1],
+                h,
                 linearized_residual,
                 state_tangents,
             )

@@ -368,8 +368,8 @@ CombinationMask = Int[Array, "2 ..."]
 class _ModeCombinationTable(NamedTuple):
     """Bit masks that mark the combinations with a given contact mode or closed stopper.
 
-    The bits follow one order of the combinations. The last of the listed axes is that of the two
-    integers of a `CombinationMask`.
+    Bit i of a mask belongs to combination i, in the order of `from_indices`. The last of the listed
+    axes is that of the two integers of a `CombinationMask`.
     """
 
     masks_by_slot_mode: Any  # indexed by slot and mode, (2, 4, 2, ...)

@@ -29,10 +29,10 @@ from vrw_jax.contact.mechanics import (
     SlotArray,
     WheelMotion,
     align_with_batch,
+    compute_contact_foot_velocities,
     compute_foot_heights,
     compute_free_leg_acceleration,
     compute_leg_directions,
-    compute_slot_foot_velocities,
     find_contact_slots,
     make_opaque_one,
     prevent_fusion,
@@ -190,7 +190,9 @@ def compute_forces(
         compute_free_leg_acceleration(s, motion, leg_directions), opaque_one
     )
     slot_foot_velocities = prevent_fusion(
-        compute_slot_foot_velocities(motion, leg_directions, contact_mode_dynamics.contact_slots),
+        compute_contact_foot_velocities(
+            motion, leg_directions, contact_mode_dynamics.contact_slots
+        ),
         opaque_one,
     )
     force_solution = solve_contact_forces(contact_mode_dynamics.configure_contacts(motion))

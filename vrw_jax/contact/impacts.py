@@ -40,13 +40,13 @@ from vrw_jax.contact.mechanics import (
     SlotArray,
     WheelMotion,
     align_with_batch,
+    compute_contact_foot_velocities,
     compute_foot_heights,
     compute_foot_velocities,
     compute_free_acceleration,
     compute_free_velocity,
     compute_kinetic_energy,
     compute_leg_directions,
-    compute_slot_foot_velocities,
     find_contact_slots,
     make_inverse_inertia,
     select_slot_friction,
@@ -295,7 +295,7 @@ def _apply_restitution(
         return free_motion
     rebound_speeds = (
         contact_law.restitution
-        * compute_slot_foot_velocities(
+        * compute_contact_foot_velocities(
             motion, inverse_inertia.leg_directions, contact_slots
         ).normal_to_slope
     )

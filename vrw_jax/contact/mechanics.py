@@ -398,11 +398,14 @@ class PlaneVelocities(NamedTuple):
 
 
 def _compute_point_velocities(
-    motion: WheelMotion, leg_directions: LegDirections, distances: Array, distance_rates: Array
+    motion: WheelMotion,
+    leg_directions: LegDirections,
+    distances_from_hub: Array,
+    distance_rates: Array,
 ) -> PlaneVelocities:
-    """Return the velocities of points at given distances from the hub along the legs."""
+    """Return the velocities of points on the legs, at given distances from the hub."""
     sin, cos = leg_directions
-    transverse_velocity = distances * motion.dtheta
+    transverse_velocity = distances_from_hub * motion.dtheta
     return PlaneVelocities(
         motion.vx - distance_rates * sin - transverse_velocity * cos,
         motion.vz - distance_rates * cos + transverse_velocity * sin,
@@ -414,7 +417,7 @@ def compute_foot_velocities(motion: WheelMotion, leg_directions: LegDirections) 
     return _compute_point_velocities(motion, leg_directions, motion.L, motion.dL)
 
 
-def compute_slot_foot_velocities(
+def compute_contact_foot_velocities(
     motion: WheelMotion, leg_directions: LegDirections, contact_slots: ContactSlots
 ) -> PlaneVelocities:
     """Return the velocities of the feet in the contact slots."""

@@ -391,13 +391,14 @@ def record_contact_interval(
     motion: WheelMotion,
     duration: Elementwise,
 ) -> UnilateralStepDetails:
-    """Return the step details updated at one end of an interval.
+    """Return the step details updated at the start or at the end of an interval.
 
     The minimum of the stopper force on legs in the air is updated. The duration is added to the
     entry of `mode_durations` for the present contact modes.
 
-    - `motion`: motion at this end of the interval;
-    - `duration`: length of the interval, s, at one of its ends, and 0 at the other.
+    - `motion`: motion at this time;
+    - `duration`: time to add, s. It is the length of the interval at one of the two times, and 0 at
+      the other.
     """
     slot_modes = contact_mode_dynamics.slot_modes
     stopper_forces = compute_forces(contact_mode_dynamics, motion).airborne_stopper_forces

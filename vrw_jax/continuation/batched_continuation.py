@@ -189,16 +189,16 @@ def continue_branches_uncompiled(
 
 
 def _linearize_selected_branches(
-    setup: ContinuationSetup, args_by_branch: Any, trials: Any, is_branch_selected: np.ndarray
+    setup: ContinuationSetup, args_by_branch: Any, trial_points: Any, is_branch_selected: np.ndarray
 ) -> NewtonStep:
     """Return the Newton steps for the selected branches. All other branches receive NaN.
 
-    `trials` contains the trial unknowns z and the trial parameter fractions of all branches.
+    `trial_points` contains the trial unknowns z and the trial parameter fractions of all branches.
     """
     lower_bound, upper_bound = np.asarray(setup.parameter_bounds)
-    p = lower_bound + (upper_bound - lower_bound) * np.asarray(trials.parameter_fraction)
+    p = lower_bound + (upper_bound - lower_bound) * np.asarray(trial_points.parameter_fraction)
     selected_newton_steps = setup.problem.linearize(
-        *jax.device_put(select_tree_rows((args_by_branch, trials.z, p), is_branch_selected))
+        *jax.device_put(select_tree_rows((args_by_branch, trial_points.z, p), is_branch_selected))
     )
 
     def insert_rows(selected_leaf: Any) -> np.ndarray:

@@ -179,10 +179,12 @@ class CollocationState(NamedTuple):
         cls, collocation_solution: CollocationSolution, is_phase_active: LaneArray
     ) -> "CollocationState":
         """Return a start of the search, with zeros in the fields that the search computes."""
-        zero_flag = jnp.zeros_like(collocation_solution.section_state[0])
+        zeros_of_lanes = jnp.zeros_like(collocation_solution.section_state[0])
         durations = collocation_solution.durations
         zero_end_states = jnp.zeros((len(durations), 4, *durations.shape[2:]), durations.dtype)
-        return cls(collocation_solution, is_phase_active, zero_flag, zero_flag, zero_end_states)
+        return cls(
+            collocation_solution, is_phase_active, zeros_of_lanes, zeros_of_lanes, zero_end_states
+        )
 
 
 class CycleSearchResult(NamedTuple):

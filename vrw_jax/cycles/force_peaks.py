@@ -113,7 +113,9 @@ def _find_force_extrema(
 def _summarize_force_extrema(
     extrema_of_phases: list[PhaseExtrema], phase_durations: Array
 ) -> dict[str, Scalar]:
-    """Compute the measures of a gait step for one force, from the extrema in its phases.
+    """Return the measures of a force over a gait step, from the force's extrema in each phase.
+
+    The force is that on the fore foot, or the total force.
 
     The measures are those of the fore foot in `measures.FORCE_PEAK_MEASURES`, by name.
     """

@@ -653,11 +653,11 @@ def _find_guard_minima(
     """Return the location of each guard's minimum, and whether the guard may be negative there.
 
     The location is a fraction of the solver step, at most nine tenths. It is the minimum of the
-    guard's cubic, whose coefficients are those of `interpolate_by_cubics`. The cubic is
-    nowhere below the smallest of its Bernstein coefficients, so a guard with positive coefficients
-    stays positive. For any other guard, the caller repeats the solver step up to the location. In
-    shorter steps, the coefficients are closer to the guard. The caller stops when the coefficients
-    are positive or the guard is negative at the end of a step.
+    guard's cubic, whose coefficients are those of `interpolate_by_cubics`. In the solver step, the
+    cubic is nowhere below the smallest of its Bernstein coefficients, so a guard with positive
+    coefficients stays positive. For any other guard, the caller repeats the solver step up to the
+    location. In shorter steps, the coefficients are closer to the guard. The caller stops when the
+    coefficients are positive or the guard is negative at the end of a step.
     """
     start_values, start_rates, end_values, end_rates = guard_cubics
     minimum_fractions, _ = find_cubic_minimum(*guard_cubics)

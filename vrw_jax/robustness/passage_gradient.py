@@ -68,7 +68,7 @@ class FailingWalks(NamedTuple):
         """Return whether each walk of the wheel `params` fails if its slope deviations are scaled
         to `norms`, shape (walks,).
         """
-        walk_results = walker_groups.run_changed_walks(
+        walk_results = walker_groups.run_walks_with_changes(
             params,
             self.section_states,
             self.start_slopes,

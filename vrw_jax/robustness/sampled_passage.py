@@ -214,7 +214,7 @@ class WalkerGroups:
           (walks, lines).
         """
         walker_indices = np.arange(len(slope_deviations)) % self.n_walkers
-        walk_results = self.run_changed_walks(
+        walk_results = self.run_walks_with_changes(
             self.params, self.states[walker_indices], self.slopes[walker_indices], slope_deviations
         )
         has_failed = walk_results.outcome != Outcome.STEPPED
@@ -222,7 +222,7 @@ class WalkerGroups:
         is_in_last_step = walk_results.n_stepped == slope_deviations.shape[1] - 1
         return has_failed & is_in_last_step, has_failed, walk_results
 
-    def run_changed_walks(
+    def run_walks_with_changes(
         self,
         params: WheelParams,
         section_states: np.ndarray,
@@ -270,13 +270,13 @@ class WalkerGroups:
         _, has_failed, walk_results = self.run_walks(slope_deviations)
         self.add_failure_weights(walk_results.outcome, has_failed.astype(float))
         source_indices = np.arange(self.n_walkers).reshape(self.n_groups, -1)
-        for indices_of_group, has_failed_in_group in zip(
+        for indices_of_group, has_walk_failed in zip(
             source_indices, has_failed.reshape(source_indices.shape), strict=True
         ):
-            if np.all(has_failed_in_group):
+            if np.all(has_walk_failed):
                 raise ExtinctGroupError
-            indices_of_group[has_failed_in_group] = self.random.choice(
-                indices_of_group[~has_failed_in_group], np.sum(has_failed_in_group)
+            indices_of_group[has_walk_failed] = self.random.choice(
+                indices_of_group[~has_walk_failed], np.sum(has_walk_failed)
             )
         self.states = walk_results.section_state[source_indices.ravel()]
         landing_slopes = float(self.params.slope) + self.slope_sd * slope_deviations[:, 0]

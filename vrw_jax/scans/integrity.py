@@ -188,7 +188,8 @@ class StoredMetadata:
             "consolidated_metadata": {
                 "kind": "inline",
                 "must_understand": False,
-                # Arrays that the scan did not write come last.
+                # The first operand sets the order, in which arrays that the scan did not write come
+                # last. The last operand sets the metadata.
                 "metadata": restored_metadata | self.consolidated_metadata | restored_metadata,
             },
         }

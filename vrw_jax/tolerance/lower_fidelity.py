@@ -216,7 +216,7 @@ def _compute_rigid_gaits(params: WheelParams) -> tuple:
     rigid_model, step_options = RigidWheel(stop_at_lift_off=False), StepOptions()
 
     def compute_rigid_gait(params: WheelParams) -> tuple:
-        def compute_step_quantities(x: jax.Array) -> jax.Array:
+        def compute_end_state_and_measures(x: jax.Array) -> jax.Array:
             gait_step = rigid_model.take_step(params, x, step_options)
             no_time = jnp.zeros_like(gait_step.step_length)
             step_duration = jnp.sum(gait_step.durations)
@@ -225,6 +225,6 @@ def _compute_rigid_gaits(params: WheelParams) -> tuple:
             )
 
         section_state = rigid_model.compute_default_start(params)
-        return section_state, *evaluate_with_jacobian(compute_step_quantities, section_state)
+        return section_state, *evaluate_with_jacobian(compute_end_state_and_measures, section_state)
 
     return jax.vmap(compute_rigid_gait)(params)
