@@ -7,6 +7,7 @@ import pytest
 from support.batched import compute_full_steps, make_parameter_rows
 
 import vrw_jax as vrw
+from vrw_jax.contact import embed_section_states
 
 
 @pytest.mark.parametrize(
@@ -116,6 +117,15 @@ def switched_off():
 def test_numbers_of_64_bits_are_not_computed_in_32_without_a_word(switched_off, call):
     with pytest.raises(ValueError, match=r"float32 numbers.*vrw\.start_jax"):
         call(*switched_off)
+
+
+def test_a_program_that_a_process_made_in_32_bits_is_not_used_in_64():
+    rows = np.asarray(make_parameter_rows(damping=[150.0, 160.0])).T
+    states = np.tile(np.asarray(vrw.paper_start()), (2, 1))
+    n_legs = 10  # no other test has made this program
+    with jax.enable_x64(False):
+        assert embed_section_states(rows, states, n_legs).dtype == np.float32
+    assert embed_section_states(rows, states, n_legs).dtype == np.float64
 
 
 def test_float32_works_if_requested():

@@ -49,3 +49,5 @@ def test_too_few_samples_and_no_forces_raise_one_sentence():
         vrw.force_peaks(walk)
     with pytest.raises(ValueError, match="no normal force"):
         vrw.force_peaks(walk[["hub_x"]])
+    with pytest.raises(ValueError, match="no samples, because its outcome is STEPPED"):
+        vrw.force_peaks(walk.isel(time=slice(0)))

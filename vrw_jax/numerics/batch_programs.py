@@ -50,7 +50,15 @@ def compile_batch_program(
     """
     uses_machine_code = simd.is_machine_code_available()
     program_signature = tuple(scalar_dtypes), n_lane_arrays, lane_dtype
-    program_key = (trace_key_settings, program_signature, uses_machine_code, xla_block_size)
+    # With jax_enable_x64 off, JAX converts lanes of float64 to float32 in the program.
+    has_float64 = jax.dtypes.canonicalize_dtype(float) == np.float64
+    program_key = (
+        trace_key_settings,
+        program_signature,
+        uses_machine_code,
+        xla_block_size,
+        has_float64,
+    )
     batch_program = _compiled_batch_programs.get(program_key)  # one hash of a large key
     if batch_program is None:
         batch_program = (

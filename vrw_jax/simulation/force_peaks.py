@@ -72,6 +72,11 @@ def force_peaks(walk: xr.Dataset) -> xr.Dataset:
             "feet: give the result of vrw.simulate."
         )
     sample_times, sample_steps = walk.time.values, walk.step.values
+    if not len(sample_times):
+        raise ValueError(
+            f"the walk has no samples, because its outcome is {walk.attrs.get('outcome')}: give a "
+            "walk that leaves its start."
+        )
     # The time of an event is listed twice, up to round-off.
     time_roundoff = 4.0 * np.finfo(float).eps * np.max(sample_times)
     is_interval_end = (np.diff(sample_times) <= time_roundoff) | (np.diff(sample_steps) != 0)

@@ -143,6 +143,7 @@ def measure_to_tolerance(
         else STEP_TOLERANCES.very_tight_tolerance
     )
     step_options = StepOptions(rtol=solver_tolerance, atol=solver_tolerance)
+    step_options.check_tolerances(np.dtype(float))
     wheel_batch = ContactWheelBatch.from_params(params, friction_by_wheel, stoppers, step_options)
     measure_request = _MeasureRequest(measure_names, tol, relative, wheel_batch, params)
     if gait_rank is None:
