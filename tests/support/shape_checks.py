@@ -2,6 +2,9 @@
 
 A test calls some functions many thousand times, mostly while JAX traces. A check of every call
 takes a third of the time of such tests. A wrong shape in a later call of a test is not found.
+
+A function that is defined inside another one is checked in its first call in the process, because
+Python defines it anew in each call of the outer function, and beartype would write new code for it.
 """
 
 import dataclasses
@@ -18,13 +21,15 @@ FunctionOrClass = Any
 """A function, or a class whose `__init__` is a function."""
 
 _check_every_call = jaxtyping.jaxtyped
-_checked_code: set[CodeType] = set()
+_checked_in_test: set[CodeType] = set()
 """Code of functions that the present test has called."""
+_checked_in_process: set[CodeType] = set()
+"""Code of functions inside other functions that this process has called."""
 
 
 def start_test() -> None:
-    """Let the next call of each function be checked."""
-    _checked_code.clear()
+    """Let the next call of each function be checked, except functions inside other functions."""
+    _checked_in_test.clear()
 
 
 def check_first_calls(
@@ -38,13 +43,16 @@ def check_first_calls(
                 target.__init__ = decorate(target.__init__)
             return target
         code = target.__code__
+        checked_code = (
+            _checked_in_process if "<locals>" in target.__qualname__ else _checked_in_test
+        )
         get_checked = functools.cache(lambda: _check_every_call(target, typechecker=typechecker))
 
         @functools.wraps(target)
         def call(*args: object, **kwargs: object) -> object:
-            if code in _checked_code:
+            if code in checked_code:
                 return target(*args, **kwargs)
-            _checked_code.add(code)
+            checked_code.add(code)
             return get_checked()(*args, **kwargs)
 
         return call
