@@ -38,7 +38,7 @@ from vrw_jax.cycles.slope_response import (
     compute_sensitivity_norms,
 )
 from vrw_jax.models import DoubleSupportIndicators, Margins, SectionState, ViscoelasticWheel
-from vrw_jax.numerics import Scalar, StepOptions, is_inside_jit
+from vrw_jax.numerics import Scalar, StepOptions, evaluate_by_saved_trace, is_inside_jit
 from vrw_jax.printing import LabelAndText, format_each_batch_element, format_numbers
 from vrw_jax.simulation import step
 from vrw_jax.wheel import (
@@ -192,9 +192,13 @@ class LimitCycle(AbstractCycle):
 
     def _locate_force_peaks(self) -> dict[str, Array]:
         compute_peaks = functools.partial(compute_force_peaks, self.system)
-        return self.map_over_batch_axes(compute_peaks)(
-            self.parameters, self.collocation_state.solution
+        force_peaks: dict[str, Array] = evaluate_by_saved_trace(
+            self.map_over_batch_axes(compute_peaks),
+            ("force peaks", self.system, self.outcome.ndim),
+            self.parameters,
+            self.collocation_state.solution,
         )
+        return force_peaks
 
     @property
     def margins(self) -> Margins:

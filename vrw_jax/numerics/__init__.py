@@ -45,6 +45,7 @@ from vrw_jax.numerics.cached_programs import (
     compile_batch_function,
     compile_cached_lane_program,
     compile_exported_function,
+    evaluate_by_saved_trace,
 )
 from vrw_jax.numerics.cubic_minima import (
     MINIMUM_LOCATION_TOLERANCE,

@@ -69,6 +69,28 @@ def wrap_with_saved_trace(traced_function: Callable, trace_key_settings: object)
     return evaluate_saved_trace
 
 
+_saved_programs: dict[str, Callable] = {}
+"""Functions compiled from their saved traces, by all settings on which the traces depend."""
+
+
+def evaluate_by_saved_trace(
+    traced_function: Callable, trace_key_settings: object, *arguments: Any
+) -> Any:
+    """Return `traced_function(*arguments)`, computed from the saved trace of the function.
+
+    Arguments that JAX traces call the function itself, which may then be mapped or differentiated.
+    The result consists of tuples, lists and dictionaries of arrays.
+    """
+    if any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves(arguments)):
+        return traced_function(*arguments)
+    program_key = repr((trace_key_settings, store.describe_trace_environment()))
+    if program_key not in _saved_programs:
+        _saved_programs[program_key] = jax.jit(
+            wrap_with_saved_trace(traced_function, trace_key_settings)
+        )
+    return _saved_programs[program_key](*arguments)
+
+
 def compile_cached_lane_program(
     lane_function: Callable,
     scalar_dtypes: Sequence[np.dtype],
