@@ -1,6 +1,7 @@
 """Pages that are generated from the sources: keys of a config, and every measure."""
 
 import dataclasses
+import inspect
 import json
 import re
 from collections.abc import Iterable
@@ -139,7 +140,7 @@ def _format_default(field: dataclasses.Field[Any]) -> str:
 
 
 def _first_line(function: Any) -> str:
-    return str(function.__doc__).split("\n\n")[0].strip()
+    return str(inspect.getdoc(function)).split("\n\n")[0]
 
 
 def measures_page() -> str:

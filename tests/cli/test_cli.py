@@ -439,14 +439,17 @@ INTERRUPTED_SCAN_SCRIPT = """
 import sys, time
 sys.path.insert(0, {tests!r})
 from vrw_jax.scans.planning import ScanPlan
+def wait_for_signal():
+    for _ in range(600):  # Python handles a signal that arrives just before a sleep after it.
+        time.sleep(0.1)
 def slow(columns):
     while True:
         try:
             print("at work", flush=True)
-            time.sleep(60)
+            wait_for_signal()
         except KeyboardInterrupt:
             print("stopping", flush=True)
-            time.sleep(60)
+            wait_for_signal()
 ScanPlan.build_scan_engine = lambda _: slow
 sys.argv = ["vrw", "scan", {config!r}]
 from vrw_jax.cli.commands import main
