@@ -11,6 +11,7 @@ import numpy as np
 
 from vrw_jax import simd
 from vrw_jax.numerics.cached_programs import compile_cached_lane_program
+from vrw_jax.runtime import disk_cache as store
 
 STRAGGLER_COUNT_DIVISOR = 8
 """Ratio of the block size to the number of unfinished lanes at which an XLA program stops.
@@ -50,14 +51,14 @@ def compile_batch_program(
     """
     uses_machine_code = simd.is_machine_code_available()
     program_signature = tuple(scalar_dtypes), n_lane_arrays, lane_dtype
-    # With jax_enable_x64 off, JAX converts lanes of float64 to float32 in the program.
-    has_float64 = jax.dtypes.canonicalize_dtype(float) == np.float64
+    # With jax_enable_x64 off, for example, the program converts lanes of float64 to float32.
+    trace_environment = store.describe_trace_environment()
     program_key = (
         trace_key_settings,
         program_signature,
         uses_machine_code,
         xla_block_size,
-        has_float64,
+        trace_environment,
     )
     batch_program = _compiled_batch_programs.get(program_key)  # one hash of a large key
     if batch_program is None:
