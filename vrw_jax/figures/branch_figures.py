@@ -126,7 +126,7 @@ def branch_figure(branch: Branch) -> Figure:
     panel_axes[0, 1].set_ylim(0.0, None)
     force_axes, clearance_axes = panel_axes[1]
     if has_dls_indicators:
-        for axes in (force_axes, clearance_axes):
+        for axes in panel_axes[1]:
             axes.axhline(0.0, color=DARK_GRAY_COLOR, linewidth=0.5)
         for measure_name, line_color in PAPER_BRANCH_PANELS[2][1].items():
             force_axes.plot([], [], color=line_color, label=f"${MEASURES[measure_name].mathtext}$")
@@ -240,9 +240,7 @@ def basin_figure(results: list[xr.Dataset], titles: list[str]) -> Figure:
     for axes, basin_dataset, steps_to_gait, panel_title in zip(
         panel_axes, results, steps_to_gait_by_panel, titles, strict=True
     ):
-        vertical_axis_name, horizontal_axis_name = (
-            str(axis_name) for axis_name in basin_dataset.attractor.dims
-        )
+        vertical_axis_name, horizontal_axis_name = map(str, basin_dataset.attractor.dims)
         x, y = basin_dataset[horizontal_axis_name].values, basin_dataset[vertical_axis_name].values
         step_count_image = axes.pcolormesh(
             x,

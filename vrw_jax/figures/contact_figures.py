@@ -23,7 +23,7 @@ from vrw_jax.figures.style import (
     draw_panel_letter,
     format_axis_label,
 )
-from vrw_jax.measures import CONTACT_MODE_NAMES
+from vrw_jax.measures import CONTACT_MODE_NAMES, PHASE_NAMES
 from vrw_jax.wheel import ContactMode
 
 CONTACT_MODE_COLORS = ("white", OKABE_ITO_GREEN, OKABE_ITO_AMBER, OKABE_ITO_PINK)
@@ -46,6 +46,9 @@ LEG_LINE_STYLES = {1: (LEG_1_COLOR, "-"), 2: (LEG_2_COLOR, "--")}
 STICK_LINE_STYLES: dict[int, Any] = {1: "-", 2: ":"}
 """Line styles of Legs 1 and 2 in stick diagrams; other legs are dashed."""
 
+PHASE_STICK_COLORS = ("#A0A0A0", OKABE_ITO_SKY_BLUE, "#000000")
+"""Colors of the phases in stick diagrams, in the order of phases."""
+
 OTHER_LEG_LINE_STYLES = (
     (OKABE_ITO_SKY_BLUE, "-."), (OKABE_ITO_PINK, ":"), (OKABE_ITO_AMBER, (0, (8, 3))),
     (DARK_GRAY_COLOR, (0, (5, 1, 1, 1, 1, 1))),
@@ -67,13 +70,6 @@ class HubAndFootMotion(NamedTuple):
     foot_positions: np.ndarray  # (time, leg, 2), in the same coordinates, m
     foot_forces: np.ndarray  # (time, leg, 2), tangential and normal force, N
     contact_modes: np.ndarray  # (time, leg), contact mode
-    step_numbers: np.ndarray  # (time,), number of the gait step of each sample
-
-    def find_stick_samples(self, stick_interval: float) -> np.ndarray:
-        """Return the indices of samples at time intervals of `stick_interval`, s."""
-        return np.searchsorted(
-            self.sample_times, np.arange(0.0, self.sample_times[-1], stick_interval)
-        )
 
     def interpolate_at_time(self, t: float) -> tuple[np.ndarray, np.ndarray, int]:
         """Return the positions of hub and feet at the time `t` (s), and the index of the next
@@ -127,12 +123,7 @@ def compute_foot_motion(walk: xr.Dataset) -> HubAndFootMotion:
         contact_modes[:, 0] = ContactMode.STICK
         contact_modes[walk.phase.values == 0, 1] = ContactMode.STICK
     return HubAndFootMotion(
-        walk.time.values,
-        hub_positions,
-        foot_positions,
-        foot_forces,
-        contact_modes,
-        walk.step.values,
+        walk.time.values, hub_positions, foot_positions, foot_forces, contact_modes
     )
 
 
@@ -145,9 +136,25 @@ def insert_landing_gaps(walk: xr.Dataset, sampled_values: ArrayLike) -> np.ndarr
     return np.insert(np.asarray(sampled_values, float), landing_indices, np.nan)
 
 
-def select_leg_color(leg_number: int) -> str:
-    """Return the color of the leg with the label `leg_number`. Labels start from 1."""
-    return {1: LEG_1_COLOR, 2: LEG_2_COLOR}.get(leg_number, OTHER_LEG_COLOR)
+def find_constant_spans(
+    walk: xr.Dataset, sampled_codes: np.ndarray
+) -> list[tuple[float, float, int]]:
+    """Return the start time (s), the end time (s) and the code of every span with one code.
+
+    A span ends where the code changes, and at each landing.
+
+    - `sampled_codes`: code for each sample of the trajectory.
+    """
+    is_span_end = np.any(np.diff([walk.step.values, sampled_codes]), axis=0)
+    span_start_indices = np.flatnonzero(is_span_end) + 1
+    return [
+        (span_times[0], span_times[-1], int(span_codes[0]))
+        for span_times, span_codes in zip(
+            np.split(walk.time.values, span_start_indices),
+            np.split(sampled_codes, span_start_indices),
+            strict=True,
+        )
+    ]
 
 
 def draw_feet(
@@ -231,89 +238,74 @@ def make_contact_panels(walk: xr.Dataset) -> Figure:
         axes.set_ylabel(panel_label)
     for axes in panel_axes[3:]:
         axes.axhline(0.0, color=DARK_GRAY_COLOR, linewidth=0.4, zorder=0)
-    _draw_contact_mode_bars(mode_axes, foot_motion, touching_legs)
+    for bar_row_index, leg_number in enumerate(touching_legs):
+        for start_time, end_time, contact_mode in find_constant_spans(
+            walk, foot_motion.contact_modes[:, leg_number - 1]
+        ):
+            if contact_mode != ContactMode.OFF:
+                mode_axes.broken_barh(
+                    [(start_time, end_time - start_time)],
+                    (bar_row_index - 0.35, 0.7),
+                    color=CONTACT_MODE_COLORS[contact_mode],
+                )
+    mode_axes.set_yticks(range(len(touching_legs)), list(map(str, touching_legs)))
+    mode_axes.set(ylabel="foot on\nthe ground", ylim=(len(touching_legs) - 0.5, -0.5))
+    mode_handles = [
+        Patch(color=CONTACT_MODE_COLORS[contact_mode], label=CONTACT_MODE_NAMES[contact_mode])
+        for contact_mode in np.unique(foot_motion.contact_modes[is_foot_touching])
+    ]
+    mode_axes.legend(handles=mode_handles, **LEGEND_BESIDE_PANEL)
     tangential_axes.set(xlabel="time [s]", xlim=foot_motion.sample_times[[0, -1]])
     length_axes.legend(**LEGEND_BESIDE_PANEL)
     figure.align_ylabels(panel_axes)
     return figure
 
 
-def _draw_contact_mode_bars(
-    axes: Axes, foot_motion: HubAndFootMotion, drawn_legs: list[int]
-) -> None:
-    """Draw the contact modes of each leg as colored bars over time."""
-    for bar_row_index, leg_number in enumerate(drawn_legs):
-        contact_modes = foot_motion.contact_modes[:, leg_number - 1]
-        contact_mode_change_indices = (
-            np.flatnonzero(np.diff(contact_modes) | np.diff(foot_motion.step_numbers)) + 1
-        )
-        for modes_of_bar, times_of_bar in zip(
-            np.split(contact_modes, contact_mode_change_indices),
-            np.split(foot_motion.sample_times, contact_mode_change_indices),
-            strict=True,
-        ):
-            if modes_of_bar[0] != ContactMode.OFF:
-                axes.broken_barh(
-                    [(times_of_bar[0], times_of_bar[-1] - times_of_bar[0])],
-                    (bar_row_index - 0.35, 0.7),
-                    color=CONTACT_MODE_COLORS[modes_of_bar[0]],
-                )
-    axes.set_yticks(range(len(drawn_legs)), [str(leg_number) for leg_number in drawn_legs])
-    axes.set(ylabel="foot on\nthe ground", ylim=(len(drawn_legs) - 0.5, -0.5))
-    occurring_contact_modes = np.unique(foot_motion.contact_modes[:, np.array(drawn_legs) - 1])
-    legend_patches = [
-        Patch(color=CONTACT_MODE_COLORS[contact_mode], label=CONTACT_MODE_NAMES[contact_mode])
-        for contact_mode in occurring_contact_modes
-        if contact_mode != ContactMode.OFF
-    ]
-    axes.legend(handles=legend_patches, **LEGEND_BESIDE_PANEL)
-
-
-def draw_stick(
-    axes: Axes,
-    foot_motion: HubAndFootMotion,
-    sample_index: int,
-    leg_number: int,
-    stick_color: str,
-    line_width: float,
-) -> None:
-    """Draw the leg with the label `leg_number` at one sample, from its foot to the hub."""
-    foot_position = foot_motion.foot_positions[sample_index, leg_number - 1]
-    axes.plot(
-        *np.stack([foot_position, foot_motion.hub_positions[sample_index]], -1),
-        color=stick_color,
-        linestyle=STICK_LINE_STYLES.get(leg_number, "--"),
-        linewidth=line_width,
-    )
-
-
-def draw_contact_sticks(axes: Axes, walk: xr.Dataset, stick_interval: float) -> None:
+def draw_sticks(axes: Axes, walk: xr.Dataset, stick_interval: float) -> None:
     """Draw Legs 1 and 2 and every leg on the ground at equal time intervals.
 
-    The feet have the colors of their contact modes. `stick_interval` is in s.
+    The sticks have the colors of the phases. For walks with unilateral contact, the feet have the
+    colors of their contact modes instead. `stick_interval` is in s.
     """
     foot_motion = compute_foot_motion(walk)
-    sample_indices = foot_motion.find_stick_samples(stick_interval)
+    stick_times = np.arange(0.0, foot_motion.sample_times[-1], stick_interval)
+    sample_indices = np.searchsorted(foot_motion.sample_times, stick_times)
     is_leg_drawn = foot_motion.contact_modes != ContactMode.OFF
     is_leg_drawn[:, :2] = True
+    has_contact_modes = reports_contact_modes(walk)
+    line_width = 0.7 if has_contact_modes else 0.8
     for sample_index in sample_indices:
         drawn_legs = np.flatnonzero(is_leg_drawn[sample_index])
-        for leg_number in (drawn_legs + 1).tolist():
-            stick_color = "black" if leg_number < 3 else DARK_GRAY_COLOR
-            draw_stick(axes, foot_motion, sample_index, leg_number, stick_color, 0.7)
-        draw_feet(
-            axes,
-            foot_motion.foot_positions[sample_index, drawn_legs].T,
-            foot_motion.contact_modes[sample_index, drawn_legs],
-            4.0,
-        )
+        foot_positions = foot_motion.foot_positions[sample_index, drawn_legs]
+        for leg_number, foot_position in zip(
+            (drawn_legs + 1).tolist(), foot_positions, strict=True
+        ):
+            if has_contact_modes:
+                stick_color = "black" if leg_number < 3 else DARK_GRAY_COLOR
+            else:
+                stick_color = PHASE_STICK_COLORS[int(walk.phase[sample_index])]
+            axes.plot(
+                *np.stack([foot_position, foot_motion.hub_positions[sample_index]], -1),
+                color=stick_color,
+                linestyle=STICK_LINE_STYLES.get(leg_number, "--"),
+                linewidth=line_width,
+            )
+        if has_contact_modes:
+            contact_modes = foot_motion.contact_modes[sample_index, drawn_legs]
+            draw_feet(axes, foot_positions.T, contact_modes, 4.0)
     legend_leg_labels = [(1, "Leg 1"), (2, "Leg 2")]
     if is_leg_drawn[sample_indices, 2:].any():
         legend_leg_labels.append((3, "another leg"))
     for leg_number, legend_text in legend_leg_labels:
         line_style = STICK_LINE_STYLES.get(leg_number, "--")
-        axes.plot([], [], color="black", linestyle=line_style, linewidth=0.7, label=legend_text)
+        axes.plot(
+            [], [], color="black", linestyle=line_style, linewidth=line_width, label=legend_text
+        )
     axes.plot([], [], color=LEG_2_COLOR, label="hub")
+    if not has_contact_modes:
+        for phase_name, phase_color in zip(PHASE_NAMES, PHASE_STICK_COLORS, strict=True):
+            axes.plot([], [], color=phase_color, linewidth=3.0, label=phase_name)
+        return
     for legend_handle in make_contact_mode_handles(
         foot_motion.contact_modes[sample_indices][is_leg_drawn[sample_indices]]
     ):

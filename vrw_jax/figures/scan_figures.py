@@ -264,7 +264,15 @@ def draw_parameter_pairs(scan: xr.Dataset, parameter_names: Sequence[str]) -> Fi
         x, y = parameter_names[j], parameter_names[i]
         x_values, y_values = drawn_samples[x].values, drawn_samples[y].values
         if i == j:
-            _draw_stable_fraction(axes, x_values, outcome_codes == Outcome.STEPPED)
+            histogram_edges = np.linspace(x_values.min(), x_values.max(), 13)
+            n_samples, n_stable_samples = (
+                np.histogram(parameter_values, histogram_edges)[0]
+                for parameter_values in (x_values, x_values[outcome_codes == Outcome.STEPPED])
+            )
+            stable_fraction = n_stable_samples / np.maximum(n_samples, 1)
+            stable_color = OUTCOME_LABELS_AND_COLORS[Outcome.STEPPED][1]
+            axes.stairs(stable_fraction, histogram_edges, fill=True, color=stable_color)
+            axes.set_ylim(0.0, 1.0)
         elif i < j:
             _draw_outcome_samples(axes, x_values, y_values, outcome_codes, marker_size)
         elif measure_name is not None:
@@ -321,22 +329,6 @@ def _draw_outcome_samples(
     axes.scatter(x, y, s=marker_size, color=outcome_colors, linewidths=0.0, rasterized=True)
 
 
-def _draw_stable_fraction(axes: Axes, x: np.ndarray, has_stable_gait: np.ndarray) -> None:
-    """Draw the fraction of samples with a stable gait as a function of a parameter."""
-    histogram_edges = np.linspace(x.min(), x.max(), 13)
-    n_samples, n_stable_samples = (
-        np.histogram(parameter_values, histogram_edges)[0]
-        for parameter_values in (x, x[has_stable_gait])
-    )
-    axes.stairs(
-        n_stable_samples / np.maximum(n_samples, 1),
-        histogram_edges,
-        fill=True,
-        color=OUTCOME_LABELS_AND_COLORS[Outcome.STEPPED][1],
-    )
-    axes.set_ylim(0.0, 1.0)
-
-
 @figure_style()
 def draw_sobol_indices(indices: xr.Dataset) -> Figure:
     """Return a figure of the Sobol' indices of each measure, with their confidence intervals."""
@@ -376,8 +368,8 @@ def draw_sobol_indices(indices: xr.Dataset) -> Figure:
     for axes in panel_axes[-MAX_PANELS_PER_ROW:]:
         axes.set_xlabel("share of the variance")
         axes.tick_params(labelbottom=True)
-    legend_handles, legend_texts = panel_axes[0].get_legend_handles_labels()
-    figure.legend(legend_handles, legend_texts, loc="outside lower center", ncols=2)
+    legend_entries = panel_axes[0].get_legend_handles_labels()
+    figure.legend(*legend_entries, loc="outside lower center", ncols=2)
     omitted_samples_percent = 100.0 * indices.attrs["left_out"]
     omitted_rows_note = (
         f"{indices.attrs['rows']:,} rows; {omitted_samples_percent:.1f} % left out, without a gait"

@@ -16,7 +16,7 @@ import numpy as np
 import xarray as xr
 from cycler import cycler
 from matplotlib.axes import Axes
-from matplotlib.colors import BoundaryNorm, ListedColormap
+from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
@@ -355,17 +355,13 @@ def draw_outcome_cells(
         ~np.isin(outcome_codes, drawn_outcome_codes),
         np.searchsorted(drawn_outcome_codes, outcome_codes),
     )
-    outcome_color_norm = (
-        BoundaryNorm(np.arange(len(drawn_outcome_codes) + 1) - 0.5, len(drawn_outcome_codes))
-        if len(drawn_outcome_codes) > 1
-        else None
-    )
     axes.pcolormesh(
         x,
         y,
         outcome_code_indices,
         cmap=outcome_color_map,
-        norm=outcome_color_norm,
+        vmin=-0.5,
+        vmax=len(drawn_outcome_codes) - 0.5,
         rasterized=True,
     )
 

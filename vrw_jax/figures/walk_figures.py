@@ -1,6 +1,6 @@
 """Figures of walks: Figs 6 to 10 of the paper, and an animation of a walk."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -14,16 +14,16 @@ from PIL import Image
 from vrw_jax.figures.contact_figures import (
     GROUND_FORCE_NAMES,
     LEG_LINE_STYLES,
+    OTHER_LEG_COLOR,
     HubAndFootMotion,
     compute_foot_motion,
-    draw_contact_sticks,
     draw_feet,
-    draw_stick,
+    draw_sticks,
+    find_constant_spans,
     insert_landing_gaps,
     make_contact_mode_handles,
     make_contact_panels,
     reports_contact_modes,
-    select_leg_color,
 )
 from vrw_jax.figures.style import (
     COLUMN_FIGURE_WIDTH_INCHES,
@@ -32,7 +32,6 @@ from vrw_jax.figures.style import (
     LEG_2_COLOR,
     LEGEND_BESIDE_PANEL,
     LIGHT_GRAY_COLOR,
-    OKABE_ITO_SKY_BLUE,
     PAGE_FIGURE_WIDTH_INCHES,
     draw_markers,
     draw_panel_letter,
@@ -66,20 +65,6 @@ def _require_nonempty_walk(argument_name: str, walk: xr.Dataset) -> None:
         )
 
 
-def find_phase_spans(gait: xr.Dataset) -> list[tuple[float, float, int]]:
-    """Return the start time (s), the end time (s) and the phase code for every phase of a
-    trajectory.
-    """
-    step_phase_codes = 3 * gait.step.values + gait.phase.values
-    phase_change_indices = np.flatnonzero(np.diff(step_phase_codes)) + 1
-    times_by_phase = np.split(gait.time.values, phase_change_indices)
-    phase_codes = gait.phase.values[np.r_[0, phase_change_indices]]
-    return [
-        (phase_sample_times[0], phase_sample_times[-1], int(phase_code))
-        for phase_sample_times, phase_code in zip(times_by_phase, phase_codes, strict=True)
-    ]
-
-
 @figure_style()
 def gait_panels(gait: xr.Dataset) -> Figure:
     """Return a figure of the motion and the ground forces of a gait (Fig. 6 of the paper).
@@ -106,7 +91,7 @@ def gait_panels(gait: xr.Dataset) -> Figure:
         for variable_name in ("time", "theta", "L1", "L2", "foot_2_z", *GROUND_FORCE_NAMES)
     )
     rear_load_percent = 100.0 * ground_forces[3] / (ground_forces[1] + ground_forces[3])
-    phase_spans = find_phase_spans(gait)
+    phase_spans = find_constant_spans(gait, gait.phase.values)
     figure = Figure(figsize=(0.8 * PAGE_FIGURE_WIDTH_INCHES, 7.4))
     panel_axes = figure.subplots(5, 1, sharex=True, height_ratios=[1, 1, 1, 1, 1.5])
     for axes, panel_letter in zip(panel_axes, "abcde", strict=True):
@@ -185,7 +170,6 @@ def sticks(gait: xr.Dataset, interval: float = 0.05) -> Figure:
     check_positive("interval", interval)
     figure = Figure(figsize=(PAGE_FIGURE_WIDTH_INCHES, 2.8))
     axes = figure.subplots()
-    draw_sticks = draw_contact_sticks if reports_contact_modes(gait) else _draw_phase_sticks
     draw_sticks(axes, gait, interval)
     axes.plot(gait.hub_x, gait.hub_z, color=LEG_2_COLOR, linewidth=1.0)
     axes.axhline(0.0, color="black", linewidth=0.8, zorder=1)
@@ -201,21 +185,6 @@ def sticks(gait: xr.Dataset, interval: float = 0.05) -> Figure:
     axes.set(xlabel="$X$ [m]", ylabel="$Z$ [m]", ylim=(-0.12, None), aspect="equal")
     axes.legend(**LEGEND_BESIDE_PANEL)
     return figure
-
-
-def _draw_phase_sticks(axes: Axes, gait: xr.Dataset, interval: float) -> None:
-    """Draw Legs 1 and 2 in the colors of the phases, at equal time intervals of `interval` s."""
-    phase_colors = ("#A0A0A0", OKABE_ITO_SKY_BLUE, "#000000")
-    foot_motion = compute_foot_motion(gait)
-    for sample_index in foot_motion.find_stick_samples(interval):
-        stick_color = phase_colors[int(gait.phase[sample_index])]
-        for leg_number in (1, 2):
-            draw_stick(axes, foot_motion, sample_index, leg_number, stick_color, 0.8)
-    for line_style, leg_name in (("-", "Leg 1"), (":", "Leg 2")):
-        axes.plot([], [], color="black", linestyle=line_style, linewidth=0.8, label=leg_name)
-    axes.plot([], [], color=LEG_2_COLOR, label="hub")
-    for phase_name, phase_color in zip(PHASE_NAMES, phase_colors, strict=True):
-        axes.plot([], [], color=phase_color, linewidth=3.0, label=phase_name)
 
 
 GAIT_LINE_STYLES = ("-", "--", (0, (4, 1, 1, 1)), ":")
@@ -411,15 +380,6 @@ def indicators(gaits: xr.Dataset, every: int = 4) -> Figure:
     return figure
 
 
-def _rotate_to_gravity_frame(slope_points: ArrayLike, slope: float) -> np.ndarray:
-    """Return coordinates in a frame whose z axis is vertical, m, shape (2, ...).
-
-    The points have the shape (..., 2), with x and z in the slope's frame.
-    """
-    x, z = np.moveaxis(np.asarray(slope_points), -1, 0)
-    return np.array([x * np.cos(slope) + z * np.sin(slope), z * np.cos(slope) - x * np.sin(slope)])
-
-
 @figure_style()
 def walk_frames(
     step: xr.Dataset, n_frames: int = 36, slow: float = 2.0
@@ -445,12 +405,22 @@ def walk_frames(
     """
     _require_nonempty_walk("step", step)
     n_frames, slow = check_int("n_frames", n_frames), check_positive("slow", slow)
-    ground_slope, foot_motion = step.attrs["parameter_slope"], compute_foot_motion(step)
+    slope, foot_motion = step.attrs["parameter_slope"], compute_foot_motion(step)
+
+    def rotate_to_view(slope_points: ArrayLike) -> np.ndarray:
+        """Return points (..., 2) of the slope's frame in a frame with a vertical z axis, shape
+        (2, ...).
+        """
+        x, z = np.moveaxis(np.asarray(slope_points), -1, 0)
+        return np.array(
+            [x * np.cos(slope) + z * np.sin(slope), z * np.cos(slope) - x * np.sin(slope)]
+        )
+
     walk_duration = foot_motion.sample_times[-1]
     hub_travel_distance = float(foot_motion.hub_positions[-1, 0] - foot_motion.hub_positions[0, 0])
-    hub_distance_per_step = hub_travel_distance / max(
-        int(foot_motion.step_numbers[-1] - foot_motion.step_numbers[0]) + 1, 1
-    )
+    n_steps = int(step.step[-1] - step.step[0]) + 1
+    # The ground has two marks per step, so that the animation loops without a jump.
+    mark_spacing = 0.5 * hub_travel_distance / n_steps
     frame_images = []
     for t in np.linspace(0.0, walk_duration, n_frames, endpoint=False):
         figure = Figure(figsize=(3.6, 3.3), dpi=100)
@@ -461,9 +431,14 @@ def walk_frames(
         camera_position = (
             float(foot_motion.hub_positions[0, 0]) + hub_travel_distance * t / walk_duration
         )
-        _draw_ground_with_marks(axes, ground_slope, camera_position, hub_distance_per_step)
-        sample_index = _draw_wheel_at_time(axes, foot_motion, t, ground_slope)
-        camera_x, camera_z = _rotate_to_gravity_frame((camera_position, 0.75), ground_slope)
+        ground_ends = [(camera_position - 3.0, 0.0), (camera_position + 3.0, 0.0)]
+        axes.plot(*rotate_to_view(ground_ends), color="black", linewidth=1.2)
+        first_mark_number = np.ceil((camera_position - 2.0) / mark_spacing)
+        for mark_number in range(int(4.0 / mark_spacing)):
+            x = (first_mark_number + mark_number) * mark_spacing
+            axes.plot(*rotate_to_view([(x, 0.0), (x - 0.06, -0.06)]), color="black", linewidth=0.7)
+        sample_index = _draw_wheel_at_time(axes, foot_motion, t, rotate_to_view)
+        camera_x, camera_z = rotate_to_view((camera_position, 0.75))
         axes.set(xlim=(camera_x - 1.35, camera_x + 1.35), ylim=(camera_z - 1.25, camera_z + 1.225))
         if reports_contact_modes(step):
             legend_handles = make_contact_mode_handles(foot_motion.contact_modes)
@@ -478,18 +453,20 @@ def walk_frames(
 
 
 def _draw_wheel_at_time(
-    axes: Axes, foot_motion: HubAndFootMotion, time: float, slope: float
+    axes: Axes,
+    foot_motion: HubAndFootMotion,
+    time: float,
+    rotate_to_view: Callable[[ArrayLike], np.ndarray],
 ) -> int:
     """Draw hub, legs, feet and forces at the time `time`, s.
 
     Return the index of the sample whose contact modes are drawn.
     """
     hub_position, foot_positions, sample_index = foot_motion.interpolate_at_time(time)
-    rotate_to_view = lambda slope_points: _rotate_to_gravity_frame(slope_points, slope)
     for leg_number, foot_position in enumerate(foot_positions, 1):
         axes.plot(
             *rotate_to_view([hub_position, foot_position]),
-            color=select_leg_color(leg_number),
+            color={1: LEG_1_COLOR, 2: LEG_2_COLOR}.get(leg_number, OTHER_LEG_COLOR),
             linewidth=3.0 if leg_number < 3 else 1.5,
             solid_capstyle="round",
             zorder=5 if leg_number < 3 else 3,
@@ -508,22 +485,6 @@ def _draw_wheel_at_time(
                 arrowprops={"arrowstyle": "-|>", "linewidth": 1.2, "color": "black"},
             )
     return sample_index
-
-
-def _draw_ground_with_marks(
-    axes: Axes, slope: float, camera_position: float, mark_period: float
-) -> None:
-    """Draw the sloping ground with two marks per step, so that the animation loops without a
-    jump.
-    """
-    ground_ends = [(camera_position - 3.0, 0.0), (camera_position + 3.0, 0.0)]
-    axes.plot(*_rotate_to_gravity_frame(ground_ends, slope), color="black", linewidth=1.2)
-    mark_spacing = 0.5 * mark_period
-    first_mark_number = np.ceil((camera_position - 2.0) / mark_spacing)
-    for mark_number in range(int(4.0 / mark_spacing)):
-        x = (first_mark_number + mark_number) * mark_spacing
-        mark_ends = [(x, 0.0), (x - 0.06, -0.06)]
-        axes.plot(*_rotate_to_gravity_frame(mark_ends, slope), color="black", linewidth=0.7)
 
 
 def save_animation(frames: Sequence[Image.Image], milliseconds: int, path: str | Path) -> Path:
