@@ -37,8 +37,13 @@ from vrw_jax.scans.collocation_engine import CollocationScanEngine
 from vrw_jax.scans.dask import connect_dask_workers
 from vrw_jax.scans.execution import ScanProgress
 from vrw_jax.scans.measure_catalog import ALWAYS_INCLUDED_VARIABLES
-from vrw_jax.scans.planning import ChunkResult, ScanPlan, plan_scan
-from vrw_jax.scans.store import choose_chunk_shape, find_first_settings_difference, open_scan
+from vrw_jax.scans.planning import (
+    ChunkResult,
+    ScanPlan,
+    describe_settings_difference,
+    plan_scan,
+)
+from vrw_jax.scans.store import choose_chunk_shape, open_scan
 from vrw_jax.wheel.outcomes import Outcome
 from vrw_jax.wheel.params import PARAMETER_NAMES, WheelParams
 
@@ -335,9 +340,11 @@ def test_progress_counts_samples_failures_and_reused_samples(tmp_path: Path) -> 
 
 
 def test_the_first_difference_is_named_by_its_path() -> None:
-    assert find_first_settings_difference({"a": {"b": 1}}, {"a": {"b": 2}}) == ("a.b", 1, 2)
-    assert find_first_settings_difference({"a": 1}, {"a": 1, "c": 3}) == ("c", None, 3)
-    assert find_first_settings_difference({"a": 1}, {"a": 1})[0] == ""
+    nested_difference = describe_settings_difference({"a": {"b": 1}}, {"a": {"b": 2}})
+    assert nested_difference == "a.b is 1 there and 2 here"
+    additional_setting = describe_settings_difference({"a": 1}, {"a": 1, "c": 3})
+    assert additional_setting == "c is None there and 3 here"
+    assert describe_settings_difference({"a": 1}, {"a": 1}) == ""
 
 
 @pytest.mark.parametrize(

@@ -258,10 +258,10 @@ def test_too_large_a_design_is_refused_in_one_sentence(monkeypatch: pytest.Monke
     with pytest.raises(ValueError, match="a list takes 10,000,000 samples"):
         designs.sobol({"damping": (100.0, 200.0)}, 20_000_000_000)
 
-    def full(*_: object) -> None:
+    def copy(*_: object, deep: bool) -> None:
         raise MemoryError
 
-    monkeypatch.setattr(scan_store.np, "full", full)
+    monkeypatch.setattr(xr.Variable, "copy", copy)
     with pytest.raises(ValueError, match="more than this memory holds: give a store"):
         run_plan(make_plan(), evaluate=evaluate_arithmetically)
 

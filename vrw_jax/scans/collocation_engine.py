@@ -20,16 +20,17 @@ from jaxtyping import Array
 
 from vrw_jax.cycles import AbstractCycle, CycleOptions, confirm_outcome_by_step, make_finder
 from vrw_jax.measures import MARGIN_MEASURES
-from vrw_jax.models import AbstractWheel
 from vrw_jax.numerics import (
     StepOptions,
     batch_sizes,
     compile_exported_function,
     with_default_jax_settings,
 )
+from vrw_jax.scans.design import ParameterSamples
 from vrw_jax.scans.measure_catalog import (
     DIFFERENTIABLE_MEASURES,
     MeasureDerivative,
+    ValuesByVariable,
     parse_derivative,
 )
 from vrw_jax.wheel import PARAMETER_NAMES, Outcome, WheelParams, make_wheel_from_parameters
@@ -58,6 +59,21 @@ class EvaluationRequest(NamedTuple):
         """Return the measures that are derivatives."""
         return tuple(filter(None, map(parse_derivative, self.measure_names)))
 
+    def stack_parameter_rows(self, samples_by_parameter: ParameterSamples) -> np.ndarray:
+        """Return the model's parameters for each sample, shape (samples, parameters).
+
+        Parameters that are not swept are those of `base_wheel` and `wheel_model`.
+        """
+        n_samples = len(next(iter(samples_by_parameter.values())))
+        base_parameter_values = np.asarray(
+            self.wheel_model.collect_parameter_values(self.base_wheel)
+        )
+        parameter_rows = np.tile(base_parameter_values, (n_samples, 1))
+        for parameter_name, parameter_samples in samples_by_parameter.items():
+            parameter_index = self.wheel_model.parameter_names.index(parameter_name)
+            parameter_rows[:, parameter_index] = parameter_samples
+        return parameter_rows
+
 
 class CollocationScanEngine:
     """Scan engine for the paper's model and a fixed set of measures, compiled on the first call.
@@ -74,8 +90,7 @@ class CollocationScanEngine:
         """
         measure_names, base_wheel, wheel_model, step_options, cycle_options, *_ = evaluation_request
         self._n_threads = count_available_cores() if n_threads is None else n_threads
-        self._base_wheel, self._wheel_model = base_wheel, wheel_model
-        self._step_options = step_options
+        self._evaluation_request = evaluation_request
         requested_derivatives = evaluation_request.requested_derivatives
         differentiation_parameters = list(
             dict.fromkeys(derivative.parameter_name for derivative in requested_derivatives)
@@ -87,11 +102,9 @@ class CollocationScanEngine:
             wheel_model, base_wheel.n_legs, cycle_options=cycle_options, step_options=step_options
         )
 
-        def find_cycle_with_derivatives(
-            parameter_values: Array,
-        ) -> tuple[AbstractCycle, dict[str, Array]]:
-            """Return the limit cycle for one vector of parameters, and the requested derivatives by
-            name.
+        def evaluate_cycle(parameter_values: Array) -> GaitOutputs:
+            """Return outcome, section state, measures and derivatives of the limit cycle for one
+            vector of parameters.
             """
 
             def find_measures_and_cycle(
@@ -106,24 +119,11 @@ class CollocationScanEngine:
                     derivative.measure_name for derivative in requested_derivatives
                 ), limit_cycle
 
-            differentiated_parameter_values = parameter_values[differentiated_parameter_indices]
-            if not requested_derivatives:
-                return find_measures_and_cycle(differentiated_parameter_values)[1], {}
-            measure_jacobian, limit_cycle = jax.jacfwd(find_measures_and_cycle, has_aux=True)(
-                differentiated_parameter_values
+            if requested_derivatives:
+                find_measures_and_cycle = jax.jacfwd(find_measures_and_cycle, has_aux=True)
+            measure_jacobian, limit_cycle = find_measures_and_cycle(
+                parameter_values[differentiated_parameter_indices]
             )
-            return limit_cycle, {
-                derivative.variable_name: measure_jacobian[derivative.measure_name][
-                    differentiation_parameters.index(derivative.parameter_name)
-                ]
-                for derivative in requested_derivatives
-            }
-
-        def evaluate_cycle(parameter_values: Array) -> GaitOutputs:
-            """Return outcome, section state and measures of the limit cycle for one vector of
-            parameters.
-            """
-            limit_cycle, derivatives_by_name = find_cycle_with_derivatives(parameter_values)
             cycle_measure_names = [
                 measure_name
                 for measure_name in measure_names
@@ -133,7 +133,12 @@ class CollocationScanEngine:
                 limit_cycle.outcome,
                 limit_cycle.section_state,
                 limit_cycle.measures([*cycle_measure_names, "spectral_radius"])
-                | derivatives_by_name,
+                | {
+                    derivative.variable_name: measure_jacobian[derivative.measure_name][
+                        differentiation_parameters.index(derivative.parameter_name)
+                    ]
+                    for derivative in requested_derivatives
+                },
             )
 
         def evaluate_confirming_step(
@@ -155,7 +160,7 @@ class CollocationScanEngine:
             }
             return step_result.outcome, step_result.section_state, step_measures
 
-        self._evaluate_cycle_batch: Callable = jax.vmap(evaluate_cycle)
+        self._evaluate_cycle_batch = jax.vmap(evaluate_cycle)
         self._evaluate_step_batch: Callable = jax.vmap(
             evaluate_confirming_step, in_axes=(0, 0, None)
         )
@@ -169,14 +174,12 @@ class CollocationScanEngine:
         self._free_programs: SimpleQueue[_CompiledDevicePrograms] = SimpleQueue()
         self._n_workers, self._compilation_lock = 0, Lock()
 
-    def __call__(self, samples_by_parameter: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    def __call__(self, samples_by_parameter: ParameterSamples) -> ValuesByVariable:
         """Return the value of each variable for all samples, by the name of the variable.
 
         - `samples_by_parameter`: value of each swept parameter for each sample.
         """
-        parameter_rows = stack_parameter_rows(
-            samples_by_parameter, self._wheel_model, self._base_wheel
-        )
+        parameter_rows = self._evaluation_request.stack_parameter_rows(samples_by_parameter)
         with self._compilation_lock:
             if not self._n_workers:
                 self._compile_programs()
@@ -194,7 +197,7 @@ class CollocationScanEngine:
         }
 
     @with_default_jax_settings  # It runs in a thread of its own.
-    def _evaluate_sample_batch(self, parameter_rows: np.ndarray) -> dict[str, np.ndarray]:
+    def _evaluate_sample_batch(self, parameter_rows: np.ndarray) -> ValuesByVariable:
         """Return the value of each variable for a batch of samples, by the name of the variable.
 
         A small batch is padded with copies of its first wheel.
@@ -213,7 +216,9 @@ class CollocationScanEngine:
             cycle_outcome, cycle_section_state, cycle_measures = device_programs.cycle_program(
                 device_parameter_rows
             )
-            device_step_options = jax.device_put(self._step_options, device_programs.device)
+            device_step_options = jax.device_put(
+                self._evaluation_request.step_options, device_programs.device
+            )
             step_outcome, step_end_state, step_measures = device_programs.step_program(
                 device_parameter_rows, cycle_section_state, device_step_options
             )
@@ -231,14 +236,18 @@ class CollocationScanEngine:
         All cores of a CPU use the same programs.
         """
         local_devices = jax.local_devices()
-        parameter_dtype = np.dtype(self._base_wheel.damping.dtype)
+        parameter_dtype = np.dtype(self._evaluation_request.base_wheel.damping.dtype)
         parameter_rows_shape = jax.ShapeDtypeStruct(
             (self._batch_size, len(PARAMETER_NAMES)), parameter_dtype
         )
         section_states_shape = jax.ShapeDtypeStruct((self._batch_size, 3), parameter_dtype)
         # Threads have separate settings.
         compile_function = with_default_jax_settings(compile_exported_function)
-        step_arguments = (parameter_rows_shape, section_states_shape, self._step_options)
+        step_arguments = (
+            parameter_rows_shape,
+            section_states_shape,
+            self._evaluation_request.step_options,
+        )
         functions_and_arguments = {
             "cycle": (self._evaluate_cycle_batch, (parameter_rows_shape,)),
             "step": (self._evaluate_step_batch, step_arguments),
@@ -284,26 +293,9 @@ def count_available_cores() -> int:
     return os.cpu_count() or 1
 
 
-def stack_parameter_rows(
-    samples_by_parameter: Mapping[str, np.ndarray],
-    wheel_model: AbstractWheel,
-    base_wheel: WheelParams,
-) -> np.ndarray:
-    """Return the model's parameters for each sample, shape (samples, parameters).
-
-    Parameters that are not swept are those of `base_wheel` and `wheel_model`.
-    """
-    n_samples = len(next(iter(samples_by_parameter.values())))
-    base_parameter_values = np.asarray(wheel_model.collect_parameter_values(base_wheel))
-    parameter_rows = np.tile(base_parameter_values, (n_samples, 1))
-    for parameter_name, parameter_samples in samples_by_parameter.items():
-        parameter_rows[:, wheel_model.parameter_names.index(parameter_name)] = parameter_samples
-    return parameter_rows
-
-
 def concatenate_results(
-    results_by_batch: Sequence[Mapping[str, np.ndarray]],
-) -> dict[str, np.ndarray]:
+    results_by_batch: Sequence[ValuesByVariable],
+) -> ValuesByVariable:
     """Return the values of each variable for the samples of all batches, by the name of the
     variable.
     """
@@ -317,7 +309,7 @@ def concatenate_results(
 
 def mask_failed_samples(
     outcome: np.ndarray, measures_by_name: Mapping[str, Any]
-) -> dict[str, np.ndarray]:
+) -> ValuesByVariable:
     """Return outcomes and measures by name, where measures of samples without a gait are missing
     values.
 

@@ -13,21 +13,19 @@ import itertools
 import logging
 import pickle
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from queue import Empty, SimpleQueue
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from vrw_jax.runtime import start_jax
 from vrw_jax.scans.collocation_engine import count_available_cores
 from vrw_jax.scans.design import ParameterSamples
-from vrw_jax.scans.engines import make_scan_engine
+from vrw_jax.scans.engines import SampleEvaluator, make_scan_engine
+from vrw_jax.scans.measure_catalog import ValuesByVariable
 from vrw_jax.scans.planning import (
     ChunkExecutor,
     ChunkResult,
-    SampleEvaluator,
     ScanPlan,
     describe_computing_environment,
     describe_settings_difference,
@@ -141,6 +139,7 @@ def _compute_chunks_on_cluster(
     remaining_chunks = iter(missing_chunks)
     chunk_index_by_future: dict[Future, int] = {}
     completed_futures: SimpleQueue[Future] = SimpleQueue()
+    has_warned_of_no_workers = False
 
     def submit_remaining_chunks() -> None:
         """Submit chunks until there are `N_QUEUED_CHUNKS_PER_THREAD` chunks per thread of the
@@ -161,10 +160,20 @@ def _compute_chunks_on_cluster(
         with _explain_lost_cluster(scheduler_address, OSError):
             submit_remaining_chunks()
         while chunk_index_by_future:
-            with _explain_lost_cluster(scheduler_address, OSError):
-                chunk_future = _wait_for_completed_future(
-                    dask_client, scheduler_address, completed_futures
-                )
+            try:
+                chunk_future = completed_futures.get(timeout=MAX_SECONDS_WITHOUT_RESULT)
+            except Empty:
+                with _explain_lost_cluster(scheduler_address, OSError):
+                    is_warning_due = not (has_warned_of_no_workers or dask_client.nthreads())
+                if is_warning_due:
+                    warnings.warn(
+                        f"the dask cluster at {scheduler_address} has no workers, so that nothing "
+                        f"is computed: start some, as with `dask worker {scheduler_address}`; the "
+                        "scan continues as soon as there is one.",
+                        stacklevel=1,
+                    )
+                    has_warned_of_no_workers = True
+                continue
             with _explain_lost_cluster(scheduler_address):
                 worker_environment, chunk_results = chunk_future.result()
             environment_difference_text = describe_settings_difference(
@@ -183,26 +192,6 @@ def _compute_chunks_on_cluster(
     finally:
         if dask_client.status == "running":
             dask_client.cancel(list(chunk_index_by_future))
-
-
-def _wait_for_completed_future(
-    dask_client: "Client", scheduler_address: str, completed_futures: "SimpleQueue[Future]"
-) -> "Future":
-    """Return the next completed future. Warn once if the cluster has no workers."""
-    has_warned_of_no_workers = False
-    while True:
-        try:
-            return completed_futures.get(timeout=MAX_SECONDS_WITHOUT_RESULT)
-        except Empty:
-            pass
-        if not has_warned_of_no_workers and not dask_client.nthreads():
-            warnings.warn(
-                f"the dask cluster at {scheduler_address} has no workers, so that nothing is "
-                f"computed: start some, as with `dask worker {scheduler_address}`; the scan "
-                "continues as soon as there is one.",
-                stacklevel=1,
-            )
-            has_warned_of_no_workers = True
 
 
 @contextlib.contextmanager
@@ -239,7 +228,7 @@ def _explain_lost_cluster(
 
 def _compute_chunk_in_worker(
     pickled_request: bytes, samples_by_parameter: ParameterSamples
-) -> tuple[dict[str, object], Mapping[str, np.ndarray]]:
+) -> tuple[dict[str, object], ValuesByVariable]:
     """Compute a chunk in a worker.
 
     Return a description of the worker's environment, and the values of each variable in the chunk,

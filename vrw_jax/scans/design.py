@@ -26,8 +26,14 @@ SWEEPABLE_PARAMETERS = (*PARAMETER_NAMES, FRICTION_NAME)
 ground.
 """
 
+ParameterValues = Sequence[float] | np.ndarray
+"""Values of a parameter, in its unit."""
+
 ParameterRange = tuple[float, float]
 """Lower and upper bound of a parameter, in its unit."""
+
+ParameterRanges = Mapping[str, ParameterRange]
+"""Range of each parameter, by the parameter's name."""
 
 MAX_LISTED_SAMPLES = 10_000_000
 """Largest number of values of one axis, or of samples in a list.
@@ -82,32 +88,35 @@ class AbstractSampleDesign(abc.ABC):
         - `region_of_samples`: one slice for each axis of the design.
         """
 
-    @abc.abstractmethod
-    def make_result_coordinates(self) -> dict[str, tuple[str, np.ndarray]]:
+    def make_result_coordinates(self) -> dict[str, tuple[tuple[str, ...], np.ndarray]]:
         """Return the axis and the values of each coordinate of the labeled result, by the name of
         the coordinate.
         """
+        return {
+            parameter_name: (
+                (parameter_name,) if parameter_name in self.dims else self.dims,
+                parameter_values,
+            )
+            for parameter_name, parameter_values in self.values_by_parameter.items()
+        }
 
     def describe_design(self) -> dict[str, object]:
         """Return the settings that identify the design.
 
-        The settings are the kind of the design, the parameter names, the shape, and a digest of all
-        samples.
+        The settings are the kind of the design, the parameter names, the shape, and a SHA-256
+        digest of the kind, the names and all samples.
         """
+        sample_digest = hashlib.sha256(
+            json.dumps([self.design_kind, *self.values_by_parameter]).encode()
+        )
+        for parameter_values in self.values_by_parameter.values():
+            sample_digest.update(np.ascontiguousarray(parameter_values, dtype="<f8").tobytes())
         return {
             "kind": self.design_kind,
             "swept": list(self.swept_parameters),
             "shape": list(self.shape),
-            "digest": digest_sample_columns(self.design_kind, self.values_by_parameter),
+            "digest": sample_digest.hexdigest(),
         }
-
-
-def digest_sample_columns(design_kind: str, values_by_parameter: Mapping[str, np.ndarray]) -> str:
-    """Return the SHA-256 digest of a design's kind, parameter names and samples."""
-    column_digest = hashlib.sha256(json.dumps([design_kind, *values_by_parameter]).encode())
-    for parameter_values in values_by_parameter.values():
-        column_digest.update(np.ascontiguousarray(parameter_values, dtype="<f8").tobytes())
-    return column_digest.hexdigest()
 
 
 @dataclass(frozen=True, repr=False)
@@ -125,9 +134,7 @@ class GridDesign(AbstractSampleDesign):
 
     @property
     def shape(self) -> tuple[int, ...]:
-        return tuple(
-            len(parameter_values) for parameter_values in self.values_by_parameter.values()
-        )
+        return tuple(map(len, self.values_by_parameter.values()))
 
     def select_samples(self, region_of_samples: tuple[slice, ...]) -> ParameterSamples:
         selected_axis_values = [
@@ -137,16 +144,7 @@ class GridDesign(AbstractSampleDesign):
             )
         ]
         grid_columns = np.meshgrid(*selected_axis_values, indexing="ij")
-        return {
-            parameter_name: grid_column.ravel()
-            for parameter_name, grid_column in zip(self.swept_parameters, grid_columns, strict=True)
-        }
-
-    def make_result_coordinates(self) -> dict[str, tuple[str, np.ndarray]]:
-        return {
-            parameter_name: (parameter_name, parameter_values)
-            for parameter_name, parameter_values in self.values_by_parameter.items()
-        }
+        return dict(zip(self.swept_parameters, map(np.ravel, grid_columns), strict=True))
 
 
 @dataclass(frozen=True, repr=False)
@@ -173,12 +171,9 @@ class SampleListDesign(AbstractSampleDesign):
             for parameter_name, parameter_values in self.values_by_parameter.items()
         }
 
-    def make_result_coordinates(self) -> dict[str, tuple[str, np.ndarray]]:
-        sample_index_coordinate = {"sample": ("sample", np.arange(self.size))}
-        return sample_index_coordinate | {
-            parameter_name: ("sample", parameter_values)
-            for parameter_name, parameter_values in self.values_by_parameter.items()
-        }
+    def make_result_coordinates(self) -> dict[str, tuple[tuple[str, ...], np.ndarray]]:
+        sample_indices = np.arange(self.size)
+        return {"sample": (self.dims, sample_indices)} | super().make_result_coordinates()
 
 
 def _merge_mapping_and_keywords(
@@ -243,9 +238,9 @@ def _parse_value_columns(
 
 
 def grid(
-    values: Mapping[str, Sequence[float] | np.ndarray] | None = None,
+    values: Mapping[str, ParameterValues] | None = None,
     /,
-    **parameters: Sequence[float] | np.ndarray,
+    **parameters: ParameterValues,
 ) -> GridDesign:
     """Return the design that contains every combination of parameter values.
 
@@ -275,9 +270,9 @@ def grid(
 
 
 def samples(
-    values: Mapping[str, Sequence[float] | np.ndarray] | None = None,
+    values: Mapping[str, ParameterValues] | None = None,
     /,
-    **parameters: Sequence[float] | np.ndarray,
+    **parameters: ParameterValues,
 ) -> SampleListDesign:
     """Return the design that contains a list of samples, such as `samples({"damping": [100],
     "slope": [0.29]})`.
@@ -312,7 +307,7 @@ def samples(
 
 
 def sobol(
-    ranges: Mapping[str, ParameterRange] | None = None,
+    ranges: ParameterRanges | None = None,
     n: int | None = None,
     seed: int = 0,
     **parameters: ParameterRange,
@@ -346,7 +341,7 @@ def sobol(
 
 
 def uniform(
-    ranges: Mapping[str, ParameterRange] | None = None,
+    ranges: ParameterRanges | None = None,
     n: int | None = None,
     seed: int = 0,
     **parameters: ParameterRange,
@@ -375,7 +370,7 @@ def uniform(
 
 
 def saltelli(
-    ranges: Mapping[str, ParameterRange] | None = None,
+    ranges: ParameterRanges | None = None,
     n: int | None = None,
     seed: int = 0,
     **parameters: ParameterRange,
@@ -421,7 +416,7 @@ def saltelli(
 
 
 def _scale_unit_points_to_box(
-    ranges: Mapping[str, ParameterRange], unit_cube_points: np.ndarray, design_kind: str
+    ranges: ParameterRanges, unit_cube_points: np.ndarray, design_kind: str
 ) -> SampleListDesign:
     """Return the design whose samples are points of the unit cube, scaled to the box between the
     bounds.
@@ -442,8 +437,8 @@ def _make_random_generator(seed: int) -> np.random.Generator:
 
 def _parse_sampling_box(
     function_name: str,
-    ranges: Mapping[str, ParameterRange] | None,
-    parameter_keywords: Mapping[str, ParameterRange],
+    ranges: ParameterRanges | None,
+    parameter_keywords: ParameterRanges,
     n: int | None,
 ) -> tuple[dict[str, ParameterRange], int]:
     """Return the range of each parameter, by name, and the number of samples, all checked.

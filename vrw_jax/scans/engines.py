@@ -9,7 +9,8 @@ then evaluated with unilateral contact.
 
 import contextlib
 import dataclasses
-from collections.abc import Mapping
+import functools
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -41,29 +42,32 @@ from vrw_jax.scans.collocation_engine import (
     concatenate_results,
     count_available_cores,
     mask_failed_samples,
-    stack_parameter_rows,
 )
-from vrw_jax.scans.measure_catalog import make_error_variable_name, parse_derivative
+from vrw_jax.scans.design import ParameterSamples
+from vrw_jax.scans.measure_catalog import (
+    ValuesByVariable,
+    make_error_variable_name,
+    parse_derivative,
+)
 from vrw_jax.selection import ModelCode, find_selection_reason
 from vrw_jax.tolerance import ModelIndex, measure_to_tolerance
 from vrw_jax.wheel import FRICTION_NAME, PARAMETER_NAMES, Outcome, make_wheel_from_parameters
 
-ParameterSampleMapping = Mapping[str, np.ndarray]
-"""Swept parameters by name, with one value per sample."""
-ValuesByVariable = dict[str, np.ndarray]
-"""Values of each variable by its name, with one value per sample."""
+SampleEvaluator = Callable[[ParameterSamples], ValuesByVariable]
+"""Function that returns the values of each variable for samples, by the name of the variable."""
 
 
 class UnilateralScanEngine:
     """Scan engine for unilateral contact and a fixed set of measures."""
 
     def __init__(self, evaluation_request: EvaluationRequest, n_threads: int | None = None) -> None:
-        variable_names, self._base_wheel, self._wheel_model, step_options, *_ = evaluation_request
+        self._evaluation_request = evaluation_request
+        variable_names, base_wheel, self._wheel_model, step_options, *_ = evaluation_request
         self._n_threads = count_available_cores() if n_threads is None else n_threads
         self._requested_derivatives = evaluation_request.requested_derivatives
         measure_names = [name for name in variable_names if parse_derivative(name) is None]
         gait_finder: Any = make_finder(
-            self._wheel_model, self._base_wheel.n_legs, step_options=step_options
+            self._wheel_model, base_wheel.n_legs, step_options=step_options
         )
         self._gait_finder = dataclasses.replace(
             gait_finder, gait_batch_sizes=(batch_sizes.GAIT_READ_BATCH_SIZE,)
@@ -75,14 +79,12 @@ class UnilateralScanEngine:
         )
         self._derivative_reader = MeasureReader(read_measure, tuple(differentiated_measures))
 
-    def __call__(self, samples_by_parameter: ParameterSampleMapping) -> ValuesByVariable:
+    def __call__(self, samples_by_parameter: ParameterSamples) -> ValuesByVariable:
         """Return the value of each variable for all samples, by the name of the variable.
 
         - `samples_by_parameter`: value of each swept parameter for each sample.
         """
-        parameter_rows = stack_parameter_rows(
-            samples_by_parameter, self._wheel_model, self._base_wheel
-        )
+        parameter_rows = self._evaluation_request.stack_parameter_rows(samples_by_parameter)
         parameter_row_subsets = np.array_split(
             parameter_rows,
             max(self._n_threads, -(-len(parameter_rows) // batch_sizes.SCAN_TASK_SIZE)),
@@ -177,6 +179,9 @@ The keys are names of measures with unilateral contact.
 """
 
 
+_find_selection_reason = jax.jit(find_selection_reason)
+
+
 class ModelSelectionScanEngine:
     """Scan engine that evaluates each sample with the simplest model that is valid for the
     sample.
@@ -200,7 +205,7 @@ class ModelSelectionScanEngine:
             evaluation_request._replace(wheel_model=self._wheel_model.fallback_model), n_threads
         )
 
-    def __call__(self, samples_by_parameter: ParameterSampleMapping) -> ValuesByVariable:
+    def __call__(self, samples_by_parameter: ParameterSamples) -> ValuesByVariable:
         """Return the value of each variable for all samples, by the name of the variable.
 
         The variables include `rung`, the code of the model, and `reason`, the code of the reason
@@ -255,8 +260,8 @@ class ModelSelectionScanEngine:
         - `sample_friction`: friction coefficient of the ground for each sample.
         """
         variable_names = (*SELECTION_MARGIN_NAMES, "outcome")
-        selection_reasons = map_in_numpy_batches(
-            _find_batch_selection_reasons,
+        selection_reasons, _ = map_in_numpy_batches(
+            _find_selection_reason,
             (batch_sizes.GAIT_READ_BATCH_SIZE,),
             {variable_name: paper_results[variable_name] for variable_name in variable_names},
             sample_friction - self._paper_model.friction,
@@ -264,45 +269,36 @@ class ModelSelectionScanEngine:
         return selection_reasons.astype(np.int8)
 
 
-@jax.jit
-def _find_batch_selection_reasons(
-    step_measures: dict[str, Array], friction_difference: Array
-) -> Array:
-    """Return `ModelChoice.reason_code` for each viscoelastic gait step of a batch."""
-    return find_selection_reason(step_measures, friction_difference)[0]
+def evaluate_to_tolerance(
+    evaluation_request: EvaluationRequest, samples_by_parameter: ParameterSamples
+) -> ValuesByVariable:
+    """Return the value of each variable for all samples, computed to a tolerance, by the name of
+    the variable.
 
+    See `vrw.measure_to_tolerance`.
 
-class ToleranceScanEngine:
-    """Scan engine that computes measures to a tolerance. See `vrw.measure_to_tolerance`."""
-
-    def __init__(self, evaluation_request: EvaluationRequest) -> None:
-        assert evaluation_request.error_tolerance is not None
-        self._measure_names, self._base_wheel, self._wheel_model, *_ = evaluation_request
-        self._error_tolerance = evaluation_request.error_tolerance
-
-    def __call__(self, samples_by_parameter: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-        """Return the value of each variable for all samples, by the name of the variable.
-
-        - `samples_by_parameter`: value of each swept parameter for each sample.
-        """
-        *wheel_parameter_columns, sample_friction = stack_parameter_rows(
-            samples_by_parameter, self._wheel_model, self._base_wheel
-        ).T
-        params = make_wheel_from_parameters(
-            tuple(map(jnp.asarray, wheel_parameter_columns)), self._base_wheel.n_legs
-        )
-        measure_result = measure_to_tolerance(
-            self._measure_names,
-            params,
-            self._error_tolerance,
-            friction=sample_friction,
-            stoppers=self._wheel_model.stoppers,
-        )
-        error_names = map(make_error_variable_name, self._measure_names)
-        sample_results = dict(zip(self._measure_names, measure_result.values.T, strict=True))
-        sample_results |= dict(zip(error_names, measure_result.errors.T, strict=True))
-        model_codes = np.maximum(measure_result.models - ModelIndex.RIGID, 0).astype(np.int8)
-        return mask_failed_samples(measure_result.outcomes, sample_results | {"rung": model_codes})
+    - `samples_by_parameter`: value of each swept parameter for each sample.
+    """
+    assert evaluation_request.error_tolerance is not None
+    measure_names = evaluation_request.measure_names
+    *wheel_parameter_columns, sample_friction = evaluation_request.stack_parameter_rows(
+        samples_by_parameter
+    ).T
+    params = make_wheel_from_parameters(
+        tuple(map(jnp.asarray, wheel_parameter_columns)), evaluation_request.base_wheel.n_legs
+    )
+    measure_result = measure_to_tolerance(
+        measure_names,
+        params,
+        evaluation_request.error_tolerance,
+        friction=sample_friction,
+        stoppers=evaluation_request.wheel_model.stoppers,
+    )
+    error_names = map(make_error_variable_name, measure_names)
+    sample_results = dict(zip(measure_names, measure_result.values.T, strict=True))
+    sample_results |= dict(zip(error_names, measure_result.errors.T, strict=True))
+    model_codes = np.maximum(measure_result.models - ModelIndex.RIGID, 0).astype(np.int8)
+    return mask_failed_samples(measure_result.outcomes, sample_results | {"rung": model_codes})
 
 
 class PassageScanEngine:
@@ -320,14 +316,14 @@ class PassageScanEngine:
         gait_request = evaluation_request._replace(
             measure_names=gait_measure_names, slope_standard_deviation=None
         )
-        self._gait_engine: Any = make_scan_engine(gait_request, n_threads)
+        self._gait_engine = make_scan_engine(gait_request, n_threads)
 
-    def __call__(self, samples_by_parameter: ParameterSampleMapping) -> ValuesByVariable:
+    def __call__(self, samples_by_parameter: ParameterSamples) -> ValuesByVariable:
         """Return the value of each variable for all samples, by the name of the variable.
 
         - `samples_by_parameter`: value of each swept parameter for each sample.
         """
-        sample_results: ValuesByVariable = dict(self._gait_engine(samples_by_parameter))
+        sample_results = self._gait_engine(samples_by_parameter)
         gait_outcomes = sample_results["outcome"]
         passage_measures = {
             measure_name: np.full(len(gait_outcomes), np.nan, self._base_wheel.damping.dtype)
@@ -359,19 +355,13 @@ class PassageScanEngine:
 
 def make_scan_engine(
     evaluation_request: EvaluationRequest, n_threads: int | None = None
-) -> (
-    CollocationScanEngine
-    | UnilateralScanEngine
-    | ModelSelectionScanEngine
-    | ToleranceScanEngine
-    | PassageScanEngine
-):
+) -> SampleEvaluator:
     """Return the engine that computes the measures of an `EvaluationRequest`.
 
     - `n_threads`: number of CPU threads, by default one per core.
     """
     if evaluation_request.error_tolerance is not None:
-        return ToleranceScanEngine(evaluation_request)
+        return functools.partial(evaluate_to_tolerance, evaluation_request)
     if evaluation_request.slope_standard_deviation is not None:
         return PassageScanEngine(evaluation_request, n_threads)
     gait_method = evaluation_request.wheel_model.capabilities.gait_method

@@ -11,7 +11,7 @@ import contextlib
 import errno
 import math
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -154,14 +154,14 @@ def resolve_executor(dask: str | None) -> contextlib.AbstractContextManager[Chun
 @with_default_jax_settings
 def run_scan(
     scan_plan: ScanPlan,
-    store: str | Path | AbstractResultStore | None = None,
+    store: str | Path | AbstractResultStore | None,
     *,
     on_progress: ProgressCallback | None = None,
     chunk_executor: ChunkExecutor | None = None,
 ) -> xr.Dataset:
     """Compute a scan plan, and return its results as a labeled dataset.
 
-    - `store`: store or folder to which the results are written; by default they stay in memory;
+    - `store`: store or folder to which the results are written; with None they stay in memory;
     - `chunk_executor`: function that computes the chunks; by default this process computes them.
     """
     if isinstance(store, AbstractResultStore):
@@ -174,26 +174,20 @@ def run_scan(
             warnings.warn(f"{result_store.damage_description}: computed again.", stacklevel=3)
     if result_store.damage_description or result_store.find_missing_chunks():
         with result_store.open_for_writing():
-            _compute_and_write_chunks(
-                scan_plan,
-                result_store,
-                result_store.find_missing_chunks(),
-                on_progress,
-                chunk_executor or _compute_chunks_in_process,
-            )
+            _compute_and_write_chunks(scan_plan, result_store, on_progress, chunk_executor)
     return result_store.load_dataset()
 
 
 def _compute_and_write_chunks(
     scan_plan: ScanPlan,
     result_store: AbstractResultStore,
-    missing_chunks: list[int],
     on_progress: ProgressCallback | None,
-    chunk_executor: ChunkExecutor,
+    chunk_executor: ChunkExecutor | None,
 ) -> None:
     """Compute the missing chunks, write each chunk to the store, and report the progress after each
     chunk.
     """
+    missing_chunks = result_store.find_missing_chunks()
     chunk_shapes = {
         chunk_index: scan_plan.result_layout.compute_chunk_sample_shape(chunk_index)
         for chunk_index in missing_chunks
@@ -204,7 +198,15 @@ def _compute_and_write_chunks(
     if on_progress is not None:
         on_progress(scan_progress)
     try:
-        for chunk_index, flat_chunk_results in chunk_executor(scan_plan, missing_chunks):
+        if chunk_executor is None:
+            scan_engine = scan_plan.build_scan_engine()
+            computed_chunks: Iterable[ChunkResult] = (
+                (chunk_index, scan_engine(scan_plan.select_chunk_samples(chunk_index)))
+                for chunk_index in missing_chunks
+            )
+        else:
+            computed_chunks = chunk_executor(scan_plan, missing_chunks)
+        for chunk_index, flat_chunk_results in computed_chunks:
             chunk_shape = chunk_shapes[chunk_index]
             chunk_results = {
                 variable_name: variable_values.reshape(*chunk_shape, *variable_values.shape[1:])
@@ -241,25 +243,15 @@ def _compute_and_write_chunks(
         ) from None
 
 
-def _compute_chunks_in_process(
-    scan_plan: ScanPlan, missing_chunks: Sequence[int]
-) -> Iterator[ChunkResult]:
-    """Yield each missing chunk's index and results, computed one after another in this process."""
-    scan_engine = scan_plan.build_scan_engine()
-    for chunk_index in missing_chunks:
-        yield chunk_index, scan_engine(scan_plan.select_chunk_samples(chunk_index))
-
-
 def open_or_create_store(scan_plan: ScanPlan, store_path: Path) -> ZarrResultStore:
     """Return the store at `store_path`, which is created if it does not exist.
 
     Raise a ValueError if the store contains another scan.
     """
-    zarr_store = find_matching_store(scan_plan, store_path)
-    if zarr_store is None:
+    if read_stored_manifest(store_path) is None:
         create_empty_store(store_path, scan_plan.result_layout, scan_plan.store_attributes)
-        zarr_store = find_matching_store(scan_plan, store_path)
-        assert zarr_store is not None
+    zarr_store = find_matching_store(scan_plan, store_path)
+    assert zarr_store is not None
     stored_manifest = read_stored_manifest(store_path) or {}
     settings_difference_text = describe_settings_difference(
         stored_manifest[PROVENANCE_ATTRIBUTE], describe_computing_environment()

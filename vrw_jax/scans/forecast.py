@@ -20,12 +20,12 @@ SCAN_STARTUP_SECONDS = 5.0
 docs/benchmarks/scans.md.
 """
 
-TYPICAL_SCAN_MEMORY_BYTES = 0.5e9
+TYPICAL_SCAN_MEMORY_BYTES = 500_000_000
 """Typical memory that code and arrays of a scan occupy, bytes; see docs/benchmarks/scans.md."""
 
 
 @with_default_jax_settings
-def forecast_scan(scan_plan: ScanPlan, store_path: str | Path | None = None) -> dict[str, str]:
+def forecast_scan(scan_plan: ScanPlan, store_path: Path) -> dict[str, str]:
     """Return a forecast of a scan: its size, chunks, memory and time, as texts by label.
 
     No file is written. Time and memory are measured while samples that are spread over the design
@@ -36,11 +36,7 @@ def forecast_scan(scan_plan: ScanPlan, store_path: str | Path | None = None) -> 
     """
     result_layout, n_samples = scan_plan.result_layout, scan_plan.design.size
     measure_catalog = scan_plan.measure_catalog
-    existing_store = (
-        None
-        if store_path is None
-        else find_matching_store(scan_plan, Path(store_path), verifies_files=False)
-    )
+    existing_store = find_matching_store(scan_plan, store_path, verifies_files=False)
     missing_chunks = (
         range(result_layout.n_chunks)
         if existing_store is None
@@ -54,7 +50,7 @@ def forecast_scan(scan_plan: ScanPlan, store_path: str | Path | None = None) -> 
     sample_axes_description = " x ".join(
         f"{axis_length} {sample_axis_name}"
         for sample_axis_name, axis_length in zip(
-            result_layout.sample_dimension_names, result_layout.sample_shape, strict=True
+            scan_plan.design.dims, scan_plan.design.shape, strict=True
         )
     )
     forecast_texts = {
@@ -76,12 +72,16 @@ def forecast_scan(scan_plan: ScanPlan, store_path: str | Path | None = None) -> 
     compilation_end_seconds = perf_counter()
     scan_engine(_select_spread_samples(scan_plan.design, n_measured_samples))
     samples_per_second = n_measured_samples / (perf_counter() - compilation_end_seconds)
-    forecast_memory_bytes = (
-        _measure_peak_memory_bytes() + chunk_size * 2 * result_layout.bytes_per_sample
-    )
+    try:
+        import resource
+
+        bytes_per_unit = 1 if sys.platform == "darwin" else 1024
+        peak_memory_bytes = bytes_per_unit * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    except ImportError:  # Windows has no such module.
+        peak_memory_bytes = TYPICAL_SCAN_MEMORY_BYTES
+    forecast_memory_bytes = peak_memory_bytes + chunk_size * 2 * result_layout.bytes_per_sample
     return forecast_texts | {
-        "memory": f"about {_format_bytes(forecast_memory_bytes)}, "
-        + ("whatever the number of samples" if store_path is not None else "plus the result"),
+        "memory": f"about {_format_bytes(forecast_memory_bytes)}, whatever the number of samples",
         "time": f"about "
         f"{format_duration(n_missing_samples / samples_per_second + SCAN_STARTUP_SECONDS)}: "
         f"{n_missing_samples:,} samples at {samples_per_second:,.0f} per "
@@ -96,27 +96,15 @@ def _select_spread_samples(
 ) -> ParameterSamples:
     """Return samples that are spread evenly over a design, as one column per parameter."""
     flat_sample_indices = np.linspace(0, design.size - 1, n_selected_samples).round().astype(int)
-    sample_indices = zip(*np.unravel_index(flat_sample_indices, design.shape), strict=True)
-    single_samples = [
-        design.select_samples(tuple(slice(i, i + 1) for i in sample_index))
-        for sample_index in sample_indices
-    ]
+    axis_indices = np.unravel_index(flat_sample_indices, design.shape)
+    indices_by_axis = dict(zip(design.dims, axis_indices, strict=True))
     return {
-        parameter_name: np.concatenate(
-            [samples_by_parameter[parameter_name] for samples_by_parameter in single_samples]
+        parameter_name: parameter_values[indices_by_axis[axis_name]]
+        for parameter_name, ((axis_name,), parameter_values) in (
+            design.make_result_coordinates().items()
         )
-        for parameter_name in design.swept_parameters
+        if parameter_name in design.values_by_parameter
     }
-
-
-def _measure_peak_memory_bytes() -> float:
-    """Return the peak memory of this process, bytes."""
-    try:
-        import resource
-    except ImportError:  # Windows has no such module.
-        return TYPICAL_SCAN_MEMORY_BYTES
-    bytes_per_unit = 1 if sys.platform == "darwin" else 1024
-    return float(bytes_per_unit) * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 
 
 def _format_bytes(n_bytes: int | float) -> str:

@@ -21,6 +21,9 @@ import numpy as np
 ZarrGroup = Any
 """Zarr group; the type is `Any` because only the module `store` imports zarr."""
 
+JsonObject = dict[str, Any]
+"""Object of JSON: settings, attributes or metadata by name."""
+
 MANIFEST_ATTRIBUTE = "scan"
 """Name of the attribute of a store that contains the settings of the scan."""
 
@@ -49,15 +52,18 @@ METADATA_FILE_NAME = "zarr.json"
 """Name of the file that contains the metadata of a Zarr array or group."""
 
 
-def read_scan_manifest(store_attributes: Any) -> dict[str, Any]:
-    """Return the settings of the scan from the attributes of a store or a labeled result."""
-    stored_manifest = store_attributes.get(MANIFEST_ATTRIBUTE, {})
-    return (
-        json.loads(stored_manifest) if isinstance(stored_manifest, str) else dict(stored_manifest)
-    )
+def read_scan_manifest(
+    store_attributes: Any, attribute_name: str = MANIFEST_ATTRIBUTE
+) -> JsonObject:
+    """Return the settings of the scan from the attributes of a store or a labeled result.
+
+    - `attribute_name`: attribute that contains the table; by default that of the settings.
+    """
+    stored_table = store_attributes.get(attribute_name, {})
+    return json.loads(stored_table) if isinstance(stored_table, str) else dict(stored_table)
 
 
-def add_attribute_seal(chunk_mark_attributes: dict[str, Any]) -> dict[str, Any]:
+def add_attribute_seal(chunk_mark_attributes: JsonObject) -> JsonObject:
     """Return the attributes of the Zarr group of marks, with their digest added under
     `ATTRIBUTE_SEAL_KEY`.
     """
@@ -81,7 +87,7 @@ def digest_coordinate_values(coordinate_values: np.ndarray) -> str:
     )
 
 
-def read_metadata_file(metadata_path: Path) -> dict[str, Any]:
+def read_metadata_file(metadata_path: Path) -> JsonObject:
     """Return the content of a metadata file, or an empty dictionary if the file cannot be read."""
     try:
         return _ensure_dictionary(json.loads(metadata_path.read_text(encoding="utf-8")))
@@ -89,7 +95,7 @@ def read_metadata_file(metadata_path: Path) -> dict[str, Any]:
         return {}
 
 
-def _ensure_dictionary(metadata: Any) -> dict[str, Any]:
+def _ensure_dictionary(metadata: Any) -> JsonObject:
     """Return `metadata`, or an empty dictionary if damaged metadata are no dictionary."""
     return metadata if isinstance(metadata, dict) else {}
 
@@ -124,14 +130,14 @@ class StoredMetadata:
             for attribute_copy in usable_attribute_copies
             if attribute_copy == add_attribute_seal(attribute_copy)
         )
-        self.mark_attributes: dict[str, Any] = next(
+        self.mark_attributes: JsonObject = next(
             intact_attribute_copies, (*usable_attribute_copies, {})[0]
         )
         """Attributes of the Zarr group of marks, from the intact copy; empty if both copies are
         lost.
         """
         self._root_attributes = _ensure_dictionary(self.root_metadata.get("attributes"))
-        self.store_attributes: dict[str, Any] = self._root_attributes | self.mark_attributes.get(
+        self.store_attributes: JsonObject = self._root_attributes | self.mark_attributes.get(
             STORE_ATTRIBUTES_KEY, {}
         )
         """Attributes of the store, completed from the copy in the Zarr group of marks."""
@@ -204,7 +210,7 @@ class StoredMetadata:
                 temporary_path.write_text(json.dumps(array_metadata, indent=2), encoding="utf-8")
                 temporary_path.replace(metadata_path)
 
-    def _read_array_metadata(self, array_name: str) -> dict[str, Any]:
+    def _read_array_metadata(self, array_name: str) -> JsonObject:
         """Return the metadata of one array or group, read from its separate file."""
         return read_metadata_file(self._store_path / array_name / METADATA_FILE_NAME)
 

@@ -6,6 +6,8 @@ import re
 from collections.abc import Iterable
 from typing import NamedTuple
 
+import numpy as np
+
 from vrw_jax.cycles import CollocationFinder, UnilateralFinder
 from vrw_jax.measures import (
     MARGIN_MEASURES,
@@ -19,6 +21,9 @@ from vrw_jax.selection import SELECTION_VARIABLE_ATTRIBUTES
 from vrw_jax.tolerance import MEASURE_FUNCTIONS
 from vrw_jax.validation import format_name_suggestion
 from vrw_jax.wheel import FRICTION_NAME, PARAMETER_NAMES
+
+ValuesByVariable = dict[str, np.ndarray]
+"""Values of each variable for samples, by the name of the variable; the sample axes come first."""
 
 ALWAYS_INCLUDED_VARIABLES = ("outcome", "spectral_radius", *MARGIN_MEASURES)
 """Names of the variables that every scan contains, requested or not: outcome, spectral radius and
@@ -110,8 +115,8 @@ ERROR_VARIABLE_SUFFIX = "_error"
 
 def select_measure_catalog(
     wheel_model: AbstractWheel | type[AbstractWheel],
-    error_tolerance: float | None = None,
-    slope_standard_deviation: float | None = None,
+    error_tolerance: float | None,
+    slope_standard_deviation: float | None,
 ) -> MeasureCatalog:
     """Return the catalog of measures that a scan with `wheel_model` can compute.
 
@@ -159,10 +164,8 @@ class MeasureDerivative(NamedTuple):
     @property
     def variable_attributes(self) -> dict[str, object]:
         """Return unit, long name, symbol and description of the derivative, by attribute name."""
-        measure_description, parameter_description = (
-            MEASURES[self.measure_name],
-            MEASURES[self.parameter_name],
-        )
+        measure_description = MEASURES[self.measure_name]
+        parameter_description = MEASURES[self.parameter_name]
         derivative_unit = f"{measure_description.unit}/({parameter_description.unit})"
         if parameter_description.unit == "1":
             derivative_unit = measure_description.unit

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import json
 import platform
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,10 +22,11 @@ from vrw_jax.numerics import StepOptions, batch_sizes
 from vrw_jax.runtime import compute_source_digest
 from vrw_jax.scans.collocation_engine import EvaluationRequest
 from vrw_jax.scans.design import AbstractSampleDesign, ParameterSamples
-from vrw_jax.scans.engines import make_scan_engine
-from vrw_jax.scans.integrity import MANIFEST_ATTRIBUTE
+from vrw_jax.scans.engines import SampleEvaluator, make_scan_engine
+from vrw_jax.scans.integrity import MANIFEST_ATTRIBUTE, JsonObject
 from vrw_jax.scans.measure_catalog import (
     MeasureCatalog,
+    ValuesByVariable,
     canonicalize_variable_name,
     check_measure_names,
     get_variable_attributes,
@@ -36,9 +37,7 @@ from vrw_jax.scans.store import (
     PROVENANCE_ATTRIBUTE,
     REQUESTED_MEASURES_ATTRIBUTE,
     ResultLayout,
-    VariableLayout,
     choose_chunk_shape,
-    find_first_settings_difference,
 )
 from vrw_jax.selection import describe_accepted_models
 from vrw_jax.simulation import (
@@ -96,13 +95,7 @@ STORED_NAME_BY_MODEL_FIELD = {
 differ.
 """
 
-SampleEvaluator = Callable[[ParameterSamples], Mapping[str, np.ndarray]]
-"""Function that returns the values of each variable for samples, by the name of the variable.
-
-The first axis of each array is that of the samples.
-"""
-
-ChunkResult = tuple[int, Mapping[str, np.ndarray]]
+ChunkResult = tuple[int, ValuesByVariable]
 """Index of a chunk, and the values of each variable in the chunk, by the name of the variable."""
 
 ChunkExecutor = Callable[["ScanPlan", Sequence[int]], Iterator[ChunkResult]]
@@ -123,13 +116,13 @@ class ScanPlan:
     config_file_text: str
 
     @property
-    def scan_settings(self) -> dict[str, object]:
+    def scan_settings(self) -> JsonObject:
         """Return the settings that identify the scan.
 
         A scan continues a store only if the store contains the same settings.
         """
         request, base_wheel = self.evaluation_request, self.evaluation_request.base_wheel
-        scan_settings: dict[str, object] = {
+        scan_settings: JsonObject = {
             "design": self.design.describe_design(),
             "wheel": {
                 parameter_name: float(getattr(base_wheel, parameter_name))
@@ -151,7 +144,7 @@ class ScanPlan:
         return scan_settings
 
     @property
-    def store_attributes(self) -> dict[str, object]:
+    def store_attributes(self) -> JsonObject:
         """Return the attributes that the labeled result and its store have."""
         return {
             "title": f"Steady gaits of the viscoelastic-legged rimless wheel over "
@@ -251,13 +244,13 @@ def plan_scan(
     evaluation_request = EvaluationRequest(
         measure_names, base, model, options, cycle_options, tol, slope_sd
     )
-    result_layout = _make_result_layout(design, tuple(dict.fromkeys(variable_names)), base, chunk)
+    result_layout = _make_result_layout(design, variable_names, base, chunk)
     return ScanPlan(
         design, evaluation_request, measure_catalog, result_layout, requested_measures, config_text
     )
 
 
-def describe_computing_environment() -> dict[str, object]:
+def describe_computing_environment() -> JsonObject:
     """Return a description of the environment in which this process computes.
 
     It consists of the digest of the source code, the versions of the libraries and the device.
@@ -285,23 +278,35 @@ last digits of results.
 """
 
 
-def describe_settings_difference(stored_settings: object, current_settings: object) -> str:
-    """Return a sentence that states the first setting that differs, or "" if no setting differs."""
-    setting_name, stored_value, current_value = find_first_settings_difference(
-        stored_settings, current_settings
-    )
-    if not setting_name:
+def describe_settings_difference(
+    stored_settings: object, current_settings: object, setting_name: str = ""
+) -> str:
+    """Return a sentence that states the first setting that differs, or "" if no setting differs.
+
+    - `setting_name`: name of the compared setting, "" for the table of all settings.
+    """
+    if isinstance(stored_settings, dict) and isinstance(current_settings, dict):
+        differences = (
+            describe_settings_difference(
+                stored_settings.get(nested_name),
+                current_settings.get(nested_name),
+                f"{setting_name}.{nested_name}".removeprefix("."),
+            )
+            for nested_name in stored_settings | current_settings
+        )
+        return next(filter(None, differences), "")
+    if stored_settings == current_settings:
         return ""
     if setting_name == "design.digest":
         return "the values of the swept parameters differ"
     if setting_name == "code":
         return "the library's code differs"
-    return f"{setting_name} is {stored_value!r} there and {current_value!r} here"
+    return f"{setting_name} is {stored_settings!r} there and {current_settings!r} here"
 
 
 def _make_result_layout(
     design: AbstractSampleDesign,
-    variable_names: tuple[str, ...],
+    variable_names: Iterable[str],
     base_wheel: WheelParams,
     chunk_size: int,
 ) -> ResultLayout:
@@ -309,41 +314,41 @@ def _make_result_layout(
 
     - `chunk_size`: largest number of samples in a chunk.
     """
-    parameter_dtype = str(base_wheel.damping.dtype)
     locked_leg_coordinate = make_locked_leg_coordinate(base_wheel.n_legs)
 
-    def make_variable_layout(variable_name: str) -> VariableLayout:
-        """Return the layout of one variable: its type, missing value and attributes."""
-        variable_dtype = INTEGER_VARIABLE_DTYPES.get(variable_name, parameter_dtype)
-        variable_attributes = get_variable_attributes(variable_name)
+    def make_empty_variable(variable_name: str) -> xr.Variable:
+        """Return a variable without results: NaN for every sample, or -1 for an integer."""
+        missing_value = np.array(np.nan, base_wheel.damping.dtype)
+        if variable_name in INTEGER_VARIABLE_DTYPES:
+            missing_value = np.array(-1, INTEGER_VARIABLE_DTYPES[variable_name])
+        dimension_names, shape = design.dims, design.shape
         if variable_name in MARGIN_MEASURES and MARGIN_MEASURES[variable_name].leg_dimension:
-            return VariableLayout(
-                variable_name,
-                variable_dtype,
-                variable_attributes,
-                ("leg",),
-                locked_leg_coordinate.shape,
-            )
-        return VariableLayout(variable_name, variable_dtype, variable_attributes)
+            dimension_names, shape = (*dimension_names, "leg"), (*shape, locked_leg_coordinate.size)
+        return xr.Variable(
+            dimension_names,
+            np.broadcast_to(missing_value, shape),
+            get_variable_attributes(variable_name),
+        )
 
     result_coordinates = {
         coordinate_name: xr.Variable(
-            dimension_name,
+            dimension_names,
             coordinate_values,
             make_measure_attributes(coordinate_name)
             if coordinate_name in design.swept_parameters
             else None,
         )
         for coordinate_name, (
-            dimension_name,
+            dimension_names,
             coordinate_values,
         ) in design.make_result_coordinates().items()
     }
     return ResultLayout(
-        sample_dimension_names=design.dims,
         sample_shape=design.shape,
         chunk_shape=choose_chunk_shape(design.shape, chunk_size),
-        variable_layouts=tuple(map(make_variable_layout, variable_names)),
+        empty_variables={
+            variable_name: make_empty_variable(variable_name) for variable_name in variable_names
+        },
         result_coordinates=result_coordinates | {"leg": locked_leg_coordinate},
     )
 
@@ -357,12 +362,10 @@ INTEGER_VARIABLE_DTYPES = {
 """Types of the variables that are integers."""
 
 
-def _convert_settings_to_json(settings_object: object) -> dict[str, object]:
+def _convert_settings_to_json(settings_object: object) -> JsonObject:
     """Return the class name and the fields of `settings_object` as JSON values, by field name."""
     class_name = type(settings_object).__name__
-    field_value_by_name: dict[str, object] = {
-        "kind": STORED_NAME_BY_CLASS.get(class_name, class_name)
-    }
+    field_value_by_name: JsonObject = {"kind": STORED_NAME_BY_CLASS.get(class_name, class_name)}
     stored_name_by_field = STORED_NAME_BY_MODEL_FIELD | STORED_NAMES_BY_FIELD_OF_CLASS.get(
         class_name, {}
     )

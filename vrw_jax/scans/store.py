@@ -18,7 +18,7 @@ import shutil
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
@@ -34,6 +34,7 @@ from vrw_jax.scans.integrity import (
     SCAN_VARIABLES_KEY,
     STORE_ATTRIBUTES_KEY,
     ChunkChecksums,
+    JsonObject,
     StoredMetadata,
     add_attribute_seal,
     describe_store_damage,
@@ -41,7 +42,7 @@ from vrw_jax.scans.integrity import (
     lock_store,
     read_scan_manifest,
 )
-from vrw_jax.scans.measure_catalog import canonicalize_variable_name
+from vrw_jax.scans.measure_catalog import ValuesByVariable, canonicalize_variable_name
 from vrw_jax.validation import check_bool, check_path
 
 if TYPE_CHECKING:
@@ -57,42 +58,19 @@ REQUESTED_MEASURES_ATTRIBUTE = "asked"
 
 ChunkRegion = tuple[slice, ...]
 """Slices that select the samples of a chunk, one for each sample axis."""
-ChunkVariables = Mapping[str, np.ndarray]
-"""Values of each variable in one chunk, by the name of the variable; the sample axes come first."""
-
-
-@dataclass(frozen=True)
-class VariableLayout:
-    """Description of one variable of a result.
-
-    The dimensions and the shape do not include the sample axes.
-    """
-
-    variable_name: str
-    dtype: str
-    variable_attributes: Mapping[str, Any]
-    extra_dimension_names: tuple[str, ...] = ()
-    extra_shape: tuple[int, ...] = ()
-
-    @property
-    def fill_value(self) -> float | int:
-        """Return the value of a sample without results: NaN, or -1 for an integer."""
-        return -1 if np.dtype(self.dtype).kind == "i" else np.nan
-
-    @property
-    def bytes_per_sample(self) -> int:
-        """Return the number of bytes that the variable occupies per sample."""
-        return np.dtype(self.dtype).itemsize * math.prod(self.extra_shape)
 
 
 @dataclass(frozen=True)
 class ResultLayout:
-    """Description of a result: its sample axes, chunks, variables and coordinates."""
+    """Description of a result: its sample axes, chunks, variables and coordinates.
 
-    sample_dimension_names: tuple[str, ...]
+    The variables have the shape of the whole result and contain missing values, which occupy no
+    memory.
+    """
+
     sample_shape: tuple[int, ...]
     chunk_shape: tuple[int, ...]
-    variable_layouts: tuple[VariableLayout, ...]
+    empty_variables: Mapping[str, xr.Variable]
     result_coordinates: Mapping[str, xr.Variable]
 
     @property
@@ -126,7 +104,8 @@ class ResultLayout:
     @property
     def bytes_per_sample(self) -> int:
         """Return the number of bytes that the uncompressed results of one sample occupy."""
-        return sum(variable_layout.bytes_per_sample for variable_layout in self.variable_layouts)
+        n_bytes = sum(variable.nbytes for variable in self.empty_variables.values())
+        return n_bytes // math.prod(self.sample_shape)
 
 
 def choose_chunk_shape(sample_shape: tuple[int, ...], max_chunk_samples: int) -> tuple[int, ...]:
@@ -156,7 +135,7 @@ class AbstractResultStore(abc.ABC):
         """Return the indices of the chunks whose results are missing, in ascending order."""
 
     @abc.abstractmethod
-    def write_chunk(self, chunk_index: int, chunk_results: ChunkVariables) -> None:
+    def write_chunk(self, chunk_index: int, chunk_results: ValuesByVariable) -> None:
         """Write the results of a chunk and mark the chunk as written."""
 
     @abc.abstractmethod
@@ -174,21 +153,13 @@ class AbstractResultStore(abc.ABC):
 class MemoryResultStore(AbstractResultStore):
     """Storage of a scan's results in memory."""
 
-    def __init__(self, result_layout: ResultLayout, store_attributes: Mapping[str, object]) -> None:
+    def __init__(self, result_layout: ResultLayout, store_attributes: JsonObject) -> None:
         self._result_layout = result_layout
         self._is_chunk_done = np.zeros(result_layout.n_chunks, bool)
         try:
             dataset_variables = {
-                variable_layout.variable_name: (
-                    (*result_layout.sample_dimension_names, *variable_layout.extra_dimension_names),
-                    np.full(
-                        (*result_layout.sample_shape, *variable_layout.extra_shape),
-                        variable_layout.fill_value,
-                        variable_layout.dtype,
-                    ),
-                    dict(variable_layout.variable_attributes),
-                )
-                for variable_layout in result_layout.variable_layouts
+                variable_name: empty_variable.copy(deep=True)
+                for variable_name, empty_variable in result_layout.empty_variables.items()
             }
         except MemoryError as memory_error:
             n_samples = math.prod(result_layout.sample_shape)
@@ -204,7 +175,7 @@ class MemoryResultStore(AbstractResultStore):
     def find_missing_chunks(self) -> list[int]:
         return list(np.flatnonzero(~self._is_chunk_done).tolist())
 
-    def write_chunk(self, chunk_index: int, chunk_results: ChunkVariables) -> None:
+    def write_chunk(self, chunk_index: int, chunk_results: ValuesByVariable) -> None:
         chunk_slices = self._result_layout.compute_chunk_region(chunk_index)
         for variable_name, variable_array in self._dataset.data_vars.items():
             variable_array.values[chunk_slices] = chunk_results[str(variable_name)]
@@ -261,12 +232,12 @@ class ZarrResultStore(AbstractResultStore):
         are_chunks_written[np.asarray(self.damaged_chunks, int)] = False
         return list(np.flatnonzero(~are_chunks_written).tolist())
 
-    def write_chunk(self, chunk_index: int, chunk_results: ChunkVariables) -> None:
+    def write_chunk(self, chunk_index: int, chunk_results: ValuesByVariable) -> None:
         chunk_slices = self._result_layout.compute_chunk_region(chunk_index)
-        for variable_layout in self._result_layout.variable_layouts:
-            _select_zarr_array(self._zarr_group, variable_layout.variable_name)[chunk_slices] = (
-                chunk_results[variable_layout.variable_name]
-            )
+        for variable_name in self._result_layout.empty_variables:
+            _select_zarr_array(self._zarr_group, variable_name)[chunk_slices] = chunk_results[
+                variable_name
+            ]
         assert self._chunk_checksums is not None
         self._chunk_checksums.mark_chunk_as_written(chunk_index)
         self.damaged_chunks = [
@@ -461,15 +432,9 @@ def read_stored_manifest(store_path: Path) -> dict | None:
         return None
     store_attributes = _read_scan_metadata(store_path).store_attributes
     try:
-        provenance_record = store_attributes.get(PROVENANCE_ATTRIBUTE, {})
-        provenance_record = (
-            json.loads(provenance_record)
-            if isinstance(provenance_record, str)
-            else provenance_record
-        )
         return {
-            MANIFEST_ATTRIBUTE: read_scan_manifest(store_attributes),
-            PROVENANCE_ATTRIBUTE: provenance_record,
+            attribute_name: read_scan_manifest(store_attributes, attribute_name)
+            for attribute_name in (MANIFEST_ATTRIBUTE, PROVENANCE_ATTRIBUTE)
         }
     except (TypeError, ValueError) as error:
         raise ValueError(
@@ -477,32 +442,8 @@ def read_stored_manifest(store_path: Path) -> dict | None:
         ) from error
 
 
-def find_first_settings_difference(
-    stored_settings: object, current_settings: object, nested_setting_path: str = ""
-) -> tuple[str, object, object]:
-    """Return the name of the first setting that differs, its stored value and its current value.
-
-    If no setting differs, return ("", None, None).
-    """
-    if isinstance(stored_settings, dict) and isinstance(current_settings, dict):
-        for setting_name in stored_settings | current_settings:
-            nested_settings_difference = find_first_settings_difference(
-                stored_settings.get(setting_name),
-                current_settings.get(setting_name),
-                f"{nested_setting_path}.{setting_name}".removeprefix("."),
-            )
-            if nested_settings_difference[0]:
-                return nested_settings_difference
-        return "", None, None
-    return (
-        ("", None, None)
-        if stored_settings == current_settings
-        else (nested_setting_path, stored_settings, current_settings)
-    )
-
-
 def create_empty_store(
-    store_path: Path, result_layout: ResultLayout, store_attributes: Mapping[str, object]
+    store_path: Path, result_layout: ResultLayout, store_attributes: JsonObject
 ) -> None:
     """Create an empty store at `store_path` atomically.
 
@@ -524,7 +465,7 @@ def create_empty_store(
 
 @contextlib.contextmanager
 def _build_temporary_store(
-    store_path: Path, result_layout: ResultLayout, store_attributes: Mapping[str, object]
+    store_path: Path, result_layout: ResultLayout, store_attributes: JsonObject
 ) -> Iterator[Path]:
     """Yield the path of an empty store beside `store_path`, and remove what is left of it
     afterwards.
@@ -539,7 +480,7 @@ def _build_temporary_store(
 
 
 def _create_zarr_arrays(
-    store_path: Path, result_layout: ResultLayout, store_attributes: Mapping[str, object]
+    store_path: Path, result_layout: ResultLayout, store_attributes: JsonObject
 ) -> None:
     """Create the Zarr group of a store, with the coordinates and with empty arrays for variables
     and marks.
@@ -560,26 +501,21 @@ def _create_zarr_arrays(
             compressors=array_compressors,
             attributes=coordinate.attrs,
         )
-    for variable_layout in result_layout.variable_layouts:
+    chunk_shape = result_layout.chunk_shape
+    for variable_name, empty_variable in result_layout.empty_variables.items():
         zarr_group.create_array(
-            variable_layout.variable_name,
-            shape=(*result_layout.sample_shape, *variable_layout.extra_shape),
-            chunks=(*result_layout.chunk_shape, *variable_layout.extra_shape),
-            dtype=variable_layout.dtype,
-            fill_value=variable_layout.fill_value,
-            dimension_names=(
-                *result_layout.sample_dimension_names,
-                *variable_layout.extra_dimension_names,
-            ),
+            variable_name,
+            shape=empty_variable.shape,
+            chunks=(*chunk_shape, *empty_variable.shape[len(chunk_shape) :]),
+            dtype=empty_variable.dtype,
+            fill_value=empty_variable.values.flat[0],
+            dimension_names=map(str, empty_variable.dims),
             compressors=array_compressors,
-            attributes=dict(variable_layout.variable_attributes),
+            attributes=empty_variable.attrs,
         )
-    variable_names = [
-        variable_layout.variable_name for variable_layout in result_layout.variable_layouts
-    ]
     chunk_mark_attributes = add_attribute_seal(
         {
-            SCAN_VARIABLES_KEY: variable_names,
+            SCAN_VARIABLES_KEY: list(result_layout.empty_variables),
             COORDINATE_DIGESTS_KEY: {
                 coordinate_name: digest_coordinate_values(coordinate.values)
                 for coordinate_name, coordinate in result_coordinates.items()
@@ -600,7 +536,7 @@ def _create_zarr_arrays(
         array_name: json.loads((store_path / array_name / METADATA_FILE_NAME).read_text())
         for array_name in (
             *result_coordinates,
-            *variable_names,
+            *result_layout.empty_variables,
             CHECKSUM_GROUP_NAME,
             CHECKSUM_ARRAY_NAME,
         )
