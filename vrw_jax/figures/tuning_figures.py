@@ -55,7 +55,25 @@ def tuning_figure(tuned: TuneResult) -> Figure:
     )
     panel_axes["objective"].sharex(panel_axes["parameters"])
     _draw_objective_path(panel_axes["objective"], path_dataset)
-    _draw_parameter_paths(panel_axes["parameters"], path_dataset)
+    parameter_axes = panel_axes["parameters"]
+    # The parameters are scaled so that their bounds are 0 and 1.
+    for parameter_name, lower_bound, upper_bound in zip(
+        path_dataset.attrs["free"].split(),
+        path_dataset.attrs["lower"],
+        path_dataset.attrs["upper"],
+        strict=True,
+    ):
+        parameter_axes.plot(
+            path_dataset.evaluation,
+            (path_dataset[parameter_name].values - lower_bound) / (upper_bound - lower_bound),
+            marker=".",
+            markersize=4.0,
+            label=f"${MEASURES[parameter_name].mathtext}$",
+        )
+    parameter_axes.set_yticks([0.0, 1.0], ["lower\nbound", "upper\nbound"])
+    parameter_axes.set(xlabel="gaits evaluated", ylim=(-0.05, 1.05))
+    parameter_axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    parameter_axes.legend(**LEGEND_BESIDE_PANEL)
     _draw_constraint_slacks(panel_axes["slack"], tuned)
     return figure
 
@@ -102,27 +120,6 @@ def _draw_objective_path(axes: Axes, path_dataset: xr.Dataset) -> None:
         legend_text = None  # One line is in the legend.
     axes.set_ylabel(format_axis_label(path_dataset.objective.attrs["long_name"], "{name}"))
     axes.legend(loc="best", fontsize=7.0)
-
-
-def _draw_parameter_paths(axes: Axes, path_dataset: xr.Dataset) -> None:
-    """Draw the parameters of each evaluated gait, scaled so that their bounds are 0 and 1."""
-    for parameter_name, lower_bound, upper_bound in zip(
-        path_dataset.attrs["free"].split(),
-        path_dataset.attrs["lower"],
-        path_dataset.attrs["upper"],
-        strict=True,
-    ):
-        axes.plot(
-            path_dataset.evaluation,
-            (path_dataset[parameter_name].values - lower_bound) / (upper_bound - lower_bound),
-            marker=".",
-            markersize=4.0,
-            label=f"${MEASURES[parameter_name].mathtext}$",
-        )
-    axes.set_yticks([0.0, 1.0], ["lower\nbound", "upper\nbound"])
-    axes.set(xlabel="gaits evaluated", ylim=(-0.05, 1.05))
-    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-    axes.legend(**LEGEND_BESIDE_PANEL)
 
 
 def _draw_constraint_slacks(axes: Axes, tune_result: TuneResult) -> None:

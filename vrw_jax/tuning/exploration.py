@@ -8,12 +8,12 @@ is halved.
 from dataclasses import dataclass
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
+from vrw_jax.numerics import concatenate_tree_rows, select_tree_rows
 from vrw_jax.runtime import lazy_import
-from vrw_jax.tuning.maximization import EvaluatedTrial, TrialEvaluator
+from vrw_jax.tuning.maximization import TrialEvaluator
 from vrw_jax.tuning.objective import compute_max_violation, compute_slack_scales
 
 optax = lazy_import("optax")
@@ -131,7 +131,10 @@ def explore_starts(
         optimizer_step_lengths = np.where(
             is_trial_accepted[:, None], optimizer_step_lengths, 0.5 * optimizer_step_lengths
         )
-        current_trials = _select_trials(is_trial_accepted, new_trials, current_trials)
+        current_trials = select_tree_rows(
+            concatenate_tree_rows(current_trials, new_trials),
+            np.arange(n_starts) + np.where(is_trial_accepted, n_starts, 0),
+        )
     end_objectives = np.where(has_active_gait, current_trials.objective, np.nan)
     max_violations = compute_max_violation(current_trials.constraint_slacks, slack_scales)
     penalized_objectives = (
@@ -148,15 +151,3 @@ def explore_starts(
         n_lost_trials,
         n_evaluations,
     )
-
-
-def _select_trials(
-    is_new_trial_selected: np.ndarray, new_trials: EvaluatedTrial, old_trials: EvaluatedTrial
-) -> EvaluatedTrial:
-    """Select each trial of a batch from `new_trials` or from `old_trials`."""
-    # A transposed array has its trials on the last axis. JAX would compile each transposition.
-    select_rows = lambda new_leaf, old_leaf: (
-        np.where(is_new_trial_selected, np.asarray(new_leaf).T, np.asarray(old_leaf).T).T
-    )
-    selected_trials: EvaluatedTrial = jax.tree.map(select_rows, new_trials, old_trials)
-    return selected_trials

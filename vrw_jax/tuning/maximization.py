@@ -16,11 +16,9 @@ import numpy as np
 
 from vrw_jax.numerics import StatusCode
 from vrw_jax.tuning.objective import (
-    UPPER_BOUND_PREFIX,
     GaitEvaluation,
     compute_max_violation,
     compute_slack_scales,
-    restore_sign_of_bound,
 )
 from vrw_jax.wheel import Outcome
 
@@ -79,30 +77,6 @@ class EvaluatedTrial(NamedTuple):
         """Return whether the maximization may continue from this trial."""
         return self.has_gait_on_branch & self.has_finite_values
 
-    def describe_first_nonfinite_value(
-        self,
-        objective_label: str,
-        constraint_names: tuple[str, ...],
-        min_constraint_values: np.ndarray,
-    ) -> str:
-        """Return a text that names the first value or derivative that is not finite.
-
-        The objective is checked first, then the constraints in their order.
-        """
-        for measure_name, value, gradient in zip(
-            (objective_label, *constraint_names),
-            (self.objective, *(self.constraint_slacks + min_constraint_values)),
-            (self.objective_gradient, *self.slack_jacobian),
-            strict=True,
-        ):
-            unprefixed_measure_name = measure_name.removeprefix(UPPER_BOUND_PREFIX)
-            if not np.isfinite(value):
-                measure_value = restore_sign_of_bound(measure_name, value)
-                return f"{unprefixed_measure_name} is {measure_value:g}"
-            if not np.isfinite(gradient).all():
-                return f"{unprefixed_measure_name} has a derivative that is not finite"
-        raise ValueError("Every number of this trial is finite: describe another.")
-
 
 class MaximizationResult(NamedTuple):
     """Best trial of a maximization, the reason why it ended, and all trials in order with their
@@ -116,10 +90,7 @@ class MaximizationResult(NamedTuple):
 
 
 class _LostBranchError(Exception):
-    """Exception that signals a trial without a usable gait."""
-
-    def __init__(self, lost_trial: EvaluatedTrial) -> None:
-        self.lost_trial = lost_trial
+    """Exception that signals a trial without a usable gait. Its argument is the trial."""
 
 
 class _EvaluationLimitReachedError(Exception):
@@ -128,11 +99,8 @@ class _EvaluationLimitReachedError(Exception):
 
 class _OptimumReachedError(Exception):
     """Exception that signals a trial that satisfies the first-order condition and the
-    constraints.
+    constraints. Its argument is the trial.
     """
-
-    def __init__(self, optimal_trial: EvaluatedTrial) -> None:
-        self.optimal_trial = optimal_trial
 
 
 @dataclass(frozen=True)
@@ -230,7 +198,6 @@ def maximize_objective(
     """Maximize the objective locally from `start_trial`, subject to slacks of at least 0."""
     from scipy.optimize import minimize  # This import is slow.
 
-    maximization_options = MAXIMIZATION_OPTIONS
     trial_record = _TrialRecord(trial_evaluator, start_trial, max_evaluations)
     gradient_norm = max(float(np.linalg.norm(start_trial.objective_gradient)), 1e-12)
     slack_scales = compute_slack_scales(start_trial.constraint_slacks, start_trial.slack_jacobian)
@@ -238,15 +205,17 @@ def maximize_objective(
     compute_violation_of = lambda trial: compute_max_violation(
         trial.constraint_slacks, slack_scales
     )
-    active_bound_tolerance = maximization_options.active_bound_tolerance
+    active_bound_tolerance = MAXIMIZATION_OPTIONS.active_bound_tolerance
 
-    def stop_at_optimum(trial: EvaluatedTrial) -> EvaluatedTrial:
+    def record_iterate(trial_parameters: np.ndarray) -> None:
+        """Record an iterate of the present box, and stop if it is an optimum."""
+        trial = trial_record.evaluate_iterate_once(trial_parameters)
         if (
             compute_violation_of(trial) <= active_bound_tolerance
             and compute_optimality_conditions(trial).kkt_residual <= tolerance
         ):
             raise _OptimumReachedError(trial)
-        return trial
+        trust_box_iterates.append(trial)
 
     def evaluate_loss(trial_parameters: np.ndarray) -> tuple[float, np.ndarray]:
         """Return the function that SLSQP minimizes, and its gradient."""
@@ -264,7 +233,7 @@ def maximize_objective(
         ),
     }
     center_trial = start_trial
-    trust_box_radius = max_trust_box_radius = maximization_options.full_trust_box_radius
+    trust_box_radius = max_trust_box_radius = MAXIMIZATION_OPTIONS.full_trust_box_radius
     tune_status, n_trials_before_trust_box = TuneStatus.CONVERGED, 0
     while True:
         # If this box had no new evaluation, the next box is smaller, because the search would be
@@ -273,7 +242,7 @@ def maximize_objective(
             max_trust_box_radius *= 0.5
         n_trials_before_trust_box = len(trial_record.trials)
         trust_box_radius = min(trust_box_radius, max_trust_box_radius)
-        if trust_box_radius < maximization_options.min_trust_box_radius:
+        if trust_box_radius < MAXIMIZATION_OPTIONS.min_trust_box_radius:
             tune_status = TuneStatus.BRANCH_ENDED
             break
         lower_trust_box_side = np.maximum(
@@ -292,29 +261,26 @@ def maximize_objective(
                 constraints=slack_constraints,
                 method="SLSQP",
                 options={
-                    "ftol": maximization_options.fine_objective_tolerance
+                    "ftol": MAXIMIZATION_OPTIONS.fine_objective_tolerance
                     if trust_box_radius >= max_trust_box_radius
-                    else maximization_options.coarse_objective_tolerance,
+                    else MAXIMIZATION_OPTIONS.coarse_objective_tolerance,
                     "maxiter": 100,
                 },
-                callback=lambda trial_parameters, trust_box_iterates=trust_box_iterates: (
-                    trust_box_iterates.append(
-                        stop_at_optimum(trial_record.evaluate_iterate_once(trial_parameters))
-                    )
-                ),
+                callback=record_iterate,
             )
             end_trial = trial_record.evaluate_iterate_once(
                 np.clip(slsqp_result.x, lower_trust_box_side, upper_trust_box_side)
             )
         except _LostBranchError as lost_branch:
             center_trial = trust_box_iterates[-1]
+            (lost_trial,) = lost_branch.args
             distances_to_lost_trial = np.abs(
-                lost_branch.lost_trial.normalized_parameters - center_trial.normalized_parameters
+                lost_trial.normalized_parameters - center_trial.normalized_parameters
             )
             trust_box_radius = 0.5 * float(np.max(distances_to_lost_trial))
             continue
         except _OptimumReachedError as reached_optimum:
-            center_trial = reached_optimum.optimal_trial
+            (center_trial,) = reached_optimum.args
             break
         except _EvaluationLimitReachedError:
             tune_status = TuneStatus.MAX_EVALUATIONS_REACHED
@@ -326,12 +292,12 @@ def maximize_objective(
             end_trial.normalized_parameters >= upper_trust_box_side - 1e-9
         ) & (upper_trust_box_side < 1.0)
         center_trial = end_trial
-        if trust_box_radius >= maximization_options.full_trust_box_radius:
+        if trust_box_radius >= MAXIMIZATION_OPTIONS.full_trust_box_radius:
             break
         trust_box_radius = (
-            min(2.0 * trust_box_radius, maximization_options.full_trust_box_radius)
+            min(2.0 * trust_box_radius, MAXIMIZATION_OPTIONS.full_trust_box_radius)
             if has_reached_inner_box_side.any()
-            else maximization_options.full_trust_box_radius
+            else MAXIMIZATION_OPTIONS.full_trust_box_radius
         )
     if (
         tune_status == TuneStatus.CONVERGED
@@ -374,10 +340,8 @@ def compute_optimality_conditions(trial: EvaluatedTrial) -> OptimalityConditions
     """
     from scipy.optimize import nnls  # This import is slow.
 
-    normalized_parameters, slack_scales = (
-        trial.normalized_parameters,
-        compute_slack_scales(trial.constraint_slacks, trial.slack_jacobian),
-    )
+    normalized_parameters = trial.normalized_parameters
+    slack_scales = compute_slack_scales(trial.constraint_slacks, trial.slack_jacobian)
     active_bound_tolerance = MAXIMIZATION_OPTIONS.active_bound_tolerance
     is_limit_active = np.concatenate(
         [

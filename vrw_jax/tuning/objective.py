@@ -165,8 +165,25 @@ def parse_constraint_margins(
         return dict(default_margins(params)) if gait_finder.supports_cold_start else {}
     constraint_margins: dict[str, float] = {}
     if isinstance(constraints, Mapping):
-        for measure_name, lower_bound in constraints.items():
-            constraint_margins |= _parse_constraint_bound(measure_name, lower_bound)
+        for measure_name, bound_or_range in constraints.items():
+            if not isinstance(bound_or_range, tuple):
+                lower_bound = check_real(f"the margin of {measure_name}", bound_or_range)
+                constraint_margins[measure_name] = lower_bound
+                continue
+            if bound_or_range == (None, None):
+                raise ValueError(
+                    f"the range of {measure_name} is (None, None), which bounds nothing: give a "
+                    "lower or an upper bound, as in (None, 0.6), or leave the constraint out."
+                )
+            if len(bound_or_range) != 2 or None not in bound_or_range:
+                bound_or_range = check_range(f"the range of {measure_name}", bound_or_range)
+            lower_limit, upper_limit = bound_or_range
+            if upper_limit is not None:
+                upper_bound = check_real(f"the upper end of {measure_name}", upper_limit)
+                constraint_margins[UPPER_BOUND_PREFIX + measure_name] = -upper_bound
+            if lower_limit is not None:
+                lower_bound = check_real(f"the lower end of {measure_name}", lower_limit)
+                constraint_margins[measure_name] = lower_bound
     else:
         constraint_margins = dict.fromkeys(check_names("constraints", constraints), 0.0)
     if "clearance_sls1" in constraint_margins:
@@ -177,36 +194,6 @@ def parse_constraint_margins(
             measure_name.removeprefix(UPPER_BOUND_PREFIX),
             gait_finder.readable_measures,
             "measure for a constraint",
-        )
-    return constraint_margins
-
-
-def _parse_constraint_bound(
-    measure_name: str, bound_or_range: float | tuple[float | None, float | None]
-) -> dict[str, float]:
-    """Return the smallest allowed values of one measure and of its negative, by name.
-
-    - `bound_or_range`: lower bound, or pair of a lower and an upper bound, one of which may be
-      None.
-    """
-    if not isinstance(bound_or_range, tuple):
-        return {measure_name: check_real(f"the margin of {measure_name}", bound_or_range)}
-    if bound_or_range == (None, None):
-        raise ValueError(
-            f"the range of {measure_name} is (None, None), which bounds nothing: give a lower or "
-            "an upper "
-            "bound, as in (None, 0.6), or leave the constraint out."
-        )
-    if len(bound_or_range) != 2 or None not in bound_or_range:
-        bound_or_range = check_range(f"the range of {measure_name}", bound_or_range)
-    lower_limit, upper_limit = bound_or_range
-    constraint_margins = {}
-    if upper_limit is not None:
-        upper_bound = check_real(f"the upper end of {measure_name}", upper_limit)
-        constraint_margins[UPPER_BOUND_PREFIX + measure_name] = -upper_bound
-    if lower_limit is not None:
-        constraint_margins[measure_name] = check_real(
-            f"the lower end of {measure_name}", lower_limit
         )
     return constraint_margins
 

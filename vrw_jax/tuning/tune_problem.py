@@ -88,6 +88,9 @@ from vrw_jax.wheel import (
     check_parameter_name,
 )
 
+ParameterBounds = Mapping[str, tuple[float, float]]
+"""Lower and upper bound of each free parameter, by the parameter's name."""
+
 ObjectiveSpecification = str | Mapping[str, float] | Callable[..., Array] | WheelObjective
 
 
@@ -120,7 +123,7 @@ def tune(
     params: WheelParams,
     objective: ObjectiveSpecification,
     free: Sequence[str],
-    bounds: Mapping[str, tuple[float, float]],
+    bounds: ParameterBounds,
     constraints: ConstraintSpecification | None = None,
     *,
     model: ModelLike | None = None,
@@ -309,13 +312,28 @@ class TuneProblem:
                 "): start from a wheel that walks, such as WheelParams()."
             )
         if not start_trial.has_finite_values:
-            nonfinite_description = start_trial.describe_first_nonfinite_value(
-                self.objective_label, self.constraint_names, self.min_constraint_values
-            )
+            nonfinite_descriptions = []
+            for constraint_name, value, gradient in zip(
+                (self.objective_label, *self.constraint_names),
+                (
+                    start_trial.objective,
+                    *(start_trial.constraint_slacks + self.min_constraint_values),
+                ),
+                (start_trial.objective_gradient, *start_trial.slack_jacobian),
+                strict=True,
+            ):
+                measure_name = constraint_name.removeprefix(UPPER_BOUND_PREFIX)
+                if not np.isfinite(value):
+                    measure_value = restore_sign_of_bound(constraint_name, value)
+                    nonfinite_descriptions.append(f"{measure_name} is {measure_value:g}")
+                elif not np.isfinite(gradient).all():
+                    nonfinite_descriptions.append(
+                        f"{measure_name} has a derivative that is not finite"
+                    )
             raise ValueError(
-                f"{nonfinite_description} at the start, but a maximization needs finite numbers: "
-                "start from "
-                "another wheel, or give an objective and constraints that are finite there."
+                f"{nonfinite_descriptions[0]} at the start, but a maximization needs finite "
+                "numbers: start from another wheel, or give an objective and constraints that are "
+                "finite there."
             )
         return start_trial
 
@@ -407,7 +425,7 @@ class TuneProblem:
         maximization_result: MaximizationResult,
         start_seconds: float,
         compilation_end_seconds: float,
-        exploration_result: ExplorationResult | None = None,
+        exploration_result: ExplorationResult | None,
     ) -> TuneResult:
         """Return the `TuneResult` for a maximization, with active constraints and a validation
         walk.
@@ -546,7 +564,7 @@ class TuneProblem:
             "kind": (
                 "evaluation",
                 np.array(maximization_result.trial_kinds, int),
-                make_flag_attributes(trial_kind.name for trial_kind in TrialKind),
+                make_flag_attributes(TrialKind.__members__),
             ),
             "outcome": (
                 "evaluation",
@@ -587,7 +605,7 @@ def make_tune_problem(
     params: WheelParams,
     objective: ObjectiveSpecification,
     free: Sequence[str],
-    bounds: Mapping[str, tuple[float, float]],
+    bounds: ParameterBounds,
     constraints: ConstraintSpecification | None = None,
     *,
     model: ModelLike | None = None,
@@ -655,12 +673,6 @@ def _parse_objective_function(
     """
     if isinstance(objective, WheelObjective):
         return zero_objective, objective.label
-    if not (callable(objective) or isinstance(objective, str | Mapping)):
-        raise TypeError(
-            f"objective is {format_value(objective)}, but it is a measure's name, weights of "
-            "several or a "
-            'function of the cycle: give "dls_fraction", say.'
-        )
     if callable(objective):
         if not gait_finder.supports_cold_start:
             raise TypeError(
@@ -672,6 +684,11 @@ def _parse_objective_function(
         return (
             objective if len(objective_arguments) >= 2 else CycleObjective(objective)
         ), objective_label
+    if not isinstance(objective, str | Mapping):
+        raise TypeError(
+            f"objective is {format_value(objective)}, but it is a measure's name, weights of "
+            'several or a function of the cycle: give "dls_fraction", say.'
+        )
     measure_weights = {objective: 1.0} if isinstance(objective, str) else dict(objective)
     if not measure_weights:
         raise ValueError(
@@ -684,8 +701,7 @@ def _parse_objective_function(
         if MEASURES[measure_name].leg_dimension:
             raise ValueError(
                 f"{measure_name} has one value for each locked leg, but an objective is one "
-                "number: "
-                "give a function of the cycle and the step that reduces it."
+                "number: give a function of the cycle and the step that reduces it."
             )
     objective_label = " + ".join(
         measure_name if measure_weight == 1.0 else f"{measure_weight:g} {measure_name}"
@@ -697,7 +713,7 @@ def _parse_objective_function(
 
 
 def _check_parameter_bounds(
-    params: WheelParams, free: Sequence[str], bounds: Mapping[str, tuple[float, float]]
+    params: WheelParams, free: Sequence[str], bounds: ParameterBounds
 ) -> tuple[tuple[str, ...], np.ndarray, np.ndarray]:
     """Return the names of the free parameters, and the arrays of their lower and upper bounds."""
     free_parameters = check_names("free", free)
@@ -739,4 +755,4 @@ def _check_parameter_bounds(
                 f"({lower_bound:g}, {upper_bound:g}): widen the bounds or start inside them."
             )
     bound_pairs = np.array([bounds[parameter_name] for parameter_name in free_parameters], float)
-    return free_parameters, bound_pairs[:, 0], bound_pairs[:, 1]
+    return free_parameters, *bound_pairs.T

@@ -120,9 +120,8 @@ class TuneResult:
         feasibility_text = (
             "every constraint kept" if self.validation.is_feasible else "a constraint broken"
         )
-        feasibility_text = (
-            feasibility_text if self.path.sizes["constraint"] else "no constraint to keep"
-        )
+        if not self.path.sizes["constraint"]:
+            feasibility_text = "no constraint to keep"
         active_constraint_texts = [
             f"{parameter_name} at {get_measure(parameter_name).format_with_unit(constraint_limit)}"
             for parameter_name, constraint_limit, *_ in self.active
