@@ -119,42 +119,37 @@ def find_paper_gaits(params: WheelParams, step_options: StepOptions) -> LowerFid
     )
     step_jacobian = jax.tree.map(np.asarray, gait_step.derivatives[SECTION_STATE_NAME])
     gait_step_end_states = np.asarray(gait_step.section_state)
-    step_durations = np.asarray(gait_step.durations)
     has_stepped = np.asarray(gait_step.outcome) == Outcome.STEPPED
     # The feet's distance at touchdown is L0 sin(alpha) / cos(theta-), m.
     leg_span = np.asarray(params_with_gait.locked_length) * np.sin(params_with_gait.leg_angle)
     foot_distance = leg_span / np.cos(gait_step_end_states[:, 0])
-    step_quantities = np.column_stack(
-        [
-            step_durations[:, 0],
-            step_durations[:, 1] + step_durations[:, 2],
-            np.zeros(len(found_wheel_indices)),
-            foot_distance,
-            gait_step_end_states,
-        ]
-    )
-    dls_jacobian, sls1_jacobian, sls2_jacobian = np.moveaxis(step_jacobian.durations, 1, 0)
     foot_distance_rate = foot_distance * np.tan(gait_step_end_states[:, 0])
-    quantity_jacobian_rows = [
-        dls_jacobian,
-        sls1_jacobian + sls2_jacobian,
-        0.0 * dls_jacobian,
-        foot_distance_rate[:, None] * step_jacobian.section_state[:, 0],
-    ]
+    foot_distance_jacobian = foot_distance_rate[:, None] * step_jacobian.section_state[:, 0]
+
+    def stack_step_quantities(
+        durations: np.ndarray, foot_distances: np.ndarray, end_states: np.ndarray
+    ) -> np.ndarray:
+        """Return the step quantities or their Jacobian as one array, (wheels, 7, ...)."""
+        dls_duration, sls1_duration, sls2_duration = np.moveaxis(durations, 1, 0)
+        single_durations = sls1_duration + sls2_duration
+        no_flight = 0.0 * dls_duration
+        durations_and_distance = [dls_duration, single_durations, no_flight, foot_distances]
+        return np.concatenate([np.stack(durations_and_distance, 1), end_states], 1)
+
     stepped_gaits = _make_lower_fidelity_gaits(
         ModelIndex.VISCOELASTIC,
         section_states[found_wheel_indices],
-        step_quantities,
-        np.concatenate([np.stack(quantity_jacobian_rows, 1), step_jacobian.section_state], 1),
+        stack_step_quantities(np.asarray(gait_step.durations), foot_distance, gait_step_end_states),
+        stack_step_quantities(
+            step_jacobian.durations, foot_distance_jacobian, step_jacobian.section_state
+        ),
     )
+    gaits_of_all_wheels.search_outcomes[found_wheel_indices] = gait_step.outcome
     replace_rows(
         gaits_of_all_wheels,
         found_wheel_indices[has_stepped],
         select_tree_rows(stepped_gaits, has_stepped),
     )
-    gaits_of_all_wheels.search_outcomes[found_wheel_indices[~has_stepped]] = np.asarray(
-        gait_step.outcome
-    )[~has_stepped]
     return gaits_of_all_wheels
 
 

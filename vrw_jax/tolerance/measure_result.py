@@ -14,7 +14,7 @@ from vrw_jax.printing import (
     format_each_batch_element,
     format_outcome_counts,
 )
-from vrw_jax.tolerance.lower_fidelity import MODEL_NAMES
+from vrw_jax.tolerance.lower_fidelity import MODEL_NAMES, ModelIndex
 from vrw_jax.wheel import Outcome
 
 
@@ -203,7 +203,7 @@ class MeasureResult(AbstractPrintable):
         error_parts_text = (
             f"numerical {_format_rounded_number(self.numerical_errors[measure_index])}"
         )
-        if MODEL_NAMES[int(self.models)] != MODEL_NAMES[-1]:
+        if self.models != ModelIndex.UNILATERAL:
             model_error_text = _format_rounded_number(abs(self.model_errors[measure_index]))
             error_parts_text = f"model {model_error_text}, {error_parts_text}"
         return f"{value_text} ± {_format_rounded_number(error_bound)} ({error_parts_text})"

@@ -1,6 +1,7 @@
 """Quantities of one walking step that every model provides, and the measures computed from them."""
 
 from collections.abc import Callable, Sequence
+from operator import itemgetter
 
 import numpy as np
 
@@ -35,13 +36,9 @@ MEASURE_FUNCTIONS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "speed": lambda t: t[..., 3] / _compute_step_period(t),
     "period": _compute_step_period,
     "dls_fraction": lambda t: t[..., 0] / _compute_step_period(t),
-    "step_length": lambda t: t[..., 3],
-    "duration_dls": lambda t: t[..., 0],
-    "duration_single": lambda t: t[..., 1],
-    "duration_flight": lambda t: t[..., 2],
-    "theta_touchdown": lambda t: t[..., 4],
-    "dtheta_touchdown": lambda t: t[..., 5],
-    "dL1_touchdown": lambda t: t[..., 6],
+} | {
+    quantity_name: itemgetter((..., quantity_index))
+    for quantity_index, quantity_name in enumerate(QUANTITY_NAMES)
 }
 """Functions that compute the measures of every model from the step quantities.
 

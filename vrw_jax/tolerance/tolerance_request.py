@@ -21,6 +21,7 @@ from vrw_jax.cycles import GaitChoice, compute_walk_starts, parse_gait_choice
 from vrw_jax.numerics import StepOptions, select_tree_rows, with_default_jax_settings
 from vrw_jax.tolerance.contact_steps import STEP_TOLERANCES, ContactWheelBatch, replace_rows
 from vrw_jax.tolerance.lower_fidelity import (
+    LowerFidelityGaits,
     ModelIndex,
     compute_static_leg_contraction,
     find_paper_gaits,
@@ -242,12 +243,9 @@ class _MeasureRequest:
                 REQUEST_OPTIONS.error_safety_factor * compute_static_leg_contraction(self.params)
                 <= self.tol
             )
-        if not len(wheel_indices):
-            return
-        rigid_gaits = find_rigid_gaits(select_wheels(self.params, wheel_indices))
-        replace_rows(self.lower_gaits, wheel_indices, rigid_gaits)
-        has_gait = np.isfinite(rigid_gaits.step_quantities).all(1)
-        self._correct_lower_gaits(wheel_indices[has_gait], are_rejected_gaits_refined=False)
+        if len(wheel_indices):
+            rigid_gaits = find_rigid_gaits(select_wheels(self.params, wheel_indices))
+            self._correct_lower_gaits(wheel_indices, rigid_gaits, are_rejected_gaits_refined=False)
 
     def try_paper_model(self) -> None:
         """Compute gaits of the paper's model, and store measures to within `tol`.
@@ -256,14 +254,11 @@ class _MeasureRequest:
         stored.
         """
         wheel_indices = self.find_unfinished_indices()
-        if not len(wheel_indices):
-            return
-        paper_gaits = find_paper_gaits(
-            select_wheels(self.params, wheel_indices), self.wheel_batch.step_options
-        )
-        replace_rows(self.lower_gaits, wheel_indices, paper_gaits)
-        has_gait = paper_gaits.model_index != ModelIndex.NONE
-        self._correct_lower_gaits(wheel_indices[has_gait], are_rejected_gaits_refined=True)
+        if len(wheel_indices):
+            paper_gaits = find_paper_gaits(
+                select_wheels(self.params, wheel_indices), self.wheel_batch.step_options
+            )
+            self._correct_lower_gaits(wheel_indices, paper_gaits, are_rejected_gaits_refined=True)
 
     def walk_to_gaits(self) -> None:
         """Compute walks of wheels without a result, and store the measures of the gaits reached."""
@@ -310,7 +305,10 @@ class _MeasureRequest:
         )
 
     def _correct_lower_gaits(
-        self, wheel_indices: np.ndarray, are_rejected_gaits_refined: bool
+        self,
+        wheel_indices: np.ndarray,
+        lower_gaits: LowerFidelityGaits,
+        are_rejected_gaits_refined: bool,
     ) -> None:
         """Compute one step with unilateral contact from each lower gait, and store measures.
 
@@ -318,7 +316,9 @@ class _MeasureRequest:
         `are_rejected_gaits_refined` is True, the other lower gaits are the initial guesses for
         gaits with unilateral contact, whose measures are stored as well.
         """
-        lower_gaits = select_tree_rows(self.lower_gaits, wheel_indices)
+        replace_rows(self.lower_gaits, wheel_indices, lower_gaits)
+        has_gait = np.isfinite(lower_gaits.step_quantities).all(1)
+        wheel_indices, lower_gaits = select_tree_rows((wheel_indices, lower_gaits), has_gait)
         section_states, contact_step, measure_estimates = estimate_measures_from_lower_gaits(
             self.wheel_batch, wheel_indices, lower_gaits, self.measure_names
         )
