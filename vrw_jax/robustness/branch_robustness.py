@@ -153,7 +153,7 @@ def measure_gait_sensitivity(
     checked_model = convert_model_argument(model)
     measure_names = check_names("measures", measures)
     point_indices = _select_branch_points(branch, checked_model, n_points)
-    point_norms: list[Any] = []
+    point_norms = []
     for i in point_indices:
         branch_gait = _load_branch_gait(branch, i, checked_model, StepOptions())
         params, point_model = branch_gait.params, branch_gait.model
@@ -208,8 +208,7 @@ def _select_branch_points(branch: Branch, model: AbstractWheel, n_points: int | 
     if n_points is not None:
         n_points = min(check_int("n_points", n_points), n_branch_points)
     spaced_points = np.linspace(0, n_branch_points - 1, n_points or n_branch_points)
-    point_indices: list[int] = np.unique(spaced_points.round().astype(int)).tolist()
-    return point_indices
+    return np.unique(spaced_points.round().astype(int)).tolist()
 
 
 def _make_point_dataset(

@@ -7,8 +7,11 @@ fitted to the failures, and the inflation decreases to 1 in stages.
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
+
+from vrw_jax.numerics import concatenate_tree_rows
 
 DeviationWalkFunction = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 """Function that simulates one walk for each sequence of standardized slopes.
@@ -101,8 +104,7 @@ class FailureDensityOptions:
 FAILURE_DENSITY_OPTIONS = FailureDensityOptions()
 
 
-@dataclass(frozen=True)
-class GaussianMixture:
+class GaussianMixture(NamedTuple):
     """Mixture of Gaussian densities of standardized slope deviations."""
 
     gaussian_weights: np.ndarray  # (components,), sum 1
@@ -129,27 +131,14 @@ class GaussianMixture:
 
         The weight of this mixture is 1 - `added_mixture_weight`.
         """
-        return GaussianMixture(
-            np.concatenate(
-                [
-                    (1.0 - added_mixture_weight) * self.gaussian_weights,
-                    added_mixture_weight * added_mixture.gaussian_weights,
-                ]
-            ),
-            np.concatenate([self.gaussian_means, added_mixture.gaussian_means]),
-            np.concatenate(
-                [self.covariance_cholesky_factors, added_mixture.covariance_cholesky_factors]
-            ),
-        )
-
-    def widen_gaussians(self, standard_deviation_factor: float) -> "GaussianMixture":
-        """Return the mixture with all standard deviations multiplied by
-        `standard_deviation_factor`."""
-        return GaussianMixture(
-            self.gaussian_weights,
-            self.gaussian_means,
-            standard_deviation_factor * self.covariance_cholesky_factors,
-        )
+        weighted_mixtures = [
+            mixture._replace(gaussian_weights=mixture_weight * mixture.gaussian_weights)
+            for mixture, mixture_weight in (
+                (self, 1.0 - added_mixture_weight),
+                (added_mixture, added_mixture_weight),
+            )
+        ]
+        return concatenate_tree_rows(*weighted_mixtures)
 
     def compute_gaussian_log_densities(self, slope_deviations: np.ndarray) -> np.ndarray:
         """Return the logarithm of each Gaussian's density times its weight, shape (components,
@@ -171,10 +160,7 @@ class GaussianMixture:
 
     def compute_log_density(self, slope_deviations: np.ndarray) -> np.ndarray:
         """Return the logarithm of the mixture's density at each sample, shape (samples,)."""
-        gaussian_log_densities: np.ndarray = np.logaddexp.reduce(
-            self.compute_gaussian_log_densities(slope_deviations), 0
-        )
-        return gaussian_log_densities
+        return np.logaddexp.reduce(self.compute_gaussian_log_densities(slope_deviations), 0)
 
     def draw_samples(self, n_samples: int, random_generator: np.random.Generator) -> np.ndarray:
         """Return independent samples from the mixture, shape (samples, dimensions)."""
@@ -266,15 +252,11 @@ def fit_failure_density(
     - `max_walks_per_stage`: a smaller limit than that of the options.
     """
     density_options = FAILURE_DENSITY_OPTIONS
-    nominal_walk_fraction = density_options.nominal_walk_fraction
     n_walks = min(density_options.max_walks_per_stage, max_walks_per_stage)
     n_inflation_test_walks = min(density_options.max_inflation_test_walks, n_walks)
-    make_isotropic_gaussian = lambda standard_deviation: GaussianMixture.make_isotropic_gaussian(
-        n_dimensions, standard_deviation
-    )
     slope_inflation = 1.0
     while True:
-        proposal_density = make_isotropic_gaussian(slope_inflation)
+        proposal_density = GaussianMixture.make_isotropic_gaussian(n_dimensions, slope_inflation)
         _, has_walk_failed = run_walks(
             proposal_density.draw_samples(n_inflation_test_walks, random_generator)
         )
@@ -283,8 +265,8 @@ def fit_failure_density(
         slope_inflation *= density_options.slope_inflation_factor
         if slope_inflation > density_options.max_slope_inflation:
             return None
-    n_finished_fits = 0
-    while True:
+    n_uninflated_fits = 0
+    while n_uninflated_fits < density_options.n_uninflated_fits:
         slope_deviations = proposal_density.draw_samples(n_walks, random_generator)
         has_failed_in_last_step, _ = run_walks(slope_deviations)
         if not np.any(has_failed_in_last_step):
@@ -301,17 +283,20 @@ def fit_failure_density(
         fitted_mixture = fit_gaussian_mixture(
             failing_deviations[resampled_indices], random_generator
         )
-        fitted_mixture = fitted_mixture.add_mixture(
-            fitted_mixture.widen_gaussians(density_options.widening_factor),
-            density_options.wide_walk_fraction,
+        wide_mixture = fitted_mixture._replace(
+            covariance_cholesky_factors=density_options.widening_factor
+            * fitted_mixture.covariance_cholesky_factors
         )
-        n_finished_fits += slope_inflation == 1.0
-        if n_finished_fits == density_options.n_uninflated_fits:
-            return fitted_mixture.add_mixture(make_isotropic_gaussian(1.0), nominal_walk_fraction)
+        fitted_mixture = fitted_mixture.add_mixture(
+            wide_mixture, density_options.wide_walk_fraction
+        )
+        n_uninflated_fits += slope_inflation == 1.0
         slope_inflation = next_slope_inflation
         proposal_density = fitted_mixture.add_mixture(
-            make_isotropic_gaussian(slope_inflation), nominal_walk_fraction
+            GaussianMixture.make_isotropic_gaussian(n_dimensions, slope_inflation),
+            density_options.nominal_walk_fraction,
         )
+    return proposal_density
 
 
 def _find_next_slope_inflation(

@@ -313,13 +313,13 @@ def _solve_passage_by_quadrature(
             f"slope is {float(params.slope):g} rad, on which this rigid wheel has no gait: give a "
             "steeper one."
         )
-    passage = solve_rigid_passage(params, slope_sd, model, n_nodes // 2)
+    survival_analysis, *_ = solve_rigid_passage(params, slope_sd, model, n_nodes // 2)
     while True:
-        coarse_passage, passage = passage, solve_rigid_passage(params, slope_sd, model, n_nodes)
-        coarse_mean_steps, mean_steps = (
-            1.0 / rigid_passage.survival_analysis.failure_probability
-            for rigid_passage in (coarse_passage, passage)
+        coarse_mean_steps = 1.0 / survival_analysis.failure_probability
+        survival_analysis, mean_steps_from_gait, squared_rate_nodes = solve_rigid_passage(
+            params, slope_sd, model, n_nodes
         )
+        mean_steps = 1.0 / survival_analysis.failure_probability
         error = lax.stop_gradient(jnp.abs(mean_steps - coarse_mean_steps))
         is_within_tolerance = error <= relative_tolerance * mean_steps
         if (
@@ -332,14 +332,13 @@ def _solve_passage_by_quadrature(
     status = jnp.where(
         is_within_tolerance, PassageStatus.CONVERGED, PassageStatus.TOLERANCE_NOT_MET
     )
-    survival_analysis = passage.survival_analysis
     return FirstPassage(
         mean_steps=mean_steps,
-        mean_steps_from_gait=passage.mean_steps_from_gait,
+        mean_steps_from_gait=mean_steps_from_gait,
         failure_probability=survival_analysis.failure_probability,
         kappa_2=survival_analysis.kappa_2,
         error=error,
-        states=passage.squared_rate_nodes[:, None],
+        states=squared_rate_nodes[:, None],
         weights=survival_analysis.quasi_stationary_weights,
         status=status.astype(jnp.int32),
         end_fractions=jnp.ones(1, mean_steps.dtype),

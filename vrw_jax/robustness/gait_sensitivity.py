@@ -177,17 +177,18 @@ def compute_gait_sensitivity(
     measure_names: tuple[str, ...],
 ) -> GaitSensitivity:
     """Return the `GaitSensitivity` of a gait and for checked arguments, zero without a gait."""
-    sensitivity_norms = compute_sensitivity_norms(
-        cycle_finder.compute_slope_response(params, limit_cycle_result, measure_names)
-    )
     zero_without_gait = lambda sensitivity_or_zero: jnp.where(
         limit_cycle_result.outcome == Outcome.STEPPED, sensitivity_or_zero, 0.0
     )
+    slope_response = cycle_finder.compute_slope_response(params, limit_cycle_result, measure_names)
+    norm, ending_step, beginning_step, later_steps = map(
+        zero_without_gait, compute_sensitivity_norms(slope_response)
+    )
     return GaitSensitivity(
-        norm=zero_without_gait(sensitivity_norms.sensitivity_norms),
-        ending_step=zero_without_gait(sensitivity_norms.ending_step_response),
-        beginning_step=zero_without_gait(sensitivity_norms.beginning_step_response),
-        later_steps=zero_without_gait(sensitivity_norms.later_steps_response),
+        norm=norm,
+        ending_step=ending_step,
+        beginning_step=beginning_step,
+        later_steps=later_steps,
         spectral_radius=zero_without_gait(limit_cycle_result.spectral_radius_value),
         outcome=limit_cycle_result.outcome,
         measures=measure_names,

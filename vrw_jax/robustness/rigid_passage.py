@@ -6,7 +6,7 @@ probability density of the slopes therefore determines the kernel.
 """
 
 import functools
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -31,19 +31,14 @@ only 1e-23.
 """
 
 
-class RigidPassage(NamedTuple):
-    """First-passage times of the rigid wheel, computed by quadrature."""
-
-    survival_analysis: SurvivalAnalysis
-    mean_steps_from_gait: Scalar
-    squared_rate_nodes: Float[Array, " n"]  # squared rates with the stance leg vertical, 1/s^2
-
-
 @functools.partial(jax.jit, static_argnums=(2, 3))
 def solve_rigid_passage(
     params: WheelParams, slope_sd: Scalar, rigid_model: Any, n_nodes: int
-) -> RigidPassage:
-    """Return mean numbers of steps until the rigid wheel fails, by quadrature with `n_nodes` nodes.
+) -> tuple[SurvivalAnalysis, Scalar, Float[Array, " n"]]:
+    """Analyze the survival of the rigid wheel, by quadrature with `n_nodes` nodes.
+
+    Return the analysis, the mean number of steps from the gait until the wheel fails, and the
+    nodes. The nodes are squared angular rates with the stance leg vertical, 1/s^2.
 
     - `slope_sd`: standard deviation of the slopes, rad.
     """
@@ -92,8 +87,7 @@ def solve_rigid_passage(
     survival_matrix, failure_probabilities = jax.vmap(evaluate_kernel_row)(squared_rate_nodes)
     survival_analysis = analyze_survival_operator(survival_matrix, failure_probabilities)
     survival_row_of_gait = evaluate_kernel_row(vertical_rate_map.compute_fixed_point(mean_slope))
-    return RigidPassage(
-        survival_analysis,
-        compute_mean_steps(survival_analysis, survival_matrix, *survival_row_of_gait),
-        squared_rate_nodes,
+    mean_steps_from_gait = compute_mean_steps(
+        survival_analysis, survival_matrix, *survival_row_of_gait
     )
+    return survival_analysis, mean_steps_from_gait, squared_rate_nodes
