@@ -561,13 +561,13 @@ def test_batched_newton_steps_back_from_states_without_a_complete_step(monkeypat
         on_ground, "stack_section_units", lambda _, values, __: np.ones((len(values), 2))
     )
     a, begin = np.array([[0.25], [0.75], [-9.0]]), np.array([[1.9, 0.0], [1.5, 0.0], [0.0, 0.0]])
-    solution = on_ground.find_contact_fixed_points(
+    solution, _ = on_ground.find_contact_fixed_points(
         on_ground.PeriodMap(None, 1, 1, a), vrw.StepOptions(), begin, True
     )
-    assert solution.is_gait_found.tolist() == [True, True, False]  # the last has no fixed point
+    assert solution.converged.tolist() == [True, True, False]  # the last has no fixed point
     exact = 2.0 - 2.0 * np.sqrt(a[:2, 0])
-    np.testing.assert_allclose(solution.fixed_section_states[:2, 0], exact, atol=1e-12)
-    np.testing.assert_allclose(solution.newton_residuals[:2], 0.0, atol=1e-12)
+    np.testing.assert_allclose(solution.x[:2, 0], exact, atol=1e-12)
+    np.testing.assert_allclose(solution.residual[:2], 0.0, atol=1e-12)
     assert max(np.abs(x).max() for x in calls) > 3.0  # where it was sent back from
 
 
@@ -591,15 +591,15 @@ def test_batched_newton_finds_a_repeating_state_next_to_a_jump_of_the_map(monkey
     monkeypatch.setattr(
         on_ground, "stack_section_units", lambda _, values, __: np.ones((len(values), 2))
     )
-    solution = on_ground.find_contact_fixed_points(
+    solution, _ = on_ground.find_contact_fixed_points(
         on_ground.PeriodMap(None, 1, 1, np.zeros((1, 1))),
         vrw.StepOptions(rtol=1e-10, atol=1e-10),
         np.array([[begin, 0.0]]),
         True,
     )
-    assert solution.is_gait_found[0]
-    assert solution.newton_residuals[0] < 1e-10
-    assert abs(solution.fixed_section_states[0, 0] + 2.0) < 1e-10
+    assert solution.converged[0]
+    assert solution.residual[0] < 1e-10
+    assert abs(solution.x[0, 0] + 2.0) < 1e-10
 
 
 def test_a_singular_linear_system_does_not_affect_the_others():

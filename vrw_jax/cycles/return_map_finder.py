@@ -274,43 +274,35 @@ class ReturnMapFinder(AbstractReturnMapFinder):
             lambda parameter_values: self.find_cycle_from_values(parameter_values, cycle_guess),
             parameter_values,
         )
-        cycle_derivatives: Any = move_derivative_axis_first(parameter_jacobian)
-        step = jax.tree.map(lambda x: x[0], cycle.steps)
-        step_derivatives = jax.tree.map(lambda x: x[:, 0], cycle_derivatives.steps)
-        return make_return_map_gait(
-            self.model, self.n_legs, cycle, step, cycle_derivatives, step_derivatives
-        )
+        cycle_derivatives = move_derivative_axis_first(parameter_jacobian)
+        return make_return_map_gait(self.model, self.n_legs, cycle, cycle_derivatives)
 
 
 def make_return_map_gait(
-    model: AbstractWheel,
-    n_legs: int,
-    cycle: Any,
-    event_driven_step: Any,
-    cycle_derivatives: Any,
-    step_derivatives: Any,
+    model: AbstractWheel, n_legs: int, cycle: Any, cycle_derivatives: Any
 ) -> Gait:
     """Build a gait with the data that identify its branch.
 
     The active phases do not identify a branch. With unilateral contact the order of events may
     change on a branch.
 
-    - `event_driven_step`: first gait step of the cycle;
-    - `cycle_derivatives`, `step_derivatives`: derivatives of cycle and step with respect to the
-      parameters on the branch, with a leading axis over the parameters.
+    - `cycle_derivatives`: derivatives of the cycle with respect to the parameters on the branch,
+      with a leading axis over the parameters.
     """
+    gait_step = jax.tree.map(lambda x: x[0], cycle.steps)
+    step_derivatives = jax.tree.map(lambda x: x[:, 0], cycle_derivatives.steps)
     n_coordinates = model.count_continuous_section_entries(WheelParams(n_legs=n_legs))
     coordinates_and_derivatives = compute_value_and_tangents(
         lambda cycle, gait_step: jnp.concatenate(
             [cycle.section_state[:n_coordinates], gait_step.durations]
         ),
-        (cycle, event_driven_step),
+        (cycle, gait_step),
         (cycle_derivatives, step_derivatives),
     )
     return_map_jacobian = cycle.monodromy_value[:n_coordinates, :n_coordinates]
     return Gait(
         cycle,
-        event_driven_step,
+        gait_step,
         cycle_derivatives,
         step_derivatives,
         GaitBranchPoint(*coordinates_and_derivatives, jnp.ones(1), return_map_jacobian),

@@ -6,7 +6,7 @@ together, and no large program is compiled for the derivatives.
 
 import functools
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
@@ -121,7 +121,10 @@ class UnilateralFinder(AbstractReturnMapFinder):
     def find_cycles_near(self, parameter_values: Any, section_states: Any) -> ReturnMapCycle:
         """Find one gait for each wheel near the given section states, without derivatives."""
         return self._solve_and_evaluate(
-            _make_contact_cycle, parameter_values, section_states, needs_parameter_derivatives=False
+            _make_contact_cycles,
+            parameter_values,
+            section_states,
+            needs_parameter_derivatives=False,
         )
 
     def precompile_newton_programs(self, parameter_values: np.ndarray) -> None:
@@ -151,7 +154,7 @@ class UnilateralFinder(AbstractReturnMapFinder):
 
     def find_gaits(self, parameter_values: Array, cycle_guess: Any) -> Gait:
         return self._solve_and_evaluate(
-            _make_contact_gait,
+            _make_contact_gaits,
             parameter_values,
             getattr(cycle_guess, "section_state", cycle_guess),
             needs_parameter_derivatives=True,
@@ -159,30 +162,30 @@ class UnilateralFinder(AbstractReturnMapFinder):
 
     def _solve_and_evaluate(
         self,
-        evaluate_fixed_point: Callable,
+        evaluate_fixed_points: Callable,
         parameter_values: Any,
         section_states: Any,
         needs_parameter_derivatives: bool,
     ) -> Any:
         """Find the fixed point of the return map for each wheel, and evaluate a function of it.
 
-        - `evaluate_fixed_point`: function of a wheel's parameters and fixed point;
+        - `evaluate_fixed_points`: function of the wheels' parameters, fixed points and periods;
         - `section_states`: starts of Newton's method;
         - `needs_parameter_derivatives`: whether the steps are differentiated with respect to
           parameters.
         """
         parameter_values = np.asarray(parameter_values)
-        fixed_points = find_contact_fixed_points(
+        fixed_points_and_periods = find_contact_fixed_points(
             PeriodMap(self.model, self.n_legs, self.period_n, parameter_values),
             self.step_options,
             np.asarray(section_states),
             needs_parameter_derivatives,
         )
-        evaluate_wheel_batch = functools.partial(
-            _evaluate_over_wheels, evaluate_fixed_point, self.model, self.n_legs
-        )
         return map_in_batches(
-            evaluate_wheel_batch, self.gait_batch_sizes, parameter_values, fixed_points
+            functools.partial(evaluate_fixed_points, self.model, self.n_legs),
+            self.gait_batch_sizes,
+            parameter_values,
+            *fixed_points_and_periods,
         )
 
     def take_gait_step(self, params: WheelParams, section_state: Array) -> AbstractStep:
@@ -242,10 +245,6 @@ class PeriodMap(NamedTuple):
     def section_units_by_wheel(self) -> np.ndarray:
         """Return the units of the section state of each wheel, shape (wheels, section)."""
         return stack_section_units(self.model, self.parameter_values, self.n_legs)
-
-    def select_wheels(self, wheel_indices: np.ndarray) -> "PeriodMap":
-        """Return the map for the wheels with the indices `wheel_indices`."""
-        return self._replace(parameter_values=self.parameter_values[wheel_indices])
 
     def evaluate_period(
         self,
@@ -330,18 +329,6 @@ class PeriodEvaluation(NamedTuple):
         return newton_correction
 
 
-class _ContactFixedPoints(NamedTuple):
-    """Fixed points of the return maps of many wheels. The fields have a leading axis over the
-    wheels.
-    """
-
-    fixed_section_states: Any
-    period_evaluation: PeriodEvaluation  # at the fixed points
-    newton_residuals: Any
-    is_gait_found: Any
-    n_newton_iterations: Any
-
-
 def solve_linear_systems(
     linear_system_matrices: np.ndarray, right_hand_sides: np.ndarray
 ) -> np.ndarray:
@@ -371,26 +358,23 @@ def find_contact_fixed_points(
     step_options: StepOptions,
     start_states: np.ndarray,
     needs_parameter_derivatives: bool,
-) -> _ContactFixedPoints:
+) -> tuple[FixedPointResult, PeriodEvaluation]:
     """Find the fixed points of the return maps near `start_states`.
 
-    The last components of a section state are discrete codes, which are copied from its image.
-    Newton's method first uses gait steps with a loose tolerance, until corrections are small. It
-    then uses one step at the tolerance of `step_options`, with the same Jacobian. One more step
-    evaluates the gait with all derivatives. If loose steps move away from a state that an exact
-    step hardly changes, all steps are exact.
+    Return the fixed points, and the periods that start from them. The last components of a section
+    state are discrete codes, which are copied from its image. Newton's method first uses gait steps
+    with a loose tolerance, until corrections are small. It then uses one step at the tolerance of
+    `step_options`, with the same Jacobian. One more step evaluates the gait with all derivatives.
+    If loose steps move away from a state that an exact step hardly changes, all steps are exact.
     """
-    loose_step_tolerances = [
-        np.maximum(step_tolerance, CONTACT_NEWTON_OPTIONS.step_tolerance_far_from_gait)
-        for step_tolerance in (step_options.rtol, step_options.atol)
-    ]
-    loose_step_options = eqx.tree_at(
-        lambda step_options: (step_options.rtol, step_options.atol),
+    loose_tolerance = CONTACT_NEWTON_OPTIONS.step_tolerance_far_from_gait
+    loose_step_options = replace(
         step_options,
-        jax.device_put(loose_step_tolerances),
+        rtol=jnp.maximum(step_options.rtol, loose_tolerance),
+        atol=jnp.maximum(step_options.atol, loose_tolerance),
     )
     max_correction_near_gait = CONTACT_NEWTON_OPTIONS.max_correction_near_gait
-    loose_fixed_points = _run_contact_newton(
+    loose_fixed_points, loose_evaluation = _run_contact_newton(
         period_map,
         loose_step_options,
         start_states,
@@ -398,21 +382,19 @@ def find_contact_fixed_points(
         max_correction_near_gait,
         np.ones(len(start_states), bool),
     )
-    is_near_gait = loose_fixed_points.is_gait_found
-    section_states = np.where(
-        is_near_gait[:, None], loose_fixed_points.fixed_section_states, start_states
-    )
+    is_near_gait = np.asarray(loose_fixed_points.converged)
+    section_states = np.where(is_near_gait[:, None], loose_fixed_points.x, start_states)
     section_units = period_map.section_units_by_wheel
     exact_evaluation = period_map.evaluate_period(step_options, section_states, False, False)
     newton_correction = exact_evaluation.compute_newton_correction(
-        section_states, loose_fixed_points.period_evaluation.return_map_jacobian
+        section_states, loose_evaluation.return_map_jacobian
     )
     section_states[is_near_gait] += newton_correction[is_near_gait] * (
         np.abs(newton_correction / section_units)[is_near_gait].max(-1, keepdims=True)
         < max_correction_near_gait
     )
     period_defects = np.abs((exact_evaluation.end_states - section_states) / section_units).max(-1)
-    exact_fixed_points = _run_contact_newton(
+    exact_fixed_points, evaluation = _run_contact_newton(
         period_map,
         step_options,
         section_states,
@@ -422,11 +404,8 @@ def find_contact_fixed_points(
         | (exact_evaluation.is_period_complete & (period_defects < max_correction_near_gait)),
         stops_at_small_correction=False,
     )
-    return exact_fixed_points._replace(
-        n_newton_iterations=loose_fixed_points.n_newton_iterations
-        + 1
-        + exact_fixed_points.n_newton_iterations
-    )
+    n_iterations = loose_fixed_points.n_iterations + 1 + exact_fixed_points.n_iterations
+    return exact_fixed_points._replace(n_iterations=n_iterations), evaluation
 
 
 def _run_contact_newton(
@@ -437,7 +416,7 @@ def _run_contact_newton(
     newton_tolerance: float,
     is_wheel_requested: np.ndarray,
     stops_at_small_correction: bool = True,
-) -> _ContactFixedPoints:
+) -> tuple[FixedPointResult, PeriodEvaluation]:
     """Run Newton's method on the requested wheels until corrections are small.
 
     If no period completes after a correction, the correction is halved. If
@@ -459,7 +438,10 @@ def _run_contact_newton(
     active_wheels = np.arange(n_wheels)
     for _ in range(options.max_iterations + options.max_correction_halvings):
         active_states = section_states[active_wheels]
-        active_evaluation = period_map.select_wheels(active_wheels).evaluate_period(
+        active_map = period_map._replace(
+            parameter_values=period_map.parameter_values[active_wheels]
+        )
+        active_evaluation = active_map.evaluate_period(
             step_options, active_states, needs_parameter_derivatives
         )
         if period_evaluation is None:
@@ -511,59 +493,45 @@ def _run_contact_newton(
         if not len(active_wheels):
             break
     assert period_evaluation is not None
-    return _ContactFixedPoints(
-        section_states, period_evaluation, newton_residuals, is_gait_found, n_iterations
+    fixed_points: Any = (
+        section_states,
+        period_evaluation.return_map_jacobian,
+        newton_residuals,
+        is_gait_found,
+        n_iterations,
     )
-
-
-@eqx.filter_jit
-def _evaluate_over_wheels(
-    evaluate_fixed_point: Callable,
-    model: AbstractWheel,
-    n_legs: int,
-    parameter_values: Array,
-    fixed_points: _ContactFixedPoints,
-) -> Any:
-    """Evaluate `evaluate_fixed_point` at the fixed point of each wheel, by one program for the
-    batch.
-    """
-    return eqx.filter_vmap(
-        lambda parameter_values, fixed_points: evaluate_fixed_point(
-            model, n_legs, parameter_values, fixed_points
-        )
-    )(parameter_values, fixed_points)
+    return FixedPointResult(*fixed_points), period_evaluation
 
 
 def _make_contact_cycle(
-    model: AbstractWheel, n_legs: int, parameter_values: Array, fixed_points: _ContactFixedPoints
+    model: AbstractWheel,
+    n_legs: int,
+    parameter_values: Array,
+    fixed_point: FixedPointResult,
+    period_evaluation: PeriodEvaluation,
 ) -> ReturnMapCycle:
     """Build the cycle that belongs to a fixed point."""
-    period_evaluation: Any = fixed_points.period_evaluation
     wheel_model, params = model.from_parameter_values(parameter_values, n_legs)
-    fixed_point = FixedPointResult(
-        fixed_points.fixed_section_states,
-        period_evaluation.return_map_jacobian,
-        fixed_points.newton_residuals,
-        fixed_points.is_gait_found,
-        fixed_points.n_newton_iterations,
-    )
     return make_return_map_cycle(
         params, wheel_model, fixed_point, period_evaluation.gait_steps_of_period
     )
 
 
 def _make_contact_gait(
-    model: AbstractWheel, n_legs: int, parameter_values: Array, fixed_points: _ContactFixedPoints
+    model: AbstractWheel,
+    n_legs: int,
+    parameter_values: Array,
+    fixed_point: FixedPointResult,
+    period_evaluation: Any,
 ) -> Gait:
     """Build the gait that belongs to a fixed point, with derivatives by the implicit
     function theorem.
     """
-    period_evaluation = fixed_points.period_evaluation
     n_parameter_values = len(parameter_values)
-    section_state = fixed_points.fixed_section_states
+    section_state = fixed_point.x
     identity_matrix = jnp.eye(len(section_state), dtype=section_state.dtype)
     newton_matrix = jnp.where(
-        fixed_points.is_gait_found,
+        fixed_point.converged,
         identity_matrix - period_evaluation.return_map_jacobian,
         identity_matrix,
     )
@@ -595,10 +563,8 @@ def _make_contact_gait(
             model,
             n_legs,
             parameter_values,
-            fixed_points._replace(
-                fixed_section_states=section_state,
-                period_evaluation=period_evaluation._replace(gait_steps_of_period=gait_steps),
-            ),
+            fixed_point._replace(x=section_state),
+            period_evaluation._replace(gait_steps_of_period=gait_steps),
         )
 
     _, cycle_derivatives = compute_value_and_tangents(
@@ -610,11 +576,11 @@ def _make_contact_gait(
             step_derivatives,
         ),
     )
-    return make_return_map_gait(
-        model,
-        n_legs,
-        _make_contact_cycle(model, n_legs, parameter_values, fixed_points),
-        jax.tree.map(lambda x: x[0], period_evaluation.gait_steps_of_period),
-        cycle_derivatives,
-        jax.tree.map(lambda x: x[:, 0], step_derivatives),
-    )
+    cycle = _make_contact_cycle(model, n_legs, parameter_values, fixed_point, period_evaluation)
+    return make_return_map_gait(model, n_legs, cycle, cycle_derivatives)
+
+
+_make_contact_cycles, _make_contact_gaits = (
+    eqx.filter_jit(eqx.filter_vmap(make_one, in_axes=(None, None, 0, 0, 0)))
+    for make_one in (_make_contact_cycle, _make_contact_gait)
+)
