@@ -189,7 +189,7 @@ def limit_cycle(
             f"period_n is {period_n} and there is no guess, but a gait of several steps is one of "
             "many beside the gait of one step: give guess=, a section state near it."
         )
-    cycle: Any = _search_with_fallbacks(
+    cycle = _search_with_fallbacks(
         gait_finder, params, check_cycle_guess(guess), options is None, which
     )
     return cycle.replace_missing_gaits_by_nan(params) if fills_missing_gait_with_nan else cycle
@@ -254,8 +254,7 @@ def limit_cycles(
         params = jax.tree.map(lambda x: np.broadcast_to(np.asarray(x), batch_shape), params)
         params, first_wheel_params = jax.device_put((params, select_tree_rows(params, 0)))
     gait_finder = resolve_finder(first_wheel_params, model, options, period_n)
-    cycle: Any = _search_with_fallbacks(gait_finder, params, None, options is None, which)
-    return cycle
+    return _search_with_fallbacks(gait_finder, params, None, options is None, which)
 
 
 def parse_gait_choice(which: GaitChoice) -> int:
@@ -343,11 +342,7 @@ def _search_with_fallbacks(
         gait_finder, *params_and_cycle, section_state, can_refine_mesh
     )
     if gait_finder.period_n > 1 and section_state is not None:
-        if finder_and_starts is None:
-            finder_and_starts = _retry_from_other_steps(
-                gait_finder, *params_and_cycle, section_state
-            )
-        finder_and_starts = _align_first_step(
+        finder_and_starts = _choose_first_step(
             gait_finder, *params_and_cycle, section_state, finder_and_starts
         )
     if finder_and_starts is None:
@@ -621,33 +616,7 @@ def search_again_from_walks(
     return _restore_first_failure_reason(search_result, retried_cycle)
 
 
-def _retry_from_other_steps(
-    gait_finder: CollocationFinder,
-    params: WheelParams,
-    cycle: LimitCycle,
-    section_states: np.ndarray,
-) -> tuple[CollocationFinder, CollocationState] | None:
-    """Search for the same gait of one wheel with another gait step as the first step.
-
-    Return a finder and the gait, or None if no gait is found. A guess contains the accelerations of
-    all gait steps, whose errors accumulate. A gait step without double support is the most
-    sensitive step. If it is the first or the last step, the search may fail.
-    """
-    if int(cycle.outcome[0]) not in RETRY_OUTCOMES:
-        return None
-    for _ in range(1, gait_finder.period_n):
-        section_states = np.asarray(
-            step_batch(params, section_states, model=gait_finder.model).section_state
-        )
-        retried_cycle = map_in_batches(
-            gait_finder.find_cycles, batch_sizes.GAIT_BATCH_SIZES, params, section_states
-        )
-        if retried_cycle.found[0]:
-            return gait_finder, retried_cycle.collocation_state
-    return None
-
-
-def _align_first_step(
+def _choose_first_step(
     gait_finder: CollocationFinder,
     params: WheelParams,
     cycle: LimitCycle,
@@ -656,8 +625,21 @@ def _align_first_step(
 ) -> tuple[CollocationFinder, CollocationState] | None:
     """Return a finder and the same gait of one wheel, with the first step selected by its state.
 
-    The first step is the gait step that starts nearest to `start_section_states`.
+    The first step is the gait step that starts nearest to `start_section_states`. If no gait is
+    found, the search is repeated with each other gait step as the first step. A guess contains the
+    accelerations of all gait steps, whose errors accumulate. A gait step without double support is
+    the most sensitive step. If it is the first or the last step, the search may fail.
     """
+    section_states = start_section_states
+    for _ in range(1, gait_finder.period_n):
+        if finder_and_starts is not None or int(cycle.outcome[0]) not in RETRY_OUTCOMES:
+            break
+        section_states = step_batch(params, section_states, model=gait_finder.model).section_state
+        cycle = map_in_batches(
+            gait_finder.find_cycles, batch_sizes.GAIT_BATCH_SIZES, params, section_states
+        )
+        if cycle.found[0]:
+            finder_and_starts = gait_finder, cycle.collocation_state
     gait_finder, collocation_state = finder_and_starts or (gait_finder, cycle.collocation_state)
     end_states = np.asarray(collocation_state.gait_step_end_states)[0][:, [0, 2, 3]]
     distances_to_start = np.abs(np.roll(end_states, 1, axis=0) - start_section_states).max(-1)
