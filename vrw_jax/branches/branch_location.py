@@ -278,11 +278,10 @@ class AbstractContinuation(abc.ABC):
                 is_branch_requested,
             )
         )
-        results: ContinuationResult = jax.tree.map(
+        return jax.tree.map(
             np.asarray,
             continue_all_branches(self.continuation_problem, self.arclength_options, *arguments),
         )
-        return results
 
     def continue_in_both_directions(
         self, z: Any, parameter_values: Array, is_branch_requested: np.ndarray
@@ -311,7 +310,7 @@ class AbstractContinuation(abc.ABC):
 
         The points of the first direction are reversed and precede those of the second.
         """
-        row_indices: list[tuple[int, int, int]] = []  # (wheel, direction, point)
+        row_indices = []  # (wheel, direction, point)
         for wheel_index, (n_toward_lower, n_toward_upper) in enumerate(
             results_by_direction.n_points
         ):
@@ -439,7 +438,7 @@ class _SpecialPointLocator(NamedTuple):
         """Return a table with the admissible points of all ranges and the points next to the
         located ends.
         """
-        joined_tables: list[BranchPointTable] = []
+        joined_tables = []
         for admissible_range in admissible_ranges:
             tables_of_range = [select_tree_rows(self.point_table, admissible_range.point_indices)]
             for range_end_index in admissible_range.point_pairs_at_ends:
@@ -452,8 +451,7 @@ class _SpecialPointLocator(NamedTuple):
                 else:
                     tables_of_range.append(end_table)
             joined_tables += tables_of_range
-        joined_table: BranchPointTable = concatenate_tree_rows(*joined_tables)
-        return joined_table
+        return concatenate_tree_rows(*joined_tables)
 
     def locate_roots(self, root_requests: list[RootRequest]) -> list[LocatedRoot]:
         """Locate the root that each request describes."""
@@ -624,7 +622,7 @@ class _SpecialPointLocator(NamedTuple):
         """Locate all special points of the branches except their ends."""
         points, wheel_indices, quantity_table = self.point_table
         continuation_problem = self.branch_continuation.continuation_problem
-        jump_pairs: list[tuple[int, int]] = []
+        jump_pairs = []
         if continuation_problem.has_kinks:
             parameter_bounds = self.branch_continuation.parameter_bounds
             jump_pairs = find_state_jumps(

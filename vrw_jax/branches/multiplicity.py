@@ -55,20 +55,6 @@ def are_multipliers_off_circle(multiplier_moduli: np.ndarray) -> np.ndarray:
     )
 
 
-def find_unexplained_ranks(multiplier_moduli: np.ndarray, n_explained_crossings: int) -> range:
-    """Return the ranks whose moduli cross 1 between two points.
-
-    The moduli have the shape (2, ranks), and are in decreasing order. The result is empty if
-    located bifurcations explain all crossings.
-    """
-    first_multiplier_rank, last_multiplier_rank = sorted(
-        np.sum(multiplier_moduli > 1.0, -1).tolist()
-    )
-    if last_multiplier_rank - first_multiplier_rank <= n_explained_crossings:
-        return range(0)
-    return range(first_multiplier_rank, last_multiplier_rank)
-
-
 def classify_crossing_ranks(
     return_map_jacobian: np.ndarray,
     crossing_multiplier_ranks: range,
@@ -122,12 +108,14 @@ def add_multiple_bifurcations(
         n_explained_crossings = sum(
             root.n_multipliers for root in located_roots if is_root_between(root, point_pair)
         )
-        root_requests += [
-            request_mean_modulus_root(point_pair, range(rank, rank + 1))
-            for rank in find_unexplained_ranks(
-                multiplier_moduli[list(point_pair)], n_explained_crossings
-            )
-        ]
+        crossing_ranks = range(
+            *sorted(np.sum(multiplier_moduli[list(point_pair)] > 1.0, -1).tolist())
+        )
+        if len(crossing_ranks) > n_explained_crossings:
+            root_requests += [
+                request_mean_modulus_root(point_pair, range(rank, rank + 1))
+                for rank in crossing_ranks
+            ]
     # Each group contains the roots for ranks that may cross the unit circle together.
     root_groups: list[list[LocatedRoot]] = []
     for root in locate_roots(root_requests):
@@ -152,7 +140,7 @@ def add_multiple_bifurcations(
         mean_root_requests.append(
             request_mean_modulus_root(point_pair, range(first_rank, first_rank + len(root_group)))
         )
-    multiple_bifurcations: list[LocatedRoot] = []
+    multiple_bifurcations = []
     for root_group, mean_root in zip(root_groups, locate_roots(mean_root_requests), strict=True):
         moduli_beside_root = mean_root.table_beside_root.quantity_table[MULTIPLIER_MODULI_COLUMN][0]
         unit_circle_distances = np.abs(

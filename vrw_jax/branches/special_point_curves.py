@@ -82,8 +82,9 @@ def _check_parameter_plane(parameters: Any, bounds: Any) -> tuple[tuple[str, str
     check_type("bounds", bounds, (Mapping, type(None)), "write {'damping': (100.0, 200.0)}")
     bounds_by_parameter = {**DEFAULT_PARAMETER_BOUNDS, **(bounds or {})}
     parameter_names = check_names("parameters", parameters)
-    for parameter_name in bounds_by_parameter:
+    for parameter_name, bounds_of_parameter in bounds_by_parameter.items():
         check_parameter_name(parameter_name, tuple(PARAMETER_DOMAINS), "parameter that has bounds")
+        check_range(f"bounds[{parameter_name!r}]", bounds_of_parameter)
     for parameter_name in parameter_names:
         check_parameter_name(parameter_name, tuple(bounds_by_parameter), "parameter with bounds")
     if len(parameter_names) != 2 or len(set(parameter_names)) != 2:
@@ -91,12 +92,8 @@ def _check_parameter_plane(parameters: Any, bounds: Any) -> tuple[tuple[str, str
             f"parameters are {parameter_names}, but a curve needs two different ones: write "
             "('damping', 'slope')."
         )
-    parameter_ranges = {
-        parameter_name: check_range(f"bounds[{parameter_name!r}]", bounds_of_parameter)
-        for parameter_name, bounds_of_parameter in bounds_by_parameter.items()
-    }
     return (parameter_names[0], parameter_names[1]), np.array(
-        [parameter_ranges[parameter_name] for parameter_name in parameter_names], float
+        [bounds_by_parameter[parameter_name] for parameter_name in parameter_names], float
     )
 
 

@@ -92,6 +92,15 @@ class ScanSignChange(NamedTuple):
     sample_indices: tuple[int, int]  # indices of the first sample, which has a gait
     scan_position_in_cells: tuple[float, float]  # position of the change in each parameter
 
+    def is_near(self, other: "ScanSignChange") -> bool:
+        """Return whether another sign change is one of the same quantity and near this one."""
+        return (
+            self.quantity_name == other.quantity_name
+            and self.parameter_index == other.parameter_index
+            and math.dist(self.scan_position_in_cells, other.scan_position_in_cells)
+            <= SPECIAL_POINT_MAP_OPTIONS.min_distance_to_examined
+        )
+
 
 @with_default_jax_settings
 def trace_special_points(
@@ -130,9 +139,10 @@ def trace_special_points(
         scan_dataset,
     )
     for _ in range(SPECIAL_POINT_MAP_OPTIONS.max_search_rounds):
-        new_sign_changes = _select_distant_sign_changes(
-            find_remaining_sign_changes(), examined_sign_changes
-        )
+        new_sign_changes: list[ScanSignChange] = []
+        for sign_change in find_remaining_sign_changes():
+            if not any(map(sign_change.is_near, (*examined_sign_changes, *new_sign_changes))):
+                new_sign_changes.append(sign_change)
         if not new_sign_changes:
             break
         examined_sign_changes += new_sign_changes
@@ -236,28 +246,6 @@ def _find_seeds_in_batches(
     return curve_seeds
 
 
-def _collect_signed_quantities(
-    scan_dataset: xr.Dataset, parameter_names: tuple[str, str]
-) -> dict[str, np.ndarray]:
-    """Return by name the quantities whose signs may change, as arrays over the two parameters."""
-    signed_quantities = {
-        STABILITY_CHANGE_NAME: 1.0
-        - scan_dataset[STABILITY_CHANGE_NAME].transpose(*parameter_names).values
-    }
-    margin_names = [name for name in MARGIN_MEASURES if name not in LINEAR_MARGIN_SUBSTITUTES]
-    peak_names = [SECOND_PEAK_RATE_NAME] if SECOND_PEAK_RATE_NAME in scan_dataset else []
-    for measure_name in ("lambda_4_plus", *peak_names, *margin_names):
-        measure = scan_dataset[measure_name].transpose(*parameter_names, ...)
-        if "leg" in measure.dims:
-            signed_quantities |= {
-                f"{measure_name}[{leg_number}]": measure.values[..., i]
-                for i, leg_number in enumerate(scan_dataset.leg.values)
-            }
-        else:
-            signed_quantities[measure_name] = measure.values
-    return signed_quantities
-
-
 def find_sign_changes_in_scan(
     scan_dataset: xr.Dataset, parameter_names: tuple[str, str]
 ) -> list[ScanSignChange]:
@@ -265,16 +253,28 @@ def find_sign_changes_in_scan(
 
     A sign change of a measure is ignored if exactly one of the two samples has double support.
     """
-    outcome_codes = scan_dataset.outcome.transpose(*parameter_names).values
-    has_gait_at_sample = outcome_codes == Outcome.STEPPED
-    has_coarse_mesh_at_sample = outcome_codes == Outcome.MESH_TOO_COARSE
-    signed_quantities, sign_changes = _collect_signed_quantities(scan_dataset, parameter_names), []
+    scan_dataset = scan_dataset.transpose(*parameter_names, ...)
+    has_gait_at_sample = scan_dataset.outcome.values == Outcome.STEPPED
+    has_coarse_mesh_at_sample = scan_dataset.outcome.values == Outcome.MESH_TOO_COARSE
+    signed_quantities = {STABILITY_CHANGE_NAME: 1.0 - scan_dataset[STABILITY_CHANGE_NAME].values}
+    margin_names = [name for name in MARGIN_MEASURES if name not in LINEAR_MARGIN_SUBSTITUTES]
+    peak_names = [SECOND_PEAK_RATE_NAME] if SECOND_PEAK_RATE_NAME in scan_dataset else []
+    for measure_name in ("lambda_4_plus", *peak_names, *margin_names):
+        measure = scan_dataset[measure_name]
+        if "leg" in measure.dims:
+            signed_quantities |= {
+                f"{measure_name}[{leg_number}]": measure.values[..., i]
+                for i, leg_number in enumerate(scan_dataset.leg.values)
+            }
+        else:
+            signed_quantities[measure_name] = measure.values
     signed_quantities[GAIT_CHANGE_NAME] = np.where(
         has_gait_at_sample, 1.0, np.where(has_coarse_mesh_at_sample, np.nan, -1.0)
     )
     signed_quantities[COARSE_MESH_END_NAME] = np.where(
         has_gait_at_sample, 1.0, np.where(has_coarse_mesh_at_sample, -1.0, np.nan)
     )
+    sign_changes = []
     for parameter_index in range(2):
         get_neighbor_values = lambda x, parameter_index=parameter_index: (
             np.moveaxis(x, parameter_index, 0)[:-1],
@@ -323,27 +323,21 @@ def find_unexplained_sign_changes(
             for sign_change in sign_changes
             if sign_change.quantity_name == quantity_name
         ]
-        explaining_curves = [
-            special_point_curve
-            for special_point_curve in special_point_curves
-            if special_point_curve.name
-            in EXPLAINING_CURVE_NAMES.get(quantity_name, (quantity_name,))
-        ]
+        explaining_names = EXPLAINING_CURVE_NAMES.get(quantity_name, (quantity_name,))
         sign_change_positions = np.array(
             [sign_change.scan_position_in_cells for sign_change in sign_changes_of_quantity]
         )
         curve_distances = np.full(len(sign_changes_of_quantity), np.inf)
-        for special_point_curve in explaining_curves:
-            curve_values_and_names = zip(
-                special_point_curve.values.T, special_point_curve.parameters, strict=True
-            )
+        for special_point_curve in special_point_curves:
+            if special_point_curve.name not in explaining_names:
+                continue
             curve_positions = [
                 np.interp(
-                    curve_parameter_values,
+                    special_point_curve.dataset[parameter_name].values,
                     scan_dataset[parameter_name].values,
                     np.arange(scan_dataset.sizes[parameter_name]),
                 )
-                for curve_parameter_values, parameter_name in curve_values_and_names
+                for parameter_name in special_point_curve.parameters
             ]
             curve_distances = np.minimum(
                 curve_distances,
@@ -357,25 +351,3 @@ def find_unexplained_sign_changes(
             if curve_distance > SPECIAL_POINT_MAP_OPTIONS.max_distance_to_explaining_curve
         ]
     return unexplained_sign_changes
-
-
-def _select_distant_sign_changes(
-    unexplained_sign_changes: Sequence[ScanSignChange],
-    examined_sign_changes: Sequence[ScanSignChange],
-) -> list[ScanSignChange]:
-    """Select sign changes of each quantity that are distant from each other.
-
-    The selected changes are also distant from `examined_sign_changes`.
-    """
-    selected_sign_changes: list[ScanSignChange] = []
-    for sign_change in unexplained_sign_changes:
-        is_close_to_examined = any(
-            compared.quantity_name == sign_change.quantity_name
-            and compared.parameter_index == sign_change.parameter_index
-            and math.dist(compared.scan_position_in_cells, sign_change.scan_position_in_cells)
-            <= SPECIAL_POINT_MAP_OPTIONS.min_distance_to_examined
-            for compared in (*examined_sign_changes, *selected_sign_changes)
-        )
-        if not is_close_to_examined:
-            selected_sign_changes.append(sign_change)
-    return selected_sign_changes

@@ -106,14 +106,14 @@ def compute_lagrange_weights(location_in_interval: float) -> np.ndarray:
     return np.prod(lagrange_factors, axis=1)
 
 
-def build_mesh_transfer_matrix(source_mesh: PhaseMesh, target_mesh: PhaseMesh) -> np.ndarray:
-    """Build the matrix that maps node accelerations on one mesh to node accelerations on another
-    mesh.
+def transfer_accelerations(
+    source_mesh: PhaseMesh, target_mesh: PhaseMesh, node_accelerations: Array
+) -> Array:
+    """Return the node accelerations of one phase on another mesh.
 
-    The matrix has the shape (target nodes, source nodes). The transfer is exact for accelerations
+    The axes of the accelerations are (interval, node, ...). The transfer is exact for accelerations
     that are cubic polynomials in each interval of the source mesh.
     """
-
     source_boundaries = source_mesh.interval_boundary_fractions
     target_node_fractions = target_mesh.node_time_fractions
     transfer_matrix = np.zeros((len(target_node_fractions), len(source_mesh.node_time_fractions)))
@@ -126,21 +126,10 @@ def build_mesh_transfer_matrix(source_mesh: PhaseMesh, target_mesh: PhaseMesh) -
         transfer_matrix[node_index, first_source_node : first_source_node + N_GAUSS_NODES] = (
             compute_lagrange_weights(location_in_interval)
         )
-    return transfer_matrix
-
-
-def transfer_accelerations(
-    source_mesh: PhaseMesh, target_mesh: PhaseMesh, node_accelerations: Array
-) -> Array:
-    """Return the node accelerations of one phase on another mesh.
-
-    The axes of the accelerations are (interval, node, ...).
-    """
-    transfer_matrix = build_mesh_transfer_matrix(source_mesh, target_mesh)
     trailing_shape = node_accelerations.shape[2:]
     return jnp.tensordot(
         jnp.asarray(transfer_matrix, node_accelerations.dtype),
-        node_accelerations.reshape(len(source_mesh.node_time_fractions), *trailing_shape),
+        node_accelerations.reshape(transfer_matrix.shape[1], *trailing_shape),
         1,
     ).reshape(target_mesh.n_intervals, N_GAUSS_NODES, *trailing_shape)
 

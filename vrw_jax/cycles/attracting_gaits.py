@@ -105,7 +105,7 @@ def _find_gaits_from_starts(
         scaled_step_end_states[:, :-1] - scaled_step_end_states[:, -1:]
     ).max(-1)
     is_gait_valid &= ~(state_distances_to_last_step < DUPLICATE_GAIT_DISTANCE).any(1)
-    selected_gait_indices: list[int] = []
+    selected_gait_indices = []
     for wheel_candidates in np.split(
         np.arange(len(candidate_wheel_indices)),
         find_slowest_gait_indices(candidate_wheel_indices, n_wheels)[1:],

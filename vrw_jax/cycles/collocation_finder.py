@@ -181,8 +181,7 @@ class CollocationFinder(AbstractGaitFinder):
         self, parameter_values: ParameterValues, cycle_guess: Any
     ) -> CollocationState:
         cycle: Any = self.find_cycle_from_values(parameter_values, cycle_guess)
-        collocation_state: CollocationState = cycle.collocation_state
-        return collocation_state
+        return cycle.collocation_state
 
     def compute_slope_response(
         self, params: WheelParams, cycle: Any, measure_names: Sequence[str]
@@ -196,8 +195,7 @@ class CollocationFinder(AbstractGaitFinder):
         """
         if not set(measure_names) <= set(COLLOCATION_RESPONSE_MEASURES):
             return super().compute_slope_response(params, cycle, measure_names)
-        slope_response: SlopeResponse = cycle.slope_response
-        return slope_response.select_measures(
+        return cycle.slope_response.select_measures(
             [COLLOCATION_RESPONSE_MEASURES.index(measure_name) for measure_name in measure_names]
         )
 

@@ -201,8 +201,7 @@ class AbstractGaitFinder(eqx.Module):
         """Compute one event-driven step from a section state, by a program that is
         already compiled.
         """
-        gait_step: AbstractStep = self.model.take_step(params, section_state, self.step_options)
-        return gait_step
+        return self.model.take_step(params, section_state, self.step_options)
 
     def find_cycle_from_values(
         self, parameter_values: ParameterValues, cycle_guess: Any = None

@@ -59,14 +59,13 @@ def make_finder(
         if finder_class.options_type is CycleOptions
         else {}
     )
-    finder: AbstractGaitFinder = finder_class(
+    return finder_class(
         model=resolved_model,
         n_legs=n_legs,
         step_options=convert_step_options(step_options),
         period_n=period_n,
         **search_options,
     )
-    return finder
 
 
 def resolve_model(params: WheelParams, model: ModelLike | None) -> ModelLike | None:

@@ -72,7 +72,8 @@ def compute_walk_starts(params: WheelParams) -> np.ndarray:
     """Return the section states that WALK_STARTS describe for each wheel, shape
     (starts, wheels, 3).
     """
-    wheels = _convert_params_to_numpy(params)
+    # With JAX arrays, each operation would be compiled for every number of wheels.
+    wheels = jax.tree.map(np.asarray, params)
     leg_angle_sine = math.sin(wheels.leg_angle)
     leg_angle_cosine = math.cos(wheels.leg_angle)
     weight_normal_to_slope = (
@@ -94,17 +95,9 @@ def compute_fallback_walk_starts(params: WheelParams) -> np.ndarray:
 
     The shape is (starts, wheels, 3).
     """
-    wheels = _convert_params_to_numpy(params)
+    wheels = jax.tree.map(np.asarray, params)
     angle_shares, rate_shares = np.array(FALLBACK_WALK_STARTS).T[..., None]
     return _make_section_states(wheels, angle_shares * wheels.leg_angle, rate_shares)
-
-
-def _convert_params_to_numpy(params: WheelParams) -> Any:
-    """Return the wheels with parameters that are NumPy arrays.
-
-    With JAX arrays, each operation would be compiled for every number of wheels.
-    """
-    return jax.tree.map(np.asarray, params)
 
 
 def _make_section_states(
@@ -280,10 +273,9 @@ def _split_parameter_values(
     """Return the model and the wheels that `parameter_values` of shape (wheels,
     n_parameter_values) describe.
     """
-    model, params = gait_finder.model.from_parameter_values(
+    return gait_finder.model.from_parameter_values(
         tuple(jax.device_put(list(parameter_values.T))), gait_finder.n_legs
     )
-    return model, params
 
 
 def _find_duplicate_walks(
