@@ -455,9 +455,12 @@ def complete_solver_step(
     start_point = lane_states.contact_interval_point
     last_stage = len(tableau.stage_nodes) - 1
     n = len(start_point.q)
-    end_point = ContactIntervalPoint(
-        *compute_stage_state(tableau, last_stage, start_point.q, start_point.v, stage_rows, h),
-        stage_rows[last_stage],
+    *inner_stage_points, end_point = (
+        ContactIntervalPoint(
+            *compute_stage_state(tableau, i, start_point.q, start_point.v, stage_rows, h),
+            stage_rows[i],
+        )
+        for i in (*tableau.guard_stage_indices, last_stage)
     )
     accumulator_increments = None
     if contact_mode_dynamics.has_accumulators:
@@ -465,17 +468,13 @@ def complete_solver_step(
             tableau.stage_matrix[last_stage][j] * stage_rows[j, -N_ACCUMULATOR_ROWS:]
             for j in range(last_stage)
         )
-    inner_stage_points = [
-        ContactIntervalPoint(
-            *compute_stage_state(tableau, i, start_point.q, start_point.v, stage_rows, h),
-            stage_rows[i],
-        )
-        for i in tableau.guard_stage_indices
+    guard_values = [
+        lane_states.guard_values,
+        *(
+            evaluate_guards_at_point(contact_mode_dynamics, guard_point) - lane_states.guard_offset
+            for guard_point in (*inner_stage_points, end_point)
+        ),
     ]
-    *inner_guard_values, end_guard_values = (
-        evaluate_guards_at_point(contact_mode_dynamics, guard_point) - lane_states.guard_offset
-        for guard_point in (*inner_stage_points, end_point)
-    )
     sum_weighted_stages = lambda weights: sum(
         float(w) * stage_rows[j, :n] for j, w in enumerate(weights) if w != 0.0
     )
@@ -489,27 +488,22 @@ def complete_solver_step(
         error_estimates,
         start_point,
         end_point,
-        end_guard_values,
-    )
-    middle_guard_values = (
-        inner_guard_values[tableau.guard_stage_indices.index(tableau.middle_stage_index)]
-        if inner_guard_values
-        else lane_states.guard_values
+        guard_values[-1],
     )
     parabola_terms = fit_guard_parabola(
-        tableau, lane_states.guard_values, middle_guard_values, end_guard_values
+        tableau, guard_values[0], guard_values[tableau.middle_guard_index], guard_values[-1]
     )
-    guard_minimum_fraction = _find_earliest_minimum(
-        tableau,
-        [lane_states.guard_values, *inner_guard_values, end_guard_values],
-        _flag_initiating_guards(lane_states),
+    # A guard that is positive at both ends of a solver step may be negative between them.
+    has_guard_minimum, guard_minimum_fraction = find_guard_minimum(tableau, guard_values)
+    is_minimum_counted = (
+        has_guard_minimum & (guard_values[0] > 0.0) & ~_flag_initiating_guards(lane_states)
     )
     return AttemptedSolverStep(
         end_point,
         mean_squared_error,
-        end_guard_values,
+        guard_values[-1],
         *parabola_terms,
-        guard_minimum_fraction,
+        jnp.min(jnp.where(is_minimum_counted, guard_minimum_fraction, 1.0), axis=0),
         accumulator_increments,
     )
 
@@ -574,11 +568,10 @@ def advance_running_lanes(
         start_time + h,
     )
     reached_time = jnp.where(is_accepted, end_time, start_time)
-    next_integration_h = jnp.minimum(h * step_size_ratio, latest_event_time - reached_time)
     next_step_size = jnp.where(
         is_searching | has_guard_crossed,
         search_step_size,
-        next_integration_h,
+        jnp.minimum(h * step_size_ratio, latest_event_time - reached_time),
     )
 
     event_time_shift = jnp.where(has_reached_event, event_time_shift, 0.0)
@@ -594,13 +587,13 @@ def advance_running_lanes(
             is_state_updated, attempted_step.accumulator_increments, 0.0
         )
     time = jnp.where(is_state_updated, end_time + event_time_shift, start_time)
-    is_past_time_limit = is_accepted & (time >= latest_event_time)
-    is_past_time_limit = is_past_time_limit | (has_reached_event & (time > latest_event_time))
-    has_step_failed = (next_bracket.n_iterations >= options.max_event_iterations) | (
-        lane_states.n_solver_steps + 1 >= options.max_solver_steps
+    is_past_time_limit = (is_accepted & (time >= latest_event_time)) | (
+        has_reached_event & (time > latest_event_time)
     )
-    has_step_failed = has_step_failed | (
-        ~is_searching & (start_time + next_step_size == start_time)
+    has_step_failed = (
+        (next_bracket.n_iterations >= options.max_event_iterations)
+        | (lane_states.n_solver_steps + 1 >= options.max_solver_steps)
+        | (~is_searching & (start_time + next_step_size == start_time))
     )
     painleve_determinant_row = len(start_point.q)
     determinant_before = start_point.dynamics_rows[painleve_determinant_row]
@@ -763,26 +756,6 @@ def _compute_squared_error(
 def _flag_initiating_guards(lane_states: ContactIntervalState) -> Array:
     """Return which guards are initiating guards at the start of their interval, (guards, batch)."""
     return (lane_states.time_since_event == 0.0) & (lane_states.guard_offset != 0.0)
-
-
-def _find_earliest_minimum(
-    tableau: ButcherTableau, guard_values: list[Array], is_initiating: Array
-) -> Array:
-    """Return the earliest negative guard minimum as a fraction of the solver step.
-
-    The result is 1 if there is no such minimum. A guard that is positive at both ends of a solver
-    step may be negative between them: see `integrator.find_guard_minimum`. Initiating guards are
-    excluded.
-    """
-    has_guard_minimum, guard_minimum_fraction = find_guard_minimum(tableau, guard_values)
-    return jnp.min(
-        jnp.where(
-            has_guard_minimum & (guard_values[0] > 0.0) & ~is_initiating,
-            guard_minimum_fraction,
-            1.0,
-        ),
-        axis=0,
-    )
 
 
 def _find_first_guard(guard_flags: Array) -> Array:

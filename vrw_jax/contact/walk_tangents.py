@@ -13,7 +13,6 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import lax
 from jaxtyping import Array
 
@@ -38,8 +37,12 @@ from vrw_jax.contact.walk_kernel import (
     LaneState,
     init_lane_states,
 )
-from vrw_jax.integrator import ButcherTableau, compute_real_stability_limit
-from vrw_jax.numerics import StepOptions, run_if_any_element_active, select_trees_by_condition
+from vrw_jax.integrator import (
+    ButcherTableau,
+    compute_event_time_tangent,
+    compute_real_stability_limit,
+)
+from vrw_jax.numerics import run_if_any_element_active, select_trees_by_condition
 from vrw_jax.wheel import ContactMode, compute_wheel_units
 
 
@@ -154,8 +157,6 @@ def walk_with_tangents(
 
     The first axis of the resulting tangents also contains the tangents.
     """
-    tableau = walk_settings.tableau
-    assert tableau is not None  # diffrax differentiates in another way.
     count_rows = lambda array_tree: len(_pack_tree_into_rows(array_tree))
 
     def begin_walk(
@@ -210,18 +211,8 @@ def walk_with_tangents(
         tangent_rows = tangents.map_tangents_sequentially(
             push_event_tangent, tangent_rows, n_dynamics_rows
         )
-        is_unfinished = next_state.walk_outcome == STATUS_UNFINISHED
-        contact_state = next_state.contact_interval_state.contact_state
         interval_state, tangent_rows = _integrate_with_tangents(
-            lambda columns: walk_settings.make_lane_contact_dynamics(columns, contact_state),
-            input_columns,
-            next_state.contact_interval_state,
-            tangents,
-            tangent_rows,
-            interval_template,
-            is_unfinished,
-            walk_settings.step_options,
-            tableau,
+            walk_settings, input_columns, next_state, tangents, tangent_rows, interval_template
         )
         return next_state._replace(contact_interval_state=interval_state), tangent_rows
 
@@ -264,24 +255,28 @@ def walk_with_tangents(
 
 
 def _integrate_with_tangents(
-    make_contact_dynamics: DynamicsFn,
+    walk_settings: BatchWalkSettings,
     input_columns: Array,
-    initial_state: ContactIntervalState,
+    lane_state: LaneState,
     tangents: TangentBatch,
     start_tangent_rows: Array,
     tangent_template: _IntervalTangent,
-    has_unfinished_walk: Array,
-    options: StepOptions,
-    tableau: ButcherTableau,
 ) -> tuple[ContactIntervalState, Array]:
     """Return the result of `integrate_contact_interval`, and the tangents at its end.
 
     The tangents have the shape (tangents, rows, batch).
     """
+    initial_state, tableau = lane_state.contact_interval_state, walk_settings.tableau
+    assert tableau is not None  # diffrax differentiates in another way.
+    make_contact_dynamics = lambda columns: walk_settings.make_lane_contact_dynamics(
+        columns, initial_state.contact_state
+    )
     contact_mode_dynamics = make_contact_dynamics(input_columns)
     guard_scales = compute_guard_scales(contact_mode_dynamics)
     last_stage = len(tableau.stage_nodes) - 1
-    options = compute_wheel_units(contact_mode_dynamics.s).scale_times_to_seconds(options)
+    options = compute_wheel_units(contact_mode_dynamics.s).scale_times_to_seconds(
+        walk_settings.step_options
+    )
     max_stable_step_size = _compute_max_stable_step_size(contact_mode_dynamics, tableau)
 
     def try_solver_step(
@@ -348,7 +343,10 @@ def _integrate_with_tangents(
 
     is_running = lambda state: state[0].lane_status == LaneStatus.RUNNING
     contact_interval_state, tangent_rows = iterate_until_stopped(
-        is_running, has_unfinished_walk, try_solver_step, (initial_state, start_tangent_rows)
+        is_running,
+        lane_state.walk_outcome == STATUS_UNFINISHED,
+        try_solver_step,
+        (initial_state, start_tangent_rows),
     )
     return contact_interval_state, tangents.map_tangents_sequentially(
         _make_event_shift(
@@ -463,8 +461,8 @@ def _propagate_stage_coordinates(
 ) -> tuple[Array, Array]:
     """Return the tangents of `compute_stage_state`, from the tangents at the earlier stages."""
     flat_matrices = [
-        jnp.asarray(np.reshape(section_state, -1))
-        for section_state in (tableau.stage_matrix, tableau.squared_stage_matrix)
+        jnp.asarray(stage_matrix.ravel())
+        for stage_matrix in (tableau.stage_matrix, tableau.squared_stage_matrix)
     ]
     n_stages, stage_node = len(tableau.stage_matrix[0]), jnp.asarray(tableau.stage_nodes)[i]
 
@@ -537,20 +535,12 @@ def _make_event_shift(
 
     def shift_tangent_to_event(k: Array, tangent_row: Array) -> _IntervalTangent:
         tangent = _unpack_tree_from_rows(tangent_row, tangent_template)
-        time_tangent = jnp.zeros_like(contact_interval_state.time_since_event)
-        guard_tangents = guard_pushforward(tangents.get_input_tangent(k), tangent.q, tangent.v)
-        for guard_index in range(len(guard_tangents)):
-            is_at_guard = (
-                has_reached_event
-                & (contact_interval_state.triggered_guard_index == guard_index)
-                & (guard_rates[guard_index] < 0.0)
-            )
-            time_tangent = jnp.where(
-                is_at_guard,
-                -guard_tangents[guard_index]
-                / jnp.where(is_at_guard, guard_rates[guard_index], -1.0),
-                time_tangent,
-            )
+        time_tangent = compute_event_time_tangent(
+            has_reached_event,
+            contact_interval_state.triggered_guard_index,
+            guard_rates,
+            guard_pushforward(tangents.get_input_tangent(k), tangent.q, tangent.v),
+        )
         interval_accumulators = tangent.interval_accumulators
         if interval_accumulators is not None:
             interval_accumulators = (

@@ -1,6 +1,7 @@
 """Batched Runge-Kutta integrator with location of events and minima, and with tangents."""
 
 from vrw_jax.integrator import tableaus
+from vrw_jax.integrator.event_location import compute_event_time_tangent
 from vrw_jax.integrator.integrate import (
     integrate_batch_phase,
     sample_at_equal_times,

@@ -2,7 +2,7 @@
 
 import functools
 from enum import IntEnum
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -270,6 +270,29 @@ def locate_event(
             refined_search.is_event_unresolved, integrator_state.state, event_state
         ),
     )
+
+
+def compute_event_time_tangent(
+    is_at_event: Array, event_guard_index: Array, guard_rates: Any, guard_tangents: Any
+) -> Array:
+    """Return the tangent of the event's time, s, from rates and tangents of all guards.
+
+    The tangent follows from the condition that the guard is zero at the event of the perturbed
+    motion. Without an event, or if the guard does not fall, the tangent is zero.
+
+    - `event_guard_index`: index of the guard that is zero at the event;
+    - `guard_rates`, `guard_tangents`: time derivatives and tangents, one array for each guard.
+    """
+    event_time_tangent = jnp.zeros_like(guard_tangents[0])
+    for guard_index in range(len(guard_tangents)):
+        guard_rate = guard_rates[guard_index]
+        is_event_guard = is_at_event & (event_guard_index == guard_index) & (guard_rate < 0.0)
+        event_time_tangent = jnp.where(
+            is_event_guard,
+            -guard_tangents[guard_index] / jnp.where(is_event_guard, guard_rate, -1.0),
+            event_time_tangent,
+        )
+    return event_time_tangent
 
 
 @jax.jit  # The function is traced once for all guards.

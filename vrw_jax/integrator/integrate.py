@@ -14,10 +14,14 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
-from vrw_jax.integrator.event_location import IntegrationStatus, IntegratorState, locate_event
+from vrw_jax.integrator.event_location import (
+    IntegrationStatus,
+    IntegratorState,
+    compute_event_time_tangent,
+    locate_event,
+)
 from vrw_jax.integrator.minima import (
     MarginMinimaResult,
-    TriedSolverStep,
     compute_margin_minima_jvp,
     init_margin_minima_state,
     refine_margin_minima,
@@ -102,7 +106,7 @@ def integrate_batch_phase(
     see `tangents`.
     """
     integrate_with_rule = jax.custom_jvp(
-        lambda *arguments: _integrate_to_event(make_phase, tableau, None, *arguments).phase_end
+        lambda *arguments: _integrate_to_event(make_phase, tableau, None, *arguments)[0]
     )
 
     @integrate_with_rule.defjvp
@@ -110,20 +114,13 @@ def integrate_batch_phase(
     def compute_integration_jvp(
         primals: tuple, state_tangents: tuple
     ) -> tuple[BatchPhaseEnd, BatchPhaseEnd]:
-        def integrate_with_tangents(
-            primals: tuple, directions: tuple
-        ) -> tuple[BatchPhaseEnd, tuple]:
+        def integrate_with_tangents(primals: tuple, directions: tuple) -> tuple[BatchPhaseEnd, Any]:
             phase_constants_tangents, held_constants, q, v = directions
             start_tangents = stack_directions((*q, *v, *held_constants))
             phase_tangents = PhaseTangents(
                 make_phase, primals[0], primals[1], phase_constants_tangents, start_tangents
             )
-            phase_integration_result = _integrate_to_event(
-                make_phase, tableau, phase_tangents, *primals
-            )
-            return phase_integration_result.phase_end, _compute_phase_end_jvp(
-                tableau, phase_tangents, phase_integration_result
-            )
+            return _integrate_to_event(make_phase, tableau, phase_tangents, *primals)
 
         phase_end, (q, v, event_time_tangent, minima_tangents) = apply_batched_jvp_rule(
             integrate_with_tangents, primals, state_tangents[:4]
@@ -139,29 +136,22 @@ def integrate_batch_phase(
     )
 
 
-class _PhaseIntegrationResult(NamedTuple):
-    """End of a phase, with the intermediate results from which its tangents are computed."""
-
-    solver_step_function: TakeStep
-    start_state: StageState
-    phase_end: BatchPhaseEnd
-    integrator_state: IntegratorState  # with the minima of the whole phase
-    margin_minima_result: MarginMinimaResult | None
-
-
 def _compute_phase_end_jvp(
     tableau: ButcherTableau,
     phase_tangents: PhaseTangents,
-    phase_integration_result: _PhaseIntegrationResult,
+    solver_step_function: TakeStep,
+    start_state: StageState,
+    phase_end: BatchPhaseEnd,
+    integrator_state: IntegratorState,
+    margin_minima_result: MarginMinimaResult | None,
 ) -> tuple[Vector, Vector, Array, Array | None]:
     """Return the tangents at the end of a phase, for given tangents of its start and constants.
 
     The result contains the tangents of positions, rates, duration and minima of the margins. The
     first axis contains the directions.
+
+    - `integrator_state`: state of the loop after it has ended, with the minima of the whole phase.
     """
-    solver_step_function, start_state, phase_end, integrator_state, margin_minima_result = (
-        phase_integration_result
-    )
     n = len(start_state.q)
     last_step_length = jnp.where(
         integrator_state.has_guard_crossed, phase_end.duration - integrator_state.elapsed_time, 0.0
@@ -174,8 +164,14 @@ def _compute_phase_end_jvp(
 
     end_state = stage_states[-1]
     tangents_by_component = tuple(jnp.moveaxis(end_state_tangents, 1, 0))
-    event_time_tangent = _compute_event_time_jvp(
-        phase_tangents, end_state, end_state_tangents, integrator_state, phase_end.end_guard_index
+    phase = phase_tangents.make_phase(phase_tangents.phase_constants, phase_tangents.held_constants)
+    event_time_tangent = compute_event_time_tangent(
+        integrator_state.has_guard_crossed,
+        phase_end.end_guard_index,
+        phase.evaluate_with_rates(phase.evaluate_guards, end_state)[1],
+        phase_tangents.evaluate_tangents(
+            lambda phase, state: phase.evaluate_guards(state), end_state, end_state_tangents
+        ),
     )
     motion_rates = (*end_state.v, *end_state.acceleration.acceleration[:n])
     state_tangents = tuple(
@@ -198,48 +194,6 @@ def _compute_phase_end_jvp(
     return state_tangents[:n], state_tangents[n:], event_time_tangent, minima_tangents
 
 
-def _compute_event_time_jvp(
-    phase_tangents: PhaseTangents,
-    end_state: StageState,
-    state_tangents: Array,
-    integrator_state: IntegratorState,
-    event_guard_index: Array,
-) -> Array:
-    """Return the tangent of the event's time, s, shape (directions, batch).
-
-    The tangent follows from the condition that the guard is zero at the event of the perturbed
-    motion.
-    """
-
-    def evaluate_perturbed_guards(
-        phase_constants: Any, held_constants: Vector, q: Vector, v: Vector
-    ) -> Vector:
-        phase = make_phase(phase_constants, held_constants)
-        return phase.evaluate_guards(phase.make_state(q, v))
-
-    make_phase = phase_tangents.make_phase
-    phase = make_phase(phase_tangents.phase_constants, phase_tangents.held_constants)
-    _, guard_rates = phase.evaluate_with_rates(phase.evaluate_guards, end_state)
-    guard_tangents = phase_tangents.evaluate_tangents(
-        evaluate_perturbed_guards, end_state, state_tangents
-    )
-    event_time_tangent = jnp.zeros_like(integrator_state.next_step_length)
-    for candidate_guard_index, (guard_rate, guard_tangent) in enumerate(
-        zip(guard_rates, guard_tangents, strict=True)
-    ):
-        is_event_guard = (
-            integrator_state.has_guard_crossed
-            & (event_guard_index == candidate_guard_index)
-            & (guard_rate < 0.0)
-        )
-        event_time_tangent = jnp.where(
-            is_event_guard,
-            -guard_tangent / jnp.where(is_event_guard, guard_rate, -1.0),
-            event_time_tangent,
-        )
-    return event_time_tangent
-
-
 def _integrate_to_event(
     make_phase: MakeBatchPhase,
     tableau: ButcherTableau,
@@ -252,8 +206,11 @@ def _integrate_to_event(
     initial_dt: Array,
     options: StepOptions,
     straggler_count: Array | None,
-) -> _PhaseIntegrationResult:
-    """Return the end of a phase with all intermediate results, for each batch element."""
+) -> tuple[BatchPhaseEnd, Any]:
+    """Return the end of a phase for each batch element, and its tangents.
+
+    The tangents are those of `_compute_phase_end_jvp`; None without `phase_tangents`.
+    """
     phase = make_phase(phase_constants, held_constants)
     phase = _wrap_each_phase_function(
         phase, mark_noinline if phase.is_compiled_separately else jax.jit
@@ -300,15 +257,14 @@ def _integrate_to_event(
     )
     margin_minima_state, margin_minima_result = integrator_state.margin_minima_state, None
     if margin_minima_state is not None:
-        tried_solver_step = TriedSolverStep(
+        margin_minima_state = update_margin_minima_state(
+            phase,
+            margin_minima_state,
             integrator_state.state,
             end_state,
             event_search.event_step_length,
             has_guard_crossed,
             integrator_state.state_tangents,
-        )
-        margin_minima_state = update_margin_minima_state(
-            phase, margin_minima_state, tried_solver_step
         )
         margin_minima_result = refine_margin_minima(
             phase,
@@ -341,7 +297,11 @@ def _integrate_to_event(
         if margin_minima_result is None
         else margin_minima_result.phase_margin_minima,
     )
-    return _PhaseIntegrationResult(
+    if phase_tangents is None:
+        return phase_end, None
+    return phase_end, _compute_phase_end_jvp(
+        tableau,
+        phase_tangents,
         solver_step_function,
         start_state,
         phase_end,
@@ -388,15 +348,16 @@ def _integrate_until_crossing(
     def take_one_solver_step(integrator_state: IntegratorState) -> IntegratorState:
         step_length = integrator_state.next_step_length
         stage_states = solver_step_function(integrator_state.state, step_length)
-        stage_guard_values = [
-            phase.evaluate_guards(stage_states[i]) for i in tableau.guard_stage_indices
+        inner_guard_values = [
+            integrator_state.guard_values,
+            *(phase.evaluate_guards(stage_states[i]) for i in tableau.guard_stage_indices),
         ]
         end_guard_values = phase.evaluate_guards(stage_states[-1])
         mean_squared_error = _compute_mean_squared_error(
             tableau, stage_states, step_length, end_guard_values, options, phase.state_units
         )
         guard_minimum_fraction = find_earliest_guard_minimum_fraction(
-            tableau, [integrator_state.guard_values, *stage_guard_values, end_guard_values]
+            tableau, [*inner_guard_values, end_guard_values]
         )
         is_within_tolerance = mean_squared_error <= 1.0
         # A step inside which a guard may be negative is repeated up to the guard's minimum.
@@ -416,25 +377,23 @@ def _integrate_until_crossing(
             (stage_states[-1], end_guard_values),
             (integrator_state.state, integrator_state.guard_values),
         )
-        middle_guard_values = (
-            stage_guard_values[tableau.guard_stage_indices.index(tableau.middle_stage_index)]
-            if stage_guard_values
-            else integrator_state.guard_values
-        )
         middle_guard_values, end_guard_values = select_trees_by_condition(
             integrator_state.is_running,
-            (middle_guard_values, end_guard_values),
+            (inner_guard_values[tableau.middle_guard_index], end_guard_values),
             (integrator_state.middle_guard_values, integrator_state.end_guard_values),
         )
         margin_minima_state = integrator_state.margin_minima_state
         state_tangents = integrator_state.state_tangents
         n_iterations_until_half_ended = integrator_state.n_iterations_until_half_ended
         if margin_minima_state is not None:
-            tried_solver_step = TriedSolverStep(
-                integrator_state.state, stage_states[-1], step_length, is_accepted, state_tangents
-            )
             margin_minima_state = update_margin_minima_state(
-                phase, margin_minima_state, tried_solver_step
+                phase,
+                margin_minima_state,
+                integrator_state.state,
+                stage_states[-1],
+                step_length,
+                is_accepted,
+                state_tangents,
             )
         if phase_tangents is not None and state_tangents is not None:
             state_tangents = phase_tangents.propagate_if_accepted(

@@ -7,7 +7,7 @@ another.
 """
 
 import functools
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -78,21 +78,20 @@ def init_margin_minima_state(
     )
 
 
-class TriedSolverStep(NamedTuple):
-    """Solver step of all batch elements, and whether each element accepts the step."""
-
-    start_state: StageState
-    end_state: StageState
-    step_length: Array
-    is_accepted: Array
-    step_start_tangents: Array | None  # tangents of the step's start
-
-
 def update_margin_minima_state(
-    phase: BatchPhase, margin_minima_state: MarginMinimaState, tried_solver_step: TriedSolverStep
+    phase: BatchPhase,
+    margin_minima_state: MarginMinimaState,
+    step_start: StageState,
+    step_end: StageState,
+    step_length: Array,
+    is_accepted: Array,
+    step_start_tangents: Array | None,
 ) -> MarginMinimaState:
-    """Return the lowest interior minima after one more accepted solver step."""
-    step_start, step_end, step_length, is_accepted, step_start_tangents = tried_solver_step
+    """Return the lowest interior minima after one more solver step.
+
+    - `is_accepted`: whether each batch element accepts the step;
+    - `step_start_tangents`: tangents of the step's start.
+    """
     margin_values, margin_rates = map(
         jnp.stack, phase.evaluate_with_rates(phase.evaluate_margins, step_end)
     )
@@ -291,16 +290,11 @@ def compute_margin_minima_jvp(
     no first-order effect. `start_state` and `end_state` are the states at the start and at the end
     of the phase, and `end_tangents` are the tangents of the end state.
     """
-    make_phase = phase_tangents.make_phase
-    phase = make_phase(phase_tangents.phase_constants, phase_tangents.held_constants)
-
-    def evaluate_margins(
-        phase_constants: Any, held_constants: Vector, q: Vector, v: Vector
-    ) -> Array:
-        phase = make_phase(phase_constants, held_constants)
-        return jnp.stack(phase.evaluate_margins(phase.make_state(q, v)))
-
-    compute_margin_tangents = functools.partial(phase_tangents.evaluate_tangents, evaluate_margins)
+    phase = phase_tangents.make_phase(phase_tangents.phase_constants, phase_tangents.held_constants)
+    compute_margin_tangents = functools.partial(
+        phase_tangents.evaluate_tangents,
+        lambda phase, state: jnp.stack(phase.evaluate_margins(state)),
+    )
 
     def compute_margin_tangent(_: None, margin_scan_inputs: tuple) -> tuple[None, Array]:
         margin_index, margin_minimum_state, step_length = margin_scan_inputs

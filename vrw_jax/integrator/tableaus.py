@@ -37,8 +37,6 @@ class ButcherTableau(NamedTuple):
     squared_stage_matrix: np.ndarray  # A squared: from accelerations to positions
     rate_error_weights: np.ndarray
     position_error_weights: np.ndarray
-    middle_stage_index: int
-    """Index of a stage near the middle of the solver step, used to fit parabolas to guards."""
     guard_stage_indices: tuple[int, ...]
     """Indices of the stages at which guards are evaluated to find minima inside a solver step.
 
@@ -50,6 +48,12 @@ class ButcherTableau(NamedTuple):
     The guard values are those at the start, at `guard_stage_indices` and at the end. The polynomial
     through these values does not fall below its smallest coefficient.
     """
+    middle_guard_index: int
+    """Index of the guard value near the middle of the solver step, used to fit parabolas to guards.
+
+    The guard values are those at the start and at `guard_stage_indices`.
+    """
+    middle_node: float  # time of this value, in step lengths
 
     def __eq__(self, other: object) -> bool:
         return self is other  # `load_explicit_tableau` creates each tableau once.
@@ -79,8 +83,22 @@ def load_explicit_tableau(solver_name: str) -> ButcherTableau | None:
     if not has_step_end_stage:
         stage_matrix[n_stages, :n_stages] = tableau_entry["b_sol"]
     stage_nodes = stage_matrix.sum(axis=1)
-    guard_stage_indices = _choose_guard_stages(stage_nodes)
+    # Of several stages at one node, the last stage is the most accurate.
+    last_stage_at_node = {
+        round(float(stage_node), 3): i
+        for i, stage_node in enumerate(stage_nodes)
+        if 0.05 < stage_node < 0.95
+    }
+    nearest_nodes = {
+        min((abs(stage_node - guard_node), stage_node) for stage_node in last_stage_at_node)[1]
+        for guard_node in GUARD_STAGE_NODES
+        if last_stage_at_node
+    }
+    guard_stage_indices = tuple(last_stage_at_node[node] for node in sorted(nearest_nodes))
     guard_nodes = np.array([0.0, *stage_nodes[list(guard_stage_indices)], 1.0])
+    middle_guard_index = min(
+        range(1, len(guard_nodes) - 1), key=lambda i: abs(guard_nodes[i] - 0.45), default=0
+    )
     polynomial_degree = len(guard_nodes) - 1
     bernstein_basis = [
         math.comb(polynomial_degree, i)
@@ -95,11 +113,10 @@ def load_explicit_tableau(solver_name: str) -> ButcherTableau | None:
         squared_stage_matrix=_set_roundoff_to_zero(stage_matrix @ stage_matrix),
         rate_error_weights=rate_error_weights,
         position_error_weights=_set_roundoff_to_zero(rate_error_weights @ stage_matrix),
-        middle_stage_index=min(
-            guard_stage_indices, key=lambda i: abs(stage_nodes[i] - 0.45), default=0
-        ),
         guard_stage_indices=guard_stage_indices,
         bernstein_matrix=np.linalg.inv(np.stack(bernstein_basis, 1))[1:-1],
+        middle_guard_index=middle_guard_index,
+        middle_node=float(guard_nodes[middle_guard_index]),
     )
 
 
@@ -111,24 +128,6 @@ or before the end is the hardest to detect.
 """
 
 
-def _choose_guard_stages(stage_nodes: np.ndarray) -> tuple[int, ...]:
-    """Return the indices of the stages nearest to GUARD_STAGE_NODES.
-
-    Of several stages at one node, the last stage is chosen, because it is the most accurate.
-    """
-    last_stage_at_node = {
-        round(float(stage_node), 3): i
-        for i, stage_node in enumerate(stage_nodes)
-        if 0.05 < stage_node < 0.95
-    }
-    nearest_nodes = {
-        min((abs(stage_node - guard_node), stage_node) for stage_node in last_stage_at_node)[1]
-        for guard_node in GUARD_STAGE_NODES
-        if last_stage_at_node
-    }
-    return tuple(last_stage_at_node[stage_node] for stage_node in sorted(nearest_nodes))
-
-
 def fit_guard_parabola(
     tableau: ButcherTableau,
     start_guard_value: Array,
@@ -138,12 +137,12 @@ def fit_guard_parabola(
     """Return the quadratic and linear coefficients of the parabola through three values of a guard.
 
     The variable of the parabola is the fraction of the solver step. `middle_guard_value` is the
-    guard at the stage `middle_stage_index`.
+    guard at `middle_guard_index`.
     """
-    middle_node = float(tableau.stage_nodes[tableau.middle_stage_index])
-    quadratic_coefficient = (
-        end_guard_value - start_guard_value - (middle_guard_value - start_guard_value) / middle_node
-    ) / (1.0 - middle_node)
+    middle_slope = (middle_guard_value - start_guard_value) / tableau.middle_node
+    quadratic_coefficient = (end_guard_value - start_guard_value - middle_slope) / (
+        1.0 - tableau.middle_node
+    )
     return quadratic_coefficient, end_guard_value - start_guard_value - quadratic_coefficient
 
 

@@ -224,8 +224,11 @@ def _compute_stage_jacobians(
         n = (len(packed_state) - 2) // 3
         state_components = tuple(packed_state)
         sin, cos, *accelerations = state_components[2 * n :]
-        acceleration = StageAccelerations(sin, cos, tuple(accelerations))
-        stage_state = StageState(state_components[:n], state_components[n : 2 * n], acceleration)
+        stage_state = StageState(
+            state_components[:n],
+            state_components[n : 2 * n],
+            StageAccelerations(sin, cos, tuple(accelerations)),
+        )
         implicit_dynamics = make_phase(phase_constants, held_constants).implicit_dynamics
         implicit_dynamics = ImplicitDynamics(*[jax.jit(f) for f in implicit_dynamics])
         evaluate_residual = lambda *constants: make_phase(
@@ -234,22 +237,29 @@ def _compute_stage_jacobians(
         compute_acceleration_derivative = lambda *tangent: _solve_acceleration(
             implicit_dynamics, stage_state, jax.jvp(evaluate_residual, *tangent)[1]
         )
-        zero_phase_constants = jax.tree.map(jnp.zeros_like, phase_constants)
-        jacobian_columns = [
-            jnp.stack(
-                _compute_acceleration_tangent(
-                    implicit_dynamics, stage_state, unit_vector[:n], unit_vector[n:]
-                )
+        zero_phase_constants, zero_held_constants, zero_accelerations = jax.tree.map(
+            jnp.zeros_like, (phase_constants, held_constants, tuple(accelerations))
+        )
+        jacobian_columns = []
+        for unit_vector in _make_unit_vectors((*stage_state.q, *stage_state.v)):
+            unit_theta = unit_vector[0]
+            state_tangent = StageState(
+                unit_vector[:n],
+                unit_vector[n:],
+                StageAccelerations(cos * unit_theta, -sin * unit_theta, zero_accelerations),
             )
-            for unit_vector in _make_unit_vectors((*stage_state.q, *stage_state.v))
-        ]
+            _, residual_tangent = jax.jvp(
+                implicit_dynamics.evaluate_residual, (stage_state,), (state_tangent,)
+            )
+            jacobian_columns.append(
+                _solve_acceleration(implicit_dynamics, stage_state, residual_tangent)
+            )
         jacobian_columns += [
             compute_acceleration_derivative(
                 (phase_constants, held_constants), (zero_phase_constants, unit_vector)
             )
             for unit_vector in _make_unit_vectors(held_constants)
         ]
-        zero_held_constants = tuple(jnp.zeros_like(x) for x in held_constants)
         differentiate_by_phase_constants = lambda phase_constants_direction: (
             compute_acceleration_derivative(
                 (phase_constants, held_constants), (phase_constants_direction, zero_held_constants)
@@ -282,26 +292,6 @@ def _make_unit_vectors(template_state: Vector) -> list[Vector]:
     return [
         tuple(jnp.full_like(template_state[j], float(i == j)) for j in range(n)) for i in range(n)
     ]
-
-
-def _compute_acceleration_tangent(
-    implicit_dynamics: ImplicitDynamics,
-    state: StageState,
-    position_tangent: Vector,
-    rate_tangent: Vector,
-) -> Vector:
-    """Return the tangent of the accelerations for given tangents of positions and rates."""
-    sin, cos, acceleration = state.acceleration
-    zero_accelerations = tuple(jnp.zeros_like(x) for x in acceleration)
-    state_tangent = StageState(
-        position_tangent,
-        rate_tangent,
-        StageAccelerations(
-            cos * position_tangent[0], -sin * position_tangent[0], zero_accelerations
-        ),
-    )
-    _, residual_tangent = jax.jvp(implicit_dynamics.evaluate_residual, (state,), (state_tangent,))
-    return tuple(_solve_acceleration(implicit_dynamics, state, residual_tangent))
 
 
 def _solve_acceleration(
@@ -452,18 +442,26 @@ class PhaseTangents(NamedTuple):
         )
 
     def evaluate_tangents(
-        self, evaluate_function: Callable[..., Any], state: StageState, directions: Array
+        self,
+        evaluate_function: Callable[[BatchPhase, StageState], Any],
+        state: StageState,
+        directions: Array,
     ) -> Any:
-        """Return the tangents of `evaluate_function(phase_constants, held_constants, q, v)` at a
-        state.
+        """Return the tangents of a function of phase and state, for tangents of a state.
 
         The first axis of the result contains the directions.
         """
+
+        def evaluate_for_constants(
+            phase_constants: Any, held_constants: Vector, q: Vector, v: Vector
+        ) -> Any:
+            phase = self.make_phase(phase_constants, held_constants)
+            return evaluate_function(phase, phase.make_state(q, v))
+
         n, direction_components = len(state.q), tuple(jnp.moveaxis(directions, 1, 0))
-        primals = self.phase_constants, self.held_constants, state.q, state.v
         return compute_each_jvp(
-            evaluate_function,
-            primals,
+            evaluate_for_constants,
+            (self.phase_constants, self.held_constants, state.q, state.v),
             (
                 self.phase_constants_tangents,
                 direction_components[2 * n :],
