@@ -19,6 +19,7 @@ from vrw_jax.contact.dynamics_jvp import (
     ContactConfiguration,
     WheelForceSolution,
     compute_slip_signs,
+    find_slot_contacts,
     solve_contact_forces,
 )
 from vrw_jax.contact.mechanics import (
@@ -33,10 +34,8 @@ from vrw_jax.contact.mechanics import (
     compute_foot_heights,
     compute_free_leg_acceleration,
     compute_leg_directions,
-    find_contact_slots,
     make_opaque_one,
     prevent_fusion,
-    select_slot_friction,
     stop_gradients,
     sum_over_legs,
 )
@@ -106,12 +105,12 @@ class ContactModeDynamics(NamedTuple):
 
     s: Symbols
     friction: SlotArray  # friction coefficient of the feet in the contact slots
-    has_one_sided_stoppers: bool  # whether legs in the air may leave their stoppers
-    contact_state: ContactState
     contact_slots: ContactSlots
     slot_modes: Int[Array, "2"]  # `ContactMode` of the foot in each contact slot
     is_stopper_holding: Bool[Array, "2"]  # whether the leg in each contact slot is on its stopper
     is_airborne_leg_locked: Bool[Array, " n_legs"]  # whether a leg is in the air on its stopper
+    has_one_sided_stoppers: bool  # whether legs in the air may leave their stoppers
+    contact_state: ContactState
     has_accumulators: bool  # whether a batch integrates the accumulators
     tilt: Elementwise | None = None  # angle by which the next line is steeper, rad
 
@@ -127,13 +126,15 @@ class ContactModeDynamics(NamedTuple):
 
     def configure_contacts(self, motion: WheelMotion) -> ContactConfiguration:
         """Return the contact configuration for this motion, from which the forces are computed."""
-        contact_slots = (
+        return ContactConfiguration(
+            self.s,
+            motion,
+            self.friction,
             self.contact_slots,
             self.slot_modes,
             self.is_stopper_holding,
             self.is_airborne_leg_locked,
         )
-        return ContactConfiguration(self.s, motion, self.friction, *contact_slots)
 
 
 def make_contact_mode_dynamics(
@@ -152,20 +153,11 @@ def make_contact_mode_dynamics(
     - `has_accumulators`: whether losses and slip are integrated together with the motion;
     - `tilt`: angle by which the next straight line of uneven ground is steeper, rad.
     """
-    contact_slots = find_contact_slots(contact_state.contact_modes != ContactMode.OFF)
-    slot_modes = contact_slots.gather_from_legs(contact_state.contact_modes)
-    is_stopper_holding = contact_slots.gather_flags_from_legs(contact_state.is_leg_locked)
-    is_airborne_leg_locked = contact_state.is_leg_locked & ~contact_slots.is_in_slot
-    friction = select_slot_friction(friction, contact_slots)
     return ContactModeDynamics(
         s,
-        friction,
+        *find_slot_contacts(friction, *contact_state[:2]),
         has_one_sided_stoppers,
         contact_state,
-        contact_slots,
-        slot_modes,
-        is_stopper_holding,
-        is_airborne_leg_locked,
         has_accumulators,
         tilt,
     )
@@ -463,27 +455,7 @@ def evaluate_guards(
     replace_if_not_evaluated = lambda is_evaluated, guard_value: jnp.where(
         is_evaluated, guard_value, 1.0
     )
-    airborne_guards = (
-        []
-        if contact_quantities.airborne_stopper_forces is None
-        else [
-            replace_if_not_evaluated(
-                contact_mode_dynamics.is_airborne_leg_locked,
-                contact_quantities.airborne_stopper_forces,
-            )
-        ]
-    )
-    force_rate_guards = (
-        []
-        if contact_quantities.force_rates is None or contact_state.force_rate_signs is None
-        else [
-            replace_if_not_evaluated(
-                _flag_varying_forces(contact_mode_dynamics),
-                contact_state.force_rate_signs * contact_quantities.force_rates,
-            )
-        ]
-    )
-    return [
+    guards = [
         replace_if_not_evaluated(
             is_airborne,
             compute_foot_heights(
@@ -506,9 +478,22 @@ def evaluate_guards(
         ),
         motion.dtheta[None],
         (jnp.min(motion.L, axis=0) - s.a)[None],
-        *airborne_guards,
-        *force_rate_guards,
     ]
+    if contact_quantities.airborne_stopper_forces is not None:
+        guards.append(
+            replace_if_not_evaluated(
+                contact_mode_dynamics.is_airborne_leg_locked,
+                contact_quantities.airborne_stopper_forces,
+            )
+        )
+    if contact_quantities.force_rates is not None and contact_state.force_rate_signs is not None:
+        guards.append(
+            replace_if_not_evaluated(
+                _flag_varying_forces(contact_mode_dynamics),
+                contact_state.force_rate_signs * contact_quantities.force_rates,
+            )
+        )
+    return guards
 
 
 def _flag_varying_forces(contact_mode_dynamics: ContactModeDynamics) -> Array:
@@ -543,20 +528,14 @@ def compute_guard_scales(contact_mode_dynamics: ContactModeDynamics) -> Array:
 
 def compute_state_units(s: Symbols) -> tuple[Array, Array]:
     """Return the wheel's units for (hub x, hub z, theta, leg lengths) and for their rates."""
-    wheel_units, angle_unit = compute_wheel_units(s), jnp.ones_like(s.L0)
-    position_units = [
-        wheel_units.length_unit,
-        wheel_units.length_unit,
-        angle_unit,
-        *[wheel_units.length_unit] * s.n,
-    ]
-    rate_units = [
-        wheel_units.velocity_unit,
-        wheel_units.velocity_unit,
-        wheel_units.rate_unit,
-        *[wheel_units.velocity_unit] * s.n,
-    ]
-    return jnp.stack(position_units), jnp.stack(rate_units)
+    wheel_units = compute_wheel_units(s)
+    stack_units = lambda linear_unit, angular_unit: jnp.stack(
+        [linear_unit, linear_unit, angular_unit, *[linear_unit] * s.n]
+    )
+    return (
+        stack_units(wheel_units.length_unit, jnp.ones_like(s.L0)),
+        stack_units(wheel_units.velocity_unit, wheel_units.rate_unit),
+    )
 
 
 def is_wheel_at_rest(
@@ -616,14 +595,8 @@ def compute_packed_units(s: Symbols) -> PackedState:
         wheel_units.energy_unit,
         wheel_units.length_unit,
     )
-    packed_units = (
-        position_units[:3],
-        rate_units[:3],
-        position_units[3:],
-        rate_units[3:],
-        jnp.stack(accumulator_units),
-    )
-    return lax.stop_gradient(jnp.concatenate(packed_units))
+    motion_units = position_units[:3], rate_units[:3], position_units[3:], rate_units[3:]
+    return lax.stop_gradient(jnp.concatenate([*motion_units, jnp.stack(accumulator_units)]))
 
 
 def compute_guard_values(

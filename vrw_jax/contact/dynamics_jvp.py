@@ -18,16 +18,19 @@ from vrw_jax.contact.mechanics import (
     ContactInverseInertia,
     ContactSlots,
     FreeMotion,
+    Friction,
     HubVector,
     LegArray,
     SlotArray,
     WheelMotion,
     compute_free_acceleration,
     compute_free_velocity,
+    find_contact_slots,
     make_inverse_inertia,
     make_opaque_one,
     multiply_by_inverse_inertia,
     prevent_fusion,
+    select_slot_friction,
     sum_over_legs,
 )
 from vrw_jax.numerics import with_default_jax_settings
@@ -51,6 +54,26 @@ class ContactConfiguration(NamedTuple):
         return self.is_airborne_leg_locked | (
             self.contact_slots.scatter_to_legs(self.is_stopper_holding) > 0
         )
+
+
+def find_slot_contacts(
+    friction: Friction | float, contact_modes: Array, is_leg_locked: Array
+) -> tuple[SlotArray, ContactSlots, Array, Array, Array]:
+    """Return the last five fields of `ContactConfiguration` for the contacts of all legs.
+
+    - `friction`: friction coefficient for all feet, or a pair for the foot that landed last and for
+      all other feet;
+    - `contact_modes`, `is_leg_locked`: `ContactMode` of every foot, and whether each leg is on its
+      stopper.
+    """
+    contact_slots = find_contact_slots(contact_modes != ContactMode.OFF)
+    return (
+        select_slot_friction(friction, contact_slots),
+        contact_slots,
+        contact_slots.gather_from_legs(contact_modes),
+        contact_slots.gather_flags_from_legs(is_leg_locked),
+        is_leg_locked & ~contact_slots.is_in_slot,
+    )
 
 
 class WheelForceSolution(NamedTuple):
@@ -140,15 +163,7 @@ def solve_contact_configuration(
         0.0,
         outward_leg_motion - contact_slots.scatter_to_legs(slot_solution.leg_pull_forces) / s.m,
     )
-    force_pairs = (
-        slot_solution.tangential_forces,
-        slot_solution.normal_forces,
-        slot_solution.stopper_forces,
-        slot_solution.leg_pull_forces,
-    )
-    return WheelForceSolution(
-        *force_pairs, slot_solution.hub_motion, slot_solution.painleve_determinant, length_motion
-    )
+    return WheelForceSolution(*slot_solution[:5], slot_solution.painleve_determinant, length_motion)
 
 
 def _solve_with_free_motion(
@@ -158,21 +173,15 @@ def _solve_with_free_motion(
     s, motion, _, contact_slots, _, _, is_airborne_leg_locked = contact_configuration
     opaque_one = make_opaque_one(motion.theta)
     inverse_inertia = prevent_fusion(
-        make_inverse_inertia(s, motion, contact_slots, is_airborne_leg_locked),
-        opaque_one,
+        make_inverse_inertia(s, motion, contact_slots, is_airborne_leg_locked), opaque_one
     )
     free_motion = prevent_fusion(
-        free_motion_fn(s, motion, contact_slots, inverse_inertia),
-        opaque_one,
+        free_motion_fn(s, motion, contact_slots, inverse_inertia), opaque_one
     )
-    return (
-        inverse_inertia,
-        free_motion,
-        prevent_fusion(
-            solve_contact_configuration(contact_configuration, inverse_inertia, free_motion),
-            opaque_one,
-        ),
+    force_solution = solve_contact_configuration(
+        contact_configuration, inverse_inertia, free_motion
     )
+    return inverse_inertia, free_motion, prevent_fusion(force_solution, opaque_one)
 
 
 def _solve_with_jvp_rule(
@@ -204,56 +213,44 @@ def _solve_with_jvp_rule(
         inverse_inertia, free_motion, force_solution = _solve_with_free_motion(
             free_motion_fn, contact_configuration
         )
-        residual_tangent = _compute_residual_tangent(
-            contact_configuration,
-            configuration_tangent,
-            inverse_inertia,
-            force_solution,
-            *equation_tangent_fn(
-                contact_configuration, configuration_tangent, inverse_inertia, force_solution
-            ),
-        )
-        free_motion_tangents = _compute_free_motion_tangent(
-            contact_configuration.contact_slots, inverse_inertia, residual_tangent
+        free_motion_tangent, friction_force_tangents, leg_pull_tangents = (
+            _compute_free_motion_tangent(
+                contact_configuration,
+                configuration_tangent,
+                inverse_inertia,
+                force_solution,
+                *equation_tangent_fn(
+                    contact_configuration, configuration_tangent, inverse_inertia, force_solution
+                ),
+            )
         )
         _, solution_tangent = jax.jvp(
             lambda free_motion: solve_contact_configuration(
                 contact_configuration, inverse_inertia, free_motion
             ),
             (free_motion,),
-            (free_motion_tangents,),
+            (free_motion_tangent,),
         )
         return force_solution, solution_tangent._replace(
-            tangential_forces=solution_tangent.tangential_forces + residual_tangent.friction_force,
-            leg_pull_forces=solution_tangent.leg_pull_forces + residual_tangent.leg_pull_forces,
+            tangential_forces=solution_tangent.tangential_forces + friction_force_tangents,
+            leg_pull_forces=solution_tangent.leg_pull_forces + leg_pull_tangents,
         )
 
     return solve_from_arrays(float_leaves, nonfloat_arrays)
 
 
-class _ResidualTangent(NamedTuple):
-    """Tangent of the residual of the contact equations, with one entry per leg or contact slot."""
-
-    leg_length_residual: LegArray  # effect on each leg's length
-    hub_residual_by_leg: tuple[
-        LegArray, LegArray, LegArray
-    ]  # effect of each leg on the hub's equations
-    hub_residual_without_legs: HubVector  # effect on the hub's equations without the legs
-    foot_transverse_motion: SlotArray
-    foot_radial_motion: SlotArray
-    friction_force: SlotArray  # tangent of the friction force by its coefficient
-    leg_pull_forces: SlotArray  # tangent due to friction and rotation of the legs in contact
-
-
-def _compute_residual_tangent(
+def _compute_free_motion_tangent(
     contact_configuration: ContactConfiguration,
     configuration_tangent: ContactConfiguration,
     inverse_inertia: ContactInverseInertia,
     force_solution: WheelForceSolution,
     constant_motion_terms: _ConstantMotionTerms,
     equation_tangents: _EquationTangents,
-) -> _ResidualTangent:
-    """Return the tangent of the contact equations' residual for a tangent of the configuration.
+) -> tuple[FreeMotion, SlotArray, SlotArray]:
+    """Return the tangent of the free motion that is equivalent to the tangent of the residual.
+
+    The residual is that of the contact equations. The result is (free motion, friction forces by
+    their coefficient, pull forces of the legs in contact by friction and rotation).
 
     - `configuration_tangent`: tangent of the configuration;
     - `constant_motion_terms`: accelerations or velocity jumps that are treated as constants;
@@ -271,7 +268,7 @@ def _compute_residual_tangent(
     friction_force_tangents = -compute_slip_signs(slot_modes) * friction_coefficient_tangent * n
     transverse_forces = t * slot_cos - n * slot_sin
     radial_forces = t * slot_sin + n * slot_cos
-    leg_pull_tangent = friction_force_tangents * slot_sin + transverse_forces * dtheta
+    leg_pull_tangents = friction_force_tangents * slot_sin + transverse_forces * dtheta
     foot_moments = contact_slots.gather_from_legs(
         motion_tangent.L
     ) * transverse_forces + inverse_inertia.L * (
@@ -296,7 +293,7 @@ def _compute_residual_tangent(
         length_tangent
         + (
             equation_tangents.spring_force
-            - contact_slots.scatter_to_legs(leg_pull_tangent)
+            - contact_slots.scatter_to_legs(leg_pull_tangents)
             + (radial_hub_motion - constant_motion_terms.radial_leg_motion) * ds.m
         )
         / s.m
@@ -317,60 +314,41 @@ def _compute_residual_tangent(
         - cos * hub_motion_tangent_x
         + sin * hub_motion_tangent_z
     )
-    return _ResidualTangent(
-        leg_length_residual=length_tangent,
-        hub_residual_by_leg=(
-            s.m
-            * (radial_tangent * sin + equation_tangents.transverse_leg_motion * cos + z * dtheta)
-            + ds.m * x,
-            s.m
-            * (radial_tangent * cos - equation_tangents.transverse_leg_motion * sin - x * dtheta)
-            + ds.m * z,
-            -s.m * leg_torque
-            - ds.m * (b * transverse_residual)
-            - contact_slots.scatter_to_legs(foot_moments),
-        ),
-        hub_residual_without_legs=(
+    force_x_by_leg = (
+        s.m * (radial_tangent * sin + equation_tangents.transverse_leg_motion * cos + z * dtheta)
+        + ds.m * x
+    )
+    force_z_by_leg = (
+        s.m * (radial_tangent * cos - equation_tangents.transverse_leg_motion * sin - x * dtheta)
+        + ds.m * z
+    )
+    torque_by_leg = (
+        -s.m * leg_torque
+        - ds.m * (b * transverse_residual)
+        - contact_slots.scatter_to_legs(foot_moments)
+    )
+    hub_residual = (
+        sum_over_legs(force_x_by_leg)
+        + (
             friction_force_tangents[0]
             + friction_force_tangents[1]
             - ds.Mt * hub_motion_x
-            - s.Mt * hub_motion_tangent_x,
-            -ds.Mt * hub_motion_z - s.Mt * hub_motion_tangent_z,
-            0.0,
+            - s.Mt * hub_motion_tangent_x
         ),
-        foot_transverse_motion=equation_tangents.foot_transverse_motion,
-        foot_radial_motion=equation_tangents.foot_radial_motion,
-        friction_force=friction_force_tangents,
-        leg_pull_forces=leg_pull_tangent,
+        sum_over_legs(force_z_by_leg) + (-ds.Mt * hub_motion_z - s.Mt * hub_motion_tangent_z),
+        sum_over_legs(torque_by_leg),
     )
-
-
-def _compute_free_motion_tangent(
-    contact_slots: ContactSlots,
-    inverse_inertia: ContactInverseInertia,
-    residual_tangent: _ResidualTangent,
-) -> FreeMotion:
-    """Return the tangent of the free motion that is equivalent to the tangent of the residual."""
-    x, z, rotation = (
-        sum_over_legs(residual_by_leg) + residual_without_legs
-        for residual_by_leg, residual_without_legs in zip(
-            residual_tangent.hub_residual_by_leg,
-            residual_tangent.hub_residual_without_legs,
-            strict=True,
-        )
-    )
-    hub_motion_tangent = multiply_by_inverse_inertia(
-        inverse_inertia.inverse_inertia, (x, z, rotation)
-    )
-    slot_length_tangents = contact_slots.gather_from_legs(residual_tangent.leg_length_residual)
-    return FreeMotion(
+    hub_motion_tangent = multiply_by_inverse_inertia(inverse_inertia.inverse_inertia, hub_residual)
+    slot_length_tangents = contact_slots.gather_from_legs(length_tangent)
+    free_motion_tangent = FreeMotion(
         hub_motion_tangent,
-        residual_tangent.leg_length_residual,
+        length_tangent,
         slot_length_tangents,
         inverse_inertia.compute_transverse_foot_motion(hub_motion_tangent)
-        + residual_tangent.foot_transverse_motion,
-        residual_tangent.foot_radial_motion - slot_length_tangents,
+        + equation_tangents.foot_transverse_motion,
+        equation_tangents.foot_radial_motion - slot_length_tangents,
     )
+    return free_motion_tangent, friction_force_tangents, leg_pull_tangents
 
 
 def _compute_motion_equation_tangents(

@@ -27,6 +27,7 @@ from vrw_jax.contact.contact_state import ContactState, GuardLayout
 from vrw_jax.contact.dynamics_jvp import (
     ContactConfiguration,
     WheelForceSolution,
+    find_slot_contacts,
     solve_contact_configuration,
     solve_contact_forces,
     solve_impact,
@@ -533,10 +534,10 @@ def _solve_acceleration_level(
     `is_release_consistent`).
     """
     contact_law, motion = stop_gradients((contact_law, motion))
-    s, contact_slots = contact_law.s, find_contact_slots(contact_modes != ContactMode.OFF)
-    friction = select_slot_friction(contact_law.friction, contact_slots)
-    slot_modes = contact_slots.gather_from_legs(contact_modes)
-    is_slot_locked = contact_slots.gather_flags_from_legs(is_at_stopper)
+    s = contact_law.s
+    friction, contact_slots, slot_modes, is_slot_locked, is_airborne_leg_locked = (
+        find_slot_contacts(contact_law.friction, contact_modes, is_at_stopper)
+    )
     was_resting = (slot_modes == ContactMode.STICK) | contact_event.is_stopping_to_slide
     # When such a foot is released, its tangential force jumps to zero.
     follows_paper_rule = (slot_modes == ContactMode.STICK) & (friction == PAPER_RULE_SENTINEL)
@@ -612,7 +613,6 @@ def _solve_acceleration_level(
             chosen_combination, force_solution, s.m * outward_leg_motion, outward_leg_motion, motion
         )
 
-    is_airborne_leg_locked = is_at_stopper & ~contact_slots.is_in_slot
     level_solution, is_held_airborne = _solve_stopper_lcp(
         solve_kinematic_level,
         contact_law,
@@ -743,28 +743,19 @@ def _replace_liftoff_by_slip(
     tangential force.
     """
     contact_law, motion = stop_gradients((contact_law, motion))
-    contact_slots = find_contact_slots(contact_state.contact_modes != ContactMode.OFF)
-    friction = select_slot_friction(contact_law.friction, contact_slots)
-    slot_modes = contact_slots.gather_from_legs(contact_state.contact_modes)
+    contact_configuration = ContactConfiguration(
+        contact_law.s, motion, *find_slot_contacts(contact_law.friction, *contact_state[:2])
+    )
     is_starting_to_slide = (
         contact_event.is_foot_lifting_off
-        & (slot_modes == ContactMode.STICK)
-        & (friction == jnp.inf)
-    )
-    slot_modes_and_stoppers = (
-        contact_slots,
-        slot_modes,
-        contact_slots.gather_flags_from_legs(contact_state.is_leg_locked),
-        contact_state.is_leg_locked & ~contact_slots.is_in_slot,
-    )
-    tangential_forces = lambda _: (
-        solve_contact_forces(
-            ContactConfiguration(contact_law.s, motion, friction, *slot_modes_and_stoppers)
-        ).tangential_forces
+        & (contact_configuration.slot_modes == ContactMode.STICK)
+        & (contact_configuration.friction == jnp.inf)
     )
     is_force_uphill = (
         run_if_any_element_active(
-            jnp.any(is_starting_to_slide), tangential_forces, jnp.zeros_like(friction)
+            jnp.any(is_starting_to_slide),
+            lambda _: solve_contact_forces(contact_configuration).tangential_forces,
+            jnp.zeros_like(contact_configuration.friction),
         )
         > 0.0
     )
@@ -906,23 +897,15 @@ def project_motion(
         (contact_modes != ContactMode.OFF) & ~is_leg_locked, motion.z / leg_directions.cos, motion.L
     )
     motion = motion._replace(L=jnp.where(is_leg_locked, s.L0, L))
-    contact_slots = find_contact_slots(contact_modes != ContactMode.OFF)
-    is_airborne_leg_locked = is_leg_locked & ~contact_slots.is_in_slot
-    slot_modes = contact_slots.gather_from_legs(contact_modes)
-    is_stopper_holding = contact_slots.gather_flags_from_legs(is_leg_locked)
-    # Two resting feet on two held legs would constrain the hub twice.
-    is_overdetermined = jnp.all((slot_modes == ContactMode.STICK) & is_stopper_holding, axis=0)
-    is_stopper_holding = jnp.stack(
-        [is_stopper_holding[0], is_stopper_holding[1] & ~is_overdetermined]
-    )
     contact_configuration = ContactConfiguration(
-        s,
-        motion,
-        select_slot_friction(friction, contact_slots),
-        contact_slots,
-        slot_modes,
-        is_stopper_holding,
-        is_airborne_leg_locked,
+        s, motion, *find_slot_contacts(friction, contact_modes, is_leg_locked)
+    )
+    is_sticking = contact_configuration.slot_modes == ContactMode.STICK
+    is_first_held, is_second_held = contact_configuration.is_stopper_holding
+    # Two resting feet on two held legs would constrain the hub twice.
+    is_overdetermined = jnp.all(is_sticking & contact_configuration.is_stopper_holding, axis=0)
+    contact_configuration = contact_configuration._replace(
+        is_stopper_holding=jnp.stack([is_first_held, is_second_held & ~is_overdetermined])
     )
     projected_motion = _apply_impact_velocities(motion, solve_impact(contact_configuration))
     return projected_motion._replace(dL=jnp.where(is_leg_locked, 0.0, projected_motion.dL))

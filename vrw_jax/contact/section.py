@@ -7,7 +7,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from vrw_jax.contact.contact_state import ContactState
-from vrw_jax.contact.mechanics import WheelMotion, compute_leg_directions
+from vrw_jax.contact.mechanics import (
+    WheelMotion,
+    compute_foot_heights,
+    compute_leg_directions,
+)
 from vrw_jax.models import (
     PAPER_START_STATE,
     is_slope_in_domain,
@@ -103,16 +107,16 @@ def replace_invalid_start(
         # No foot may be below the ground, and no leg longer than its stopper allows. Loaded feet
         # must be on the ground.
         s = params.symbols()
-        theta, (_, z), L, _, contact_modes, _ = _unpack_leg_posture(s, section_state)
-        foot_height = z - L * compute_leg_directions(s, theta).cos
+        motion, contact_state = unpack_section_state(s, section_state)
+        foot_heights = compute_foot_heights(motion, compute_leg_directions(s, motion.theta))
         height_tolerance = PENETRATION_TOLERANCE * s.L0
-        is_contact_consistent = (contact_modes == ContactMode.OFF) | (
-            foot_height <= height_tolerance
+        is_contact_consistent = (contact_state.contact_modes == ContactMode.OFF) | (
+            foot_heights <= height_tolerance
         )
         is_leg_consistent = (
-            (foot_height >= -height_tolerance)
+            (foot_heights >= -height_tolerance)
             & is_contact_consistent
-            & (height_tolerance >= L - s.L0)
+            & (height_tolerance >= motion.L - s.L0)
         )
         is_valid = is_valid & jnp.all(is_leg_consistent, axis=0)
     params, section_state = replace_invalid_inputs(is_valid, params, section_state, valid_column)
@@ -127,14 +131,12 @@ the first events to correct the error.
 """
 
 
-def _unpack_leg_posture(
-    s: Symbols, section_state: FullState
-) -> tuple[Elementwise, tuple, Array, Array, Array, Array]:
-    """Return posture, contact modes and stopper flags from a full section state.
+def unpack_section_state(s: Symbols, section_state: FullState) -> tuple[WheelMotion, ContactState]:
+    """Return the motion and the contact state just before the landing that starts a step.
 
-    The result is (theta in rad, hub position in m, leg lengths in m, their rates in m/s, contact
-    modes, stopper flags). The legs are numbered as in the step that starts. The landing foot is the
-    origin. Lengths of loaded legs are replaced so that their feet are on the slope.
+    The legs are numbered as in the step that starts, and the landing foot is the origin. Lengths of
+    loaded legs are replaced so that their feet are on the slope. Every vector near a section state
+    is therefore valid. The impact at landing brings sticking feet to rest.
     """
     n_legs = s.n
     theta = section_state[0] - s.alpha
@@ -148,22 +150,9 @@ def _unpack_leg_posture(
     is_leg_locked = contact_codes >= LOCKED_CODE_OFFSET
     L = jnp.where(is_leg_locked, s.L0, L)
     leg_directions = compute_leg_directions(s, theta)
-    hub_position = L[0] * leg_directions.sin[0], L[0] * leg_directions.cos[0]
+    hub_x, hub_z = L[0] * leg_directions.sin[0], L[0] * leg_directions.cos[0]
     L = jnp.where(
-        (contact_modes != ContactMode.OFF) & ~is_leg_locked, hub_position[1] / leg_directions.cos, L
-    )
-    return theta, hub_position, L, dL, contact_modes, is_leg_locked
-
-
-def unpack_section_state(s: Symbols, section_state: FullState) -> tuple[WheelMotion, ContactState]:
-    """Return the motion and the contact state just before the landing that starts a step.
-
-    The legs are numbered as in the step that starts, and the landing foot is the origin. Loaded
-    feet are placed on the slope, so that every vector near a section state is valid. The impact at
-    landing brings sticking feet to rest.
-    """
-    theta, (hub_x, hub_z), L, dL, contact_modes, is_leg_locked = _unpack_leg_posture(
-        s, section_state
+        (contact_modes != ContactMode.OFF) & ~is_leg_locked, hub_z / leg_directions.cos, L
     )
     dtheta, vx, vz = section_state[1], section_state[2], section_state[3]
     motion = WheelMotion(hub_x, hub_z, theta, vx, vz, dtheta, L, dL)
