@@ -202,7 +202,7 @@ def _on_ground(wheel: Callable[[Array], WheelParams], n_legs: int) -> dict[str, 
             past.contact_interval_state.contact_state,
         )
         codes = [stance.contact_modes.astype(float), stance.is_leg_locked.astype(float)]
-        step = walk.compute_step_result(after, None)
+        step = walk.compute_step_result(after, columns(parameters, friction))
         result = (
             step.durations, step.step_length, step.post_impact, step.slip, step.energy_impacts,
             step.energy_damping, step.energy_friction,

@@ -353,12 +353,11 @@ def test_independent_rates_and_their_shares_do_not_depend_on_other_batch_element
         np.linalg.qr(method_name[:, : 4 + k % 6])[0] for k, method_name in enumerate(method_names)
     ]
     settled, requested = np.stack([b @ b.T for b in bases]), np.ones((12, 11), bool)
-    joint_result = ground_lanes._IndependentStartRates.from_rate_projection(settled, requested)
+    find_rates = ground_lanes._IndependentStartRates.from_rate_projection
+    joint_result = find_rates(settled, requested, np.ones((12, 11)))
     for k, basis in enumerate(bases):
-        single_result, n = (
-            ground_lanes._IndependentStartRates.from_rate_projection(settled[[k]], requested[[k]]),
-            basis.shape[1],
-        )
+        single_result = find_rates(settled[[k]], requested[[k]], np.ones((1, 11)))
+        n = basis.shape[1]
         weights = single_result.combination_weights[0]
         np.testing.assert_array_equal(joint_result.combination_weights[k], weights)
         assert not weights[n:].any()

@@ -13,7 +13,6 @@ from jaxtyping import Array
 
 from vrw_jax.contact.batch_integrator import pack_coordinates
 from vrw_jax.contact.impacts import project_motion
-from vrw_jax.contact.mechanics import WheelMotion
 from vrw_jax.contact.section import (
     LOCKED_CODE_OFFSET,
     compute_full_section_size,
@@ -121,9 +120,9 @@ def step_batch_with_jacobian(
         rate_units[:, None] / projected_units[:, :, None]
     )
     independent_rates = _IndependentStartRates.from_rate_projection(
-        rate_projection, is_tangent_needed[:, rate_indices]
-    ).convert_weights_to_si(rate_units)
-    is_tangent_needed[:, rate_indices] = independent_rates.flag_independent_rates()
+        rate_projection, is_tangent_needed[:, rate_indices], rate_units
+    )
+    is_tangent_needed[:, rate_indices] = independent_rates.is_independent
     wheel_index, input_index = np.nonzero(is_tangent_needed)
     lane_index, tangent_index_in_wheel, lane_wheels = _pack_tangents(is_tangent_needed.sum(1))
     tangent_input_indices = np.full((MAX_TANGENTS_PER_LANE, len(lane_wheels)), -1.0)
@@ -147,7 +146,7 @@ def step_batch_with_jacobian(
         return np.moveaxis(jacobian_rows, 1, -1)
 
     return jax.tree.map(
-        lambda section_state: section_state[first_lane_of_wheel], walk_result.step_result
+        lambda leaf: leaf[first_lane_of_wheel], walk_result.step_result
     ), jax.tree.map(gather_tangents, tangents)
 
 
@@ -202,19 +201,21 @@ class _IndependentStartRates(NamedTuple):
     """
 
     independent_rate_indices: np.ndarray  # index of each independent rate, (wheels, independent)
-    is_rate_used: np.ndarray  # whether each independent rate exists
+    is_independent: np.ndarray  # whether each rate is an independent rate, (wheels, rates)
     # weights of the independent rates in all rates, (wheels, independent, rates)
     combination_weights: np.ndarray
 
     @classmethod
     def from_rate_projection(
-        cls, rate_projection: np.ndarray, is_requested: np.ndarray
+        cls, rate_projection: np.ndarray, is_requested: np.ndarray, rate_units: np.ndarray
     ) -> "_IndependentStartRates":
         """Return the independent rates for the projection of all rates at the start of a step.
 
         The axes of `rate_projection` are (wheels, projected rates, rates). Among the rates for
         which `is_requested` is True, the one with the largest remainder is selected repeatedly.
-        The remainder is the part of a projection that is orthogonal to the selected ones.
+        The remainder is the part of a projection that is orthogonal to the selected ones. The
+        projection is dimensionless, and the weights are those of rates in SI units. `rate_units`
+        contains the unit of each rate, (wheels, rates).
         """
         requested_projection = np.nan_to_num(rate_projection) * is_requested[:, None]
         projection_remainder = requested_projection
@@ -222,12 +223,14 @@ class _IndependentStartRates(NamedTuple):
         n_selected = int(is_requested.sum(1).max(initial=0))
         rate_indices = np.zeros((n_wheels, n_selected), int)
         is_rate_used = np.zeros((n_wheels, n_selected), bool)
+        is_independent = np.zeros(is_requested.shape, bool)
         directions = np.zeros((n_wheels, n_selected, n_projected_rates))
         smallest_norm = RATE_RANK_TOLERANCE * np.linalg.norm(requested_projection, axis=1).max(-1)
         for i in range(n_selected):
             remainder_norms = np.linalg.norm(projection_remainder, axis=1)
             rate_indices[:, i] = remainder_norms.argmax(-1)
             is_rate_used[:, i] = remainder_norms.max(-1) > smallest_norm
+            is_independent[np.arange(n_wheels), rate_indices[:, i]] |= is_rate_used[:, i]
             selected_remainder = np.take_along_axis(
                 projection_remainder, rate_indices[:, i, None, None], 2
             )[:, :, 0]
@@ -241,30 +244,10 @@ class _IndependentStartRates(NamedTuple):
         # Each direction is the remainder of one rate, so the matrix is triangular.
         triangular_matrix = np.triu(np.take_along_axis(components, rate_indices[:, None], 2))
         triangular_matrix += np.eye(n_selected) * ~is_rate_used[:, None]
-        return cls(rate_indices, is_rate_used, np.linalg.solve(triangular_matrix, components))
-
-    def convert_weights_to_si(self, rate_units: np.ndarray) -> "_IndependentStartRates":
-        """Return the independent rates with weights for SI units.
-
-        `rate_units` contains the unit of each rate, (wheels, rates).
-        """
-        independent_rate_units = np.take_along_axis(rate_units, self.independent_rate_indices, 1)
-        return self._replace(
-            combination_weights=self.combination_weights
-            * independent_rate_units[:, :, None]
-            / rate_units[:, None]
-        )
-
-    def flag_independent_rates(self) -> np.ndarray:
-        """Return whether each rate is among the independent rates, (wheels, rates)."""
-        independence_flags = np.zeros(
-            (len(self.independent_rate_indices), self.combination_weights.shape[2]), bool
-        )
-        wheel_index, independent_rate_position = np.nonzero(self.is_rate_used)
-        independence_flags[
-            wheel_index, self.independent_rate_indices[wheel_index, independent_rate_position]
-        ] = True
-        return independence_flags
+        weights = np.linalg.solve(triangular_matrix, components)
+        independent_rate_units = np.take_along_axis(rate_units, rate_indices, 1)
+        weights = weights * independent_rate_units[:, :, None] / rate_units[:, None]
+        return cls(rate_indices, is_independent, weights)
 
     def expand_tangents_to_all_rates(self, tangents: np.ndarray) -> np.ndarray:
         """Return the tangents with respect to all rates, (wheels, rates, ...).
@@ -286,56 +269,41 @@ def _project_start_rates(
 
     The result has the shape (wheels, projected rates, rates).
     """
+
+    def compute_projected_rates(s: Symbols, section_state: Array) -> Array:
+        motion, contact_state = unpack_section_state(s, section_state)
+        return pack_coordinates(project_motion(s, motion, *contact_state[:2]))[1]
+
     unit_rates = np.eye(3 + n_legs)
     repeated_states = np.repeat(section_states, 3 + n_legs, 0)
     start_rates_by_unit = np.tile(unit_rates, (len(section_states), 1))
     repeated_states[:, 1:4] = start_rates_by_unit[:, :3]
     repeated_states[:, 4 + n_legs : 4 + 2 * n_legs] = start_rates_by_unit[:, 3:]
     lane_rows = [*np.repeat(input_columns[:N_PARAMETERS], 3 + n_legs, 1), *repeated_states.T]
-    rates = _evaluate_on_lane_rows(n_legs, "rates at a start", lane_rows).T
+    rates = _evaluate_on_lane_rows(compute_projected_rates, n_legs, lane_rows).T
     return np.swapaxes(rates.reshape(len(section_states), 3 + n_legs, 3 + n_legs), 1, 2)
 
 
-def _project_section_state(s: Symbols, section_state: Array) -> WheelMotion:
-    """Return the motion for a section state, projected onto its contact constraints."""
-    motion, contact_state = unpack_section_state(s, section_state)
-    return project_motion(s, motion, contact_state.contact_modes, contact_state.is_leg_locked)
-
-
-SECTION_STATE_FUNCTIONS: dict[str, Callable[[Symbols, Array], Array]] = {
-    "full states": embed_section_state,
-    "rates at a start": lambda s, section_state: pack_coordinates(
-        _project_section_state(s, section_state)
-    )[1],
-}
-"""Functions of wheel symbols and section states, by name, with the batch on the last axis."""
-
-
 def _evaluate_on_lane_rows(
-    n_legs: int, section_function_name: str, lane_rows: list[np.ndarray]
+    section_function: Callable[[Symbols, Array], Array], n_legs: int, lane_rows: list[np.ndarray]
 ) -> np.ndarray:
-    """Return the result of a function in `SECTION_STATE_FUNCTIONS` for all batch elements.
+    """Return the result of a function of wheel symbols and section states for all batch elements.
 
     `lane_rows` contains the parameters and the section state, one array (batch,) per entry. One
     program is compiled for any number of wheels. JAX alone would compile a new program for each
-    number.
+    number. The name of the function identifies the program.
     """
 
     def evaluate_section_function(_: tuple, lane_rows: tuple) -> tuple:
-        parameter_values = lane_rows[: len(PARAMETER_NAMES)]
-        section_states = jnp.stack(lane_rows[len(PARAMETER_NAMES) :])
-        return tuple(
-            SECTION_STATE_FUNCTIONS[section_function_name](
-                compute_symbols(n_legs, *parameter_values), section_states
-            )
-        )
+        s = compute_symbols(n_legs, *lane_rows[:N_PARAMETERS])
+        return tuple(section_function(s, jnp.stack(lane_rows[N_PARAMETERS:])))
 
     lane_program = compile_batch_program(
         evaluate_section_function,
         [],
         len(lane_rows),
         lane_rows[0].dtype,
-        ("with unilateral contact", section_function_name, n_legs),
+        ("with unilateral contact", section_function.__name__, n_legs),
         batch_sizes.CONTACT_XLA_BATCH_SIZE,
     )
     return np.stack(lane_program([], [np.ascontiguousarray(lane_row) for lane_row in lane_rows]))
@@ -373,8 +341,8 @@ def _list_input_row_counts(static_walk_settings: BatchWalkSettings) -> tuple[int
         + N_UNEVEN_GROUND_COLUMNS * static_walk_settings.has_uneven_ground
         + static_walk_settings.has_restitution
     )
-    row_counts = n_columns, compute_full_section_size(static_walk_settings.n_legs)
-    return (*row_counts, MAX_TANGENTS_PER_LANE) if static_walk_settings.is_detailed else row_counts
+    n_state_entries = compute_full_section_size(static_walk_settings.n_legs)
+    return n_columns, n_state_entries, *[MAX_TANGENTS_PER_LANE] * static_walk_settings.is_detailed
 
 
 def _run_walk(
@@ -392,29 +360,18 @@ def _run_walk(
     # high damping limits the step size by stability.
     lane_order = np.argsort(-input_arrays[0][PARAMETER_NAMES.index("damping")], kind="stable")
     traced_options, options_structure = jax.tree.flatten(eqx.filter(options, eqx.is_array))
-    scalar_arguments = [
-        np.int32(n_steps),
-        *(np.asarray(option, dtype) for option in traced_options),
-    ]
+    scalar_arguments = [np.int32(n_steps), *(np.asarray(x, dtype) for x in traced_options)]
     lane_rows = [input_row[lane_order] for input_array in input_arrays for input_row in input_array]
-    walk_result_rows = (
-        _compile_walk(static_walk_settings, dtype, options_structure)(scalar_arguments, lane_rows)
-        if len(lane_order)
-        else None
-    )
-    inverse_lane_order = np.argsort(lane_order, kind="stable")
     walk_result_leaves, result_tree_structure = _flatten_result_structure(
         static_walk_settings, dtype
     )
-    if walk_result_rows is None:
-        walk_result_rows = [np.zeros((*leaf.shape, 0), leaf.dtype) for leaf in walk_result_leaves]
-    return jax.tree.unflatten(
-        result_tree_structure,
-        [
-            np.moveaxis(np.asarray(result_array), -1, 0)[inverse_lane_order]
-            for result_array in walk_result_rows
-        ],
-    )
+    walk_result_rows = [np.zeros((*leaf.shape, 0), leaf.dtype) for leaf in walk_result_leaves]
+    if len(lane_order):
+        walk_program = _compile_walk(static_walk_settings, dtype, options_structure)
+        walk_result_rows = walk_program(scalar_arguments, lane_rows)
+    inverse_lane_order = np.argsort(lane_order, kind="stable")
+    restore_order = lambda x: np.moveaxis(np.asarray(x), -1, 0)[inverse_lane_order]
+    return jax.tree.unflatten(result_tree_structure, map(restore_order, walk_result_rows))
 
 
 @functools.cache
@@ -451,7 +408,7 @@ def embed_section_states(
     if section_states.shape[1] != 3:
         return section_states
     return _evaluate_on_lane_rows(
-        n_legs, "full states", [*input_columns[:N_PARAMETERS], *section_states.T]
+        embed_section_state, n_legs, [*input_columns[:N_PARAMETERS], *section_states.T]
     ).T
 
 
@@ -483,21 +440,21 @@ def _compile_walk(
         input_columns, section_state, tangent_input_indices = walk_inputs
         # Batches have no tangent of restitution, which is the last column.
         n_columns = len(input_columns) - static_walk_settings.has_restitution
-        column_index = [*range(n_columns), *[-2] * static_walk_settings.has_restitution]
-        input_index = np.array(
-            [*column_index, *n_columns + np.arange(len(section_state))], np.int32
-        )[:, None]
-        unit_tangents = (tangent_input_indices[:, None] == input_index).astype(section_state.dtype)
-        unit_tangents = lax.optimization_barrier(unit_tangents)
-        tangents = unit_tangents[:, : len(input_columns)], unit_tangents[:, len(input_columns) :]
-        n_tangents = jnp.sum(tangent_input_indices >= 0, axis=0, dtype=jnp.int32)
-        return tuple(
-            jax.tree.leaves(
-                walk_with_tangents(
-                    walk_settings, input_columns, section_state, *tangents, n_tangents
-                )
-            )
+        input_index = np.arange(n_columns + len(section_state), dtype=np.int32)
+        if static_walk_settings.has_restitution:
+            input_index = np.insert(input_index, n_columns, -2)
+        unit_tangents = lax.optimization_barrier(
+            (tangent_input_indices[:, None] == input_index[:, None]).astype(section_state.dtype)
         )
+        walk_result_and_tangents = walk_with_tangents(
+            walk_settings,
+            input_columns,
+            section_state,
+            unit_tangents[:, : len(input_columns)],
+            unit_tangents[:, len(input_columns) :],
+            jnp.sum(tangent_input_indices >= 0, axis=0, dtype=jnp.int32),
+        )
+        return tuple(jax.tree.leaves(walk_result_and_tangents))
 
     return compile_batch_program(
         run_compiled_walk,

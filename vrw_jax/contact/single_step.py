@@ -385,9 +385,7 @@ def build_contact_step_sampler(
             record_interval_end,
             (initial_state, jax.tree.map(allocate_log_array, log_template)),
         )
-        step_summary = walk_settings.summarize_step(
-            lane_state, walk_settings.extract_next_line_tilt(input_columns)
-        )
+        step_summary = walk_settings.summarize_step(lane_state, input_columns)
         if step_config.uses_diffrax:
             interval_samples = lax.map(
                 functools.partial(sample_logged_interval, leaves), contact_interval_log

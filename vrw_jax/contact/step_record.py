@@ -37,7 +37,7 @@ from vrw_jax.contact.mechanics import (
 )
 from vrw_jax.contact.section import FullState
 from vrw_jax.models import AbstractContactStep
-from vrw_jax.numerics import Elementwise, StepOptions, select_trees_by_condition
+from vrw_jax.numerics import Elementwise, StepOptions
 from vrw_jax.wheel import ContactMode, Outcome, Symbols, replace_rest_outcome
 
 
@@ -357,26 +357,17 @@ def record_event(
 
     - `is_first_event`: whether the event is the first in the walking step.
     """
-    step_start_quantities = (
-        jnp.stack([event_result.motion.theta, event_result.motion.dtheta]),
-        event_result.normal_impulse,
-        event_result.tangential_impulse,
-    )
-    previous_quantities = (
-        step_details.post_impact,
-        step_details.landing_normal,
-        step_details.landing_tangential,
-    )
-    post_impact, landing_normal, landing_tangential = select_trees_by_condition(
-        is_first_event, step_start_quantities, previous_quantities
-    )
+    keep_first = lambda first, previous: jnp.where(is_first_event, first, previous)
+    post_impact = jnp.stack([event_result.motion.theta, event_result.motion.dtheta])
     stopper_impulse = jnp.minimum(
         step_details.margins.stopper_impulse, event_result.stopper_impulse
     )
     return step_details._replace(
-        post_impact=post_impact,
-        landing_normal=landing_normal,
-        landing_tangential=landing_tangential,
+        post_impact=keep_first(post_impact, step_details.post_impact),
+        landing_normal=keep_first(event_result.normal_impulse, step_details.landing_normal),
+        landing_tangential=keep_first(
+            event_result.tangential_impulse, step_details.landing_tangential
+        ),
         energy_impacts=step_details.energy_impacts + event_result.impact_energy_loss,
         margins=UnilateralMargins(step_details.margins.stopper_force, stopper_impulse),
         impacts=step_details.impacts + contact_event.is_impact,

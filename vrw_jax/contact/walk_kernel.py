@@ -321,23 +321,18 @@ class BatchWalkSettings(NamedTuple):
             interval_state.time_since_event,
             interval_state.n_solver_steps,
         )
-        step_details = lane_state.step_details
-        step_accumulators = lane_state.step_energy_loss_accumulators
-        if (
-            step_details is not None
-            and step_accumulators is not None
-            and interval_state.interval_accumulators is not None
-        ):
+        step_details: Any = lane_state.step_details
+        step_accumulators: Any = lane_state.step_energy_loss_accumulators
+        n_events = step_counters.n_events
+        if self.is_detailed:
             step_details = record_contact_interval(
                 step_details, dynamics_before, motion, interval_state.time_since_event
             )
             step_accumulators = step_accumulators + interval_state.interval_accumulators
-        force_peaks = None if step_details is None else step_details.force_peaks
+        if self.measures_force_peaks:
+            n_events = n_events + step_details.force_peaks.n_force_extrema
         is_at_event = interval_state.lane_status == LaneStatus.EVENT
         has_landed = is_at_event & (guard_index == guard_layout.foremost_landing_guard)
-        n_events = step_counters.n_events
-        if force_peaks is not None:
-            n_events = n_events + force_peaks.n_force_extrema
         outcome = determine_interval_outcome(
             n_events,
             guard_layout,
@@ -395,7 +390,7 @@ class BatchWalkSettings(NamedTuple):
         )
         # At the extremum of a force, motion and contacts continue without change.
         n_contact_events: Any = 1
-        if step_details is not None and step_details.force_peaks is not None:
+        if self.measures_force_peaks:
             is_contact_event = guard_index < guard_layout.first_force_rate_guard
             n_contact_events = is_contact_event.astype(jnp.int32)
             is_rate_zero = flag_zero_force_rates(guard_layout, guard_index)
@@ -429,7 +424,7 @@ class BatchWalkSettings(NamedTuple):
                 event_outcome != Outcome.STEPPED, event_outcome, next_interval.lane_status
             ),
         )
-        if step_details is not None:
+        if self.is_detailed:
             step_details = record_event(
                 step_details, step_counters.n_events == 0, event_result, contact_event
             )
@@ -454,9 +449,9 @@ class BatchWalkSettings(NamedTuple):
             lane_state,
         )
 
-    def compute_step_result(self, lane_state: LaneState, next_line_tilt: Array | None) -> Any:
+    def compute_step_result(self, lane_state: LaneState, input_columns: Array) -> Any:
         """Return the results of the last step of all batch elements, whose walks have ended."""
-        step_summary = self.summarize_step(lane_state, next_line_tilt)
+        step_summary = self.summarize_step(lane_state, input_columns)
         if lane_state.step_details is None or lane_state.step_energy_loss_accumulators is None:
             return step_summary
         return make_unilateral_step(
@@ -468,16 +463,16 @@ class BatchWalkSettings(NamedTuple):
             self.engine_name,
         )
 
-    def summarize_step(
-        self, lane_state: LaneState, next_line_tilt: Array | None
-    ) -> GaitStepSummary:
+    def summarize_step(self, lane_state: LaneState, input_columns: Array) -> GaitStepSummary:
         """Return the section state, durations and length of a step that has ended.
 
         If the step failed, section state and length are zero.
         """
         motion = unpack_motion(lane_state.contact_interval_state.contact_interval_point)
         contact_state = lane_state.contact_interval_state.contact_state
-        section_state = pack_section_state(motion, contact_state, next_line_tilt)
+        section_state = pack_section_state(
+            motion, contact_state, self.extract_next_line_tilt(input_columns)
+        )
         zero_unless_stepped = lambda value: jnp.where(
             lane_state.walk_outcome == Outcome.STEPPED, value, 0.0
         )
@@ -573,9 +568,7 @@ def run_walks(
     )
     lane_state = lax.while_loop(should_continue, run_iteration, lane_state)
     return BatchWalkResult(
-        walk_settings.compute_step_result(
-            lane_state, walk_settings.extract_next_line_tilt(input_columns)
-        ),
+        walk_settings.compute_step_result(lane_state, input_columns),
         lane_state.walk_outcome,
         lane_state.n_stepped,
         lane_state.step_counters.n_solver_steps,

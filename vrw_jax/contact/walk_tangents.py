@@ -222,11 +222,11 @@ def walk_with_tangents(
     )
 
     def partition_step_result(
-        differentiable: DifferentiableLaneState, next_line_tilt: Array | None
+        differentiable: DifferentiableLaneState, input_columns: Array
     ) -> tuple[Any, Any]:
         return eqx.partition(
             walk_settings.compute_step_result(
-                lane_state.replace_differentiable_state(differentiable), next_line_tilt
+                lane_state.replace_differentiable_state(differentiable), input_columns
             ),
             eqx.is_inexact_array,
         )
@@ -234,12 +234,12 @@ def walk_with_tangents(
     float_leaves, pushforward, nonfloat_leaves = jax.linearize(
         partition_step_result,
         lane_state.get_differentiable_state(),
-        walk_settings.extract_next_line_tilt(input_columns),
+        input_columns,
         has_aux=True,
     )
     push_result_tangent = lambda k, _: pushforward(
         _unpack_tangent(tangent_rows, k, tangent_template, n_dynamics_rows),
-        walk_settings.extract_next_line_tilt(tangents.get_input_tangent(k)),
+        tangents.get_input_tangent(k),
     )
     result_tangents = tangents.map_tangents_sequentially(
         push_result_tangent, tangents.allocate_tangent_rows(count_rows(float_leaves))
