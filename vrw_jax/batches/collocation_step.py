@@ -208,12 +208,13 @@ def solve_phase_by_collocation(
         lowest_guard_value, end_guard_values = _find_lowest_guard_value(
             phase, progress.q, progress.v, interval, progress.guard_values, int(ends_at_event)
         )
+        # The correction by one more sweep is extrapolated from those by the last two sweeps.
+        _, _, correction, previous_correction = interval.newton_sweep_state
+        correction_ratio = correction / jnp.maximum(previous_correction, 1e-300)
+        next_correction = correction * jnp.minimum(correction_ratio, 1.0)
         return _PhaseProgress(
             *interval.interval_end_state,
-            jnp.maximum(
-                progress.estimated_rate_correction,
-                _estimate_next_correction(interval.newton_sweep_state),
-            ),
+            jnp.maximum(progress.estimated_rate_correction, next_correction),
             jnp.maximum(progress.largest_start_rate_error, interval.largest_start_rate_error),
             jnp.minimum(progress.lowest_guard_value, lowest_guard_value),
             end_guard_values,
@@ -249,16 +250,6 @@ def solve_phase_by_collocation(
         largest_start_rate_error=progress.largest_start_rate_error,
         lowest_guard_value=jnp.minimum(progress.lowest_guard_value, last_interval_length),
     )
-
-
-def _estimate_next_correction(newton_sweep_state: _NewtonSweepState) -> Array:
-    """Return the correction that one more Newton sweep would make, extrapolated from the last two
-    sweeps.
-    """
-    rate_correction_ratio = newton_sweep_state.rate_correction / jnp.maximum(
-        newton_sweep_state.previous_rate_correction, 1e-300
-    )
-    return newton_sweep_state.rate_correction * jnp.minimum(rate_correction_ratio, 1.0)
 
 
 def _sum_over_nodes(node_weights: np.ndarray, node_accelerations: NodeAccelerations) -> Vector:
@@ -330,20 +321,6 @@ def _solve_mesh_interval(
         for gauss_eigenvalue in INTEGRATION_MATRIX_EIGENVALUES
     ]
 
-    def apply_projected_correction(
-        node_accelerations: NodeAccelerations, h: Array, residual_projections: list
-    ) -> tuple[NodeAccelerations, Array]:
-        eigenvector_corrections = [
-            [
-                _multiply_and_sum(matrix_row, residual_projection)
-                for matrix_row in inverse_stage_matrix
-            ]
-            for inverse_stage_matrix, residual_projection in zip(
-                inverse_stage_matrices, residual_projections, strict=True
-            )
-        ]
-        return _correct_node_accelerations(node_accelerations, eigenvector_corrections, h)
-
     def run_newton_sweep(
         newton_sweep_state: _NewtonSweepState, _: None
     ) -> tuple[_NewtonSweepState, None]:
@@ -373,8 +350,8 @@ def _solve_mesh_interval(
             )
             for eigenvector_weights in EIGENVECTOR_PROJECTION_MATRIX
         ]
-        node_accelerations, largest_rate_correction = apply_projected_correction(
-            node_accelerations, interval_length, residual_projections
+        node_accelerations, largest_rate_correction = _correct_node_accelerations(
+            node_accelerations, inverse_stage_matrices, residual_projections, interval_length
         )
         return _NewtonSweepState(
             interval_length, node_accelerations, largest_rate_correction, rate_correction
@@ -421,12 +398,13 @@ def _solve_mesh_interval(
         )
         return (newton_sweep_state, compute_time_to_event(newton_sweep_state)), None
 
-    linearized_solution, largest_rate_correction = apply_projected_correction(
+    linearized_solution, largest_rate_correction = _correct_node_accelerations(
         (start_acceleration,) * N_GAUSS_NODES,
-        h,
+        inverse_stage_matrices,
         _project_linearized_residuals(
             dynamics_residual, jacobian_q, jacobian_v, v, start_acceleration, h
         ),
+        h,
     )
     newton_sweep_state = _NewtonSweepState(
         h,
@@ -541,15 +519,16 @@ def _invert_stage_matrix(
     residual_jacobian_v: Any,
     residual_jacobian_a: Any,
 ) -> list[list[_ComplexNumber]]:
-    """Return the inverse of the complex stage matrix A + h e V + (h e)^2 Q as nested lists.
+    """Return the inverse of the complex stage matrix m = A + h e V + (h e)^2 Q as nested lists.
 
     Here e is `gauss_eigenvalue`, and h is the length of the interval. A, V and Q are the
-    derivatives of the residual with respect to accelerations, rates and coordinates.
+    derivatives of the residual with respect to accelerations, rates and coordinates. The inverse is
+    the adjugate divided by the determinant.
     """
     n, squared_eigenvalue = len(residual_jacobian_q), gauss_eigenvalue * gauss_eigenvalue
     scaled_eigenvalue = _ComplexNumber(h * gauss_eigenvalue.real, h * gauss_eigenvalue.imag)
     scaled_square = _ComplexNumber(h * h * squared_eigenvalue.real, h * h * squared_eigenvalue.imag)
-    stage_matrix = [
+    m = [
         [
             _ComplexNumber(
                 residual_jacobian_a[j][i]
@@ -562,7 +541,19 @@ def _invert_stage_matrix(
         ]
         for i in range(n)
     ]
-    adjugate_matrix, determinant = _compute_adjugate_and_determinant(stage_matrix)
+
+    def compute_cofactor(i: int, j: int) -> _ComplexNumber:
+        (a, b), (c, d) = ((i + 1) % 3, (i + 2) % 3), ((j + 1) % 3, (j + 2) % 3)
+        return m[a][c] * m[b][d] - m[a][d] * m[b][c]
+
+    if n == 1:
+        adjugate_matrix, determinant = [[_ComplexNumber(1.0, 0.0)]], m[0][0]
+    elif n == 2:
+        adjugate_matrix = [[m[1][1], -m[0][1]], [-m[1][0], m[0][0]]]
+        determinant = m[0][0] * m[1][1] - m[0][1] * m[1][0]
+    else:
+        adjugate_matrix = [[compute_cofactor(j, i) for j in range(3)] for i in range(3)]
+        determinant = _multiply_and_sum(m[0], [matrix_row[0] for matrix_row in adjugate_matrix])
     squared_modulus = determinant.real * determinant.real + determinant.imag * determinant.imag
     inverse_determinant = _ComplexNumber(
         determinant.real / squared_modulus, -determinant.imag / squared_modulus
@@ -571,24 +562,6 @@ def _invert_stage_matrix(
         [inverse_determinant * matrix_entry for matrix_entry in matrix_row]
         for matrix_row in adjugate_matrix
     ]
-
-
-def _compute_adjugate_and_determinant(
-    m: list[list[_ComplexNumber]],
-) -> tuple[list[list[_ComplexNumber]], _ComplexNumber]:
-    """Return the adjugate and the determinant of a matrix `m` with one, two or three rows."""
-    if len(m) == 1:
-        return [[_ComplexNumber(1.0, 0.0)]], m[0][0]
-    if len(m) == 2:
-        return [[m[1][1], -m[0][1]], [-m[1][0], m[0][0]]], m[0][0] * m[1][1] - m[0][1] * m[1][0]
-
-    def compute_cofactor(i: int, j: int) -> _ComplexNumber:
-        (a, b), (c, d) = ((i + 1) % 3, (i + 2) % 3), ((j + 1) % 3, (j + 2) % 3)
-        return m[a][c] * m[b][d] - m[a][d] * m[b][c]
-
-    adjugate_rows = [[compute_cofactor(j, i) for j in range(3)] for i in range(3)]
-    first_column = [adjugate_row[0] for adjugate_row in adjugate_rows]
-    return adjugate_rows, _multiply_and_sum(m[0], first_column)
 
 
 def _project_linearized_residuals(
@@ -639,10 +612,20 @@ def _project_linearized_residuals(
 
 def _correct_node_accelerations(
     node_accelerations: NodeAccelerations,
-    eigenvector_corrections: list[list[_ComplexNumber]],
+    inverse_stage_matrices: list,
+    residual_projections: list,
     h: Array,
 ) -> tuple[NodeAccelerations, Array]:
-    """Return the corrected node accelerations, and the largest change of a rate that results."""
+    """Return the corrected node accelerations, and the largest change of a rate that results.
+
+    - `inverse_stage_matrices`, `residual_projections`: one entry per eigenvector.
+    """
+    eigenvector_corrections = [
+        [_multiply_and_sum(matrix_row, residual_projection) for matrix_row in inverse_stage_matrix]
+        for inverse_stage_matrix, residual_projection in zip(
+            inverse_stage_matrices, residual_projections, strict=True
+        )
+    ]
     acceleration_changes = tuple(
         tuple(
             sum(
