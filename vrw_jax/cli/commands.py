@@ -190,7 +190,7 @@ def run_gait_command(
             )
             force_peaks: dict[str, Any] = {}
             missing_force_peaks_reason = ""
-            if model.is_compliant and bool(limit_cycle_result.found):
+            if model.is_compliant and limit_cycle_result.found:
                 try:
                     force_peaks = limit_cycle_result.measures(FORCE_PEAK_MEASURES)
                 except ValueError as error:  # for unilateral contact without machine code
@@ -258,14 +258,8 @@ def run_init_command(
 def find_example_config_folder() -> Path:
     """Return the folder of the example configs, which is in the installed package or next to it."""
     package_folder = Path(__file__).parents[1]
-    return next(
-        candidate_config_folder
-        for candidate_config_folder in (
-            package_folder / "configs",
-            package_folder.parent / "configs",
-        )
-        if candidate_config_folder.is_dir()
-    )
+    candidate_folders = (package_folder / "configs", package_folder.parent / "configs")
+    return next(filter(Path.is_dir, candidate_folders))
 
 
 def _require_writable_folder(folder: Path, draws_figure: bool = False) -> None:

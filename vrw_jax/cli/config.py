@@ -52,6 +52,9 @@ PARAMETER_SET_KEY = "parameter_set"
 """Key of `[wheel]` that names a parameter set. Other keys of the table replace values of this
 set.
 """
+ConfigTable = Mapping[str, Any]
+"""Table of a config, as read from TOML."""
+
 _GRID_AXIS_KEYS = ("from", "to", "count")
 
 MAX_CONFIG_INTEGER = 2**53
@@ -91,7 +94,7 @@ class ScanConfig:
 
     @classmethod
     def from_table(
-        cls, config_table: Mapping[str, object], model_class: type[AbstractWheel]
+        cls, config_table: ConfigTable, model_class: type[AbstractWheel]
     ) -> "ScanConfig":
         """Read the settings of the table `[scan]`.
 
@@ -132,7 +135,7 @@ class GaitConfig:
     start: tuple[float, float, float] | None = None
 
     @classmethod
-    def from_table(cls, config_table: Mapping[str, object]) -> "GaitConfig":
+    def from_table(cls, config_table: ConfigTable) -> "GaitConfig":
         """Read the settings of the table `[gait]`."""
         return cls(
             **_parse_settings(
@@ -166,7 +169,7 @@ class TuneConfig:
     evaluations: int = 200
 
     @classmethod
-    def from_table(cls, config_table: Mapping[str, object]) -> "TuneConfig":
+    def from_table(cls, config_table: ConfigTable) -> "TuneConfig":
         """Read the settings of the table `[tune]` and of its subtables."""
         return cls(
             **_parse_settings(
@@ -211,7 +214,7 @@ class BranchConfig:
 
     @classmethod
     def from_table(
-        cls, config_table: Mapping[str, object], allowed_parameter_names: tuple[str, ...]
+        cls, config_table: ConfigTable, allowed_parameter_names: tuple[str, ...]
     ) -> "BranchConfig":
         """Read the settings of the table `[branch]`.
 
@@ -253,10 +256,10 @@ class BranchConfig:
 class Config:
     """Validated settings from a config, and the text of the file."""
 
-    wheel_values: Mapping[str, float | int] = field(default_factory=dict)
+    wheel_values: Mapping[str, Any] = field(default_factory=dict)
     model_name: str = "viscoelastic"
-    model_settings: Mapping[str, float | int | str | bool] = field(default_factory=dict)
-    step_option_values: Mapping[str, float | int | str | bool] = field(default_factory=dict)
+    model_settings: Mapping[str, Any] = field(default_factory=dict)
+    step_option_values: Mapping[str, Any] = field(default_factory=dict)
     scan: ScanConfig = ScanConfig()
     gait: GaitConfig = GaitConfig()
     tune: TuneConfig | None = None
@@ -270,8 +273,7 @@ class Config:
 
         `changed_values` replaces parameters of the config.
         """
-        parameter_values: dict[str, Any] = {**self.wheel_values, **(changed_values or {})}
-        return WheelParams(**parameter_values)
+        return WheelParams(**{**self.wheel_values, **(changed_values or {})})
 
     def make_model(self) -> AbstractWheel:
         """Return the model with the settings from the config."""
@@ -279,8 +281,7 @@ class Config:
 
     def make_options(self) -> StepOptions:
         """Return the numerical options of the walking steps."""
-        step_option_values: dict[str, Any] = {**self.step_option_values}
-        return StepOptions(**step_option_values)
+        return StepOptions(**self.step_option_values)
 
 
 def load_config(config_path: str | Path) -> Config:
@@ -329,9 +330,7 @@ def parse_config(config_text: str, file_name: str = "config") -> Config:
         raise ValueError(f"{file_name}: {config_error}") from config_error
 
 
-def _parse_config_tables(
-    config_tables: Mapping[str, object], config_text: str, file_name: str
-) -> Config:
+def _parse_config_tables(config_tables: ConfigTable, config_text: str, file_name: str) -> Config:
     """Validate the parsed tables of a file. Raise a ValueError if a table is invalid."""
     _require_known_keys(config_tables, CONFIG_TABLE_NAMES, "the file", "tables")
     for table_name, config_table in config_tables.items():
@@ -349,8 +348,23 @@ def _parse_config_tables(
             "design: keep one."
         )
     tables: dict[str, Any] = {name: {} for name in CONFIG_TABLE_NAMES} | dict(config_tables)
-    model_name, model_settings = _parse_model_table(tables["model"])
+    model_name = tables["model"].get("name", Config.model_name)
+    require_known_name(model_name, list_model_config_names(), "model")
     model_class = find_model_class(model_name)
+    default_settings = {
+        model_field.name: model_field.default for model_field in fields(model_class)
+    }
+    _require_known_keys(
+        tables["model"],
+        ("name", *default_settings),
+        f'[model] with name = "{model_name}"',
+        "settings",
+    )
+    model_settings = {
+        setting_name: setting_value
+        for setting_name, setting_value in tables["model"].items()
+        if setting_name != "name"
+    }
     parameter_names = model_class.parameter_names
     sample_design = None
     if design_kinds:
@@ -367,7 +381,7 @@ def _parse_config_tables(
     checked_config = Config(
         wheel_values=_parse_wheel_table(tables["wheel"]),
         model_name=model_name,
-        model_settings=model_settings,
+        model_settings=_parse_with_default_types(model_settings, default_settings),
         step_option_values=_parse_with_default_types(tables["options"], default_options),
         scan=ScanConfig.from_table(tables["scan"], model_class),
         gait=GaitConfig.from_table(tables["gait"]),
@@ -405,14 +419,14 @@ def parse_assignment(assignment_text: str) -> tuple[str, float | int]:
     return parameter_name, _parse_wheel_table({parameter_name: assigned_number})[parameter_name]
 
 
-def _parse_wheel_table(config_table: Mapping[str, object]) -> dict[str, float | int]:
+def _parse_wheel_table(config_table: ConfigTable) -> dict[str, float | int]:
     """Return the parameters in the table `[wheel]`, by name."""
     known_wheel_keys = (*PARAMETER_NAMES, "n_legs", PARAMETER_SET_KEY)
     _require_known_keys(config_table, known_wheel_keys, "[wheel]", "parameters")
     parameter_values: dict[str, float | int] = {}
     if (parameter_set_name := config_table.get(PARAMETER_SET_KEY)) is not None:
         require_known_name(parameter_set_name, tuple(parameter_sets), "parameter set")
-        parameter_values |= parameter_sets[str(parameter_set_name)].values
+        parameter_values |= parameter_sets[parameter_set_name].values
     for parameter_name, config_value in config_table.items():
         if parameter_name == PARAMETER_SET_KEY:
             continue
@@ -427,35 +441,13 @@ def _parse_wheel_table(config_table: Mapping[str, object]) -> dict[str, float | 
     return parameter_values
 
 
-def _parse_model_table(
-    config_table: Mapping[str, object],
-) -> tuple[str, dict[str, float | int | str | bool]]:
-    """Return the name of the model in the table `[model]`, and the model's settings."""
-    model_name = config_table.get("name", Config.model_name)
-    require_known_name(model_name, list_model_config_names(), "model")
-    assert isinstance(model_name, str)
-    default_settings = {
-        model_field_definition.name: model_field_definition.default
-        for model_field_definition in fields(find_model_class(model_name))
-    }
-    _require_known_keys(
-        config_table, ("name", *default_settings), f'[model] with name = "{model_name}"', "settings"
-    )
-    model_settings = {
-        setting_name: setting_value
-        for setting_name, setting_value in config_table.items()
-        if setting_name != "name"
-    }
-    return model_name, _parse_with_default_types(model_settings, default_settings)
-
-
 def _parse_with_default_types(
-    config_table: Mapping[str, object], default_setting_values: Mapping[str, object]
-) -> dict[str, float | int | str | bool]:
+    config_table: ConfigTable, default_setting_values: ConfigTable
+) -> dict[str, Any]:
     """Return the settings, converted to the types of their default values. Numbers must be
     positive.
     """
-    parsed_settings: dict[str, float | int | str | bool] = {}
+    parsed_settings: dict[str, Any] = {}
     for setting_name, config_value in config_table.items():
         default_value = default_setting_values[setting_name]
         if isinstance(default_value, bool | str):
@@ -478,7 +470,7 @@ def _parse_with_default_types(
 
 
 def _parse_design_table(
-    design_kind: str, config_table: Mapping[str, object], allowed_parameter_names: tuple[str, ...]
+    design_kind: str, config_table: ConfigTable, allowed_parameter_names: tuple[str, ...]
 ) -> designs.AbstractSampleDesign:
     """Return the sample design that a table defines.
 
@@ -518,7 +510,9 @@ def _parse_design_table(
     return RANDOM_DESIGN_FUNCTIONS[design_kind](swept_settings, n, random_seed)
 
 
-def _parse_grid_axis(parameter_name: str, grid_axis_setting: object) -> np.ndarray:
+def _parse_grid_axis(
+    parameter_name: str, grid_axis_setting: object
+) -> np.ndarray | tuple[float, ...]:
     """Return the values on an axis of a grid.
 
     The setting is a list of values, or a table with the first value, the last value and the count.
@@ -549,15 +543,13 @@ def _parse_grid_axis(parameter_name: str, grid_axis_setting: object) -> np.ndarr
 
 def _parse_value_list(
     parameter_name: str, config_value_list: object, alternative_text: str = ""
-) -> np.ndarray:
-    """Return an array of numbers from a list. They must lie in the domain of the parameter."""
-    return np.asarray(
-        _parse_numbers(
-            parameter_name,
-            config_value_list,
-            f"a list of numbers{alternative_text}",
-            parse_number=_parse_parameter_value,
-        )
+) -> tuple[float, ...]:
+    """Return a list of numbers as a tuple. They must lie in the domain of the parameter."""
+    return _parse_numbers(
+        parameter_name,
+        config_value_list,
+        f"a list of numbers{alternative_text}",
+        parse_number=_parse_parameter_value,
     )
 
 
@@ -625,20 +617,6 @@ def _parse_free_parameters(
     }
 
 
-def _parse_numbers(
-    setting_name: str,
-    config_value: object,
-    requirement_text: str,
-    length: int | None = None,
-    parse_number: Callable[[str, Any], float] | None = None,
-) -> tuple[float, ...]:
-    """Return a list of numbers as a tuple. Raise a ValueError if it is no list of that length."""
-    if not isinstance(config_value, list) or length not in (None, len(config_value)):
-        raise _make_value_error(setting_name, config_value, requirement_text)
-    parse_number = parse_number or _parse_finite_number
-    return tuple(parse_number(setting_name, number) for number in config_value)
-
-
 def _parse_positive_number(setting_name: str, config_value: object) -> float:
     """Return a value as a float. Raise a ValueError if it is not a positive finite number."""
     positive_number = _parse_finite_number(setting_name, config_value)
@@ -659,6 +637,19 @@ def _parse_finite_number(setting_name: str, config_value: object) -> float:
     return finite_number
 
 
+def _parse_numbers(
+    setting_name: str,
+    config_value: object,
+    requirement_text: str,
+    length: int | None = None,
+    parse_number: Callable[[str, Any], float] = _parse_finite_number,
+) -> tuple[float, ...]:
+    """Return a list of numbers as a tuple. Raise a ValueError if it is no list of that length."""
+    if not isinstance(config_value, list) or length not in (None, len(config_value)):
+        raise _make_value_error(setting_name, config_value, requirement_text)
+    return tuple(parse_number(setting_name, number) for number in config_value)
+
+
 def _parse_whole_number(setting_name: str, config_value: object, min_value: int = 1) -> int:
     """Return a value as an integer. Raise a ValueError if it is not an integer of at least
     `min_value`.
@@ -677,7 +668,7 @@ def _parse_whole_number(setting_name: str, config_value: object, min_value: int 
 
 
 def _parse_settings(
-    config_table: Mapping[str, object],
+    config_table: ConfigTable,
     table_location: str,
     **parser_by_key: Callable[[str, Any], Any],
 ) -> dict[str, Any]:
@@ -693,7 +684,7 @@ def _parse_settings(
 
 
 def _require_known_keys(
-    config_table: Mapping[str, object],
+    config_table: ConfigTable,
     allowed_keys: Iterable[str],
     table_location: str,
     key_kind: str,

@@ -306,6 +306,7 @@ def print_wheel_and_gait(
     """
     import numpy as np
 
+    from vrw_jax.cycles import format_floquet_multipliers
     from vrw_jax.wheel import PARAMETER_DOMAINS, Outcome
 
     parameter_texts = [
@@ -335,7 +336,21 @@ def print_wheel_and_gait(
             f"[bold]Step {n_steps_walked + 1} ended as {step_outcome.name}:[/] "
             f"{step_outcome.meaning}"
         )
-    _print_limit_cycle(limit_cycle_result)
+    if limit_cycle_result.found:
+        spectral_radius, multiplier_texts = format_floquet_multipliers(
+            np.asarray(limit_cycle_result.monodromy_value)
+        )
+        stdout_console.print(
+            f"[bold]Limit cycle[/]  {'stable' if spectral_radius < 1.0 else 'unstable'}: "
+            f"multipliers {multiplier_texts}; period {float(limit_cycle_result.period):.5f} s, "
+            f"speed {float(limit_cycle_result.speed):.5f} m/s, DLS "
+            f"{100 * float(limit_cycle_result.dls_fraction):.2f} %."
+        )
+    else:
+        search_outcome = Outcome(int(limit_cycle_result.outcome))
+        stdout_console.print(
+            f"[bold]Limit cycle[/]  {search_outcome.name}: {search_outcome.meaning}"
+        )
     if force_peaks:
         _print_measure_table("Force in the gait", force_peaks)
     # This is a cycle of the paper's model.
@@ -359,30 +374,6 @@ def _print_measure_table(table_title: str, measure_values: "Mapping[str, Any]") 
     )
     print_text_table(
         table_title, measure_table_rows, ("quantity", "symbol", "value", "unit"), ("value",)
-    )
-
-
-def _print_limit_cycle(limit_cycle_result: "LimitCycle | ReturnMapCycle") -> None:
-    """Print the stability, period, speed and DLS fraction of a limit cycle."""
-    import numpy as np
-
-    from vrw_jax.cycles import format_floquet_multipliers
-    from vrw_jax.wheel import Outcome
-
-    if not bool(limit_cycle_result.found):
-        search_outcome = Outcome(int(limit_cycle_result.outcome))
-        stdout_console.print(
-            f"[bold]Limit cycle[/]  {search_outcome.name}: {search_outcome.meaning}"
-        )
-        return
-    spectral_radius, multiplier_texts = format_floquet_multipliers(
-        np.asarray(limit_cycle_result.monodromy_value)
-    )
-    stability_text = "stable" if spectral_radius < 1.0 else "unstable"
-    stdout_console.print(
-        f"[bold]Limit cycle[/]  {stability_text}: multipliers {multiplier_texts}; period "
-        f"{float(limit_cycle_result.period):.5f} s, speed {float(limit_cycle_result.speed):.5f} "
-        f"m/s, DLS {100 * float(limit_cycle_result.dls_fraction):.2f} %."
     )
 
 

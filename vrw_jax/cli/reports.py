@@ -26,9 +26,7 @@ def write_scan_figures(scan: xr.Dataset, folder: Path) -> list[Path]:
     ]
 
 
-def write_tuning_report(
-    tune_result: TuneResult, folder: Path, draws_figure: bool = True
-) -> list[Path]:
+def write_tuning_report(tune_result: TuneResult, folder: Path, draws_figure: bool) -> list[Path]:
     """Write the data, summary, config and figure for a tuned gait into `folder`, and return the
     paths.
     """
