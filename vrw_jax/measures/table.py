@@ -7,6 +7,7 @@ slope.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
@@ -76,6 +77,9 @@ class Measure:
     def format_with_unit(self, measured_value: object) -> str:
         """Return a value as text with the unit of this measure and six significant digits."""
         return f"{float(np.asarray(measured_value)):.6g} {self.display_unit}".strip()
+
+
+_make_leg_measure = functools.partial(Measure, leg_dimension="leg")
 
 
 def _index_measures_by_name(*measures: Measure) -> dict[str, Measure]:
@@ -156,9 +160,9 @@ MARGIN_MEASURES = _index_measures_by_name(
     Measure("clearance_sls2", "m", "min z2, SLS-II", "foot clearance in SLS-II",
             "Least height of foot 2 in SLS-II; negative if the foot scuffs.",
             violation_text="rear foot scuffs in SLS-II"),
-    Measure("locked_stopper_force", "N", "min F_stop", "stopper force of the locked legs",
+    _make_leg_measure("locked_stopper_force", "N", "min F_stop", "stopper force of the locked legs",
             "Least force of the stopper on each of Legs 3 to n; negative if a stopper has to pull.",
-            leg_dimension="leg", violation_text="locked leg leaves its stopper"),
+            violation_text="locked leg leaves its stopper"),
     Measure("rear_stopper_force", "N", "min F_stop,2", "stopper force of Leg 2 in SLS-II",
             "Least force of the stopper on Leg 2 in SLS-II; negative if the stopper has to pull.",
             violation_text="Leg 2 leaves its stopper"),
@@ -171,12 +175,13 @@ MARGIN_MEASURES = _index_measures_by_name(
     Measure("friction_rear", "1", "μ - |λ3⁺|/λ4⁺", "friction left at the rear foot after landing",
             "Friction coefficient minus the one that the rear foot needs just after landing.",
             violation_text="rear foot slides just after landing"),
-    Measure("landing_stopper_impulse", "N s", "I_stop, I", "stopper impulse at the landing",
+    _make_leg_measure("landing_stopper_impulse", "N s", "I_stop, I",
+            "stopper impulse at the landing",
             "Impulse on each of Legs 3 to n; negative if a stopper has to pull in the landing.",
-            leg_dimension="leg", violation_text="landing throws a locked leg off"),
-    Measure("hit_stopper_impulse", "N s", "I_stop, II", "stopper impulse at collision II",
+            violation_text="landing throws a locked leg off"),
+    _make_leg_measure("hit_stopper_impulse", "N s", "I_stop, II", "stopper impulse at collision II",
             "Impulse on each of Legs 3 to n; negative if a stopper has to pull in the collision.",
-            leg_dimension="leg", violation_text="collision II throws a locked leg off"),
+            violation_text="collision II throws a locked leg off"),
     Measure("hit_planted_impulse", "N s", "λ_s2", "normal impulse of the planted foot",
             "Impulse of collision II; negative if the ground would have to pull.", "(22)",
             violation_text="foot pulls in collision II"),
@@ -354,20 +359,19 @@ TRAJECTORY_MEASURES = _index_measures_by_name(
 """Measures that are coordinates or variables of a trajectory."""
 
 CONTACT_MEASURES = _index_measures_by_name(
-    Measure("length", "m", "L", "length of the leg", "Distance from the hub to the foot.",
-            leg_dimension="leg"),
-    Measure("length_rate", "m/s", "L̇", "rate of the leg's length", "Rate of the distance.",
-            leg_dimension="leg"),
-    Measure("foot_x", "m", "x", "foot along the slope", "Downhill position.", leg_dimension="leg"),
-    Measure("foot_z", "m", "z", "foot above the slope", "Height.", leg_dimension="leg"),
-    Measure("tangential", "N", "λ_t", "tangential force on the foot", "Positive downhill.",
-            leg_dimension="leg"),
-    Measure("normal", "N", "λ_n", "normal force on the foot", "Positive if the ground pushes.",
-            leg_dimension="leg"),
-    Measure("contact", "1", "contact", "contact mode of the foot", "Code of the mode.",
-            leg_dimension="leg"),
-    Measure("on_stopper", "1", "on stopper", "whether the leg is on its stopper", "1 or 0.",
-            leg_dimension="leg"),
+    _make_leg_measure("length", "m", "L", "length of the leg",
+            "Distance from the hub to the foot."),
+    _make_leg_measure("length_rate", "m/s", "L̇", "rate of the leg's length",
+            "Rate of the distance."),
+    _make_leg_measure("foot_x", "m", "x", "foot along the slope", "Downhill position."),
+    _make_leg_measure("foot_z", "m", "z", "foot above the slope", "Height."),
+    _make_leg_measure("tangential", "N", "λ_t", "tangential force on the foot",
+            "Positive downhill."),
+    _make_leg_measure("normal", "N", "λ_n", "normal force on the foot",
+            "Positive if the ground pushes."),
+    _make_leg_measure("contact", "1", "contact", "contact mode of the foot", "Code of the mode."),
+    _make_leg_measure("on_stopper", "1", "on stopper", "whether the leg is on its stopper",
+            "1 or 0."),
 )
 """Variables of a trajectory with unilateral contact, one value for each of the legs 1 to n."""
 
@@ -474,7 +478,5 @@ def make_measure_attributes(variable_name: str) -> dict[str, object]:
     if variable_name == "contact":
         measure_attributes |= make_flag_attributes(CONTACT_MODE_NAMES)
     if variable_name == "outcome":
-        measure_attributes |= make_flag_attributes(
-            outcome_member.name for outcome_member in Outcome
-        )
+        measure_attributes |= make_flag_attributes(Outcome.__members__)
     return measure_attributes

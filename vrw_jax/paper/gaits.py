@@ -161,9 +161,11 @@ def measure_gaits_along_parameter(
         gait_measures: dict[str, Any] = dict(step_result.measures())
         if gait_walk.outcome != Outcome.STEPPED.name:
             gait_measures["outcome"] = int(Outcome[gait_walk.outcome])
-        gait_measures["section_state"] = last_section_state
-        gait_measures["change"] = gait_walk.attrs["last_change"]
-        gait_measures["settled"] = bool(gait_walk.settled)
+        gait_measures |= {
+            "section_state": last_section_state,
+            "change": gait_walk.attrs["last_change"],
+            "settled": bool(gait_walk.settled),
+        }
         measures_by_gait.append(gait_measures)
         if on_progress is not None:
             on_progress(len(measures_by_gait) / len(parameter_values))

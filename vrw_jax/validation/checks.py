@@ -85,11 +85,13 @@ def format_value(given_value: object) -> str:
 
 
 def _is_single_number(given_value: Any) -> bool:
-    """Return whether a value is a single real number. True and False are not numbers in this
+    """Return whether a value is a single real number. Bools and tracers are not numbers in this
     sense.
     """
     if isinstance(given_value, int | float) and not isinstance(given_value, bool):
         return True
+    if isinstance(given_value, jax.core.Tracer):
+        return False
     is_array_type = isinstance(given_value, jax.Array | np.ndarray | np.generic)
     # The dtype of random keys has no kind.
     dtype_kind = getattr(given_value.dtype, "kind", "O") if is_array_type else "O"
@@ -104,24 +106,19 @@ def check_int(
     The clause `min_value_reason` explains the limit in the error message.
     """
     raise_if_process_forked()
-    is_single_number = _is_single_number(given_value) and not isinstance(
-        given_value, jax.core.Tracer
-    )
+    is_single_number = _is_single_number(given_value)
     is_whole_number = is_single_number and (
         isinstance(given_value, int) or np.asarray(given_value).dtype.kind in "iu"
     )
     if is_whole_number and int(given_value) > MAX_INT64:
         raise ValueError(
             f"{argument_name} is {format_value(given_value)}, but it must be at most "
-            f"{MAX_INT64:,}: give a "
-            f"smaller one."
+            f"{MAX_INT64:,}: give a smaller one."
         )
     if not is_whole_number or int(given_value) < min_value:
         raise (ValueError if is_single_number else TypeError)(
             f"{argument_name} is {format_value(given_value)}, but it must be a whole number of at "
-            "least "
-            f"{min_value}{min_value_reason}: "
-            f"give {argument_name} = {min_value}, say."
+            f"least {min_value}{min_value_reason}: give {argument_name} = {min_value}, say."
         )
     return int(given_value)
 
@@ -129,7 +126,7 @@ def check_int(
 def check_real(argument_name: str, given_value: Any) -> float:
     """Return the given number as a float. Raise an error if it is not one finite real number."""
     raise_if_process_forked()
-    if not _is_single_number(given_value) or isinstance(given_value, jax.core.Tracer):
+    if not _is_single_number(given_value):
         raise TypeError(
             f"{argument_name} is {format_value(given_value)}, but it is one real number: give it "
             "as a float."
@@ -164,13 +161,10 @@ def check_range(argument_name: str, given_range: Any) -> tuple[float, float]:
     except (TypeError, ValueError):
         raise TypeError(
             f"{argument_name} is {format_value(given_range)}, but it is a lower and an upper "
-            "bound: write "
-            f"(lower, upper)."
+            "bound: write (lower, upper)."
         ) from None
-    lower_bound, upper_bound = (
-        check_real(f"the lower end of {argument_name}", lower_bound),
-        check_real(f"the upper end of {argument_name}", upper_bound),
-    )
+    lower_bound = check_real(f"the lower end of {argument_name}", lower_bound)
+    upper_bound = check_real(f"the upper end of {argument_name}", upper_bound)
     if not lower_bound < upper_bound:
         raise ValueError(
             f"{argument_name} is ({lower_bound:g}, {upper_bound:g}), which holds nothing: give "
@@ -207,8 +201,7 @@ def check_reals(
             requested_jax_platforms = os.environ.get("JAX_PLATFORMS")
             raise OSError(
                 f"JAX_PLATFORMS is {requested_jax_platforms!r}, but JAX finds no device of that "
-                "kind: "
-                "unset it, or set it to cpu, before Python starts."
+                "kind: unset it, or set it to cpu, before Python starts."
             ) from device_error
         real_array = None
     if real_array is None or not (
@@ -261,9 +254,8 @@ def check_choice(argument_name: str, given_value: Any, allowed_names: Sequence[s
     if given_value not in allowed_names:
         raise ValueError(
             f"{argument_name} is "
-            f"{given_value!r}{format_name_suggestion(given_value, allowed_names)}, but it "
-            "must be one of "
-            f"{', '.join(map(repr, allowed_names))}: choose among these."
+            f"{given_value!r}{format_name_suggestion(given_value, allowed_names)}, but it must be "
+            f"one of {', '.join(map(repr, allowed_names))}: choose among these."
         )
     return given_value
 
@@ -345,6 +337,5 @@ def require_untraced_arguments(function_name: str, remedy_text: str, *argument_t
     if has_traced_leaf(*argument_trees):
         raise TypeError(
             f"{function_name} is called inside jit, vmap or grad, but it runs on known numbers: "
-            "call it "
-            f"outside, or {remedy_text}."
+            f"call it outside, or {remedy_text}."
         )

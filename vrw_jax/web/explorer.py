@@ -69,14 +69,8 @@ def find_wheel_page() -> Path:
     it.
     """
     package_folder = Path(__file__).parents[1]
-    return next(
-        candidate_page_path
-        for candidate_page_path in (
-            package_folder / "wheel.html",
-            package_folder.parent / "docs/wheel.html",
-        )
-        if candidate_page_path.exists()
-    )
+    candidate_paths = (package_folder / "wheel.html", package_folder.parent / "docs/wheel.html")
+    return next(filter(Path.exists, candidate_paths))
 
 
 def make_page_address(params: WheelParams, model_name: str = PAGE_MODEL_NAMES[0]) -> str:
@@ -246,12 +240,7 @@ def _make_page_map(dataset: "xr.Dataset") -> dict[str, Any]:
             f"the dataset has the axes {', '.join(map(str, dataset.sizes))}, but a map has two "
             "parameters: give a scan of vrw.grid over two of them."
         )
-    single_values = {
-        dimension_name: 0
-        for dimension_name in dataset.sizes
-        if dimension_name in PARAMETER_DOMAINS and dimension_name not in map_axis_names
-    }
-    map_dataset = dataset.isel(single_values).transpose(*map_axis_names[::-1], ...)
+    map_dataset = dataset.squeeze().transpose(*map_axis_names[::-1], ...)
     map_measures: dict[str, Any] = {}
     for variable_name, measure_array in map_dataset.data_vars.items():
         if measure_array.dtype.kind == "f" and set(map_axis_names) <= set(measure_array.dims):

@@ -289,15 +289,11 @@ def _compute_assumption_values(paper_evidence: PaperEvidence) -> ClaimValues:
 
     The claims concern the gait of Table 1 of the paper.
     """
-    table_1_gait, first_step_trajectory = (
-        paper_evidence.table_1_gait,
-        select_first_step_of_trajectory(paper_evidence.table_1_trajectory),
-    )
+    table_1_gait = paper_evidence.table_1_gait
+    first_step_trajectory = select_first_step_of_trajectory(paper_evidence.table_1_trajectory)
     double_support, *_ = split_trajectory_by_phase(first_step_trajectory)
-    natural_length, locked_length = (
-        float(paper_evidence.params.natural_length),
-        float(paper_evidence.params.locked_length),
-    )
+    natural_length = float(paper_evidence.params.natural_length)
+    locked_length = float(paper_evidence.params.locked_length)
     stopper_impulses_per_mass = table_1_gait.landing_stopper_impulse.values / float(
         paper_evidence.params.leg_mass
     )

@@ -47,9 +47,9 @@ def summarize_paper_facts(paper_facts: Sequence[PaperFact]) -> str:
     """Return a sentence that states how many facts hold, and the sources of their published
     values.
     """
-    n_facts, n_facts_from_reference_code = (
-        len(paper_facts),
-        sum(paper_fact.is_from_reference_code for paper_fact in paper_facts),
+    n_facts = len(paper_facts)
+    n_facts_from_reference_code = sum(
+        paper_fact.is_from_reference_code for paper_fact in paper_facts
     )
     n_facts_that_hold = sum(paper_fact.holds for paper_fact in paper_facts)
     return (
@@ -63,9 +63,8 @@ CORRECTED_STATEMENTS = (
     "“Corrections of the paper” of the page `docs/studies/beyond_the_border.md` contains computed "
     "walks at other dampings. From c = 220 N s/m on, the paper's model has cycles of seven to four "
     "steps. With unilateral contact, gaits of one step there have 44 to 50 % double support. At "
-    "dampings of 4 N s/m and below, the fore foot does not bounce with unilateral contact and "
-    "μ = 15. At c = 50 and 100 N s/m, the wheel has a gait of one step although its rear foot "
-    "scuffs."
+    "dampings of 4 N s/m and below, the fore foot does not bounce with unilateral contact and μ = "
+    "15. At c = 50 and 100 N s/m, the wheel has a gait of one step although its rear foot scuffs."
 )
 """Paragraph about statements of the paper that computed walks correct. A table of the page
 `docs/studies/beyond_the_border.md` contains the walks.
