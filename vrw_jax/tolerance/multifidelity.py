@@ -28,6 +28,7 @@ from vrw_jax.tolerance.refinement import estimate_measures_from_lower_gaits
 from vrw_jax.tolerance.step_quantities import MEASURE_FUNCTIONS, evaluate_measures
 from vrw_jax.tolerance.tolerance_request import broadcast_params_and_friction, measure_to_tolerance
 from vrw_jax.validation import (
+    check_choice,
     check_int,
     check_positive,
     check_type,
@@ -184,6 +185,7 @@ def multifidelity_mean(
     )
     check_type("measure", measure, str, "give the name of one, 'speed', say")
     require_known_name(measure, tuple(MEASURE_FUNCTIONS), "measure that every model has")
+    check_choice("stoppers", stoppers, ("bilateral", "one-sided"))
     min_pilot_gaits = SAMPLING_OPTIONS.min_pilot_gaits
     tol = check_positive("tol", tol)
     pilot = check_int("pilot", pilot, min_pilot_gaits, ", to estimate a variance")
