@@ -268,9 +268,7 @@ def _step_batch_without_contact(
             n_slopes,
             lambda k: ((0, k, 1.0), (1, min(k + 1, n_slopes - 1), 1.0)),
         )
-    values_by_parameter = [
-        ground_slopes[0] if i == SLOPE_INPUT_INDEX else x for i, x in enumerate(values_by_parameter)
-    ]
+    values_by_parameter[SLOPE_INPUT_INDEX] = ground_slopes[0]
     wheel_order = order_wheels_by_work(values_by_parameter, section_states)
     parameter_matrix = np.stack(
         [np.broadcast_to(x, n_wheels)[wheel_order] for x in values_by_parameter]

@@ -59,15 +59,10 @@ def step_batch_with_contact(
     stepwise_ground = _StepwiseGround.repeat_over_steps(
         values_by_parameter[CONTACT_SLOPE_INDEX], element_friction, len(section_states), n_steps
     )
-    values_by_parameter = [
-        stepwise_ground.slopes_by_step[0] if i == CONTACT_SLOPE_INDEX else x
-        for i, x in enumerate(values_by_parameter)
-    ]
+    first_step_values = [*values_by_parameter, stepwise_ground.friction_by_step[0]]
+    first_step_values[CONTACT_SLOPE_INDEX] = stepwise_ground.slopes_by_step[0]
     parameter_matrix = np.stack(
-        [
-            np.broadcast_to(x, len(section_states))
-            for x in (*values_by_parameter, stepwise_ground.friction_by_step[0])
-        ]
+        [np.broadcast_to(x, len(section_states)) for x in first_step_values]
     )
     section_states = embed_section_states(parameter_matrix, section_states, n_legs)
     solver_indices = np.zeros(len(section_states), np.int32)
@@ -149,9 +144,9 @@ class _StepwiseGround(NamedTuple):
             x.shape[1] if x.ndim == 2 else None for x in (element_slopes, element_friction)
         )
 
-        def repeat_parameter_over_steps(x: np.ndarray, n_repetitions: int) -> np.ndarray:
-            return x if x.ndim == 2 else np.broadcast_to(x, (n_repetitions, n_elements)).T
-
+        repeat_parameter_over_steps = lambda x, n_repetitions: (
+            x if x.ndim == 2 else np.broadcast_to(x, (n_repetitions, n_elements)).T
+        )
         slopes_by_step = complete_slopes_over_steps(
             repeat_parameter_over_steps(element_slopes, n_steps + 1), n_steps
         )
@@ -180,25 +175,21 @@ class _StepwiseGround(NamedTuple):
         The mapping contains "friction" and, if the slope varies over gait steps, "slope".
         """
         previous_friction_input_index = len(CONTACT_PARAMETER_NAMES)
-        tilt_input_index = previous_friction_input_index + 1
         last_slope_index = (self.n_stepwise_slopes or 1) - 1
         last_friction_index = (self.n_stepwise_frictions or 1) - 1
-
-        def list_slope_chain_terms(k: int) -> tuple[tuple[int, int, float], ...]:
-            return (0, k, 1.0), (1, k, -1.0), (1, min(k + 1, last_slope_index), 1.0)
-
-        def list_friction_chain_terms(k: int) -> tuple[tuple[int, int, float], ...]:
-            k = min(k, last_friction_index)
-            return (0, k, 1.0), (1, max(k - 1, 0), 1.0)
-
         stepwise_friction = StepwiseParameter(
             (CONTACT_FRICTION_INDEX, previous_friction_input_index),
             self.n_stepwise_frictions,
-            list_friction_chain_terms,
+            lambda k: (
+                (0, min(k, last_friction_index), 1.0),
+                (1, max(min(k, last_friction_index) - 1, 0), 1.0),
+            ),
         )
         if self.n_stepwise_slopes is None:
             return {"friction": stepwise_friction}
         stepwise_slope = StepwiseParameter(
-            (CONTACT_SLOPE_INDEX, tilt_input_index), self.n_stepwise_slopes, list_slope_chain_terms
+            (CONTACT_SLOPE_INDEX, previous_friction_input_index + 1),
+            self.n_stepwise_slopes,
+            lambda k: ((0, k, 1.0), (1, k, -1.0), (1, min(k + 1, last_slope_index), 1.0)),
         )
         return {"slope": stepwise_slope, "friction": stepwise_friction}

@@ -487,25 +487,17 @@ def evaluate_guards(
             )
         )
     if contact_quantities.force_rates is not None and contact_state.force_rate_signs is not None:
+        # If only the fore foot is loaded, the extrema of its force are those of the total force.
+        is_fore_loaded = contact_state.contact_modes[0] != ContactMode.OFF
+        is_first_loaded, is_second_loaded = contact_mode_dynamics.slot_modes != ContactMode.OFF
+        is_total_different = is_second_loaded | (is_first_loaded & ~is_fore_loaded)
         guards.append(
             replace_if_not_evaluated(
-                _flag_varying_forces(contact_mode_dynamics),
+                jnp.stack([is_fore_loaded, is_total_different, is_fore_loaded]),
                 contact_state.force_rate_signs * contact_quantities.force_rates,
             )
         )
     return guards
-
-
-def _flag_varying_forces(contact_mode_dynamics: ContactModeDynamics) -> Array:
-    """Return whether the guard of each of the `NormalForceRates` is evaluated, (3, ...).
-
-    Guards are evaluated for loaded feet. If only the fore foot is loaded, the extrema of its force
-    are those of the total force.
-    """
-    is_fore_loaded = contact_mode_dynamics.contact_state.contact_modes[0] != ContactMode.OFF
-    is_first_loaded, is_second_loaded = contact_mode_dynamics.slot_modes != ContactMode.OFF
-    is_total_different = is_second_loaded | (is_first_loaded & ~is_fore_loaded)
-    return jnp.stack([is_fore_loaded, is_total_different, is_fore_loaded])
 
 
 def compute_guard_scales(contact_mode_dynamics: ContactModeDynamics) -> Array:

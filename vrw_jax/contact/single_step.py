@@ -304,8 +304,9 @@ def build_contact_step_sampler(
     of each interval. The function has no derivatives.
     """
 
-    def init_lane_state(*leaves: Array) -> Any:
-        return init_lane_states(*step_config.unpack_argument_leaves(leaves))[1]
+    init_lane_state = lambda *leaves: init_lane_states(*step_config.unpack_argument_leaves(leaves))[
+        1
+    ]
 
     def advance_to_event(
         leaves: tuple[Array, ...], lane_state: Any

@@ -28,7 +28,7 @@ from vrw_jax.contact.batch_integrator import (
     evaluate_guards_of_coordinates,
     iterate_until_stopped,
 )
-from vrw_jax.contact.contact_state import ContactModeDynamics, compute_guard_scales
+from vrw_jax.contact.contact_state import compute_guard_scales
 from vrw_jax.contact.walk_kernel import (
     STATUS_UNFINISHED,
     BatchWalkResult,
@@ -277,7 +277,21 @@ def _integrate_with_tangents(
     options = compute_wheel_units(contact_mode_dynamics.s).scale_times_to_seconds(
         walk_settings.step_options
     )
-    max_stable_step_size = _compute_max_stable_step_size(contact_mode_dynamics, tableau)
+    # The damper stops a leg swinging in the air within a time of order m / c. The tangents of such
+    # a leg must not grow, but step-size control is based on the motion alone, in which the leg may
+    # be nearly at rest.
+    stability_safety_factor = 0.85
+    has_swing_leg = jnp.any(
+        ~initial_state.contact_state.is_leg_locked
+        & (initial_state.contact_state.contact_modes == ContactMode.OFF),
+        axis=0,
+    )
+    stable_step_factor = stability_safety_factor * compute_real_stability_limit(tableau)
+    max_stable_step_size = jnp.where(
+        has_swing_leg,
+        stable_step_factor * contact_mode_dynamics.s.m / contact_mode_dynamics.s.c,
+        jnp.inf,
+    )
 
     def try_solver_step(
         state: tuple[ContactIntervalState, Array],
@@ -481,29 +495,6 @@ def _propagate_stage_coordinates(
         lambda state: state[0] < i, add_stage_increment, initial_state
     )
     return q + h * (stage_node * v + h * coordinate_increment), v + h * rate_increment
-
-
-def _compute_max_stable_step_size(
-    contact_mode_dynamics: ContactModeDynamics,
-    tableau: ButcherTableau,
-    stability_safety_factor: float = 0.85,
-) -> Array:
-    """Return the largest step size for which tangents of a leg swinging in the air do not grow, s.
-
-    The damper stops such a leg within a time of order m / c (leg mass over damping). Step-size
-    control is based on the motion alone, in which the leg may be nearly at rest.
-    """
-    has_swing_leg = jnp.any(
-        ~contact_mode_dynamics.contact_state.is_leg_locked
-        & (contact_mode_dynamics.contact_state.contact_modes == ContactMode.OFF),
-        axis=0,
-    )
-    stable_step_factor = stability_safety_factor * compute_real_stability_limit(tableau)
-    return jnp.where(
-        has_swing_leg,
-        stable_step_factor * contact_mode_dynamics.s.m / contact_mode_dynamics.s.c,
-        jnp.inf,
-    )
 
 
 def _make_event_shift(

@@ -204,8 +204,9 @@ def locate_event(
     low_order_tableau = load_explicit_tableau("Bosh3")
     assert low_order_tableau is not None
 
-    def can_take_short_step(is_event_distant: Array, remaining_time_to_event: Array) -> Array:
-        return is_event_distant & (jnp.abs(remaining_time_to_event) <= max_short_step_duration)
+    can_take_short_step = lambda is_event_distant, remaining_time_to_event: (
+        is_event_distant & (jnp.abs(remaining_time_to_event) <= max_short_step_duration)
+    )
 
     def take_short_step(event_search: EventSearch) -> EventSearch:
         is_step_taken = can_take_short_step(

@@ -20,7 +20,6 @@ from vrw_jax.integrator.tangents import BatchPhase, PhaseTangents
 from vrw_jax.numerics import (
     MINIMUM_LOCATION_TOLERANCE,
     StepOptions,
-    Vector,
     find_cubic_minimum,
     select_trees_by_condition,
 )
@@ -176,8 +175,9 @@ def refine_margin_minima(
             tuple(margin_minimum_state.step_start_q), tuple(margin_minimum_state.step_start_v)
         )
 
-        def evaluate_selected_margin(state: StageState) -> Vector:
-            return (_select_margin(jnp.stack(phase.evaluate_margins(state)), margin_index),)
+        evaluate_selected_margin = lambda state: (
+            _select_margin(jnp.stack(phase.evaluate_margins(state)), margin_index),
+        )
 
         def improve_margin_minimum_search(
             margin_minimum_search: _MarginMinimumSearch,

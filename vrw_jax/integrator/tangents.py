@@ -429,14 +429,11 @@ class PhaseTangents(NamedTuple):
         All other elements have their `start_tangents`. The computation is skipped if no element
         accepts the step. `h` is the length of the step, s.
         """
-
-        def propagate_accepted_tangents(start_tangents: Array) -> Array:
-            return jnp.where(
-                is_accepted,
-                self.propagate_to_step_end(tableau, stage_states, start_tangents, h),
-                start_tangents,
-            )
-
+        propagate_accepted_tangents = lambda start_tangents: jnp.where(
+            is_accepted,
+            self.propagate_to_step_end(tableau, stage_states, start_tangents, h),
+            start_tangents,
+        )
         return run_if_any_element_active(
             jnp.any(is_accepted), propagate_accepted_tangents, start_tangents
         )
