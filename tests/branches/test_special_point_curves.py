@@ -40,7 +40,7 @@ class MapTestFunction(AbstractTestFunction):
         value = lambda z, p: self.quantity(jax.jacfwd(image)(z, p), z, p)
         gz, gp = jax.jacfwd(value, argnums=(0, 1))(z, p)
         result = value(z, p) + gz @ solved[:, 0]
-        columns = solved[:, 1], solved[:, 2]
+        columns = solved[:, 1:].T
         return TestFunctionNewtonStep(solved[:, 0], columns, by_x, result, gp + gz @ solved[:, 1:])
 
     def section_state(self, z):

@@ -61,7 +61,6 @@ class BranchStart(NamedTuple):
 
 def find_special_cycle(
     gait_finder: Any,
-    model: AbstractWheel,
     parameter_name: str,
     start_params: WheelParams,
     start_cycle: LimitCycle,
@@ -70,7 +69,7 @@ def find_special_cycle(
     """Find the limit cycle at a special point, from the collocation solution at the point next to
     it.
 
-    - `gait_finder`, `model`: finder and model of the branch's gaits;
+    - `gait_finder`: finder of the branch's gaits;
     - `parameter_name`: name of the continued parameter;
     - `start_params`, `start_cycle`: wheel and gait at the start of the branch.
     """
@@ -82,9 +81,8 @@ def find_special_cycle(
         collocation_state=guess_cycle.collocation_state._replace(solution=branch_point.z),
         system=gait_finder.collocation_system,
     )
-    _, params = model.with_parameter(params, parameter_name, branch_point.p)
-    limit_cycle: LimitCycle = gait_finder.find_cycle(params, guess_cycle)
-    return limit_cycle
+    _, params = gait_finder.model.with_parameter(params, parameter_name, branch_point.p)
+    return gait_finder.find_cycle(params, guess_cycle)
 
 
 def find_collocation_starts(branch_request: BranchRequest, known_start_cycle: Any) -> BranchStart:
@@ -130,7 +128,6 @@ def find_collocation_starts(branch_request: BranchRequest, known_start_cycle: An
         return functools.partial(
             find_special_cycle,
             gait_finder,
-            branch_request.model,
             parameter_name,
             start_params,
             start_cycle_of_wheel,
@@ -139,6 +136,8 @@ def find_collocation_starts(branch_request: BranchRequest, known_start_cycle: An
 
     return BranchStart(
         CollocationProblem(
+            model=branch_request.model,
+            step_options=branch_request.step_options,
             collocation_system=collocation_system,
             parameter_name=parameter_name,
             additional_quantity_function=None,

@@ -7,7 +7,6 @@ Special points are therefore as accurate as the gaits.
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -113,10 +112,6 @@ GAIT_CONTINUATION_OPTIONS = GaitContinuationOptions()
 class GaitContinuation(AbstractContinuation):
     """Continuation of gaits."""
 
-    model: AbstractWheel
-    step_options: StepOptions
-    n_legs: int
-
     branch_ending_quantities: ClassVar[tuple[str, ...]] = (
         *BRANCH_ENDING_QUANTITIES,
         FRICTION_SURPLUS_COLUMN_NAME,
@@ -144,15 +139,14 @@ class GaitContinuation(AbstractContinuation):
         If a margin has one value per leg, the result contains one quantity for each leg.
         """
         gait_problem: Any = self.continuation_problem
-        measure_gaits = functools.partial(gait_problem.measure_gaits, self.model, self.step_options)
         quantity_table = self.map_over_points(
-            measure_gaits, batch_sizes.POINT_BATCH_SIZE, wheels, points
+            gait_problem.measure_gaits, batch_sizes.POINT_BATCH_SIZE, wheels, points
         )
         for measure_name, margin_measure in MARGIN_MEASURES.items():
             if margin_measure.leg_dimension and measure_name in quantity_table:
                 quantity_table |= {
                     f"{measure_name}[{leg_number}]": quantity_table[measure_name][:, leg_number - 3]
-                    for leg_number in range(3, self.n_legs + 1)
+                    for leg_number in range(3, wheels.params.n_legs + 1)
                 }
         return quantity_table
 
@@ -401,9 +395,6 @@ def _continue_gait_branches(
             arclength_options,
             branch_start.wheels,
             parameter_bounds,
-            branch_request.model,
-            branch_request.step_options,
-            branch_request.params.n_legs,
         )
         has_branch_start = branch_start.start_outcomes == Outcome.STEPPED
         has_branch_start &= np.arange(len(has_branch_start)) < n_wheels

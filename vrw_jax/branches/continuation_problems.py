@@ -19,7 +19,7 @@ from jax import lax
 from jaxtyping import Array, Bool
 
 from vrw_jax.branches.branch_points import CONTACT_ORDER_COLUMN
-from vrw_jax.collocation import CollocationSolution, estimate_mesh_error
+from vrw_jax.collocation import CollocationSolution
 from vrw_jax.continuation import (
     AbstractContinuationProblem,
     ContinuationPoint,
@@ -33,7 +33,6 @@ from vrw_jax.cycles import (
     PeriodMap,
     compute_correction_norm,
     compute_force_peaks,
-    compute_takeoff_acceleration,
     measure_return_map_force_peaks,
     solve_linear_systems,
 )
@@ -74,8 +73,13 @@ class BranchWheel(NamedTuple):
 
 
 class AbstractGaitProblem(AbstractContinuationProblem):
-    """Continuation problem of gaits with `n_steps` gait steps, in one parameter of the wheel."""
+    """Continuation problem of gaits in one parameter of the wheel.
 
+    Event-driven steps of the model measure the gaits.
+    """
+
+    model: eqx.AbstractVar[AbstractWheel]
+    step_options: eqx.AbstractVar[StepOptions]
     parameter_name: eqx.AbstractVar[str]
 
     @property
@@ -83,32 +87,27 @@ class AbstractGaitProblem(AbstractContinuationProblem):
     def n_steps(self) -> int:
         """Return the number of gait steps after which the gaits repeat."""
 
-    @abc.abstractmethod
     def read_gait_state(
         self, wheel: BranchWheel, z: ProblemUnknowns, p: Scalar
     ) -> tuple[AnySectionState, dict[str, Array]]:
         """Return the section state before the first landing, and the continued quantities by name.
 
-        A continued quantity is defined on both sides of a special point.
+        A continued quantity is defined on both sides of a special point. By default, z is the
+        section state, and all quantities are measures of the event-driven step.
         """
+        return z, {}
 
     @eqx.filter_jit
-    def measure_gaits(
-        self,
-        model: AbstractWheel,
-        step_options: StepOptions,
-        wheels: BranchWheel,
-        points: ContinuationPoint,
-    ) -> dict[str, Array]:
+    def measure_gaits(self, wheels: BranchWheel, points: ContinuationPoint) -> dict[str, Array]:
         """Return the measures of the gaits at many points by name, computed by
         event-driven steps.
         """
 
         def measure_point(wheel: BranchWheel, z: Any, p: Array) -> dict[str, Array]:
             section_state, continued_quantities = self.read_gait_state(wheel, z, p)
-            model_at_point, params = model.with_parameter(wheel.params, self.parameter_name, p)
+            model, params = self.model.with_parameter(wheel.params, self.parameter_name, p)
             gait_measures = measure_gait_period(
-                model_at_point, params, section_state, step_options, self.n_steps
+                model, params, section_state, self.step_options, self.n_steps
             )
             return gait_measures | continued_quantities | {"section_state": section_state}
 
@@ -127,6 +126,8 @@ class CollocationProblem(AbstractGaitProblem):
     - `measures_force_peaks`: whether the points also have the measures of the gait's force.
     """
 
+    model: AbstractWheel
+    step_options: StepOptions
     collocation_system: CollocationSystem = eqx.field(static=True)
     parameter_name: str = eqx.field(static=True)
     additional_quantity_function: Callable | None = eqx.field(static=True)
@@ -140,11 +141,7 @@ class CollocationProblem(AbstractGaitProblem):
         """Return the wheel's parameters as a vector, in which the continued parameter
         has the value p.
         """
-        return stack_parameters(
-            eqx.tree_at(
-                lambda wheel_params: getattr(wheel_params, self.parameter_name), wheel.params, p
-            )
-        )
+        return stack_parameters(self.model.with_parameter(wheel.params, self.parameter_name, p)[1])
 
     def linearize(self, wheel: BranchWheel, z: ProblemUnknowns, p: Scalar) -> NewtonStep:
         linearize_trial = make_trial_linearizer(
@@ -184,26 +181,18 @@ class CollocationProblem(AbstractGaitProblem):
             parameters, self.collocation_system.n_legs
         ).symbols()
         phase_points_by_step = self.collocation_system.evaluate_phase_points(parameters, z)
-        takeoff_accelerations = [
-            compute_takeoff_acceleration(wheel_symbols, sls1_phase_points)
-            for _, sls1_phase_points, _ in phase_points_by_step
-        ]
         last_end_point, min_durations = (
             phase_points_by_step[-1][-1].phase_end_point,
             jnp.min(z.durations, 0),
         )
-        solution_with_lane = jax.tree.map(lambda x: x[..., None], z)
-        mesh_error = estimate_mesh_error(
-            self.collocation_system.phase_sequence,
-            self.collocation_system.phase_meshes,
-            solution_with_lane,
-        )[0]
         continued_quantities = {
             "duration_dls": jnp.where(wheel.is_phase_active[0, 0] > 0.5, min_durations[0], jnp.nan),
             "duration_sls1": min_durations[1],
             "duration_sls2": min_durations[2],
-            "takeoff_acceleration": jnp.min(jnp.stack(takeoff_accelerations)),
-            "mesh_error": mesh_error,
+            "takeoff_acceleration": self.collocation_system.compute_takeoff_acceleration(
+                parameters, z
+            ),
+            "mesh_error": self.collocation_system.estimate_mesh_error(z),
         }
         if self.additional_quantity_function is not None:
             continued_quantities |= self.additional_quantity_function(
@@ -246,23 +235,18 @@ def make_trial_linearizer(
         )
         if gait_quantity_function is None:
             return newton_results
-        parameter_rows = np.eye(parameters.shape[0], dtype=parameters.dtype)[
-            list(parameter_indices)
-        ]
-        parameter_tangents = np.concatenate([np.zeros_like(parameter_rows[:1]), parameter_rows])[
-            :, :, None
-        ]
-        correction_stacker = lambda correction_leaf, tangent_leaf: jnp.concatenate(
-            [correction_leaf[None], tangent_leaf]
-        )
-        solution_tangents = jax.tree.map(
-            correction_stacker,
-            cycle_linearization.newton_correction,
-            cycle_linearization.parameter_tangents,
-        )
+        # The parameters do not change in the direction of the correction.
+        parameter_tangents = np.zeros((1 + len(parameter_indices), len(parameters), 1))
+        parameter_tangents[range(1, len(parameter_tangents)), parameter_indices] = 1.0
         tangent_directions = (
-            jnp.broadcast_to(parameter_tangents, (len(parameter_tangents), *parameters.shape)),
-            solution_tangents,
+            jnp.broadcast_to(
+                parameter_tangents.astype(parameters.dtype),
+                (len(parameter_tangents), *parameters.shape),
+            ),
+            jax.tree.map(
+                lambda correction, tangents: jnp.concatenate([correction[None], tangents]),
+                *newton_results[:2],
+            ),
         )
         evaluate_quantities = lambda parameters, z: gait_quantity_function(
             collocation_system, parameters, is_phase_active, z
@@ -340,15 +324,6 @@ class AbstractReturnMapProblem(AbstractGaitProblem):
         """
         return jnp.all(left_point[self.n_coordinates :] == right_point[self.n_coordinates :])
 
-    def read_gait_state(
-        self, wheel: BranchWheel, z: ProblemUnknowns, p: Scalar
-    ) -> tuple[AnySectionState, dict[str, Array]]:
-        """Return the section state before the first landing, and no continued quantities.
-
-        All quantities are measures of the event-driven step.
-        """
-        return z, {}
-
 
 class ReturnMapProblem(AbstractReturnMapProblem):
     """Continuation problem of the gaits of a model whose gait steps JAX can differentiate."""
@@ -421,15 +396,9 @@ class ContactGaitProblem(AbstractReturnMapProblem):
         )
         return NewtonStep(newton_corrections, parameter_tangents, jnp.asarray(return_map_jacobian))
 
-    def measure_gaits(
-        self,
-        model: AbstractWheel,
-        step_options: StepOptions,
-        wheels: BranchWheel,
-        points: ContinuationPoint,
-    ) -> dict[str, Array]:
+    def measure_gaits(self, wheels: BranchWheel, points: ContinuationPoint) -> dict[str, Array]:
         period_evaluation = self._make_period_map(wheels, points.p).evaluate_period(
-            step_options, np.asarray(points.z), False, False
+            self.step_options, np.asarray(points.z), False, False
         )
         section_states = jnp.asarray(points.z)
         additional_quantities = {
@@ -443,7 +412,6 @@ class ContactGaitProblem(AbstractReturnMapProblem):
         }
         if self.measures_force_peaks:
             additional_quantities |= self._measure_force_peaks(
-                step_options,
                 wheels,
                 points.p,
                 section_states,
@@ -456,16 +424,11 @@ class ContactGaitProblem(AbstractReturnMapProblem):
 
     @eqx.filter_jit
     def _measure_force_peaks(
-        self,
-        step_options: StepOptions,
-        wheels: BranchWheel,
-        p: Array,
-        section_states: Array,
-        step_ends: Array,
+        self, wheels: BranchWheel, p: Array, section_states: Array, step_ends: Array
     ) -> dict[str, Array]:
         """Return the `measures.FORCE_PEAK_MEASURES` of many gaits by name.
 
-        The first axis of all arguments except the options is that of the gaits.
+        The first axis of all arguments is that of the gaits.
         """
 
         def measure_gait_force(
@@ -473,7 +436,7 @@ class ContactGaitProblem(AbstractReturnMapProblem):
         ) -> dict[str, Array]:
             model, params = self.model.with_parameter(wheel.params, self.parameter_name, p)
             return measure_return_map_force_peaks(
-                model, params, section_state, step_ends, step_options
+                model, params, section_state, step_ends, self.step_options
             )
 
         return jax.vmap(measure_gait_force)(wheels, p, section_states, step_ends)

@@ -5,6 +5,7 @@ as accurate as the gaits. If a curve meets another special point, a new curve is
 meeting point.
 """
 
+import itertools
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
@@ -14,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vrw_jax.branches.branch import Codim2Point, SpecialPoint, SpecialPointCurve
+from vrw_jax.branches.branch import Codim2Point, SpecialPointCurve
 from vrw_jax.branches.branch_location import (
     AbstractContinuation,
     BranchData,
@@ -102,9 +103,7 @@ class CurveContinuation(AbstractContinuation):
     """
 
     continuation_problem: TestFunctionCurve
-    second_parameter_name: str
     special_point_names: tuple[str, ...]  # one name per wheel
-    gait_continuation: GaitContinuation  # continuation of the gaits in the first parameter
 
     branch_ending_quantities: ClassVar[tuple[str, ...]] = (
         *BRANCH_ENDING_QUANTITIES,
@@ -119,14 +118,15 @@ class CurveContinuation(AbstractContinuation):
     def evaluate_point_quantities(
         self, wheels: TestFunctionWheel, points: ContinuationPoint
     ) -> QuantitiesByName:
+        test_function: Any = self.continuation_problem.test_function
         second_parameter_values = self.continuation_problem.compute_second_parameter(points.z)
-        get_second_parameter_value = lambda params: getattr(params, self.second_parameter_name)
-        gait_wheels = wheels.branch_wheel._replace(
-            params=eqx.tree_at(
-                get_second_parameter_value, wheels.branch_wheel.params, second_parameter_values
-            )
+        gait_wheels = test_function.with_parameters(
+            wheels.branch_wheel, (points.p, second_parameter_values)
         )
-        quantity_table = self.gait_continuation.evaluate_point_quantities(
+        gait_continuation = GaitContinuation(
+            test_function.gait_problem, self.arclength_options, gait_wheels, self.parameter_bounds
+        )
+        quantity_table = gait_continuation.evaluate_point_quantities(
             gait_wheels, points._replace(z=points.z.z)
         )
         # Without double support, the rear foot's force must not be positive.
@@ -241,10 +241,7 @@ class CurveTracer(NamedTuple):
     ) -> WheelParams:
         """Return the wheel with new values of the two parameters."""
         get_values = lambda params: [getattr(params, name) for name in self.parameter_names]
-        changed_params: WheelParams = eqx.tree_at(
-            get_values, params, [jnp.asarray(value) for value in parameter_values]
-        )
-        return changed_params
+        return eqx.tree_at(get_values, params, [jnp.asarray(value) for value in parameter_values])
 
     def compute_parameter_fractions(self, parameter_values: np.ndarray) -> np.ndarray:
         """Return the two parameters as fractions of their ranges, on the last axis."""
@@ -269,32 +266,27 @@ class CurveTracer(NamedTuple):
             model=self.model,
             force_peaks=self.measures_force_peaks,
         )
-        return [
-            self._make_seed(special_point)
-            for branch in branches
-            for special_point in branch.special_points
-            if can_continue_special_point(special_point.name)
-        ]
-
-    def _make_seed(self, special_point: SpecialPoint) -> CurveSeed:
-        """Return the seed from which the curve of a special point is traced."""
-        limit_cycle = special_point.cycle
-        params = make_wheel_from_parameters(limit_cycle.parameters, limit_cycle.system.n_legs)
-        first_parameter_value, second_parameter_value = (
-            float(getattr(params, parameter_name)) for parameter_name in self.parameter_names
-        )
-        branch_wheel = BranchWheel(params, limit_cycle.collocation_state.is_phase_active)
-        z = limit_cycle.collocation_state.solution
-        special_point_name = choose_continued_special_point_name(
-            special_point.name, branch_wheel, z
-        )
-        return CurveSeed(
-            special_point_name,
-            (first_parameter_value, second_parameter_value),
-            limit_cycle.system,
-            branch_wheel,
-            z,
-        )
+        curve_seeds = []
+        for special_point in itertools.chain(*(branch.special_points for branch in branches)):
+            if not can_continue_special_point(special_point.name):
+                continue
+            limit_cycle = special_point.cycle
+            params = make_wheel_from_parameters(limit_cycle.parameters, limit_cycle.system.n_legs)
+            first_parameter_value, second_parameter_value = (
+                float(getattr(params, parameter_name)) for parameter_name in self.parameter_names
+            )
+            branch_wheel = BranchWheel(params, limit_cycle.collocation_state.is_phase_active)
+            z = limit_cycle.collocation_state.solution
+            curve_seeds.append(
+                CurveSeed(
+                    choose_continued_special_point_name(special_point.name, branch_wheel, z),
+                    (first_parameter_value, second_parameter_value),
+                    limit_cycle.system,
+                    branch_wheel,
+                    z,
+                )
+            )
+        return curve_seeds
 
     def trace_curves(
         self, curve_seeds: Sequence[CurveSeed], known_curves: Sequence[TracedCurve]
@@ -360,7 +352,7 @@ class CurveTracer(NamedTuple):
 
         - `quantity_group`: names of the quantities that are evaluated together.
         """
-        traced_curves: list[TracedCurve] = []
+        traced_curves = []
         special_point_names = ", ".join(
             sorted({curve_seed.special_point_name for curve_seed in curve_seeds})
         )
@@ -442,23 +434,12 @@ class CurveTracer(NamedTuple):
         wheels, z, first_parameter_values = jax.tree.map(
             lambda *leaves: np.stack(leaves), *map(make_start, padded_seeds)
         )
-        gait_continuation = GaitContinuation(
-            test_function.gait_problem,
-            self.arclength_options,
-            wheels.branch_wheel,
-            self.parameter_ranges[0],
-            self.model,
-            self.step_options,
-            collocation_system.n_legs,
-        )
         branch_continuation = CurveContinuation(
             TestFunctionCurve(test_function, (lower_bound, upper_bound)),
             self.arclength_options,
             wheels,
             self.parameter_ranges[0],
-            self.parameter_names[1],
             tuple(curve_seed.special_point_name for curve_seed in padded_seeds),
-            gait_continuation,
         )
         is_seed_requested = np.arange(len(padded_seeds)) < len(curve_seeds)
         branch_data_by_seed = continue_and_locate_special_points(

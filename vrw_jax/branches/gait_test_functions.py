@@ -26,7 +26,7 @@ from vrw_jax.branches.continuation_problems import (
     make_trial_linearizer,
     measure_gait_period,
 )
-from vrw_jax.collocation import CollocationSolution, PhasePoints
+from vrw_jax.collocation import CollocationSolution
 from vrw_jax.continuation import (
     BIFURCATION_NAMES,
     AbstractTestFunction,
@@ -185,16 +185,12 @@ class GaitTestFunction(AbstractTestFunction):
             parameter_indices,
             QUANTITY_FUNCTION_BY_GROUP.get(self.quantity_names),
         )
-        newton_correction, stacked_tangents, monodromy_matrix, *quantities_and_gradients = (
+        newton_correction, parameter_tangents, monodromy_matrix, *quantities_and_gradients = (
             linearize_trial(
                 stack_parameters(self.with_parameters(branch_wheel, p).params),
                 branch_wheel.is_phase_active,
                 z,
             )
-        )
-        tangents_by_parameter = (
-            jax.tree.map(lambda x: x[0], stacked_tangents),
-            jax.tree.map(lambda x: x[1], stacked_tangents),
         )
         if quantities_and_gradients:
             quantity_values, parameter_gradients = quantities_and_gradients
@@ -211,11 +207,11 @@ class GaitTestFunction(AbstractTestFunction):
             )
         else:
             quantity_values, parameter_gradients = self._differentiate_step_quantities(
-                branch_wheel, z, p, newton_correction, tangents_by_parameter
+                branch_wheel, z, p, newton_correction, parameter_tangents
             )
         return TestFunctionNewtonStep(
             newton_correction,
-            tangents_by_parameter,
+            parameter_tangents,
             monodromy_matrix,
             quantity_values[wheel.quantity_index],
             parameter_gradients[:, wheel.quantity_index],
@@ -227,7 +223,7 @@ class GaitTestFunction(AbstractTestFunction):
         z: CollocationSolution,
         p: Array,
         newton_correction: CollocationSolution,
-        tangents_by_parameter: tuple,
+        parameter_tangents: CollocationSolution,
     ) -> tuple[Array, Array]:
         """Return the step's quantities at the corrected gait, and their derivatives.
 
@@ -238,12 +234,7 @@ class GaitTestFunction(AbstractTestFunction):
         an orthonormal basis of the tangents' plane. They start from the point of that plane that is
         nearest to the trial.
         """
-        tangents_times_parameters = jnp.stack(
-            [
-                p[parameter_index] * self.section_state(parameter_tangent)
-                for parameter_index, parameter_tangent in enumerate(tangents_by_parameter)
-            ]
-        )
+        tangents_times_parameters = p[:, None] * self.section_state(parameter_tangents)
         orthonormal_tangent_basis, triangular_factor = jnp.linalg.qr(
             jnp.concatenate([tangents_times_parameters, jnp.eye(2, dtype=p.dtype)], 1).T
         )
@@ -255,7 +246,7 @@ class GaitTestFunction(AbstractTestFunction):
         def measure_gait_at_offset(basis_offset: Array) -> Array:
             parameter_change = basis_coefficients @ (basis_offset - correction_coordinates)
             displaced_solution = displace_solution(
-                z, newton_correction, tangents_by_parameter, parameter_change
+                z, newton_correction, parameter_tangents, parameter_change
             )
             return self.measure_step_quantities(
                 branch_wheel, displaced_solution, p + parameter_change
@@ -282,6 +273,8 @@ class GaitTestFunction(AbstractTestFunction):
     def gait_problem(self) -> CollocationProblem:
         """Return the problem that continues the gaits in the first parameter."""
         return CollocationProblem(
+            model=self.model,
+            step_options=self.step_options,
             collocation_system=self.collocation_system,
             parameter_name=self.parameter_names[0],
             additional_quantity_function=_compute_continued_quantities,
@@ -330,22 +323,18 @@ class GaitTestFunction(AbstractTestFunction):
 def displace_solution(
     z: CollocationSolution,
     newton_correction: CollocationSolution,
-    tangents_by_parameter: tuple[CollocationSolution, CollocationSolution],
+    parameter_tangents: CollocationSolution,
     parameter_change: Array,
 ) -> CollocationSolution:
     """Return a corrected solution, displaced along its tangents by a change of two parameters."""
-    displaced_solution: CollocationSolution = jax.tree.map(
-        lambda x, correction_leaf, first_tangent_leaf, second_tangent_leaf: (
-            x
-            + correction_leaf
-            + parameter_change[0] * first_tangent_leaf
-            + parameter_change[1] * second_tangent_leaf
+    return jax.tree.map(
+        lambda x, correction, tangents: (
+            x + correction + parameter_change[0] * tangents[0] + parameter_change[1] * tangents[1]
         ),
         z,
         newton_correction,
-        *tangents_by_parameter,
+        parameter_tangents,
     )
-    return displaced_solution
 
 
 @eqx.filter_jit
@@ -370,19 +359,18 @@ def locate_jump_onset(
 
     def take_newton_step(solution_and_parameters: tuple, _: None) -> tuple[tuple, Array]:
         z, p = solution_and_parameters
-        force_newton_step, force_fall_newton_step = (
+        newton_steps = [
             test_function.linearize(TestFunctionWheel(branch_wheel, quantity_index), z, p)
             for quantity_index in quantity_indices
-        )
-        newton_steps = force_newton_step, force_fall_newton_step
+        ]
         parameter_change = -jnp.linalg.solve(
             jnp.stack([newton_step.parameter_gradient for newton_step in newton_steps]),
             jnp.stack([newton_step.test_function_value for newton_step in newton_steps]),
         )
         z = displace_solution(
             z,
-            force_newton_step.newton_correction,
-            force_newton_step.tangents_by_parameter,
+            newton_steps[0].newton_correction,
+            newton_steps[0].parameter_tangents,
             parameter_change,
         )
         return (z, p + parameter_change), parameter_change / p
@@ -414,29 +402,14 @@ def _compute_continued_quantities(
     """Return the `CONTINUED_QUANTITIES` of a gait step by name, computed from the points of its
     phases.
     """
-    dls_phase_points, sls1_phase_points, sls2_phase_points = phase_points
-    landing_result = transitions.resolve_landing(
-        wheel_symbols, sls2_phase_points.phase_end_point.q[0], *sls2_phase_points.phase_end_point.v
-    )
+    (dls_start, _, dls_end), sls1_phase_points, (_, _, sls2_end) = phase_points
+    landing_result = transitions.resolve_landing(wheel_symbols, sls2_end.q[0], *sls2_end.v)
     fore_force, rear_force = transitions.compute_landing_forces(wheel_symbols, landing_result)
+    takeoff_acceleration = compute_takeoff_acceleration(wheel_symbols, sls1_phase_points)
     dls_duration, *single_support_durations = z.durations[0]
-    landing_forces = landing_result.rear_impulse.normal, fore_force.normal, rear_force.normal
-    quantity_values = (
-        *landing_forces,
-        *single_support_durations,
-        compute_takeoff_acceleration(wheel_symbols, sls1_phase_points),
-        *_compute_force_decrease_rates(wheel_symbols, dls_phase_points, dls_duration),
+    dls_phase, *_ = make_paper_phases(
+        wheel_symbols, dls_start.held_constants[0], stop_at_lift_off=False
     )
-    return dict(zip(CONTINUED_QUANTITIES, quantity_values, strict=True))
-
-
-def _compute_force_decrease_rates(
-    s: Symbols, dls_phase_points: PhasePoints, dls_duration: Array
-) -> tuple[Array, Array]:
-    """Return the initial and the mean rate at which the rear foot's force decreases in DLS, N/s."""
-    dls_phase = make_paper_phases(
-        s, dls_phase_points.phase_start_point.held_constants[0], stop_at_lift_off=False
-    )[0]
 
     def make_dls_instant(theta: Array, dtheta: Array) -> PhaseInstant:
         return PhaseInstant(dls_phase, dls_phase.compute_motion((theta,), (dtheta,)), None)
@@ -444,16 +417,22 @@ def _compute_force_decrease_rates(
     compute_rear_force = lambda *dls_state: dls_phase.compute_end_guard(
         make_dls_instant(*dls_state)
     )
-    start_state, end_state = (
-        (*dls_phase_points.phase_start_point.q, *dls_phase_points.phase_start_point.v),
-        (*dls_phase_points.phase_end_point.q, *dls_phase_points.phase_end_point.v),
-    )
+    start_state = *dls_start.q, *dls_start.v
     dls_state_rates = start_state[1], make_dls_instant(*start_state).acceleration.ddtheta
     initial_rear_force, rear_force_rate = jax.jvp(compute_rear_force, start_state, dls_state_rates)
-    mean_decrease_rate = (initial_rear_force - compute_rear_force(*end_state)) / jnp.where(
+    mean_force_fall = (initial_rear_force - compute_rear_force(*dls_end.q, *dls_end.v)) / jnp.where(
         dls_duration == 0.0, 1.0, dls_duration
     )
-    return -rear_force_rate, mean_decrease_rate
+    quantity_values = (
+        landing_result.rear_impulse.normal,
+        fore_force.normal,
+        rear_force.normal,
+        *single_support_durations,
+        takeoff_acceleration,
+        -rear_force_rate,
+        mean_force_fall,
+    )
+    return dict(zip(CONTINUED_QUANTITIES, quantity_values, strict=True))
 
 
 def _compute_trial_monodromy(

@@ -102,12 +102,28 @@ class NewtonStep(NamedTuple):
     return_map_jacobian: Float[Array, "n n"]  # with respect to the section state
 
 
-class AbstractContinuationProblem(eqx.Module):
-    """Base class of continuation problems.
+class AbstractProblem(eqx.Module):
+    """Base class of problems whose unknowns contain a section state.
 
-    The argument `z` contains the unknowns, and `p` is the continued parameter. The argument `args`
-    is a pytree of all other inputs.
+    The argument `z` contains the unknowns, and `p` contains the varied parameters. The argument
+    `args` is a pytree of all other inputs.
     """
+
+    @abc.abstractmethod
+    def section_state(self, z: ProblemUnknowns) -> SectionStateVector:
+        """Return the section state, which is a part of the unknowns z."""
+
+    def correction_norm(self, z: ProblemUnknowns, correction: ProblemUnknowns) -> Scalar:
+        """Return the norm of a Newton correction, which is compared with the tolerance."""
+        return jnp.max(jnp.abs(correction))
+
+    def is_admissible(self, args: Any, z: ProblemUnknowns, p: Array) -> Bool[Array, ""]:
+        """Return whether the converged unknowns z satisfy the conditions of their branch."""
+        return jnp.all(jnp.isfinite(self.section_state(z)))
+
+
+class AbstractContinuationProblem(AbstractProblem):
+    """Base class of continuation problems, in one continued parameter `p`."""
 
     is_traceable: ClassVar[bool] = True
     """Whether JAX can trace `linearize`. If False, `linearize` is called outside compiled code, for
@@ -129,10 +145,6 @@ class AbstractContinuationProblem(eqx.Module):
         The values are not finite if the map is undefined at (z, p).
         """
 
-    @abc.abstractmethod
-    def section_state(self, z: ProblemUnknowns) -> SectionStateVector:
-        """Return the section state, which is a part of the unknowns z."""
-
     def interpolate_unknowns(
         self, left_point: ProblemUnknowns, right_point: ProblemUnknowns, location_fraction: Scalar
     ) -> ProblemUnknowns:
@@ -152,14 +164,6 @@ class AbstractContinuationProblem(eqx.Module):
     ) -> Bool[Array, ""]:
         """Return whether the branch has no detected kink between two neighboring points."""
         return jnp.asarray(True)
-
-    def correction_norm(self, z: ProblemUnknowns, correction: ProblemUnknowns) -> Scalar:
-        """Return the norm of a Newton correction, which is compared with the tolerance."""
-        return jnp.max(jnp.abs(correction))
-
-    def is_admissible(self, args: Any, z: ProblemUnknowns, p: Scalar) -> Bool[Array, ""]:
-        """Return whether the converged unknowns z satisfy the conditions of their branch."""
-        return jnp.all(jnp.isfinite(z))
 
 
 def compute_fixed_point_newton_step(

@@ -75,7 +75,10 @@ def iterate_plane_newton(
     plane_newton_state: PlaneNewtonState,
     newton_step: NewtonStep,
 ) -> PlaneNewtonState:
-    """Apply one Newton iteration in a plane, and return the new state of Newton's method."""
+    """Apply one Newton iteration in a plane, and return the new state of Newton's method.
+
+    The state is unchanged if Newton's method needs no other iteration.
+    """
     corrector_state = plane_newton_state.corrector_state
     next_corrector_state = correct_trial_point(
         setup,
@@ -100,8 +103,12 @@ def iterate_plane_newton(
         plane_newton_state.n_converged_iterations + n_added_converged_iterations,
         0,
     )
-    return PlaneNewtonState(
-        next_corrector_state, plane_newton_state.n_iterations + 1, n_converged_iterations
+    return select_trees_by_condition(
+        needs_newton_iteration(options, plane_newton_state),
+        PlaneNewtonState(
+            next_corrector_state, plane_newton_state.n_iterations + 1, n_converged_iterations
+        ),
+        plane_newton_state,
     )
 
 
@@ -206,8 +213,7 @@ def _linearize_selected_branches(
         leaf_of_all_branches[is_branch_selected] = selected_leaf
         return leaf_of_all_branches
 
-    newton_steps: NewtonStep = jax.device_put(jax.tree.map(insert_rows, selected_newton_steps))
-    return newton_steps
+    return jax.device_put(jax.tree.map(insert_rows, selected_newton_steps))
 
 
 def solve_on_planes(
@@ -221,10 +227,8 @@ def solve_on_planes(
     Return the points, and whether Newton's method converged for each branch. Every array has a
     leading axis over the branches; see `solve_on_plane`.
     """
-    points_and_convergence: tuple[ContinuationPoint, Bool[Array, " many"]]
     if setup.problem.is_traceable:
-        points_and_convergence = _solve_on_planes_jit(setup, args_by_branch, z, corrector_planes)
-        return points_and_convergence
+        return _solve_on_planes_jit(setup, args_by_branch, z, corrector_planes)
     states = _init_plane_newton_jit(z, corrector_planes)
     while np.any(
         is_solve_unfinished := np.asarray(_needs_newton_iteration_jit(setup.options, states))
@@ -232,11 +236,8 @@ def solve_on_planes(
         newton_steps = _linearize_selected_branches(
             setup, args_by_branch, states.corrector_state, is_solve_unfinished
         )
-        states = _iterate_unfinished_plane_newton(setup, corrector_planes, states, newton_steps)
-    points_and_convergence = _make_plane_newton_points_jit(
-        setup, args_by_branch, corrector_planes, states
-    )
-    return points_and_convergence
+        states = _iterate_plane_newton_jit(setup, corrector_planes, states, newton_steps)
+    return _make_plane_newton_points_jit(setup, args_by_branch, corrector_planes, states)
 
 
 _solve_on_planes_jit: Any = eqx.filter_jit(eqx.filter_vmap(solve_on_plane, in_axes=(None, 0, 0, 0)))
@@ -244,31 +245,9 @@ _are_branches_active_jit: Any = eqx.filter_jit(are_branches_active)
 _iterate_branches_jit: Any = eqx.filter_jit(iterate_branches)
 _init_plane_newton_jit: Any = eqx.filter_jit(jax.vmap(init_plane_newton))
 _needs_newton_iteration_jit: Any = eqx.filter_jit(needs_newton_iteration)
+_iterate_plane_newton_jit: Any = eqx.filter_jit(
+    eqx.filter_vmap(iterate_plane_newton, in_axes=(None, 0, 0, 0))
+)
 _make_plane_newton_points_jit: Any = eqx.filter_jit(
     eqx.filter_vmap(make_plane_newton_point, in_axes=(None, 0, 0, 0))
 )
-
-
-@eqx.filter_jit
-def _iterate_unfinished_plane_newton(
-    setup: ContinuationSetup,
-    corrector_planes: CorrectorPlane,
-    plane_newton_states: PlaneNewtonState,
-    newton_steps: NewtonStep,
-) -> PlaneNewtonState:
-    """Apply one Newton iteration to each unfinished plane solve, and return the states
-    of all solves.
-    """
-
-    def iterate_if_unfinished(
-        corrector_plane: CorrectorPlane,
-        plane_newton_state: PlaneNewtonState,
-        newton_step: NewtonStep,
-    ) -> PlaneNewtonState:
-        return select_trees_by_condition(
-            needs_newton_iteration(setup.options, plane_newton_state),
-            iterate_plane_newton(setup, corrector_plane, plane_newton_state, newton_step),
-            plane_newton_state,
-        )
-
-    return jax.vmap(iterate_if_unfinished)(corrector_planes, plane_newton_states, newton_steps)

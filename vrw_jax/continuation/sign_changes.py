@@ -52,8 +52,7 @@ def evaluate_bifurcation_functions(return_map_jacobians: np.ndarray) -> np.ndarr
     bifurcation_values = np.full(
         (*bifurcation_margin_values.shape[:-1], len(BIFURCATION_NAMES)), np.nan
     )
-    n_margins = min(bifurcation_margin_values.shape[-1], len(BIFURCATION_NAMES))
-    bifurcation_values[..., :n_margins] = bifurcation_margin_values[..., :n_margins]
+    bifurcation_values[..., : bifurcation_margin_values.shape[-1]] = bifurcation_margin_values
     return bifurcation_values
 
 

@@ -15,6 +15,7 @@ from jaxtyping import Array, Bool, Float
 
 from vrw_jax.continuation.arclength import (
     AbstractContinuationProblem,
+    AbstractProblem,
     NewtonStep,
     ProblemUnknowns,
     SectionStateVector,
@@ -32,36 +33,24 @@ class TestFunctionNewtonStep(NamedTuple):
     """
 
     newton_correction: ProblemUnknowns  # of z at fixed p
-    # derivatives dz/dp of the fixed point with respect to both parameters
-    tangents_by_parameter: tuple[ProblemUnknowns, ProblemUnknowns]
+    # derivatives dz/dp of the fixed point, with both parameters on a leading axis
+    parameter_tangents: ProblemUnknowns
     return_map_jacobian: Float[Array, "n n"]  # Jacobian of the return map
     test_function_value: Scalar  # at the corrected z
     # total derivatives of the test function with respect to both parameters
     parameter_gradient: ParameterPair
 
 
-class AbstractTestFunction(eqx.Module):
+class AbstractTestFunction(AbstractProblem):
     """Base class of test functions that are evaluated at fixed points, in two parameters.
 
     The argument `z` contains the unknowns of the fixed point. The argument `p` contains the values
-    of the two parameters. The argument `args` is a pytree of all other inputs.
+    of the two parameters.
     """
 
     @abc.abstractmethod
     def linearize(self, args: Any, z: ProblemUnknowns, p: ParameterPair) -> TestFunctionNewtonStep:
         """Return the Newton step at (z, p). It is not finite if the map is undefined there."""
-
-    @abc.abstractmethod
-    def section_state(self, z: ProblemUnknowns) -> SectionStateVector:
-        """Return the section state, which is a part of the unknowns z."""
-
-    def correction_norm(self, z: ProblemUnknowns, correction: ProblemUnknowns) -> Scalar:
-        """Return the norm of a Newton correction, which is compared with the tolerance."""
-        return jnp.max(jnp.abs(correction))
-
-    def is_admissible(self, args: Any, z: ProblemUnknowns, p: ParameterPair) -> Bool[Array, ""]:
-        """Return whether the converged unknowns z satisfy the conditions of their branch."""
-        return jnp.all(jnp.isfinite(self.section_state(z)))
 
 
 class TestFunctionPoint(NamedTuple):
@@ -96,17 +85,17 @@ class TestFunctionCurve(AbstractContinuationProblem):
         derivative_by_second_fraction = parameter_range * newton_step.parameter_gradient[1]
         second_fraction_change = -newton_step.test_function_value / derivative_by_second_fraction
         second_fraction_tangent = -newton_step.parameter_gradient[0] / derivative_by_second_fraction
-        tangent_by_first_parameter, tangent_by_second_parameter = newton_step.tangents_by_parameter
         add_second_tangent = lambda tree, fraction_change: jax.tree.map(
-            lambda leaf, tangent_leaf: leaf + parameter_range * fraction_change * tangent_leaf,
+            lambda leaf, tangents: leaf + parameter_range * fraction_change * tangents[1],
             tree,
-            tangent_by_second_parameter,
+            newton_step.parameter_tangents,
         )
         fixed_point_correction = add_second_tangent(
             newton_step.newton_correction, second_fraction_change
         )
         fixed_point_tangent = add_second_tangent(
-            tangent_by_first_parameter, second_fraction_tangent
+            jax.tree.map(lambda tangents: tangents[0], newton_step.parameter_tangents),
+            second_fraction_tangent,
         )
         # The fraction adds a multiplier of zero, which has no effect.
         padded_return_map_jacobian = jnp.pad(newton_step.return_map_jacobian, (0, 1))

@@ -34,6 +34,7 @@ from vrw_jax.collocation import (
     reconstruct_gait_step,
 )
 from vrw_jax.cycles.gait_surface import predict_gait
+from vrw_jax.cycles.margin_defaults import compute_takeoff_acceleration
 from vrw_jax.cycles.options import CycleOptions
 from vrw_jax.cycles.phase_sequence import (
     ADMISSIBILITY_CHECKS,
@@ -155,6 +156,30 @@ class CollocationSystem(NamedTuple):
             )
             phase_points_of_steps.append(phase_points)
         return phase_points_of_steps
+
+    @functools.partial(jax.jit, static_argnums=0)
+    def estimate_mesh_error(self, collocation_solution: CollocationSolution) -> Array:
+        """Return the estimated mesh error of a solution for one wheel."""
+        solution_with_lane = jax.tree.map(lambda x: x[..., None], collocation_solution)
+        return estimate_mesh_error(self.phase_sequence, self.phase_meshes, solution_with_lane)[0]
+
+    @functools.partial(jax.jit, static_argnums=0)
+    def compute_takeoff_acceleration(
+        self, parameters: Array, collocation_solution: CollocationSolution
+    ) -> Array:
+        """Return the lowest acceleration of the rear foot at take-off over the gait steps of one
+        wheel, m/s^2.
+        """
+        s = make_wheel_from_parameters(parameters, self.n_legs).symbols()
+        points_by_step = self.evaluate_phase_points(parameters, collocation_solution)
+        return jnp.min(
+            jnp.stack(
+                [
+                    compute_takeoff_acceleration(s, sls1_points)
+                    for _, sls1_points, _ in points_by_step
+                ]
+            )
+        )
 
 
 class CollocationState(NamedTuple):
@@ -465,7 +490,7 @@ def find_first_failed_check(
             phase_durations,
             accelerations_by_phase,
         )
-        is_check_satisfied: list[Array] = []
+        is_check_satisfied = []
         for phase, points_of_phase, is_active, duration in zip(
             phase_sequence.phases, phase_points, is_phase_active, phase_durations, strict=True
         ):
@@ -683,7 +708,10 @@ def run_search_attempts(
 
 
 def search_all_attempts(
-    collocation_system: CollocationSystem, run_attempts: BatchFunction, *parameters_and_guess: Any
+    collocation_system: CollocationSystem,
+    run_attempts: BatchFunction,
+    parameters: LaneParameters,
+    *search_guess: CollocationState,
 ) -> CycleSearchResult:
     """Run all attempts, and return the search result for each wheel (lane).
 
@@ -691,12 +719,11 @@ def search_all_attempts(
     wheels without a cycle are therefore gathered before each stage.
 
     - `run_attempts`: batched form of `run_search_attempts`;
-    - `parameters_and_guess`: the parameters and, optionally, a guess.
+    - `search_guess`: optionally, a guess.
     """
-    parameters = parameters_and_guess[0]
     n_lanes = parameters.shape[-1]
     # The first two attempts require a guess.
-    first_attempt_index = jnp.asarray(2 if len(parameters_and_guess) == 1 else 0, jnp.int32)
+    first_attempt_index = jnp.asarray(0 if search_guess else 2, jnp.int32)
     # For several gait steps, the homotopy would continue a gait of one step, which decides nothing.
     n_attempts = (
         len(list_search_attempts(collocation_system.cycle_options))
@@ -710,11 +737,11 @@ def search_all_attempts(
             search_result,
             first_attempt_index,
             jnp.asarray(n_attempts, jnp.int32),
-            *parameters_and_guess[1:],
+            *search_guess,
         )
 
     def has_next_attempt_stage(loop_carry: tuple) -> Array:
-        attempt_index, _, search_result, _ = loop_carry
+        attempt_index, _, search_result, *_ = loop_carry
         return (attempt_index < n_attempts) & jnp.any(
             _can_attempt_change_result(attempt_index, search_result)
         )
@@ -724,28 +751,21 @@ def search_all_attempts(
         lane_order_pending_first = jnp.argsort(
             ~_can_attempt_change_result(attempt_index, lane_arrays[0]), stable=True
         )
-        lane_indices, search_result, parameters_and_guess = jax.tree.map(
+        lane_indices, search_result, parameters, *search_guess = jax.tree.map(
             lambda x: x[..., lane_order_pending_first], (lane_indices, *lane_arrays)
         )
         end_attempt_index = jnp.where(
             attempt_index < N_DIRECT_ATTEMPTS, attempt_index + 1, n_attempts
         )
-        return (
-            end_attempt_index,
-            lane_indices,
-            run_attempts(
-                parameters_and_guess[0],
-                search_result,
-                attempt_index,
-                end_attempt_index,
-                *parameters_and_guess[1:],
-            ),
-            parameters_and_guess,
+        search_result = run_attempts(
+            parameters, search_result, attempt_index, end_attempt_index, *search_guess
         )
+        return end_attempt_index, lane_indices, search_result, parameters, *search_guess
 
-    initial_carry = first_attempt_index, jnp.arange(n_lanes), search_result, parameters_and_guess
-    _, lane_indices, gathered_search_result, _ = lax.while_loop(
-        has_next_attempt_stage, run_attempt_stage, initial_carry
+    lane_indices = jnp.arange(n_lanes)
+    initial_carry: tuple = first_attempt_index, lane_indices, search_result, parameters
+    _, lane_indices, gathered_search_result, *_ = lax.while_loop(
+        has_next_attempt_stage, run_attempt_stage, (*initial_carry, *search_guess)
     )
     original_lane_order = jnp.argsort(lane_indices)
     return jax.tree.map(lambda x: x[..., original_lane_order], gathered_search_result)

@@ -17,7 +17,6 @@ from jaxtyping import Array, Bool, Float, Int
 from vrw_jax.collocation import (
     N_GAUSS_NODES,
     CollocationSolution,
-    estimate_mesh_error,
     transfer_accelerations,
 )
 from vrw_jax.continuation import floquet
@@ -29,7 +28,6 @@ from vrw_jax.cycles.collocation_search import (
 from vrw_jax.cycles.cycle import AbstractCycle
 from vrw_jax.cycles.derivatives import attach_monodromy_derivatives, solve_cycle_with_derivatives
 from vrw_jax.cycles.force_peaks import compute_force_peaks
-from vrw_jax.cycles.margin_defaults import compute_takeoff_acceleration
 from vrw_jax.cycles.phase_sequence import ADMISSIBILITY_CHECKS
 from vrw_jax.cycles.slope_response import (
     COLLOCATION_RESPONSE_MEASURES,
@@ -139,8 +137,8 @@ class LimitCycle(AbstractCycle):
         See `collocation.estimate_mesh_error`. A gait whose estimate is above 1e-5 is rejected. More
         mesh intervals in `CycleOptions` reduce the error.
         """
-        estimate_error = functools.partial(_estimate_found_mesh_error, self.system)
-        return self.map_over_batch_axes(estimate_error)(self.found, self.collocation_state.solution)
+        estimate_error = self.map_over_batch_axes(self.system.estimate_mesh_error)
+        return jnp.where(self.found, estimate_error(self.collocation_state.solution), 0.0)
 
     @property
     def takeoff_acceleration(self) -> Array:
@@ -148,12 +146,9 @@ class LimitCycle(AbstractCycle):
 
         See `margin_defaults`.
         """
-        compute_least_takeoff_acceleration = functools.partial(
-            _compute_takeoff_acceleration, self.system
-        )
         return self._zero_without_gait(
-            self.map_over_batch_axes(compute_least_takeoff_acceleration)(
-                self.parameters, self.collocation_state
+            self.map_over_batch_axes(self.system.compute_takeoff_acceleration)(
+                self.parameters, self.collocation_state.solution
             )
         )
 
@@ -192,13 +187,12 @@ class LimitCycle(AbstractCycle):
 
     def _locate_force_peaks(self) -> dict[str, Array]:
         compute_peaks = functools.partial(compute_force_peaks, self.system)
-        force_peaks: dict[str, Array] = evaluate_by_saved_trace(
+        return evaluate_by_saved_trace(
             self.map_over_batch_axes(compute_peaks),
             ("force peaks", self.system, self.outcome.ndim),
             self.parameters,
             self.collocation_state.solution,
         )
-        return force_peaks
 
     @property
     def margins(self) -> Margins:
@@ -236,39 +230,6 @@ class LimitCycle(AbstractCycle):
             ("durations of DLS, SLS-I, SLS-II", f"{format_numbers(self.durations)} s"),
             ("indicators λ_I4, λ2⁺, λ4⁺", indicator_text),
         ]
-
-
-@functools.partial(jax.jit, static_argnums=0)
-def _estimate_found_mesh_error(
-    collocation_system: CollocationSystem,
-    is_gait_found: Array,
-    collocation_solution: CollocationSolution,
-) -> Array:
-    """Return the estimated mesh error of a cycle, or 0 if no cycle was found."""
-    solution_with_lane = jax.tree.map(lambda x: x[..., None], collocation_solution)
-    return jnp.where(
-        is_gait_found,
-        estimate_mesh_error(
-            collocation_system.phase_sequence, collocation_system.phase_meshes, solution_with_lane
-        )[0],
-        0.0,
-    )
-
-
-@functools.partial(jax.jit, static_argnums=0)
-def _compute_takeoff_acceleration(
-    collocation_system: CollocationSystem, parameters: Array, collocation_state: CollocationState
-) -> Array:
-    """Return the lowest take-off acceleration over the gait steps of a cycle, m/s^2."""
-    s = make_wheel_from_parameters(parameters, collocation_system.n_legs).symbols()
-    points_by_step = collocation_system.evaluate_phase_points(
-        parameters, collocation_state.solution
-    )
-    return jnp.min(
-        jnp.stack(
-            [compute_takeoff_acceleration(s, sls1_points) for _, sls1_points, _ in points_by_step]
-        )
-    )
 
 
 _attach_monodromy_compiled = jax.jit(attach_monodromy_derivatives, static_argnums=0)
