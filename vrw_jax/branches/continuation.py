@@ -432,9 +432,9 @@ def _check_arclength_options(options: ArclengthOptions | None) -> ArclengthOptio
 
     Return them, or `ArclengthOptions()` if they are None.
     """
-    if options is not None:
-        check_type("options", options, ArclengthOptions, "give vrw.ArclengthOptions()")
-    return ArclengthOptions() if options is None else options
+    options = ArclengthOptions() if options is None else options
+    check_type("options", options, ArclengthOptions, "give vrw.ArclengthOptions()")
+    return options
 
 
 def _make_labeled_gait_branch(
@@ -454,9 +454,8 @@ def _make_labeled_gait_branch(
     branch_attrs = {"title": f"Branch of limit cycles along {parameter_name}"} | start_provenance
     if branch_data is None:
         branch_outcome = Outcome(start_outcome)
-        branch_outcome = (
-            Outcome.NO_CYCLE_FOUND if branch_outcome == Outcome.STEPPED else branch_outcome
-        )
+        if branch_outcome == Outcome.STEPPED:
+            branch_outcome = Outcome.NO_CYCLE_FOUND
         empty_dataset = xr.Dataset(
             coords={parameter_name: ("point", np.zeros(0))}, attrs=branch_attrs
         )

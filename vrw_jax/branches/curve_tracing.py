@@ -194,7 +194,7 @@ class CurveSeed(NamedTuple):
     """Point on or near a curve of special points, from which the curve is traced."""
 
     special_point_name: str
-    parameter_values: tuple[float, float]  # of the two parameters
+    parameter_values: tuple[float, ...]  # of the two parameters
     collocation_system: CollocationSystem
     branch_wheel: BranchWheel
     z: CollocationSolution
@@ -272,15 +272,12 @@ class CurveTracer(NamedTuple):
                 continue
             limit_cycle = special_point.cycle
             params = make_wheel_from_parameters(limit_cycle.parameters, limit_cycle.system.n_legs)
-            first_parameter_value, second_parameter_value = (
-                float(getattr(params, parameter_name)) for parameter_name in self.parameter_names
-            )
             branch_wheel = BranchWheel(params, limit_cycle.collocation_state.is_phase_active)
             z = limit_cycle.collocation_state.solution
             curve_seeds.append(
                 CurveSeed(
                     choose_continued_special_point_name(special_point.name, branch_wheel, z),
-                    (first_parameter_value, second_parameter_value),
+                    tuple(float(getattr(params, name)) for name in self.parameter_names),
                     limit_cycle.system,
                     branch_wheel,
                     z,
@@ -577,7 +574,6 @@ class CurveTracer(NamedTuple):
             x[0] + overrun_distance / distances_to_meeting[point_index] * (x[0] - x[point_index])
         )
         z = jax.tree.map(lambda x: jnp.asarray(extrapolate_from_meeting(x)), z)
-        first_parameter_value, second_parameter_value = extrapolate_from_meeting(parameter_points)
         dls_duration = (
             0.0
             if special_point_name == DLS_VANISHING_NAME
@@ -586,7 +582,7 @@ class CurveTracer(NamedTuple):
         z = z._replace(durations=z.durations.at[0, 0].set(dls_duration))
         return curve_seed._replace(
             special_point_name=special_point_name,
-            parameter_values=(first_parameter_value, second_parameter_value),
+            parameter_values=tuple(extrapolate_from_meeting(parameter_points)),
             z=z,
         )
 

@@ -412,7 +412,7 @@ def _compute_continued_quantities(
     )
 
     def make_dls_instant(theta: Array, dtheta: Array) -> PhaseInstant:
-        return PhaseInstant(dls_phase, dls_phase.compute_motion((theta,), (dtheta,)), None)
+        return PhaseInstant(dls_phase, dls_phase.compute_motion((theta,), (dtheta,)))
 
     compute_rear_force = lambda *dls_state: dls_phase.compute_end_guard(
         make_dls_instant(*dls_state)

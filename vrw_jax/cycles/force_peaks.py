@@ -101,7 +101,7 @@ def _find_force_extrema(
         )
 
     def evaluate_normal_force(q: Array, v: Array) -> Array:
-        phase_instant = PhaseInstant(phase, phase.compute_motion(tuple(q), tuple(v)), None)
+        phase_instant = PhaseInstant(phase, phase.compute_motion(tuple(q), tuple(v)))
         normal_force = jnp.asarray(phase_instant.fore_force.normal)
         if includes_rear_force and phase_instant.rear_force is not None:
             normal_force = normal_force + phase_instant.rear_force.normal

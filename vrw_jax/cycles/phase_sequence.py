@@ -24,8 +24,6 @@ from vrw_jax.numerics import Elementwise, Vector, compute_sine_cosine
 from vrw_jax.wheel import (
     PAPER_PHASES,
     SHARED_FAILURE_OUTCOMES,
-    AbstractPhase,
-    Motion,
     PhaseInstant,
     Symbols,
     compute_symbols,
@@ -72,9 +70,7 @@ def _make_collocation_phase(
     """
     phase_class = PAPER_PHASES[phase_index]
 
-    def evaluate_phase_motion(
-        phase_constants: PhaseConstants, phase_point: PhasePoint
-    ) -> tuple[AbstractPhase, Motion]:
+    def make_instant(phase_constants: PhaseConstants, phase_point: PhasePoint) -> PhaseInstant:
         tilt = phase_constants[N_SYMBOL_CONSTANTS:]
         wheel_phase = phase_class(
             _restore_symbols(n_legs, phase_constants),
@@ -82,21 +78,21 @@ def _make_collocation_phase(
             True,
             compute_sine_cosine(*tilt) if tilt else (),
         )
-        return wheel_phase, wheel_phase.compute_motion(phase_point.q, phase_point.v)
+        return PhaseInstant(wheel_phase, wheel_phase.compute_motion(phase_point.q, phase_point.v))
 
     def evaluate_dynamics_residual(
         phase_constants: PhaseConstants, phase_point: PhasePoint, phase_acceleration: Vector
     ) -> Vector:
-        wheel_phase, wheel_motion = evaluate_phase_motion(phase_constants, phase_point)
-        return wheel_phase.compute_dynamics_residual(wheel_motion, phase_acceleration)
+        instant = make_instant(phase_constants, phase_point)
+        return instant.phase.compute_dynamics_residual(instant.motion, phase_acceleration)
 
     def evaluate_end_event(phase_constants: PhaseConstants, phase_point: PhasePoint) -> Elementwise:
-        wheel_phase, wheel_motion = evaluate_phase_motion(phase_constants, phase_point)
-        return wheel_phase.compute_end_guard(PhaseInstant(wheel_phase, wheel_motion, None))
+        instant = make_instant(phase_constants, phase_point)
+        return instant.phase.compute_end_guard(instant)
 
     def evaluate_phase_guards(phase_constants: PhaseConstants, phase_point: PhasePoint) -> Vector:
-        wheel_phase, wheel_motion = evaluate_phase_motion(phase_constants, phase_point)
-        guard_values = wheel_phase.compute_guards(PhaseInstant(wheel_phase, wheel_motion, None))
+        instant = make_instant(phase_constants, phase_point)
+        guard_values = instant.phase.compute_guards(instant)
         # Every guard keeps its index in ADMISSIBILITY_CHECKS, even if it is not checked.
         return (
             guard_values
@@ -105,11 +101,11 @@ def _make_collocation_phase(
         )
 
     def reset_to_next_phase(phase_constants: PhaseConstants, phase_point: PhasePoint) -> PhasePoint:
-        wheel_phase, wheel_motion = evaluate_phase_motion(phase_constants, phase_point)
+        instant = make_instant(phase_constants, phase_point)
         return PhasePoint(
             (),
             *PAPER_PHASES[phase_index + 1].select_phase_coordinates(
-                phase_point.q[0], wheel_phase.reset_motion(wheel_motion)
+                phase_point.q[0], instant.phase.reset_motion(instant.motion)
             ),
         )
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from vrw_jax.cycles import limit_cycle
 from vrw_jax.robustness.failure_density import GaussianMixture
-from vrw_jax.robustness.sampled_passage import WalkerGroups, run_biased_walks
+from vrw_jax.robustness.sampled_passage import WalkerGroups
 from vrw_jax.wheel import Outcome, WheelParams
 
 
@@ -192,7 +192,7 @@ def _draw_failing_walks(walker_groups: WalkerGroups, walk_density: GaussianMixtu
     ):
         drawn_deviations = walk_density.draw_samples(n_walkers, walker_groups.random)
         deviations_by_round.append(drawn_deviations)
-        weights_by_round.append(run_biased_walks(walker_groups, walk_density, drawn_deviations))
+        weights_by_round.append(walker_groups.run_biased_walks(walk_density, drawn_deviations))
         walk_weights = np.concatenate(weights_by_round)
         if np.any(walk_weights):
             n_effective_walks = np.sum(walk_weights) ** 2 / np.sum(walk_weights**2)

@@ -240,6 +240,27 @@ class WalkerGroups:
             options=self.step_options,
         )
 
+    def run_biased_walks(
+        self, walk_density: GaussianMixture, slope_deviations: np.ndarray
+    ) -> np.ndarray:
+        """Return the failure weights of one walk from every walker, shape (walkers,).
+
+        The weight of a walk is the likelihood ratio if the walk fails in its last step, and 0
+        otherwise. The mean weight is the probability of a failure in the last step.
+
+        - `walk_density`: density from which the slope deviations are drawn;
+        - `slope_deviations`: standardized deviations of the slopes, shape (walkers, lines).
+        """
+        has_failed_in_last_step, _, walk_results = self.run_walks(slope_deviations)
+        nominal_density = GaussianMixture.make_isotropic_gaussian(slope_deviations.shape[1], 1.0)
+        likelihood_ratios = np.exp(
+            nominal_density.compute_log_density(slope_deviations)
+            - walk_density.compute_log_density(slope_deviations)
+        )
+        failure_importance_weights = np.where(has_failed_in_last_step, likelihood_ratios, 0.0)
+        self.add_failure_weights(walk_results.outcome, failure_importance_weights)
+        return failure_importance_weights
+
     def add_failure_weights(self, walk_outcomes: np.ndarray, walk_weights: np.ndarray) -> None:
         """Add the weights of failed walks to `weight_by_outcome`, the total for each outcome."""
         for outcome_code in np.unique(walk_outcomes[walk_weights > 0.0]):
@@ -622,33 +643,11 @@ def _make_weight_sampler(
                 for net in group_nets
             ]
         )
-        return run_biased_walks(
-            walker_groups, walk_density, walk_density.map_uniform_numbers(net_points)
+        return walker_groups.run_biased_walks(
+            walk_density, walk_density.map_uniform_numbers(net_points)
         )
 
     return sample_failure_weights
-
-
-def run_biased_walks(
-    walker_groups: WalkerGroups, walk_density: GaussianMixture, slope_deviations: np.ndarray
-) -> np.ndarray:
-    """Return the failure weights of one walk from every walker, shape (walkers,).
-
-    The weight of a walk is the likelihood ratio if the walk fails in its last step, and 0
-    otherwise. The mean weight is the probability of a failure in the last step.
-
-    - `walk_density`: density from which the slope deviations are drawn;
-    - `slope_deviations`: standardized deviations of the slopes, shape (walkers, lines).
-    """
-    has_failed_in_last_step, _, walk_results = walker_groups.run_walks(slope_deviations)
-    nominal_density = GaussianMixture.make_isotropic_gaussian(slope_deviations.shape[1], 1.0)
-    likelihood_ratios = np.exp(
-        nominal_density.compute_log_density(slope_deviations)
-        - walk_density.compute_log_density(slope_deviations)
-    )
-    failure_importance_weights = np.where(has_failed_in_last_step, likelihood_ratios, 0.0)
-    walker_groups.add_failure_weights(walk_results.outcome, failure_importance_weights)
-    return failure_importance_weights
 
 
 def _solve_failure_probability(

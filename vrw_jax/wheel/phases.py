@@ -266,7 +266,7 @@ class PhaseInstant:
     """
 
     def __init__(
-        self, phase: AbstractPhase, motion: Motion, phase_acceleration: Vector | None
+        self, phase: AbstractPhase, motion: Motion, phase_acceleration: Vector | None = None
     ) -> None:
         self.phase, self.motion, self._phase_acceleration = phase, motion, phase_acceleration
 
