@@ -278,6 +278,7 @@ def test_import_of_any_module_changes_no_setting_and_starts_no_plotting():
     )
 
 
+@pytest.mark.slow
 def test_the_architecture_figure_is_drawn_from_the_imports(tmp_path):
     command = [sys.executable, "-m", "experiments.shared.draw_packages", str(tmp_path)]
     subprocess.run(command, cwd=ROOT, check=True)

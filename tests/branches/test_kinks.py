@@ -82,6 +82,7 @@ def test_a_branch_goes_on_where_contacts_change_their_order(from_above):
     np.testing.assert_allclose(state[i - 1, :20], state[i, :20], atol=1e-4)
 
 
+@pytest.mark.slow
 def test_from_either_side_of_the_kink_the_branch_is_the_same(from_above):
     below = down_to_the_slope(250.0, 0.325, 0.331)
     assert_ends_at_the_slope(below, 0.331)

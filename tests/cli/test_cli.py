@@ -171,7 +171,7 @@ def test_every_printed_symbol_has_a_spelling_in_ascii() -> None:
             assert "?" not in spelled, (text, spelled)
 
 
-@pytest.mark.parametrize("encoding", ["ascii", "cp1252"])
+@pytest.mark.parametrize("encoding", ["ascii", pytest.param("cp1252", marks=pytest.mark.slow)])
 def test_a_gait_is_printed_on_a_terminal_without_greek_letters(encoding: str) -> None:
     environment = {**os.environ, "PYTHONIOENCODING": encoding, "COLUMNS": "200"}
     command = [sys.executable, "-m", "vrw_jax", "gait", "--steps", "1"]

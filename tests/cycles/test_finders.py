@@ -93,7 +93,7 @@ def test_a_gait_of_one_step_asked_for_as_one_of_several_says_what_it_is():
         vrw.WheelParams(slope=0.1),
         (0.39, 1.5),
     )
-    for n in (1, 2, 4):
+    for n in (1, 2):
         gait = vrw.limit_cycle(wheel, model=model, guess=[*start, 0.0], period_n=n)
         assert bool(gait.found)
         assert int(gait.minimal_period) == 1

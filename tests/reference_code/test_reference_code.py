@@ -69,6 +69,7 @@ def test_the_step_agrees_with_the_reference(name: str) -> None:
     assert step_result["constraint_residual"] < 1e-12
 
 
+@pytest.mark.slow
 def test_the_limit_cycle_agrees_with_the_reference() -> None:
     reference = CASES["table_1"]["cycle"]
     cycle = five_coordinates.limit_cycle(five_coordinates.TABLE_1, five_coordinates.START)

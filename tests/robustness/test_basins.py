@@ -163,8 +163,14 @@ def state_at_time(step, time):
     raise AssertionError
 
 
-@pytest.mark.parametrize("engine", ["auto", "diffrax"])
-@pytest.mark.parametrize("share_of_step", [0.2, 0.7, 0.97])
+@pytest.mark.parametrize(
+    ("share_of_step", "engine"),
+    [
+        (0.2, "auto"), (0.7, "auto"), (0.97, "auto"), (0.2, "diffrax"),
+        pytest.param(0.7, "diffrax", marks=pytest.mark.slow),
+        pytest.param(0.97, "diffrax", marks=pytest.mark.slow),
+    ],
+)  # fmt: skip
 def test_the_rest_of_a_disturbed_step_is_that_of_five_coordinates(gait_step, share_of_step, engine):
     x, step = gait_step
     phase, state = state_at_time(step, share_of_step * step["durations"].sum())

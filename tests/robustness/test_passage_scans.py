@@ -75,11 +75,18 @@ def test_the_command_needs_the_standard_deviation_of_the_slopes(tmp_path: Path) 
     assert "write slope_sd = 0.01" in " ".join(result.stderr.split())
 
 
-def test_the_command_writes_a_store_of_a_design(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "measures",
+    [
+        ["mean_steps"],
+        pytest.param(["mean_steps", "gait_sensitivity_period"], marks=pytest.mark.slow),
+    ],
+    ids="-".join,
+)
+def test_the_command_writes_a_store_of_a_design(tmp_path: Path, measures: list[str]) -> None:
     config = tmp_path / "two.toml"
     config.write_text(
-        f"[grid]\ndamping = [190.0, 200.0]\n[scan]\nslope_sd = {SLOPE_SD}\n"
-        'measures = ["mean_steps", "gait_sensitivity_period"]\n'
+        f"[grid]\ndamping = [190.0, 200.0]\n[scan]\nslope_sd = {SLOPE_SD}\nmeasures = {measures}\n"
     )
     folder = tmp_path / "out"
     result = run_command("robustness", config, "--out", folder)
@@ -87,3 +94,4 @@ def test_the_command_writes_a_store_of_a_design(tmp_path: Path) -> None:
     data = vrw.open_scan(folder / "scan.zarr")
     assert np.all(data.mean_steps > 5.0)
     assert data.mean_steps[0] > data.mean_steps[1]
+    assert set(measures) <= set(data)

@@ -216,7 +216,10 @@ def test_folders_of_code_are_the_users_alone_whatever_the_umask(tmp_path):
     assert list((tmp_path / "a").rglob("lanes_code_*"))
 
 
-@pytest.mark.parametrize("mode", [0o777, 0o770, 0o702, 0o1777])
+@pytest.mark.parametrize(
+    "mode", [pytest.param(0o777, marks=pytest.mark.slow), 0o770, 0o702,
+             pytest.param(0o1777, marks=pytest.mark.slow)],
+)  # fmt: skip
 def test_a_folder_that_others_can_write_is_refused_in_one_sentence(tmp_path, mode):
     place = tmp_path / "cache"
     place.mkdir()

@@ -5,7 +5,10 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
 
+
+@pytest.mark.slow
 def test_all_signatures_are_type_checked_while_code_is_generated():
     """In a process of its own: what is checked is settled when the library is imported."""
     tests = Path(__file__).with_name("test_simd.py")

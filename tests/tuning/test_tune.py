@@ -353,6 +353,7 @@ def estimate_log_life(params: vrw.WheelParams) -> jnp.ndarray:
     return jnp.log(vrw.first_passage(params, 0.01, n_walkers=4096, tol=0.03).mean_steps)
 
 
+@pytest.mark.slow  # docs/tuning.md runs the same call
 def test_tuning_raises_the_mean_number_of_steps_on_random_slopes():
     """A second estimate with another seed confirms the life of the tuned wheel."""
     bounds = {"damping": (190.0, 202.0)}
