@@ -345,11 +345,9 @@ class ArrayEmitter:
         return MemoryArray(self, array.shape, llvm_element_type, llvm_table)
 
     def emit_elementwise_array(
-        self, primitive_call: PrimitiveCall, operand_arrays: Sequence[LlvmArray]
+        self, primitive_call: PrimitiveCall, *operand_arrays: LlvmArray
     ) -> LlvmArray:
-        """Emit an elementwise primitive for each entry of the operands, and return the array of the
-        results.
-        """
+        """Apply the primitive to each entry, and return the array of the results."""
         primitive_name, primitive_params, operand_avals, result_aval = primitive_call
         result_shape = primitive_call.result_shape
         emit_result_entry = lambda entry_operands: emit_llvm_elementwise_primitive(
@@ -367,10 +365,10 @@ class ArrayEmitter:
             return make_entry_array((), [emit_result_entry(entry_operands)])
         if any(x.shape != result_shape for x in operand_arrays):
             # An operand without lanes may have an extra axis, or fewer axes.
-            operand_arrays = [self.drop_extra_axis(x, len(result_shape)) for x in operand_arrays]
-            operand_arrays = [
-                self.broadcast_array(x, result_shape, range(len(x.shape))) for x in operand_arrays
-            ]
+            shortened_arrays = [self.drop_extra_axis(x, len(result_shape)) for x in operand_arrays]
+            operand_arrays = tuple(
+                self.broadcast_array(x, result_shape, range(len(x.shape))) for x in shortened_arrays
+            )
         if any(isinstance(x, LazyArray) for x in operand_arrays):
             emit_entry_at_index = lambda entry_index: emit_result_entry(
                 [self.get_array_entry(x, entry_index) for x in operand_arrays]

@@ -37,7 +37,6 @@ def write_llvm_kernel(
     `lanes_per_group` is 1, the lane is computed twice, in a vector, because LLVM's code for scalars
     differs in the last digits.
     """
-    _check_lane_axes(closed_jaxpr)
     llvm_module = ir.Module(LANE_KERNEL_NAME)
     llvm_pointer_type = ir.PointerType()
     llvm_kernel = ir.Function(
@@ -93,26 +92,6 @@ def write_llvm_kernel(
     return str(llvm_module)
 
 
-def _check_lane_axes(closed_jaxpr: ClosedJaxpr) -> None:
-    """Raise a NotImplementedError unless the lane axis is the last axis of every result.
-
-    Raise the error also if another axis of an argument or a result has the length of the lane axis.
-    """
-    for error_subject, checked_avals in (
-        ("An argument", closed_jaxpr.in_avals),
-        ("A result", closed_jaxpr.out_avals),
-    ):
-        for aval in checked_avals:
-            if LANE_AXIS_SENTINEL in aval.shape[:-1]:
-                raise make_lane_axis_error(error_subject, aval)
-    for aval in closed_jaxpr.out_avals:
-        if not has_lane_axis(aval):
-            raise NotImplementedError(
-                f"A result has the shape {aval.str_short()}, the same for all lanes: compute it "
-                "outside, or add zeros of the lanes."
-            )
-
-
 @dataclass
 class _LaneGroupAccess:
     """Emitter of loads and stores for one group of lanes in the caller's arrays.
@@ -128,8 +107,11 @@ class _LaneGroupAccess:
     def read_argument_array(self, base_pointer: LlvmValue, aval: Any) -> LlvmArray:
         """Return the argument at `base_pointer` as an array of LLVM values.
 
-        An argument without axes is one number for all lanes.
+        An argument without axes is one number for all lanes. Raise a NotImplementedError if an axis
+        before the last one has the length of the lane axis.
         """
+        if LANE_AXIS_SENTINEL in aval.shape[:-1]:
+            raise make_lane_axis_error("An argument", aval)
         llvm_builder = self.array_emitter.llvm_builder
 
         def emit_entry_load(entry_index: EntryIndex) -> LlvmValue:
@@ -169,7 +151,14 @@ class _LaneGroupAccess:
     ) -> None:
         """Emit stores of `result_array`, for the lanes of the group, into the memory at
         `base_pointer`.
+
+        Raise a NotImplementedError unless the last axis is the lane axis.
         """
+        if not has_lane_axis(aval):
+            raise NotImplementedError(
+                f"A result has the shape {aval.str_short()}, the same for all lanes: compute it "
+                "outside, or add zeros of the lanes."
+            )
         llvm_builder = self.array_emitter.llvm_builder
 
         def emit_entry_store(entry_index: EntryIndex, _: Any) -> list[LlvmValue]:

@@ -26,9 +26,9 @@ def emit_cumulative_sum(
     array_emitter: ArrayEmitter, primitive_call: PrimitiveCall, array: LlvmArray
 ) -> LlvmArray:
     """Return the cumulative sums along an axis, from its start or, with `reverse`, from its end."""
-    if primitive_call.primitive_params["axis"] == len(array.shape):
-        raise make_lane_mixing_error(primitive_call.primitive_name)
     sum_axis, is_reversed = (primitive_call.primitive_params[name] for name in ("axis", "reverse"))
+    if sum_axis == len(array.shape):
+        raise make_lane_mixing_error(primitive_call.primitive_name)
     array_entries = array_emitter.get_array_entries(array)
     emit_sum = _make_combination(array_emitter, "add", primitive_call.result_aval.dtype)
     if is_reversed:
@@ -103,80 +103,86 @@ def emit_array_product(
     return product_memory
 
 
-def make_reduction_rule(combining_primitive: str) -> Callable[..., LlvmArray]:
-    """Return the rule for a reduction that combines entries by an elementwise primitive such as
-    "add".
+COMBINING_PRIMITIVE_BY_REDUCTION = {
+    "reduce_and": "and",
+    "reduce_max": "max",
+    "reduce_min": "min",
+    "reduce_or": "or",
+    "reduce_sum": "add",
+}
+"""Elementwise primitive by which each reduction combines two entries."""
+
+
+def emit_reduced_array(
+    array_emitter: ArrayEmitter, primitive_call: PrimitiveCall, array: LlvmArray
+) -> LlvmArray:
+    """Return the array reduced along axes. Only `reduce_and` and `reduce_or` also reduce over
+    lanes.
     """
+    combining_primitive = COMBINING_PRIMITIVE_BY_REDUCTION[primitive_call.primitive_name]
+    reduces_over_lanes = has_lane_axis(primitive_call.operand_avals[0]) and not has_lane_axis(
+        primitive_call.result_aval
+    )
+    result_dtype = primitive_call.operand_avals[0].dtype
+    if reduces_over_lanes and (
+        combining_primitive not in ("and", "or") or result_dtype.kind != "b"
+    ):
+        raise make_lane_mixing_error(primitive_call.primitive_name)
+    reduced_axes = [
+        axis for axis in primitive_call.primitive_params["axes"] if axis < len(array.shape)
+    ]
+    emit_combination = _make_combination(array_emitter, combining_primitive, result_dtype)
+    result_axis_lengths = [n for axis, n in enumerate(array.shape) if axis not in reduced_axes]
+    reduced_axis_lengths = [array.shape[axis] for axis in reduced_axes]
 
-    def emit_reduced_array(
-        array_emitter: ArrayEmitter, primitive_call: PrimitiveCall, array: LlvmArray
-    ) -> LlvmArray:
-        """Return the array reduced along axes. Only `reduce_and` and `reduce_or` also reduce over
-        lanes.
-        """
-        reduces_over_lanes = has_lane_axis(primitive_call.operand_avals[0]) and not has_lane_axis(
-            primitive_call.result_aval
-        )
-        result_dtype = primitive_call.operand_avals[0].dtype
-        if reduces_over_lanes and (
-            combining_primitive not in ("and", "or") or result_dtype.kind != "b"
-        ):
-            raise make_lane_mixing_error(primitive_call.primitive_name)
-        reduced_axes = tuple(
-            axis for axis in primitive_call.primitive_params["axes"] if axis < len(array.shape)
-        )
-        emit_combination = _make_combination(array_emitter, combining_primitive, result_dtype)
-        result_axis_lengths = [n for axis, n in enumerate(array.shape) if axis not in reduced_axes]
-        reduced_axis_lengths = [array.shape[axis] for axis in reduced_axes]
-
-        def merge_result_and_reduced_index(
-            result_index: EntryIndex, reduced_index: EntryIndex
-        ) -> EntryIndex:
+    def emit_reduced_entry(result_index: EntryIndex) -> LlvmValue:
+        def get_entry_to_reduce(reduced_index: EntryIndex) -> LlvmValue:
             reduced_index_iterator, result_index_iterator = iter(reduced_index), iter(result_index)
-            return tuple(
+            entry_index = tuple(
                 next(reduced_index_iterator if i in reduced_axes else result_index_iterator)
                 for i in range(len(array.shape))
             )
+            return array_emitter.get_array_entry(array, entry_index)
 
-        def emit_reduced_entry(result_index: EntryIndex) -> LlvmValue:
-            get_entry_to_reduce = lambda reduced_index: array_emitter.get_array_entry(
-                array, merge_result_and_reduced_index(result_index, reduced_index)
+        n_terms = math.prod(reduced_axis_lengths)
+        if (
+            isinstance(array, np.ndarray)
+            or n_terms <= array_emitter.register_limits.max_unrolled_reduction_terms
+        ):
+            return functools.reduce(
+                emit_combination, map(get_entry_to_reduce, np.ndindex(*reduced_axis_lengths))
             )
-            n_terms = math.prod(reduced_axis_lengths)
-            if (
-                isinstance(array, np.ndarray)
-                or n_terms <= array_emitter.register_limits.max_unrolled_reduction_terms
-            ):
-                return functools.reduce(
-                    emit_combination, map(get_entry_to_reduce, np.ndindex(*reduced_axis_lengths))
-                )
-            # The first entry is counted twice, which changes no reduction except a sum.
-            initial_reduction_value = get_entry_to_reduce((0,) * len(reduced_axis_lengths))
-            if combining_primitive == "add":
-                initial_reduction_value = array_emitter.value_emitter.make_llvm_constant(
-                    array.entry_type, 0
-                )
-            elif isinstance(array.entry_type, ir.VectorType):
-                initial_reduction_value = array_emitter.value_emitter.to_lane_vector(
-                    initial_reduction_value
-                )
-            return array_emitter.emit_index_loops(
-                reduced_axis_lengths,
-                lambda i, loop_carried_values: [
-                    emit_combination(loop_carried_values[0], get_entry_to_reduce(i))
-                ],
-                [initial_reduction_value],
-            )[0]
-
-        reduced_entries = list(map(emit_reduced_entry, np.ndindex(*result_axis_lengths)))
-        if reduces_over_lanes:
-            emit_lane_test = functools.partial(
-                _emit_any_or_all_lanes, array_emitter, combining_primitive
+        # The first entry is counted twice, which changes no reduction except a sum.
+        initial_reduction_value = get_entry_to_reduce((0,) * len(reduced_axis_lengths))
+        if combining_primitive == "add":
+            initial_reduction_value = array_emitter.value_emitter.make_llvm_constant(
+                array.entry_type, 0
             )
-            reduced_entries = list(map(emit_lane_test, reduced_entries))
-        return make_entry_array(tuple(result_axis_lengths), reduced_entries)
+        elif isinstance(array.entry_type, ir.VectorType):
+            initial_reduction_value = array_emitter.value_emitter.to_lane_vector(
+                initial_reduction_value
+            )
+        return array_emitter.emit_index_loops(
+            reduced_axis_lengths,
+            lambda i, loop_carried_values: [
+                emit_combination(loop_carried_values[0], get_entry_to_reduce(i))
+            ],
+            [initial_reduction_value],
+        )[0]
 
-    return emit_reduced_array
+    reduced_entries = list(map(emit_reduced_entry, np.ndindex(*result_axis_lengths)))
+    for i, lane_flags in enumerate(reduced_entries):
+        # This truth value of the group is a scalar: whether any ("or") or all ("and") lanes are
+        # true.
+        if reduces_over_lanes and isinstance(lane_flags.type, ir.VectorType):
+            lane_bits = array_emitter.llvm_builder.bitcast(
+                lane_flags, ir.IntType(array_emitter.value_emitter.n_vector_lanes)
+            )
+            comparison_operator, number = ("!=", 0) if combining_primitive == "or" else ("==", -1)
+            reduced_entries[i] = array_emitter.llvm_builder.icmp_unsigned(
+                comparison_operator, lane_bits, ir.Constant(lane_bits.type, number)
+            )
+    return make_entry_array(tuple(result_axis_lengths), reduced_entries)
 
 
 def _make_combination(
@@ -186,21 +192,3 @@ def _make_combination(
     return lambda x, y: emit_llvm_elementwise_primitive(
         array_emitter.value_emitter, primitive_name, {}, number_dtype, number_dtype, (x, y)
     )
-
-
-def _emit_any_or_all_lanes(
-    array_emitter: ArrayEmitter, combining_primitive: str, lane_flags: LlvmValue
-) -> LlvmValue:
-    """Emit the test whether any ("or") or all ("and") lanes of a group are true.
-
-    Return its LLVM truth value, a scalar.
-    """
-    llvm_builder = array_emitter.llvm_builder
-    if not isinstance(lane_flags.type, ir.VectorType):
-        return lane_flags
-    lane_bits = llvm_builder.bitcast(
-        lane_flags, ir.IntType(array_emitter.value_emitter.n_vector_lanes)
-    )
-    if combining_primitive == "or":
-        return llvm_builder.icmp_unsigned("!=", lane_bits, ir.Constant(lane_bits.type, 0))
-    return llvm_builder.icmp_unsigned("==", lane_bits, ir.Constant(lane_bits.type, -1))

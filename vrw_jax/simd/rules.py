@@ -4,11 +4,13 @@ entry.
 
 import math
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 from vrw_jax.simd import data_movement, loops, reductions
 from vrw_jax.simd.arithmetic import ELEMENTWISE_RULES
 from vrw_jax.simd.array_emitter import (
+    ArrayEmitter,
     PrimitiveCall,
     get_llvm_number_type,
     has_lane_axis,
@@ -24,55 +26,46 @@ from vrw_jax.simd.lowering import (
 )
 
 
-def _make_single_result_rule(emit_single_result: Callable[..., LlvmArray]) -> PrimitiveRule:
-    """Return a `PrimitiveRule` for a primitive with one result.
+def _emit_single_result(
+    single_result_rule: Callable[..., LlvmArray],
+    jaxpr_lowering: JaxprLowering,
+    equation: Any,
+    operands: list[LlvmArray],
+) -> list[LlvmArray]:
+    """Return the result of a primitive with one result, after checks of the lane axes.
 
-    - `emit_single_result`: function of an `ArrayEmitter`, a `PrimitiveCall` and the operands that
+    - `single_result_rule`: function of an `ArrayEmitter`, a `PrimitiveCall` and the operands that
       returns the result.
     """
-
-    def emit_result_with_lane_checks(
-        jaxpr_lowering: JaxprLowering, equation: Any, operands: list[LlvmArray]
-    ) -> list[LlvmArray]:
-        primitive_name, result_aval = equation.primitive.name, equation.outvars[0].aval
-        operand_avals = [input_atom.aval for input_atom in equation.invars]
-        result_has_lanes = has_lane_axis(result_aval)
-        operand_has_lanes = any(map(has_lane_axis, operand_avals))
-        if (
-            operand_has_lanes
-            and not result_has_lanes
-            and primitive_name not in ("reduce_and", "reduce_or")
-        ):
-            raise make_lane_mixing_error(primitive_name)
-        if (
-            result_has_lanes
-            and not operand_has_lanes
-            and primitive_name not in ("broadcast_in_dim", "empty")
-        ):
-            raise make_lane_axis_error(f"The result of {primitive_name}", result_aval)
-        get_llvm_number_type(result_aval)  # This call raises an error for unsupported number types.
-        array_emitter = jaxpr_lowering.array_emitter
-        result_array = emit_single_result(
-            array_emitter,
-            PrimitiveCall(primitive_name, equation.params, operand_avals, result_aval),
-            *operands,
-        )
-        if (
-            isinstance(result_array, LazyArray)
-            and math.prod(result_array.shape) <= array_emitter.register_limits.max_unrolled_entries
-        ):
-            result_array = array_emitter.get_array_entries(result_array)
-        return [result_array]
-
-    emit_result_with_lane_checks.__doc__ = emit_single_result.__doc__
-    return emit_result_with_lane_checks
-
-
-def _emit_elementwise_result(
-    array_emitter: Any, primitive_call: PrimitiveCall, *operands: LlvmArray
-) -> LlvmArray:
-    """Apply the primitive to each entry, and return the array of the results."""
-    return array_emitter.emit_elementwise_array(primitive_call, operands)
+    primitive_name, result_aval = equation.primitive.name, equation.outvars[0].aval
+    operand_avals = [input_atom.aval for input_atom in equation.invars]
+    result_has_lanes = has_lane_axis(result_aval)
+    operand_has_lanes = any(map(has_lane_axis, operand_avals))
+    if (
+        operand_has_lanes
+        and not result_has_lanes
+        and primitive_name not in ("reduce_and", "reduce_or")
+    ):
+        raise make_lane_mixing_error(primitive_name)
+    if (
+        result_has_lanes
+        and not operand_has_lanes
+        and primitive_name not in ("broadcast_in_dim", "empty")
+    ):
+        raise make_lane_axis_error(f"The result of {primitive_name}", result_aval)
+    get_llvm_number_type(result_aval)  # This call raises an error for unsupported number types.
+    array_emitter = jaxpr_lowering.array_emitter
+    result_array = single_result_rule(
+        array_emitter,
+        PrimitiveCall(primitive_name, equation.params, operand_avals, result_aval),
+        *operands,
+    )
+    if (
+        isinstance(result_array, LazyArray)
+        and math.prod(result_array.shape) <= array_emitter.register_limits.max_unrolled_entries
+    ):
+        result_array = array_emitter.get_array_entries(result_array)
+    return [result_array]
 
 
 def _emit_optimization_barrier(
@@ -88,7 +81,7 @@ def _emit_optimization_barrier(
 
 
 SINGLE_RESULT_RULES: dict[str, Callable[..., LlvmArray]] = {
-    **dict.fromkeys(ELEMENTWISE_RULES, _emit_elementwise_result),
+    **dict.fromkeys(ELEMENTWISE_RULES, ArrayEmitter.emit_elementwise_array),
     "broadcast_in_dim": data_movement.emit_broadcast_array,
     "concatenate": data_movement.emit_concatenated_array,
     "dynamic_slice": data_movement.emit_dynamic_slice,
@@ -104,16 +97,12 @@ SINGLE_RESULT_RULES: dict[str, Callable[..., LlvmArray]] = {
     "transpose": data_movement.emit_transposed_array,
     "cumsum": reductions.emit_cumulative_sum,
     "dot_general": reductions.emit_array_product,
-    "reduce_and": reductions.make_reduction_rule("and"),
-    "reduce_max": reductions.make_reduction_rule("max"),
-    "reduce_min": reductions.make_reduction_rule("min"),
-    "reduce_or": reductions.make_reduction_rule("or"),
-    "reduce_sum": reductions.make_reduction_rule("add"),
+    **dict.fromkeys(reductions.COMBINING_PRIMITIVE_BY_REDUCTION, reductions.emit_reduced_array),
 }
 """Rules of primitives with one result, by the name of the primitive."""
 
 PRIMITIVE_RULES: dict[str, PrimitiveRule] = {
-    **{name: _make_single_result_rule(rule) for name, rule in SINGLE_RESULT_RULES.items()},
+    **{name: partial(_emit_single_result, rule) for name, rule in SINGLE_RESULT_RULES.items()},
     **dict.fromkeys(CALLED_JAXPR_PARAMETERS, emit_called_jaxpr),
     "optimization_barrier": _emit_optimization_barrier,
     "scan": loops.emit_scan_loop,
@@ -131,5 +120,5 @@ def describe_supported_primitives() -> dict[str, str]:
     get_first_paragraph = lambda docstring: " ".join(docstring.partition("\n\n")[0].split())
     return {
         primitive_name: get_first_paragraph(primitive_rule.__doc__ or "")
-        for primitive_name, primitive_rule in PRIMITIVE_RULES.items()
+        for primitive_name, primitive_rule in (PRIMITIVE_RULES | SINGLE_RESULT_RULES).items()
     }
