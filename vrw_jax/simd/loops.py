@@ -36,12 +36,10 @@ def emit_while_loop(
     n_loop_constants = n_condition_constants + equation_params["body_nconsts"]
     # The constants are shared, because each iteration reads them again.
     loop_constants = list(map(mark_memory_as_shared, operands[:n_loop_constants]))
-    initial_loop_carry_arrays = operands[n_loop_constants:]
     loop_carry = _LoopCarry(
         array_emitter,
         equation_params["body_jaxpr"].out_avals,
-        array_emitter.register_limits.max_register_entries,
-        initial_loop_carry_arrays,
+        operands[n_loop_constants:],
     )
 
     def emit_while_condition(register_values: list[LlvmValue]) -> LlvmValue:
@@ -64,10 +62,9 @@ def emit_while_loop(
         )
         return loop_carry.get_next_register_values(body_results)
 
-    initial_registers = loop_carry.store_initial_loop_carry(initial_loop_carry_arrays)
     return loop_carry.make_loop_carry_arrays(
         array_emitter.value_emitter.emit_llvm_loop(
-            initial_registers, emit_while_condition, emit_while_body
+            loop_carry.initial_register_values, emit_while_condition, emit_while_body
         )
     )
 
@@ -110,18 +107,10 @@ def emit_scan_loop(
         not _contains_loop(body_jaxpr.jaxpr),
     )
     loop_constants = list(map(mark_memory_as_shared, operands[:n_loop_constants]))
-    initial_loop_carry_arrays = operands[n_loop_constants : n_loop_constants + n_carried_arrays]
-    register_limits = array_emitter.register_limits
-    max_register_entries = (
-        register_limits.max_innermost_register_entries
-        if array_emitter.is_in_innermost_loop
-        else register_limits.max_register_entries
-    )
     loop_carry = _LoopCarry(
         array_emitter,
         body_jaxpr.out_avals[:n_carried_arrays],
-        max_register_entries,
-        initial_loop_carry_arrays,
+        operands[n_loop_constants : n_loop_constants + n_carried_arrays],
     )
 
     def get_scanned_slice(
@@ -130,7 +119,7 @@ def emit_scan_loop(
         scanned_slice = scanned_array.get_subarray(iteration_index)
         fits_registers = (
             array_emitter.is_in_innermost_loop
-            or math.prod(scanned_slice.shape) <= register_limits.max_register_entries
+            or math.prod(scanned_slice.shape) <= array_emitter.register_limits.max_register_entries
         )
         return array_emitter.get_array_entries(scanned_slice) if fits_registers else scanned_slice
 
@@ -156,9 +145,10 @@ def emit_scan_loop(
             )
         return loop_carry.get_next_register_values(body_results[:n_carried_arrays])
 
-    initial_registers = loop_carry.store_initial_loop_carry(initial_loop_carry_arrays)
     final_loop_carry_arrays = loop_carry.make_loop_carry_arrays(
-        array_emitter.emit_range_loop(0, n_iterations, emit_scan_body, initial_registers)
+        array_emitter.emit_range_loop(
+            0, n_iterations, emit_scan_body, loop_carry.initial_register_values
+        )
     )
     array_emitter.is_in_innermost_loop = was_in_innermost_loop
     return [*final_loop_carry_arrays, *stacked_arrays]
@@ -167,19 +157,24 @@ def emit_scan_loop(
 class _LoopCarry:
     """Arrays that a loop carries from one iteration to the next.
 
-    Arrays of at most `max_register_entries` entries are in registers, and larger arrays in memory.
-    A larger array is stored in the memory of its initial value, unless another array uses this
-    memory. In that case, new memory is allocated.
+    Small arrays are in registers, and larger arrays in memory. A larger array is stored in the
+    memory of its initial value, unless another array uses this memory. In that case, new memory is
+    allocated. The constructor emits stores of the initial arrays that are carried in memory.
     """
 
     def __init__(
         self,
         array_emitter: ArrayEmitter,
         loop_carry_avals: Sequence[Any],
-        max_register_entries: int | float,
         initial_loop_carry_arrays: Sequence[LlvmArray],
     ) -> None:
         self.array_emitter, self.loop_carry_avals = array_emitter, loop_carry_avals
+        register_limits = array_emitter.register_limits
+        max_register_entries = (
+            register_limits.max_innermost_register_entries
+            if array_emitter.is_in_innermost_loop
+            else register_limits.max_register_entries
+        )
         self.loop_carry_memory = [
             self.choose_loop_carry_memory(aval, initial_loop_carry_array)
             if math.prod(get_shape_without_lanes(aval)) > max_register_entries
@@ -189,6 +184,12 @@ class _LoopCarry:
             )
         ]
         self.is_in_registers = [memory_array is None for memory_array in self.loop_carry_memory]
+        for initial_loop_carry_array, memory_array in zip(
+            initial_loop_carry_arrays, self.loop_carry_memory, strict=True
+        ):
+            if memory_array is not None:
+                array_emitter.emit_array_stores(memory_array, initial_loop_carry_array)
+        self.initial_register_values = self._flatten_register_entries(initial_loop_carry_arrays)
 
     def choose_loop_carry_memory(
         self, loop_carry_aval: Any, initial_loop_carry_array: LlvmArray
@@ -231,19 +232,6 @@ class _LoopCarry:
             )
             for memory_array in self.loop_carry_memory
         ]
-
-    def store_initial_loop_carry(
-        self, initial_loop_carry_arrays: Sequence[LlvmArray]
-    ) -> list[LlvmValue]:
-        """Emit stores of the initial arrays that are carried in memory, and return the initial
-        values of all registers.
-        """
-        for initial_loop_carry_array, memory_array in zip(
-            initial_loop_carry_arrays, self.loop_carry_memory, strict=True
-        ):
-            if memory_array is not None:
-                self.array_emitter.emit_array_stores(memory_array, initial_loop_carry_array)
-        return self._flatten_register_entries(initial_loop_carry_arrays)
 
     def get_next_register_values(
         self, next_loop_carry_arrays: Sequence[LlvmArray]

@@ -3,8 +3,7 @@
 Instructions that repeat an earlier computation are not emitted again.
 """
 
-import contextlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -61,9 +60,8 @@ class ValueEmitter:
         # Values computed so far, by operation and operands, because traces contain many
         # repetitions.
         self.emitted_values: dict[tuple, Any] = {}
-        self.recent_value_keys: list[
-            tuple
-        ] = []  # Keys of the values emitted within the present inner context.
+        # Keys of the values emitted within the innermost loop.
+        self.recent_value_keys: list[tuple] = []
         self.n_emitted_instructions = 0
         self.llvm_constants: dict[tuple[str, str], ir.Constant] = {}
 
@@ -146,17 +144,6 @@ class ValueEmitter:
             return [self.to_lane_vector(llvm_value) for llvm_value in llvm_values]
         return list(llvm_values)
 
-    @contextlib.contextmanager
-    def discard_values_after_context(self) -> Iterator[None]:
-        """Return a context that, at its end, discards the values stored within it by
-        `emit_value_once`.
-        """
-        outer_value_keys, self.recent_value_keys = self.recent_value_keys, []
-        yield
-        for recent_value_key in self.recent_value_keys:
-            del self.emitted_values[recent_value_key]
-        self.recent_value_keys = outer_value_keys
-
     def emit_llvm_loop(
         self,
         initial_loop_values: Sequence[LlvmValue],
@@ -179,21 +166,25 @@ class ValueEmitter:
             phi_instruction = llvm_builder.phi(initial_loop_value.type)
             phi_instruction.add_incoming(initial_loop_value, entry_basic_block)
             loop_carried_values.append(phi_instruction)
-        with self.discard_values_after_context():
-            llvm_builder.cbranch(
-                emit_loop_condition(loop_carried_values), body_basic_block, exit_basic_block
+        outer_value_keys, self.recent_value_keys = self.recent_value_keys, []
+        llvm_builder.cbranch(
+            emit_loop_condition(loop_carried_values), body_basic_block, exit_basic_block
+        )
+        llvm_builder.position_at_end(body_basic_block)
+        next_loop_values = emit_loop_body(loop_carried_values)
+        for phi_instruction, next_loop_value in zip(
+            loop_carried_values, next_loop_values, strict=True
+        ):
+            phi_instruction.add_incoming(
+                self.to_lane_vector(next_loop_value)
+                if isinstance(phi_instruction.type, ir.VectorType)
+                else next_loop_value,
+                llvm_builder.block,
             )
-            llvm_builder.position_at_end(body_basic_block)
-            next_loop_values = emit_loop_body(loop_carried_values)
-            for phi_instruction, next_loop_value in zip(
-                loop_carried_values, next_loop_values, strict=True
-            ):
-                phi_instruction.add_incoming(
-                    self.to_lane_vector(next_loop_value)
-                    if isinstance(phi_instruction.type, ir.VectorType)
-                    else next_loop_value,
-                    llvm_builder.block,
-                )
-            llvm_builder.branch(head_basic_block)
+        llvm_builder.branch(head_basic_block)
+        # Code after the loop cannot use values that were emitted inside it.
+        for recent_value_key in self.recent_value_keys:
+            del self.emitted_values[recent_value_key]
+        self.recent_value_keys = outer_value_keys
         llvm_builder.position_at_end(exit_basic_block)
         return loop_carried_values
