@@ -47,13 +47,15 @@ class CodeStore(Protocol):
         """Save `cache_record_content` under the name `cache_record_name`."""
 
 
+ResultTypes = tuple[tuple[tuple[int, ...], np.dtype], ...]
+"""For each result of machine code, the lengths of all axes before the lanes, and the dtype."""
+
+
 class MachineCode(NamedTuple):
     """Machine code of a function over lanes, which may still be compiled in the background."""
 
     ffi_target_name: str  # digest of the text that LLVM compiles; JAX programs call the code by it
-    result_shapes_and_dtypes: tuple[
-        tuple[tuple[int, ...], np.dtype], ...
-    ]  # for each result, the lengths of all axes before the lanes and the dtype
+    result_shapes_and_dtypes: ResultTypes
     object_code_future: Future[bytes]
 
 
@@ -68,7 +70,7 @@ def get_machine_code(
     """Return machine code for a function over lanes.
 
     The code is taken from this process or from `code_store`. If neither contains it, the function
-    is traced and compiled.
+    is traced, and compiled in the background.
 
     - `argument_shapes`: shapes and dtypes of the arguments;
     - `trace_key`: object whose `repr` identifies all other inputs of the trace;
@@ -82,7 +84,7 @@ def get_machine_code(
         jax.__version__,
         describe_compiler_settings(),
     )
-    code_index_name = f"lanes_index_{_compute_sha256_digest(repr(code_index_key).encode())}"
+    code_index_name = f"lanes_index_{hashlib.sha256(repr(code_index_key).encode()).hexdigest()}"
     if code_index_name in _machine_code_by_record_name:
         return _machine_code_by_record_name[code_index_name]
     machine_code = None
@@ -96,47 +98,31 @@ def get_machine_code(
         with _jax_tracing_lock, _pause_garbage_collection():
             closed_jaxpr = trace_for_machine_code(lane_function, *argument_shapes)
             llvm_text = write_llvm_kernel(closed_jaxpr, lanes_per_group, register_limits)
-        result_shapes_and_dtypes = [
-            (aval.shape[:-1], aval.dtype.name) for aval in closed_jaxpr.out_avals
-        ]
-        machine_code = _compile_llvm_text(
-            llvm_text, json.dumps(result_shapes_and_dtypes), code_index_name, code_store
+        encoded_result_types = json.dumps(
+            [(aval.shape[:-1], aval.dtype.name) for aval in closed_jaxpr.out_avals]
         )
+        digested_text = f"{encoded_result_types}{describe_compiler_settings()}{llvm_text}"
+        ffi_target_name = f"lanes_code_{hashlib.sha256(digested_text.encode()).hexdigest()}"
+
+        def compile_and_save_code() -> bytes:
+            object_code = compile_llvm_for_processor(llvm_text)
+            if code_store is not None:
+                encoded_machine_code = encoded_result_types.encode() + b"\n" + object_code
+                code_store.save_cache_record(ffi_target_name, encoded_machine_code)
+                code_store.save_cache_record(code_index_name, ffi_target_name.encode())
+            return object_code
+
+        # Another trace may have given the same LLVM text.
+        machine_code = load_machine_code(ffi_target_name, code_store)
+        if machine_code is None:
+            machine_code = _machine_code_by_record_name[ffi_target_name] = MachineCode(
+                ffi_target_name,
+                _parse_result_shapes_and_dtypes(encoded_result_types),
+                _llvm_compiler_pool.submit(compile_and_save_code),
+            )
+        elif code_store is not None:
+            code_store.save_cache_record(code_index_name, ffi_target_name.encode())
     _machine_code_by_record_name[code_index_name] = machine_code
-    return machine_code
-
-
-def _compile_llvm_text(
-    llvm_text: str,
-    encoded_result_types: str,
-    code_index_name: str,
-    code_store: CodeStore | None,
-) -> MachineCode:
-    """Return the machine code of a function over lanes.
-
-    The compilation runs in the background, unless the cache contains code for the same LLVM text.
-    """
-    digested_text = f"{encoded_result_types}{describe_compiler_settings()}{llvm_text}"
-    ffi_target_name = f"lanes_code_{_compute_sha256_digest(digested_text.encode())}"
-    machine_code = load_machine_code(ffi_target_name, code_store)
-    if machine_code is not None:
-        if code_store is not None:
-            code_store.save_cache_record(code_index_name, ffi_target_name.encode())
-        return machine_code
-
-    def compile_and_save_code() -> bytes:
-        object_code = compile_llvm_for_processor(llvm_text)
-        if code_store is not None:
-            encoded_machine_code = encoded_result_types.encode() + b"\n" + object_code
-            code_store.save_cache_record(ffi_target_name, encoded_machine_code)
-            code_store.save_cache_record(code_index_name, ffi_target_name.encode())
-        return object_code
-
-    machine_code = _machine_code_by_record_name[ffi_target_name] = MachineCode(
-        ffi_target_name,
-        _parse_result_shapes_and_dtypes(encoded_result_types),
-        _llvm_compiler_pool.submit(compile_and_save_code),
-    )
     return machine_code
 
 
@@ -172,11 +158,6 @@ def load_machine_code(ffi_target_name: str, code_store: CodeStore | None) -> Mac
     return _machine_code_by_record_name[ffi_target_name]
 
 
-def _compute_sha256_digest(digested_bytes: bytes) -> str:
-    """Return the SHA-256 digest of `digested_bytes` in hexadecimal digits."""
-    return hashlib.sha256(digested_bytes).hexdigest()
-
-
 _machine_code_by_record_name: dict[str, MachineCode] = {}
 """Machine code of this process, by the name of its index record and by its code name.
 
@@ -210,9 +191,7 @@ One thread suffices, because LLVM's lock lets only one thread compile.
 """
 
 
-def _parse_result_shapes_and_dtypes(
-    encoded_result_types: str | bytes,
-) -> tuple[tuple[tuple[int, ...], np.dtype], ...]:
+def _parse_result_shapes_and_dtypes(encoded_result_types: str | bytes) -> ResultTypes:
     """Return `MachineCode.result_shapes_and_dtypes`, parsed from JSON."""
     return tuple(
         (tuple(axis_lengths), np.dtype(dtype_name))

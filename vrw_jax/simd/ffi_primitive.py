@@ -1,7 +1,6 @@
 """JAX primitive by which JAX programs call machine code by its name."""
 
-import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from threading import Lock
 from typing import Any
 
@@ -53,25 +52,17 @@ def _make_abstract_results(
     return [jax.core.ShapedArray(x.shape, x.dtype) for x in result_shapes]
 
 
+_calling_program = jax.jit(
+    MACHINE_CODE_PRIMITIVE.bind, static_argnames=("machine_code", "result_shapes")
+)
+"""Compiled JAX program that only calls machine code."""
+
+
 @MACHINE_CODE_PRIMITIVE.def_impl
-def _call_machine_code(
-    *call_arguments: Any, machine_code: MachineCode, result_shapes: Sequence[jax.ShapeDtypeStruct]
-) -> Any:
+def _call_machine_code(*call_arguments: Any, **static_arguments: Any) -> Any:
     """Return the results of a machine code call outside of `jax.jit`."""
     with jax.disable_jit(False):  # Only a compiled program can call machine code.
-        return _make_calling_program(machine_code, tuple(result_shapes))(*call_arguments)
-
-
-@functools.cache
-def _make_calling_program(
-    machine_code: MachineCode, result_shapes: tuple[jax.ShapeDtypeStruct, ...]
-) -> Callable[..., Any]:
-    """Return a compiled JAX program that only calls the machine code `machine_code`."""
-    return jax.jit(
-        functools.partial(
-            MACHINE_CODE_PRIMITIVE.bind, machine_code=machine_code, result_shapes=result_shapes
-        )
-    )
+        return _calling_program(*call_arguments, **static_arguments)
 
 
 def _lower_machine_code_call(
