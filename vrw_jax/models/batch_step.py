@@ -232,7 +232,7 @@ def _make_phase_runner(
         scaled_options = compute_wheel_units(phase.s).scale_times_to_seconds(options)
         dt0 = scaled_options.dt0 + jnp.zeros_like(q[0])
         if previous_phase_end is not None:
-            next_phase_inputs: _NextPhaseInputs = previous_phase_end.next_phase_inputs
+            next_phase_inputs = previous_phase_end.next_phase_inputs
             dt0 = next_phase_inputs.next_solver_dt
             if phase.has_stiff_start:
                 tolerance_root = jnp.exp(
@@ -389,19 +389,16 @@ class StepTraceConfig(NamedTuple):
         }
         if self.friction is None:
             return eqx.partition(AdvanceResult(**template), eqx.is_inexact_array)
-        measure_groups: dict[str, Any] = {
-            name: group(*(x for _ in dataclasses.fields(group)))
-            for name, group in (
-                ("indicators", DoubleSupportIndicators),
-                ("margins", Margins),
-                ("energy", EnergyLoss),
-            )
-        }
-        post_impact = jnp.broadcast_to(x, (2, *x.shape))
-        return eqx.partition(
-            StepResult(post_impact=post_impact, step_length=x, **measure_groups, **template),
-            eqx.is_inexact_array,
+        make_group: Any = lambda group: group(*(x for _ in dataclasses.fields(group)))
+        step_result_template = StepResult(
+            post_impact=jnp.broadcast_to(x, (2, *x.shape)),
+            step_length=x,
+            indicators=make_group(DoubleSupportIndicators),
+            margins=make_group(Margins),
+            energy=make_group(EnergyLoss),
+            **template,
         )
+        return eqx.partition(step_result_template, eqx.is_inexact_array)
 
 
 def build_step_function(step_trace_config: StepTraceConfig) -> ForwardFunction:
@@ -494,12 +491,6 @@ def build_step_jacobian(
     leaves at `input_indices`.
     """
 
-    def tighten_tolerances(*argument_leaves: Array) -> list[Array]:
-        params, x, options = jax.tree.unflatten(
-            step_trace_config.argument_structure, argument_leaves
-        )
-        return jax.tree.leaves((params, x, options.with_derivative_tolerances()))
-
     def make_jacobian_template(*argument_leaves: Array) -> tuple:
         float_outputs, nonfloat_outputs = step_trace_config.make_output_template(*argument_leaves)
         return float_outputs, float_outputs, nonfloat_outputs
@@ -507,24 +498,23 @@ def build_step_jacobian(
     lane_jacobian_function = lambda *leaves: compute_jacobian_columns(
         step_trace_config.compute_step_outputs, leaves, input_indices
     )
-    jacobian_functions_by_size = {
-        n: step_trace_config.compile_for_one_wheel(
+
+    def evaluate_step_jacobian(*argument_leaves: Array) -> tuple:
+        params, x, options = jax.tree.unflatten(
+            step_trace_config.argument_structure, argument_leaves
+        )
+        n_jacobian_columns = sum(math.prod(jnp.shape(argument_leaves[i])) for i in input_indices)
+        jacobian_column_function = step_trace_config.compile_for_one_wheel(
             lane_jacobian_function,
             make_jacobian_template,
             "gait step with derivatives",
             input_indices,
-            register_limits=simd.RegisterLimits(n),
+            register_limits=simd.RegisterLimits(
+                N_STEP_INPUTS + (n_jacobian_columns > N_STEP_INPUTS)
+            ),
         )
-        for n in (N_STEP_INPUTS, N_STEP_INPUTS + 1)
-    }
-
-    def evaluate_step_jacobian(*argument_leaves: Array) -> tuple:
-        n_jacobian_columns = sum(math.prod(jnp.shape(argument_leaves[i])) for i in input_indices)
-        jacobian_column_function = jacobian_functions_by_size[
-            N_STEP_INPUTS + (n_jacobian_columns > N_STEP_INPUTS)
-        ]
         jacobian_columns, float_outputs, nonfloat_outputs = jacobian_column_function(
-            *tighten_tolerances(*argument_leaves)
+            *jax.tree.leaves((params, x, options.with_derivative_tolerances()))
         )
         return (
             split_jacobian_by_leaf(jacobian_columns, argument_leaves, input_indices),
@@ -546,13 +536,11 @@ def split_jacobian_by_leaf(
     for i in input_indices:
         leaf_shape = jnp.shape(argument_leaves[i])
         end_column = first_column + math.prod(leaf_shape)
-        leaf_columns = jax.tree.map(
-            operator.itemgetter(slice(first_column, end_column)), jacobian_columns
+        columns_of_leaf = slice(first_column, end_column)
+        select_leaf_columns = lambda x, columns=columns_of_leaf, leaf_shape=leaf_shape: (
+            jnp.moveaxis(x[columns], 0, -1).reshape(*x.shape[1:], *leaf_shape)
         )
-        reshape_columns = lambda x, leaf_shape=leaf_shape: jnp.moveaxis(x, 0, -1).reshape(
-            *x.shape[1:], *leaf_shape
-        )
-        jacobian_by_leaf.append(jax.tree.map(reshape_columns, leaf_columns))
+        jacobian_by_leaf.append(jax.tree.map(select_leaf_columns, jacobian_columns))
         first_column = end_column
     return tuple(jacobian_by_leaf)
 
@@ -582,24 +570,11 @@ def compute_jacobian_columns(
         return batch_function(*all_leaves)
 
     selected_leaves = [argument_leaves[i] for i in input_indices]
-    directional_derivative_function = lambda tangents: jax.jvp(
-        evaluate_at_selected_leaves, selected_leaves, tangents, has_aux=True
-    )
-    float_outputs, jacobian_columns, nonfloat_outputs = jax.vmap(
-        directional_derivative_function, out_axes=(None, 0, None)
-    )(_make_unit_tangents(selected_leaves))
-    return jacobian_columns, float_outputs, nonfloat_outputs
-
-
-def _make_unit_tangents(selected_leaves: Sequence[Array]) -> list[Array]:
-    """Return the unit vectors of the space of all entries of the leaves, split by leaf.
-
-    The leading axis runs over the unit vectors. Each entry of a unit vector is a separate constant
-    0 or 1, so that machine code omits products with 0.
-    """
     n_entries_by_leaf = [math.prod(leaf.shape[:-1]) for leaf in selected_leaves]
     n_vectors = sum(n_entries_by_leaf)
-    unit_vectors, leaf_tangents = iter(np.eye(n_vectors)), []
+    # Each entry of a unit vector is a separate constant 0 or 1, so that machine code omits products
+    # with 0.
+    unit_vectors, unit_tangents = iter(np.eye(n_vectors)), []
     for leaf, n_entries in zip(selected_leaves, n_entries_by_leaf, strict=True):
         lane_tangents = [
             jnp.broadcast_to(
@@ -607,5 +582,11 @@ def _make_unit_tangents(selected_leaves: Sequence[Array]) -> list[Array]:
             )
             for _ in range(n_entries)
         ]
-        leaf_tangents.append(lane_tangents[0] if leaf.ndim == 1 else jnp.stack(lane_tangents, 1))
-    return leaf_tangents
+        unit_tangents.append(lane_tangents[0] if leaf.ndim == 1 else jnp.stack(lane_tangents, 1))
+    directional_derivative_function = lambda tangents: jax.jvp(
+        evaluate_at_selected_leaves, selected_leaves, tangents, has_aux=True
+    )
+    float_outputs, jacobian_columns, nonfloat_outputs = jax.vmap(
+        directional_derivative_function, out_axes=(None, 0, None)
+    )(unit_tangents)
+    return jacobian_columns, float_outputs, nonfloat_outputs

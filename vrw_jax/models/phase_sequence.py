@@ -10,6 +10,7 @@ import operator
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
@@ -367,13 +368,12 @@ def make_trajectory(
     time_fractions = jnp.linspace(0.0, 1.0, n_samples).reshape(
         -1, *(1 for _ in phase_durations.shape[1:])
     )
-    arrays_by_phase_sample = [
-        evaluate_phase_states(phase, jnp.moveaxis(phase_states, 1, 0))
+    quantities_by_phase = [
+        jax.vmap(functools.partial(evaluate_phase_states, phase))(phase_states)
         for phase, phase_states in zip(phase_sequence.phases, phase_samples, strict=True)
     ]
-    phase_states, foot_forces, phase_energies = (
-        jnp.stack([jnp.moveaxis(phase_array, 0, 1) for phase_array in arrays_by_phase])
-        for arrays_by_phase in zip(*arrays_by_phase_sample, strict=True)
+    phase_states, foot_forces, phase_energies = map(
+        jnp.stack, zip(*quantities_by_phase, strict=True)
     )
     sample_times = start_times[:, None] + time_fractions * phase_durations[:, None]
     return Trajectory(

@@ -263,8 +263,8 @@ class RigidWheel(AbstractWheel):
         has_passed_apex = (angular_rate > 0.0) & (
             rolling_motion.compute_squared_rate(apex_angle) > 0.0
         )
-        sampled_angles = wheel_angle + (half_angle - wheel_angle) * jnp.linspace(
-            0.0, 1.0, MARGIN_MINIMUM_SEARCH_OPTIONS.n_angles_per_zoom_round
+        sampled_angles = jnp.linspace(
+            wheel_angle, half_angle, MARGIN_MINIMUM_SEARCH_OPTIONS.n_angles_per_zoom_round
         )
         lowest_normal_force = jnp.min(
             rolling_motion.compute_foot_force_at_angle(sampled_angles).normal

@@ -20,6 +20,7 @@ from vrw_jax.wheel.params import (
     UNIT_POWERS,
     Symbols,
     WheelParams,
+    compute_symbols,
 )
 
 TABLE_1_LENGTH_M = 1.0
@@ -71,11 +72,8 @@ class WheelUnits(NamedTuple):
 
     def scale_times_to_seconds(self, options: StepOptions) -> StepOptions:
         """Convert the times in step options from the wheel's own unit to seconds."""
-        select_times_in_options = lambda o: (o.max_phase_time, o.dt0)
         return eqx.tree_at(
-            select_times_in_options,
-            options,
-            tuple(self.time_unit * x for x in select_times_in_options(options)),
+            lambda o: (o.max_phase_time, o.dt0), options, replace_fn=lambda x: self.time_unit * x
         )
 
 
@@ -111,15 +109,15 @@ def compute_wheel_units_of_rows(parameter_values_by_row: np.ndarray, n_legs: int
 
     - `parameter_values_by_row`: parameters of each wheel in the order of `PARAMETER_NAMES`.
     """
-    values_by_name = dict(zip(PARAMETER_NAMES, np.asarray(parameter_values_by_row).T, strict=False))
-    length_ratio = values_by_name["locked_length"] / TABLE_1_LENGTH_M
-    gravity_ratio = values_by_name["gravity"] / TABLE_1_GRAVITY_M_PER_S2
-    total_mass = values_by_name["hub_mass"] + n_legs * values_by_name["leg_mass"]
-    mass_ratio = total_mass / TABLE_1_MASS_KG
+    s = compute_symbols(n_legs, *np.asarray(parameter_values_by_row).T[: len(PARAMETER_NAMES)])
+    length_ratio, gravity_ratio = s.L0 / TABLE_1_LENGTH_M, s.g / TABLE_1_GRAVITY_M_PER_S2
+    mass_ratio = s.Mt / TABLE_1_MASS_KG
     is_valid_wheel = np.isfinite(length_ratio + gravity_ratio + mass_ratio) & (
         np.minimum(length_ratio, gravity_ratio) > 0.0
     )
-    length_ratio, gravity_ratio, mass_ratio = (
+    valid_length_ratio, valid_gravity_ratio, valid_mass_ratio = (
         np.where(is_valid_wheel, x, 1.0) for x in (length_ratio, gravity_ratio, mass_ratio)
     )
-    return WheelUnits(length_ratio, np.sqrt(length_ratio / gravity_ratio), mass_ratio)
+    return WheelUnits(
+        valid_length_ratio, np.sqrt(valid_length_ratio / valid_gravity_ratio), valid_mass_ratio
+    )
