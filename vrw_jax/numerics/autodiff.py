@@ -48,12 +48,20 @@ def enable_all_ad_modes(
 
     @functools.cache
     def get_differentiable_jacobian(argnums: tuple[int, ...]) -> ForwardFunction:
-        forward_jacobian = _make_forward_jacobian_function(
+        compute_output_jacobians = _differentiate_float_outputs(
             function_to_differentiate or function, argnums
         )
+
+        def compute_argument_jacobians(*arrays: Any) -> tuple[PyTree, PyTree]:
+            output_jacobians, (float_outputs, nonfloat_outputs) = compute_output_jacobians(*arrays)
+            argument_jacobians = jax.tree.transpose(
+                jax.tree.structure(float_outputs), jax.tree.structure(argnums), output_jacobians
+            )
+            return (argument_jacobians, float_outputs), nonfloat_outputs
+
         if make_jacobian is None:
-            return enable_all_ad_modes(forward_jacobian)
-        return enable_all_ad_modes(make_jacobian(argnums), forward_jacobian)
+            return enable_all_ad_modes(compute_argument_jacobians)
+        return enable_all_ad_modes(make_jacobian(argnums), compute_argument_jacobians)
 
     @with_default_jax_settings
     def compute_function_jvp(primals: tuple, tangents: tuple) -> tuple:
@@ -91,29 +99,19 @@ def enable_all_ad_modes(
     return call_differentiable_function
 
 
-def _make_forward_jacobian_function(
-    function: ForwardFunction, argnums: tuple[int, ...]
-) -> ForwardFunction:
-    """Return a function that computes one Jacobian of the float outputs per differentiated
-    argument.
+def _differentiate_float_outputs(
+    function: ForwardFunction, argnums: int | tuple[int, ...]
+) -> Callable[..., tuple]:
+    """Return a function that computes the Jacobians of the float outputs, and all outputs.
 
-    The returned function gives (Jacobians, float outputs), and the other outputs.
+    The Jacobians are with respect to the arguments `argnums`, as those of `jax.jacfwd`.
     """
 
-    def evaluate_with_aux(*arrays: Any) -> tuple[PyTree, PyTree]:
-        float_outputs, nonfloat_outputs = function(*arrays)
-        return float_outputs, (float_outputs, nonfloat_outputs)
+    def evaluate_with_aux(*arrays: Any) -> tuple[PyTree, tuple]:
+        outputs = function(*arrays)
+        return outputs[0], outputs
 
-    def evaluate_argument_jacobians(*arrays: Any) -> tuple[PyTree, PyTree]:
-        output_jacobians, (float_outputs, nonfloat_outputs) = jax.jacfwd(
-            evaluate_with_aux, argnums=argnums, has_aux=True
-        )(*arrays)
-        jacobians_by_argument = jax.tree.transpose(
-            jax.tree.structure(float_outputs), jax.tree.structure(argnums), output_jacobians
-        )
-        return (jacobians_by_argument, float_outputs), nonfloat_outputs
-
-    return evaluate_argument_jacobians
+    return jax.jacfwd(evaluate_with_aux, argnums=argnums, has_aux=True)
 
 
 @jax.jit
@@ -153,8 +151,7 @@ def with_implicit_derivative(
     returned. The derivative rule returns the total derivative with respect to p times the tangent
     of p. The rule ignores the tangent of z, because that can only be dz/dp times the tangent of p.
     """
-    unbatched_function = unbatch(execution_wrapper(function, derivative_order))
-    wrapped_function = jax.custom_jvp(lambda p, z: unbatched_function(p, z))
+    wrapped_function = jax.custom_jvp(unbatch(execution_wrapper(function, derivative_order)))
 
     @wrapped_function.defjvp
     @with_default_jax_settings
@@ -218,15 +215,10 @@ def evaluate_with_jacobian(function: Callable, *arguments: Array) -> tuple[Any, 
     one entry per argument.
     """
 
-    def select_float_outputs(*arguments: Array) -> tuple:
-        float_outputs, nonfloat_outputs = eqx.partition(function(*arguments), eqx.is_inexact_array)
-        return float_outputs, (float_outputs, nonfloat_outputs)
-
+    split_function = lambda *arrays: eqx.partition(function(*arrays), eqx.is_inexact_array)
     all_argnums = tuple(range(len(arguments))) if len(arguments) > 1 else 0
-    output_jacobian, (float_outputs, nonfloat_outputs) = jax.jacfwd(
-        select_float_outputs, all_argnums, has_aux=True
-    )(*arguments)
-    return eqx.combine(float_outputs, nonfloat_outputs), output_jacobian
+    output_jacobian, outputs = _differentiate_float_outputs(split_function, all_argnums)(*arguments)
+    return eqx.combine(*outputs), output_jacobian
 
 
 def apply_jacobian(jacobian: PyTree, tangent: Array) -> PyTree:
