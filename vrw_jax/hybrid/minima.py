@@ -99,9 +99,7 @@ def find_guards_met_at_start(
     is_guard_zero = guard_values == 0.0
     if guards_and_margins.guard_scales is not None:
         guard_roundoff = GUARD_ROUNDOFF_IN_EPS * jnp.finfo(guard_values.dtype).eps
-        is_guard_zero = is_guard_zero | (
-            guard_values >= -guard_roundoff * guards_and_margins.guard_scales
-        )
+        is_guard_zero = guard_values >= -guard_roundoff * guards_and_margins.guard_scales
     if guards_and_margins.is_zero_at_start is not None:
         is_guard_zero = guards_and_margins.is_zero_at_start
         is_guard_met = jnp.where(is_guard_zero, guard_rates <= 0.0, is_guard_met)
@@ -138,16 +136,11 @@ def interpolate_by_cubics(
 class InteriorMarginMinima(NamedTuple):
     """Lowest interior minimum of each margin so far, and the solver step that contains it."""
 
-    interior_minimum_values: Float[Array, " n"]
+    interior_minimum_values: Float[Array, " n"]  # infinite if a margin has no interior minimum
     step_start_state: Float[Array, "n dim"]
     step_length: Float[Array, " n"]  # length of the solver step, s
     time_to_minimum: Float[Array, " n"]  # time from the start of the solver step, s
     step_start_margin_rates: Float[Array, " n"]
-
-    @property
-    def has_interior_minimum(self) -> Bool[Array, " n"]:
-        """Return whether each margin has an interior minimum, shape (margins,)."""
-        return jnp.isfinite(self.interior_minimum_values)
 
 
 class MarginMinimumRefinement(NamedTuple):
@@ -328,7 +321,7 @@ def advance_margin_minimum_refinement(
     start_margin_values = jnp.where(
         jnp.asarray(guards_and_margins.includes_phase_start), margin_values, jnp.inf
     )
-    needs_margin_refinement = interior_margin_minima.has_interior_minimum & (
+    needs_margin_refinement = jnp.isfinite(interior_margin_minima.interior_minimum_values) & (
         is_phase_end | (margin_indices > margin_index)
     )
     is_next_margin_selected = is_phase_end | is_margin_refined

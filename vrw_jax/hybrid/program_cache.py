@@ -143,15 +143,23 @@ def _make_cache_key(keyed_value: Any, ids_of_enclosing_objects: frozenset) -> Ha
         return value_type, _make_function_key(
             keyed_value, ids_of_enclosing_objects | {id(keyed_value)}
         )
-    if isinstance(keyed_value, type):
-        return _make_class_key(keyed_value, ids_of_enclosing_objects | {id(keyed_value)})
+    if isinstance(keyed_value, type):  # The key for a user's class has its methods and constants.
+        if _is_in_unchanging_package(keyed_value.__module__):
+            return _IdentityKey(keyed_value)
+        class_attributes = {
+            attribute_name: class_attribute
+            for attribute_name, class_attribute in vars(keyed_value).items()
+            if not attribute_name.startswith("__") or attribute_name == "__call__"
+        }
+        return _IdentityKey(keyed_value), make_inner_key((class_attributes, keyed_value.__bases__))
     if isinstance(keyed_value, types.ModuleType) and _is_in_unchanging_package(
         keyed_value.__name__
     ):
         return _IdentityKey(keyed_value)
     if isinstance(keyed_value, functools.partial):
-        function_parts = keyed_value.func, keyed_value.args, keyed_value.keywords
-        return value_type, make_inner_key(function_parts)
+        return value_type, make_inner_key(
+            (keyed_value.func, keyed_value.args, keyed_value.keywords)
+        )
     if isinstance(keyed_value, types.MethodType):
         return value_type, make_inner_key((keyed_value.__func__, keyed_value.__self__))
     # A function with a derivative rule, as from jax.custom_jvp, refers to the values of the user's
@@ -173,20 +181,6 @@ def _make_cache_key(keyed_value: Any, ids_of_enclosing_objects: frozenset) -> Ha
 def _is_in_unchanging_package(module_name: str | None) -> bool:
     """Return whether `module_name` is a module of a package in `UNCHANGING_PACKAGES`."""
     return (module_name or "").split(".")[0] in UNCHANGING_PACKAGES
-
-
-def _make_class_key(value_type: type, ids_of_enclosing_objects: frozenset) -> Hashable:
-    """Return the key for a class. The key for a user's class contains its methods and constants."""
-    if _is_in_unchanging_package(value_type.__module__):
-        return _IdentityKey(value_type)
-    class_attributes = {
-        attribute_name: class_attribute
-        for attribute_name, class_attribute in vars(value_type).items()
-        if not attribute_name.startswith("__") or attribute_name == "__call__"
-    }
-    return _IdentityKey(value_type), _make_cache_key(
-        (class_attributes, value_type.__bases__), ids_of_enclosing_objects
-    )
 
 
 def _make_function_key(

@@ -37,9 +37,8 @@ class ReturnMap:
 
     def simulate(self, x: Float[Array, " n"]) -> HybridSolution:
         """Return the simulation that begins at section coordinates `x`, shape (n,)."""
-        start, events = self.embed(x), self.events
         return simulate_hybrid(
-            self.modes, start, events=events, mode=self.mode, options=self.options
+            self.modes, self.embed(x), events=self.events, mode=self.mode, options=self.options
         )
 
     def __call__(self, x: Float[Array, " n"]) -> Float[Array, " n"]:

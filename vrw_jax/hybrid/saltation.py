@@ -3,7 +3,8 @@
 The computation uses Liouville's formula and saltation matrices.
 """
 
-from collections.abc import Callable, Sequence
+import functools
+from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
@@ -58,7 +59,7 @@ def _multiply_event_determinants(
     modes: tuple[Mode, ...], start: Array, solution: HybridSolution, options: StepOptions
 ) -> Scalar:
     event_determinant_functions = [
-        _make_event_determinant_function(mode, guard, options)
+        functools.partial(_compute_event_determinant, mode, guard, options)
         for mode in modes
         for guard in mode.guards
     ]
@@ -72,41 +73,43 @@ def _multiply_event_determinants(
     next_modes = jnp.where(event_indices == solution.n_events - 1, solution.mode, next_modes)
     vector_fields = [mode.field for mode in modes]
 
-    def multiply_event_determinant(
-        flow_determinant: Array, event_inputs: tuple
-    ) -> tuple[Array, None]:
+    def compute_event_determinant(event_inputs: tuple) -> Array:
         (
-            event_index,
+            event_determinant_index,
+            next_mode,
             start_state,
             state_before_event,
             state_after_event,
             mode_duration,
-            event_determinant_index,
-            next_mode,
         ) = event_inputs
-        field_after_event = lax.switch(next_mode, vector_fields, state_after_event)
-        event_determinant = lax.switch(
+        return lax.switch(
             event_determinant_index,
             event_determinant_functions,
             start_state,
             state_before_event,
-            field_after_event,
+            lax.switch(next_mode, vector_fields, state_after_event),
             mode_duration,
         )
-        return flow_determinant * jnp.where(
-            event_index < solution.n_events, event_determinant, 1.0
-        ), None
 
     event_inputs_by_event = (
-        event_indices, phase_start_states, solution.states_before, solution.states_after, durations,
         first_guard_index_by_mode[solution.modes] + solution.guards,
         next_modes,
+        phase_start_states, solution.states_before, solution.states_after, durations,
     )  # fmt: skip
-    return lax.scan(multiply_event_determinant, jnp.ones((), start.dtype), event_inputs_by_event)[0]
+    event_determinants = lax.map(compute_event_determinant, event_inputs_by_event)
+    return jnp.prod(jnp.where(event_indices < solution.n_events, event_determinants, 1.0))
 
 
-def _make_event_determinant_function(mode: Mode, guard: Guard, options: StepOptions) -> Callable:
-    """Return a function that computes one factor of the determinant.
+def _compute_event_determinant(
+    mode: Mode,
+    guard: Guard,
+    options: StepOptions,
+    start: Array,
+    state_before_event: Array,
+    field_after_event: Array,
+    mode_duration: Array,
+) -> Array:
+    """Return one factor of the determinant.
 
     The factor is that of one phase in `mode` and of the event of `guard` that ends the phase.
     """
@@ -118,22 +121,17 @@ def _make_event_determinant_function(mode: Mode, guard: Guard, options: StepOpti
             [mode.field(state), jnp.stack([divergence, jnp.ones_like(divergence)])]
         )
 
-    def evaluate_determinant_factor(
-        start: Array, state_before_event: Array, field_after_event: Array, mode_duration: Array
-    ) -> Array:
-        end_state = sample_phase(
-            evaluate_flow_and_divergence, jnp.append(start, jnp.zeros(2)), mode_duration, 2, options
-        )[-1]
-        # Otherwise the solver steps were exhausted.
-        has_reached_end = jnp.abs(end_state[-1] - mode_duration) <= 1e-9 * mode_duration
-        reset_jacobian = jax.jacfwd(guard.reset)(state_before_event)
-        guard_gradient = jax.jacfwd(guard.value)(state_before_event)
-        field_before_event = mode.field(state_before_event)
-        saltation_matrix = reset_jacobian + jnp.outer(
-            field_after_event - reset_jacobian @ field_before_event, guard_gradient
-        ) / (guard_gradient @ field_before_event)
-        return jnp.where(
-            has_reached_end, jnp.exp(end_state[-2]) * jnp.linalg.det(saltation_matrix), jnp.nan
-        )
-
-    return evaluate_determinant_factor
+    end_state = sample_phase(
+        evaluate_flow_and_divergence, jnp.append(start, jnp.zeros(2)), mode_duration, 2, options
+    )[-1]
+    # Otherwise the solver steps were exhausted.
+    has_reached_end = jnp.abs(end_state[-1] - mode_duration) <= 1e-9 * mode_duration
+    reset_jacobian = jax.jacfwd(guard.reset)(state_before_event)
+    guard_gradient = jax.jacfwd(guard.value)(state_before_event)
+    field_before_event = mode.field(state_before_event)
+    saltation_matrix = reset_jacobian + jnp.outer(
+        field_after_event - reset_jacobian @ field_before_event, guard_gradient
+    ) / (guard_gradient @ field_before_event)
+    return jnp.where(
+        has_reached_end, jnp.exp(end_state[-2]) * jnp.linalg.det(saltation_matrix), jnp.nan
+    )

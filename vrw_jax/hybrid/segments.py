@@ -176,8 +176,7 @@ def product_multipliers(
             "were exhausted; take more segments, or raise StepOptions.max_solver_steps."
         )
     n_coordinates = jacobians.shape[1]
-    orthonormal_basis = np.eye(jacobians.shape[1])
-    closing_matrix = np.eye(jacobians.shape[1])
+    orthonormal_basis = np.eye(n_coordinates)
     triangular_factors = np.zeros_like(jacobians)
     for _ in range(N_SCHUR_SWEEPS):
         next_orthonormal_basis = orthonormal_basis

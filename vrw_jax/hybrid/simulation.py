@@ -7,6 +7,7 @@ A mode whose functions have wrong shapes raises a ValueError. If the simulation 
 has a code of `Termination` and contains all earlier events.
 """
 
+import functools
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -18,7 +19,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int
 
 from vrw_jax.hybrid.minima import GuardsAndMargins, StateArray
-from vrw_jax.hybrid.phase_integration import PhaseEnd, VectorField, integrate_phase
+from vrw_jax.hybrid.phase_integration import VectorField, integrate_phase
 from vrw_jax.hybrid.program_cache import call_compiled_program
 from vrw_jax.numerics import (
     Scalar,
@@ -146,7 +147,29 @@ def simulate_hybrid(
     check_type("options", options, StepOptions, "give vrw.StepOptions()")
     start, events = check_reals("start", start), check_int("events", events)
     modes = convert_modes_to_tuple(modes)
-    _check_simulation_arguments(modes, start, events, mode)
+    if start.ndim != 1 or not start.size:
+        raise ValueError(f"start has shape {start.shape}, but a state is one row of numbers.")
+    if not isinstance(start, jax.core.Tracer) and not np.all(np.isfinite(start)):
+        raise ValueError("start contains a number that is not finite: give finite numbers.")
+    if events * start.size > MAX_STORED_NUMBERS:
+        raise ValueError(f"events is {events}, but so many states don't fit: give fewer.")
+    if not 0 <= mode < len(modes):
+        raise ValueError(f"mode is {mode}, but there are {len(modes)} modes: count from 0.")
+    for mode_number, (field, guards) in enumerate(modes):
+        if not guards:
+            raise ValueError(
+                f"mode {mode_number} has no guard, but only a guard can end it: give one."
+            )
+        _check_output_shape(f"the field of mode {mode_number}", field, start, start.shape)
+        for guard_number, guard in enumerate(guards):
+            guard_name = f"guard {guard_number} of mode {mode_number}"
+            _check_output_shape(guard_name, guard.value, start, ())
+            _check_output_shape(f"the reset of {guard_name}", guard.reset, start, start.shape)
+            if guard.target_mode is not None and not 0 <= guard.target_mode < len(modes):
+                raise ValueError(
+                    f"{guard_name} leads to mode {guard.target_mode}, but there are {len(modes)}: "
+                    "count from 0."
+                )
     options.check_tolerances(start.dtype)
     mode_index = jnp.asarray(mode, jnp.int32)
     solution = call_compiled_program(_simulate_modes, (modes, events), options, start, mode_index)
@@ -249,38 +272,6 @@ def convert_modes_to_tuple(modes: Sequence[Mode] | Mode) -> tuple[Mode, ...]:
     return tuple(modes_with_guard_tuples)
 
 
-def _check_simulation_arguments(
-    modes: tuple[Mode, ...], start: Array, events: int, mode: int
-) -> None:
-    """Raise a ValueError if an argument of `simulate_hybrid` is invalid.
-
-    The check includes the shapes that the functions of the modes return at `start`.
-    """
-    if start.ndim != 1 or not start.size:
-        raise ValueError(f"start has shape {start.shape}, but a state is one row of numbers.")
-    if not isinstance(start, jax.core.Tracer) and not np.all(np.isfinite(start)):
-        raise ValueError("start contains a number that is not finite: give finite numbers.")
-    if events * start.size > MAX_STORED_NUMBERS:
-        raise ValueError(f"events is {events}, but so many states don't fit: give fewer.")
-    if not 0 <= mode < len(modes):
-        raise ValueError(f"mode is {mode}, but there are {len(modes)} modes: count from 0.")
-    for mode_number, (field, guards) in enumerate(modes):
-        if not guards:
-            raise ValueError(
-                f"mode {mode_number} has no guard, but only a guard can end it: give one."
-            )
-        _check_output_shape(f"the field of mode {mode_number}", field, start, start.shape)
-        for guard_number, guard in enumerate(guards):
-            guard_name = f"guard {guard_number} of mode {mode_number}"
-            _check_output_shape(guard_name, guard.value, start, ())
-            _check_output_shape(f"the reset of {guard_name}", guard.reset, start, start.shape)
-            if guard.target_mode is not None and not 0 <= guard.target_mode < len(modes):
-                raise ValueError(
-                    f"{guard_name} leads to mode {guard.target_mode}, but there are {len(modes)}: "
-                    "count from 0."
-                )
-
-
 def _check_output_shape(
     function_name: str, function: Callable, start: Array, expected_shape: tuple
 ) -> None:
@@ -301,10 +292,16 @@ def _check_output_shape(
         )
 
 
-def _integrate_mode(
-    mode: Mode, state: Array, time: Array, options: StepOptions
-) -> tuple[PhaseEnd, Array]:
-    """Return the end of the phase in `mode`, and whether a guard is violated at its start."""
+def _simulate_one_event(
+    modes: tuple[Mode, ...], mode_index: int, options: StepOptions, state: Array, time: Array
+) -> tuple:
+    """Return the result of one phase in a mode, and of the reset that ends it.
+
+    The result consists of the end of the phase, whether a guard is violated at its start, the
+    errors of the event time due to tolerance and to round-off of the state (s), the next state and
+    the next mode. The errors are large if the guard is grazed.
+    """
+    mode = modes[mode_index]
     compute_guard_rates = lambda y: jax.jvp(mode.guard_values, (y,), (mode.field(y),))[1]
     guard_values = mode.guard_values(state)
     guard_rates, second_guard_rates = jax.jvp(compute_guard_rates, (state,), (mode.field(state),))
@@ -322,34 +319,26 @@ def _integrate_mode(
     # rise.
     will_guard_rise = (guard_values == 0.0) & (guard_rates == 0.0) & (second_guard_rates > 0.0)
     guard_offset = jnp.where(will_guard_rise, jnp.finfo(state.dtype).tiny, guard_offset)
-    is_guard_zero = (guard_values <= 0.0) & is_guard_near_zero & ~will_guard_rise
     guards_and_margins = GuardsAndMargins(
         lambda y: mode.guard_values(y) + guard_offset,
         len(mode.guards),
-        is_zero_at_start=is_guard_zero,
+        is_zero_at_start=(guard_values <= 0.0) & is_guard_near_zero & ~will_guard_rise,
     )
-    return integrate_phase(
-        mode.field, guards_and_margins, state, ~is_guard_violated, options
-    ), is_guard_violated
-
-
-def _compute_event_time_errors(
-    mode: Mode, phase_end: PhaseEnd, options: StepOptions
-) -> tuple[Array, Array]:
-    """Return the errors of the event time due to tolerance and to round-off of the state, s.
-
-    The errors are large if the guard is grazed.
-    """
-    state = lax.stop_gradient(phase_end.state)
-    guard_gradient = jax.jacfwd(mode.guard_values)(state)[jnp.maximum(phase_end.end_guard_index, 0)]
-    state_roundoff = jnp.finfo(state.dtype).eps * jnp.abs(state)
-    state_tolerance = options.atol + options.rtol * jnp.abs(state)
-    guard_rate = jnp.abs(guard_gradient @ mode.field(state))
+    phase_end = integrate_phase(mode.field, guards_and_margins, state, ~is_guard_violated, options)
+    guard_index = jnp.maximum(phase_end.end_guard_index, 0)
+    end_state = lax.stop_gradient(phase_end.state)
+    guard_gradient = jax.jacfwd(mode.guard_values)(end_state)[guard_index]
+    state_roundoff = jnp.finfo(state.dtype).eps * jnp.abs(end_state)
+    state_tolerance = options.atol + options.rtol * jnp.abs(end_state)
+    guard_rate = jnp.abs(guard_gradient @ mode.field(end_state))
     event_time_errors = [
-        jnp.abs(guard_gradient) @ state_error_bound / guard_rate
+        lax.stop_gradient(jnp.abs(guard_gradient) @ state_error_bound / guard_rate)
         for state_error_bound in (state_tolerance, state_roundoff)
     ]
-    return lax.stop_gradient((event_time_errors[0], event_time_errors[1]))
+    next_state = lax.switch(guard_index, [g.reset for g in mode.guards], phase_end.state)
+    next_modes = [mode_index if g.target_mode is None else g.target_mode for g in mode.guards]
+    next_mode = jnp.asarray(next_modes, jnp.int32)[guard_index]
+    return phase_end, is_guard_violated, event_time_errors, next_state, next_mode
 
 
 def _simulate_modes(
@@ -364,20 +353,10 @@ def _simulate_modes(
     """
     modes, events = modes_and_max_events
 
-    def make_mode_branch(mode_index: int) -> Callable:
-        def integrate_indexed_mode(state: Array, time: Array) -> tuple:
-            phase_end, is_guard_violated = _integrate_mode(modes[mode_index], state, time, options)
-            event_time_errors = _compute_event_time_errors(modes[mode_index], phase_end, options)
-            guards = modes[mode_index].guards
-            guard_index = jnp.maximum(phase_end.end_guard_index, 0)
-            next_state = lax.switch(guard_index, [g.reset for g in guards], phase_end.state)
-            next_modes = [mode_index if g.target_mode is None else g.target_mode for g in guards]
-            next_mode = jnp.asarray(next_modes, jnp.int32)[guard_index]
-            return phase_end, is_guard_violated, event_time_errors, next_state, next_mode
-
-        return integrate_indexed_mode
-
-    mode_branches = [make_mode_branch(mode_index) for mode_index in range(len(modes))]
+    mode_branches = [
+        functools.partial(_simulate_one_event, modes, mode_index, options)
+        for mode_index in range(len(modes))
+    ]
     # The n - 1 guards between n bodies that meet in one point have up to n (n - 1) / 2 events.
     max_simultaneous_events = sum(len(mode.guards) ** 2 for mode in modes)
 
@@ -397,29 +376,26 @@ def _simulate_modes(
         n_events_without_progress = jnp.where(
             time > solution.time, 0, n_events_without_progress + 1
         )
-        has_exhausted_solver_steps = phase_end.solver_steps >= options.max_solver_steps
-        termination = jnp.where(
-            solution.n_events + 1 >= events,
-            Termination.MAX_EVENTS_REACHED,
-            STATUS_RUNNING_CODE,
-        )
-        termination = jnp.where(
-            n_events_without_progress > max_simultaneous_events, Termination.ZENO, termination
-        )
-        failure_termination = jnp.where(
-            phase_end.is_timed_out,
-            Termination.MAX_TIME_REACHED,
+        # The first condition that holds determines the termination.
+        termination = jnp.select(
+            [
+                has_event & (n_events_without_progress > max_simultaneous_events),
+                has_event & (solution.n_events + 1 >= events),
+                has_event,
+                is_guard_violated,
+                phase_end.has_integration_failed
+                & (phase_end.solver_steps >= options.max_solver_steps),
+                phase_end.is_timed_out,
+            ],
+            [
+                Termination.ZENO,
+                Termination.MAX_EVENTS_REACHED,
+                STATUS_RUNNING_CODE,
+                Termination.GUARD_VIOLATED_AT_ENTRY,
+                Termination.MAX_STEPS_REACHED,
+                Termination.MAX_TIME_REACHED,
+            ],
             Termination.STEP_SIZE_UNDERFLOW,
-        )
-        failure_termination = jnp.where(
-            phase_end.has_integration_failed & has_exhausted_solver_steps,
-            Termination.MAX_STEPS_REACHED,
-            failure_termination,
-        )
-        termination = jnp.where(
-            has_event,
-            termination,
-            jnp.where(is_guard_violated, Termination.GUARD_VIOLATED_AT_ENTRY, failure_termination),
         )
         event_index = jnp.where(has_event, solution.n_events, events)
         event_entries = (
