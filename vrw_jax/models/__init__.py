@@ -30,7 +30,6 @@ from vrw_jax.models.step_results import (
     EnergyLoss,
     Margins,
     StepResult,
-    Trajectory,
 )
 from vrw_jax.models.unit_scaling import complete_jacobian_columns
 from vrw_jax.models.viscoelastic import ViscoelasticWheel

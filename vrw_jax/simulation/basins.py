@@ -105,10 +105,20 @@ def basin(
     options = options.with_engine(engine)
     max_steps = check_int("max_steps", max_steps)
     max_period = check_int("max_period", max_period)
-    start_component_values = _parse_start_grid(grid)
-    start_component_names = tuple(start_component_values)
-    axis_names = [x for x in start_component_names if np.ndim(grid[x]) > 0]
-    grid_shape = tuple(len(start_component_values[axis_name]) for axis_name in axis_names)
+    check_type("grid", grid, Mapping, "write {'theta_touchdown': 0.09, 'dtheta_touchdown': ...}")
+    start_component_names = select_start_components("grid", grid, "a number or an axis")
+    start_component_values = {
+        component_name: np.asarray(check_reals(component_name, grid[component_name]), float)
+        for component_name in start_component_names
+    }
+    for component_name, values in start_component_values.items():
+        if values.ndim > 1 or not values.size:
+            raise ValueError(
+                f"{component_name} has shape {values.shape}, but it must be "
+                "a number, or a list of at least one: give one axis of values."
+            )
+    axis_names = [name for name, values in start_component_values.items() if values.ndim]
+    grid_shape = [start_component_values[axis_name].size for axis_name in axis_names]
     coordinate_grids = np.meshgrid(*start_component_values.values(), indexing="ij")
     start_states = compute_section_states_of_starts(
         params, start_component_names, np.stack([x.ravel() for x in coordinate_grids], -1)
@@ -118,26 +128,23 @@ def basin(
     walk_ends = walk_until_periodic(params, start_states, model, options, max_steps, max_period)
     distinct_orbits = find_distinct_orbits(walk_ends)
 
-    walk_columns: dict[str, tuple[np.ndarray, dict[str, object]]] = {
-        "attractor": (
+    make_walk_variable = lambda values, attributes: xr.Variable(
+        axis_names, values.reshape(grid_shape), attributes
+    )
+    walk_variables = {
+        "attractor": make_walk_variable(
             distinct_orbits.orbit_indices,
             {"long_name": "orbit that the walk settles on", "flag_none": -1},
         ),
-        "outcome": (walk_ends.outcome, make_measure_attributes("outcome")),
-        "steps": (
+        "outcome": make_walk_variable(walk_ends.outcome, make_measure_attributes("outcome")),
+        "steps": make_walk_variable(
             walk_ends.n_steps_to_orbit,
             {"units": "1", "long_name": "steps until the orbit is reached, or the fall"},
         ),
     }
-    walk_variables = {
-        variable_name: xr.Variable(axis_names, values.reshape(grid_shape), attributes)
-        for variable_name, (values, attributes) in walk_columns.items()
-    }
     start_dataset_coordinates = {
         component_name: xr.Variable(
-            (component_name,) if component_name in axis_names else (),
-            values if component_name in axis_names else values[0],
-            make_measure_attributes(component_name),
+            (component_name,) * values.ndim, values, make_measure_attributes(component_name)
         )
         for component_name, values in start_component_values.items()
     }
@@ -156,29 +163,6 @@ def basin(
         start_dataset_coordinates,
         basin_attributes | collect_provenance_attributes(params, model, options),
     )
-
-
-def _parse_start_grid(grid: StartGrid) -> dict[str, np.ndarray]:
-    """Return the values of each component of a start as an array with one axis.
-
-    Raise a `ValueError` unless the grid contains all components before touchdown or all components
-    after landing. Each component is a number or an array with one axis.
-    """
-    check_type("grid", grid, Mapping, "write {'theta_touchdown': 0.09, 'dtheta_touchdown': ...}")
-    start_component_values = {
-        component_name: np.asarray(check_reals(component_name, grid[component_name]), float)
-        for component_name in select_start_components("grid", grid, "a number or an axis")
-    }
-    for component_name, values in start_component_values.items():
-        if values.ndim > 1 or not values.size:
-            raise ValueError(
-                f"{component_name} has shape {values.shape}, but it must be "
-                "a number, or a list of at least one: give one axis of values."
-            )
-    return {
-        component_name: np.atleast_1d(values)
-        for component_name, values in start_component_values.items()
-    }
 
 
 def select_start_components(

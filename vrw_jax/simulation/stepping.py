@@ -382,7 +382,7 @@ def _simulate_walk_by_scan(
     """Simulate a walk of `n_steps` steps. Steps after a failure repeat the outcome of the failed
     step.
 
-    - `stepwise_ground`: ground of each step, see `split_stepwise_ground`; None for flat ground.
+    - `stepwise_ground`: ground of each step, see `convert_walk_arguments`; None for flat ground.
     """
 
     def advance_walk_by_one_step(
@@ -493,7 +493,18 @@ def convert_walk_arguments(
 
     - `start_checks`: further arguments of `convert_step_arguments`.
     """
-    checked_model, params, stepwise_ground = split_stepwise_ground(params, model, n_steps)
+    checked_model = convert_model_argument(model, allows_friction_arrays=True)
+    stepwise_ground = (
+        checked_model.split_ground_by_step(params, n_steps)
+        if isinstance(params, WheelParams)
+        else None
+    )
+    if stepwise_ground is not None:
+        checked_model, _ = checked_model.with_step_ground(
+            params, tuple(ground_by_step[0] for ground_by_step in stepwise_ground)
+        )
+        first_step_slope = jnp.reshape(params.slope, -1)[0]
+        params = eqx.tree_at(lambda wheel: wheel.slope, params, first_step_slope)
     params, section_state, checked_model, options = convert_step_arguments(
         params, x, checked_model, options, engine, **start_checks
     )
@@ -502,27 +513,6 @@ def convert_walk_arguments(
             ground_by_step.astype(section_state.dtype) for ground_by_step in stepwise_ground
         )
     return params, section_state, checked_model, options, stepwise_ground
-
-
-def split_stepwise_ground(
-    params: Any, model: ModelLike | None, n_steps: int
-) -> tuple[AbstractWheel, Any, StepGroundValues | None]:
-    """Return the model and the wheel on the ground of the first step, and the ground of each step.
-
-    On flat ground, the model and the wheel are the given ones, and the third result is None.
-    """
-    checked_model = convert_model_argument(model, allows_friction_arrays=True)
-    if not isinstance(params, WheelParams):
-        return checked_model, params, None
-    stepwise_ground = checked_model.split_ground_by_step(params, n_steps)
-    if stepwise_ground is None:
-        return checked_model, params, None
-    first_step_model, _ = checked_model.with_step_ground(
-        params, tuple(ground_quantity_by_step[0] for ground_quantity_by_step in stepwise_ground)
-    )
-    first_step_slope = jnp.reshape(params.slope, -1)[0]
-    first_step_wheel = eqx.tree_at(lambda wheel: wheel.slope, params, first_step_slope)
-    return first_step_model, first_step_wheel, stepwise_ground
 
 
 def start_walk_toward_gait(

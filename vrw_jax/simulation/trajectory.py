@@ -29,8 +29,6 @@ from vrw_jax.contact import (
 from vrw_jax.measures import CONTACT_MEASURES, TRAJECTORY_MEASURES, make_labeled_variables
 from vrw_jax.measures import xarray as xr
 from vrw_jax.models import (
-    AbstractWheel,
-    Trajectory,
     complete_ground_line_slopes,
     separate_next_slope,
 )
@@ -46,7 +44,6 @@ from vrw_jax.validation import check_int, require_untraced_arguments
 from vrw_jax.wheel import (
     Motion,
     Outcome,
-    Symbols,
     WheelParams,
     compute_damping_power,
     rotate_to_landing_leg,
@@ -126,8 +123,9 @@ def simulate(
         specify_contact_trajectory if model.reports_contacts else specify_phase_trajectory
     )
     trajectory_spec = specify_trajectory(models_and_wheels, options, n_samples)
-    sampled_walk = sample_walk_steps(trajectory_spec, x, n_steps, ground_lines)
-    sampled_columns = sampled_walk.sampled_columns
+    sampled_columns, n_stepped, walk_outcome = sample_walk_steps(
+        trajectory_spec, x, n_steps, ground_lines
+    )
     dataset_variables = make_labeled_variables(
         {
             variable_name: sampled_columns[variable_name]
@@ -141,9 +139,9 @@ def simulate(
         )
     walk_attributes = {
         "title": f"Walk of the {type(model).__name__}",
-        "n_steps": sampled_walk.n_stepped,
-        "outcome": sampled_walk.outcome.name,
-        "outcome_meaning": sampled_walk.outcome.meaning,
+        "n_steps": n_stepped,
+        "outcome": walk_outcome.name,
+        "outcome_meaning": walk_outcome.meaning,
         "start": np.asarray(x).tolist(),
     }
     provenance_attributes = trajectory_spec.dataset_attributes | collect_provenance_attributes(
@@ -155,16 +153,12 @@ def simulate(
             "slopes": ground_lines.slopes.tolist(),
         }
         del provenance_attributes["parameter_slope"]
-    dataset_index_coordinates = {
-        variable_name: dataset_variables.pop(variable_name)
-        for variable_name in ("step", "phase")
-        if variable_name in dataset_variables
-    }
-    return xr.Dataset(
+    dataset = xr.Dataset(
         dataset_variables,
-        trajectory_spec.extra_coordinates | dataset_index_coordinates,
+        trajectory_spec.extra_coordinates,
         walk_attributes | provenance_attributes,
     )
+    return dataset.set_coords(dataset_variables.keys() & {"step", "phase"})
 
 
 class SampledStep(NamedTuple):
@@ -190,16 +184,6 @@ class TrajectorySpecification(NamedTuple):
     slope_position_names: tuple[str, ...]  # names of the positions along the slope
     extra_coordinates: dict[str, Any]  # additional coordinates of the dataset
     dataset_attributes: dict[str, object]
-
-
-class SampledWalk(NamedTuple):
-    """Samples of a walk, and the outcome of the last step of the walk."""
-
-    sampled_columns: dict[
-        str, np.ndarray
-    ]  # (time, ...), with `step`; empty if no interval occurred
-    n_stepped: int
-    outcome: Outcome
 
 
 HEIGHT_DEPENDENT_ENERGIES = ("gravitational_energy", "total_energy")
@@ -238,8 +222,11 @@ class GroundLines(NamedTuple):
 
 def sample_walk_steps(
     trajectory_spec: TrajectorySpecification, x: Array, n_steps: int, ground_lines: GroundLines
-) -> SampledWalk:
+) -> tuple[dict[str, np.ndarray], int, Outcome]:
     """Return samples of the walk from the section state x. The walk ends at the first failed step.
+
+    Return also the number of completed steps and the outcome of the last step. The samples have the
+    shape (time, ...); they are empty if no interval occurred.
 
     The samples of a step are in the frame of the line of the ground under both feet in double
     support. Positions (m) and energies (J) are converted to the frame of line 0. Its origin is the
@@ -288,47 +275,10 @@ def sample_walk_steps(
         name: np.concatenate([columns[name] for columns in columns_by_step])
         for name in columns_by_step[0]
     }
-    return SampledWalk(walk_columns, k, walk_outcome)
+    return walk_columns, k, walk_outcome
 
 
-@eqx.filter_jit
-def _sample_step(
-    model: AbstractWheel, params: WheelParams, x: Array, options: StepOptions, n_samples: int
-) -> Trajectory:
-    """Return samples of a step."""
-    return model.sample_step(params, x, options, n_samples)
-
-
-def _make_phase_columns(s: Symbols, trajectory: Trajectory) -> dict[str, np.ndarray]:
-    """Return the samples of each trajectory variable in a step, by name, shape (phase, sample).
-
-    The names are those of `TRAJECTORY_MEASURES`. Positions are relative to the foot of Leg 1. Two
-    additional entries, `landing_foot_x` and `landing_foot_z`, contain the position (m) of the foot
-    that lands next.
-    """
-    state = np.moveaxis(np.asarray(trajectory.state), -1, 0)
-    energies = np.moveaxis(np.asarray(trajectory.energy), -1, 0)
-    foot_forces = np.moveaxis(np.asarray(trajectory.forces), -1, 0)
-    motion = Motion.from_angle(*state)
-    rear_leg_direction = rotate_to_rear_leg(s, motion.sin_theta, motion.cos_theta)
-    landing_leg_direction = rotate_to_landing_leg(s, motion.sin_theta, motion.cos_theta)
-    hub_x, hub_z = motion.L1 * motion.sin_theta, motion.L1 * motion.cos_theta
-    zero_names = ("x", "z", "dx", "dz", "foot_1_x", "foot_1_z")
-    return {
-        **dict.fromkeys(zero_names, np.zeros_like(hub_x)),
-        **dict(zip(("theta", "L1", "L2", "dtheta", "dL1", "dL2"), state, strict=True)),
-        "time": np.array(trajectory.time),
-        **{f"lambda_{i + 1}": foot_force for i, foot_force in enumerate(foot_forces)},
-        **dict(zip(ENERGY_NAMES, energies, strict=True)),
-        "total_energy": sum(energies),
-        "damping_power": compute_damping_power(s, motion),
-        "foot_2_x": hub_x - motion.L2 * rear_leg_direction.sin,
-        "foot_2_z": hub_z - motion.L2 * rear_leg_direction.cos,
-        "hub_x": hub_x,
-        "hub_z": hub_z,
-        "landing_foot_x": hub_x - s.L0 * landing_leg_direction.sin,
-        "landing_foot_z": hub_z - s.L0 * landing_leg_direction.cos,
-    }
+_sample_step = eqx.filter_jit(lambda model, *arguments: model.sample_step(*arguments))
 
 
 StepwiseModelsAndWheels = list[tuple[Any, WheelParams]]
@@ -348,9 +298,33 @@ def specify_phase_trajectory(
     def sample_phase_step(x: Array, k: int) -> SampledStep:
         i = min(k, len(models_and_wheels) - 1)
         trajectory = _sample_step(*models_and_wheels[i], x, options, n_samples)
-        phase_durations = np.asarray(trajectory.durations)
-        step_columns = _make_phase_columns(symbols_by_step[i], trajectory)
-        step_columns["phase"] = np.tile(np.arange(len(phase_durations))[:, None], (1, n_samples))
+        s, phase_durations = symbols_by_step[i], np.asarray(trajectory.durations)
+        state, energies, foot_forces = (
+            np.moveaxis(np.asarray(samples), -1, 0)
+            for samples in (trajectory.state, trajectory.energy, trajectory.forces)
+        )
+        motion = Motion.from_angle(*state)
+        rear_leg_direction = rotate_to_rear_leg(s, motion.sin_theta, motion.cos_theta)
+        landing_leg_direction = rotate_to_landing_leg(s, motion.sin_theta, motion.cos_theta)
+        # Positions are relative to the foot of Leg 1.
+        hub_x, hub_z = motion.L1 * motion.sin_theta, motion.L1 * motion.cos_theta
+        zero_names = ("x", "z", "dx", "dz", "foot_1_x", "foot_1_z")
+        step_columns = {
+            **dict.fromkeys(zero_names, np.zeros_like(hub_x)),
+            **dict(zip(("theta", "L1", "L2", "dtheta", "dL1", "dL2"), state, strict=True)),
+            "time": np.array(trajectory.time),
+            **{f"lambda_{i + 1}": foot_force for i, foot_force in enumerate(foot_forces)},
+            **dict(zip(ENERGY_NAMES, energies, strict=True)),
+            "total_energy": sum(energies),
+            "damping_power": compute_damping_power(s, motion),
+            "foot_2_x": hub_x - motion.L2 * rear_leg_direction.sin,
+            "foot_2_z": hub_z - motion.L2 * rear_leg_direction.cos,
+            "hub_x": hub_x,
+            "hub_z": hub_z,
+            "landing_foot_x": hub_x - s.L0 * landing_leg_direction.sin,
+            "landing_foot_z": hub_z - s.L0 * landing_leg_direction.cos,
+            "phase": np.tile(np.arange(len(phase_durations))[:, None], (1, n_samples)),
+        }
         return SampledStep(
             step_columns,
             phase_durations,
