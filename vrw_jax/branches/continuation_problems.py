@@ -189,7 +189,7 @@ class CollocationProblem(AbstractGaitProblem):
             "duration_dls": jnp.where(wheel.is_phase_active[0, 0] > 0.5, min_durations[0], jnp.nan),
             "duration_sls1": min_durations[1],
             "duration_sls2": min_durations[2],
-            "takeoff_acceleration": self.collocation_system.compute_takeoff_acceleration(
+            "takeoff_acceleration": self.collocation_system.measure_takeoff_acceleration(
                 parameters, z
             ),
             "mesh_error": self.collocation_system.estimate_mesh_error(z),

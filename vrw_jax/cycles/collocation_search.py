@@ -164,7 +164,7 @@ class CollocationSystem(NamedTuple):
         return estimate_mesh_error(self.phase_sequence, self.phase_meshes, solution_with_lane)[0]
 
     @functools.partial(jax.jit, static_argnums=0)
-    def compute_takeoff_acceleration(
+    def measure_takeoff_acceleration(
         self, parameters: Array, collocation_solution: CollocationSolution
     ) -> Array:
         """Return the lowest acceleration of the rear foot at take-off over the gait steps of one

@@ -147,7 +147,7 @@ class LimitCycle(AbstractCycle):
         See `margin_defaults`.
         """
         return self._zero_without_gait(
-            self.map_over_batch_axes(self.system.compute_takeoff_acceleration)(
+            self.map_over_batch_axes(self.system.measure_takeoff_acceleration)(
                 self.parameters, self.collocation_state.solution
             )
         )
