@@ -13,7 +13,10 @@ import vrw_jax as vrw
 from experiments.gaits.both_sides import judge_curve
 from vrw_jax.branches.branch_location import continue_and_locate_special_points
 from vrw_jax.branches.continuation import MapContinuation
-from vrw_jax.branches.special_point_curves import continue_special_points
+from vrw_jax.branches.special_point_curves import (
+    _check_parameter_plane,
+    continue_special_points,
+)
 from vrw_jax.continuation.arclength import ArclengthOptions, ContinuationStatus
 from vrw_jax.continuation.test_functions import (
     AbstractTestFunction,
@@ -133,6 +136,12 @@ KNOWN_SPECIAL_POINTS = {
 def assert_through_the_branch(curve):
     off = np.abs(curve.values - (KNOWN_SPECIAL_POINTS[curve.name], 500.0)).max(1)
     assert np.min(off) < 1e-7, curve.name
+
+
+def test_the_bounds_of_a_parameter_are_read_once():
+    bounds = {"damping": map(float, ("100", "200")), "slope": (0.2, 0.3)}
+    _, ranges = _check_parameter_plane(("damping", "slope"), bounds)
+    np.testing.assert_array_equal(ranges, [[100.0, 200.0], [0.2, 0.3]])
 
 
 @pytest.fixture(scope="module")

@@ -84,7 +84,9 @@ def _check_parameter_plane(parameters: Any, bounds: Any) -> tuple[tuple[str, str
     parameter_names = check_names("parameters", parameters)
     for parameter_name, bounds_of_parameter in bounds_by_parameter.items():
         check_parameter_name(parameter_name, tuple(PARAMETER_DOMAINS), "parameter that has bounds")
-        check_range(f"bounds[{parameter_name!r}]", bounds_of_parameter)
+        bounds_by_parameter[parameter_name] = check_range(
+            f"bounds[{parameter_name!r}]", bounds_of_parameter
+        )
     for parameter_name in parameter_names:
         check_parameter_name(parameter_name, tuple(bounds_by_parameter), "parameter with bounds")
     if len(parameter_names) != 2 or len(set(parameter_names)) != 2:
