@@ -255,6 +255,9 @@ def test_too_large_a_design_is_refused_in_one_sentence(monkeypatch: pytest.Monke
     wide = np.linspace(100.0, 200.0, 100_000)
     with pytest.raises(ValueError, match="10,000,000,000 samples, but a scan takes"):
         plan_scan(designs.grid(damping=wide, stiffness=wide))
+    half = np.linspace(0.1, 0.2, 2**16)
+    with pytest.raises(ValueError, match="18,446,744,073,709,551,616 samples, but a scan takes"):
+        plan_scan(designs.grid(damping=half, stiffness=half, slope=half, leg_mass=half))
     with pytest.raises(ValueError, match="a list takes 10,000,000 samples"):
         designs.sobol({"damping": (100.0, 200.0)}, 20_000_000_000)
 

@@ -3,6 +3,7 @@
 import abc
 import hashlib
 import json
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -66,7 +67,7 @@ class AbstractSampleDesign(abc.ABC):
     @property
     def size(self) -> int:
         """Return the number of samples in the design."""
-        return int(np.prod(self.shape, dtype=np.int64))
+        return math.prod(self.shape)
 
     @property
     @abc.abstractmethod
