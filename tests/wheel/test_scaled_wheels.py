@@ -1,10 +1,13 @@
 """A scaled wheel has the same gait in other units of mass, length and time."""
 
+import warnings
+
 import jax
 import numpy as np
 import pytest
 
 import vrw_jax as vrw
+from vrw_jax.wheel import PARAMETER_NAMES, compute_wheel_units_of_rows
 
 MASS, LENGTH, TIME = 0.01, 0.2, 0.5
 FACTORS = {"mass": MASS, "length": LENGTH, "time": TIME}
@@ -58,3 +61,12 @@ def test_the_factors_can_be_traced_and_batched():
 def test_a_factor_that_is_not_positive_is_refused(value):
     with pytest.raises(ValueError, match=r"length is .* but a factor of scale is positive"):
         vrw.WheelParams().scaled(length=value)
+
+
+def test_the_units_of_a_wheel_on_a_huge_slope_are_computed_without_a_warning():
+    row = np.array([getattr(vrw.WheelParams(), name) for name in PARAMETER_NAMES])
+    row[PARAMETER_NAMES.index("slope")] = 1e300
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        units = compute_wheel_units_of_rows(row[None], 8)
+    np.testing.assert_allclose(np.ravel(units), 1.0, rtol=1e-12)

@@ -20,7 +20,6 @@ from vrw_jax.wheel.params import (
     UNIT_POWERS,
     Symbols,
     WheelParams,
-    compute_symbols,
 )
 
 TABLE_1_LENGTH_M = 1.0
@@ -109,9 +108,12 @@ def compute_wheel_units_of_rows(parameter_values_by_row: np.ndarray, n_legs: int
 
     - `parameter_values_by_row`: parameters of each wheel in the order of `PARAMETER_NAMES`.
     """
-    s = compute_symbols(n_legs, *np.asarray(parameter_values_by_row).T[: len(PARAMETER_NAMES)])
-    length_ratio, gravity_ratio = s.L0 / TABLE_1_LENGTH_M, s.g / TABLE_1_GRAVITY_M_PER_S2
-    mass_ratio = s.Mt / TABLE_1_MASS_KG
+    # Only these parameters are read. The sine of an invalid slope may overflow.
+    values_by_name = dict(zip(PARAMETER_NAMES, np.asarray(parameter_values_by_row).T, strict=False))
+    length_ratio = values_by_name["locked_length"] / TABLE_1_LENGTH_M
+    gravity_ratio = values_by_name["gravity"] / TABLE_1_GRAVITY_M_PER_S2
+    total_mass = values_by_name["hub_mass"] + n_legs * values_by_name["leg_mass"]
+    mass_ratio = total_mass / TABLE_1_MASS_KG
     is_valid_wheel = np.isfinite(length_ratio + gravity_ratio + mass_ratio) & (
         np.minimum(length_ratio, gravity_ratio) > 0.0
     )
