@@ -2,6 +2,7 @@
 
 import gc
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -48,6 +49,16 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Run long files first, so that two workers end together."""
     position = {name: index for index, name in enumerate(LONGEST_COMPILATIONS)}
     items.sort(key=lambda item: position.get(item.path.stem, len(position)))
+
+
+@pytest.fixture(autouse=True)
+def _keep_cache_folder() -> Iterator[None]:
+    """Fail if a test leaves another folder for compiled code: later tests would compile again."""
+    import jax
+
+    cache_folder = jax.config.jax_compilation_cache_dir  # type: ignore[attr-defined]
+    yield
+    assert jax.config.jax_compilation_cache_dir == cache_folder  # type: ignore[attr-defined]
 
 
 @pytest.hookimpl(tryfirst=True)

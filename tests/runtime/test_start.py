@@ -65,6 +65,15 @@ def test_the_cache_folder_may_be_relative_to_the_home_folder(tmp_path):
     assert read_output_lines(code, HOME=str(tmp_path)) == [str(tmp_path / "code")]
 
 
+def test_a_later_call_without_a_folder_keeps_the_folder(tmp_path):
+    """Workers of a scan start JAX, too, and a worker may be a thread of the calling process."""
+    code = (
+        "import jax, vrw_jax as vrw; vrw.start_jax('~/code'); vrw.start_jax(); "
+        "print(jax.config.jax_compilation_cache_dir)"
+    )
+    assert read_output_lines(code, HOME=str(tmp_path)) == [str(tmp_path / "code")]
+
+
 def test_a_flag_set_by_the_user_is_kept():
     flag = "--xla_cpu_use_fusion_emitters=true"
     code = "import os, vrw_jax as vrw; vrw.start_jax(); print(os.environ['XLA_FLAGS'])"

@@ -608,9 +608,13 @@ def test_chunks_may_be_computed_in_any_order(tmp_path: Path) -> None:
 def test_workers_with_another_environment_are_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A cluster of threads in this process, which say that they run other code."""
+    """A cluster of threads in this process, which say that they run other code.
+
+    The threads leave the folder for compiled code that the process has chosen.
+    """
     from distributed import LocalCluster
 
+    cache = jax.config.jax_compilation_cache_dir  # type: ignore[attr-defined]
     scan_dask = dask
     environments = iter([{"code": "ours"}])
     monkeypatch.setattr(
@@ -624,6 +628,7 @@ def test_workers_with_another_environment_are_refused(
     ):
         run_plan(make_plan(), tmp_path / "s.zarr", chunk_executor=executor)
     assert np.all(open_scan(tmp_path / "s.zarr").outcome.values == -1)
+    assert jax.config.jax_compilation_cache_dir == cache  # type: ignore[attr-defined]
 
 
 def test_an_address_without_a_scheduler_gets_one_sentence(

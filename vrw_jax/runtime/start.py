@@ -17,8 +17,9 @@ def start_jax(cache: str | Path | None = None, *, trust_shared: bool = False) ->
     """Configure JAX: 64-bit numbers, a cache for compiled code, and faster XLA compilation on CPUs.
 
     Call this function before the first array is created. The library also works without this call,
-    but processes then take much longer to start. The default of `cache` is the folder in
-    JAX_COMPILATION_CACHE_DIR, or else a folder in the user's cache folder.
+    but processes then take much longer to start. The default of `cache` is the folder that
+    JAX already uses, from JAX_COMPILATION_CACHE_DIR or an earlier call, or else a folder in the
+    user's cache folder.
 
     Args:
         cache: folder for compiled code; `~` means the user's home folder.
@@ -48,7 +49,7 @@ def start_jax(cache: str | Path | None = None, *, trust_shared: bool = False) ->
             "1"  # The setting also holds for child processes.
         )
     jax.config.update("jax_enable_x64", True)
-    if cache is not None or "JAX_COMPILATION_CACHE_DIR" not in os.environ:
+    if cache is not None or not jax.config.jax_compilation_cache_dir:  # type: ignore[attr-defined]
         jax_cache_folder = _find_user_cache_folder() / "vrw_jax" if cache is None else cache
         jax.config.update("jax_compilation_cache_dir", str(jax_cache_folder))
     cache_folder = jax.config.jax_compilation_cache_dir  # type: ignore[attr-defined]
