@@ -21,12 +21,14 @@ PAGES = [
     if "```python" in page.read_text()
 ]
 SLOW_PAGES = {
-    "docs/any_system.md", "docs/own_loops.md", "docs/explanation/ladder.md",
+    "docs/any_system.md", "docs/choose.md", "docs/own_loops.md", "docs/tuning.md",
+    "docs/explanation/ladder.md",
     "docs/explanation/batches.md", "docs/explanation/branches.md",
     "docs/explanation/contact_gaits.md", "docs/explanation/contact_model.md",
     "docs/explanation/numerics.md", "docs/explanation/tolerances.md",
     "docs/howto/add_a_measure.md", "docs/howto/basins.md", "docs/howto/cluster.md",
-    "docs/howto/numpyro.md", "docs/howto/own_constraint.md", "docs/howto/unilateral_contact.md",
+    "docs/howto/numpyro.md", "docs/howto/own_constraint.md", "docs/howto/robustness.md",
+    "docs/howto/unilateral_contact.md",
     "docs/studies/beyond_the_border.md", "docs/studies/borders.md",
     "docs/studies/double_support.md", "docs/studies/friction.md",
     "docs/studies/one_peak_or_two.md",

@@ -82,9 +82,10 @@ def is_line_refused(checked_folder: Path, command: list[str], line: str) -> dict
             ],
             r"^(\w+\.py):(\d+): error",
         ),
-        (
+        pytest.param(
             ["basedpyright", "--pythonpath", sys.executable, "--level", "error", "."],
             r"/(\w+\.py):(\d+):\d+ - error",
+            marks=pytest.mark.slow,
         ),
     ],
     ids=("mypy", "pyright"),

@@ -12,6 +12,7 @@ from support.batched import (
     TIME_LIMIT_CASES,
     make_parameter_rows,
 )
+from support.slow_variants import mark_slow
 
 import vrw_jax as vrw
 from vrw_jax import Outcome, simd
@@ -75,6 +76,7 @@ def test_batched_state_and_durations_are_accurate_to_the_claimed_error(options, 
     assert reference_values.compute_scaled_error(solution, VALUES) < claimed
 
 
+@pytest.mark.slow
 def test_hard_starts_have_the_outcomes_of_the_diffrax_engine():
     parameter_rows, states = draw_hard_starts(512)
     by_lanes, codes = compute_values(parameter_rows, states)
@@ -346,7 +348,7 @@ million random lanes those in which a parabola through the guard saw nothing of 
 1, which dips below zero within a step; in the last it is still below when another guard falls."""
 
 
-@pytest.mark.parametrize("engine", ["lanes", pytest.param("diffrax", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("engine", ["lanes", *mark_slow("diffrax")])
 def test_dips_within_one_solver_step_are_found(engine):
     names = "damping", "stiffness", "natural_length", "slope", "hub_mass", "leg_mass"
     columns = np.array(HIDDEN_DIPS).T

@@ -68,6 +68,7 @@ class ExternallyLinearizedProblem(AbstractContinuationProblem):
         return z
 
 
+@pytest.mark.slow
 def test_a_branch_linearized_outside_of_compiled_programs_is_the_same():
     def followed(options_used):
         given = jnp.zeros(1), np.array([-0.5, 1.0])
@@ -438,6 +439,7 @@ def assert_same_points_in_random_bounds(branch, count):
             )
 
 
+@pytest.mark.slow
 def test_special_points_do_not_depend_on_bounds_or_continuation_step(branch):
     assert_same_points_in_random_bounds(branch, 8)
 
@@ -519,6 +521,7 @@ def test_the_mesh_of_a_branch_resolves_its_gaits_or_ends_the_branch():
     assert "range" in fine.ends[0]
 
 
+@pytest.mark.slow
 def test_a_rigid_wheel_is_continued_with_its_own_step():
     branch = vrw.continue_branch(
         vrw.WheelParams(), "slope", (0.2, 0.35), model=vrw.RigidWheel(stop_at_lift_off=False)

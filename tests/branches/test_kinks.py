@@ -44,18 +44,17 @@ def test_a_branch_passes_a_kink_at_which_no_step_is_short_enough(slope):
     np.testing.assert_allclose(x, np.where(p < 0.0, 0.5 * p, slope * p), atol=1e-12)
 
 
-def down_to_the_slope(damping, friction, highest_friction):
+def continue_friction(damping, friction, lowest_friction, highest_friction):
     return vrw.continue_branch(
         vrw.WheelParams(damping=damping),
         "friction",
-        (0.30, highest_friction),
+        (lowest_friction, highest_friction),
         model=vrw.UnilateralWheel(friction=friction),
     )
 
 
-@pytest.fixture(scope="module")
-def from_above():
-    return down_to_the_slope(250.0, 0.331, 0.331)
+def down_to_the_slope(damping, friction, highest_friction):
+    return continue_friction(damping, friction, 0.30, highest_friction)
 
 
 def assert_ends_at_the_slope(branch, highest_friction):
@@ -70,22 +69,29 @@ def assert_ends_at_the_slope(branch, highest_friction):
     assert branch.dataset.closure.max() < 1e-8
 
 
-def test_a_branch_goes_on_where_contacts_change_their_order(from_above):
-    assert_ends_at_the_slope(from_above, 0.331)
-    changes = [b for b in from_above.special_points if b.kind == "order_of_contacts_changes"]
+def assert_goes_on_at_the_kink(branch):
+    changes = [b for b in branch.special_points if b.kind == "order_of_contacts_changes"]
     (kink,) = [b for b in changes if abs(b.value - 0.3293878) < 1e-6]
     assert not kink.ends_branch
     assert str(kink) == f"{kink.value:.9g}: order of contacts changes"
-    i = int(np.searchsorted(from_above.values, kink.value))
-    state = from_above.dataset.section_state.values
+    i = int(np.searchsorted(branch.values, kink.value))
+    state = branch.dataset.section_state.values
     assert state[i - 1, 20] != state[i, 20]  # the foot slides before the landing, or rests
     np.testing.assert_allclose(state[i - 1, :20], state[i, :20], atol=1e-4)
 
 
+def test_a_branch_goes_on_where_contacts_change_their_order():
+    branch = continue_friction(250.0, 0.3296, 0.3292, 0.3296)
+    assert branch.values[[0, -1]].tolist() == [0.3292, 0.3296]
+    assert_goes_on_at_the_kink(branch)
+
+
 @pytest.mark.slow
-def test_from_either_side_of_the_kink_the_branch_is_the_same(from_above):
-    below = down_to_the_slope(250.0, 0.325, 0.331)
-    assert_ends_at_the_slope(below, 0.331)
+def test_from_either_side_of_the_kink_the_branch_is_the_same():
+    from_above, below = (down_to_the_slope(250.0, mu, 0.331) for mu in (0.331, 0.325))
+    for branch in (from_above, below):
+        assert_ends_at_the_slope(branch, 0.331)
+        assert_goes_on_at_the_kink(branch)
     ours, theirs = ([b.value for b in branch.special_points] for branch in (from_above, below))
     np.testing.assert_allclose(theirs, ours, atol=1e-8)
     speeds = np.interp([0.315, 0.3293, 0.3295], below.values, below.dataset.speed)

@@ -161,6 +161,7 @@ def test_special_point_curves_pass_through_the_special_points_of_the_branch(spec
         assert_through_the_branch(curve)
 
 
+@pytest.mark.slow
 def test_gaits_on_both_sides_of_a_curve_differ_in_its_sign(special_point_curves):
     random = np.random.default_rng(3)
     for curve in special_point_curves:

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from support.scanning import CountingEngine, evaluate_arithmetically
+from support.slow_variants import mark_slow
 from typer.testing import CliRunner, Result
 
 import vrw_jax as vrw
@@ -139,8 +140,8 @@ def test_the_bar_of_a_resumed_scan_includes_the_earlier_run(
     ("encoding", "words", "sentence"),
     [
         ("ascii", ["theta'-", "lambda4+", "N.s^2"], "vrw: phi >= 0 ... ?"),
-        ("cp1252", ["theta'-", "lambda4+", "N·s²"], "vrw: phi >= 0 … ?"),
         ("utf-8", ["θ̇⁻", "λ4⁺", "N·s²"], "vrw: φ ≥ 0 … Ω"),
+        *mark_slow(("cp1252", ["theta'-", "lambda4+", "N·s²"], "vrw: phi >= 0 … ?")),
     ],
 )
 def test_characters_that_a_terminal_lacks_are_spelled(
@@ -171,7 +172,7 @@ def test_every_printed_symbol_has_a_spelling_in_ascii() -> None:
             assert "?" not in spelled, (text, spelled)
 
 
-@pytest.mark.parametrize("encoding", ["ascii", pytest.param("cp1252", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("encoding", ["ascii", *mark_slow("cp1252")])
 def test_a_gait_is_printed_on_a_terminal_without_greek_letters(encoding: str) -> None:
     environment = {**os.environ, "PYTHONIOENCODING": encoding, "COLUMNS": "200"}
     command = [sys.executable, "-m", "vrw_jax", "gait", "--steps", "1"]

@@ -100,8 +100,14 @@ def test_a_gait_of_one_step_asked_for_as_one_of_several_says_what_it_is():
         assert ("its minimal period is 1" in str(gait)) == (n > 1)
     lost = vrw.limit_cycle(vrw.WheelParams(slope=0.0), model=model, guess=[*start, 0.0], period_n=2)
     assert (bool(lost.found), int(lost.minimal_period)) == (False, 0)
+
+
+@pytest.mark.slow
+def test_minimal_periods_of_several_wheels_are_found_under_vmap():
     slopes = vrw.WheelParams(slope=jnp.array([0.0, 0.1]))
-    search = lambda params: vrw.limit_cycle(params, model=model, guess=[*start, 0.0], period_n=2)
+    search = lambda params: vrw.limit_cycle(
+        params, model=vrw.RigidWheel(held_landing=True), guess=[0.39, 1.5, 0.0], period_n=2
+    )
     every = jax.vmap(search, in_axes=(WHEEL_AXES,))(slopes)
     np.testing.assert_array_equal(every.minimal_period, [0, 1])
 

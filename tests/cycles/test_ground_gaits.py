@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from support.slow_variants import mark_slow
 
 import vrw_jax as vrw
 from vrw_jax import simd
@@ -459,17 +460,17 @@ def test_results_approach_infinite_friction_as_the_inverse_of_the_friction(stopp
     np.testing.assert_allclose(shares[:, 1:], shares[:, :2], rtol=0.03)
 
 
-def test_a_gait_is_found_if_the_slow_starts_end_in_a_paradox():
+@pytest.mark.parametrize("friction", [28.0, *mark_slow(29.0, 31.0, 32.0, 34.0)])
+def test_a_gait_is_found_if_the_slow_starts_end_in_a_paradox(friction):
     """From the gait of a neighboring friction it is found at once; its spectral radius is 0.13."""
     params = vrw.WheelParams(damping=300.0)
     neighbor = vrw.limit_cycle(params, model=vrw.UnilateralWheel(friction=27.0))
-    for friction in (28.0, 29.0, 31.0, 32.0, 34.0):
-        model = vrw.UnilateralWheel(friction=friction)
-        known = vrw.limit_cycle(params, model=model, guess=neighbor)
-        cycle = vrw.limit_cycle(params, model=model)
-        assert int(cycle.outcome) == vrw.Outcome.STEPPED
-        np.testing.assert_allclose(cycle.section_state, known.section_state, atol=1e-10)
-        assert float(cycle.spectral_radius) == pytest.approx(0.13, abs=5e-3)
+    model = vrw.UnilateralWheel(friction=friction)
+    known = vrw.limit_cycle(params, model=model, guess=neighbor)
+    cycle = vrw.limit_cycle(params, model=model)
+    assert int(cycle.outcome) == vrw.Outcome.STEPPED
+    np.testing.assert_allclose(cycle.section_state, known.section_state, atol=1e-10)
+    assert float(cycle.spectral_radius) == pytest.approx(0.13, abs=5e-3)
 
 
 @pytest.mark.slow

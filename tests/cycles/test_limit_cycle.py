@@ -424,6 +424,14 @@ def test_another_model_is_solved_on_its_own_return_map():
     rate_ratio = cycle.post_impact[1] / cycle.section_state[1]
     np.testing.assert_allclose(cycle.spectral_radius, rate_ratio**2, rtol=1e-10)
     assert float(cycle.dls_fraction) == 0.0
+    cycle_without_gait = vrw.limit_cycle(vrw.WheelParams(slope=0.02), model=model)
+    assert int(cycle_without_gait.outcome) == Outcome.NO_CYCLE_FOUND
+    assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(cycle_without_gait))
+
+
+@pytest.mark.slow
+def test_sensitivities_of_another_model_are_central_differences():
+    params, model = vrw.WheelParams(slope=0.1), vrw.RigidWheel()
     table = vrw.sensitivities(params, model=model, measures=("period", "speed"))
     above, below = (
         vrw.limit_cycle(vrw.WheelParams(slope=0.1 + h), model=model) for h in (1e-5, -1e-5)
@@ -434,9 +442,6 @@ def test_another_model_is_solved_on_its_own_return_map():
         np.testing.assert_allclose(
             solution, difference, rtol=1e-7
         )  # error of differences: h squared
-    cycle_without_gait = vrw.limit_cycle(vrw.WheelParams(slope=0.02), model=model)
-    assert int(cycle_without_gait.outcome) == Outcome.NO_CYCLE_FOUND
-    assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(cycle_without_gait))
 
 
 def test_options_of_the_wrong_type_are_refused_in_one_sentence():

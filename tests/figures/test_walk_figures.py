@@ -4,6 +4,7 @@ import matplotlib as mpl
 import numpy as np
 import pytest
 import xarray as xr
+from support.slow_variants import mark_slow
 
 import vrw_jax as vrw
 from vrw_jax.figures import contact_figures, tornado_figure
@@ -85,7 +86,9 @@ def test_sticks_have_feet_in_the_colors_of_their_modes(sliding_walk):
     assert {"at rest", "sliding downhill", "in the air"} <= set(names)
 
 
-@pytest.mark.parametrize("name", ["paper_walk", "rigid_walk", "sliding_walk", "ladder_walk"])
+@pytest.mark.parametrize(
+    "name", ["paper_walk", "rigid_walk", "sliding_walk", *mark_slow("ladder_walk")]
+)
 def test_a_walk_of_every_model_is_drawn(name, request):
     walk = request.getfixturevalue(name)
     assert len(vrw.plot.gait_panels(walk).axes) in (5, 6)

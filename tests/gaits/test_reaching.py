@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from support.slow_variants import mark_slow
 
 import vrw_jax as vrw
 from vrw_jax.cycles import gait_search
@@ -96,6 +97,7 @@ def take_wheel(cycles, i):
     return jax.tree.map(lambda x: x[i], cycles)
 
 
+@pytest.mark.slow
 def test_a_walk_reaches_a_gait_of_16_legs():
     params = vrw.WheelParams(
         n_legs=16, damping=150.7, stiffness=1146.0, natural_length=1.0469, slope=0.1453
@@ -119,6 +121,7 @@ def test_a_walk_reaches_a_gait_with_very_short_single_support():
     assert np.abs(batch_result.section_state[0] - cycle.section_state).max() < 1e-8
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("n_legs", "damping", "stiffness", "natural_length", "slope", "state"),
     [(5, 36.09, 845.4, 1.0281, 0.1435, (0.5661, 2.2441, 0.2098))],
@@ -140,6 +143,7 @@ def test_gaits_of_few_legs_that_only_fast_walks_reach_are_found(
     np.testing.assert_allclose(from_walk.section_state, cycle.section_state, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_gaits_of_a_finer_mesh_have_accurate_derivatives():
     period = lambda slope: vrw.limit_cycle(vrw.WheelParams(slope=slope)).period
     slope, step = 0.12, 1e-6
@@ -147,6 +151,7 @@ def test_gaits_of_a_finer_mesh_have_accurate_derivatives():
     np.testing.assert_allclose(jax.jacfwd(period)(slope), quotient, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_gait_near_a_section_state_has_the_derivatives_of_the_one_found_cold():
     period = lambda params, guess: vrw.limit_cycle(params, guess=guess).period
     for transform in (jax.jacfwd, jax.grad):
@@ -169,9 +174,12 @@ def ten_step_orbit_points():
     return points
 
 
-def test_a_ten_step_orbit_is_found_from_each_of_its_points_and_starts_there(ten_step_orbit_points):
+@pytest.mark.parametrize("points", [slice(0, 2), *mark_slow(slice(2, 10))], ids=["two", "others"])
+def test_a_ten_step_orbit_is_found_from_each_of_its_points_and_starts_there(
+    ten_step_orbit_points, points
+):
     # The start may lie on either side of the step without double support.
-    for point in ten_step_orbit_points:
+    for point in ten_step_orbit_points[points]:
         cycle = vrw.limit_cycle(ORBIT_WHEEL, guess=point, period_n=10)
         assert int(cycle.outcome) == vrw.Outcome.STEPPED
         assert np.max(np.abs(point - cycle.section_state)) < 1e-7

@@ -125,6 +125,7 @@ def test_derivatives_through_every_kind_of_event_are_tested():
     }  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("solver", ["Tsit5", "Bosh3"])
 def test_derivatives_are_accurate_if_only_stability_limits_the_solver_step(solver):
     """Compare with far shorter solver steps.

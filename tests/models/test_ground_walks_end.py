@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from reference_code import complementarity
 from scipy.integrate import solve_ivp
+from support.slow_variants import mark_slow
 
 import vrw_jax as vrw
 from vrw_jax.contact.batch_integrator import (
@@ -43,7 +44,7 @@ def find_walk_ends(friction, stoppers, tolerance):
     return {int(i): outcomes[i] for i in np.flatnonzero(outcomes)}
 
 
-@pytest.mark.parametrize("tolerance", [1e-6, pytest.param(1e-8, marks=pytest.mark.slow), 1e-10])
+@pytest.mark.parametrize("tolerance", [1e-6, *mark_slow(1e-8, 1e-10)])
 def test_outcomes_of_walks_do_not_depend_on_the_tolerance(tolerance):
     assert find_walk_ends(INFINITE_FRICTION, "bilateral", tolerance) == FALL_OUTCOMES
     assert find_walk_ends(HIGH_FRICTION, "bilateral", tolerance) == PARADOX_OUTCOMES

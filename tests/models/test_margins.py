@@ -8,14 +8,12 @@ import pytest
 from reference_code import five_coordinates
 from support import reference_values
 from support.batched import NAMES, compute_full_steps, make_parameter_rows
+from support.slow_variants import mark_slow
 
 import vrw_jax as vrw
 
-CASE_INDICES = (
-    0,
-    1,
-    5,
-)  # Table 1; c = 100, where foot 2 scuffs; a heavy-legged, softly damped wheel
+CASE_INDICES = (0, 1, 5)
+"""Table 1; c = 100, where foot 2 scuffs; a heavy-legged, softly damped wheel."""
 
 
 @functools.cache  # Both engines are compared with it.
@@ -29,7 +27,9 @@ def compute_reference_margins(index):
 
 @pytest.mark.parametrize("by_lanes", [False, True], ids=["wheel", "lanes"])
 @pytest.mark.parametrize(
-    "index", CASE_INDICES, ids=lambda i: reference_values.REFERENCE_CASES[i]["name"]
+    "index",
+    [*mark_slow(0, 1), 5],
+    ids=lambda i: reference_values.REFERENCE_CASES[i]["name"],
 )
 def test_every_margin_equals_the_reference(index, by_lanes):
     solution = compute_full_steps(

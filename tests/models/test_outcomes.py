@@ -15,6 +15,7 @@ from support.batched import (
     compute_states_and_work,
     make_parameter_rows,
 )
+from support.slow_variants import mark_slow
 
 import vrw_jax as vrw
 from vrw_jax import Outcome
@@ -84,17 +85,17 @@ def test_a_wheel_at_rest_has_the_same_outcome_from_every_engine(tolerance):
     assert not np.any(lanes == Outcome.SOLVER_FAILED)
 
 
-def test_a_wheel_comes_to_rest_where_the_ground_carries_its_weight():
+@pytest.mark.parametrize("engine", ["lanes", *mark_slow("diffrax")])
+def test_a_wheel_comes_to_rest_where_the_ground_carries_its_weight(engine):
     """Reference: statics, the sum of both feet's forces against gravity in the slope's frame."""
     parameter_rows, start = OUTCOME_CASES[Outcome.CAME_TO_REST]
     params = reference_values.make_wheel(parameter_rows[0])
-    for engine in ("lanes", "diffrax"):
-        options = vrw.StepOptions(engine=engine)
-        trace = vrw.ViscoelasticWheel().sample_step(params, jnp.asarray(start), options, 2)
-        tangential, normal = np.asarray(trace.forces)[0, -1].reshape(2, 2).sum(0)
-        weight = 9.81 * (10.0 + 8.0 * 0.53)
-        assert tangential == pytest.approx(-weight * np.sin(0.1), rel=1e-6)
-        assert normal == pytest.approx(weight * np.cos(0.1), rel=1e-6)
+    options = vrw.StepOptions(engine=engine)
+    trace = vrw.ViscoelasticWheel().sample_step(params, jnp.asarray(start), options, 2)
+    tangential, normal = np.asarray(trace.forces)[0, -1].reshape(2, 2).sum(0)
+    weight = 9.81 * (10.0 + 8.0 * 0.53)
+    assert tangential == pytest.approx(-weight * np.sin(0.1), rel=1e-6)
+    assert normal == pytest.approx(weight * np.cos(0.1), rel=1e-6)
 
 
 @pytest.mark.slow

@@ -40,10 +40,14 @@ class PointFeetWheel(vrw.AbstractWheel):
 PARAMS = vrw.WheelParams(slope=0.15)
 
 
-def test_a_new_model_has_gaits_and_branches():
+def test_a_new_model_has_gaits():
     cycle = vrw.limit_cycle(PARAMS, model=PointFeetWheel())
     reference = vrw.limit_cycle(PARAMS, model=vrw.RigidWheel())
     assert float(cycle.period) == float(reference.period)
+
+
+@pytest.mark.slow
+def test_a_new_model_has_branches():
     branch = vrw.continue_branch(PARAMS, "slope", (0.1, 0.2), model=PointFeetWheel())
     assert float(branch.dataset.slope.min()) == pytest.approx(0.1, abs=1e-12)
 

@@ -100,6 +100,7 @@ def test_derivatives_agree_with_differences():
     np.testing.assert_allclose(jax.jacrev(value)(0.15), jax.jacfwd(value)(0.15), rtol=1e-13)
 
 
+@pytest.mark.slow
 def test_the_rigid_wheel_is_the_second_order_limit_of_the_viscoelastic_wheel():
     """k = k0/e^2, c = c0/e, L* - L0 = d e^2: preload and damping ratio stay, the leg stiffens.
 

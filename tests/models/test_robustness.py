@@ -41,7 +41,7 @@ def make_batch(vector, x):
     return st.lists(st.tuples(vector, x), min_size=BATCH_SIZE, max_size=BATCH_SIZE)
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=5, deadline=None)
 @given(lanes=make_batch(sensible_parameters, start))
 def test_every_wheel_gets_an_outcome(lanes):
     assert_valid_outcomes(lanes)

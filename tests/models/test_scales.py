@@ -3,6 +3,7 @@
 import jax
 import numpy as np
 import pytest
+from support.slow_variants import mark_slow
 
 import vrw_jax as vrw
 from vrw_jax.models.unit_scaling import UNIT_SCALING_BY_PARAMETER_INDEX
@@ -57,13 +58,7 @@ def test_a_step_is_the_same_in_other_units():
 UNIT_SCALED_NAMES = [PARAMETER_NAMES[last] for last in UNIT_SCALING_BY_PARAMETER_INDEX]
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        UNIT_SCALED_NAMES[0],
-        *(pytest.param(x, marks=pytest.mark.slow) for x in UNIT_SCALED_NAMES[1:]),
-    ],
-)
+@pytest.mark.parametrize("name", [UNIT_SCALED_NAMES[0], *mark_slow(*UNIT_SCALED_NAMES[1:])])
 def test_tangents_derived_from_units_equal_those_of_the_step(name):
     """A single column is propagated through the step; with all columns, units give two of them."""
     table, start, length, time = random_batch()
@@ -139,7 +134,9 @@ def test_collocated_steps_are_accepted_alike_in_units_of_any_size(scale):
     np.testing.assert_allclose(section_states, section_states_in_si, rtol=0, atol=1e-11)
 
 
-@pytest.mark.parametrize("scale", SCALES, ids=str)
+@pytest.mark.parametrize(
+    "scale", [SCALES[0], *mark_slow(*((x,) for x in SCALES[1:-1])), SCALES[-1]], ids=str
+)
 def test_gaits_are_the_same_in_units_of_any_size(scale):
     """Both gaits with unilateral contact, and the paper's. Reference: those in SI."""
     cases = [

@@ -4,6 +4,7 @@ stoppers."""
 import numpy as np
 import pytest
 from reference_code import complementarity
+from support.slow_variants import mark_slow
 
 import vrw_jax as vrw
 
@@ -117,7 +118,7 @@ def test_only_the_event_limit_ends_a_chain_of_five_hundred_events():
     assert 1e-5 < abs(cut.period - reference.sum()) < 1e-4  # 4.2e-5 s: 264 of 558 events are made
 
 
-@pytest.mark.parametrize("x", [START, (0.1, 4.0, -0.1)])
+@pytest.mark.parametrize("x", [START, *mark_slow(((0.1, 4.0, -0.1),))])
 def test_a_wheel_without_friction_falls_back_in_both_codes(x):
     wheel = complementarity.ComplementarityWheel(0.0)
     with pytest.raises(complementarity.NoAdmissibleContactError, match="fell back"):

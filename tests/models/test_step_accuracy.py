@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from support import reference_values
 from support.batched import compute_full_steps, compute_jacobians, compute_states_and_work
+from support.slow_variants import mark_slow
 
 import vrw_jax as vrw
 
@@ -97,9 +98,7 @@ def test_indicators_impact_and_step_length_are_accurate():
         ), key
 
 
-@pytest.mark.parametrize(
-    "solver", ["Tsit5", "Dopri5", pytest.param("Kvaerno5", marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize("solver", ["Tsit5", "Dopri5", *mark_slow("Kvaerno5")])
 def test_all_solvers_agree(solver):
     # Kvaerno5's implicit stages stop at their own tolerance: ten times the explicit bound.
     options = vrw.StepOptions(solver=solver, rtol=1e-9, atol=1e-9)
@@ -107,9 +106,7 @@ def test_all_solvers_agree(solver):
     assert reference_values.compute_scaled_error(solution, VALUES) < 1e-7
 
 
-@pytest.mark.parametrize(
-    ("solver", "order"), [pytest.param("Tsit5", 5, marks=pytest.mark.slow), ("Dopri8", 8)]
-)
+@pytest.mark.parametrize(("solver", "order"), [*mark_slow(("Tsit5", 5)), ("Dopri8", 8)])
 def test_work_falls_with_the_order_of_the_solver(solver, order):
     """Error against number of steps has the solver's order: state, event times and derivatives.
 

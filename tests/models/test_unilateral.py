@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from reference_code import moreau_jean
 from scipy.optimize import brentq
+from support.slow_variants import mark_slow
 
 import vrw_jax as vrw
 from vrw_jax.contact.contact_state import (
@@ -155,7 +156,7 @@ def test_energy_lost_in_a_step_is_reported_by_cause(scene_traces):
     assert float(step.energy_friction) > 0.0
 
 
-@pytest.mark.parametrize("friction", [0.7, pytest.param(1.3, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("friction", [0.7, *mark_slow(1.3)])
 def test_time_stepping_converges_to_the_same_step_in_first_order(friction):
     reference = compute_step(friction)
     sizes = (16e-4, 8e-4, 4e-4, 2e-4)

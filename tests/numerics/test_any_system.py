@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import mpmath
 import numpy as np
 import pytest
+from support.slow_variants import mark_slow
 
 import vrw_jax as vrw
 from vrw_jax.continuation import solve_fixed_point
@@ -187,9 +188,10 @@ def make_attracted_field(rate):
     ("stiff", "rate", "solver"),
     [
         (make_switching_system, 2.7e6, "Kvaerno5"),
-        (make_switching_system, 1e3, "Kvaerno5"),
-        (make_rotating_field, 1e6, "Kvaerno5"),
         (make_attracted_field, 1e3, "Kvaerno4"),
+        *mark_slow(
+            (make_switching_system, 1e3, "Kvaerno5"), (make_rotating_field, 1e6, "Kvaerno5")
+        ),
     ],
 )
 def test_event_times_of_implicit_solvers_are_within_their_stated_errors(stiff, rate, solver):
@@ -239,7 +241,7 @@ def make_impact_oscillator(depth):
     return [Mode(field, (stop,))], jnp.array([1.0, rate, (np.pi - np.arctan(sine)) / w]), r
 
 
-@pytest.mark.parametrize("depth", [1e-2, 1e-6])
+@pytest.mark.parametrize("depth", [*mark_slow(1e-2), 1e-6])
 def test_the_product_of_multipliers_is_accurate_at_a_grazing_event(depth):
     modes, start, restitution = make_impact_oscillator(depth)
 

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from support.slow_variants import mark_slow
 
 import vrw_jax as vrw
 from vrw_jax.continuation import solve_fixed_point
@@ -29,7 +30,7 @@ def turn(y):
 
 
 @pytest.mark.parametrize("limit", [1e-4, 0.3, 2.0])
-@pytest.mark.parametrize("solver", ["Dopri8", "Tsit5", "Kvaerno5"])
+@pytest.mark.parametrize("solver", ["Dopri8", *mark_slow("Tsit5", "Kvaerno5")])
 def test_a_walk_that_runs_out_of_time_ends_in_the_state_at_the_time_limit(solver, limit):
     """A rotation: its state at any time is a cosine and a sine. The limit is that of each mode."""
     options = vrw.StepOptions(solver, rtol=1e-11, atol=1e-11, max_phase_time=limit)
@@ -71,7 +72,7 @@ def accelerated(acceleration, distance, options):
     return simulate_hybrid([mode], [0.0, 0.0], events=1, options=options)
 
 
-@pytest.mark.parametrize("tolerance", [1e-5, 1e-10, 1e-13])
+@pytest.mark.parametrize("tolerance", [*mark_slow(1e-5, 1e-10), 1e-13])
 def test_an_event_much_earlier_than_the_first_solver_step_has_the_closed_form_s_time(tolerance):
     options = vrw.StepOptions(rtol=tolerance, atol=tolerance)
     run = jax.jit(lambda acceleration: accelerated(acceleration, 1e-6, options))

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from support.slow_variants import mark_slow
 
 import vrw_jax as vrw
 from vrw_jax.hybrid import Guard, Mode, Termination, simulate_hybrid
@@ -40,7 +41,7 @@ def height_at(time, start):
 
 
 @pytest.mark.parametrize("options", [vrw.StepOptions(), TIGHT], ids=["default", "tight"])
-@pytest.mark.parametrize("n", [2, 3])
+@pytest.mark.parametrize("n", [*mark_slow(2), 3])
 def test_balls_that_land_together_have_the_derivatives_of_one_ball(n, options):
     jacobian = jax.jit(jax.jacfwd(lambda start: heights_at(0.7, start, n, options)))
     for height in (0.9, 1.0, 1.3):
@@ -64,7 +65,7 @@ def thrown_in_closed_form(start):
     return jnp.stack([rate * left - 0.5 * G * left**2, rate - G * left, impact])
 
 
-@pytest.mark.parametrize("solver", ["Dopri8", "Tsit5", "Kvaerno5"])
+@pytest.mark.parametrize("solver", ["Dopri8", "Tsit5", *mark_slow("Kvaerno5")])
 @pytest.mark.parametrize("height", [0.0, -1e-17])
 def test_a_start_on_a_falling_guard_has_the_event_time_s_derivatives(height, solver):
     options = vrw.StepOptions(solver, rtol=1e-12, atol=1e-12)
@@ -122,7 +123,7 @@ def test_saltation_matrices_of_coinciding_events_are_composed_in_order():
         np.testing.assert_allclose(jax.jacfwd(late)(start), reference, rtol=1e-10, atol=1e-10)
 
 
-@pytest.mark.parametrize("n", [3, 5, 12])
+@pytest.mark.parametrize("n", [*mark_slow(3, 5), 12])
 def test_many_balls_that_land_together_go_on_bouncing(n):
     walked = simulate_hybrid(
         [balls(n)], jnp.repeat(jnp.array([1.0, 0.0]), n), events=3 * n, options=TIGHT

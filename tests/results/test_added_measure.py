@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 import vrw_jax as vrw
 
@@ -17,6 +18,7 @@ HOWTO = ROOT / "docs" / "howto" / "add_a_measure.md"
 USE = """
 import json, sys
 import numpy as np
+import pytest
 import vrw_jax as vrw
 
 vrw.start_jax(sys.argv[1])
@@ -53,6 +55,7 @@ def changed(source: str, change: str) -> str:
     return source.replace(below, below + added)
 
 
+@pytest.mark.slow
 def test_a_measure_added_by_the_how_to_works_wherever_measures_are_named(tmp_path):
     """In a steady gait the energy lost per distance is the weight times the slope's sine."""
     shutil.copytree(ROOT / "vrw_jax", tmp_path / "vrw_jax")

@@ -10,6 +10,7 @@ import pytest
 from reference_code import five_coordinates
 from reference_code import five_coordinates_equations as equations
 from reference_code.constrained_wheel import Wheel, run_phase
+from support.slow_variants import mark_slow
 
 import vrw_jax as vrw
 from vrw_jax.robustness.basin_share import compute_share_error
@@ -45,6 +46,7 @@ def test_the_share_of_the_rigid_wheel_is_that_of_its_closed_form():
     assert by_sobol.failure_shares == {"FELL_BACK": 1.0 - by_sobol.share}
 
 
+@pytest.mark.slow
 def test_the_share_of_the_papers_wheel_is_that_of_a_larger_count():
     n, n_steps = 16_384, 60
     result = vrw.basin_share(TABLE_1, BOX, n_starts=2048)
@@ -74,6 +76,7 @@ def test_a_gait_that_is_not_stable_has_no_basin():
         vrw.smallest_disturbance(TABLE_1, cycle=unstable)
 
 
+@pytest.mark.slow
 def test_errors_of_shares_are_standard_deviations_over_seeds():
     shares = {
         sampling: [
@@ -166,9 +169,8 @@ def state_at_time(step, time):
 @pytest.mark.parametrize(
     ("share_of_step", "engine"),
     [
-        (0.2, "auto"), (0.7, "auto"), (0.97, "auto"), (0.2, "diffrax"),
-        pytest.param(0.7, "diffrax", marks=pytest.mark.slow),
-        pytest.param(0.97, "diffrax", marks=pytest.mark.slow),
+        (0.2, "auto"), (0.7, "auto"), (0.97, "auto"),
+        *mark_slow((0.2, "diffrax"), (0.7, "diffrax"), (0.97, "diffrax")),
     ],
 )  # fmt: skip
 def test_the_rest_of_a_disturbed_step_is_that_of_five_coordinates(gait_step, share_of_step, engine):
@@ -199,7 +201,7 @@ def test_just_below_the_smallest_disturbance_five_coordinates_walk_on(gait_step,
         wheel = five_coordinates.TABLE_1
         ending, section = finish_by_five_coordinates(wheel, phase, disturbed)
         n_steps = 0
-        while ending == "stepped" and n_steps < 8:
+        while ending == "stepped" and n_steps < 4:
             result = five_coordinates.step(wheel, section)
             ending, section, n_steps = result["outcome"], result["section_state"], n_steps + 1
         return ending, section
@@ -212,7 +214,8 @@ def test_just_below_the_smallest_disturbance_five_coordinates_walk_on(gait_step,
     assert ending in ("touchdown", five_coordinates.TOUCHDOWN_EARLY)
 
 
-@pytest.mark.parametrize("damping", [pytest.param(100.0, marks=pytest.mark.slow), 200.0])
+@pytest.mark.slow
+@pytest.mark.parametrize("damping", [100.0, 200.0])
 def test_no_smaller_disturbance_at_random_instants_leaves_the_basin(damping):
     # At these dampings the smallest disturbances are in SLS-I and in double support.
     params = vrw.WheelParams(damping=damping)

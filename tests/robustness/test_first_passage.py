@@ -5,6 +5,7 @@ import jax
 import numpy as np
 import pytest
 from scipy.special import ndtr
+from support.slow_variants import mark_slow
 
 import vrw_jax as vrw
 from vrw_jax.robustness.passage_gradient import differentiate_log_mean_steps
@@ -86,7 +87,7 @@ def test_the_derivative_of_a_long_life_is_a_central_difference():
     assert abs(gradient / difference - 1.0) < 1e-6
 
 
-@pytest.mark.parametrize("degrees", [pytest.param(1.25, marks=pytest.mark.slow), 2.0, 3.0])
+@pytest.mark.parametrize("degrees", [*mark_slow(1.25), 2.0, 3.0])
 def test_samples_agree_with_quadrature_within_their_error(degrees):
     gait = vrw.limit_cycle(BYL, model=RIGID)
     start, slope_sd = np.asarray(gait.section_state), degrees * DEGREE
@@ -103,7 +104,9 @@ def test_samples_agree_with_quadrature_within_their_error(degrees):
     assert tuple(sample.fraction_by_outcome) == ("FELL_BACK",)
 
 
-@pytest.mark.parametrize(("slope_sd", "steps", "error"), [(0.015, 13.23, 0.06), (0.02, 6.9, 0.05)])
+@pytest.mark.parametrize(
+    ("slope_sd", "steps", "error"), [(0.015, 13.23, 0.06), *mark_slow((0.02, 6.9, 0.05))]
+)
 def test_the_papers_wheel_lasts_as_long_as_an_independent_code_counts(slope_sd, steps, error):
     passage = vrw.first_passage(vrw.WheelParams(), slope_sd)
     relative_error = 1.5 * float(passage.error / passage.mean_steps)
@@ -136,11 +139,13 @@ def count_failure_share(params, slope_sd, n_walkers, n_steps, model=None):
 @pytest.mark.parametrize(
     ("slope_sd", "damping", "n_walkers", "n_steps", "tol"),
     [
-        pytest.param(0.007, 200.0, 16384, 85, 0.01, marks=pytest.mark.slow),
-        pytest.param(0.01, 200.0, 16384, 85, 0.01, marks=pytest.mark.slow),
-        pytest.param(0.0125, 200.0, 16384, 85, 0.01, marks=pytest.mark.slow),
         (0.0125, 200.0, 8192, 32, 0.02),
-        pytest.param(0.015, 150.0, 16384, 85, 0.01, marks=pytest.mark.slow),
+        *mark_slow(
+            (0.007, 200.0, 16384, 85, 0.01),
+            (0.01, 200.0, 16384, 85, 0.01),
+            (0.0125, 200.0, 16384, 85, 0.01),
+            (0.015, 150.0, 16384, 85, 0.01),
+        ),
     ],
 )
 def test_samples_agree_with_counted_steps(slope_sd, damping, n_walkers, n_steps, tol):
@@ -194,6 +199,7 @@ def test_a_life_of_millions_of_steps_depends_on_no_choice_of_the_sampling():
     assert float(passage.kappa_2) == pytest.approx(float(gait.spectral_radius), abs=0.02)
 
 
+@pytest.mark.slow
 def test_the_error_keeps_its_level_although_the_error_ends_the_sampling():
     """Normal group means with known mean: an error test after each round covers only 98.6 %."""
     random, n_estimates, probability, tol = np.random.default_rng(0), 2000, 1e-6, 0.02

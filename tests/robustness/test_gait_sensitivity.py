@@ -61,6 +61,7 @@ def test_a_long_walk_on_slightly_uneven_ground_has_that_standard_deviation(sensi
     assert abs(deviation / float(sensitivity.norm[0]) - 1.0) < 0.01
 
 
+@pytest.mark.slow
 def test_norms_along_a_branch_are_those_of_its_wheels():
     branch = vrw.continue_branch(TABLE_1, "damping", (198.0, 202.0))
     norms = vrw.measure_gait_sensitivity(branch, ("period", "speed"), n_points=3)
@@ -146,6 +147,7 @@ def test_the_norm_is_a_measure_of_tables_of_sensitivities():
     assert table.measure_unit.values.tolist() == ["s/rad", "m/(s rad)"]
 
 
+@pytest.mark.slow
 def test_the_rigid_wheel_has_the_norm_of_its_closed_map():
     params = vrw.WheelParams(slope=0.1)
     result = vrw.gait_sensitivity(params, ["period"], model=HELD, guess=[0.39, 1.5, 0.0])

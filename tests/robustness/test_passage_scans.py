@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from support.slow_variants import mark_slow
 from typer.testing import CliRunner
 
 import vrw_jax as vrw
@@ -13,6 +14,7 @@ SLOPE_SD = 0.02
 MEASURES = ["mean_steps", "mean_steps_error", "failure_probability"]
 
 
+@pytest.mark.slow
 def test_a_scan_contains_the_life_of_each_wheel_with_a_gait() -> None:
     data = vrw.scan(vrw.grid(damping=[200.0, 300.0]), [*MEASURES, "speed"], slope_sd=SLOPE_SD)
     passage = vrw.first_passage(vrw.WheelParams(damping=200.0), SLOPE_SD)
@@ -23,6 +25,7 @@ def test_a_scan_contains_the_life_of_each_wheel_with_a_gait() -> None:
     assert data.mean_steps.attrs["long_name"] == "mean number of steps until failure"
 
 
+@pytest.mark.slow
 def test_an_interrupted_scan_of_lives_continues_with_the_same_numbers(tmp_path: Path) -> None:
     design, store = vrw.grid(damping=[190.0, 200.0]), tmp_path / "lives.zarr"
 
@@ -79,7 +82,7 @@ def test_the_command_needs_the_standard_deviation_of_the_slopes(tmp_path: Path) 
     "measures",
     [
         ["mean_steps"],
-        pytest.param(["mean_steps", "gait_sensitivity_period"], marks=pytest.mark.slow),
+        *mark_slow((["mean_steps", "gait_sensitivity_period"],)),
     ],
     ids="-".join,
 )

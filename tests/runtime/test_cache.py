@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from jax.experimental.compilation_cache import compilation_cache
 from support.machine_code import CodeRegistrySpy
+from support.slow_variants import mark_slow
 
 import vrw_jax as vrw
 from vrw_jax.numerics import (
@@ -216,10 +217,7 @@ def test_folders_of_code_are_the_users_alone_whatever_the_umask(tmp_path):
     assert list((tmp_path / "a").rglob("lanes_code_*"))
 
 
-@pytest.mark.parametrize(
-    "mode", [pytest.param(0o777, marks=pytest.mark.slow), 0o770, 0o702,
-             pytest.param(0o1777, marks=pytest.mark.slow)],
-)  # fmt: skip
+@pytest.mark.parametrize("mode", [*mark_slow(0o777, 0o702, 0o1777), 0o770])
 def test_a_folder_that_others_can_write_is_refused_in_one_sentence(tmp_path, mode):
     place = tmp_path / "cache"
     place.mkdir()

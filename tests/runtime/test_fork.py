@@ -104,6 +104,7 @@ def test_a_child_forked_before_any_array_computes(tmp_path):
     assert fork("none", calls, 60, tmp_path) == {"arithmetic": ["", ""]}
 
 
+@pytest.mark.slow
 def test_the_how_to_runs_as_a_file_and_prints_what_it_says(tmp_path):
     """Reference: the gaits' periods, computed one by one in this process."""
     code, results = re.search(

@@ -90,7 +90,7 @@ def run_as_machine_code(program, x, forces_copies):
         return np.asarray(jax.jit(run)(x))
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=12, deadline=None)
 @given(st.lists(OPERATIONS, min_size=1, max_size=4), st.booleans())
 def test_loops_in_place_compute_what_loops_with_copies_compute(operations, reads_again):
     program = make_program(operations, reads_again)

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax import lax
+from support.slow_variants import mark_slow
 
 from vrw_jax import simd
 from vrw_jax.simd.arithmetic import ELEMENTWISE_RULES
@@ -244,7 +245,7 @@ def pick_rows(x, large):
     return lax.fori_loop(2, 12, turn, large)
 
 
-@pytest.mark.parametrize("n", [1, 4, 1001])
+@pytest.mark.parametrize("n", [*mark_slow(1, 4), 1001])
 def test_array_functions_are_called_from_jax_programs(n):
     x = jnp.asarray(RANDOM_GENERATOR.normal(size=(20, 3, n)))
     call = simd.compile_lane_function(use_arrays_in_loops, use_arrays_in_loops, "arrays", None)

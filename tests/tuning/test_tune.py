@@ -177,6 +177,7 @@ def test_trials_without_a_finite_objective_are_shortened(bad):
     assert tuned.n_backtracks == beyond.sum() > 0
 
 
+@pytest.mark.slow
 def test_a_climb_ends_where_the_objective_ceases_to_be_finite():
     def objective(cycle):
         damping = cycle.parameters[PARAMETER_NAMES.index("damping")]

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from support.slow_variants import mark_slow
 from support.web_code import PAGE_PATH, PageCode
 
 import vrw_jax as vrw
@@ -152,7 +153,7 @@ def test_all_measures_of_a_step_equal_the_librarys():
         ), name
 
 
-@pytest.mark.parametrize("n_legs", [8, *(pytest.param(n, marks=pytest.mark.slow) for n in (6, 10))])
+@pytest.mark.parametrize("n_legs", [8, *mark_slow(6, 10)])
 def test_a_step_on_rigid_legs_equals_the_librarys(n_legs):
     """Values, its slope, and all that it tells."""
     n, model = 300, vrw.RigidWheel(friction=0.9)
