@@ -62,6 +62,7 @@ FRICTION = {
 """By function: the margin to the friction needed at the fore foot that it tells."""
 SLOW_FUNCTIONS = {
     "gait_sensitivity",
+    "scan",
     "first_passage",
     "basin_share",
     "measure_basins",

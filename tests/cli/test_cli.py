@@ -175,7 +175,7 @@ def test_every_printed_symbol_has_a_spelling_in_ascii() -> None:
 @pytest.mark.parametrize("encoding", ["ascii", *mark_slow("cp1252")])
 def test_a_gait_is_printed_on_a_terminal_without_greek_letters(encoding: str) -> None:
     environment = {**os.environ, "PYTHONIOENCODING": encoding, "COLUMNS": "200"}
-    command = [sys.executable, "-m", "vrw_jax", "gait", "--steps", "1"]
+    command = [sys.executable, "-m", "vrw_jax", "gait", "--steps", "2"]
     done = subprocess.run(command, capture_output=True, text=True, env=environment)
     assert done.returncode == 0, done.stderr
     assert "lambda4+" in done.stdout

@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from support.slow_variants import mark_slow
 
 import vrw_jax as vrw
 from vrw_jax.cycles import CYCLE_MEASURE_FUNCTIONS, confirm_outcome_by_step, make_finder
@@ -86,19 +87,19 @@ def test_values_and_from_values_of_a_model_are_inverse_to_each_other(model: Abst
         assert float(ground.friction) == 1.25
 
 
-def test_a_gait_of_one_step_asked_for_as_one_of_several_says_what_it_is():
+@pytest.mark.parametrize("period_n", [2, *mark_slow(1)])
+def test_a_gait_of_one_step_asked_for_as_one_of_several_says_what_it_is(period_n):
     """A rigid wheel's steps all contract towards one: it has gaits of one step alone."""
     model, wheel, start = (
         vrw.RigidWheel(held_landing=True),
         vrw.WheelParams(slope=0.1),
         (0.39, 1.5),
     )
-    for n in (1, 2):
-        gait = vrw.limit_cycle(wheel, model=model, guess=[*start, 0.0], period_n=n)
-        assert bool(gait.found)
-        assert int(gait.minimal_period) == 1
-        assert ("its minimal period is 1" in str(gait)) == (n > 1)
-    lost = vrw.limit_cycle(vrw.WheelParams(slope=0.0), model=model, guess=[*start, 0.0], period_n=2)
+    find = lambda wheel: vrw.limit_cycle(wheel, model=model, guess=[*start, 0.0], period_n=period_n)
+    gait, lost = find(wheel), find(vrw.WheelParams(slope=0.0))
+    assert bool(gait.found)
+    assert int(gait.minimal_period) == 1
+    assert ("its minimal period is 1" in str(gait)) == (period_n > 1)
     assert (bool(lost.found), int(lost.minimal_period)) == (False, 0)
 
 

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from support import reference_values
 from support.files import assert_netcdf_round_trip
+from support.slow_variants import mark_slow
 
 import vrw_jax as vrw
 from vrw_jax import simd
@@ -77,7 +78,7 @@ def compute_relative_error(solution, expected):
     return np.max(np.abs(np.asarray(solution) - expected) / scale)
 
 
-@pytest.mark.parametrize(("options", "allowed"), [(None, 1e-9), (TIGHT_OPTIONS, 1e-12)])
+@pytest.mark.parametrize(("options", "allowed"), [(None, 1e-9), *mark_slow((TIGHT_OPTIONS, 1e-12))])
 def test_cycles_agree_with_the_reference(options, allowed):
     solution = find_reference_cycles(options)
     assert np.all(np.asarray(solution.outcome) == Outcome.STEPPED)

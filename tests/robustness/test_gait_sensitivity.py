@@ -32,6 +32,7 @@ def test_squares_of_the_parts_add_up_to_the_square_of_the_norm(sensitivity):
     np.testing.assert_allclose(sum(x**2 for x in parts), sensitivity.norm**2, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_collocation_and_event_driven_steps_give_the_same_norms(sensitivity):
     finder = make_finder(None, TABLE_1.n_legs)
     x = vrw.limit_cycle(TABLE_1).section_state
