@@ -77,7 +77,9 @@ def assert_goes_on_at_the_kink(branch):
     i = int(np.searchsorted(branch.values, kink.value))
     state = branch.dataset.section_state.values
     assert state[i - 1, 20] != state[i, 20]  # the foot slides before the landing, or rests
-    np.testing.assert_allclose(state[i - 1, :20], state[i, :20], atol=1e-4)
+    # Without a jump, the states change between both points as slowly as beside the kink.
+    changes = np.max(np.abs(np.diff(state[:, :20], axis=0)), axis=1) / np.diff(branch.values)
+    assert changes[i - 1] < 1.1 * max(changes[i - 2], changes[i])
 
 
 def test_a_branch_goes_on_where_contacts_change_their_order():
