@@ -420,9 +420,9 @@ def _compute_continued_quantities(
     start_state = *dls_start.q, *dls_start.v
     dls_state_rates = start_state[1], make_dls_instant(*start_state).acceleration.ddtheta
     initial_rear_force, rear_force_rate = jax.jvp(compute_rear_force, start_state, dls_state_rates)
-    mean_force_fall = (initial_rear_force - compute_rear_force(*dls_end.q, *dls_end.v)) / jnp.where(
-        dls_duration == 0.0, 1.0, dls_duration
-    )
+    mean_decrease_rate = (
+        initial_rear_force - compute_rear_force(*dls_end.q, *dls_end.v)
+    ) / jnp.where(dls_duration == 0.0, 1.0, dls_duration)
     quantity_values = (
         landing_result.rear_impulse.normal,
         fore_force.normal,
@@ -430,7 +430,7 @@ def _compute_continued_quantities(
         *single_support_durations,
         takeoff_acceleration,
         -rear_force_rate,
-        mean_force_fall,
+        mean_decrease_rate,
     )
     return dict(zip(CONTINUED_QUANTITIES, quantity_values, strict=True))
 

@@ -139,8 +139,8 @@ def fit_guard_parabola(
     The variable of the parabola is the fraction of the solver step. `middle_guard_value` is the
     guard at `middle_guard_index`.
     """
-    middle_slope = (middle_guard_value - start_guard_value) / tableau.middle_node
-    quadratic_coefficient = (end_guard_value - start_guard_value - middle_slope) / (
+    secant_rate = (middle_guard_value - start_guard_value) / tableau.middle_node
+    quadratic_coefficient = (end_guard_value - start_guard_value - secant_rate) / (
         1.0 - tableau.middle_node
     )
     return quadratic_coefficient, end_guard_value - start_guard_value - quadratic_coefficient

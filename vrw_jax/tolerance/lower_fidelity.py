@@ -132,8 +132,8 @@ def find_paper_gaits(params: WheelParams, step_options: StepOptions) -> LowerFid
         """Return the step quantities or their Jacobian as one array, (wheels, 7, ...)."""
         dls_duration, sls1_duration, sls2_duration = np.moveaxis(durations, 1, 0)
         single_durations = sls1_duration + sls2_duration
-        no_flight = 0.0 * dls_duration
-        durations_and_distance = [dls_duration, single_durations, no_flight, foot_distances]
+        flight_duration = 0.0 * dls_duration
+        durations_and_distance = [dls_duration, single_durations, flight_duration, foot_distances]
         return np.concatenate([np.stack(durations_and_distance, 1), end_states], 1)
 
     stepped_gaits = _make_lower_fidelity_gaits(
