@@ -14,9 +14,9 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from vrw_jax.numerics import (
-    MINIMUM_LOCATION_TOLERANCE,
     Scalar,
     find_cubic_minimum,
+    improve_minimum_location,
     select_trees_by_condition,
 )
 
@@ -288,29 +288,17 @@ def advance_margin_minimum_refinement(
         select_entry_by_mask(margin_index, x)
         for x in (margin_values, margin_rates, interior_margin_minima.step_length)
     )
-    margin_rate_value, step_length_value = lax.stop_gradient((margin_rate, step_length))
-    length_change = step_length_value - margin_minimum_refinement.best_step_length
-    margin_rate_slope = (
-        margin_rate_value - margin_minimum_refinement.best_margin_rate
-    ) / jnp.where(length_change == 0.0, 1.0, length_change)
-    is_secant_usable = (length_change != 0.0) & (margin_rate_slope > 0.0)
-    proposed_step_length = step_length - jnp.where(
-        is_secant_usable, margin_rate / jnp.where(is_secant_usable, margin_rate_slope, 1.0), 0.0
-    )
-    proposed_step_length = jnp.clip(
-        proposed_step_length, 0.0, lax.stop_gradient(minimum_step_length)
-    )
-    has_secant_converged = (
-        jnp.abs(proposed_step_length - step_length)
-        <= MINIMUM_LOCATION_TOLERANCE * minimum_step_length
+    proposed_step_length, has_secant_converged, best_step_length, best_margin_rate = (
+        improve_minimum_location(
+            step_length,
+            margin_rate,
+            lax.stop_gradient(minimum_step_length),
+            margin_minimum_refinement.best_step_length,
+            margin_minimum_refinement.best_margin_rate,
+        )
     )
     is_margin_refined = is_refining & (
         (n_iterations == max_iterations) | (has_secant_converged & (n_iterations >= min_iterations))
-    )
-    best_step_length, best_margin_rate = select_trees_by_condition(
-        jnp.abs(margin_rate_value) < jnp.abs(margin_minimum_refinement.best_margin_rate),
-        (step_length_value, margin_rate_value),
-        (margin_minimum_refinement.best_step_length, margin_minimum_refinement.best_margin_rate),
     )
     margin_indices = jnp.arange(margin_values.shape[0])
     lowest_margin_values = jnp.where(

@@ -18,9 +18,9 @@ from jaxtyping import Array
 from vrw_jax.integrator.tableaus import ButcherTableau, StageState, TakeStep
 from vrw_jax.integrator.tangents import BatchPhase, PhaseTangents
 from vrw_jax.numerics import (
-    MINIMUM_LOCATION_TOLERANCE,
     StepOptions,
     find_cubic_minimum,
+    improve_minimum_location,
     select_trees_by_condition,
 )
 
@@ -188,40 +188,19 @@ def refine_margin_minima(
             (margin_value,), (margin_rate,) = phase.evaluate_with_rates(
                 evaluate_selected_margin, step_end
             )
-            length_change = (
-                margin_minimum_search.step_length - margin_minimum_search.best_step_length
-            )
-            margin_rate_slope = (margin_rate - margin_minimum_search.best_margin_rate) / jnp.where(
-                length_change == 0.0, 1.0, length_change
-            )
-            is_secant_usable = (length_change != 0.0) & (margin_rate_slope > 0.0)
-            length_correction = jnp.where(
-                is_secant_usable,
-                -margin_rate / jnp.where(is_secant_usable, margin_rate_slope, 1.0),
-                0.0,
-            )
-            step_length = jnp.clip(
-                margin_minimum_search.step_length + length_correction,
-                0.0,
-                margin_minimum_state.step_length,
-            )
-            has_secant_converged = (
-                jnp.abs(step_length - margin_minimum_search.step_length)
-                <= MINIMUM_LOCATION_TOLERANCE * margin_minimum_state.step_length
-            )
-            has_smaller_margin_rate = jnp.abs(margin_rate) < jnp.abs(
-                margin_minimum_search.best_margin_rate
+            step_length, has_secant_converged, best_step_length, best_margin_rate = (
+                improve_minimum_location(
+                    margin_minimum_search.step_length,
+                    margin_rate,
+                    margin_minimum_state.step_length,
+                    margin_minimum_search.best_step_length,
+                    margin_minimum_search.best_margin_rate,
+                )
             )
             improved_margin_minimum_search = margin_minimum_search._replace(
                 step_length=step_length,
-                best_step_length=jnp.where(
-                    has_smaller_margin_rate,
-                    margin_minimum_search.step_length,
-                    margin_minimum_search.best_step_length,
-                ),
-                best_margin_rate=jnp.where(
-                    has_smaller_margin_rate, margin_rate, margin_minimum_search.best_margin_rate
-                ),
+                best_step_length=best_step_length,
+                best_margin_rate=best_margin_rate,
                 margin_value=margin_value,
                 is_minimum_unresolved=margin_minimum_search.is_minimum_unresolved
                 & ~has_secant_converged,

@@ -48,9 +48,9 @@ from vrw_jax.numerics.cached_programs import (
     evaluate_by_saved_trace,
 )
 from vrw_jax.numerics.cubic_minima import (
-    MINIMUM_LOCATION_TOLERANCE,
     evaluate_cubic,
     find_cubic_minimum,
+    improve_minimum_location,
 )
 from vrw_jax.numerics.forward_only import forbid_reverse_mode
 from vrw_jax.numerics.options import EngineName, SolverName, StepOptions, make_real_field

@@ -2,7 +2,10 @@
 
 import jax
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array
+
+from vrw_jax.numerics.batching import select_trees_by_condition
 
 MINIMUM_LOCATION_TOLERANCE = 1e-6
 """Accuracy of the location of a minimum, as a fraction of the solver step. The value is chosen
@@ -65,3 +68,39 @@ def find_cubic_minimum(
         evaluate_cubic(x, cubic_value_at_0, cubic_rate_at_0, cubic_value_at_1, cubic_rate_at_1),
         jnp.inf,
     )
+
+
+def improve_minimum_location(
+    step_length: Array,
+    margin_rate: Array,
+    max_step_length: Array,
+    best_step_length: Array,
+    best_margin_rate: Array,
+) -> tuple[Array, Array, Array, Array]:
+    """Return the next step of a secant iteration for the time at which a margin's rate is zero.
+
+    The result consists of the next step length, whether the iteration has converged, and the step
+    length with the smallest rate so far, with that rate. The slope of the secant has no derivative.
+
+    - `margin_rate`: time derivative of the margin after a solver step of `step_length`, s;
+    - `max_step_length`: length of the solver step that contains the minimum, s.
+    """
+    length_value, rate_value = lax.stop_gradient((step_length, margin_rate))
+    length_change = length_value - best_step_length
+    rate_slope = (rate_value - best_margin_rate) / jnp.where(
+        length_change == 0.0, 1.0, length_change
+    )
+    is_secant_usable = (length_change != 0.0) & (rate_slope > 0.0)
+    length_correction = jnp.where(
+        is_secant_usable, -margin_rate / jnp.where(is_secant_usable, rate_slope, 1.0), 0.0
+    )
+    next_step_length = jnp.clip(step_length + length_correction, 0.0, max_step_length)
+    has_converged = (
+        jnp.abs(next_step_length - step_length) <= MINIMUM_LOCATION_TOLERANCE * max_step_length
+    )
+    best_step_length, best_margin_rate = select_trees_by_condition(
+        jnp.abs(rate_value) < jnp.abs(best_margin_rate),
+        (length_value, rate_value),
+        (best_step_length, best_margin_rate),
+    )
+    return next_step_length, has_converged, best_step_length, best_margin_rate
