@@ -212,11 +212,6 @@ def update_interior_margin_minima(
     minimum_fractions, cubic_minimum_values = find_cubic_minimum(
         start_margin_values, start_margin_rates * step_length, end_margin_values, end_margin_changes
     )
-    cubic_minimum_values = jnp.where(
-        jnp.isfinite(cubic_minimum_values),
-        cubic_minimum_values,
-        jnp.minimum(start_margin_values, end_margin_values),
-    )
     is_minimum_lower = (
         is_step_in_phase
         & (start_margin_rates < 0.0)

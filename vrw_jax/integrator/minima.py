@@ -100,11 +100,6 @@ def update_margin_minima_state(
         margin_values,
         margin_rates * step_length,
     )
-    margin_minimum = jnp.where(
-        jnp.isfinite(margin_minimum),
-        margin_minimum,
-        jnp.minimum(margin_minima_state.margin_values, margin_values),
-    )
     has_interior_minimum = (margin_minima_state.margin_rates < 0.0) & (margin_rates >= 0.0)
     is_minimum_lower = (
         is_accepted

@@ -38,7 +38,8 @@ def find_cubic_minimum(
 ) -> tuple[Array, Array]:
     """Return the location and the value of the interior minimum of the cubic Hermite interpolant.
 
-    The location is between 0 and 1. The value is infinite if there is no interior minimum.
+    The location is between 0 and 1. Without an interior minimum, the value is the lower one of the
+    two ends.
     """
     quadratic_coefficient = 3.0 * (
         2.0 * cubic_value_at_0 + cubic_rate_at_0 - 2.0 * cubic_value_at_1 + cubic_rate_at_1
@@ -66,7 +67,7 @@ def find_cubic_minimum(
     return x, jnp.where(
         has_interior_minimum,
         evaluate_cubic(x, cubic_value_at_0, cubic_rate_at_0, cubic_value_at_1, cubic_rate_at_1),
-        jnp.inf,
+        jnp.minimum(cubic_value_at_0, cubic_value_at_1),
     )
 
 
