@@ -87,15 +87,10 @@ def classify_event(guard_layout: GuardLayout, guard_index: Int[Array, "..."]) ->
     select_flags = lambda first_guard_index, n_guards: (
         guard_index == first_guard_index + align_with_batch(np.arange(n_guards), guard_index)
     )
-    is_leg_leaving_stopper = (
-        select_flags(guard_layout.first_airborne_release_guard, n_legs)
-        if guard_layout.n_guards > guard_layout.first_airborne_release_guard
-        else select_flags(guard_layout.first_landing_guard, n_legs) & False
-    )
     return ContactEvent(
         is_foot_landing=select_flags(guard_layout.first_landing_guard, n_legs),
         is_leg_meeting_stopper=select_flags(guard_layout.first_stopper_guard, n_legs),
-        is_leg_leaving_stopper=is_leg_leaving_stopper,
+        is_leg_leaving_stopper=select_flags(guard_layout.first_airborne_release_guard, n_legs),
         is_foot_lifting_off=select_flags(guard_layout.first_liftoff_guard, 2),
         is_starting_to_slide_up=select_flags(guard_layout.first_slip_up_guard, 2),
         is_starting_to_slide_down=select_flags(guard_layout.first_slip_down_guard, 2),
