@@ -309,39 +309,32 @@ def solve_combination(
     )
 
 
-def _enumerate_mode_combinations() -> tuple[np.ndarray, np.ndarray]:
-    """Return contact modes and closed stoppers for all combinations, each of shape (63, 2).
-
-    The combinations are sorted by decreasing number of sticking feet, then of sliding feet. Two
-    sticking feet of two legs on their stoppers are excluded. They constrain the hub twice, so their
-    forces are not unique.
-    """
-    mode_priority = {
-        ContactMode.STICK: 0,
-        ContactMode.SLIP_DOWN: 1,
-        ContactMode.SLIP_UP: 1,
-        ContactMode.OFF: 2,
-    }
-    combinations = [
+_MODE_PRIORITY = {
+    ContactMode.STICK: 0,
+    ContactMode.SLIP_DOWN: 1,
+    ContactMode.SLIP_UP: 1,
+    ContactMode.OFF: 2,
+}
+# Two sticking feet of two legs on their stoppers are excluded. They constrain the hub twice, so
+# their forces are not unique.
+_COMBINATIONS = sorted(
+    (
         (slot_modes, is_stopper_holding)
-        for slot_modes in itertools.product(
-            (ContactMode.STICK, ContactMode.SLIP_DOWN, ContactMode.SLIP_UP, ContactMode.OFF),
-            repeat=2,
-        )
+        for slot_modes in itertools.product(_MODE_PRIORITY, repeat=2)
         for is_stopper_holding in itertools.product((False, True), repeat=2)
         if not (slot_modes == (ContactMode.STICK, ContactMode.STICK) and all(is_stopper_holding))
-    ]
-    combinations.sort(
-        key=lambda combination: (
-            sum(mode_priority[mode] for mode in combination[0]),
-            sum(combination[1]),
-        )
-    )
-    return np.array([r[0] for r in combinations], np.int32), np.array([r[1] for r in combinations])
+    ),
+    key=lambda combination: (
+        sum(_MODE_PRIORITY[mode] for mode in combination[0]),
+        sum(combination[1]),
+    ),
+)
+CONTACT_MODE_TABLE, HELD_STOPPER_TABLE = map(np.array, zip(*_COMBINATIONS, strict=True))
+"""Contact modes and closed stoppers for all combinations in order of preference, each (63, 2).
 
-
-CONTACT_MODE_TABLE, HELD_STOPPER_TABLE = _enumerate_mode_combinations()
-"""Contact modes and closed stoppers for all combinations in order of preference, each (63, 2)."""
+The combinations are sorted by decreasing number of sticking feet, then of sliding feet, then by
+increasing number of closed stoppers.
+"""
 PAPER_RULE_ORDER = np.argsort(
     [
         sum(
