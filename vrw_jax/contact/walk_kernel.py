@@ -240,10 +240,6 @@ class BatchWalkSettings(NamedTuple):
         """
         return input_columns[N_PARAMETERS + 2] if self.has_uneven_ground else None
 
-    def extract_restitution(self, input_columns: Array) -> Array | None:
-        """Return Newton's coefficient of restitution of the feet; None if it is not an input."""
-        return input_columns[-1] if self.has_restitution else None
-
     def begin_walk(self, input_columns: Array, section_state: Array) -> LaneState:
         """Return the state of all batch elements at the first landing, before the impact."""
         motion, contact_state = unpack_section_state(
@@ -376,7 +372,7 @@ class BatchWalkSettings(NamedTuple):
             self.has_one_sided_stoppers,
             self.is_detailed,
             compute_rest_speed(s, self.step_options),
-            self.extract_restitution(input_columns),
+            input_columns[-1] if self.has_restitution else None,
             self.extract_next_line_tilt(input_columns),
         )
         event_result, contact_event, event_outcome = process_event(
