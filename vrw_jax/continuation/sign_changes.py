@@ -70,25 +70,17 @@ def has_unit_circle_pair(return_map_jacobian: np.ndarray) -> bool:
     return bool(np.any(is_on_circle & is_complex_pair))
 
 
-class QuantitySignChange(NamedTuple):
-    """Sign change of one quantity between two points of a branch, described by three indices."""
-
-    left_point_index: int
-    right_point_index: int
-    quantity_index: int
-
-
-def find_sign_changes(quantity_values: np.ndarray) -> list[QuantitySignChange]:
+def find_sign_changes(quantity_values: np.ndarray) -> list[tuple[int, int, int]]:
     """Return the sign changes of each quantity between neighboring points.
 
-    A sign change names the two points and the quantity by their indices. `quantity_values` has the
-    shape (points, quantities). NaN and 0 have no sign. Two sign changes
-    between the same neighboring points cancel, and neither is detected.
+    A sign change consists of the indices of the two points and of the quantity. `quantity_values`
+    has the shape (points, quantities). NaN and 0 have no sign. Two sign changes between the same
+    neighboring points cancel, and neither is detected.
     """
     quantity_signs = np.sign(np.nan_to_num(quantity_values))
     sign_change_indices = np.argwhere(quantity_signs[:-1] * quantity_signs[1:] < 0.0)
     return [
-        QuantitySignChange(int(point_index), int(point_index) + 1, int(quantity_index))
+        (int(point_index), int(point_index) + 1, int(quantity_index))
         for point_index, quantity_index in sign_change_indices
     ]
 
