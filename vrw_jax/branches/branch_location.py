@@ -332,14 +332,15 @@ class AbstractContinuation(abc.ABC):
         return BranchPointTable(points, wheel_indices, quantity_table)
 
 
-def _guess_point_on_chord(
+@eqx.filter_jit
+@eqx.filter_vmap(in_axes=(None, 0, 0, 0))
+def _guess_points_on_chords(
     setup: ContinuationSetup,
     left_point: ContinuationPoint,
     right_point: ContinuationPoint,
     chord_fraction: Array,
 ) -> tuple[Any, CorrectorPlane]:
-    """Return the initial guess for a point between two neighboring points, and the plane of the
-    point.
+    """Return the initial guess for each point between neighboring points, and the point's plane.
 
     The plane divides the chord between the neighboring points at the fraction `chord_fraction`.
     """
@@ -352,11 +353,6 @@ def _guess_point_on_chord(
         problem.section_state(right_point.z) - problem.section_state(left_point.z),
         (right_point.p - left_point.p) / setup.parameter_range,
     )
-
-
-_guess_points_on_chords = eqx.filter_jit(
-    eqx.filter_vmap(_guess_point_on_chord, in_axes=(None, 0, 0, 0))
-)
 
 
 def _solve_for_points_on_chords(
