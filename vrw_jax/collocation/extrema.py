@@ -428,16 +428,13 @@ def evaluate_quantity_time_derivatives(
 ) -> QuantityTimeDerivatives:
     """Return the value and the first two time derivatives of a quantity at the state (q, v)."""
 
-    def compute_value_and_time_derivative(function_of_state: Callable, q: Array, v: Array) -> tuple:
-        return jax.jvp(function_of_state, (q, v), (v, compute_acceleration(q, v)))
+    def append_time_derivative(function_of_state: Callable) -> Callable:
+        return lambda q, v: jax.jvp(function_of_state, (q, v), (v, compute_acceleration(q, v)))
 
-    compute_quantity_and_rate = lambda q, v: compute_value_and_time_derivative(
-        compute_quantity, q, v
-    )
-    (quantity_value, first_time_derivative), (_, second_time_derivative) = (
-        compute_value_and_time_derivative(compute_quantity_and_rate, q, v)
-    )
-    return QuantityTimeDerivatives(quantity_value, first_time_derivative, second_time_derivative)
+    value_and_rate, (_, second_time_derivative) = append_time_derivative(
+        append_time_derivative(compute_quantity)
+    )(q, v)
+    return QuantityTimeDerivatives(*value_and_rate, second_time_derivative)
 
 
 def _bisect_zeros(
