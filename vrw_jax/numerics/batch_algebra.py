@@ -165,7 +165,7 @@ def evaluate_with_jvps(function: Callable, primals: tuple, tangents: tuple) -> t
     directions.
     """
     linearized_function = lambda *t: jax.jvp(function, primals, t)
-    return jax.vmap(linearized_function, in_axes=0, out_axes=(None, 0))(*tangents)
+    return jax.vmap(linearized_function, out_axes=(None, 0))(*tangents)
 
 
 def evaluate_with_partial_derivatives(
