@@ -519,7 +519,7 @@ def _invert_stage_matrix(
     residual_jacobian_v: Any,
     residual_jacobian_a: Any,
 ) -> list[list[_ComplexNumber]]:
-    """Return the inverse of the complex stage matrix stage_matrix = A + h e V + (h e)^2 Q as nested lists.
+    """Return the inverse of the complex stage matrix A + h e V + (h e)^2 Q as nested lists.
 
     Here e is `gauss_eigenvalue`, and h is the length of the interval. A, V and Q are the
     derivatives of the residual with respect to accelerations, rates and coordinates. The inverse is
@@ -549,11 +549,18 @@ def _invert_stage_matrix(
     if n == 1:
         adjugate_matrix, determinant = [[_ComplexNumber(1.0, 0.0)]], stage_matrix[0][0]
     elif n == 2:
-        adjugate_matrix = [[stage_matrix[1][1], -stage_matrix[0][1]], [-stage_matrix[1][0], stage_matrix[0][0]]]
-        determinant = stage_matrix[0][0] * stage_matrix[1][1] - stage_matrix[0][1] * stage_matrix[1][0]
+        adjugate_matrix = [
+            [stage_matrix[1][1], -stage_matrix[0][1]],
+            [-stage_matrix[1][0], stage_matrix[0][0]],
+        ]
+        determinant = (
+            stage_matrix[0][0] * stage_matrix[1][1] - stage_matrix[0][1] * stage_matrix[1][0]
+        )
     else:
         adjugate_matrix = [[compute_cofactor(j, i) for j in range(3)] for i in range(3)]
-        determinant = _multiply_and_sum(stage_matrix[0], [matrix_row[0] for matrix_row in adjugate_matrix])
+        determinant = _multiply_and_sum(
+            stage_matrix[0], [matrix_row[0] for matrix_row in adjugate_matrix]
+        )
     squared_modulus = determinant.real * determinant.real + determinant.imag * determinant.imag
     inverse_determinant = _ComplexNumber(
         determinant.real / squared_modulus, -determinant.imag / squared_modulus
