@@ -341,20 +341,8 @@ def _run_newton_jvp(
     return jax.jvp(solve_from_fixed_point, tuple(closed_over_values), tuple(tangents[2:]))
 
 
-@functools.partial(jax.custom_jvp, nondiff_argnums=(0, 1))
-def _run_newton_implicit(
-    closure_converted_map: ClosureConvertedMap,
-    max_iterations: int,
-    start: Array,
-    tolerance: Array,
-    *closed_over_values: Any,
-) -> FixedPointResult:
-    """Find the fixed point by Newton's method, with derivatives by the implicit
-    function theorem.
-    """
-    return _run_newton_loop(
-        closure_converted_map, max_iterations, start, tolerance, *closed_over_values
-    )
+# The same loop, with derivatives by the implicit function theorem.
+_run_newton_implicit = jax.custom_jvp(_run_newton_loop, nondiff_argnums=(0, 1))
 
 
 @_run_newton_implicit.defjvp
@@ -381,7 +369,6 @@ def _run_newton_implicit_jvp(
     )
     fixed_point_tangent = jnp.where(newton_result.converged, fixed_point_tangent, 0.0)
     nan_jacobian_tangent = jnp.full_like(jacobian, jnp.nan) * jnp.sum(fixed_point_tangent)
-    zero_tangents = make_zero_tangent(newton_result)
-    return newton_result, zero_tangents._replace(
+    return newton_result, make_zero_tangent(newton_result)._replace(
         x=fixed_point_tangent, jacobian=nan_jacobian_tangent
     )
