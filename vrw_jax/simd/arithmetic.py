@@ -334,8 +334,7 @@ def _emit_polynomial(
 
 def _get_integer_type(llvm_type: ir.Type) -> ir.Type:
     """Return the type of 32-bit integers, or of vectors of them if `llvm_type` is a vector."""
-    is_vector = isinstance(llvm_type, ir.VectorType)
-    return ir.VectorType(I32, llvm_type.count) if is_vector else I32
+    return ir.VectorType(I32, llvm_type.count) if isinstance(llvm_type, ir.VectorType) else I32
 
 
 def _emit_float32_logarithm(operation: ElementwiseOperation, operand: LlvmValue) -> LlvmValue:
@@ -429,17 +428,13 @@ ELEMENTWISE_RULES: dict[str, ElementwiseRule] = {
     "and": partial(emit_bitwise_operation, "and_"),
     "convert_element_type": emit_conversion,
     "copy": _return_operand,
-    "cos": partial(emit_float_function, "cos"),
     "div": emit_quotient,
     "eq": partial(emit_comparison, "=="),
-    "exp": partial(emit_float_function, "exp"),
-    "floor": partial(emit_float_function, "floor"),
     "ge": partial(emit_comparison, ">="),
     "gt": partial(emit_comparison, ">"),
     "integer_pow": emit_integer_power,
     "is_finite": emit_finiteness_test,
     "le": partial(emit_comparison, "<="),
-    "log": partial(emit_float_function, "log"),
     "lt": partial(emit_comparison, "<"),
     "max": partial(emit_extremum, ">"),
     "min": partial(emit_extremum, "<"),
@@ -452,10 +447,12 @@ ELEMENTWISE_RULES: dict[str, ElementwiseRule] = {
     "shift_left": partial(emit_bitwise_operation, "shl"),
     "shift_right_arithmetic": partial(emit_bitwise_operation, "ashr"),
     "shift_right_logical": partial(emit_bitwise_operation, "lshr"),
-    "sin": partial(emit_float_function, "sin"),
-    "sqrt": partial(emit_float_function, "sqrt"),
     "square": lambda operation, x: _emit_binary_instruction("mul", operation, x, x),
     "stop_gradient": _return_operand,
     "sub": emit_difference,
     "xor": partial(emit_bitwise_operation, "xor"),
+    **{
+        name: partial(emit_float_function, name)
+        for name in ("cos", "exp", "floor", "log", "sin", "sqrt")
+    },
 }
