@@ -74,26 +74,22 @@ def contract_inner_axis(left_array: Array, right_array: Array) -> Array:
 
 def invert_small_matrices(matrix: Float[Array, "n n lanes"]) -> Float[Array, "n n lanes"]:
     """Return the inverse of each 1x1, 2x2 or 3x3 matrix, computed by cofactors."""
-    if matrix.shape[0] == 1:
+    n = len(matrix)
+    if n == 1:
         return 1.0 / matrix
-    if matrix.shape[0] == 2:
-        determinant = matrix[0, 0] * matrix[1, 1] - matrix[0, 1] * matrix[1, 0]
-        first_row = jnp.stack([matrix[1, 1], -matrix[0, 1]])
-        second_row = jnp.stack([-matrix[1, 0], matrix[0, 0]])
-        return jnp.stack([first_row, second_row]) / determinant
-    if matrix.shape[0] != 3:
-        raise ValueError(f"the matrix has {matrix.shape[0]} rows, but only 1, 2 or 3 are built.")
+    if n > 3:
+        raise ValueError(f"the matrix has {n} rows, but only 1, 2 or 3 are built.")
 
     def compute_cofactor(i: int, j: int) -> Array:
         (a, b), (c, d) = ((i + 1) % 3, (i + 2) % 3), ((j + 1) % 3, (j + 2) % 3)
         return matrix[a, c] * matrix[b, d] - matrix[a, d] * matrix[b, c]
 
-    adjugate = [[compute_cofactor(j, i) for j in range(3)] for i in range(3)]
-    determinant = (
-        matrix[0, 0] * adjugate[0][0]
-        + matrix[0, 1] * adjugate[1][0]
-        + matrix[0, 2] * adjugate[2][0]
+    adjugate = (
+        [[matrix[1, 1], -matrix[0, 1]], [-matrix[1, 0], matrix[0, 0]]]
+        if n == 2
+        else [[compute_cofactor(j, i) for j in range(3)] for i in range(3)]
     )
+    determinant = functools.reduce(operator.add, [matrix[0, j] * adjugate[j][0] for j in range(n)])
     return jnp.stack([jnp.stack(adjugate_row) for adjugate_row in adjugate]) / determinant
 
 
