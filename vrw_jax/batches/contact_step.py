@@ -164,9 +164,8 @@ class _StepwiseGround(NamedTuple):
         parameter_matrix = parameter_matrix[: len(CONTACT_PARAMETER_NAMES)].copy()
         parameter_matrix[CONTACT_SLOPE_INDEX] = self.slopes_by_step[k]
         parameter_matrix[CONTACT_FRICTION_INDEX] = self.friction_by_step[k]
-        previous_friction = self.friction_by_step[max(k - 1, 0)]
         tilt = self.slopes_by_step[k + 1] - self.slopes_by_step[k]
-        return np.vstack([parameter_matrix, previous_friction, tilt])
+        return np.vstack([parameter_matrix, self.friction_by_step[max(k - 1, 0)], tilt])
 
     def make_stepwise_parameters(self) -> dict[str, StepwiseParameter]:
         """Return a mapping from parameter names to the terms by which the parameters enter the

@@ -376,10 +376,9 @@ def iterate_until_stopped(
             (n_attempts < EVENT_SEARCH_OPTIONS.max_attempts_with_waiting_lane) | ~has_stopped
         )
 
-    initial_attempt_count = jnp.zeros((), jnp.int32)
     advance_loop_state = lambda loop_state: (advance_state(loop_state[0]), loop_state[1] + 1)
     return lax.while_loop(
-        should_continue, advance_loop_state, (initial_state, initial_attempt_count)
+        should_continue, advance_loop_state, (initial_state, jnp.zeros((), jnp.int32))
     )[0]
 
 

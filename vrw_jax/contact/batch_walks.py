@@ -254,11 +254,10 @@ class _IndependentStartRates(NamedTuple):
 
         `tangents` contains the tangents with respect to the independent rates.
         """
-        wheel_indices = np.arange(len(tangents))[:, None]
         return np.einsum(
             "wir,wi...->wr...",
             self.combination_weights,
-            tangents[wheel_indices, self.independent_rate_indices],
+            tangents[np.arange(len(tangents))[:, None], self.independent_rate_indices],
         )
 
 
@@ -274,9 +273,8 @@ def _project_start_rates(
         motion, contact_state = unpack_section_state(s, section_state)
         return pack_coordinates(project_motion(s, motion, *contact_state[:2]))[1]
 
-    unit_rates = np.eye(3 + n_legs)
     repeated_states = np.repeat(section_states, 3 + n_legs, 0)
-    start_rates_by_unit = np.tile(unit_rates, (len(section_states), 1))
+    start_rates_by_unit = np.tile(np.eye(3 + n_legs), (len(section_states), 1))
     repeated_states[:, 1:4] = start_rates_by_unit[:, :3]
     repeated_states[:, 4 + n_legs : 4 + 2 * n_legs] = start_rates_by_unit[:, 3:]
     lane_rows = [*np.repeat(input_columns[:N_PARAMETERS], 3 + n_legs, 1), *repeated_states.T]

@@ -269,9 +269,8 @@ class UnilateralWheel(AbstractContactWheel):
         step_result, _ = self._compute_step(
             params, x, options, is_detailed=True, measures_force_peaks=True
         )
-        landing_impulse = step_result.landing_normal[..., 0]
         return step_result.force_peaks.compute_force_measures() | {
-            "landing_impulse": landing_impulse
+            "landing_impulse": step_result.landing_normal[..., 0]
         }
 
     def _compute_step(

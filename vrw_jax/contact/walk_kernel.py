@@ -424,9 +424,8 @@ class BatchWalkSettings(NamedTuple):
             step_details = record_event(
                 step_details, step_counters.n_events == 0, event_result, contact_event
             )
-            zero_duration = jnp.zeros_like(motion.x)
             step_details = record_contact_interval(
-                step_details, contact_mode_dynamics, event_result.motion, zero_duration
+                step_details, contact_mode_dynamics, event_result.motion, jnp.zeros_like(motion.x)
             )
         continued_lane_state = LaneState(
             next_interval,

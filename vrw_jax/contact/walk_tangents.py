@@ -244,9 +244,8 @@ def walk_with_tangents(
     result_tangents = tangents.map_tangents_sequentially(
         push_result_tangent, tangents.allocate_tangent_rows(count_rows(float_leaves))
     )
-    step_result = eqx.combine(float_leaves, nonfloat_leaves)
     walk_result = BatchWalkResult(
-        step_result,
+        eqx.combine(float_leaves, nonfloat_leaves),
         lane_state.walk_outcome,
         lane_state.n_stepped,
         lane_state.step_counters.n_solver_steps,

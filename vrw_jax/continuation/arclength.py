@@ -591,10 +591,8 @@ class ContinuationState(NamedTuple):
         The continuation step is lengthened after few Newton iterations, shortened after many, and
         halved after a failure.
         """
-        has_converged_quickly = self.n_newton_iterations < 4
-        has_converged_slowly = self.n_newton_iterations >= 6
         ds_growth_factor = jnp.where(
-            has_converged_quickly, 1.4, jnp.where(has_converged_slowly, 0.6, 1.0)
+            self.n_newton_iterations < 4, 1.4, jnp.where(self.n_newton_iterations >= 6, 0.6, 1.0)
         )
         longer_ds = jnp.minimum(self.ds * ds_growth_factor, options.max_ds)
         shorter_ds = jnp.where(trial_verdict.has_trial_failed, 0.5 * self.ds, self.ds)

@@ -320,9 +320,8 @@ def _compute_correction_fraction(
     gait_step_duration = jnp.sum(durations, 1, keepdims=True)
 
     def compute_least_ratio(max_changes: Array, changes: Array) -> LaneArray:
-        smallest_float = jnp.finfo(changes.dtype).tiny
         return reduce_over_non_lane_axes(
-            jnp.minimum, max_changes / jnp.maximum(jnp.abs(changes), smallest_float)
+            jnp.minimum, max_changes / jnp.maximum(jnp.abs(changes), jnp.finfo(changes.dtype).tiny)
         )
 
     section_ratio = compute_least_ratio(
@@ -359,9 +358,8 @@ def run_newton_iterations(
     its corrections from decreasing. The result for a wheel therefore does not depend on other
     wheels.
     """
-    cycle_options = collocation_system.cycle_options
     machine_epsilon = float(jnp.finfo(parameters.dtype).eps)
-    tight_newton_tolerance = max(cycle_options.tolerance, 1e3 * machine_epsilon)
+    tight_newton_tolerance = max(collocation_system.cycle_options.tolerance, 1e3 * machine_epsilon)
     loose_newton_tolerance = max(CycleOptions.tolerance, tight_newton_tolerance)
 
     def run_newton_iteration(newton_state: _NewtonState) -> _NewtonState:

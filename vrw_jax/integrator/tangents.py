@@ -281,9 +281,8 @@ def _pack_stage_state(state: StageState) -> Array:
 
     The array has the shape (components, batch).
     """
-    n = len(state.q)
     sin, cos, acceleration = state.acceleration
-    return jnp.stack([*state.q, *state.v, sin, cos, *acceleration[:n]])
+    return jnp.stack([*state.q, *state.v, sin, cos, *acceleration[: len(state.q)]])
 
 
 def _make_unit_vectors(template_state: Vector) -> list[Vector]:

@@ -343,14 +343,13 @@ class StepTraceConfig(NamedTuple):
         params, x, options = jax.tree.unflatten(self.argument_structure, argument_leaves)
         tableau = load_explicit_tableau(options.solver)
         assert tableau is not None  # `can_use_batch_kernel` has checked the solver.
-        records_margins = self.friction is not None
         phase_sequence = run_batch_phases(
             params,
             tuple(x),
             options,
             tableau,
             self.stop_at_lift_off,
-            records_margins,
+            self.friction is not None,
             is_compiled_separately=True,
         )
         return phase_sequence, tableau, options

@@ -456,8 +456,7 @@ class RollingMotion(eqx.Module):
         Let t be sin^2 of half the angle from the vertical. The rate is the square root of a linear
         function of t. Therefore the time is the complete cubic form of the elliptic integral.
         """
-        s = self.s
-        kappa = 2.0 * _compute_gravity_stiffness(s)
+        kappa = 2.0 * _compute_gravity_stiffness(self.s)
         first_half_angle, last_half_angle = (
             0.5 * (self.phi + self.first_angle),
             0.5 * (self.phi + theta),

@@ -64,10 +64,9 @@ def compute_sine_cosine(angle: Elementwise) -> tuple[Elementwise, Elementwise]:
     arrays and Python numbers the results are NumPy numbers, computed in a tenth of the time of JAX
     calls.
     """
-    is_angle_concrete = isinstance(angle, (float, np.ndarray))
     return (
         _evaluate_sine_and_cosine(np, angle)
-        if is_angle_concrete
+        if isinstance(angle, (float, np.ndarray))
         else _differentiable_sine_cosine(angle)
     )
 

@@ -58,9 +58,8 @@ def are_coordinates_at_rest(
     - `rate_units`, `time_unit`: the wheel's own units of the rates and of time;
     - `atol`: absolute tolerance in the wheel's own units.
     """
-    max_acceleration = MAX_REST_ACCELERATION / time_unit
     return are_rates_negligible(coordinate_rates, rate_units, atol) & _are_quantities_small(
-        coordinate_accelerations, rate_units, max_acceleration
+        coordinate_accelerations, rate_units, MAX_REST_ACCELERATION / time_unit
     )
 
 
