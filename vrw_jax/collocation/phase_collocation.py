@@ -15,7 +15,6 @@ The last axis of each array contains the batch elements, which are independent w
 the code depends on values.
 """
 
-import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -129,62 +128,6 @@ class CycleLinearization(NamedTuple):
     monodromy: LaneArray  # Jacobian of the return map: (row, column, batch)
 
 
-class _LinearizationContext(NamedTuple):
-    """Inputs of a linearization, which also define the order of the tangents.
-
-    The first tangent is the Newton correction. Tangents for the components of the section state
-    follow, and then tangents for the parameters in `parameter_indices`. Within a phase, the last
-    tangent belongs to the duration of that phase.
-    """
-
-    section_size: int
-    parameter_indices: tuple[int, ...]
-    parameters: LaneArray
-    compute_phase_constants: Callable[..., PhaseConstants]
-    phase_constants: PhaseConstants
-    phase_constants_tangents: tuple[
-        LaneArray, ...
-    ]  # tangents of each constant with respect to the requested parameters
-    prevent_fusion: FusionBarrierFn
-
-    @property
-    def n_tangents(self) -> int:
-        """Return the number of tangents at a phase boundary, where no tangent belongs
-        to a duration.
-        """
-        return 1 + self.section_size + len(self.parameter_indices)
-
-    @property
-    def section_tangent_slice(self) -> slice:
-        """Return the slice that selects the tangents for the section state."""
-        return slice(1, 1 + self.section_size)
-
-    def evaluate_function_with_tangents(
-        self, function_of_point: Callable, phase_point: tuple, point_tangents: tuple
-    ) -> tuple:
-        """Evaluate `function_of_point(*point, *phase_constants)` and its tangents."""
-        if not self.parameter_indices:
-            return evaluate_with_jvps(
-                lambda *phase_point: function_of_point(*phase_point, *self.phase_constants),
-                tuple(phase_point),
-                point_tangents,
-            )
-        n_duration_tangents = point_tangents[0].shape[0] - self.n_tangents
-        tangent_padding = (
-            (self.section_tangent_slice.stop, n_duration_tangents),
-            *((0, 0),) * (self.parameters.ndim - 1),
-        )
-        padded_phase_constants_tangents = (
-            jnp.pad(phase_constant_tangent, tangent_padding)
-            for phase_constant_tangent in self.phase_constants_tangents
-        )
-        return evaluate_with_jvps(
-            function_of_point,
-            (*phase_point, *self.phase_constants),
-            (*point_tangents, *padded_phase_constants_tangents),
-        )
-
-
 class _PhaseState(NamedTuple):
     """State at one time of a phase, or the tangents of a state on an additional leading axis."""
 
@@ -294,287 +237,324 @@ def _evaluate_interval_end(
     )
 
 
-def _linearize_residual(
-    linearization_context: _LinearizationContext,
-    phase: CollocationPhase,
-    held_constants: LaneArray,
-    node_q: LaneArray,
-    node_v: LaneArray,
-    node_accelerations: LaneArray,
-) -> tuple[Array, Array, Any]:
-    """Return the residual of the equations of motion at the nodes, and its partial derivatives.
+class _LinearizationContext(NamedTuple):
+    """Inputs of a linearization, which also define the order of the tangents.
 
-    The Jacobian has the axes (node, equation, argument, batch). Its arguments are the coordinates,
-    the rates, the accelerations and the held constants. The partial derivatives with respect to the
-    parameters are a separate array with the parameters on the leading axis.
-    """
-    n_coordinates = phase.n_coordinates
-    n_state_arguments = 3 * n_coordinates + len(held_constants)
-
-    def evaluate_residual_of_arguments(*residual_arguments: Array) -> Vector:
-        q, v, a = (
-            residual_arguments[i * n_coordinates : (i + 1) * n_coordinates] for i in range(3)
-        )
-        held_constants = residual_arguments[3 * n_coordinates : n_state_arguments]
-        phase_constants = (
-            linearization_context.compute_phase_constants(*residual_arguments[n_state_arguments:])
-            if linearization_context.parameter_indices
-            else linearization_context.phase_constants
-        )
-        return phase.residual_function(phase_constants, PhasePoint(held_constants, q, v), a)
-
-    constant_arguments = [*held_constants]
-    if linearization_context.parameter_indices:
-        constant_arguments += [*linearization_context.parameters]
-    residual_arguments = [
-        node_array[:, coordinate_index]
-        for node_array in (node_q, node_v, node_accelerations)
-        for coordinate_index in range(n_coordinates)
-    ] + [jnp.broadcast_to(x, node_q[:, 0].shape) for x in constant_arguments]
-    # The partial derivatives are stacked only after they are computed, because each is a small
-    # kernel and stacking copies it.
-    dynamics_residual, partial_derivatives_by_output = linearization_context.prevent_fusion(
-        evaluate_with_partial_derivatives(evaluate_residual_of_arguments, residual_arguments)
-    )
-    derivatives_by_argument = list(zip(*partial_derivatives_by_output, strict=True))
-    residual_jacobian = jnp.stack(
-        [
-            jnp.stack(derivatives_of_argument, 1)
-            for derivatives_of_argument in derivatives_by_argument[:n_state_arguments]
-        ],
-        2,
-    )
-    parameter_derivatives = [
-        jnp.stack(derivatives_by_argument[n_state_arguments + parameter_index], 1)
-        for parameter_index in linearization_context.parameter_indices
-    ]
-    return linearization_context.prevent_fusion(
-        (
-            jnp.stack(dynamics_residual, 1),
-            residual_jacobian,
-            jnp.stack(parameter_derivatives) if parameter_derivatives else (),
-        )
-    )
-
-
-def _assemble_node_system(
-    linearization_context: _LinearizationContext,
-    held_constants_tangents: LaneArray,
-    h: LaneArray,
-    linearized_residual: tuple,
-    state_tangents: LaneArray,
-) -> tuple[Array, Array]:
-    """Assemble the linear equations whose solutions are the tangents of the node accelerations.
-
-    Return the matrix and the right-hand sides. Each tangent has one right-hand side.
-    """
-    dynamics_residual, residual_jacobian, parameter_derivatives = linearized_residual
-    n_coordinates = dynamics_residual.shape[1]
-    float_dtype = h.dtype
-    tangent_terms = [
-        residual_jacobian[:, :, state_index] * state_tangents[:, :, state_index, None]
-        for state_index in range(2 * n_coordinates)
-    ]
-    tangent_terms += [
-        residual_jacobian[:, :, 3 * n_coordinates + constant_index]
-        * held_constants_tangents[:, constant_index, None, None]
-        for constant_index in range(held_constants_tangents.shape[1])
-    ]
-    right_hand_sides = sum(
-        tangent_terms,
-        start=_make_unit_tangent(len(state_tangents), 0, float_dtype) * dynamics_residual,
-    )
-    if linearization_context.parameter_indices:
-        n_tangents_before_parameters = linearization_context.section_tangent_slice.stop
-        right_hand_sides = right_hand_sides + jnp.pad(
-            parameter_derivatives, ((n_tangents_before_parameters, 1), *((0, 0),) * 3)
-        )
-    double_integration_matrix, integration_matrix = (
-        float64_matrix.astype(float_dtype)[:, None, :, None, None]
-        for float64_matrix in (DOUBLE_INTEGRATION_MATRIX, INTEGRATION_MATRIX)
-    )
-    residual_by_q, residual_by_v, residual_by_a = (
-        residual_jacobian[:, :, None, i * n_coordinates : (i + 1) * n_coordinates] for i in range(3)
-    )
-    node_identity = np.eye(N_GAUSS_NODES, dtype=float_dtype)[:, None, :, None, None]
-    system_matrix = node_identity * residual_by_a + h * (
-        h * double_integration_matrix * residual_by_q + integration_matrix * residual_by_v
-    )
-    return system_matrix, -jnp.moveaxis(right_hand_sides, 0, 2)
-
-
-def _linearize_phase(
-    linearization_context: _LinearizationContext,
-    phase: CollocationPhase,
-    phase_mesh: PhaseMesh,
-    phase_start: _StateAndTangents,
-    phase_duration: LaneArray,
-    phase_accelerations: LaneArray,
-) -> tuple[_StateAndTangents, LaneArray]:
-    """Return the state at the end of a phase, and the tangents of the phase's node accelerations.
-
-    Both have the directions of `phase_start`, and after them one further direction, that of the
-    phase's duration.
-    """
-    prevent_fusion = linearization_context.prevent_fusion
-
-    def linearize_mesh_interval(
-        start: _StateAndTangents, interval_scan_inputs: tuple
-    ) -> tuple[_StateAndTangents, Array]:
-        node_accelerations, interval_length_fraction = interval_scan_inputs
-        h = interval_length_fraction * phase_duration
-        mesh_interval = interval_length_fraction, h, node_accelerations
-        node_q, node_v, node_q_tangents, node_v_tangents = prevent_fusion(
-            _evaluate_interval_nodes(start, *mesh_interval)
-        )
-        linearized_residual = _linearize_residual(
-            linearization_context,
-            phase,
-            start.state.held_constants,
-            node_q,
-            node_v,
-            node_accelerations,
-        )
-        # Axes: (tangent, node, argument, batch).
-        state_tangents = jnp.concatenate([node_q_tangents, node_v_tangents], 2)
-        node_system = prevent_fusion(
-            _assemble_node_system(
-                linearization_context,
-                start.tangents.held_constants,
-                h,
-                linearized_residual,
-                state_tangents,
-            )
-        )
-        # Axes: (node, row, tangent, batch).
-        acceleration_tangents = prevent_fusion(
-            solve_node_equations(*node_system, linearization_context.parameters)
-        )
-        return (
-            _evaluate_interval_end(start, *mesh_interval, acceleration_tangents),
-            jnp.moveaxis(acceleration_tangents, 2, 0),
-        )
-
-    append_duration_tangent = lambda x: jnp.concatenate([x, jnp.zeros_like(x[:1])])
-    interval_length_fractions = jnp.asarray(
-        phase_mesh.interval_length_fractions, phase_duration.dtype
-    )
-    return lax.scan(
-        linearize_mesh_interval,
-        phase_start._replace(tangents=jax.tree.map(append_duration_tangent, phase_start.tangents)),
-        (phase_accelerations, interval_length_fractions),
-    )
-
-
-def _eliminate_phase_duration(
-    linearization_context: _LinearizationContext,
-    phase: CollocationPhase,
-    phase_end: _StateAndTangents,
-    phase_duration: LaneArray,
-    is_phase_active: Bool[Array, " lanes"],
-) -> tuple[_StateAndTangents, LaneArray, Callable[[Array], Array]]:
-    """Eliminate the duration tangent of a phase by the phase's end event, and apply the reset.
-
-    Return the state at the start of the next phase, the tangents of the duration, and a function.
-    The function eliminates the duration tangent from other tangents. The duration of an inactive
-    phase is 0 s.
+    The first tangent is the Newton correction. Tangents for the components of the section state
+    follow, and then tangents for the parameters in `parameter_indices`. Within a phase, the last
+    tangent belongs to the duration of that phase.
     """
 
-    def evaluate_phase_end(
-        held_constants: Array, q: Array, v: Array, *phase_constants: Array
+    phase_sequence: PhaseSequence
+    phase_meshes: tuple[PhaseMesh, ...]
+    parameter_indices: tuple[int, ...]
+    parameters: LaneArray
+    compute_phase_constants: Callable[..., PhaseConstants]
+    phase_constants: PhaseConstants
+    phase_constants_tangents: tuple[
+        LaneArray, ...
+    ]  # tangents of each constant with respect to the requested parameters
+    prevent_fusion: FusionBarrierFn
+
+    @property
+    def n_tangents(self) -> int:
+        """Return the number of tangents at a phase boundary, where no tangent belongs
+        to a duration.
+        """
+        return 1 + self.phase_sequence.section_size + len(self.parameter_indices)
+
+    @property
+    def section_tangent_slice(self) -> slice:
+        """Return the slice that selects the tangents for the section state."""
+        return slice(1, 1 + self.phase_sequence.section_size)
+
+    def evaluate_function_with_tangents(
+        self, function_of_point: Callable, phase_point: tuple, point_tangents: tuple
     ) -> tuple:
-        phase_end_point = PhasePoint(tuple(held_constants), tuple(q), tuple(v))
-        return phase.end_event_function(phase_constants, phase_end_point), _stack_phase_point(
-            phase.reset_map(phase_constants, phase_end_point), q
+        """Evaluate `function_of_point(*point, *phase_constants)` and its tangents."""
+        if not self.parameter_indices:
+            return evaluate_with_jvps(
+                lambda *phase_point: function_of_point(*phase_point, *self.phase_constants),
+                tuple(phase_point),
+                point_tangents,
+            )
+        n_duration_tangents = point_tangents[0].shape[0] - self.n_tangents
+        tangent_padding = (
+            (self.section_tangent_slice.stop, n_duration_tangents),
+            *((0, 0),) * (self.parameters.ndim - 1),
+        )
+        padded_phase_constants_tangents = (
+            jnp.pad(phase_constant_tangent, tangent_padding)
+            for phase_constant_tangent in self.phase_constants_tangents
+        )
+        return evaluate_with_jvps(
+            function_of_point,
+            (*phase_point, *self.phase_constants),
+            (*point_tangents, *padded_phase_constants_tangents),
         )
 
-    (event_value, next_state), (event_tangents, next_tangents) = (
-        linearization_context.evaluate_function_with_tangents(evaluate_phase_end, *phase_end)
-    )
-    newton_correction_unit_tangent, duration_unit_tangent = (
-        _make_unit_tangent(event_tangents.shape[0], i, phase_duration.dtype)[:, 0, 0]
-        for i in (0, -1)
-    )
-    event_value = jnp.where(is_phase_active, event_value, phase_duration)
-    event_tangents = jnp.where(is_phase_active, event_tangents, duration_unit_tangent)
-    duration_tangents = (
-        -(event_tangents[:-1] + newton_correction_unit_tangent[:-1] * event_value)
-        / event_tangents[-1]
-    )
+    def linearize_residual(
+        self,
+        phase: CollocationPhase,
+        held_constants: LaneArray,
+        node_q: LaneArray,
+        node_v: LaneArray,
+        node_accelerations: LaneArray,
+    ) -> tuple[Array, Array, Any]:
+        """Return the residual of the equations of motion at the nodes, and its partial derivatives.
 
-    def eliminate_duration_tangent(tangents_with_duration: Array) -> Array:
-        duration_factor = duration_tangents.reshape(
-            duration_tangents.shape[:1] + (1,) * (tangents_with_duration.ndim - 2) + (-1,)
+        The Jacobian has the axes (node, equation, argument, batch). Its arguments are the
+        coordinates, the rates, the accelerations and the held constants. The partial derivatives
+        with respect to the parameters are a separate array with the parameters on the leading axis.
+        """
+        n_coordinates = phase.n_coordinates
+        n_state_arguments = 3 * n_coordinates + len(held_constants)
+
+        def evaluate_residual_of_arguments(*residual_arguments: Array) -> Vector:
+            q, v, a = (
+                residual_arguments[i * n_coordinates : (i + 1) * n_coordinates] for i in range(3)
+            )
+            held_constants = residual_arguments[3 * n_coordinates : n_state_arguments]
+            phase_constants = (
+                self.compute_phase_constants(*residual_arguments[n_state_arguments:])
+                if self.parameter_indices
+                else self.phase_constants
+            )
+            return phase.residual_function(phase_constants, PhasePoint(held_constants, q, v), a)
+
+        constant_arguments = [*held_constants]
+        if self.parameter_indices:
+            constant_arguments += [*self.parameters]
+        residual_arguments = [
+            node_array[:, coordinate_index]
+            for node_array in (node_q, node_v, node_accelerations)
+            for coordinate_index in range(n_coordinates)
+        ] + [jnp.broadcast_to(x, node_q[:, 0].shape) for x in constant_arguments]
+        # The partial derivatives are stacked only after they are computed, because each is a small
+        # kernel and stacking copies it.
+        dynamics_residual, partial_derivatives_by_output = self.prevent_fusion(
+            evaluate_with_partial_derivatives(evaluate_residual_of_arguments, residual_arguments)
         )
-        return tangents_with_duration[:-1] + duration_factor * tangents_with_duration[-1:]
-
-    next_phase_start = _StateAndTangents(
-        next_state, jax.tree.map(eliminate_duration_tangent, next_tangents)
-    )
-    return next_phase_start, duration_tangents, eliminate_duration_tangent
-
-
-def _linearize_gait_step(
-    linearization_context: _LinearizationContext,
-    phase_sequence: PhaseSequence,
-    phase_meshes: tuple[PhaseMesh, ...],
-    section_state_and_tangents: tuple,
-    gait_step_inputs: tuple,
-) -> tuple:
-    """Linearize one gait step, and return the section state after it, its tangents and the outputs.
-
-    The outputs are the state at the end of the gait step and its tangents. Further outputs are the
-    tangents of the phase durations and of the node accelerations.
-    """
-    section_state, section_tangents = section_state_and_tangents
-    phase_durations, accelerations_by_phase, is_phase_active = gait_step_inputs
-
-    def evaluate_gait_step_start(section_state: Array, *phase_constants: Array) -> tuple:
-        return _stack_phase_point(
-            phase_sequence.step_start_map(phase_constants, tuple(section_state)), section_state
+        derivatives_by_argument = list(zip(*partial_derivatives_by_output, strict=True))
+        residual_jacobian = jnp.stack(
+            [
+                jnp.stack(derivatives_of_argument, 1)
+                for derivatives_of_argument in derivatives_by_argument[:n_state_arguments]
+            ],
+            2,
         )
-
-    phase_start = _StateAndTangents(
-        *linearization_context.evaluate_function_with_tangents(
-            evaluate_gait_step_start, (section_state,), (section_tangents,)
-        )
-    )
-    duration_tangents = []
-    acceleration_tangents = []
-    for i, collocation_phase in enumerate(phase_sequence.phases):
-        phase_end, phase_acceleration_tangents = _linearize_phase(
-            linearization_context,
-            collocation_phase,
-            phase_meshes[i],
-            phase_start,
-            phase_durations[i],
-            accelerations_by_phase[i],
-        )
-        phase_start, phase_duration_tangents, eliminate_duration_tangent = (
-            _eliminate_phase_duration(
-                linearization_context,
-                collocation_phase,
-                phase_end,
-                phase_durations[i],
-                is_phase_active[i],
+        parameter_derivatives = [
+            jnp.stack(derivatives_by_argument[n_state_arguments + parameter_index], 1)
+            for parameter_index in self.parameter_indices
+        ]
+        return self.prevent_fusion(
+            (
+                jnp.stack(dynamics_residual, 1),
+                residual_jacobian,
+                jnp.stack(parameter_derivatives) if parameter_derivatives else (),
             )
         )
-        duration_tangents.append(phase_duration_tangents)
-        # Axes: (tangent, interval, node, row, batch).
-        acceleration_tangents.append(
-            eliminate_duration_tangent(jnp.swapaxes(phase_acceleration_tangents, 0, 1))
+
+    def assemble_node_system(
+        self,
+        held_constants_tangents: LaneArray,
+        h: LaneArray,
+        linearized_residual: tuple,
+        state_tangents: LaneArray,
+    ) -> tuple[Array, Array]:
+        """Assemble the linear equations whose solutions are the tangents of the node accelerations.
+
+        Return the matrix and the right-hand sides. Each tangent has one right-hand side.
+        """
+        dynamics_residual, residual_jacobian, parameter_derivatives = linearized_residual
+        n_coordinates = dynamics_residual.shape[1]
+        float_dtype = h.dtype
+        tangent_terms = [
+            residual_jacobian[:, :, state_index] * state_tangents[:, :, state_index, None]
+            for state_index in range(2 * n_coordinates)
+        ]
+        tangent_terms += [
+            residual_jacobian[:, :, 3 * n_coordinates + constant_index]
+            * held_constants_tangents[:, constant_index, None, None]
+            for constant_index in range(held_constants_tangents.shape[1])
+        ]
+        right_hand_sides = sum(
+            tangent_terms,
+            start=_make_unit_tangent(len(state_tangents), 0, float_dtype) * dynamics_residual,
         )
-        phase_start = linearization_context.prevent_fusion(phase_start)
-    # After the loop, the end belongs to the last phase, and the start to the next gait step.
-    gait_step_tangent_outputs = (
-        jnp.concatenate((phase_end.state.q, phase_end.state.v), -2),
-        eliminate_duration_tangent(
-            jnp.concatenate((phase_end.tangents.q, phase_end.tangents.v), -2)
-        ),
-        jnp.stack(duration_tangents, 1),
-        tuple(acceleration_tangents),
-    )
-    return (phase_start.state.q, phase_start.tangents.q), gait_step_tangent_outputs
+        if self.parameter_indices:
+            n_tangents_before_parameters = self.section_tangent_slice.stop
+            right_hand_sides = right_hand_sides + jnp.pad(
+                parameter_derivatives, ((n_tangents_before_parameters, 1), *((0, 0),) * 3)
+            )
+        double_integration_matrix, integration_matrix = (
+            float64_matrix.astype(float_dtype)[:, None, :, None, None]
+            for float64_matrix in (DOUBLE_INTEGRATION_MATRIX, INTEGRATION_MATRIX)
+        )
+        residual_by_q, residual_by_v, residual_by_a = (
+            residual_jacobian[:, :, None, i * n_coordinates : (i + 1) * n_coordinates]
+            for i in range(3)
+        )
+        node_identity = np.eye(N_GAUSS_NODES, dtype=float_dtype)[:, None, :, None, None]
+        system_matrix = node_identity * residual_by_a + h * (
+            h * double_integration_matrix * residual_by_q + integration_matrix * residual_by_v
+        )
+        return system_matrix, -jnp.moveaxis(right_hand_sides, 0, 2)
+
+    def linearize_phase(
+        self,
+        phase: CollocationPhase,
+        phase_mesh: PhaseMesh,
+        phase_start: _StateAndTangents,
+        phase_duration: LaneArray,
+        phase_accelerations: LaneArray,
+    ) -> tuple[_StateAndTangents, LaneArray]:
+        """Return the state at the end of a phase, and the tangents of its node accelerations.
+
+        Both have the directions of `phase_start`, and after them one further direction, that of the
+        phase's duration.
+        """
+
+        def linearize_mesh_interval(
+            start: _StateAndTangents, interval_scan_inputs: tuple
+        ) -> tuple[_StateAndTangents, Array]:
+            node_accelerations, interval_length_fraction = interval_scan_inputs
+            h = interval_length_fraction * phase_duration
+            mesh_interval = interval_length_fraction, h, node_accelerations
+            node_q, node_v, node_q_tangents, node_v_tangents = self.prevent_fusion(
+                _evaluate_interval_nodes(start, *mesh_interval)
+            )
+            linearized_residual = self.linearize_residual(
+                phase, start.state.held_constants, node_q, node_v, node_accelerations
+            )
+            # Axes: (tangent, node, argument, batch).
+            state_tangents = jnp.concatenate([node_q_tangents, node_v_tangents], 2)
+            node_system = self.prevent_fusion(
+                self.assemble_node_system(
+                    start.tangents.held_constants, h, linearized_residual, state_tangents
+                )
+            )
+            # Axes: (node, row, tangent, batch).
+            acceleration_tangents = self.prevent_fusion(
+                solve_node_equations(*node_system, self.parameters)
+            )
+            return (
+                _evaluate_interval_end(start, *mesh_interval, acceleration_tangents),
+                jnp.moveaxis(acceleration_tangents, 2, 0),
+            )
+
+        append_duration_tangent = lambda x: jnp.concatenate([x, jnp.zeros_like(x[:1])])
+        interval_length_fractions = jnp.asarray(
+            phase_mesh.interval_length_fractions, phase_duration.dtype
+        )
+        return lax.scan(
+            linearize_mesh_interval,
+            phase_start._replace(
+                tangents=jax.tree.map(append_duration_tangent, phase_start.tangents)
+            ),
+            (phase_accelerations, interval_length_fractions),
+        )
+
+    def eliminate_phase_duration(
+        self,
+        phase: CollocationPhase,
+        phase_end: _StateAndTangents,
+        phase_duration: LaneArray,
+        is_phase_active: Bool[Array, " lanes"],
+    ) -> tuple[_StateAndTangents, LaneArray, Callable[[Array], Array]]:
+        """Eliminate the duration tangent of a phase by the phase's end event, and apply the reset.
+
+        Return the state at the start of the next phase, the tangents of the duration, and a
+        function. The function eliminates the duration tangent from other tangents. The duration of
+        an inactive phase is 0 s.
+        """
+
+        def evaluate_phase_end(
+            held_constants: Array, q: Array, v: Array, *phase_constants: Array
+        ) -> tuple:
+            phase_end_point = PhasePoint(tuple(held_constants), tuple(q), tuple(v))
+            return phase.end_event_function(phase_constants, phase_end_point), _stack_phase_point(
+                phase.reset_map(phase_constants, phase_end_point), q
+            )
+
+        (event_value, next_state), (event_tangents, next_tangents) = (
+            self.evaluate_function_with_tangents(evaluate_phase_end, *phase_end)
+        )
+        newton_correction_unit_tangent, duration_unit_tangent = (
+            _make_unit_tangent(event_tangents.shape[0], i, phase_duration.dtype)[:, 0, 0]
+            for i in (0, -1)
+        )
+        event_value = jnp.where(is_phase_active, event_value, phase_duration)
+        event_tangents = jnp.where(is_phase_active, event_tangents, duration_unit_tangent)
+        duration_tangents = (
+            -(event_tangents[:-1] + newton_correction_unit_tangent[:-1] * event_value)
+            / event_tangents[-1]
+        )
+
+        def eliminate_duration_tangent(tangents_with_duration: Array) -> Array:
+            duration_factor = duration_tangents.reshape(
+                duration_tangents.shape[:1] + (1,) * (tangents_with_duration.ndim - 2) + (-1,)
+            )
+            return tangents_with_duration[:-1] + duration_factor * tangents_with_duration[-1:]
+
+        next_phase_start = _StateAndTangents(
+            next_state, jax.tree.map(eliminate_duration_tangent, next_tangents)
+        )
+        return next_phase_start, duration_tangents, eliminate_duration_tangent
+
+    def linearize_gait_step(
+        self, section_state_and_tangents: tuple, gait_step_inputs: tuple
+    ) -> tuple:
+        """Linearize one gait step, and return the section state after it, its tangents and outputs.
+
+        The outputs are the state at the end of the gait step and its tangents. Further outputs are
+        the tangents of the phase durations and of the node accelerations.
+        """
+        section_state, section_tangents = section_state_and_tangents
+        phase_durations, accelerations_by_phase, is_phase_active = gait_step_inputs
+
+        def evaluate_gait_step_start(section_state: Array, *phase_constants: Array) -> tuple:
+            return _stack_phase_point(
+                self.phase_sequence.step_start_map(phase_constants, tuple(section_state)),
+                section_state,
+            )
+
+        phase_start = _StateAndTangents(
+            *self.evaluate_function_with_tangents(
+                evaluate_gait_step_start, (section_state,), (section_tangents,)
+            )
+        )
+        duration_tangents = []
+        acceleration_tangents = []
+        for i, collocation_phase in enumerate(self.phase_sequence.phases):
+            phase_end, phase_acceleration_tangents = self.linearize_phase(
+                collocation_phase,
+                self.phase_meshes[i],
+                phase_start,
+                phase_durations[i],
+                accelerations_by_phase[i],
+            )
+            phase_start, phase_duration_tangents, eliminate_duration_tangent = (
+                self.eliminate_phase_duration(
+                    collocation_phase, phase_end, phase_durations[i], is_phase_active[i]
+                )
+            )
+            duration_tangents.append(phase_duration_tangents)
+            # Axes: (tangent, interval, node, row, batch).
+            acceleration_tangents.append(
+                eliminate_duration_tangent(jnp.swapaxes(phase_acceleration_tangents, 0, 1))
+            )
+            phase_start = self.prevent_fusion(phase_start)
+        # After the loop, the end belongs to the last phase, and the start to the next gait step.
+        gait_step_tangent_outputs = (
+            jnp.concatenate((phase_end.state.q, phase_end.state.v), -2),
+            eliminate_duration_tangent(
+                jnp.concatenate((phase_end.tangents.q, phase_end.tangents.v), -2)
+            ),
+            jnp.stack(duration_tangents, 1),
+            tuple(acceleration_tangents),
+        )
+        return (phase_start.state.q, phase_start.tangents.q), gait_step_tangent_outputs
 
 
 def linearize_cycle(
@@ -609,7 +589,8 @@ def linearize_cycle(
     else:
         phase_constants = compute_phase_constants(*parameters)
     linearization_context = _LinearizationContext(
-        phase_sequence.section_size,
+        phase_sequence,
+        phase_meshes,
         parameter_indices,
         parameters,
         compute_phase_constants,
@@ -627,19 +608,20 @@ def linearize_cycle(
         jnp.broadcast_to(section_unit_tangents, (n_tangents, *section_state.shape)),
     )
     gait_step_inputs = (trial_solution.durations, trial_solution.accelerations, is_phase_active)
-    linearize_one_gait_step = functools.partial(
-        _linearize_gait_step, linearization_context, phase_sequence, phase_meshes
-    )
     if trial_solution.durations.shape[0] == 1:
         (section_state_after_cycle, section_tangents_after_cycle), gait_step_tangent_outputs = (
-            linearize_one_gait_step(
+            linearization_context.linearize_gait_step(
                 section_state_and_tangents, jax.tree.map(lambda x: x[0], gait_step_inputs)
             )
         )
         gait_step_tangent_outputs = jax.tree.map(lambda x: x[None], gait_step_tangent_outputs)
     else:
         (section_state_after_cycle, section_tangents_after_cycle), gait_step_tangent_outputs = (
-            lax.scan(linearize_one_gait_step, section_state_and_tangents, gait_step_inputs)
+            lax.scan(
+                linearization_context.linearize_gait_step,
+                section_state_and_tangents,
+                gait_step_inputs,
+            )
         )
 
     monodromy = jnp.swapaxes(
@@ -649,13 +631,13 @@ def linearize_cycle(
         [x[:1], x[linearization_context.section_tangent_slice.stop :]]
     )
     newton_correction_unit_vector = np.eye(
-        n_tangents - linearization_context.section_size, dtype=float_dtype
+        n_tangents - phase_sequence.section_size, dtype=float_dtype
     )[0][:, None, None]
     right_hand_sides = drop_section_tangents(
         section_tangents_after_cycle
     ) + newton_correction_unit_vector * (section_state_after_cycle - section_state)
     cycle_closing_matrix = invert_small_matrices(
-        jnp.eye(linearization_context.section_size, dtype=float_dtype)[:, :, None] - monodromy
+        jnp.eye(phase_sequence.section_size, dtype=float_dtype)[:, :, None] - monodromy
     )
     section_state_tangents = jnp.swapaxes(
         contract_inner_axis(cycle_closing_matrix, jnp.swapaxes(right_hand_sides, 0, 1)), 0, 1
