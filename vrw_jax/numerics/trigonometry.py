@@ -53,7 +53,8 @@ def _compute_economized_coefficients(taylor_order_offset: int) -> tuple[float, .
     return 1.0, *series_coefficients
 
 
-_SINE_COEFFICIENTS, _COSINE_COEFFICIENTS = map(_compute_economized_coefficients, (1, 0))
+_SINE_COEFFICIENTS = _compute_economized_coefficients(1)
+_COSINE_COEFFICIENTS = _compute_economized_coefficients(0)
 
 
 def compute_sine_cosine(angle: Elementwise) -> tuple[Elementwise, Elementwise]:
