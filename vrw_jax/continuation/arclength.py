@@ -599,21 +599,44 @@ class ContinuationState(NamedTuple):
         chosen_ds = jnp.where(trial_verdict.is_trial_accepted, longer_ds, shorter_ds)
         return jnp.where(self.n_points == 0, options.initial_ds, chosen_ds)
 
+    def is_curve_closed(
+        self, setup: ContinuationSetup, next_point: ContinuationPoint
+    ) -> Bool[Array, ""]:
+        """Return whether the start of the branch lies on the segment up to the next point."""
+        start, current, next_coordinates = (
+            jnp.append(
+                setup.problem.section_state(point.z), setup.compute_parameter_fraction(point.p)
+            )
+            for point in (self.first_point, self.current_point, next_point)
+        )
+        chord_vector, offset_to_start = next_coordinates - current, start - current
+        squared_chord_length = chord_vector @ chord_vector
+        chord_fraction = (
+            offset_to_start
+            @ chord_vector
+            / jnp.where(squared_chord_length > 0.0, squared_chord_length, 1.0)
+        )
+        offset_from_chord = offset_to_start - chord_fraction * chord_vector
+        return (
+            (chord_fraction >= 0.0)
+            & (chord_fraction <= 1.0)
+            & (offset_from_chord @ offset_from_chord < 0.01 * squared_chord_length)
+        )
+
     def compute_next_status_code(
         self,
-        options: ArclengthOptions,
+        setup: ContinuationSetup,
         trial_verdict: _TrialVerdict,
         new_point: ContinuationPoint,
         ds: Scalar,
         next_arc_length: Scalar,
-        is_curve_closed: Bool[Array, ""],
     ) -> Int[Array, ""]:
         """Return the `ContinuationStatus` of a branch after a trial.
 
         `ds` is the proposed length of the next continuation step. `next_arc_length` is its
         predicted arc length, which is shorter at the end of the range.
         """
-        is_trial_accepted, has_trial_failed, *_ = trial_verdict
+        options, (is_trial_accepted, has_trial_failed, *_) = setup.options, trial_verdict
         n_points, branch_status_code = self.n_points + is_trial_accepted, self.status_code
         for has_branch_ended, status_code in (
             (ds < options.min_ds, ContinuationStatus.STEP_SIZE_UNDERFLOW),
@@ -628,38 +651,12 @@ class ContinuationState(NamedTuple):
             ),
             (is_trial_accepted & ~new_point.is_admissible, ContinuationStatus.POINT_NOT_ADMISSIBLE),
             (
-                is_trial_accepted & is_curve_closed & (self.n_points > 2),
+                is_trial_accepted & (self.n_points > 2) & self.is_curve_closed(setup, new_point),
                 ContinuationStatus.CURVE_CLOSED,
             ),
         ):
             branch_status_code = jnp.where(has_branch_ended, int(status_code), branch_status_code)
         return branch_status_code.astype(jnp.int32)
-
-
-def _is_curve_closed(
-    setup: ContinuationSetup,
-    start_point: ContinuationPoint,
-    current_point: ContinuationPoint,
-    next_point: ContinuationPoint,
-) -> Bool[Array, ""]:
-    """Return whether the start of the branch lies on the segment between two successive points."""
-    start, current, next_coordinates = (
-        jnp.append(setup.problem.section_state(point.z), setup.compute_parameter_fraction(point.p))
-        for point in (start_point, current_point, next_point)
-    )
-    chord_vector, offset_to_start = next_coordinates - current, start - current
-    squared_chord_length = chord_vector @ chord_vector
-    chord_fraction = (
-        offset_to_start
-        @ chord_vector
-        / jnp.where(squared_chord_length > 0.0, squared_chord_length, 1.0)
-    )
-    offset_from_chord = offset_to_start - chord_fraction * chord_vector
-    return (
-        (chord_fraction >= 0.0)
-        & (chord_fraction <= 1.0)
-        & (offset_from_chord @ offset_from_chord < 0.01 * squared_chord_length)
-    )
 
 
 BranchBatch = tuple[ContinuationState, ContinuationPoint]
@@ -788,16 +785,8 @@ def iterate_branches(
                 z=corrector_state.z, parameter_fraction=corrector_state.parameter_fraction
             ),
         )
-        is_curve_closed = _is_curve_closed(
-            setup, first_point, continuation_state.current_point, new_point
-        )
         next_status = continuation_state.compute_next_status_code(
-            options,
-            trial_verdict,
-            new_point,
-            ds,
-            next_trial_point.predicted_arc_length,
-            is_curve_closed,
+            setup, trial_verdict, new_point, ds, next_trial_point.predicted_arc_length
         )
         next_n_newton_iterations = jnp.where(
             is_trial_finished, 0, continuation_state.n_newton_iterations + 1
