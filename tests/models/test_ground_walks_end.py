@@ -14,7 +14,6 @@ from vrw_jax.contact.batch_integrator import (
     EVENT_SEARCH_OPTIONS,
     EventBracket,
     _find_earliest_root,
-    _find_earliest_secant_root,
 )
 from vrw_jax.contact.mechanics import compute_leg_directions
 
@@ -114,5 +113,5 @@ def test_a_guard_that_is_already_negative_precedes_falling_guards():
     assert first[0] == -jnp.inf
     none = jnp.zeros(1)
     search = EventBracket(none > 0, crossing, *(none,) * 4, jnp.asarray([1.0]), 2.0 * end)
-    first, _ = _find_earliest_secant_root(search, end, jnp.asarray([1.1]), crossing)
+    first, _ = search.find_earliest_secant_root(end, jnp.asarray([1.1]), crossing)
     assert first[0] == -jnp.inf

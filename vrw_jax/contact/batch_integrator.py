@@ -126,6 +126,27 @@ class EventBracket(NamedTuple):
     previous_step_size: Array  # size of the previous attempt, s
     guard_values: Array  # guards at the end of the previous attempt, (guards, batch)
 
+    def find_earliest_secant_root(
+        self, guard_values: Array, h: Array, is_guard_crossing: Array
+    ) -> tuple[Array, Array]:
+        """Return the step size to the earliest root of a guard's secant, s, and the guard's index.
+
+        The secants pass through the guards at the ends of the last two attempts, which are more
+        accurate than guards at inner stages. The step size is infinite if no guard falls. It is
+        minus infinity if a guard is negative and does not fall, because this guard fell to zero
+        earlier.
+        """
+        guard_secant_rate = (guard_values - self.guard_values) / jnp.where(
+            h == self.previous_step_size, jnp.inf, h - self.previous_step_size
+        )
+        is_guard_falling = is_guard_crossing & (guard_secant_rate < 0.0)
+        root_step_size = h - guard_values / jnp.where(is_guard_falling, guard_secant_rate, 1.0)
+        is_already_negative = is_guard_crossing & ~is_guard_falling & (guard_values < 0.0)
+        return _find_lowest_guard(
+            jnp.where(is_already_negative, -jnp.inf, root_step_size),
+            is_guard_falling | is_already_negative,
+        )
+
 
 class ContactIntervalState(NamedTuple):
     """State of all batch elements in the interval between two events."""
@@ -649,8 +670,8 @@ def _iterate_event_search(
     root_fraction, guard_index = _find_earliest_root(
         *parabolas, is_guard_crossing, _flag_initiating_guards(lane_states)
     )
-    secant_step_size, secant_guard = _find_earliest_secant_root(
-        event_bracket, attempted_step.guard_values, h, is_guard_crossing
+    secant_step_size, secant_guard = event_bracket.find_earliest_secant_root(
+        attempted_step.guard_values, h, is_guard_crossing
     )
     uses_secant_step = is_searching & (
         event_bracket.n_iterations >= EVENT_SEARCH_OPTIONS.n_parabola_iterations
@@ -783,27 +804,6 @@ def _find_lowest_guard(
         lowest_value = jnp.where(is_lower, guard_values[guard_index], lowest_value)
         lowest_guard = jnp.where(is_lower, guard_index, lowest_guard)
     return lowest_value, lowest_guard
-
-
-def _find_earliest_secant_root(
-    event_bracket: EventBracket, guard_values: Array, h: Array, is_guard_crossing: Array
-) -> tuple[Array, Array]:
-    """Return the step size to the earliest root of a guard's secant, s, and the guard's index.
-
-    The secants pass through the guards at the ends of the last two attempts, which are more
-    accurate than guards at inner stages. The step size is infinite if no guard falls. It is minus
-    infinity if a guard is negative and does not fall, because this guard fell to zero earlier.
-    """
-    guard_secant_rate = (guard_values - event_bracket.guard_values) / jnp.where(
-        h == event_bracket.previous_step_size, jnp.inf, h - event_bracket.previous_step_size
-    )
-    is_guard_falling = is_guard_crossing & (guard_secant_rate < 0.0)
-    root_step_size = h - guard_values / jnp.where(is_guard_falling, guard_secant_rate, 1.0)
-    is_already_negative = is_guard_crossing & ~is_guard_falling & (guard_values < 0.0)
-    return _find_lowest_guard(
-        jnp.where(is_already_negative, -jnp.inf, root_step_size),
-        is_guard_falling | is_already_negative,
-    )
 
 
 def _find_earliest_root(
