@@ -153,7 +153,7 @@ def step_batch(
     check_choice("engine", engine, BATCH_ENGINE_NAMES)
     n_steps = check_int("n_steps", n_steps)
     derivatives = check_names("derivatives", derivatives, '"section_state", "damping"')
-    checked_section_states: np.ndarray = convert_section_state(states, "states", check_numpy_reals)
+    checked_section_states = convert_section_state(states, "states", check_numpy_reals)
     values_by_parameter = _check_parameter_shapes(
         params, checked_section_states, checked_model, options, n_steps
     )
@@ -587,9 +587,7 @@ def _step_lanes_by_diffrax(
         solved. Bisection isolates that element.
         """
         try:
-            step_result_arrays: tuple[np.ndarray, ...] = step_all_elements(
-                step_input_matrix, options, input_indices
-            )
+            step_result_arrays = step_all_elements(step_input_matrix, options, input_indices)
         except eqx.EquinoxRuntimeError:
             step_outputs = step_all_elements(step_input_matrix, derivative_step_options, ())
             step_outcomes = step_outputs[2]

@@ -82,7 +82,7 @@ def step_batch_with_contact(
             "lanes",
             (options.solver,),
         )
-    parameter_names: tuple[str, ...] = CONTACT_PARAMETER_NAMES
+    parameter_names = CONTACT_PARAMETER_NAMES
     stepwise_parameters: dict[str, StepwiseParameter] = {}
     if is_ground_uneven:
         parameter_names = (*CONTACT_PARAMETER_NAMES, *UNEVEN_GROUND_PARAMETER_NAMES)

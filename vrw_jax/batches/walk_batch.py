@@ -198,9 +198,7 @@ class WalkBatch:
         inverse_lane_order = np.empty_like(lane_order)
         inverse_lane_order[lane_order] = np.arange(len(lane_order))
         restore_order = lambda x: x.take(inverse_lane_order, -1).T
-        lane_arrays: dict[str, Any] = {
-            name: restore_order(getattr(self, name)) for name in LANE_ARRAY_NAMES
-        }
+        lane_arrays = {name: restore_order(getattr(self, name)) for name in LANE_ARRAY_NAMES}
         return StepBatchResult(
             **lane_arrays,
             solver_index=restore_order(solver_index),

@@ -324,7 +324,7 @@ class AbstractContinuation(abc.ABC):
         points = select_tree_rows(
             results_by_direction.points, (wheel_indices, direction_indices, point_indices)
         )
-        fraction_rate: Any = np.where(
+        fraction_rate = np.where(
             direction_indices == 0, -points.fraction_rate, points.fraction_rate
         )
         points = points._replace(fraction_rate=fraction_rate)

@@ -380,7 +380,7 @@ def _flatten_result_structure(
 
     If tangents are requested, the tangents of the results follow.
     """
-    walk_result_shapes: Any = jax.eval_shape(
+    walk_result_shapes = jax.eval_shape(
         lambda: make_result_template(
             static_walk_settings.n_legs, dtype, static_walk_settings.is_detailed
         )

@@ -143,7 +143,7 @@ class CollocationSystem(NamedTuple):
         The arguments belong to one wheel, or to several wheels on the last axis.
         """
         phase_constants = self.phase_constants_function(*parameters)
-        section_state: Vector = tuple(collocation_solution.section_state)
+        section_state = tuple(collocation_solution.section_state)
         phase_points_of_steps = []
         for step_index in range(self.period_n):
             section_state, phase_points = reconstruct_gait_step(

@@ -388,7 +388,7 @@ class StepTraceConfig(NamedTuple):
         }
         if self.friction is None:
             return eqx.partition(AdvanceResult(**template), eqx.is_inexact_array)
-        make_group: Any = lambda group: group(*(x for _ in dataclasses.fields(group)))
+        make_group = lambda group: group(*(x for _ in dataclasses.fields(group)))
         step_result_template = StepResult(
             post_impact=jnp.broadcast_to(x, (2, *x.shape)),
             step_length=x,
