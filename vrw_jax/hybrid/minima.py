@@ -277,19 +277,21 @@ def advance_margin_minimum_refinement(
     """
     margin_values = tried_step_end.guard_and_margin_values[guards_and_margins.n_guards :]
     margin_rates = tried_step_end.guard_and_margin_rates[guards_and_margins.n_guards :]
-    margin_index = margin_minimum_refinement.margin_index
-    n_iterations = margin_minimum_refinement.n_iterations + is_refining
+    margin_index, n_iterations, best_step_length, best_margin_rate, lowest_margin_values = (
+        margin_minimum_refinement
+    )
+    n_iterations = n_iterations + is_refining
     margin_value, margin_rate, minimum_step_length = (
         select_entry_by_mask(margin_index, x)
         for x in (margin_values, margin_rates, interior_margin_minima.step_length)
     )
-    proposed_step_length, has_secant_converged, best_step_length, best_margin_rate = (
+    proposed_step_length, best_step_length, best_margin_rate, has_secant_converged = (
         improve_minimum_location(
             step_length,
             margin_rate,
             lax.stop_gradient(minimum_step_length),
-            margin_minimum_refinement.best_step_length,
-            margin_minimum_refinement.best_margin_rate,
+            best_step_length,
+            best_margin_rate,
         )
     )
     is_margin_refined = is_refining & (
@@ -298,8 +300,8 @@ def advance_margin_minimum_refinement(
     margin_indices = jnp.arange(margin_values.shape[0])
     lowest_margin_values = jnp.where(
         is_margin_refined & (margin_indices == margin_index),
-        jnp.minimum(margin_value, margin_minimum_refinement.lowest_margin_values),
-        margin_minimum_refinement.lowest_margin_values,
+        jnp.minimum(margin_value, lowest_margin_values),
+        lowest_margin_values,
     )
     start_margin_values = jnp.where(
         jnp.asarray(guards_and_margins.includes_phase_start), margin_values, jnp.inf
@@ -322,15 +324,14 @@ def advance_margin_minimum_refinement(
         (0, 0.0, step_start_margin_rate),
         (n_iterations, best_step_length, best_margin_rate),
     )
-    next_margin_minimum_refinement = MarginMinimumRefinement(
-        margin_index,
-        n_iterations,
-        best_step_length,
-        best_margin_rate,
-        jnp.where(is_phase_start, start_margin_values, lowest_margin_values),
-    )
     return (
-        next_margin_minimum_refinement,
+        MarginMinimumRefinement(
+            margin_index,
+            n_iterations,
+            best_step_length,
+            best_margin_rate,
+            jnp.where(is_phase_start, start_margin_values, lowest_margin_values),
+        ),
         jnp.where(is_next_margin_selected, jnp.any(needs_margin_refinement), is_refining),
         jnp.where(is_next_margin_selected, time_to_minimum, proposed_step_length),
     )

@@ -104,7 +104,16 @@ def locate_event(
     ]
 
     def improve_event_search(event_search: EventSearch) -> EventSearch:
-        step_end = solver_step_function(integrator_state.state, event_search.event_step_length)[-1]
+        (
+            event_step_length,
+            lower_step_length_bound,
+            upper_step_length_bound,
+            is_event_unresolved,
+            *previous_proposal,
+            n_tried_steps,
+            n_iterations,
+        ) = event_search
+        step_end = solver_step_function(integrator_state.state, event_step_length)[-1]
         guard_values, guard_rates = phase.evaluate_with_rates(phase.evaluate_guards, step_end)
         time_to_event, guard_index = _propose_earliest_event(guard_values, guard_rates, is_crossing)
         is_before_event = jnp.ones(step_length.shape, bool)
@@ -113,17 +122,17 @@ def locate_event(
             integrator_state.guard_values, guard_values, guard_rates, is_crossing, strict=True
         ):
             has_crossed, is_guard_curved = _classify_guard_crossing(
-                start_guard_value, guard_value, guard_rate, event_search.event_step_length
+                start_guard_value, guard_value, guard_rate, event_step_length
             )
             is_before_event = is_before_event & ~(is_crossing_guard & has_crossed)
             is_guard_straight = is_guard_straight & ~(is_crossing_guard & is_guard_curved)
         lower_step_length_bound = jnp.where(
-            is_before_event, event_search.event_step_length, event_search.lower_step_length_bound
+            is_before_event, event_step_length, lower_step_length_bound
         )
         upper_step_length_bound = jnp.where(
-            is_before_event, event_search.upper_step_length_bound, event_search.event_step_length
+            is_before_event, upper_step_length_bound, event_step_length
         )
-        proposed_step_length = event_search.event_step_length + time_to_event
+        proposed_step_length = event_step_length + time_to_event
         is_proposal_in_bracket = (
             proposed_step_length >= lower_step_length_bound - max_extrapolation_time
         ) & (proposed_step_length <= upper_step_length_bound + max_extrapolation_time)
@@ -133,7 +142,7 @@ def locate_event(
             0.5 * (lower_step_length_bound + upper_step_length_bound),
         )
         is_at_event = (
-            event_search.is_event_unresolved
+            is_event_unresolved
             & is_proposal_in_bracket
             & (
                 jnp.abs(time_to_event)
@@ -143,26 +152,22 @@ def locate_event(
         end_state, remaining_time_to_event, guard_index = select_trees_by_condition(
             is_at_event,
             (step_end, time_to_event, guard_index),
-            (
-                event_search.end_state,
-                event_search.remaining_time_to_event,
-                event_search.guard_index,
-            ),
+            tuple(previous_proposal),
         )
         return EventSearch(
             event_step_length=jnp.where(
-                event_search.is_event_unresolved,
+                is_event_unresolved,
                 next_event_step_length,
-                event_search.event_step_length,
+                event_step_length,
             ),
             lower_step_length_bound=lower_step_length_bound,
             upper_step_length_bound=upper_step_length_bound,
-            is_event_unresolved=event_search.is_event_unresolved & ~is_at_event,
+            is_event_unresolved=is_event_unresolved & ~is_at_event,
             end_state=end_state,
             remaining_time_to_event=remaining_time_to_event,
             guard_index=guard_index,
-            n_tried_steps=event_search.n_tried_steps + event_search.is_event_unresolved,
-            n_iterations=event_search.n_iterations + 1,
+            n_tried_steps=n_tried_steps + is_event_unresolved,
+            n_iterations=n_iterations + 1,
         )
 
     first_crossing_fraction = jnp.ones_like(step_length)

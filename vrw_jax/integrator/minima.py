@@ -177,34 +177,24 @@ def refine_margin_minima(
         def improve_margin_minimum_search(
             margin_minimum_search: _MarginMinimumSearch,
         ) -> _MarginMinimumSearch:
-            step_end = solver_step_function(
-                minimum_step_start_state, margin_minimum_search.step_length
-            )[-1]
+            step_length, *best_step, _, is_minimum_unresolved, n_iterations = margin_minimum_search
+            step_end = solver_step_function(minimum_step_start_state, step_length)[-1]
             (margin_value,), (margin_rate,) = phase.evaluate_with_rates(
                 evaluate_selected_margin, step_end
             )
-            step_length, has_secant_converged, best_step_length, best_margin_rate = (
-                improve_minimum_location(
-                    margin_minimum_search.step_length,
-                    margin_rate,
-                    margin_minimum_state.step_length,
-                    margin_minimum_search.best_step_length,
-                    margin_minimum_search.best_margin_rate,
-                )
-            )
-            improved_margin_minimum_search = margin_minimum_search._replace(
-                step_length=step_length,
-                best_step_length=best_step_length,
-                best_margin_rate=best_margin_rate,
-                margin_value=margin_value,
-                is_minimum_unresolved=margin_minimum_search.is_minimum_unresolved
-                & ~has_secant_converged,
+            *next_and_best_step, has_secant_converged = improve_minimum_location(
+                step_length, margin_rate, margin_minimum_state.step_length, *best_step
             )
             return select_trees_by_condition(
-                margin_minimum_search.is_minimum_unresolved,
-                improved_margin_minimum_search,
+                is_minimum_unresolved,
+                _MarginMinimumSearch(
+                    *next_and_best_step,
+                    margin_value,
+                    is_minimum_unresolved & ~has_secant_converged,
+                    n_iterations,
+                ),
                 margin_minimum_search,
-            )._replace(n_iterations=margin_minimum_search.n_iterations + 1)
+            )._replace(n_iterations=n_iterations + 1)
 
         zero_step_length = jnp.zeros_like(margin_minimum_state.step_length)
         margin_minimum_search = _MarginMinimumSearch(

@@ -80,8 +80,8 @@ def improve_minimum_location(
 ) -> tuple[Array, Array, Array, Array]:
     """Return the next step of a secant iteration for the time at which a margin's rate is zero.
 
-    The result consists of the next step length, whether the iteration has converged, and the step
-    length with the smallest rate so far, with that rate. The slope of the secant has no derivative.
+    The result consists of the next step length, the step length with the smallest rate so far, that
+    rate, and whether the iteration has converged. The slope of the secant has no derivative.
 
     - `margin_rate`: time derivative of the margin after a solver step of `step_length`, s;
     - `max_step_length`: length of the solver step that contains the minimum, s.
@@ -104,4 +104,4 @@ def improve_minimum_location(
         (length_value, rate_value),
         (best_step_length, best_margin_rate),
     )
-    return next_step_length, has_converged, best_step_length, best_margin_rate
+    return next_step_length, best_step_length, best_margin_rate, has_converged
