@@ -107,7 +107,7 @@ def trace_special_points(
     scan_dataset: xr.Dataset,
     params: WheelParams,
     model: ViscoelasticWheel,
-    on_stage: Callable[[str], None] | None = None,
+    on_stage: Callable[[str], None] | None,
 ) -> tuple[tuple[SpecialPointCurve, ...], tuple[ScanSignChange, ...]]:
     """Trace the curves of special points in the two parameters of a scan.
 

@@ -564,7 +564,7 @@ def linearize_cycle(
     parameters: LaneArray,
     trial_solution: CollocationSolution,
     is_phase_active: Bool[Array, "n n_phases lanes"],
-    parameter_indices: tuple[int, ...] = (),
+    parameter_indices: tuple[int, ...],
 ) -> CycleLinearization:
     """Return the Newton correction, the monodromy matrix and the parameter tangents of a cycle.
 

@@ -84,7 +84,7 @@ def replace_invalid_start(
     params: WheelParams,
     friction: Elementwise,
     section_state: FullState,
-    next_line_tilt: Elementwise | None = None,
+    next_line_tilt: Elementwise | None,
 ) -> tuple[Bool[Array, "..."], WheelParams, Elementwise, FullState]:
     """Return which starts of a step are valid, and the input with invalid starts replaced.
 

@@ -250,7 +250,7 @@ class PeriodMap(NamedTuple):
         self,
         step_options: StepOptions,
         section_states: np.ndarray,
-        is_value_differentiated: Any = True,
+        is_value_differentiated: Any,
         is_start_differentiated: bool = True,
     ) -> "PeriodEvaluation":
         """Compute the gait steps of one period from the given section states, and their
