@@ -154,7 +154,8 @@ class Branch:
         return f"At the first point: {self.ends[0]} At the last point: {self.ends[1]}"
 
     def __str__(self) -> str:
-        if not self.values.size:
+        values = self.values
+        if not values.size:
             return f"Branch along {self.parameter}: none. {self.outcome.meaning}"
         has_parameter_unit = self.parameter in MEASURES
         parameter_unit = (
@@ -162,11 +163,11 @@ class Branch:
         )
         is_gait_stable = self.stable
         text_lines = [
-            f"Branch along {self.parameter}: {self.values.size} gaits from "
-            f"{self.values.min():.6g} to {self.values.max():.6g}{parameter_unit}, "
+            f"Branch along {self.parameter}: {values.size} gaits from "
+            f"{values.min():.6g} to {values.max():.6g}{parameter_unit}, "
             f"{int(is_gait_stable.sum())} stable, {int((~is_gait_stable).sum())} unstable.",
-            f"  at {self.values[0]:.6g}: {self.ends[0]}",
-            f"  at {self.values[-1]:.6g}: {self.ends[1]}",
+            f"  at {values[0]:.6g}: {self.ends[0]}",
+            f"  at {values[-1]:.6g}: {self.ends[1]}",
             f"  special points: {len(self.special_points)}",
             *(
                 f"    {special_point}"

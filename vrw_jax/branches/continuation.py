@@ -460,55 +460,45 @@ def _make_labeled_gait_branch(
             coords={parameter_name: ("point", np.zeros(0))}, attrs=branch_attrs
         )
         return Branch(parameter_name, empty_dataset, (), ("", ""), branch_outcome)
+    points, quantity_table, special_points, end_reasons, _ = branch_data
     measures = STEP_MEASURES | MARGIN_MEASURES | UNILATERAL_STEP_MEASURES | FORCE_PEAK_MEASURES
     branch_variables = make_labeled_variables(
         {
-            measure_name: branch_data.quantity_table[measure_name]
+            measure_name: quantity_table[measure_name]
             for measure_name in measures
-            if measure_name in branch_data.quantity_table
-            and measure_name not in MEASURES_OUTSIDE_BRANCHES
+            if measure_name in quantity_table and measure_name not in MEASURES_OUTSIDE_BRANCHES
         },
         "point",
     )
     branch_variables["section_state"] = xr.Variable(
         ("point", "component"),
-        branch_data.quantity_table["section_state"],
+        quantity_table["section_state"],
         {"long_name": "section state just before touchdown"},
     )
     branch_variables["closure"] = xr.Variable(
         "point",
-        branch_data.quantity_table["closure"],
+        quantity_table["closure"],
         {"units": "1", "long_name": "miss of the section state after one event-driven period"},
     )
     component_names = ["theta", "dtheta", "dL1"]
-    if branch_data.quantity_table["section_state"].shape[-1] != len(component_names):
-        leg_numbers = range(1, params.n_legs + 1)
+    if quantity_table["section_state"].shape[-1] != len(component_names):
         leg_names = [
             f"{quantity_name}{leg_number}"
             for quantity_name in ("L", "dL", "code")
-            for leg_number in leg_numbers
+            for leg_number in range(1, params.n_legs + 1)
         ]
         component_names = ["theta", "dtheta", "vx", "vz", *leg_names]
     branch_coordinates = {
-        parameter_name: xr.Variable(
-            "point", branch_data.points.p, make_measure_attributes(parameter_name)
-        ),
+        parameter_name: xr.Variable("point", points.p, make_measure_attributes(parameter_name)),
         "component": component_names,
         "leg": make_locked_leg_coordinate(params.n_legs),
     }
     branch_dataset = xr.Dataset(
-        branch_variables
-        | _make_stability_variables(np.asarray(branch_data.points.return_map_jacobian)),
+        branch_variables | _make_stability_variables(np.asarray(points.return_map_jacobian)),
         branch_coordinates,
         branch_attrs,
     )
-    return Branch(
-        parameter_name,
-        branch_dataset,
-        branch_data.special_points,
-        branch_data.end_reasons,
-        Outcome.STEPPED,
-    )
+    return Branch(parameter_name, branch_dataset, special_points, end_reasons, Outcome.STEPPED)
 
 
 def _make_stability_variables(return_map_jacobians: np.ndarray) -> dict[str, xr.Variable]:

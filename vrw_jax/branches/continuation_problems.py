@@ -176,11 +176,10 @@ class CollocationProblem(AbstractGaitProblem):
         `takeoff_acceleration`, m/s^2. The latter is the lowest acceleration of the rear foot at
         take-off over the gait steps.
         """
+        collocation_system = self.collocation_system
         parameters = self._stack_parameters_at(wheel, p)
-        wheel_symbols = make_wheel_from_parameters(
-            parameters, self.collocation_system.n_legs
-        ).symbols()
-        phase_points_by_step = self.collocation_system.evaluate_phase_points(parameters, z)
+        wheel_symbols = make_wheel_from_parameters(parameters, collocation_system.n_legs).symbols()
+        phase_points_by_step = collocation_system.evaluate_phase_points(parameters, z)
         last_end_point, min_durations = (
             phase_points_by_step[-1][-1].phase_end_point,
             jnp.min(z.durations, 0),
@@ -189,17 +188,15 @@ class CollocationProblem(AbstractGaitProblem):
             "duration_dls": jnp.where(wheel.is_phase_active[0, 0] > 0.5, min_durations[0], jnp.nan),
             "duration_sls1": min_durations[1],
             "duration_sls2": min_durations[2],
-            "takeoff_acceleration": self.collocation_system.measure_takeoff_acceleration(
-                parameters, z
-            ),
-            "mesh_error": self.collocation_system.estimate_mesh_error(z),
+            "takeoff_acceleration": collocation_system.measure_takeoff_acceleration(parameters, z),
+            "mesh_error": collocation_system.estimate_mesh_error(z),
         }
         if self.additional_quantity_function is not None:
             continued_quantities |= self.additional_quantity_function(
                 wheel_symbols, phase_points_by_step[0], z
             )
         if self.measures_force_peaks:
-            continued_quantities |= compute_force_peaks(self.collocation_system, parameters, z)
+            continued_quantities |= compute_force_peaks(collocation_system, parameters, z)
         return jnp.stack([last_end_point.q[0], *last_end_point.v]), continued_quantities
 
 

@@ -599,10 +599,9 @@ def linearize_cycle(
         make_fusion_barrier(parameters),
     )
     section_state = trial_solution.section_state
+    section_tangent_slice = linearization_context.section_tangent_slice
     n_tangents = linearization_context.n_tangents
-    section_unit_tangents = np.eye(n_tangents, dtype=float_dtype)[
-        :, linearization_context.section_tangent_slice, None
-    ]
+    section_unit_tangents = np.eye(n_tangents, dtype=float_dtype)[:, section_tangent_slice, None]
     section_state_and_tangents = (
         section_state,
         jnp.broadcast_to(section_unit_tangents, (n_tangents, *section_state.shape)),
@@ -624,12 +623,8 @@ def linearize_cycle(
             )
         )
 
-    monodromy = jnp.swapaxes(
-        section_tangents_after_cycle[linearization_context.section_tangent_slice], 0, 1
-    )
-    drop_section_tangents = lambda x: jnp.concatenate(
-        [x[:1], x[linearization_context.section_tangent_slice.stop :]]
-    )
+    monodromy = jnp.swapaxes(section_tangents_after_cycle[section_tangent_slice], 0, 1)
+    drop_section_tangents = lambda x: jnp.concatenate([x[:1], x[section_tangent_slice.stop :]])
     newton_correction_unit_vector = np.eye(
         n_tangents - phase_sequence.section_size, dtype=float_dtype
     )[0][:, None, None]
@@ -649,7 +644,7 @@ def linearize_cycle(
         The axes (n, tangent, ...) of the argument become (tangent, n, ...).
         """
         open_cycle_tangent = jnp.swapaxes(open_cycle_tangent, 0, 1)
-        section_tangents = open_cycle_tangent[linearization_context.section_tangent_slice]
+        section_tangents = open_cycle_tangent[section_tangent_slice]
         return drop_section_tangents(open_cycle_tangent) + contract_inner_axis(
             section_state_tangents, section_tangents
         )

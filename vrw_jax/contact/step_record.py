@@ -258,6 +258,16 @@ def record_force_extremum(
     - `is_rate_zero`: which of the `NormalForceRates` is zero; if none is, the record is unchanged;
     - `contact_mode_dynamics`, `motion`: dynamics before the extremum, and motion at the extremum.
     """
+    (
+        n_force_peaks,
+        peak_force,
+        lowest_force_after_peak,
+        trough_depth,
+        second_peak_rate,
+        n_total_force_peaks,
+        peak_total_force,
+        n_force_extrema,
+    ) = force_peak_record
     is_fore_extremum, is_total_extremum, is_rate_extremum = is_rate_zero
     assert contact_mode_dynamics.contact_state.force_rate_signs is not None
     is_fore_rising, is_total_rising, is_rate_rising = (
@@ -265,41 +275,40 @@ def record_force_extremum(
     )
     (force, total_force), (rate, _) = compute_normal_force_rates(contact_mode_dynamics, motion)
     is_peak = is_fore_extremum & is_fore_rising
-    is_trough = is_fore_extremum & ~is_fore_rising & (force_peak_record.n_force_peaks > 0)
-    is_after_trough = jnp.isfinite(force_peak_record.lowest_force_after_peak)
-    trough_depth = jnp.where(
+    is_trough = is_fore_extremum & ~is_fore_rising & (n_force_peaks > 0)
+    is_after_trough = jnp.isfinite(lowest_force_after_peak)
+    last_trough_depth = jnp.where(
         is_peak & is_after_trough,
-        jnp.minimum(force, force_peak_record.peak_force)
-        - jnp.where(is_after_trough, force_peak_record.lowest_force_after_peak, 0.0),
+        jnp.minimum(force, peak_force) - jnp.where(is_after_trough, lowest_force_after_peak, 0.0),
         0.0,
     )
-    is_highest_peak = is_peak & (force > force_peak_record.peak_force)
+    is_highest_peak = is_peak & (force > peak_force)
     lowest_force_after_peak = jnp.where(
-        is_trough & (force < force_peak_record.lowest_force_after_peak),
+        is_trough & (force < lowest_force_after_peak),
         force,
-        force_peak_record.lowest_force_after_peak,
+        lowest_force_after_peak,
     )
-    is_second_rise = is_rate_extremum & is_rate_rising & (force_peak_record.n_force_peaks > 0)
+    is_second_rise = is_rate_extremum & is_rate_rising & (n_force_peaks > 0)
     # If only the fore foot is loaded, both forces have the same extrema.
     is_fore_foot_alone = contact_mode_dynamics.slot_modes[1] == ContactMode.OFF
     is_total_peak = (is_total_extremum & is_total_rising) | (is_peak & is_fore_foot_alone)
     return ForcePeakRecord(
-        n_force_peaks=force_peak_record.n_force_peaks + is_peak,
-        peak_force=jnp.where(is_highest_peak, force, force_peak_record.peak_force),
+        n_force_peaks=n_force_peaks + is_peak,
+        peak_force=jnp.where(is_highest_peak, force, peak_force),
         lowest_force_after_peak=jnp.where(is_highest_peak, jnp.inf, lowest_force_after_peak),
-        trough_depth=jnp.maximum(force_peak_record.trough_depth, trough_depth),
+        trough_depth=jnp.maximum(trough_depth, last_trough_depth),
         second_peak_rate=jnp.where(
-            is_second_rise & (rate > force_peak_record.second_peak_rate),
+            is_second_rise & (rate > second_peak_rate),
             rate,
-            force_peak_record.second_peak_rate,
+            second_peak_rate,
         ),
-        n_total_force_peaks=force_peak_record.n_total_force_peaks + is_total_peak,
+        n_total_force_peaks=n_total_force_peaks + is_total_peak,
         peak_total_force=jnp.where(
-            is_total_peak & (total_force > force_peak_record.peak_total_force),
+            is_total_peak & (total_force > peak_total_force),
             total_force,
-            force_peak_record.peak_total_force,
+            peak_total_force,
         ),
-        n_force_extrema=force_peak_record.n_force_extrema + jnp.any(is_rate_zero, axis=0),
+        n_force_extrema=n_force_extrema + jnp.any(is_rate_zero, axis=0),
     )
 
 

@@ -299,11 +299,10 @@ class BatchWalkSettings(NamedTuple):
         If a walk ends, its outcome is set. Running elements are unchanged.
         """
         interval_state = lane_state.contact_interval_state
+        contact_state = interval_state.contact_state
         motion = unpack_motion(interval_state.contact_interval_point)
         s, friction = self.unpack_input_columns(input_columns)
-        dynamics_before = self.make_lane_contact_dynamics(
-            input_columns, interval_state.contact_state
-        )
+        dynamics_before = self.make_lane_contact_dynamics(input_columns, contact_state)
         guard_layout = dynamics_before.guard_layout
         _, rates, dynamics_rows = lax.stop_gradient(interval_state.contact_interval_point)
         is_resting = is_wheel_at_rest(s, rates, dynamics_rows[: len(rates)], self.step_options.atol)
@@ -313,7 +312,7 @@ class BatchWalkSettings(NamedTuple):
         interval_state = interval_state._replace(triggered_guard_index=guard_index)
         step_counters = count_contact_interval(
             lane_state.step_counters,
-            interval_state.contact_state,
+            contact_state,
             interval_state.time_since_event,
             interval_state.n_solver_steps,
         )
@@ -348,15 +347,15 @@ class BatchWalkSettings(NamedTuple):
         # A landing of the foremost foot opens the next step. Then every event is processed.
         begins_step = has_landed & ~has_ended
         motion_at_step_start, contact_state_at_step_start = unpack_section_state(
-            s, pack_section_state(motion, interval_state.contact_state)
+            s, pack_section_state(motion, contact_state)
         )
         contact_state_at_step_start = contact_state_at_step_start._replace(
-            force_rate_signs=interval_state.contact_state.force_rate_signs
+            force_rate_signs=contact_state.force_rate_signs
         )
         motion, contact_state = select_trees_by_condition(
             begins_step,
             (motion_at_step_start, contact_state_at_step_start),
-            (motion, interval_state.contact_state),
+            (motion, contact_state),
         )
         initial_counters, *initial_records = self._init_step_records(motion.x)
         initial_counters = initial_counters._replace(n_solver_steps=step_counters.n_solver_steps)

@@ -747,15 +747,16 @@ def iterate_branches(
         is_trial_suspicious = continuation_state.is_jump_suspicious(
             problem, trial_verdict, new_point
         )
+        is_trial_accepted = trial_verdict.is_trial_accepted & ~is_trial_suspicious
+        has_trial_failed = trial_verdict.has_trial_failed | is_trial_suspicious
         trial_verdict = trial_verdict._replace(
-            is_trial_accepted=trial_verdict.is_trial_accepted & ~is_trial_suspicious,
-            has_trial_failed=trial_verdict.has_trial_failed | is_trial_suspicious,
+            is_trial_accepted=is_trial_accepted, has_trial_failed=has_trial_failed
         )
         current_point = select_trees_by_condition(
-            trial_verdict.is_trial_accepted, new_point, continuation_state.current_point
+            is_trial_accepted, new_point, continuation_state.current_point
         )
         first_point = select_trees_by_condition(
-            trial_verdict.is_trial_accepted & (continuation_state.n_points == 0),
+            is_trial_accepted & (continuation_state.n_points == 0),
             new_point,
             continuation_state.first_point,
         )
@@ -764,12 +765,12 @@ def iterate_branches(
             trial_verdict.is_trial_kink, new_point, continuation_state.current_point
         )
         previous_point = select_trees_by_condition(
-            trial_verdict.is_trial_accepted, previous_point, continuation_state.previous_point
+            is_trial_accepted, previous_point, continuation_state.previous_point
         )
-        n_points = continuation_state.n_points + trial_verdict.is_trial_accepted
+        n_points = continuation_state.n_points + is_trial_accepted
         jump_suspicion, ds = continuation_state.jump_suspicion.update_after_trial(
             is_trial_suspicious,
-            trial_verdict.is_trial_accepted,
+            is_trial_accepted,
             continuation_state.ds,
             continuation_state.choose_next_ds(options, trial_verdict),
             options.min_ds,
@@ -777,7 +778,7 @@ def iterate_branches(
         next_trial_point = _predict_trial_point(
             setup, previous_point, current_point, n_points > 1, ds
         )
-        is_trial_finished = trial_verdict.is_trial_accepted | trial_verdict.has_trial_failed
+        is_trial_finished = is_trial_accepted | has_trial_failed
         next_trial_point = select_trees_by_condition(
             is_trial_finished,
             next_trial_point,
@@ -803,7 +804,7 @@ def iterate_branches(
             next_status,
             continuation_state.n_linearizations + 1,
         )
-        return next_continuation_state, new_point, trial_verdict.is_trial_accepted
+        return next_continuation_state, new_point, is_trial_accepted
 
     # Buffers are updated outside `select_trees_by_condition`, which would copy them in every
     # iteration.

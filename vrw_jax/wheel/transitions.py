@@ -113,18 +113,16 @@ def _solve_both_feet_landing(
 
     # (A1) If both feet stay on the ground, the hub can only move on its circle.
     foot_distance = s.L0 * s.sin_alpha / rear_leg.cos
-    hub_circle = compute_double_support_circle(s, foot_distance, sin, cos)
+    _, _, dL1_dtheta, dL2_dtheta = compute_double_support_circle(s, foot_distance, sin, cos)
     momentum_per_hub_circle_rate = M.multiply_vector(
-        (jnp.ones_like(hub_circle.dL1_dtheta), hub_circle.dL1_dtheta, hub_circle.dL2_dtheta)
+        (jnp.ones_like(dL1_dtheta), dL1_dtheta, dL2_dtheta)
     )
     hub_circle_inertia = (
         momentum_per_hub_circle_rate[0]
-        + hub_circle.dL1_dtheta * momentum_per_hub_circle_rate[1]
-        + hub_circle.dL2_dtheta * momentum_per_hub_circle_rate[2]
+        + dL1_dtheta * momentum_per_hub_circle_rate[1]
+        + dL2_dtheta * momentum_per_hub_circle_rate[2]
     )
-    dtheta_after = (
-        p1 + hub_circle.dL1_dtheta * p2 + hub_circle.dL2_dtheta * p3
-    ) / hub_circle_inertia
+    dtheta_after = (p1 + dL1_dtheta * p2 + dL2_dtheta * p3) / hub_circle_inertia
     locked_length = s.L0 + 0.0 * L1_before
     motion_after = Motion(
         sin,
@@ -132,8 +130,8 @@ def _solve_both_feet_landing(
         locked_length,
         L1_before,
         dtheta_after,
-        hub_circle.dL1_dtheta * dtheta_after,
-        hub_circle.dL2_dtheta * dtheta_after,
+        dL1_dtheta * dtheta_after,
+        dL2_dtheta * dtheta_after,
     )
     return _BothFeetLanding(
         motion_before,
