@@ -213,10 +213,9 @@ def _check_parameter_shapes(
         *(parameter_values.dtype for parameter_values in values_by_parameter)
     )
     StepOptions.check_tolerances(options, parameter_dtype)  # a bound method takes 0.1 ms
-    friction_coefficients = getattr(model, FRICTION_NAME, np.zeros(()))
     for parameter_name, parameter_values in zip(
         (*PARAMETER_NAMES, FRICTION_NAME),
-        (*values_by_parameter, friction_coefficients),
+        (*values_by_parameter, getattr(model, FRICTION_NAME, np.zeros(()))),
         strict=True,
     ):
         is_parameter_stepwise = (
@@ -294,10 +293,9 @@ def _step_batch_without_contact(
             parameter_matrix, options.with_derivative_tolerances() if derivative_names else options
         )
         if np.any(solver_indices != SolverIndex.REQUESTED_SOLVER):
-            stable_options = dataclasses.replace(options, solver=stable_solver)
             engine_by_solver[SolverIndex.STABLE_SOLVER] = select_engine(
                 "lanes",
-                stable_options.with_tightened_tolerances(
+                dataclasses.replace(options, solver=stable_solver).with_tightened_tolerances(
                     SOLVER_SELECTION_OPTIONS.stable_solver_tightening_factor
                 ),
             )

@@ -740,10 +740,9 @@ def take_collocation_step(
     landing_result = transitions.resolve_landing(s, *x)
     is_collocation_trusted = is_start_state_valid & landing_result.is_rear_foot_planted
     wheel_angle, wheel_motion = landing_result.theta_after_landing, landing_result.motion_after
-    phases_of_step = make_paper_phases(s, landing_result.foot_distance, stop_at_lift_off)
     phase_durations = []
     for collocated_phase, expected_duration, phase_mesh, max_start_rate_error in zip(
-        phases_of_step,
+        make_paper_phases(s, landing_result.foot_distance, stop_at_lift_off),
         expected_durations,
         options.phase_meshes,
         options.max_start_rate_errors,

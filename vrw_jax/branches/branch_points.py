@@ -145,10 +145,9 @@ class LocatedRoot(NamedTuple):
         - `quantity_table`: quantities of the branch on which the root is located.
         """
         evaluate_quantity = self.request.evaluate_quantity
-        values_at_bracket_ends = evaluate_quantity(quantity_table)[list(self.request.point_pair)]
         (value_beside_root,) = np.abs(evaluate_quantity(self.table_beside_root.quantity_table))
         max_value_beside_root = LOCATED_ROOT_TOLERANCES.max_value_beside_root * np.max(
-            np.abs(values_at_bracket_ends)
+            np.abs(evaluate_quantity(quantity_table)[list(self.request.point_pair)])
         )
         return not value_beside_root > max_value_beside_root
 

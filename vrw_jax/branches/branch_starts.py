@@ -108,9 +108,8 @@ def find_collocation_starts(branch_request: BranchRequest, known_start_cycle: An
     cycle_options = branch_request.cycle_options
     if cycle_options is None:
         cycle_options = CycleOptions.tight()
-        start_mesh_intervals = start_cycle.system.cycle_options.mesh_intervals
         n_dls_intervals, n_sls1_intervals, n_sls2_intervals = map(
-            max, cycle_options.mesh_intervals, start_mesh_intervals
+            max, cycle_options.mesh_intervals, start_cycle.system.cycle_options.mesh_intervals
         )
         cycle_options = dataclasses.replace(
             cycle_options, mesh_intervals=(n_dls_intervals, n_sls1_intervals, n_sls2_intervals)

@@ -438,12 +438,11 @@ class CurveTracer(NamedTuple):
             self.parameter_ranges[0],
             tuple(curve_seed.special_point_name for curve_seed in padded_seeds),
         )
-        is_seed_requested = np.arange(len(padded_seeds)) < len(curve_seeds)
         branch_data_by_seed = continue_and_locate_special_points(
             branch_continuation,
             z,
             jnp.asarray(first_parameter_values),
-            is_seed_requested,
+            np.arange(len(padded_seeds)) < len(curve_seeds),
             lambda wheel_index, point: lambda: point,
             is_finest_mesh,
         )

@@ -212,10 +212,9 @@ class CollocatedPhaseMotion(NamedTuple):
                 residual_jacobian, compute_dynamics_residual(flat_accelerations)
             ), None
 
-        initial_accelerations = lax.stop_gradient(self.node_accelerations[interval_index].ravel())
         node_accelerations = lax.scan(
             refine_node_accelerations,
-            initial_accelerations,
+            lax.stop_gradient(self.node_accelerations[interval_index].ravel()),
             length=EXTREMUM_SEARCH_OPTIONS.n_state_newton_iterations,
         )[0].reshape(N_GAUSS_NODES, -1)
         return interval_start_q + partial_interval_length * (
@@ -376,10 +375,9 @@ def find_quantity_extrema(
             corrected_times = jnp.clip(corrected_times - time_corrections, 0.0, phase_duration)
             return (corrected_times, jax.vmap(evaluate_quantity_at_time)(corrected_times)), None
 
-        zero_derivatives = QuantityTimeDerivatives(*jnp.zeros((3, *extremum_times.shape)))
         return lax.scan(
             correct_extremum_times_once,
-            (extremum_times, zero_derivatives),
+            (extremum_times, QuantityTimeDerivatives(*jnp.zeros((3, *extremum_times.shape)))),
             length=EXTREMUM_SEARCH_OPTIONS.n_time_corrections,
         )[0]
 

@@ -278,9 +278,8 @@ class _LinearizationContext(NamedTuple):
                 tuple(phase_point),
                 point_tangents,
             )
-        n_duration_tangents = point_tangents[0].shape[0] - self.n_tangents
         tangent_padding = (
-            (self.section_tangent_slice.stop, n_duration_tangents),
+            (self.section_tangent_slice.stop, point_tangents[0].shape[0] - self.n_tangents),
             *((0, 0),) * (self.parameters.ndim - 1),
         )
         padded_phase_constants_tangents = (
@@ -383,9 +382,8 @@ class _LinearizationContext(NamedTuple):
             start=_make_unit_tangent(len(state_tangents), 0, float_dtype) * dynamics_residual,
         )
         if self.parameter_indices:
-            n_tangents_before_parameters = self.section_tangent_slice.stop
             right_hand_sides = right_hand_sides + jnp.pad(
-                parameter_derivatives, ((n_tangents_before_parameters, 1), *((0, 0),) * 3)
+                parameter_derivatives, ((self.section_tangent_slice.stop, 1), *((0, 0),) * 3)
             )
         double_integration_matrix, integration_matrix = (
             float64_matrix.astype(float_dtype)[:, None, :, None, None]
@@ -644,9 +642,8 @@ def linearize_cycle(
         The axes (n, tangent, ...) of the argument become (tangent, n, ...).
         """
         open_cycle_tangent = jnp.swapaxes(open_cycle_tangent, 0, 1)
-        section_tangents = open_cycle_tangent[section_tangent_slice]
         return drop_section_tangents(open_cycle_tangent) + contract_inner_axis(
-            section_state_tangents, section_tangents
+            section_state_tangents, open_cycle_tangent[section_tangent_slice]
         )
 
     gait_step_end_states, *open_cycle_tangents = linearization_context.prevent_fusion(

@@ -758,9 +758,8 @@ def _compute_squared_error(
     The result is infinite for a solver step whose end is not finite.
     """
     squared_error_sum = 0.0 * jnp.sum(guard_values, axis=0)
-    state_units = compute_state_units(s)
     for error_rows, a, b, coordinate_unit in zip(
-        error_estimates, start_point[:2], end_point[:2], state_units, strict=True
+        error_estimates, start_point[:2], end_point[:2], compute_state_units(s), strict=True
     ):
         error_tolerance = options.atol * coordinate_unit + options.rtol * jnp.maximum(
             jnp.abs(a), jnp.abs(b)

@@ -263,10 +263,9 @@ def solve_cycle_with_derivatives(
 
     The state is differentiable with respect to the parameters. The guess has no derivatives.
     """
-    derivative_free_search = functools.partial(run_search_attempts, collocation_system)
     make_output_template = lambda parameters, search_start, *_: search_start
     batched_search = compile_batch_function(
-        derivative_free_search,
+        functools.partial(run_search_attempts, collocation_system),
         make_output_template,
         ("search", collocation_system),
         collocation_system.cycle_options.batch_size,
@@ -309,13 +308,11 @@ def attach_monodromy_derivatives(
     compile_function = _make_derivative_compiler(
         "monodromy", (make_output_template, make_output_template), collocation_system
     )
-    compute_monodromy = functools.partial(_compute_masked_monodromy, collocation_system)
-    compute_monodromy_tangents = functools.partial(_compute_monodromy_tangents, collocation_system)
     compute_parameter_jacobian = make_implicit_jacobian(
-        compute_monodromy,
+        functools.partial(_compute_masked_monodromy, collocation_system),
         _make_tangent_function(collocation_system),
         compile_function,
-        make_jacobian=compute_monodromy_tangents,
+        make_jacobian=functools.partial(_compute_monodromy_tangents, collocation_system),
     )
 
     @jax.custom_jvp

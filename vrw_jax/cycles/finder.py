@@ -307,13 +307,12 @@ def compute_value_and_tangents(
     The tangents have a leading axis.
     """
     float_primals, non_float_inputs = eqx.partition(input_values, eqx.is_inexact_array)
-    float_tangents = eqx.filter(input_tangents, eqx.is_inexact_array)
     evaluate_at_floats = lambda all_float_inputs: differentiated_function(
         *eqx.combine(all_float_inputs, non_float_inputs)
     )
     tangents_of_value = jax.vmap(
         lambda float_tangent: jax.jvp(evaluate_at_floats, (float_primals,), (float_tangent,))[1]
-    )(float_tangents)
+    )(eqx.filter(input_tangents, eqx.is_inexact_array))
     return evaluate_at_floats(float_primals), tangents_of_value
 
 

@@ -489,12 +489,11 @@ def _make_search_starts(
     )
     wheels_with_walk = np.flatnonzero(np.isfinite(walk_end_states[:, 0]) & ~has_known_state)
     if len(wheels_with_walk):
-        guess_from_state = jax.vmap(gait_finder.guess_cycle_from_state)
         start_states = _replace_wheels(
             start_states,
             wheels_with_walk,
             map_in_batches(
-                guess_from_state,
+                jax.vmap(gait_finder.guess_cycle_from_state),
                 batch_sizes.GAIT_BATCH_SIZES,
                 _take_wheels_on_device(params, wheels_with_walk),
                 walk_end_states[wheels_with_walk],

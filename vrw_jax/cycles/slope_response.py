@@ -225,8 +225,7 @@ def compute_collocation_slope_response(
             *(phase_accelerations[0] for phase_accelerations in collocation_solution.accelerations),
         )
     )
-    compute_response = _make_collocation_response_function(collocation_system)
-    return compute_response(
+    return _make_collocation_response_function(collocation_system)(
         parameters,
         collocation_solution.section_state,
         lax.stop_gradient(is_phase_active),

@@ -206,9 +206,8 @@ def product_multipliers(
     )
     is_known = relative_error <= accuracy
     descending_order = np.argsort(-logarithms, kind="stable")
-    multipliers_or_nan = np.where(is_known, block_multipliers, np.nan)
     return ProductMultipliers(
-        multipliers_or_nan[descending_order],
+        np.where(is_known, block_multipliers, np.nan)[descending_order],
         logarithms[descending_order],
         relative_error[descending_order],
         is_known[descending_order],

@@ -283,12 +283,10 @@ def compute_margin_minima_jvp(
         0,
         1,
     )
-    start_tangents = compute_margin_tangents(start_state, phase_tangents.start_tangents)
-    end_margin_tangents = compute_margin_tangents(end_state, end_tangents)
     end_margin_minima_tangents = jnp.where(
         margin_minima_state.margin_values <= margin_minima_result.phase_margin_minima,
-        end_margin_tangents,
-        start_tangents,
+        compute_margin_tangents(end_state, end_tangents),
+        compute_margin_tangents(start_state, phase_tangents.start_tangents),
     )
     return jnp.where(
         margin_minima_result.interior_margin_minima <= margin_minima_result.phase_margin_minima,

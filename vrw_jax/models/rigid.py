@@ -645,9 +645,8 @@ def _compute_rolling_time(
     """
     has_nonzero_range = last_half_angle_squared > first_half_angle_squared
     smaller_half_angle_squared = jnp.where(has_nonzero_range, first_half_angle_squared, 0.0)
-    larger_half_angle_squared = jnp.where(has_nonzero_range, last_half_angle_squared, 1.0)
     smaller_half_angle = compute_square_root(smaller_half_angle_squared)
-    larger_half_angle = jnp.sqrt(larger_half_angle_squared)
+    larger_half_angle = jnp.sqrt(jnp.where(has_nonzero_range, last_half_angle_squared, 1.0))
     y1, y2 = jnp.sin(smaller_half_angle), jnp.cos(smaller_half_angle)
     x1, x2 = jnp.sin(larger_half_angle), jnp.cos(larger_half_angle)
     y3 = jnp.sqrt(jnp.maximum(min_rate_squared + 2.0 * kappa * y1**2, 1e-300))

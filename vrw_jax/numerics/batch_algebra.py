@@ -55,8 +55,7 @@ def apply_matrix(matrix: np.ndarray, x: Array) -> Array:
 
 def sum_with_weights(weights: np.ndarray, x: Array) -> Array:
     """Return the weighted sum of `x` over its leading axis."""
-    weighted_terms = [float(weights[j]) * x[j] for j in range(len(weights))]
-    return functools.reduce(operator.add, weighted_terms)
+    return functools.reduce(operator.add, [float(weights[j]) * x[j] for j in range(len(weights))])
 
 
 def contract_inner_axis(left_array: Array, right_array: Array) -> Array:

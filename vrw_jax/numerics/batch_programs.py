@@ -91,11 +91,10 @@ def _run_xla_program_by_blocks(
     The program then runs again for the unfinished lanes of all blocks together.
     """
     if len(lane_arrays[0]) == 0:
-        lane_shapes = (jax.ShapeDtypeStruct((block_size,), x.dtype) for x in lane_arrays)
         output_shapes = jax.eval_shape(
             xla_program,
             tuple(scalar_arguments),
-            tuple(lane_shapes),
+            tuple(jax.ShapeDtypeStruct((block_size,), x.dtype) for x in lane_arrays),
             *[np.int32(0)] * can_leave_lanes_unfinished,
         )
         return [np.empty((*x.shape[:-1], 0), x.dtype) for x in output_shapes]

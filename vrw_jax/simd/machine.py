@@ -87,8 +87,7 @@ def compile_llvm_for_webassembly(
     llvm_module.get_function(entry_function_name).name = exported_function_name
     llvm.initialize_all_targets()
     llvm.initialize_all_asmprinters()
-    llvm_target = llvm.Target.from_triple("wasm32-unknown-unknown")
-    llvm_target_machine = llvm_target.create_target_machine(
+    llvm_target_machine = llvm.Target.from_triple("wasm32-unknown-unknown").create_target_machine(
         cpu="generic",
         features="+simd128",
         opt=LLVM_OPTIMIZATION_LEVEL,
