@@ -429,10 +429,10 @@ def evaluate_quantity_time_derivatives(
     def append_time_derivative(function_of_state: Callable) -> Callable:
         return lambda q, v: jax.jvp(function_of_state, (q, v), (v, compute_acceleration(q, v)))
 
-    value_and_rate, (_, second_time_derivative) = append_time_derivative(
+    (quantity_value, first_time_derivative), (_, second_time_derivative) = append_time_derivative(
         append_time_derivative(compute_quantity)
     )(q, v)
-    return QuantityTimeDerivatives(*value_and_rate, second_time_derivative)
+    return QuantityTimeDerivatives(quantity_value, first_time_derivative, second_time_derivative)
 
 
 def _bisect_zeros(

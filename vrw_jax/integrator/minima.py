@@ -182,13 +182,17 @@ def refine_margin_minima(
             (margin_value,), (margin_rate,) = phase.evaluate_with_rates(
                 evaluate_selected_margin, step_end
             )
-            *next_and_best_step, has_secant_converged = improve_minimum_location(
-                step_length, margin_rate, margin_minimum_state.step_length, *best_step
+            step_length, best_step_length, best_margin_rate, has_secant_converged = (
+                improve_minimum_location(
+                    step_length, margin_rate, margin_minimum_state.step_length, *best_step
+                )
             )
             return select_trees_by_condition(
                 is_minimum_unresolved,
                 _MarginMinimumSearch(
-                    *next_and_best_step,
+                    step_length,
+                    best_step_length,
+                    best_margin_rate,
                     margin_value,
                     is_minimum_unresolved & ~has_secant_converged,
                     n_iterations,
