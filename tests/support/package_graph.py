@@ -2,8 +2,8 @@
 
 Every import counts: inside functions, for type checkers, by name (`import_module("a.b")`, or a
 string with a module's dotted name) and by attribute (`package.module.name`). A name imported
-through an `__init__` file or by `lazy_import` also gives an edge to the module that defines it. The
-package itself does not run.
+through an `__init__` file also gives an edge to the module that defines it. The package itself does
+not run.
 """
 
 import ast
@@ -211,7 +211,7 @@ def find_loaded_module(node: ast.AST, names: dict[str, str]) -> str | None:
         return None
     first, *rest = _attribute_chain(node.func) or [""]
     called = _join_names(names.get(first, first), rest).replace(":", ".").split(".")[-1]
-    if called not in {"import_module", "__import__", "lazy_import"}:
+    if called not in {"import_module", "__import__"}:
         return None
     name = node.args[0]
     return name.value if isinstance(name, ast.Constant) else ""

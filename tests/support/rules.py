@@ -88,7 +88,7 @@ def _bypasses_init_file(import_graph: ImportGraph, edge: ImportEdge) -> bool:
 
 def find_misplaced_external_imports(import_graph: ImportGraph) -> list[str]:
     """Return the imports of libraries outside `ALLOWED_IMPORTERS`, or by a computed name."""
-    violations, lazy = [], f"{import_graph.name}.runtime.lazy_import"
+    violations = []
     for edge in import_graph.edges:
         places = [
             f"{import_graph.name}.{place}"
@@ -106,7 +106,7 @@ def find_misplaced_external_imports(import_graph: ImportGraph) -> list[str]:
                 f"{_format_location(edge)} imports {edge.target}: simd imports no other package"
             )
     for module, tree in import_graph.trees.items():
-        if module != lazy and any(
+        if any(
             find_loaded_module(node, import_graph.names[module]) == "" for node in ast.walk(tree)
         ):
             violations.append(f"{module} imports a module by a computed name")

@@ -42,12 +42,9 @@ from vrw_jax.numerics import (
     make_opaque_loop_condition,
     select_trees_by_condition,
 )
-from vrw_jax.runtime import lazy_import
 
 if TYPE_CHECKING:
     import diffrax
-else:
-    diffrax = lazy_import("diffrax")
 
 VectorField = Callable[[StateArray], StateArray]
 """Autonomous vector field of a phase: function that returns the time derivative of the state."""
@@ -178,6 +175,8 @@ class _SolverStepper(NamedTuple):
 
         The third result is the new internal state of the solver.
         """
+        import diffrax  # This import is slow.
+
         zero_duration = jnp.zeros_like(step_length)
         end_state, error_estimate, _, solver_state, solver_result = self.diffrax_solver.step(
             self.ode_term, zero_duration, step_length, state, None, solver_state, jnp.asarray(False)
@@ -233,6 +232,8 @@ def _make_stepper(vector_field: VectorField, options: StepOptions) -> _SolverSte
 
     The solver is configured for forward-mode derivatives.
     """
+    import diffrax  # This import is slow.
+
     diffrax_solver_class = getattr(diffrax, options.solver)
     field_names = diffrax_solver_class.__dataclass_fields__
     solver_arguments: dict[str, Any] = {}

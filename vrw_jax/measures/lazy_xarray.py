@@ -1,10 +1,19 @@
 """The library xarray, imported on first use. All labeled results are its datasets."""
 
-from typing import TYPE_CHECKING
-
-from vrw_jax.runtime import lazy_import
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     import xarray as xarray
 else:
-    xarray = lazy_import("xarray")
+
+    class _LazyXarray:
+        """Proxy for xarray, which is imported when an attribute is first read, because its import
+        takes long.
+        """
+
+        def __getattr__(self, attribute_name: str) -> Any:
+            import xarray
+
+            return getattr(xarray, attribute_name)
+
+    xarray = _LazyXarray()

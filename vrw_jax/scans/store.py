@@ -23,7 +23,6 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from vrw_jax.measures import xarray as xr
-from vrw_jax.runtime import lazy_import
 from vrw_jax.scans.integrity import (
     CHECKSUM_ARRAY_NAME,
     CHECKSUM_GROUP_NAME,
@@ -47,8 +46,6 @@ from vrw_jax.validation import check_bool, check_path
 
 if TYPE_CHECKING:
     import zarr
-else:
-    zarr = lazy_import("zarr")
 
 PROVENANCE_ATTRIBUTE = "provenance"
 """Name of the attribute of a store that describes the origin of the results."""
@@ -269,6 +266,8 @@ class ZarrResultStore(AbstractResultStore):
 
 def _select_zarr_array(zarr_group: zarr.Group, array_name: str) -> zarr.Array:
     """Return an array of a Zarr group. Raise an error if the name belongs to a group."""
+    import zarr  # This import is slow.
+
     zarr_array = zarr_group[array_name]
     assert isinstance(zarr_array, zarr.Array)
     return zarr_array
@@ -355,6 +354,8 @@ def _open_zarr_group(
     """Return the Zarr group of a store, opened with the first copy of the metadata that can be
     read.
     """
+
+    import zarr  # This import is slow.
 
     def open_with_all_arrays(uses_consolidated_metadata: bool | None) -> zarr.Group:
         zarr_group = zarr.open_group(
@@ -485,6 +486,7 @@ def _create_zarr_arrays(
     """Create the Zarr group of a store, with the coordinates and with empty arrays for variables
     and marks.
     """
+    import zarr  # This import is slow.
     from zarr.codecs import Crc32cCodec, ZstdCodec
 
     # xarray reads from this attribute which arrays are coordinates, and removes it on opening.

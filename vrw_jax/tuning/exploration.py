@@ -12,11 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from vrw_jax.numerics import concatenate_tree_rows, select_tree_rows
-from vrw_jax.runtime import lazy_import
 from vrw_jax.tuning.maximization import TrialEvaluator
 from vrw_jax.tuning.objective import compute_max_violation, compute_slack_scales
-
-optax = lazy_import("optax")
 
 
 @dataclass(frozen=True)
@@ -71,6 +68,8 @@ def explore_starts(
     - `evaluate_trials`: function that evaluates a batch of trials;
     - `normalized_starts`: normalized parameters of the starts, (n_starts, n_free_parameters).
     """
+    import optax  # This import is slow.
+
     n_starts = len(normalized_starts)
     current_trials = evaluate_trials(normalized_starts, None)
     has_active_gait = current_trials.is_usable_trial
