@@ -199,7 +199,7 @@ def test_a_map_prints_its_stages_after_the_scan(
         on_stage("following special points: fold")
         return SpecialPointMap(scan, (), ())
 
-    monkeypatch.setattr("vrw_jax.scans.follow_special_points", follow)
+    monkeypatch.setattr("vrw_jax.cli.commands.follow_special_points", follow)
     result = run_command("map", config)
     assert result.exit_code == 0, result.output
     stages = [line for line in result.stderr.splitlines() if line.endswith(" ...")]
@@ -221,7 +221,7 @@ def test_a_map_of_force_peaks_has_those_of_each_gait_on_the_mesh_of_the_config(
         "mesh_intervals = [40, 32, 16]\n"
     )
     monkeypatch.setattr(
-        "vrw_jax.scans.follow_special_points", lambda scan, *_: SpecialPointMap(scan, (), ())
+        "vrw_jax.cli.commands.follow_special_points", lambda scan, *_: SpecialPointMap(scan, (), ())
     )
     result = run_command("map", config, "--out", tmp_path)
     assert result.exit_code == 0, result.output
@@ -373,7 +373,7 @@ def test_a_branch_without_a_gait_is_reported_and_writes_nothing(
 ) -> None:
     none = Branch("damping", xr.Dataset(coords={"damping": ("point", np.zeros(0))}), (),
                   ("", ""), Outcome.NO_CYCLE_FOUND)  # fmt: skip
-    monkeypatch.setattr("vrw_jax.branches.continue_branch", lambda *_, **__: none)
+    monkeypatch.setattr("vrw_jax.cli.commands.continue_branch", lambda *_, **__: none)
     config.write_text('[branch]\nparameter = "damping"\nbounds = [290.0, 300.0]\n')
     result = run_command("continue", config)
     assert result.exit_code == 1

@@ -1,7 +1,7 @@
 """The commands: walk a wheel, reproduce the paper, scan parameters, tune, continue branches.
 
-The commands import slow libraries themselves, so that help appears quickly. A user's mistake is
-reported in one sentence on standard error, with exit code 2.
+The commands that draw figures import matplotlib themselves, so that help appears quickly. A user's
+mistake is reported in one sentence on standard error, with exit code 2.
 """
 
 import gc
@@ -12,12 +12,16 @@ import signal
 import tempfile
 import webbrowser
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
+import jax
+import jax.numpy as jnp
 import typer
 
+from vrw_jax.branches import SPECIAL_POINT_MEASURES, continue_branch
 from vrw_jax.cli import console as printing
 from vrw_jax.cli import scanning
+from vrw_jax.cli.config import Config, load_config, parse_assignment
 from vrw_jax.cli.console import (
     ExitCode,
     print_error_sentence,
@@ -27,10 +31,17 @@ from vrw_jax.cli.console import (
     stdout_console,
 )
 from vrw_jax.cli.encoding import replace_unencodable_output
-
-if TYPE_CHECKING:
-    from vrw_jax.cli.config import Config
-    from vrw_jax.wheel import WheelParams
+from vrw_jax.continuation import ArclengthOptions
+from vrw_jax.cycles import limit_cycle, make_finder, resolve_model_with_reason
+from vrw_jax.measures import FORCE_PEAK_MEASURES
+from vrw_jax.robustness import first_passage, gait_sensitivity
+from vrw_jax.runtime import start_jax
+from vrw_jax.scans import follow_special_points, forecast_scan, require_map_grid
+from vrw_jax.selection import list_model_config_names
+from vrw_jax.simulation import step
+from vrw_jax.tuning import tune
+from vrw_jax.web import make_page_address
+from vrw_jax.wheel import Outcome, WheelParams
 
 MAX_OPTION_INTEGER = 10**9
 """Largest integer that an option accepts, chosen because no scan has more samples."""
@@ -160,13 +171,6 @@ def run_gait_command(
     """
     with report_command_errors():
         gait_config, params = _load_config_and_wheel(config, changes)
-        import jax.numpy as jnp
-
-        from vrw_jax.cycles import limit_cycle, make_finder, resolve_model_with_reason
-        from vrw_jax.measures import FORCE_PEAK_MEASURES
-        from vrw_jax.simulation import step
-        from vrw_jax.wheel import Outcome
-
         model: Any = gait_config.make_model()
         options = gait_config.make_options()
         start = gait_config.gait.start
@@ -214,8 +218,6 @@ def run_explore_command(
 ) -> None:
     """Open an interactive page of the wheel in your browser. The browser computes the steps."""
     with report_command_errors():
-        from vrw_jax.web import make_page_address
-
         _, params = _load_config_and_wheel(None, changes)
         page_address = make_page_address(params, model_name)
         webbrowser.open(page_address)
@@ -367,8 +369,6 @@ def run_scan_command(
     with report_command_errors():
         scan_config, folder = _load_config_with_table(config, folder, "design", "scan")
         scan_plan, store_path = scanning.plan_config_scan(scan_config, chunk), folder / "scan.zarr"
-        from vrw_jax.scans import forecast_scan
-
         if explain:
             with show_computation_stages(
                 "measuring some samples (the first time compiles for a while)"
@@ -416,8 +416,6 @@ def run_robustness_command(
                 "write slope_sd = 0.01, in rad, say."
             )
         if robustness_config.design is None:
-            from vrw_jax.robustness import first_passage, gait_sensitivity
-
             params, wheel_model = robustness_config.make_wheel(), robustness_config.make_model()
             with show_computation_stages(
                 "walking over random slopes (the first time compiles for a while)"
@@ -440,9 +438,7 @@ def run_map_command(
     """Draw all special points of gaits over two parameters: `vrw map configs/map_c_k.toml`."""
     with report_command_errors():
         special_point_map_config, folder = _load_config_with_table(config, folder, "design", "map")
-        from vrw_jax.branches import SPECIAL_POINT_MEASURES
         from vrw_jax.cli.reports import write_special_point_map
-        from vrw_jax.scans import follow_special_points, require_map_grid
 
         scan_plan = scanning.plan_config_scan(
             special_point_map_config, None, SPECIAL_POINT_MEASURES
@@ -495,10 +491,9 @@ def run_tune_command(
         assert tune_config is not None
         _require_writable_folder(folder, picture)
         from vrw_jax.cli.reports import write_tuning_report
-        from vrw_jax.tuning import tune as tune_wheel
 
         with show_computation_stages("tuning (the first time compiles for a while)"):
-            tune_result = tune_wheel(
+            tune_result = tune(
                 command_config.make_wheel(),
                 tune_config.objective,
                 tuple(tune_config.bounds),
@@ -540,9 +535,7 @@ def run_continue_command(
         branch_config = command_config.branch
         assert branch_config is not None
         _require_writable_folder(folder, picture)
-        from vrw_jax.branches import continue_branch
         from vrw_jax.cli.reports import write_branch_report
-        from vrw_jax.continuation import ArclengthOptions
 
         arclength_options = ArclengthOptions()
         if branch_config.max_ds is not None:
@@ -567,34 +560,26 @@ def run_continue_command(
         printing.print_written_paths(write_branch_report(branch, folder, picture))
 
 
-def _start_jax_and_load_config(config_path: Path | None) -> "Config":
+def _start_jax_and_load_config(config_path: Path | None) -> Config:
     """Start JAX, and return the config in the file `config_path`, or the default config for
     None.
     """
-    import jax
-
-    from vrw_jax.runtime import start_jax
-
     start_jax()
     if jax.config.jax_disable_jit:  # type: ignore[attr-defined]
         # Commands would run for hours.
         raise ValueError(
             "JAX_DISABLE_JIT is set, but commands compute with compiled code: unset it."
         )
-    from vrw_jax.cli.config import Config, load_config
-
     return Config() if config_path is None else load_config(config_path)
 
 
 def _load_config_and_wheel(
     config_path: Path | None, changes: list[str] | None
-) -> tuple["Config", "WheelParams"]:
+) -> tuple[Config, WheelParams]:
     """Start JAX, and return a config with its wheel, changed by assignments such as
     "damping=150".
     """
     command_config = _start_jax_and_load_config(config_path)
-    from vrw_jax.cli.config import parse_assignment
-
     return command_config, command_config.make_wheel(dict(map(parse_assignment, changes or [])))
 
 
@@ -611,7 +596,7 @@ MISSING_CONFIG_TABLE_MESSAGES = {
 
 def _load_config_with_table(
     config_path: Path, result_folder: Path | None, table_name: str, command_name: str
-) -> tuple["Config", Path]:
+) -> tuple[Config, Path]:
     """Load a config, and return it with the folder for the results.
 
     Raise a ValueError if the config lacks the table that the command needs, or if the command does
@@ -620,8 +605,6 @@ def _load_config_with_table(
     command_config = _start_jax_and_load_config(config_path)
     if getattr(command_config, table_name) is None:
         raise ValueError(f"{command_config.file_name} {MISSING_CONFIG_TABLE_MESSAGES[table_name]}")
-    from vrw_jax.selection import list_model_config_names
-
     supported_models = list_model_config_names(command_name)
     if command_config.model_name not in supported_models:
         raise ValueError(

@@ -4,28 +4,31 @@ import contextlib
 import enum
 import os
 import sys
+import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
+import numpy as np
 import typer
+from jax.typing import ArrayLike
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
 from vrw_jax.cli.encoding import replace_unencodable_characters
+from vrw_jax.cycles import LimitCycle, ReturnMapCycle, format_floquet_multipliers
+from vrw_jax.measures import MARGIN_MEASURES, MEASURES
+from vrw_jax.models import StepResult
+from vrw_jax.scans import ScanProgress, format_duration
+from vrw_jax.wheel import PARAMETER_DOMAINS, Outcome, WheelParams
 
 if TYPE_CHECKING:
     import xarray as xr
-    from jax.typing import ArrayLike
     from rich.progress import Progress as Bar
 
-    from vrw_jax.cycles import LimitCycle, ReturnMapCycle
-    from vrw_jax.models import StepResult
     from vrw_jax.paper import PaperFact
-    from vrw_jax.scans import ScanProgress
-    from vrw_jax.wheel import WheelParams
 
 
 class ExitCode(enum.IntEnum):
@@ -223,20 +226,16 @@ def make_progress_bar(task_name: str) -> "Bar":
 
 def make_scan_progress_reporter(
     update_progress_bar: Callable, progress_task: int
-) -> Callable[["ScanProgress"], None]:
+) -> Callable[[ScanProgress], None]:
     """Return a function that shows the progress of a scan.
 
     It shows the rate, the fraction of samples without a gait, and the remaining time. The rate is
     measured from the second chunk on, because the first chunk includes compilation. The bar
     includes the samples of an earlier run; the rate and the fraction refer only to the present run.
     """
-    import time
-
-    from vrw_jax.scans import format_duration
-
     times_and_counts: list[tuple[float, int]] = []
 
-    def report_progress(scan_progress: "ScanProgress") -> None:
+    def report_progress(scan_progress: ScanProgress) -> None:
         """Update the progress bar from the progress of the scan."""
         current_seconds, n_samples_done = time.monotonic(), scan_progress.n_done
         progress_bar_note = (
@@ -270,10 +269,6 @@ def make_scan_progress_reporter(
 
 def print_outcome_counts(scan_dataset: "xr.Dataset") -> None:
     """Print the number of samples for each outcome of a scan."""
-    import numpy as np
-
-    from vrw_jax.wheel import Outcome
-
     outcome_codes, n_samples_by_code = np.unique(scan_dataset.outcome.values, return_counts=True)
     outcomes = [Outcome(int(outcome_code)) for outcome_code in outcome_codes]
     print_text_table(
@@ -293,22 +288,17 @@ def print_outcome_counts(scan_dataset: "xr.Dataset") -> None:
 
 
 def print_wheel_and_gait(
-    params: "WheelParams",
+    params: WheelParams,
     step_result: Any,  # `step_result` is the step of any model.
-    start_state: "ArrayLike | tuple[float, ...]",
+    start_state: ArrayLike,
     n_steps_walked: int,
-    limit_cycle_result: "LimitCycle | ReturnMapCycle",
-    force_peaks: "Mapping[str, Any]",
+    limit_cycle_result: LimitCycle | ReturnMapCycle,
+    force_peaks: Mapping[str, Any],
 ) -> None:
     """Print a wheel, the last step of its walk, its limit cycle and the force peaks of the gait.
 
     `start_state` is the section state at the start of the last step.
     """
-    import numpy as np
-
-    from vrw_jax.cycles import format_floquet_multipliers
-    from vrw_jax.wheel import PARAMETER_DOMAINS, Outcome
-
     parameter_texts = [
         f"{parameter_name} {float(getattr(params, parameter_name)):g} {parameter_domain.unit}"
         for parameter_name, parameter_domain in PARAMETER_DOMAINS.items()
@@ -325,8 +315,6 @@ def print_wheel_and_gait(
             f"Walked {n_steps_walked} steps; the last changed the section state by "
             f"{last_state_change:.1e}."
         )
-        from vrw_jax.measures import MARGIN_MEASURES
-
         shown_measures = dict(step_result.measures())
         for measure_name in ("outcome", "solver_steps", *MARGIN_MEASURES):
             shown_measures.pop(measure_name, None)
@@ -358,10 +346,8 @@ def print_wheel_and_gait(
         _print_step_margins(step_result)
 
 
-def _print_measure_table(table_title: str, measure_values: "Mapping[str, Any]") -> None:
+def _print_measure_table(table_title: str, measure_values: Mapping[str, Any]) -> None:
     """Print a table of measures, given as a mapping from names to values."""
-    from vrw_jax.measures import MEASURES
-
     measure_table_rows = (
         (
             measure_description.long_name,
@@ -377,12 +363,8 @@ def _print_measure_table(table_title: str, measure_values: "Mapping[str, Any]") 
     )
 
 
-def _print_step_margins(step_result: "StepResult") -> None:
+def _print_step_margins(step_result: StepResult) -> None:
     """Print the margins of a step, and whether each of them holds."""
-    import numpy as np
-
-    from vrw_jax.measures import MARGIN_MEASURES
-
     margin_table_rows, n_violated_margins = [], 0
     for margin_name, margin_description in MARGIN_MEASURES.items():
         margin_values = np.atleast_1d(np.asarray(getattr(step_result.margins, margin_name)))

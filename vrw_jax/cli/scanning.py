@@ -6,26 +6,30 @@ from typing import TYPE_CHECKING
 import typer
 
 from vrw_jax.cli import console as printing
+from vrw_jax.cli.config import Config
 from vrw_jax.cli.console import (
     ExitCode,
     print_error_sentence,
     report_command_errors,
     stdout_console,
 )
+from vrw_jax.scans import (
+    ScanPlan,
+    find_matching_store,
+    open_or_create_store,
+    plan_scan,
+    resolve_executor,
+    run_scan,
+)
 
 if TYPE_CHECKING:
     import xarray as xr
 
-    from vrw_jax.cli.config import Config
-    from vrw_jax.scans import ScanPlan
-
 
 def plan_config_scan(
-    command_config: "Config", chunk_size: int | None, additional_measures: tuple[str, ...] = ()
-) -> "ScanPlan":
+    command_config: Config, chunk_size: int | None, additional_measures: tuple[str, ...] = ()
+) -> ScanPlan:
     """Return the plan for the scan that a config defines, extended by additional measures."""
-    from vrw_jax.scans import plan_scan
-
     assert command_config.design is not None
     measure_names = command_config.scan.measures
     if additional_measures:
@@ -45,10 +49,8 @@ def plan_config_scan(
     )
 
 
-def verify_scan_store(scan_plan: "ScanPlan", store_path: Path) -> None:
+def verify_scan_store(scan_plan: ScanPlan, store_path: Path) -> None:
     """Print whether a scan store is complete and intact, and exit with code 1 if it is damaged."""
-    from vrw_jax.scans import find_matching_store
-
     zarr_store = find_matching_store(scan_plan, store_path)
     if zarr_store is None:
         raise ValueError(
@@ -71,13 +73,11 @@ def verify_scan_store(scan_plan: "ScanPlan", store_path: Path) -> None:
 
 
 def compute_scan_with_progress(
-    scan_plan: "ScanPlan", store_path: Path, dask: str | None
+    scan_plan: ScanPlan, store_path: Path, dask: str | None
 ) -> "xr.Dataset":
     """Compute the missing chunks of a scan store with a progress bar, and return the labeled
     dataset.
     """
-    from vrw_jax.scans import open_or_create_store, resolve_executor, run_scan
-
     interruption_message = f"stopped; what is done stays in {store_path}, run the same to go on."
     with report_command_errors(interruption_message), resolve_executor(dask) as chunk_executor:
         zarr_store = open_or_create_store(scan_plan, store_path)
