@@ -118,9 +118,9 @@ def test_scans_run_over_their_constants():
 def test_a_lane_gives_the_same_bits_in_any_batch_and_on_any_number_of_cores(monkeypatch, n):
     lanes = [RANDOM_GENERATOR.normal(size=5_003) for _ in range(2)]
     run = make_program(evaluate_arithmetic, lanes, [np.float64(0.7)])
-    monkeypatch.setattr(simd.program, "_count_available_cores", lambda: 1)
+    monkeypatch.setattr(simd.program, "count_available_cores", lambda: 1)
     results_of_all_lanes = run([np.float64(0.7)], lanes)
-    monkeypatch.setattr(simd.program, "_count_available_cores", lambda: 3)
+    monkeypatch.setattr(simd.program, "count_available_cores", lambda: 3)
     selection = RANDOM_GENERATOR.permutation(5_003)[:n]
     for part, all_ in zip(
         run([np.float64(0.7)], [x[selection] for x in lanes]), results_of_all_lanes, strict=True

@@ -7,7 +7,6 @@ other samples. Batches run in parallel with one compiled program: one thread per
 per GPU.
 """
 
-import os
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from queue import SimpleQueue
@@ -33,6 +32,7 @@ from vrw_jax.scans.measure_catalog import (
     ValuesByVariable,
     parse_derivative,
 )
+from vrw_jax.simd import count_available_cores
 from vrw_jax.wheel import PARAMETER_NAMES, Outcome, WheelParams, make_wheel_from_parameters
 
 GaitOutputs = tuple[Array, Array, dict[str, Array]]
@@ -284,13 +284,6 @@ class _CompiledDevicePrograms(NamedTuple):
     device: jax.Device
     cycle_program: Callable
     step_program: Callable
-
-
-def count_available_cores() -> int:
-    """Return the number of processor cores that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 def concatenate_results(

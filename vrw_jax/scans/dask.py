@@ -19,7 +19,6 @@ from queue import Empty, SimpleQueue
 from typing import TYPE_CHECKING
 
 from vrw_jax.runtime import start_jax
-from vrw_jax.scans.collocation_engine import count_available_cores
 from vrw_jax.scans.design import ParameterSamples
 from vrw_jax.scans.engines import SampleEvaluator, make_scan_engine
 from vrw_jax.scans.measure_catalog import ValuesByVariable
@@ -30,6 +29,7 @@ from vrw_jax.scans.planning import (
     describe_computing_environment,
     describe_settings_difference,
 )
+from vrw_jax.simd import count_available_cores
 
 if TYPE_CHECKING:
     from distributed import Client, Future

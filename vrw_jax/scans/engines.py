@@ -40,7 +40,6 @@ from vrw_jax.scans.collocation_engine import (
     CollocationScanEngine,
     EvaluationRequest,
     concatenate_results,
-    count_available_cores,
     mask_failed_samples,
 )
 from vrw_jax.scans.design import ParameterSamples
@@ -50,6 +49,7 @@ from vrw_jax.scans.measure_catalog import (
     parse_derivative,
 )
 from vrw_jax.selection import ModelCode, find_selection_reason
+from vrw_jax.simd import count_available_cores
 from vrw_jax.tolerance import ModelIndex, measure_to_tolerance
 from vrw_jax.wheel import FRICTION_NAME, PARAMETER_NAMES, Outcome, make_wheel_from_parameters
 

@@ -10,10 +10,10 @@ from time import perf_counter
 import numpy as np
 
 from vrw_jax.numerics import with_default_jax_settings
-from vrw_jax.scans.collocation_engine import count_available_cores
 from vrw_jax.scans.design import AbstractSampleDesign, ParameterSamples
 from vrw_jax.scans.execution import find_matching_store
 from vrw_jax.scans.planning import ScanPlan
+from vrw_jax.simd import count_available_cores
 
 SCAN_STARTUP_SECONDS = 5.0
 """Typical time until the first sample is computed with cached code, s; see
@@ -99,11 +99,8 @@ def _select_spread_samples(
     axis_indices = np.unravel_index(flat_sample_indices, design.shape)
     indices_by_axis = dict(zip(design.dims, axis_indices, strict=True))
     return {
-        parameter_name: parameter_values[indices_by_axis[axis_name]]
-        for parameter_name, ((axis_name,), parameter_values) in (
-            design.make_result_coordinates().items()
-        )
-        if parameter_name in design.values_by_parameter
+        parameter_name: parameter_values[indices_by_axis.get(parameter_name, axis_indices[0])]
+        for parameter_name, parameter_values in design.values_by_parameter.items()
     }
 
 

@@ -12,6 +12,7 @@ from vrw_jax.simd.program import (
     compile_lane_function,
     compile_lane_program,
     compile_wasm_object,
+    count_available_cores,
     is_machine_code_available,
     load_saved_machine_code,
 )

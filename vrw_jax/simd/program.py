@@ -302,8 +302,8 @@ class _LoadedLaneProgram:
             min(first_lane_group + LANE_GROUPS_PER_TASK, n_lane_groups),
         )
         first_lane_groups_of_tasks = range(0, n_lane_groups, LANE_GROUPS_PER_TASK)
-        if len(first_lane_groups_of_tasks) > 1 and _count_available_cores() > 1:
-            with ThreadPoolExecutor(_count_available_cores()) as thread_pool:
+        if len(first_lane_groups_of_tasks) > 1 and count_available_cores() > 1:
+            with ThreadPoolExecutor(count_available_cores()) as thread_pool:
                 list(thread_pool.map(compute_lane_groups_of_task, first_lane_groups_of_tasks))
         else:
             for first_lane_group in first_lane_groups_of_tasks:
@@ -316,7 +316,7 @@ def _make_pointer_table(numpy_arrays: Sequence[np.ndarray]) -> Any:
     return (ctypes.c_void_p * len(numpy_arrays))(*(x.ctypes.data for x in numpy_arrays))
 
 
-def _count_available_cores() -> int:
+def count_available_cores() -> int:
     """Return the number of processor cores that this process may use."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
