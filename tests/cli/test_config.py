@@ -37,7 +37,7 @@ def test_the_quickstart_covers_table_1_with_at_least_4096_samples() -> None:
     assert design is not None
     assert design.size >= 4096
     assert set(design.swept_parameters) == {"damping", "stiffness", "natural_length", "slope"}
-    for name, (_, values) in design.make_result_coordinates().items():
+    for name, values in design.values_by_parameter.items():
         assert values.min() <= float(getattr(WheelParams(), name)) <= values.max()
 
 

@@ -1,5 +1,7 @@
 """Designs of scans: samples of the wheel's parameters, as a grid or as a list."""
 
+from __future__ import annotations
+
 import abc
 import hashlib
 import json
@@ -9,6 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from vrw_jax.measures import make_measure_attributes
+from vrw_jax.measures import xarray as xr
 from vrw_jax.printing import format_quantity
 from vrw_jax.validation import (
     check_int,
@@ -89,14 +93,13 @@ class AbstractSampleDesign(abc.ABC):
         - `region_of_samples`: one slice for each axis of the design.
         """
 
-    def make_result_coordinates(self) -> dict[str, tuple[tuple[str, ...], np.ndarray]]:
-        """Return the axis and the values of each coordinate of the labeled result, by the name of
-        the coordinate.
-        """
+    def make_result_coordinates(self) -> dict[str, xr.Variable]:
+        """Return the coordinates of the labeled result by their names."""
         return {
-            parameter_name: (
+            parameter_name: xr.Variable(
                 (parameter_name,) if parameter_name in self.dims else self.dims,
                 parameter_values,
+                make_measure_attributes(parameter_name),
             )
             for parameter_name, parameter_values in self.values_by_parameter.items()
         }
@@ -172,9 +175,9 @@ class SampleListDesign(AbstractSampleDesign):
             for parameter_name, parameter_values in self.values_by_parameter.items()
         }
 
-    def make_result_coordinates(self) -> dict[str, tuple[tuple[str, ...], np.ndarray]]:
-        sample_indices = np.arange(self.size)
-        return {"sample": (self.dims, sample_indices)} | super().make_result_coordinates()
+    def make_result_coordinates(self) -> dict[str, xr.Variable]:
+        sample_coordinate = xr.Variable(self.dims, np.arange(self.size))
+        return {"sample": sample_coordinate} | super().make_result_coordinates()
 
 
 def _merge_mapping_and_keywords(

@@ -15,7 +15,7 @@ import numpy as np
 
 from vrw_jax import simd
 from vrw_jax.cycles import CycleOptions, make_finder
-from vrw_jax.measures import MARGIN_MEASURES, make_locked_leg_coordinate, make_measure_attributes
+from vrw_jax.measures import MARGIN_MEASURES, make_locked_leg_coordinate
 from vrw_jax.measures import xarray as xr
 from vrw_jax.models import ModelCapabilities, ViscoelasticWheel
 from vrw_jax.numerics import StepOptions, batch_sizes
@@ -330,26 +330,13 @@ def _make_result_layout(
             get_variable_attributes(variable_name),
         )
 
-    result_coordinates = {
-        coordinate_name: xr.Variable(
-            dimension_names,
-            coordinate_values,
-            make_measure_attributes(coordinate_name)
-            if coordinate_name in design.swept_parameters
-            else None,
-        )
-        for coordinate_name, (
-            dimension_names,
-            coordinate_values,
-        ) in design.make_result_coordinates().items()
-    }
     return ResultLayout(
         sample_shape=design.shape,
         chunk_shape=choose_chunk_shape(design.shape, chunk_size),
         empty_variables={
             variable_name: make_empty_variable(variable_name) for variable_name in variable_names
         },
-        result_coordinates=result_coordinates | {"leg": locked_leg_coordinate},
+        result_coordinates=design.make_result_coordinates() | {"leg": locked_leg_coordinate},
     )
 
 
