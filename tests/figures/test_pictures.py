@@ -62,10 +62,6 @@ def test_colors_of_okabe_and_ito_stay_distinct_without_green_cones():
 
 def test_outcome_colors_stay_distinct_with_and_without_green_cones():
     rows = [colour for _, colour in style.OUTCOME_LABELS_AND_COLORS.values()]
-    rows += [
-        style.OKABE_ITO_YELLOW,
-        style.NOT_COMPUTED_SAMPLE_STYLE[1],
-    ]  # of unstable gaits, and of what is missing
     for i, one in enumerate(rows):
         for other in rows[:i]:
             plain = np.array(mpl.colors.to_rgb(one)) - mpl.colors.to_rgb(other)

@@ -42,8 +42,8 @@ def test_a_label_has_name_symbol_and_unit(label, text):
 
 def test_every_outcome_has_its_own_color():
     colours = [
-        style.select_outcome_style(int(code))[1]
-        for code in (*Outcome, style.UNSTABLE_CYCLE_CODE, -1)
+        style.OUTCOME_LABELS_AND_COLORS[code][1]
+        for code in (*Outcome, style.UNSTABLE_CYCLE_CODE, style.NOT_COMPUTED_CODE)
     ]
     assert len(set(colours)) == len(Outcome) + 2
 

@@ -33,7 +33,6 @@ from vrw_jax.figures.style import (
     make_outcome_patches,
     make_panel_grid,
     require_dataset_variables,
-    select_outcome_style,
     select_special_point_style,
     typeset_greek_symbols,
 )
@@ -325,7 +324,7 @@ def _draw_outcome_samples(
     axes: Axes, x: np.ndarray, y: np.ndarray, outcome_codes: np.ndarray, marker_size: float
 ) -> None:
     """Draw samples in the colors of their outcomes."""
-    outcome_colors = [select_outcome_style(int(outcome_code))[1] for outcome_code in outcome_codes]
+    outcome_colors = [OUTCOME_LABELS_AND_COLORS[outcome_code][1] for outcome_code in outcome_codes]
     axes.scatter(x, y, s=marker_size, color=outcome_colors, linewidths=0.0, rasterized=True)
 
 
@@ -440,12 +439,9 @@ def _add_color_bar(
     """Add a color bar, whose ends are pointed if finite `measure_values` lie beyond them."""
     min_shown_value, max_shown_value = colored_values.get_clim()
     finite_values = measure_values[np.isfinite(measure_values)]
-    pointed_ends = {
-        (False, False): "neither",
-        (True, False): "min",
-        (False, True): "max",
-        (True, True): "both",
-    }[bool((finite_values < min_shown_value).any()), bool((finite_values > max_shown_value).any())]
+    has_lower_values = bool((finite_values < min_shown_value).any())
+    has_higher_values = bool((finite_values > max_shown_value).any())
+    pointed_ends = ("neither", "min", "max", "both")[has_lower_values + 2 * has_higher_values]
     figure.colorbar(colored_values, ax=axes, extend=pointed_ends, **color_bar_settings).set_label(
         label_text
     )

@@ -90,7 +90,15 @@ MAX_PANELS_PER_ROW = 3
 parameter symbols.
 """
 
-OUTCOME_LABELS_AND_COLORS: dict[Outcome, tuple[str, str]] = {
+UNSTABLE_CYCLE_CODE = 100
+"""Outcome code that figures use for a cycle with a spectral radius of at least 1. It is chosen
+above all codes of `Outcome`.
+"""
+
+NOT_COMPUTED_CODE = -1
+"""Outcome code of a sample that has not been computed."""
+
+OUTCOME_LABELS_AND_COLORS: dict[int, tuple[str, str]] = {
     Outcome.STEPPED: ("stable limit cycle", OKABE_ITO_BLUE),
     Outcome.TOUCHDOWN_BEFORE_STOPPER: ("touchdown before stopper", OKABE_ITO_AMBER),
     Outcome.STOPPER_IN_DOUBLE_SUPPORT: ("stopper in DLS", OKABE_ITO_GREEN),
@@ -109,8 +117,10 @@ OUTCOME_LABELS_AND_COLORS: dict[Outcome, tuple[str, str]] = {
     Outcome.BRANCH_ENDS_BEFORE_TARGET: ("branch ends on the way", "#454545"),
     Outcome.PAINLEVE_PARADOX: ("friction paradox", "#862DB8"),
     Outcome.CAME_TO_REST: ("came to rest", "#8C6D31"),
+    UNSTABLE_CYCLE_CODE: ("unstable limit cycle", OKABE_ITO_YELLOW),
+    NOT_COMPUTED_CODE: ("not computed", "#FFFFFF"),
 }
-"""Label and color for each outcome."""
+"""Label and color for each outcome code."""
 
 SPECIAL_POINT_LINE_STYLES = ("-", "--", ":", "-.", (0, (5, 1, 1, 1, 1, 1)), (0, (8, 3)))
 """Line styles for curves of special points, in the order of names in
@@ -133,14 +143,6 @@ SPECIAL_POINT_NAMES_BY_COLOR = {
 """Names of special points, by color. The index of a name determines the line style of the special
 point, which is the same in every figure. Green and pink share no line style, because color-blind
 readers may confuse them.
-"""
-
-NOT_COMPUTED_SAMPLE_STYLE = ("not computed", "#FFFFFF")
-"""Label and color for a sample that has not been computed."""
-
-UNSTABLE_CYCLE_CODE = 100
-"""Outcome code that figures use for a cycle with a spectral radius of at least 1. It is chosen
-above all codes of `Outcome`.
 """
 
 
@@ -323,20 +325,6 @@ def select_special_point_style(special_point_name: str) -> tuple[str, Any]:
     ]
 
 
-def select_outcome_style(outcome_code: int) -> tuple[str, str]:
-    """Return the label and the color for an outcome code.
-
-    The code may also mean an unstable cycle, or a sample that has not been computed.
-    """
-    if outcome_code == UNSTABLE_CYCLE_CODE:
-        return "unstable limit cycle", OKABE_ITO_YELLOW
-    return (
-        OUTCOME_LABELS_AND_COLORS[Outcome(outcome_code)]
-        if outcome_code >= 0
-        else NOT_COMPUTED_SAMPLE_STYLE
-    )
-
-
 def draw_outcome_cells(
     axes: Axes,
     x: np.ndarray,
@@ -349,7 +337,7 @@ def draw_outcome_cells(
     Cells with codes that are not in `drawn_outcome_codes` are omitted.
     """
     outcome_color_map = ListedColormap(
-        [select_outcome_style(int(outcome_code))[1] for outcome_code in drawn_outcome_codes]
+        [OUTCOME_LABELS_AND_COLORS[outcome_code][1] for outcome_code in drawn_outcome_codes]
     )
     outcome_code_indices = np.ma.masked_where(
         ~np.isin(outcome_codes, drawn_outcome_codes),
@@ -368,7 +356,8 @@ def draw_outcome_cells(
 
 def make_outcome_patches(outcome_codes: Iterable[int]) -> list[Patch]:
     """Return a legend entry for each outcome code."""
+    outcome_styles = [OUTCOME_LABELS_AND_COLORS[outcome_code] for outcome_code in outcome_codes]
     return [
         Patch(facecolor=outcome_color, edgecolor="#888888", linewidth=0.4, label=outcome_label)
-        for outcome_label, outcome_color in map(select_outcome_style, map(int, outcome_codes))
+        for outcome_label, outcome_color in outcome_styles
     ]
