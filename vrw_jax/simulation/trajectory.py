@@ -113,7 +113,7 @@ def simulate(
     line_slopes = given_params.slope if given_params.slope.ndim else jnp.full(n_steps, params.slope)
     ground_line_slopes = complete_ground_line_slopes(line_slopes, n_steps)
     ground_lines = GroundLines(np.asarray(ground_line_slopes, float), float(s.Mt * s.g))
-    models_and_wheels = [(model, params)]
+    models_and_wheels = [(model, params)] * n_steps
     if stepwise_ground is not None:
         models_and_wheels = [
             model.with_step_ground(params, step_ground)
@@ -282,7 +282,7 @@ _sample_step = eqx.filter_jit(lambda model, *arguments: model.sample_step(*argum
 
 
 StepwiseModelsAndWheels = list[tuple[Any, WheelParams]]
-"""Model and wheel for each step, or one pair for all steps."""
+"""Model and wheel for each step."""
 
 
 def specify_phase_trajectory(
@@ -290,15 +290,11 @@ def specify_phase_trajectory(
 ) -> TrajectorySpecification:
     """Return the trajectory specification for a model whose steps have the paper's phases."""
 
-    symbols_by_step = [
-        jax.tree.map(float, separate_next_slope(params)[0]).symbols()
-        for _, params in models_and_wheels
-    ]
-
     def sample_phase_step(x: Array, k: int) -> SampledStep:
-        i = min(k, len(models_and_wheels) - 1)
-        trajectory = _sample_step(*models_and_wheels[i], x, options, n_samples)
-        s, phase_durations = symbols_by_step[i], np.asarray(trajectory.durations)
+        step_model, step_params = models_and_wheels[k]
+        trajectory = _sample_step(step_model, step_params, x, options, n_samples)
+        s = jax.tree.map(float, separate_next_slope(step_params)[0]).symbols()
+        phase_durations = np.asarray(trajectory.durations)
         state, energies, foot_forces = (
             np.moveaxis(np.asarray(samples), -1, 0)
             for samples in (trajectory.state, trajectory.energy, trajectory.forces)
@@ -406,9 +402,8 @@ def specify_contact_trajectory(
     n_legs = models_and_wheels[0][1].n_legs
 
     def sample_contact_step(x: Array, k: int) -> SampledStep:
-        step_model_and_wheel = models_and_wheels[min(k, len(models_and_wheels) - 1)]
         trajectory, step_columns = jax.tree.map(
-            np.array, _compute_contact_columns(*step_model_and_wheel, x, options, n_samples)
+            np.array, _compute_contact_columns(*models_and_wheels[k], x, options, n_samples)
         )
         sample_shape = (len(trajectory.duration), n_samples)
         repeat_over_samples = lambda values_by_leg: np.repeat(
