@@ -8,12 +8,12 @@ The command writes `basin.svg` and `.png` to `results/` or the given folder.
 """
 
 import numpy as np
+import xarray as xr
 
 import vrw_jax as vrw
 from experiments.shared.command import parse_folder_and_start_jax
 from vrw_jax import figures as plots
 from vrw_jax.figures.style import format_value_label
-from vrw_jax.simulation.basins import compute_walk_end_fractions
 
 DAMPINGS = (100.0, 200.0)  # N s/m
 ANGULAR_RATES = np.linspace(0.4, 3.2, 57)  # rad/s
@@ -44,6 +44,29 @@ def main() -> None:
             basin_result.orbit_period.values,
         )
     plots.save(plots.basin_figure(results, titles), folder, "basin")
+
+
+def compute_walk_end_fractions(basin_dataset: xr.Dataset) -> dict[str, float]:
+    """Return the fraction of starts for each end of a walk, by the name of the end.
+
+    The names are "attractor 0", "attractor 1" and so on, "unsettled", and the names of outcomes.
+    """
+    attractor_indices = basin_dataset.attractor.values.ravel()
+    outcome_codes = basin_dataset.outcome.values.ravel()
+    walk_end_names = [
+        f"attractor {attractor_code}"
+        if attractor_code >= 0
+        else (
+            "unsettled"
+            if outcome_code == vrw.Outcome.STEPPED
+            else vrw.Outcome(int(outcome_code)).name
+        )
+        for attractor_code, outcome_code in zip(attractor_indices, outcome_codes, strict=True)
+    ]
+    return {
+        walk_end_name: walk_end_names.count(walk_end_name) / len(walk_end_names)
+        for walk_end_name in sorted(set(walk_end_names))
+    }
 
 
 if __name__ == "__main__":

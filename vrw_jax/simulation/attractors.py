@@ -219,7 +219,7 @@ def find_distinct_orbits(walk_ends: PeriodicWalkEnds) -> DistinctOrbits:
         else:
             orbit_indices[i] = len(distinct_orbits)
             distinct_orbits.append(orbit_states)
-    n_starts_by_orbit = [int(np.sum(orbit_indices == j)) for j in range(len(distinct_orbits))]
+    n_starts_by_orbit = np.bincount(orbit_indices[orbit_indices >= 0])
     orbit_sort_order = np.argsort(n_starts_by_orbit)[::-1]
     rank_by_orbit = np.full(len(distinct_orbits) + 1, -1)
     rank_by_orbit[orbit_sort_order] = np.arange(len(distinct_orbits))

@@ -38,7 +38,7 @@ from vrw_jax.validation import (
     require_untraced_arguments,
     with_renamed_arguments,
 )
-from vrw_jax.wheel import Outcome, WheelParams, transitions
+from vrw_jax.wheel import WheelParams, transitions
 
 StartGrid = Mapping[str, float | Sequence[float] | np.ndarray]
 """One or more values of each component of a start, by name. A component with a single number is not
@@ -252,23 +252,4 @@ def _make_orbit_variables(
             )
             for measure_name, measure_values in orbit_measures.items()
         },
-    }
-
-
-def compute_walk_end_fractions(basin_dataset: xr.Dataset) -> dict[str, float]:
-    """Return the fraction of starts for each end of a walk, by the name of the end.
-
-    The names are "attractor 0", "attractor 1" and so on, "unsettled", and the names of outcomes.
-    """
-    attractor_indices = basin_dataset.attractor.values.ravel()
-    outcome_codes = basin_dataset.outcome.values.ravel()
-    walk_end_names = [
-        f"attractor {attractor_code}"
-        if attractor_code >= 0
-        else ("unsettled" if outcome_code == Outcome.STEPPED else Outcome(int(outcome_code)).name)
-        for attractor_code, outcome_code in zip(attractor_indices, outcome_codes, strict=True)
-    ]
-    return {
-        walk_end_name: walk_end_names.count(walk_end_name) / len(walk_end_names)
-        for walk_end_name in sorted(set(walk_end_names))
     }
