@@ -171,9 +171,17 @@ class TuneConfig:
     @classmethod
     def from_table(cls, config_table: ConfigTable) -> "TuneConfig":
         """Read the settings of the table `[tune]` and of its subtables."""
+        _require_known_keys(config_table, cls.__dataclass_fields__, "[tune]", "settings")
+        bounds_table = config_table.get("bounds")
+        if not isinstance(bounds_table, dict) or not bounds_table:
+            raise ValueError(
+                "[tune] has no free parameter, but it needs at least one: add [tune.bounds] with "
+                "lines such as damping = [20.0, 215.0]."
+            )
+        _require_known_keys(bounds_table, PARAMETER_NAMES, "[tune.bounds]", "parameters")
         return cls(
             **_parse_settings(
-                {"bounds": {}, **config_table},
+                config_table,
                 "[tune]",
                 objective=lambda setting_name, value: (
                     value
@@ -185,7 +193,10 @@ class TuneConfig:
                         '"dls_fraction" or objective = { dls_fraction = 1.0, speed = 0.1 }',
                     )
                 ),
-                bounds=_parse_free_parameters,
+                bounds=lambda *_: {
+                    parameter_name: _parse_parameter_range(parameter_name, parameter_bounds)
+                    for parameter_name, parameter_bounds in bounds_table.items()
+                },
                 constraints=partial(
                     _parse_numbers_by_name,
                     requirement_text="a table: write [tune.constraints] and below it lines such "
@@ -599,22 +610,6 @@ def _parse_numbers_by_name(
     if not isinstance(config_value, dict):
         raise _make_value_error(setting_name, config_value, requirement_text)
     return {name: _parse_finite_number(name, number) for name, number in config_value.items()}
-
-
-def _parse_free_parameters(
-    _setting_name: str, config_value: object
-) -> dict[str, tuple[float, float]]:
-    """Return the bounds of each free parameter of a tuning run, by name."""
-    if not isinstance(config_value, dict) or not config_value:
-        raise ValueError(
-            "[tune] has no free parameter, but it needs at least one: add [tune.bounds] with "
-            "lines such as damping = [20.0, 215.0]."
-        )
-    _require_known_keys(config_value, PARAMETER_NAMES, "[tune.bounds]", "parameters")
-    return {
-        parameter_name: _parse_parameter_range(parameter_name, parameter_bounds)
-        for parameter_name, parameter_bounds in config_value.items()
-    }
 
 
 def _parse_positive_number(setting_name: str, config_value: object) -> float:

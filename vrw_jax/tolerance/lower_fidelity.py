@@ -206,20 +206,18 @@ def _make_lower_fidelity_gaits(
 
 
 @jax.jit
+@jax.vmap
 def _compute_rigid_gaits(params: WheelParams) -> tuple:
     """Return section states of the gaits of rigid wheels, step quantities and their Jacobians."""
-    rigid_model, step_options = RigidWheel(stop_at_lift_off=False), StepOptions()
+    rigid_model = RigidWheel(stop_at_lift_off=False)
 
-    def compute_rigid_gait(params: WheelParams) -> tuple:
-        def compute_end_state_and_measures(x: jax.Array) -> jax.Array:
-            gait_step = rigid_model.take_step(params, x, step_options)
-            no_time = jnp.zeros_like(gait_step.step_length)
-            step_duration = jnp.sum(gait_step.durations)
-            return jnp.stack(
-                [no_time, step_duration, no_time, gait_step.step_length, *gait_step.section_state]
-            )
+    def compute_step_quantities(x: jax.Array) -> jax.Array:
+        gait_step = rigid_model.take_step(params, x, StepOptions())
+        no_time = jnp.zeros_like(gait_step.step_length)
+        step_duration = jnp.sum(gait_step.durations)
+        return jnp.stack(
+            [no_time, step_duration, no_time, gait_step.step_length, *gait_step.section_state]
+        )
 
-        section_state = rigid_model.compute_default_start(params)
-        return section_state, *evaluate_with_jacobian(compute_end_state_and_measures, section_state)
-
-    return jax.vmap(compute_rigid_gait)(params)
+    section_state = rigid_model.compute_default_start(params)
+    return section_state, *evaluate_with_jacobian(compute_step_quantities, section_state)
