@@ -5,7 +5,6 @@ everything on which the content depends. The content is executed. Therefore reco
 from a folder that no other user can write to, unless the user has declared the folder trusted.
 """
 
-import contextlib
 import functools
 import hashlib
 import importlib.metadata
@@ -49,16 +48,13 @@ def compute_source_digest() -> str:
     return source_hasher.hexdigest()
 
 
-@functools.cache
-def _list_library_versions() -> tuple[str, ...]:
-    """Return the versions of Python and of the installed libraries in `TRACE_LIBRARY_NAMES`."""
-    library_version_texts = [f"python {sys.version_info[0]}.{sys.version_info[1]}"]
-    for library_name in TRACE_LIBRARY_NAMES:
-        with contextlib.suppress(importlib.metadata.PackageNotFoundError):
-            library_version_texts.append(
-                f"{library_name} {importlib.metadata.version(library_name)}"
-            )
-    return tuple(library_version_texts)
+@functools.cache  # Reading the metadata takes longer than the steps of a walk.
+def find_installed_version(library_name: str) -> str:
+    """Return the version of an installed library, or "not installed"."""
+    try:
+        return importlib.metadata.version(library_name)
+    except importlib.metadata.PackageNotFoundError:
+        return "not installed"
 
 
 def describe_trace_environment() -> tuple[object, ...]:
@@ -68,7 +64,8 @@ def describe_trace_environment() -> tuple[object, ...]:
     jax_config: Any = jax.config
     return (
         compute_source_digest(),
-        _list_library_versions(),
+        sys.version_info[:2],
+        *map(find_installed_version, TRACE_LIBRARY_NAMES),
         jax.dtypes.canonicalize_dtype(float).name,
         jax_config.jax_default_matmul_precision,
         jax_config.jax_numpy_dtype_promotion,

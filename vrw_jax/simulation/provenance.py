@@ -1,12 +1,11 @@
 """Provenance of results: versions, device, floating-point type, tolerances and parameters."""
 
-import functools
-import importlib.metadata
 import platform
 
 import jax
 
 from vrw_jax.numerics import StepOptions
+from vrw_jax.runtime import find_installed_version
 from vrw_jax.wheel import PARAMETER_NAMES, WheelParams
 
 
@@ -29,7 +28,7 @@ def collect_provenance_attributes(
         "parameter_n_legs": params.n_legs,
         "model": repr(model),
         "versions": ", ".join(
-            f"{library_name} {_find_installed_version(library_name)}"
+            f"{library_name} {find_installed_version(library_name)}"
             for library_name in library_names
         )
         + f", python {platform.python_version()}",
@@ -39,12 +38,3 @@ def collect_provenance_attributes(
         "rtol": float(options.rtol),
         "atol": float(options.atol),
     }
-
-
-@functools.cache  # Reading the metadata takes longer than the steps of a walk.
-def _find_installed_version(library_name: str) -> str:
-    """Return the version of an installed library, or "not installed"."""
-    try:
-        return importlib.metadata.version(library_name)
-    except importlib.metadata.PackageNotFoundError:
-        return "not installed"
