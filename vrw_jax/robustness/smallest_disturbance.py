@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from vrw_jax.cycles import AbstractCycle
-from vrw_jax.models import AbstractWheel, AdvanceResult
+from vrw_jax.models import AdvanceResult
 from vrw_jax.numerics import (
     StepOptions,
     batch_sizes,
@@ -381,12 +381,7 @@ def _walk_after_disturbance(
     for phase_index in np.unique(phase_indices):
         is_in_phase = phase_indices == phase_index
         finish_disturbed_batch = functools.partial(
-            _finish_disturbed_steps,
-            stable_gait.model,
-            stable_gait.step_options,
-            stable_gait.params,
-            int(phase_index),
-            gait.foot_distance,
+            _finish_disturbed_steps, stable_gait, int(phase_index), gait.foot_distance
         )
         step_results: Any = map_in_batches(
             finish_disturbed_batch,
@@ -407,12 +402,7 @@ def _walk_after_disturbance(
 
 @eqx.filter_jit
 def _finish_disturbed_steps(
-    model: AbstractWheel,
-    options: StepOptions,
-    params: WheelParams,
-    phase_index: int,
-    foot_distance: Array,
-    phase_states: Array,
+    stable_gait: StableGait, phase_index: int, foot_distance: Array, phase_states: Array
 ) -> AdvanceResult:
     """Return the results of gait steps that begin at `phase_states`, within the phase
     `phase_index`.
@@ -420,6 +410,7 @@ def _finish_disturbed_steps(
     - `phase_states`: states (theta, L1, L2) and their rates after the disturbance, shape (states,
       6).
     """
+    params, model, options, _ = stable_gait
     finish_step = lambda phase_state: model.finish_step(
         params, phase_index, foot_distance, phase_state, options
     )
