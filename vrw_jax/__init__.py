@@ -179,11 +179,10 @@ def __getattr__(name: str) -> Any:
         return importlib.metadata.version("vrw-jax")
     if name == "plot":  # imports matplotlib only if figures are drawn
         return importlib.import_module("vrw_jax.figures")
-    if sentence := describe_renamed_attribute("vrw_jax", name, NEW_PUBLIC_NAME_BY_OLD_NAME):
-        raise AttributeError(sentence)
     raise AttributeError(
-        f"vrw_jax has no {name!r}{format_name_suggestion(name, __all__)}: dir(vrw_jax) lists what "
-        "it has."
+        describe_renamed_attribute("vrw_jax", name, NEW_PUBLIC_NAME_BY_OLD_NAME)
+        or f"vrw_jax has no {name!r}{format_name_suggestion(name, __all__)}: dir(vrw_jax) lists "
+        "what it has."
     )
 
 

@@ -8,7 +8,7 @@ import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TextIO
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import typer
@@ -106,17 +106,12 @@ def show_warnings_as_sentences() -> None:
     default_show_warning = warnings.showwarning
 
     def show_warning(
-        message: Warning | str,
-        category: type[Warning],
-        filename: str,
-        lineno: int,
-        file: TextIO | None = None,
-        line: str | None = None,
+        message: Warning | str, category: type[Warning], filename: str, *args: Any, **kwargs: Any
     ) -> None:
         if category is UserWarning and Path(filename).is_relative_to(Path(__file__).parents[1]):
             print_error_sentence(str(message))
         else:
-            default_show_warning(message, category, filename, lineno, file, line)
+            default_show_warning(message, category, filename, *args, **kwargs)
 
     warnings.showwarning = show_warning
 

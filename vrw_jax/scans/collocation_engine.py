@@ -17,6 +17,7 @@ import jax
 import numpy as np
 from jaxtyping import Array
 
+from vrw_jax import simd
 from vrw_jax.cycles import AbstractCycle, CycleOptions, confirm_outcome_by_step, make_finder
 from vrw_jax.measures import MARGIN_MEASURES
 from vrw_jax.numerics import (
@@ -32,7 +33,6 @@ from vrw_jax.scans.measure_catalog import (
     ValuesByVariable,
     parse_derivative,
 )
-from vrw_jax.simd import count_available_cores
 from vrw_jax.wheel import PARAMETER_NAMES, Outcome, WheelParams, make_wheel_from_parameters
 
 GaitOutputs = tuple[Array, Array, dict[str, Array]]
@@ -89,7 +89,7 @@ class CollocationScanEngine:
         - `n_threads`: number of CPU threads, by default one per core.
         """
         measure_names, base_wheel, wheel_model, step_options, cycle_options, *_ = evaluation_request
-        self._n_threads = count_available_cores() if n_threads is None else n_threads
+        self._n_threads = simd.count_available_cores() if n_threads is None else n_threads
         self._evaluation_request = evaluation_request
         requested_derivatives = evaluation_request.requested_derivatives
         differentiation_parameters = list(
@@ -225,10 +225,9 @@ class CollocationScanEngine:
             confirmed_outcome = confirm_outcome_by_step(
                 cycle_outcome, cycle_section_state, step_outcome, step_end_state
             )
-            sample_measures = cycle_measures | step_measures
         finally:
             self._free_programs.put(device_programs)
-        return mask_failed_samples(confirmed_outcome, sample_measures)
+        return mask_failed_samples(confirmed_outcome, cycle_measures | step_measures)
 
     def _compile_programs(self) -> None:
         """Compile the functions for cycles and for gait steps in parallel, once for each device.
@@ -243,15 +242,15 @@ class CollocationScanEngine:
         section_states_shape = jax.ShapeDtypeStruct((self._batch_size, 3), parameter_dtype)
         # Threads have separate settings.
         compile_function = with_default_jax_settings(compile_exported_function)
-        step_arguments = (
-            parameter_rows_shape,
-            section_states_shape,
-            self._evaluation_request.step_options,
+        step_options = self._evaluation_request.step_options
+        names_functions_arguments = (
+            ("cycle", self._evaluate_cycle_batch, (parameter_rows_shape,)),
+            (
+                "step",
+                self._evaluate_step_batch,
+                (parameter_rows_shape, section_states_shape, step_options),
+            ),
         )
-        functions_and_arguments = {
-            "cycle": (self._evaluate_cycle_batch, (parameter_rows_shape,)),
-            "step": (self._evaluate_step_batch, step_arguments),
-        }
         with ThreadPoolExecutor(2) as scan_thread_pool:
             futures_by_device = {
                 device: [
@@ -262,7 +261,7 @@ class CollocationScanEngine:
                         (program_name, *self._program_cache_key),
                         device,
                     )
-                    for program_name, (batch_function, arguments) in functions_and_arguments.items()
+                    for program_name, batch_function, arguments in names_functions_arguments
                 ]
                 for device in local_devices
             }

@@ -18,6 +18,7 @@ from concurrent.futures import ThreadPoolExecutor
 from queue import Empty, SimpleQueue
 from typing import TYPE_CHECKING
 
+from vrw_jax import simd
 from vrw_jax.runtime import start_jax
 from vrw_jax.scans.design import ParameterSamples
 from vrw_jax.scans.engines import SampleEvaluator, make_scan_engine
@@ -29,7 +30,6 @@ from vrw_jax.scans.planning import (
     describe_computing_environment,
     describe_settings_difference,
 )
-from vrw_jax.simd import count_available_cores
 
 if TYPE_CHECKING:
     from distributed import Client, Future
@@ -67,7 +67,7 @@ def connect_dask_workers(scheduler_address: str) -> Iterator[ChunkExecutor]:
         exit_stack.enter_context(hide_cancelled_tasks_in_log())
         if scheduler_address == "local":
             local_cluster = LocalCluster(
-                n_workers=count_available_cores(), threads_per_worker=1, dashboard_address=None
+                n_workers=simd.count_available_cores(), threads_per_worker=1, dashboard_address=None
             )
             dask_client = Client(exit_stack.enter_context(local_cluster), set_as_default=False)
         else:

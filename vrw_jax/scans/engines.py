@@ -20,6 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from vrw_jax import simd
 from vrw_jax.cycles import (
     MeasureReader,
     ReturnMapCycle,
@@ -49,7 +50,6 @@ from vrw_jax.scans.measure_catalog import (
     parse_derivative,
 )
 from vrw_jax.selection import ModelCode, find_selection_reason
-from vrw_jax.simd import count_available_cores
 from vrw_jax.tolerance import ModelIndex, measure_to_tolerance
 from vrw_jax.wheel import FRICTION_NAME, PARAMETER_NAMES, Outcome, make_wheel_from_parameters
 
@@ -63,7 +63,7 @@ class UnilateralScanEngine:
     def __init__(self, evaluation_request: EvaluationRequest, n_threads: int | None = None) -> None:
         self._evaluation_request = evaluation_request
         variable_names, base_wheel, self._wheel_model, step_options, *_ = evaluation_request
-        self._n_threads = count_available_cores() if n_threads is None else n_threads
+        self._n_threads = simd.count_available_cores() if n_threads is None else n_threads
         self._requested_derivatives = evaluation_request.requested_derivatives
         measure_names = [name for name in variable_names if parse_derivative(name) is None]
         gait_finder: Any = make_finder(

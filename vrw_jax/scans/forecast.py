@@ -9,11 +9,11 @@ from time import perf_counter
 
 import numpy as np
 
+from vrw_jax import simd
 from vrw_jax.numerics import with_default_jax_settings
 from vrw_jax.scans.design import AbstractSampleDesign, ParameterSamples
 from vrw_jax.scans.execution import find_matching_store
 from vrw_jax.scans.planning import ScanPlan
-from vrw_jax.simd import count_available_cores
 
 SCAN_STARTUP_SECONDS = 5.0
 """Typical time until the first sample is computed with cached code, s; see
@@ -64,7 +64,7 @@ def forecast_scan(scan_plan: ScanPlan, store_path: Path) -> dict[str, str]:
     if not n_missing_samples:
         return forecast_texts | {"time": "none: the store is complete"}
     n_measured_samples = min(
-        n_missing_samples, measure_catalog.forecast_samples_per_core * count_available_cores()
+        n_missing_samples, measure_catalog.forecast_samples_per_core * simd.count_available_cores()
     )
     scan_engine = scan_plan.build_scan_engine()
     start_seconds = perf_counter()
@@ -85,7 +85,7 @@ def forecast_scan(scan_plan: ScanPlan, store_path: Path) -> dict[str, str]:
         "time": f"about "
         f"{format_duration(n_missing_samples / samples_per_second + SCAN_STARTUP_SECONDS)}: "
         f"{n_missing_samples:,} samples at {samples_per_second:,.0f} per "
-        f"second on {count_available_cores()} cores, {SCAN_STARTUP_SECONDS:.0f} s to start",
+        f"second on {simd.count_available_cores()} cores, {SCAN_STARTUP_SECONDS:.0f} s to start",
         "measured": f"just now, on {n_measured_samples:,} samples spread over the design; the code "
         f"for it took {compilation_end_seconds - start_seconds:.0f} s and is kept",
     }

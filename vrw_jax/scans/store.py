@@ -170,7 +170,7 @@ class MemoryResultStore(AbstractResultStore):
         )
 
     def find_missing_chunks(self) -> list[int]:
-        return list(np.flatnonzero(~self._is_chunk_done).tolist())
+        return np.flatnonzero(~self._is_chunk_done).tolist()
 
     def write_chunk(self, chunk_index: int, chunk_results: ValuesByVariable) -> None:
         chunk_slices = self._result_layout.compute_chunk_region(chunk_index)
@@ -227,7 +227,7 @@ class ZarrResultStore(AbstractResultStore):
             return list(range(self._result_layout.n_chunks))
         are_chunks_written = self._chunk_checksums.are_chunks_marked()
         are_chunks_written[np.asarray(self.damaged_chunks, int)] = False
-        return list(np.flatnonzero(~are_chunks_written).tolist())
+        return np.flatnonzero(~are_chunks_written).tolist()
 
     def write_chunk(self, chunk_index: int, chunk_results: ValuesByVariable) -> None:
         chunk_slices = self._result_layout.compute_chunk_region(chunk_index)
