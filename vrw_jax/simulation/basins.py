@@ -192,8 +192,6 @@ def compute_section_states_of_starts(
     landing results in this start. The angular rates before and after this landing are proportional.
     A section state is NaN if no landing leads to the start.
     """
-    if start_component_names == PRE_TOUCHDOWN_COMPONENT_NAMES:
-        return np.where(np.isfinite(starts).all(-1, keepdims=True), starts, np.nan)
     s = params.symbols()
 
     def find_section_state_before(post_landing_state: jax.Array) -> jax.Array:
@@ -209,7 +207,9 @@ def compute_section_states_of_starts(
             jnp.nan,
         )
 
-    section_states = np.asarray(jax.vmap(find_section_state_before)(jnp.asarray(starts)))
+    section_states = starts
+    if start_component_names == POST_LANDING_COMPONENT_NAMES:
+        section_states = np.asarray(jax.vmap(find_section_state_before)(jnp.asarray(starts)))
     return np.where(np.isfinite(section_states).all(-1, keepdims=True), section_states, np.nan)
 
 

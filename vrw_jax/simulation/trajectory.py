@@ -232,7 +232,7 @@ def sample_walk_steps(
     support. Positions (m) and energies (J) are converted to the frame of line 0. Its origin is the
     first foothold.
     """
-    columns_by_step: list[dict[str, np.ndarray]] = []
+    columns_by_step = []
     walk_outcome, k, step_start_time = Outcome.STEPPED, 0, 0.0
     foothold_x, foothold_z = 0.0, 0.0
     is_ground_uneven = np.ptp(ground_lines.slopes) > 0.0
@@ -328,21 +328,16 @@ def specify_phase_trajectory(
             trajectory.section_state,
         )
 
-    dataset_attributes: dict[str, object] = {
-        "frame": "x downhill along the slope, z normal to it, first foot at the origin",
-        "start_meaning": "theta-, dtheta-, dL1- just before the first landing, rad, rad/s, m/s",
-    }
     return TrajectorySpecification(
         sample_phase_step,
         tuple(TRAJECTORY_MEASURES),
-        POSITION_NAMES_ALONG_SLOPE,
+        ("x", "foot_1_x", "foot_2_x", "hub_x"),
         {},
-        dataset_attributes,
+        {
+            "frame": "x downhill along the slope, z normal to it, first foot at the origin",
+            "start_meaning": "theta-, dtheta-, dL1- just before the first landing, rad, rad/s, m/s",
+        },
     )
-
-
-POSITION_NAMES_ALONG_SLOPE = ("x", "foot_1_x", "foot_2_x", "hub_x")
-"""Names of the variables that are positions along the slope."""
 
 
 CONTACT_MOTION_NAMES = ("time", "step", "hub_x", "hub_z", "theta", "dtheta")
@@ -399,7 +394,6 @@ def specify_contact_trajectory(
     """
 
     friction_by_step = [float(model.friction) for model, _ in models_and_wheels]
-    n_legs = models_and_wheels[0][1].n_legs
 
     def sample_contact_step(x: Array, k: int) -> SampledStep:
         trajectory, step_columns = jax.tree.map(
@@ -427,16 +421,15 @@ def specify_contact_trajectory(
             jnp.asarray(trajectory.section_state),
         )
 
-    dataset_attributes: dict[str, object] = {
-        "frame": "x downhill along the slope, z normal to it, first landing at the origin",
-        "friction": friction_by_step[0] if len(set(friction_by_step)) == 1 else friction_by_step,
-    }
-    variable_names = (*CONTACT_MOTION_NAMES, *ENERGY_NAMES, *CONTACT_MEASURES)
-    leg_number_coordinate = {"leg": np.arange(1, n_legs + 1)}
     return TrajectorySpecification(
         sample_contact_step,
-        variable_names,
+        (*CONTACT_MOTION_NAMES, *ENERGY_NAMES, *CONTACT_MEASURES),
         ("hub_x", "foot_x"),
-        leg_number_coordinate,
-        dataset_attributes,
+        {"leg": np.arange(1, models_and_wheels[0][1].n_legs + 1)},
+        {
+            "frame": "x downhill along the slope, z normal to it, first landing at the origin",
+            "friction": friction_by_step[0]
+            if len(set(friction_by_step)) == 1
+            else friction_by_step,
+        },
     )
