@@ -567,7 +567,7 @@ def map_figure(scan: xr.Dataset, measure: str, curves: Sequence[SpecialPointCurv
     figure.colorbar(measure_image, ax=axes, aspect=30, pad=0.01).set_label(
         format_axis_label(measure)
     )
-    labeled_special_points: set[str] = set()
+    labeled_special_points = set()
     for special_point_curve in curves:
         curve_color, line_style = select_special_point_style(special_point_curve.name)
         is_stable = special_point_curve.dataset.spectral_radius.values < 1.0

@@ -146,7 +146,7 @@ def measure_gaits_along_parameter(
 
     - `on_progress`: function that is called with the completed fraction of the work.
     """
-    measures_by_gait: list[dict[str, Any]] = []
+    measures_by_gait = []
     for parameter_value, gait_walk in zip(
         parameter_values,
         walk_along_parameter(params, parameter_name, parameter_values, x),

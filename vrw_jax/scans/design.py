@@ -212,7 +212,7 @@ def _parse_value_columns(
 
     Raise an error if that is impossible.
     """
-    value_columns: ParameterSamples = {}
+    value_columns = {}
     for parameter_name, parameter_values in _merge_mapping_and_keywords(
         function_name, parameter_mapping, parameter_keywords
     ).items():

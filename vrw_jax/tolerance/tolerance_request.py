@@ -289,7 +289,7 @@ class _MeasureRequest:
         wheel_indices_of_gaits, refined_gaits = self._walk_and_refine_gaits(
             np.tile(wheel_indices, len(walk_starts)), np.concatenate(walk_starts)
         )
-        selected_gait_indices: list[int] = []
+        selected_gait_indices = []
         for wheel_index in wheel_indices:
             distinct_gait_indices = refined_gaits.find_distinct_gaits(
                 np.flatnonzero(wheel_indices_of_gaits == wheel_index)

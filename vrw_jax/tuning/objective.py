@@ -163,7 +163,7 @@ def parse_constraint_margins(
     """
     if constraints is None:
         return dict(default_margins(params)) if gait_finder.supports_cold_start else {}
-    constraint_margins: dict[str, float] = {}
+    constraint_margins = {}
     if isinstance(constraints, Mapping):
         for measure_name, bound_or_range in constraints.items():
             if not isinstance(bound_or_range, tuple):

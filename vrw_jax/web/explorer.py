@@ -241,7 +241,7 @@ def _make_page_map(dataset: "xr.Dataset") -> dict[str, Any]:
             "parameters: give a scan of vrw.grid over two of them."
         )
     map_dataset = dataset.squeeze().transpose(*map_axis_names[::-1], ...)
-    map_measures: dict[str, Any] = {}
+    map_measures = {}
     for variable_name, measure_array in map_dataset.data_vars.items():
         if measure_array.dtype.kind == "f" and set(map_axis_names) <= set(measure_array.dims):
             min_values_over_legs = measure_array.min(measure_array.dims[2:]).values
