@@ -57,6 +57,7 @@ def test_every_fact_has_a_source_and_a_reason_for_its_tolerance(evidence: PaperE
         assert fact.source
         assert fact.published_value
         assert fact.computed
+        assert "{" not in fact.computed  # A value is missing.
         assert fact.tolerance_reason
 
 
@@ -87,7 +88,7 @@ def test_a_failed_fact_is_printed_and_sets_the_exit_code(
     broken = dataclasses.replace(evidence, damping_branch=branch)
     monkeypatch.setattr(reproduce, "collect_paper_evidence", lambda on_progress: broken)
     monkeypatch.setattr(reproduce, "write_paper_figures", lambda evidence, folder: [])
-    monkeypatch.setattr("vrw_jax.runtime.start_jax", lambda: None)
+    monkeypatch.setattr("vrw_jax.cli.commands.start_jax", lambda: None)
     result = CliRunner().invoke(cli.app, ["reproduce", "--out", str(tmp_path)])
     assert result.exit_code == cli.ExitCode.CHECK_FAILED
     table = facts.compute_paper_facts(broken)

@@ -337,7 +337,7 @@ def _compute_assumption_values(paper_evidence: PaperEvidence) -> ClaimValues:
         else (np.nan, np.nan),
         "n_thrown": separation_speeds.size,
         "thrown_off": f"{separation_speeds.size} of {stopper_impulses_per_mass.size}, "
-        "{separation_speeds[-1]:.2f} … "
+        f"{separation_speeds[-1]:.2f} … "
         f"{separation_speeds[0]:.2f} m/s"
         if separation_speeds.size
         else "none",
