@@ -89,7 +89,7 @@ class CollocationScanEngine:
         - `n_threads`: number of CPU threads, by default one per core.
         """
         measure_names, base_wheel, wheel_model, step_options, cycle_options, *_ = evaluation_request
-        self._n_threads = simd.count_available_cores() if n_threads is None else n_threads
+        self._n_threads = n_threads or simd.count_available_cores()
         self._evaluation_request = evaluation_request
         requested_derivatives = evaluation_request.requested_derivatives
         differentiation_parameters = list(

@@ -63,7 +63,7 @@ class UnilateralScanEngine:
     def __init__(self, evaluation_request: EvaluationRequest, n_threads: int | None = None) -> None:
         self._evaluation_request = evaluation_request
         variable_names, base_wheel, self._wheel_model, step_options, *_ = evaluation_request
-        self._n_threads = simd.count_available_cores() if n_threads is None else n_threads
+        self._n_threads = n_threads or simd.count_available_cores()
         self._requested_derivatives = evaluation_request.requested_derivatives
         measure_names = [name for name in variable_names if parse_derivative(name) is None]
         gait_finder: Any = make_finder(

@@ -167,8 +167,9 @@ def parse_constraint_margins(
     if isinstance(constraints, Mapping):
         for measure_name, bound_or_range in constraints.items():
             if not isinstance(bound_or_range, tuple):
-                lower_bound = check_real(f"the margin of {measure_name}", bound_or_range)
-                constraint_margins[measure_name] = lower_bound
+                constraint_margins[measure_name] = check_real(
+                    f"the margin of {measure_name}", bound_or_range
+                )
                 continue
             if bound_or_range == (None, None):
                 raise ValueError(
@@ -182,8 +183,9 @@ def parse_constraint_margins(
                 upper_bound = check_real(f"the upper end of {measure_name}", upper_limit)
                 constraint_margins[UPPER_BOUND_PREFIX + measure_name] = -upper_bound
             if lower_limit is not None:
-                lower_bound = check_real(f"the lower end of {measure_name}", lower_limit)
-                constraint_margins[measure_name] = lower_bound
+                constraint_margins[measure_name] = check_real(
+                    f"the lower end of {measure_name}", lower_limit
+                )
     else:
         constraint_margins = dict.fromkeys(check_names("constraints", constraints), 0.0)
     if "clearance_sls1" in constraint_margins:

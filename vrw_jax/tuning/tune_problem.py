@@ -312,7 +312,6 @@ class TuneProblem:
                 "): start from a wheel that walks, such as WheelParams()."
             )
         if not start_trial.has_finite_values:
-            nonfinite_descriptions = []
             for constraint_name, value, gradient in zip(
                 (self.objective_label, *self.constraint_names),
                 (
@@ -322,19 +321,16 @@ class TuneProblem:
                 (start_trial.objective_gradient, *start_trial.slack_jacobian),
                 strict=True,
             ):
-                measure_name = constraint_name.removeprefix(UPPER_BOUND_PREFIX)
+                description = "has a derivative that is not finite"
                 if not np.isfinite(value):
-                    measure_value = restore_sign_of_bound(constraint_name, value)
-                    nonfinite_descriptions.append(f"{measure_name} is {measure_value:g}")
-                elif not np.isfinite(gradient).all():
-                    nonfinite_descriptions.append(
-                        f"{measure_name} has a derivative that is not finite"
-                    )
-            raise ValueError(
-                f"{nonfinite_descriptions[0]} at the start, but a maximization needs finite "
-                "numbers: start from another wheel, or give an objective and constraints that are "
-                "finite there."
-            )
+                    description = f"is {restore_sign_of_bound(constraint_name, value):g}"
+                elif np.isfinite(gradient).all():
+                    continue
+                raise ValueError(
+                    f"{constraint_name.removeprefix(UPPER_BOUND_PREFIX)} {description} at the "
+                    "start, but a maximization needs finite numbers: start from another wheel, or "
+                    "give an objective and constraints that are finite there."
+                )
         return start_trial
 
     def evaluate_trial(
