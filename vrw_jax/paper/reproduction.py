@@ -146,8 +146,8 @@ def collect_paper_evidence(
     )
 
 
-def write_paper_figures(paper_evidence: PaperEvidence, folder: Path) -> list[Path]:
-    """Write Figs 6 to 10 as SVG and PNG files, and the walk as a GIF file, and return the paths."""
+def write_paper_figures(paper_evidence: PaperEvidence, folder: Path) -> None:
+    """Write Figs 6 to 10 as SVG and PNG files, and the walk as a GIF file."""
     two_step_trajectory = paper_evidence.table_1_trajectory.isel(
         time=paper_evidence.table_1_trajectory.step.values < 2
     )
@@ -158,16 +158,10 @@ def write_paper_figures(paper_evidence: PaperEvidence, folder: Path) -> list[Pat
         "fig09_rear_force": plots.rear_force(paper_evidence.gaits_by_damping),
         "fig10_indicators": plots.indicators(paper_evidence.damping_branch),
     }
-    figure_paths = [
-        figure_path
-        for figure_name, figure in figure_by_name.items()
-        for figure_path in plots.save(figure, folder, figure_name)
-    ]
+    for figure_name, figure in figure_by_name.items():
+        plots.save(figure, folder, figure_name)
     frame_images, frame_duration_ms = plots.walk_frames(paper_evidence.gaits_by_damping[-1])
-    return [
-        *figure_paths,
-        plots.save_animation(frame_images, frame_duration_ms, folder / "walk.gif"),
-    ]
+    plots.save_animation(frame_images, frame_duration_ms, folder / "walk.gif")
 
 
 def reproduce_paper(

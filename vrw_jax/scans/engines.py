@@ -60,7 +60,7 @@ SampleEvaluator = Callable[[ParameterSamples], ValuesByVariable]
 class UnilateralScanEngine:
     """Scan engine for unilateral contact and a fixed set of measures."""
 
-    def __init__(self, evaluation_request: EvaluationRequest, n_threads: int | None = None) -> None:
+    def __init__(self, evaluation_request: EvaluationRequest, n_threads: int | None) -> None:
         self._evaluation_request = evaluation_request
         variable_names, base_wheel, self._wheel_model, step_options, *_ = evaluation_request
         self._n_threads = n_threads or simd.count_available_cores()
@@ -187,7 +187,7 @@ class ModelSelectionScanEngine:
     sample.
     """
 
-    def __init__(self, evaluation_request: EvaluationRequest, n_threads: int | None = None) -> None:
+    def __init__(self, evaluation_request: EvaluationRequest, n_threads: int | None) -> None:
         self._measure_names, self._base_wheel, self._wheel_model, *_ = evaluation_request
         self._paper_model = ViscoelasticWheel()
         paper_measure_names = (
@@ -308,7 +308,7 @@ class PassageScanEngine:
     Samples are computed one after another, each with the same random numbers.
     """
 
-    def __init__(self, evaluation_request: EvaluationRequest, n_threads: int | None = None) -> None:
+    def __init__(self, evaluation_request: EvaluationRequest, n_threads: int | None) -> None:
         measure_names, self._base_wheel, self._wheel_model, *_ = evaluation_request
         self._slope_standard_deviation = evaluation_request.slope_standard_deviation
         self._passage_measure_names = [name for name in measure_names if name in PASSAGE_MEASURES]

@@ -137,7 +137,7 @@ def follow_special_points(
     scanned_samples: xr.Dataset,
     base_wheel: WheelParams,
     wheel_model: Any,
-    on_stage: Callable[[str], None] | None = None,
+    on_stage: Callable[[str], None] | None,
 ) -> SpecialPointMap:
     """Return the map of special points over the two parameters of a scan.
 

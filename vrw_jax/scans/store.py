@@ -191,9 +191,7 @@ class ZarrResultStore(AbstractResultStore):
     - `verifies_files`: whether damaged chunks are searched for when the store is opened.
     """
 
-    def __init__(
-        self, store_path: Path, result_layout: ResultLayout, verifies_files: bool = True
-    ) -> None:
+    def __init__(self, store_path: Path, result_layout: ResultLayout, verifies_files: bool) -> None:
         self._store_path, self._result_layout = store_path, result_layout
         self.store_location, self._verifies_files = str(store_path), verifies_files
         self._open_arrays()

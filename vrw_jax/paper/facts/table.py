@@ -126,16 +126,14 @@ def format_facts_page(paper_facts: Sequence[PaperFact]) -> str:
     return "\n".join(page_lines) + "\n"
 
 
-def write_facts_files(paper_facts: Sequence[PaperFact], folder: Path) -> list[Path]:
-    """Write the table of facts to facts.md and facts.csv, and return the paths."""
+def write_facts_files(paper_facts: Sequence[PaperFact], folder: Path) -> None:
+    """Write the table of facts to facts.md and facts.csv."""
     folder.mkdir(parents=True, exist_ok=True)
-    written_paths = [folder / "facts.md", folder / "facts.csv"]
-    written_paths[0].write_text(format_facts_page(paper_facts), encoding="utf-8")
-    with written_paths[1].open("w", newline="", encoding="utf-8") as csv_file:
+    (folder / "facts.md").write_text(format_facts_page(paper_facts), encoding="utf-8")
+    with (folder / "facts.csv").open("w", newline="", encoding="utf-8") as csv_file:
         fact_rows = [
             asdict(paper_fact) | {"holds": paper_fact.verdict} for paper_fact in paper_facts
         ]
         csv_writer = csv.DictWriter(csv_file, fact_rows[0].keys())
         csv_writer.writeheader()
         csv_writer.writerows(fact_rows)
-    return written_paths
