@@ -15,19 +15,18 @@ import typer
 from jax.typing import ArrayLike
 from rich.console import Console
 from rich.markup import escape
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 from vrw_jax.cli.encoding import replace_unencodable_characters
 from vrw_jax.cycles import LimitCycle, ReturnMapCycle, format_floquet_multipliers
 from vrw_jax.measures import MARGIN_MEASURES, MEASURES
+from vrw_jax.measures import xarray as xr
 from vrw_jax.models import StepResult
 from vrw_jax.scans import ScanProgress, format_duration
 from vrw_jax.wheel import PARAMETER_DOMAINS, Outcome, WheelParams
 
 if TYPE_CHECKING:
-    import xarray as xr
-    from rich.progress import Progress as Bar
-
     from vrw_jax.paper import PaperFact
 
 
@@ -204,19 +203,17 @@ def print_paper_facts(paper_facts: "list[PaperFact]", folder: Path) -> None:
     )
 
 
-def make_progress_bar(task_name: str) -> "Bar":
+def make_progress_bar(task_name: str) -> Progress:
     """Return a progress bar on standard error. The bar for a scan counts samples and shows a
     note.
     """
-    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn
-    from rich.progress import Progress as Bar
-
     last_columns = (
         (MofNCompleteColumn(), TextColumn("{task.fields[note]}"))
         if task_name == "scan"
         else (TimeElapsedColumn(),)
     )
-    return Bar(TextColumn("{task.description}"), BarColumn(), *last_columns, console=stderr_console)
+    task_columns = (TextColumn("{task.description}"), BarColumn(), *last_columns)
+    return Progress(*task_columns, console=stderr_console)
 
 
 def make_scan_progress_reporter(

@@ -1,7 +1,6 @@
 """Scans from the command line: planning from a config, verification and computation."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import typer
 
@@ -13,6 +12,7 @@ from vrw_jax.cli.console import (
     report_command_errors,
     stdout_console,
 )
+from vrw_jax.measures import xarray as xr
 from vrw_jax.scans import (
     ScanPlan,
     find_matching_store,
@@ -21,9 +21,6 @@ from vrw_jax.scans import (
     resolve_executor,
     run_scan,
 )
-
-if TYPE_CHECKING:
-    import xarray as xr
 
 
 def plan_config_scan(
