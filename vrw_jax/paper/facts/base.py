@@ -57,6 +57,11 @@ class PaperEvidence:
         """Return the measures of the gait for Table 1 of the paper, whose damping is 200 N s/m."""
         return self.damping_branch.sel(damping=200.0)
 
+    @property
+    def first_step_trajectory(self) -> xr.Dataset:
+        """Return the part of the trajectory for Table 1 of the paper in its first step."""
+        return self.table_1_trajectory.isel(time=self.table_1_trajectory.step.values == 0)
+
 
 INDEPENDENT_CODE_LABEL = "independent code"
 """Label for the source of a value that the paper does not print."""
@@ -131,11 +136,6 @@ def make_agreement_test(
         np.all(np.abs(np.subtract(getattr(n, value_name), published_value)) <= tolerance)
         for value_name, (published_value, tolerance) in published_values_and_tolerances.items()
     )
-
-
-def select_first_step_of_trajectory(walk_trajectory: xr.Dataset) -> xr.Dataset:
-    """Return the part of a trajectory in its first step."""
-    return walk_trajectory.isel(time=walk_trajectory.step.values == 0)
 
 
 def split_trajectory_by_phase(walk_trajectory: xr.Dataset) -> list[xr.Dataset]:

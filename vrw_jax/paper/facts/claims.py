@@ -15,7 +15,6 @@ from vrw_jax.paper.facts.base import (
     PaperClaimGroup,
     PaperEvidence,
     make_agreement_test,
-    select_first_step_of_trajectory,
     split_trajectory_by_phase,
 )
 from vrw_jax.paper.gaits import DEFAULT_SETTLING_OPTIONS
@@ -24,7 +23,7 @@ from vrw_jax.wheel import Outcome
 
 def _compute_typical_gait_values(paper_evidence: PaperEvidence) -> ClaimValues:
     """Compute the values that the claims on the gait of Table 1 of the paper need, by name."""
-    first_step_trajectory = select_first_step_of_trajectory(paper_evidence.table_1_trajectory)
+    first_step_trajectory = paper_evidence.first_step_trajectory
     phase_trajectories = double_support, single_support_1, single_support_2 = (
         split_trajectory_by_phase(first_step_trajectory)
     )
@@ -290,7 +289,7 @@ def _compute_assumption_values(paper_evidence: PaperEvidence) -> ClaimValues:
     The claims concern the gait of Table 1 of the paper.
     """
     table_1_gait = paper_evidence.table_1_gait
-    first_step_trajectory = select_first_step_of_trajectory(paper_evidence.table_1_trajectory)
+    first_step_trajectory = paper_evidence.first_step_trajectory
     double_support, *_ = split_trajectory_by_phase(first_step_trajectory)
     natural_length = float(paper_evidence.params.natural_length)
     locked_length = float(paper_evidence.params.locked_length)
