@@ -25,7 +25,7 @@ from vrw_jax.contact import (
     UnilateralWheel,
     embed_section_state,
 )
-from vrw_jax.measures import MARGIN_MEASURES, SELECTION_MARGIN_NAMES
+from vrw_jax.measures import MARGIN_MEASURES, SELECTION_MARGIN_NAMES, make_flag_attributes
 from vrw_jax.models import (
     PAPER_START_STATE,
     AbstractContactStep,
@@ -63,8 +63,7 @@ START_NOT_EMBEDDABLE_REASON_CODE = 1 + len(SELECTION_MARGIN_NAMES)
 SELECTION_VARIABLE_ATTRIBUTES: dict[str, dict[str, object]] = {
     "rung": {
         "long_name": "model that was used",
-        "flag_values": [int(model_code) for model_code in ModelCode],
-        "flag_meanings": " ".join(
+        **make_flag_attributes(
             model_class.__name__ for model_class in (RigidWheel, ViscoelasticWheel, UnilateralWheel)
         ),
     },

@@ -35,7 +35,7 @@ from vrw_jax.validation import (
     require_known_name,
     require_untraced_arguments,
 )
-from vrw_jax.wheel import WheelParams, convert_friction
+from vrw_jax.wheel import WheelParams
 
 
 @dataclass(frozen=True)
@@ -190,9 +190,7 @@ def multifidelity_mean(
     tol = check_positive("tol", tol)
     pilot = check_int("pilot", pilot, min_pilot_gaits, ", to estimate a variance")
     seed = check_int("seed", seed, 0)
-    params, friction_by_wheel, batch_shape = broadcast_params_and_friction(
-        params, convert_friction(friction)
-    )
+    params, friction_by_wheel, batch_shape = broadcast_params_and_friction(params, friction)
     n_wheels = len(friction_by_wheel)
     if not batch_shape or n_wheels <= pilot:
         raise ValueError(

@@ -134,9 +134,7 @@ def measure_to_tolerance(
         raise ValueError("measures is empty, but at least one is needed: give 'speed', say.")
     tol, relative = check_positive("tol", tol), check_bool("relative", relative)
     check_choice("stoppers", stoppers, ("bilateral", "one-sided"))
-    params, friction_by_wheel, batch_shape = broadcast_params_and_friction(
-        params, convert_friction(friction)
-    )
+    params, friction_by_wheel, batch_shape = broadcast_params_and_friction(params, friction)
     gait_rank = None if which is None else parse_gait_choice(which)
     solver_tolerance = (
         STEP_TOLERANCES.tight_tolerance
@@ -173,6 +171,7 @@ def broadcast_params_and_friction(
     axes or different lengths.
     """
     check_type("params", params, WheelParams, "write vrw.WheelParams(damping=..., slope=...)")
+    friction = convert_friction(friction)
     batch_argument_shapes = {
         np.shape(wheel_argument_array)
         for wheel_argument_array in (*jax.tree.leaves(params), friction)

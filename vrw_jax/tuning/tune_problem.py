@@ -35,6 +35,7 @@ from vrw_jax.measures import (
     SELECTION_MARGIN_NAMES,
     get_measure,
     make_flag_attributes,
+    make_labeled_variables,
     make_measure_attributes,
 )
 from vrw_jax.measures import xarray as xr
@@ -533,14 +534,9 @@ class TuneProblem:
         trial_outcomes = [
             trial.outcome if trial.is_on_branch else Outcome.NO_CYCLE_FOUND for trial in trials
         ]
-        path_dataset_variables: dict[str, Any] = {
-            parameter_name: (
-                "evaluation",
-                parameter_values[:, parameter_index],
-                make_measure_attributes(parameter_name),
-            )
-            for parameter_index, parameter_name in enumerate(self.free_parameters)
-        }
+        path_dataset_variables: dict[str, Any] = make_labeled_variables(
+            dict(zip(self.free_parameters, parameter_values.T, strict=True)), "evaluation"
+        )
         path_dataset_variables |= {
             "objective": (
                 "evaluation",
