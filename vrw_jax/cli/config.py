@@ -442,11 +442,9 @@ def _parse_wheel_table(config_table: ConfigTable) -> dict[str, float | int]:
         if parameter_name == PARAMETER_SET_KEY:
             continue
         if parameter_name == "n_legs":
-            parameter_values[parameter_name] = _parse_whole_number(parameter_name, config_value, 5)
-            if parameter_values[parameter_name] > MAX_CONFIG_LEGS:
-                raise _make_value_error(
-                    parameter_name, config_value, f"at most {MAX_CONFIG_LEGS:,}"
-                )
+            parameter_values[parameter_name] = _parse_whole_number(
+                parameter_name, config_value, 5, MAX_CONFIG_LEGS
+            )
         else:
             parameter_values[parameter_name] = _parse_parameter_value(parameter_name, config_value)
     return parameter_values
@@ -645,9 +643,14 @@ def _parse_numbers(
     return tuple(parse_number(setting_name, number) for number in config_value)
 
 
-def _parse_whole_number(setting_name: str, config_value: object, min_value: int = 1) -> int:
-    """Return a value as an integer. Raise a ValueError if it is not an integer of at least
-    `min_value`.
+def _parse_whole_number(
+    setting_name: str,
+    config_value: object,
+    min_value: int = 1,
+    max_value: int = MAX_CONFIG_INTEGER,
+) -> int:
+    """Return a value as an integer. Raise a ValueError if it is not an integer from `min_value` to
+    `max_value`.
     """
     if (
         isinstance(config_value, bool)
@@ -657,8 +660,8 @@ def _parse_whole_number(setting_name: str, config_value: object, min_value: int 
         raise _make_value_error(
             setting_name, config_value, f"a whole number of at least {min_value}"
         )
-    if config_value > MAX_CONFIG_INTEGER:
-        raise _make_value_error(setting_name, config_value, f"at most {MAX_CONFIG_INTEGER:,}")
+    if config_value > max_value:
+        raise _make_value_error(setting_name, config_value, f"at most {max_value:,}")
     return config_value
 
 

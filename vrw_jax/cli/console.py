@@ -55,16 +55,15 @@ def report_command_errors(
     except KeyboardInterrupt:
         print_error_sentence(interruption_message)
         raise typer.Exit(ExitCode.INTERRUPTED) from None
-    except MemoryError as command_error:
-        print_error_sentence(
-            "this asks for more memory than there is: give smaller designs, or fewer at once."
-        )
-        raise typer.Exit(ExitCode.USER_ERROR) from command_error
-    except ValueError as command_error:
-        print_error_sentence(str(command_error))
-        raise typer.Exit(ExitCode.USER_ERROR) from command_error
-    except OSError as command_error:
-        print_error_sentence(_format_system_error(command_error))
+    except (MemoryError, OSError, ValueError) as command_error:
+        error_sentence = str(command_error)
+        if isinstance(command_error, MemoryError):
+            error_sentence = (
+                "this asks for more memory than there is: give smaller designs, or fewer at once."
+            )
+        elif isinstance(command_error, OSError):
+            error_sentence = _format_system_error(command_error)
+        print_error_sentence(error_sentence)
         raise typer.Exit(ExitCode.USER_ERROR) from command_error
 
 
@@ -262,7 +261,7 @@ def make_scan_progress_reporter(
 def print_outcome_counts(scan_dataset: "xr.Dataset") -> None:
     """Print the number of samples for each outcome of a scan."""
     outcome_codes, n_samples_by_code = np.unique(scan_dataset.outcome.values, return_counts=True)
-    outcomes = [Outcome(int(outcome_code)) for outcome_code in outcome_codes]
+    outcomes = map(Outcome, outcome_codes.tolist())
     print_text_table(
         "Outcomes",
         (

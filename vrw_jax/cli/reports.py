@@ -89,8 +89,7 @@ def write_special_point_map(special_point_map: SpecialPointMap, folder: Path) ->
     Return the paths.
     """
     scan_dataset, special_point_curves, _ = special_point_map
-    parameter_names = tuple(map(str, scan_dataset.outcome.dims))
-    csv_lines = [",".join(("border", *parameter_names))]
+    csv_lines = [",".join(("border", *map(str, scan_dataset.outcome.dims)))]
     for special_point_curve in special_point_curves:
         csv_lines += [
             f"{special_point_curve.name},{x:.12g},{y:.12g}" for x, y in special_point_curve.values
