@@ -197,8 +197,10 @@ def _add_branch_legend(figure: Figure, special_points: list[SpecialPoint], param
                 label=f"{special_point_number}  {value_text}: {violation_text}{ending_text}",
             )
         )
-    legend_handles.append(Line2D([], [], color="black", linestyle="-", label="stable"))
-    legend_handles.append(Line2D([], [], color="black", linestyle="--", label="unstable"))
+    legend_handles += [
+        Line2D([], [], color="black", linestyle="-", label="stable"),
+        Line2D([], [], color="black", linestyle="--", label="unstable"),
+    ]
     figure.legend(handles=legend_handles, loc="outside lower center", ncols=2, fontsize=7.5)
 
 

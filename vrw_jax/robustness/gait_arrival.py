@@ -86,10 +86,11 @@ class StableGait(NamedTuple):
             )
         section_states = [np.asarray(cycle.section_state)[None]]
         for _ in range(cycle.period_n):
-            gait_step = step_batch(
-                params, section_states[-1], model=checked_model, options=checked_step_options
+            section_states.append(
+                step_batch(
+                    params, section_states[-1], model=checked_model, options=checked_step_options
+                ).section_state
             )
-            section_states.append(gait_step.section_state)
         stable_gait = cls(
             params, checked_model, checked_step_options, np.concatenate(section_states[:-1])
         )

@@ -134,10 +134,9 @@ def load_cache_record(cache_record_name: str) -> bytes | None:
     try:
         with open(cache_record_path, "rb", opener=open_nonblocking) as cache_record_file:
             file_stat_result = os.fstat(cache_record_file.fileno())
-            is_regular_file = stat.S_ISREG(file_stat_result.st_mode)
-            distrust_reason = (
-                _explain_file_distrust(file_stat_result) if is_regular_file else "is no file"
-            )
+            distrust_reason = "is no file"
+            if stat.S_ISREG(file_stat_result.st_mode):
+                distrust_reason = _explain_file_distrust(file_stat_result)
             cache_record_bytes = b"" if distrust_reason else cache_record_file.read()
     except FileNotFoundError:
         return None

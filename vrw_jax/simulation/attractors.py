@@ -124,12 +124,10 @@ def walk_until_periodic(
     walk_outcomes = np.full(n_starts, int(Outcome.STEPPED))
     orbit_periods, n_steps_to_orbit = np.zeros(n_starts, int), np.zeros(n_starts, int)
     unsettled_walk_indices = np.arange(n_starts)
-    simulate_round: Callable[..., tuple]
-    if model.batch_kernel == "legs":
-        simulate_round = functools.partial(
-            _simulate_starts_with_contact, model, options, n_steps_of_round
-        )
-    else:
+    simulate_round: Callable[..., tuple] = functools.partial(
+        _simulate_starts_with_contact, model, options, n_steps_of_round
+    )
+    if model.batch_kernel != "legs":
         simulate_round = functools.partial(
             map_in_batches,
             functools.partial(_simulate_block_of_starts, model, options, n_steps_of_round),

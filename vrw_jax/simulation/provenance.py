@@ -18,7 +18,6 @@ def collect_provenance_attributes(
     `options` is `StepOptions()`.
     """
     options = StepOptions() if options is None else options
-    library_names = ("vrw-jax", "jax", "diffrax", "numpy")
     parameter_attributes: dict[str, str | float | int] = {
         f"parameter_{parameter_name}": float(getattr(params, parameter_name))
         for parameter_name in PARAMETER_NAMES
@@ -29,7 +28,7 @@ def collect_provenance_attributes(
         "model": repr(model),
         "versions": ", ".join(
             f"{library_name} {find_installed_version(library_name)}"
-            for library_name in library_names
+            for library_name in ("vrw-jax", "jax", "diffrax", "numpy")
         )
         + f", python {platform.python_version()}",
         "device": jax.devices()[0].device_kind,

@@ -111,8 +111,9 @@ def simulate(
     )
     s = jax.tree.map(float, params).symbols()
     line_slopes = given_params.slope if given_params.slope.ndim else jnp.full(n_steps, params.slope)
-    ground_line_slopes = complete_ground_line_slopes(line_slopes, n_steps)
-    ground_lines = GroundLines(np.asarray(ground_line_slopes, float), float(s.Mt * s.g))
+    ground_lines = GroundLines(
+        np.asarray(complete_ground_line_slopes(line_slopes, n_steps), float), float(s.Mt * s.g)
+    )
     models_and_wheels = [(model, params)] * n_steps
     if stepwise_ground is not None:
         models_and_wheels = [

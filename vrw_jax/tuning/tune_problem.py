@@ -598,7 +598,7 @@ def make_tune_problem(
     objective: ObjectiveSpecification,
     free: Sequence[str],
     bounds: ParameterBounds,
-    constraints: ConstraintSpecification | None = None,
+    constraints: ConstraintSpecification | None,
     *,
     model: ModelLike | None = None,
     options: StepOptions | None = None,
