@@ -251,6 +251,15 @@ def test_an_unwritable_folder_is_refused_in_one_sentence() -> None:
         run_plan(make_plan(), "/proc/x", evaluate=evaluate_arithmetically)
 
 
+@pytest.mark.parametrize("name", ["scan", "provenance"])
+def test_a_store_whose_settings_are_no_table_is_damaged(tmp_path: Path, name: str) -> None:
+    plan = make_plan()
+    attributes = plan.store_attributes | {name: "null"}
+    scan_store.create_empty_store(tmp_path / "s.zarr", plan.result_layout, attributes)
+    with pytest.raises(ValueError, match="has damaged attributes"):
+        run_plan(plan, tmp_path / "s.zarr", evaluate=evaluate_arithmetically)
+
+
 def test_too_large_a_design_is_refused_in_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
     wide = np.linspace(100.0, 200.0, 100_000)
     with pytest.raises(ValueError, match="10,000,000,000 samples, but a scan takes"):

@@ -60,7 +60,7 @@ def read_scan_manifest(
     - `attribute_name`: attribute that contains the table; by default that of the settings.
     """
     stored_table = store_attributes.get(attribute_name, {})
-    return json.loads(stored_table) if isinstance(stored_table, str) else dict(stored_table)
+    return dict(json.loads(stored_table) if isinstance(stored_table, str) else stored_table)
 
 
 def add_attribute_seal(chunk_mark_attributes: JsonObject) -> JsonObject:
