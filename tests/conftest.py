@@ -1,10 +1,13 @@
 """Start JAX as `start_jax` does, with a compilation cache, and check shapes against signatures."""
 
+import ctypes
 import gc
 import os
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
+import psutil
 import pytest
 from support import shape_checks
 
@@ -17,6 +20,9 @@ PACKAGE_POSITIONS = [
     for place in (ROOT / "vrw_jax").iterdir()
     if place.is_dir() and place.name != UNCHECKED_PACKAGE
 ]
+
+MAX_MEMORY_BYTES = 3_000_000_000
+"""Memory of a process above which programs are forgotten: all programs of the suite need 9 GB."""
 
 LONGEST_COMPILATIONS = (
     "test_continuation", "test_limit_cycle", "test_unilateral", "test_any_system", "test_reaching",
@@ -59,6 +65,20 @@ def _keep_cache_folder() -> Iterator[None]:
     cache_folder = jax.config.jax_compilation_cache_dir  # type: ignore[attr-defined]
     yield
     assert jax.config.jax_compilation_cache_dir == cache_folder  # type: ignore[attr-defined]
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_runtest_teardown(item: pytest.Item, nextitem: pytest.Item | None) -> None:
+    """Clear JAX's caches after a test file if this process needs much memory."""
+    import jax
+
+    if nextitem is None or nextitem.path == item.path:
+        return
+    if psutil.Process().memory_info().rss > MAX_MEMORY_BYTES:
+        jax.clear_caches()
+        gc.collect()
+        if sys.platform == "linux" and hasattr(libc := ctypes.CDLL(None), "malloc_trim"):
+            libc.malloc_trim(0)  # Otherwise glibc keeps the freed memory.
 
 
 @pytest.hookimpl(tryfirst=True)
