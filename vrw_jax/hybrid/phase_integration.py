@@ -121,6 +121,66 @@ class _EventSearch(NamedTuple):
     n_confirming_steps: Int[Array, ""]  # number of solver steps that confirmed the time
     last_event_time_correction: Scalar  # last correction of the event's time, s
 
+    def propose_event_time(
+        self, guard_values: Array, guard_rates: Array, step_length: Scalar
+    ) -> tuple[Scalar, Array, _EventSearch]:
+        """Return the earliest event time that Newton's method proposes for the crossing guards.
+
+        The result is (time from the start of the solver step, s, index of the proposing guard,
+        search with the remaining bracket).
+
+        A proposal outside the bracket is replaced by the bracket's midpoint. The proposal has
+        derivatives. After k proposals in the range of quadratic convergence, derivatives are
+        accurate to order 2^k - 1.
+        """
+        is_guard_falling = self.is_guard_crossing & (guard_rates < 0.0)
+        time_to_zero = -guard_values / jnp.where(is_guard_falling, guard_rates, -1.0)
+        # A guard that rises below zero has crossed at an unknown earlier time.
+        missed_event_time = jnp.where(
+            self.is_guard_crossing & (guard_values < 0.0), -jnp.inf, jnp.inf
+        )
+        proposed_step_lengths = jnp.where(
+            is_guard_falling, step_length + time_to_zero, missed_event_time
+        )
+        # If no crossing guard falls here, the lowest of the crossing guards is taken.
+        lowest_guard_index = jnp.argmin(jnp.where(self.is_guard_crossing, guard_values, jnp.inf))
+        proposing_guard_index = jnp.where(
+            jnp.any(proposed_step_lengths < jnp.inf),
+            jnp.argmin(proposed_step_lengths),
+            lowest_guard_index,
+        ).astype(jnp.int32)
+        # This happens at the start of the step.
+        is_guard_rising = (guard_values == 0.0) & (guard_rates > 0.0)
+        is_step_before_event = jnp.all(
+            jnp.where(self.is_guard_crossing, (guard_values > 0.0) | is_guard_rising, True)
+        )
+        lower_step_length_bound = jnp.where(
+            is_step_before_event, lax.stop_gradient(step_length), self.lower_step_length_bound
+        )
+        upper_step_length_bound = jnp.where(
+            is_step_before_event, self.upper_step_length_bound, lax.stop_gradient(step_length)
+        )
+        earliest_proposed_step_length = proposed_step_lengths[proposing_guard_index]
+        # A proposal within round-off of a collapsed bracket counts as inside.
+        is_proposal_in_bracket = (
+            earliest_proposed_step_length >= lower_step_length_bound - self.time_tolerance
+        ) & (earliest_proposed_step_length <= upper_step_length_bound + self.time_tolerance)
+        # If round-off moves Newton's proposal out of the bracket, its derivative is still valid.
+        finite_proposed_step_length = jnp.where(
+            jnp.isfinite(earliest_proposed_step_length), earliest_proposed_step_length, 0.0
+        )
+        bisected_step_length = 0.5 * (lower_step_length_bound + upper_step_length_bound) + (
+            finite_proposed_step_length - lax.stop_gradient(finite_proposed_step_length)
+        )
+        next_step_length = jnp.where(
+            is_proposal_in_bracket, finite_proposed_step_length, bisected_step_length
+        )
+        remaining_search = self._replace(
+            lower_step_length_bound=lower_step_length_bound,
+            upper_step_length_bound=upper_step_length_bound,
+        )
+        return next_step_length, proposing_guard_index, remaining_search
+
 
 class _PhaseState(NamedTuple):
     """State of the loop that integrates a phase."""
@@ -384,8 +444,8 @@ def _advance_phase_state(phase_context: _PhaseContext, phase_state: _PhaseState)
     step_assessment = _assess_solver_step(
         phase_context, phase_state, tried_step_end, error_estimate
     )
-    proposed_step_length, proposing_guard_index, event_search = _propose_event_time(
-        event_search, guard_values, guard_rates, step_length
+    proposed_step_length, proposing_guard_index, event_search = event_search.propose_event_time(
+        guard_values, guard_rates, step_length
     )
     # A try confirms the event if it changes the event's time by little compared with the step. For
     # an event much earlier than the step's end, the change is also compared with the time since the
@@ -727,69 +787,6 @@ def _guess_event_fraction(guard_cubics: tuple[Array, ...], is_guard_crossing: Ar
             fraction_to_zero,
         )
     return jnp.min(jnp.where(is_guard_crossing, fraction_to_zero, 1.0))
-
-
-def _propose_event_time(
-    event_search: _EventSearch, guard_values: Array, guard_rates: Array, step_length: Scalar
-) -> tuple[Scalar, Array, _EventSearch]:
-    """Return the earliest event time that Newton's method proposes for the crossing guards.
-
-    The result is (time from the start of the solver step, s, index of the proposing guard, search
-    with the remaining bracket).
-
-    A proposal outside the bracket is replaced by the bracket's midpoint. The proposal has
-    derivatives. After k proposals in the range of quadratic convergence, derivatives are accurate
-    to order 2^k - 1.
-    """
-    is_guard_falling = event_search.is_guard_crossing & (guard_rates < 0.0)
-    time_to_zero = -guard_values / jnp.where(is_guard_falling, guard_rates, -1.0)
-    # A guard that rises below zero has crossed at an unknown earlier time.
-    missed_event_time = jnp.where(
-        event_search.is_guard_crossing & (guard_values < 0.0), -jnp.inf, jnp.inf
-    )
-    proposed_step_lengths = jnp.where(
-        is_guard_falling, step_length + time_to_zero, missed_event_time
-    )
-    # If no crossing guard falls here, the lowest of the crossing guards is taken.
-    lowest_guard_index = jnp.argmin(
-        jnp.where(event_search.is_guard_crossing, guard_values, jnp.inf)
-    )
-    proposing_guard_index = jnp.where(
-        jnp.any(proposed_step_lengths < jnp.inf),
-        jnp.argmin(proposed_step_lengths),
-        lowest_guard_index,
-    ).astype(jnp.int32)
-    # This happens at the start of the step.
-    is_guard_rising = (guard_values == 0.0) & (guard_rates > 0.0)
-    is_step_before_event = jnp.all(
-        jnp.where(event_search.is_guard_crossing, (guard_values > 0.0) | is_guard_rising, True)
-    )
-    lower_step_length_bound = jnp.where(
-        is_step_before_event, lax.stop_gradient(step_length), event_search.lower_step_length_bound
-    )
-    upper_step_length_bound = jnp.where(
-        is_step_before_event, event_search.upper_step_length_bound, lax.stop_gradient(step_length)
-    )
-    earliest_proposed_step_length = proposed_step_lengths[proposing_guard_index]
-    # A proposal within round-off of a collapsed bracket counts as inside.
-    is_proposal_in_bracket = (
-        earliest_proposed_step_length >= lower_step_length_bound - event_search.time_tolerance
-    ) & (earliest_proposed_step_length <= upper_step_length_bound + event_search.time_tolerance)
-    # If round-off moves Newton's proposal out of the bracket, its derivative is still valid.
-    finite_proposed_step_length = jnp.where(
-        jnp.isfinite(earliest_proposed_step_length), earliest_proposed_step_length, 0.0
-    )
-    bisected_step_length = 0.5 * (lower_step_length_bound + upper_step_length_bound) + (
-        finite_proposed_step_length - lax.stop_gradient(finite_proposed_step_length)
-    )
-    next_step_length = jnp.where(
-        is_proposal_in_bracket, finite_proposed_step_length, bisected_step_length
-    )
-    event_search = event_search._replace(
-        lower_step_length_bound=lower_step_length_bound,
-        upper_step_length_bound=upper_step_length_bound,
-    )
-    return next_step_length, proposing_guard_index, event_search
 
 
 def sample_phase(
