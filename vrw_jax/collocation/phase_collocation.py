@@ -161,80 +161,83 @@ class _StateAndTangents(NamedTuple):
     state: _PhaseState
     tangents: _PhaseState
 
+    def evaluate_interval_nodes(
+        self,
+        interval_length_fraction: Array,
+        h: LaneArray,
+        node_accelerations: LaneArray,
+    ) -> tuple[Array, ...]:
+        """Return the coordinates, the rates and their tangents at the nodes of a mesh interval.
+
+        - `interval_length_fraction`: length of the interval as a fraction of the phase's duration;
+        - `h`: length of the interval, s;
+        - `node_accelerations`: shape (node, coordinate, batch).
+        """
+        state, tangents = self
+        gauss_nodes_as_column = GAUSS_NODES.astype(h.dtype)[:, None, None]
+        duration_unit_tangent = _make_unit_tangent(len(tangents.q), -1, h.dtype)
+        rate_increments = apply_matrix(INTEGRATION_MATRIX, node_accelerations)
+        position_increments = apply_matrix(DOUBLE_INTEGRATION_MATRIX, node_accelerations)
+        node_q = state.q + h * (gauss_nodes_as_column * state.v + h * position_increments)
+        node_v = state.v + h * rate_increments
+        node_q_tangents = (
+            tangents.q[:, None]
+            + (h * gauss_nodes_as_column) * tangents.v[:, None]
+            + duration_unit_tangent
+            * (
+                interval_length_fraction
+                * (gauss_nodes_as_column * state.v + 2.0 * h * position_increments)
+            )
+        )
+        node_v_tangents = tangents.v[:, None] + duration_unit_tangent * (
+            interval_length_fraction * rate_increments
+        )
+        return node_q, node_v, node_q_tangents, node_v_tangents
+
+    def evaluate_interval_end(
+        self,
+        interval_length_fraction: Array,
+        h: LaneArray,
+        node_accelerations: LaneArray,
+        acceleration_tangents: LaneArray,
+    ) -> "_StateAndTangents":
+        """Return the state and its tangents at the end of a mesh interval.
+
+        The arguments are those of `evaluate_interval_nodes`, and the tangents of the node
+        accelerations.
+        """
+        (held_constants, q, v), (held_constants_tangents, q_tangents, v_tangents) = self
+        duration_unit_tangent = _make_unit_tangent(len(q_tangents), -1, h.dtype)[:, 0]
+        rate_increment = sum_with_weights(END_WEIGHTS, node_accelerations)
+        position_increment = sum_with_weights(DOUBLE_END_WEIGHTS, node_accelerations)
+        rate_increment_tangents = sum_with_weights(END_WEIGHTS, acceleration_tangents).swapaxes(
+            0, 1
+        )
+        position_increment_tangents = sum_with_weights(DOUBLE_END_WEIGHTS, acceleration_tangents)
+        position_increment_tangents = position_increment_tangents.swapaxes(0, 1)
+        q_tangents = (
+            q_tangents
+            + h * v_tangents
+            + h * h * position_increment_tangents
+            + duration_unit_tangent
+            * (interval_length_fraction * (v + 2.0 * h * position_increment))
+        )
+        v_tangents = (
+            v_tangents
+            + h * rate_increment_tangents
+            + duration_unit_tangent * (interval_length_fraction * rate_increment)
+        )
+        return _StateAndTangents(
+            _PhaseState(
+                held_constants, q + h * v + h * h * position_increment, v + h * rate_increment
+            ),
+            _PhaseState(held_constants_tangents, q_tangents, v_tangents),
+        )
+
 
 def _make_unit_tangent(n_tangents: int, tangent_index: int, float_dtype: Any) -> np.ndarray:
     """Return the unit vector that selects one tangent, of shape (n_tangents, 1, 1, 1)."""
     return np.eye(n_tangents, dtype=float_dtype)[tangent_index][:, None, None, None]
-
-
-def _evaluate_interval_nodes(
-    start: _StateAndTangents,
-    interval_length_fraction: Array,
-    h: LaneArray,
-    node_accelerations: LaneArray,
-) -> tuple[Array, ...]:
-    """Return the coordinates, the rates and their tangents at the nodes of a mesh interval.
-
-    - `interval_length_fraction`: length of the interval as a fraction of the phase's duration;
-    - `h`: length of the interval, s;
-    - `node_accelerations`: shape (node, coordinate, batch).
-    """
-    state, tangents = start
-    gauss_nodes_as_column = GAUSS_NODES.astype(h.dtype)[:, None, None]
-    duration_unit_tangent = _make_unit_tangent(len(tangents.q), -1, h.dtype)
-    rate_increments = apply_matrix(INTEGRATION_MATRIX, node_accelerations)
-    position_increments = apply_matrix(DOUBLE_INTEGRATION_MATRIX, node_accelerations)
-    node_q = state.q + h * (gauss_nodes_as_column * state.v + h * position_increments)
-    node_v = state.v + h * rate_increments
-    node_q_tangents = (
-        tangents.q[:, None]
-        + (h * gauss_nodes_as_column) * tangents.v[:, None]
-        + duration_unit_tangent
-        * (
-            interval_length_fraction
-            * (gauss_nodes_as_column * state.v + 2.0 * h * position_increments)
-        )
-    )
-    node_v_tangents = tangents.v[:, None] + duration_unit_tangent * (
-        interval_length_fraction * rate_increments
-    )
-    return node_q, node_v, node_q_tangents, node_v_tangents
-
-
-def _evaluate_interval_end(
-    start: _StateAndTangents,
-    interval_length_fraction: Array,
-    h: LaneArray,
-    node_accelerations: LaneArray,
-    acceleration_tangents: LaneArray,
-) -> _StateAndTangents:
-    """Return the state and its tangents at the end of a mesh interval.
-
-    The arguments are those of `_evaluate_interval_nodes`, and the tangents of the node
-    accelerations.
-    """
-    (held_constants, q, v), (held_constants_tangents, q_tangents, v_tangents) = start
-    duration_unit_tangent = _make_unit_tangent(len(q_tangents), -1, h.dtype)[:, 0]
-    rate_increment = sum_with_weights(END_WEIGHTS, node_accelerations)
-    position_increment = sum_with_weights(DOUBLE_END_WEIGHTS, node_accelerations)
-    rate_increment_tangents = sum_with_weights(END_WEIGHTS, acceleration_tangents).swapaxes(0, 1)
-    position_increment_tangents = sum_with_weights(DOUBLE_END_WEIGHTS, acceleration_tangents)
-    position_increment_tangents = position_increment_tangents.swapaxes(0, 1)
-    q_tangents = (
-        q_tangents
-        + h * v_tangents
-        + h * h * position_increment_tangents
-        + duration_unit_tangent * (interval_length_fraction * (v + 2.0 * h * position_increment))
-    )
-    v_tangents = (
-        v_tangents
-        + h * rate_increment_tangents
-        + duration_unit_tangent * (interval_length_fraction * rate_increment)
-    )
-    return _StateAndTangents(
-        _PhaseState(held_constants, q + h * v + h * h * position_increment, v + h * rate_increment),
-        _PhaseState(held_constants_tangents, q_tangents, v_tangents),
-    )
 
 
 class _LinearizationContext(NamedTuple):
@@ -420,7 +423,7 @@ class _LinearizationContext(NamedTuple):
             h = interval_length_fraction * phase_duration
             mesh_interval = interval_length_fraction, h, node_accelerations
             node_q, node_v, node_q_tangents, node_v_tangents = self.prevent_fusion(
-                _evaluate_interval_nodes(start, *mesh_interval)
+                start.evaluate_interval_nodes(*mesh_interval)
             )
             linearized_residual = self.linearize_residual(
                 phase, start.state.held_constants, node_q, node_v, node_accelerations
@@ -437,7 +440,7 @@ class _LinearizationContext(NamedTuple):
                 solve_node_equations(*node_system, self.parameters)
             )
             return (
-                _evaluate_interval_end(start, *mesh_interval, acceleration_tangents),
+                start.evaluate_interval_end(*mesh_interval, acceleration_tangents),
                 jnp.moveaxis(acceleration_tangents, 2, 0),
             )
 
