@@ -224,10 +224,8 @@ def _integrate_to_event(
     )
     # The index is that of the first guard whose event is the start itself; -1 if there is none.
     start_event_guard_index = jnp.full(is_guard_met_at_start[0].shape, -1, jnp.int32)
-    for guard_index in range(len(is_guard_met_at_start) - 1, -1, -1):
-        start_event_guard_index = jnp.where(
-            is_guard_met_at_start[guard_index], guard_index, start_event_guard_index
-        )
+    for guard_index, is_guard_met in reversed(list(enumerate(is_guard_met_at_start))):
+        start_event_guard_index = jnp.where(is_guard_met, guard_index, start_event_guard_index)
     is_phase_started = is_active & (start_event_guard_index < 0)
 
     integrator_state = _integrate_until_crossing(
@@ -375,16 +373,16 @@ def _integrate_until_crossing(
         state, guard_values = select_trees_by_condition(
             is_accepted,
             (stage_states[-1], end_guard_values),
-            (integrator_state.state, integrator_state.guard_values),
+            integrator_state[:2],
         )
         middle_guard_values, end_guard_values = select_trees_by_condition(
             integrator_state.is_running,
             (inner_guard_values[tableau.middle_guard_index], end_guard_values),
             (integrator_state.middle_guard_values, integrator_state.end_guard_values),
         )
-        margin_minima_state = integrator_state.margin_minima_state
-        state_tangents = integrator_state.state_tangents
-        n_iterations_until_half_ended = integrator_state.n_iterations_until_half_ended
+        *_, n_iterations_until_half_ended, n_iterations, margin_minima_state, state_tangents = (
+            integrator_state
+        )
         if margin_minima_state is not None:
             margin_minima_state = update_margin_minima_state(
                 phase,
@@ -403,7 +401,7 @@ def _integrate_until_crossing(
             n_running_elements = jnp.sum(next_state.is_running, dtype=jnp.int32)
             n_iterations_until_half_ended = jnp.where(
                 2 * n_running_elements > is_accepted.size,
-                integrator_state.n_iterations + 1,
+                n_iterations + 1,
                 n_iterations_until_half_ended,
             )
         return next_state._replace(
@@ -413,7 +411,7 @@ def _integrate_until_crossing(
             end_guard_values=end_guard_values,
             n_tried_steps=integrator_state.n_tried_steps + integrator_state.is_running,
             n_iterations_until_half_ended=n_iterations_until_half_ended,
-            n_iterations=integrator_state.n_iterations + 1,
+            n_iterations=n_iterations + 1,
             margin_minima_state=margin_minima_state,
             state_tangents=state_tangents,
         )
