@@ -69,18 +69,17 @@ def is_guard_at_roundoff(
 
     Guards are compared after division by their scales.
     """
-    guard_scales = (
-        jnp.ones_like(guard_values)
-        if guards_and_margins.guard_scales is None
-        else guards_and_margins.guard_scales
-    )
-    scaled_guard_values = jnp.where(is_guard_crossing, guard_values / guard_scales, jnp.inf)
+    guard_scales = guards_and_margins.guard_scales
+    scaled_guard_values = guard_values if guard_scales is None else guard_values / guard_scales
+    scaled_guard_values = jnp.where(is_guard_crossing, scaled_guard_values, jnp.inf)
     is_guard_near_zero = (
         jnp.abs(jnp.min(scaled_guard_values))
         <= GUARD_ROUNDOFF_IN_EPS * jnp.finfo(scaled_guard_values.dtype).eps
     )
-    has_guard_scales = guards_and_margins.guard_scales is not None
-    return is_guard_near_zero & has_guard_scales, jnp.argmin(scaled_guard_values).astype(jnp.int32)
+    return (
+        is_guard_near_zero & (guard_scales is not None),
+        jnp.argmin(scaled_guard_values).astype(jnp.int32),
+    )
 
 
 def find_guards_met_at_start(
@@ -95,8 +94,8 @@ def find_guards_met_at_start(
     derivative. Only then does the event time depend on the start state. `guard_rates` are the time
     derivatives of the guards.
     """
-    is_guard_met = (guard_values < 0.0) | ((guard_values == 0.0) & (guard_rates <= 0.0))
     is_guard_zero = guard_values == 0.0
+    is_guard_met = (guard_values < 0.0) | (is_guard_zero & (guard_rates <= 0.0))
     if guards_and_margins.guard_scales is not None:
         guard_roundoff = GUARD_ROUNDOFF_IN_EPS * jnp.finfo(guard_values.dtype).eps
         is_guard_zero = guard_values >= -guard_roundoff * guards_and_margins.guard_scales
