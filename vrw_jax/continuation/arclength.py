@@ -102,7 +102,7 @@ class NewtonStep(NamedTuple):
     return_map_jacobian: Float[Array, "n n"]  # with respect to the section state
 
 
-class AbstractProblem(eqx.Module):
+class AbstractSectionStateProblem(eqx.Module):
     """Base class of problems whose unknowns contain a section state.
 
     The argument `z` contains the unknowns, and `p` contains the varied parameters. The argument
@@ -122,7 +122,7 @@ class AbstractProblem(eqx.Module):
         return jnp.all(jnp.isfinite(self.section_state(z)))
 
 
-class AbstractContinuationProblem(AbstractProblem):
+class AbstractContinuationProblem(AbstractSectionStateProblem):
     """Base class of continuation problems, in one continued parameter `p`."""
 
     is_traceable: ClassVar[bool] = True

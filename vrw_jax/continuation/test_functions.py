@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float
 
 from vrw_jax.continuation.arclength import (
     AbstractContinuationProblem,
-    AbstractProblem,
+    AbstractSectionStateProblem,
     NewtonStep,
     ProblemUnknowns,
     SectionStateVector,
@@ -41,7 +41,7 @@ class TestFunctionNewtonStep(NamedTuple):
     parameter_gradient: ParameterPair
 
 
-class AbstractTestFunction(AbstractProblem):
+class AbstractTestFunction(AbstractSectionStateProblem):
     """Base class of test functions that are evaluated at fixed points, in two parameters.
 
     The argument `z` contains the unknowns of the fixed point. The argument `p` contains the values

@@ -394,7 +394,7 @@ def find_contact_fixed_points(
         < max_correction_near_gait
     )
     period_defects = np.abs((exact_evaluation.end_states - section_states) / section_units).max(-1)
-    exact_fixed_points, evaluation = _run_contact_newton(
+    exact_fixed_points, period_evaluation = _run_contact_newton(
         period_map,
         step_options,
         section_states,
@@ -405,7 +405,7 @@ def find_contact_fixed_points(
         stops_at_small_correction=False,
     )
     n_iterations = loose_fixed_points.n_iterations + 1 + exact_fixed_points.n_iterations
-    return exact_fixed_points._replace(n_iterations=n_iterations), evaluation
+    return exact_fixed_points._replace(n_iterations=n_iterations), period_evaluation
 
 
 def _run_contact_newton(
@@ -581,6 +581,6 @@ def _make_contact_gait(
 
 
 _make_contact_cycles, _make_contact_gaits = (
-    eqx.filter_jit(eqx.filter_vmap(make_one, in_axes=(None, None, 0, 0, 0)))
-    for make_one in (_make_contact_cycle, _make_contact_gait)
+    eqx.filter_jit(eqx.filter_vmap(make_result_of_wheel, in_axes=(None, None, 0, 0, 0)))
+    for make_result_of_wheel in (_make_contact_cycle, _make_contact_gait)
 )

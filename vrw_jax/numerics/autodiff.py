@@ -215,9 +215,11 @@ def evaluate_with_jacobian(function: Callable, *arguments: Array) -> tuple[Any, 
     one entry per argument.
     """
 
-    split_function = lambda *arrays: eqx.partition(function(*arrays), eqx.is_inexact_array)
+    partitioned_function = lambda *arrays: eqx.partition(function(*arrays), eqx.is_inexact_array)
     all_argnums = tuple(range(len(arguments))) if len(arguments) > 1 else 0
-    output_jacobian, outputs = _differentiate_float_outputs(split_function, all_argnums)(*arguments)
+    output_jacobian, outputs = _differentiate_float_outputs(partitioned_function, all_argnums)(
+        *arguments
+    )
     return eqx.combine(*outputs), output_jacobian
 
 

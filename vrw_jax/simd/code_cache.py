@@ -47,7 +47,7 @@ class CodeStore(Protocol):
         """Save `cache_record_content` under the name `cache_record_name`."""
 
 
-ResultTypes = tuple[tuple[tuple[int, ...], np.dtype], ...]
+ResultShapesAndDtypes = tuple[tuple[tuple[int, ...], np.dtype], ...]
 """For each result of machine code, the lengths of all axes before the lanes, and the dtype."""
 
 
@@ -55,7 +55,7 @@ class MachineCode(NamedTuple):
     """Machine code of a function over lanes, which may still be compiled in the background."""
 
     ffi_target_name: str  # digest of the text that LLVM compiles; JAX programs call the code by it
-    result_shapes_and_dtypes: ResultTypes
+    result_shapes_and_dtypes: ResultShapesAndDtypes
     object_code_future: Future[bytes]
 
 
@@ -191,7 +191,7 @@ One thread suffices, because LLVM's lock lets only one thread compile.
 """
 
 
-def _parse_result_shapes_and_dtypes(encoded_result_types: str | bytes) -> ResultTypes:
+def _parse_result_shapes_and_dtypes(encoded_result_types: str | bytes) -> ResultShapesAndDtypes:
     """Return `MachineCode.result_shapes_and_dtypes`, parsed from JSON."""
     return tuple(
         (tuple(axis_lengths), np.dtype(dtype_name))
