@@ -242,11 +242,11 @@ def _compute_stage_jacobians(
         )
         jacobian_columns = []
         for unit_vector in _make_unit_vectors((*stage_state.q, *stage_state.v)):
-            unit_theta = unit_vector[0]
+            theta_tangent = unit_vector[0]
             state_tangent = StageState(
                 unit_vector[:n],
                 unit_vector[n:],
-                StageAccelerations(cos * unit_theta, -sin * unit_theta, zero_accelerations),
+                StageAccelerations(cos * theta_tangent, -sin * theta_tangent, zero_accelerations),
             )
             _, residual_tangent = jax.jvp(
                 implicit_dynamics.evaluate_residual, (stage_state,), (state_tangent,)
