@@ -435,19 +435,11 @@ def _compute_continued_quantities(
     return dict(zip(CONTINUED_QUANTITIES, quantity_values, strict=True))
 
 
-def _compute_trial_monodromy(
-    collocation_system: CollocationSystem,
-    parameters: Array,
-    is_phase_active: Array,
-    z: CollocationSolution,
-) -> Array:
-    """Return the monodromy matrix at a trial solution."""
-    return collocation_system.linearize_at(parameters, z, is_phase_active).monodromy
-
-
 QUANTITY_FUNCTION_BY_GROUP = {
     CONTINUED_QUANTITIES: _stack_continued_quantities,
-    BIFURCATION_NAMES: _compute_trial_monodromy,
+    BIFURCATION_NAMES: lambda collocation_system, parameters, is_phase_active, z: (
+        collocation_system.linearize_at(parameters, z, is_phase_active).monodromy
+    ),
 }
 """Function that computes a group of quantities without an event-driven step, by the names in the
 group.
