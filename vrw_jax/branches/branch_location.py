@@ -727,8 +727,10 @@ class _SpecialPointLocator(NamedTuple):
             if np.prod(quantity_table["fold"][list(point_pair)]) > 0.0
             and np.prod(points.fraction_rate[list(point_pair)]) < 0.0
         ]
-        for stepwise_name, change_name in STEPWISE_CHANGE_NAMES.items():
-            integer_values = quantity_table.get(stepwise_name, np.zeros(len(wheel_indices)))
+        for stepwise_quantity_name, change_name in STEPWISE_CHANGE_NAMES.items():
+            integer_values = quantity_table.get(
+                stepwise_quantity_name, np.zeros(len(wheel_indices))
+            )
             for point_pair in self.point_table.find_neighbor_pairs(
                 np.flatnonzero(np.isfinite(integer_values))
             ):
@@ -739,7 +741,9 @@ class _SpecialPointLocator(NamedTuple):
                         RootRequest(
                             point_pair,
                             change_name,
-                            functools.partial(compare_with_integer, stepwise_name, integer_value),
+                            functools.partial(
+                                compare_with_integer, stepwise_quantity_name, integer_value
+                            ),
                         )
                         for integer_value in (left_value, right_value)
                     ]

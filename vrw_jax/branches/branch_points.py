@@ -153,13 +153,13 @@ class LocatedRoot(NamedTuple):
 
 
 def compare_with_integer(
-    stepwise_name: str, integer_value: float, quantity_table: QuantitiesByName
+    stepwise_quantity_name: str, integer_value: float, quantity_table: QuantitiesByName
 ) -> np.ndarray:
     """Return 1 for each point at which a stepwise quantity has the given value, and else -1.
 
-    - `stepwise_name`: name of the quantity, one of `STEPWISE_CHANGE_NAMES`.
+    - `stepwise_quantity_name`: name of the quantity, one of `STEPWISE_CHANGE_NAMES`.
     """
-    integer_values = quantity_table[stepwise_name]
+    integer_values = quantity_table[stepwise_quantity_name]
     equality_sign = np.where(integer_values == integer_value, 1.0, -1.0)
     return np.where(np.isnan(integer_values), np.nan, equality_sign)
 

@@ -147,7 +147,7 @@ def find_state_jumps(
     `fraction_rates` contains the derivative of that fraction with respect to arc length.
     """
 
-    def is_state_jump_between(left_index: int, right_index: int) -> bool:
+    def has_state_jump_between(left_index: int, right_index: int) -> bool:
         parameter_fraction_change = (
             parameter_fractions[right_index] - parameter_fractions[left_index]
         )
@@ -166,4 +166,4 @@ def find_state_jumps(
         )
         return bool(has_same_direction and is_chord_steeper)
 
-    return [point_pair for point_pair in point_pairs if is_state_jump_between(*point_pair)]
+    return [point_pair for point_pair in point_pairs if has_state_jump_between(*point_pair)]

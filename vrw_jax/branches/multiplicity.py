@@ -131,17 +131,19 @@ def add_multiple_bifurcations(
             root_groups[-1].append(root)
         else:
             root_groups.append([root])
-    mean_root_requests = []
+    mean_modulus_root_requests = []
     for root_group in root_groups:
         point_pair, first_rank = (
             root_group[0].request.point_pair,
             root_group[0].request.multiplier_ranks.start,
         )
-        mean_root_requests.append(
+        mean_modulus_root_requests.append(
             request_mean_modulus_root(point_pair, range(first_rank, first_rank + len(root_group)))
         )
     multiple_bifurcations = []
-    for root_group, mean_root in zip(root_groups, locate_roots(mean_root_requests), strict=True):
+    for root_group, mean_root in zip(
+        root_groups, locate_roots(mean_modulus_root_requests), strict=True
+    ):
         moduli_beside_root = mean_root.table_beside_root.quantity_table[MULTIPLIER_MODULI_COLUMN][0]
         unit_circle_distances = np.abs(
             moduli_beside_root[list(mean_root.request.multiplier_ranks)] - 1.0

@@ -432,9 +432,14 @@ def _solve_velocity_level(
             else solve_contact_configuration(contact_configuration, inverse_inertia, rebound_motion)
         )
         motion_after = _apply_impact_velocities(motion, force_solution)
-        hub_jump_x, hub_jump_z = motion_after.vx - motion.vx, motion_after.vz - motion.vz
+        hub_velocity_jump_x, hub_velocity_jump_z = (
+            motion_after.vx - motion.vx,
+            motion_after.vz - motion.vz,
+        )
         contact_impulse = s.m * (
-            leg_directions.sin * hub_jump_x + leg_directions.cos * hub_jump_z + motion.dL
+            leg_directions.sin * hub_velocity_jump_x
+            + leg_directions.cos * hub_velocity_jump_z
+            + motion.dL
         )
         return _KinematicLevelSolution(
             chosen_combination, force_solution, contact_impulse, motion_after.dL, motion_after

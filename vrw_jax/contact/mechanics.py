@@ -384,10 +384,10 @@ def compute_foot_heights(
         return foot_heights
     downhill_positions = compute_foot_positions(motion, leg_directions)
     foremost_distance = downhill_positions[-1] - downhill_positions[0]
-    foremost_height = foot_heights[-1] * jnp.cos(next_line_tilt) + foremost_distance * jnp.sin(
+    foremost_foot_height = foot_heights[-1] * jnp.cos(next_line_tilt) + foremost_distance * jnp.sin(
         next_line_tilt
     )
-    return jnp.concatenate([foot_heights[:-1], foremost_height[None]])
+    return jnp.concatenate([foot_heights[:-1], foremost_foot_height[None]])
 
 
 class PlaneVelocities(NamedTuple):

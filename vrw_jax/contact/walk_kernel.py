@@ -398,7 +398,7 @@ class BatchWalkSettings(NamedTuple):
             motion_after, contact_state_after = select_trees_by_condition(
                 is_contact_event,
                 (event_result.motion, event_result.contact_state),
-                (motion, ContactState.without_changes(*contact_state[:2])),
+                (motion, ContactState.with_unchanged_contacts(*contact_state[:2])),
             )
             dynamics_after = self.make_lane_contact_dynamics(input_columns, contact_state_after)
             force_rate_signs = update_force_rate_signs(
@@ -460,7 +460,7 @@ class BatchWalkSettings(NamedTuple):
     def summarize_step(self, lane_state: LaneState, input_columns: Array) -> GaitStepSummary:
         """Return the section state, durations and length of a step that has ended.
 
-        If the step failed, section state and length are zero.
+        If the step failed, the section state and the step length are zero.
         """
         motion = unpack_motion(lane_state.contact_interval_state.contact_interval_point)
         contact_state = lane_state.contact_interval_state.contact_state

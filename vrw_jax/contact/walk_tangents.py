@@ -90,8 +90,8 @@ class TangentBatch(NamedTuple):
 
         The results of the function replace the rows from `first_replaced_row` onward.
 
-        - `compute_new_rows`: function of the index of a tangent and its rows that returns a tree of
-          new rows.
+        - `compute_new_rows`: function that takes the index and the rows of a tangent, and returns a
+          tree of new rows.
         """
         should_continue = lambda state: jnp.any(state[0] < self.n_tangents)
 
@@ -261,7 +261,7 @@ def _integrate_with_tangents(
     start_tangent_rows: Array,
     tangent_template: _IntervalTangent,
 ) -> tuple[ContactIntervalState, Array]:
-    """Return the result of `integrate_contact_interval`, and the tangents at its end.
+    """Return the result of `integrate_contact_interval`, and the tangents of its end state.
 
     The tangents have the shape (tangents, rows, batch).
     """

@@ -72,8 +72,7 @@ def _find_gaits_from_starts(
     """Find the attracting gaits that walks from given starts reach.
 
     Return the index of the wheel to which each gait belongs, and the gaits. The walks begin at the
-    states that `start_state_function` returns. The gaits of a wheel are in the order of increasing
-    speed.
+    states that `start_state_function` returns. The gaits of a wheel are sorted by increasing speed.
     """
     n_wheels = len(parameter_values)
     with ThreadPoolExecutor(1) as compile_thread:
@@ -161,7 +160,7 @@ def find_slow_gaits(gait_finder: Any, parameter_values: Any) -> Any:
 def find_slowest_gait_indices(gait_wheel_indices: np.ndarray, n_wheels: int) -> np.ndarray:
     """Return the index of the slowest gait of each wheel, shape (wheels,).
 
-    - `gait_wheel_indices`: index of the wheel to which each gait belongs, in ascending order. The
-      gaits of a wheel are in the order of increasing speed.
+    - `gait_wheel_indices`: index of the wheel to which each gait belongs, in ascending order.
+      The gaits of a wheel are sorted by increasing speed.
     """
     return np.searchsorted(gait_wheel_indices, np.arange(n_wheels))

@@ -194,7 +194,8 @@ class CollocationState(NamedTuple):
     # (lanes,): 1 for a limit cycle, 0 for a replacement of a missing cycle
     has_cycle: LaneArray
     # (lanes,): 1 + index in ADMISSIBILITY_CHECKS of the check that a root fails;
-    # plus HOMOTOPY_FAILURE_OFFSET for a root of a wheel on the homotopy; a HomotopyFailure; else 0
+    # plus HOMOTOPY_FAILURE_CODE_OFFSET for a root of a wheel on the homotopy; a HomotopyFailure;
+    # else 0
     failed_check: LaneArray
     # (n, 4, lanes): theta, L1 and their rates at the end of each step
     gait_step_end_states: LaneArray
@@ -642,7 +643,7 @@ def _run_search_attempt(
     failed_check = attempt_result.collocation_state.failed_check
     homotopy_check = jnp.where(
         failed_check > 0.0,
-        failed_check + jnp.where(is_before_target, HOMOTOPY_FAILURE_OFFSET, 0.0),
+        failed_check + jnp.where(is_before_target, HOMOTOPY_FAILURE_CODE_OFFSET, 0.0),
         jnp.where(
             is_second_try,
             float(HomotopyFailure.BOTH_TRIES_FAILED),
@@ -801,7 +802,7 @@ def init_search_result(
 FAILED_MESH_CHECK_CODE = len(ADMISSIBILITY_CHECKS)
 """Value of `CollocationState.failed_check` for a root whose mesh is too coarse."""
 
-HOMOTOPY_FAILURE_OFFSET = float(len(ADMISSIBILITY_CHECKS))
+HOMOTOPY_FAILURE_CODE_OFFSET = float(len(ADMISSIBILITY_CHECKS))
 """Offset of `CollocationState.failed_check` if the check fails for an intermediate wheel of the
 homotopy.
 """

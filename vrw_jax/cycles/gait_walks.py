@@ -146,7 +146,10 @@ def scale_section_states(
 
 
 class DistinctWalkEnds(NamedTuple):
-    """Distinct end states of walks, sorted by wheel. Each wheel has at least one end state."""
+    """Distinct end states of walks, sorted by wheel.
+
+    The result contains at least one end state for each wheel.
+    """
 
     wheel_indices: np.ndarray  # (ends,)
     section_states: np.ndarray  # (ends, section)

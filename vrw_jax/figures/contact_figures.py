@@ -187,7 +187,7 @@ def make_contact_mode_handles(contact_modes: np.ndarray) -> list[Line2D]:
 def _select_marked_legs(is_leg_marked: np.ndarray) -> list[int]:
     """Return the labels of Legs 1 and 2, and of all legs that are marked at any time.
 
-    - `is_leg_marked`: whether a leg is marked, shape (time, leg).
+    - `is_leg_marked`: whether a panel marks the contact of a leg, shape (time, leg).
     """
     return [
         leg_number

@@ -71,7 +71,7 @@ def gait_panels(gait: xr.Dataset) -> Figure:
 
     The panels show angle, leg lengths, load share, foot height and ground forces. Gray bands mark
     double support, and dotted lines mark collision II. For walks with unilateral contact, the
-    panels show angle, leg lengths, contact modes, foot heights, normal and tangential forces.
+    panels show angle, leg lengths, contact modes, foot heights, and normal and tangential forces.
 
     Args:
         gait: dataset that `vrw.simulate` returns for any model.
@@ -386,7 +386,7 @@ def walk_frames(
 ) -> tuple[list[Image.Image], int]:
     """Return the frames of a looping animation of a steady gait, and the duration of a frame in ms.
 
-    The camera moves at the mean speed. Arrows show ground forces, with a length of 1 m for 300 N.
+    The camera moves at the mean speed. Arrows show ground forces. An arrow of 1 m represents 300 N.
     The colors of the feet show their contact modes.
 
     Args:

@@ -295,7 +295,7 @@ def _check_output_shape(
 def _simulate_one_event(
     modes: tuple[Mode, ...], mode_index: int, options: StepOptions, state: Array, time: Array
 ) -> tuple:
-    """Return the result of one phase in a mode, and of the reset that ends it.
+    """Integrate one phase in a mode, apply the reset at its end, and return both results.
 
     The result consists of the end of the phase, whether a guard is violated at its start, the
     errors of the event time due to tolerance and to round-off of the state (s), the next state and

@@ -12,8 +12,8 @@ from jaxtyping import Array
 from vrw_jax.integrator.minima import MarginMinimaState
 from vrw_jax.integrator.tableaus import (
     ButcherTableau,
+    SolverStepFunction,
     StageState,
-    TakeStep,
     fit_guard_parabola,
     load_explicit_tableau,
     take_rk_step,
@@ -79,7 +79,7 @@ class EventSearch(NamedTuple):
 
 def locate_event(
     phase: BatchPhase,
-    solver_step_function: TakeStep,
+    solver_step_function: SolverStepFunction,
     tableau: ButcherTableau,
     integrator_state: IntegratorState,
     options: StepOptions,

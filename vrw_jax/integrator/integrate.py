@@ -29,8 +29,8 @@ from vrw_jax.integrator.minima import (
 )
 from vrw_jax.integrator.tableaus import (
     ButcherTableau,
+    SolverStepFunction,
     StageState,
-    TakeStep,
     compute_step_size_factor,
     estimate_step_error,
     find_earliest_guard_minimum_fraction,
@@ -139,7 +139,7 @@ def integrate_batch_phase(
 def _compute_phase_end_jvp(
     tableau: ButcherTableau,
     phase_tangents: PhaseTangents,
-    solver_step_function: TakeStep,
+    solver_step_function: SolverStepFunction,
     start_state: StageState,
     phase_end: BatchPhaseEnd,
     integrator_state: IntegratorState,
@@ -308,7 +308,7 @@ def _integrate_to_event(
     )
 
 
-def _make_solver_step_function(phase: BatchPhase, tableau: ButcherTableau) -> TakeStep:
+def _make_solver_step_function(phase: BatchPhase, tableau: ButcherTableau) -> SolverStepFunction:
     """Return a function of state and length that takes one Runge-Kutta step in the phase.
 
     The function is traced once for all its calls.
@@ -327,7 +327,7 @@ def _wrap_each_phase_function(phase: BatchPhase, wrap_function: Callable) -> Bat
 
 def _integrate_until_crossing(
     phase: BatchPhase,
-    solver_step_function: TakeStep,
+    solver_step_function: SolverStepFunction,
     tableau: ButcherTableau,
     start_state: StageState,
     guard_values: Vector,
@@ -337,10 +337,11 @@ def _integrate_until_crossing(
     straggler_count: Array | None,
     phase_tangents: PhaseTangents | None,
 ) -> IntegratorState:
-    """Return the state of the integration loop after adaptive solver steps in all batch elements.
+    """Take adaptive solver steps in all batch elements, and return the state of the loop.
 
     An element stops when a guard crosses zero, when it reaches the time limit, or when it fails.
-    The loop ends when no element is running, or earlier if it cuts off stragglers.
+    The loop ends when no element is running, or earlier if it may leave the slowest
+    elements unfinished.
     """
 
     def take_one_solver_step(integrator_state: IntegratorState) -> IntegratorState:

@@ -15,7 +15,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
-from vrw_jax.integrator.tableaus import ButcherTableau, StageState, TakeStep
+from vrw_jax.integrator.tableaus import ButcherTableau, SolverStepFunction, StageState
 from vrw_jax.integrator.tangents import BatchPhase, PhaseTangents
 from vrw_jax.numerics import (
     StepOptions,
@@ -150,7 +150,7 @@ class _MarginMinimumSearch(NamedTuple):
 
 def refine_margin_minima(
     phase: BatchPhase,
-    solver_step_function: TakeStep,
+    solver_step_function: SolverStepFunction,
     margin_minima_state: MarginMinimaState,
     start_margin_values: Array,
     options: StepOptions,
@@ -243,7 +243,7 @@ def _select_margin(margins: Array, margin_index: Array) -> Array:
 
 
 def compute_margin_minima_jvp(
-    solver_step_function: TakeStep,
+    solver_step_function: SolverStepFunction,
     tableau: ButcherTableau,
     phase_tangents: PhaseTangents,
     margin_minima_state: MarginMinimaState,

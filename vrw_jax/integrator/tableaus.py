@@ -309,7 +309,7 @@ class StageState(NamedTuple):
 
 
 EvaluateAcceleration = Callable[[Vector, Vector], StageAccelerations]
-TakeStep = Callable[[StageState, Array], list[StageState]]
+SolverStepFunction = Callable[[StageState, Array], list[StageState]]
 """Function of a state and a step length that returns all stages of a Runge-Kutta step.
 
 The first state is the start of the step, and the last state is its end.

@@ -17,17 +17,17 @@ because it exceeds pi/2, the largest angle of a valid start.
 """
 
 
-def _compute_economized_coefficients(taylor_order_offset: int) -> tuple[float, ...]:
+def _compute_economized_coefficients(lowest_taylor_order: int) -> tuple[float, ...]:
     """Return nine coefficients of a polynomial in the squared angle.
 
-    The polynomial approximates the cosine if `taylor_order_offset` is 0, and the sine divided by
+    The polynomial approximates the cosine if `lowest_taylor_order` is 0, and the sine divided by
     the angle if it is 1. The coefficients are those of the Taylor series, in which Chebyshev
     polynomials of lower degree replace the last terms. The polynomial is as accurate as a Taylor
     series with three more terms.
     """
     factorial_of_order, squared_angle_limit = math.factorial, MAX_EXACT_ANGLE * MAX_EXACT_ANGLE
     series_coefficients = [
-        (-1) ** taylor_order / factorial_of_order(2 * taylor_order + taylor_order_offset)
+        (-1) ** taylor_order / factorial_of_order(2 * taylor_order + lowest_taylor_order)
         for taylor_order in range(1, 14)
     ]
     while len(series_coefficients) > 8:

@@ -22,7 +22,7 @@ from vrw_jax.wheel import Outcome, WheelParams
 
 
 @dataclass(frozen=True)
-class PassageGradientOptions:
+class FirstPassageGradientOptions:
     """Numerical options for the derivatives of mean numbers of gait steps from sampled walks."""
 
     n_failing_walks: int = 1024
@@ -51,7 +51,7 @@ class PassageGradientOptions:
     """
 
 
-PASSAGE_GRADIENT_OPTIONS = PassageGradientOptions()
+PASSAGE_GRADIENT_OPTIONS = FirstPassageGradientOptions()
 
 
 class FailingWalks(NamedTuple):
