@@ -72,6 +72,15 @@ def describe_trace_environment() -> tuple[object, ...]:
     )
 
 
+def find_user_cache_folder() -> Path:
+    """Return the folder in which this operating system stores the user's caches."""
+    if sys.platform == "win32":
+        return Path(os.environ.get("LOCALAPPDATA", Path.home() / "AppData" / "Local"))
+    if sys.platform == "darwin":
+        return Path.home() / "Library" / "Caches"
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+
+
 def find_cache_folder() -> Any:
     """Return the folder of JAX's compilation cache, or None if no trusted folder is set."""
     jax_cache_folder = jax.config.jax_compilation_cache_dir  # type: ignore[attr-defined]

@@ -4,7 +4,6 @@ compilation.
 
 import contextlib
 import os
-import sys
 from pathlib import Path
 
 import jax
@@ -50,7 +49,7 @@ def start_jax(cache: str | Path | None = None, *, trust_shared: bool = False) ->
         )
     jax.config.update("jax_enable_x64", True)
     if cache is not None or not jax.config.jax_compilation_cache_dir:  # type: ignore[attr-defined]
-        jax_cache_folder = _find_user_cache_folder() / "vrw_jax" if cache is None else cache
+        jax_cache_folder = store.find_user_cache_folder() / "vrw_jax" if cache is None else cache
         jax.config.update("jax_compilation_cache_dir", str(jax_cache_folder))
     cache_folder = jax.config.jax_compilation_cache_dir  # type: ignore[attr-defined]
     if cache_folder and "://" not in cache_folder:  # A storage bucket is no folder.
@@ -87,12 +86,3 @@ def _accepts_fusion_emitters_flag() -> bool:
     A version that does not accept the flag may abort the process on receiving it.
     """
     return jax.__version_info__[:2] in ((0, 9), (0, 10))
-
-
-def _find_user_cache_folder() -> Path:
-    """Return the folder in which this operating system stores the user's caches."""
-    if sys.platform == "win32":
-        return Path(os.environ.get("LOCALAPPDATA", Path.home() / "AppData" / "Local"))
-    if sys.platform == "darwin":
-        return Path.home() / "Library" / "Caches"
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")

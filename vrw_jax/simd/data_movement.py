@@ -152,6 +152,18 @@ def emit_unstacked_arrays(
     return [take_axis_slice(slice_position) for slice_position in range(len(equation.outvars))]
 
 
+def emit_optimization_barrier(
+    jaxpr_lowering: JaxprLowering, equation: Any, operands: list[LlvmArray]
+) -> list[LlvmArray]:
+    """Return the operands. Large lazy arrays among them are computed and stored in memory at this
+    point.
+    """
+    return [
+        jaxpr_lowering.array_emitter.store_array_in_memory(x) if isinstance(x, LazyArray) else x
+        for x in operands
+    ]
+
+
 def _concatenate_along_axis(
     array_emitter: ArrayEmitter,
     primitive_call: PrimitiveCall,

@@ -68,18 +68,6 @@ def _emit_single_result(
     return [result_array]
 
 
-def _emit_optimization_barrier(
-    jaxpr_lowering: JaxprLowering, equation: Any, operands: list[LlvmArray]
-) -> list[LlvmArray]:
-    """Return the operands. Large lazy arrays among them are computed and stored in memory at this
-    point.
-    """
-    return [
-        jaxpr_lowering.array_emitter.store_array_in_memory(x) if isinstance(x, LazyArray) else x
-        for x in operands
-    ]
-
-
 SINGLE_RESULT_RULES: dict[str, Callable[..., LlvmArray]] = {
     **dict.fromkeys(ELEMENTWISE_RULES, ArrayEmitter.emit_elementwise_array),
     "broadcast_in_dim": data_movement.emit_broadcast_array,
@@ -104,7 +92,7 @@ SINGLE_RESULT_RULES: dict[str, Callable[..., LlvmArray]] = {
 PRIMITIVE_RULES: dict[str, PrimitiveRule] = {
     **{name: partial(_emit_single_result, rule) for name, rule in SINGLE_RESULT_RULES.items()},
     **dict.fromkeys(CALLED_JAXPR_PARAMETERS, emit_called_jaxpr),
-    "optimization_barrier": _emit_optimization_barrier,
+    "optimization_barrier": data_movement.emit_optimization_barrier,
     "scan": loops.emit_scan_loop,
     "unstack": data_movement.emit_unstacked_arrays,
     "while": loops.emit_while_loop,
