@@ -195,7 +195,7 @@ class WheelParams(AbstractPrintable):
     def __check_init__(self) -> None:
         known_parameter_values = {
             parameter_name: float(parameter_value)
-            for parameter_name, parameter_value in self._get_parameters().items()
+            for parameter_name, parameter_value in self._parameters.items()
             if not isinstance(parameter_value, jax.core.Tracer) and parameter_value.ndim == 0
         }
         for parameter_name, parameter_value in known_parameter_values.items():
@@ -226,7 +226,7 @@ class WheelParams(AbstractPrintable):
             )
         parameter_shapes = {
             parameter_name: parameter_value.shape
-            for parameter_name, parameter_value in self._get_parameters().items()
+            for parameter_name, parameter_value in self._parameters.items()
             if parameter_value.ndim
         }
         if len({parameter_shape[0] for parameter_shape in parameter_shapes.values()}) > 1:
@@ -235,7 +235,8 @@ class WheelParams(AbstractPrintable):
                 "each element of its axis: give arrays of one length."
             )
 
-    def _get_parameters(self) -> dict[str, Any]:
+    @property
+    def _parameters(self) -> dict[str, Any]:
         """Return the floating-point parameters by their names, in the order of their fields."""
         return {
             parameter_name: getattr(self, parameter_name) for parameter_name in PARAMETER_DOMAINS
@@ -252,7 +253,7 @@ class WheelParams(AbstractPrintable):
 
     def require_single_wheel(self, remedy_text: str) -> None:
         """Raise a `ValueError` if a parameter has an axis. The message ends with `remedy_text`."""
-        for parameter_name, parameter_value in self._get_parameters().items():
+        for parameter_name, parameter_value in self._parameters.items():
             if parameter_value.ndim:
                 raise ValueError(
                     f"{parameter_name} has shape {parameter_value.shape}, but this is about one "
@@ -273,7 +274,7 @@ class WheelParams(AbstractPrintable):
         A gradient has labels that begin with "by", one for each parameter.
         """
         parameters_with_domains = [
-            (name, value, PARAMETER_DOMAINS[name]) for name, value in self._get_parameters().items()
+            (name, value, PARAMETER_DOMAINS[name]) for name, value in self._parameters.items()
         ]
         if not np.all(self.is_in_domain()):
             return [
@@ -297,7 +298,7 @@ class WheelParams(AbstractPrintable):
         The product of any four parameters must also be finite in their floating-point type.
         """
         is_in_all_domains = self.leg_com < self.locked_length
-        value_by_parameter = self._get_parameters()
+        value_by_parameter = self._parameters
         for parameter_name, parameter_value in value_by_parameter.items():
             max_value_of_dtype = float(jnp.finfo(jnp.result_type(parameter_value)).max) ** 0.25
             parameter_domain = PARAMETER_DOMAINS[parameter_name]
@@ -350,7 +351,7 @@ class WheelParams(AbstractPrintable):
                     "scale is positive: give 2, say, for twice as much."
                 )
         scaled_parameter_values = {}
-        for parameter_name, parameter_value in self._get_parameters().items():
+        for parameter_name, parameter_value in self._parameters.items():
             unit_powers = UNIT_POWERS[PARAMETER_DOMAINS[parameter_name].unit]
             scale_factor = math.prod(map(pow, factor_by_dimension.values(), unit_powers))
             scaled_parameter_values[parameter_name] = parameter_value * scale_factor
@@ -360,7 +361,7 @@ class WheelParams(AbstractPrintable):
         """Return the parameters by their symbols in the paper, and quantities that several formulas
         share.
         """
-        return compute_symbols(self.n_legs, **self._get_parameters())
+        return compute_symbols(self.n_legs, **self._parameters)
 
 
 def _square_relative_parameters(
