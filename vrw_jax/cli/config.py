@@ -171,17 +171,22 @@ class TuneConfig:
     @classmethod
     def from_table(cls, config_table: ConfigTable) -> "TuneConfig":
         """Read the settings of the table `[tune]` and of its subtables."""
-        _require_known_keys(config_table, cls.__dataclass_fields__, "[tune]", "settings")
-        bounds_table = config_table.get("bounds")
-        if not isinstance(bounds_table, dict) or not bounds_table:
-            raise ValueError(
-                "[tune] has no free parameter, but it needs at least one: add [tune.bounds] with "
-                "lines such as damping = [20.0, 215.0]."
-            )
-        _require_known_keys(bounds_table, PARAMETER_NAMES, "[tune.bounds]", "parameters")
+
+        def parse_bounds(_: str, bounds_table: object) -> dict[str, tuple[float, float]]:
+            if not isinstance(bounds_table, dict) or not bounds_table:
+                raise ValueError(
+                    "[tune] has no free parameter, but it needs at least one: add [tune.bounds] "
+                    "with lines such as damping = [20.0, 215.0]."
+                )
+            _require_known_keys(bounds_table, PARAMETER_NAMES, "[tune.bounds]", "parameters")
+            return {
+                parameter_name: _parse_parameter_range(parameter_name, parameter_bounds)
+                for parameter_name, parameter_bounds in bounds_table.items()
+            }
+
         return cls(
             **_parse_settings(
-                config_table,
+                {"bounds": {}, **config_table},
                 "[tune]",
                 objective=lambda setting_name, value: (
                     value
@@ -193,10 +198,7 @@ class TuneConfig:
                         '"dls_fraction" or objective = { dls_fraction = 1.0, speed = 0.1 }',
                     )
                 ),
-                bounds=lambda *_: {
-                    parameter_name: _parse_parameter_range(parameter_name, parameter_bounds)
-                    for parameter_name, parameter_bounds in bounds_table.items()
-                },
+                bounds=parse_bounds,
                 constraints=partial(
                     _parse_numbers_by_name,
                     requirement_text="a table: write [tune.constraints] and below it lines such "
