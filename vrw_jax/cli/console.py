@@ -55,15 +55,16 @@ def report_command_errors(
     except KeyboardInterrupt:
         print_error_sentence(interruption_message)
         raise typer.Exit(ExitCode.INTERRUPTED) from None
-    except (MemoryError, OSError, ValueError) as command_error:
-        error_sentence = str(command_error)
-        if isinstance(command_error, MemoryError):
-            error_sentence = (
-                "this asks for more memory than there is: give smaller designs, or fewer at once."
-            )
-        elif isinstance(command_error, OSError):
-            error_sentence = _format_system_error(command_error)
-        print_error_sentence(error_sentence)
+    except MemoryError as command_error:
+        print_error_sentence(
+            "this asks for more memory than there is: give smaller designs, or fewer at once."
+        )
+        raise typer.Exit(ExitCode.USER_ERROR) from command_error
+    except ValueError as command_error:
+        print_error_sentence(str(command_error))
+        raise typer.Exit(ExitCode.USER_ERROR) from command_error
+    except OSError as command_error:
+        print_error_sentence(_format_system_error(command_error))
         raise typer.Exit(ExitCode.USER_ERROR) from command_error
 
 
