@@ -29,7 +29,9 @@ class PaperFact:
     @property
     def is_from_reference_code(self) -> bool:
         """Return whether the published value comes from independent code instead of the paper."""
-        return INDEPENDENT_CODE_LABEL in self.source + self.published_value
+        return (
+            INDEPENDENT_CODE_LABEL in self.source or INDEPENDENT_CODE_LABEL in self.published_value
+        )
 
     @property
     def verdict(self) -> str:
