@@ -176,7 +176,7 @@ def test_a_trace_of_other_versions_is_not_used(folder, monkeypatch):
     run = lambda: compile_exported_function(double, (X,), "versions", jax.devices()[0])(X)
     run(), run()
     assert len(traces) == 1
-    monkeypatch.setattr(store, "find_installed_version", lambda library_name: "0.0")
+    monkeypatch.setattr(store, "find_library_version", lambda library_name: "0.0")
     run()
     assert len(traces) == 2
 

@@ -131,18 +131,18 @@ def add_multiple_bifurcations(
             root_groups[-1].append(root)
         else:
             root_groups.append([root])
-    mean_modulus_root_requests = []
+    requests_for_mean_modulus_roots = []
     for root_group in root_groups:
         point_pair, first_rank = (
             root_group[0].request.point_pair,
             root_group[0].request.multiplier_ranks.start,
         )
-        mean_modulus_root_requests.append(
+        requests_for_mean_modulus_roots.append(
             request_mean_modulus_root(point_pair, range(first_rank, first_rank + len(root_group)))
         )
     multiple_bifurcations = []
     for root_group, mean_root in zip(
-        root_groups, locate_roots(mean_modulus_root_requests), strict=True
+        root_groups, locate_roots(requests_for_mean_modulus_roots), strict=True
     ):
         moduli_beside_root = mean_root.table_beside_root.quantity_table[MULTIPLIER_MODULI_COLUMN][0]
         unit_circle_distances = np.abs(

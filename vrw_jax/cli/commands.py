@@ -34,7 +34,7 @@ from vrw_jax.continuation import ArclengthOptions
 from vrw_jax.cycles import limit_cycle, make_finder, resolve_model_with_reason
 from vrw_jax.measures import FORCE_PEAK_MEASURES
 from vrw_jax.robustness import first_passage, gait_sensitivity
-from vrw_jax.runtime import find_installed_version, start_jax
+from vrw_jax.runtime import find_library_version, start_jax
 from vrw_jax.scans import follow_special_points, forecast_scan, require_map_grid
 from vrw_jax.selection import list_model_config_names
 from vrw_jax.simulation import step
@@ -94,7 +94,7 @@ def _handle_first_interrupt(_signal: int, _frame: object) -> None:
 def _print_version_and_exit(is_version_requested: bool) -> None:
     """Print the version and exit if the option `--version` is given."""
     if is_version_requested:
-        print(f"vrw {find_installed_version('vrw-jax')}")
+        print(f"vrw {find_library_version('vrw-jax')}")
         raise typer.Exit
 
 

@@ -94,7 +94,7 @@ class ContactState(NamedTuple):
     force_rate_signs: Array | None = None
 
     @classmethod
-    def with_unchanged_contacts(cls, contact_modes: Array, is_leg_locked: Array) -> "ContactState":
+    def without_recent_changes(cls, contact_modes: Array, is_leg_locked: Array) -> "ContactState":
         """Return the contact state without changes at the last event, and without signs."""
         no_leg_flags = is_leg_locked & False
         return cls(contact_modes, is_leg_locked, no_leg_flags, no_leg_flags, no_leg_flags)

@@ -156,7 +156,7 @@ def unpack_section_state(s: Symbols, section_state: FullState) -> tuple[WheelMot
     )
     dtheta, vx, vz = section_state[1], section_state[2], section_state[3]
     motion = WheelMotion(hub_x, hub_z, theta, vx, vz, dtheta, L, dL)
-    return motion, ContactState.with_unchanged_contacts(contact_modes, is_leg_locked)
+    return motion, ContactState.without_recent_changes(contact_modes, is_leg_locked)
 
 
 def pack_section_state(

@@ -341,7 +341,7 @@ def build_contact_step_sampler(
         start_states, contact_modes, is_leg_locked, durations = contact_interval_log
         contact_mode_dynamics = walk_settings.make_lane_contact_dynamics(
             walk_settings.replace_invalid_lanes(input_columns, x)[0],
-            ContactState.with_unchanged_contacts(contact_modes, is_leg_locked),
+            ContactState.without_recent_changes(contact_modes, is_leg_locked),
         )
         options, tableau = walk_settings.step_options, walk_settings.tableau
         if tableau is None:

@@ -398,7 +398,7 @@ class BatchWalkSettings(NamedTuple):
             motion_after, contact_state_after = select_trees_by_condition(
                 is_contact_event,
                 (event_result.motion, event_result.contact_state),
-                (motion, ContactState.with_unchanged_contacts(*contact_state[:2])),
+                (motion, ContactState.without_recent_changes(*contact_state[:2])),
             )
             dynamics_after = self.make_lane_contact_dynamics(input_columns, contact_state_after)
             force_rate_signs = update_force_rate_signs(

@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float, Int
 from vrw_jax.numerics import (
     Scalar,
     find_cubic_minimum,
-    improve_minimum_location,
+    refine_minimum_location,
     select_trees_by_condition,
 )
 
@@ -285,7 +285,7 @@ def advance_margin_minimum_refinement(
         for x in (margin_values, margin_rates, interior_margin_minima.step_length)
     )
     proposed_step_length, best_step_length, best_margin_rate, has_secant_converged = (
-        improve_minimum_location(
+        refine_minimum_location(
             step_length,
             margin_rate,
             lax.stop_gradient(minimum_step_length),

@@ -340,8 +340,8 @@ def _integrate_until_crossing(
     """Take adaptive solver steps in all batch elements, and return the state of the loop.
 
     An element stops when a guard crosses zero, when it reaches the time limit, or when it fails.
-    The loop ends when no element is running, or earlier if it may leave the slowest elements
-    unfinished.
+    The loop ends when no element is running, or earlier if the caller allows the slowest elements
+    to be left unfinished.
     """
 
     def take_one_solver_step(integrator_state: IntegratorState) -> IntegratorState:

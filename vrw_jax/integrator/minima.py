@@ -20,7 +20,7 @@ from vrw_jax.integrator.tangents import BatchPhase, PhaseTangents
 from vrw_jax.numerics import (
     StepOptions,
     find_cubic_minimum,
-    improve_minimum_location,
+    refine_minimum_location,
     select_trees_by_condition,
 )
 
@@ -183,7 +183,7 @@ def refine_margin_minima(
                 evaluate_selected_margin, step_end
             )
             step_length, best_step_length, best_margin_rate, has_secant_converged = (
-                improve_minimum_location(
+                refine_minimum_location(
                     step_length, margin_rate, margin_minimum_state.step_length, *best_step
                 )
             )

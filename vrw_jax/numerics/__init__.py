@@ -50,7 +50,7 @@ from vrw_jax.numerics.cached_programs import (
 from vrw_jax.numerics.cubic_minima import (
     evaluate_cubic,
     find_cubic_minimum,
-    improve_minimum_location,
+    refine_minimum_location,
 )
 from vrw_jax.numerics.forward_only import forbid_reverse_mode
 from vrw_jax.numerics.options import EngineName, SolverName, StepOptions, make_real_field

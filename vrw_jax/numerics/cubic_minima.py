@@ -38,8 +38,8 @@ def find_cubic_minimum(
 ) -> tuple[Array, Array]:
     """Return the location and the value of the interior minimum of the cubic Hermite interpolant.
 
-    The location is between 0 and 1. Without an interior minimum, the value is the lower one of the
-    two ends.
+    The location is between 0 and 1. If there is no interior minimum, the value is the
+    lower of the values at the two ends.
     """
     quadratic_coefficient = 3.0 * (
         2.0 * cubic_value_at_0 + cubic_rate_at_0 - 2.0 * cubic_value_at_1 + cubic_rate_at_1
@@ -71,7 +71,7 @@ def find_cubic_minimum(
     )
 
 
-def improve_minimum_location(
+def refine_minimum_location(
     step_length: Array,
     margin_rate: Array,
     max_step_length: Array,

@@ -454,7 +454,8 @@ def _estimate_failure_probability(
     A round samples one walk per walker. After the first rounds, and after each further number of
     rounds that is expected to suffice, the error is compared with the tolerance. The error is
     infinite if a few walks dominate the probability. Sampling also ends if the estimate depends on
-    the start by more than the tolerance and further rounds cannot reduce this dependence.
+    the section state at the start by more than the tolerance, and further rounds cannot reduce this
+    dependence.
 
     - `failure_weight_sampler`: function that returns the weight of each walk of a round, which is 0
       unless the walk fails in its last step;

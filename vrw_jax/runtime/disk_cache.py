@@ -49,7 +49,7 @@ def compute_source_digest() -> str:
 
 
 @functools.cache  # Reading the metadata takes longer than the steps of a walk.
-def find_installed_version(library_name: str) -> str:
+def find_library_version(library_name: str) -> str:
     """Return the version of an installed library, or "not installed"."""
     try:
         return importlib.metadata.version(library_name)
@@ -65,7 +65,7 @@ def describe_trace_environment() -> tuple[object, ...]:
     return (
         compute_source_digest(),
         sys.version_info[:2],
-        *map(find_installed_version, TRACE_LIBRARY_NAMES),
+        *map(find_library_version, TRACE_LIBRARY_NAMES),
         jax.dtypes.canonicalize_dtype(float).name,
         jax_config.jax_default_matmul_precision,
         jax_config.jax_numpy_dtype_promotion,

@@ -16,9 +16,9 @@ def start_jax(cache: str | Path | None = None, *, trust_shared: bool = False) ->
     """Configure JAX: 64-bit numbers, a cache for compiled code, and faster XLA compilation on CPUs.
 
     Call this function before the first array is created. The library also works without this call,
-    but processes then take much longer to start. The default of `cache` is the folder that JAX
-    already uses, from JAX_COMPILATION_CACHE_DIR or an earlier call, or else a folder in the user's
-    cache folder.
+    but processes then take much longer to start. By default, `cache` is the folder that JAX already
+    uses, set by JAX_COMPILATION_CACHE_DIR or by an earlier call. If JAX uses none, it is a folder
+    in the user's cache folder.
 
     Args:
         cache: folder for compiled code; `~` means the user's home folder.

@@ -243,7 +243,7 @@ class CollocationScanEngine:
         # Threads have separate settings.
         compile_function = with_default_jax_settings(compile_exported_function)
         step_options = self._evaluation_request.step_options
-        program_specifications = (
+        scan_program_specifications = (
             ("cycle", self._evaluate_cycle_batch, (parameter_rows_shape,)),
             (
                 "step",
@@ -261,7 +261,7 @@ class CollocationScanEngine:
                         (program_name, *self._program_cache_key),
                         device,
                     )
-                    for program_name, batch_function, arguments in program_specifications
+                    for program_name, batch_function, arguments in scan_program_specifications
                 ]
                 for device in local_devices
             }

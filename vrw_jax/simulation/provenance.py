@@ -5,7 +5,7 @@ import platform
 import jax
 
 from vrw_jax.numerics import StepOptions
-from vrw_jax.runtime import find_installed_version
+from vrw_jax.runtime import find_library_version
 from vrw_jax.wheel import PARAMETER_NAMES, WheelParams
 
 
@@ -27,7 +27,7 @@ def collect_provenance_attributes(
         "parameter_n_legs": params.n_legs,
         "model": repr(model),
         "versions": ", ".join(
-            f"{library_name} {find_installed_version(library_name)}"
+            f"{library_name} {find_library_version(library_name)}"
             for library_name in ("vrw-jax", "jax", "diffrax", "numpy")
         )
         + f", python {platform.python_version()}",
