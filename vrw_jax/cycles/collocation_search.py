@@ -21,6 +21,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from vrw_jax import simd
 from vrw_jax.collocation import (
+    N_GAUSS_NODES,
     CollocationPhase,
     CollocationSolution,
     CycleLinearization,
@@ -45,7 +46,6 @@ from vrw_jax.numerics import (
     BatchFunction,
     LaneArray,
     Vector,
-    make_zeros_like_output,
     select_trees_by_condition,
 )
 from vrw_jax.wheel import WheelParams, make_wheel_from_parameters, stack_parameters
@@ -785,17 +785,25 @@ def init_search_result(
     collocation_system: CollocationSystem, parameters: LaneParameters
 ) -> CycleSearchResult:
     """Return the search result of each wheel (lane) before the first attempt."""
-    section_size = collocation_system.phase_sequence.section_size
-    zeros = jnp.zeros_like(parameters[0])
-    return CycleSearchResult(
-        collocation_state=make_zeros_like_output(
-            functools.partial(predict_start_from_gait_surface, collocation_system),
-            parameters,
-            zeros,
+    phase_sequence, period_n = collocation_system.phase_sequence, collocation_system.period_n
+    section_size = phase_sequence.section_size
+    make_zeros = lambda *shape: jnp.zeros((*shape, parameters.shape[-1]), parameters.dtype)
+    # No call of `predict_start_from_gait_surface`: its trace would take 30 ms of a first answer.
+    start_solution = CollocationSolution(
+        section_state=make_zeros(section_size),
+        durations=make_zeros(period_n, len(phase_sequence.phases)),
+        accelerations=tuple(
+            make_zeros(period_n, phase_mesh.n_intervals, N_GAUSS_NODES, phase.n_coordinates)
+            for phase_mesh, phase in zip(
+                collocation_system.phase_meshes, phase_sequence.phases, strict=True
+            )
         ),
-        monodromy_matrix=jnp.zeros((section_size, section_size, *zeros.shape), zeros.dtype),
-        correction_norm=zeros + jnp.inf,
-        n_newton_iterations=zeros.astype(jnp.int32),
+    )
+    return CycleSearchResult(
+        collocation_state=CollocationState.make_start(start_solution, start_solution.durations),
+        monodromy_matrix=make_zeros(section_size, section_size),
+        correction_norm=make_zeros() + jnp.inf,
+        n_newton_iterations=make_zeros().astype(jnp.int32),
     )
 
 
