@@ -22,6 +22,7 @@ def page_names(request, monkeypatch, tmp_path) -> dict:
     return left_part
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("page_names", [0], indirect=True)
 def test_the_loop_increases_its_objective_and_satisfies_its_margins(page_names):
     before, after = (vrw.limit_cycle(page_names["wheel"](u)) for u in ([1.8, 3.0], page_names["u"]))

@@ -30,7 +30,8 @@ SLOW_EXAMPLES = {
     "UnilateralWheel", "UnilateralStep", "LadderWheel", "LadderStep", "continue_branches",
     "continue_special_point", "SpecialPointCurve",
     "measure_to_tolerance", "MeasureResult", "multifidelity_mean", "MultifidelityMean",
-    "gait_sensitivity", "GaitSensitivity", "smallest_disturbance", "TuneResult",
+    "gait_sensitivity", "GaitSensitivity", "measure_gait_sensitivity",
+    "smallest_disturbance", "TuneResult",
     "WheelObjective", "measure_basins", "FirstPassage", "SmallestDisturbance",
 }  # fmt: skip
 """Names whose examples compile for a minute, or compute for seconds what other tests cover."""

@@ -156,6 +156,7 @@ def special_point_curves(table_1_cycle):
     return continue_special_points(names, CURVE_PARAMETERS, table_1_cycle, bounds=CURVE_BOX)
 
 
+@pytest.mark.slow
 def test_special_point_curves_pass_through_the_special_points_of_the_branch(special_point_curves):
     for curve in special_point_curves[:2]:
         assert_through_the_branch(curve)
@@ -172,6 +173,7 @@ def test_gaits_on_both_sides_of_a_curve_differ_in_its_sign(special_point_curves)
         assert result["right, found cold"] > 0 or curve.name == "duration_dls", result
 
 
+@pytest.mark.slow
 def test_period_doubling_lies_between_its_meetings_with_both_double_support_curves(
     special_point_curves,
 ):
@@ -192,6 +194,7 @@ def test_period_doubling_lies_between_its_meetings_with_both_double_support_curv
     assert abs(one[1] + share * (other[1] - one[1]) - 571.4737) < 4e-3
 
 
+@pytest.mark.slow
 def test_curves_of_vanishing_and_of_zero_double_support_meet_at_one_point(special_point_curves):
     """And the polynomial through six points at which it still lasts says where it does not."""
     _, jumps, rolls = special_point_curves
@@ -215,6 +218,7 @@ def test_curves_of_vanishing_and_of_zero_double_support_meet_at_one_point(specia
     assert f"{one[0]:.9g}" in jumps.ends[0] + jumps.ends[1]
 
 
+@pytest.mark.slow
 def test_both_test_functions_vanish_at_a_codimension_two_point(special_point_curves):
     scuffing, *_ = special_point_curves
     (codim2_point,) = [

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from reference_code import complementarity
 from reference_code.contact_force_extrema import find_step_extrema, make_start
+from support.slow_variants import mark_slow
 
 import vrw_jax as vrw
 from vrw_jax.measures import FORCE_PEAK_MEASURES
@@ -29,7 +30,7 @@ def read_peaks(gait, names=FORCE_PEAK_MEASURES):
     return {name: float(value) for name, value in gait.measures(names).items()}
 
 
-@pytest.mark.parametrize("wheel_name", WHEELS)
+@pytest.mark.parametrize("wheel_name", ["two peaks", *mark_slow("Table 1")])
 def test_peaks_of_a_gait_are_those_of_the_second_formulation(gaits, wheel_name):
     """The relative error is that of the step, 1e-10 per solver step, after some hundred steps."""
     gait, params = gaits[wheel_name], WHEELS[wheel_name]

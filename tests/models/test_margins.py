@@ -25,7 +25,7 @@ def compute_reference_margins(index):
     )
 
 
-@pytest.mark.parametrize("by_lanes", [False, True], ids=["wheel", "lanes"])
+@pytest.mark.parametrize("by_lanes", [*mark_slow(False), True], ids=["wheel", "lanes"])
 @pytest.mark.parametrize(
     "index",
     [*mark_slow(0, 1), 5],

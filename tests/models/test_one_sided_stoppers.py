@@ -163,8 +163,6 @@ def test_batches_with_one_sided_stoppers_equal_single_wheels():
 def test_round_off_does_not_repeat_the_event_of_a_released_contact(tolerance):
     """Wheels apart by rounding alone: a leg let go from rest reads zero for 1e-8 s and longer."""
     wheels, friction = 64, 0.7
-    options_used = {"model": make_model(friction), "options": TIGHT_OPTIONS, "engine": "diffrax"}
-    period = vrw.walk(vrw.WheelParams(), START, 1, **options_used).steps.durations.sum()
     batch_result = vrw.step_batch(
         vrw.WheelParams(damping=200.0 * (1.0 + 1e-12 * np.arange(wheels))),
         np.tile(START, (wheels, 1)),
@@ -173,7 +171,7 @@ def test_round_off_does_not_repeat_the_event_of_a_released_contact(tolerance):
         options=vrw.StepOptions(rtol=tolerance, atol=tolerance),
     )
     assert np.all(np.asarray(batch_result.outcome) == vrw.Outcome.STEPPED)
-    np.testing.assert_allclose(batch_result.durations.sum(1), period, rtol=0, atol=1e-10)
+    assert np.ptp(batch_result.durations.sum(1)) < 1e-10
 
 
 @pytest.mark.slow

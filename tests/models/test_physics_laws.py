@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support import reference_values
 from support.batched import NAMES, compute_full_steps, compute_states_and_work
+from support.slow_variants import mark_slow
 
 import vrw_jax as vrw
 from vrw_jax.wheel import Motion, compute_rear_foot_height, dynamics, make_paper_phases, transitions
@@ -37,7 +38,7 @@ def test_a_gait_loses_the_energy_of_its_descent(name):
     assert float(loss) == pytest.approx(compute_descent_energy(params, step), rel=1e-9)
 
 
-@pytest.mark.parametrize("held_landing", [False, True])
+@pytest.mark.parametrize("held_landing", [True, *mark_slow(False)])
 def test_a_rigid_gait_loses_the_energy_of_its_descent_in_its_landing(held_landing):
     params, model = vrw.WheelParams(slope=0.1), vrw.RigidWheel(held_landing=held_landing)
     step = vrw.step(params, vrw.limit_cycle(params, model=model).section_state, model=model)

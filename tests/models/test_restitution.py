@@ -98,6 +98,7 @@ def test_batches_with_restitution_on_uneven_ground_equal_walks_by_diffrax():
         np.testing.assert_allclose(batch.derivatives["damping"].durations[i], jacobian, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_the_derivative_by_restitution_is_a_difference_quotient():
     def duration(restitution):
         model = vrw.UnilateralWheel(friction=0.7, restitution=restitution)

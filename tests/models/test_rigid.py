@@ -84,20 +84,16 @@ def test_too_fast_a_start_lifts_off():
 
 
 def test_derivatives_agree_with_differences():
-    evaluate = lambda slope: vrw.step(
-        vrw.WheelParams(slope=slope), [HALF_ANGLE, 2.0, 0.0], model=rigid_walks()
-    )
-    value = lambda slope: jnp.stack(
-        [
-            evaluate(slope).section_state[1],
-            evaluate(slope).period,
-            evaluate(slope).margins.fore_foot_force,
-        ]
-    )
+    def value(slope):
+        wheel = vrw.WheelParams(slope=slope)
+        step = vrw.step(wheel, [HALF_ANGLE, 2.0, 0.0], model=rigid_walks())
+        return jnp.stack([step.section_state[1], step.period, step.margins.fore_foot_force])
+
     h = 1e-4
     difference = (value(0.15 + h) - value(0.15 - h)) / (2 * h)
-    np.testing.assert_allclose(jax.jacfwd(value)(0.15), difference, rtol=1e-6)
-    np.testing.assert_allclose(jax.jacrev(value)(0.15), jax.jacfwd(value)(0.15), rtol=1e-13)
+    forward, reverse = (transform(value)(0.15) for transform in (jax.jacfwd, jax.jacrev))
+    np.testing.assert_allclose(forward, difference, rtol=1e-6)
+    np.testing.assert_allclose(reverse, forward, rtol=1e-13)
 
 
 @pytest.mark.slow

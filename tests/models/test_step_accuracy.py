@@ -106,7 +106,7 @@ def test_all_solvers_agree(solver):
     assert reference_values.compute_scaled_error(solution, VALUES) < 1e-7
 
 
-@pytest.mark.parametrize(("solver", "order"), [*mark_slow(("Tsit5", 5)), ("Dopri8", 8)])
+@pytest.mark.parametrize(("solver", "order"), mark_slow(("Tsit5", 5), ("Dopri8", 8)))
 def test_work_falls_with_the_order_of_the_solver(solver, order):
     """Error against number of steps has the solver's order: state, event times and derivatives.
 

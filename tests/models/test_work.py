@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from support import reference_values
 from support.batched import compute_states_and_work
+from support.slow_variants import mark_slow
 
 import vrw_jax as vrw
 from vrw_jax.integrator.tableaus import compute_real_stability_limit, load_explicit_tableau
@@ -41,7 +42,7 @@ def lane_engine_steps():
 
 @pytest.mark.parametrize(
     ("engine", "steps", "error"),
-    [(diffrax_steps, 55.5, 8.5e-12), (lane_engine_steps, 44.44, 1.4e-11)],
+    [*mark_slow((diffrax_steps, 55.5, 8.5e-12)), (lane_engine_steps, 44.44, 1.4e-11)],
     ids=["diffrax", "lanes"],
 )
 def test_a_step_needs_no_more_solver_steps_and_is_no_less_accurate_than_recorded(

@@ -45,6 +45,7 @@ def read_termination(result):
     return Termination(int(result.termination))
 
 
+@pytest.mark.slow
 def test_the_examples_of_the_page_print_the_shown_output(capsys, monkeypatch):
     monkeypatch.setattr(vrw, "start_jax", lambda: None)
     blocks = re.findall(r"```python\n(.*?)```\n\n```text\n(.*?)```", PAGE.read_text(), re.DOTALL)
@@ -188,9 +189,10 @@ def make_attracted_field(rate):
     ("stiff", "rate", "solver"),
     [
         (make_switching_system, 2.7e6, "Kvaerno5"),
-        (make_attracted_field, 1e3, "Kvaerno4"),
         *mark_slow(
-            (make_switching_system, 1e3, "Kvaerno5"), (make_rotating_field, 1e6, "Kvaerno5")
+            (make_attracted_field, 1e3, "Kvaerno4"),
+            (make_switching_system, 1e3, "Kvaerno5"),
+            (make_rotating_field, 1e6, "Kvaerno5"),
         ),
     ],
 )

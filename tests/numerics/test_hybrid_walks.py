@@ -170,65 +170,90 @@ def test_one_mode_and_one_guard_may_be_given_without_a_tuple():
             simulate_hybrid(modes, start, events=3)
 
 
-def test_reverse_mode_is_refused_in_a_sentence_that_names_forward_mode():
-    fall, floor = bouncing()
-    start = lambda height: jnp.stack([height, 0.0 * height])
-    time = lambda height: simulate_hybrid(Mode(fall, floor), start(height), events=2).time
+def drop_twice(height, restitution=0.8):
+    return simulate_hybrid(
+        Mode(*bouncing(restitution)), jnp.stack([height, 0.0 * height]), events=2
+    )
 
-    def by_restitution(restitution):
-        return simulate_hybrid(Mode(*bouncing(restitution)), [1.0, 0.0], events=2).state[1]
 
-    cut = lambda height: segment_maps(fall, start(height), 0.1, 1, TIGHT).jacobians[0, 0, 1]
-    refused = [
-        lambda: jax.grad(time)(1.0),
-        lambda: jax.jit(jax.jacrev(time))(1.0),
-        lambda: jax.vmap(jax.grad(time))(jnp.ones(2)),
-        lambda: jax.hessian(time)(1.0),
-        lambda: jax.grad(by_restitution)(0.8),
-    ]
-    for call in refused:
-        with pytest.raises(ValueError, match=r"has no .* use forward mode, jax.jacf"):
-            call()
+@pytest.mark.parametrize(
+    "differentiate",
+    [
+        lambda time: jax.grad(time)(1.0),
+        *mark_slow(
+            lambda time: jax.jit(jax.jacrev(time))(1.0),
+            lambda time: jax.vmap(jax.grad(time))(jnp.ones(2)),
+            lambda time: jax.hessian(time)(1.0),
+            lambda _: jax.grad(lambda share: drop_twice(1.0, share).state[1])(0.8),
+        ),
+    ],
+    ids=["grad", "jit", "vmap", "hessian", "closure"],
+)
+def test_reverse_mode_is_refused_in_a_sentence_that_names_forward_mode(differentiate):
+    with pytest.raises(ValueError, match=r"has no .* use forward mode, jax.jacf"):
+        differentiate(lambda height: drop_twice(height).time)
+
+
+def test_segment_maps_refuse_reverse_mode_in_a_sentence():
+    fall, _ = bouncing()
+    cut = lambda height: segment_maps(fall, [height, 0.0], 0.1, 1, TIGHT).jacobians[0, 0, 1]
     with pytest.raises(ValueError, match=r"segment_maps has no .* jax.jacfwd"):
         jax.grad(cut)(1.0)
+
+
+def test_forward_mode_of_a_batch_gives_the_closed_form():
+    time = lambda height: drop_twice(height).time
     forwards = jax.vmap(jax.jit(jax.jacfwd(time)))(jnp.ones(2))
     np.testing.assert_allclose(forwards, 0.5 * 2.6 * np.sqrt(2.0 / 9.81), rtol=1e-12)
 
 
-def test_a_return_map_repeats_no_state_at_which_a_walk_stopped():
-    """A floor that gives back half of the rate and 2 m/s more: rates of 4 m/s return."""
-    fall, floor = bouncing(0.5, 2.0)
+def make_speeding_map(height, options=None):
+    """Return the map of a floor that gives back half of the rate and 2 m/s more.
 
-    def back(height, options=None):
-        embed = lambda rate: jnp.stack([height + 0.0 * rate[0], rate[0]])
-        return ReturnMap(Mode(fall, floor), embed, lambda y: y[1:], options=options)
+    Rates of 4 m/s return.
+    """
+    embed = lambda rate: jnp.stack([height + 0.0 * rate[0], rate[0]])
+    return ReturnMap(Mode(*bouncing(0.5, 2.0)), embed, lambda y: y[1:], options=options)
 
-    below, rate = back(-0.1), jnp.array([1.0])
-    stopped = simulate_hybrid(below.modes, below.embed(rate), events=1)
-    assert Termination(int(stopped.termination)) == Termination.GUARD_VIOLATED_AT_ENTRY
-    np.testing.assert_array_equal(stopped.state[1:], rate)  # unchanged, as if it had returned
-    for early, stop in (
-        (below, Termination.GUARD_VIOLATED_AT_ENTRY),
-        (back(0.0, vrw.StepOptions(max_phase_time=0.01)), Termination.MAX_TIME_REACHED),
-        (back(1.0, vrw.StepOptions(max_solver_steps=2)), Termination.MAX_STEPS_REACHED),
-    ):
-        assert np.isnan(early(rate)).all()
-        assert np.isnan(jax.jacfwd(early)(rate)).all()
-        lost = solve_fixed_point(early, rate)
-        assert not lost.converged
-        assert Termination(int(lost.termination)) == stop
-        assert stop.meaning in repr(lost)
-        assert np.isnan(lost.residual)
-    cycle = solve_fixed_point(back(0.0, TIGHT), rate)
+
+@pytest.mark.parametrize(
+    ("height", "options", "stop"),
+    [
+        (-0.1, None, Termination.GUARD_VIOLATED_AT_ENTRY),
+        *mark_slow(
+            (0.0, vrw.StepOptions(max_phase_time=0.01), Termination.MAX_TIME_REACHED),
+            (1.0, vrw.StepOptions(max_solver_steps=2), Termination.MAX_STEPS_REACHED),
+        ),
+    ],
+)
+def test_a_return_map_repeats_no_state_at_which_a_walk_stopped(height, options, stop):
+    early, rate = make_speeding_map(height, options), jnp.array([1.0])
+    stopped = simulate_hybrid(early.modes, early.embed(rate), events=1, options=options)
+    assert Termination(int(stopped.termination)) == stop
+    if stop == Termination.GUARD_VIOLATED_AT_ENTRY:
+        np.testing.assert_array_equal(stopped.state[1:], rate)  # as if the walk had returned
+    assert np.isnan(early(rate)).all()
+    assert np.isnan(jax.jacfwd(early)(rate)).all()
+    lost = solve_fixed_point(early, rate)
+    assert not lost.converged
+    assert Termination(int(lost.termination)) == stop
+    assert stop.meaning in repr(lost)
+    assert np.isnan(lost.residual)
+
+
+def test_a_return_map_has_the_fixed_point_and_the_multiplier_of_the_closed_form():
+    rate = jnp.array([1.0])
+    cycle = solve_fixed_point(make_speeding_map(0.0, TIGHT), rate)
     assert cycle.converged
     assert Termination(int(cycle.termination)) == Termination.MAX_EVENTS_REACHED
     np.testing.assert_allclose(cycle.x, 4.0, rtol=1e-12)
     np.testing.assert_allclose(cycle.jacobian, 0.5, rtol=1e-12)
-    twice = solve_fixed_point(back(0.0, TIGHT), rate, period_n=2)
+    twice = solve_fixed_point(make_speeding_map(0.0, TIGHT), rate, period_n=2)
     np.testing.assert_allclose(twice.jacobian, 0.25, rtol=1e-12)
     assert Termination(int(twice.termination)) == Termination.MAX_EVENTS_REACHED
 
 
+@pytest.mark.slow
 def test_a_return_map_s_point_moves_with_what_its_modes_close_over():
     def rate(lift):
         embed = lambda rate: jnp.stack([0.0 * rate[0], rate[0]])

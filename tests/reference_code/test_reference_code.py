@@ -139,6 +139,7 @@ def test_derivatives_of_the_reference_obey_the_scaling_laws_in_22_digits(name: s
         _assert_euler(value, power, [(x, slope, scale) for (x, scale), slope in pairs])
 
 
+@pytest.mark.slow
 def test_newtons_law_on_the_point_masses_gives_the_multipliers() -> None:
     solution = five_coordinates.step_margins(five_coordinates.TABLE_1, five_coordinates.START)
     assert solution["newton_residual"] < 1e-9

@@ -189,6 +189,7 @@ def test_the_rest_of_a_disturbed_step_is_that_of_five_coordinates(gait_step, sha
             np.testing.assert_allclose(section, x, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_just_below_the_smallest_disturbance_five_coordinates_walk_on(gait_step, smallest):
     x, step = gait_step
     phase, state = state_at_time(step, smallest.time)

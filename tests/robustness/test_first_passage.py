@@ -87,7 +87,7 @@ def test_the_derivative_of_a_long_life_is_a_central_difference():
     assert abs(gradient / difference - 1.0) < 1e-6
 
 
-@pytest.mark.parametrize("degrees", [*mark_slow(1.25), 2.0, 3.0])
+@pytest.mark.parametrize("degrees", [*mark_slow(1.25, 2.0), 3.0])
 def test_samples_agree_with_quadrature_within_their_error(degrees):
     gait = vrw.limit_cycle(BYL, model=RIGID)
     start, slope_sd = np.asarray(gait.section_state), degrees * DEGREE
@@ -139,8 +139,8 @@ def count_failure_share(params, slope_sd, n_walkers, n_steps, model=None):
 @pytest.mark.parametrize(
     ("slope_sd", "damping", "n_walkers", "n_steps", "tol"),
     [
-        (0.0125, 200.0, 8192, 32, 0.02),
         *mark_slow(
+            (0.0125, 200.0, 8192, 32, 0.02),
             (0.007, 200.0, 16384, 85, 0.01),
             (0.01, 200.0, 16384, 85, 0.01),
             (0.0125, 200.0, 16384, 85, 0.01),
@@ -372,6 +372,7 @@ def test_derivatives_of_sampled_means_are_those_of_quadrature():
     assert abs(gradient["hub_mass"]) < 1e-3 * abs(gradient["slope"])
 
 
+@pytest.mark.slow
 def test_a_gradient_of_the_papers_wheel_is_a_central_difference():
     """At this damping walks fail in two ways, with different derivatives."""
 

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from support.slow_variants import mark_slow
 
 import vrw_jax as vrw
 from vrw_jax.cycles import compute_sensitivity_norms, make_finder, slope_response
@@ -79,6 +80,7 @@ def test_norms_along_a_branch_are_those_of_its_wheels():
         vrw.measure_gait_sensitivity(branch, "spectral_radius")
 
 
+@pytest.mark.slow
 def test_norms_are_infinite_at_unstable_gaits_of_a_branch():
     # A fold near 0.319 rad separates the stable gaits from the unstable ones.
     params = vrw.WheelParams(damping=105.0, stiffness=530.0, slope=0.318)
@@ -179,7 +181,7 @@ def test_an_unstable_gait_has_an_infinite_norm():
     [
         ("perod", {}, "did you mean 'period'"),
         ([], {}, "'nothing' is no measure of a step"),
-        ("period", {"damping": 300.0}, "this wheel has no gait whose sensitivity"),
+        *mark_slow(("period", {"damping": 300.0}, "this wheel has no gait whose sensitivity")),
     ],
 )
 def test_bad_arguments_are_one_sentence(measures, changes, sentence):

@@ -65,8 +65,13 @@ CALLS = {
     "simulate_hybrid": simulate_ball,
 }
 
+SLOW_CALLS = ("grad", "continue_branch", "tune")
+"""Calls that trace for seconds under each setting."""
 
-@pytest.mark.parametrize("name", CALLS)
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(x, marks=[pytest.mark.slow] * (x in SLOW_CALLS)) for x in CALLS]
+)
 def test_strict_settings_of_the_process_change_no_bit(name):
     results = [np.asarray(leaf) for leaf in jax.tree.leaves(CALLS[name]())]
     for setting, value in STRICT_SETTINGS:

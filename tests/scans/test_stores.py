@@ -18,6 +18,7 @@ from support.scanning import (
     make_plan,
     run_plan,
 )
+from support.slow_variants import mark_slow
 
 import vrw_jax as vrw
 from vrw_jax.scans import design as designs
@@ -56,7 +57,9 @@ CHUNK_FILE = "c/1/0"
 
 
 @pytest.mark.parametrize("what", DAMAGE_CASES)
-@pytest.mark.parametrize("variable", ["outcome", "speed", "clearance_sls1", "locked_stopper_force"])
+@pytest.mark.parametrize(
+    "variable", ["locked_stopper_force", *mark_slow("outcome", "speed", "clearance_sls1")]
+)
 def test_a_damaged_chunk_is_computed_again_with_a_warning(
     complete_store: Path, what: str, variable: str
 ) -> None:
@@ -346,7 +349,7 @@ METADATA = {
 
 
 @pytest.mark.parametrize("what", METADATA)
-@pytest.mark.parametrize("name", ["speed", "outcome", "damping", "bookkeeping/digest"])
+@pytest.mark.parametrize("name", ["speed", "bookkeeping/digest", *mark_slow("outcome", "damping")])
 def test_damaged_metadata_of_an_array_are_said_and_mended(
     complete_store: Path, name: str, what: str
 ) -> None:

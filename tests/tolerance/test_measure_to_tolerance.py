@@ -30,6 +30,7 @@ def test_measures_equal_those_of_the_paper_if_feet_cannot_slip():
     assert abs(measured.model_error) < 1e-8
 
 
+@pytest.mark.slow
 def test_a_converged_measure_repeats_with_unilateral_contact():
     names = ["theta_touchdown", "dtheta_touchdown", "dL1_touchdown"]
     measured = vrw.measure_to_tolerance(names, TABLE_1, 1e-9, friction=20.0)

@@ -49,6 +49,7 @@ def test_central_differences_agree(forward_jacobian, name):
     )
 
 
+@pytest.mark.slow
 def test_the_saltation_formula_agrees(forward_jacobian):
     """Product of flow, saltation and reset Jacobians, with a flow that has nothing to do with ours.
 

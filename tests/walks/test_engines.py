@@ -127,6 +127,7 @@ def test_derivatives_of_several_steps_agree_with_the_walk():
         np.testing.assert_allclose(by_input.durations[0], wanted[1], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_the_result_names_its_engine():
     params, x = vrw.WheelParams(), jnp.asarray(START)
     assert vrw.step(params, x).engine == "lanes"

@@ -165,6 +165,7 @@ def test_a_symbol_of_the_paper_gets_the_name_of_its_parameter(call, sentence):
         call()
 
 
+@pytest.mark.slow
 def test_invalid_numbers_in_a_batch_have_outcomes():
     vectors = make_parameter_rows(damping=[200.0, -1.0, np.nan])
     outcomes = compute_full_steps(vectors, vrw.paper_start()).outcome

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from reference_code import complementarity, uneven_ground
 from reference_code.five_coordinates import TABLE_1
+from support.slow_variants import mark_slow
 
 import vrw_jax as vrw
 from vrw_jax.contact.mechanics import find_contact_slots, select_slot_friction
@@ -26,16 +27,16 @@ def paper_walk(slopes, n_steps, **given):
     return vrw.walk(vrw.WheelParams(**WHEEL, slope=jnp.asarray(slopes)), START, n_steps, **given)
 
 
-def test_ten_steps_of_the_papers_wheel_are_those_in_an_absolute_frame():
-    walk, other = paper_walk(LINES, 10, options=TIGHT), uneven_ground.walk(OTHER, START, LINES)
+@pytest.mark.parametrize("engine", ["lanes", *mark_slow("diffrax")])
+def test_ten_steps_of_the_papers_wheel_are_those_in_an_absolute_frame(engine):
+    walk = paper_walk(LINES, 10, options=TIGHT, engine=engine)
+    other = uneven_ground.walk(OTHER, START, LINES)
     assert int(walk.n_stepped) == len(other) == 10
     durations, states = (np.stack([getattr(step, name) for step in other]) for name in
                          ("durations", "section_state"))  # fmt: skip
     assert abs(float(jnp.sum(walk.steps.durations)) - durations.sum()) < 1e-12
     np.testing.assert_allclose(walk.steps.durations, durations, atol=1e-12)
     np.testing.assert_allclose(walk.steps.section_state, states, atol=1e-12)
-    by_diffrax = paper_walk(LINES, 10, options=TIGHT, engine="diffrax")
-    np.testing.assert_allclose(by_diffrax.steps.durations, durations, atol=1e-12)
 
 
 def test_energies_and_margins_of_a_step_are_those_of_an_absolute_frame():
@@ -56,26 +57,39 @@ def test_energies_and_margins_of_a_step_are_those_of_an_absolute_frame():
         x = step.section_state
 
 
+N_LINES = 4
+NAMES = [name for name in PARAMETER_NAMES if name != "slope"]
+WALK_INPUTS = np.array([*START, *(OTHER[name] for name in NAMES), *LINES[:N_LINES]])
+"""Start, parameters and slopes of a walk over three steps."""
+
+
+def end_walk(inputs):
+    """Return the last state and the last durations of a walk."""
+    params = vrw.WheelParams(
+        **dict(zip(NAMES, inputs[3:-N_LINES], strict=True)), slope=inputs[-N_LINES:]
+    )
+    last = vrw.walk(params, inputs[:3], N_LINES - 1, options=TIGHT).steps
+    return jnp.concatenate([last.section_state[-1], last.durations[-1]])
+
+
+@pytest.mark.slow
+def test_reverse_mode_of_a_walk_gives_the_derivatives_of_forward_mode():
+    reverse, forward = (
+        transform(end_walk)(jnp.asarray(WALK_INPUTS)) for transform in (jax.jacrev, jax.jacfwd)
+    )
+    np.testing.assert_allclose(reverse, forward, atol=1e-11)
+
+
 def test_derivatives_of_a_walk_are_differences_of_an_absolute_frame():
     """With respect to the start, every parameter and every slope, over three steps."""
-    slopes, n_lines = LINES[:4], 4
-    names = [name for name in PARAMETER_NAMES if name != "slope"]
-    point = np.array([*START, *(OTHER[name] for name in names), *slopes])
 
-    def other(point):
-        given = OTHER | dict(zip(names, point[3:-n_lines].tolist(), strict=True))
-        last = uneven_ground.walk(given, point[:3].tolist(), point[-n_lines:].tolist())[-1]
+    def other(inputs):
+        given = OTHER | dict(zip(NAMES, inputs[3:-N_LINES].tolist(), strict=True))
+        last = uneven_ground.walk(given, inputs[:3].tolist(), inputs[-N_LINES:].tolist())[-1]
         return np.concatenate([last.section_state, last.durations])
 
-    def end(point):
-        params = vrw.WheelParams(
-            **dict(zip(names, point[3:-n_lines], strict=True)), slope=point[-n_lines:]
-        )
-        last = vrw.walk(params, point[:3], 3, options=TIGHT).steps
-        return jnp.concatenate([last.section_state[-1], last.durations[-1]])
-
-    forward = jax.jacfwd(end)(jnp.asarray(point))
-    np.testing.assert_allclose(jax.jacrev(end)(jnp.asarray(point)), forward, atol=1e-11)
+    point = WALK_INPUTS
+    forward = jax.jacfwd(end_walk)(jnp.asarray(point))
     # A wrong derivative with respect to any input changes the derivative along a random direction.
     directions = np.random.default_rng(0).standard_normal((4, len(point)))
     for direction in directions * np.maximum(np.abs(point), 1.0):
